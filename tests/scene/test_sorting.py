@@ -1,12 +1,27 @@
 """Sorting by frequencies of kinetic effects, and the reasons that are given."""
 
+import re
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from vmri_jax import fully_implicit
-from vmri_jax.scene import Body, Coulomb, Gravity, Kinetic, MagneticField, Potential, RigidLink, Scene, Spring
+from vmri_jax.scene import (
+    Body,
+    Box,
+    Coulomb,
+    Gravity,
+    Kinetic,
+    MagneticField,
+    Potential,
+    Revolute,
+    RigidBody,
+    RigidLink,
+    Scene,
+    Spring,
+)
 from vmri_jax.scene.rates import measure
 
 
@@ -47,6 +62,35 @@ def test_gyration_and_stiffness_share_the_border():
     scene = Scene(bodies, [Gravity(), Spring(("a", "b"), 50.0), MagneticField(1000.0, 1.0, "ion")])
     assert paces(scene) == {"ion": "fast", "a": "slow", "b": "slow"}
     assert paces(scene.without("magnetic_field")) == {"ion": "slow", "a": "fast", "b": "fast"}
+
+
+def test_the_reason_of_a_slow_body_names_a_stiff_spring_that_is_part_of_v():
+    """A spring of 300 rad/s to a body with the pace "slow" leaves the other body slow; its reason does not say that none touches it."""
+    bodies = [Body("a", 1.0, [0.0, 0.0], pace="slow"), Body("b", 1.0, [1.0, 0.0])]
+    scene = Scene(bodies, [Gravity(), Spring(("a", "b"), 4.5e4)])
+    pace = scene.sorting.paces["b"]
+    assert pace.value == "slow"
+    assert pace.reason.startswith("springs, 300 rad/s, above ")
+    assert pace.reason.endswith(", is part of V: it also touches a, whose pace is slow")
+
+
+def test_the_reason_of_a_slow_body_names_a_stiff_spring_between_bodies_that_it_carries():
+    box = Box((0.2, 0.2, 0.2))
+    bodies = [
+        RigidBody("hub", 100.0, box, [0.0, 0.0, 0.0]),
+        *(RigidBody(b, 1.0, box, [x, 0.0, 0.0]) for b, x in SIDES.items()),
+    ]
+    hinges = [
+        Revolute(("hub", b), axis=[0.0, 0.0, 1.0], at=[x / 2, 0.0, 0.0], name=f"to {b}") for b, x in SIDES.items()
+    ]
+    scene = Scene(bodies, [Gravity(), *hinges, Spring(("left", "right"), 4.5e4)], coordinates="joint")
+    assert paces(scene) == {"hub": "slow", "left": "fast", "right": "fast"}
+    assert re.fullmatch(
+        r"springs, 3\d\d rad/s, above [\d.]+, acts between bodies that it carries", scene.sorting.paces["hub"].reason
+    )
+
+
+SIDES = {"left": -1.0, "right": 1.0}
 
 
 def test_declared_rate_of_a_kinetic_effect_wins():

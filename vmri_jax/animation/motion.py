@@ -31,7 +31,7 @@ class Motion:
         points, velocities: (k, n_bodies, 3) in the coordinates of the picture, where z points upwards.
         energy: (k, c) change of the energy since the start. For a system that keeps its energy it is relative to the energy at the
             start, unless that is zero. For other systems there are further columns: the work of forces and of moving
-            constraints since the start, and the balance.
+            constraints since the start, and the balance: the change of the energy minus both works.
         energy_names: names of the c columns.
         relative: whether the change of the energy is relative.
         residual: (k, 2) largest value and largest rate of a constraint.
@@ -182,7 +182,7 @@ def _energies(trajectory: Trajectory, count: int, system: System | None) -> tupl
 
 
 def _differences(t, values) -> np.ndarray:
-    """Central differences, also at the ends of second order; zero for a single node."""
+    """Central differences, and one-sided differences of second order at the ends; zero for a single node."""
     if len(t) == 1:
         return np.zeros_like(values)
     return np.gradient(values, t, axis=0, edge_order=2 if len(t) > 2 else 1)

@@ -65,12 +65,12 @@ class Block:
 
 @dataclass(frozen=True)
 class Joint:
-    """A link or spring between two bodies, or from a body to a fixed point.
+    """A line of the drawing: a link or spring between two bodies, or from a body to a fixed point. Joints of a scene are drawn otherwise.
 
     Attributes:
         kind: "link" or "spring".
         bodies: one name or two.
-        point: the fixed point of a joint with one body.
+        point: the fixed point of a line with one body.
         pace: "slow" or "fast", which colours a spring; None for the pace of the bodies.
     """
 

@@ -54,7 +54,9 @@ def slow_signal(motion: Motion) -> Signal | None:
 
 
 def fast_signal(motion: Motion) -> Signal | None:
-    """The length of a fast spring with the largest speed times frequency that the nodes resolve; else such a coordinate of a fast body.
+    """The length of a fast spring that moves most: of those whose frequency the nodes resolve, the largest speed times frequency.
+
+    Without such a spring, a coordinate of a fast body, chosen likewise.
 
     Args:
         motion: from `vmri_jax.animation.motion`.

@@ -41,7 +41,7 @@ def plot_control(optimum: Any, *, title: str = "", theme: Theme = LIGHT) -> Note
                 below.semilogy(numbers, np.maximum(values, ROUNDOFF_FLOOR), ".-", color=color, label=MEANING[name])
         below.set(
             xlabel="iteration",
-            ylabel="left",
+            ylabel="remaining error",
             xticks=1 + np.arange(0, len(optimum.history), 1 + len(optimum.history) // 12),
         )
         legend_beside(below)
@@ -49,5 +49,5 @@ def plot_control(optimum: Any, *, title: str = "", theme: Theme = LIGHT) -> Note
     return figure
 
 
-MEANING = {"update": "update", "gap": "gaps of steps", "miss": "goal", "over": "limits"}
+MEANING = {"update": "update", "gap": "gaps of steps", "miss": "goal missed by", "over": "limits exceeded by"}
 """Names in the legend, by the keys in the history of an optimisation."""

@@ -41,7 +41,9 @@ class Marked(NamedTuple):
 
 
 class Bound(NamedTuple):
-    """Lower bound of the time with N micro steps per macro step: the time of the same steps as single steps, less their slow forces.
+    """Lower bound of the time with N micro steps per macro step.
+
+    It is the time of single steps as small as the micro steps, without the slow forces that a macro step saves.
 
     label: name in the legend.
     kind: kind of schemes with single steps, whose times are multiplied by `factor`.

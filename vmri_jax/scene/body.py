@@ -88,7 +88,7 @@ class AnyBody(ABC):
         block: whether it has general coordinates, not the position of a point.
         rigid: whether its coordinates are a centre and directors.
         rotation: (3, 3) axes of the body in space at the start as columns; None for a body without axes.
-        wide: numbers of the directors that are among its coordinates: of the axes along which the body has a width.
+        wide: indices of the directors that are among its coordinates: of the axes along which the body has a width.
     """
 
     name: str

@@ -82,7 +82,7 @@ class Parameter:
         shape: "number", () the same for all n elements or (n,); "vector", (d,) or (n, d), which the function gets as (n, d);
             "common", (d,) the same for all elements; "array", any shape, the same for all elements.
         sign: "positive", "at least zero", or "" for any.
-        measured: whether None stands for the value at the start, see `Effect.rest`; otherwise the function gets no parameter for None.
+        measured: if True, the value at the start takes the place of None, see `Effect.rest`; if False, params lack a field that is None.
         may_be_number: whether a number () is allowed instead of a common vector.
     """
 

@@ -58,7 +58,7 @@ class Effect(ABC):
         name: of this effect in its scene; by default the name of its class.
         rate: how often a potential is evaluated: "slow" (as part of V), "fast" (on the micro grid, with the rule of W), a whole number k
             (on every k-th micro node), or "auto" (the scene decides by stiffness). A potential with the rate "fast" or k makes its bodies fast, except bodies
-            with the pace "slow": then the equations of these slow bodies are implicit in the potential. Of a kinetic effect "slow",
+            with the pace "slow": the positions of these slow bodies are then solved for by iteration over the macro step. Of a kinetic effect "slow",
             "fast" or "auto"; here the rate decides only whether its bodies are fast, since all kinetic effects are on the micro grid.
     """
 

@@ -44,7 +44,7 @@ class _OfTerms:
         return self.kinematics(slow, fast, params[JOINTS])
 
     def motions(self, q_s, q_f, v_s, v_f, params):
-        """((Q_s, Q_f), (V_s, V_f)) with the velocities ``V = dQ/dq v`` of the bodies."""
+        """Coordinates (Q_s, Q_f) of the bodies, and their velocities (V_s, V_f), ``V = dQ/dq v``; Q = q without joint coordinates."""
         if self.kinematics is None:
             return (q_s, q_f), (v_s, v_f)
         return jax.jvp(lambda q_s, q_f: self.bodies(q_s, q_f, params), (q_s, q_f), (v_s, v_f))

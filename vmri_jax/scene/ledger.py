@@ -52,7 +52,7 @@ class LedgerRow:
     kind: "body", or the term that the effect is part of.
     grid: "macro" or "micro", the grid of its unknowns or evaluations.
     why: the reason for this grid.
-    unknowns, multipliers: numbers of these that it adds to the equations of a macro step.
+    unknowns, multipliers: how many of each it adds to the equations of a macro step.
     evaluations: number of nodes in a macro step at which its function is evaluated (by implicit schemes in every Newton iteration).
     microseconds: computing time of its first derivatives once at all these nodes, None if not measured.
     """
@@ -76,7 +76,7 @@ class Ledger:
 
     @property
     def unknowns(self) -> int:
-        """Unknowns of a macro step, multipliers included: ``r n_s + r n_gs + num_micro r (n_f + n_g)``."""
+        """Unknowns of a macro step, multipliers included: ``r n_s + r n_gs + num_micro r (n_f + n_g)``, r the degree."""
         return sum(row.unknowns + row.multipliers for row in self.rows)
 
     def as_dict(self) -> dict[str, Any]:

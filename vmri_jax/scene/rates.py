@@ -1,8 +1,8 @@
 """The rate at which each effect alone would move its bodies, and the border between slow and fast rates.
 
-The part L(q, v) of the Lagrangian of a potential (L = -V) or kinetic effect gives the force ``f(q, v) = L_q - L_vq v`` at constant
-velocity, in which gauge terms cancel. The stiffness is ``K = -df/dq``, the gyroscopic matrix G is the antisymmetric part of df/dv, and
-M is the mass matrix of the bodies of an element. The frequency of the element is the largest w at the start with
+An effect adds L(q, v) to the Lagrangian; of a potential, ``L = -V``. At constant v its force is ``f = dL/dq - d/dt dL/dv = L_q - L_vq v``; a
+total time derivative in L adds nothing to f. The stiffness is ``K = -df/dq``, the gyroscopic matrix G is the antisymmetric part of df/dv,
+and M is the mass matrix of the bodies of an element. The frequency of the element is the largest w at the start with
 ``det(K - w^2 M) = 0`` or ``det(G - i w M) = 0``.
 
 The rate of the element is the larger of this frequency and ``sqrt(a / L)``, with its largest acceleration a of bodies at rest and the
@@ -28,8 +28,8 @@ SEPARATION = 3.0
 """Smallest ratio of neighbouring rates that separates slow from fast: below it micro steps cost more than they save. With a larger value
 fewer scenes have fast bodies."""
 SPAN = 1e3
-"""Largest ratio between the fastest rate and any other: slower rates are raised to this one. Such effects are slow in any case, and with a
-larger value the gap to them may be wider than the gap between slow and fast effects."""
+"""Rates below the fastest rate over SPAN count as the fastest rate over SPAN. Their effects are slow in any case, and with a larger value the
+gap between these effects and all others may be wider than the gap between slow and fast effects."""
 ROUND_OFF = 1e-12
 """An eigenvalue of the stiffness below this fraction of its largest entry is round-off, and the frequency zero. A larger value hides soft
 motions of stiff elements."""
@@ -46,7 +46,7 @@ class Linearised(NamedTuple):
     """An element at the start. All derivatives are with respect to the velocities that its bodies can have: of a rigid body the velocity
     of its centre and its spin.
 
-    columns: numbers of these velocities among the velocities of all bodies.
+    columns: indices of these velocities among the velocities of all bodies.
     force: on the bodies at rest.
     stiffness, gyroscopic: K and G.
     mass: d2L/dv2, the part of the element in the mass matrix.

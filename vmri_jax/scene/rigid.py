@@ -166,7 +166,7 @@ class RigidBody(AnyBody):
 
     @property
     def wide(self) -> tuple[int, ...]:
-        """Numbers of the directors of the body: of the principal axes in which it has width, all three of a traced inertia."""
+        """Indices of the directors of the body: of the principal axes in which it has width, all three of a traced inertia."""
         return tuple(range(3)) if not is_concrete(self.moments) else tuple(np.flatnonzero(self._inertias()).tolist())
 
     @property
@@ -337,7 +337,9 @@ def _cross_matrix(u):
 
 
 def rotation(q):
-    """Rotation matrices (..., 3, 3) of a rigid body from its coordinates, its principal axes of inertia as columns, which the directors are.
+    """Rotation matrices (..., 3, 3) of a rigid body from its coordinates: its directors, the principal axes of inertia, as columns.
+
+    The columns of ``rotation(q) @ body.axes.T`` are the axes of `RigidBody.rotation` along the run.
 
     Args:
         q: (..., 12) coordinates, ``run.position("hub")``.
@@ -374,7 +376,7 @@ def quaternion(q):
 def angular_velocity(q, v):
     """``omega`` of ``d_i' = omega x d_i``, in space, (..., 3) rad/s, from directors d_i of length 1.
 
-    Their sum of ``d_i x d_i' = (1 - d_i d_i^T) omega`` is solved for omega. A body with two directors, a plate, has all three components; a
+    The sum over i of ``d_i x d_i' = (1 - d_i d_i^T) omega`` is solved for omega. A body with two directors, a plate, has all three components; a
     body with one, a rod, has no spin about itself, and gets the omega across it.
 
     Args:

@@ -42,7 +42,7 @@ class Scene:
             [Body("bob", 100.0, [10, 0, 0]), Body("hook", 1.0, [10, 2, 0]), Body("load", 1.0, [10, 2, 3])],
             [Gravity(), Anchor("bob", [0, 0, 0]), RigidLink(("bob", "hook")), Spring(("hook", "load"), 5000.0)],
         )
-        run = simulate(scene.system(), fully_implicit(10), scene.state(), macro_dt=0.01, num_steps=1000)
+        run = simulate(scene, fully_implicit(10), macro_dt=0.01, num_steps=1000)
 
     Absent terms cost nothing: a scene without constraints gives a system without multipliers, a scene without forces a system without a
     force function. Scenes of the same structure (the same names, bodies of each effect, slow and fast bodies) share compiled programs.
@@ -59,7 +59,7 @@ class Scene:
             "drop" leaves out as many rows as there are dependences, see `dropped`. The dropped rows must follow from the others along the
             motion, not only at the start: the scene tries random motions, and runs watch the rows, see `System.implied`.
         coordinates: of rigid bodies. "directors": a centre and directors for each body, joints are constraints. "joint": bodies in trees
-            are functions of the freedoms of their joints; each freedom is a coordinate, zero where the bodies are given, and the joint has no
+            are functions of the freedoms of their joints; each freedom is a coordinate, zero at the positions in `bodies`, and the joint has no
             constraint rows. Roots of trees other than the ground keep directors; joints that close loops and `Spherical` joints keep
             their rows. "auto": joint coordinates for trees short enough that these are faster, see `vmri_jax.scene.trees.LONGEST`.
         joint_starts: values and rates of joint coordinates at the start; `with_joints` sets them.
@@ -174,7 +174,7 @@ class Scene:
 
     @cached_property
     def everything(self) -> tuple[Effect, ...]:
-        """All effects: `Rigidity` of the bodies by directors, then the effects of the user, with joints instead of names of joints."""
+        """All effects: `Rigidity` of the bodies that have directors, then the effects of the user, with joints instead of names of joints."""
         carried = {branch.child for branch in self.branches}
         rigid = [body.name for body in self.bodies if body.rigid and body.name not in carried]
         effects = tuple(effect.bound(self.effects) for effect in self.effects)
@@ -193,7 +193,7 @@ class Scene:
 
     @property
     def places(self) -> dict[str, Place]:
-        """Where each body's coordinates are in q_s and q_f; with joint coordinates, in (Q_s, Q_f) of `Names.kinematics`."""
+        """Where each body's coordinates are in q_s and q_f; with joint coordinates, in the (Q_s, Q_f) that `Names.kinematics` computes."""
         return self.sorting.places
 
     @cached_property
@@ -228,7 +228,7 @@ class Scene:
         return build(self.sorting, self.sorting.placed)
 
     def problem(self) -> Problem:
-        """The system with positions and velocities at the start, and with the drawing unless the numbers of the scene are traced."""
+        """The system with positions and velocities at the start, and with the drawing unless jax.jit, grad or vmap traces numbers of the scene."""
         if self._problems:
             return self._problems[0]
         is_drawn = is_concrete((self.params, [body.radius for body in self.bodies]))
@@ -266,7 +266,7 @@ class Scene:
         return along_run(joints[joint], run, self.by_name, of, pair)
 
     def by_directors(self, run: Trajectory) -> Trajectory:
-        """The same run with the coordinates of bodies by directors, where joints have rows, multipliers and reaction forces.
+        """The same run with bodies described by their centres and directors, where joints have rows, multipliers and reaction forces.
 
             scene.by_directors(run).reaction_forces("hinge")["panel"]  # on the centre and the directors of the panel
 
@@ -279,7 +279,7 @@ class Scene:
         frames = [body.name for body in self.bodies if isinstance(body, Frame)]
         if frames:
             raise ValueError(
-                f"Scene.by_directors: {', '.join(frames)} have no mass, which bodies by directors need. Reaction forces are known of scenes "
+                f"Scene.by_directors: {', '.join(frames)} have no mass, which bodies with directors need. Reaction forces are known of scenes "
                 "without frames: join bodies by Universal, Cylindrical or Planar, or put bodies of small mass in place of the frames."
             )
         # all bodies slow: on the micro grid, rows that the fast bodies alone cannot satisfy would be refused
@@ -350,7 +350,7 @@ class Scene:
                 number, or a number for each pair of the joint. Of a joint with several freedoms, ``{"turn": 1.0, "slide": 0.1}``.
 
         Raises:
-            TypeError: no mapping, or numbers of the scene that are traced.
+            TypeError: no mapping, or numbers of the scene that jax.jit, grad or vmap traces.
             ValueError: no joint of this name, a joint without this freedom, rates that contradict each other or the constraints.
         """
         bodies, starts = with_rates(self.sorting, self.effects, self.system(), rates)

@@ -1,24 +1,27 @@
 """Sorting of bodies into slow and fast, and of effects into the functions of a `System`.
 
-An effect touches the bodies whose coordinates it depends on. Each of its elements has a home, the argument of `System` that it is part of:
+An effect touches the bodies whose coordinates it depends on. Each of its elements has a home, the argument of `System` that it is part of.
+Of several lines that fit, the first one counts:
 
 | element of a | home | function |
 |---|---|---|
-| potential that touches a slow body | "slow_potential" | V |
-| potential between fast bodies, stiff | "fast_potential" | W(q_f) |
-| potential between fast bodies, not stiff | "slow_potential" | V, on the grid of the rule of V |
 | potential with the rate k | k | V_k, at every k-th micro node |
 | potential with the rate "fast" that touches a slow body | "fast" | on the micro grid like W, but of q_s too |
+| potential that touches a slow body | "slow_potential" | V, on the grid of the rule of V |
+| potential between fast bodies with the rate "slow", or not stiff | "slow_potential" | V |
+| potential between fast bodies with the rate "fast", or stiff | "fast_potential" | W(q_f), on the micro grid |
 | constraint that touches a fast body | "constraint" | g, on the micro grid |
 | constraint between slow bodies | "slow_constraint" | g_s, on the macro grid; on the micro grid it would have more rows than unknowns |
-| kinetic effect | "kinetic" | T, on the micro grid, where momenta need it |
+| kinetic effect | "kinetic" | T, on the micro grid: the momenta of fast bodies follow from it |
 | force | "force" | F |
 | control | "control" | none: a run has no controls |
 
 The kinetic energy T_s of bodies that depend on slow coordinates alone is on the macro grid.
 
-A body with the pace "auto" is fast if a stiff kinetic effect, or a stiff potential outside V, touches it. An effect is stiff if its
-frequency is above the border between slow and fast, see `vmri_jax.scene.rates`.
+A body with the pace "auto" is fast if one of these effects moves it against another body: a kinetic effect or a potential with the rate
+"fast" or k, or a stiff one with the rate "auto". A stiff potential that touches a body with the pace "slow" does not count, since it is
+part of V. An effect is stiff if its frequency is above the border between slow and fast, see `vmri_jax.scene.rates`. Without a border no
+effect makes bodies fast by its frequency, and every potential between fast bodies with a frequency above zero is stiff.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -62,9 +65,9 @@ class Reason(NamedTuple):
 class Placed(NamedTuple):
     """Some elements of an effect with a common home.
 
-    effect, elements: the effect, and the numbers of these elements.
+    effect, elements: the effect, and the indices of these elements.
     home, reason: the argument of `System` that they are part of, and why.
-    dropped: numbers of the rows of a constraint that the scene leaves out, in the order of its terms.
+    dropped: indices of the rows of a constraint that the scene leaves out, in the order of its terms.
     sizes: of the dropped rows, see `ConstraintRows.sizes`.
     """
 
@@ -84,7 +87,7 @@ class Sorting:
         bodies, paces: by name.
         layout: places of all coordinates.
         placed: the effects, each with its home.
-        links: the frames of bodies on joints, in the order of the kinematics; None pads paths to the same length.
+        links: of bodies on joints, in the order of the kinematics; None where a chain of joints is shorter than the longest one.
         joint_starts: values and rates of freedoms of joints at the start, by the keys of `Layout.freedoms`. Other freedoms start at zero,
             with the rates that follow from the velocities of bodies.
     """
@@ -103,7 +106,7 @@ class Sorting:
 
     @property
     def places(self) -> dict[str, Place]:
-        """Places of the coordinates of bodies in Q_s and Q_f, see `Layout`."""
+        """Places of the coordinates of bodies (centres and directors) in Q_s and Q_f, see `Layout`."""
         return self.layout.bodies
 
     @property
@@ -296,8 +299,9 @@ def _measure(bodies, energies, owned: Mapping[str, Sequence[Owners]]) -> dict[st
     numbers = [(body.masses, body.coordinates, body.rates if kinetic else None) for body in bodies.values()]
     if not is_concrete((numbers, [effect.parameters(bodies) for effect in energies])):
         raise ValueError(
-            f"Scene: whether {', '.join(undecided or bodies)} is slow or fast depends on numbers that are traced. Give every body a "
-            "pace and every potential between fast bodies a rate, or build the system outside of jit and vary its params."
+            f"Scene: whether {', '.join(undecided or bodies)} is slow or fast depends on numbers that jax.jit, grad or vmap traces, so that "
+            "their values are unknown. Give every body a pace and every potential between fast bodies a rate, or build the system outside of "
+            "jit and vary its params."
         )
     return measure(bodies, energies)
 
@@ -315,12 +319,19 @@ def _paces(bodies, energies, measured, limit, owned: Mapping[str, Sequence[Owner
     for effect in energies:
         for i, (names, between) in enumerate(owned[effect.name]):
             declared = effect.rate == "fast" or isinstance(effect.rate, int)
-            if effect.kind == "potential" and not declared and any(bodies[name].pace == "slow" for name in names):
-                continue  # the potential is part of V, however stiff
+            slow = [name for name in names if bodies[name].pace == "slow"]
+            in_v = effect.kind == "potential" and not declared and slow  # part of V, however stiff
             reason = _stiff(effect, i, measured, limit)
-            for name in between if reason else ():
-                if paces[name].value == "slow" and bodies[name].pace == "auto":
+            for name in names if reason else ():
+                if paces[name].value == "fast" or bodies[name].pace != "auto":
+                    continue
+                if in_v:
+                    text = f"{effect.name}, {reason}, is part of V: it also touches {slow[0]}, whose pace is slow"
+                    paces[name] = DecidedPace("slow", text)
+                elif name in between:
                     paces[name] = DecidedPace("fast", f"touched by {effect.name}, {reason}")
+                else:
+                    paces[name] = DecidedPace("slow", f"{effect.name}, {reason}, acts between bodies that it carries")
     return paces
 
 

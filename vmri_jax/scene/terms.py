@@ -115,7 +115,7 @@ class EffectTerm:
         name: of the effect, the key of its parameters in params.
         function: of the effect.
         roles: the maps from q_s and q_f to the coordinates of each role.
-        select: numbers of the elements; None for all.
+        select: indices of the elements; None for all.
         split: names of the parameters that have an entry for each element.
         timed: whether the first argument of the function is the time.
     """

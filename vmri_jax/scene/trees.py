@@ -42,7 +42,7 @@ class Branch(NamedTuple):
 
     @property
     def size(self) -> int:
-        """Number of frames between the parent and the child, including the child."""
+        """Number of links from the parent to the child, see `Link`."""
         return max(1, len(self.joint.moves))
 
     @property
@@ -58,9 +58,11 @@ class Branch(NamedTuple):
 
 
 class Link(NamedTuple):
-    """A frame of a tree with a single coordinate or none: the child of a branch, or a frame between two moves of its joint.
+    """One elementary motion of a joint, with one freedom or none, and the frame (coordinate system) behind it.
 
-    step: number of the move, counted from the parent of the branch.
+    The last frame of a branch is its child; those before it lie between two motions of the joint. No such frame is a body `Frame`.
+
+    step: number of the motion, counted from the parent of the branch.
     """
 
     branch: Branch
@@ -189,15 +191,17 @@ def check_frames(bodies: Bodies, branches: Sequence[Branch]) -> None:
                 f'Scene: {name} is a frame without mass, which moves with joints alone; give the scene coordinates="joint".'
             )
         if name not in hanging or name not in carrying:
-            lack = "hangs on no body, by no joint that may carry it," if name not in hanging else "carries no body"
+            lack = f"no joint carries the frame {name}" if name not in hanging else f"the frame {name} carries no body"
             raise ValueError(
-                f"Scene: the frame {name} {lack} and has no mass of its own; join it to the body that it hangs on and to a body that it "
+                f"Scene: {lack}, and it has no mass; join it to the body that it hangs on and to a body that it "
                 "carries by joints with coordinates, such as Revolute, or leave it out."
             )
 
 
 def with_weight(bodies: Bodies, branches: Sequence[Branch]) -> Bodies:
-    """The bodies, with a rigid body of the mass of a carried body in place of each frame: the frequency of an effect on a frame needs a mass.
+    """The bodies, each frame replaced by a rigid body with the mass and the inertia of a body that it carries.
+
+    The frequencies of effects on a frame are estimated with this mass.
 
     Args:
         bodies: by name.
@@ -275,7 +279,7 @@ def _with_kinematics(bodies: Bodies, branches: Sequence[Branch], places, coordin
         groups[grid, grid != "s" or branch.child in carriers].append(branch)
     frames, links, carried, num_fast = [], [], [], 0
     for (grid, is_needed), group in groups.items():
-        group.sort(key=lambda branch: depths[branch.child])  # the order of the frames, which few slices then take
+        group.sort(key=lambda branch: depths[branch.child])  # by depth, so that few slices take the frames in order
         if group:
             of_group, links_of_group = _frames(grid, len(links), group, bodies, freedoms, numbers)
             numbers |= {branch.child: len(roots) + len(carried) + i for i, branch in enumerate(group)}
@@ -305,10 +309,10 @@ def _frames(grid: Grid, first: int, branches: Sequence[Branch], bodies: Bodies, 
 
     Args:
         grid: the part of the coordinates: slow, fast, or both.
-        first: number of the first of these frames.
+        first: index of the first of these frames.
         branches: parents before children.
         freedoms: as of `Layout`.
-        numbers: of the bodies that the branches may hang on.
+        numbers: indices of the bodies that the branches may hang on.
     """
     branch_of = {branch.child: branch for branch in branches}
     parents = {branch.parent for branch in branches}

@@ -26,7 +26,7 @@ class CostRow:
 
     label: of the system or the scheme, as passed to `cost_study`.
     method: name of the solver, as in ``vm.solvers.named(method)()``.
-    num_unknowns: unknowns of one macro step, ``r n_s + r n_gs + num_micro r (n_f + n_g)``.
+    num_unknowns: unknowns of one macro step, ``r n_s + r n_gs + num_micro r (n_f + n_g)``, r the degree.
     num_steps: macro steps of the timed run.
     seconds_per_unit: computing time per unit of simulated time; the figures of the reference paper up to a constant.
     us_per_micro_step: computing time per micro step, in microseconds.

@@ -130,7 +130,7 @@ class _Coupling(Effect):
             violation < START,
             "the equation",
             violation,
-            "freedoms are counted from the start, where it must be zero; or let the scene move the joints, project=True",
+            "it must be zero at the positions in `bodies`, where all freedoms are zero; change it, or let project=True move the joints",
         )
 
 
@@ -148,7 +148,8 @@ class JointCoupling(_Coupling):
         joints: names of joints of the scene, each with a single pair of bodies; ``(name, freedom)`` for a joint with several freedoms.
         law: ``g(x, params) -> ()`` or (k,) with the freedoms x (n,) in the order of `joints`, rad and m from the given position; zero at x = 0.
             Define the law at module level: functions are compared by identity.
-        params: numbers, arrays or trees of them that the law gets; traced.
+        params: numbers, arrays or trees of them that the law gets. They may change without a new compilation, and derivatives may be taken
+            by them.
 
     Raises:
         TypeError: a law that is no function of (x, params).

@@ -35,7 +35,8 @@ class CustomEffect(Effect):
         function: see `Effect`; define it at module level: functions are compared by identity.
         bodies: names of the bodies, in the order in which the function takes them. The function gets all coordinates of a rigid body;
             with ``(name, [x, y, z])`` the position of this point in it, and with ``("ground", [x, y, z])`` a fixed point.
-        params: of the function: numbers, arrays, or lists and dictionaries of them; traced.
+        params: of the function: numbers, arrays, or lists and dictionaries of them. They may change without a new compilation, and
+            derivatives may be taken by them.
         name: the name of the function by default.
         drawn_as: "link" or "spring", drawn between each of the bodies and the next; None draws nothing.
 

@@ -81,7 +81,7 @@ class Drive(Effect):
     Args:
         bodies: a name, or a list of names; each gets this force.
         history: ``history(t, params) -> (d,)``, N; define it at module level: functions are compared by identity.
-        params: of `history`; traced.
+        params: of `history`. They may change without a new compilation, and derivatives may be taken by them.
     """
 
     bodies: Any = names()

@@ -62,7 +62,7 @@ class Joint(Effect):
         return np.zeros(())
 
     def frame(self, count: int) -> list | None:
-        """(n, 3, 3) triads (m, m', n) of all pairs in space where the freedoms are zero; None if the joint has no axis."""
+        """(n, 3, 3) axes (m, m', n) of the joint in space, for all pairs, where the freedoms are zero; None if the joint has no axis."""
         return None
 
     def check_bodies(self, bodies):

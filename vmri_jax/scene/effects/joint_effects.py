@@ -165,7 +165,9 @@ class JointSpring(InJoint):
 
 @effect_class
 class JointLimit(InJoint):
-    """Stops of a joint by a smooth penalty: ``V = sum k/2 (d_-^2 + d_+^2)``, ``d = s log(1 + exp(depth / s))``.
+    """Stops of a joint by a smooth penalty: ``V = sum k/2 (d_-^2 + d_+^2)``.
+
+    The depths are ``d_- = s log(1 + exp((lower - x) / s))`` and ``d_+ = s log(1 + exp((x - upper) / s))``, with the freedom x of the joint.
 
     Args:
         joint, of: as of `InJoint`.
@@ -293,7 +295,7 @@ class JointDrive(InJoint):
     Args:
         joint, of: as of `InJoint`.
         history: ``history(t, params) -> ()``, N m or N; define it at module level: functions are compared by identity.
-        params: of `history`; traced.
+        params: of `history`. They may change without a new compilation, and derivatives may be taken by them.
     """
 
     history: Callable = of_time()
@@ -341,12 +343,14 @@ class GivenMotion:
 
 @effect_class
 class JointMotion(InJoint):
-    """A prescribed angle or displacement of a joint, ``x = a(t)``; the multiplier is the drive that it takes, and does work.
+    """A prescribed angle or displacement of a joint, ``x = a(t)``.
+
+    Minus the multiplier is the torque (N m) or the force (N) of the drive that moves b against a so; it does work.
 
     Args:
         joint, of: as of `InJoint`.
         path: a, ``path(t, params) -> ()``, rad or m from the given position, zero at t = 0; define it at module level.
-        params: of `path`; traced.
+        params: of `path`. They may change without a new compilation, and derivatives may be taken by them.
 
     Raises:
         ValueError: (of the scene) a path that does not start at zero.
