@@ -36,8 +36,8 @@ from vmri_jax.steppers.solved import Solution, Solver, largest_constraint, statu
 from vmri_jax.steppers.solvers import Newton
 
 EXTRA_PASSES = 1
-"""Passes above the fewest with a matrix K that the solver tolerates; it renews K after a step with more. A larger number lets steps with an old K take more passes; with
-zero, every fluctuation of the number of passes renews K."""
+"""Passes above the fewest with a matrix K that the solver tolerates; it renews K after a step with more. A larger number lets steps with an old K
+take more passes; with zero, every fluctuation of the number of passes renews K."""
 PASSES_OF_UNUSED_MATRIX = 10**6
 """Initial value of the least number of passes with a new matrix: larger than the number of any step."""
 

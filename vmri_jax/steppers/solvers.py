@@ -11,10 +11,11 @@ In a *pass* of `Nested` every micro interval takes one Newton step, in order; th
 
 `Auto` takes `Nested` where every term belongs to single micro intervals (constant masses, potentials on the micro grid or kicks at the macro
 nodes), else `Arrowhead`. If a run does not converge with `Nested`, `Auto` computes again with `Arrowhead`: `macro_step` the step,
-`prepare` the whole run, a batch the lane, `simulate` and `stream` the piece that failed and all pieces after it. ``StepInfo.method`` and ``Trajectory.info.method`` say which solver took a step,
-``print(vm.plan(problem, scheme))`` says it beforehand. Two special cases have cheaper solvers of their own, also with `Nested`, which ``method`` names: RATTLE for a single
-drift along the constraints between kicks, COLLOCATION for a single interval of higher degree (``galerkin(1, degree)``), solved for all
-variables at once in modes of time. The classes here are settings; the algorithms are each a `vmri_jax.steppers.solved.Solver`.
+`prepare` the whole run, a batch the lane, `simulate` and `stream` the piece that failed and all pieces after it.
+``StepInfo.method`` and ``Trajectory.info.method`` say which solver took a step, ``print(vm.plan(problem, scheme))`` says it beforehand. In
+two special cases a cheaper solver replaces `Nested`, and ``method`` names it: RATTLE for a single drift along the constraints between
+kicks, COLLOCATION for a single interval of higher degree (``galerkin(1, degree)``), solved for all variables at once in modes of time. The
+classes here are settings; the algorithms are each a `vmri_jax.steppers.solved.Solver`.
 
 An iteration ends if its next correction is below a tenth of the tolerance times the motion (of slow variables over the macro step, of
 fast variables over a micro step), or is round-off of the positions: the formula is in `vmri_jax.steppers.accept`.

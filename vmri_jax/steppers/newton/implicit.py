@@ -51,8 +51,8 @@ def _implicit_derivative(primals, tangents):
     equations, root, _ = primals
     direction = _direction(equations, root)
     # For second derivatives: a Newton step x - (dR/dx)^-1 R at the root changes nothing, but makes x a function of the equations with the
-    # right first derivative. A recursive call of `differentiable` would not do: in reverse mode JAX has replaced it by its first derivative
-    # before it takes the second one.
+    # right first derivative. A recursive call of `differentiable` would not do: for reverse mode JAX evaluates the first derivative in part,
+    # and this partial evaluation drops the rules of custom derivatives (`process_custom_jvp_call` in jax/_src/interpreters/partial_eval.py).
     residual = equations.residual(root)
     unknown_beyond = _no_third_derivative(residual)
     x = jax.tree.map(lambda a, step: a + step + unknown_beyond, root, direction(residual))
