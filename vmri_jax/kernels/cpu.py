@@ -29,7 +29,8 @@ raises their number: 0.1 takes a quarter more passes, in 0.8 of the time for the
 pendulum in angles."""
 LARGEST_RENEWED = 16
 """Most rows of the matrix K of a micro interval that every macro step computes anew; a larger K is kept until a step takes
-`EXTRA_PASSES` more passes than the fewest with it (`vmri_jax.steppers.nested`). With a larger number, macro steps of large systems spend most of their time on K."""
+more than `EXTRA_PASSES` passes above the fewest with it (`vmri_jax.steppers.nested`). With a larger number, macro steps of large systems spend
+most of their time on K."""
 DIAGONAL_MATRICES = True
 """Whether K is one matrix per coordinate where W is a sum over the coordinates."""
 LINEARISES_FORCES = True

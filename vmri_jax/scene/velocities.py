@@ -49,7 +49,7 @@ def with_rates(
     """
     if not is_concrete((sorting.start, system)):
         raise TypeError(
-            "Scene.with_rates: numbers of the scene are traced; find its velocities outside of jit and grad."
+            "Scene.with_rates: jax.jit, grad or vmap traces numbers of the scene; call with_rates outside of these."
         )
     q_s, q_f, v_s, v_f = sorting.start
     q, v, n_s = jnp.concatenate([q_s, q_f]), np.concatenate([v_s, v_f]), q_s.size
