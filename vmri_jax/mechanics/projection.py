@@ -44,12 +44,13 @@ def project_momentum(system: System, state, guess=None, sparsity: Sparsity | Non
         (p_s, p_f, v_s, v_f); NaN where Newton's iteration does not converge.
     """
     if system.has_constant_mass:
-        return _by_one_solve(system, state.t, state.q_s, state.q_f, state.p_s, state.p_f, sparsity)
-    return _by_newton(system, state.t, state.q_s, state.q_f, state.p_s, state.p_f, guess)
+        return _by_one_solve(system, state, sparsity)
+    return _by_newton(system, state, guess)
 
 
-def _by_one_solve(system: System, t, q_s, q_f, p_s, p_f, sparsity: Sparsity | None):
+def _by_one_solve(system: System, state, sparsity: Sparsity | None):
     """``G M^-1 G^T mu = G M^-1 p + dg/dt``."""
+    t, q_s, q_f, p_s, p_f = state.t, state.q_s, state.q_f, state.p_s, state.p_f
     velocity = system.kinetic.velocity
     constraints = partial(system.constraints, t)
     g, pull = jax.vjp(constraints, q_s, q_f)
@@ -68,13 +69,13 @@ def _by_one_solve(system: System, t, q_s, q_f, p_s, p_f, sparsity: Sparsity | No
     return p_s, p_f, *velocity(p_s, p_f)
 
 
-def _by_newton(system: System, t, q_s, q_f, p_s, p_f, guess):
-    n_s = q_s.shape[0]
+def _by_newton(system: System, state, guess):
+    t, q_s, q_f, n_s = state.t, state.q_s, state.q_f, state.q_s.shape[0]
     jacobian = jnp.concatenate(jax.jacrev(system.constraints, argnums=(1, 2))(t, q_s, q_f), axis=1)  # (n_g + n_gs, n)
     rates = _time_rates(system, t, q_s, q_f)
-    p = jnp.concatenate([p_s, p_f])
+    p = jnp.concatenate([state.p_s, state.p_f])
     guess = jnp.zeros_like(p) if guess is None else jnp.concatenate(guess)
-    v, impulse = _velocity_and_impulse(system, q_s, q_f, jacobian, rates, p, guess)
+    v, impulse = _velocity_and_impulse(system, q_s, q_f, (jacobian, rates), p, guess)
     if jacobian.shape[0]:
         p = p - impulse
     return p[:n_s], p[n_s:], v[:n_s], v[n_s:]
@@ -87,8 +88,16 @@ def _time_rates(system: System, t, q_s, q_f):
     return system.constraint_rates(t, q_s, q_f, jnp.zeros_like(q_s), jnp.zeros_like(q_f))
 
 
-def _velocity_and_impulse(system: System, q_s, q_f, jacobian, rates, p, guess):
-    """The v that minimises ``T(v) - p . v`` over ``jacobian v + rates = 0``, and ``G^T mu``; NaN if Newton's iteration does not converge."""
+def _velocity_and_impulse(system: System, q_s, q_f, constraints, p, guess):
+    """The v that minimises ``T(v) - p . v`` over ``G v + dg/dt = 0``, and ``G^T mu``; NaN if Newton's iteration does not converge.
+
+    Args:
+        system: with its kinetic energy.
+        q_s, q_f: positions.
+        constraints: G and dg/dt.
+        p: momenta of all variables.
+        guess: velocities from which the iteration starts.
+    """
 
     def kinetic(system, q_s, q_f, v):
         return system.kinetic(q_s, q_f, v[: q_s.size], v[q_s.size :], system.params)
@@ -114,7 +123,7 @@ def _velocity_and_impulse(system: System, q_s, q_f, jacobian, rates, p, guess):
         stop = small | ~jnp.any(better)
         return jnp.where(stop, v, v + fractions[jnp.argmax(better)] * d), k + 1, stop
 
-    data = (system, q_s, q_f, jacobian, rates, p)
+    data = (system, q_s, q_f, *constraints, p)
     if has_constant_hessian(lambda v: kinetic(system, q_s, q_f, v), guess):
         return direction(data, jnp.zeros_like(p))  # T is quadratic in v: Newton's first step is the solution
     constants, guess = jax.lax.stop_gradient((data, guess))

@@ -21,7 +21,7 @@ def simulation_error(trajectory: Trajectory, macro_dt, save_every: int, num_micr
         int(trajectory.info.iterations[interval]),
         float(trajectory.info.residual[interval]),
         trajectory,
-        largest_motion_in_words(trajectory, step, save_every, float(macro_dt), num_micro),
+        moved=largest_motion_in_words(trajectory, step, save_every, float(macro_dt), num_micro),
     )
     return error.advised(float(macro_dt), swapped_at_start(trajectory), _jump(trajectory, macro_dt, save_every))
 

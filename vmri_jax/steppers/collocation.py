@@ -312,8 +312,15 @@ class Collocation(Solver):
         x, mu = last.x.T, last.mu.T
         unknowns = Unknowns(x[:, :n_s], mu[:, n_g:], x[None, :, n_s:], mu[None, :, :n_g])
         end = equations.q_f + x[-1, n_s:], p[:n_s], p[n_s:]
-        residuals = max_abs(rows), max_abs(forces.g)
-        status = status_of(equations, last.result, Method.COLLOCATION, last.iterations, *residuals, newton.tolerance)
+        status = status_of(
+            equations,
+            last.result,
+            Method.COLLOCATION,
+            last.iterations,
+            rows=max_abs(rows),
+            g=max_abs(forces.g),
+            tolerance=newton.tolerance,
+        )
         return Solution(unknowns, end, status), memory
 
     def describe(self) -> list[str]:

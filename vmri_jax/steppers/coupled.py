@@ -41,7 +41,7 @@ class Coupled(Solver):
         residual, (p_s, p_f) = equations.evaluate(x)
         rows = jnp.maximum(max_abs(residual.slow), max_abs(residual.fast))
         g = jnp.maximum(max_abs(residual.multiplier), max_abs(residual.slow_multiplier))
-        status = status_of(equations, result, Method.DENSE, iterations, rows, g, self.newton.tolerance)
+        status = status_of(equations, result, Method.DENSE, iterations, rows=rows, g=g, tolerance=self.newton.tolerance)
         status = with_dependent_constraints(equations, status)
         return Solution(x, (equations.q_f + x.fast[:, -1].sum(0), p_s, p_f), status), memory
 
@@ -80,7 +80,9 @@ class Coupled(Solver):
             back = damped & ~(size < (1 - last.damping / 4) * last.size)
             damping = jnp.where(back, last.damping / 2, jnp.minimum(2 * last.damping, 1.0))
             is_roundoff = accepted.is_roundoff(jnp.maximum(*changes))
-            result = _result(last, size, is_roundoff, damping, residual, last.iterations + 1 >= limit, back)
+            result = _result(
+                last, size, damping, residual, is_roundoff=is_roundoff, is_last=last.iterations + 1 >= limit, back=back
+            )
             base, d = jax.tree.map(partial(jnp.where, back), (last.base, last.update), (last.x, d))
             x = jax.tree.map(lambda a, b: a + damping * b, base, d)
             return Iterate(x, base, d, jnp.where(back, last.size, size), damping, last.iterations + 1, result)
@@ -117,15 +119,15 @@ def _slow_and_fast(x: Unknowns):
     return max_abs(x.slow), max_abs(x.fast)
 
 
-def _result(last: Iterate, size, is_roundoff, damping, residual: Unknowns, is_last, back):
+def _result(last: Iterate, size, damping, residual: Unknowns, *, is_roundoff, is_last, back):
     """`Result` of an iteration, or RUNNING.
 
     Args:
         last: the iterate before.
         size: size of the new update, as the ratio to the accepted correction.
-        is_roundoff: whether the new update is round-off of the positions.
         damping: of the next update.
         residual: at the iterate before.
+        is_roundoff: whether the new update is round-off of the positions.
         is_last: whether no iterations are left.
         back: whether the iterate before is taken back.
     """

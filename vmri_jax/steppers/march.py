@@ -215,7 +215,7 @@ class MarchEquations:
         d = -matvec(inverse, residual)
         return d, Handed(arriving.position + self.last_increment(x + d), gradients + matvec(hands_on, d))
 
-    def passed(self, matrices: Matrices, z, x, worst: "Worst", end: Handed, residual, p_s) -> "Passed":
+    def passed(self, matrices: Matrices, z, x, worst: "Worst", end: Handed, slow_values) -> "Passed":
         """The pass after its last interval: the slow correction ``dz = -S^-1 R_s``, and ``dx_m = (dx_m/dz) dz``.
 
         Args:
@@ -223,8 +223,9 @@ class MarchEquations:
             z, x: unknowns, x corrected by the pass.
             worst: maxima over the intervals.
             end: the quantities that the last interval hands on.
-            residual, p_s: of `slow_equations`.
+            slow_values: of `slow_equations`.
         """
+        residual, p_s = slow_values
         dz = -matvec(matrices.slow, residual)
         dx = jnp.sum(matrices.response * self.seen(dz), axis=-1)
         return Passed(z, x, dz, dx, end, p_s, worst.add(residual, dz, worst.moved))
@@ -327,7 +328,7 @@ def exact_pass(march: MarchEquations, z, x, last, from_last) -> tuple[Matrices, 
     x, inverse, hands_on, response = stacked
     slow_inverse, slow_values = march.slow_inverse(z, end, sensitivities)
     matrices = Matrices(inverse, hands_on, response, slow_inverse)
-    return matrices, march.passed(matrices, z, x, worst, end, *slow_values)
+    return matrices, march.passed(matrices, z, x, worst, end, slow_values)
 
 
 def further_pass(march: MarchEquations, matrices: Matrices, z, x, last, from_last) -> Passed:
@@ -344,7 +345,7 @@ def further_pass(march: MarchEquations, matrices: Matrices, z, x, last, from_las
 
     intervals = jnp.arange(march.n), x, matrices.inverse, matrices.hands_on
     (end, _, worst), x = jax.lax.scan(interval, (march.start(), last, Worst.none()), intervals)
-    return march.passed(matrices, z, x, worst, end, *march.slow_equations(z, end))
+    return march.passed(matrices, z, x, worst, end, march.slow_equations(z, end))
 
 
 class Factors(NamedTuple):

@@ -192,7 +192,7 @@ class Marched(Solver):
         shrinks = done.still_moves / jnp.maximum(passed.worst.moved, jnp.finfo(float).tiny)
         rows, g = passed.worst.rows * jnp.minimum(shrinks, 1.0), largest_constraint(equations, x)
         method = Method[self.linear_solver.upper()]
-        status = status_of(equations, result, method, passes, rows, g, self.newton.tolerance)
+        status = status_of(equations, result, method, passes, rows=rows, g=g, tolerance=self.newton.tolerance)
         return Solution(x, end, with_dependent_constraints(equations, status))
 
     def _learned(self, march: MarchEquations, memory: MarchMemory, done: Progress) -> MarchMemory:

@@ -133,7 +133,9 @@ class Nested(Solver):
         per_h = 1 / equations.micro_dt
         end = done.totals.q_f, equations.p_s + per_h * done.impulse, per_h * done.totals.p_f
         g = largest_constraint(equations, x)
-        status = status_of(equations, done.result, Method.NESTED, done.passes, done.rows, g, newton.tolerance)
+        status = status_of(
+            equations, done.result, Method.NESTED, done.passes, rows=done.rows, g=g, tolerance=newton.tolerance
+        )
 
         learned = NestedState(
             memory.matrix,
@@ -175,7 +177,9 @@ class _Passes:
         z = self.memory.slow.next(self.r * self.n_s)
         fast, totals = self.sweep.first_pass(self._apart(z)[0], self.memory.multiplier)
         inertia = self.slow_equations.constraint_inertia(jax.tree.map(lambda a: a[0], fast.schur_inverse))
-        return self._judged(z, fast, totals, inertia, self.memory.slow_model_error, totals.moved, 1)
+        return self._judged(
+            z, fast, totals, inertia, error=self.memory.slow_model_error, still_moves=totals.moved, passes=1
+        )
 
     def next(self, last: Pass) -> Pass:
         """The next pass, with corrected slow unknowns."""
@@ -200,10 +204,26 @@ class _Passes:
         z = _joined(last) + d
         fast, totals = self.sweep.next_pass(self._apart(z)[0], last.fast)
         still_moves = expected(totals.moved, last.totals.moved)
-        return self._judged(z, fast, totals, last.inertia, last.slow_model_error, still_moves, last.passes + 1)
+        return self._judged(
+            z,
+            fast,
+            totals,
+            last.inertia,
+            error=last.slow_model_error,
+            still_moves=still_moves,
+            passes=last.passes + 1,
+        )
 
     def _judged(
-        self, z, fast: FastUnknowns, totals: SweepTotals, inertia: ConstraintInertia | None, error, still_moves, passes
+        self,
+        z,
+        fast: FastUnknowns,
+        totals: SweepTotals,
+        inertia: ConstraintInertia | None,
+        *,
+        error,
+        still_moves,
+        passes,
     ) -> Pass:
         """A pass with slow unknowns z, with their next update d, and with the `Result` of the iteration so far.
 

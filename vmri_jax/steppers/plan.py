@@ -212,19 +212,20 @@ def _between_kicks(system: System, scheme: Scheme, choice: _Choice, q_s, q_f) ->
     interval = Interval.of(system, scheme, q_s, q_f)
     if _is_linear(system, scheme, interval, q_s):
         return Linear(system, scheme, interval)
-    solver = _first_choice(system, scheme, newton, interval, rows, q_s, q_f)
+    solver = _first_choice(system, scheme, newton, interval, rows, q_f.size or q_s.size)
     if choice.falls_back:
         solver = Fallback(solver, Marched(newton, "arrowhead"))
     return Solved(system, scheme, solver, rows, choice.reverse_only)
 
 
 def _first_choice(
-    system: System, scheme: Scheme, newton: Newton, interval: Interval, rows: Sparsity, q_s, q_f
+    system: System, scheme: Scheme, newton: Newton, interval: Interval, rows: Sparsity, size: int
 ) -> Solver:
+    """The solver of `Auto` for masses that are constant; `size` is the number of variables of an interval."""
     if DRIFTS and _is_drift(system, scheme):
         return Rattle(newton, rows)
     single = COLLOCATES and scheme.num_micro == 1 and scheme.degree > 1
-    small = (q_f.size or q_s.size) <= SMALL  # Nested keeps a larger matrix over many steps, Collocation does not
+    small = size <= SMALL  # Nested keeps a larger matrix over many steps, Collocation does not
     if single and small and system.force is None and not interval.is_diagonal:
         return Collocation(newton)
     return Nested(newton, interval)

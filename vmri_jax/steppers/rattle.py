@@ -117,7 +117,13 @@ class Rattle(Solver):
         impulse = force(done.mu) / h  # p+ = p - G_0^T mu / h
         end = equations.q_f + done.x[n_s:], equations.p_s - impulse[:n_s], equations.p_f - impulse[n_s:]
         status = status_of(
-            equations, done.result, Method.RATTLE, done.iterations, 0.0, max_abs(done.g), newton.tolerance
+            equations,
+            done.result,
+            Method.RATTLE,
+            done.iterations,
+            rows=0.0,
+            g=max_abs(done.g),
+            tolerance=newton.tolerance,
         )
         n_g, _ = system.num_constraints(equations.q_s, equations.q_f)
         x, mu = done.x[None], done.mu[None]

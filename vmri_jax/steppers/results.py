@@ -1,6 +1,7 @@
 """Outcome of a step: a status code whose message names the failure, its likely causes and a remedy."""
 
 from enum import IntEnum
+from functools import partial
 
 import numpy as np
 
@@ -126,7 +127,7 @@ class SimulationError(RuntimeError):
     """
 
     def __init__(
-        self, result: Result, step: int, time: float, iterations: int, residual: float, trajectory, moved: str = ""
+        self, result: Result, step: int, time: float, iterations: int, residual: float, trajectory, *, moved: str = ""
     ):
         self.result, self.step, self.time, self.moved = result, step, time, moved
         self.iterations, self.residual, self.trajectory, self.labels = iterations, residual, trajectory, ""
@@ -155,5 +156,5 @@ class SimulationError(RuntimeError):
         return self
 
     def __reduce__(self):
-        fields = self.result, self.step, self.time, self.iterations, self.residual, self.trajectory, self.moved
-        return type(self), fields
+        fields = self.result, self.step, self.time, self.iterations, self.residual, self.trajectory
+        return partial(type(self), moved=self.moved), fields

@@ -201,7 +201,7 @@ class Fallback(Solver):
         return [*self.first.describe(), "where that does not converge:", *indented(self.exact.describe())]
 
 
-def status_of(equations: StepEquations, result, method, iterations, rows, g, tolerance) -> Status:
+def status_of(equations: StepEquations, result, method, iterations, *, rows, g, tolerance) -> Status:
     """The status of a step. Converged increments with violated constraints get CONSTRAINT_VIOLATED: the constraints contradict each other.
 
     Args:

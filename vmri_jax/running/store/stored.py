@@ -159,7 +159,9 @@ class StoredTrajectory(Exports):
         iterations, residual = int(before.info.iterations[0]), float(before.info.residual[0])
         macro_dt = float(before.t[1] - before.t[0]) / self.save_every
         motion = largest_motion_in_words(before, 0, 1, macro_dt, num_micro)
-        raise SimulationError(self.result, self.failed_at, time, iterations, residual, self, motion).advised(macro_dt)
+        raise SimulationError(self.result, self.failed_at, time, iterations, residual, self, moved=motion).advised(
+            macro_dt
+        )
 
     def _rows(self, name: str, rows: slice) -> np.ndarray:
         return read_rows(self.path, name, rows, self.chunk)
