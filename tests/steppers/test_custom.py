@@ -12,7 +12,7 @@ from tests.user_systems import double_pendulum
 from vmri_jax.schemes.discrete_lagrangian import lagrangian
 from vmri_jax.steppers.kicked import Kicked
 from vmri_jax.steppers.marched import Marched
-from vmri_jax.steppers.stepper import Status, StepInfo, Stepper
+from vmri_jax.steppers.stepper import StepInfo, Stepper, StepStatus
 
 STEPS = {"macro_dt": 0.01, "num_steps": 20}
 
@@ -28,7 +28,7 @@ class Rotation(Stepper):
         c, s = jnp.cos(omega * macro_dt), jnp.sin(omega * macro_dt)
         q_f, p_f = c * state.q_f + s / omega * state.p_f, c * state.p_f - omega * s * state.q_f
         nothing = {"multiplier": jnp.zeros((1, 1, 0)), "slow_multiplier": jnp.zeros((1, 0))}
-        info = StepInfo(*Status.direct(vm.Method.EXPLICIT), q_f_micro=q_f[None], **nothing)
+        info = StepInfo(*StepStatus.direct(vm.Method.EXPLICIT), q_f_micro=q_f[None], **nothing)
         return vm.State(state.t + macro_dt, state.q_s + macro_dt * state.p_s, q_f, state.p_s, p_f), info, memory
 
     def describe(self):

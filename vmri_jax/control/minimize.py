@@ -24,7 +24,7 @@ from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.results import Result
 from vmri_jax.steppers.solvers import Newton
-from vmri_jax.steppers.stepper import Status
+from vmri_jax.steppers.stepper import StepStatus
 
 
 def minimize(
@@ -149,7 +149,7 @@ def minimize(
     )
 
 
-def _trajectory(setup: Transcription, z, status: Status) -> Trajectory:
+def _trajectory(setup: Transcription, z, status: StepStatus) -> Trajectory:
     """The run with nodes z (N, n) after the start."""
     count = len(z)
     nodes = jax.vmap(setup.state)(jnp.concatenate([setup.z_start[None], z]), jnp.arange(count + 1))

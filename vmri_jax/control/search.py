@@ -116,7 +116,7 @@ class Search:
         return Point(z, u, ends - z, self._goal(z))
 
     def rolled(self, u):
-        """Nodes of the motion with controls u, NaN from the first failed step on, and the `Status` of the steps."""
+        """Nodes of the motion with controls u, NaN from the first failed step on, and the `StepStatus` of the steps."""
         return steps(self.setup, jnp.zeros((len(u), self.setup.z_start.size)), u, jnp.asarray(True))
 
     def motion(self, u) -> Point:

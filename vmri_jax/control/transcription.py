@@ -100,7 +100,7 @@ class Transcription(eqx.Module):
         return jnp.concatenate([self.z_start[None], z[:-1]])
 
     def step(self, z, u, k):
-        """The end of the step from node k at z (n,) with controls u (parts, m), and the `Status` of the step."""
+        """The end of the step from node k at z (n,) with controls u (parts, m), and the `StepStatus` of the step."""
         state = self.state(z, k)
         held = u, state.t, self.macro_dt / self.parts
         system = self.controlled.replace(params={**self.system.params, CONTROL: held})
@@ -108,7 +108,7 @@ class Transcription(eqx.Module):
         return phase_vector(end), info.status
 
     def steps(self, z, u, follow):
-        """Ends (N, n) of all steps, NaN where a step fails, and their `Status`.
+        """Ends (N, n) of all steps, NaN where a step fails, and their `StepStatus`.
 
         Each step starts from its node in z, or from the end of the step before if `follow` is true. One program computes both,
         since a step takes long to compile.

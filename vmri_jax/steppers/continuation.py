@@ -22,7 +22,7 @@ from vmri_jax.kernels import max_abs
 from vmri_jax.mechanics.constraints import is_rank_deficient
 from vmri_jax.schemes.equations import StepEquations, Unknowns
 from vmri_jax.steppers.results import RUNNING, Result
-from vmri_jax.steppers.stepper import Status
+from vmri_jax.steppers.stepper import StepStatus
 
 SHORTEST_PART = 1 / 64
 """Smallest stride, relative to the step. Continuation has failed if it would need a smaller one; a smaller value makes failing runs slower."""
@@ -118,7 +118,7 @@ def has_dependent_constraints(equations: StepEquations):
     return is_rank_deficient(g_f, g_s, RANK) | is_rank_deficient(g_slow, tolerance=RANK)
 
 
-def with_dependent_constraints(equations: StepEquations, status: Status) -> Status:
+def with_dependent_constraints(equations: StepEquations, status: StepStatus) -> StepStatus:
     """The status of a step, with RANK_DEFICIENT as the result if it failed and constraints are dependent."""
     if not equations.system.is_constrained:
         return status

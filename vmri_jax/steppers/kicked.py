@@ -12,7 +12,7 @@ from vmri_jax.mechanics.arrays import Numbers, is_concrete
 from vmri_jax.mechanics.state import State
 from vmri_jax.schemes.discrete_lagrangian import Term
 from vmri_jax.steppers.results import Result
-from vmri_jax.steppers.stepper import Status, StepInfo, Stepper, indented
+from vmri_jax.steppers.stepper import StepInfo, Stepper, StepStatus, indented
 
 
 class KickedState(NamedTuple):
@@ -85,7 +85,7 @@ class Kicked(Stepper):
 
         inner = memory.inner
         state = kicked(state, self.kicks, memory.gradients, macro_dt, start=1.0)
-        best = Status(jnp.asarray(0), jnp.asarray(0), jnp.asarray(0), jnp.zeros(()))
+        best = StepStatus(jnp.asarray(0), jnp.asarray(0), jnp.asarray(0), jnp.zeros(()))
         (state, inner, worst), (q_f, multiplier) = jax.lax.scan(between, (state, inner, best), length=count - 1)
         # The last step stands outside of the loop: a weight that depends on the number of the step, and a carry with its gradients, would
         # cost as much as half of a short step.

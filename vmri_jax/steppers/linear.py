@@ -11,7 +11,7 @@ from vmri_jax.schemes.equations import StepEquations
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.interval import Interval, Matrix
 from vmri_jax.steppers.results import Method
-from vmri_jax.steppers.stepper import Status, StepInfo, Stepper
+from vmri_jax.steppers.stepper import StepInfo, Stepper, StepStatus
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class Linear(Stepper):
         p_f = (d.fast[0, -1] + memory.outgoing(increments)) / h
         q_f = state.q_f + increments[-1]
         none = jnp.zeros((1, self.scheme.degree, 0)), jnp.zeros((self.scheme.degree, 0))
-        info = StepInfo(*Status.direct(Method.LINEAR), q_f[None], *none)
+        info = StepInfo(*StepStatus.direct(Method.LINEAR), q_f[None], *none)
         return State(state.t + macro_dt, state.q_s, q_f, state.p_s, p_f), info, memory
 
     def describe(self) -> list[str]:

@@ -21,7 +21,7 @@ from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.interval import constant_mass
 from vmri_jax.steppers.newton.implicit import differentiable, differentiable_reverse_only
 from vmri_jax.steppers.results import RUNNING, Result
-from vmri_jax.steppers.stepper import Status, StepInfo, Stepper, indented
+from vmri_jax.steppers.stepper import StepInfo, Stepper, StepStatus, indented
 
 ROOT = "root"
 """Name of the solution and the status of a step for `jax.checkpoint`: a policy that saves this name lets derivatives reuse the solution."""
@@ -35,7 +35,7 @@ class Solution(NamedTuple):
 
     x: Unknowns
     end: tuple[Float[Numbers, "n_f"], Float[Numbers, "n_s"], Float[Numbers, "n_f"]]
-    status: Status
+    status: StepStatus
 
 
 @dataclass(frozen=True)
@@ -147,7 +147,7 @@ class Solved(Stepper):
 
         lambdas = physical_multipliers(self.scheme, macro_dt, x.multiplier, x.slow_multiplier)
         q_f_micro = jnp.concatenate([equations.path(x).fast_start[1:], q_f[None]])
-        info = StepInfo(*Status(*status), q_f_micro, *lambdas)
+        info = StepInfo(*StepStatus(*status), q_f_micro, *lambdas)
         end = State(state.t + macro_dt, state.q_s + x.slow[-1], q_f, p_s, p_f)
         velocity = memory.velocity
         if not self.system.has_constant_mass:  # mean velocities of the last intervals: guess of the next step
@@ -201,7 +201,7 @@ class Fallback(Solver):
         return [*self.first.describe(), "where that does not converge:", *indented(self.exact.describe())]
 
 
-def status_of(equations: StepEquations, result, method, iterations, *, rows, g, tolerance) -> Status:
+def status_of(equations: StepEquations, result, method, iterations, *, rows, g, tolerance) -> StepStatus:
     """The status of a step. Converged increments with violated constraints get CONSTRAINT_VIOLATED: the constraints contradict each other.
 
     Args:
@@ -218,7 +218,7 @@ def status_of(equations: StepEquations, result, method, iterations, *, rows, g, 
     # residual = max(|R| / (h max |p|), max |g|), with |R| itself where all momenta are zero
     momentum = jnp.maximum(max_abs(equations.p_s), max_abs(equations.p_f)) * equations.micro_dt
     residual = jnp.maximum(rows / jnp.where(momentum > 0, momentum, 1.0), g)
-    return Status(result, jnp.asarray(int(method)), iterations, residual)
+    return StepStatus(result, jnp.asarray(int(method)), iterations, residual)
 
 
 def ended(result):

@@ -37,12 +37,12 @@ class StepInfo(eqx.Module):
     slow_multiplier: Float[Numbers, "r n_gs"]
 
     @property
-    def status(self) -> "Status":
+    def status(self) -> "StepStatus":
         """The fields without the arrays along the step."""
-        return Status(self.result, self.method, self.iterations, self.residual)
+        return StepStatus(self.result, self.method, self.iterations, self.residual)
 
 
-class Status(NamedTuple):
+class StepStatus(NamedTuple):
     """How a step ended: the first four fields of `StepInfo`."""
 
     result: Int[Numbers, ""]
@@ -51,13 +51,13 @@ class Status(NamedTuple):
     residual: Float[Numbers, ""]
 
     @classmethod
-    def direct(cls, method: Method) -> "Status":
+    def direct(cls, method: Method) -> "StepStatus":
         """The status of a step without iteration, as constants that are known while JAX traces."""
         return cls(np.asarray(int(Result.CONVERGED)), np.asarray(int(method)), np.asarray(0), np.zeros(()))
 
-    def worse(self, other: "Status") -> "Status":
+    def worse(self, other: "StepStatus") -> "StepStatus":
         """The larger value of every field."""
-        return Status(*(jnp.maximum(a, b) for a, b in zip(self, other, strict=True)))
+        return StepStatus(*(jnp.maximum(a, b) for a, b in zip(self, other, strict=True)))
 
 
 @dataclass(frozen=True)
