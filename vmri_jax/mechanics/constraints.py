@@ -6,7 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from vmri_jax.mechanics.by_name import constraint_sizes
 from vmri_jax.mechanics.checks import CONSTRAINT_TOLERANCE
+from vmri_jax.mechanics.functions import Rheonomic
 from vmri_jax.mechanics.projection import legendre
 from vmri_jax.mechanics.system import System
 
@@ -144,6 +146,11 @@ def check_constraints(
     """
     if not system.is_constrained:
         return
+
+    def in_words(rows, name: str) -> str:
+        arguments = (state.q_s,) if name == "slow_constraint" else (state.q_s, state.q_f)
+        return _rows_in_words(getattr(system, name), rows, *arguments, system.params)
+
     values, slow, fast, alone = _values_and_jacobians(system, state.t, state.q_s, state.q_f)
     _check_values(values, place, tolerance, advice)
     if system.implied is not None:
@@ -154,7 +161,7 @@ def check_constraints(
     slow_only = np.flatnonzero(np.linalg.norm(fast, axis=1) <= LEAST_FAST_PART * size)
     if slow_only.size:
         raise ValueError(
-            f"System: row(s) {slow_only.tolist()} of constraint do not depend on the fast variables q_f. {MICRO_GRID} "
+            f"System: row(s) {in_words(slow_only, 'constraint')} of constraint do not depend on the fast variables q_f. {MICRO_GRID} "
             "Give them as System(slow_constraint=...), a function of (q_s, params), which is held at the macro nodes; or make the "
             "variables that they hold fast."
         )
@@ -163,8 +170,8 @@ def check_constraints(
         # At a singular configuration (a linkage folded flat) rows are dependent there and nowhere else, and runs pass it: only rows that are
         # dependent at a generic configuration nearby are refused.
         _, _, fast, alone = _values_and_jacobians(system, state.t, *_nearby(state.q_s, state.q_f))
-        _check_rank("slow_constraint", alone, "slow variables.")
-        _check_rank("constraint", fast, f"fast variables. {MICRO_GRID}")
+        _check_rank("slow_constraint", alone, "slow variables.", in_words)
+        _check_rank("constraint", fast, f"fast variables. {MICRO_GRID}", in_words)
 
 
 def _values_and_jacobians(system, t, q_s, q_f) -> tuple[np.ndarray, ...]:
@@ -217,11 +224,22 @@ def _check_counts(fast, alone) -> None:
         )
 
 
-def _check_rank(name: str, jacobian, of: str) -> None:
+def _rows_in_words(constraint, rows, *arguments) -> str:
+    """Numbers of the rows of a constraint, with the names of rows that the constraint returns by name: ``[0, 2]`` or ``0 (rope), 2 (rail)``."""
+    if isinstance(constraint, Rheonomic):
+        constraint, arguments = constraint.function, (0.0, *arguments)
+    sizes = constraint_sizes(constraint, *arguments)
+    if not sizes:
+        return str([int(row) for row in rows])
+    names = [name for name, size in sizes.items() for _ in range(size)]
+    return ", ".join(f"{row} ({names[row]})" for row in rows)
+
+
+def _check_rank(name: str, jacobian, of: str, in_words) -> None:
     rank, dependent = rank_of(jacobian)
     if dependent:
         raise ValueError(
-            f"System: rows {dependent} of {name} depend on each other: {len(jacobian)} rows have rank {rank} in the {of} Remove "
+            f"System: rows {in_words(dependent, name)} of {name} depend on each other: {len(jacobian)} rows have rank {rank} in the {of} Remove "
             "redundant ones of these rows, or make the variables they need fast."
         )
 
