@@ -1,7 +1,7 @@
 """Arguments of `minimize`: their checks, the `Transcription` that they make, and the point where the iteration starts."""
 
 from collections.abc import Callable, Mapping
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -40,37 +40,30 @@ def actuation_of(problem, actuate, num_controls) -> tuple[Callable, tuple[str, .
     return actuate, tuple(f"u {i}" for i in range(num_controls)) if num_controls > 1 else ("u",)
 
 
-class Aims(NamedTuple):
-    """Costs, goal and inequalities of an optimal control, as in `vmri_jax.control.minimize`."""
-
-    cost: Callable
-    final_cost: Callable | None
-    goal: Callable | None
-    limits: Callable | None
-    bounds: Any
-
-
-class Grid(NamedTuple):
-    """The grid of the motion and of the controls, as in `vmri_jax.control.minimize`."""
-
-    scheme: Scheme | Composition
-    macro_dt: float
-    num_steps: int
-    kind: Literal["macro", "micro"]
-    solver: Newton | None
-
-
-def transcribed(problem, actuate: Callable, num_controls: int, aims: Aims, grid: Grid) -> Transcription:
-    """The optimal control problem on the grid of the scheme.
+def transcribed(
+    problem,
+    actuate: Callable,
+    num_controls: int,
+    *,
+    cost: Callable,
+    final_cost: Callable | None,
+    goal: Callable | None,
+    limits: Callable | None,
+    bounds: Any,
+    scheme: Scheme | Composition,
+    macro_dt: float,
+    num_steps: int,
+    grid: Literal["macro", "micro"],
+    solver: Newton | None,
+) -> Transcription:
+    """The optimal control problem on the grid of the scheme; arguments as of `vmri_jax.control.minimize`.
 
     Raises:
         ValueError, TypeError: bad arguments, functions that return other shapes.
     """
-    cost, final_cost, goal, limits, bounds = aims
-    scheme, macro_dt, num_steps, kind, solver = grid
     whole_number("minimize: num_steps", num_steps)
-    if kind not in ("macro", "micro"):
-        raise ValueError(f"minimize: grid is {kind!r}; it must be 'macro' or 'micro'.")
+    if grid not in ("macro", "micro"):
+        raise ValueError(f"minimize: grid is {grid!r}; it must be 'macro' or 'micro'.")
     system, state = start_of("minimize", problem, None)
     params = {} if system.params is None else system.params
     if not isinstance(params, Mapping):
@@ -108,7 +101,7 @@ def transcribed(problem, actuate: Callable, num_controls: int, aims: Aims, grid:
         goal or unaimed,
         limits,
         _bounds(bounds, num_controls),
-        scheme.num_micro if kind == "micro" else 1,
+        scheme.num_micro if grid == "micro" else 1,
     )
 
 

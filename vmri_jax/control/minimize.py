@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.control import bounded
-from vmri_jax.control.asked import Aims, Grid, actuation_of, started, transcribed
+from vmri_jax.control.asked import actuation_of, started, transcribed
 from vmri_jax.control.optimum import Optimum
 from vmri_jax.control.search import Search
 from vmri_jax.control.transcription import Transcription
@@ -95,9 +95,9 @@ def minimize(
         raise ValueError(f"minimize: tolerance is {tolerance}; it must be positive.")
     actuate, labels = actuation_of(problem, actuate, num_controls)
     opened_problem = problem_of("minimize", problem)
-    aims = Aims(cost, final_cost, goal, limits, bounds)
-    steps = Grid(scheme, macro_dt, num_steps, grid, solver)
-    setup = transcribed(opened_problem, actuate, len(labels), aims, steps)
+    aims: dict[str, Any] = {"cost": cost, "final_cost": final_cost, "goal": goal, "limits": limits, "bounds": bounds}
+    steps: dict[str, Any] = {"scheme": scheme, "macro_dt": macro_dt, "num_steps": num_steps, "grid": grid}
+    setup = transcribed(opened_problem, actuate, len(labels), **aims, **steps, solver=solver)
     search = Search(setup)
     point = started(search, start, num_steps, len(labels), grid)
     rho, history, nu = 1.0, [], np.zeros(0)
