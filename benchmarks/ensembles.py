@@ -24,7 +24,7 @@ from vmri_jax.ensembles import Axis, Draws, Ensemble, Product
 from vmri_jax.ensembles.executors import as_done, executor_of, local_workers
 from vmri_jax.ensembles.prepared import prepared
 from vmri_jax.ensembles.store import committed
-from vmri_jax.ensembles.work import StepArguments, Work
+from vmri_jax.ensembles.work import Work
 from vmri_jax.ensembles.worker import call_in_worker, call_packed, known_versions, packed
 
 PARTS = ("speed", "paper", "million", "study")
@@ -196,7 +196,7 @@ def _listing(path: Path) -> float:
 
 def _picked(lanes: int) -> int:
     """The chunk that the library takes for so many runs."""
-    work = Work("fpu", {"scheme": SCHEME}, tuple(START), StepArguments(RUN["t_end"], None, RUN["macro_dt"]))
+    work = Work("fpu", {"scheme": SCHEME}, tuple(START), RUN)
     return prepared(work, Draws(lanes, START)).chunks.size
 
 

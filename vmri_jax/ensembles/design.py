@@ -9,7 +9,7 @@ Rows are numbered from 0. Any row can be made without the others: a random row d
 
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -102,16 +102,15 @@ class Product:
     axes: Mapping[str, Any]
 
     def __post_init__(self):
-        axes = {name: axis if isinstance(axis, Axis) else Axis(axis) for name, axis in self.axes.items()}
+        axes = _axes("the axis", self.axes)
         for name, axis in axes.items():
-            values = _values(f"the axis {name!r}", axis.values)
+            values = axis.values
             if values.ndim != 1 or not values.size:
                 raise ValueError(
                     f"Product: the axis {name!r} has values of shape {values.shape}; give a list of one or more."
                 )
             if len(np.unique(values)) < values.size:
                 raise ValueError(f"Product: the axis {name!r} has a value more than once: {values.tolist()}.")
-            axes[name] = Axis(values, axis.unit, axis.description)
         object.__setattr__(self, "axes", axes)
 
     @property
@@ -149,11 +148,7 @@ class Table:
     columns: Mapping[str, Any]
 
     def __post_init__(self):
-        columns = {name: axis if isinstance(axis, Axis) else Axis(axis) for name, axis in self.columns.items()}
-        columns = {
-            name: Axis(_values(f"the column {name!r}", axis.values), axis.unit, axis.description)
-            for name, axis in columns.items()
-        }
+        columns = _axes("the column", self.columns)
         lengths = {name: axis.values.shape[:1] for name, axis in columns.items()}
         if len(set(lengths.values())) != 1 or () in lengths.values() or (0,) in lengths.values():
             lengths_text = ", ".join(
@@ -289,6 +284,12 @@ def _draw(name: str, entry) -> Draw:
             "('uniform', 10, 50) or ('normal', 0, 0.1)."
         )
     return Draw(entry[0], tuple(float(x) for x in entry[1:]))
+
+
+def _axes(subject: str, columns: Mapping[str, Any]) -> dict[str, Axis]:
+    """An `Axis` for each column, its values as an array."""
+    axes = {name: axis if isinstance(axis, Axis) else Axis(axis) for name, axis in columns.items()}
+    return {name: replace(axis, values=_values(f"{subject} {name!r}", axis.values)) for name, axis in axes.items()}
 
 
 def _values(subject: str, values) -> np.ndarray:

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from vmri_jax.ensembles.columns import lanes_of
 from vmri_jax.ensembles.design import Design, Draws, Product
 from vmri_jax.ensembles.quantities import Kept, what_is_kept
 from vmri_jax.ensembles.task import Chunks
@@ -63,7 +64,9 @@ def prepared(work: Work, design: Design, chunk: int | None = None) -> Prepared:
 
 def _checked(work: Work, design: Design) -> list[Simulation]:
     """One run of each group, the longest first, after a check of all arguments."""
-    work.check_values(design.rows(0, 1))
+    lanes_of(
+        work.problem, work.places, design.rows(0, 1), 1
+    )  # refuses values of other shapes than the numbers that they replace
     runs = [work.simulation(group) for group in all_groups(work, design)]
     runs[0].check("ensemble: the start", constraints=False)
     over_nodes = [name for name, quantity in zip(work.save, work.quantities, strict=True) if quantity.over_nodes]
@@ -126,7 +129,6 @@ def attributes_of(work: Work, design: Design, run: Simulation, chunks: Chunks) -
     design_record = {"kind": type(design).__name__, "columns": design.described()}
     if isinstance(design, Draws):
         design_record |= {"method": design.method, "seed": design.seed}
-    settings = {name: value for name, value in work.steps._asdict().items() if value is not None}
     return {
         "lanes": chunks.lanes,
         "chunk": chunks.size,
@@ -135,12 +137,12 @@ def attributes_of(work: Work, design: Design, run: Simulation, chunks: Chunks) -
         "system": work.system if isinstance(work.system, str) else "a problem",
         "slow": names.slow_coordinates,
         "fast": names.fast_coordinates,
-        "identity": _identity(work, design, run, settings),
+        "identity": _identity(work, design, run),
         "made_with": environment(),
     }
 
 
-def _identity(work: Work, design: Design, run: Simulation, settings: dict) -> dict[str, str]:
+def _identity(work: Work, design: Design, run: Simulation) -> dict[str, str]:
     """In words and digests, by name, everything that the results depend on."""
     schemes = {}
     for label, scheme in work.schemes.items():
@@ -149,7 +151,7 @@ def _identity(work: Work, design: Design, run: Simulation, settings: dict) -> di
     identity_record = {
         name: text for name, text in identity(run, run.state).items() if not name.startswith(("scheme", "macro_dt"))
     }
-    identity_record |= schemes | {name: str(value) for name, value in settings.items()}
+    identity_record |= schemes | {name: str(value) for name, value in work.steps.items()}
     identity_record |= {"num_micro": str(work.num_micro), "save": ", ".join(Path(name).name for name in work.save)}
     identity_record |= {"num_saves": str(work.num_saves), "project": str(work.project), "runs": str(len(design))}
     identity_record |= {f"file {Path(file).name}": digest for file, digest in work.sources.items()}
@@ -185,16 +187,13 @@ def check_same(path: Path, attributes: dict, stored: dict, chunk: int | None) ->
     Raises:
         ValueError: with all differences.
     """
-    old_conditions, conditions = stored["made_with"], attributes["made_with"]
-    changes = differences(attributes["identity"], stored["identity"], old_conditions["jax"] == conditions["jax"])
-    if chunk not in (None, stored["chunk"]):
-        changes.append(f"chunk: {chunk} here, {stored['chunk']} in the store")
+    changes = differences(attributes, stored, chunk)
     if changes:
         raise ValueError(
             f"{path} holds another ensemble and cannot go on with this one. Differences: {'; '.join(changes)}. Give the arguments of the "
             "first call, or another name."
         )
-    changed = changed_conditions(conditions, old_conditions)
+    changed = changed_conditions(attributes, stored)
     if changed:
         warnings.warn(
             f"{path} was started under other conditions; the last digits of its runs may differ. Now: {', '.join(changed)}.",

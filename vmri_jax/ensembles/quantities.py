@@ -135,15 +135,13 @@ def quantity(name: str) -> Quantity:
 
     def function(run: Trajectory) -> dict[str, Kept]:
         result = user_function(run)
-        arrays = result if isinstance(result, dict) else {label: result}
+        by_name = result if isinstance(result, dict) else {label: result}
+        arrays: dict[str, Any] = {key: jnp.asarray(value) for key, value in by_name.items()}
         description = (getattr(user_function, "__doc__", None) or "").strip().partition("\n")[0]
-        return {key: _of_user(key, jnp.asarray(value), description) for key, value in arrays.items()}
+        axes = {key: tuple(f"{key}_{i}" for i in range(array.ndim)) for key, array in arrays.items()}
+        return {key: Kept(array, axes[key], description) for key, array in arrays.items()}
 
     return Quantity(function, False)
-
-
-def _of_user(name: str, value, description: str) -> Kept:
-    return Kept(value, tuple(f"{name}_{i}" for i in range(value.ndim)), description)
 
 
 def kept(quantities: Sequence[Quantity], run: Trajectory) -> dict[str, Kept]:

@@ -13,8 +13,8 @@ from vmri_jax.ensembles import store
 from vmri_jax.ensembles.design import Design, Draws, Product, Table
 from vmri_jax.ensembles.executors import Here, as_done, executor_of
 from vmri_jax.ensembles.prepared import attributes_of, check_same, prepared
-from vmri_jax.ensembles.task import Chunks, Done, Job, job_of, run_chunk, run_packed_chunk
-from vmri_jax.ensembles.work import AnyScheme, StepArguments, Work
+from vmri_jax.ensembles.task import Chunks, Job, run_chunk, run_packed_chunk
+from vmri_jax.ensembles.work import AnyScheme, Work
 from vmri_jax.ensembles.worker import NotAWorker, call_in_worker, known_versions, packed
 from vmri_jax.mechanics.arrays import require_x64, whole_number
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
@@ -185,11 +185,12 @@ def ensemble(
                 "ensemble: there are several schemes, but the design has no column 'scheme' that chooses one for each run."
             )
         design = Product({"scheme": list(schemes), **design.axes})
+    steps = {"t_end": t_end, "num_steps": num_steps, "macro_dt": macro_dt, "micro_dt": micro_dt}
     work = Work(
         system=system,
         schemes=schemes,
         columns=tuple(design.described()),
-        steps=StepArguments(t_end, num_steps, macro_dt, micro_dt),
+        steps={name: value for name, value in steps.items() if value is not None},
         num_micro=num_micro,
         solver=solver,
         project=project,
@@ -218,7 +219,8 @@ def ensemble(
         tell = opened.enter_context(progress_to("ensemble", progress))
         interrupted = opened.enter_context(interrupts_noted())
         runs = Ensemble(path, chunks, store.committed(path))
-        _compute(runs, job_of(path, chunks, work, design), tasks, room, tell, interrupted)
+        job = Job(str(path.resolve()), chunks, work, None if isinstance(design, Table) else design)
+        _compute(runs, job, tasks, room, tell, interrupted)
     if runs.failures and throw:
         raise EnsembleError(runs)
     return runs
@@ -237,12 +239,12 @@ def _compute(runs: Ensemble, job: Job, tasks, room, tell: Progress, interrupted)
     try:
         for (number,), future in as_done(submit, room, missing, interrupted):
             try:
-                done: Done = future.result()
+                runs.done[number] = future.result()
             except Exception as error:
                 runs.failures[number] = _why(error, runs)
             else:
-                runs.done[number] = done.failed
-                runs.computed += done.lanes
+                first, last = runs.chunks.ends(number)
+                runs.computed += last - first
             if not runs.computed and len(runs.failures) >= FAILURES_TO_STOP:
                 return
             runs.seconds = time.perf_counter() - begin

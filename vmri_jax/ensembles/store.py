@@ -21,9 +21,16 @@ from typing import Any
 import numpy as np
 
 from vmri_jax.ensembles.design import Rows
-from vmri_jax.running.export import FILL
 from vmri_jax.running.files import made_beside, replaced
-from vmri_jax.running.store.layout import CONFIG, METADATA, consolidate, synchronize_files
+from vmri_jax.running.store.layout import (
+    CONFIG,
+    KEYS,
+    METADATA,
+    chunk_file,
+    consolidate,
+    create_array,
+    synchronize_files,
+)
 
 FORMAT = "vmri_jax ensemble store 1"
 COMMITTED = Path("resume", "chunks")
@@ -49,12 +56,19 @@ def create(path: Path, attributes: Mapping[str, Any], arrays: Mapping[str, dict]
     with made_beside(path) as partial:
         group = zarr.create_group(partial, attributes={"format": FORMAT, **attributes})
         for name, array in arrays.items():
-            _create(group, name, (lanes, *array["shape"]), chunk, array)
+            dimensions, options = (LANE, *array["dimensions"]), {"attributes": array["attributes"]}
+            create_array(group, name, (lanes, *array["shape"]), array["dtype"], chunk, dimensions, **options)
         for name, values in columns.items():
             _store_column(group.require_group(DESIGN), name, values, chunk)
         count = -(-lanes // chunk)
         group.require_group(COMMITTED.parent.name).create_array(
-            COMMITTED.name, shape=(count,), chunks=(1,), dtype="<i4", fill_value=-1, compressors=None, **_KEYS
+            COMMITTED.name,
+            shape=(count,),
+            chunks=(1,),
+            dtype="<i4",
+            fill_value=-1,
+            compressors=None,
+            chunk_key_encoding=KEYS,
         )
         (partial / COMMITTED).mkdir(parents=True, exist_ok=True)
         consolidate(partial)
@@ -67,30 +81,8 @@ def _store_column(group, name: str, values: np.ndarray, chunk: int) -> None:
     if values.dtype.kind == "U":
         labels, values = np.unique(values, return_inverse=True)
         attributes = {LABELS: labels.tolist()}
-    dimensions = [f"{name}_{i}" for i in range(values.ndim - 1)]
-    array = {"dtype": values.dtype, "dimensions": dimensions, "attributes": attributes}
-    _create(group, name, values.shape, chunk, array)[:] = values
-
-
-def _create(group, name: str, shape: tuple[int, ...], chunk: int, array: dict):
-    from zarr.codecs import Crc32cCodec
-
-    dtype = np.dtype(array["dtype"])
-    return group.create_array(
-        name,
-        shape=shape,
-        chunks=(chunk, *(max(n, 1) for n in shape[1:])),
-        dtype=dtype,
-        fill_value=FILL.get(dtype.kind, 0),
-        compressors=Crc32cCodec(),
-        dimension_names=(LANE, *array["dimensions"]),
-        attributes=array.get("attributes", {}),
-        config=CONFIG,
-        **_KEYS,
-    )
-
-
-_KEYS: Any = {"chunk_key_encoding": {"name": "default", "separator": "."}}
+    dimensions = [LANE, *(f"{name}_{i}" for i in range(values.ndim - 1))]
+    create_array(group, name, values.shape, values.dtype, chunk, dimensions, attributes=attributes)[:] = values
 
 
 class Writer:
@@ -117,7 +109,7 @@ class Writer:
             if first + len(value) > array.shape[0]:  # zarr would write nothing, without an error
                 raise ValueError(f"{self._path}: {name} has {array.shape[0]} rows, none for chunk {number}.")
             array[first : first + len(value)] = value
-            files.append(self._path / name / ".".join(["c", str(number)] + ["0"] * (array.ndim - 1)))
+            files.append(chunk_file(self._path / name, array.ndim, number))
         synchronize_files(files)  # after all writes: the system writes them together
         failed = int(np.count_nonzero(values["failed_at"] >= 0))
         with replaced(self._path / COMMITTED / f"c.{number}") as file:

@@ -5,7 +5,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
 
-from vmri_jax.ensembles.design import Design, Table
+from vmri_jax.ensembles.design import Design
 from vmri_jax.ensembles.store import Writer, made
 from vmri_jax.ensembles.work import Work
 
@@ -47,28 +47,15 @@ class Job(NamedTuple):
     design: Design | None
 
 
-class Done(NamedTuple):
-    """The result of a task: the number of runs of its chunk, and how many of them failed."""
-
-    lanes: int
-    failed: int
-
-
-def job_of(path: Path, chunks: Chunks, work: Work, design: Design) -> Job:
-    """The job of an ensemble whose store exists."""
-    return Job(str(path.resolve()), chunks, work, None if isinstance(design, Table) else design)
-
-
-def run_chunk(job: Job, number: int) -> Done:
-    """Compute a chunk of runs, write it and commit it."""
+def run_chunk(job: Job, number: int) -> int:
+    """Compute a chunk of runs, write it and commit it; returns how many of its runs failed."""
     first, last = job.chunks.ends(number)
     writer = _writer(job.path, job.chunks.size, made(Path(job.path)))
     rows = writer.columns(first, last) if job.design is None else job.design.rows(first, last)
-    values = job.work.compute(rows, last - first, job.chunks.width)
-    return Done(last - first, writer.write(number, values))
+    return writer.write(number, job.work.compute(rows, last - first, job.chunks.width))
 
 
-def run_packed_chunk(packed: bytes, number: int) -> Done:
+def run_packed_chunk(packed: bytes, number: int) -> int:
     """`run_chunk` of a pickled job."""
     return run_chunk(_job(packed), number)
 

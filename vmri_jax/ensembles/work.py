@@ -31,15 +31,6 @@ AnyScheme = str | Scheme | Composition | Callable[[int], Scheme | Composition]
 """A scheme, the name of one, or a function from the number of micro steps to a scheme."""
 
 
-class StepArguments(NamedTuple):
-    """Arguments of `ensemble` about steps; None for columns, and for values that follow from the others."""
-
-    t_end: float | None = None
-    num_steps: int | None = None
-    macro_dt: float | None = None
-    micro_dt: float | None = None
-
-
 class Group(NamedTuple):
     """Runs that one compiled program computes.
 
@@ -61,7 +52,8 @@ class Work:
     system: name of a system, or a problem that can be pickled.
     schemes: by label.
     columns: names of the columns of the design.
-    steps, num_micro, solver, project: as in `ensemble`.
+    steps: arguments of `ensemble` about steps by name: t_end, num_steps, macro_dt, micro_dt, as far as they are not columns.
+    num_micro, solver, project: as in `ensemble`.
     save: names of the quantities that are kept.
     num_saves: number of saved nodes after the start.
     sources: digests of the user's files, by path.
@@ -70,7 +62,7 @@ class Work:
     system: str | Problem
     schemes: Mapping[str, AnyScheme]
     columns: tuple[str, ...]
-    steps: StepArguments
+    steps: Mapping[str, Any]
     num_micro: int | None = None
     solver: Newton | None = None
     project: bool | None = None
@@ -129,7 +121,8 @@ class Work:
     @cached_property
     def told_apart(self) -> list[str]:
         """Columns of which every value needs a group of its own: schemes, number of steps, and step sizes that the number follows from."""
-        steps = STEPS if self.steps.t_end is not None and not self._has("num_steps") else ("num_steps",)
+        knows_number = "t_end" not in self.steps or "num_steps" in (*self.columns, *self.steps)
+        steps = ("num_steps",) if knows_number else STEPS
         return [name for name in self.columns if name in (*SCHEMES, *steps)]
 
     def groups(self, rows: Rows, count: int) -> Iterator[Group]:
@@ -164,14 +157,6 @@ class Work:
         every = num_steps // self.num_saves
         steps = arguments.Steps(macro_dt, num_steps=num_steps, save_every=every)
         return simulation(self.problem, group.scheme, state, self.solver, steps)
-
-    def check_values(self, rows: Rows) -> None:
-        """Refuse values of other shapes than the numbers that they replace.
-
-        Raises:
-            ValueError: with the column.
-        """
-        lanes_of(self.problem, self.places, rows, len(next(iter(rows.values()))) if rows else 1)
 
     def compute(self, rows: Rows, count: int, width: int) -> dict[str, np.ndarray]:
         """Kept quantities and status of some runs, arrays by name with a row for each run.
@@ -211,12 +196,9 @@ class Work:
             chunk=width,
             warn=False,
         )
+        kept_of = _kept_of(self.save, tuple(self.sources.items()))
         kept = {name: np.asarray(getattr(trajectory, name))[:count] for name in STATUS}
-        return kept | {name: np.asarray(value)[:count] for name, value in self._kept(trajectory).items()}
-
-    @cached_property
-    def _kept(self) -> Callable[[Trajectory], dict[str, Any]]:
-        return _kept_of(self.save, tuple(self.sources.items()))
+        return kept | {name: np.asarray(value)[:count] for name, value in kept_of(trajectory).items()}
 
     def _scheme(self, values: Mapping[str, Any]) -> Scheme | Composition:
         label = str(values.get("scheme", next(iter(self.schemes))))
@@ -242,16 +224,13 @@ class Work:
             raise TypeError(f"ensemble: the scheme {label!r} makes {type(made).__name__}; it must make a Scheme.")
         return made
 
-    def _has(self, name: str) -> bool:
-        return name in self.columns or getattr(self.steps, name) is not None
-
     def _steps(self, values: Mapping[str, Any], scheme) -> tuple[Any, int]:
         """Macro step, a number or one for each run, and number of macro steps.
 
         Raises:
             ValueError: not two of t_end, num_steps and a step; a step that is not positive.
         """
-        values_by_name = {name: value for name, value in self.steps._asdict().items() if value is not None}
+        values_by_name = dict(self.steps)
         twice = sorted(set(values_by_name) & set(values))
         if twice:
             raise ValueError(f"ensemble: {', '.join(twice)} is a column and an argument; leave one of them out.")

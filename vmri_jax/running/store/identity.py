@@ -37,22 +37,28 @@ def environment() -> dict[str, str]:
     return versions | {"machine": f"{platform.system()} {platform.machine()}", "XLA_FLAGS": flags}
 
 
-def differences(here: dict[str, str], there: dict[str, str], same_jax: bool) -> list[str]:
-    """Sentences about the differences of two identities.
+def differences(attributes: dict, stored: dict, chunk: int | None) -> list[str]:
+    """Sentences about the differences of two identities, and of the sizes of chunks.
+
+    Operations are compared only if both were made with the same version of JAX: another version prints them differently.
 
     Args:
-        here, there: identities of the run and of the store.
-        same_jax: whether both were made with the same version of JAX; another version prints operations differently, so that they are not
-            compared.
+        attributes, stored: of the store that the user wants, and of the store on disk, with "identity", "made_with" and "chunk".
+        chunk: size of a chunk that the user wants, or None.
     """
+    here, there = attributes["identity"], stored["identity"]
     names = [name for name in {**here, **there} if here.get(name) != there.get(name)]
-    if not same_jax:
+    if attributes["made_with"]["jax"] != stored["made_with"]["jax"]:
         names = [name for name in names if not name.startswith("operations of ")]
-    return [f"{name}: {here.get(name, 'none')} here, {there.get(name, 'none')} in the store" for name in names]
+    changes = [f"{name}: {here.get(name, 'none')} here, {there.get(name, 'none')} in the store" for name in names]
+    return changes + (
+        [] if chunk in (None, stored["chunk"]) else [f"chunk: {chunk} here, {stored['chunk']} in the store"]
+    )
 
 
-def changed_conditions(here: dict[str, str], there: dict[str, str]) -> list[str]:
-    """Texts about the differences of two environments, the present one and the one of the store."""
+def changed_conditions(attributes: dict, stored: dict) -> list[str]:
+    """Texts about the differences of the environments in the attributes of two stores, the present one and the one on disk."""
+    here, there = attributes["made_with"], stored["made_with"]
     return [f"{name} {value} ({there.get(name)} then)" for name, value in here.items() if value != there.get(name)]
 
 

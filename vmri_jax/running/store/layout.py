@@ -20,7 +20,7 @@ import json
 import os
 import warnings
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -41,6 +41,8 @@ CHECKPOINT = Path("resume", "checkpoint", "c", "0")
 """File of the checkpoint within a store; in a separate group, which datasets leave out."""
 CONFIG: Any = {"write_empty_chunks": True}
 """Configuration of the arrays: every chunk gets a file, even if all its values are the fill value, so that a missing file is an error."""
+KEYS: Any = {"name": "default", "separator": "."}
+"""Names of the files of an array: c.0.0, c.1.0, ..."""
 
 
 class Record(NamedTuple):
@@ -120,7 +122,7 @@ class Writer:
         for name, value in values.items():
             self._arrays[name][first : last + 1] = value[1 if saved else 0 :]
             chunks = range(first // self._chunk, last // self._chunk + 1)
-            files += [_chunk_file(self._path / name, value.ndim, k) for k in chunks]
+            files += [chunk_file(self._path / name, value.ndim, k) for k in chunks]
         # At the end: while the system writes the first file, it writes most of the others, too.
         synchronize_files(files)
 
@@ -129,7 +131,9 @@ class Writer:
         import zarr
 
         group = zarr.open_group(self._path, mode="r+")
-        self._arrays = {name: _create_array(group, name, v, self._rows, self._chunk) for name, v in values.items()}
+        for name, value in values.items():
+            shape = (self._rows, *value.shape[1:])
+            self._arrays[name] = create_array(group, name, shape, value.dtype, self._chunk, DIMENSIONS[name])
         consolidate(self._path)
         return _files(self._path)
 
@@ -202,7 +206,7 @@ def read_rows(path: Path, name: str, rows: slice, chunk: int) -> np.ndarray:
     try:
         array = zarr.open_array(path / name, mode="r")
         for k in range(rows.start // chunk, -(-rows.stop // chunk)):
-            if array.size and not _chunk_file(path / name, array.ndim, k).is_file():  # zarr would return fill values
+            if array.size and not chunk_file(path / name, array.ndim, k).is_file():  # zarr would return fill values
                 raise ValueError(f"chunk {k} is missing")
         return np.asarray(array[rows])
     except Exception as error:
@@ -241,21 +245,22 @@ def _packed(record: Record) -> bytes:
     return out.getvalue()
 
 
-def _create_array(group, name: str, like: np.ndarray, rows: int, chunk: int):
+def create_array(group, name: str, shape: tuple[int, ...], dtype, chunk: int, dimensions: Sequence[str], **options):
+    """An array of a group, one file per `chunk` rows; `options` of `zarr.Group.create_array` come on top."""
     from zarr.codecs import Crc32cCodec
 
-    shape = like.shape[1:]
     return group.create_array(
         name,
-        shape=(rows, *shape),
-        chunks=(chunk, *(max(n, 1) for n in shape)),
-        dtype=like.dtype,
-        fill_value=FILL[like.dtype.kind],
+        shape=shape,
+        chunks=(chunk, *(max(n, 1) for n in shape[1:])),
+        dtype=dtype,
+        fill_value=FILL.get(np.dtype(dtype).kind, 0),
         compressors=Crc32cCodec(),
-        dimension_names=DIMENSIONS[name],
+        dimension_names=dimensions,
         config=CONFIG,
-        chunk_key_encoding={"name": "default", "separator": "."},
+        chunk_key_encoding=KEYS,
         overwrite=True,
+        **options,
     )
 
 
@@ -268,7 +273,8 @@ def consolidate(path: Path) -> None:
         zarr.consolidate_metadata(path)
 
 
-def _chunk_file(array: Path, dimensions: int, k: int) -> Path:
+def chunk_file(array: Path, dimensions: int, k: int) -> Path:
+    """The file of rows number `k` times the chunk and on of an array."""
     return array / ".".join(["c", str(k)] + ["0"] * (dimensions - 1))
 
 

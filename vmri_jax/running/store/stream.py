@@ -176,16 +176,13 @@ def _check_place(path: Path, resume: bool, overwrite: bool) -> None:
 
 
 def _check_same_run(stored: StoredTrajectory, attributes: dict[str, Any], chunk: int | None) -> None:
-    there, here = stored.attributes["made_with"], attributes["made_with"]
-    different = differences(attributes["identity"], stored.attributes["identity"], there["jax"] == here["jax"])
-    if chunk not in (None, stored.chunk):
-        different.append(f"chunk: {chunk} here, {stored.chunk} in the store")
+    different = differences(attributes, stored.attributes, chunk)
     if different:
         raise ValueError(
             f"{stored.path} holds another run and cannot go on with this one. Differences: {'; '.join(different)}. Give the "
             "arguments it was started with, or another name."
         )
-    changed = changed_conditions(here, there)
+    changed = changed_conditions(attributes, stored.attributes)
     if changed and not stored.complete:
         warnings.warn(
             f"{stored.path} was started under other conditions; its last digits may differ from those of an uninterrupted "
