@@ -17,10 +17,8 @@ def swapped(motions: SmallMotions, names: Names | None = None) -> tuple[str, flo
         motions: the small motions of a system about a state.
         names: names of its coordinates, or None.
     """
-    frequencies, modes = motions.modes
-    n_s, n_f, d = motions.rest.q_s.size, motions.rest.q_f.size, len(frequencies)
-    # Coordinate i has the share u_i (M u)_i of the kinetic energy of the mode u, with u^T M u = 1.
-    shares = (motions.shapes @ modes) * (motions.embed[n_s + n_f :, d:] @ modes)
+    frequencies, _ = motions.modes
+    n_s, n_f, shares = motions.rest.q_s.size, motions.rest.q_f.size, motions.kinetic_shares
     slow = shares[:n_s].sum(axis=0) > 0.5
     slow_highest, fast_highest = frequencies[slow].max(initial=0.0), frequencies[~slow].max(initial=0.0)
     if not n_f or slow_highest <= SWAPPED_RATIO * fast_highest or slow_highest == 0:

@@ -109,6 +109,13 @@ class SmallMotions:
         return np.sqrt(np.maximum(values[::-1], 0.0)), vectors[:, ::-1]
 
     @property
+    def kinetic_shares(self) -> np.ndarray:
+        """(n_s + n_f, d) share ``u_i (M u)_i`` of coordinate i in the kinetic energy of each mode u, with ``u^T M u = 1``."""
+        n, d = self.shapes.shape
+        _, modes = self.modes
+        return (self.shapes @ modes) * (self.embed[n:, d:] @ modes)  # `embed` has M N in its block of momenta
+
+    @property
     def omega(self) -> float:
         """The largest frequency of W alone; if W has none, the largest rate of all motions."""
         fast = self.fast_frequencies.max(initial=0.0)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.diagnostics.linear import phase_splits, phase_vector, symplectic_form, tangents
-from vmri_jax.mechanics.arrays import QUICK, is_concrete
+from vmri_jax.mechanics.arrays import QUICK, is_concrete, whole_number
 from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.running.macro_step import macro_step
 from vmri_jax.schemes.composition import Composition
@@ -76,8 +76,7 @@ def monodromy(
         RuntimeError: a step failed; with its number and reason.
     """
     system, state = start_of("monodromy", system, state)
-    if isinstance(num_steps, bool) or not isinstance(num_steps, int | np.integer) or num_steps < 1:
-        raise ValueError(f"monodromy: num_steps is {num_steps!r}; it must be an integer of at least 1.")
+    whole_number("monodromy: num_steps", num_steps)
     if is_concrete(macro_dt) and not (np.ndim(macro_dt) == 0 and np.isfinite(macro_dt) and macro_dt > 0):
         raise ValueError(f"monodromy: macro_dt is {macro_dt}; it must be a positive number.")
     start = State(*(jnp.asarray(a, dtype=float) for a in (state.t, state.q_s, state.q_f, state.p_s, state.p_f)))

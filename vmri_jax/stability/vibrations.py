@@ -91,12 +91,8 @@ def vibrations(system: Movable, state: State | None = None) -> Vibrations:
     names = names.of_coordinates(n_s, n_f)
     labels = [*names.slow_coordinates, *names.fast_coordinates]
     motions = small_motions(system, state)
-    frequencies, modes = motions.modes
-    d = motions.shapes.shape[1]
-    # u_i (M u)_i, a column for each vibration; `embed` has M times the shapes in its block of momenta.
-    energies = (motions.shapes @ modes) * (motions.embed[n_s + n_f :, d:] @ modes)
     rows = []
-    for frequency, parts in zip(frequencies.tolist(), energies.T, strict=True):
+    for frequency, parts in zip(motions.modes[0].tolist(), motions.kinetic_shares.T, strict=True):
         largest = {labels[i]: float(parts[i]) for i in np.argsort(-parts)}
         period = 2 * np.pi / frequency if frequency > 0 else np.inf
         rows.append(Vibration(frequency, period, float(parts[n_s:].sum()), largest))
