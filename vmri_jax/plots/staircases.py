@@ -1,28 +1,26 @@
 """Staircases of error against computing time: the least error that each kind of schemes reaches in a time."""
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import to_hex, to_rgb
 from matplotlib.ticker import EngFormatter
 
-from vmri_jax.plots.theme import LIGHT, NotebookFigure, Theme, legend_below, log_ticks, new_figure, positive
+from vmri_jax.plots.theme import (
+    LIGHT,
+    NotebookFigure,
+    Theme,
+    legend_below,
+    log_ticks,
+    mark_reference,
+    new_figure,
+    positive,
+)
 
 MARKERS = ("s", "o", "D", "P")
 """Markers of the kinds of schemes, in the order of the kinds."""
-
-
-class Step(Protocol):
-    """A run of a staircase."""
-
-    @property
-    def seconds(self) -> float: ...
-    @property
-    def error(self) -> float: ...
-    @property
-    def fast_share(self) -> float: ...
 
 
 class Marked(NamedTuple):
@@ -56,8 +54,8 @@ class Bound(NamedTuple):
 
 
 def plot_staircases(
-    kinds: Mapping[str, Sequence[Step]],
-    peers: Mapping[str, Sequence[Step]] | None = None,
+    kinds: Mapping[str, Sequence[Any]],
+    peers: Mapping[str, Sequence[Any]] | None = None,
     marked: Sequence[Marked] = (),
     bound: Bound | None = None,
     known_to: float = 0.0,
@@ -69,7 +67,7 @@ def plot_staircases(
     The colour of a corner is mixed from the colours of the slow and the fast share of its error.
 
     Args:
-        kinds: staircases by kind, the fastest run first, at most four; a kind without runs reserves its colour and marker.
+        kinds: staircases of `vmri_jax.study.staircase` by kind, the fastest run first, at most four; a kind without runs reserves its colour and marker.
         peers: staircases of other programs, by name.
         marked: runs to mark.
         bound: lower bound of the times with micro steps.
@@ -113,12 +111,14 @@ def plot_staircases(
         if any(np.isfinite(stair.fast_share) for stairs in kinds.values() for stair in stairs):
             for name, color in (("error of the macro steps", blue), ("error of the micro steps", orange)):
                 axes.plot([], [], "o", color=theme.rod, markerfacecolor=color, markersize=7, label=name)
-        _limits(axes, kinds, known_to, theme)
+        mark_reference(axes, known_to, theme)
+        log_ticks(axes.xaxis, [stair.seconds for stairs in kinds.values() for stair in stairs])
+        axes.xaxis.set_major_formatter(EngFormatter("s"))
         legend_below(figure)
     return figure
 
 
-def _steps(axes: Axes, stairs: Sequence[Step], **look) -> None:
+def _steps(axes: Axes, stairs: Sequence[Any], **look) -> None:
     """Draw a staircase."""
     axes.step([s.seconds for s in stairs], positive([s.error for s in stairs]), where="post", **look)
 
@@ -127,13 +127,3 @@ def _mixed(slow: str, fast: str, share: float) -> str:
     """The colour ``(1 - share) slow + share fast``, channel by channel."""
     red, green, blue = ((1 - share) * a + share * b for a, b in zip(to_rgb(slow), to_rgb(fast), strict=True))
     return to_hex((red, green, blue))
-
-
-def _limits(axes: Axes, kinds: Mapping[str, Sequence[Step]], known_to: float, theme: Theme) -> None:
-    """Set the ticks, and draw a line at the error of the reference if it lies within the axes."""
-    if known_to > axes.get_ylim()[0]:
-        axes.axhline(known_to, color=theme.ink, linewidth=0.8, linestyle=":")
-        above = {"ha": "right", "va": "bottom", "fontsize": 7.5, "transform": axes.get_yaxis_transform()}
-        axes.text(0.995, known_to, "error of the reference ", **above)
-    log_ticks(axes.xaxis, [stair.seconds for stairs in kinds.values() for stair in stairs])
-    axes.xaxis.set_major_formatter(EngFormatter("s"))

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -15,34 +15,20 @@ from vmri_jax.plots.theme import (
     curve_look,
     legend_below,
     log_ticks,
+    mark_reference,
     new_figure,
     panel_grid,
     positive,
 )
 
 
-class ConvergenceErrors(Protocol):
-    """Errors by scheme and quantity, "q" or "p".
-
-    `errors` returns macro steps and errors, `usable` the same without the round-off plateau, `order` the observed order.
-    """
-
-    @property
-    def schemes(self) -> Sequence[str]: ...
-    def errors(self, scheme: str, quantity: str) -> tuple[np.ndarray, np.ndarray]: ...
-    def usable(self, scheme: str, quantity: str) -> tuple[np.ndarray, np.ndarray]: ...
-    def order(self, scheme: str, quantity: str) -> float: ...
-
-
-def plot_convergence(
-    study: ConvergenceErrors, orders: Sequence[int] = (), title: str = "", theme: Theme = LIGHT
-) -> NotebookFigure:
+def plot_convergence(study: Any, orders: Sequence[int] = (), title: str = "", theme: Theme = LIGHT) -> NotebookFigure:
     """Errors of positions and of momenta against the macro step, with guide triangles of the given slopes.
 
     The legend has the observed orders of both.
 
     Args:
-        study: e.g. of `vmri_jax.study.convergence_study`.
+        study: result of `vmri_jax.study.convergence_study`.
         orders: slopes to draw for comparison.
         title: title above the panels.
         theme: colours.
@@ -67,7 +53,7 @@ def plot_convergence(
     return figure
 
 
-def _orders(study: ConvergenceErrors, scheme: str) -> str:
+def _orders(study: Any, scheme: str) -> str:
     """The observed orders of positions and of momenta in words."""
     orders = {quantity: study.order(scheme, quantity) for quantity in ("q", "p")}
     if not np.isfinite([*orders.values()]).any():
@@ -85,24 +71,11 @@ WORK = {
 """Labels of the axis of work in `plot_work_precision`, by the names of the attributes of the rows."""
 
 
-class RunsByWork(Protocol):
-    """Runs by scheme, and their Pareto front: rows with the attributes `error_q`, `num_steps` and every key of `WORK`."""
-
-    @property
-    def schemes(self) -> Sequence[str]: ...
-    @property
-    def reference(self) -> Any: ...
-    def curve(self, scheme: str) -> Sequence[Any]: ...
-    def pareto(self, work: str) -> Sequence[Any]: ...
-
-
-def plot_work_precision(
-    study: RunsByWork, title: str = "", work: str = "seconds", theme: Theme = LIGHT
-) -> NotebookFigure:
+def plot_work_precision(study: Any, title: str = "", work: str = "seconds", theme: Theme = LIGHT) -> NotebookFigure:
     """Error of the positions against work, one curve per scheme; the Pareto front is underlaid.
 
     Args:
-        study: e.g. of `vmri_jax.study.work_precision`, or the runs of a recommendation.
+        study: result of `vmri_jax.study.work_precision`, or the runs of a recommendation.
         title: title above the panel.
         work: "seconds", "slow_evaluations", "fast_evaluations" or "solves".
         theme: colours.
@@ -124,10 +97,7 @@ def plot_work_precision(
             axes.loglog(x, y, label=scheme, markersize=4, linewidth=1.1, **curve_look(i, theme))
         axes.set(xlabel=WORK[work], ylabel=r"largest error $|q - q_{\mathrm{ref}}|$")
         axes.set_ylim(top=30 * np.nanmax(errors, initial=0.0) or None)
-        if study.reference.error_q > axes.get_ylim()[0]:
-            axes.axhline(study.reference.error_q, color=theme.ink, linewidth=0.8, linestyle=":")
-            above = {"ha": "right", "va": "bottom", "fontsize": 7.5, "transform": axes.get_yaxis_transform()}
-            axes.text(0.995, study.reference.error_q, "error of the reference ", **above)
+        mark_reference(axes, study.reference.error_q, theme)
         log_ticks(axes.xaxis, [getattr(row, work) for scheme in study.schemes for row in study.curve(scheme)])
         if work == "seconds":
             axes.xaxis.set_major_formatter(EngFormatter("s"))
@@ -135,16 +105,8 @@ def plot_work_precision(
     return figure
 
 
-class CostCurves(Protocol):
-    """Curves by label and method: `curve` returns numbers of micro steps, and microseconds per micro step."""
-
-    @property
-    def curves(self) -> Sequence[tuple[str, str]]: ...
-    def curve(self, label: str, method: str) -> tuple[np.ndarray, np.ndarray]: ...
-
-
 def plot_cost(
-    studies: Mapping[str, CostCurves],
+    studies: Mapping[str, Any],
     paper_minima: Mapping[str, int] | None = None,
     title: str = "",
     theme: Theme = LIGHT,
@@ -172,7 +134,7 @@ def plot_cost(
     return figure
 
 
-def _cost_panel(axes: Axes, study: CostCurves, paper_minimum: int | None, theme: Theme) -> None:
+def _cost_panel(axes: Axes, study: Any, paper_minimum: int | None, theme: Theme) -> None:
     one_label = len({label for label, _ in study.curves}) == 1
     curves = [study.curve(label, method) for label, method in study.curves]
     for i, ((label, method), (num_micro, cost)) in enumerate(zip(study.curves, curves, strict=True)):
@@ -193,7 +155,7 @@ def _cost_panel(axes: Axes, study: CostCurves, paper_minimum: int | None, theme:
     log_ticks(axes.yaxis, np.concatenate([cost for _, cost in curves]))
 
 
-def _guide_triangle(axes: Axes, study: ConvergenceErrors, quantity: str, order: int, theme: Theme) -> None:
+def _guide_triangle(axes: Axes, study: Any, quantity: str, order: int, theme: Theme) -> None:
     """Draw a triangle of slope `order` just below the most accurate curve whose order is within 0.5 of it."""
     lowest = None
     for scheme in study.schemes:
