@@ -29,12 +29,11 @@ MAX_CHECKS = 4
 
 @dataclass(frozen=True)
 class Verification:
-    """A run from another start: its error and time, and their ratios to the error and the time in the search."""
+    """A run from another start: its error and time, and the ratio of the error to the error in the search."""
 
     error_q: float
     seconds: float
     error_ratio: float
-    time_ratio: float
 
 
 def another_start(problem: Problem, speed: float) -> Problem:
@@ -63,7 +62,7 @@ def verified(setting: Setting, problem: Problem, reference: ReferenceSolution, t
     row = work_row(setting.row.scheme, program, setting.num_steps, reference).timed(seconds)
     # a search in which nothing moves has errors of exactly 0
     error_ratio = row.error_q / setting.row.error_q if setting.row.error_q else 1.0
-    return Verification(row.error_q, row.seconds, error_ratio, row.seconds / setting.row.seconds)
+    return Verification(row.error_q, row.seconds, error_ratio)
 
 
 def first_verified(

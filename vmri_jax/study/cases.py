@@ -45,18 +45,15 @@ def cases_of(
     Raises:
         ValueError: no set of parameters; references with other labels or of another shape.
     """
-    problems = _problems(problem, params)
+    if params is not None and not params:
+        raise ValueError("convergence_study: params is empty; give a set of parameters by label, or leave it out.")
+    problems = (
+        {"": problem}
+        if params is None
+        else {label: replace(problem, system=problem.system.replace(params=p)) for label, p in params.items()}
+    )
     references = _references(problems, reference, t_end, num_saves, progress)
     return [Case(label, changed, references[label]) for label, changed in problems.items()]
-
-
-def _problems(problem: Problem, params: Mapping[str, Any] | None) -> dict[str, Problem]:
-    """The problem with every set of parameters, by label."""
-    if params is None:
-        return {"": problem}
-    if not params:
-        raise ValueError("convergence_study: params is empty; give a set of parameters by label, or leave it out.")
-    return {case: replace(problem, system=problem.system.replace(params=p)) for case, p in params.items()}
 
 
 def _references(

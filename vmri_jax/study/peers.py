@@ -1,7 +1,6 @@
 """Another program on the same problem: adaptive Runge-Kutta steps of diffrax, if installed, for problems ``q'' = f(q)``."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from importlib.util import find_spec
 from typing import Any
 
@@ -32,13 +31,12 @@ def can_run_dopri8(problem: Problem) -> bool:
     return plain and not any(system.num_constraints(problem.q_s, problem.q_f)) and find_spec("diffrax") is not None
 
 
-def dopri8_runs(problem: Problem, t_end: float, stride: int = STRIDE) -> Iterator[tuple[int, Callable[[], np.ndarray]]]:
+def dopri8_runs(problem: Problem, t_end: float) -> Iterator[tuple[int, Callable[[], np.ndarray]]]:
     """Runs of Dopri8 with smaller and smaller tolerances ``2^-power``: the power, and a function that gives q at the end, slow coordinates first.
 
     Args:
         problem: a problem that `can_run_dopri8`.
         t_end: simulated time.
-        stride: step from one power to the next.
     """
     import diffrax  # pyright: ignore[reportMissingImports]
 
@@ -72,7 +70,7 @@ def dopri8_runs(problem: Problem, t_end: float, stride: int = STRIDE) -> Iterato
         )
         return solution.ys[0][-1]  # pyright: ignore[reportOptionalSubscript]
 
-    for power in range(7, LARGEST_POWER, stride):
+    for power in range(7, LARGEST_POWER, STRIDE):
         yield power, lambda tolerance=2.0**-power: np.asarray(solve(tolerance))
 
 
@@ -95,29 +93,15 @@ def dopri8_stairs(problem: Problem, t_end: float, reference: ReferenceSolution, 
     rows = [
         # diffrax chooses its steps, so that the row needs a stand-in for their number: it doubles with each tolerance, and
         # each run then confirms the one before
-        replace(DOPRI8_ROW, num_steps=2 ** (power // STRIDE), error_q=error).timed(seconds[str(power)])
+        WorkRow(
+            scheme="diffrax Dopri8",
+            num_micro=1,
+            order=8,
+            num_steps=2 ** (power // STRIDE),
+            macro_dt=np.nan,
+            error_q=error,
+            error_p=np.nan,
+        ).timed(seconds[str(power)])
         for power, error in errors.items()
     ]
     return front(confirmed(rows))
-
-
-DOPRI8_ROW = WorkRow(
-    scheme="diffrax Dopri8",
-    num_micro=1,
-    order=8,
-    num_steps=0,
-    macro_dt=np.nan,
-    error_q=np.nan,
-    error_p=np.nan,
-    seconds=np.nan,
-    low=np.nan,
-    high=np.nan,
-    compile_seconds=np.nan,
-    slow_evaluations=0,
-    fast_evaluations=0,
-    solves=0,
-    iterations=0,
-    method="",
-    result="",
-)
-"""A run of Dopri8 without its error and its time; diffrax counts no gradients and no solves."""

@@ -55,16 +55,16 @@ class WorkRow:
     macro_dt: float
     error_q: float
     error_p: float
-    seconds: float
-    low: float
-    high: float
-    compile_seconds: float
-    slow_evaluations: int
-    fast_evaluations: int
-    solves: int
-    iterations: int
-    method: str
-    result: str
+    seconds: float = np.nan
+    low: float = np.nan
+    high: float = np.nan
+    compile_seconds: float = np.nan
+    slow_evaluations: int = 0
+    fast_evaluations: int = 0
+    solves: int = 0
+    iterations: int = 0
+    method: str = ""
+    result: str = ""
     stages: int = 1
     degree: int = 1
     evaluations: Mapping[str | int, int] = field(default_factory=dict)
@@ -134,7 +134,11 @@ class WorkPrecision(ResultTable):
 
     def records(self) -> list[dict[str, Any]]:
         """The rows as dictionaries, with an entry for the gradients of each further potential."""
-        return [_record(row) for row in self.rows]
+        rows = [asdict(row) for row in self.rows]
+        return [
+            row | {f"evaluations of {label(name)}": count for name, count in row.pop("evaluations").items()}
+            for row in rows
+        ]
 
     def content(self) -> dict[str, Any]:
         """Rows, error of the reference, machine and versions."""
@@ -144,12 +148,6 @@ class WorkPrecision(ResultTable):
     def plot(self, title: str = "", work: str = "seconds"):
         """Error against work, see `vmri_jax.plots.plot_work_precision`."""
         return plots.plot_work_precision(self, title, work)
-
-
-def _record(row: WorkRow) -> dict[str, Any]:
-    """A row as plain values."""
-    plain = asdict(row)
-    return plain | {f"evaluations of {label(name)}": count for name, count in plain.pop("evaluations").items()}
 
 
 def work_row(name: str, program: Program, num_steps: int, reference: ReferenceSolution) -> WorkRow:
@@ -172,9 +170,6 @@ def work_row(name: str, program: Program, num_steps: int, reference: ReferenceSo
         macro_dt=program.t_end / num_steps,
         error_q=error_q,
         error_p=error_p,
-        seconds=np.nan,
-        low=np.nan,
-        high=np.nan,
         compile_seconds=program.compile_seconds,
         slow_evaluations=round(evaluations * cost.slow_evaluations),
         fast_evaluations=round(evaluations * cost.fast_evaluations),
