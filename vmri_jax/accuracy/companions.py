@@ -22,6 +22,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from vmri_jax.mechanics.arrays import of_one_type
 from vmri_jax.running.run_error import RunError, largest_of
 from vmri_jax.running.simulation import Simulation
 from vmri_jax.running.trajectory import Trajectory, from_named_arrays
@@ -60,8 +61,9 @@ def with_error(
     scheme, order = run.scheme, run.order
     halved = companion(run, scheme, 2) if halved is None else halved
     if int(halved.failed_at) >= 0:
+        failed = float(halved.t[0]) + int(halved.failed_at) * float(run.macro_dt) / 2
         warnings.warn(
-            f"simulate: the error is not known; the same run with half the macro step failed at t = {_failure(halved, run):.4g}.",
+            f"simulate: the error is not known; the same run with half the macro step failed at t = {failed:.4g}.",
             UncertifiedWarning,
             stacklevel=3,
         )
@@ -164,22 +166,18 @@ def companion(run: Simulation, scheme: Scheme | Composition, parts: int) -> Traj
     """The run with another scheme and every macro step divided into equal parts, at the same saved nodes; it may fail."""
     finer = replace(
         run,
+        scheme=scheme if scheme is run.scheme else of_one_type(scheme),
         macro_dt=run.macro_dt / parts,
         num_steps=run.num_steps * parts,
         save_every=run.save_every * parts,
         save_micro=False,
     )
-    return (finer if scheme is run.scheme else finer.with_scheme(scheme)).in_pieces()
+    return finer.in_pieces()
 
 
 def _positions(trajectory: Trajectory) -> np.ndarray:
     """(k, n_s + n_f) positions, slow first."""
     return np.concatenate([trajectory.states.q_s, trajectory.states.q_f], axis=1)
-
-
-def _failure(halved: Trajectory, run: Simulation) -> float:
-    """Time of the failed step of the companion with half the macro step."""
-    return float(halved.t[0]) + int(halved.failed_at) * float(run.macro_dt) / 2
 
 
 def _uncertified(error: RunError, trajectory: Trajectory) -> str:

@@ -85,6 +85,15 @@ def print_written(title: str, path: Path | None) -> None:
         console.print(f"{title}: [bold]{escape(str(path))}[/bold]", soft_wrap=True)
 
 
+def print_named(texts: dict[str, str]) -> None:
+    """Print a line for each name and its text; empty texts are left out."""
+    table = plain_table("", "", show_header=False)
+    for name, text in texts.items():
+        if text:
+            table.add_row(f"[dim]{name}[/dim]", escape(text))
+    console.print(table)
+
+
 def plain_table(*columns: str, show_header: bool = True) -> Table:
     """A table without lines."""
     return Table(*columns, box=None, pad_edge=False, show_header=show_header)

@@ -17,7 +17,7 @@ from vmri_jax import plots
 from vmri_jax.accuracy.simulate import simulate as run_at_once
 from vmri_jax.catalogue import find_problem, find_scheme
 from vmri_jax.cli import options
-from vmri_jax.cli.common import PICTURES, RUN, check_target_file, console, plain_table, print_failure, refusals
+from vmri_jax.cli.common import PICTURES, RUN, check_target_file, console, print_failure, print_named, refusals
 from vmri_jax.running.arguments import nothing_fast
 from vmri_jax.running.interrupts import Interrupted
 from vmri_jax.running.settings import Settings
@@ -143,7 +143,7 @@ def simulate(
                 done = 0  # micro steps; the time of a run with an accuracy includes trial runs, so that it has no time per step
                 if steps is not None and chosen is not None:
                     done = (steps - (0 if before is None else before.step)) * chosen.num_micro
-                _print_named(
+                print_named(
                     {
                         **_steps_in_words(trajectory, chosen, steps),
                         "": "" if chosen is None else nothing_fast(chosen, problem.q_f.size),
@@ -198,15 +198,6 @@ def _print_again(chosen: Settings, system: str, method: str) -> None:
     method_option = "" if method == "auto" else f" --method {method}"
     command = f"vmri simulate {shlex.quote(system)} {chosen.options} {numbers} {saved}{method_option}"
     console.print(f"The same run again:\n[bold]{escape(command)}[/bold]", soft_wrap=True)
-
-
-def _print_named(texts: dict[str, str]) -> None:
-    """Print a line for each name and its text; empty texts are left out."""
-    table = plain_table("", "", show_header=False)
-    for name, text in texts.items():
-        if text:
-            table.add_row(f"[dim]{name}[/dim]", escape(text))
-    console.print(table)
 
 
 def _run(run, problem, scheme, arguments: dict):
@@ -281,18 +272,14 @@ def _summary(trajectory: Trajectory | StoredTrajectory, constrained: bool) -> di
     pieces = [trajectory] if isinstance(trajectory, Trajectory) else trajectory.chunks()
     times, energies, largest = (np.array(column) for column in zip(*map(_extremes, pieces), strict=True))
     position, velocity, method, iterations = largest.max(axis=0)
+    error = trajectory.error if isinstance(trajectory, Trajectory) else None
     return {
         "simulated time": f"{times[0, 0]:g} to {times[-1, 1]:g}",
         "Newton iterations": f"at most {int(iterations)} per step, {Method(int(method)).name.lower()}",
         **(_energy_error(energies) if trajectory.keeps_energy else _energy_balance(trajectory)),
-        "error": _error(trajectory),
+        "error": "" if error is None else error.in_words(),
         "constraint residual": f"{position:.2e} in positions, {velocity:.2e} in velocities" if constrained else "",
     }
-
-
-def _error(trajectory: Trajectory | StoredTrajectory) -> str:
-    """The estimated error of the positions in words, empty without an estimate."""
-    return trajectory.error.in_words() if isinstance(trajectory, Trajectory) and trajectory.error is not None else ""
 
 
 def _energy_error(energies: np.ndarray) -> dict[str, str]:

@@ -19,8 +19,8 @@ from vmri_jax.cli.common import (
     PICTURES,
     check_target_file,
     console,
-    plain_table,
     print_failure,
+    print_named,
     print_written,
     refusals,
 )
@@ -200,17 +200,14 @@ def _client(workers: int | None, scheduler: str | None) -> Iterator[Any]:
 
 
 def _print_summary(runs: Ensemble) -> None:
-    table = plain_table("", "", show_header=False)
-    rows = {
+    texts = {
         "runs": f"{len(runs):,}" + (f", of which {runs.failed_runs:,} failed" if runs.failed_runs else ""),
         "computed now": f"{runs.computed:,} in {runs.seconds:.1f} s"
         + (f", {runs.runs_per_second:,.0f} a second" if runs.computed else ""),
         "chunks": f"{len(runs.done)} of {runs.chunks.count} are in the store, {runs.chunks.size:,} runs each",
         "store": f'{runs.path}; read it with vmri_jax.open_ensemble("{os.path.relpath(runs.path)}")',
     }
-    for name, text in rows.items():
-        table.add_row(f"[dim]{name}[/dim]", escape(text))
-    console.print(table)
+    print_named(texts)
 
 
 def _write_example(file: Path) -> None:

@@ -132,15 +132,9 @@ def _differentiated_by(exact: Callable, run: Callable, real) -> Trajectory:
     return run(real)
 
 
-def _exact_forward(exact: Callable, run: Callable, real):
-    return jax.vjp(exact, real)
-
-
-def _exact_backward(exact: Callable, run: Callable, pull, cotangent: Trajectory):
-    return pull(cotangent)
-
-
-_differentiated_by.defvjp(_exact_forward, _exact_backward)
+_differentiated_by.defvjp(
+    lambda exact, run, real: jax.vjp(exact, real), lambda exact, run, pull, cotangent: pull(cotangent)
+)
 
 
 class _Interval(NamedTuple):
@@ -213,7 +207,8 @@ def _back(engine: Engine, save_every: int, leaves, macro_dt, nodes: State, at_no
             else:
                 state, info, memory = back.step(state, memory, -macro_dt)
                 state, memory = back.project(state, memory)
-                state = _where_solved(info.result, state)
+                solved = info.result <= Result.CONVERGED_AT_ROUNDOFF
+                state = jax.tree.map(lambda a: jnp.where(solved, a, jnp.nan), state)
             # Only the last step of the interval saves micro nodes.
             by_micro = jnp.where(number == 0, interval.by_micro, 0.0)
             by_real_of_step, by_state, by_dt_of_step = jax.vjp(step, real, state, macro_dt)[1]((by_state, by_micro))
@@ -246,11 +241,6 @@ reversible.defvjp(_run_and_nodes, _stepped_back)
 
 def _plus(a, b):
     return jax.tree.map(jnp.add, a, b)
-
-
-def _where_solved(result, state: State) -> State:
-    """A state, or NaN after a step that failed."""
-    return jax.tree.map(lambda a: jnp.where(result <= Result.CONVERGED_AT_ROUNDOFF, a, jnp.nan), state)
 
 
 def _distance(a: State, b: State):

@@ -179,10 +179,6 @@ class Simulation:
         }
         return summary("Simulation, prepared: run() makes a Trajectory", lines | self.system.terms())
 
-    def with_scheme(self, scheme: Scheme | Composition) -> "Simulation":
-        """The same run with another scheme."""
-        return replace(self, scheme=of_one_type(scheme))
-
     @property
     def order(self) -> int:
         """Order of convergence of its scheme, with the rules of all potentials of the system."""
