@@ -80,19 +80,6 @@ def energy(trajectory: Trajectory, num_steps: int, scale: float = 1.0) -> Energy
     return Energy(band, float(np.abs(np.diff(e)).max()), change / num_steps * 1e5, share)
 
 
-def smooth_shift(trajectory: Trajectory, num_steps: int, scale: float = 1.0) -> float:
-    """Change of the mean energy per 1e5 steps, between the halves of a run, for motion that is quasi-periodic.
-
-    The means are weighted by ``exp(-1 / (x (1 - x)))``, x from 0 to 1: they converge faster than any power of the length
-    (Das, Saiki, Sander and Yorke 2017), so that the shift is not hidden by oscillations.
-    """
-    e = np.asarray(trajectory.energy) / scale
-    half = len(e) // 2
-    x = (np.arange(half) + 0.5) / half
-    weights = np.exp(-1 / (x * (1 - x)))
-    return float(weights @ (e[-half:] - e[:half]) / weights.sum() / (num_steps - num_steps / 2) * 1e5)
-
-
 def energy_scale(problem: Problem, trajectory: Trajectory) -> float:
     """Size of the energies of a run: the larger of ``|E_0|`` and the largest kinetic energy, at least 1e-300."""
     still = problem.system.replace(slow_potential=None, fast_potential=None, potentials=None)
