@@ -60,10 +60,8 @@ class Fit:
     again: Callable = field(repr=False)
 
     @classmethod
-    def of(
-        cls, shooting: Shooting, u, misses, *, by_parameters, by_starts, iterations, converged, gap, squares, again
-    ) -> "Fit":
-        """The fit at the end of a search, see `vmri_jax.fitting.fit`."""
+    def of(cls, shooting: Shooting, u, misses, *, by_parameters, by_starts, **search: Any) -> "Fit":
+        """The fit at the end of a search, see `vmri_jax.fitting.fit`; `search` has the other fields by name."""
         unknowns = shooting.unknowns
         parameters = {name: np.asarray(value) for name, value in unknowns.at(u).items()}
         numbers = np.asarray(unknowns.vector(parameters))
@@ -74,21 +72,8 @@ class Fit:
             sigma = float(np.sqrt(np.sum(misses**2) / max(freedom, 1)))
             misses = misses / sigma
         covariance, undetermined = _covariance(by_parameters, by_starts, numbers, unknowns.labels)
-        return cls(
-            parameters,
-            unknowns.labels,
-            sigma**2 * covariance,
-            misses,
-            freedom,
-            sigma,
-            undetermined,
-            iterations,
-            converged,
-            gap,
-            squares,
-            shooting,
-            again,
-        )
+        estimates = parameters, unknowns.labels, sigma**2 * covariance, misses, freedom, sigma, undetermined
+        return cls(*estimates, shooting=shooting, **search)
 
     @property
     def problem(self) -> Problem:
