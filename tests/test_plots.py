@@ -317,7 +317,9 @@ def test_staircases_are_drawn(error, share):
     bound = plots.Bound("bound", "single", 0.5)
     marked = [plots.Marked("answers", 1e-3, error), plots.Marked("accuracy", 2e-3, error, star=True)]
     kinds = {"single": stairs, "micro": stairs[:1]}
-    assert is_drawn(plots.plot_staircases(kinds, {"peer": stairs}, marked, bound, 1e-3, "title", plots.DARK))
+    assert is_drawn(
+        plots.plot_staircases(kinds, {"peer": stairs}, marked, bound, known_to=1e-3, title="title", theme=plots.DARK)
+    )
 
 
 def test_no_answer_of_a_cost_page_is_slower_than_that_for_a_smaller_error():

@@ -44,7 +44,7 @@ def _refusal(call) -> str:
 
 
 def bad_lane(
-    problem: Problem, scheme, macro_dt, num_steps: int, solver: Newton, lanes: int = 256, compared: int = 4
+    problem: Problem, scheme, macro_dt, num_steps: int, solver: Newton, *, lanes: int = 256, compared: int = 4
 ) -> Outcome:
     """A batch whose lanes start at the nodes of a run, one of them with overflowing momenta, compared with single runs of some lanes."""
     bad = lanes // 3

@@ -58,6 +58,7 @@ def plot_staircases(
     peers: Mapping[str, Sequence[Any]] | None = None,
     marked: Sequence[Marked] = (),
     bound: Bound | None = None,
+    *,
     known_to: float = 0.0,
     title: str = "",
     theme: Theme = LIGHT,

@@ -167,17 +167,24 @@ def _stepped_back(run, engine: Engine, save_every: int, residuals, cotangent: Tr
     """Cotangents of `Arrays`."""
     (leaves, _, macro_dt), nodes = only_once(residuals)
     at_nodes = (*vars(cotangent.states).values(), cotangent.energy, cotangent.constraint_residual)
-    by_real, by_state, by_dt = _back(engine, save_every, leaves, macro_dt, nodes, at_nodes, cotangent.micro)
+    by_real, by_state, by_dt = _back(engine, save_every, leaves, macro_dt, nodes, (at_nodes, cotangent.micro))
     by_leaves = [by_real[i] if i in by_real else _no_cotangent(leaf) for i, leaf in enumerate(leaves)]
     return (Arrays(by_leaves, tuple(vars(by_state).values()), by_dt),)
 
 
 @partial(jax.jit, static_argnums=(0, 1))
-def _back(engine: Engine, save_every: int, leaves, macro_dt, nodes: State, at_nodes, at_micro):
+def _back(engine: Engine, save_every: int, leaves, macro_dt, nodes: State, cotangents):
     """All steps back: cotangents of the floating-point leaves by number, of the start, and of the macro step.
 
     Jitted for itself: a gradient outside of `jax.jit` would compile these loops at every call.
+
+    Args:
+        engine, save_every: of the run.
+        leaves, macro_dt: of its `Arrays`.
+        nodes: saved states.
+        cotangents: of the fields of the saved nodes, and of the micro nodes.
     """
+    at_nodes, at_micro = cotangents
     real = {i: jnp.asarray(leaf) for i, leaf in enumerate(leaves) if _is_real(leaf)}
 
     def complete(real: dict) -> list:

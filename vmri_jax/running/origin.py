@@ -141,7 +141,7 @@ def at_nodes(function, origin: Origin, nodes, *static):
     # Arrays that all lanes share go in once: mapped over the lanes they would be copied for each.
     repeated = tuple(_is_repeated(array, axes - 1) for array in arrays)
     arrays = [array[(0,) * (axes - 1)] if shared else array for array, shared in zip(arrays, repeated, strict=True)]
-    return _mapped(function, axes, repeated, structure, static, arrays, nodes)
+    return _mapped(function, repeated, structure, static, arrays, nodes)
 
 
 def _is_repeated(array, axes: int) -> bool:
@@ -150,13 +150,13 @@ def _is_repeated(array, axes: int) -> bool:
 
 
 @eqx.filter_jit
-def _mapped(function, axes: int, repeated: tuple[bool, ...], structure, static: tuple, arrays: list, nodes):
+def _mapped(function, repeated: tuple[bool, ...], structure, static: tuple, arrays: list, nodes):
     def at_node(arrays, node):
         bare, params = jax.tree.unflatten(structure, arrays)
         return function(bare.with_params(params), node, *static)
 
     mapped = at_node
-    for axis in range(axes):
+    for axis in range(jax.tree.leaves(nodes)[0].ndim):
         lanes = [
             None if axis == 0 or shared else 0 for shared in repeated
         ]  # axis 0, the innermost map, runs over the nodes

@@ -218,7 +218,7 @@ def cost_report(
         answers = _confirmed(search, answers)
         progress("shares of errors", 1, 1)
         stairs = with_shares(search, staircases(search.rows().rows))
-        report = _write(search, answers, problem, name, out, stairs, _extras(search, answers, progress))
+        report = _write(search, answers, problem, name, out, stairs=stairs, extras=_extras(search, answers, progress))
     progress("done", 1, 1)
     return report
 
@@ -275,6 +275,7 @@ def _write(
     problem: Problem,
     name: str,
     out: Path,
+    *,
     stairs: dict[str, list[Stair]] | None = None,
     extras: Extras | None = None,
 ) -> CostReport:
@@ -361,7 +362,9 @@ def _draw_stairs(report: CostReport, price: dict[str, float], title: str, theme:
     if chosen is not None:
         marked.append(plots.Marked(f"accuracy={extras.accuracy_error:.0e}", chosen.seconds, chosen.error_q, star=True))
     known_to, bound = report.runs.reference.error_q, bound_of(report.stairs, price)
-    return plots.plot_staircases(report.stairs, extras.peers, marked, bound, known_to, title, theme)
+    return plots.plot_staircases(
+        report.stairs, extras.peers, marked, bound, known_to=known_to, title=title, theme=theme
+    )
 
 
 def bound_of(stairs: dict[str, list[Stair]], price: dict[str, float]) -> plots.Bound | None:
