@@ -319,10 +319,8 @@ def test_ledger_measures():
     times = {row.name: row.microseconds for row in ledger.rows if row.kind != "body"}
     assert set(times) == {"spring_anchors", "damping"}
     assert all(0 < time < ledger.microseconds for time in times.values())
-    assert ledger.as_dict()["rows"][1]["name"] == "spring_anchors"
     assert ledger.table().row_count == 4
     assert ledger.reasons().row_count == 3
-    assert json.dumps(ledger.as_dict())
 
 
 def test_dear_effects_take_longer():

@@ -2,7 +2,7 @@
 
 import re
 from collections import Counter
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import jax
@@ -79,10 +79,6 @@ class Ledger:
         """Unknowns of a macro step, multipliers included: ``r n_s + r n_gs + num_micro r (n_f + n_g)``, r the degree."""
         return sum(row.unknowns + row.multipliers for row in self.rows)
 
-    def as_dict(self) -> dict[str, Any]:
-        """The ledger as a dictionary with the keys "rows", "unknowns", "microseconds"."""
-        return asdict(self) | {"rows": [asdict(row) for row in self.rows], "unknowns": self.unknowns}
-
     def table(self) -> PrintedTable:
         """Unknowns, evaluations and time of every body and effect; the reasons for their grids are in `reasons`."""
         table = PrintedTable("name", "part of", "grid", box=None, pad_edge=False)
@@ -112,12 +108,7 @@ class Ledger:
 
 
 def ledger(sorting: Sorting, scheme: Scheme | Composition, macro_dt: float | None, measure: bool) -> Ledger:
-    """The ledger of a scene, see `Scene.explain`.
-
-    Args:
-        sorting: of the scene.
-        scheme, macro_dt, measure: as of `Scene.explain`.
-    """
+    """The ledger of a scene, see `Scene.explain`."""
     if not isinstance(scheme, Scheme | Composition):
         raise TypeError(f"Scene.explain: scheme is {scheme!r}; give a Scheme, e.g. fully_implicit(num_micro=10).")
     stage, stages, intervals = _intervals(scheme)
@@ -132,7 +123,7 @@ def ledger(sorting: Sorting, scheme: Scheme | Composition, macro_dt: float | Non
     for part, nanoseconds in zip(sorting.placed, times, strict=True):
         rule = _rule(stage, part.home)
         multipliers = intervals[rule.grid] * sum(build(sorting, [part]).num_constraints(*sorting.start[:2]))
-        count = 0 if part.home == "control" else stages * evaluations(rule, stage.num_micro)
+        count = 0 if part.home == "control" else stages * rule.evaluations(stage.num_micro)
         microseconds = None if nanoseconds is None else nanoseconds * count / 1e3
         kind = TERMS.get(part.home, f"potential on one in {part.home} micro nodes")
         rows.append(LedgerRow(part.effect.name, kind, rule.grid, part.reason, 0, multipliers, count, microseconds))
@@ -157,12 +148,7 @@ def _rule(scheme: Scheme, home: Any) -> PlacedRule:
 def ledger_of_functions(
     problem: Problem, scheme: Scheme | Composition, macro_dt: float | None = None, measure: bool = True
 ) -> Ledger:
-    """The ledger of a system of functions: its coordinates by name, and each of its functions.
-
-    Args:
-        problem: the system with its start.
-        scheme, macro_dt, measure: as of `Scene.explain`.
-    """
+    """The ledger of a system of functions: its coordinates by name, and each of its functions; see `Scene.explain`."""
     system, state = problem.system, problem.state()
     stage, stages, intervals = _intervals(scheme)
     names = (problem.names or Names()).of_coordinates(state.q_s.size, state.q_f.size)
@@ -185,13 +171,13 @@ def ledger_of_functions(
         alone = _alone(system, home, state)
         rule = _rule(stage, home)
         multipliers = intervals[rule.grid] * sum(alone.num_constraints(state.q_s, state.q_f))
-        count = stages * evaluations(rule, stage.num_micro)
+        count = stages * rule.evaluations(stage.num_micro)
         why = f"the rule of the scheme for it is on the {rule.grid} grid"
         name, time = name_of(getattr(system, home)), microseconds(alone, count)
         rows.append(LedgerRow(name, TERMS[home], rule.grid, why, 0, multipliers, count, time))
     for name, function in system.potentials:
         alone, rule = _alone(system, "", state).replace(potentials={name: function}), stage.rule_of(name)
-        count = stages * evaluations(rule, stage.num_micro)
+        count = stages * rule.evaluations(stage.num_micro)
         why, time = f"the rule of the scheme for it: {rule.in_words()}", microseconds(alone, count)
         rows.append(LedgerRow(name_of(function), f"potential {label(name)}", rule.grid, why, 0, 0, count, time))
     return Ledger(tuple(rows), _macro_step(system, scheme, state, macro_dt, DEFAULT_FREQUENCY) if measure else None)
@@ -203,13 +189,6 @@ def _alone(system: System, home: str, state: State) -> System:
     absent = {name: None for name in TERMS if name not in (home, "kinetic", "control", "fast")}
     absent["potentials"] = None
     return system.replace(**absent, **({} if home == "kinetic" else {"kinetic": masses}))
-
-
-def evaluations(rule, num_micro: int) -> int:
-    """Number of nodes of a rule in a macro step; the node that two neighbouring steps share counts once."""
-    nodes = rule.composite(num_micro).nodes
-    shared = np.isclose(nodes[0], 0.0) and np.isclose(nodes[-1], 1.0)
-    return len(nodes) - int(shared)
 
 
 def _measure(sorting: Sorting, scheme, macro_dt) -> tuple[float, list[float]]:
@@ -263,11 +242,7 @@ def _first_derivatives(system: System, n_s: int, v_s, v_f):
 
 
 def prepare_steps(system: System, scheme: Scheme | Composition, state, macro_dt, num_steps: int = STEPS) -> Simulation:
-    """A prepared simulation that saves the end alone; `operations` and `temporary_bytes` take its ``.compiled()``.
-
-    Args:
-        system, scheme, state, macro_dt, num_steps: as of `vmri_jax.prepare`.
-    """
+    """A simulation, see `vmri_jax.prepare`, that saves the end alone; `operations` and `temporary_bytes` take its ``.compiled()``."""
     return prepare(system, scheme, state, macro_dt=macro_dt, num_steps=num_steps, save_every=num_steps)
 
 

@@ -16,7 +16,7 @@ not grow with the number of micro steps.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import jax
@@ -94,9 +94,6 @@ class Term:
         q |= {a: self.sign * g for a, g in zip(self.arguments, grads, strict=True)}
         return q["q_s"], q["q_f"]
 
-    def __neg__(self):
-        return replace(self, sign=-self.sign)
-
 
 @dataclass(frozen=True)
 class QuadraticKinetic:
@@ -170,15 +167,6 @@ class Sum:
         """The terms that have nodes at the ends of the macro interval."""
         return tuple(term for term in self.terms if term.start is not None or term.end is not None)
 
-    def __neg__(self):
-        return Sum(tuple(-term for term in self.terms))
-
-    def __add__(self, other: "Sum"):
-        return Sum(self.terms + other.terms)
-
-    def __sub__(self, other: "Sum"):
-        return self + (-other)
-
 
 class PlacedPotential(NamedTuple):
     """A potential of a system with its rule.
@@ -216,13 +204,14 @@ def placed_potentials(system: System, scheme: Scheme) -> tuple[PlacedPotential, 
 
 def lagrangian(system: System, scheme: Scheme) -> Sum:
     """``T - V - W - sum_i V_i`` of a system, each term on the nodes the scheme gives it."""
-    terms = _kinetic(system, scheme)
-    for name, function, arguments, placed in placed_potentials(system, scheme):
-        terms -= _on_position_nodes(function, arguments, placed, scheme, system, name)
-    return terms + _corrections(system, scheme)
+    potentials = [
+        _on_position_nodes(function, arguments, placed, scheme, system, name, sign=-1.0)
+        for name, function, arguments, placed in placed_potentials(system, scheme)
+    ]
+    return Sum((*_kinetic(system, scheme), *potentials, *_corrections(system, scheme)))
 
 
-def _corrections(system: System, scheme: Scheme) -> Sum:
+def _corrections(system: System, scheme: Scheme) -> list[Term]:
     """The corrections by squared gradients of `vmri_jax.schemes.quadrature.gradient_corrected`.
 
         h^2/24 grad W . M^-1 grad W        H^2/24 grad V . M^-1 grad V + h^2/12 grad V . M^-1 grad W
@@ -230,7 +219,7 @@ def _corrections(system: System, scheme: Scheme) -> Sum:
     as terms of the Lagrangian, with the factor H^2 in `Term.power` and h = H / num_micro.
     """
     if not scheme.slow.gradient_corrected and not scheme.fast.gradient_corrected:
-        return Sum(())
+        return []
     if not isinstance(system.kinetic, ConstantMass):
         raise ValueError("Scheme: corrected kicks need a System whose kinetic is a ConstantMass.")
     slow_potential, fast_potential, mass = system.slow_potential, system.fast_potential, system.kinetic
@@ -248,37 +237,30 @@ def _corrections(system: System, scheme: Scheme) -> Sum:
             total += jnp.sum(v_f * jax.grad(fast_potential)(q_f, params)) / (12 * scheme.num_micro**2)  # pyright: ignore[reportArgumentType]
         return total
 
-    terms = Sum(())
+    corrections = []
     if scheme.slow.gradient_corrected and slow_potential is not None:
-        terms += _on_position_nodes(slow, ("q_s", "q_f"), scheme.slow, scheme, system, "the correction of V")
+        corrections.append((slow, ("q_s", "q_f"), scheme.slow, scheme, system, "the correction of V"))
     if both:
-        terms += _on_position_nodes(fast, ("q_f",), scheme.fast, scheme, system, "the correction of W")
-    return Sum(tuple(replace(term, power=2) for term in terms.terms))
+        corrections.append((fast, ("q_f",), scheme.fast, scheme, system, "the correction of W"))
+    return [_on_position_nodes(*correction, power=2) for correction in corrections]
 
 
-def _kinetic(system, scheme) -> Sum:
+def _kinetic(system, scheme) -> list:
     nodes = velocity_nodes(scheme.kinetic, scheme.num_micro, scheme.degree)
     if isinstance(system.kinetic, ConstantMass):
-        return Sum((QuadraticKinetic(system.kinetic, nodes),))
+        return [QuadraticKinetic(system.kinetic, nodes)]
     both, slow = system.kinetic.function, system.slow_kinetic
-    terms = Sum((Term(lambda *z: both(*z, system.params), ("q_s", "q_f", "v_s", "v_f"), nodes),))
+    terms = [Term(lambda *z: both(*z, system.params), ("q_s", "q_f", "v_s", "v_f"), nodes)]
     if slow is not None:
         nodes = slow_velocity_nodes(scheme.kinetic, scheme.num_micro, scheme.degree)
-        terms += Sum((Term(lambda *z: slow(*z, system.params), ("q_s", "v_s"), nodes, grid="macro"),))
+        terms.append(Term(lambda *z: slow(*z, system.params), ("q_s", "v_s"), nodes, grid="macro"))
     return terms
 
 
-def _on_position_nodes(function, arguments, placed, scheme, system, name: str) -> Sum:
+def _on_position_nodes(function, arguments, placed, scheme, system, name: str, **fields) -> Term:
     start, inside, end = position_nodes(placed, scheme.num_micro, scheme.degree)
-    ends = {
-        "start": start,
-        "end": end,
-        "grid": placed.grid,
-        "every": placed.every,
-        "mollified": placed.mollified,
-        "name": name,
-    }
-    return Sum((Term(lambda *q: function(*q, system.params), arguments, inside, **ends),))
+    fields |= {"grid": placed.grid, "every": placed.every, "mollified": placed.mollified, "name": name}
+    return Term(lambda *q: function(*q, system.params), arguments, inside, start, end, **fields)
 
 
 def discrete_lagrangian(system: System, scheme: Scheme) -> Callable:

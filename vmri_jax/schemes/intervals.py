@@ -166,9 +166,6 @@ class Intervals:
     position of the hub that carries the panels, and not on the angles of its wheels. The intervals then take and hand on quantities of
     these "seen" slow variables only, so that their cost does not grow with the number of the others.
 
-    Args:
-        equations: of the macro step.
-
     Attributes:
         seen: the slow variables on which terms on the micro grid depend; all of them with forces, which may act on any variable.
     """
@@ -212,8 +209,6 @@ class Intervals:
         """Residual of interval m, and the quantities that it hands on.
 
         Args:
-            m: number of the interval.
-            x: its unknowns.
             arriving: from the intervals before.
             slow: (r, n_v) increments of the slow path that are seen.
         """

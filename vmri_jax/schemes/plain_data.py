@@ -13,11 +13,7 @@ RULES = ("kinetic", "slow", "fast", "constraint", "slow_constraint", "force")
 
 
 def to_plain(scheme: Scheme | Composition) -> dict[str, Any]:
-    """A scheme as plain data; numbers of float64 stay the same through JSON.
-
-    Args:
-        scheme: with concrete weights and coefficients.
-    """
+    """A scheme with concrete weights as plain data; numbers of float64 stay the same through JSON."""
     if isinstance(scheme, Composition):
         return {"scheme": to_plain(scheme.scheme), "coefficients": np.asarray(scheme.coefficients).tolist()}
     rules = {name: _plain_rule(getattr(scheme, name)) for name in RULES}
@@ -27,10 +23,7 @@ def to_plain(scheme: Scheme | Composition) -> dict[str, Any]:
 
 
 def from_plain(data: dict[str, Any]) -> Scheme | Composition:
-    """The inverse of `to_plain`.
-
-    Args:
-        data: from `to_plain`, also after a round trip through JSON.
+    """The inverse of `to_plain`, also after a round trip through JSON.
 
     Raises:
         KeyError, TypeError, ValueError: data that are no scheme.

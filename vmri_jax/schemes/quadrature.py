@@ -232,6 +232,11 @@ class PlacedRule(eqx.Module):
         """Number of copies of the rule on the macro interval."""
         return 1 if self.grid == "macro" else num_micro // self.every
 
+    def evaluations(self, num_micro: int) -> int:
+        """Number of nodes in a macro step; the node that two neighbouring steps share counts once."""
+        nodes = self.composite(num_micro).nodes
+        return len(nodes) - (nodes[0] <= NODE_TOLERANCE and nodes[-1] >= 1 - NODE_TOLERANCE)
+
     @property
     def is_local(self) -> bool:
         """Whether every micro interval has a copy of the rule of its own."""

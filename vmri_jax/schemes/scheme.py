@@ -18,7 +18,7 @@ of order 1, each the adjoint of the other. Any other alpha also has order 1. alp
 """
 
 import math
-from dataclasses import replace
+from dataclasses import KW_ONLY, replace
 
 import equinox as eqx
 import numpy as np
@@ -66,34 +66,23 @@ class Scheme(eqx.Module):
     """
 
     num_micro: int = eqx.field(static=True)
-    degree: int = eqx.field(static=True)
+    degree: int = eqx.field(static=True, default=1)
+    _: KW_ONLY
     kinetic: PlacedRule
     slow: PlacedRule
     fast: PlacedRule
-    constraint: PlacedRule
-    slow_constraint: PlacedRule
-    force: PlacedRule
-    potentials: dict[str, PlacedRule]
+    constraint: PlacedRule = eqx.field(default=None)
+    slow_constraint: PlacedRule = eqx.field(default=None)
+    force: PlacedRule = eqx.field(default=None)
+    potentials: dict[str, PlacedRule] = eqx.field(default_factory=dict)
 
-    def __init__(
-        self,
-        num_micro,
-        degree=1,
-        *,
-        kinetic,
-        slow,
-        fast,
-        constraint=None,
-        slow_constraint=None,
-        force=None,
-        potentials=None,
-    ):
-        self.num_micro = _positive_integer("num_micro", num_micro)
-        self.degree = _positive_integer("degree", degree)
-        self.kinetic, self.slow, self.fast = kinetic, slow, fast
-        self.force = kinetic if force is None else force
-        self.constraint = micro(lobatto(degree + 1)) if constraint is None else constraint
-        self.slow_constraint = macro(lobatto(degree + 1)) if slow_constraint is None else slow_constraint
+    def __post_init__(self):
+        self.num_micro = _positive_integer("num_micro", self.num_micro)
+        self.degree = _positive_integer("degree", self.degree)
+        at_control_nodes = lobatto(self.degree + 1)
+        self.force = self.kinetic if self.force is None else self.force
+        self.constraint = micro(at_control_nodes) if self.constraint is None else self.constraint
+        self.slow_constraint = macro(at_control_nodes) if self.slow_constraint is None else self.slow_constraint
         for name in ("kinetic", "slow", "fast", "force", "constraint", "slow_constraint"):
             _check_placed(name, getattr(self, name))
             if getattr(self, name).every > 1 and name not in ("slow", "fast"):
@@ -102,8 +91,8 @@ class Scheme(eqx.Module):
                     "with_potentials(...). Take micro(rule) or macro(rule)."
                 )
         self.slow, self.fast = (_on_grid(name, getattr(self, name), self.num_micro) for name in ("slow", "fast"))
-        self.potentials = {}
-        for name, placed in dict(potentials or {}).items():
+        self.potentials = dict(self.potentials)
+        for name, placed in self.potentials.items():
             _check_placed(name, placed)
             if placed.mollified or placed.gradient_corrected:
                 how = "mollified" if placed.mollified else "corrected"
@@ -135,8 +124,8 @@ class Scheme(eqx.Module):
             nodes, needed = np.array(placed.rule.nodes), control_nodes(self.degree)
             if placed.grid != grid or nodes.shape != needed.shape or np.abs(nodes - needed).max() > NODE_TOLERANCE:
                 raise ValueError(
-                    f"Scheme: {name} must be held at the control nodes {needed.tolist()} of degree {degree}; "
-                    f"give {grid}(lobatto({degree + 1})), got {placed.grid} rule with nodes {nodes.tolist()}."
+                    f"Scheme: {name} must be held at the control nodes {needed.tolist()} of degree {self.degree}; "
+                    f"give {grid}(lobatto({self.degree + 1})), got {placed.grid} rule with nodes {nodes.tolist()}."
                 )
             if is_concrete(placed) and np.any(np.asarray(placed.rule.weights) == 0):
                 raise ValueError(f"Scheme: a weight of the {name} rule is zero; its multiplier would be undefined.")
@@ -208,13 +197,10 @@ class Scheme(eqx.Module):
     def evaluations_of(self, name: str | int) -> int:
         """Number of gradients of a potential in `System.potentials` per macro step; a node that two macro steps share counts once.
 
-        Args:
-            name: of the potential.
-
         Raises:
             ValueError: as of `rule_of`.
         """
-        return _evaluations(self.rule_of(name), self.num_micro)
+        return self.rule_of(name).evaluations(self.num_micro)
 
     def describe(self) -> Description:
         """Rules, order, symmetry, evaluations and solves per macro step; prints as a table.
@@ -228,22 +214,16 @@ class Scheme(eqx.Module):
         # solves without constraints: none if V and W only kick, one per micro step if V only kicks, else one of all unknowns
         free = 0 if drifts and kicked else self.num_micro if kicked and self.fast.grid == "micro" else 1
         slow, fast = (
-            _evaluations(placed, self.num_micro) * (1 + placed.gradient_corrected) for placed in (self.slow, self.fast)
+            placed.evaluations(self.num_micro) * (1 + placed.gradient_corrected) for placed in (self.slow, self.fast)
         )
         fast *= 1 + self.slow.mollified  # a second time along the motion of the average
         fast += self.slow.gradient_corrected and self.fast.gradient_corrected  # grad V . M^-1 grad W
         placed = self.kinetic, self.slow, self.fast, self.force, self.constraint, self.slow_constraint
         rules = {name: rule.in_words() for name, rule in zip(TERMS, placed, strict=True)}
         rules |= {label(name): rule.in_words() for name, rule in self.potentials.items()}
-        evaluations = {label(name): _evaluations(rule, self.num_micro) for name, rule in self.potentials.items()}
+        evaluations = {label(name): rule.evaluations(self.num_micro) for name, rule in self.potentials.items()}
         costs = slow, fast, free, 1, evaluations
         return Description(self.order, self.is_symmetric, rules, 1, self.num_micro, self.degree, *costs)
-
-
-def _evaluations(placed: PlacedRule, num_micro: int) -> int:
-    nodes = placed.composite(num_micro).nodes
-    shared = nodes[0] <= NODE_TOLERANCE and nodes[-1] >= 1 - NODE_TOLERANCE
-    return len(nodes) - shared
 
 
 def _on_grid(name: str, placed: PlacedRule, num_micro: int) -> PlacedRule:
