@@ -115,8 +115,6 @@ def whole_number(name: str, value, least: int = 1, otherwise: str = "") -> int:
     """An integer of at least `least`.
 
     Args:
-        name: name of the value in messages.
-        value: of the user.
         least: smallest allowed integer.
         otherwise: text in the message on other allowed values, e.g. ", or None".
 

@@ -24,11 +24,7 @@ SLOW, FAST = ("q_s", "v_s"), ("q_f", "v_f")
 
 @dataclass(frozen=True)
 class Layout:
-    """Arrays by name, and their order in a flat vector; compared by value.
-
-    Args:
-        shapes: name and shape of each array, in the order of the vector.
-    """
+    """Names and shapes of arrays, in their order in a flat vector; compared by value."""
 
     shapes: tuple[tuple[str, tuple[int, ...]], ...]
 
@@ -183,12 +179,7 @@ def flat_system(system: System, slow: Layout | None, fast: Layout | None) -> Sys
 
 
 def constraint_sizes(function: Callable | None, *arguments) -> dict[str, int]:
-    """Names and numbers of rows of a constraint that returns its rows by name; empty for other constraints.
-
-    Args:
-        function: constraint of a flat system, or None.
-        arguments: of the function.
-    """
+    """Names and numbers of rows of a constraint that returns its rows by name; empty for other constraints."""
     inner = function.function if isinstance(function, TracedOnce) else function
     return inner.row_sizes(*arguments) if isinstance(inner, ByName) else {}
 

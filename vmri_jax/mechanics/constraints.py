@@ -151,7 +151,7 @@ def check_constraints(
         arguments = (state.q_s,) if name == "slow_constraint" else (state.q_s, state.q_f)
         return _rows_in_words(getattr(system, name), rows, *arguments, system.params)
 
-    values, slow, fast, alone = _values_and_jacobians(system, state.t, state.q_s, state.q_f)
+    values, slow, fast, alone = jax.device_get(_values_and_jacobians(system, state.t, state.q_s, state.q_f))
     _check_values(values, place, tolerance, advice)
     if system.implied is not None:
         _check_implied(np.asarray(_implied_values(system, state.t, state.q_s, state.q_f)), place)
@@ -169,17 +169,13 @@ def check_constraints(
     if rank_of(alone).dependent or rank_of(fast).dependent:
         # At a singular configuration (a linkage folded flat) rows are dependent there and nowhere else, and runs pass it: only rows that are
         # dependent at a generic configuration nearby are refused.
-        _, _, fast, alone = _values_and_jacobians(system, state.t, *_nearby(state.q_s, state.q_f))
+        _, _, fast, alone = jax.device_get(_values_and_jacobians(system, state.t, *_nearby(state.q_s, state.q_f)))
         _check_rank("slow_constraint", alone, "slow variables.", in_words)
         _check_rank("constraint", fast, f"fast variables. {MICRO_GRID}", in_words)
 
 
-def _values_and_jacobians(system, t, q_s, q_f) -> tuple[np.ndarray, ...]:
-    return tuple(np.asarray(a) for a in _constraint_values(system, t, q_s, q_f))
-
-
 @jax.jit
-def _constraint_values(system, t, q_s, q_f):
+def _values_and_jacobians(system, t, q_s, q_f):
     """Values of all constraints, and the Jacobians dg/dq_s, dg/dq_f and dg_slow/dq_s."""
     jacobians = *jax.jacrev(system.g, argnums=(1, 2))(t, q_s, q_f), jax.jacrev(system.g_slow, argnums=1)(t, q_s)
     return system.constraints(t, q_s, q_f), *jacobians

@@ -12,13 +12,12 @@ from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
 
 
-def energy_parts(system: System, q_s, q_f, p_s, p_f) -> dict:
-    """Parts of the Hamiltonian ``p . v - T(q, v) + V + W + sum_i V_i``: "kinetic", "slow", "fast" and the names of `System.potentials`."""
-    return _energy_parts(system, q_s, q_f, p_s, p_f, velocity(system, q_s, q_f, p_s, p_f))
+def energy_parts(system: System, q_s, q_f, p_s, p_f, velocities=None) -> dict:
+    """Parts of the Hamiltonian ``p . v - T(q, v) + V + W + sum_i V_i``: "kinetic", "slow", "fast" and the names of `System.potentials`.
 
-
-def _energy_parts(system: System, q_s, q_f, p_s, p_f, velocities) -> dict:
-    v_s, v_f = velocities
+    `velocities` here and below: (v_s, v_f) of the momenta if they are known.
+    """
+    v_s, v_f = velocities or velocity(system, q_s, q_f, p_s, p_f)
     kinetic = jnp.sum(p_s * v_s) + jnp.sum(p_f * v_f) - system.kinetic(q_s, q_f, v_s, v_f, system.params)
     return {"kinetic": kinetic, **system.all_potentials(q_s, q_f)}
 
@@ -53,35 +52,29 @@ def energy_and_constraint_residual(system: System, state: State):
     """`energy` and `constraint_residual` of a state, with its velocities solved for once."""
     phase = state.q_s, state.q_f, state.p_s, state.p_f
     velocities = velocity(system, *phase)
-    energy = reduce(add, _energy_parts(system, *phase, velocities).values())
-    return energy, _constraint_residual(system, state, velocities)
+    energy = reduce(add, energy_parts(system, *phase, velocities).values())
+    return energy, constraint_residual(system, state, velocities)
 
 
-def constraint_residual(system: System, state: State):
+def constraint_residual(system: System, state: State, velocities=None):
     """Largest ``|g|`` (position level) and largest ``|G v + dg/dt|`` (velocity level), shape (2,).
 
     Args:
         system: with its constraints and the implied rows; without both the result is zero.
         state: time, positions and momenta.
     """
-    return _constraint_residual(system, state, velocity(system, state.q_s, state.q_f, state.p_s, state.p_f))
-
-
-def _constraint_residual(system: System, state: State, velocities):
     configuration = state.t, state.q_s, state.q_f
-    levels = _all_constraints(system, state, velocities)
+    velocities = velocities or velocity(system, state.q_s, state.q_f, state.p_s, state.p_f)
+    levels = all_constraints(system, state, velocities)
     if system.implied is not None:
         implied = system.g_implied(*configuration), system.implied_rates(*configuration, *velocities)
         levels = [jnp.concatenate(rows) for rows in zip(levels, implied, strict=True)]
     return jax.vmap(max_abs)(jnp.stack(levels))
 
 
-def all_constraints(system: System, state: State):
+def all_constraints(system: System, state: State, velocities=None):
     """Constraints and hidden constraints, ``(g, G v + dg/dt)``, each (n_g + n_gs,): zero on the constraint manifold."""
-    return _all_constraints(system, state, velocity(system, state.q_s, state.q_f, state.p_s, state.p_f))
-
-
-def _all_constraints(system: System, state: State, velocities):
+    velocities = velocities or velocity(system, state.q_s, state.q_f, state.p_s, state.p_f)
     configuration = state.t, state.q_s, state.q_f
     return system.constraints(*configuration), system.constraint_rates(*configuration, *velocities)
 

@@ -70,12 +70,7 @@ def jump_ahead(system: System, state: State, duration: float) -> Jump | None:
 
 
 def in_words(jump: Jump | None, names: Names) -> str:
-    """A sentence on the force that jumps, and on a smooth replacement; empty without a jump.
-
-    Args:
-        jump: from `jump_ahead`.
-        names: of the coordinates.
-    """
+    """A sentence on the force that jumps, and on a smooth replacement; empty without a jump."""
     if jump is None:
         return ""
     label = [*names.slow_coordinates, *names.fast_coordinates][jump.coordinate]
@@ -95,7 +90,7 @@ def in_words(jump: Jump | None, names: Names) -> str:
 def _jump_on_line(system: System, state: State, line: tuple, end: float, may_jump: np.ndarray) -> Jump | None:
     """The first discontinuity on a line, given by its rates of t, q and v, among the forces on coordinates that `may_jump` marks."""
     s = np.linspace(0.0, end, PIECES + 1)
-    forces, velocities = _along(system, state, line, s)
+    forces, velocities = jax.device_get(_on_line(system, state, line, s))
     changes = _changes(forces)
     uneven = np.where(may_jump, changes.max(axis=0), 0.0) / np.maximum(changes.mean(axis=0), np.finfo(float).tiny)
     for i in np.argsort(-uneven)[:MOST_COORDINATES]:
@@ -105,7 +100,7 @@ def _jump_on_line(system: System, state: State, line: tuple, end: float, may_jum
         for _ in range(ROUNDS - 1):
             k = int(_changes(values)[:, i].argmax())
             part = np.linspace(part[k], part[k + 1], PIECES + 1)
-            values, speeds = _along(system, state, line, part)
+            values, speeds = jax.device_get(_on_line(system, state, line, part))
         last = _changes(values)[:, i]
         k = int(last.argmax())
         size = np.abs(values[k : k + 2, i]).max()
@@ -122,17 +117,12 @@ def _changes(forces: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(changes), changes, 0.0)
 
 
-def _along(system: System, state: State, line: tuple, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Forces and velocities (k, n) on a line."""
-    forces, velocities = _on_line(system, state, line, s)
-    return np.asarray(forces), np.asarray(velocities)
-
-
 _motion = jax.jit(motion)
 
 
 @jax.jit
 def _on_line(system, state, line, s):
+    """Forces and velocities (k, n) on a line."""
     now, (dt, dq, dv) = motion(system, state), line
     q, v, n_s = jnp.append(state.q_s, state.q_f), jnp.append(now.v_s, now.v_f), state.q_s.size
 

@@ -18,7 +18,7 @@ Source: R. Featherstone, Rigid Body Dynamics Algorithms, Springer (2008), chapte
 """
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Literal, NamedTuple
 
@@ -84,7 +84,6 @@ class Frames:
         """(n, 4, 3) the rows (r, M) of every frame, relative to the frame before it on its path.
 
         Args:
-            q_s, q_f: coordinates.
             joints: the constants C, P, S, E of all frames.
         """
         joints = {name: values[self.first : self.first + len(self.moving)] for name, values in joints.items()}
@@ -164,17 +163,9 @@ class Kinematics:
         rates = self.velocities(q_s, q_f, v_s, v_f, params[JOINTS])
         return tuple(params[MASS][part] * rate for part, rate in zip(("slow", "fast"), rates, strict=True))
 
-    def to_dict(self) -> dict[str, Any]:
-        """As plain data for JSON."""
-        return asdict(self)
-
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> "Kinematics":
-        """The inverse of `to_dict`, also after a round trip through JSON.
-
-        Args:
-            data: from `to_dict`.
-        """
+        """The inverse of `dataclasses.asdict`, also after a round trip through JSON."""
         frames = []
         for entry in data["frames"]:
             rows = entry["coordinates"]

@@ -12,11 +12,7 @@ from vmri_jax.mechanics.arrays import Numbers, is_concrete, real_array
 
 
 class Diagonal(eqx.Module):
-    """A diagonal mass matrix.
-
-    Args:
-        masses: positive.
-    """
+    """A diagonal mass matrix of positive masses."""
 
     masses: Float[Numbers, "n"]
 
@@ -44,11 +40,7 @@ class Diagonal(eqx.Module):
 
 
 class Dense(eqx.Module):
-    """A full mass matrix.
-
-    Args:
-        matrix: symmetric positive definite.
-    """
+    """A full mass matrix, symmetric positive definite."""
 
     matrix: Float[Numbers, "n n"]
 

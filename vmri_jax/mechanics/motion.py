@@ -36,12 +36,7 @@ class Motion(NamedTuple):
 
 
 def motion(system: System, state: State) -> Motion:
-    """Velocities, accelerations and multipliers of a state; of dependent constraints the multipliers of least norm.
-
-    Args:
-        system: masses, potentials, constraints and forces.
-        state: time, positions and momenta.
-    """
+    """Velocities, accelerations and multipliers of a state; of dependent constraints the multipliers of least norm."""
     n_s = state.q_s.size
     v_s, v_f = velocity(system, state.q_s, state.q_f, state.p_s, state.p_f)
     q, v = jnp.append(state.q_s, state.q_f), jnp.append(v_s, v_f)
@@ -77,8 +72,6 @@ def reaction_force(system: System, state: State, rows: Sequence[int]):
     """Force ``-G^T lambda`` (n_s + n_f,) of some rows of the constraints, and (n_s + n_f,) whether it acts on each coordinate.
 
     Args:
-        system: its constraints.
-        state: time, positions and momenta.
         rows: indices among the rows of `constraint` and `slow_constraint`, joined.
     """
     chosen = jnp.asarray(rows)

@@ -71,12 +71,7 @@ class Names:
         }
 
     def shaped(self, part: Part, vectors) -> Any:
-        """Vectors (..., n) in the form of the start: a dictionary of arrays by name, or the vectors themselves.
-
-        Args:
-            part: slow or fast.
-            vectors: positions, velocities or momenta.
-        """
+        """Vectors (..., n) in the form of the start: a dictionary of arrays by name, or the vectors themselves."""
         layout = self.layouts[part == "f"]
         return vectors if layout is None else layout.by_name(vectors)
 
@@ -129,10 +124,6 @@ class Names:
     def of(self, system: System, n_s: int, n_f: int) -> "Names":
         """These names, completed by plain names for coordinates and constraints of a system without a name.
 
-        Args:
-            system: with its constraints.
-            n_s, n_f: numbers of slow and fast coordinates.
-
         Raises:
             ValueError: sizes that do not add up to the numbers of coordinates and of constraint rows.
         """
@@ -143,9 +134,6 @@ class Names:
 
     def of_coordinates(self, n_s: int, n_f: int) -> "Names":
         """These names, completed by plain names for coordinates without a name.
-
-        Args:
-            n_s, n_f: numbers of slow and fast coordinates.
 
         Raises:
             ValueError: sizes that do not add up to these numbers.
@@ -166,9 +154,8 @@ class Names:
         names, shapes = [], {name: shape for layout in self.layouts if layout for name, shape in layout.shapes}
         for name, size in sizes.items():
             *rows, columns = shapes.get(name, (size,)) or (1,)
-            if (
-                rows
-            ):  # entries of an array of points, e.g. of atoms, are called "atoms[3] x"; of other arrays "name[i,j]"
+            # entries of an array of points, e.g. of atoms, are called "atoms[3] x"; of other arrays "name[i,j]"
+            if rows:
                 are_points = columns <= len(AXES)
                 for index in np.ndindex(*rows, *([] if are_points else [columns])):
                     entry = f"{name}[{','.join(map(str, index))}]"
@@ -190,11 +177,7 @@ class Names:
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> "Names":
-        """The inverse of `to_dict`, also after a round trip through JSON.
-
-        Args:
-            data: from `to_dict`; absent fields have their defaults.
-        """
+        """The inverse of `to_dict`, also after a round trip through JSON; absent fields have their defaults."""
         fields = dict(data)
         fields["carried"] = {name: Place(*place) for name, place in data.get("carried", {}).items()}
         if data.get("kinematics") is not None:
@@ -209,20 +192,13 @@ def unknown(kind: str, name: Any, known: Iterable[str]) -> str:
 
     Args:
         kind: of the objects with names, e.g. "body".
-        name: the unknown name.
-        known: all known names.
     """
     known = list(known)
     return f"there is no {kind} {name!r}.{near(name, known)} There are {', '.join(known) or 'none'}."
 
 
 def near(name: Any, known: Iterable[str]) -> str:
-    """A question with the most similar known name; empty if no name is similar.
-
-    Args:
-        name: the unknown name.
-        known: all known names.
-    """
+    """A question with the most similar known name; empty if no name is similar."""
     close = difflib.get_close_matches(str(name), list(known), n=1)
     return f" Did you mean {close[0]}?" if close else ""
 

@@ -29,6 +29,8 @@ REFUSED_VIOLATION = 1e-2
 REPORTED_PROJECTION = 0.85
 """Violation, as in REPORTED_VIOLATION, above which a warning is given even with ``project=True``: a projection that removes most of the velocities
 is hardly intended. A larger value passes over mistakes."""
+A_SYSTEM = "a vmri_jax.System; of a scene its .system(), of a problem its .system"
+"""A right argument in messages about objects that are no system."""
 Layouts = tuple[by_name.Layout | None, by_name.Layout | None]
 """Layouts of q_s and of q_f, None for vectors."""
 
@@ -68,9 +70,7 @@ def initial_state(
             kinetic energy without mass along some coordinate.
     """
     require_x64()
-    check_type(
-        "initial_state: system", system, System, "a vmri_jax.System; of a scene its .system(), of a problem its .system"
-    )
+    check_type("initial_state: system", system, System, A_SYSTEM)
     check_params(system.params)
     system = of_one_type(system)
     for name, value in {"q_s": q_s, "q_f": q_f, "v_s": v_s, "v_f": v_f}.items():
@@ -160,12 +160,7 @@ class Problem:
 
     def __post_init__(self):
         require_x64()
-        check_type(
-            "Problem: system",
-            self.system,
-            System,
-            "a vmri_jax.System; of a scene its .system(), of a problem its .system",
-        )
+        check_type("Problem: system", self.system, System, A_SYSTEM)
         if self.names is not None:
             check_type("Problem: names", self.names, Names, "vmri_jax.Names(slow={...}, fast={...})")
         layouts = self._make_flat()
@@ -251,11 +246,7 @@ def opened(movable):
 
 
 def problem_of(caller: str, movable: Problem | HasProblem) -> Problem:
-    """The problem of a scene, or the problem itself.
-
-    Args:
-        caller: name of the calling function in the message.
-        movable: its argument.
+    """The problem of a scene, or the problem itself; `caller` begins the message.
 
     Raises:
         TypeError: an argument that is neither.
@@ -271,10 +262,9 @@ def problem_of(caller: str, movable: Problem | HasProblem) -> Problem:
 
 
 def start_of(caller: str, system, state=None) -> tuple[System, State]:
-    """The system and the start of a run.
+    """The system and the start of a run; `caller` begins the message.
 
     Args:
-        caller: name of the calling function in the message.
         system: a `System`, a `Problem`, or an object with a method ``problem()``, such as a scene.
         state: start; None for the start of the problem.
 

@@ -16,12 +16,7 @@ MOST_PARAMETERS = 12
 
 
 def summary(title: str, lines: Mapping[str, str]) -> str:
-    """A title and a line for each name, indented; names without text are left out.
-
-    Args:
-        title: name of the object.
-        lines: texts by name.
-    """
+    """A title and a line for each name, indented; names without text are left out."""
     shown = {name: text for name, text in lines.items() if text}
     width = max(map(len, shown), default=0)
     return "\n".join([title, *(f"  {name:<{width}}  {text}" for name, text in shown.items())])

@@ -1,6 +1,7 @@
 """The drawing of a scene: bodies, links, springs and the rest as plain lists, see `vmri_jax.animation.Drawing.from_dict`."""
 
 from collections.abc import Sequence
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -15,12 +16,7 @@ EFFECT_LISTS = ("solids", "links", "springs", "anchors", "planes", "spheres")
 
 
 def drawing(sorting: Sorting, effects: Sequence[Effect]) -> dict[str, Any]:
-    """The lists of a drawing, and the map from joint coordinates to bodies if the scene has some.
-
-    Args:
-        sorting: bodies at their places.
-        effects: of the scene.
-    """
+    """The lists of a drawing, and the map from joint coordinates to bodies if the scene has some."""
     entries: dict[str, Any] = {kind: [] for kind in ("bodies", "blocks", *EFFECT_LISTS)}
     radii = {body.name: float(body.radius) for body in sorting.bodies.values() if body.radius is not None}
     for body in sorting.bodies.values():
@@ -44,7 +40,7 @@ def drawing(sorting: Sorting, effects: Sequence[Effect]) -> dict[str, Any]:
             entry["radius"] = radii[entry["name"]]
     if (kinematics := sorting.layout.kinematics) is not None:
         joints = {name: np.asarray(values).tolist() for name, values in sorting.joints.items()}
-        entries["kinematics"] = {"map": kinematics.to_dict(), "joints": joints}
+        entries["kinematics"] = {"map": asdict(kinematics), "joints": joints}
     return entries
 
 
