@@ -154,11 +154,8 @@ def _user_problem(name: str) -> Problem | Scene:
                 f"{_unknown('system', name, SYSTEMS)} Your own: my_file.py:my_problem, or my_package.my_module:my_problem."
             )
         return _problem_in(_import(file_name), file_name, attribute)
-    path = Path(file_name)
-    if not path.is_file():
-        raise ValueError(f"the file {file_name} does not exist (looked in {path.resolve().parent}).")
-    module = _run_file(path)
-    return _problem_in(module, str(path), attribute or _only_name(module, file_name))
+    module = _run_file(file_name)
+    return _problem_in(module, str(Path(file_name)), attribute or _only_name(module, file_name))
 
 
 def _only_name(module, file_name: str) -> str:
@@ -219,8 +216,11 @@ def _dashed(name: str) -> str:
     return name.lower().replace("_", "-")
 
 
-def _run_file(path: Path):
+def _run_file(file_name: str):
     """The module of a Python file of the user."""
+    path = Path(file_name)
+    if not path.is_file():
+        raise ValueError(f"the file {file_name} does not exist (looked in {path.resolve().parent}).")
     name = f"vmri_user_{path.stem}"  # not the bare stem, which may be the name of a module
     spec = importlib.util.spec_from_file_location(name, path)
     if spec is None or spec.loader is None:
@@ -256,11 +256,8 @@ def imported(name: str):
         ValueError: the file or package does not exist, or does not have the name.
     """
     where, _, attribute = name.partition(":")
-    if not where.endswith(".py"):
-        return _attribute(_import(where), where, attribute)
-    if not Path(where).is_file():
-        raise ValueError(f"the file {where} does not exist (looked in {Path(where).resolve().parent}).")
-    return _attribute(_run_file(Path(where)), where, attribute)
+    module = _run_file(where) if where.endswith(".py") else _import(where)
+    return _attribute(module, where, attribute)
 
 
 def _attribute(module, where: str, attribute: str):

@@ -39,7 +39,6 @@ def with_bars(drawing: Drawing, q_s: np.ndarray, q_f: np.ndarray) -> Drawing:
     the bars; the caption tells the scales.
 
     Args:
-        drawing: with or without blocks.
         q_s, q_f: (k, n_s) and (k, n_f) positions along the run.
 
     Raises:

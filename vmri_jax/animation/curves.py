@@ -20,12 +20,7 @@ LEFT, RIGHT, BELOW, ABOVE = 0.62, 0.12, 0.42, 0.3
 
 
 class Curves:
-    """The curves of a motion: two panels side by side; a panel is left out if its signal does not move.
-
-    Args:
-        motion: from `vmri_jax.animation.motion`.
-        theme: colours.
-    """
+    """The curves of a motion: two panels side by side; a panel is left out if its signal does not move."""
 
     def __init__(self, motion: Motion, theme: plots.Theme):
         self.motion, self.theme = motion, theme

@@ -141,11 +141,7 @@ class Drawing:
         return solids
 
     def pace(self, joint: Joint) -> str:
-        """ "slow" or "fast": the pace of the joint if it has one, else "fast" if all its bodies are fast.
-
-        Args:
-            joint: between bodies of this drawing.
-        """
+        """ "slow" or "fast": the pace of the joint if it has one, else "fast" if all its bodies are fast."""
         fast = all(body.pace == "fast" for body in self.bodies if body.name in joint.bodies)
         return joint.pace or ("fast" if fast else "slow")
 

@@ -69,12 +69,7 @@ def plot_strip(
 
 
 def rows_of(count: int, columns: int) -> list[int]:
-    """The number of pictures in each row, as equal as possible, the longer rows first.
-
-    Args:
-        count: number of all pictures.
-        columns: largest number of pictures in a row.
-    """
+    """The number of pictures in each row, at most `columns` and as equal as possible, the longer rows first."""
     rows = -(-count // columns)
     return [count // rows + (row < count % rows) for row in range(rows)]
 

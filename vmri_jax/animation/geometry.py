@@ -21,10 +21,6 @@ def helix(turns: int, per_turn: int = 16) -> np.ndarray:
     """A spring whose number of turns stays when it stretches: one row (share, radius, cos, sin) per point.
 
     The point of a row is ``start + share (end - start) + radius coil (cos n + sin m)``, with unit vectors n and m across the axis.
-
-    Args:
-        turns: number of turns.
-        per_turn: number of points of a turn.
     """
     turn = np.arange(turns * per_turn + 1) / per_turn
     radius = np.minimum(1, np.minimum(turn, turns - turn))
@@ -76,7 +72,6 @@ def spring(start, end, coil: float, turns: int) -> tuple[np.ndarray, np.ndarray]
     Args:
         start, end: (3,).
         coil: radius of the helix.
-        turns: number of turns.
     """
     along = (end - start) / np.linalg.norm(end - start)
     sideways = np.cross(along, [0.36, 0.48, 0.8])  # a direction in which few springs lie

@@ -114,12 +114,7 @@ def _energy_title(motion: Motion) -> str:
 def _solid(drawing: Drawing, solid: Solid) -> dict:
     """The data of a solid, with the numbers of its four bodies."""
     index = {body.name: i for i, body in enumerate(drawing.bodies)}
-    return {
-        "points": [index[name] for name in solid.points],
-        "corners": solid.corners,
-        "faces": solid.faces,
-        "color": solid.color,
-    }
+    return vars(solid) | {"points": [index[name] for name in solid.points]}
 
 
 def _plain(record: Connection | Ground) -> dict:

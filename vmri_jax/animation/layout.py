@@ -97,11 +97,7 @@ class Layout:
 
 
 def layout(motion: Motion) -> Layout:
-    """Sizes for a picture: balls do not touch their neighbours, coils are thinner than the shortest spring is long.
-
-    Args:
-        motion: from `vmri_jax.animation.motion`.
-    """
+    """Sizes for a picture: balls do not touch their neighbours, coils are thinner than the shortest spring is long."""
     drawing, points = motion.drawing, motion.thinned(500).points
     connections = _connections(drawing)
     fixed = np.array([c.point for c in connections if c.point is not None]).reshape(-1, 3)

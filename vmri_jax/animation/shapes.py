@@ -39,12 +39,7 @@ class Stage:
 
     @classmethod
     def of(cls, motion: Motion, theme: plots.Theme) -> "Stage":
-        """The stage of a motion with its first view; the frame is as wide as the scene, between half and eight times its height.
-
-        Args:
-            motion: from `vmri_jax.animation.motion`.
-            theme: colours.
-        """
+        """The stage of a motion with its first view; the frame is as wide as the scene, between half and eight times its height."""
         sizes = layout(motion)
         radius = float(sizes.radii.max())
         start = Camera(sizes.azimuth, sizes.elevation, np.zeros(3), 1.0)

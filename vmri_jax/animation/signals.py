@@ -43,11 +43,7 @@ class Signal:
 
 
 def slow_signal(motion: Motion) -> Signal | None:
-    """The coordinate of a slow body with the largest size over frequency; of a fast body if no slow body moves.
-
-    Args:
-        motion: from `vmri_jax.animation.motion`.
-    """
+    """The coordinate of a slow body with the largest size over frequency; of a fast body if no slow body moves."""
     signals = _seen(_coordinates(motion))
     signals = [signal for signal in signals if signal.pace == "slow"] or signals
     return max(signals, key=lambda signal: signal.size / signal.frequency, default=None)
@@ -57,9 +53,6 @@ def fast_signal(motion: Motion) -> Signal | None:
     """The length of a fast spring that moves most: of those whose frequency the nodes resolve, the largest speed times frequency.
 
     Without such a spring, a coordinate of a fast body, chosen likewise.
-
-    Args:
-        motion: from `vmri_jax.animation.motion`.
     """
     for signals in (_lengths(motion), _coordinates(motion)):
         fast = [s for s in signals if s.pace == "fast" and s.frequency * _step(motion) < MOST_RADIANS_PER_NODE]
@@ -69,12 +62,7 @@ def fast_signal(motion: Motion) -> Signal | None:
 
 
 def window(motion: Motion, signal: Signal) -> tuple[float, float]:
-    """First and last time of some periods of a signal, where it moves fastest.
-
-    Args:
-        motion: from `vmri_jax.animation.motion`.
-        signal: of this motion.
-    """
+    """First and last time of some periods of a signal, where it moves fastest."""
     first, last = float(motion.t[0]), float(motion.t[-1])
     rates = np.gradient(signal.of(motion.points), motion.t)
     frequency = np.std(np.gradient(rates, motion.t)) / np.std(rates)  # of the fastest part: a drift has no curvature
