@@ -17,7 +17,6 @@ def build(sorting: Sorting, placed: Sequence[Placed]) -> System:
     """The system of bodies and effects; a function without effects is None.
 
     Args:
-        sorting: of the scene.
         placed: the effects, all of the sorting or some.
     """
     bodies, layout = sorting.bodies, sorting.layout
@@ -63,11 +62,7 @@ def build(sorting: Sorting, placed: Sequence[Placed]) -> System:
 
 
 def actuation(sorting: Sorting) -> Actuation | None:
-    """The forces of the controls of a scene, None if it has no controls.
-
-    Args:
-        sorting: of the scene.
-    """
+    """The forces of the controls of a scene, None if it has no controls."""
     controls = [part for part in sorting.placed if part.home == "control"]
     of_effects = [part.effect.terms(part.elements, sorting.bodies, sorting.layout, {}) for part in controls]
     terms = tuple(term for (term,) in of_effects)

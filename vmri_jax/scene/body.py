@@ -94,23 +94,14 @@ class AnyBody(ABC):
     name: str
     pace: Pace
     position: Any
+    coordinates: Any
+    rates: Any
+    masses: Any
     radius: float | None
     block: bool
     rigid: bool = False
     rotation: Any = None
     wide: tuple[int, ...] = ()
-
-    @property
-    @abstractmethod
-    def coordinates(self) -> Any: ...
-
-    @property
-    @abstractmethod
-    def rates(self) -> Any: ...
-
-    @property
-    @abstractmethod
-    def masses(self) -> Any: ...
 
     @property
     def size(self) -> int:
@@ -138,13 +129,13 @@ class AnyBody(ABC):
             offset: (3,) m from the centre of mass, in the axes of the body; None for the centre.
         """
 
-    @abstractmethod
     def with_rates(self, rates: np.ndarray) -> "AnyBody":
-        """The same body with other velocities.
+        """The same body with other velocities; a body without mass has none.
 
         Args:
             rates: (n,) rates of its coordinates at the start.
         """
+        return self
 
     def _check_names(self) -> None:
         kind = type(self).__name__
@@ -260,20 +251,14 @@ class Body(AnyBody):
 class Ground(AnyBody):
     """The body that does not move, with the axes of space."""
 
-    name, pace, radius, block, rigid = GROUND, "slow", None, False, True
-    position, rotation = np.zeros(3), np.eye(3)
-    coordinates = property(lambda self: GROUND_COORDINATES)
-    rates = property(lambda self: np.zeros(12))
-    masses = property(lambda self: np.full(12, np.inf))
+    name, block, rigid = GROUND, False, True
+    position, rotation, coordinates = np.zeros(3), np.eye(3), GROUND_COORDINATES
 
     def point(self, offset: Any = None) -> Point:
         """A point in space that does not move."""
         if offset is None:
             raise ValueError('the ground has no centre; give a point of it, ("ground", [x, y, z]).')
         return Point(GROUND, offset)
-
-    def with_rates(self, rates: np.ndarray) -> "Ground":
-        return self
 
 
 @dataclass(frozen=True, eq=False)
@@ -300,7 +285,7 @@ class Frame(AnyBody):
     pace: Pace = "auto"
 
     rigid, block, radius, wide = True, False, None, (0, 1, 2)
-    rotation = np.eye(3)
+    rotation, rates, masses = np.eye(3), np.zeros(12), np.zeros(12)
 
     def __post_init__(self):
         self._check_names()
@@ -314,15 +299,9 @@ class Frame(AnyBody):
         """(12,) origin and axes."""
         return joined([self.position, np.eye(3).ravel()])
 
-    rates = property(lambda self: np.zeros(12))
-    masses = property(lambda self: np.zeros(12))
-
     def point(self, offset: Any = None) -> Point:
         """The origin of the frame, or a point fixed in it, at the start."""
         return Point(self.name, self.position if offset is None else self.position + offset)
-
-    def with_rates(self, rates: np.ndarray) -> "Frame":
-        return self
 
 
 Bodies = Mapping[str, AnyBody]
@@ -330,12 +309,7 @@ Bodies = Mapping[str, AnyBody]
 
 
 def body_of(bodies: Bodies, name: str) -> AnyBody:
-    """A body by name.
-
-    Args:
-        bodies: of the scene.
-        name: of a body or of the ground.
-    """
+    """A body by name, or the ground."""
     return Ground() if name == GROUND else bodies[name]
 
 
@@ -343,7 +317,6 @@ def end_of(bodies: Bodies, name: str, whole: bool = False) -> Point:
     """The point that an effect acts on: a point mass, the centre of a rigid body, or a point fixed in a rigid body.
 
     Args:
-        bodies: of the scene.
         name: of a body, or an `Attachment`.
         whole: all coordinates of a rigid body instead of its centre.
     """

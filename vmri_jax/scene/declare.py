@@ -45,7 +45,6 @@ class Names:
 
         Args:
             argument: an element ``("a", "b")``, a list of elements ``[("a", "b"), ("b", "c")]``, or None.
-            bodies: of the scene.
             about: names of effect and field, for messages.
 
         Raises:
@@ -128,12 +127,7 @@ class Parameter:
         return squeeze(jnp.broadcast_to(value, (count, size)))
 
     def check_sign(self, about: str, argument: Any) -> None:
-        """Refuse numbers of another sign.
-
-        Args:
-            about: names of effect and field, for messages.
-            argument: the numbers of the user.
-        """
+        """Refuse numbers of another sign; `about` begins the message."""
         if self.sign and is_concrete(argument):
             value = np.asarray(argument, dtype=float)
             if not np.all(value > 0 if self.sign == "positive" else value >= 0):
@@ -198,12 +192,7 @@ def lasting(value):
 
 
 def real_tree(about: str, tree):
-    """A pytree of real numbers as a pytree of arrays; the error for another leaf names its place in the tree.
-
-    Args:
-        about: names of effect and argument, for messages.
-        tree: numbers, arrays, lists and dictionaries of them.
-    """
+    """A pytree of real numbers as a pytree of arrays; the error for another leaf begins with `about` and its place in the tree."""
 
     def convert(path, leaf):
         return jnp.asarray(real_array(about + jax.tree_util.keystr(path), leaf))

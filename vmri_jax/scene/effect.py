@@ -122,9 +122,6 @@ class Effect(ABC):
     def bound(self, effects: Sequence["Effect"]) -> "Effect":
         """A copy in which names of other effects, such as joints, are replaced by these effects.
 
-        Args:
-            effects: of the scene.
-
         Raises:
             ValueError: a name that no such effect has.
         """
@@ -168,23 +165,14 @@ class Effect(ABC):
         return squeeze(jnp.stack([self.rest(*self.element_arguments(i, bodies, params)) for i in range(count)]))
 
     def element_arguments(self, i: int, bodies: Bodies, params: dict[str, Any]) -> tuple[tuple, dict[str, Any]]:
-        """The arguments (q, params) of the function for element i at the start.
-
-        Args:
-            i: number of the element.
-            params: of all elements.
-        """
+        """The arguments (q, params) of the function for element i at the start, from the params of all elements."""
         q = tuple(end_of(bodies, name, self.whole).position for name in self.elements(bodies)[i])
         return q, self._element_params(i, bodies, params)
 
     def element_term(self, i: int, bodies: Bodies, params: dict[str, Any]) -> tuple[EffectTerm, dict[str, Any]]:
-        """Element i as a term of the coordinates of its moving bodies, one after the other, and its params.
+        """Element i as a term of the coordinates of its moving bodies, one after the other, and its part of the params of all elements.
 
         The term takes these coordinates as q_s, and no q_f: whether a body is slow or fast does not matter for a single element.
-
-        Args:
-            i: number of the element.
-            params: of all elements.
         """
         places, end = {}, 0
         for name in moving(self.elements(bodies)[i]):
@@ -261,11 +249,7 @@ class Effect(ABC):
                 parameter.check_sign(f"{self.name}: {name}", getattr(self, name))
 
     def by_size(self, select: Sequence[int], bodies: Bodies) -> list[list[int]]:
-        """Elements in groups between bodies of the same sizes and kinds: each group is a term.
-
-        Args:
-            select: numbers of the elements.
-        """
+        """Elements, by their numbers, in groups between bodies of the same sizes and kinds: each group is a term."""
         elements, groups = self.elements(bodies), {}
         for i in select:
             groups.setdefault(tuple(self._kind(name, bodies) for name in elements[i]), []).append(i)
@@ -280,8 +264,6 @@ class Effect(ABC):
         """The terms of some elements, one for each group of bodies of the same sizes.
 
         Args:
-            select: numbers of the elements.
-            layout: of all bodies.
             potentials: terms of all potentials of the scene by name of the effect.
         """
         return tuple(self._term(group, bodies, layout.bodies) for group in self.by_size(select, bodies))

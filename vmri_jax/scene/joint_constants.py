@@ -19,10 +19,6 @@ def joint_constants(bodies: Bodies, links: Sequence[Link | None]) -> dict[str, A
     """The constants C, P, S, E (n, 4, 3) of all links, see `vmri_jax.mechanics.kinematics`.
 
     The rows (r, M) of a frame are ``C + P cos x + S sin x + E x``. A link of None gets the constants of a frame that does not move.
-
-    Args:
-        bodies: by name.
-        links: of a layout.
     """
     frames = list(dict.fromkeys(link for link in links if link is not None))
     ends = _ends(bodies, frames)

@@ -13,12 +13,7 @@ from vmri_jax.scene.sorting import Placed, Sorting
 
 
 def element_label(effect: Effect, element: Sequence[str]) -> str:
-    """The label of an element: the name of its effect and the names of its bodies.
-
-    Args:
-        effect: with several elements.
-        element: names of the bodies.
-    """
+    """The label of an element: the name of its effect and the names of its bodies."""
     return f"{effect.name} {'-'.join(map(label_of, element))}"
 
 
@@ -26,9 +21,6 @@ def names_of(sorting: Sorting) -> Names:
     """Bodies and constraints by name, in the order of the coordinates and of the rows.
 
     The rows of an effect with a single element have the name of the effect; with several elements the names of the bodies follow.
-
-    Args:
-        sorting: of the scene.
     """
     sizes: dict[str, dict[str, int]] = {"s": {}, "f": {}, "constraint": {}, "slow_constraint": {}}
     for name, place in sorting.layout.coordinates.items():

@@ -59,14 +59,7 @@ class Layout:
 
 
 def join(bodies: Bodies, layout: Layout, part: Part, quantity: Literal["coordinates", "rates", "masses"]) -> Any:
-    """A vector of the length of Q_s or Q_f with a quantity of all bodies at their places, and zeros for freedoms of joints.
-
-    Args:
-        bodies: by name.
-        layout: of these bodies.
-        part: "s" for Q_s, "f" for Q_f.
-        quantity: attribute of the bodies.
-    """
+    """A vector of the length of Q_s or Q_f with a quantity of all bodies at their places, and zeros for freedoms of joints."""
     pieces = {
         place.start: getattr(bodies[name], quantity) for name, place in layout.bodies.items() if place.part == part
     }

@@ -45,6 +45,7 @@ OLDEST_VERSION = 4
 
 def bodies_and_effects(
     model: Any,
+    *,
     qpos: Any,
     qvel: Any,
     key: str | int | None,
@@ -52,11 +53,7 @@ def bodies_and_effects(
     limits: Literal["refuse", "spring"],
     coordinates: Literal["joint", "directors"],
 ) -> tuple[list[RigidBody | Frame], list[Effect]]:
-    """Bodies and effects of the scene of a model.
-
-    Args:
-        model, qpos, qvel, key, ignore, limits, coordinates: as of `Scene.from_mujoco`.
-    """
+    """Bodies and effects of the scene of a model, see `Scene.from_mujoco`."""
     try:
         import mujoco  # pyright: ignore[reportMissingImports]
     except ImportError as error:
@@ -128,11 +125,7 @@ def lift(q, params):
 
 @dataclass(frozen=True)
 class _Reader:
-    """A compiled model at its start.
-
-    Args:
-        data: `mujoco.MjData` with the positions and axes of bodies and joints at the start.
-    """
+    """A compiled model, and its `mujoco.MjData` at the start."""
 
     compiled: Compiled
     data: Any
@@ -243,11 +236,7 @@ class _Reader:
             yield kind(between, first.point, name=self.compiled.name("equality", loop.number))
 
     def gravity(self, bodies: list[RigidBody | Frame]) -> Iterator[Effect]:
-        """Gravity, unless the model switches it off, and the forces ``-c m g`` in centres of mass that compensate a fraction c of it.
-
-        Args:
-            bodies: of the scene.
-        """
+        """Gravity, unless the model switches it off, and the forces ``-c m g`` in centres of mass that compensate a fraction c of it."""
         compiled, model = self.compiled, self.compiled.model
         g = compiled.gravity
         if g.any():

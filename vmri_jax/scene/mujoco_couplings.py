@@ -28,10 +28,6 @@ def polynomial(x, params):
 def couplings(compiled: Compiled, data: Any) -> Iterator[JointCoupling]:
     """The couplings that the model does not switch off.
 
-    Args:
-        compiled: the model.
-        data: `mujoco.MjData` at the start.
-
     Raises:
         ValueError: an equality that the start violates.
     """

@@ -65,7 +65,6 @@ def loops(compiled: Compiled, data: Any) -> list[Loop]:
     """The active equalities connect and weld between bodies that can move against each other.
 
     Args:
-        compiled: the model.
         data: `mujoco.MjData` with the positions of bodies.
     """
     closed = []
@@ -79,9 +78,6 @@ def loops(compiled: Compiled, data: Any) -> list[Loop]:
 
 def close(compiled: Compiled, data: Any) -> None:
     """Move joints so that small gaps close, in place.
-
-    Args:
-        compiled, data: as of `loops`.
 
     Raises:
         ValueError: a loop whose gap is too wide, or that does not close.

@@ -116,11 +116,7 @@ class Compiled:
         return {self.model.body(b).name for b in range(self.model.nbody)}
 
     def refuse(self, ignore: Collection[str]) -> None:
-        """Raise ValueError with all features of the model that a scene does not express, except the ignored ones.
-
-        Args:
-            ignore: names in `REFUSED`.
-        """
+        """Raise ValueError with all features of the model that a scene does not express, except those in `ignore`, see `REFUSED`."""
         if isinstance(ignore, str):
             raise TypeError(f"Scene.from_mujoco: ignore is {ignore!r}; give a list, ignore=[{ignore!r}].")
         ignorable = [kind for kind, refusal in REFUSED.items() if refusal.ignorable]

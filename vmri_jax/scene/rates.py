@@ -62,10 +62,6 @@ class Linearised(NamedTuple):
 def measure(bodies: Bodies, effects: Sequence[Effect]) -> dict[str, Rates]:
     """Rates of potentials and kinetic effects by name.
 
-    Args:
-        bodies: by name.
-        effects: the potentials and kinetic effects.
-
     Raises:
         ValueError: energies that are not smooth at the start, or a kinetic energy that is not positive there.
     """
@@ -76,8 +72,8 @@ def measure(bodies: Bodies, effects: Sequence[Effect]) -> dict[str, Rates]:
     elements = {effect.name: _linearise(effect, bodies, columns) for effect in effects}
     for element in chain(*elements.values()):
         mass[np.ix_(element.columns, element.columns)] += element.mass
-    positions = _positions(bodies)
-    size = max(float(np.ptp(positions, axis=0).max(initial=0.0)), float(np.abs(positions).max()))
+    points = positions(bodies)
+    size = max(float(np.ptp(points, axis=0).max(initial=0.0)), float(np.abs(points).max()))
     return {effect.name: _rates(effect, bodies, elements[effect.name], mass, size or 1.0) for effect in effects}
 
 
@@ -165,9 +161,8 @@ def _linearise(effect: Effect, bodies: Bodies, columns: Mapping[str, np.ndarray]
 @partial(quickly_compiled, static_argnames=("term", "kinetic"))
 def _derivatives(term: EffectTerm, kinetic: bool, q, v, params):
     """The force, K, G and d2L/dv2 of an element in the coordinates of its bodies."""
-    if (
-        not kinetic
-    ):  # the derivatives of L = -V(q) by velocities are zero: tracing and compiling them would take time for nothing
+    # the derivatives of L = -V(q) by velocities are zero: tracing and compiling them would take time for nothing
+    if not kinetic:
 
         def gradient(q):
             values = jax.grad(term.value)(q, None, params)
@@ -191,7 +186,7 @@ def _derivatives(term: EffectTerm, kinetic: bool, q, v, params):
     return at_rest, -jax.jacfwd(force)(q, v), gyroscopic, jax.hessian(lagrangian, 1)(q, v)
 
 
-def _positions(bodies) -> np.ndarray:
+def positions(bodies: Bodies) -> np.ndarray:
     """(n, 3) positions of all points and centres, padded with zeros; without the blocks, or the origin if there are only blocks."""
     points = [np.asarray(body.point().position) for body in bodies.values() if not body.block] or [np.zeros(1)]
     return np.stack([np.pad(point, (0, LARGEST_POINT - point.size)) for point in points])

@@ -61,9 +61,6 @@ class Opening(NamedTuple):
 def check_constraints(sorting: Sorting) -> None:
     """Refuse redundant constraints, dropped rows that do not follow from the others, and constraints that the fast bodies cannot satisfy.
 
-    Args:
-        sorting: of the scene.
-
     Raises:
         ValueError: with the names of the constraints that are too many.
     """
@@ -83,9 +80,6 @@ def without_redundant(sorting: Sorting) -> Sorting:
     """The sorting without as many rows of constraints as depend on others at the start.
 
     A QR decomposition with pivoting chooses the kept rows, scaled by the masses and to length one. All rows of `Rigidity` are kept.
-
-    Args:
-        sorting: of the scene.
     """
     rows = ConstraintRows.of(sorting)
     if rows is None:
@@ -108,11 +102,7 @@ def without_redundant(sorting: Sorting) -> Sorting:
 
 
 def dropped_rows(sorting: Sorting) -> list[str]:
-    """Names of the dropped rows.
-
-    Args:
-        sorting: from `without_redundant`.
-    """
+    """Names of the dropped rows."""
     rows = ConstraintRows.of(sorting)
     return [] if rows is None else [row.name for row in rows.rows if not row.kept]
 
@@ -122,9 +112,6 @@ def find_opening(rows: ConstraintRows) -> Opening | None:
 
     In coordinates x over their scales, motions z along the surface solve ``dg_k(x_0) z = 0``. Newton's iteration leads from
     ``x_0 + s z`` back onto ``g_k = 0``, where the dropped rows are evaluated.
-
-    Args:
-        rows: of all constraints, kept and dropped.
     """
     kept, dropped = rows.numbers(), [i for i, row in enumerate(rows.rows) if not row.kept]
     if not dropped:

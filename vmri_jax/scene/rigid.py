@@ -21,6 +21,7 @@ from vmri_jax.scene.body import AnyBody, Pace, Point, joined
 from vmri_jax.scene.declare import effect_class, names
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.shapes import Ball, Rod, Shape, box_of
+from vmri_jax.scene.terms import split
 
 THIN = 1e-12
 """A mass E below this fraction of the largest is round-off: the body has no width in this direction, and no director. A larger value
@@ -158,16 +159,13 @@ class RigidBody(AnyBody):
     @property
     def inertias(self):
         """(3,) masses ``E_i = (J_1 + J_2 + J_3) / 2 - J_i`` of the directors."""
-        return jnp.sum(self.moments) / 2 - self.moments if not is_concrete(self.moments) else self._inertias()
-
-    def _inertias(self) -> np.ndarray:
-        masses = np.sum(self.moments) / 2 - self.moments
-        return np.where(masses > THIN * masses.max(), masses, 0.0)
+        masses = self.moments.sum() / 2 - self.moments
+        return np.where(masses > THIN * masses.max(), masses, 0.0) if is_concrete(masses) else masses
 
     @property
     def wide(self) -> tuple[int, ...]:
         """Indices of the directors of the body: of the principal axes in which it has width, all three of a traced inertia."""
-        return tuple(range(3)) if not is_concrete(self.moments) else tuple(np.flatnonzero(self._inertias()).tolist())
+        return tuple(np.flatnonzero(self.inertias).tolist()) if is_concrete(self.moments) else (0, 1, 2)
 
     @property
     def directors(self):
@@ -305,12 +303,6 @@ class Rigidity(Effect):
             ],
             axis=-1,
         )
-
-
-def split(q):
-    """Centre (..., 3) and directors (..., k, 3), a director per row, of the coordinates q (..., 3 + 3 k) of a rigid body."""
-    triples = q.reshape(*q.shape[:-1], -1, 3)
-    return triples[..., 0, :], triples[..., 1:, :]
 
 
 def matrix_of(rotation):

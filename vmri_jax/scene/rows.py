@@ -16,6 +16,7 @@ from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.effects.freedoms import ANGLES
 from vmri_jax.scene.labels import element_label
 from vmri_jax.scene.layout import join
+from vmri_jax.scene.rates import positions
 from vmri_jax.scene.sorting import Home, Placed, Sorting
 from vmri_jax.scene.terms import EffectTerm
 
@@ -180,10 +181,7 @@ def _extent(bodies: Bodies) -> float:
 
     If all bodies are at the same place, the largest coordinate of this place, or 1 at the origin.
     """
-    points = [np.asarray(body.coordinates)[:LARGEST_POINT] for body in bodies.values() if not body.block]
-    points = np.array([np.pad(point, (0, LARGEST_POINT - point.size)) for point in points]).reshape(-1, LARGEST_POINT)
-    if not points.size:
-        return 1.0
+    points = positions(bodies)
     return float(np.abs(points - points.mean(axis=0)).max() or np.abs(points).max() or 1.0)
 
 

@@ -21,7 +21,7 @@ from vmri_jax.scene.assembly import actuation, build
 from vmri_jax.scene.body import AnyBody, Frame
 from vmri_jax.scene.drawing import drawing
 from vmri_jax.scene.effect import Effect
-from vmri_jax.scene.effects.joint_base import Joint, along_run
+from vmri_jax.scene.effects.joint_base import along_run, joint_named
 from vmri_jax.scene.functions import RESERVED, Actuation
 from vmri_jax.scene.labels import names_of
 from vmri_jax.scene.ledger import Ledger, ledger
@@ -156,7 +156,9 @@ class Scene:
         """
         from vmri_jax.scene.mujoco import bodies_and_effects  # the package mujoco is an optional dependency
 
-        bodies, effects = bodies_and_effects(model, qpos, qvel, key, ignore, limits, coordinates)
+        bodies, effects = bodies_and_effects(
+            model, qpos=qpos, qvel=qvel, key=key, ignore=ignore, limits=limits, coordinates=coordinates
+        )
         return cls(bodies, effects, redundant="drop", project=True, coordinates=coordinates)
 
     @cached_property
@@ -260,10 +262,7 @@ class Scene:
             ValueError: no joint of this name, or a joint without this freedom.
             IndexError: no such pair.
         """
-        joints = {effect.name: effect for effect in self.effects if isinstance(effect, Joint)}
-        if joint not in joints:
-            raise ValueError(f"Scene.joint_motion: {unknown('joint', joint, joints)}")
-        return along_run(joints[joint], run, self.by_name, of, pair)
+        return along_run(joint_named("Scene.joint_motion", joint, self.effects), run, self.by_name, of, pair)
 
     def by_directors(self, run: Trajectory) -> Trajectory:
         """The same run with bodies described by their centres and directors, where joints have rows, multipliers and reaction forces.

@@ -246,7 +246,6 @@ def sort(bodies: Bodies, effects: Sequence[Effect], branches: Sequence[Branch] =
     """Paces of all bodies and homes of all effects.
 
     Args:
-        bodies: by name.
         effects: in the order in which their terms are added.
         branches: bodies that are functions of the freedoms of joints, parents before children.
 

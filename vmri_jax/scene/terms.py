@@ -16,13 +16,21 @@ from vmri_jax.mechanics.rows import Rows
 from vmri_jax.scene.body import GROUND_COORDINATES
 
 
+def split(q):
+    """Centre (..., 3) and directors (..., k, 3), a director per row, of the coordinates q (..., 3 + 3 k) of a rigid body."""
+    triples = q.reshape(*q.shape[:-1], -1, 3)
+    return triples[..., 0, :], triples[..., 1:, :]
+
+
+def place(q, weights):
+    """``phi + sum_i X_i d_i``, (..., 3), of the coordinates q of a body, which may have fewer than three directors, and the components X of a point."""
+    phi, d = split(q)
+    return phi + jnp.sum(weights[..., : d.shape[-2], None] * d, axis=-2)
+
+
 @dataclass(frozen=True)
 class OnBodies:
-    """A role whose bodies are points, blocks, whole rigid bodies or their centres: it takes their coordinates.
-
-    Args:
-        rows: places of the coordinates in q_s and q_f.
-    """
+    """A role whose bodies are points, blocks, whole rigid bodies or their centres: it takes their coordinates."""
 
     rows: Rows
 
@@ -30,9 +38,7 @@ class OnBodies:
         """(d,) or (n, d) coordinates."""
         return self.rows.take(q_s, q_f)
 
-    def velocities(self, v_s, v_f, params):
-        """(d,) or (n, d) rates of the coordinates."""
-        return self.rows.take(v_s, v_f)
+    velocities = positions
 
     def put(self, force, params, n_s: int, n_f: int):
         """Forces on all slow and on all fast coordinates."""
@@ -53,15 +59,9 @@ class InRigidBodies:
 
     def positions(self, q_s, q_f, params):
         """(3,) or (n, 3) points."""
-        # phi + sum_i X_i d_i; bodies without width have fewer than three directors
-        q, components = self.rows.take(q_s, q_f), params[self.parameter]
-        triples = q.reshape(*q.shape[:-1], -1, 3)
-        arms = components[..., : triples.shape[-2] - 1, None] * triples[..., 1:, :]
-        return triples[..., 0, :] + jnp.sum(arms, axis=-2)
+        return place(self.rows.take(q_s, q_f), params[self.parameter])
 
-    def velocities(self, v_s, v_f, params):
-        """(3,) or (n, 3) velocities of the points: the map of the positions is linear."""
-        return self.positions(v_s, v_f, params)
+    velocities = positions  # the map is linear
 
     def put(self, force, params, n_s: int, n_f: int):
         """Forces on all slow and on all fast coordinates."""
@@ -154,11 +154,7 @@ class EffectTerm:
         return self._put(forces, params, q_s.shape[0], q_f.shape[0])
 
     def within(self, sizes: tuple[int, int]) -> bool:
-        """Whether the term depends only on the coordinates of the scene, the first n_s of Q_s and the first n_f of Q_f.
-
-        Args:
-            sizes: (n_s, n_f).
-        """
+        """Whether the term depends only on the coordinates of the scene, the first n_s of Q_s and the first n_f of Q_f."""
         return all(isinstance(role, OnGround) or role.rows.within(sizes) for role in self.roles)
 
     def _put(self, forces, params, n_s: int, n_f: int):
@@ -172,11 +168,10 @@ class EffectTerm:
 
 
 @dataclass(frozen=True)
-class SomeRows:
-    """The values of some terms of a constraint one after the other, without the rows with the numbers `dropped`."""
+class _OfSeveral:
+    """A term that is made of terms."""
 
     terms: tuple[EffectTerm, ...]
-    dropped: tuple[int, ...]
 
     @property
     def timed(self) -> bool:
@@ -187,6 +182,13 @@ class SomeRows:
         """Whether all terms depend only on the coordinates of the scene, see `EffectTerm.within`."""
         return all(term.within(sizes) for term in self.terms)
 
+
+@dataclass(frozen=True)
+class SomeRows(_OfSeveral):
+    """The values of some terms of a constraint one after the other, without the rows with the numbers `dropped`."""
+
+    dropped: tuple[int, ...]
+
     def value(self, q_s, q_f, params, t=None):
         """The values of the rows that are kept, by static slices."""
         values = concatenated([term.value(q_s, q_f, params, t) for term in self.terms])
@@ -194,7 +196,6 @@ class SomeRows:
         return concatenated([values[low + 1 : high] for low, high in pairwise(ends)])
 
 
-@dataclass(frozen=True)
 class DroppedRows(SomeRows):
     """The values of the rows that `SomeRows` leaves out."""
 
@@ -205,15 +206,10 @@ class DroppedRows(SomeRows):
 
 
 @dataclass(frozen=True)
-class TangentDamping:
+class TangentDamping(_OfSeveral):
     """``F = -beta K v`` with the Hessian K of the energy of some terms; beta is the parameter "stiffness"."""
 
     name: str
-    terms: tuple[EffectTerm, ...]
-
-    def within(self, sizes: tuple[int, int]) -> bool:
-        """Whether all terms depend only on the coordinates of the scene, see `EffectTerm.within`."""
-        return all(term.within(sizes) for term in self.terms)
 
     def forces(self, t, q_s, q_f, v_s, v_f, params):
         """Force on all slow and on all fast coordinates."""
@@ -231,8 +227,6 @@ def choose(params, select: Sequence[int], split: Sequence[str]):
     """The parameters of some elements.
 
     Args:
-        params: of all elements.
-        select: numbers of the elements.
         split: names of parameters that may have an entry for each element.
     """
     return params | {name: pick(params[name], select) for name in split if name in params and jnp.ndim(params[name])}

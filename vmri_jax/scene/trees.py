@@ -110,12 +110,7 @@ class Link(NamedTuple):
 
 
 def grow(bodies: Bodies, effects: Sequence[Effect]) -> tuple[Branch, ...]:
-    """The branches of all trees, parents before children.
-
-    Args:
-        bodies: by name.
-        effects: joints among them.
-    """
+    """The branches of all trees, parents before children."""
     edges: dict[str, list[tuple]] = {}
     for joint in (effect for effect in effects if isinstance(effect, Joint) and effect.carries):
         for i, (a, b) in enumerate(joint.elements(bodies)):
@@ -146,11 +141,7 @@ def grow(bodies: Bodies, effects: Sequence[Effect]) -> tuple[Branch, ...]:
 
 
 def shallow(branches: Sequence[Branch]) -> tuple[Branch, ...]:
-    """The branches of trees with at most `LONGEST` bodies between the root and any leaf.
-
-    Args:
-        branches: of all trees, parents before children.
-    """
+    """The branches of trees with at most `LONGEST` bodies between the root and any leaf; parents come before children, here and below."""
     depths: dict[str, int] = {}
     roots: dict[str, str] = {}
     for branch in branches:
@@ -176,7 +167,6 @@ def check_frames(bodies: Bodies, branches: Sequence[Branch]) -> None:
     """Refuse frames that hang on no joint, or that carry no body.
 
     Args:
-        bodies: by name.
         branches: of all trees; () if all bodies have directors.
 
     Raises:
@@ -202,10 +192,6 @@ def with_weight(bodies: Bodies, branches: Sequence[Branch]) -> Bodies:
     """The bodies, each frame replaced by a rigid body with the mass and the inertia of a body that it carries.
 
     The frequencies of effects on a frame are estimated with this mass.
-
-    Args:
-        bodies: by name.
-        branches: of all trees, parents before children.
     """
     weighted = dict(bodies)
     for branch in reversed(branches):  # children first: a frame may carry a frame
@@ -223,7 +209,6 @@ def make_layout(
     A body on a joint has the freedoms of this joint as coordinates.
 
     Args:
-        bodies, paces: by name.
         branches: bodies on joints, parents before children.
 
     Returns:

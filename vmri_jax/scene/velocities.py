@@ -9,13 +9,12 @@ import numpy as np
 
 from vmri_jax.mechanics.arrays import is_concrete, real_array
 from vmri_jax.mechanics.constraints import RANK
-from vmri_jax.mechanics.names import unknown
 from vmri_jax.mechanics.projection import legendre
 from vmri_jax.mechanics.system import System
 from vmri_jax.scene.body import GROUND, GROUND_COORDINATES, AnyBody, Bodies
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.effects.freedoms import FREEDOMS
-from vmri_jax.scene.effects.joint_base import Joint, freedom_of
+from vmri_jax.scene.effects.joint_base import Joint, freedom_of, joint_named
 from vmri_jax.scene.rows import ConstraintRows
 from vmri_jax.scene.sorting import Sorting
 
@@ -40,12 +39,6 @@ def with_rates(
 
     The constraints and the rates are rows ``C v = b``. Of all solutions, v is the nearest to the present velocities v_0 in the norm
     of the kinetic energy: with ``M = R R^T``, ``x = R^T (v - v_0)`` is the shortest solution of ``C R^-T x = b - C v_0``.
-
-    Args:
-        sorting: of the scene.
-        effects: of the scene, joints among them.
-        system: of the scene.
-        rates: by the name of the joint.
     """
     if not is_concrete((sorting.start, system)):
         raise TypeError(
@@ -100,13 +93,7 @@ def _freedom_numbers(sorting: Sorting) -> dict[Key, int]:
 
 
 def joint_starts(sorting: Sorting, effects: Sequence[Effect], starts: Mapping[str, Any]) -> dict[Key, tuple[Any, Any]]:
-    """Values and rates of freedoms by the keys of `Layout.freedoms`, see `Scene.with_joints`.
-
-    Args:
-        sorting: of the scene.
-        effects: of the scene, joints among them.
-        starts: by the name of the joint.
-    """
+    """Values and rates of freedoms by the keys of `Layout.freedoms`, see `Scene.with_joints`."""
     if not isinstance(starts, Mapping):
         raise TypeError(
             f'Scene.with_joints: joints is {starts!r}; give starts by the names of joints, {{"hinge": 0.3}}.'
@@ -148,7 +135,6 @@ def with_closed_loops(sorting: Sorting, starts: dict[Key, tuple[Any, Any]]) -> d
     rows of a ball joint, are left to the projection of the initial state.
 
     Args:
-        sorting: of the scene.
         starts: value and rate by the keys of `Layout.freedoms`.
 
     Raises:
@@ -217,23 +203,15 @@ def _close(rows: ConstraintRows, numbers: np.ndarray, q: np.ndarray, free: Seque
 
 
 def _by_freedom(method: str, effects: Sequence[Effect], numbers: Mapping[str, Any]) -> Iterator[tuple[Joint, str, Any]]:
-    """(joint, freedom, numbers) from a mapping by names of joints, whose values may be mappings by freedoms.
-
-    Args:
-        method: of `Scene`, for messages.
-        effects: of the scene, joints among them.
-        numbers: by the name of the joint.
-    """
-    joints = {effect.name: effect for effect in effects if isinstance(effect, Joint)}
+    """(joint, freedom, numbers) from a mapping by names of joints, whose values may be mappings by freedoms; `method` begins messages."""
     for name, of_joint in numbers.items():
-        if name not in joints:
-            raise ValueError(f"{method}: {unknown('joint', name, joints)}")
+        joint = joint_named(method, name, effects)
         for freedom, of_freedom in of_joint.items() if isinstance(of_joint, Mapping) else [("auto", of_joint)]:
             try:
-                known = freedom_of(joints[name], freedom)
+                known = freedom_of(joint, freedom)
             except ValueError as error:
                 raise ValueError(f'{method}: {error} Give a dictionary, {{"turn": ..., "slide": ...}}.') from None
-            yield joints[name], known, of_freedom
+            yield joint, known, of_freedom
 
 
 def _rates(effects: Sequence[Effect], bodies: Bodies, rates: Mapping[str, Any]):

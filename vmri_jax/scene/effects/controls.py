@@ -11,10 +11,9 @@ from vmri_jax.mechanics.names import AXES
 from vmri_jax.scene.body import Attachment, body_of, entry, is_entry, label_of
 from vmri_jax.scene.declare import effect_class, names, vector
 from vmri_jax.scene.effect import Effect
-from vmri_jax.scene.effects.freedoms import FREEDOMS
 from vmri_jax.scene.effects.joint_base import Joint
-from vmri_jax.scene.effects.joint_effects import InJoint
-from vmri_jax.scene.rigid import split
+from vmri_jax.scene.effects.joint_effects import Along, InJoint
+from vmri_jax.scene.terms import split
 
 Load = Literal["force", "torque"]
 
@@ -134,27 +133,13 @@ class Controlled(Effect):
         axes = [""] if size == 1 else [f" {axis}" for axis in (AXES if size <= 3 else range(size))][:size]
         return tuple(f"{self.name}{axis}" for axis in axes)
 
-    def drawing(self, bodies):
-        return {}
 
-
-@dataclass(frozen=True)
-class ControlAlong:
-    """``u dx/dq`` along the freedom x of a joint; compared by value."""
-
-    freedom: Callable
+class ControlAlong(Along):
+    """``u dx/dq`` along the freedom x of a joint."""
 
     def __call__(self, q, u, params):
-        x, pull = jax.vjp(lambda q: self.freedom(q, params), q)
+        x, pull = jax.vjp(lambda q: self.x(q, params), q)
         return pull(u.reshape(x.shape))[0]
-
-
-@dataclass(frozen=True)
-class ControlOnCoordinate:
-    """u on a freedom that is a coordinate; compared by value."""
-
-    def __call__(self, q, u, params):
-        return (u.reshape(q[0].shape),)
 
 
 @effect_class
@@ -166,14 +151,7 @@ class ControlledJoint(InJoint):
     """
 
     kind = "control"
-
-    @property
-    def function(self) -> Callable:
-        return ControlAlong(FREEDOMS[self.freedom])
-
-    @property
-    def of_coordinate(self) -> Callable:
-        return ControlOnCoordinate()
+    along = ControlAlong
 
     def check_bodies(self, bodies):
         super().check_bodies(bodies)

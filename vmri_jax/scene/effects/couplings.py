@@ -3,19 +3,18 @@
 from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import jax.numpy as jnp
 
 from vmri_jax.mechanics.arrays import real_array
 from vmri_jax.mechanics.checks import describe, shape_of
 from vmri_jax.mechanics.functions import NO_VELOCITY, check_arguments
-from vmri_jax.mechanics.names import unknown
 from vmri_jax.mechanics.rows import Rows
 from vmri_jax.scene.declare import effect_class, real_tree
 from vmri_jax.scene.effect import MOST_ROLES, START, Effect
 from vmri_jax.scene.effects.freedoms import FREEDOMS, Freedom
-from vmri_jax.scene.effects.joint_base import Joint, freedom_of
+from vmri_jax.scene.effects.joint_base import freedom_of, joint_named
 from vmri_jax.scene.terms import EffectTerm, OnBodies
 
 
@@ -46,26 +45,15 @@ class EquationOfCoordinates:
 
 @effect_class
 class _Coupling(Effect):
-    """An equation between freedoms of joints.
-
-    Args:
-        joints: names of joints of the scene, each with a single pair of bodies; ``(name, freedom)`` for a joint with several freedoms.
-
-    Raises:
-        ValueError: no joints, or more than 16; (of the scene) no joint of this name, a joint with several pairs of bodies, a joint
-            without this freedom; an equation that the start violates.
-    """
+    """An equation between freedoms of joints, see `JointCoupling`."""
 
     joints: Any
 
+    law: ClassVar[Any]
+    """The equation ``g(x, params)`` of the freedoms x (n,)."""
     kind = "constraint"
     whole = True
     same_size = False
-
-    @property
-    @abstractmethod
-    def equation(self) -> Callable:
-        """``g(x, params)`` of the freedoms x (n,)."""
 
     @abstractmethod
     def numbers(self) -> Any:
@@ -82,15 +70,11 @@ class _Coupling(Effect):
 
     def bound(self, effects):
         """A copy with pairs (joint, freedom) in `joints` instead of names."""
-        known, pairs = {effect.name: effect for effect in effects if isinstance(effect, Joint)}, []
+        pairs = []
         for item in self.joints:
             name, freedom = (item, "auto") if isinstance(item, str) else item
-            if name not in known:
-                raise ValueError(f"{self.name}: {unknown('joint', name, known)}")
-            try:
-                pairs.append((known[name], freedom_of(known[name], freedom)))
-            except ValueError as error:
-                raise ValueError(f"{self.name}: {error}") from None
+            joint = joint_named(self.name, name, effects)
+            pairs.append((joint, freedom_of(joint, freedom, f"{self.name}: ")))
         return replace(self, joints=tuple(pairs))
 
     def elements(self, bodies):
@@ -101,7 +85,7 @@ class _Coupling(Effect):
 
     @property
     def function(self):
-        return EquationOfBodies(self.equation, tuple(freedom for _, freedom in self.joints))
+        return EquationOfBodies(self.law, tuple(freedom for _, freedom in self.joints))
 
     def parameters(self, bodies):
         return {"law": self.numbers(), "joints": tuple(joint.parameters(bodies) for joint, _ in self.joints)}
@@ -111,7 +95,7 @@ class _Coupling(Effect):
         if not all(key in layout.freedoms for key in keys):
             return super().terms(select, bodies, layout, potentials)
         roles = tuple(OnBodies(Rows.of([layout.freedoms[key]])) for key in keys)
-        return (EffectTerm(self.name, EquationOfCoordinates(self.equation), roles),)
+        return (EffectTerm(self.name, EquationOfCoordinates(self.law), roles),)
 
     def check_bodies(self, bodies):
         """Nothing: the joints check their bodies themselves."""
@@ -125,7 +109,7 @@ class _Coupling(Effect):
             )
 
     def check_start(self, bodies):
-        violation = jnp.abs(self.equation(jnp.zeros(len(self.joints)), self.numbers()))
+        violation = jnp.abs(self.law(jnp.zeros(len(self.joints)), self.numbers()))
         self.require(
             violation < START,
             "the equation",
@@ -157,7 +141,7 @@ class JointCoupling(_Coupling):
             without this freedom; a law that returns no vector, or that is not zero at the start.
     """
 
-    law: Callable
+    law: Callable  # pyright: ignore[reportIncompatibleVariableOverride]
     params: Any = field(default_factory=dict)
 
     default_name = "coupling"
@@ -166,10 +150,6 @@ class JointCoupling(_Coupling):
         super().__post_init__()
         instead = NO_VELOCITY.format(moving="JointMotion, of one joint", force="JointDamper")
         check_arguments(f"{self.name}: law", self.law, "x, params", instead)
-
-    @property
-    def equation(self):
-        return self.law
 
     def numbers(self):
         return real_tree(f"{self.name}: params", self.params)
@@ -205,10 +185,7 @@ class Gear(_Coupling):
     ratios: Any
 
     default_name = "gear"
-
-    @property
-    def equation(self):
-        return weighted_sum
+    law = staticmethod(weighted_sum)
 
     def numbers(self):
         return {"ratios": jnp.asarray(real_array(f"{self.name}: ratios", self.ratios))}

@@ -129,10 +129,7 @@ class CustomEffect(Effect):
 
 
 class Potential(CustomEffect):
-    """A custom potential, ``function(q, params) -> ()``.
-
-    For the arguments see `CustomEffect`.
-    """
+    """A custom potential, ``function(q, params) -> ()``; for the arguments see `CustomEffect`."""
 
     kind = "potential"
 
@@ -153,10 +150,7 @@ class Constraint(CustomEffect):
 
 
 class Kinetic(CustomEffect):
-    """A velocity-dependent part of the Lagrangian, ``function(q, v, params) -> ()``, added to the kinetic energy.
-
-    For the arguments see `CustomEffect`.
-    """
+    """A velocity-dependent part of the Lagrangian, ``function(q, v, params) -> ()``, added to the kinetic energy; see `CustomEffect`."""
 
     kind = "kinetic"
 

@@ -140,4 +140,4 @@ class RayleighDamping(Effect):
         terms = () if self.mass is None else super().terms(select, bodies, layout, potentials)
         names = [name for name in potentials if self.of is None or name in self.refers_to]
         damped = tuple(term for name in names for term in potentials[name])
-        return terms if self.stiffness is None or not damped else (*terms, TangentDamping(self.name, damped))
+        return terms if self.stiffness is None or not damped else (*terms, TangentDamping(damped, self.name))

@@ -7,16 +7,10 @@ from typing import Any, Literal
 
 import jax.numpy as jnp
 
-from vmri_jax.scene.rigid import split
+from vmri_jax.scene.terms import place, split
 
 Freedom = Literal["turn", "slide", "tilt", "along", "across"]
 """In this order: the angle about the axis n, the distance along n, the angle about the second axis e, the distances along m and m'."""
-
-
-def place(q, weights):
-    """``phi + sum_i X_i d_i``, (..., 3), of the coordinates q of a body and the components X of a point."""
-    phi, d = split(q)
-    return phi + jnp.sum(weights[..., : d.shape[-2], None] * d, axis=-2)
 
 
 def gap(q, params):
@@ -74,33 +68,27 @@ def turn(q, params):
     return jnp.arctan2(*turn_by_sine(q, params))
 
 
-def tilt(q, params):
-    """The angle by which b has turned about its axis e from the given position, rad, between -pi and pi, (...)."""
-    return jnp.arctan2(*tilt_by_sine(q, params))
-
-
 def slide(q, params):
     """How far b has moved along the axis from the given position, ``n . D``, m, (...)."""
     return dot(triads(q, params)[0][..., N, :], gap(q, params))
 
 
-def along_m(q, params):
-    """How far b has moved along m from the given position, ``m . D``, m, (...)."""
-    return across(q, params)[..., 0]
-
-
-def along_m_prime(q, params):
-    """How far b has moved along m' from the given position, ``m' . D``, m, (...)."""
-    return across(q, params)[..., 1]
+def coordinate(q, params):
+    """A freedom that is a coordinate of the scene, of which q is the place, ``((..., 1),)``."""
+    return jnp.squeeze(q[0], -1)
 
 
 ANGLES: dict[str, Any] = {"turn": turn_by_sine, "tilt": tilt_by_sine}
 """For each freedom that is an angle, the function that gives its sine and cosine."""
+COORDINATE = "coordinate"
+"""In `FREEDOMS`, the name of any freedom that is a coordinate of the scene."""
 FREEDOMS: dict[str, Any] = {
     "turn": turn,
     "slide": slide,
-    "tilt": tilt,
-    "along": along_m,
-    "across": along_m_prime,
+    "tilt": lambda q, params: jnp.arctan2(*tilt_by_sine(q, params)),
+    "along": lambda q, params: across(q, params)[..., 0],
+    "across": lambda q, params: across(q, params)[..., 1],
+    COORDINATE: coordinate,
 }
-"""For each freedom, the function ``(q, params) -> (...)`` of the coordinates of both bodies that gives its value, rad or m."""
+"""For each freedom, the function ``(q, params) -> (...)`` of the coordinates of both bodies that gives its value against the given position: rad,
+between -pi and pi, or m."""

@@ -3,16 +3,19 @@
 For the letters see `vmri_jax.scene.effects.joints`.
 """
 
+from collections.abc import Iterable
 from typing import Any, ClassVar
 
+import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.mechanics.arrays import is_concrete, library, real_array
 from vmri_jax.mechanics.kinematics import Move
+from vmri_jax.mechanics.names import unknown
 from vmri_jax.scene.body import GROUND, GROUND_COORDINATES, Attachment, Bodies, body_of, label_of
 from vmri_jax.scene.declare import effect_class, names, squeeze
 from vmri_jax.scene.effect import START, Effect
-from vmri_jax.scene.effects.freedoms import FREEDOMS, Freedom
+from vmri_jax.scene.effects.freedoms import FREEDOMS, PARALLEL, Freedom, aligned, gap
 from vmri_jax.scene.rigid import RigidBody
 
 
@@ -178,6 +181,16 @@ class AboutAxis(Joint):
 
     axis: Any = (0.0, 0.0, 1.0)
 
+    carries = True
+    lengths: ClassVar[Any] = staticmethod(gap)
+    """Rows that are components of the gap D, (..., k)."""
+    products: ClassVar[tuple[tuple[int, int], ...]] = PARALLEL
+    """Pairs of vectors of both triads whose dot products are rows, see `aligned`."""
+
+    @classmethod
+    def function(cls, q, params):
+        return jnp.concatenate([cls.lengths(q, params), aligned(q, params, *cls.products)], axis=-1)
+
     def frame(self, count: int):
         return [_triad(axis) for axis in self._directions("axis", count)]
 
@@ -189,8 +202,20 @@ class AboutAxis(Joint):
         return vectors / lengths
 
 
-def freedom_of(joint: Joint, of: str) -> Freedom:
-    """The freedom of a joint with the name `of`; with "auto" its only freedom.
+def joint_named(about: str, name: str, effects: Iterable[Effect]) -> Joint:
+    """The joint with a name among effects; `about` begins the message.
+
+    Raises:
+        ValueError: no joint has this name.
+    """
+    joints = {effect.name: effect for effect in effects if isinstance(effect, Joint)}
+    if name not in joints:
+        raise ValueError(f"{about}: {unknown('joint', name, joints)}")
+    return joints[name]
+
+
+def freedom_of(joint: Joint, of: str, about: str = "") -> Freedom:
+    """The freedom of a joint with the name `of`; with "auto" its only freedom. `about` begins the message.
 
     Raises:
         ValueError: the joint has no freedom of this name, or with "auto" none or several.
@@ -199,17 +224,11 @@ def freedom_of(joint: Joint, of: str) -> Freedom:
     if len(fitting) == 1:
         return fitting[0]
     free = " and ".join(joint.freedoms) or "neither an angle nor a displacement along an axis"
-    raise ValueError(f"of is {of!r}; {joint.name} leaves {free} free.")
+    raise ValueError(f"{about}of is {of!r}; {joint.name} leaves {free} free.")
 
 
 def along_run(joint: Joint, run, bodies: Bodies, of: str, pair: int) -> np.ndarray:
     """The freedom of a joint along a run, (k,) rad or m, angles without jumps of 2 pi; see `Scene.joint_motion`.
-
-    Args:
-        joint, bodies: of the scene.
-        run: of the scene.
-        of: name of the freedom, or "auto", see `freedom_of`.
-        pair: number of the pair of bodies, if the joint has several.
 
     Raises:
         IndexError: no such pair.
@@ -224,9 +243,8 @@ def along_run(joint: Joint, run, bodies: Bodies, of: str, pair: int) -> np.ndarr
 def _triad(axis):
     """(3, 3) orthonormal (m, m', n) with n along a unit vector."""
     xp = library(axis)
-    least_parallel = xp.eye(3)[
-        xp.argmin(xp.abs(axis))
-    ]  # the axis of space furthest from n: the product below is not small
+    # the axis of space furthest from n: the product below is not small
+    least_parallel = xp.eye(3)[xp.argmin(xp.abs(axis))]
     m = xp.cross(least_parallel, axis)
     m = m / xp.linalg.norm(m)
     return xp.stack([m, xp.cross(axis, m), axis])

@@ -1,71 +1,75 @@
 """Effects along a freedom of a joint: springs, limits, dampers, rotors, drives, prescribed motions."""
 
-from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass, field, replace
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
 
-from vmri_jax.mechanics.names import unknown
 from vmri_jax.mechanics.rows import Rows
 from vmri_jax.scene.declare import effect_class, number, of_time, positive, real_tree
 from vmri_jax.scene.effect import START, Effect
-from vmri_jax.scene.effects.freedoms import ANGLES, FREEDOMS, Freedom
-from vmri_jax.scene.effects.joint_base import Joint, freedom_of
+from vmri_jax.scene.effects.freedoms import ANGLES, COORDINATE, FREEDOMS, Freedom
+from vmri_jax.scene.effects.joint_base import Joint, freedom_of, joint_named
 from vmri_jax.scene.effects.springs import elastic_energy
 from vmri_jax.scene.terms import EffectTerm, OnBodies
 
 
 @dataclass(frozen=True)
-class EnergyOf:
-    """``law(x, params)`` of the freedom x of a joint; compared by value."""
+class Along:
+    """A law of a freedom x as a function of coordinates; compared by value.
 
-    law: Callable
-    freedom: Callable
+    Args:
+        law: function of x, its rate x', the time or params.
+        freedom: name of x in `FREEDOMS`.
+    """
+
+    law: Any
+    freedom: str
+
+    def x(self, q, params):
+        """The value of the freedom, (...)."""
+        return FREEDOMS[self.freedom](q, params)
+
+
+class EnergyOf(Along):
+    """``law(x, params)``."""
 
     def __call__(self, q, params):
-        return self.law(self.freedom(q, params), params)
+        return self.law(self.x(q, params), params)
 
 
-@dataclass(frozen=True)
-class ForceAlong:
-    """``F = f(t, x, x', params) dx/dq`` along the freedom x of a joint; compared by value.
+class EnergyOfRate(Along):
+    """``law(x', params)``."""
+
+    def __call__(self, q, v, params):
+        return self.law(jax.jvp(lambda q: self.x(q, params), (q,), (v,))[1], params)
+
+
+class ForceAlong(Along):
+    """``F = f dx/dq`` with ``f = law(t, x, x', params)``.
 
     For the angle of a hinge f is a torque about its axis: b gets it, and a its opposite.
     """
 
-    law: Callable
-    freedom: Callable
-
     def __call__(self, t, q, v, params):
         def freedom(q):
-            return self.freedom(q, params)
+            return self.x(q, params)
 
         x, rate = jax.jvp(freedom, (q,), (v,))
         return jax.vjp(freedom, q)[1](jnp.broadcast_to(self.law(t, x, rate, params), x.shape))[0]
 
 
-@dataclass(frozen=True)
-class EnergyOfCoordinate:
-    """``law(x, params)`` of a freedom x that is a coordinate; compared by value."""
+class PrescribedMotion(Along):
+    """``x - a(t)`` with the law a; for an angle x ``sin x cos a - cos x sin a``, which is homogeneous in the directors."""
 
-    law: Callable
-
-    def __call__(self, q, params):
-        return self.law(q[0][..., 0], params)
-
-
-@dataclass(frozen=True)
-class ForceOnCoordinate:
-    """``f(t, x, x', params)`` on a freedom x that is a coordinate; compared by value."""
-
-    law: Callable
-
-    def __call__(self, t, q, v, params):
-        x, rate = q[0][..., 0], v[0][..., 0]
-        return (jnp.broadcast_to(self.law(t, x, rate, params), x.shape)[..., None],)
+    def __call__(self, t, q, params):
+        a = self.law(t, params["path"])
+        if self.freedom not in ANGLES:
+            return self.x(q, params) - a
+        sine, cosine = ANGLES[self.freedom](q, params)
+        return sine * jnp.cos(a) - cosine * jnp.sin(a)
 
 
 @effect_class
@@ -86,26 +90,23 @@ class InJoint(Effect):
     whole = True
     same_size = False
     derived = Joint.derived
+    law: ClassVar[Any] = None
+    """Energy, force or path as a function of x."""
+    along: ClassVar[Any]
+    """The class derived from `Along` that makes of the law a function of coordinates."""
 
     def bound(self, effects):
         """A copy with the joint itself instead of its name."""
-        joints = {effect.name: effect for effect in effects if isinstance(effect, Joint)}
-        if self.joint not in joints:
-            raise ValueError(f"{self.name}: {unknown('joint', self.joint, joints)}")
-        return replace(self, joint=joints[self.joint])
+        return replace(self, joint=joint_named(self.name, self.joint, effects))
 
     @property
     def freedom(self) -> Freedom:
         """Name of the freedom that the effect acts on."""
-        try:
-            return freedom_of(self.joint, self.of)
-        except ValueError as error:
-            raise ValueError(f"{self.name}: {error}") from None
+        return freedom_of(self.joint, self.of, f"{self.name}: ")
 
     @property
-    @abstractmethod
-    def of_coordinate(self) -> Callable:
-        """The function for a freedom that is a coordinate of the scene: q of an element is then this coordinate, ``((1,),)``."""
+    def function(self):
+        return self.along(self.law, self.freedom)
 
     def elements(self, bodies):
         return self.joint.elements(bodies)
@@ -122,7 +123,7 @@ class InJoint(Effect):
             return terms
         numbers = None if len(carrying) == len(self.elements(bodies)) else tuple(carrying)
         roles = (OnBodies(Rows.of([layout.freedoms[keys[i]] for i in carrying])),)
-        return (*terms, EffectTerm(self.name, self.of_coordinate, roles, numbers, self.split, self.timed))
+        return (*terms, EffectTerm(self.name, self.along(self.law, COORDINATE), roles, numbers, self.split, self.timed))
 
     def parameters(self, bodies):
         return super().parameters(bodies) | self.joint.parameters(bodies)
@@ -149,18 +150,11 @@ class JointSpring(InJoint):
 
     kind = "potential"
     default_name = "joint_springs"
+    along = EnergyOf
 
     @staticmethod
     def law(x, params):
         return elastic_energy(params["stiffness"], x - params["neutral"])
-
-    @property
-    def function(self):
-        return EnergyOf(self.law, FREEDOMS[self.freedom])
-
-    @property
-    def of_coordinate(self):
-        return EnergyOfCoordinate(self.law)
 
 
 @effect_class
@@ -187,20 +181,13 @@ class JointLimit(InJoint):
 
     kind = "potential"
     default_name = "joint_limits"
+    along = EnergyOf
 
     @staticmethod
     def law(x, params):
         s = params["smoothing"]
         depths = (s * jax.nn.softplus(depth / s) for depth in (params["lower"] - x, x - params["upper"]))
         return sum(elastic_energy(params["stiffness"], depth) for depth in depths)
-
-    @property
-    def function(self):
-        return EnergyOf(self.law, FREEDOMS[self.freedom])
-
-    @property
-    def of_coordinate(self):
-        return EnergyOfCoordinate(self.law)
 
     def curvature(self, bodies):
         return None if self.freedom in ANGLES else self.stiffness
@@ -224,34 +211,11 @@ class JointDamper(InJoint):
 
     kind = "force"
     default_name = "joint_dampers"
+    along = ForceAlong
 
     @staticmethod
     def law(t, x, rate, params):
         return -params["coefficient"] * rate
-
-    @property
-    def function(self):
-        return ForceAlong(self.law, FREEDOMS[self.freedom])
-
-    @property
-    def of_coordinate(self):
-        return ForceOnCoordinate(self.law)
-
-
-@dataclass(frozen=True)
-class EnergyOfRate:
-    """``J x'^2 / 2`` of the freedom x of a joint; compared by value."""
-
-    freedom: Callable
-
-    def __call__(self, q, v, params):
-        rate = jax.jvp(lambda q: self.freedom(q, params), (q,), (v,))[1]
-        return jnp.sum(params["inertia"] * rate**2) / 2
-
-
-def energy_of_rate(q, v, params):
-    """``J x'^2 / 2`` of a freedom x that is a coordinate."""
-    return jnp.sum(params["inertia"] * v[0][..., 0] ** 2) / 2
 
 
 @effect_class
@@ -268,14 +232,11 @@ class RotorInertia(InJoint):
 
     kind = "kinetic"
     default_name = "rotors"
+    along = EnergyOfRate
 
-    @property
-    def function(self):
-        return EnergyOfRate(FREEDOMS[self.freedom])
-
-    @property
-    def of_coordinate(self):
-        return energy_of_rate
+    @staticmethod
+    def law(rate, params):
+        return jnp.sum(params["inertia"] * rate**2) / 2
 
 
 @dataclass(frozen=True)
@@ -303,42 +264,14 @@ class JointDrive(InJoint):
 
     kind = "force"
     default_name = "joint_drive"
+    along = ForceAlong
 
     @property
-    def function(self):
-        return ForceAlong(OfHistory(self.history), FREEDOMS[self.freedom])
-
-    @property
-    def of_coordinate(self):
-        return ForceOnCoordinate(OfHistory(self.history))
+    def law(self):
+        return OfHistory(self.history)
 
     def parameters(self, bodies):
         return super().parameters(bodies) | {"history": real_tree(f"{self.name}: params", self.params)}
-
-
-@dataclass(frozen=True)
-class GivenCoordinate:
-    """``x - a(t)`` of a freedom x that is a coordinate; compared by value."""
-
-    path: Callable
-
-    def __call__(self, t, q, params):
-        return q[0][..., 0] - self.path(t, params["path"])
-
-
-@dataclass(frozen=True)
-class GivenMotion:
-    """``x - a(t)``; for an angle x ``sin x cos a - cos x sin a``, which is homogeneous in the directors. Compared by value."""
-
-    path: Callable
-    freedom: Freedom
-
-    def __call__(self, t, q, params):
-        a = self.path(t, params["path"])
-        if self.freedom not in ANGLES:
-            return FREEDOMS[self.freedom](q, params) - a
-        sine, cosine = ANGLES[self.freedom](q, params)
-        return sine * jnp.cos(a) - cosine * jnp.sin(a)
 
 
 @effect_class
@@ -361,15 +294,12 @@ class JointMotion(InJoint):
 
     kind = "constraint"
     default_name = "joint_motion"
+    along = PrescribedMotion
     timed = True
 
     @property
-    def function(self):
-        return GivenMotion(self.path, self.freedom)
-
-    @property
-    def of_coordinate(self):
-        return GivenCoordinate(self.path)
+    def law(self):
+        return self.path
 
     def parameters(self, bodies):
         return super().parameters(bodies) | {"path": real_tree(f"{self.name}: params", self.params)}

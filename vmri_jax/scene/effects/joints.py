@@ -64,13 +64,8 @@ class Revolute(AboutAxis):
     """
 
     default_name = "revolute"
-    carries = True
     moves = (Move("turn", N),)
     freedoms = ("turn",)
-
-    @staticmethod
-    def function(q, params):
-        return jnp.concatenate([gap(q, params), aligned(q, params, *PARALLEL)], axis=-1)
 
 
 @effect_class
@@ -89,13 +84,9 @@ class Universal(AboutAxis):
     second: Any = (1.0, 0.0, 0.0)
 
     default_name = "universal"
-    carries = True
     moves = (Move("turn", N), Move("turn", M))
     freedoms = ("turn", "tilt")
-
-    @staticmethod
-    def function(q, params):
-        return jnp.concatenate([gap(q, params), aligned(q, params, (N, M))], axis=-1)
+    products = ((N, M),)
 
     def frame(self, count: int):
         first, second = self._directions("axis", count), self._directions("second", count)
@@ -113,11 +104,7 @@ class Fixed(AboutAxis):
     """
 
     default_name = "fixed"
-    carries = True
-
-    @staticmethod
-    def function(q, params):
-        return jnp.concatenate([gap(q, params), aligned(q, params, *PARALLEL, UNTURNED)], axis=-1)
+    products = (*PARALLEL, UNTURNED)
 
 
 @effect_class
@@ -129,13 +116,9 @@ class Cylindrical(AboutAxis):
     """
 
     default_name = "cylindrical"
-    carries = True
     moves = (Move("turn", N), Move("slide", N))
     freedoms = ("turn", "slide")
-
-    @staticmethod
-    def function(q, params):
-        return jnp.concatenate([across(q, params), aligned(q, params, *PARALLEL)], axis=-1)
+    lengths = staticmethod(across)
 
 
 @effect_class
@@ -156,7 +139,6 @@ class Screw(AboutAxis):
     pitch: Any = number(default=1e-3)
 
     default_name = "screw"
-    carries = True
     moves = (Move("screw", N),)
     freedoms = ("turn",)
 
@@ -201,13 +183,12 @@ class Planar(AboutAxis):
     """
 
     default_name = "planar"
-    carries = True
     moves = (Move("slide", M), Move("slide", M_PRIME), Move("turn", N))
     freedoms = ("along", "across", "turn")
 
     @staticmethod
-    def function(q, params):
-        return jnp.concatenate([slide(q, params)[..., None], aligned(q, params, *PARALLEL)], axis=-1)
+    def lengths(q, params):
+        return slide(q, params)[..., None]
 
 
 @effect_class
@@ -219,10 +200,7 @@ class Prismatic(AboutAxis):
     """
 
     default_name = "prismatic"
-    carries = True
     moves = (Move("slide", N),)
     freedoms = ("slide",)
-
-    @staticmethod
-    def function(q, params):
-        return jnp.concatenate([across(q, params), aligned(q, params, *PARALLEL, UNTURNED)], axis=-1)
+    lengths = staticmethod(across)
+    products = (*PARALLEL, UNTURNED)
