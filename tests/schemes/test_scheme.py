@@ -152,5 +152,5 @@ def test_rates_that_are_refused(make, error, message):
 def test_a_potential_on_every_second_micro_node_is_described():
     base = fully_explicit(4)
     kicks = micro(quadrature.trapezoidal, every=2)
-    scheme = Scheme(4, kinetic=base.kinetic, slow=base.slow, fast=base.fast, potentials={"2": kicks})
+    scheme = Scheme(4, kinetic=base.kinetic, slow=base.slow, fast=base.fast, potentials={2: kicks})
     assert "V_2" in str(scheme.describe())

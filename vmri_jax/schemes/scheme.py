@@ -19,6 +19,7 @@ of order 1, each the adjoint of the other. Any other alpha also has order 1. alp
 
 import math
 from dataclasses import KW_ONLY, replace
+from typing import Any
 
 import equinox as eqx
 import numpy as np
@@ -57,7 +58,7 @@ class Scheme(eqx.Module):
             `kinetic` must be placed with micro, `force` defaults to the rule of `kinetic`.
         constraint: where g holds: micro(rule) whose nodes are the control nodes; default micro(lobatto(degree + 1)).
         slow_constraint: where g_s holds: macro(rule) on the same nodes; default macro(lobatto(degree + 1)).
-        potentials: placed rules of `System.potentials` by name, see `with_potentials`.
+        potentials: placed rules of `System.potentials` by name (a string or a whole number), see `with_potentials`.
 
     Raises:
         TypeError: num_micro or degree not an integer, or a rule that was not placed with macro or micro.
@@ -74,7 +75,7 @@ class Scheme(eqx.Module):
     constraint: PlacedRule = eqx.field(default=None)
     slow_constraint: PlacedRule = eqx.field(default=None)
     force: PlacedRule = eqx.field(default=None)
-    potentials: dict[str, PlacedRule] = eqx.field(default_factory=dict)
+    potentials: dict[Any, PlacedRule] = eqx.field(default_factory=dict)
 
     def __post_init__(self):
         self.num_micro = _positive_integer("num_micro", self.num_micro)
