@@ -13,6 +13,7 @@ import vmri_jax as vm
 from benchmarks.measure import Ratio, Tell, silent
 from benchmarks.programs import problem
 from benchmarks.report import Claim, Report, growing
+from benchmarks.scenes import gallery_scene
 
 COLUMNS = ("program", "instructions", "to compile, s")
 STEPS = 100
@@ -67,7 +68,13 @@ class Program:
         return jax.jit(jax.value_and_grad(last)).lower(problem.state()).compile()
 
 
+def gallery(name: str) -> vm.Problem:
+    """The problem of a scene of the gallery."""
+    return gallery_scene(name).problem()
+
+
 FPU, TSP, SAM = (partial(problem, name) for name in ("FPU l=3", "TSP", "SAM"))
+SATELLITE, SQUEEZER, ENGINE = (partial(gallery, name) for name in ("rigid_satellite", "squeezer", "engine"))
 PROGRAMS: dict[str, Program] = {
     "double pendulum in angles, fully_implicit(1)": Program(double_pendulum, vm.fully_implicit(1), 2850),
     "double pendulum in angles, galerkin(1, 3)": Program(double_pendulum, vm.galerkin(1, 3), 3140),
@@ -79,6 +86,9 @@ PROGRAMS: dict[str, Program] = {
     "TSP, fully_implicit(5), exact matrices": Program(TSP, vm.fully_implicit(5), 5270, "arrowhead"),
     "SAM, fully_implicit(5)": Program(SAM, vm.fully_implicit(5), 6470),
     "SAM, fully_implicit(5), exact matrices": Program(SAM, vm.fully_implicit(5), 7020, "arrowhead"),
+    "satellite in joint coordinates, fully_explicit(5)": Program(SATELLITE, vm.fully_explicit(5), 13280),
+    "squeezer by directors, fully_implicit(1)": Program(SQUEEZER, vm.fully_implicit(1), 6430),
+    "engine by directors, explicit_slow(5)": Program(ENGINE, vm.explicit_slow(5), 13120),
     "gradient: double pendulum, fully_implicit(1)": Program(
         double_pendulum, vm.fully_implicit(1), 5020, is_gradient=True
     ),
@@ -92,8 +102,9 @@ def instructions(compiled: jax.stages.Compiled) -> int:
 
 
 def sizes(name: str) -> list[str]:
-    """ "quick" or "full": names of programs."""
-    return [name for name in PROGRAMS if "SAM" not in name] if name == "quick" else list(PROGRAMS)
+    """ "quick", without those that take longest to compile, or "full": names of programs."""
+    longest = SAM, SATELLITE, SQUEEZER, ENGINE
+    return [key for key, program in PROGRAMS.items() if name == "full" or program.problem not in longest]
 
 
 def run(size: list[str], name: str, tell: Tell = silent) -> Iterator[Report]:
