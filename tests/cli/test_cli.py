@@ -450,7 +450,7 @@ def test_a_fault_inside_is_no_usage_error(tmp_path, monkeypatch):
     """An error that another library raises, or Python itself, is shown with its origin, and what was computed is told first."""
     monkeypatch.chdir(tmp_path)
 
-    def broken(*_):
+    def broken(*_, **__):
         return int("a fault")
 
     monkeypatch.setattr("vmri_jax.plots.plot_trajectory", broken)
@@ -474,7 +474,7 @@ def test_a_page_that_cannot_be_drawn_leaves_its_table(tmp_path, monkeypatch):
         search: Any = SimpleNamespace(rows=lambda: NOTHING, t_end=1.0, not_tried=list)
         return cost_report._write(search, [cost_report.Answer(1e-2, None)], problem, name, out)
 
-    def broken(*_):
+    def broken(*_, **__):
         return int("no figure")
 
     monkeypatch.setattr("vmri_jax.plots.plot_staircases", broken)
