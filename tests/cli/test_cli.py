@@ -450,7 +450,7 @@ def test_a_fault_inside_is_no_usage_error(tmp_path, monkeypatch):
     """An error that another library raises, or Python itself, is shown with its origin, and what was computed is told first."""
     monkeypatch.chdir(tmp_path)
 
-    def broken(*_, **__):
+    def broken(*_):
         return int("a fault")
 
     monkeypatch.setattr("vmri_jax.plots.plot_trajectory", broken)

@@ -15,7 +15,7 @@ from vmri_jax.mechanics.system import System
 def energy_parts(system: System, q_s, q_f, p_s, p_f, velocities=None) -> dict:
     """Parts of the Hamiltonian ``p . v - T(q, v) + V + W + sum_i V_i``: "kinetic", "slow", "fast" and the names of `System.potentials`.
 
-    `velocities` here and below: (v_s, v_f) of the momenta if they are known.
+    Velocities (v_s, v_f) of the momenta that are known already are not computed again.
     """
     v_s, v_f = velocities or velocity(system, q_s, q_f, p_s, p_f)
     kinetic = jnp.sum(p_s * v_s) + jnp.sum(p_f * v_f) - system.kinetic(q_s, q_f, v_s, v_f, system.params)
@@ -62,6 +62,7 @@ def constraint_residual(system: System, state: State, velocities=None):
     Args:
         system: with its constraints and the implied rows; without both the result is zero.
         state: time, positions and momenta.
+        velocities: (v_s, v_f) of the momenta if they are known.
     """
     configuration = state.t, state.q_s, state.q_f
     velocities = velocities or velocity(system, state.q_s, state.q_f, state.p_s, state.p_f)

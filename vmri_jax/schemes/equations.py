@@ -169,7 +169,7 @@ def multiplier_scales(scheme: Scheme, macro_dt, before: Number = 0.0):
 
         h^2 (w_0 + (H_before / H) w_r)  at the start of the step      h^2 (w_0 + w_r)  where micro intervals meet      h^2 w_j  inside
 
-    and, with the weights of the slow constraint rule, those of g_s are ``H^2 (w_0 + (H_before / H) w_r)`` at S_0 and ``H^2 w_i`` at S_i.
+    and, with the weights of the slow constraint rule, the factors of g_s are ``H^2 (w_0 + (H_before / H) w_r)`` at S_0 and ``H^2 w_i`` at S_i.
 
     Args:
         scheme: its constraint rules.

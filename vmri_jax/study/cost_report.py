@@ -361,10 +361,8 @@ def _draw_stairs(report: CostReport, price: dict[str, float], title: str, theme:
     extras, chosen = report.extras, report.extras.accuracy
     if chosen is not None:
         marked.append(plots.Marked(f"accuracy={extras.accuracy_error:.0e}", chosen.seconds, chosen.error_q, star=True))
-    known_to, bound = report.runs.reference.error_q, bound_of(report.stairs, price)
-    return plots.plot_staircases(
-        report.stairs, extras.peers, marked, bound, known_to=known_to, title=title, theme=theme
-    )
+    look = {"known_to": report.runs.reference.error_q, "title": title, "theme": theme}
+    return plots.plot_staircases(report.stairs, extras.peers, marked, bound_of(report.stairs, price), **look)
 
 
 def bound_of(stairs: dict[str, list[Stair]], price: dict[str, float]) -> plots.Bound | None:

@@ -134,11 +134,12 @@ class WorkPrecision(ResultTable):
 
     def records(self) -> list[dict[str, Any]]:
         """The rows as dictionaries, with an entry for the gradients of each further potential."""
-        rows = [asdict(row) for row in self.rows]
-        return [
-            row | {f"evaluations of {label(name)}": count for name, count in row.pop("evaluations").items()}
-            for row in rows
-        ]
+        records = []
+        for row in self.rows:
+            record = asdict(row)
+            further = record.pop("evaluations")
+            records.append(record | {f"evaluations of {label(name)}": count for name, count in further.items()})
+        return records
 
     def content(self) -> dict[str, Any]:
         """Rows, error of the reference, machine and versions."""
