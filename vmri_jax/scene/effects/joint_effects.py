@@ -278,7 +278,7 @@ class JointDrive(InJoint):
 class JointMotion(InJoint):
     """A prescribed angle or displacement of a joint, ``x = a(t)``.
 
-    Minus the multiplier is the torque (N m) or the force (N) of the drive that moves b against a so; it does work.
+    Minus the multiplier is the torque (N m) or the force (N) of the drive that turns or shifts b against a along a(t); it does work.
 
     Args:
         joint, of: as of `InJoint`.

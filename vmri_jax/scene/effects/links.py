@@ -85,7 +85,7 @@ class MovingPivot(_Rigid, ToPath):
 
 @effect_class
 class Guide(ToPath):
-    """A body with a prescribed motion, ``g = q - a(t) = 0``. Minus the multiplier is the force (N) that moves the body so; it does work.
+    """A body with a prescribed motion, ``g = q - a(t) = 0``. Minus the multiplier is the force (N) that moves the body along a(t); it does work.
 
     Args:
         bodies: a name.
