@@ -114,7 +114,8 @@ def loose_tolerance(full: bool) -> Outcome:
 
     drift shrinks with the tolerance, the default shows none
     """
-    steps, problem = 1_000_000 if full else 100_000, vm.systems.fermi_pasta_ulam()
+    steps = 1_000_000 if full else 300_000  # in fewer chaotic motion alone may hide the drift of the loosest tolerance
+    problem = vm.systems.fermi_pasta_ulam()
     changes, details = {}, {}
     newtons = {name: vm.solvers.Nested(tolerance=float(name)) for name in ("1e-4", "1e-8", "1e-12")}
     for name, solver in (newtons | {"the default": vm.solvers.Auto()}).items():
