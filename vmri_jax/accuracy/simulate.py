@@ -134,7 +134,7 @@ def simulate(
         check_constraints(run.system, run.state, "simulate: the state")
     if throw and int(trajectory.failed_at) >= 0:
         raise simulation_error(trajectory, run.macro_dt, save_every, scheme.num_micro)
-    lost = lost_energy(trajectory, float(run.macro_dt)) if int(trajectory.failed_at) < 0 else ""
+    lost = lost_energy(trajectory, run.system, float(run.macro_dt)) if int(trajectory.failed_at) < 0 else ""
     if lost:
         warnings.warn(f"simulate: {lost}", LostEnergyWarning, stacklevel=2)
     return with_error(run, trajectory, of) if error and int(trajectory.failed_at) < 0 else trajectory

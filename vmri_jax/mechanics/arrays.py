@@ -23,7 +23,11 @@ QUICK = {"xla_backend_optimization_level": 0}
 
 def is_concrete(tree) -> bool:
     """Whether a pytree holds values, rather than tracers of jit, vmap or grad."""
-    return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))  # pyright: ignore[reportAttributeAccessIssue]
+    return not any(map(_is_traced, jax.tree.leaves(tree)))
+
+
+def _is_traced(leaf) -> bool:
+    return isinstance(leaf, jax.core.Tracer)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def library(*values):
@@ -51,7 +55,7 @@ def quickly_compiled(function: Callable, static_argnames: str | Sequence[str] = 
 
 def of_one_type(tree):
     """A pytree with all numbers as NumPy arrays, tracers unchanged: JAX would trace functions anew for each type of number."""
-    return jax.tree.map(lambda leaf: np.asarray(leaf) if is_concrete(leaf) else leaf, tree)
+    return jax.tree.map(lambda leaf: leaf if _is_traced(leaf) else np.asarray(leaf), tree)
 
 
 def require_x64() -> None:
@@ -96,6 +100,15 @@ def real_array(name: str, value, ndim: int | None = None):
         ValueError: floats of less than 64 bits, or another number of dimensions.
     """
     advice = "give a real number" if ndim == 0 else "give real numbers, an array of float64"
+    is_float64 = isinstance(value, float) or (isinstance(value, np.ndarray) and value.dtype == np.float64)
+    array = np.asarray(value) if is_float64 else _converted(name, value, advice)
+    if ndim is not None and array.ndim != ndim:
+        raise ValueError(f"{name} has shape {array.shape}; {advice}.")
+    return array
+
+
+def _converted(name: str, value, advice: str):
+    """Numbers as an array of float64, see `real_array`; refuses numbers that are not real or have less than 64 bits."""
     if is_concrete(value):
         try:
             kind = "f" if is_short(value) else np.asarray(value).dtype.kind
@@ -105,10 +118,7 @@ def real_array(name: str, value, ndim: int | None = None):
             raise TypeError(f"{name} is {value!r}; {advice}.")
     check_precision(name, value)
     is_jax = isinstance(value, jax.Array) or not is_concrete(value)
-    array = jnp.asarray(value, dtype=float) if is_jax else np.asarray(value, dtype=float)
-    if ndim is not None and array.ndim != ndim:
-        raise ValueError(f"{name} has shape {array.shape}; {advice}.")
-    return array
+    return jnp.asarray(value, dtype=float) if is_jax else np.asarray(value, dtype=float)
 
 
 def whole_number(name: str, value, least: int = 1, otherwise: str = "") -> int:

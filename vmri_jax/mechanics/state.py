@@ -35,7 +35,9 @@ Layouts = tuple[by_name.Layout | None, by_name.Layout | None]
 """Layouts of q_s and of q_f, None for vectors."""
 
 
-class State(eqx.Module):
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True, eq=False)
+class State:
     """Time, positions of the slow and of the fast variables, and their conjugate momenta."""
 
     t: Number
@@ -46,7 +48,7 @@ class State(eqx.Module):
 
     def __repr__(self) -> str:
         if not has_values(self) or np.ndim(self.t) or np.ndim(self.q_s) != 1:
-            return eqx.Module.__repr__(self)
+            return eqx.tree_pformat(self)
         vectors = {"q_s": self.q_s, "q_f": self.q_f, "p_s": self.p_s, "p_f": self.p_f}
         return summary(f"State at t = {float(self.t):.6g}", {name: numbers(a) for name, a in vectors.items()})
 

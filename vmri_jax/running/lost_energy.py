@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.mechanics.invariants import energy_parts
-from vmri_jax.mechanics.masses import ConstantMass, Diagonal
+from vmri_jax.mechanics.masses import ConstantMass
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.origin import at_nodes
@@ -27,19 +27,17 @@ ROUNDOFF_OF_STEP = 10 * np.finfo(float).eps
 """Round-off of a position in a step, as a part of the largest position; a larger value hides slower motions."""
 
 
-def lost_energy(run: Trajectory, macro_dt: float) -> str:
+def lost_energy(run: Trajectory, system: System, macro_dt: float) -> str:
     """A sentence about a run whose system keeps its energy and whose energy has changed; empty for any other run.
 
     A system at rest moves by round-off: n steps H change velocities by up to ``sqrt(n) ROUNDOFF_OF_STEP |q| / H``, in random directions. The
     check therefore ignores kinetic energies below the energy of these velocities, and changes below the round-off of the energy's terms.
 
     Args:
-        run: one run without a failure. The result is empty unless it knows its system, and its masses are constant.
+        run: one run without a failure.
+        system: its system. The result is empty unless its masses are constant.
         macro_dt: macro step H.
     """
-    if not run.origin.knows_system:
-        return ""
-    system = run.origin.system()
     if not system.keeps_energy or not isinstance(system.kinetic, ConstantMass):
         return ""
     energy = np.asarray(run.energy)
@@ -49,10 +47,12 @@ def lost_energy(run: Trajectory, macro_dt: float) -> str:
     if not change[worst] > ROUNDOFF_OF_ENERGY * np.abs(energy).max():
         return ""
     nodes = np.unique(np.append(np.linspace(0, len(energy) - 1, NODES_CHECKED).astype(int), worst))
-    slow = _kinetic(system.kinetic.slow_mass, np.asarray(run.states.p_s)[nodes])
-    fast = _kinetic(system.kinetic.fast_mass, np.asarray(run.states.p_f)[nodes])
+    slow = _kinetic(np.asarray(system.kinetic.slow), np.asarray(run.states.p_s)[nodes])
+    fast = _kinetic(np.asarray(system.kinetic.fast), np.asarray(run.states.p_f)[nodes])
     kinetic = (slow + fast).max()
-    if not change[worst] > REPORTED_CHANGE * kinetic or not change[worst] > _kinetic_of_roundoff(run, macro_dt):
+    if not change[worst] > REPORTED_CHANGE * kinetic or not change[worst] > _kinetic_of_roundoff(
+        run, system.kinetic, macro_dt
+    ):
         return ""
     states = jax.tree.map(lambda a: np.asarray(a)[nodes], run.states)
     if not change[worst] > ROUNDOFF_OF_ENERGY * np.max(at_nodes(_size_of_terms, run.origin, states)):
@@ -64,19 +64,19 @@ def lost_energy(run: Trajectory, macro_dt: float) -> str:
     )
 
 
-def _kinetic(mass, p: np.ndarray) -> np.ndarray:
-    """``p M^-1 p / 2`` at every node."""
-    if isinstance(mass, Diagonal):
-        return (p**2 / np.asarray(mass.masses)).sum(axis=1) / 2
-    return np.einsum("ki,ik->k", p, np.linalg.solve(np.asarray(mass.matrix), p.T)) / 2
+def _kinetic(mass: np.ndarray, p: np.ndarray) -> np.ndarray:
+    """``p M^-1 p / 2`` at every node; the mass matrix M is given by its diagonal (n,) or whole (n, n)."""
+    if mass.ndim == 1:
+        return (p**2 / mass).sum(axis=1) / 2
+    return np.einsum("ki,ik->k", p, np.linalg.solve(mass, p.T)) / 2
 
 
-def _kinetic_of_roundoff(run: Trajectory, macro_dt: float) -> float:
+def _kinetic_of_roundoff(run: Trajectory, mass: ConstantMass, macro_dt: float) -> float:
     """Kinetic energy ``sum_i m_i v^2 / 2`` of the velocity ``v = sqrt(n) ROUNDOFF_OF_STEP |q| / H`` that n steps make by round-off."""
-    mass, t = run.origin.system().kinetic, np.asarray(run.t)
+    t = np.asarray(run.t)
     steps = float(t[-1] - t[0]) / macro_dt
     position = max(np.abs(q).max(initial=0.0) for q in (np.asarray(run.states.q_s), np.asarray(run.states.q_f)))
-    total = sum(float(jnp.trace(part.matrix)) for part in (mass.slow_mass, mass.fast_mass))
+    total = sum(float(np.sum(part if np.ndim(part) == 1 else np.trace(part))) for part in (mass.slow, mass.fast))
     return total * steps * (ROUNDOFF_OF_STEP * position / macro_dt) ** 2 / 2
 
 

@@ -207,8 +207,7 @@ class Simulation:
     @cached_property
     def arrays(self) -> Arrays:
         """The arguments of its programs."""
-        model = Model(self.solver, self.scheme, self.system)
-        return Arrays(jax.tree.leaves(model), tuple(vars(self.state).values()), self.macro_dt)
+        return Arrays(self._model[0], tuple(vars(self.state).values()), self.macro_dt)
 
     @cached_property
     def engine(self) -> Engine:
@@ -222,13 +221,18 @@ class Simulation:
 
     def engine_for(self, is_exact: bool, num_saves: int) -> Engine:
         """Programs with the first solver or with the fallback, for a number of saved intervals."""
-        return engine(self._structures[is_exact], num_saves, self.save_micro)
+        structure = self._exact_structure if is_exact else self._model[1]
+        return engine(structure, num_saves, self.save_micro)
 
     @cached_property
-    def _structures(self) -> tuple:
-        """Structures of the `Model` with the first solver, and with the fallback."""
-        first_and_exact = self.solver, self.solver.exact()
-        return tuple(jax.tree.structure(Model(solver, self.scheme, self.system)) for solver in first_and_exact)
+    def _model(self) -> tuple[list, Any]:
+        """Leaves and structure of the `Model` with the first solver."""
+        return jax.tree.flatten(Model(self.solver, self.scheme, self.system))
+
+    @cached_property
+    def _exact_structure(self) -> Any:
+        """Structure of the `Model` with the fallback."""
+        return jax.tree.structure(Model(self.solver.exact(), self.scheme, self.system))
 
     def check(self, state_name: str = "simulate: the state", constraints: bool = True) -> None:
         """Refuse a system whose functions return wrong types or shapes, and a state that violates the constraints.
@@ -239,7 +243,7 @@ class Simulation:
         """
         shapes = tuple(a.shape for a in self.arrays.state)
         numbers = tuple(np.asarray(leaf).tobytes() for leaf in self.arrays.model)
-        _check_once(_Checked((self._structures[0], shapes, numbers), self.system, self.state, state_name, constraints))
+        _check_once(_Checked((self._model[1], shapes, numbers), self.system, self.state, state_name, constraints))
 
     def start(self, state: State | None = None, step: int = 0, fell_back: bool = False) -> Checkpoint:
         """The checkpoint before the first step; or before step number `step` at another state, with blank memory."""

@@ -376,16 +376,8 @@ def from_named_arrays(arrays: dict) -> Trajectory:
 
 def from_arrays(arrays: list) -> Trajectory:
     """The trajectory with these leaves, with or without micro nodes."""
-    return jax.tree.unflatten(_STRUCTURES[len(arrays)], arrays)
+    micro = MicroNodes(*arrays[12:]) if arrays[12:] else None
+    return Trajectory(State(*arrays[:5]), *arrays[5:7], RunInfo(*arrays[7:10]), *arrays[10:12], micro)
 
 
 _FIELDS = {*NODES, *STATUS, *MICRO, *RunInfo._fields}
-_SCALAR = np.zeros(())
-_STRUCTURES = {
-    len(jax.tree.leaves(trajectory)): jax.tree.structure(trajectory)
-    for micro in (None, _SCALAR)
-    for trajectory in [
-        from_named_arrays(dict.fromkeys(_FIELDS, _SCALAR) | dict.fromkeys(MICRO, micro))
-    ]  # its origin has no arrays
-}
-"""Tree structures of trajectories without and with micro nodes, by their number of arrays."""
