@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from matplotlib.figure import Figure
+from rich.markup import escape
 from rich.table import Table
 
 from benchmarks.measure import Ratio, Tell, machine
@@ -88,10 +89,10 @@ class Report:
         for head, *body in self._tables(columns):
             table = Table(*head, box=None, pad_edge=False)
             for row in body:
-                table.add_row(*row)
+                table.add_row(*map(escape, row))
             console.print(table, "")
         for note in self.notes:
-            console.print(note, style="dim")
+            console.print(escape(note), style="dim")
 
     def _tables(self, columns: Sequence[str]) -> Iterator[list[Sequence[str]]]:
         """Rows and claims as text, the heads first; those that are empty are left out."""

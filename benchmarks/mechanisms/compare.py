@@ -18,6 +18,8 @@ from vmri_jax import plots
 
 LEVELS = (1e-3, 1e-5)
 """Largest errors of the centres of bars at the end, over the size of the mechanism."""
+FINEST = 1e-8
+"""The smallest error asked for in full runs."""
 COLUMNS = ("mechanism", "level", "way", "setting", "step, s", "error", "µs per s", "quartiles", "to best", "first, s")
 CLOCK = time.process_time
 """Seconds in which this process runs: others may share its core."""
@@ -49,7 +51,7 @@ def sizes(name: str, only: Sequence[str] = (), way: Sequence[str] = ()) -> Size:
         raise ValueError(f"mechanisms: there is no {' or '.join(only)}; there are {', '.join(CASES)}.")
     if name == "quick":
         return Size(tuple(chosen), (10,), (10,), LEVELS[:1], 0.5, 3, tuple(way))
-    return Size(tuple(chosen), (1, 5, 10, 50), (10,), LEVELS, 2.0, 5, tuple(way))
+    return Size(tuple(chosen), (1, 5, 10, 50), (10,), (*LEVELS, FINEST), 2.0, 5, tuple(way))
 
 
 @dataclass(frozen=True)

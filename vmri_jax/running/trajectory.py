@@ -376,8 +376,10 @@ def from_named_arrays(arrays: dict) -> Trajectory:
 
 def from_arrays(arrays: list) -> Trajectory:
     """The trajectory with these leaves, with or without micro nodes."""
-    micro = MicroNodes(*arrays[12:]) if arrays[12:] else None
-    return Trajectory(State(*arrays[:5]), *arrays[5:7], RunInfo(*arrays[7:10]), *arrays[10:12], micro)
+    t, q_s, q_f, p_s, p_f, energy, constraint_residual, method, iterations, residual, result, failed_at, *micro = arrays
+    states, info = State(t, q_s, q_f, p_s, p_f), RunInfo(method, iterations, residual)
+    micro_nodes = MicroNodes(*micro) if micro else None
+    return Trajectory(states, energy, constraint_residual, info, result, failed_at, micro_nodes)
 
 
 _FIELDS = {*NODES, *STATUS, *MICRO, *RunInfo._fields}
