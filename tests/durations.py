@@ -43,7 +43,7 @@ class Durations:
 
     def __init__(self, budget: bool):
         self.budget = budget
-        self.slowness = slowness() if budget else 1.0
+        self.slowness = slowness()
         self.start = 0.0
         self.seconds: dict[str, float] = {}
         self.memory = 0.0
@@ -98,7 +98,8 @@ class Durations:
             terminalreporter.write_line("".join(lines))
         total = sum(self.seconds.values())
         terminalreporter.write_line(
-            f"{total:7.1f} s  {len(self.seconds)} tests; largest memory of a process: {self.memory:.1f} GiB"
+            f"{total:7.1f} s  {len(self.seconds)} tests; largest memory of a process: {self.memory:.1f} GiB; this machine takes "
+            f"{self.slowness:.1f} times as long as the one where the budgets were set"
         )
         if self.budget:
             for sentence in self.excesses():

@@ -47,7 +47,7 @@ def test_bounds_are_kept_at_the_least_cost():
     """Order 2."""
     exact = cost_with_bounds(4.5)
     found = [least(steps, bounds=(-4.5, 4.5)) for steps in (20, 40)]
-    assert all(optimum.converged for optimum in found)
+    assert all(optimum.success for optimum in found)
     assert all(np.abs(optimum.controls).max() <= 4.5 + 1e-9 for optimum in found)
     errors = [optimum.cost - exact for optimum in found]
     assert np.log2(errors[0] / errors[1]) == pytest.approx(2.0, abs=0.1)
@@ -57,7 +57,7 @@ def test_a_limit_of_speed():
     """Parabolas of speed up to the limit V and down: their time is 3/2 (1 - 1/V), the cost 4 V^2 / 3 over it."""
     limit = 1.2
     found = least(80, limits=lambda state, u: state.p_s - limit)
-    assert found.converged
+    assert found.success
     assert np.asarray(found.trajectory.p_s).max() == pytest.approx(limit, abs=1e-8)
     assert found.cost == pytest.approx(4 * limit**2 / (4.5 * (1 - 1 / limit)), rel=1e-3)
 
@@ -71,7 +71,7 @@ def test_wide_bounds_change_nothing():
 def test_a_goal_out_of_the_reach_of_bounds_is_said():
     """Full force one way, then the other, comes 3/4 of the way."""
     found = least(bounds=(-3.0, 3.0))
-    assert not found.converged
+    assert not found.success
     assert found.miss == pytest.approx(0.25, abs=1e-6)
     assert "goal missed by 2.5e-01" in str(found)
 

@@ -48,7 +48,7 @@ def test_a_double_integrator():
     """u = 6 - 12 t, J = 6, multipliers (-12, 6); order 2, and one iteration, since the problem is linear."""
     found = {steps: point(steps) for steps in (10, 20)}
     for steps, optimum in found.items():
-        assert optimum.converged
+        assert optimum.success
         assert optimum.iterations <= 2
         assert optimum.miss < 1e-12
         assert optimum.trajectory.success
@@ -129,7 +129,7 @@ def test_a_cart_with_a_pendulum_from_rest_to_rest():
         grid="micro",
         solver=MARCH,
     )
-    assert optimum.converged
+    assert optimum.success
     assert optimum.controls.shape == (12, 2, 1)
     assert optimum.t.shape == (12, 2)
     assert optimum.miss < 1e-8
@@ -157,7 +157,7 @@ def test_a_goal_out_of_reach_is_said():
         num_steps=10,
         max_iterations=3,
     )
-    assert not optimum.converged
+    assert not optimum.success
     assert optimum.miss == pytest.approx(1.0)
     assert "not converged: the best that was found; goal missed by 1.0e+00" in str(optimum)
 

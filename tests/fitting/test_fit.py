@@ -46,7 +46,7 @@ def found():
 
 def test_parameters_are_found_within_their_errors(found):
     truth = {"omega": 20.0, "v_s[0]": float(CHAIN.v_s[0])}
-    assert found.converged
+    assert found.success
     assert found.labels == list(truth)
     for label, (low, high) in found.intervals(0.9999).items():
         assert low < truth[label] < high

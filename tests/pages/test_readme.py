@@ -97,7 +97,7 @@ def test_optimal_control(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     scope = {}
     exec(next(program for program in PROGRAMS if "vm.control.minimize(" in program), scope)
-    assert scope["optimum"].converged
+    assert scope["optimum"].success
     assert abs(scope["optimum"].cost - 6) < 1e-3
 
 

@@ -70,7 +70,7 @@ STEPPING = {"scheme": SCHEME, "macro_dt": MACRO_DT, "num_steps": STEPS}
 
 def minimize(cell: Cell) -> None:
     best = control.minimize(cell.problem, effort, actuate=push, num_controls=1, solver=_newton(cell), **STEPPING)
-    assert best.converged
+    assert best.success
     assert str(best)
     plots.save(plots.plot_control(best), cell.folder / "controls.png")
 

@@ -83,7 +83,7 @@ def minimize(
             and then.
 
     Returns:
-        The `Optimum`. If the iteration does not converge, its last point, with ``converged`` false.
+        The `Optimum`. If the iteration does not converge, its last point, with ``success`` false.
 
     Raises:
         ImportError: bounds or limits without the package piqp.
@@ -122,7 +122,7 @@ def minimize(
             if max(record["update"], record["gap"]) <= tolerance or record["part"] == 0.0:
                 break
     last = history[-1]
-    converged = all(last[name] <= tolerance for name in ("update", "gap", "miss", "over"))
+    success = all(last[name] <= tolerance for name in ("update", "gap", "miss", "over"))
     u = point.u
     driven = setup.driven(u)
     origin = replace(Origin.of(driven), names=names_of(opened_problem))
@@ -143,7 +143,7 @@ def minimize(
         last["over"],
         last["gap"],
         len(history),
-        converged,
+        success,
         replace(opened_problem, system=driven),
         history,
     )

@@ -25,7 +25,7 @@ class Optimum:
         over: largest violation of a limit, 0 for none.
         gap: largest distance between the end of a step and the next node, relative to the largest node.
         iterations: number of linear-quadratic problems that were solved.
-        converged: whether update, gap, miss and over are all below the tolerance.
+        success: whether update, gap, miss and over are all below the tolerance.
         problem: the problem with the forces of these controls: ``vm.simulate(optimum.problem, ...)`` runs it again, on other grids
             too.
         history: of every iteration cost, gap, miss, over, the largest update, and the part of the update that was taken.
@@ -42,12 +42,12 @@ class Optimum:
     over: float
     gap: float
     iterations: int
-    converged: bool
+    success: bool
     problem: Problem
     history: list[dict] = field(repr=False, default_factory=list)
 
     def __repr__(self) -> str:
-        status = "converged" if self.converged else "not converged: the best that was found"
+        status = "converged" if self.success else "not converged: the best that was found"
         over = f", limits by {self.over:.1e}" if self.over > 0 else ""
         return (
             f"cost {self.cost:.8g} after {self.iterations} iterations, {status}; goal missed by {self.miss:.1e}{over}, "

@@ -274,7 +274,7 @@ class _Search:
             by_parameters=by_parameters,
             by_starts=by_starts,
             iterations=int(iterations),
-            converged=bool(good),
+            success=bool(good),
             gap=float(gap),
             squares=squares,
             again=partial(_again, self, u, z),

@@ -38,7 +38,7 @@ class Fit:
         sigma: 1, or the estimated standard deviation of the values.
         undetermined: in words, the combinations of parameters that the data does not determine.
         iterations: of the search.
-        converged: whether the search ended by its tolerance.
+        success: whether the search ended by its tolerance.
         gap: largest gap between parts of multiple shooting, relative to the size of the motion.
         squares: (starts,) sums of squares at the ends of all searches.
         shooting: the runs of the fit.
@@ -53,7 +53,7 @@ class Fit:
     sigma: float
     undetermined: list[str]
     iterations: int
-    converged: bool
+    success: bool
     gap: float
     squares: Float[np.ndarray, "starts"]
     shooting: Shooting = field(repr=False)
@@ -140,7 +140,7 @@ class Fit:
     def doubts(self) -> list[str]:
         """Reasons to doubt the fit, in sentences; its intervals say little then, and are not printed."""
         sentences = []
-        if not self.converged:
+        if not self.success:
             sentences.append(
                 "The search did not end by its tolerance: raise max_steps, start closer, or cut the motion into segments."
             )
