@@ -86,7 +86,7 @@ SCHEMES = {
     ),
     "takahashi-imada": NamedScheme(
         takahashi_imada,
-        "2, of frequencies 4",
+        "2; frequencies to order 4",
         "fully-explicit with corrected kicks: a Hessian product beside each gradient",
     ),
     "galerkin": NamedScheme(galerkin, "2 x degree", "one rule (gauss or lobatto) on every term, any degree"),

@@ -163,7 +163,7 @@ def potentials(system: System, scheme: Scheme, macro_dt) -> tuple[Callable, Call
 
 
 def virtual_work(system: System, scheme: Scheme, path, along, t, macro_dt):
-    """Lagrange-d'Alembert: ``sum H w_i F(t_i, q_i, v_i) . q_i``, with the forces along one path and q_i on another."""
+    """Lagrange-d'Alembert: ``sum H w_i F(t_i, q_i, v_i) . Q_i``, with q_i and v_i on the path `along`, which is not varied, and Q_i on `path`."""
     known, varied = (sample(scheme, scheme.force, slow, fast, macro_dt) for slow, fast in (along, path))
     f_s, f_f = jax.vmap(system.forces)(t + macro_dt * known.theta, known.q_s, known.q_f, known.v_s, known.v_f)
     weights = varied.weights[:, None]

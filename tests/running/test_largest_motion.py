@@ -58,5 +58,5 @@ def test_points_and_coordinates_count_by_the_extent_of_the_system(fpu):
     assert motion.name == "elongations[1]"
     assert motion.amount == pytest.approx(0.4 / extent, rel=1e-12)
     assert "take macro_dt below" in motion.sentence(0.1)
-    assert "elongations[1] has run away before it" in motion._replace(amount=1e9).sentence(0.1)
+    assert "elongations[1] ran away before the failure" in motion._replace(amount=1e9).sentence(0.1)
     assert largest(fpu, state, 0.1, None).name == "q_f[1]"

@@ -107,7 +107,7 @@ def test_work_is_a_ledger():
         "change of the energy -1.25",
         "work of forces -1.5",
         "work of moving constraints 0.25",
-        "left of the balance 1e-06, the error of the run and of the two works",
+        "remainder of the balance 1e-06, the error of the run and of the two works",
         "resolved by the nodes to 0.0002",
     ]
     cut = np.array([0.0, 1.0, np.nan])

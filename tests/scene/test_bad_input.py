@@ -132,6 +132,11 @@ def test_body(arguments, message):
             [Spring(("modes", "bob"), 1.0)],
             "springs: modes has 2 general coordinates; this effect is between points",
         ),
+        (
+            [Body(f"b{i}", 1.0, [float(i)]) for i in range(33)],
+            [Potential(height, tuple(f"b{i}" for i in range(33)))],
+            "height: an element of 33 bodies, b0, b1, b2, ...; at most 32 bodies may share a function",
+        ),
         ([A], [LinearDamping(0.0)], "damping: coefficient is 0.0; it must be positive"),
         ([A], [HarmonicDrive("bob", [1.0], 1.0)], r"harmonic_drive: amplitude has shape \(1,\)"),
         (

@@ -259,7 +259,7 @@ def test_points_that_cannot_be():
     ]:
         with pytest.raises(ValueError, match=message):
             Scene([hub, rod, ball], [Spring(between, 1.0)])
-    with pytest.raises(ValueError, match=r"hub \(1, 0, 0\) has no mass of its own"):
+    with pytest.raises(ValueError, match=r"hub \(1, 0, 0\) has no mass; this effect needs the mass of a whole body"):
         Scene([hub, ball], [NBodyGravity(1.0, (("hub", [1.0, 0, 0]), "ball"))])
 
 

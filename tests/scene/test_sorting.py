@@ -15,6 +15,7 @@ from vmri_jax.scene import (
     Gravity,
     Kinetic,
     MagneticField,
+    PlaneContact,
     Potential,
     Revolute,
     RigidBody,
@@ -54,6 +55,27 @@ def test_charges_that_gyrate_fast_are_fast():
     assert paces(IONS.replace("magnetic_field", charge=[-20.0, 1.0])) == dict.fromkeys(IONS.by_name, "slow")
     flat = [Body(name, m, [1.0, i]) for i, (name, m) in enumerate({"a": 1.0, "b": 2.0, "c": 40.0}.items())]
     assert paces(Scene(flat, [MagneticField(-8.0, 1.0)])) == {"a": "fast", "b": "fast", "c": "slow"}
+
+
+def test_a_contact_acts_on_the_mass_of_a_small_body_and_not_on_its_inertia():
+    ball = RigidBody("ball", 2.0, (1e-4, 1e-4, 1e-4), [0.0, 0.0, 1.0])
+    scene = Scene([ball], [PlaneContact(point=[0, 0, 0], normal=[0, 0, 1], stiffness=800.0, smoothing=0.01), Gravity()])
+    assert frequency(scene, "plane_contact") == pytest.approx(np.sqrt(800.0 / 2.0))
+
+
+@pytest.mark.parametrize("far", [1.0, 100.0])
+def test_angular_accelerations_count_without_the_size_of_the_scene(far):
+    """A falling potential of the turn makes a wheel turn with T / J = 30 rad/s^2."""
+    wheel = RigidBody("wheel", 1.0, (0.1, 0.1, 0.2), [0.0, 0.0, 0.0])
+
+    def turn(q, params):
+        return -6.0 * q[0][4]  # the x axis leans towards y, at the rate of the turn about z
+
+    scene = Scene([wheel, Body("stone", 1.0, [far, 0.0, 0.0])], [Potential(turn, "wheel"), Gravity()])
+    effects = [effect for effect in scene.effects if effect.kind == "potential"]
+    rates = measure(scene.by_name, effects)
+    assert rates["turn"].rate == pytest.approx(np.sqrt(30.0))
+    assert rates["gravity"].rate.max() == pytest.approx(np.sqrt(9.81 / far))
 
 
 def test_gyration_and_stiffness_share_the_border():

@@ -9,7 +9,6 @@ from vmri_jax.accuracy.companions import check_function_of_run, with_error
 from vmri_jax.accuracy.steps import with_accuracy
 from vmri_jax.mechanics.arrays import whole_number
 from vmri_jax.mechanics.checks import check_flags, check_system
-from vmri_jax.mechanics.constraints import check_constraints
 from vmri_jax.mechanics.state import Movable, State
 from vmri_jax.running.adjoints import check_adjoint
 from vmri_jax.running.arguments import Steps
@@ -60,8 +59,8 @@ def simulate(
     transformed function: ``run.position("load")``. Under ``jax.vmap`` the solver `solvers.Auto` computes its fallback for every lane: take
     `simulate_batch`, or ``solver=vm.solvers.Nested()``.
 
-    If a system keeps its energy, a run with given steps warns with `LostEnergyWarning` when the energy changes by half of the largest
-    kinetic energy.
+    With constant masses and conserved energy, a run with given steps warns with `LostEnergyWarning` if the energy changes by more than half
+    of the largest kinetic energy.
 
     Args:
         system: a `Problem` or a scene; or a `System`, with a state.
@@ -129,9 +128,6 @@ def simulate(
     check_memory("simulate", run.state, scheme.num_micro, run.num_saves, save_micro)
     check_function_of_run(of, error, run)
     trajectory = run.in_pieces(progress)
-    # A first step may fail because the start is off its constraints, which has a clearer message.
-    if int(trajectory.failed_at) == 0:
-        check_constraints(run.system, run.state, "simulate: the state")
     if throw and int(trajectory.failed_at) >= 0:
         raise simulation_error(trajectory, run.macro_dt, save_every, scheme.num_micro)
     lost = lost_energy(trajectory, run.system, float(run.macro_dt)) if int(trajectory.failed_at) < 0 else ""

@@ -28,7 +28,7 @@ MOST_SAVED = 1000
 MOST_STEPS = 2**22
 """Macro steps of the longest trial. With a larger value searches for an accuracy out of reach take minutes."""
 MOST_TRIAL_SECONDS = 20.0
-"""Seconds of a trial, compiling included, after which the search stops to halve the steps of an uncertified trial. With a larger value
+"""Seconds of a trial, compiling included, after which the search no longer halves the steps of an uncertified trial. With a larger value
 searches take longer where no error can be certified, as for chaotic motion."""
 MOST_MICRO = 64
 """Most micro steps chosen; more save little unless an evaluation of the slow force takes a hundred times as long as of the fast force."""
@@ -36,7 +36,7 @@ SAME_COST = 1.3
 """Ratio of two numbers of micro steps up to which they count as equally fast, so that the second is not compiled. A larger value misses
 savings."""
 LEAST_TIME = 0.02
-"""Least seconds a and b in ``a + b N``, as a part of the seconds of a macro step, since the noise of the clock may make either of them zero.
+"""Least seconds a and b N in ``a + b N``, as a part of the seconds of a macro step, since the noise of the clock may make either of them zero.
 A larger value pulls the number of micro steps towards the present one."""
 LEAST_SHARE = 1e-3
 """Least slow share of the error, as a part of the fast share: the number of micro steps stays finite where the slow share vanishes. A larger

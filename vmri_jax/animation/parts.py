@@ -65,7 +65,7 @@ class Block:
 
 @dataclass(frozen=True)
 class Joint:
-    """A line of the drawing: a link or spring between two bodies, or from a body to a fixed point. Joints of a scene are drawn otherwise.
+    """A line of the drawing: a link or spring between two bodies, or from a body to a fixed point; no joint of a scene.
 
     Attributes:
         kind: "link" or "spring".

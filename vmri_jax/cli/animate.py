@@ -102,7 +102,7 @@ def _load(run: Path) -> tuple[Trajectory, str | dict]:
     """A saved run, every k-th node of a long store, and the drawing stored with the run, empty if it has none."""
     if run.suffix.lower() == ".zarr":
         stored = StoredTrajectory.open(run)
-        return stored[:: max(1, len(stored) // MOST_STORE_NODES)], stored.attributes.get("drawing", "")
+        return stored[:: -(-len(stored) // MOST_STORE_NODES)], stored.attributes.get("drawing", "")
     trajectory = Trajectory.load(run)
     with np.load(run, allow_pickle=False) as arrays:
         return trajectory, str(arrays["drawing"]) if "drawing" in arrays else ""

@@ -11,7 +11,7 @@ Scheme = Annotated[str, typer.Option(help="See [bold]vmri schemes[/bold].")]
 NumMicro = Annotated[int, typer.Option(help="Micro steps per macro step.")]
 Alpha = Annotated[
     float | None,
-    typer.Option(help="Part of a kick at the start of its step, 0 to 1, of explicit schemes. [dim]0.5[/dim]"),
+    typer.Option(help="Part of each kick at the start of a step, 0 to 1, explicit schemes. [dim]0.5[/dim]"),
 ]
 Degree = Annotated[int | None, typer.Option(help="Degree of the path, galerkin.")]
 Rule = Annotated[str | None, typer.Option(help="gauss or lobatto, galerkin. [dim]gauss[/dim]")]

@@ -320,7 +320,7 @@ def _extremes(piece: Trajectory) -> tuple:
 
 
 def default_save_every(steps: int) -> int:
-    """The divisor of `steps` that saves a number of nodes nearest to SAVED_NODES, every node of a short run."""
+    """The divisor of `steps` whose number of saved nodes is nearest to `DEFAULT_SAVED_NODES`; 1 for short runs."""
     if steps <= DEFAULT_SAVED_NODES:
         return 1
     small = [d for d in range(1, math.isqrt(steps) + 1) if steps % d == 0]

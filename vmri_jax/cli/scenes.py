@@ -34,7 +34,7 @@ def explain(
 ) -> None:
     """Show the grid of every body and effect of a scene, or function of a system, with the reason, its cost, and all frequencies.
 
-    The cost are unknowns, evaluations, and the time of the first derivatives at all nodes, once. Frequencies are of
+    The cost: unknowns, evaluations, and the time of one evaluation of the first derivatives at all nodes. Frequencies are of
     small vibrations about the start.
     """
     with refusals():

@@ -47,7 +47,7 @@ def sweep(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the store.")] = False,
     plot: Annotated[
         Path | None,
-        typer.Option(help="Draw the last number per run that is saved over the longest axes: .png, .svg or .pdf."),
+        typer.Option(help="Draw the last saved number of each run against the longest axes: .png, .svg or .pdf."),
     ] = None,
     example: Annotated[bool, typer.Option("--example", help="Write a commented file that runs, and stop.")] = False,
 ) -> None:
@@ -95,7 +95,7 @@ def _drawn(arguments: Mapping[str, Any]) -> str:
     drawn = drawn_by_default(arguments["save"], find_problem(arguments["system"]))
     if not drawn:
         raise ValueError(
-            f"--plot draws one number per run, and save = {json.dumps(arguments['save'])} keeps none. Add one to the file, e.g. save = "
+            f"--plot draws one number per run or per saved node, and save = {json.dumps(arguments['save'])} keeps neither. Add one to the file, e.g. save = "
             f"{json.dumps([*arguments['save'], 'energy_error'])}, or a function of your own that returns one, my_file.py:function."
         )
     return drawn[-1]

@@ -34,7 +34,7 @@ CONTROL = "vmri_jax.control"
 """Entry of ``system.params`` with the controls: u, the time when the first one starts, and the duration of each."""
 
 BORDER_WIDTH = 1e-6
-"""Half the width of the border between two controls, over the duration of a control: within it a time counts as the border, so that round-off
+"""Half the width of the border between two controls, relative to the duration of a control: within it a time counts as the border, so that round-off
 of a node's time does not choose a control. A larger one would mix controls at micro nodes beside the border."""
 
 
@@ -48,7 +48,7 @@ class Transcription(eqx.Module):
         cost: cost per time, ``cost(state, u) -> ()``.
         final_cost: cost of the last state, ``final_cost(state) -> ()``.
         goal: equations for the last state, ``goal(state) -> (e,)``.
-        limits: ``limits(state, u) -> (c,)``, not above zero at the end of every part of an interval; None for none.
+        limits: ``limits(state, u) -> (c,)``, not above zero at the end of every macro interval, for each of its controls; None for none.
         bounds: least and largest controls, (m,) each.
         parts: number of controls that follow each other in a macro interval: 1, or num_micro.
     """

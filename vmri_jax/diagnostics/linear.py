@@ -57,7 +57,7 @@ def _null_space(normals):
 def frequencies(system: Movable, state: State | None = None):
     """Angular frequencies of small vibrations about a state, the largest first.
 
-    ``Hessian(V + W) u = omega^2 M u`` on the tangent space of the constraints; zero where omega^2 is not positive. Away from an equilibrium
+    ``Hessian(V + W + sum_i V_i) u = omega^2 M u`` for shapes u tangent to the constraints; zero where omega^2 is not positive. Away from an equilibrium
     the frequencies are estimates, since the constraint forces are left out.
 
     Args:
@@ -137,8 +137,8 @@ def step_condition(system: Movable, scheme: Scheme, state: State | None = None, 
 def null_space_condition(system: Movable, scheme: Scheme, state: State | None = None, *, macro_dt) -> float:
     """Condition number of the Newton matrix of a macro step on its free motions, without any scaling.
 
-    The matrix is ``P^T A P`` with the matrix A of the equations of motion and a basis P of the null space of the constraints, which removes
-    the multipliers: the matrix of the solver `solvers.NullSpace`. A is the dense Newton matrix of the first iteration, which starts from
+    The matrix is ``P_0^T A P_1`` with the matrix A of the momentum equations and bases of null spaces, ``G_0 P_0 = 0`` at the start and
+    ``G_1 P_1 = 0`` at the end of an interval, which removes the multipliers: the matrix of the solver `solvers.NullSpace`. A is the dense Newton matrix of the first iteration, which starts from
     straight motion.
 
     Args:

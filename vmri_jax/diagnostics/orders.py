@@ -20,8 +20,8 @@ STUDENT = (np.nan, 12.71, 4.30, 3.18, 2.78, 2.57, 2.45, 2.36, 2.31, 2.26, 2.23)
 def fit_order(macro_dt, errors, plateau: float = 10.0, floor: float = 0.0) -> OrderFit:
     """Order of convergence: least-squares slope of log error over log step, without the round-off plateau.
 
-    The plateau begins, towards smaller steps, at the first interval whose slope is less than half the steepest slope.
-    Errors within a factor `plateau` of it, or of `floor`, are left out; at least the two largest steps stay.
+    The plateau begins, towards smaller steps, at the first interval after the steepest one with less than half its slope.
+    Errors below `plateau` times its level, or times `floor`, are left out; at least the two largest steps stay.
 
     Args:
         macro_dt: (k,) step sizes.

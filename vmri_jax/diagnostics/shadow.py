@@ -88,8 +88,8 @@ def shadow_energy(system: Movable, scheme: Scheme | Composition, trajectory: Tra
         run = vm.simulate(problem, scheme, macro_dt=0.01, num_steps=10_000)
         print(vm.diagnostics.shadow_energy(problem, scheme, run))
 
-    The macro nodes must resolve the fast motion: the band shrinks with k if ``omega H`` is below about 2, fast below 1/2. A band that
-    grows with k, from ``omega H = 0.9 pi`` on, announces the resonance of kicks at pi, which the energy itself shows from 0.95 pi on.
+    The macro nodes must resolve the fast motion: the band shrinks with k if ``omega H`` is below about 2, fast below 1/2. From
+    ``omega H = 0.9 pi`` on the band grows with k: a sign of the resonance of kicks at pi, which the energy shows only from 0.95 pi on.
 
     Args:
         system, scheme: as of the run. The system has neither forces nor constraints that depend on time, since it must conserve its energy.

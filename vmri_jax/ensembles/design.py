@@ -222,7 +222,7 @@ class Draws:
         return {name: draw.quantiles(points[:, i]) for i, (name, draw) in enumerate(self.columns.items())}
 
     def combinations(self, names: Sequence[str]) -> Rows:
-        """No rows for no names; drawn values are all different, so that columns with few values cannot be drawn.
+        """No rows. Drawn values are all different, and each would need a program of its own, so that names are refused.
 
         Raises:
             ValueError: there are names.

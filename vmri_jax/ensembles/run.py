@@ -48,7 +48,7 @@ class EnsembleError(RuntimeError):
         remainder = (
             "All others are"
             if all_tried
-            else f"No chunk of this call could, so the others were not tried; {len(ensemble.done)} chunks of earlier calls are"
+            else f"No chunk of this call succeeded, so that the remaining ones were not tried; {len(ensemble.done)} chunks of earlier calls are"
         )
         super().__init__(
             f"{len(self.failures)} of {ensemble.chunks.count} chunks could not be computed: runs {lanes}{ellipsis}. Chunk {first}: "

@@ -79,7 +79,8 @@ def fit(
         The `Fit`: parameters, their covariance, what the data does not determine, the run.
 
     Raises:
-        ValueError, TypeError: bad arguments; times off the grid; a parameter that nothing depends on; a start whose run fails.
+        ValueError, TypeError: bad arguments; times off the grid; a parameter that nothing depends on.
+        SimulationError: the run with the first parameters fails.
         ImportError: optimistix is not installed.
     """
     _optimistix()

@@ -15,10 +15,10 @@ from vmri_jax.mechanics.state import Problem
 from vmri_jax.running.trajectory import Trajectory
 
 SINGULAR_VALUE_TOLERANCE = 1e-7
-"""Smallest singular value of the Jacobian by relative changes of the parameters, over the largest one, of a direction that the data
+"""Least singular value of the Jacobian in relative changes of the parameters, as a part of the largest one, of a direction that the data
 determines. Below it round-off of the runs hides the change of the predictions; a larger one also drops directions that are determined badly."""
 STARTS_RANK_TOLERANCE = 1e-12
-"""Smallest singular value, over the largest one, of a direction that counts to the range of the Jacobian by the starts; below it a
+"""Smallest singular value, over the largest one, of a direction in the range of the Jacobian in the starts; below it a
 direction is round-off. A larger one leaves real effects of the starts to the parameters."""
 DOUBTED_PROBABILITY = 1e-6
 """Probability of a chi^2 as large as that of the fit, below which the report doubts the fit. A larger one doubts good fits by chance."""

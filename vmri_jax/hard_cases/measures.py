@@ -62,7 +62,7 @@ class Energy:
 
     @property
     def drifts(self) -> bool:
-        """Whether a line explains more than half of the band: chaotic motion alone moves the mean by a tenth or two."""
+        """Whether the linear trend is more than half of the band: chaotic motion alone moves the mean by a tenth or two."""
         return not self.share <= 0.5
 
 

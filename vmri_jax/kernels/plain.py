@@ -1,4 +1,4 @@
-"""Small dense algebra in textbook form, with NumPy's names and LAPACK, and steppers without memory: the reference for tests of `cpu`."""
+"""Small dense algebra by LAPACK, and steppers without special cases and without predictors: the reference for tests of `cpu`."""
 
 import jax.numpy as jnp
 

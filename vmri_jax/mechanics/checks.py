@@ -66,8 +66,8 @@ def check_params(params) -> None:
         check_precision(name, leaf)
         if is_concrete(leaf) and getattr(leaf, "dtype", np.asarray(leaf).dtype).kind not in "biufc":
             raise TypeError(
-                f"{name} is {leaf!r}; give arrays of numbers, which are handed to every function. What is no number "
-                "belongs into the functions themselves. A class of your own becomes a pytree by "
+                f"{name} is {leaf!r}; give arrays of numbers, which are handed to every function. Keep all other objects "
+                "inside the functions. A class of your own becomes a pytree by "
                 "jax.tree_util.register_dataclass or as an equinox.Module."
             )
         if is_concrete(leaf) and not np.isfinite(leaf).all():

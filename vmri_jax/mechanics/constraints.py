@@ -17,15 +17,14 @@ RANK = 1e-8
 LEAST_EIGENVALUE = 1e-12
 """Smallest eigenvalue of a regular mass matrix, relative to the largest one. A larger value refuses large mass ratios."""
 LEAST_COEFFICIENT = 1e-6
-"""Smallest coefficient of a row in a dependence of length one with which a message names the row. A larger value leaves rows out."""
+"""Rows with at least this coefficient in a normalised linear dependence are named in messages. A larger value leaves rows out."""
 LEAST_FAST_PART = 1e-12
-"""Smallest length of a constraint gradient by fast variables, relative to its whole length, with which the constraint depends on fast variables. A
-larger value refuses weak dependences."""
+"""Least ratio ``|dg/dq_f| / |dg/dq|`` of a constraint that counts as dependent on fast variables. A larger value refuses weak dependences."""
 PROJECTION_STEPS = 20
 """Gauss-Newton steps onto the constraints. They converge quadratically from close positions; a larger number takes longer."""
 MICRO_GRID = (
-    "A constraint held on the micro grid must be satisfiable by the fast variables: the slow ones have one value per macro step, "
-    "so that a slow-only constraint held at every micro node is over-determined (rank deficit num_micro - 1)."
+    "A constraint held on the micro grid must be satisfiable by the fast variables: the slow path is one polynomial per macro step, of degree r, "
+    "so that a slow-only constraint held at every micro node is over-determined (rank deficit r (num_micro - 1) per row)."
 )
 
 
@@ -67,7 +66,7 @@ def is_rank_deficient(rows, scaled_with=None, tolerance: float = RANK):
 
 
 def project_positions(system: System, t, q_s, q_f):
-    """Positions moved onto the constraints at a time, along ``M^-1 G^T`` (the nearest point in the mass metric)."""
+    """Positions moved onto the constraints at a time, along ``M^-1 G^T`` of the start: to first order the nearest point in the mass metric."""
     n_s = q_s.shape[0]
     q0 = jnp.concatenate([q_s, q_f])
 

@@ -106,7 +106,7 @@ def check_arguments(place: str, function: Callable, arguments: str, instead: str
     except TypeError:
         pass
     if not_there or len(required) > len(expected):
-        advice = instead or "What varies besides them belongs into the params."
+        advice = instead or "Pass all further data in the params."
     else:
         advice = "Give it all of these arguments in this order, whether it uses them or not."
     name = getattr(function, "__name__", type(function).__name__)

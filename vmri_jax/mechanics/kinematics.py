@@ -112,8 +112,8 @@ class Frames:
 class Kinematics:
     """The map from coordinates q to those of points and rigid bodies Q; compared by value.
 
-    Q_s is q_s with the centres and directors of the bodies after it that depend on slow coordinates alone; Q_f is q_f with those of bodies
-    that depend on fast ones alone, and then with all others.
+    Q_s is q_s followed by centres and directors of the bodies that depend on slow coordinates alone; Q_f is q_f followed by the bodies that
+    depend on fast coordinates alone, then by all other bodies.
 
     Args:
         roots: places of the coordinates of root bodies in q_s and q_f.

@@ -117,15 +117,19 @@ def tell_of_velocities(caller: str, taken: float, project: bool, constraints: st
         constraints: name of the constraints in the message.
     """
     message = f"{caller}: {min(taken, 1.0):.2%} of the velocities (in the norm of the kinetic energy) do not fit {constraints}"
-    scenes = "of a scene, with_rates({joint: rate}) finds all that belong to the rate of a joint"
+    scenes = "for a scene, with_rates({joint: rate}) gives all velocities that belong to the rate of a joint"
     if project and taken > REPORTED_PROJECTION:
         warnings.warn(f"{message}, and project=True has taken them away; {scenes}.", stacklevel=3)
     if project:
         return
     if taken > REFUSED_VIOLATION:
-        raise ValueError(f"{message}. Correct the velocities, or pass project=True for the nearest that fit; {scenes}.")
+        raise ValueError(
+            f"{message}. Correct the velocities, or pass project=True for the nearest consistent velocities; {scenes}."
+        )
     if taken > REPORTED_VIOLATION:
-        warnings.warn(f"{message}; the nearest that fit are taken. Pass project=True if that is meant.", stacklevel=3)
+        warnings.warn(
+            f"{message}; the nearest consistent velocities are taken. Pass project=True if that is meant.", stacklevel=3
+        )
 
 
 @dataclass(frozen=True)

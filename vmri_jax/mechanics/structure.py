@@ -158,7 +158,7 @@ def curved_directions(function: Callable, q) -> np.ndarray:
 
 
 def _independent(rows: np.ndarray) -> np.ndarray:
-    """A basis of the span of the rows (k, n), of rows with few entries; of unit vectors if the basis is as large as the number of entries."""
+    """A sparse basis of the row space, chosen among the rows (k, n); unit vectors if its rank is the number of columns with non-zeros."""
     kept = np.zeros((0, rows.shape[1]))
     for row in sorted(rows, key=np.count_nonzero):
         if np.linalg.matrix_rank(more := np.concatenate([kept, row[None]])) == len(more):

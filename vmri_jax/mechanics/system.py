@@ -221,7 +221,7 @@ class System(eqx.Module):
 
     @property
     def keeps_energy(self) -> bool:
-        """Whether the energy is constant: no forces without a potential, no constraints that depend on time."""
+        """Whether the energy is conserved: no `force`, and no constraint that depends on time."""
         return self.force is None and not self.is_rheonomic
 
     def forces(self, t, q_s, q_f, v_s, v_f):

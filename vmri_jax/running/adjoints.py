@@ -8,7 +8,7 @@ the steps from the last to the first and needs the state at which each step star
 * *checkpoint*: the run keeps the starts of some steps and computes the steps between them again, see `Recursive`;
 * *reversible*: a step of length -macro_dt of a symmetric scheme undoes the step before it, so that the run is stepped back from each saved
   node to the one before;
-* *forward*: no start is needed: forward mode computes one tangent run for each number that is differentiated by.
+* *forward*: no start is needed: forward mode computes one tangent run for each number in which the run is differentiated.
 """
 
 import warnings
@@ -49,7 +49,7 @@ def check_adjoint(adjoint: str, scheme: Scheme | Composition) -> None:
     if adjoint == "reversible" and is_concrete(scheme) and not scheme.is_symmetric:
         raise ValueError(
             "simulate: adjoint='reversible' needs a symmetric scheme, whose step of -macro_dt undoes the step of macro_dt; "
-            "scheme.describe() says which is. Take 'checkpoint'."
+            "scheme.describe() says whether a scheme is symmetric. Take 'checkpoint'."
         )
 
 
@@ -67,7 +67,7 @@ def chosen_adjoint(adjoint: str, scheme: Scheme | Composition, num_steps: int, h
 
 @partial(jax.custom_jvp, nondiff_argnums=(0, 1))
 def announced(kind: str, num_steps: int, arrays):
-    """Return the arrays; whoever differentiates by them is warned once which adjoint was chosen."""
+    """Return the arrays; whoever differentiates in them is warned once which adjoint was chosen."""
     return arrays
 
 
@@ -75,7 +75,7 @@ def announced(kind: str, num_steps: int, arrays):
 def _announce(kind: str, num_steps: int, primals, tangents):
     warnings.warn(
         f"simulate: derivatives of these {num_steps} steps use adjoint={kind!r}, which gives first derivatives in reverse mode only. "
-        "Name one to choose it: 'stored' for other modes and second derivatives, 'checkpoint', 'reversible', or 'forward' for few parameters.",
+        "To choose, give adjoint='stored' (all modes, second derivatives), 'checkpoint', 'reversible', or 'forward' (few parameters).",
         stacklevel=2,
     )
     return primals[0], tangents[0]

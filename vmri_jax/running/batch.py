@@ -29,7 +29,7 @@ more of them wait for slower memory."""
 FEWEST_LANES = 64
 """Fewest lanes of a chunk, even where they exceed `NUMBERS_PER_CHUNK`: with fewer lanes the fixed cost of an operation outweighs the cache."""
 MOST_LANES = 1024
-"""Most lanes of a chunk; more make the chunk of a small batch mostly padding."""
+"""Most lanes of a chunk; with more, the last chunk of a batch may be mostly padding."""
 
 
 class FailedLanesWarning(UserWarning):

@@ -35,7 +35,7 @@ DIMENSIONS = {
 MICRO = "t_micro", "q_f_micro"
 """Names of the arrays of micro nodes."""
 FILL = {"f": np.nan, "i": -1}
-"""Missing values by kind of number, float or integer: of the solver's work before the start, and of rows not yet written."""
+"""Fill values of floats and of integers: for the solver's work before the start, and for rows not yet written."""
 
 
 def rows_of(run: SavedRun) -> dict[str, np.ndarray]:

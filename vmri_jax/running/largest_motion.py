@@ -48,11 +48,11 @@ class Motion(NamedTuple):
         step = "micro step" if self.micro else "macro step"
         moves = f"turns {self.amount:.2g} rad" if self.turns else f"moves {self.amount:.1%} of the extent of the system"
         if self.size < 1:
-            return f"Most motion before it: {self.name} {moves} in a {step}, which is little."
+            return f"Largest motion before the failure: {self.name} {moves} in a {step}, which is little."
         if self.size > RUN_AWAY:
             return (
-                f"{self.name} has run away before it: the run was unstable, its steps too large for a vibration. Look at the energy "
-                "of the nodes before."
+                f"{self.name} ran away before the failure: the run was unstable, its steps too large for a vibration. Look at the "
+                "energy of earlier nodes."
             )
         else_fast = ", or more micro steps" if self.micro else ", or make it fast, so that micro steps follow it"
         return (

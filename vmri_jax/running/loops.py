@@ -34,7 +34,7 @@ PLAIN = Loops()
 class Stored(Loops):
     """Reverse mode keeps the start of every step and the solution of its equations, and computes everything else again.
 
-    The solution is the array that a `Solver` names `ROOT`; a stepper without this name computes its step again.
+    `Solved` gives the solution of a step and its status the name `ROOT`; the steps of any other stepper are computed again.
     """
 
     def repeat(self, count: int, step: Callable, carry):

@@ -13,7 +13,7 @@ from vmri_jax.running.trajectory import Trajectory
 
 
 class LostEnergyWarning(UserWarning):
-    """The energy of a system that keeps it has changed by half of the largest kinetic energy of a run."""
+    """The energy of a system with constant masses that keeps it has changed by more than half of the largest kinetic energy of a run."""
 
 
 REPORTED_CHANGE = 0.5

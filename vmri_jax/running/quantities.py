@@ -54,7 +54,7 @@ class Work(NamedTuple):
                 "change of the energy": f"{forces + constraints + balance:.6g}",
                 "work of forces": f"{forces:.6g}",
                 "work of moving constraints": f"{constraints:.6g}",
-                "left of the balance": f"{balance:.2g}, the error of the run and of the two works",
+                "remainder of the balance": f"{balance:.2g}, the error of the run and of the two works",
                 "resolved by the nodes to": f"{float(self.uncertainty):.2g}",
             },
         )
@@ -119,7 +119,7 @@ class Quantities(ABC):
         return _of_body(run, body, _bodies, run.states.q_s, run.states.q_f)
 
     def momentum(self, body: str):
-        """Momenta of a body at the saved nodes, (..., k, size); in joint coordinates of a rigid body ``M v`` of itself alone.
+        """Momenta of a body at the saved nodes, (..., k, size); for a rigid body in joint coordinates its own ``M v``, without bodies that it carries.
 
         Args:
             body: its name; "q_s" or "q_f" for all coordinates of a system without names.
@@ -294,7 +294,7 @@ def _states(run: SavedRun, micro: bool, with_start: bool = False) -> State:
         return run.states
     reason = why_not(run.t, run.t_micro)
     if reason:
-        raise ValueError(f"micro nodes: the run has none between all of its nodes: {reason}.")
+        raise ValueError(f"micro nodes: they do not fill all intervals of the run: {reason}.")
     nodes = _all_nodes(run)
     p_s, p_f = at_nodes(_momenta, run.origin, nodes)
     states = State(nodes.t, nodes.q_s, nodes.q_f, p_s, p_f)

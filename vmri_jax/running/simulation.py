@@ -48,7 +48,7 @@ PARTS_OF_A_BAR = 50
 """Parts of a run with a progress bar. More parts move the bar more smoothly, and each costs a call of some 30 microseconds."""
 STEPPING = "the run: compiling its program if it is new, then taking its steps"
 """Line about a run that takes more than two seconds."""
-FALLING_BACK = "the first solver did not solve a step: computing the run again with exact matrices (solvers.Arrowhead), as accurate but slower"
+FALLING_BACK = "the first solver did not solve a step: repeating the run from there with exact matrices (solvers.Arrowhead), as accurate but slower"
 """Line about a fallback that takes more than two seconds."""
 
 
@@ -235,15 +235,16 @@ class Simulation:
         return jax.tree.structure(Model(self.solver.exact(), self.scheme, self.system))
 
     def check(self, state_name: str = "simulate: the state", constraints: bool = True) -> None:
-        """Refuse a system whose functions return wrong types or shapes, and a state that violates the constraints.
+        """Refuse a system whose functions return wrong types or shapes, and a state that violates the constraints; equal ones are checked once.
 
         Args:
             state_name: the state in messages.
             constraints: whether to check the constraints at the state.
         """
-        shapes = tuple(a.shape for a in self.arrays.state)
-        numbers = tuple(np.asarray(leaf).tobytes() for leaf in self.arrays.model)
-        _check_once(_Checked((self._model[1], shapes, numbers), self.system, self.state, state_name, constraints))
+        positions = (self.state.t, self.state.q_s, self.state.q_f) if constraints else ()
+        numbers = tuple(np.asarray(number).tobytes() for number in (*self.arrays.model, *positions))
+        key = self._model[1], self.state.q_s.shape, self.state.q_f.shape, numbers
+        _check_once(_Checked(key, self.system, self.state, state_name, constraints))
 
     def start(self, state: State | None = None, step: int = 0, fell_back: bool = False) -> Checkpoint:
         """The checkpoint before the first step; or before step number `step` at another state, with blank memory."""
@@ -371,7 +372,7 @@ def _float(value):
 
 @dataclass(frozen=True)
 class _Checked:
-    """A system and a state to be checked, equal to every other one of the same `key`: structure, shapes and numbers of the model."""
+    """A system and a state to be checked, equal to every other one of the same `key`: structure and numbers of the model, time and positions."""
 
     key: tuple
     system: System = field(compare=False)
@@ -382,7 +383,7 @@ class _Checked:
 
 @lru_cache(maxsize=256)
 def _check_once(checked: _Checked) -> None:
-    """Check a system at a state; the cache skips the check for equal ones, which would take longer than a short run."""
+    """Check a system at a state. The check takes longer than a short run; the cache skips it for an equal `key`."""
     check_system(checked.system, checked.state.q_s, checked.state.q_f)
     check_closures(checked.system, checked.state.q_s, checked.state.q_f)
     check_mass(checked.system, checked.state.q_s, checked.state.q_f)

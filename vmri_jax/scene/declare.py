@@ -78,7 +78,7 @@ class Parameter:
     """A field with numbers that the function of an effect gets as an array.
 
     Args:
-        shape: "number", () the same for all n elements or (n,); "vector", (d,) or (n, d), which the function gets as (n, d);
+        shape: "number", () the same for all n elements or (n,); "vector", (d,) or (n, d), which the function gets as (n, d), for n = 1 as (d,);
             "common", (d,) the same for all elements; "array", any shape, the same for all elements.
         sign: "positive", "at least zero", or "" for any.
         measured: if True, the value at the start takes the place of None, see `Effect.rest`; if False, params lack a field that is None.

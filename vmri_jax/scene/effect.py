@@ -1,4 +1,4 @@
-"""Effects: each contributes one function of the positions of some bodies to the Lagrangian, the constraints or the forces."""
+"""Effects: each adds a function of positions, velocities and time of some bodies to the Lagrangian, the constraints or the forces."""
 
 from abc import ABC
 from collections.abc import Mapping, Sequence
@@ -23,7 +23,7 @@ Kind = Literal["kinetic", "potential", "constraint", "force", "control"]
 DRAWN = {"link": "links", "spring": "springs"}
 """For each symbol that an effect may draw between two bodies, the list of the drawing that holds it."""
 MOST_ROLES = 32
-"""Most bodies of an element: the two bodies of each of sixteen joints that one equation couples. A larger number costs nothing."""
+"""Most bodies of an element: the two bodies of each of sixteen joints that one equation couples. More are refused."""
 POINTS = tuple(f"at_{role}" for role in range(MOST_ROLES))
 """Names of the parameters that hold points fixed in rigid bodies, one for each role."""
 ALONE = "alone"
@@ -211,6 +211,11 @@ class Effect(ABC):
         """Refuse names of no body, and bodies whose coordinates the function cannot take."""
         elements = self.elements(bodies)
         for element in elements:
+            if len(element) > MOST_ROLES:
+                raise ValueError(
+                    f"{self.name}: an element of {len(element)} bodies, {', '.join(map(str, element[:3]))}, ...; at most {MOST_ROLES} bodies "
+                    "may share a function. Write the function with vmri_jax.System, or join bodies to one with more coordinates."
+                )
             if not moving(element):
                 raise ValueError(f"{self.name}: {element} is about the ground alone, which does not move; name a body.")
             for name in element:
@@ -343,11 +348,11 @@ class Effect(ABC):
         mass = end_of(bodies, name).mass
         if mass is None:
             raise ValueError(
-                f"{self.name}: {label_of(name)} has no mass of its own; it acts on the masses of whole bodies. Give the name alone."
+                f"{self.name}: {label_of(name)} has no mass; this effect needs the mass of a whole body. Name a body with mass, without a point."
             )
         if mass.ndim:
             raise ValueError(
-                f"{self.name}: {name} has a mass for each coordinate; this effect needs bodies with one mass. Give bodies=[...]."
+                f"{self.name}: {name} has a mass for each coordinate; this effect needs one mass for each body. Leave this body out, or give it one mass."
             )
         return mass
 

@@ -76,7 +76,7 @@ class Ledger:
 
     @property
     def unknowns(self) -> int:
-        """Unknowns of a macro step, multipliers included: ``r n_s + r n_gs + num_micro r (n_f + n_g)``, r the degree."""
+        """Unknowns and multipliers of all stages of a macro step: ``r (n_s + n_gs + num_micro (n_f + n_g))`` for each, with degree r and rows n_gs of g_s, n_g of g."""
         return sum(row.unknowns + row.multipliers for row in self.rows)
 
     def table(self) -> PrintedTable:
@@ -216,7 +216,7 @@ def _macro_step(system: System, scheme, state: State, macro_dt: float | None, fr
 
 
 def _turning(sorting: Sorting) -> float:
-    """``max |v| / max |q|`` at the start, rad/s: of a spinning body about its angular velocity."""
+    """``max |v| / max |q|`` at the start, rad/s; for a spinning body roughly its angular velocity."""
     q_s, q_f, v_s, v_f = (np.abs(x).max(initial=0.0) for x in sorting.start)
     return float(max(v_s, v_f) / max(q_s, q_f, 1e-300))
 

@@ -38,7 +38,7 @@ IDLE = {
         nhfield* geom_matid geom_group geom_castshadow geom_rgba site_type site_dataid site_matid site_group site_size site_rgba
         site_sameframe jnt_group paths npaths""",
     "sensors": "sensor_* nsensor* opt.magnetic opt.disableflags.SENSOR",
-    "data of users, and states for qpos": "body_user jnt_user geom_user site_user nuser* numeric_* nnumeric* text_* ntext* tuple_* ntuple* key_*",
+    "data of users, and other fields of keyframes": "body_user jnt_user geom_user site_user nuser* numeric_* nnumeric* text_* ntext* tuple_* ntuple* key_*",
     "values that MuJoCo derives from other fields": """stat.* signature flg_* ngravcomp body_rootid body_dofnum body_dofadr
         body_treeid body_geomnum body_geomadr body_simple body_sameframe body_subtreemass body_invweight0 body_margin body_contype
         body_conaffinity body_bvhadr body_bvhnum bvh_* nbvh* oct_* noct dof_bodyid dof_parentid dof_treeid dof_Madr dof_simplenum
@@ -61,7 +61,7 @@ class Refusal:
 
     Attributes:
         without: the motion of the model if `ignore` names this part; for a part that `ignore` may not name, advice.
-        fields: the fields whose entries define the part, each with the flags that switch it off: any of them, or all flags of a string.
+        fields: the fields whose entries define the part, each with the flags that switch it off: any entry is enough, of an entry with several flags all of them.
         parts: fields without meaning if the part is absent.
         ignorable: whether `ignore` may name this part.
     """
@@ -74,7 +74,7 @@ class Refusal:
 
 REFUSED = {
     "actuators": Refusal(
-        "no actuator exerts anything, and neither do their armature and damping act",
+        "actuators exert no force, and their armature and damping are left out",
         {
             "nactuator": ("ACTUATION",),
             "actuator_armature": (),
@@ -125,7 +125,7 @@ REFUSED = {
         "the dampers that are named are left out, with their linear part", {"dof_dampingpoly": ("DAMPER",)}
     ),
     "springs and dampers of ball and free joints": Refusal("they are left out"),
-    "couplings": Refusal("joints and tendons that an equality ties move by themselves"),
+    "couplings": Refusal("joints and tendons in these equalities move independently"),
     "soft equalities": Refusal(
         "they are kept to round-off, as all equalities are",
         {"eq_solref": (CONSTRAINTS, "EQUALITY"), "eq_solimp": (CONSTRAINTS, "EQUALITY")},

@@ -5,8 +5,8 @@ total time derivative in L adds nothing to f. The stiffness is ``K = -df/dq``, t
 and M is the mass matrix of the bodies of an element. The frequency of the element is the largest w at the start with
 ``det(K - w^2 M) = 0`` or ``det(G - i w M) = 0``.
 
-The rate of the element is the larger of this frequency and ``sqrt(a / L)``, with its largest acceleration a of bodies at rest and the
-size L of the scene. The border is the middle of the widest gap between all rates, on a logarithmic scale.
+The rate of the element is the largest of this frequency, ``sqrt(a / L)`` and ``sqrt(alpha)``, with the largest acceleration a and angular
+acceleration alpha that it gives to bodies at rest, and the size L of the scene. The border is the middle of the widest gap between all rates, on a logarithmic scale.
 """
 
 from collections.abc import Mapping, Sequence
@@ -50,6 +50,7 @@ class Linearised(NamedTuple):
     force: on the bodies at rest.
     stiffness, gyroscopic: K and G.
     mass: d2L/dv2, the part of the element in the mass matrix.
+    translation, turning: matrices from these velocities to the rates of positions and to the rates of directors.
     """
 
     columns: np.ndarray
@@ -57,6 +58,8 @@ class Linearised(NamedTuple):
     stiffness: np.ndarray
     gyroscopic: np.ndarray
     mass: np.ndarray
+    translation: np.ndarray
+    turning: np.ndarray
 
 
 def measure(bodies: Bodies, effects: Sequence[Effect]) -> dict[str, Rates]:
@@ -107,20 +110,23 @@ def _rates(effect: Effect, bodies, elements: Sequence[Linearised], mass: np.ndar
     frequency, rate = np.zeros(len(elements)), np.zeros(len(elements))
     for i, (names, element) in enumerate(zip(effect.elements(bodies), elements, strict=True)):
         element_mass = mass[np.ix_(element.columns, element.columns)]
-        lightest = np.linalg.eigvalsh(element_mass).min()
-        if not lightest > 0:
+        if not np.linalg.eigvalsh(element_mass).min() > 0:
             raise ValueError(
                 f"{effect.name}: the kinetic energy of {', '.join(names)} is not positive at the start; change masses or kinetic "
                 "effects, or give every body a pace and every potential between fast bodies a rate."
             )
         root = np.linalg.cholesky(element_mass)
-        # largest eigenvalue w^2 of M^-1 K, or the curvature that the effect declares over the smallest mass
+        # w^2: the largest eigenvalue of M^-1 K, or the declared curvature k times the largest eigenvalue of A M^-1 A^T, where A v are the rates of
+        # positions: k / m for a body of mass m
         matrix = _scaled(root, (element.stiffness + element.stiffness.T) / 2)
-        largest = max(np.linalg.eigvalsh(matrix).max(), curvatures[i] / lightest)
+        mobility = np.linalg.solve(root, element.translation.T)
+        largest = max(np.linalg.eigvalsh(matrix).max(), curvatures[i] * np.linalg.norm(mobility, 2) ** 2)
         if largest > ROUND_OFF * np.abs(matrix).max(initial=0.0):
             frequency[i] = np.sqrt(largest)
         frequency[i] = max(frequency[i], np.linalg.norm(_scaled(root, element.gyroscopic), 2))
-        rate[i] = max(frequency[i], np.sqrt(np.abs(np.linalg.solve(element_mass, element.force)).max() / size))
+        acceleration = np.linalg.solve(element_mass, element.force)
+        a, alpha = (np.abs(part @ acceleration).max(initial=0.0) for part in (element.translation, element.turning))
+        rate[i] = max(frequency[i], np.sqrt(a / size), np.sqrt(alpha))
     # elements between the same bodies are terms of a series, as of a torsion: they get the rate of the fastest
     same_bodies: dict[frozenset, list[int]] = {}
     for i, names in enumerate(effect.elements(bodies)):
@@ -148,13 +154,18 @@ def _linearise(effect: Effect, bodies: Bodies, columns: Mapping[str, np.ndarray]
         v = jnp.concatenate([bodies[name].rates for name in element])
         force, *matrices = map(np.asarray, _derivatives(term, effect.kind == "kinetic", q, v, element_params))
         motions = block_diag(*(bodies[name].motions for name in element))
-        projected = motions.T @ force, *(motions.T @ matrix @ motions for matrix in matrices)
-        if not all(np.isfinite(part).all() for part in projected):
+        force, (stiffness, gyroscopic, mass) = motions.T @ force, [motions.T @ matrix @ motions for matrix in matrices]
+        if not all(np.isfinite(part).all() for part in (force, stiffness, gyroscopic, mass)):
             raise ValueError(
                 f"{effect.name}: its energy between {', '.join(map(label_of, effect.elements(bodies)[i]))} has no finite derivatives at the "
                 "start; move these bodies, or smooth the energy."
             )
-        linearised.append(Linearised(np.concatenate([columns[name] for name in element]), *projected))
+        # the first three coordinates of a rigid body are its centre, all others directors
+        centres = [(bodies[name].motions, 3 if bodies[name].rigid else bodies[name].size) for name in element]
+        translation = np.asarray(block_diag(*(m[:k] for m, k in centres)))
+        turning = np.asarray(block_diag(*(m[k:] for m, k in centres)))
+        joined_columns = np.concatenate([columns[name] for name in element])
+        linearised.append(Linearised(joined_columns, force, stiffness, gyroscopic, mass, translation, turning))
     return linearised
 
 

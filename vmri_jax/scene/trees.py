@@ -2,7 +2,7 @@
 
 A joint whose freedoms are coordinates without a singularity may carry a body. In each loop of such joints one joint closes the loop: it
 carries no body, and its rows stay constraints. Prim's algorithm chooses these joints. It grows a spanning tree from the ground, and from
-a body of each mechanism that is not tied to the ground: a body with the pace "slow", or else the heaviest. It adds the joint with the
+a body of each mechanism that is not tied to the ground: a body with the pace "slow", then the one with most directors, then the heaviest. It adds the joint with the
 fewest freedoms first, so that the joints left over have the fewest rows, and among equals the joint nearest to the root, so that trees
 are not deep.
 """

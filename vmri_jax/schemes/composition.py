@@ -38,7 +38,7 @@ class NamedComposition:
 
 
 def _jump(num_stages: int) -> tuple[float, ...]:
-    """First half of s equal coefficients c with another one in the middle: ``(s - 1) c + c_mid = 1`` and ``(s - 1) c^3 + c_mid^3 = 0``."""
+    """First half of s coefficients, all equal to c but c_mid in the middle: ``(s - 1) c + c_mid = 1`` and ``(s - 1) c^3 + c_mid^3 = 0``."""
     outer = 1 / (num_stages - 1 - (num_stages - 1) ** (1 / 3))
     return (outer,) * (num_stages // 2) + (1 - (num_stages - 1) * outer,)
 

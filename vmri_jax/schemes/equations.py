@@ -12,8 +12,9 @@ Forces add their virtual work ``H sum_i w_i F(t_i, q_i, v_i) . dq_i / dX`` to ev
 of these equations: p_s and p_f are the momenta after the kicks at the start of the step (`vmri_jax.steppers.kicked`).
 
 The momentum equations are multiplied by the micro step h, and the multipliers absorb their weights: the unknowns are
-``mu_j = h H w_j lambda_j`` and ``H^2 w_i nu_i``, so that the Newton matrix consists of ``k_ij M_f``, ``k_ij M_s / num_micro`` and the
-constraint Jacobian for every step size, up to ``h^2`` times the curvature of potentials. The w_j are weights on the macro interval: with
+``mu_j = h H w_j lambda_j`` and ``H^2 w_i nu_i``, so that for constant masses M_s, M_f the Newton matrix consists of ``k_ij M_f``,
+``k_ij M_s / num_micro`` and the constraint Jacobian for every step size, up to ``h^2`` times the curvature of potentials, with
+``k_ij = sum_n w_n l_i'(c_n) l_j'(c_n)`` of the rule of T. The w_j are weights on the macro interval: with
 n = num_micro, the weight of the constraint rule over n, summed over both intervals at nodes where two intervals meet
 (`multiplier_scales`).
 """
@@ -102,7 +103,7 @@ class StepEquations(eqx.Module):
         return self.micro_dt * (terms.at_nodes_inside(path) + self.virtual_work(path, held))
 
     def virtual_work(self, path: Path, held: Path):
-        """Lagrange-d'Alembert: ``H sum_i w_i F(t_i, q_i, v_i) . q_i``, with the forces along `held`."""
+        """Lagrange-d'Alembert: ``H sum_i w_i F(t_i, q_i, v_i) . Q_i``, with q_i and v_i on the path `held`, which is not varied, and Q_i on `path`."""
         if self.system.force is None:
             return 0.0
         nodes = self.force_nodes

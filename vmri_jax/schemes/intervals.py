@@ -100,7 +100,7 @@ class IntervalNodes:
 
     @classmethod
     def of(cls, nodes: Nodes) -> "list[IntervalNodes]":
-        """The nodes of a rule: one entry for all rows with a node in every interval, and one for each row with nodes in some intervals.
+        """The nodes of a rule: one entry for all rows of groups with a node in every interval, and one for each other row.
 
         So functions are evaluated at the nodes of their rule alone: a potential may not be defined elsewhere, and a rule on the macro step
         has no node in most intervals.

@@ -321,7 +321,7 @@ def gradient_corrected(placed: PlacedRule) -> PlacedRule:
 
     Fast kicks act through ``W - h^2/24 grad W . M^-1 grad W``, slow ones through
     ``V - H^2/24 grad V . M^-1 grad V - h^2/12 grad V . M^-1 grad W``, the last term where W is corrected too. With
-    velocity Verlet in between this is the method of Takahashi and Imada, J. Phys. Soc. Jpn. 53 (1984), and Rowlands,
+    a free drift between the kicks this is the method of Takahashi and Imada, J. Phys. Soc. Jpn. 53 (1984), and Rowlands,
     J. Comput. Phys. 97 (1991). Its order is 2, its effective order 4: a change of coordinates by O(h^2) conjugates it to a method of order
     4. Frequencies of harmonic vibrations do not depend on coordinates, and are of order 4 without that change.
     """

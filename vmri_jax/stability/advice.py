@@ -320,7 +320,7 @@ def _stages(scheme: Scheme | Composition) -> Iterator[Finding]:
         "note",
         "stages",
         f"The {len(parts)} stages of the composition make steps of {parts.min():.3g} to {parts.max():.3g} macro steps, some "
-        f"backwards: it meets the stability limits of its scheme at steps about {longest:.3g} times shorter.",
+        f"backwards: the largest stable macro step of the composition is about that of its scheme divided by {longest:.3g}.",
         longest,
     )
 

@@ -1,6 +1,6 @@
 """Linear models: two coupled oscillators, and the small motions of any system about a configuration.
 
-A step is stable if its derivative is. At an equilibrium the derivative of the step is exactly the step of the second-order
+A step is linearly stable if all powers of its derivative stay bounded. At an equilibrium the derivative of the step is exactly the step of the second-order
 expansion of the system; elsewhere the expansion describes the *frozen* problem: constant forces hold the configuration at rest.
 In both cases the expansion is a `System`, to which every scheme applies unchanged.
 """
@@ -63,7 +63,7 @@ class SmallMotions:
     embed, read: matrices (2 n, 2 d) from (eta, pi) to (q_s, q_f, p_s, p_f), and (2 d, 2 n) back.
     slow: (d, d) Hessian of V with its share of the constraint forces.
     fast: (d, d) Hessian of W.
-    stiffness: (d, d) Hessian of all potentials and constraint forces.
+    stiffness: (d, d) minus the derivative of all forces in eta: of potentials, constraints, the kinetic energy, and F.
     damping: (d, d) matrix of the velocities, gyroscopic and dissipative.
     rest: the state of zero displacement and momentum of the expansion.
     further: (d, d) Hessians of further potentials, by "potential " and their name.
@@ -138,7 +138,7 @@ def small_motions(system: Movable, state: State | None = None) -> SmallMotions:
 
     Every term is expanded separately, ``V(q + d) ~ d^T V'' d / 2`` and so on, and keeps its quadrature rule in the scheme. Constraints
     become ``G d + d^T g'' d / 2``. Their multipliers ``lambda`` are taken from the moving state, so that a swinging rod is under tension,
-    and act through ``lambda . g''``. V balances its share of the constraint forces by a gradient in the expanded V, on the grid of V; a
+    and act through ``lambda . g''``. A linear term in the expanded V balances the constraint forces due to dV/dq, on the grid of V; a
     constant force on the micro grid balances all other constraint forces. At an equilibrium this reproduces the original terms. The
     kinetic energy is expanded at rest, forces at the velocity of the state.
 

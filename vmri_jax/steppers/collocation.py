@@ -42,7 +42,7 @@ from vmri_jax.steppers.time_modes import TimeModes, product, taken, times_i
 class JoinedEquations:
     """The equations of the step in the joined variables q = (q_s, q_f), with the nodes as the last axis.
 
-    num_curved: number of variables, the last ones, in the Hessian W'': the fast variables, or all without fast ones.
+    num_curved: the Hessian W'' has the last num_curved variables: the fast ones, or all variables if none is fast.
     directions, along: L (d, n), the combinations of variables along which the potentials are curved, and its pseudo-inverse (n, d).
     """
 

@@ -22,7 +22,7 @@ MARGIN = 100.0
 """Safety factor on the contraction that quadratic convergence predicts for the next update. With a larger one most steps take one more iteration;
 with a smaller one the test trusts an update that is small by chance."""
 PLAIN_ITERATIONS = 15
-"""Most Newton iterations of the first attempt, before parts of the step are tried. A larger number makes failing runs slower."""
+"""Most Newton iterations of each attempt at the whole step, before parts of the step are tried. A larger number makes failing runs slower."""
 LEAST_DAMPING = 1 / 64
 """Smallest damping factor of an update. If the next update is still not smaller, the iteration has failed; a smaller value delays that."""
 

@@ -1,4 +1,4 @@
-"""The whole step of a user's stepper or solver: a solver gets the kicks, a stepper without `project` the projection of momenta; shapes are checked."""
+"""Whole steps from a user's stepper or solver: kicks around a solver, a projection where a stepper has none, and checks of shapes."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace

@@ -6,8 +6,8 @@ Its rows i = 0..r-1 and columns j = 1..r are
     K_ij = k_ij M_f - h^2 sum_k w_k l_i(c_k) l_j(c_k) U''(c_k) + h^2 sum_k w_k l_i(c_k) (dF/dq l_j(c_k) + dF/dv l_j'(c_k) / h)
     k_ij = sum_n w_n l_i'(c_n) l_j'(c_n)
 
-with k of the nodes and weights of T, and a sum over U: W and all other potentials with nodes c_k inside micro intervals. U'' and the
-derivatives of the forces F, both by fast variables, are evaluated on the straight path over the first micro interval of a macro step. A
+k_ij has the nodes c_n and weights w_n of T. The terms with U'' are summed over W and all other potentials U with nodes c_k inside micro
+intervals. U'' and the derivatives of the forces F, both in fast variables, are evaluated on the straight path over the first micro interval of a macro step. A
 `DiagonalMatrix` takes only potentials of q_f alone, and no forces.
 
 For r = 1, without forces and with W at the midpoint, ``K = -(M_f + h^2 W'' / 4)``: negative definite where the mass dominates. The row i = r
@@ -120,8 +120,8 @@ class Interval:
     """The structure of a micro interval.
 
     is_explicit: whether the fast increments are explicit functions of the multipliers, ``x = M_f^-1 (h p_f - G_0^T mu)``.
-    is_diagonal: whether K is taken as one matrix per fast coordinate: M_f is diagonal, and either all potentials inside the interval are
-        linear in q_f, or V and W are the only ones, and of these, each function of q_f alone is a sum over the coordinates. K then leaves
+    is_diagonal: whether K is taken as one matrix per fast coordinate: M_f is diagonal, and inside the interval either all potentials are
+        linear in q_f, or there are only V and W and each of their functions of q_f alone is a sum over the coordinates. K then leaves
         out forces and potentials that depend on slow variables: this costs passes, not accuracy.
     is_constant: whether K is the same for a whole run.
     sparsity: of ``G K^-1 G^T``.

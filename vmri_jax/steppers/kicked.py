@@ -30,7 +30,7 @@ class KickedState(NamedTuple):
 class Kicked(Stepper):
     """Kicks before and after an inner step, ``p <- p - H w dV/dq`` with the weight w of the rule at that end of the interval.
 
-    Corrected kicks have a further power of H, see `Term.times_step`.
+    Corrections have the factor H^3 instead of H, see `Term.times_step`.
 
     kicks: the terms with nodes at the ends of the interval; may be empty.
     inner: the stepper between the kicks.

@@ -221,7 +221,7 @@ def _between_kicks(system: System, scheme: Scheme, choice: _Choice, q_s, q_f) ->
 def _first_choice(
     system: System, scheme: Scheme, newton: Newton, interval: Interval, rows: Sparsity, size: int
 ) -> Solver:
-    """The solver of `Auto` for masses that are constant; `size` is the number of variables of an interval."""
+    """The first solver of `Auto`, and the solver of `Nested`, for constant masses; `size` is the number of variables of an interval."""
     if DRIFTS and _is_drift(system, scheme):
         return Rattle(newton, rows)
     single = COLLOCATES and scheme.num_micro == 1 and scheme.degree > 1
@@ -339,11 +339,12 @@ def _average(system: System, scheme: Scheme, choice: _Choice) -> Callable | None
     """The filter of a mollified slow potential, None if the slow potential is not mollified."""
     if not scheme.slow.mollified:
         return None
-    if scheme.fast.every > 1 or any(not scheme.rule_of(name).only_kicks for name, _ in system.potentials):
+    on_micro_grid = [str(name) for name, _ in system.potentials if not scheme.rule_of(name).only_kicks]
+    if scheme.fast.every > 1 or on_micro_grid:
+        every = f"W has nodes on every {scheme.fast.every}th micro node" if scheme.fast.every > 1 else ""
+        others = every or f"the potentials {', '.join(on_micro_grid)} are on the micro grid"
         raise ValueError(
-            "Scheme: the slow potential is mollified, which averages over the motion under W alone; here W is on every "
-            f"{scheme.fast.every} micro intervals, or one of the potentials {[name for name, _ in system.potentials]} is on the micro grid. Give "
-            "W the rule micro(...) and the others macro(trapezoidal), or take a scheme without mollified kicks, e.g. explicit_slow(num_micro)."
+            f"Scheme: the slow potential is mollified, which averages over the motion under W alone; here {others}. Give W the rule micro(...) and the others macro(trapezoidal), or take a scheme without mollified kicks, e.g. explicit_slow(num_micro)."
         )
     if not system.has_constant_mass or system.is_rheonomic:
         raise ValueError(

@@ -14,9 +14,9 @@ single accurate prediction decides on it."""
 
 
 class PolynomialPredictor(NamedTuple):
-    """Backward differences ``d_0 = x_n``, ``d_(j+1) = d_j(x_n) - d_j(x_(n-1))``.
+    """Backward differences of the unknowns x_n of step n, ``d_0^n = x_n``, ``d_(j+1)^n = d_j^n - d_j^(n-1)``.
 
-    The polynomial of order k through the last k + 1 values extrapolates to ``x_(n+1) = d_0 + ... + d_k``; d_(k+1) is the error of this
+    The polynomial of degree k through the last k + 1 values extrapolates to ``x_(n+1) = d_0 + ... + d_k``; d_(k+1) is the error of this
     prediction for x_n. Few or rough steps need a low order, smooth motion a high one.
 
     misses: largest prediction error of every order so far, with a weight that decreases by `FADING` per step.

@@ -68,8 +68,8 @@ _MESSAGES = {
         "very different size (scale them to order one)."
     ),
     Result.NOT_IMPLIED: (
-        "the constraints that are solved for are kept, but rows that were left out as following from them are not (those of a "
-        'scene with redundant="drop", of a System its implied). Likely causes: the rows follow only at the start, where links '
+        'the constraints that are solved for are kept, but rows that were left out as redundant (redundant="drop" of a scene, '
+        "implied= of a System) are violated. Likely causes: the rows follow only at the start, where links "
         "lie in line or a loop lies flat, or only for other parameters. Start elsewhere, take the parameters for which they "
         "follow, or hold these rows instead of others."
     ),
@@ -120,7 +120,7 @@ class SimulationError(RuntimeError):
         result: the `Result` of the failing step.
         step: index of the failing macro step (0 = the first).
         time: time at the start of that step.
-        iterations, residual: the most Newton iterations and the largest residual of a step from the saved node before to it.
+        iterations, residual: the most Newton iterations and the largest residual of a step between the last saved node and the failure.
         trajectory: the `Trajectory` up to the failure (NaN after it).
         moved: sentence on the body or coordinate that moved most before the failure; empty if it is not known.
         labels: sentence on variables that are slow but move fast, or the other way round; empty if there are none.

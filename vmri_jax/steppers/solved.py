@@ -92,7 +92,7 @@ class SolvedState(NamedTuple):
 
     velocity: (v_s, v_f) of the guess. Used only if masses are not constant (else the guess takes ``M^-1 p``): the mean velocities
         ``(q_s(H) - q_s(0)) / H`` and ``(q_f(H) - q_f(H - h)) / h`` of the last step, or the velocities of the projected momenta.
-    multiplier, slow_multiplier: Lagrange multipliers at the last control node of the step before that has multipliers.
+    multiplier, slow_multiplier: Lagrange multipliers of the step before, at its last control node with multipliers.
     solver: memory of the solver.
     """
 

@@ -21,8 +21,8 @@ class StepInfo(eqx.Module):
     method: code of the solver, see `Method`; with "auto" ARROWHEAD says that the cheaper solvers are not possible, or did not converge.
     iterations: most Newton iterations or passes of a solve in the step; 0 for explicit steps.
     residual: ``max(|R| / max |p|, max |g|)``, with the residual R of the momentum equations and the constraint values g; 0 for linear
-        equations. `Nested` and the march estimate R after their last correction, others evaluate it; where only multipliers
-        are unknown it is 0.
+        equations. `Nested` and the march estimate R after their last correction, RATTLE takes R = 0, all others
+        evaluate it.
     q_f_micro: fast positions at the micro nodes, the start excluded.
     multiplier, slow_multiplier: Lagrange multipliers at the control nodes, with r the degree of the scheme. A composition of s
         stages joins those of its stages: ``(s num_micro, r, n_g)`` and ``(s r, n_gs)``.
@@ -89,7 +89,7 @@ class Stepper(ABC):
         return state, replace(info, result=jnp.where(has_result, info.result, Result.NON_FINITE)), memory
 
     def project(self, state: State, memory) -> tuple[State, Any]:
-        """Project the momenta onto the hidden constraints, ``G v + dg/dt = 0``."""
+        """The state with momenta on the hidden constraints ``G v + dg/dt = 0``; by default unchanged, and `Custom` then adds a projection."""
         return state, memory
 
     def continued(self, memory, last, state: State, macro_dt) -> Any:

@@ -32,7 +32,7 @@ from vmri_jax.study.reference_solution import ReferenceSolution
 from vmri_jax.study.table import Column, ResultTable
 
 MIN_ERROR_OVER_REFERENCE = 100.0
-"""Least ratio of an error that is fitted to the error of the reference, which changes the error of the scheme by 1 % then; a larger
+"""Least ratio of a fitted error to the error of the reference; at this ratio the reference changes the error of the scheme by 1 %; a larger
 ratio fits fewer runs."""
 
 

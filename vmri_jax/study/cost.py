@@ -30,7 +30,7 @@ class CostRow:
     num_steps: macro steps of the timed run.
     seconds_per_unit: computing time per unit of simulated time; the figures of the reference paper up to a constant.
     us_per_micro_step: computing time per micro step, in microseconds.
-    first_call_seconds: tracing, compiling and one macro step; not part of the other times.
+    first_call_seconds: tracing and compiling, without a macro step; not part of the other times.
     iterations: most Newton iterations of a step.
     solved_by: name of the `Method` that took the steps, which "auto" chooses, as in ``run.info.method``.
     result: name of the `Result` of the run.

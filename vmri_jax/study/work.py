@@ -26,7 +26,7 @@ FINEST_ERROR = 1e-10
 SLOWEST = 2.0
 """Seconds of a run after which a ladder of steps ends; a larger value adds slower runs."""
 RESOLVED_ERROR = 1e-6
-"""Error of positions from which a ladder ends when errors stop falling; a larger value may end it at steps that resolve nothing yet."""
+"""Error of positions below which a ladder ends when errors stop falling; a larger value may end it at steps that resolve nothing yet."""
 LEAST_GAIN = 1.5
 """Ratio of the least error so far to the next error below which errors have stopped falling; a larger ratio ends ladders earlier."""
 

@@ -111,7 +111,7 @@ class Writer:
         self._arrays: dict[str, Any] = {}
 
     def append(self, piece: Trajectory, saved: int) -> None:
-        """Write a piece after the `saved` intervals in the store; it ends with a full chunk of rows, and counts after `commit`."""
+        """Write a piece after the `saved` intervals in the store; every piece but the last fills whole chunks; it counts after `commit`."""
         values = rows_of(piece)
         files = []
         if saved == 0:
@@ -274,7 +274,7 @@ def consolidate(path: Path) -> None:
 
 
 def chunk_file(array: Path, dimensions: int, k: int) -> Path:
-    """The file of rows number `k` times the chunk and on of an array."""
+    """The file of chunk number k of an array."""
     return array / ".".join(["c", str(k)] + ["0"] * (dimensions - 1))
 
 

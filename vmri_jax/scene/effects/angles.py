@@ -38,7 +38,7 @@ class Angle(_AmongPoints):
     Args:
         between: names (a, b, c), or a list of such.
         stiffness: k, N m, positive; one number, or one for each angle.
-        angle: theta_0, rad, between 0 and pi; likewise. The angle at the start by default.
+        angle: theta_0, rad, between 0 and pi; likewise. The angle at the positions in `bodies` by default.
 
     Raises:
         ValueError: (of the scene) a stiffness that is not positive; a rest angle that is not between 0 and pi, where this

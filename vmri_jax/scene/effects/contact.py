@@ -14,7 +14,7 @@ from vmri_jax.scene.effect import Effect
 
 
 def penalty(gap, params):
-    """``k/2 d^2`` of the smooth depth ``d = s log(1 + exp(-gap / s))``: about -gap if the bodies overlap, falling to zero within a gap of s."""
+    """``k/2 d^2`` of the smooth depth ``d = s log(1 + exp(-gap / s))``: about -gap if the bodies overlap, decaying like ``s exp(-gap / s)`` outside."""
     depth = params["smoothing"] * jax.nn.softplus(-gap / params["smoothing"])
     return jnp.sum(params["stiffness"] / 2 * depth**2)
 
@@ -45,13 +45,13 @@ class _Contact(Effect):
 class PlaneContact(_Contact):
     """Contact with the side of a plane that its normal points to: ``V = k/2 sum d^2``, ``d = s log(1 + exp(-gap / s))``.
 
-    ``gap = n . (q - p) - r``. The energy has derivatives of every order, so that schemes keep their order once the step H resolves the contact.
+    ``gap = n . (q - p) - r``. The energy has derivatives of every order, so that schemes keep their order once the steps of its grid resolve the contact.
 
     Args:
         point: p, (d,), in the plane.
         normal: n, (d,), towards the free side; scaled to length one.
         stiffness: k, N/m, positive; one number, or one for each body.
-        smoothing: s, m, positive: the distance within which the force sets in.
+        smoothing: s, m, positive: decay length of the force outside of contact.
         radius: r, m, of the bodies; one number, or one for each.
         bodies: names; all bodies of the scene by default.
 

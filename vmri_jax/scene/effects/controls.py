@@ -52,7 +52,7 @@ class Controlled(Effect):
             on b, with the opposite on a.
         load: "force" or "torque"; a torque acts on a rigid body or in a joint.
         along: (d,) the direction of a single control, of any length; by default there is a control for each axis.
-        axes: whether components are along the axes of "space" or of the rigid "body".
+        axes: "space", or "body" for the principal axes of inertia of the rigid body, its directors.
 
     Raises:
         ValueError: (of the scene) no body of this name, a torque on a body that is not rigid, a joint without this freedom, a vector of

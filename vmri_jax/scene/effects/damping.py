@@ -45,7 +45,7 @@ class QuadraticDrag(Effect):
     """Drag of a resting fluid, ``F = -c |v| v``.
 
     Args:
-        coefficient: c, kg/m, positive, half of density, drag coefficient and area; one number, or one for each body.
+        coefficient: c, kg/m, positive: density times drag coefficient times area, over 2; one number, or one for each body.
         bodies: names; all bodies of the scene by default.
 
     Raises:
@@ -66,7 +66,7 @@ class QuadraticDrag(Effect):
 
 @effect_class
 class Dashpot(BetweenPoints):
-    """Dampers between points, against the change of their distance: ``F_b = -c ((v_b - v_a) . n) n = -F_a``.
+    """Dampers between points, against the change of their distance: ``F_b = -c ((v_b - v_a) . n) n = -F_a``, n from a to b.
 
     Args:
         between: names of two bodies, or a list of such pairs.

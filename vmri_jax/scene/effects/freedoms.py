@@ -74,7 +74,7 @@ def slide(q, params):
 
 
 def coordinate(q, params):
-    """A freedom that is a coordinate of the scene, of which q is the place, ``((..., 1),)``."""
+    """The value (...) of a freedom that is itself a coordinate of the scene, from ``q = ((..., 1),)``."""
     return jnp.squeeze(q[0], -1)
 
 

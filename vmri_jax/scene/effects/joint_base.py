@@ -176,7 +176,7 @@ class AboutAxis(Joint):
 
     Args:
         between, at: as of `Joint`.
-        axis: (3,) direction n in space at the start, of any length; or a direction for each pair, (n, 3).
+        axis: (3,) direction in space at the start, of any length; or a direction for each of k pairs, (k, 3).
     """
 
     axis: Any = (0.0, 0.0, 1.0)

@@ -142,7 +142,7 @@ class JointSpring(InJoint):
     Args:
         joint, of: as of `InJoint`.
         stiffness: k, N m/rad or N/m, positive; one number, or one for each pair of the joint.
-        neutral: x_0, rad or m, where the spring is relaxed; likewise. The start by default.
+        neutral: x_0, rad or m, where the spring is relaxed; likewise. Zero, the given position, by default.
     """
 
     stiffness: Any = positive()

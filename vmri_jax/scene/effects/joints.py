@@ -14,8 +14,8 @@ The point of the joint is at ``phi + rho`` in each body, so that the gap is ``D 
 | screw | ``m . D``, ``m' . D``, ``n . e``, ``n . e'``, ``m' . e cos a - m . e sin a`` with ``a = 2 pi n . D / pitch`` |
 | planar | ``n . D``, ``n . e``, ``n . e'`` |
 
-Between macro nodes the interpolated directors of a slow body are a little too short. Shorter directors of a body only scale a row with a
-vector of each of the two triads: it still vanishes for the right directions of the axes.
+Between macro nodes the interpolated directors of a slow body are a little too short. A row that is a product of vectors of both triads is
+then only scaled: it still vanishes for the right directions of the axes.
 
 Source: P. Betsch, S. Leyendecker, Int. J. Numer. Meth. Engng 67 (2006).
 """

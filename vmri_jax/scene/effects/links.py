@@ -33,7 +33,7 @@ class RigidLink(_Rigid, BetweenPoints):
 
     Args:
         between: names of two bodies, or a list of such pairs.
-        length: l, positive; one number, or one for each link. The distance at the start by default.
+        length: l, positive; one number, or one for each link. The distance at the positions in `bodies` by default.
 
     Raises:
         ValueError: (of the scene) ends at one point at the start, a length that is not positive or not the distance at
@@ -53,7 +53,7 @@ class Anchor(_Rigid, ToFixedPoint):
     Args:
         bodies: a name, or a list of names.
         point: a, (d,); or one for each body, (n, d).
-        length: l, positive; one number, or one for each. The distance at the start by default.
+        length: l, positive; one number, or one for each. The distance at the positions in `bodies` by default.
 
     Raises:
         TypeError: a function as point.

@@ -20,7 +20,7 @@ class Spring(BetweenPoints):
     Args:
         between: names of two bodies, or a list of such pairs.
         stiffness: k, N/m, positive; one number, or one for each spring.
-        length: l, at rest, positive; likewise. The distance at the start by default.
+        length: l, at rest, positive; likewise. The distance at the positions in `bodies` by default.
 
     Raises:
         ValueError: (of the scene) numbers that are not positive, ends at one point at the start.
@@ -47,7 +47,7 @@ class NonlinearSpring(BetweenPoints):
     Args:
         between: names of two bodies, or a list of such pairs.
         coefficients: (k_1, k_2, ...), N/m^j, the same for all springs.
-        length: l, at rest, positive; one number, or one for each spring. The distance at the start by default.
+        length: l, at rest, positive; one number, or one for each spring. The distance at the positions in `bodies` by default.
 
     Raises:
         ValueError: (of the scene) no coefficients, a length that is not positive, ends at one point at the start.

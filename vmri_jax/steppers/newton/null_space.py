@@ -4,8 +4,8 @@ In Newton's equations of a micro interval, or of the slow variables,
 
     A dq - G_0^T dmu = -r        G_1 dq = -g
 
-multipliers act along the rows of G_0, the constraints at the node where the interval starts, and increments are held by G_1,
-those where it ends. With bases P_0, P_1 of the null spaces, ``G_0 P_0 = 0`` and ``G_1 P_1 = 0``, and right inverses
+multipliers act along the rows of G_0, the Jacobian at the start of the interval, and G_1, the Jacobian at its end, holds the
+increments. With bases P_0, P_1 of the null spaces, ``G_0 P_0 = 0`` and ``G_1 P_1 = 0``, and right inverses
 ``G W = 1``, the increment is ``dq = P_1 z - W_1 g`` with as few unknowns z as there are free motions,
 
     (P_0^T A P_1) z = -P_0^T (r - A W_1 g)        dmu = W_0^T (A dq + r)
