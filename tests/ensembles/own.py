@@ -8,12 +8,32 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+import vmri_jax as vm
 from vmri_jax import systems
 
 POISON = 41.0
 """A frequency at which the bad quantities go wrong."""
 
 slow_chain = systems.fermi_pasta_ulam(num_springs=2)
+
+
+hung = vm.Problem(
+    vm.System(
+        vm.ConstantMass(slow={"trolley": 5.0}, fast={"hook": 1.0, "load": 2.0}),
+        fast_potential=lambda q_f, params: params["k"] / 2 * jnp.sum((q_f["load"] - q_f["hook"] - 1.0) ** 2),
+        slow_potential=lambda q_s, q_f, params: jnp.sum((q_f["hook"] - q_s["trolley"]) ** 2),
+        params={"k": jnp.asarray(30.0)},
+    ),
+    q_s={"trolley": [0.0, 0.0]},
+    q_f={"hook": [0.5, 0.0], "load": [1.0, -1.2]},
+)
+"""Positions as dictionaries."""
+
+
+def lengths(run):
+    """Distance of load and hook at every node, and the end of the load."""
+    ends = run.q_f["load"] - run.q_f["hook"]
+    return {"distance": jnp.linalg.norm(ends, axis=-1), "load": run.position("load")[-1]}
 
 
 def reach(run):

@@ -57,6 +57,21 @@ def test_runs_are_those_of_simulate(tmp_path):
         assert one.iterations == int(run.info.iterations.max())
 
 
+@pytest.mark.parametrize("system", [own.hung, f"{OWN}:hung"], ids=["problem", "file"])
+def test_positions_as_dictionaries(tmp_path, system):
+    """The store has vectors; functions of the user get a run with its dictionaries and names."""
+    save = ("end", "nodes", "extremes", "quantiles", f"{OWN}:lengths")
+    design = {"k": [30.0, 50.0]}
+    runs = few(tmp_path / "runs.zarr", system=system, design=design, save=save, num_saves=5)
+    one = runs.open().sel(k=50.0).load()
+    stiff = replace(own.hung, system=own.hung.system.replace(params={"k": np.asarray(50.0)}))
+    run = vm.simulate(stiff, vm.explicit_slow(3), macro_dt=0.02, num_steps=10, save_every=2)
+    assert np.allclose(one.q_f, run.states.q_f[-1], rtol=0, atol=1e-13)
+    assert np.allclose(one.max_q_f, run.states.q_f.max(axis=0), rtol=0, atol=1e-13)
+    assert np.allclose(one["load"], run.q_f["load"][-1], rtol=0, atol=1e-13)
+    assert np.allclose(one.distance, np.linalg.norm(run.q_f["load"] - run.q_f["hook"], axis=-1), rtol=0, atol=1e-13)
+
+
 def test_steps_of_their_own_in_a_table_in_any_order(tmp_path):
     columns = {"num_steps": [20, 10, 20, 40, 10], "omega": [10.0, 20.0, 30.0, 40.0, 50.0]}
     runs = few(tmp_path / "table.zarr", design=Table(columns), macro_dt=None, t_end=0.2)
@@ -132,6 +147,7 @@ def test_a_poisoned_chunk_is_named_and_the_rest_goes_on(tmp_path):
     ) as caught:
         few(out, **arguments)
     assert sorted(caught.value.ensemble.done) == [0, 1, 3]
+    assert "poison" in str(caught.value.__cause__)
     data = vm.open_ensemble(out)
     assert data.raises.isnull().values.tolist() == [False, False, True, False]
     assert data.result.values.tolist() == [0, 0, -1, 0]
@@ -142,7 +158,7 @@ def test_a_poisoned_chunk_is_named_and_the_rest_goes_on(tmp_path):
 
 def test_others_are_not_tried_where_none_can_be_computed(tmp_path):
     design = Table({"q_s[0]": np.full(30, own.POISON)})
-    message = r"10 of 30 chunks could not .* and 5 more\. .*poison\. No chunk of this call could, so the others were not tried; 0 chunks of earlier calls are in"
+    message = r"10 of 30 chunks could not .* and 5 more\. .*poison\. No chunk of this call succeeded, so that the remaining ones were not tried; 0 chunks of earlier calls are in"
     with pytest.raises(EnsembleError, match=message):
         few(tmp_path / "runs.zarr", design=design, save=f"{OWN}:raises", chunk=1)
 

@@ -108,7 +108,7 @@ def test_a_start_off_the_constraints_has_failed(tsp):
     assert trajectory.result == Result.CONSTRAINT_VIOLATED
     assert np.isnan(trajectory.q_f).all()
     off = State(state.t, state.q_s, 1.01 * state.q_f, state.p_s, state.p_f)
-    with pytest.raises(ValueError, match="simulate: the state violate the constraints by"):
+    with pytest.raises(ValueError, match="simulate: the positions of the state violate constraint, row 0"):
         simulate(tsp.system, fully_explicit(2), off, macro_dt=0.01, num_steps=2)
 
 

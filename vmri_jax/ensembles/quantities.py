@@ -11,7 +11,7 @@ from vmri_jax.mechanics.names import near
 from vmri_jax.mechanics.state import Problem, State
 from vmri_jax.running.export import DIMENSIONS
 from vmri_jax.running.simulation import Simulation
-from vmri_jax.running.trajectory import RunInfo, Trajectory
+from vmri_jax.running.trajectory import RunInfo, Trajectory, with_origin
 
 LEVELS = (0.05, 0.5, 0.95)
 """Probabilities of the quantiles over the saved nodes: the median, and an interval with 90 % of them."""
@@ -44,16 +44,18 @@ class Quantity(NamedTuple):
 def _end(run: Trajectory) -> dict[str, Kept]:
     names = {"q": "positions", "p": "momenta"}
     return {
-        f"{letter}_{part}": Kept(getattr(run, f"{letter}_{part}")[-1], (dimension,), f"{names[letter]} at the end")
+        f"{letter}_{part}": Kept(
+            getattr(run.states, f"{letter}_{part}")[-1], (dimension,), f"{names[letter]} at the end"
+        )
         for letter in "qp"
         for part, dimension in (("s", "slow"), ("f", "fast"))
     }
 
 
 def _nodes(run: Trajectory) -> dict[str, Kept]:
-    names = ("t", "q_s", "q_f", "p_s", "p_f", "energy")
-    axes = {name: ("node", *DIMENSIONS[name][1:]) for name in names}
-    return {f"node_{name}": Kept(getattr(run, name), axes[name], f"{name} at the saved nodes") for name in names}
+    arrays = vars(run.states) | {"energy": run.energy}
+    axes = {name: ("node", *DIMENSIONS[name][1:]) for name in arrays}
+    return {f"node_{name}": Kept(array, axes[name], f"{name} at the saved nodes") for name, array in arrays.items()}
 
 
 def _energy_error(run: Trajectory) -> dict[str, Kept]:
@@ -81,7 +83,7 @@ def _iterations(run: Trajectory) -> dict[str, Kept]:
 def _extremes(run: Trajectory) -> dict[str, Kept]:
     extremes = {}
     for part, dimension in (("s", "slow"), ("f", "fast")):
-        q = getattr(run, f"q_{part}")
+        q = getattr(run.states, f"q_{part}")
         extremes[f"min_q_{part}"] = Kept(jnp.min(q, axis=0), (dimension,), "smallest positions")
         extremes[f"max_q_{part}"] = Kept(jnp.max(q, axis=0), (dimension,), "largest positions")
     return extremes
@@ -91,7 +93,7 @@ def _quantiles(run: Trajectory) -> dict[str, Kept]:
     levels = jnp.array(LEVELS)
     return {
         f"quantiles_q_{part}": Kept(
-            jnp.quantile(getattr(run, f"q_{part}"), levels, axis=0),
+            jnp.quantile(getattr(run.states, f"q_{part}"), levels, axis=0),
             ("quantile", dimension),
             "quantiles of the positions over the saved nodes",
         )
@@ -169,7 +171,7 @@ def what_is_kept(quantities: Sequence[Quantity], run: Simulation) -> dict[str, K
     arrays: dict[str, Kept] = {}
 
     def shapes():
-        trajectory = run.engine.trajectory(run.arrays, run.save_every)
+        trajectory = with_origin(run.engine.trajectory(run.arrays, run.save_every), run.origin)
         arrays.update(kept(quantities, trajectory))
         return {name: array.value for name, array in arrays.items()}
 

@@ -67,6 +67,7 @@ class Ensemble:
     failures: error of each chunk that could not be computed.
     seconds: wall time of this call.
     computed: number of runs that this call computed.
+    first_error: of the first chunk that could not be computed in this call.
     """
 
     path: Path
@@ -75,6 +76,7 @@ class Ensemble:
     failures: dict[int, str] = field(default_factory=dict)
     seconds: float = 0.0
     computed: int = 0
+    first_error: Exception | None = field(default=None, repr=False)
 
     def __len__(self) -> int:
         """Number of runs."""
@@ -222,7 +224,7 @@ def ensemble(
         job = Job(str(path.resolve()), chunks, work, None if isinstance(design, Table) else design)
         _compute(runs, job, tasks, room, tell, interrupted)
     if runs.failures and throw:
-        raise EnsembleError(runs)
+        raise EnsembleError(runs) from runs.first_error
     return runs
 
 
@@ -242,6 +244,7 @@ def _compute(runs: Ensemble, job: Job, tasks, room, tell: Progress, interrupted)
                 runs.done[number] = future.result()
             except Exception as error:
                 runs.failures[number] = _why(error, runs)
+                runs.first_error = runs.first_error or error
             else:
                 first, last = runs.chunks.ends(number)
                 runs.computed += last - first

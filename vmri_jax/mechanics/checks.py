@@ -104,7 +104,9 @@ def check_system(system: System, q_s, q_f) -> None:
         if function is not None:
             shape = shape_of(f"System: {name}", function, *args)
             if len(getattr(shape, "shape", ())) != 1:
-                raise ValueError(f"System: {name} returns {describe(shape)}; it must return a vector, shape (n_g,).")
+                raise ValueError(
+                    f"System: {name} returns {describe(shape)}; it must return a vector, shape (n_g,), or rows by name."
+                )
             _check_float64(name, shape)
     if system.force is not None:
         shape = shape_of("System: force", system.force, jnp.zeros(()), q_s, q_f, q_s, q_f, system.params)

@@ -151,7 +151,15 @@ def check_constraints(
         return _rows_in_words(getattr(system, name), rows, *arguments, system.params)
 
     values, slow, fast, alone = jax.device_get(_values_and_jacobians(system, state.t, state.q_s, state.q_f))
-    _check_values(values, place, tolerance, advice)
+    if not np.isfinite(values).all():
+        raise ValueError(f"{place}: the constraints are {values} there, which is not finite.")
+    worst, n_g = int(np.abs(values).argmax()), len(values) - len(alone)
+    if abs(values[worst]) > tolerance:
+        row = in_words([worst], "constraint") if worst < n_g else in_words([worst - n_g], "slow_constraint")
+        raise ValueError(
+            f"{place} violate {'constraint' if worst < n_g else 'slow_constraint'}, row {row.strip('[]')}, by {abs(values[worst]):.3e} (tolerance "
+            f"{tolerance:.0e}); {advice}"
+        )
     if system.implied is not None:
         _check_implied(np.asarray(_implied_values(system, state.t, state.q_s, state.q_f)), place)
     if not (np.isfinite(slow).all() and np.isfinite(fast).all() and np.isfinite(alone).all()):
@@ -178,17 +186,6 @@ def _values_and_jacobians(system, t, q_s, q_f):
     """Values of all constraints, and the Jacobians dg/dq_s, dg/dq_f and dg_slow/dq_s."""
     jacobians = *jax.jacrev(system.g, argnums=(1, 2))(t, q_s, q_f), jax.jacrev(system.g_slow, argnums=1)(t, q_s)
     return system.constraints(t, q_s, q_f), *jacobians
-
-
-def _check_values(values, place: str, tolerance: float, advice: str) -> None:
-    if not np.isfinite(values).all():
-        raise ValueError(f"{place}: the constraints are {values} there, which is not finite.")
-    worst = np.abs(values).max()
-    if worst > tolerance:
-        raise ValueError(
-            f"{place} violate the constraints by {worst:.3e} (row {np.abs(values).argmax()} of {values.size}, tolerance "
-            f"{tolerance:.0e}); {advice}"
-        )
 
 
 @jax.jit

@@ -100,7 +100,7 @@ def simulate_batch(
     if not (np.all(np.isfinite(dt)) and np.all(dt > 0)):
         raise ValueError(f"simulate_batch: every {name} must be a positive number, got {dt}.")
     _check_devices(devices, chunk)
-    run.check("simulate_batch: the first state", constraints=params is None)
+    run.check("simulate_batch: the positions of the first state", constraints=params is None)
     check_memory("simulate_batch", run.state, scheme.num_micro, run.num_saves, save_micro, lanes)
     width = (lanes_at_once(run) if chunk is None else chunk) * devices
     batch = {

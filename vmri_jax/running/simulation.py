@@ -234,7 +234,7 @@ class Simulation:
         """Structure of the `Model` with the fallback."""
         return jax.tree.structure(Model(self.solver.exact(), self.scheme, self.system))
 
-    def check(self, state_name: str = "simulate: the state", constraints: bool = True) -> None:
+    def check(self, state_name: str = "simulate: the positions of the state", constraints: bool = True) -> None:
         """Refuse a system whose functions return wrong types or shapes, and a state that violates the constraints; equal ones are checked once.
 
         Args:

@@ -88,7 +88,7 @@ def stream(
     num_steps = run.num_steps
     if not run.is_concrete:
         raise ValueError("stream: arguments are tracers; it writes files, call it outside of jax.jit, vmap and grad.")
-    run.check("stream: the state")
+    run.check("stream: the positions of the state")
     attributes = {
         "num_steps": num_steps,
         "save_every": save_every,
