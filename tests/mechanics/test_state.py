@@ -94,7 +94,7 @@ def test_velocities_against_a_constraint_are_said_or_refused():
     with pytest.warns(UserWarning, match=r"0.10% of the velocities"):
         assert np.allclose(start(1e-3).p_f, [0.0, 1.0], atol=1e-15)
     with pytest.warns(
-        UserWarning, match=r"89.44% of the velocities .* project=True has taken them away; of a scene, with_rates"
+        UserWarning, match=r"89.44% of the velocities .* project=True has taken them away; for a scene, with_rates"
     ):
         assert np.allclose(start(2.0, project=True).p_f, [0.0, 1.0], atol=1e-14)
     for quiet in (start(1e-8), start(0.5, project=True)):

@@ -48,7 +48,7 @@ PARTS_OF_A_BAR = 50
 """Parts of a run with a progress bar. More parts move the bar more smoothly, and each costs a call of some 30 microseconds."""
 STEPPING = "the run: compiling its program if it is new, then taking its steps"
 """Line about a run that takes more than two seconds."""
-FALLING_BACK = "the first solver did not solve a step: repeating the run from there with exact matrices (solvers.Arrowhead), as accurate but slower"
+FALLING_BACK = "a step was not solved: computing its part of the run again with exact matrices (solvers.Arrowhead), as accurate but slower"
 """Line about a fallback that takes more than two seconds."""
 
 
