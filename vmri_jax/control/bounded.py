@@ -20,6 +20,7 @@ from scipy import sparse
 
 from vmri_jax.control.riccati import Final, Solution, Stages
 from vmri_jax.mechanics.arrays import Numbers
+from vmri_jax.running import export
 
 RELAXATION_WEIGHT = 1e4
 """Cost of one unit of slack, relative to the largest slope of the cost. It has to exceed the multipliers of goal and limits, else the
@@ -69,7 +70,7 @@ def solve(stages: Stages, final: Final, limits: Limits) -> tuple[Solution, float
 
 def _solved(stages: Stages, final: Final, limits: Limits, weight: float | None) -> tuple[Solution, float] | None:
     """The solution, and its largest multiplier, of the problem as it is or of its relaxation with this weight; None if PIQP fails."""
-    piqp = _piqp()
+    piqp = export.extra("piqp", "minimize with bounds or limits of controls", "control")
     (count, n, m), c, e = stages.B.shape, limits.value.shape[1], len(final.g)
     num_slacks = 0 if weight is None else c
     # Unknowns, stage by stage: the control du_k, the node dz_{k+1}, the slacks of its limits; slacks of the goal at the end.
@@ -134,13 +135,3 @@ def _sparse(blocks, shape) -> sparse.csc_matrix:
     made = sparse.csc_matrix((np.concatenate(values), (np.concatenate(i), np.concatenate(j))), shape)
     made.eliminate_zeros()
     return made
-
-
-def _piqp():
-    try:
-        import piqp
-    except ImportError:
-        raise ImportError(
-            "bounds and limits of controls need the package piqp; install it with: pip install 'vmri_jax[control]'"
-        ) from None
-    return piqp

@@ -8,6 +8,7 @@ from typing import Any
 
 from vmri_jax.ensembles.worker import call_in_worker, call_packed, known_versions, packed
 from vmri_jax.mechanics.arrays import whole_number
+from vmri_jax.running.export import extra
 from vmri_jax.running.interrupts import Interrupted, interrupts_noted
 
 DASK_RETRIES = 2
@@ -95,12 +96,9 @@ def local_workers(count: int) -> Iterator[Any]:
     Raises:
         ImportError: Dask is not installed.
     """
-    try:
-        from distributed import Client, LocalCluster
-    except ImportError as error:
-        raise ImportError("processes need Dask; install it with pip install 'vmri_jax[ensemble]'.") from error
-    cluster = LocalCluster(n_workers=count, threads_per_worker=1, processes=True, dashboard_address=":0")
-    with cluster, Client(cluster) as client:
+    distributed = extra("distributed", "processes=", "ensemble")
+    cluster = distributed.LocalCluster(n_workers=count, threads_per_worker=1, processes=True, dashboard_address=":0")
+    with cluster, distributed.Client(cluster) as client:
         yield client
 
 

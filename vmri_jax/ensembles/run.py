@@ -18,7 +18,7 @@ from vmri_jax.ensembles.work import AnyScheme, Work
 from vmri_jax.ensembles.worker import NotAWorker, call_in_worker, known_versions, packed
 from vmri_jax.mechanics.arrays import require_x64, whole_number
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
-from vmri_jax.running.files import check_writable, clear_partial
+from vmri_jax.running.files import clear_partial, is_new
 from vmri_jax.running.interrupts import Interrupted, interrupts_noted
 from vmri_jax.running.progress import Progress, ShowsProgress, progress_to
 from vmri_jax.running.store.layout import locked
@@ -346,12 +346,7 @@ def _design(design) -> Design:
 
 def _check_place(path: Path, resume: bool, overwrite: bool) -> None:
     """Refuse a folder that does not exist, a file that is in the way, and a store without `resume` or `overwrite`."""
-    if resume and overwrite:
-        raise ValueError("ensemble: both resume and overwrite are true; choose one of them.")
-    if not path.resolve().parent.is_dir():
-        raise FileNotFoundError(f"ensemble: out is {path}, but the folder {path.parent} does not exist; make it first.")
-    if not path.exists():
-        check_writable(path)
+    if is_new("ensemble", path, resume, overwrite):
         return
     stored = store.read_attributes(path)  # raises if this is no store
     if not (resume or overwrite):

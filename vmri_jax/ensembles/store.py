@@ -12,7 +12,6 @@ The last file of a chunk commits the chunk: a worker writes it when all other fi
 without this file, and the ensemble computes it again. So any number of workers can write at once, and be killed at any moment.
 """
 
-import json
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -26,6 +25,7 @@ from vmri_jax.running.store.layout import (
     CONFIG,
     KEYS,
     METADATA,
+    attributes_in,
     chunk_file,
     consolidate,
     create_array,
@@ -147,10 +147,4 @@ def read_attributes(path: Path) -> dict[str, Any]:
     """
     if not path.exists():
         raise FileNotFoundError(f"{path} does not exist; give the folder of an ensemble.")
-    try:
-        attributes = json.loads((path / METADATA).read_text())["attributes"]
-        if attributes["format"] != FORMAT:
-            raise ValueError(f"its format is {attributes['format']!r}, an ensemble has the format {FORMAT!r}")
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise ValueError(f"{path} is not the store of an ensemble ({type(error).__name__}: {error}).") from error
-    return attributes
+    return attributes_in(path, FORMAT, "the store of an ensemble")

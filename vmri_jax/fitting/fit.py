@@ -16,6 +16,7 @@ from vmri_jax.fitting.unknowns import Unknown, Unknowns
 from vmri_jax.mechanics.arrays import whole_number
 from vmri_jax.mechanics.checks import check_type
 from vmri_jax.mechanics.state import HasProblem, Problem, opened
+from vmri_jax.running.export import extra
 from vmri_jax.running.progress import Progress, Working
 from vmri_jax.running.simulation import prepare
 from vmri_jax.schemes.composition import Composition
@@ -83,7 +84,7 @@ def fit(
         SimulationError: the run with the first parameters fails.
         ImportError: optimistix is not installed.
     """
-    _optimistix()
+    extra("optimistix", "fit", "fit")
     model = _model(problem, parameters)
     unknowns = Unknowns({name: u if isinstance(u, Unknown) else Unknown(u) for name, u in parameters.items()})
     data = [data] if isinstance(data, Measured) else list(data)
@@ -107,16 +108,6 @@ def fit(
         u[1:] = spread * np.random.default_rng(seed).standard_normal((starts - 1, unknowns.size))
         search.check_dependence(tell)
         return search.result(u, tell)
-
-
-def _optimistix():
-    try:
-        import optimistix
-    except ImportError:
-        raise ImportError(
-            "fit searches with optimistix, which is not installed: pip install 'vmri_jax[fit]'."
-        ) from None
-    return optimistix
 
 
 def _model(problem, parameters: Mapping) -> Callable[[Mapping], Problem]:
@@ -201,7 +192,7 @@ class _Search:
 
     def solve(self, u, z, values):
         """The search from u, z: its end (u, z), misses, iterations, whether it converged, largest gap."""
-        optimistix = _optimistix()
+        optimistix = extra("optimistix", "fit", "fit")
         solver = optimistix.LevenbergMarquardt(rtol=TOLERANCE, atol=TOLERANCE)
         weights = jnp.asarray(GAP_WEIGHTS if self.shooting.segments > 1 else (1.0,))
 

@@ -171,12 +171,21 @@ def read_attributes(path: Path) -> dict[str, Any]:
         raise ValueError(
             f"{path} is not a stored trajectory but a file; a run written by Trajectory.save is read by Trajectory.load({str(path)!r})."
         )
+    return attributes_in(path, FORMAT, "a stored trajectory")
+
+
+def attributes_in(path: Path, format_name: str, kind: str) -> dict[str, Any]:
+    """Attributes of a group of Zarr with an attribute "format".
+
+    Args:
+        kind: in the message on another format.
+    """
     try:
         attributes = json.loads((path / METADATA).read_text())["attributes"]
-        if attributes["format"] != FORMAT:
-            raise ValueError(f"its format is {attributes['format']!r}, the format of this version {FORMAT!r}")
+        if attributes["format"] != format_name:
+            raise ValueError(f"its format is {attributes['format']!r}, the format of this version {format_name!r}")
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise ValueError(f"{path} is not a stored trajectory ({type(error).__name__}: {error}).") from error
+        raise ValueError(f"{path} is not {kind} ({type(error).__name__}: {error}).") from error
     return attributes
 
 

@@ -11,7 +11,7 @@ from typing import Any
 from vmri_jax.mechanics.arrays import whole_number
 from vmri_jax.mechanics.state import Movable, State
 from vmri_jax.running.arguments import Steps
-from vmri_jax.running.files import check_writable, clear_partial
+from vmri_jax.running.files import clear_partial, is_new
 from vmri_jax.running.interrupts import Interrupted, interrupts_noted
 from vmri_jax.running.progress import Progress, ShowsProgress, progress_to
 from vmri_jax.running.simulation import Simulation, simulation
@@ -160,12 +160,7 @@ def _explained(path: Path, step: int) -> Iterator[None]:
 
 def _check_place(path: Path, resume: bool, overwrite: bool) -> None:
     """Refuse an existing file or store, unless it is to be resumed or replaced, and a folder that does not exist."""
-    if resume and overwrite:
-        raise ValueError("stream: both resume and overwrite are asked for; choose one of them.")
-    if not path.resolve().parent.is_dir():
-        raise FileNotFoundError(f"stream: out is {path}, but the folder {path.parent} does not exist; make it first.")
-    if not path.exists():
-        check_writable(path)
+    if is_new("stream", path, resume, overwrite):
         return
     stored = StoredTrajectory(path)  # raises if the path is no store
     if not (resume or overwrite):
