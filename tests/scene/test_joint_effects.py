@@ -108,3 +108,8 @@ def test_a_limit_of_a_hinge_turns_it_back():
     assert seen.max() == pytest.approx(0.3 + depth, abs=2e-3)
     assert seen.min() < -0.2
     assert np.ptp(run.energy) < 1e-4
+
+
+def test_a_list_of_joints_is_refused():
+    with pytest.raises(TypeError, match=r"joint_springs: joint is \['hinge', 'other'\]; give the name of one joint"):
+        pendulum(JointSpring(["hinge", "other"], 1.0)).system()

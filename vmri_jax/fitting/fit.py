@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
-from typing import cast
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -67,7 +67,7 @@ def fit(
         problem: a problem whose ``system.params`` is a dict; `parameters` name its entries, or "q_s", "q_f", "v_s", "v_f" for the
             start. Or a function ``{name: value} -> Problem``, for everything else.
         data: one or several sets of measurements.
-        parameters: an `Unknown` for each name, or the number where its search starts.
+        parameters: an `Unknown` for each name, or the number where its search starts. Names of nested params have dots, "bonds.stiffness".
         scheme, macro_dt, solver: as in `simulate`. The times of measurement must be macro nodes. Where the solver is not chosen,
             runs have no fallback.
         segments: parts of multiple shooting; more than one for long or chaotic motion.
@@ -123,7 +123,7 @@ def _model(problem, parameters: Mapping) -> Callable[[Mapping], Problem]:
             f"fit: problem is {type(base).__name__}; give a Problem, a scene, or a function from parameters to a Problem."
         )
     params = base.system.params
-    known = params if isinstance(params, Mapping) else {}
+    known = _by_name(params) if isinstance(params, Mapping) else {}
     for name, unknown in parameters.items():
         if name not in known and name not in START:
             raise ValueError(
@@ -140,10 +140,28 @@ def _model(problem, parameters: Mapping) -> Callable[[Mapping], Problem]:
     def model(values: Mapping) -> Problem:
         inside = {name: value for name, value in values.items() if name in known}
         start = {name: value for name, value in values.items() if name not in known}
-        system = base.system.replace(params={**known, **inside}) if inside else base.system
+        system = base.system.replace(params=_with(params, inside)) if inside else base.system
         return replace(base, system=system, **start)
 
     return model
+
+
+def _by_name(params: Mapping, above: str = "") -> dict[str, Any]:
+    """The numbers in nested dictionaries by name, ``"bonds.stiffness"``."""
+    named: dict[str, Any] = {}
+    for key, value in params.items():
+        named |= _by_name(value, f"{above}{key}.") if isinstance(value, Mapping) else {f"{above}{key}": value}
+    return named
+
+
+def _with(params: Mapping, values: Mapping[str, Any], above: str = "") -> dict:
+    """Nested dictionaries with other numbers, see `_by_name`."""
+    return {
+        key: _with(value, values, f"{above}{key}.")
+        if isinstance(value, Mapping)
+        else values.get(f"{above}{key}", value)
+        for key, value in params.items()
+    }
 
 
 def _check(data: list, segments: int, starts: int, max_steps: int) -> None:

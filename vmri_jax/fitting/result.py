@@ -28,6 +28,8 @@ DOUBTED_PROBABILITY = 1e-6
 class Fit:
     """Fitted parameters, their covariance, and the quality of the fit.
 
+    Further results are properties: `standard_errors`, `values`, `problem`, `doubts`, `probability`, and the method `intervals`.
+
     Attributes:
         parameters: values by name.
         labels: names of the p numbers in them.
@@ -142,7 +144,7 @@ class Fit:
         sentences = []
         if not self.success:
             sentences.append(
-                "The search did not end by its tolerance: raise max_steps, start closer, or cut the motion into segments."
+                "The search did not end by its tolerance: raise max_steps, start closer, fit a shorter time first, or cut the motion into segments."
             )
         if self.probability < DOUBTED_PROBABILITY:
             remedies = [] if len(self.squares) > 1 else ["starts=8"]

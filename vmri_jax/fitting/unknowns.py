@@ -37,6 +37,10 @@ class Unknown:
     scale: Any = None
 
     def __post_init__(self):
+        if isinstance(self.start, Mapping):
+            raise TypeError(
+                'Unknown: start is a dictionary; name its numbers one by one, {"bonds.stiffness": Unknown(...)}.'
+            )
         start = np.asarray(real_array("Unknown: start", self.start))
         object.__setattr__(self, "start", start)
         if not np.isfinite(start).all():

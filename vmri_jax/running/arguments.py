@@ -64,7 +64,7 @@ def nothing_fast(scheme: Scheme | Composition, num_fast: int) -> str:
         return ""
     return (
         "no body of the scene is fast, so that all micro steps but one resolve nothing. Take num_micro=1; or say which potential is slow, "
-        'Torsion(..., rate="slow"), or which bodies are fast, Body(..., pace="fast").'
+        'rate="slow", or which bodies are fast, pace="fast".'
     )
 
 

@@ -230,7 +230,7 @@ class Scene:
         return build(self.sorting, self.sorting.placed)
 
     def problem(self) -> Problem:
-        """The system with positions and velocities at the start, and with the drawing unless jax.jit, grad or vmap traces numbers of the scene."""
+        """The `Problem`: the system with positions and velocities at the start, and with the drawing unless jax.jit, grad or vmap traces numbers of the scene."""
         if self._problems:
             return self._problems[0]
         is_drawn = is_concrete((self.params, [body.radius for body in self.bodies]))

@@ -206,9 +206,15 @@ def joint_named(about: str, name: str, effects: Iterable[Effect]) -> Joint:
     """The joint with a name among effects; `about` begins the message.
 
     Raises:
+        TypeError: a name that is no string.
         ValueError: no joint has this name.
     """
     joints = {effect.name: effect for effect in effects if isinstance(effect, Joint)}
+    if not isinstance(name, str):
+        raise TypeError(
+            f"{about}: joint is {name!r}; give the name of one joint. Each joint has an effect of its own with a name=, or several pairs of "
+            "bodies are one joint."
+        )
     if name not in joints:
         raise ValueError(f"{about}: {unknown('joint', name, joints)}")
     return joints[name]
