@@ -49,7 +49,7 @@ def explain(
     console.print(ledger.table())
     console.print()
     console.print(ledger.reasons())
-    console.print("\n[bold]Small vibrations[/bold] about the start\n", small.table())
+    console.print("\n[bold]Small vibrations[/bold] about the start, estimates where it is not at rest\n", small.table())
     useless = nothing_fast(chosen, sum(row.kind == "body" and row.grid != "macro" for row in ledger.rows))
     if useless:
         console.print(f"\n[yellow]{escape(useless)}[/yellow]")
