@@ -372,10 +372,10 @@ def _home(effect: Effect, i: int, slow: tuple[str, ...], size: int, measured, li
         return "slow_potential", Reason("touches {}, which {} slow", slow)
     if effect.rate != "auto":
         return ("fast_potential" if effect.rate == "fast" else "slow_potential"), Reason("as given")
-    border = f"{limit:.3g} rad/s" if limit else "zero: no border between slow and fast"
+    level = f"{limit:.3g} rad/s" if limit else "zero: no border between slow and fast"
     if measured[effect.name].frequency[i] > (limit or 0.0):
-        return "fast_potential", Reason(f"between fast bodies and stiff, above {border}")
-    return "slow_potential", Reason(f"between fast bodies but soft, {'below' if limit else 'at'} {border}")
+        return "fast_potential", Reason(f"between fast bodies and stiff, above {level}")
+    return "slow_potential", Reason(f"between fast bodies but soft, {'below' if limit else 'at'} {level}")
 
 
 def _summary(reasons: Iterable[Reason]) -> str:
