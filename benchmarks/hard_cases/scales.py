@@ -7,10 +7,10 @@ import numpy as np
 
 import vmri_jax as vm
 from benchmarks.hard_cases.case import hard_case
+from benchmarks.hard_cases.known_methods import apart_from, midpoint_integrator, rattle
 from benchmarks.hard_cases.pictures import draw_oscillatory_energies
 from benchmarks.hard_cases.systems import three_scales
 from vmri_jax.hard_cases import Outcome
-from vmri_jax.hard_cases.known_methods import apart_from, midpoint_integrator, rattle
 from vmri_jax.hard_cases.measures import difference, run, status
 
 

@@ -1,4 +1,4 @@
-"""Hard cases for any system: constraints, energy, tolerance, tiny steps, reversal, known methods, bad input."""
+"""Hard cases for any system: constraints, energy, tolerance, tiny steps, reversal, the textbook, bad input."""
 
 from vmri_jax.hard_cases.case import Case, Outcome
 from vmri_jax.hard_cases.cases import cases_for

@@ -6,12 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax import diagnostics
+from vmri_jax import diagnostics, textbook
 from vmri_jax.diagnostics import step_condition
 from vmri_jax.hard_cases.case import Case, Outcome
 from vmri_jax.hard_cases.derivatives import derivatives
 from vmri_jax.hard_cases.guards import bad_lane, single_precision
-from vmri_jax.hard_cases.known_methods import apart_from, midpoint_integrator, rattle
 from vmri_jax.hard_cases.measures import (
     Energy,
     constraints,
@@ -26,6 +25,7 @@ from vmri_jax.hard_cases.measures import (
     status,
 )
 from vmri_jax.hard_cases.pictures import draw_energy
+from vmri_jax.mechanics.projection import legendre
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.progress import Working
@@ -49,6 +49,8 @@ ROUND_OFF_BAND = 1e-9
 """Relative band of the energy up to which it is round-off; a larger value overlooks small drifts."""
 SHADOW_STEPS = 2_000
 """Steps of the run for the shadow energy; more of them find slower drifts and take longer."""
+ROUND_OFF = 4 * np.finfo(float).eps
+"""Round-off of a position in a step, as a part of the largest position; a larger value hides differences of momenta."""
 ENERGY_CRITERION = "the linear trend is at most half of the largest energy error, or flattens in a longer run, or the error is below 1e-9"
 EXPLICIT_CRITERION = "runs at omega h = 1; at 2.5 every NaN is reported as a failure"
 LANE_CRITERION = "the bad lane reports its failure, the others equal their single runs to 1e-12"
@@ -158,14 +160,40 @@ class Resolved:
             {"band_below": bounded, "failed_at_beyond": beyond.failed_at},
         )
 
-    def reductions(self, full: bool) -> Outcome:
-        h, steps, values = 0.1 / self.omega, 100 if full else 20, {}
-        free = not self.problem.system.is_constrained
-        if free:
-            values["midpoint"] = apart_from(midpoint_integrator, self.problem, fully_implicit(1), h, steps)
-        values["Verlet" if free else "RATTLE"] = apart_from(rattle, self.problem, fully_explicit(1), h, steps)
-        words = ", ".join(f"{name} {value:.0e}" for name, value in values.items())
-        return Outcome(f"from the known method after {steps} steps: {words}", max(values.values()) < 1e-10, values)
+    def textbook(self, full: bool) -> Outcome:
+        steps = 100 if full else 20
+        single = fully_explicit(1), 0.1 / self.omega
+        implicit, explicit = (self._from_textbook(*of, steps) for of in ((self.scheme, self.macro_dt), single))
+        return Outcome(
+            f"largest difference in {steps} steps: fully_implicit {implicit:.0e}, fully_explicit {explicit:.0e}",
+            max(implicit, explicit) < 1e-10,
+            {"fully_implicit": implicit, "fully_explicit": explicit},
+        )
+
+    def _from_textbook(self, scheme: Scheme, macro_dt: float, steps: int) -> float:
+        """Largest difference of a run from the textbook, relative to the largest positions and momenta, less round-off.
+
+        A step divides the round-off of ``M (q_+ - q)`` by its micro step h, so that momenta have a round-off of ``eps |M| |q| / h``.
+        """
+        system, state = self.problem.system, self.problem.state()
+        oracle = jax.jit(textbook.simulate, static_argnames="num_steps")(
+            system, scheme, state, macro_dt, num_steps=steps
+        )
+        ours = run(self.problem, scheme, macro_dt, steps).states
+        mass = jax.jacfwd(
+            lambda v: jnp.concatenate(legendre(system, state.q_s, state.q_f, *jnp.split(v, [state.q_s.size])))
+        )
+        size = float(jnp.abs(mass(jnp.zeros(state.q_s.size + state.q_f.size))).max())
+        (q, q_oracle), (p, p_oracle) = (
+            [
+                np.concatenate([getattr(run, f"{letter}_s"), getattr(run, f"{letter}_f")], axis=1)
+                for run in (ours, oracle)
+            ]
+            for letter in "qp"
+        )
+        largest_q, largest_p = np.abs(q_oracle).max(), np.abs(p_oracle).max()
+        round_off = steps * ROUND_OFF * size * largest_q * scheme.num_micro / macro_dt
+        return max(difference(q, q_oracle) / largest_q, max(difference(p, p_oracle) - round_off, 0.0) / largest_p)
 
     def advice(self, full: bool) -> Outcome:
         advice = advise(self.problem, self.scheme, macro_dt=self.macro_dt)
@@ -235,7 +263,7 @@ def cases_for(problem: Problem | HasProblem) -> tuple[Case, ...]:
             cases.explicit_limit,
             _has_no_limit(system),
         ),
-        ("reductions", single, "known methods to 1e-10", cases.reductions, _is_not_reduced(system)),
+        ("textbook", f"{step}; fully_explicit, {single}", "steps of vmri_jax.textbook to 1e-10", cases.textbook),
         ("float32", "64-bit mode off, and float32 data", "refused with the one-line fix", precision),
         ("one bad lane in a batch", step, LANE_CRITERION, lane),
         ("derivatives", step, "gradients and Hessians are those of the functions, to 1e-4", differences),
@@ -264,17 +292,6 @@ def _has_no_limit(system: System) -> str:
         return "its kinetic energy is a function, not that of constant masses: every step solves equations"
     if system.force is not None:
         return "it has forces besides its potentials: every step solves equations, and damping changes the limit"
-    return ""
-
-
-def _is_not_reduced(system: System) -> str:
-    """The reason why the scheme does not reduce to the known methods as written here; empty if it does."""
-    if not system.has_constant_mass:
-        return "its kinetic energy is a function, and the known methods are written here for constant masses"
-    if system.is_rheonomic:
-        return "its constraints move with time, and the known methods are written here for constraints at rest"
-    if system.force is not None:
-        return "it has forces besides its potentials, and the known methods are written here for potentials alone"
     return ""
 
 
