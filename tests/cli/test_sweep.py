@@ -63,7 +63,7 @@ def test_a_sweep_runs_is_drawn_and_gone_on_with(vmri, tmp_path):
 def test_what_cannot_be_drawn_is_refused_before_it_runs(vmri, tmp_path):
     code, text = vmri("sweep", "sweep.toml", "--plot", "map.png")
     assert code == 2
-    assert '--plot draws one number per run, and save = ["end"] keeps none.' in text
+    assert '--plot draws one number per run or per saved node, and save = ["end"] keeps neither.' in text
     assert 'save = ["end", "energy_error"]' in text
     assert not (tmp_path / "runs.zarr").exists()
 
