@@ -176,22 +176,18 @@ class Resolved:
         A step divides the round-off of ``M (q_+ - q)`` by its micro step h, so that momenta have a round-off of ``eps |M| |q| / h``.
         """
         system, state = self.problem.system, self.problem.state()
-        oracle = jax.jit(textbook.simulate, static_argnames="num_steps")(
-            system, scheme, state, macro_dt, num_steps=steps
+        simulated = jax.jit(textbook.simulate, static_argnames="num_steps")
+        (q, p), (q_oracle, p_oracle) = (
+            (np.concatenate([states.q_s, states.q_f], axis=1), np.concatenate([states.p_s, states.p_f], axis=1))
+            for states in (
+                run(self.problem, scheme, macro_dt, steps).states,
+                simulated(system, scheme, state, macro_dt, num_steps=steps),
+            )
         )
-        ours = run(self.problem, scheme, macro_dt, steps).states
-        mass = jax.jacfwd(
-            lambda v: jnp.concatenate(legendre(system, state.q_s, state.q_f, *jnp.split(v, [state.q_s.size])))
-        )
-        size = float(jnp.abs(mass(jnp.zeros(state.q_s.size + state.q_f.size))).max())
-        (q, q_oracle), (p, p_oracle) = (
-            [
-                np.concatenate([getattr(run, f"{letter}_s"), getattr(run, f"{letter}_f")], axis=1)
-                for run in (ours, oracle)
-            ]
-            for letter in "qp"
-        )
-        largest_q, largest_p = np.abs(q_oracle).max(), np.abs(p_oracle).max()
+        n_s, still = state.q_s.size, jnp.zeros(q.shape[1])
+        mass = jax.jacfwd(lambda v: jnp.concatenate(legendre(system, state.q_s, state.q_f, v[:n_s], v[n_s:])))(still)
+        size = float(jnp.abs(mass).max())
+        largest_q, largest_p = (max(np.abs(a).max(), 1e-300) for a in (q_oracle, p_oracle))
         round_off = steps * ROUND_OFF * size * largest_q * scheme.num_micro / macro_dt
         return max(difference(q, q_oracle) / largest_q, max(difference(p, p_oracle) - round_off, 0.0) / largest_p)
 

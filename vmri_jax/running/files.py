@@ -67,10 +67,14 @@ def check_place(path: Path) -> None:
 
 
 def is_new(caller: str, path: Path, resume: bool, overwrite: bool) -> bool:
-    """Whether nothing is at the path of a store; refuses both `resume` and `overwrite`, and a path where no store can be written.
+    """Whether nothing is at the path of a store yet.
 
     Args:
         caller: begins the messages.
+
+    Raises:
+        ValueError: both `resume` and `overwrite`.
+        FileNotFoundError, OSError: no store can be written there.
     """
     if resume and overwrite:
         raise ValueError(f"{caller}: both resume and overwrite are true; choose one of them.")
