@@ -154,3 +154,14 @@ def test_a_potential_on_every_second_micro_node_is_described():
     kicks = micro(quadrature.trapezoidal, every=2)
     scheme = Scheme(4, kinetic=base.kinetic, slow=base.slow, fast=base.fast, potentials={2: kicks})
     assert "V_2" in str(scheme.describe())
+
+
+def test_schemes_print_a_few_lines_that_say_what_they_are():
+    scheme = explicit_slow(7)
+    assert repr(scheme).splitlines()[:3] == [
+        "Scheme",
+        "  order           2, symmetric",
+        "  path            7 micro steps of degree 1 per macro step",
+    ]
+    assert repr(compose(scheme, "suzuki4")).startswith("Composition\n  order           4, symmetric")
+    assert "PlacedRule" in repr(jax.tree.map(lambda a: np.stack([a, a]), scheme))

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float
 
 from vmri_jax.mechanics.arrays import Numbers, is_concrete, real_array
-from vmri_jax.schemes.description import Description
+from vmri_jax.schemes.description import Description, printed
 from vmri_jax.schemes.scheme import Scheme
 
 
@@ -147,6 +147,9 @@ class Composition(eqx.Module):
     def with_num_micro(self, num_micro: int) -> "Composition":
         """The same composition of a scheme with another number of micro steps in every stage."""
         return Composition(self.scheme.with_num_micro(num_micro), self.coefficients)
+
+    def __repr__(self) -> str:
+        return printed(self)
 
     def describe(self) -> Description:
         """As `Scheme.describe`, for all stages; the rules are the rules of a stage."""

@@ -3,6 +3,12 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
+import equinox as eqx
+import jax
+import numpy as np
+
+from vmri_jax.mechanics.summary import has_values
+
 TERMS = ("T", "V", "W", "F", "g", "g_s")
 """Terms with a rule: the kinetic energy, the slow and the fast potential, forces, constraints."""
 
@@ -55,3 +61,10 @@ class Description:
         }
         width = max(16, *(len(name) + 2 for name in rows))
         return "\n".join(f"{name:<{width}}{value}" for name, value in rows.items())
+
+
+def printed(scheme) -> str:
+    """The text that a scheme or composition prints: its class and its description; its fields where weights are traced or have lanes."""
+    if not has_values(scheme) or any(np.ndim(leaf) > 1 for leaf in jax.tree.leaves(scheme)):
+        return eqx.Module.__repr__(scheme)
+    return "\n".join([type(scheme).__name__, *(f"  {line}" for line in str(scheme.describe()).splitlines())])

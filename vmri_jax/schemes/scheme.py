@@ -26,7 +26,7 @@ import numpy as np
 
 from vmri_jax.mechanics.arrays import is_concrete
 from vmri_jax.mechanics.system import label
-from vmri_jax.schemes.description import TERMS, Description
+from vmri_jax.schemes.description import TERMS, Description, printed
 from vmri_jax.schemes.path import control_nodes, lagrange_derivative
 from vmri_jax.schemes.quadrature import (
     NODE_TOLERANCE,
@@ -202,6 +202,9 @@ class Scheme(eqx.Module):
             ValueError: as of `rule_of`.
         """
         return self.rule_of(name).evaluations(self.num_micro)
+
+    def __repr__(self) -> str:
+        return printed(self)
 
     def describe(self) -> Description:
         """Rules, order, symmetry, evaluations and solves per macro step; prints as a table.
