@@ -46,6 +46,9 @@ class State:
     p_s: Float[Numbers, "n_s"]
     p_f: Float[Numbers, "n_f"]
 
+    def __eq__(self, other) -> Any:
+        return eqx.tree_equal(self, other)
+
     def __repr__(self) -> str:
         if not has_values(self) or np.ndim(self.t) or np.ndim(self.q_s) != 1:
             return eqx.tree_pformat(self)
