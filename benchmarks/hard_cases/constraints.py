@@ -31,12 +31,12 @@ def both_rods(q_s, q_f, params):
 def slow_only_constraint(full: bool) -> Outcome:
     """triple pendulum, first rod passed as `constraint`
 
-    refused with the row, the reason (rank deficit num_micro - 1) and the fix
+    refused with the row, the reason (rank deficit r (num_micro - 1) per row) and the fix
     """
     problem = vm.systems.triple_spherical_pendulum()
     system = problem.system.replace(constraint=both_rods, slow_constraint=None)
     said = refusal(replace(problem, system=system, names=None))
-    parts = {"row": "row(s) [0]", "reason": "rank deficit num_micro - 1", "fix": "System(slow_constraint=...)"}
+    parts = {"row": "row(s) [0]", "reason": "rank deficit r (num_micro - 1) per row", "fix": "System(slow_constraint=...)"}
     found = {name: text in said for name, text in parts.items()}
     words = ", ".join(name for name, there in found.items() if there)
     return Outcome(f"refused, with {words}" if said else "not refused", all(found.values()), found)
