@@ -36,7 +36,11 @@ def slow_only_constraint(full: bool) -> Outcome:
     problem = vm.systems.triple_spherical_pendulum()
     system = problem.system.replace(constraint=both_rods, slow_constraint=None)
     said = refusal(replace(problem, system=system, names=None))
-    parts = {"row": "row(s) [0]", "reason": "rank deficit r (num_micro - 1) per row", "fix": "System(slow_constraint=...)"}
+    parts = {
+        "row": "row(s) [0]",
+        "reason": "rank deficit r (num_micro - 1) per row",
+        "fix": "System(slow_constraint=...)",
+    }
     found = {name: text in said for name, text in parts.items()}
     words = ", ".join(name for name, there in found.items() if there)
     return Outcome(f"refused, with {words}" if said else "not refused", all(found.values()), found)
