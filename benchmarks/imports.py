@@ -1,7 +1,8 @@
 """Model files that ship with gymnasium and dm_control: which are read, and how their motion differs from MuJoCo's.
 
-From a random start, with what is ignored switched off, the accelerations of both are compared. All then move for half a
-second: in MuJoCo by its Runge-Kutta method of order four, as scenes by a composition of order four. The files alone are needed: pip install --no-deps gymnasium==1.4.0 dm_control==1.0.50.
+From a random start, with what is ignored switched off, the accelerations of both are compared. All models then move for
+half a second: in MuJoCo by its Runge-Kutta method of order four, as scenes by a composition of order four. The files alone are needed:
+pip install --no-deps gymnasium==1.4.0 dm_control==1.0.50.
 """
 
 import time

@@ -169,15 +169,15 @@ def test_a_parameter_that_nothing_depends_on_is_refused():
 def test_numbers_of_a_scene_have_the_names_of_their_effects():
     bodies = [vm.scene.Body("a", 1.0, [0.0]), vm.scene.Body("b", 1.0, [1.2])]
     scene = vm.scene.Scene(bodies, [vm.scene.Spring(("a", "b"), 40.0, 1.0, name="bond")])
-    one = vm.fully_explicit(1)
-    run = vm.simulate(scene, one, macro_dt=DT, num_steps=20)
+    single = vm.fully_explicit(1)
+    run = vm.simulate(scene, single, macro_dt=DT, num_steps=20)
     data = Measured(run.t, run.states.q_s, sigma=1e-6, observe=lambda state: state.q_s)
-    found = vm.fit(scene, data, {"bond.stiffness": Unknown(36.0, lower=0)}, scheme=one, macro_dt=DT)
+    found = vm.fit(scene, data, {"bond.stiffness": Unknown(36.0, lower=0)}, scheme=single, macro_dt=DT)
     assert found.parameters["bond.stiffness"] == pytest.approx(40.0, rel=1e-6)
     with pytest.raises(
         ValueError, match=r"'bond.length_', which is none of system.params \(bond.stiffness, bond.length\)"
     ):
-        vm.fit(scene, data, {"bond.length_": 1.0}, scheme=one, macro_dt=DT)
+        vm.fit(scene, data, {"bond.length_": 1.0}, scheme=single, macro_dt=DT)
     with pytest.raises(TypeError, match="start is a dictionary; name its numbers one by one"):
         Unknown({"stiffness": 1.0})
 

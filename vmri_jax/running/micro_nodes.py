@@ -43,7 +43,7 @@ def why_not(t, t_micro) -> str:
     # the first micro node than after it, there are further macro steps.
     before, after = t_micro[:, 0] - t[:-1], t[1:] - t_micro[:, 0]
     if t_micro.shape[1] > 1 and np.any(before > after * (1 + ROUND_OFF)):
-        return "it kept those of some macro steps only; simulate with save_every=1"
+        return "it kept the micro nodes of some macro steps only; simulate with save_every=1"
     return ""
 
 

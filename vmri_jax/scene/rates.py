@@ -153,7 +153,8 @@ def _linearise(effect: Effect, bodies: Bodies, columns: Mapping[str, np.ndarray]
         q = jnp.concatenate([bodies[name].coordinates for name in element])
         v = jnp.concatenate([bodies[name].rates for name in element])
         force, *matrices = map(np.asarray, _derivatives(term, effect.kind == "kinetic", q, v, element_params))
-        motions = block_diag(*(bodies[name].motions for name in element))
+        each = [bodies[name].motions for name in element]
+        motions = block_diag(*each)
         force, (stiffness, gyroscopic, mass) = motions.T @ force, [motions.T @ matrix @ motions for matrix in matrices]
         if not all(np.isfinite(part).all() for part in (force, stiffness, gyroscopic, mass)):
             raise ValueError(
@@ -161,7 +162,7 @@ def _linearise(effect: Effect, bodies: Bodies, columns: Mapping[str, np.ndarray]
                 "start; move these bodies, or smooth the energy."
             )
         # the first three coordinates of a rigid body are its centre, all others directors
-        centres = [(bodies[name].motions, 3 if bodies[name].rigid else bodies[name].size) for name in element]
+        centres = [(m, 3 if bodies[name].rigid else bodies[name].size) for m, name in zip(each, element, strict=True)]
         translation = np.asarray(block_diag(*(m[:k] for m, k in centres)))
         turning = np.asarray(block_diag(*(m[k:] for m, k in centres)))
         joined_columns = np.concatenate([columns[name] for name in element])
