@@ -19,8 +19,8 @@ import vmri_jax as vm
 from benchmarks.measure import Tell, silent
 from benchmarks.report import Report
 from vmri_jax.ensembles import Draws, Ensemble
-from vmri_jax.ensembles.executors import local_workers
 from vmri_jax.ensembles.store import committed
+from vmri_jax.executors.executor import local_workers
 
 COLUMNS = ("ensemble", "kills", "chunks before a resume", "calls", "identical")
 LANES, CHUNK = 30_000, 500

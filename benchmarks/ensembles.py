@@ -21,11 +21,11 @@ from benchmarks.measure import Ratio, Tell, ratio, silent
 from benchmarks.report import Claim, Part, Report
 from vmri_jax import plots
 from vmri_jax.ensembles import Axis, Draws, Ensemble, Product
-from vmri_jax.ensembles.executors import as_done, executor_of, local_workers
 from vmri_jax.ensembles.prepared import prepared
 from vmri_jax.ensembles.store import committed
 from vmri_jax.ensembles.work import Work
-from vmri_jax.ensembles.worker import call_in_worker, call_packed, known_versions, packed
+from vmri_jax.executors.executor import as_done, executor_of, local_workers
+from vmri_jax.executors.worker import call_in_worker, call_packed, known_versions, packed
 
 PARTS = ("speed", "paper", "million", "study")
 COLUMNS = {
@@ -203,13 +203,13 @@ def _picked(lanes: int) -> int:
 def _sleep(client, count: int, seconds: float) -> float:
     """Time that so many tasks take that do nothing but sleep."""
     call, versions = packed("sleep", (time.sleep, (seconds,))), known_versions()
-    with executor_of("sleep", client, None) as (tasks, room):
+    with executor_of("sleep", client) as tasks:
 
         def submit(_: int) -> Future:
             return tasks.submit(*call_in_worker(versions, call_packed, call))
 
         begin = time.perf_counter()
-        for _, future in as_done(submit, room, ((i,) for i in range(count))):
+        for _, future in as_done(submit, ((i,) for i in range(count))):
             future.result()
     return time.perf_counter() - begin
 

@@ -22,7 +22,7 @@ import vmri_jax as vm
 from tests.ensembles import own
 from tests.ensembles.test_ensemble import OWN
 from vmri_jax.ensembles import EnsembleError
-from vmri_jax.ensembles.worker import NotAWorker, in_worker, known_versions
+from vmri_jax.executors.worker import NotAWorker, in_worker, known_versions
 
 distributed = pytest.importorskip("distributed")
 pytestmark = pytest.mark.filterwarnings("default")  # of Dask, about ports and slow loops
@@ -194,7 +194,7 @@ def test_processes_that_run_jax_already():
     jnp.zeros(1)
     program = (
         "import jax.numpy as jnp\njnp.zeros(1)\n"
-        "from vmri_jax.ensembles.worker import in_worker, known_versions\nin_worker(known_versions(), print, b'')"
+        "from vmri_jax.executors.worker import in_worker, known_versions\nin_worker(known_versions(), print, b'')"
     )
     environment = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, env=environment)

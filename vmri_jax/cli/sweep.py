@@ -25,8 +25,8 @@ from vmri_jax.cli.common import (
     refusals,
 )
 from vmri_jax.ensembles import Axis, Draw, Draws, Ensemble, EnsembleError, Product, ensemble
-from vmri_jax.ensembles.executors import local_workers
 from vmri_jax.ensembles.quantities import drawn_by_default
+from vmri_jax.executors.executor import local_workers
 from vmri_jax.mechanics.names import near
 from vmri_jax.running.export import extra
 from vmri_jax.running.interrupts import Interrupted

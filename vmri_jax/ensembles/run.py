@@ -3,7 +3,7 @@
 import os
 import time
 from collections.abc import Mapping, Sequence
-from concurrent.futures import BrokenExecutor, CancelledError
+from concurrent.futures import BrokenExecutor, CancelledError, Executor
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,11 +11,11 @@ from typing import Any
 
 from vmri_jax.ensembles import store
 from vmri_jax.ensembles.design import Design, Draws, Product, Table
-from vmri_jax.ensembles.executors import Here, as_done, executor_of
 from vmri_jax.ensembles.prepared import attributes_of, check_same, prepared
 from vmri_jax.ensembles.task import Chunks, Job, run_chunk, run_packed_chunk
 from vmri_jax.ensembles.work import AnyScheme, Work
-from vmri_jax.ensembles.worker import NotAWorker, call_in_worker, known_versions, packed
+from vmri_jax.executors.executor import Here, as_done, executor_of
+from vmri_jax.executors.worker import NotAWorker, call_in_worker, known_versions, packed
 from vmri_jax.mechanics.arrays import require_x64, whole_number
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
 from vmri_jax.running.files import clear_partial, is_new
@@ -207,7 +207,7 @@ def ensemble(
         chunks = chunks._replace(size=stored["chunk"], width=stored["width"])
         check_same(path, attributes, stored, chunk)
     with ExitStack() as opened:
-        tasks, room = opened.enter_context(executor_of("ensemble", executor, processes))
+        tasks = opened.enter_context(executor_of("ensemble", executor, processes))
         if not isinstance(tasks, Here):
             packed("ensemble", work)
         if not (resume and path.exists()):
@@ -222,13 +222,13 @@ def ensemble(
         interrupted = opened.enter_context(interrupts_noted())
         runs = Ensemble(path, chunks, store.committed(path))
         job = Job(str(path.resolve()), chunks, work, None if isinstance(design, Table) else design)
-        _compute(runs, job, tasks, room, tell, interrupted)
+        _compute(runs, job, tasks, tell, interrupted)
     if runs.failures and throw:
         raise EnsembleError(runs) from runs.first_error
     return runs
 
 
-def _compute(runs: Ensemble, job: Job, tasks, room, tell: Progress, interrupted) -> None:
+def _compute(runs: Ensemble, job: Job, tasks: Executor, tell: Progress, interrupted) -> None:
     """Compute the missing chunks and record them in `runs`."""
     begin = time.perf_counter()
     missing = ((number,) for number in range(job.chunks.count) if number not in runs.done)
@@ -239,7 +239,7 @@ def _compute(runs: Ensemble, job: Job, tasks, room, tell: Progress, interrupted)
         submit = lambda number: tasks.submit(*call_in_worker(versions, run_packed_chunk, data, number))  # noqa: E731
     tell(_progress(runs), _lanes_done(runs), job.chunks.lanes)
     try:
-        for (number,), future in as_done(submit, room, missing, interrupted):
+        for (number,), future in as_done(submit, missing, interrupted):
             try:
                 runs.done[number] = future.result()
             except Exception as error:

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from vmri_jax.ensembles.executors import mapped
+from vmri_jax.executors.executor import mapped
 from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.mechanics.system import System
 from vmri_jax.schemes.composition import Composition

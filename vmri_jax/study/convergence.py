@@ -15,7 +15,7 @@ import numpy as np
 
 from vmri_jax import diagnostics, plots
 from vmri_jax.diagnostics import OrderFit
-from vmri_jax.ensembles.executors import mapped
+from vmri_jax.executors.executor import mapped
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
 from vmri_jax.running.batch import simulate_batch
 from vmri_jax.running.export import extra

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from vmri_jax import diagnostics, plots
-from vmri_jax.ensembles.executors import mapped
+from vmri_jax.executors.executor import mapped
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
 from vmri_jax.mechanics.system import label
 from vmri_jax.running.interrupts import Interrupted

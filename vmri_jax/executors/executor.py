@@ -1,12 +1,12 @@
 """Executors of tasks: this process, workers on this machine, or an executor that the user gives."""
 
-import time
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, wait
-from contextlib import ExitStack, contextmanager, suppress
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
+from contextlib import ExitStack, contextmanager
+from itertools import islice
 from typing import Any
 
-from vmri_jax.ensembles.worker import call_in_worker, call_packed, known_versions, packed
+from vmri_jax.executors.worker import call_in_worker, call_packed, known_versions, packed
 from vmri_jax.mechanics.arrays import whole_number
 from vmri_jax.running.export import extra
 from vmri_jax.running.interrupts import Interrupted, interrupts_noted
@@ -14,9 +14,9 @@ from vmri_jax.running.interrupts import Interrupted, interrupts_noted
 DASK_RETRIES = 2
 """Number of times that Dask repeats a task that raised an error; a larger one delays the report of an error that is no accident. A
 setting of Dask tells how often it repeats a task whose worker died."""
-TASKS_PER_THREAD = 4
-"""Tasks under way for each thread of the workers, so that no thread waits for the next task. With more of them more work is lost when the
-program is stopped."""
+MOST_UNDER_WAY = 1000
+"""Largest number of tasks that an executor has at once: enough for several hundred workers. The arguments of all of them are in memory:
+with a larger number ensembles of large systems need more of it, with a smaller one large clusters wait for tasks."""
 POLL_SECONDS = 1.0
 """Seconds between two looks at the workers and at all futures: `wait` does not return for futures that Dask cancels when its scheduler
 ends. With a larger value the program notices later that the scheduler is gone."""
@@ -35,12 +35,12 @@ class Here(Executor):
 
 
 @contextmanager
-def executor_of(caller: str, executor: Any, processes: int | None) -> Iterator[tuple[Executor, Callable[[], int]]]:
-    """An executor, and a function that returns the number of tasks that it should have under way.
+def executor_of(caller: str, executor: Any, processes: int | None = None) -> Iterator[Executor]:
+    """The `concurrent.futures.Executor` that computes the tasks of a call.
 
     Args:
         caller: name of the calling function, for messages.
-        executor: None for this process, a `concurrent.futures.Executor`, or a `dask.distributed.Client`.
+        executor: None for this process, a `concurrent.futures.Executor`, or a `dask.distributed.Client`, which makes one.
         processes: number of workers to start on this machine, or None.
 
     Raises:
@@ -52,41 +52,14 @@ def executor_of(caller: str, executor: Any, processes: int | None) -> Iterator[t
     with ExitStack() as resources:
         if processes is not None:
             executor = resources.enter_context(local_workers(whole_number(f"{caller}: processes", processes)))
-        if executor is None:
-            yield Here(), lambda: 1
-        elif isinstance(executor, Executor):
-            size = getattr(executor, "_max_workers", 1)
-            yield executor, lambda: TASKS_PER_THREAD * size
-        elif hasattr(executor, "get_executor"):
-            tasks = executor.get_executor(retries=DASK_RETRIES, pure=False)
-            try:
-                yield tasks, _room(executor)
-            finally:
-                if executor.status == "running":
-                    tasks.shutdown(wait=False)  # nobody needs the results of tasks that still run
-        else:
+        if executor is not None and hasattr(executor, "get_executor"):
+            executor = executor.get_executor(retries=DASK_RETRIES, pure=False)
+        if not isinstance(executor, Executor | None):
             raise TypeError(
                 f"{caller}: executor is {type(executor).__name__}; give a dask.distributed.Client or a concurrent.futures.Executor, "
                 "or the number of processes on this machine."
             )
-
-
-def _room(client: Any) -> Callable[[], int]:
-    """A function that returns the number of tasks for all workers of a client.
-
-    While the scheduler does not answer the number stays; once the client has closed it is 0.
-    """
-    tasks, counted_at = TASKS_PER_THREAD, -POLL_SECONDS
-
-    def room() -> int:
-        nonlocal tasks, counted_at
-        if time.monotonic() - counted_at > POLL_SECONDS:
-            counted_at = time.monotonic()
-            with suppress(OSError, RuntimeError, AttributeError):
-                tasks = TASKS_PER_THREAD * max(1, sum(client.nthreads().values()))
-        return 0 if client.status == "closed" else tasks
-
-    return room
+        yield Here() if executor is None else executor
 
 
 @contextmanager
@@ -103,22 +76,17 @@ def local_workers(count: int) -> Iterator[Any]:
 
 
 def as_done(
-    submit: Callable[..., Future],
-    room: Callable[[], int],
-    arguments: Iterable[tuple],
-    interrupted: Callable[[], bool] = lambda: False,
+    submit: Callable[..., Future], arguments: Iterable[tuple], interrupted: Callable[[], bool] = lambda: False
 ) -> Iterator[tuple[tuple, Future]]:
-    """Submit a task for each tuple of arguments, not too many ahead, and yield the arguments with the future as tasks end.
+    """Submit a task for each tuple of arguments, at most `MOST_UNDER_WAY` ahead, and yield the arguments with the future as tasks end.
 
     Args:
-        submit: starts one task.
-        room: returns the largest number of tasks under way.
+        submit: starts one task. A task of this process has ended when `submit` returns, and is yielded before the next one starts.
         arguments: a tuple for each task.
         interrupted: returns whether Ctrl-C was pressed. Python loses a `KeyboardInterrupt` that is raised in the finaliser of a future
             of Dask; therefore a handler notes Ctrl-C, and this function polls it.
 
     Raises:
-        CancelledError: `room` returned 0: the workers are gone.
         KeyboardInterrupt: Ctrl-C was pressed.
     """
     waiting: dict[Future, tuple] = {}
@@ -127,15 +95,16 @@ def as_done(
         while True:
             if interrupted():
                 raise KeyboardInterrupt
-            if not room():
-                raise CancelledError
-            while len(waiting) < room() and (call := next(left, None)) is not None:
-                waiting[submit(*call)] = call
+            for future in [future for future in waiting if future.done()]:
+                yield waiting.pop(future), future
+            for call in islice(left, MOST_UNDER_WAY - len(waiting)):
+                future = submit(*call)
+                waiting[future] = call
+                if future.done():
+                    break
             if not waiting:
                 return
             wait(waiting, POLL_SECONDS, FIRST_COMPLETED)
-            for future in [future for future in waiting if future.done()]:
-                yield waiting.pop(future), future
     finally:
         for future in waiting:
             future.cancel()
@@ -163,7 +132,7 @@ def mapped(
     calls = list(arguments)
     results: list = [None] * len(calls)
     with ExitStack() as opened:
-        tasks, room = opened.enter_context(executor_of(caller, executor, None))
+        tasks = opened.enter_context(executor_of(caller, executor))
         here, versions = isinstance(tasks, Here), known_versions()
         # In this process Ctrl-C stops the task itself, so that nothing has to poll.
         interrupted = (lambda: False) if here else opened.enter_context(interrupts_noted())
@@ -176,7 +145,7 @@ def mapped(
             return tasks.submit(*call_in_worker(versions, call_packed, packed(caller, (task, calls[i]))))
 
         try:
-            for (i,), future in as_done(submit, room, numbers, interrupted):
+            for (i,), future in as_done(submit, numbers, interrupted):
                 results[i] = future.result()
         except KeyboardInterrupt:
             done = sum(result is not None for result in results)
