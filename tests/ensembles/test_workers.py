@@ -98,6 +98,13 @@ def test_problems_and_schemes_travel(tmp_path, client):
     assert contents(one.path) == contents(two.path)
 
 
+def test_a_function_of_rows_travels(tmp_path, client):
+    design = {"frequency": [20.0, 50.0], "speed": [1.0]}
+    arguments = {"system": vm.systems.fermi_pasta_ulam(), "design": design, "vary": own.faster, "chunk": 1, "num_micro": 2}
+    here = sweep(tmp_path / "one.zarr", **arguments)
+    assert contents(here.path) == contents(sweep(tmp_path / "two.zarr", **arguments, executor=client).path)
+
+
 def test_a_worker_that_is_killed(tmp_path, client, here_slowly):
     pids = list(client.run(os.getpid).values())
     out = tmp_path / "runs.zarr"

@@ -1,4 +1,4 @@
-"""Columns of a design by name: each sets a parameter, a part of the start, a step or the scheme of a run.
+"""Columns of a design: a function ``(problem, row) -> problem`` makes the problem of a run. Without one, names of columns say what they set:
 
 omega, springs.stiffness, masses[2]     a parameter of the system, or one number of it
 q_s, v_f, ...                           a whole vector of the start
@@ -10,18 +10,27 @@ num_micro, scheme                       schemes
 
 import re
 from collections.abc import Callable, Collection, Mapping
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.ensembles.design import Rows
+from vmri_jax.mechanics.checks import check_type, is_concrete
 from vmri_jax.mechanics.names import Names, near
 from vmri_jax.mechanics.state import Problem
+from vmri_jax.mechanics.system import System
 
 STEPS = ("macro_dt", "micro_dt", "num_steps")
 SCHEMES = ("scheme", "num_micro")
 START = ("t", "q_s", "q_f", "v_s", "v_f")
+
+Row = Mapping[str, Any]
+"""The values of one row of a design, by column."""
+Vary = Callable[[Problem, Row], Problem]
+"""A function that makes the problem of a run from a problem and a row."""
 
 
 class ColumnPlace(NamedTuple):
@@ -40,66 +49,110 @@ class ColumnPlace(NamedTuple):
 class Lanes(NamedTuple):
     """Runs side by side, the first axis of every array.
 
-    params: of the structure of the system's parameters; None if no column changes a parameter.
-    start: t, q_s, q_f, v_s, v_f by name.
+    params: of the structure of the system's parameters; None if no row changes a parameter.
+    start: t, q_s, q_f, v_s, v_f.
     """
 
     params: Any
-    start: dict[str, np.ndarray]
+    start: tuple[Any, ...]
 
 
-def places(problem: Problem, columns: Collection[str]) -> dict[str, ColumnPlace]:
-    """The place of each column that sets a parameter or a part of the start.
+def by_name(problem: Problem, columns: Collection[str]) -> Vary:
+    """The function ``(problem, row) -> problem`` that puts the value of each column in the place that its name says.
 
     Raises:
         ValueError: a name that the problem does not have, an index that does not exist, or two columns for one number.
     """
-    known = _known(problem)
-    by_column: dict[str, ColumnPlace] = {}
-    for name in columns:
-        if name not in (*STEPS, *SCHEMES):
-            by_column[name] = _place(name, problem, known)
+    known, places = _known(problem), {}
     numbers: dict[tuple, str] = {}
-    for name, place in by_column.items():
+    for name in columns:
+        places[name] = place = _place(name, problem, known)
         for number in np.ndindex(*_target(problem, place).shape) if not place.index else [place.index]:
             first = numbers.setdefault((*place[:2], *number), name)
             if first != name:
                 raise ValueError(f"ensemble: the columns {first!r} and {name!r} both give {_shown(place, number)}.")
-    return by_column
+
+    def vary(problem: Problem, row: Row) -> Problem:
+        leaves, structure = jax.tree.flatten(problem.system.params)
+        start = {part: getattr(problem, part) for part in START}
+        for name, place in places.items():
+            arrays, key = (leaves, place.leaf) if place.part == "params" else (start, place.part)
+            arrays[key] = _with_number(arrays[key], place.index, name, row[name])
+        if any(place.part == "params" for place in places.values()):
+            start["system"] = problem.system.replace(params=jax.tree.unflatten(structure, leaves))
+        return replace(problem, **start)
+
+    return vary
 
 
-def lanes_of(problem: Problem, where: Mapping[str, ColumnPlace], rows: Rows, count: int) -> Lanes:
-    """Parameters and starts of some runs.
-
-    Args:
-        problem: has the values that no column changes.
-        where: the place of each column, see `places`.
-        rows: the values of the columns.
-        count: number of runs.
+def _with_number(array, index: tuple[int, ...], name: str, value):
+    """The array with the value of a column at an index.
 
     Raises:
-        ValueError: values of another shape than the numbers that they replace.
+        ValueError: the value has another shape than the numbers that it replaces.
     """
-    leaves, structure = jax.tree.flatten(problem.system.params)
-    start = {name: _repeated(getattr(problem, name), count) for name in START}
-    params = None
-    if any(place.part == "params" for place in where.values()):
-        params = [_repeated(leaf, count) for leaf in leaves]
-    for name, place in where.items():
-        target = start[place.part] if params is None or place.part != "params" else params[place.leaf]
-        shape = target[:, *place.index].shape
-        if rows[name].shape != shape or rows[name].dtype.kind not in "if":
+    array = jnp.asarray(array, dtype=float)
+    shape = array.shape[len(index) :]
+    if np.shape(value) != shape:
+        raise ValueError(
+            f"ensemble: each value of {name!r} has the shape {np.shape(value)}; it must be numbers of shape {shape}."
+        )
+    return array.at[index].set(value)
+
+
+def numbers_in(rows: Rows) -> Rows:
+    """The columns of numbers that change the problem; steps and schemes are left out.
+
+    Raises:
+        ValueError: a column of labels.
+    """
+    columns = {name: values for name, values in rows.items() if name not in (*STEPS, *SCHEMES)}
+    for name, values in columns.items():
+        if values.dtype.kind not in "if":
             raise ValueError(
-                f"ensemble: each value of {name!r} has the shape {rows[name].shape[1:]}; it must be numbers of shape {shape[1:]}."
+                f"ensemble: the column {name!r} has labels; only the column 'scheme' may have them. Give numbers."
             )
-        target[:, *place.index] = rows[name]
-    return Lanes(None if params is None else jax.tree.unflatten(structure, params), start)
+    return columns
 
 
-def _repeated(value, count: int) -> np.ndarray:
-    """(count, ...) copies of an array."""
-    value = np.asarray(value, dtype=float)
-    return np.repeat(value[None], count, axis=0)
+def lane_function(problem: Problem, vary: Vary) -> Callable[[Row], Lanes]:
+    """The function from a row to the parameters and the start of its run.
+
+    Raises (when it is called):
+        TypeError: `vary` returns no problem.
+        ValueError: `vary` changes something else than the values of parameters and the start.
+    """
+
+    def lane(row: Row) -> Lanes:
+        changed = vary(problem, row)
+        check_type(
+            "ensemble: vary(problem, row)", changed, Problem, "dataclasses.replace(problem, q_s=...), for example"
+        )
+        _check_only_values_differ(problem, changed)
+        is_same = changed.system.params is problem.system.params
+        return Lanes(None if is_same else changed.system.params, tuple(getattr(changed, part) for part in START))
+
+    return lane
+
+
+def _check_only_values_differ(problem: Problem, changed: Problem) -> None:
+    """Refuse a row whose run the program of the problem cannot compute: another system but for parameters, or arrays of other shapes."""
+    same_system = _is_same(problem.system.replace(params=None), changed.system.replace(params=None))
+    before, after = ((entry.system.params, [getattr(entry, part) for part in START]) for entry in (problem, changed))
+    if not same_system or jax.tree.map(np.shape, before) != jax.tree.map(np.shape, after):
+        raise ValueError(
+            "ensemble: vary(problem, row) may change the values of system.params, positions, velocities and t. It changes "
+            f"{'the structure or shape of one of them' if same_system else 'the system besides its params'}; such runs need an ensemble of their own."
+        )
+
+
+def _is_same(before: System, after: System) -> bool:
+    """Whether two systems have the same functions and the same arrays."""
+    leaves, structure = jax.tree.flatten(before)
+    other_leaves, other_structure = jax.tree.flatten(after)
+    return structure == other_structure and all(
+        a is b or (is_concrete(b) and np.array_equal(a, b)) for a, b in zip(leaves, other_leaves, strict=True)
+    )
 
 
 def _known(problem: Problem) -> dict[str, Callable[[tuple[int, ...]], ColumnPlace]]:

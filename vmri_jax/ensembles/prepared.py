@@ -4,9 +4,10 @@ import warnings
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
-from vmri_jax.ensembles.columns import lanes_of
+from vmri_jax.ensembles.columns import Row, numbers_in
 from vmri_jax.ensembles.design import Design, Draws, Product
 from vmri_jax.ensembles.quantities import Kept, what_is_kept
 from vmri_jax.ensembles.task import Chunks
@@ -15,7 +16,7 @@ from vmri_jax.mechanics.arrays import whole_number
 from vmri_jax.mechanics.names import Names
 from vmri_jax.running.batch import lanes_at_once
 from vmri_jax.running.simulation import Simulation
-from vmri_jax.running.store.identity import changed_conditions, describe, differences, environment, identity
+from vmri_jax.running.store.identity import changed_conditions, describe, differences, environment, identity, operations
 from vmri_jax.steppers.results import Result
 
 CHUNK_SECONDS = 1.0
@@ -64,9 +65,7 @@ def prepared(work: Work, design: Design, chunk: int | None = None) -> Prepared:
 
 def _checked(work: Work, design: Design) -> list[Simulation]:
     """One run of each group, the longest first, after a check of all arguments."""
-    lanes_of(
-        work.problem, work.places, design.rows(0, 1), 1
-    )  # refuses values of other shapes than the numbers that they replace
+    jax.eval_shape(work.lane, _first_row(design))
     runs = [work.simulation(group) for group in all_groups(work, design)]
     runs[0].check("ensemble: the start", constraints=False)
     over_nodes = [name for name, quantity in zip(work.save, work.quantities, strict=True) if quantity.over_nodes]
@@ -76,6 +75,11 @@ def _checked(work: Work, design: Design) -> list[Simulation]:
             "for example 50."
         )
     return sorted(runs, key=_micro_steps, reverse=True)
+
+
+def _first_row(design: Design) -> Row:
+    """The numbers of the first row of a design."""
+    return {name: values[0] for name, values in numbers_in(design.rows(0, 1)).items()}
 
 
 def _micro_steps(run: Simulation) -> int:
@@ -155,6 +159,10 @@ def _identity(work: Work, design: Design, run: Simulation) -> dict[str, str]:
     identity_record |= {"num_micro": str(work.num_micro), "save": ", ".join(Path(name).name for name in work.save)}
     identity_record |= {"num_saves": str(work.num_saves), "project": str(work.project), "runs": str(len(design))}
     identity_record |= {f"file {Path(file).name}": digest for file, digest in work.sources.items()}
+    if work.vary is not None:
+        identity_record |= describe("vary", work.vary) | {
+            "operations of vary": operations(work.lane, _first_row(design))
+        }
     return identity_record | _describe_design(design)
 
 

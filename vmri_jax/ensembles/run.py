@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from vmri_jax.ensembles import store
+from vmri_jax.ensembles.columns import Vary
 from vmri_jax.ensembles.design import Design, Draws, Product, Table
 from vmri_jax.ensembles.prepared import attributes_of, check_same, prepared
 from vmri_jax.ensembles.task import Chunks, Job, run_chunk, run_packed_chunk
@@ -115,6 +116,7 @@ def ensemble(
     macro_dt: float | None = None,
     micro_dt: float | None = None,
     num_micro: int | None = None,
+    vary: Vary | None = None,
     save: str | Sequence[str] = "end",
     num_saves: int = 1,
     solver: Newton | None = None,
@@ -150,6 +152,9 @@ def ensemble(
         out: folder of the store, a zarr group; conventionally named .zarr. All workers must see it.
         t_end, num_steps, macro_dt, micro_dt: two of: the time at the end, the number of macro steps, a step size (macro_dt or micro_dt).
         num_micro: number of micro steps, for schemes given by name or by a function.
+        vary: a function ``(problem, row) -> problem`` that makes the problem of a run from the values of its row by column, for example
+            ``lambda problem, row: replace(problem, v_s=row["speed"] * problem.v_s)``. Columns, besides steps and schemes, then have names
+            of your choice. It may change the values of parameters and of the start, and is traced: its operations are those of JAX.
         save: quantities that are kept of each run: names from `vmri_jax.ensembles.QUANTITIES`, or functions of a trajectory,
             ``my_file.py:function``.
         num_saves: number of saved nodes of a run after the start, equally spaced, from which the quantities are computed.
@@ -198,6 +203,7 @@ def ensemble(
         project=project,
         save=(save,) if isinstance(save, str) else tuple(save),
         num_saves=whole_number("ensemble: num_saves", num_saves),
+        vary=vary,
     ).with_sources()
     arrays, chunks, run = prepared(work, design, chunk)
     attributes = attributes_of(work, design, run, chunks)

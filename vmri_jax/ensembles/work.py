@@ -12,7 +12,7 @@ import jax
 import numpy as np
 
 from vmri_jax.catalogue import find_problem, find_scheme
-from vmri_jax.ensembles.columns import SCHEMES, STEPS, ColumnPlace, lanes_of, places
+from vmri_jax.ensembles.columns import SCHEMES, STEPS, Lanes, Row, Vary, by_name, lane_function, numbers_in
 from vmri_jax.ensembles.design import Design, Rows, unique_rows
 from vmri_jax.ensembles.quantities import Quantity, of_lanes, quantity
 from vmri_jax.mechanics.names import near
@@ -56,6 +56,7 @@ class Work:
     num_micro, solver, project: as in `ensemble`.
     save: names of the quantities that are kept.
     num_saves: number of saved nodes after the start.
+    vary: makes the problem of a run from the problem and a row; None where names of columns say what they set.
     sources: digests of the user's files, by path.
     """
 
@@ -68,6 +69,7 @@ class Work:
     project: bool | None = None
     save: tuple[str, ...] = ("end",)
     num_saves: int = 1
+    vary: Vary | None = None
     sources: Mapping[str, str] = field(default_factory=dict)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -109,9 +111,15 @@ class Work:
         return find_problem(self.system) if isinstance(self.system, str) else self.system
 
     @cached_property
-    def places(self) -> dict[str, ColumnPlace]:
-        """The place of each column in the problem."""
-        return places(self.problem, self.columns)
+    def lane(self) -> Callable[[Row], Lanes]:
+        """The function from the numbers of a row to the parameters and the start of its run."""
+        names = [name for name in self.columns if name not in (*STEPS, *SCHEMES)]
+        return lane_function(self.problem, self.vary or by_name(self.problem, names))
+
+    @cached_property
+    def lanes(self) -> Callable[[Rows, int], Lanes]:
+        """The compiled function from the numbers of some rows, and their count, to the parameters and starts of their runs."""
+        return jax.jit(lambda rows, count: jax.vmap(self.lane, axis_size=count)(rows), static_argnums=1)
 
     @cached_property
     def quantities(self) -> list[Quantity]:
@@ -180,10 +188,9 @@ class Work:
         filled = np.minimum(np.arange(max(count, width)), count - 1)
         rows = {name: values[filled] for name, values in rows.items()}
         macro_dt = group.macro_dt[filled] if np.ndim(group.macro_dt) else group.macro_dt
-        lanes = lanes_of(self.problem, self.places, rows, len(filled))
-        start = tuple(lanes.start.values())
+        lanes = self.lanes(numbers_in(rows), len(filled))
         project = self.problem.project if self.project is None else self.project
-        states = _states(self.problem.system, lanes.params, start, project)
+        states = _states(self.problem.system, lanes.params, lanes.start, project)
         trajectory = simulate_batch(
             self.problem,
             group.scheme,

@@ -95,8 +95,6 @@ def as_done(
         while True:
             if interrupted():
                 raise KeyboardInterrupt
-            for future in [future for future in waiting if future.done()]:
-                yield waiting.pop(future), future
             for call in islice(left, MOST_UNDER_WAY - len(waiting)):
                 future = submit(*call)
                 waiting[future] = call
@@ -105,6 +103,8 @@ def as_done(
             if not waiting:
                 return
             wait(waiting, POLL_SECONDS, FIRST_COMPLETED)
+            for future in [future for future in waiting if future.done()]:
+                yield waiting.pop(future), future
     finally:
         for future in waiting:
             future.cancel()

@@ -102,10 +102,11 @@ def _operations(system: System, start: State) -> dict[str, str]:
     if isinstance(system.kinetic, KineticFunction):
         functions["kinetic"] = system.kinetic.function, (q_s, q_f, q_s, q_f, params)
         functions["slow_kinetic"] = system.slow_kinetic, (q_s, q_s, params)
-    return {name: _traced(function, args) for name, (function, args) in functions.items() if function is not None}
+    return {name: operations(function, *args) for name, (function, args) in functions.items() if function is not None}
 
 
-def _traced(function: Callable, arguments) -> str:
+def operations(function: Callable, *arguments) -> str:
+    """A digest of the operations that a function traces to."""
     closed = jax.make_jaxpr(function)(*arguments)
     text = re.sub(r"0x[0-9a-f]+", "", str(closed.jaxpr))  # addresses in memory
     return f"digest {_digest(text.encode(), *(np.asarray(c).tobytes() for c in closed.consts))}"
