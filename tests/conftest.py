@@ -64,7 +64,7 @@ def pytest_configure(config):
     # Tests make functions of one piece of code again for each case, runs that lose their energy, and starts with random velocities.
     config.addinivalue_line("filterwarnings", "ignore::vmri_jax.CompiledAgainWarning")
     config.addinivalue_line("filterwarnings", "ignore::vmri_jax.LostEnergyWarning")
-    config.addinivalue_line("filterwarnings", "ignore:.*project=True has taken them away")
+    config.addinivalue_line("filterwarnings", "ignore:.*project=True has replaced them")
 
 
 def pytest_collection_modifyitems(config, items):

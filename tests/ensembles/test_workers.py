@@ -100,7 +100,13 @@ def test_problems_and_schemes_travel(tmp_path, client):
 
 def test_a_function_of_rows_travels(tmp_path, client):
     design = {"frequency": [20.0, 50.0], "speed": [1.0]}
-    arguments = {"system": vm.systems.fermi_pasta_ulam(), "design": design, "vary": own.faster, "chunk": 1, "num_micro": 2}
+    arguments = {
+        "system": vm.systems.fermi_pasta_ulam(),
+        "design": design,
+        "vary": own.faster,
+        "chunk": 1,
+        "num_micro": 2,
+    }
     here = sweep(tmp_path / "one.zarr", **arguments)
     assert contents(here.path) == contents(sweep(tmp_path / "two.zarr", **arguments, executor=client).path)
 

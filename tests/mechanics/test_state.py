@@ -7,7 +7,7 @@ import pytest
 
 from tests.support import largest_difference
 from tests.user_systems import arms_kinetic, bent_system, double_pendulum
-from vmri_jax import ConstantMass, Problem, State, System, fully_implicit, initial_state, simulate
+from vmri_jax import ConstantMass, Problem, Rheonomic, State, System, fully_implicit, initial_state, simulate
 from vmri_jax.diagnostics import constraint_residual, velocity
 from vmri_jax.mechanics.projection import legendre, project_momentum
 
@@ -89,16 +89,32 @@ def test_velocities_against_a_constraint_are_said_or_refused():
         return initial_state(pendulum, [], [1.0, 0.0], [], [radial, 1.0], **options)
 
     pendulum = System(ConstantMass(jnp.zeros(0), jnp.ones(2)), constraint=constraint)
-    with pytest.raises(ValueError, match=r"44.72% of the velocities .* Correct the velocities, or pass project=True"):
+    with pytest.raises(ValueError, match=r"differ by 44.72% .* Correct the velocities, or pass project=True"):
         start(0.5)  # 0.5 / sqrt(1.25)
-    with pytest.warns(UserWarning, match=r"0.10% of the velocities"):
+    with pytest.warns(UserWarning, match=r"differ by 0.10%"):
         assert np.allclose(start(1e-3).p_f, [0.0, 1.0], atol=1e-15)
     with pytest.warns(
-        UserWarning, match=r"89.44% of the velocities .* project=True has taken them away; for a scene, with_rates"
+        UserWarning, match=r"differ by 89.44% .* project=True has replaced them; for a scene, with_rates"
     ):
         assert np.allclose(start(2.0, project=True).p_f, [0.0, 1.0], atol=1e-14)
     for quiet in (start(1e-8), start(0.5, project=True)):
         assert np.allclose(quiet.p_f, [0.0, 1.0], atol=1e-15)
+
+
+def test_moving_constraints_say_that_they_change_a_start_at_rest():
+    """A winch pulls the second coordinate at speed 2; a start at rest cannot fit, one with another speed is refused."""
+    winds = Rheonomic(lambda t, q_s, q_f, params: jnp.array([q_f[1] - 2.0 * t]))
+    winch = System(ConstantMass(jnp.zeros(0), jnp.ones(2)), constraint=winds)
+
+    def start(*v_f, **options):
+        return initial_state(winch, [], [1.0, 0.0], [], v_f, **options)
+
+    with pytest.warns(UserWarning, match=r"all velocities are zero, but the constraints move"):
+        assert np.allclose(start(0.0, 0.0).p_f, [0.0, 2.0], atol=1e-15)
+    with pytest.raises(ValueError, match=r"differ by 100.00% "):  # 2 / sqrt(4 + 1e-6)
+        start(1e-3, 0.0)
+    for quiet in (start(0.0, 0.0, project=True), start(0.0, 2.0)):
+        assert np.allclose(quiet.p_f, [0.0, 2.0], atol=1e-15)
 
 
 def test_a_kinetic_energy_without_mass_is_refused_at_the_start():

@@ -5,7 +5,7 @@ import pytest
 
 from tests.support import PROBLEMS, convergence, ground_truth
 from tests.verification.schemes import SCHEMES
-from vmri_jax import explicit_slow, fully_explicit, fully_implicit
+from vmri_jax import Scheme, explicit_slow, fully_explicit, fully_implicit, macro, micro, quadrature
 from vmri_jax.diagnostics import observed_order
 
 TRUTH = {"fpu": "fpu3_t1", "tsp": "tsp_t1"}
@@ -34,6 +34,24 @@ def test_observed_order(scheme, name):
     observed = [observed_order(macro_dt, e, floor=TRUTH_ACCURACY) for e in errors]
     assert observed == pytest.approx([order, order], abs=0.1)  # measured 0.041, 0.2 wanted
     assert SCHEMES[scheme].order == order
+
+
+@pytest.mark.parametrize(
+    ("slow", "num_micro", "order"),
+    [
+        (macro(quadrature.gauss(2)), 4, 2),
+        (macro(quadrature.simpson), 2, 2),
+        (micro(quadrature.simpson, every=2), 4, 2),
+        (macro(quadrature.gauss(2)), 1, 4),
+    ],
+)
+def test_observed_order_of_rules_over_several_micro_intervals(slow, num_micro, order):
+    rule = micro(quadrature.gauss(2))
+    scheme = Scheme(num_micro, 2, kinetic=rule, slow=slow, fast=rule)
+    macro_dt, *errors = convergence(PROBLEMS["fpu"](), scheme, ground_truth(TRUTH["fpu"]), STEPS[order])
+    observed = [observed_order(macro_dt, e, floor=TRUTH_ACCURACY) for e in errors]
+    assert min(observed) == pytest.approx(order, abs=0.1)  # momenta show order 4 down to far smaller steps
+    assert scheme.order == order
 
 
 # An independent re-run of the reference study: FPU chain, t = 1, largest errors over all components at the end, not a sup

@@ -65,8 +65,8 @@ def initial_state(
         system: masses, potentials, constraints and forces.
         q_s, q_f, v_s, v_f: (n_s,), (n_f,) arrays of float64.
         t: start time.
-        project: move positions onto the constraints instead of refusing them, and project velocities onto the hidden constraints
-            without a warning.
+        project: move positions onto the constraints, and velocities onto the hidden constraints, instead of refusing them. A warning tells
+            of velocities of which the projection leaves little.
         tolerance: largest constraint value, in the unit of the constraint, of a satisfied constraint.
 
     Raises:
@@ -93,7 +93,7 @@ def initial_state(
         check_mass(system, q_s, q_f)
     if project:
         q_s, q_f = _projected_positions(system, t, q_s, q_f)
-    state, taken = _consistent(system, t, q_s, q_f, v_s, v_f)
+    state, violation = _consistent(system, t, q_s, q_f, v_s, v_f)
     if is_concrete(state):
         advice = (
             "projection did not reach the constraints; start closer to them."
@@ -106,30 +106,40 @@ def initial_state(
                 "initial_state: the momenta are not finite. The mass matrix d2T/dv2 or the constraint Jacobian is "
                 "singular at the initial positions, or a function returned NaN there."
             )
-        tell_of_velocities("initial_state", float(taken), project)
+        at_rest = not (np.any(v_s) or np.any(v_f))
+        tell_of_velocities("initial_state", float(violation), project, at_rest=at_rest)
     return state
 
 
-def tell_of_velocities(caller: str, taken: float, project: bool, constraints: str = "the constraints") -> None:
+def tell_of_velocities(
+    caller: str, violation: float, project: bool, constraints: str = "the constraints", at_rest: bool = False
+) -> None:
     """Warn about velocities that violate the hidden constraints, and refuse a large violation.
 
     Args:
         caller: name of the caller in the message.
-        taken: violation, the part that the projection removes, relative to the velocities in the norm of the kinetic energy.
+        violation: as of `_consistent`.
         project: whether the user wants the projected velocities.
         constraints: name of the constraints in the message.
+        at_rest: whether all velocities of the user are zero; moving constraints may demand others, which are then taken.
     """
-    message = f"{caller}: {min(taken, 1.0):.2%} of the velocities (in the norm of the kinetic energy) do not fit {constraints}"
+    message = f"{caller}: the velocities differ by {violation:.2%} (in the norm of the kinetic energy) from the nearest ones that fit {constraints}"
     scenes = "for a scene, with_rates({joint: rate}) gives all velocities that belong to the rate of a joint"
-    if project and taken > REPORTED_PROJECTION:
-        warnings.warn(f"{message}, and project=True has taken them away; {scenes}.", stacklevel=3)
+    if project and violation > REPORTED_PROJECTION and not at_rest:
+        warnings.warn(f"{message}, and project=True has replaced them; {scenes}.", stacklevel=3)
     if project:
         return
-    if taken > REFUSED_VIOLATION:
+    if at_rest and violation > REPORTED_VIOLATION:
+        warnings.warn(
+            f"{caller}: all velocities are zero, but {constraints} move; the nearest velocities that fit are taken. Pass project=True if "
+            "that is meant.",
+            stacklevel=3,
+        )
+    elif violation > REFUSED_VIOLATION:
         raise ValueError(
             f"{message}. Correct the velocities, or pass project=True for the nearest consistent velocities; {scenes}."
         )
-    if taken > REPORTED_VIOLATION:
+    elif violation > REPORTED_VIOLATION:
         warnings.warn(
             f"{message}; the nearest consistent velocities are taken. Pass project=True if that is meant.", stacklevel=3
         )
@@ -298,18 +308,19 @@ def start_of(caller: str, system, state=None) -> tuple[System, State]:
 
 @jax.jit
 def _consistent(system, t, q_s, q_f, v_s, v_f):
-    """The state with projected momenta, and the violation ``|v - v'| / |v|`` of the hidden constraints in the norm of the kinetic energy.
+    """The state with projected momenta, and the violation of the hidden constraints, between 0 and 1.
 
-    The values of the user's functions are checked while JAX traces this function.
+    The violation is ``|v - v'| / max(|v|, |v'|)`` in the norm of the kinetic energy, with the projected velocities v': constraints may take
+    velocity away, and moving ones may add it. The values of the user's functions are checked while JAX traces this function.
     """
     check_system(system, q_s, q_f)
     momenta = legendre(system, q_s, q_f, v_s, v_f)
     p_s, p_f, *velocities = project_momentum(system, State(t, q_s, q_f, *momenta), (v_s, v_f))
     v, projected_v, p, projected_p = (jnp.concatenate(a) for a in ((v_s, v_f), velocities, momenta, (p_s, p_f)))
-    # |v - v'|^2 / |v|^2 with |v|^2 = v . p
-    size = v @ p
+    # |v - v'|^2 / max(|v|^2, |v'|^2) with |v|^2 = v . p
+    size = jnp.maximum(v @ p, projected_v @ projected_p)
     part = jnp.where(size > 0, (v - projected_v) @ (p - projected_p) / jnp.where(size > 0, size, 1.0), 0.0)
-    return State(t, q_s, q_f, p_s, p_f), jnp.sqrt(jnp.maximum(part, 0.0))
+    return State(t, q_s, q_f, p_s, p_f), jnp.sqrt(jnp.clip(part, 0.0, 1.0))
 
 
 _projected_positions = jax.jit(project_positions)

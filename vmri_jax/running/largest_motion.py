@@ -48,7 +48,7 @@ class Motion(NamedTuple):
         step = "micro step" if self.micro else "macro step"
         moves = f"turns {self.amount:.2g} rad" if self.turns else f"moves {self.amount:.1%} of the extent of the system"
         if self.size < 1:
-            return f"Largest motion before the failure: {self.name} {moves} in a {step}, which is little."
+            return f"By the velocities before the failed step, {self.name} {moves} in a {step}, which is little; its forces may be too large for the step."
         if self.size > RUN_AWAY:
             return (
                 f"{self.name} ran away before the failure: the run was unstable, its steps too large for a vibration. Look at the "

@@ -55,7 +55,7 @@ class Effect(ABC):
     The argument `bodies` of the methods holds all bodies of the scene by name.
 
     Args:
-        name: of this effect in its scene; by default the name of its class.
+        name: of this effect in its scene; by default `default_name` of its class.
         rate: how often a potential is evaluated: "slow" (as part of V), "fast" (on the micro grid, with the rule of W), a whole number k
             (on every k-th micro node), or "auto" (the scene decides by stiffness). A potential with the rate "fast" or k makes its bodies fast, except bodies
             with the pace "slow": the positions of these slow bodies are then solved for by iteration over the macro step. Of a kinetic effect "slow",

@@ -237,6 +237,12 @@ class PlacedRule(eqx.Module):
         nodes = self.composite(num_micro).nodes
         return len(nodes) - (nodes[0] <= NODE_TOLERANCE and nodes[-1] >= 1 - NODE_TOLERANCE)
 
+    def order(self, num_micro: int) -> int:
+        """Order of a scheme by this rule, for a term of fast variables. Their path has a corner at every micro node: a copy of the rule that
+        spans several micro intervals acts by kicks at its nodes, and counts as order 2 at most.
+        """
+        return min(self.rule.order, 2) if self.copies(num_micro) < num_micro else self.rule.order
+
     @property
     def is_local(self) -> bool:
         """Whether every micro interval has a copy of the rule of its own."""

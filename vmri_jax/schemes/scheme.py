@@ -48,8 +48,9 @@ class Scheme(eqx.Module):
     """Variational multirate scheme: the degree of the path and the rule of every term.
 
     Without forces every scheme is symplectic and conserves the momentum maps its discrete Lagrangian inherits. Its order is ``min(2 degree,
-    order of the rules of energies and forces)`` (Ober-Bloebaum, Wenger, Gail, Leyendecker 2024, arXiv:2406.12991); it is symmetric (time-reversible)
-    exactly when these rules are.
+    order of the rules of energies and forces)`` (Ober-Bloebaum, Wenger, Gail, Leyendecker 2024, arXiv:2406.12991), where a rule that spans several
+    micro intervals counts as order 2 at most: the fast path has a corner at every micro node, and the nodes of the rule act as kicks. A scheme is
+    symmetric (time-reversible) exactly when these rules are.
 
     Args:
         num_micro: micro intervals per macro interval.
@@ -133,9 +134,13 @@ class Scheme(eqx.Module):
 
     @property
     def order(self) -> int:
-        """Order of convergence, ``min(2 degree, order of the rules of T, all potentials and the forces)``; needs concrete weights."""
+        """Order of convergence, ``min(2 degree, order of the rules of T, all potentials and the forces)``; needs concrete weights.
+
+        A rule that spans several micro intervals counts as order 2 at most. Potentials and forces of slow variables alone have the full order
+        of their rule; the scheme does not know what they depend on.
+        """
         placed = self.kinetic, self.slow, self.fast, self.force, *self.potentials.values()
-        return min(2 * self.degree, *(placed.rule.order for placed in placed))
+        return min(2 * self.degree, *(placed.order(self.num_micro) for placed in placed))
 
     @property
     def is_symmetric(self) -> bool:
@@ -274,8 +279,8 @@ def _check_placed(name: str, placed) -> None:
 def fully_implicit(num_micro: int) -> Scheme:
     """V and W at the midpoint of every micro interval. Order 2, symmetric, implicit.
 
-    Evaluations per macro step and Newton iteration: V num_micro, W num_micro. The first choice for stiff springs: their
-    ``omega h`` does not limit the step. Constraint forces act at the nodes, as in `fully_explicit`: a light link with two equal masses at
+    Evaluations per macro step and Newton iteration: V num_micro, W num_micro. The first choice for stiff springs: ``omega h``
+    limits the step only of springs that turn, to ``omega h`` times the angle of a turn in the step (in radians) below about 2. Constraint forces act at the nodes, as in `fully_explicit`: a light link with two equal masses at
     its ends, together ``mass``, stretched by a force, swings about the direction of the force with ``omega = 2 sqrt(force / (mass length))``
     and needs ``omega h < 2``.
 

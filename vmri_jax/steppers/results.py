@@ -36,9 +36,9 @@ _MESSAGES = {
         "the step converged to the round-off floor of its own numbers, which lies above the Newton tolerance."
     ),
     Result.STAGNATED: (
-        "Newton's iteration used up its iterations while still improving slowly, and so did shorter parts of the step. Likely "
+        "the iteration of the step used up its iterations; its corrections still shrank, or did not grow. Likely "
         "causes: the step is too large for the motion or for the fast forces, or the constraints are nearly dependent. Try a smaller "
-        "macro_dt or a larger num_micro, or raise solvers.Auto(max_iterations=...)."
+        "macro_dt or a larger num_micro, or raise max_iterations (or fixed_iterations) of the solver."
     ),
     Result.DIVERGED: (
         "Newton's iteration moved away from a solution, and following the solution of shorter steps ended before the whole "

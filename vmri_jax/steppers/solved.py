@@ -215,7 +215,7 @@ def status_of(equations: StepEquations, result, method, iterations, *, rows, g, 
         violated = g > jnp.maximum(CONSTRAINT_TOLERANCE, CONSTRAINT_OVER_TOLERANCE * tolerance)
         contradicts = (result <= Result.CONVERGED_AT_ROUNDOFF) & violated
         result = jnp.where(contradicts, Result.CONSTRAINT_VIOLATED, result)
-    # residual = max(|R| / (h max |p|), max |g|), with |R| itself where all momenta are zero
+    # residual = max(rows / (h max |p|), max |g|), where `rows` is h |R|; with `rows` itself where all momenta are zero
     momentum = jnp.maximum(max_abs(equations.p_s), max_abs(equations.p_f)) * equations.micro_dt
     residual = jnp.maximum(rows / jnp.where(momentum > 0, momentum, 1.0), g)
     return StepStatus(result, jnp.asarray(int(method)), iterations, residual)

@@ -9,13 +9,13 @@
 
 In a *pass* of `Nested` every micro interval takes one Newton step, in order; then the slow variables are corrected.
 
-`Auto` takes `Nested` where every term belongs to single micro intervals (constant masses, potentials on the micro grid or kicks at the macro
-nodes), else `Arrowhead`. If a run does not converge with `Nested`, `Auto` computes it again with `Arrowhead`: the step (in
+`Auto` takes `Nested` where every term belongs to single micro intervals (constant masses, potentials on the micro grid, or kicks at the macro
+nodes or at every k-th micro node), else `Arrowhead`. If a run does not converge with `Nested`, `Auto` computes it again with `Arrowhead`: the step (in
 `macro_step`), the whole run (`prepare`), the lane (batches), or the piece that failed and all pieces after it (`simulate`, `stream`).
 ``StepInfo.method`` and ``Trajectory.info.method`` say which solver took a step, ``print(vm.plan(problem, scheme))`` says it beforehand. In
 two special cases a cheaper solver replaces `Nested`, and ``method`` names it: RATTLE for a single drift along the constraints between
-kicks, COLLOCATION for a single interval of higher degree (``galerkin(1, degree)``) without forces and with at most 16 fast variables, coupled by
-potentials: solved for all variables at once in modes of time. The classes here are settings; the algorithms are each a `vmri_jax.steppers.solved.Solver`.
+kicks, COLLOCATION for a single interval of higher degree (``galerkin(1, degree)``) without forces and with at most 16 fast variables, unless W is
+a sum over single coordinates: solved for all variables at once in modes of time. The classes here are settings; the algorithms are each a `vmri_jax.steppers.solved.Solver`.
 
 An iteration ends if its next correction is below a tenth of the tolerance times the motion (of slow variables over the macro step, of
 fast variables over a micro step) plus the round-off of the positions: the formula is in `vmri_jax.steppers.accept`.
@@ -41,7 +41,8 @@ class Newton(eqx.Module):
 
     Args:
         tolerance: the iteration ends when the next correction is below ``tolerance / 10 * max |increments|`` plus the round-off of the
-            positions, for slow and for fast variables each (`vmri_jax.steppers.accept`).
+            positions, for slow and for fast variables each (`vmri_jax.steppers.accept`). A step whose constraints are violated by more than
+            max(1e-6, 100 tolerance) has failed.
         max_iterations: a step that needs more iterations has failed; for the march and for `Nested` the passes count.
         fixed_iterations: number of iterations of every step, without a loop that depends on the data; the result is checked at the end, and
             a step that has not converged has failed, without a fallback. None: as many iterations as the tolerance needs.

@@ -93,7 +93,7 @@ class Stepper(ABC):
         return state, memory
 
     def continued(self, memory, last, state: State, macro_dt) -> Any:
-        """The memory of a stage of a composition.
+        """The memory of a stage of a composition; by default `init`, as if the stage were a first step.
 
         Args:
             memory: of the same stage in the macro step before.
@@ -101,7 +101,7 @@ class Stepper(ABC):
             state: at the start of this stage.
             macro_dt: length of this stage.
         """
-        return memory
+        return self.init(state, macro_dt)
 
     @abstractmethod
     def describe(self) -> list[str]:
