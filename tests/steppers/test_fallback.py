@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from jax.extend.core import jaxprs_in_params
 
+import vmri_jax as vm
 from tests.support import largest_difference
 from tests.user_systems import cart, double_pendulum, two_oscillators
 from vmri_jax import (
@@ -134,3 +135,20 @@ def test_no_library_call_in_a_compiled_run(tsp):
     text = str(run.lower(tsp.state()).compile().as_text())
     assert "custom-call" not in text
     assert " dot(" not in text
+
+
+@pytest.mark.parametrize("height", [0.0, 1.0])
+@pytest.mark.parametrize("form", ["squares", "norm"])
+def test_round_off_of_a_constraint_counts_by_its_own_length(height, form):
+    """A slow bob near the origin on a rod of 5 m: the constraint has the round-off of 5 m, the positions have none."""
+
+    def rod(q_s, params):
+        distance = q_s - jnp.array([0.0, 0.0, height + 5.0])
+        return jnp.array([distance @ distance / 10 - 2.5 if form == "squares" else jnp.linalg.norm(distance) - 5.0])
+
+    system = vm.System(vm.ConstantMass(jnp.ones(3), jnp.zeros(0)), slow_constraint=rod)
+    problem = vm.Problem(system, [0.0, 0.0, height], [], [0.01, 0.0, 0.0], [])
+    for solver in (vm.solvers.Auto(), vm.solvers.Arrowhead()):
+        run = vm.simulate(problem, vm.fully_implicit(1), macro_dt=0.0025, num_steps=100, solver=solver)
+        angle = 0.01 * 0.25 / 5  # of free motion along the circle
+        assert run.q_s[-1] == pytest.approx([5 * np.sin(angle), 0.0, height + 5 * (1 - np.cos(angle))], abs=1e-13)

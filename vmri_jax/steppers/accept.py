@@ -17,7 +17,9 @@ that no longer shrink near round-off (`Accepted.at_floor`).
 
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from vmri_jax.kernels import max_abs
@@ -53,12 +55,14 @@ class Accepted(NamedTuple):
         entry, used later: with the round-off of the variables that constraints tie to them.
     roundoff: `ROUNDOFF` units of round-off of all positions, ``4 eps max |q|``, for `at_floor`. If the kinetic energy is a function,
         ``4 eps max(1, |q|)``: coordinates may be angles, and an angle near zero has the round-off of one radian.
+    constraints: the same with `constraint_length` in place of the positions; zero where a solver does not use `at_floor`.
     """
 
     tolerance: Number
     slow: Float[Array, "2"]
     fast: Float[Array, "2"]
     roundoff: Float[Array, ""]
+    constraints: Number = 0.0
 
     @classmethod
     def of(cls, equations: StepEquations, newton) -> "Accepted":
@@ -100,8 +104,15 @@ class Accepted(NamedTuple):
         return slow, fast
 
     def at_floor(self, size, before, floor=FLOOR):
-        """Whether corrections no longer shrink, from `before` to `size`, and are at most `floor` units ``eps max |positions|``."""
-        return (size > before / 2) & self.is_roundoff(size, floor)
+        """Whether corrections no longer shrink, from `before` to `size`, and are at most `floor` units ``eps max |positions|``, or `FLOOR`
+        units of the round-off of constraints.
+        """
+        is_roundoff = self.is_roundoff(size, floor) | (size <= FLOOR / ROUNDOFF * self.constraints)
+        return (size > before / 2) & is_roundoff
+
+    def with_constraints(self, equations: StepEquations) -> "Accepted":
+        """The same with the round-off of constraints."""
+        return self._replace(constraints=ROUNDOFF * jnp.finfo(float).eps * constraint_length(equations))
 
     def is_roundoff(self, size, floor=FLOOR):
         """Whether a correction is at most `floor` units ``eps max |positions|``."""
@@ -115,6 +126,26 @@ class Accepted(NamedTuple):
             motions, iterations: as in `allowed`.
         """
         return jnp.maximum(*(c / size for c, size in zip(changes, self.allowed(motions, iterations), strict=True)))
+
+
+def constraint_length(equations: StepEquations):
+    """Largest radius of curvature of the constraints at the start of a step, ``max_i |e . grad g_i| / |e^T (hess g_i) e|`` along a direction e.
+
+    A constraint has the round-off of the lengths in it, which may be far larger than the positions: for ``g = |q - c| - R`` with q near the
+    origin it moves q by ``eps R``. Straight constraints count as zero. The direction e is arbitrary, but the same in all steps.
+    """
+    system, n_s = equations.system, equations.q_s.size
+    if not system.is_constrained:
+        return jnp.zeros(())
+    q = jnp.concatenate([equations.q_s, equations.q_f])
+    e = np.random.default_rng(0).normal(size=q.size)
+
+    def along(q):
+        return jax.jvp(lambda q: system.constraints(equations.t, q[:n_s], q[n_s:]), (q,), (e / np.linalg.norm(e),))[1]
+
+    slope, curvature = (jnp.abs(a) for a in jax.jvp(along, (q,), (e / np.linalg.norm(e),)))
+    is_curved = curvature > 0
+    return jnp.max(jnp.where(is_curved, slope / jnp.where(is_curved, curvature, 1.0), 0.0))
 
 
 def expected(moved, before):

@@ -128,7 +128,8 @@ class Marched(Solver):
         self, march: MarchEquations, guess: Unknowns, start: Progress, memory: MarchMemory, limit, is_first: Any = True
     ) -> Progress:
         """At most `limit` passes. The first attempt starts from the predicted slow unknowns, later attempts from the guess."""
-        accepted, fixed = Accepted.of(march.equations, self.newton), self.newton.fixed_iterations
+        accepted = Accepted.of(march.equations, self.newton).with_constraints(march.equations)
+        fixed = self.newton.fixed_iterations
         z, x = march.flat(guess)
         z = jnp.where(is_first, memory.slow.next(march.num_slow), z)
         progress = start._replace(
