@@ -11,13 +11,13 @@ from vmri_jax import plots
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
 from vmri_jax.running.interrupts import Interrupted
 from vmri_jax.running.progress import shows_progress
+from vmri_jax.running.timing import interleaved
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers import solvers
 from vmri_jax.steppers.results import Method, Result
 from vmri_jax.study.program import Program
 from vmri_jax.study.table import Column, ResultTable
-from vmri_jax.study.timing import interleaved
 
 
 @dataclass(frozen=True)
