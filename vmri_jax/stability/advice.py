@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from vmri_jax.diagnostics.linear import frequencies_of
 from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.mechanics.system import label
@@ -192,8 +191,8 @@ def advise(
         windows=tuple(windows),
         scanned=(lower, SCANNED_STEPS[1] * macro_dt),
         safe_macro_dt=safe,
-        fast_frequencies=motions.fast_frequencies,
-        slow_frequencies=motions.slow_frequencies,
+        fast_frequencies=motions.frequencies("fast"),
+        slow_frequencies=motions.frequencies("slow"),
     )
 
 
@@ -247,23 +246,22 @@ def _stability_limit(motions: SmallMotions, scheme: Scheme | Composition, macro_
     of_stage = " of the longest stage" if isinstance(scheme, Composition) else ""
     micro_dt = longest / stage.num_micro
     cases = [
-        ("fast", motions.fast_frequencies, "the micro step", micro_dt, fast_limit(stage)),
-        ("slow", motions.slow_frequencies, "the macro step", longest, slow_limit(stage)),
+        ("fast", "fast", "the micro step", micro_dt, fast_limit(stage)),
+        ("slow", "slow", "the macro step", longest, slow_limit(stage)),
     ]
-    labels = {"fast": "fast", "slow": "slow"}
     for name, _ in motions.system.potentials:
-        labels[f"potential {name}"] = f"further {name}" if name in labels else label(name)
-        placed, key = stage.rule_of(name), f"potential {name}"
+        placed, words = stage.rule_of(name), f"further {name}" if name in ("fast", "slow") else label(name)
         span = stage.num_micro if placed.grid == "macro" else placed.every
-        step = f"the step of {span} micro intervals"
-        cases.append((key, frequencies_of(motions.further[key]), step, span * micro_dt, kick_limit(placed)))
-    for key, frequencies, step_name, step, limit in cases:
+        step_name = f"the step of {span} micro intervals"
+        cases.append((f"potential {name}", words, step_name, span * micro_dt, kick_limit(placed)))
+    for key, words, step_name, step, limit in cases:
         alone = multipliers(motions.only(key), scheme, [macro_dt * (1 + LONGER_FOR_CAUSE)])
         if alone.radius[0] > 1 + TOLERANCE:
             bound = f"; its quadrature rule is stable below {limit:.4g}" if np.isfinite(limit) else ""
+            frequency = motions.frequencies(key)[0]
             return (
-                f"The step is unstable for the {labels[key]} potential alone: its frequency {frequencies[0]:.4g} times {step_name}{of_stage} "
-                f"is {frequencies[0] * step:.4g}{bound}."
+                f"The step is unstable for the {words} potential alone: its frequency {frequency:.4g} times {step_name}{of_stage} "
+                f"is {frequency * step:.4g}{bound}."
             )
     return ""
 
@@ -295,7 +293,7 @@ def _turn(motions: SmallMotions, scheme: Scheme | Composition, macro_dt: float, 
     """Angle by which vibration i turns in a macro step: the phase of the micro steps if W carries the vibration, else ``omega H``."""
     frequencies, modes = motions.modes
     exact = float(frequencies[i] * macro_dt)
-    if modes[:, i] @ motions.fast @ modes[:, i] < frequencies[i] ** 2 / 2:
+    if modes[:, i] @ motions.hessians["fast"] @ modes[:, i] < frequencies[i] ** 2 / 2:
         return exact
     stage = stage_scheme(scheme)
     phases = [phase(stage, exact * part / stage.num_micro) for part in _stage_lengths(scheme)]

@@ -5,7 +5,8 @@ expansion of the system; elsewhere the expansion describes the *frozen* problem:
 In both cases the expansion is a `System`, to which every scheme applies unchanged.
 """
 
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
 import jax
@@ -61,24 +62,21 @@ class SmallMotions:
     system: the expansion to second order; its equilibrium is zero, its `params` are the coefficients.
     shapes: N, (n_s + n_f, d).
     embed, read: matrices (2 n, 2 d) from (eta, pi) to (q_s, q_f, p_s, p_f), and (2 d, 2 n) back.
-    slow: (d, d) Hessian of V with its share of the constraint forces.
-    fast: (d, d) Hessian of W.
+    hessians: (d, d) Hessians of the potentials: of V with its share of the constraint forces ("slow"), of W ("fast"), and of each further
+        potential ("potential " and its name).
     stiffness: (d, d) minus the derivative of all forces in eta: of potentials, constraints, the kinetic energy, and F.
     damping: (d, d) matrix of the velocities, gyroscopic and dissipative.
     rest: the state of zero displacement and momentum of the expansion.
-    further: (d, d) Hessians of further potentials, by "potential " and their name.
     """
 
     system: System
     shapes: np.ndarray
     embed: np.ndarray
     read: np.ndarray
-    slow: np.ndarray
-    fast: np.ndarray
+    hessians: dict[str, np.ndarray]
     stiffness: np.ndarray
     damping: np.ndarray
     rest: State
-    further: dict[str, np.ndarray] = field(default_factory=dict)
 
     @cached_property
     def rates(self) -> np.ndarray:
@@ -92,15 +90,9 @@ class SmallMotions:
         """The rates of motions of the system that grow, whatever the scheme."""
         return self.rates[np.real(self.rates) > LEAST_GROWTH * np.abs(self.rates).max(initial=0.0)]
 
-    @property
-    def slow_frequencies(self) -> np.ndarray:
-        """(d,) frequencies of the slow potential alone, the largest first; zero where it is not convex."""
-        return frequencies_of(self.slow)
-
-    @property
-    def fast_frequencies(self) -> np.ndarray:
-        """(d,) frequencies of the fast potential alone, the largest first, which micro steps must resolve; zero where it is not convex."""
-        return frequencies_of(self.fast)
+    def frequencies(self, name: str) -> np.ndarray:
+        """(d,) frequencies of one potential alone, a key of `hessians`, the largest first; zero where it is not convex."""
+        return frequencies_of(self.hessians[name])
 
     @cached_property
     def modes(self) -> tuple[np.ndarray, np.ndarray]:
@@ -118,19 +110,19 @@ class SmallMotions:
     @property
     def omega(self) -> float:
         """The largest frequency of W alone; if W has none, the largest rate of all motions."""
-        fast = self.fast_frequencies.max(initial=0.0)
+        fast = self.frequencies("fast").max(initial=0.0)
         return float(fast if fast > 0 else np.abs(self.rates).max(initial=0.0))
 
     def only(self, name: str) -> "SmallMotions":
-        """The small motions under one potential alone: "slow" (V), "fast" (W), or a key of `further`."""
-        hessians = {"slow": self.slow, "fast": self.fast, **self.further}
-        removed = [key for key in hessians if key != name]
+        """The small motions under one potential alone, a key of `hessians`."""
+        removed = {key: hessian for key, hessian in self.hessians.items() if key != name}
         zeros = {key: jax.tree.map(np.zeros_like, self.system.params[key]) for key in removed}
-        stiffness = self.stiffness - sum(hessians[key] for key in removed)
-        hessians |= {key: np.zeros_like(hessians[key]) for key in removed}
-        system = self.system.replace(params=self.system.params | zeros)
-        slow, fast = hessians.pop("slow"), hessians.pop("fast")
-        return replace(self, system=system, stiffness=stiffness, slow=slow, fast=fast, further=hessians)
+        return replace(
+            self,
+            system=self.system.replace(params=self.system.params | zeros),
+            stiffness=self.stiffness - sum(removed.values()),
+            hessians=self.hessians | {key: np.zeros_like(hessian) for key, hessian in removed.items()},
+        )
 
 
 def small_motions(system: Movable, state: State | None = None) -> SmallMotions:
@@ -169,8 +161,8 @@ def small_motions(system: Movable, state: State | None = None) -> SmallMotions:
     def reduced(matrix):
         return shapes.T @ matrix @ shapes
 
-    further = {name: terms[name] for name, _ in _further_potentials(system)}
-    potentials = sum((terms["slow"], terms["fast"], *further.values()))
+    hessians = {name: terms[name] for name in _potentials(system)}
+    potentials = sum(hessians.values())
     gyroscopic = reduced(coupling)
     zero = np.zeros_like(shapes)
     return SmallMotions(
@@ -178,12 +170,12 @@ def small_motions(system: Movable, state: State | None = None) -> SmallMotions:
         shapes=shapes,
         embed=np.block([[shapes, zero], [coupling @ shapes - mass @ shapes @ gyroscopic, mass @ shapes]]),
         read=np.block([[shapes.T @ mass, zero.T], [zero.T, shapes.T]]),
-        slow=reduced(terms["slow"] + slow_bending),
-        fast=reduced(terms["fast"]),
+        hessians={
+            name: reduced(hessian) for name, hessian in (hessians | {"slow": terms["slow"] + slow_bending}).items()
+        },
         stiffness=reduced(potentials + bending - terms["kinetic"][:n, :n] - terms["force_q"]),
         damping=gyroscopic - gyroscopic.T - reduced(terms["force_v"]),
         rest=State(jnp.asarray(state.t, dtype=float), *np.split(np.zeros(2 * n), phase_splits(state))),
-        further={name: reduced(hessian) for name, hessian in further.items()},
     )
 
 
@@ -234,15 +226,20 @@ def _expanded_system(system: System, state: State, terms: dict, multiplier, slow
             "constraint": (G[:n_g], curvature[:n_g]),
             "slow_constraint": (G[n_g:, :n_s], curvature[n_g:, :n_s, :n_s]),
             "force": (constant_force, terms["force_q"], terms["force_v"]),
-            **{name: terms[name] for name, _ in _further_potentials(system)},
+            **{name: terms[name] for name in list(_potentials(system))[2:]},
         },
         potentials=[(name, _FurtherPotential(f"potential {name}")) for name, _ in system.potentials],
     )
 
 
-def _further_potentials(system: System):
-    """The further potentials, with their keys among the terms."""
-    return [(f"potential {name}", function) for name, function in system.potentials]
+def _potentials(system: System) -> dict[str, Callable]:
+    """V, W and the further potentials as functions of (q_s, q_f, params), by their keys among the terms; zero without V or W."""
+    V, W = system.slow_potential, system.fast_potential
+    return {
+        "slow": lambda q_s, q_f, params: jnp.zeros(()) if V is None else V(q_s, q_f, params),
+        "fast": lambda q_s, q_f, params: jnp.zeros(()) if W is None else W(q_f, params),
+        **{f"potential {name}": function for name, function in system.potentials},
+    }
 
 
 @partial(jax.jit, compiler_options=QUICK)
@@ -256,13 +253,8 @@ def _expansion(system: System, state: State) -> dict:
     q = jnp.concatenate([state.q_s, state.q_f])
     v = jnp.concatenate(velocity(system, state.q_s, state.q_f, state.p_s, state.p_f))
 
-    def slow(q):
-        if system.slow_potential is None:
-            return jnp.zeros(())
-        return system.slow_potential(q[:n_s], q[n_s:], system.params)
-
-    def fast(q):
-        return jnp.zeros(()) if system.fast_potential is None else system.fast_potential(q[n_s:], system.params)
+    def of_positions(potential):
+        return lambda q: potential(q[:n_s], q[n_s:], system.params)
 
     def energy(q):
         return potential_energy(system, q[:n_s], q[n_s:])
@@ -281,24 +273,20 @@ def _expansion(system: System, state: State) -> dict:
         return jnp.concatenate(system.forces(state.t, q[:n_s], q[n_s:], v[:n_s], v[n_s:]))
 
     z = jnp.concatenate([q, v])
+    potentials = {name: of_positions(potential) for name, potential in _potentials(system).items()}
     # The gradient (dT/dq, dT/dv) and its rate of change along q' = v, v' = 0.
     gradient, rate = jax.jvp(jax.grad(kinetic), (z,), (jnp.concatenate([v, jnp.zeros_like(v)]),))
     force_q, force_v = jax.jacfwd(force, argnums=(0, 1))(q, v)
     return {
         "kinetic": jax.hessian(kinetic)(z.at[q.size :].set(0.0)),
-        "slow_gradient": jax.grad(slow)(q),
-        "slow": jax.hessian(slow)(q),
-        "fast": jax.hessian(fast)(q),
+        **{name: jax.hessian(potential)(q) for name, potential in potentials.items()},
+        "slow_gradient": jax.grad(potentials["slow"])(q),
         "jacobian": jax.jacrev(constraints)(q),
         "curvature": jax.jacfwd(jax.jacrev(constraints))(q),
         "centripetal": jax.jacfwd(jax.jacfwd(constraints_in_motion))(0.0),
         "force_q": force_q,
         "force_v": force_v,
         "impetus": gradient[: q.size] - rate[q.size :] - jax.grad(energy)(q) + force(q, v),
-        **{
-            name: jax.hessian(lambda q, f=f: f(q[:n_s], q[n_s:], system.params))(q)
-            for name, f in _further_potentials(system)
-        },
     }
 
 
