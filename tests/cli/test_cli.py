@@ -471,8 +471,8 @@ def test_a_page_that_cannot_be_drawn_leaves_its_table(tmp_path, monkeypatch):
     cost_report = importlib.import_module("vmri_jax.study.cost_report")
 
     def failing(problem, name, out, **_):
-        search: Any = SimpleNamespace(rows=lambda: NOTHING, t_end=1.0, not_tried=list)
-        return cost_report._write(search, [cost_report.Answer(1e-2, None)], problem, name, out)
+        search: Any = SimpleNamespace(problem=problem, rows=lambda: NOTHING, t_end=1.0, not_tried=list)
+        return cost_report._write(search, [cost_report.Answer(1e-2, None)], name, out)
 
     def broken(*_, **__):
         return int("no figure")

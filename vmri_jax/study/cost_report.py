@@ -56,20 +56,6 @@ class Answer:
     all: tuple[Setting, ...] = ()
 
 
-@dataclass(frozen=True)
-class Extras:
-    """Runs on a page that are not from the search.
-
-    accuracy: the run that ``simulate(..., accuracy=accuracy_error)`` takes; None where it refuses the error or fails.
-    accuracy_error: the middle one of the errors of the page.
-    peers: staircases of other programs by name.
-    """
-
-    accuracy: WorkRow | None = None
-    accuracy_error: float = math.nan
-    peers: dict[str, list[Stair]] = field(default_factory=dict)
-
-
 class PageFailed(RuntimeError):
     """The search came to its end, but its page could not be drawn or written; its results are in `.report` and in cost.csv."""
 
@@ -97,7 +83,9 @@ class CostReport(ResultTable):
     shares: parts of the time of the middle answer by function, see `vmri_jax.study.prices.shares`.
     not_tried: families that the search had no time to compile.
     stairs: the staircase of each kind of schemes, see `vmri_jax.study.staircase`.
-    extras: runs that are made when the search is over.
+    accuracy: the run that ``simulate(..., accuracy=accuracy_error)`` takes; None where it refuses the error or fails.
+    accuracy_error: the middle one of the errors.
+    peers: staircases of other programs by name.
     """
 
     columns = (
@@ -115,7 +103,9 @@ class CostReport(ResultTable):
     shares: dict[str, float]
     not_tried: tuple[str, ...] = ()
     stairs: dict[str, list[Stair]] = field(default_factory=dict)
-    extras: Extras = field(default_factory=Extras)
+    accuracy: WorkRow | None = None
+    accuracy_error: float = math.nan
+    peers: dict[str, list[Stair]] = field(default_factory=dict)
 
     @property
     def rows(self) -> tuple[Answer, ...]:
@@ -206,7 +196,7 @@ def cost_report(
             settings = search.cheapest(error, part(progress, i, len(errors)), budget=seconds_left / 2)
             answers.append(Answer(error, settings[0] if settings else None, tuple(settings)))
             with suppress(PageFailed):  # the last call below raises it
-                _write(search, answers, problem, name, out)
+                _write(search, answers, name, out)
         progress("runs with smaller steps", 1, 1)
         confirm(search)
         progress("measuring times", 1, 1)
@@ -218,22 +208,22 @@ def cost_report(
         answers = _confirmed(search, answers)
         progress("shares of errors", 1, 1)
         stairs = with_shares(search, staircases(search.rows().rows))
-        report = _write(search, answers, problem, name, out, stairs=stairs, extras=_extras(search, answers, progress))
+        report = _write(search, answers, name, out, stairs=stairs, **_later_runs(search, answers, progress))
     progress("done", 1, 1)
     return report
 
 
-def _extras(search: Search, answers: Sequence[Answer], progress: Progress) -> Extras:
-    """The run of ``simulate(..., accuracy=...)`` for the middle error, and runs of diffrax where it can run the problem."""
-    middle_error = answers[len(answers) // 2].error
-    progress(f"accuracy {middle_error:.0e}", 1, 1)
-    extras = Extras(_of_accuracy(search, middle_error), middle_error)
+def _later_runs(search: Search, answers: Sequence[Answer], progress: Progress) -> dict[str, Any]:
+    """Fields of the report: the run with the middle error as its accuracy, and runs of diffrax where it can run the problem."""
+    error = answers[len(answers) // 2].error
+    progress(f"accuracy {error:.0e}", 1, 1)
+    runs = {"accuracy": _of_accuracy(search, error), "accuracy_error": error}
     if not can_run_dopri8(search.problem):
-        return extras
+        return runs
     progress("diffrax", 1, 1)
     least = min(answer.error for answer in answers)
     stairs = dopri8_stairs(search.problem, search.t_end, search.reference, least)
-    return replace(extras, peers={"diffrax Dopri8": stairs})
+    return runs | {"peers": {"diffrax Dopri8": stairs}}
 
 
 def _of_accuracy(search: Search, error: float) -> WorkRow | None:
@@ -269,20 +259,12 @@ def _default_errors(problem: Problem, reference: ReferenceSolution, t_end: float
     return errors
 
 
-def _write(
-    search: Search,
-    answers: Sequence[Answer],
-    problem: Problem,
-    name: str,
-    out: Path,
-    *,
-    stairs: dict[str, list[Stair]] | None = None,
-    extras: Extras | None = None,
-) -> CostReport:
-    """Write the page of the answers so far, and hand back its report."""
+def _write(search: Search, answers: Sequence[Answer], name: str, out: Path, **later: Any) -> CostReport:
+    """Write the page of the answers so far, and hand back its report; `later` has its fields from runs after the search."""
     answers = _fastest_that_keep(answers)
     runs, middle = search.rows(), answers[len(answers) // 2].setting
-    price = prices(problem) if middle is not None else {}
+    price = prices(search.problem) if middle is not None else {}
+    fields: dict[str, Any] = {"stairs": staircases(runs.rows), **later}
     report = CostReport(
         path=out / "cost.html",
         name=name,
@@ -291,12 +273,11 @@ def _write(
         runs=runs,
         shares=shares(price, middle.row) if middle is not None else {},
         not_tried=tuple(search.not_tried()),
-        stairs=staircases(runs.rows) if stairs is None else stairs,
-        extras=extras or Extras(),
+        **fields,
     )
     runs.to_csv(out / "cost.csv")
     try:
-        _draw(report, problem, price)
+        _draw(report, search.problem, price)
     except Exception as error:
         raise PageFailed(report) from error
     return report
@@ -358,11 +339,11 @@ def _draw_stairs(report: CostReport, price: dict[str, float], title: str, theme:
     marked = [
         plots.Marked("answers", row.seconds, errors.get((row.scheme, row.num_steps), row.error_q)) for row in rows
     ]
-    extras, chosen = report.extras, report.extras.accuracy
+    chosen = report.accuracy
     if chosen is not None:
-        marked.append(plots.Marked(f"accuracy={extras.accuracy_error:.0e}", chosen.seconds, chosen.error_q, star=True))
+        marked.append(plots.Marked(f"accuracy={report.accuracy_error:.0e}", chosen.seconds, chosen.error_q, star=True))
     look = {"known_to": report.runs.reference.error_q, "title": title, "theme": theme}
-    return plots.plot_staircases(report.stairs, extras.peers, marked, bound_of(report.stairs, price), **look)
+    return plots.plot_staircases(report.stairs, report.peers, marked, bound_of(report.stairs, price), **look)
 
 
 def bound_of(stairs: dict[str, list[Stair]], price: dict[str, float]) -> plots.Bound | None:
