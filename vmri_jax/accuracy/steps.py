@@ -75,14 +75,7 @@ def with_accuracy(
 ) -> tuple[Trial, Settings]:
     """The trial whose largest estimated error of a position is at most `accuracy`, and its settings.
 
-    Warns with `AccuracyNotReached` if no trial is as accurate.
-
-    Args:
-        system, scheme, state, solver, t_end: as of `vmri_jax.simulate`; scheme None for a scheme from the menu.
-        accuracy: largest error, in the unit of the positions.
-        num_saves: saved intervals, equally spaced; None for at most `MOST_SAVED`.
-        of: function of a run, refused before the trials if it returns no numbers.
-        progress: called before every trial run.
+    Warns with `AccuracyNotReached` if no trial is as accurate. Arguments are as of `vmri_jax.simulate`.
 
     Raises:
         TypeError: scheme is not a scheme.

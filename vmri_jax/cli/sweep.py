@@ -87,11 +87,7 @@ def sweep(
 
 
 def _drawn(arguments: Mapping[str, Any]) -> str:
-    """The array that --plot draws, chosen before anything runs.
-
-    Raises:
-        ValueError: nothing that is saved can be drawn over the axes.
-    """
+    """The array that --plot draws, chosen before anything runs."""
     drawn = drawn_by_default(arguments["save"], find_problem(arguments["system"]))
     if not drawn:
         raise ValueError(

@@ -56,11 +56,7 @@ def transcribed(
     grid: Literal["macro", "micro"],
     solver: Newton | None,
 ) -> Transcription:
-    """The optimal control problem on the grid of the scheme; arguments as of `vmri_jax.control.minimize`.
-
-    Raises:
-        ValueError, TypeError: bad arguments, functions that return other shapes.
-    """
+    """The optimal control problem on the grid of the scheme, from the arguments of `minimize`, which are checked."""
     whole_number("minimize: num_steps", num_steps)
     if grid not in ("macro", "micro"):
         raise ValueError(f"minimize: grid is {grid!r}; it must be 'macro' or 'micro'.")
@@ -133,13 +129,7 @@ def _bounds(bounds, num_controls: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def started(search: Search, start, num_steps: int, num_controls: int, grid: str) -> Point:
-    """Nodes and controls of the first iteration, without their gaps and the miss of the goal.
-
-    Args:
-        search: of the problem.
-        start: the argument of `minimize`: None, controls, or an `Optimum`.
-        num_steps, num_controls: N and m.
-        grid: "macro" or "micro".
+    """Nodes and controls of the first iteration, without their gaps and the miss of the goal; `start` as of `minimize`.
 
     Raises:
         ValueError: controls of another shape, an optimum of another problem, or a motion that fails.

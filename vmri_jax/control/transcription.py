@@ -209,10 +209,7 @@ def held(t, u, t_start, length):
     weight each control by its duration.
 
     Args:
-        t: time.
-        u: (k, m) controls that follow each other.
-        t_start: start of the first one.
-        length: duration of each.
+        u: (k, m) controls that follow each other, each of duration `length`, the first from t_start on.
     """
     sides = (t - t_start) / length + jnp.array([-BORDER_WIDTH, BORDER_WIDTH])
     return jnp.mean(u[jnp.clip(jnp.floor(sides).astype(int), 0, len(u) - 1)], axis=0)

@@ -251,11 +251,7 @@ class _Search:
         return jax.jit(self.jacobian)
 
     def check_dependence(self, tell: Progress) -> None:
-        """Refuse parameters that no measured value depends on.
-
-        Raises:
-            ValueError: with the names of these parameters.
-        """
+        """Refuse parameters that no measured value depends on."""
         tell("compiling and running the derivatives by the parameters", 1, NUM_PHASES)
         point = np.zeros(self.size), self.part_starts / self.scale, self.shooting.values
         by_parameters = np.asarray(self.compiled_jacobian(*point)[0])

@@ -95,12 +95,9 @@ def plot_oscillatory_energies(trajectory: SavedRun, omega, title: str = "", them
 
 
 def position_panels(run: SavedRun) -> list[tuple[np.ndarray, list[str], str, np.ndarray | None]]:
-    """For slow and fast positions, as far as there are any: values (k, n), names, label of the axis, and errors (k, n) or None.
+    """For slow and fast positions of a run, if there are any: values (k, n), names, label of the axis, and errors (k, n) or None.
 
     Directors of rigid bodies are left out.
-
-    Args:
-        run: one run, not a batch.
     """
     names, error = run.names, run.error
     slow, fast = (None, None) if error is None else (error.q_s, error.q_f)

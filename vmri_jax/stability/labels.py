@@ -11,12 +11,7 @@ a larger value overlooks more swapped labels."""
 
 
 def swapped(motions: SmallMotions, names: Names | None = None) -> tuple[str, float] | None:
-    """Advice if slow variables vibrate faster than fast ones, and the ratio of their highest frequencies; else None.
-
-    Args:
-        motions: the small motions of a system about a state.
-        names: names of its coordinates, or None.
-    """
+    """Advice if slow variables vibrate faster than fast ones, and the ratio of their highest frequencies; else None."""
     frequencies, _ = motions.modes
     n_s, n_f, shares = motions.rest.q_s.size, motions.rest.q_f.size, motions.kinetic_shares
     slow = shares[:n_s].sum(axis=0) > 0.5
@@ -34,11 +29,7 @@ def swapped(motions: SmallMotions, names: Names | None = None) -> tuple[str, flo
 
 
 def swapped_at_start(trajectory) -> str:
-    """The sentence of `swapped` about the first node of a failed run; empty if its labels are right.
-
-    Args:
-        trajectory: a run that knows its system; for any other the result is empty.
-    """
+    """The sentence of `swapped` about the first node of a failed run; empty if its labels are right or its system is not known."""
     if not trajectory.states.q_s.shape[-1] or not trajectory.states.q_f.shape[-1]:
         return ""  # nothing to swap: small motions of all coordinates would take seconds to compile
     try:

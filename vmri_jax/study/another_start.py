@@ -40,11 +40,7 @@ def another_start(problem: Problem, speed: float) -> Problem:
     """The problem with velocities that differ by about a hundredth and satisfy its constraints, moving ones included.
 
     Random numbers are added to the velocities; the momenta of the sums are projected onto the hidden constraints
-    ``G v + dg/dt = 0``.
-
-    Args:
-        problem: of the search.
-        speed: mean speed of the run: the size of velocities where the run starts at rest.
+    ``G v + dg/dt = 0``. `speed` is the mean speed of the run: the size of velocities where the run starts at rest.
     """
     system, state, random = problem.system, problem.state(), np.random.default_rng(1)
     velocities = problem.v_s, problem.v_f
@@ -68,15 +64,7 @@ def verified(setting: Setting, problem: Problem, reference: ReferenceSolution, t
 def first_verified(
     settings: Sequence[Setting], problem: Problem, reference: ReferenceSolution, t_end: float, solver: Newton | None
 ) -> tuple[Setting, Verification]:
-    """The first of the best settings whose error is not small by chance; the very first setting if all are.
-
-    Args:
-        settings: of the search, the fastest first.
-        problem: the problem from `another_start`.
-        reference: its reference solution.
-        t_end: simulated time.
-        solver: how implicit equations are solved.
-    """
+    """The first setting whose error is not small by chance, the fastest one first; the very first setting if all are."""
     checks: list[Verification] = []
     for setting in settings[:MAX_CHECKS]:
         checks.append(verified(setting, problem, reference, t_end, solver))

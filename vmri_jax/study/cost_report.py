@@ -241,11 +241,7 @@ def _of_accuracy(search: Search, error: float) -> WorkRow | None:
 
 
 def _default_errors(problem: Problem, reference: ReferenceSolution, t_end: float) -> list[float]:
-    """RELATIVE_ERRORS times a power of ten near how far the system moves, without errors too near round-off or the error of the reference.
-
-    Raises:
-        ValueError: no error remains, as where nothing moves.
-    """
+    """RELATIVE_ERRORS of a power of ten near how far the system moves, without errors that the reference cannot tell."""
     moved = float(np.abs(reference.q[-1] - reference.q[0]).max())
     least = max(MIN_ERROR_OVER_REFERENCE * reference.error_q, round_off(problem)[1])
     motion = 10.0 ** math.floor(math.log10(max(moved, 1e-300)))
