@@ -1,5 +1,7 @@
 """Stability maps against measured windows, and against runs."""
 
+import json
+
 import numpy as np
 import pytest
 
@@ -14,7 +16,7 @@ from vmri_jax import (
     galerkin,
     simulate,
 )
-from vmri_jax.stability import StabilityMap, linear_model, plot_stability, stability_map
+from vmri_jax.stability import linear_model, plot_stability, stability_map
 
 GRID = np.linspace(0.05, 4 * np.pi, 126)
 CASE_3 = 57 * 0.1  # omega H at omega h = 0.1
@@ -82,10 +84,9 @@ def test_rows_over_kappa_compositions_and_the_explicit_limit(tmp_path):
     assert triple.radius[0] == pytest.approx([triple_jump_radius(1.5), triple_jump_radius(1.6)], rel=1e-12)
 
     over_kappa.to_json(tmp_path / "map.json")
-    again = StabilityMap.from_json(tmp_path / "map.json")
-    assert again.unstable == over_kappa.unstable
-    assert again.rows == over_kappa.rows
-    assert np.array_equal(again.radius, over_kappa.radius)
+    content = json.loads((tmp_path / "map.json").read_text())
+    assert content["rows"] == list(over_kappa.rows)
+    assert np.array_equal(content["radius"], over_kappa.radius)
     over_kappa.to_csv(tmp_path / "map.csv")
     lines = (tmp_path / "map.csv").read_text().splitlines()
     assert lines[0] == "kappa,omega_H,macro_dt,radius"
