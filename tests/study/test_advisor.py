@@ -14,7 +14,6 @@ from tests.study.test_convergence import PROBLEM
 from vmri_jax.running.interrupts import Interrupted
 from vmri_jax.study import (
     Program,
-    ReferenceSolution,
     families,
     reference_solution,
     tune,
@@ -40,18 +39,6 @@ def found(reference):
 def test_a_reference_refines_itself_until_it_agrees(reference):
     assert 0 < reference.error_q < 1e-12
     assert reference.num_saves == 1
-
-
-def test_a_reference_survives_a_file(reference, tmp_path):
-    reference.save(tmp_path / "reference.npz")
-    again = ReferenceSolution.load(tmp_path / "reference.npz")
-    np.testing.assert_array_equal(again.q, reference.q)
-    assert again.error_p == reference.error_p
-    (tmp_path / "other.npz").write_text("no")
-    with pytest.raises(ValueError, match=r"not a file written by ReferenceSolution\.save"):
-        ReferenceSolution.load(tmp_path / "other.npz")
-    with pytest.raises(FileNotFoundError, match="does not exist"):
-        ReferenceSolution.load(tmp_path / "none.npz")
 
 
 def test_the_setting_keeps_the_error(found):
