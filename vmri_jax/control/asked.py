@@ -113,12 +113,11 @@ def unaimed(state):
 
 def _bounds(bounds, num_controls: int) -> tuple[np.ndarray, np.ndarray]:
     """The least and the largest controls, (m,) each."""
-    if bounds is None:
-        return np.full(num_controls, -np.inf), np.full(num_controls, np.inf)
+    bounds = (None, None) if bounds is None else bounds
     if not isinstance(bounds, tuple) or len(bounds) != 2:
         raise ValueError(f"minimize: bounds is {bounds!r}; give (least, largest), each a number or ({num_controls},).")
-    sides = [np.asarray(real_array("minimize: bounds", -np.inf if side is None else side)) for side in bounds]
-    sides[1] = np.full((), np.inf) if bounds[1] is None else sides[1]
+    ends = [unbounded if side is None else side for side, unbounded in zip(bounds, (-np.inf, np.inf), strict=True)]
+    sides = [np.asarray(real_array("minimize: bounds", end)) for end in ends]
     if any(side.shape not in ((), (num_controls,)) for side in sides):
         shapes = " and ".join(str(side.shape) for side in sides)
         raise ValueError(f"minimize: bounds have shapes {shapes}; each is a number or ({num_controls},).")

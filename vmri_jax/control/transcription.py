@@ -71,20 +71,16 @@ class Transcription(eqx.Module):
         """Whether there are inequalities."""
         return self.limits is not None or bool(np.isfinite(self.bounds).any())
 
-    @property
-    def controlled(self) -> System:
-        """The system with forces of controls, which it expects in its params."""
-        return self.system.replace(force=_forces(self.system.force, self.actuate))
-
     def times(self, count: int) -> np.ndarray:
         """(count, parts) starts of the intervals over which each control is constant."""
         start = float(self.start.t) + float(self.macro_dt) * np.arange(count)
         return start[:, None] + np.arange(self.parts) * (float(self.macro_dt) / self.parts)
 
-    def driven(self, u) -> System:
-        """The system with the forces of controls u (N, parts, m) over the whole motion."""
-        held = jnp.reshape(u, (-1, u.shape[-1])), self.start.t, self.macro_dt / self.parts
-        return self.controlled.replace(params={**self.system.params, CONTROL: held})
+    def driven(self, u, t) -> System:
+        """The system with the forces of controls u (..., parts, m) from time t on."""
+        held = jnp.reshape(u, (-1, u.shape[-1])), t, self.macro_dt / self.parts
+        forces = _forces(self.system.force, self.actuate)
+        return self.system.replace(force=forces, params={**self.system.params, CONTROL: held})
 
     def state(self, z, k) -> State:
         """The state at node k."""
@@ -102,9 +98,7 @@ class Transcription(eqx.Module):
     def step(self, z, u, k):
         """The end of the step from node k at z (n,) with controls u (parts, m), and the `StepStatus` of the step."""
         state = self.state(z, k)
-        held = u, state.t, self.macro_dt / self.parts
-        system = self.controlled.replace(params={**self.system.params, CONTROL: held})
-        end, info = macro_step(system, self.scheme, state, self.macro_dt, self.solver)
+        end, info = macro_step(self.driven(u, state.t), self.scheme, state, self.macro_dt, self.solver)
         return phase_vector(end), info.status
 
     def steps(self, z, u, follow):
