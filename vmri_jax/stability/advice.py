@@ -183,7 +183,7 @@ def advise(
         upper, lower = lower, lower / 3
         windows = _scan(motions, scheme, lower, upper, upper, tolerance) + windows
 
-    findings = [*step_findings, *_labels(motions, names), *_stages(scheme), *_motion(motions)]
+    findings = [*step_findings, *_further_findings(motions, scheme, names)]
     return Advice(
         macro_dt=macro_dt,
         growth=growth,
@@ -301,41 +301,27 @@ def _turn(motions: SmallMotions, scheme: Scheme | Composition, macro_dt: float, 
     return turn if np.isfinite(turn) else exact
 
 
-def _labels(motions: SmallMotions, names: Names | None) -> Iterator[Finding]:
-    """A warning if slow variables carry the fastest vibrations."""
+def _further_findings(motions: SmallMotions, scheme: Scheme | Composition, names: Names | None) -> Iterator[Finding]:
+    """A warning if slow variables carry the fastest vibrations; notes on backward steps, and on a state that is itself unstable."""
     sentence_and_ratio = swapped(motions, names)
     if sentence_and_ratio is not None:
         yield Finding("warning", "labels", *sentence_and_ratio)
-
-
-def _stages(scheme: Scheme | Composition) -> Iterator[Finding]:
-    """A note if a composition has backward steps."""
     parts = _stage_lengths(scheme)
-    if (parts > 0).all():
-        return
-    longest = float(np.abs(parts).max())
-    yield Finding(
-        "note",
-        "stages",
-        f"The {len(parts)} stages of the composition make steps of {parts.min():.3g} to {parts.max():.3g} macro steps, some "
-        f"backwards: the largest stable macro step of the composition is about that of its scheme divided by {longest:.3g}.",
-        longest,
-    )
+    if not (parts > 0).all():
+        longest = float(np.abs(parts).max())
+        sentence = (
+            f"The {len(parts)} stages of the composition make steps of {parts.min():.3g} to {parts.max():.3g} macro steps, some "
+            f"backwards: the largest stable macro step of the composition is about that of its scheme divided by {longest:.3g}."
+        )
+        yield Finding("note", "stages", sentence, longest)
+    if motions.growing.size:
+        rate = float(np.real(motions.growing).max())
+        sentence = (
+            f"Motion about this state grows by itself, like exp({rate:.3g} t); that is left out of what is measured."
+        )
+        yield Finding("note", "motion", sentence, rate)
 
 
 def _stage_lengths(scheme: Scheme | Composition) -> np.ndarray:
     """Lengths of the stages of a macro step, in macro steps."""
     return np.asarray(scheme.coefficients) if isinstance(scheme, Composition) else np.ones(1)
-
-
-def _motion(motions: SmallMotions) -> Iterator[Finding]:
-    """A note if the state itself is unstable."""
-    if not motions.growing.size:
-        return
-    rate = float(np.real(motions.growing).max())
-    yield Finding(
-        "note",
-        "motion",
-        f"Motion about this state grows by itself, like exp({rate:.3g} t); that is left out of what is measured.",
-        rate,
-    )

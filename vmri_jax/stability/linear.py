@@ -214,7 +214,7 @@ def _expanded_system(system: System, state: State, terms: dict, multiplier, slow
     has_constant_force = np.abs(constant_force).max(initial=0.0) > 1e-12 * np.abs(G.T @ multiplier).max(initial=0.0)
     return System(
         system.kinetic if system.has_constant_mass else _kinetic,
-        None if system.slow_potential is None else _slow_potential,
+        None if system.slow_potential is None else _Potential("slow"),
         None if system.fast_potential is None else _fast_potential,
         None if system.constraint is None else _constraint,
         None if system.slow_constraint is None else _slow_constraint,
@@ -226,9 +226,9 @@ def _expanded_system(system: System, state: State, terms: dict, multiplier, slow
             "constraint": (G[:n_g], curvature[:n_g]),
             "slow_constraint": (G[n_g:, :n_s], curvature[n_g:, :n_s, :n_s]),
             "force": (constant_force, terms["force_q"], terms["force_v"]),
-            **{name: terms[name] for name in list(_potentials(system))[2:]},
+            **{name: (np.zeros(len(G.T)), terms[name]) for name in list(_potentials(system))[2:]},
         },
-        potentials=[(name, _FurtherPotential(f"potential {name}")) for name, _ in system.potentials],
+        potentials=[(name, _Potential(f"potential {name}")) for name, _ in system.potentials],
     )
 
 
@@ -295,25 +295,20 @@ def _kinetic(q_s, q_f, v_s, v_f, params):
     return z @ params["kinetic"] @ z / 2
 
 
-def _slow_potential(q_s, q_f, params):
-    q = jnp.concatenate([q_s, q_f])
-    gradient, hessian = params["slow"]
-    return gradient @ q + q @ hessian @ q / 2
-
-
 def _fast_potential(q_f, params):
     return q_f @ params["fast"] @ q_f / 2
 
 
 @dataclass(frozen=True)
-class _FurtherPotential:
-    """A further potential ``q^T H q / 2``; `name` is the key of its Hessian H in the params."""
+class _Potential:
+    """A potential ``gradient . q + q^T H q / 2``; `name` is the key of its gradient and Hessian H in the params."""
 
     name: str
 
     def __call__(self, q_s, q_f, params):
         q = jnp.concatenate([q_s, q_f])
-        return q @ params[self.name] @ q / 2
+        gradient, hessian = params[self.name]
+        return gradient @ q + q @ hessian @ q / 2
 
 
 def _constraint(q_s, q_f, params):

@@ -51,23 +51,18 @@ def another_start(problem: Problem, speed: float) -> Problem:
     return replace(problem, q_s=state.q_s, q_f=state.q_f, v_s=v_s, v_f=v_f, project=False)
 
 
-def verified(setting: Setting, problem: Problem, reference: ReferenceSolution, t_end: float, solver) -> Verification:
-    """Run a setting from the start of `problem` and compare the run with `reference`, the solution from that start."""
-    program = Program(problem, setting.scheme, t_end, reference.num_saves, solver)
-    seconds = program.seconds(setting.num_steps, TIMED_RUNS)
-    row = work_row(setting.row.scheme, program, setting.num_steps, reference).timed(seconds)
-    # a search in which nothing moves has errors of exactly 0
-    error_ratio = row.error_q / setting.row.error_q if setting.row.error_q else 1.0
-    return Verification(row.error_q, row.seconds, error_ratio)
-
-
 def first_verified(
     settings: Sequence[Setting], problem: Problem, reference: ReferenceSolution, t_end: float, solver: Newton | None
 ) -> tuple[Setting, Verification]:
     """The first setting whose error is not small by chance, the fastest one first; the very first setting if all are."""
     checks: list[Verification] = []
     for setting in settings[:MAX_CHECKS]:
-        checks.append(verified(setting, problem, reference, t_end, solver))
+        program = Program(problem, setting.scheme, t_end, reference.num_saves, solver)
+        seconds = program.seconds(setting.num_steps, TIMED_RUNS)
+        row = work_row(setting.row.scheme, program, setting.num_steps, reference).timed(seconds)
+        # a search in which nothing moves has errors of exactly 0
+        error_ratio = row.error_q / setting.row.error_q if setting.row.error_q else 1.0
+        checks.append(Verification(row.error_q, row.seconds, error_ratio))
         if checks[-1].error_ratio <= MAX_ERROR_RATIO:
             return setting, checks[-1]
     return settings[0], checks[0]
