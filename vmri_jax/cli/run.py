@@ -32,7 +32,7 @@ DEFAULT_SCHEME = "fully-implicit"
 DEFAULT_SAVED_NODES = 1000
 """Approximate number of saved nodes of a run without --save-every; more make larger files, and figures do not show them."""
 MOST_DRAWN_NODES = 10_000
-"""Largest number of nodes of a stored run in a figure; more are not seen, and take longer to read."""
+"""Largest number of nodes of a run in a figure; more are not seen, and take longer to read and to draw."""
 
 app = typer.Typer()
 
@@ -128,11 +128,7 @@ def simulate(
                 trajectory.save(out, problem.drawing)
                 saved.append(str(out))
             if plot is not None:
-                nodes = (
-                    trajectory
-                    if isinstance(trajectory, Trajectory)
-                    else trajectory[:: -(-len(trajectory) // MOST_DRAWN_NODES)]
-                )
+                nodes = trajectory[:: -(-len(trajectory) // MOST_DRAWN_NODES)]
                 title = (
                     f"{system}, accuracy {accuracy:g}" if accuracy else f"{system}, {scheme}, {num_micro} micro steps"
                 )

@@ -27,7 +27,7 @@ from vmri_jax.cli.common import (
 from vmri_jax.ensembles import Axis, Draw, Draws, Ensemble, EnsembleError, Product, ensemble
 from vmri_jax.ensembles.executors import local_workers
 from vmri_jax.ensembles.quantities import drawn_by_default
-from vmri_jax.mechanics.names import near
+from vmri_jax.mechanics.names import unknown
 from vmri_jax.running.export import extra
 from vmri_jax.running.interrupts import Interrupted
 
@@ -166,7 +166,7 @@ def _draws(file: Path, entries: Mapping[str, Any]) -> Draws:
 def _check_entries(where: str, entries: Mapping[str, Any], known: Collection[str]) -> None:
     for name in entries:
         if name not in known:
-            raise ValueError(f"{where}: there is no entry {name!r}.{near(name, known)} There are {', '.join(known)}.")
+            raise ValueError(f"{where}: {unknown('entry', name, known)}")
 
 
 def _located(name: str, folder: Path) -> str:
