@@ -10,6 +10,7 @@ import numpy as np
 from vmri_jax.control.optimum import Optimum
 from vmri_jax.control.search import Point, Search
 from vmri_jax.control.transcription import Transcription
+from vmri_jax.diagnostics.linear import phase_vector
 from vmri_jax.mechanics.arrays import real_array, whole_number
 from vmri_jax.mechanics.state import start_of
 from vmri_jax.running.simulation import prepare
@@ -159,9 +160,7 @@ def started(search: Search, start, num_steps: int, num_controls: int, grid: str)
 def _resampled(setup: Transcription, start: Optimum, num_steps: int):
     """Nodes (N, n) and controls (N, parts, m) of an optimum, interpolated to the grid of another problem of the same duration."""
     run, m = start.trajectory, start.controls.shape[-1]
-    old_nodes = np.concatenate(
-        [np.asarray(x) for x in (run.states.q_s, run.states.q_f, run.states.p_s, run.states.p_f)], axis=1
-    )
+    old_nodes = np.asarray(phase_vector(run.states))
     duration, expected = float(run.t[-1] - run.t[0]), num_steps * setup.macro_dt
     if abs(duration - expected) > 1e-9 * expected:
         raise ValueError(

@@ -16,8 +16,8 @@ from vmri_jax.steppers.solvers import Newton
 
 
 def phase_vector(state: State):
-    """``z = (q_s, q_f, p_s, p_f)``, joined, (2 n,)."""
-    return jnp.concatenate([state.q_s, state.q_f, state.p_s, state.p_f])
+    """``z = (q_s, q_f, p_s, p_f)``, joined, (2 n,), or (k, 2 n) for k states."""
+    return jnp.concatenate([state.q_s, state.q_f, state.p_s, state.p_f], axis=-1)
 
 
 def phase_splits(state: State) -> tuple[int, int, int]:
