@@ -360,10 +360,10 @@ def test_cost_writes_its_page(vmri, short_menu, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("tune", "user.py:my_problem", "--error", "1e-19", "--t-end", "1"), "round-off alone"),
+        (("tune", "user.py:my_problem", "--error", "1e-19", "--t-end", "1"), "round-off of float64 alone"),
         (("tune", "user.py:my_problem", "--error", "1e-3", "--t-end", "-1"), "t_end is -1.0"),
         (("tune", "user.py:my_problem", "--error", "1e-3", "--t-end", "1", "--out", "runs.txt"), ".csv or .json"),
-        (("cost", "user.py:my_problem", "--error", "-1"), "round-off alone"),
+        (("cost", "user.py:my_problem", "--error", "-1"), "round-off of float64 alone"),
         (("cost", "user.py:my_problem", "--t-end", "0"), "t_end is 0.0"),
         (("simulate", "fpu", *RUN, "--compose", "yoshida5"), "there is no composition"),
         (("simulate", "fpu", "--macro-dt", "0.1"), "got neither of --steps and --accuracy"),

@@ -113,7 +113,7 @@ def test_exhaustive_search_tries_every_num_micro(reference):
 
 @pytest.mark.parametrize(
     ("error", "t_end", "words"),
-    [(1e-18, 1.0, "round-off"), (float("nan"), 1.0, "round-off"), (1e-4, 0.0, "t_end is 0.0")],
+    [(1e-18, 1.0, "round-off"), (float("nan"), 1.0, "error is nan; it must be finite"), (1e-4, 0.0, "t_end is 0.0")],
 )
 def test_refuses(error, t_end, words):
     with pytest.raises(ValueError, match=words):

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from vmri_jax.accuracy.families import Family, families
+from vmri_jax.accuracy.steps import check_error
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
 from vmri_jax.running.progress import shows_progress
 from vmri_jax.steppers.results import SimulationError
@@ -23,8 +24,6 @@ MIN_ERROR_OVER_REFERENCE = 10.0
 runs keep the accepted error, a larger one refuses searches that would succeed."""
 SETTINGS_PRINTED = 5
 """Number of settings, the recommended one included, that a recommendation and `vmri tune` print."""
-ROUND_OFF_UNITS = 100
-"""Round-off of a position after a run, in units of machine epsilon times the largest position; a larger number refuses more errors."""
 
 
 class NothingReached(ValueError):
@@ -95,22 +94,11 @@ class Recommendation(ResultTable):
         return self.setting.num_steps
 
 
-def round_off(problem: Problem) -> tuple[float, float]:
-    """The largest position at the start, and the error of positions that round-off alone causes in a run."""
-    size = float(max(np.abs(problem.q_s).max(initial=0), np.abs(problem.q_f).max(initial=0), 1e-300))
-    return size, ROUND_OFF_UNITS * np.finfo(float).eps * size
-
-
 def check_target(error: float, t_end: float, problem: Problem) -> None:
     """Refuse errors and times that no run can meet."""
     if not (np.isfinite(t_end) and t_end > 0):
         raise ValueError(f"tune: t_end is {t_end}; it must be a positive number.")
-    size, floor = round_off(problem)
-    if not (np.isfinite(error) and error > floor):
-        raise ValueError(
-            f"tune: error is {error:g}; the largest position is {size:.3g}, so that round-off alone is about "
-            f"{floor:.0e}. Give a larger error, in the unit of the positions."
-        )
+    check_error("tune: error", error, problem)
 
 
 @shows_progress

@@ -13,12 +13,12 @@ import numpy as np
 
 from vmri_jax import diagnostics, plots
 from vmri_jax.accuracy.families import Family, families
-from vmri_jax.accuracy.steps import with_accuracy
+from vmri_jax.accuracy.steps import round_off, with_accuracy
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
 from vmri_jax.running.files import make_writable_folder
 from vmri_jax.running.progress import Progress, part, shows_progress
 from vmri_jax.steppers.results import SimulationError
-from vmri_jax.study.advisor import MIN_ERROR_OVER_REFERENCE, round_off
+from vmri_jax.study.advisor import MIN_ERROR_OVER_REFERENCE
 from vmri_jax.study.cost_figures import draw_num_micro, draw_shares
 from vmri_jax.study.html import embedded, write_page
 from vmri_jax.study.peers import can_run_dopri8, dopri8_stairs
