@@ -12,6 +12,7 @@ from functools import cached_property, partial
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.linalg import null_space
 
 from vmri_jax.diagnostics.linear import frequencies_of, phase_splits
 from vmri_jax.mechanics.arrays import QUICK
@@ -181,12 +182,8 @@ def small_motions(system: Movable, state: State | None = None) -> SmallMotions:
 
 def _shapes(mass: np.ndarray, jacobian: np.ndarray) -> np.ndarray:
     """N (n, d) with ``N^T M N = 1`` and ``G N = 0``: a basis T of the null space of G, divided by the Cholesky factor of ``T^T M T``."""
-    tangents = np.eye(len(mass))
-    if len(jacobian):
-        _, sizes, rows = np.linalg.svd(jacobian)
-        tangents = rows[
-            np.count_nonzero(sizes > 1e-10 * sizes.max(initial=0.0)) :
-        ].T  # dependent constraints count once
+    # dependent constraints count once
+    tangents = null_space(jacobian, rcond=1e-10) if len(jacobian) else np.eye(len(mass))
     if not tangents.shape[1]:
         raise ValueError(
             f"small_motions: the {len(jacobian)} constraints leave none of the {len(mass)} coordinates free; nothing moves."
