@@ -14,8 +14,8 @@ from benchmarks.measure import Ratio, Tell, silent
 from benchmarks.report import Claim, Report, growing
 from vmri_jax.mechanics import constraint_pattern
 from vmri_jax.running.engine import engine
+from vmri_jax.running.timing import seconds_per_call
 from vmri_jax.scene import Box, Gravity, JointSpring, Revolute, RigidBody, Scene
-from vmri_jax.study.timing import seconds_per_call
 
 Coordinates = Literal["joint", "directors"]
 COLUMNS = (

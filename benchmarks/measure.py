@@ -1,4 +1,4 @@
-"""Before anything is measured: the process keeps to one core, and JAX is told how to compile."""
+"""Before anything is measured: the process keeps to one core, and JAX is told how to compile. Ratios of times with their spread."""
 
 import os
 import time
@@ -6,10 +6,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
+import jax
 import numpy as np
 
 from vmri_jax.configure import cache_folder, configure
-from vmri_jax.study.timing import Ratio, Tell, interleaved, machine, ratio, silent, steps_for
+from vmri_jax.running.timing import Tell, interleaved, seconds_per_call, silent
+from vmri_jax.study.machine import machine
 
 __all__ = [
     "Ratio",
@@ -48,6 +50,52 @@ class Size(Generic[Case]):
     def clock_name(self) -> str:
         """The kind of times, for reports."""
         return "processor time" if self.shared else "wall time"
+
+
+@dataclass(frozen=True)
+class Ratio:
+    """A ratio of two times: of their medians, and the quartiles of the ratios of samples taken in turn."""
+
+    value: float
+    low: float
+    high: float
+
+    def __str__(self) -> str:
+        return f"{self.value:.3g} ({self.low:.3g} to {self.high:.3g})"
+
+    @property
+    def inverse(self) -> "Ratio":
+        """The ratio of the second time to the first."""
+        return Ratio(1 / self.value, 1 / self.high, 1 / self.low)
+
+
+def ratio(above: Sequence[float], below: Sequence[float]) -> Ratio:
+    """`above` over `below`, two lists of samples from one `interleaved`.
+
+    Raises:
+        ValueError: lists of different lengths, or empty ones.
+    """
+    if len(above) != len(below) or not len(above):
+        raise ValueError(f"ratio: {len(above)} samples over {len(below)}; both must come from one `interleaved`.")
+    low, high = np.quantile(np.divide(above, below), (0.25, 0.75))
+    return Ratio(float(np.median(above) / np.median(below)), float(low), float(high))
+
+
+def steps_for(run: Callable[[int], object], seconds: float, unit: int = 1, most: int = 10**9) -> int:
+    """A multiple of `unit`, at most `most`, for which ``run(steps)`` takes about `seconds`.
+
+    The first call, which compiles, is not counted. Steps are added until the time of a call is several times the time of a
+    call with `unit` steps, so that the fixed cost of a call does not count either.
+    """
+    steps = unit
+    jax.block_until_ready(run(steps))
+    shortest = seconds_per_call(lambda: run(unit), 2)
+    while True:
+        taken = seconds_per_call(lambda n=steps: run(n), 1)
+        if (taken >= seconds / 8 and taken > 3 * shortest) or taken >= seconds or steps * 4 > most:
+            break
+        steps *= 4
+    return max(1, min(round(steps * seconds / taken), most) // unit) * unit
 
 
 def quartiles(samples: Sequence[float], scale: float = 1.0) -> Ratio:

@@ -11,8 +11,8 @@ from benchmarks.measure import Ratio, Tell, silent
 from benchmarks.report import Claim, Report
 from benchmarks.scenes import gallery_scene
 from vmri_jax import plots
+from vmri_jax.running.timing import interleaved
 from vmri_jax.study.program import Program, joined
-from vmri_jax.study.timing import interleaved
 
 COLUMNS = ("scene", "num_micro", "H", "error", "ms", "saving")
 SURGE = 4.0

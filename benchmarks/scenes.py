@@ -8,7 +8,7 @@ from pathlib import Path
 from benchmarks import programs
 from benchmarks.measure import Tell, interleaved, quartiles, ratio, silent
 from benchmarks.report import Claim, Report
-from vmri_jax.catalogue import find_scene
+from vmri_jax.catalogue import imported
 from vmri_jax.scene import Scene
 from vmri_jax.scene.ledger import operations, prepare_steps, temporary_bytes
 
@@ -34,7 +34,7 @@ class Size:
 
 def gallery_scene(name: str) -> Scene:
     """The scene in a file of the gallery."""
-    return find_scene(f"{GALLERY / name}.py:scene")
+    return imported(f"{GALLERY / name}.py:scene")
 
 
 def sizes(name: str) -> Size:

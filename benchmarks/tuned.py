@@ -16,9 +16,9 @@ from benchmarks.report import Claim, Report
 from vmri_jax.accuracy.companions import UncertifiedWarning
 from vmri_jax.accuracy.steps import AccuracyNotReached
 from vmri_jax.mechanics.state import problem_of
+from vmri_jax.running.timing import interleaved
 from vmri_jax.study import Program, families, reference_solution, tune
 from vmri_jax.study.advisor import NothingReached
-from vmri_jax.study.timing import interleaved
 
 COLUMNS = (
     "system",

@@ -147,14 +147,6 @@ def test_the_energy_of_a_driven_system_has_a_balance():
     )
 
 
-def test_oscillatory_energies_and_their_sum():
-    trajectory = run()
-    lines = plots.plot_oscillatory_energies(trajectory, omega=3.0).axes[0].lines
-    energies = (np.asarray(trajectory.p_f) ** 2 + 9.0 * np.asarray(trajectory.q_f) ** 2) / 2
-    np.testing.assert_allclose(y_data(lines[0]), energies.sum(1))
-    np.testing.assert_allclose([y_data(line) for line in lines[1:]], energies.T)
-
-
 def test_convergence_names_the_orders_and_draws_guides_only_where_asked():
     figure = plots.plot_convergence(study(), orders=(2,))
     assert [axes.get_title(loc="left") for axes in figure.axes] == ["positions", "momenta"]

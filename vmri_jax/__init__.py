@@ -100,36 +100,24 @@ if TYPE_CHECKING:
     from vmri_jax.stability import advise
     from vmri_jax.study import tune
 
-_LATER = {
-    "advise": "vmri_jax.stability:advise",
-    "animation": "vmri_jax.animation",
-    "check": "vmri_jax.hard_cases:check",
-    "control": "vmri_jax.control",
-    "ensemble": "vmri_jax.ensembles:ensemble",
-    "ensembles": "vmri_jax.ensembles",
-    "fit": "vmri_jax.fitting.fit:fit",
-    "fitting": "vmri_jax.fitting",
-    "hard_cases": "vmri_jax.hard_cases",
-    "minimize": "vmri_jax.control.minimize:minimize",
-    "open_ensemble": "vmri_jax.ensembles:open_ensemble",
-    "plots": "vmri_jax.plots",
-    "scene": "vmri_jax.scene",
-    "stability": "vmri_jax.stability",
-    "study": "vmri_jax.study",
-    "textbook": "vmri_jax.textbook",
-    "tune": "vmri_jax.study:tune",
+_ROOM_OF = {
+    "advise": "stability",
+    "check": "hard_cases",
+    "ensemble": "ensembles",
+    "fit": "fitting",
+    "minimize": "control",
+    "open_ensemble": "ensembles",
+    "tune": "study",
 }
-"""Modules, and functions in modules, that are imported when they are asked for. matplotlib and scipy.stats take half a second."""
+"""Functions that are imported with their rooms when they are asked for. matplotlib and scipy.stats take half a second."""
 
 
 def __getattr__(name: str) -> Any:
-    """Import a module or a function of `_LATER`."""
-    if name not in _LATER:
+    """Import a public room, or a function of a room."""
+    if name not in __all__:
         raise AttributeError(f"module 'vmri_jax' has no attribute {name!r}")
-    module, _, attribute = _LATER[name].partition(":")
-    value = import_module(module)
-    if attribute:
-        value = getattr(value, attribute)
+    room = import_module(f"vmri_jax.{_ROOM_OF.get(name, name)}")
+    value = getattr(room, name) if name in _ROOM_OF else room
     globals()[name] = value
     return value
 

@@ -5,12 +5,12 @@ import importlib.util
 import inspect
 import sys
 import traceback
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 from vmri_jax import systems
-from vmri_jax.mechanics.names import near
+from vmri_jax.mechanics.names import near, unknown
 from vmri_jax.mechanics.state import Problem
 from vmri_jax.scene import Scene
 from vmri_jax.schemes import composition
@@ -108,9 +108,7 @@ def find_problem(name: str) -> Problem:
     Raises:
         ValueError: an unknown name; a file that does not exist, fails to run, or lacks the name; a value that is no problem.
     """
-    if name in SYSTEMS:
-        return SYSTEMS[name].factory()
-    scene_or_problem = _user_problem(name)
+    scene_or_problem = find_scene_or_problem(name)
     try:
         return scene_or_problem.problem() if isinstance(scene_or_problem, Scene) else scene_or_problem
     except Exception as error:
@@ -123,25 +121,8 @@ def find_scene_or_problem(name: str) -> Scene | Problem:
     Raises:
         ValueError: as in `find_problem`.
     """
-    return SYSTEMS[name].factory() if name in SYSTEMS else _user_problem(name)
-
-
-def find_scene(name: str) -> Scene:
-    """The scene in a file of the user, ``my_file.py:my_scene``, or ``my_file.py`` as in `find_problem`.
-
-    Raises:
-        ValueError: as in `find_problem`; a system that is no scene.
-    """
-    scene = SYSTEMS[name] if name in SYSTEMS else _user_problem(name)
-    if not isinstance(scene, Scene):
-        raise ValueError(
-            f"{name} is a system of functions, not a scene; give a vmri_jax.scene.Scene, my_file.py:my_scene."
-        )
-    return scene
-
-
-def _user_problem(name: str) -> Problem | Scene:
-    """The problem or scene in a file, a package or a model of MuJoCo."""
+    if name in SYSTEMS:
+        return SYSTEMS[name].factory()
     file_name, colon, attribute = name.partition(":")
     if Path(name).suffix.lower() in MODELS:
         try:
@@ -151,7 +132,7 @@ def _user_problem(name: str) -> Problem | Scene:
     if not file_name.endswith(".py"):
         if not colon or not all(part.isidentifier() for part in file_name.split(".")):
             raise ValueError(
-                f"{_unknown('system', name, SYSTEMS)} Your own: my_file.py:my_problem, or my_package.my_module:my_problem."
+                f"{unknown('system', name, SYSTEMS)} Your own: my_file.py:my_problem, or my_package.my_module:my_problem."
             )
         return _problem_in(_import(file_name), file_name, attribute)
     module = _run_file(file_name)
@@ -192,28 +173,18 @@ def find_scheme(name: str, num_micro: int, compose: str | None = None, **options
     Raises:
         ValueError: an unknown name, an option that the scheme does not have, or no degree for galerkin.
     """
-    if _dashed(name) not in SCHEMES:
-        raise ValueError(_unknown("scheme", name, SCHEMES))
-    name, scheme = _dashed(name), SCHEMES[_dashed(name)]
+    scheme = SCHEMES.get(name.lower().replace("_", "-"))
+    if scheme is None:
+        raise ValueError(unknown("scheme", name, SCHEMES))
     arguments = {key: value for key, value in options.items() if value is not None}
     for key in arguments:
         if key not in scheme.options:
             takers = [label for label, entry in SCHEMES.items() if key in entry.options]
             raise ValueError(f"the scheme {name} has no {key}; leave --{key} out or use {' or '.join(takers)}.")
-    if name == "galerkin" and "degree" not in arguments:
+    if scheme.factory is galerkin and "degree" not in arguments:
         raise ValueError("the scheme galerkin needs the degree of its path; give e.g. --degree 2.")
     made = scheme.factory(num_micro, **arguments)
     return made if compose is None else composition.compose(made, compose)
-
-
-def _unknown(kind: str, name: str, known: Collection[str]) -> str:
-    """The message for a name that is not among the known names."""
-    return f"there is no {kind} {name!r}.{near(_dashed(name), known)} There are {', '.join(known)}."
-
-
-def _dashed(name: str) -> str:
-    """The spelling of the tables: fully_explicit and Fully-Explicit become fully-explicit."""
-    return name.lower().replace("_", "-")
 
 
 def _run_file(file_name: str):

@@ -19,9 +19,8 @@ from benchmarks.measure import Ratio, Size, Tell, silent
 from benchmarks.report import Claim, Report
 from benchmarks.savings import ratio_at
 from vmri_jax import plots
-from vmri_jax.running.timing import seconds_each
+from vmri_jax.running.timing import interleaved, seconds_each
 from vmri_jax.study.program import Program, joined
-from vmri_jax.study.timing import interleaved
 
 COLUMNS = ("system", "scheme", "H", "error", "ms", "gain", "bound")
 TARGET = 1e-5

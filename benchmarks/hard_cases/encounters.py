@@ -11,7 +11,7 @@ from benchmarks.hard_cases.case import hard_case
 from benchmarks.hard_cases.systems import bouncing_ball, two_body
 from vmri_jax.hard_cases import Outcome
 from vmri_jax.hard_cases.measures import energy, long_run, run, status
-from vmri_jax.study.timing import interleaved
+from vmri_jax.running.timing import interleaved
 
 
 @hard_case(19, "stiff penalty contact")

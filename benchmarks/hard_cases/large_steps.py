@@ -10,7 +10,7 @@ from benchmarks.hard_cases.case import hard_case
 from vmri_jax.diagnostics import step_condition
 from vmri_jax.hard_cases import Outcome
 from vmri_jax.hard_cases.measures import constraints, difference, energy, iterations, nodes, run, status
-from vmri_jax.study.timing import interleaved
+from vmri_jax.running.timing import interleaved
 
 EXACT = vm.solvers.Arrowhead()
 """The march with exact matrices, which a pass may take over from those before it: it has to converge."""

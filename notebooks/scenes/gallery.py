@@ -20,7 +20,7 @@ import numpy as np
 from PIL import Image, ImageSequence
 
 import vmri_jax as vm
-from vmri_jax.catalogue import find_scene
+from vmri_jax.catalogue import imported
 from vmri_jax.diagnostics import energy_parts, velocity
 from vmri_jax.scene import Scene
 
@@ -166,7 +166,7 @@ def row(path: Path, folder: Path) -> str:
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     vmri("animate", out, *animate[2:], "--out", str(path.with_suffix(".png")), cache=folder)
     shrink(path.with_suffix(".png"))
-    scene, run = find_scene(f"{path}:scene"), vm.Trajectory.load(out)
+    scene, run = imported(f"{path}:scene"), vm.Trajectory.load(out)
     found = kept(scene, run)
     sizes = [run.q_s.shape[1], run.q_f.shape[1], sum(scene.system().num_constraints(run.q_s[0], run.q_f[0]))]
     cells = [

@@ -18,7 +18,7 @@ from benchmarks import batch, c_loops, chains, compilation, cost, curves, floor,
 from benchmarks.curves import Case
 from benchmarks.measure import Ratio, interleaved, ratio, steps_for
 from benchmarks.report import Claim, Report
-from vmri_jax.study import timing
+from vmri_jax.running import timing
 
 
 # --- measuring -------------------------------------------------------------------------------------------------------

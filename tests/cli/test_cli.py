@@ -360,10 +360,10 @@ def test_cost_writes_its_page(vmri, short_menu, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("tune", "user.py:my_problem", "--error", "1e-19", "--t-end", "1"), "round-off alone"),
+        (("tune", "user.py:my_problem", "--error", "1e-19", "--t-end", "1"), "round-off of float64 alone"),
         (("tune", "user.py:my_problem", "--error", "1e-3", "--t-end", "-1"), "t_end is -1.0"),
         (("tune", "user.py:my_problem", "--error", "1e-3", "--t-end", "1", "--out", "runs.txt"), ".csv or .json"),
-        (("cost", "user.py:my_problem", "--error", "-1"), "round-off alone"),
+        (("cost", "user.py:my_problem", "--error", "-1"), "round-off of float64 alone"),
         (("cost", "user.py:my_problem", "--t-end", "0"), "t_end is 0.0"),
         (("simulate", "fpu", *RUN, "--compose", "yoshida5"), "there is no composition"),
         (("simulate", "fpu", "--macro-dt", "0.1"), "got neither of --steps and --accuracy"),
@@ -471,8 +471,8 @@ def test_a_page_that_cannot_be_drawn_leaves_its_table(tmp_path, monkeypatch):
     cost_report = importlib.import_module("vmri_jax.study.cost_report")
 
     def failing(problem, name, out, **_):
-        search: Any = SimpleNamespace(rows=lambda: NOTHING, t_end=1.0, not_tried=list)
-        return cost_report._write(search, [cost_report.Answer(1e-2, None)], problem, name, out)
+        search: Any = SimpleNamespace(problem=problem, rows=lambda: NOTHING, t_end=1.0, not_tried=list)
+        return cost_report._write(search, [cost_report.Answer(1e-2, None)], name, out)
 
     def broken(*_, **__):
         return int("no figure")

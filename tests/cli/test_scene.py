@@ -4,7 +4,7 @@ import pytest
 from typer.testing import CliRunner
 
 from vmri_jax import Problem, cli, systems
-from vmri_jax.catalogue import find_problem, find_scene
+from vmri_jax.catalogue import find_problem, find_scene_or_problem
 from vmri_jax.scene import Scene
 
 FILE = """
@@ -26,14 +26,11 @@ def file(tmp_path):
 
 
 def test_scenes_are_found_in_files(file):
-    assert isinstance(find_scene(file), Scene)
+    assert isinstance(find_scene_or_problem(file), Scene)
     assert isinstance(find_problem(file), Problem)
     assert find_problem(f"{file}:other").system.params.keys() == {"spring_anchors"}
     with pytest.raises(ValueError, match=r"has no name 'scen'\. Did you mean scene\? Problems in it: scene"):
         find_problem(f"{file}:scen")
-    for name in (f"{file}:chain", "fpu"):
-        with pytest.raises(ValueError, match="is a system of functions, not a scene"):
-            find_scene(name)
     assert find_problem("fpu").q_s.shape == systems.fermi_pasta_ulam().q_s.shape
 
 

@@ -3,7 +3,7 @@
 from functools import cache
 from pathlib import Path
 
-from vmri_jax.catalogue import find_scene
+from vmri_jax.catalogue import imported
 from vmri_jax.scene import Scene
 
 FOLDER = Path(__file__).parents[2] / "notebooks" / "scenes"
@@ -13,4 +13,4 @@ SCENES = sorted(path.stem for path in FOLDER.glob("*.py") if path.stem != "galle
 @cache
 def gallery_scene(name: str) -> Scene:
     """The scene in a file of the gallery."""
-    return find_scene(f"{FOLDER / name}.py:scene")
+    return imported(f"{FOLDER / name}.py:scene")

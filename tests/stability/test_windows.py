@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from vmri_jax.stability.windows import find_windows
+from vmri_jax.stability.map import find_windows
 
 WINDOWS = [(0.1, 0.35), (0.5, 0.50004), (0.8, 0.80002), (0.95, 1.0)]
 

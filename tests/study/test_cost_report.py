@@ -15,17 +15,17 @@ def test_cost_report(tmp_path):
     """Above 20 s of compiling: the schemes of the search, with twice their micro steps for the shares, and the trials of an accuracy."""
     report = cost_report(PROBLEM, "spring", tmp_path, t_end=1.0, errors=(1e-5, 1e-3), menu=SHORT_MENU)
     text = report.path.read_text()
-    assert [answer.error for answer in report.answers] == [1e-3, 1e-5]
+    assert [answer.error for answer in report.rows] == [1e-3, 1e-5]
     assert "What accuracy costs" in text
     assert not report.not_tried
     printed = " ".join(str(report).split())  # whatever the width of the terminal
     assert "Runs to t = 1, with errors of the positions there. The reference solution is good to" in printed
-    setting = report.answers[1].setting
+    setting = report.rows[1].setting
     assert setting is not None
     assert setting.command("spring") in text.replace("&#34;", '"')
     assert sum(report.shares.values()) == pytest.approx(1)
-    assert report.extras.accuracy is not None
-    assert report.extras.accuracy.error_q <= report.extras.accuracy_error
+    assert report.accuracy is not None
+    assert report.accuracy.error_q <= report.accuracy_error
     shares = [stair.fast_share for stairs in report.stairs.values() for stair in stairs]
     assert all(0 <= share <= 1 for share in shares if not np.isnan(share))
     assert not all(np.isnan(share) for share in shares)
@@ -39,7 +39,7 @@ def test_a_cost_report_names_the_schemes_that_it_had_no_time_for(tmp_path, monke
     """Once a scheme has kept the error, a search without time compiles no other one."""
     module = import_module("vmri_jax.study.cost_report")
     monkeypatch.setattr(module, "BUDGET", -1.0)
-    monkeypatch.setattr(module, "_extras", lambda *_: module.Extras())
+    monkeypatch.setattr(module, "_later_runs", lambda *_: {})
     report = cost_report(PROBLEM, "spring", tmp_path, t_end=1.0, errors=(1e-3,), menu=SHORT_MENU)
     assert 0 < len(report.not_tried) < len(SHORT_MENU)
     for text in (str(report), report.path.read_text()):

@@ -52,8 +52,7 @@ def with_error(
     """The trajectory with its `RunError`; warns if the error is not certified over the whole run.
 
     Args:
-        run: the simulation.
-        trajectory: its trajectory, without a failed step.
+        trajectory: of the run, without a failed step.
         of: function of a run, whose error is estimated, too.
         shares: whether to estimate the slow and the fast share, too. Their companion has twice the micro steps, another program.
         halved: the companion with half the macro step, if it has been computed.
@@ -109,12 +108,7 @@ def _of_error(
 
 
 def certified_nodes(trajectory: Trajectory, error: np.ndarray) -> tuple[np.ndarray, float]:
-    """(k,) whether the error of each node is certified, and the growth of the error in the second half of the certified time.
-
-    Args:
-        trajectory: the run.
-        error: (k, n_s + n_f) estimated error of its positions.
-    """
+    """(k,) whether the error (k, n_s + n_f) of each node is certified, and its growth in the second half of the certified time."""
     t, extent = np.asarray(trajectory.t), extent_of(trajectory)
     envelope = np.maximum.accumulate(largest_of(error))
     certified = envelope <= LARGEST_CERTIFIED * extent if extent > 0 else np.isfinite(envelope)
@@ -130,16 +124,7 @@ def extent_of(trajectory: Trajectory) -> float:
 
 
 def check_function_of_run(of: Callable | None, error: bool, run: Simulation) -> None:
-    """Refuse a function of a run that does not return numbers; it is called with a run that rests at the start.
-
-    Args:
-        of, error: as of `simulate`.
-        run: the simulation whose error is estimated.
-
-    Raises:
-        TypeError: `of` is no function, or returns no numbers.
-        ValueError: `of` without ``error=True``.
-    """
+    """Refuse a function `of` that returns no numbers; it is called with a run that rests at the start."""
     if of is None:
         return
     if not error:

@@ -25,7 +25,7 @@ from vmri_jax.mechanics.arrays import is_concrete
 from vmri_jax.mechanics.checks import check_number
 from vmri_jax.mechanics.invariants import velocity
 from vmri_jax.mechanics.masses import ConstantMass
-from vmri_jax.mechanics.state import Movable, State, start_of
+from vmri_jax.mechanics.state import Movable, Problem, State, start_of
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.arguments import Steps
 from vmri_jax.running.memory import check_memory
@@ -75,14 +75,7 @@ def with_accuracy(
 ) -> tuple[Trial, Settings]:
     """The trial whose largest estimated error of a position is at most `accuracy`, and its settings.
 
-    Warns with `AccuracyNotReached` if no trial is as accurate.
-
-    Args:
-        system, scheme, state, solver, t_end: as of `vmri_jax.simulate`; scheme None for a scheme from the menu.
-        accuracy: largest error, in the unit of the positions.
-        num_saves: saved intervals, equally spaced; None for at most `MOST_SAVED`.
-        of: function of a run, refused before the trials if it returns no numbers.
-        progress: called before every trial run.
+    Warns with `AccuracyNotReached` if no trial is as accurate. Arguments are as of `vmri_jax.simulate`.
 
     Raises:
         TypeError: scheme is not a scheme.
@@ -158,16 +151,26 @@ def _accurate(search: Search, best: Trial, accuracy: float) -> Trial:
 
 def _check(accuracy: float, length: float, start: State) -> None:
     """Refuse accuracies below round-off, and an end before the start."""
-    check_number("simulate: accuracy", accuracy)
-    size = max(np.abs(np.asarray(q)).max(initial=0.0) for q in (start.q_s, start.q_f))
-    floor = ROUNDOFF * size
-    if not (np.isfinite(accuracy) and accuracy > floor):
-        raise ValueError(
-            f"simulate: accuracy is {accuracy:g}; round-off of float64 alone is about {floor:.0e}, since the largest position is {size:.3g}. "
-            "Give a larger one, in the unit of the positions."
-        )
+    check_error("simulate: accuracy", accuracy, start)
     if not length > 0:
         raise ValueError(f"simulate: t_end is {length:g} after the start; it must be later.")
+
+
+def check_error(name: str, error: float, start: State | Problem) -> None:
+    """Refuse errors of positions that round-off hides; `name` begins the message."""
+    check_number(name, error)
+    size, floor = round_off(start)
+    if not error > floor:
+        raise ValueError(
+            f"{name} is {error:g}; the largest position is {size:.3g}, so that round-off of float64 alone is about {floor:.0e}. "
+            "Give a larger one, in the unit of the positions."
+        )
+
+
+def round_off(start: State | Problem) -> tuple[float, float]:
+    """The largest position at the start, and the error of positions that round-off alone causes in a run."""
+    size = max(float(np.abs(np.asarray(q)).max(initial=0.0)) for q in (start.q_s, start.q_f))
+    return size, ROUNDOFF * size
 
 
 def _menu(scheme, system: System, start: State, accuracy: float, length: float) -> list[tuple[Family, int]]:

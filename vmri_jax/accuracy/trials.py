@@ -158,10 +158,7 @@ class Search:
     def trial(self, family: Family, num_micro: int, num_steps: int, falls_back: bool = False) -> Trial:
         """The first trial with a certified error, of 1, 2, 4, ... times the macro steps; the last trial if the search runs out of time or steps.
 
-        Args:
-            family, num_micro: the scheme.
-            num_steps: least number of macro steps.
-            falls_back: whether the fallback is tried where the first solver fails, see `Simulation`.
+        `falls_back` tells whether the fallback is tried where the first solver fails, see `Simulation`.
         """
         while True:
             run = replace(self.run(family, num_micro, num_steps), may_fall_back=falls_back)

@@ -100,11 +100,7 @@ def plain_table(*columns: str, show_header: bool = True) -> Table:
 
 
 def check_target_file(option: str, path: Path | None, endings: tuple[str, ...]) -> None:
-    """Refuse a file that cannot be written, before anything is computed.
-
-    Raises:
-        ValueError: the file has another ending, no folder, or cannot be written.
-    """
+    """Refuse a file that has another ending, no folder, or cannot be written, before anything is computed."""
     if path is None:
         return
     if path.suffix.lower() not in endings:
@@ -120,11 +116,7 @@ def check_target_file(option: str, path: Path | None, endings: tuple[str, ...]) 
 
 
 def check_target_folder(option: str, path: Path | None) -> None:
-    """Make the folder for results, or refuse it, before anything is computed.
-
-    Raises:
-        ValueError: the folder cannot be made, or no file can be written in it.
-    """
+    """Make the folder for results, or refuse it, before anything is computed."""
     if path is None:
         return
     try:

@@ -32,7 +32,7 @@ DEFAULT_SCHEME = "fully-implicit"
 DEFAULT_SAVED_NODES = 1000
 """Approximate number of saved nodes of a run without --save-every; more make larger files, and figures do not show them."""
 MOST_DRAWN_NODES = 10_000
-"""Largest number of nodes of a stored run in a figure; more are not seen, and take longer to read."""
+"""Largest number of nodes of a run in a figure; more are not seen, and take longer to read and to draw."""
 
 app = typer.Typer()
 
@@ -128,11 +128,7 @@ def simulate(
                 trajectory.save(out, problem.drawing)
                 saved.append(str(out))
             if plot is not None:
-                nodes = (
-                    trajectory
-                    if isinstance(trajectory, Trajectory)
-                    else trajectory[:: -(-len(trajectory) // MOST_DRAWN_NODES)]
-                )
+                nodes = trajectory[:: -(-len(trajectory) // MOST_DRAWN_NODES)]
                 title = (
                     f"{system}, accuracy {accuracy:g}" if accuracy else f"{system}, {scheme}, {num_micro} micro steps"
                 )
@@ -166,11 +162,7 @@ def simulate(
 
 
 def _check_steps(steps: int | None, accuracy: float | None, t_end: float | None, streamed: bool, error: bool) -> None:
-    """Refuse options that do not fix the length of a run, or contradict each other.
-
-    Raises:
-        ValueError: with the options.
-    """
+    """Refuse options that do not fix the length of a run, or contradict each other."""
     if (steps is None) == (accuracy is None):
         got = "neither" if steps is None else "both"
         raise ValueError(f"got {got} of --steps and --accuracy; give exactly one of them.")
@@ -230,12 +222,7 @@ def _print_stop(stopped: SimulationError | Interrupted, saved: list[str], stream
 
 
 def _print_advice(system: str, values: dict) -> None:
-    """Print the command that judges the step of a failed run: resonances, limits, slow and fast swapped.
-
-    Args:
-        system: its name.
-        values: of the options of the run, by name; None for options that are not given.
-    """
+    """Print the command that judges the step of a failed run, from its options by name; None for options that are not given."""
     options = [word for name, value in values.items() if value is not None for word in (f"--{name}", str(value))]
     command = shlex.join(["vmri", "advise", system, *options])
     text = f"Whether this step is stable, which one near it is, and whether slow and fast are swapped:\n[bold]{escape(command)}[/bold]"
@@ -283,11 +270,7 @@ def _summary(trajectory: Trajectory | StoredTrajectory, constrained: bool) -> di
 
 
 def _energy_error(energies: np.ndarray) -> dict[str, str]:
-    """The largest change of the energy of a system that keeps it.
-
-    Args:
-        energies: (pieces, 3) at the start, lowest and highest of each piece of the run.
-    """
+    """The largest change of the energy of a system that keeps it, from rows (start, lowest, highest) of all pieces of a run."""
     start = energies[0, 0]
     change = np.abs(energies - start).max()
     energy = f"{change / abs(start):.2e} of the energy at the start" if abs(start) > 1e-12 else f"{change:.2e}"

@@ -27,7 +27,7 @@ from vmri_jax.cli.common import (
 from vmri_jax.ensembles import Axis, Draw, Draws, Ensemble, EnsembleError, Product, ensemble
 from vmri_jax.ensembles.quantities import drawn_by_default
 from vmri_jax.executors.executor import local_workers
-from vmri_jax.mechanics.names import near
+from vmri_jax.mechanics.names import unknown
 from vmri_jax.running.export import extra
 from vmri_jax.running.interrupts import Interrupted
 
@@ -87,11 +87,7 @@ def sweep(
 
 
 def _drawn(arguments: Mapping[str, Any]) -> str:
-    """The array that --plot draws, chosen before anything runs.
-
-    Raises:
-        ValueError: nothing that is saved can be drawn over the axes.
-    """
+    """The array that --plot draws, chosen before anything runs."""
     drawn = drawn_by_default(arguments["save"], find_problem(arguments["system"]))
     if not drawn:
         raise ValueError(
@@ -170,7 +166,7 @@ def _draws(file: Path, entries: Mapping[str, Any]) -> Draws:
 def _check_entries(where: str, entries: Mapping[str, Any], known: Collection[str]) -> None:
     for name in entries:
         if name not in known:
-            raise ValueError(f"{where}: there is no entry {name!r}.{near(name, known)} There are {', '.join(known)}.")
+            raise ValueError(f"{where}: {unknown('entry', name, known)}")
 
 
 def _located(name: str, folder: Path) -> str:

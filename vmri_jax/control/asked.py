@@ -10,6 +10,7 @@ import numpy as np
 from vmri_jax.control.optimum import Optimum
 from vmri_jax.control.search import Point, Search
 from vmri_jax.control.transcription import Transcription
+from vmri_jax.diagnostics.linear import phase_vector
 from vmri_jax.mechanics.arrays import real_array, whole_number
 from vmri_jax.mechanics.state import start_of
 from vmri_jax.running.simulation import prepare
@@ -56,11 +57,7 @@ def transcribed(
     grid: Literal["macro", "micro"],
     solver: Newton | None,
 ) -> Transcription:
-    """The optimal control problem on the grid of the scheme; arguments as of `vmri_jax.control.minimize`.
-
-    Raises:
-        ValueError, TypeError: bad arguments, functions that return other shapes.
-    """
+    """The optimal control problem on the grid of the scheme, from the arguments of `minimize`, which are checked."""
     whole_number("minimize: num_steps", num_steps)
     if grid not in ("macro", "micro"):
         raise ValueError(f"minimize: grid is {grid!r}; it must be 'macro' or 'micro'.")
@@ -117,12 +114,11 @@ def unaimed(state):
 
 def _bounds(bounds, num_controls: int) -> tuple[np.ndarray, np.ndarray]:
     """The least and the largest controls, (m,) each."""
-    if bounds is None:
-        return np.full(num_controls, -np.inf), np.full(num_controls, np.inf)
+    bounds = (None, None) if bounds is None else bounds
     if not isinstance(bounds, tuple) or len(bounds) != 2:
         raise ValueError(f"minimize: bounds is {bounds!r}; give (least, largest), each a number or ({num_controls},).")
-    sides = [np.asarray(real_array("minimize: bounds", -np.inf if side is None else side)) for side in bounds]
-    sides[1] = np.full((), np.inf) if bounds[1] is None else sides[1]
+    ends = [unbounded if side is None else side for side, unbounded in zip(bounds, (-np.inf, np.inf), strict=True)]
+    sides = [np.asarray(real_array("minimize: bounds", end)) for end in ends]
     if any(side.shape not in ((), (num_controls,)) for side in sides):
         shapes = " and ".join(str(side.shape) for side in sides)
         raise ValueError(f"minimize: bounds have shapes {shapes}; each is a number or ({num_controls},).")
@@ -133,13 +129,7 @@ def _bounds(bounds, num_controls: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def started(search: Search, start, num_steps: int, num_controls: int, grid: str) -> Point:
-    """Nodes and controls of the first iteration, without their gaps and the miss of the goal.
-
-    Args:
-        search: of the problem.
-        start: the argument of `minimize`: None, controls, or an `Optimum`.
-        num_steps, num_controls: N and m.
-        grid: "macro" or "micro".
+    """Nodes and controls of the first iteration, without their gaps and the miss of the goal; `start` as of `minimize`.
 
     Raises:
         ValueError: controls of another shape, an optimum of another problem, or a motion that fails.
@@ -170,9 +160,7 @@ def started(search: Search, start, num_steps: int, num_controls: int, grid: str)
 def _resampled(setup: Transcription, start: Optimum, num_steps: int):
     """Nodes (N, n) and controls (N, parts, m) of an optimum, interpolated to the grid of another problem of the same duration."""
     run, m = start.trajectory, start.controls.shape[-1]
-    old_nodes = np.concatenate(
-        [np.asarray(x) for x in (run.states.q_s, run.states.q_f, run.states.p_s, run.states.p_f)], axis=1
-    )
+    old_nodes = np.asarray(phase_vector(run.states))
     duration, expected = float(run.t[-1] - run.t[0]), num_steps * setup.macro_dt
     if abs(duration - expected) > 1e-9 * expected:
         raise ValueError(

@@ -124,7 +124,7 @@ def minimize(
     last = history[-1]
     success = all(last[name] <= tolerance for name in ("update", "gap", "miss", "over"))
     u = point.u
-    driven = setup.driven(u)
+    driven = setup.driven(u, setup.start.t)
     origin = replace(Origin.of(driven), names=names_of(opened_problem))
     # The last nodes may have gaps; the trajectory is the motion that the controls make.
     trajectory = with_origin(_trajectory(setup, *search.rolled(u)), origin)

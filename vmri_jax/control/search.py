@@ -60,11 +60,7 @@ class Search:
         self.setup = setup
 
     def update(self, point: Point) -> tuple[riccati.Solution, float, riccati.Stages, riccati.Final]:
-        """The linear-quadratic problem at a point.
-
-        Returns:
-            Its solution, the largest absolute multiplier, and the problem: stages and conditions on the last state.
-        """
+        """The solution of the linear-quadratic problem at a point, the largest absolute multiplier, and the problem."""
         stages, final = linearised(self.setup, point.z, point.u)
         if self.setup.bounded:
             change, steepest = bounded.solve(stages, final, limited(self.setup, point.z, point.u))

@@ -71,20 +71,16 @@ class Transcription(eqx.Module):
         """Whether there are inequalities."""
         return self.limits is not None or bool(np.isfinite(self.bounds).any())
 
-    @property
-    def controlled(self) -> System:
-        """The system with forces of controls, which it expects in its params."""
-        return self.system.replace(force=_forces(self.system.force, self.actuate))
-
     def times(self, count: int) -> np.ndarray:
         """(count, parts) starts of the intervals over which each control is constant."""
         start = float(self.start.t) + float(self.macro_dt) * np.arange(count)
         return start[:, None] + np.arange(self.parts) * (float(self.macro_dt) / self.parts)
 
-    def driven(self, u) -> System:
-        """The system with the forces of controls u (N, parts, m) over the whole motion."""
-        held = jnp.reshape(u, (-1, u.shape[-1])), self.start.t, self.macro_dt / self.parts
-        return self.controlled.replace(params={**self.system.params, CONTROL: held})
+    def driven(self, u, t) -> System:
+        """The system with the forces of controls u (..., parts, m) from time t on."""
+        held = jnp.reshape(u, (-1, u.shape[-1])), t, self.macro_dt / self.parts
+        forces = _forces(self.system.force, self.actuate)
+        return self.system.replace(force=forces, params={**self.system.params, CONTROL: held})
 
     def state(self, z, k) -> State:
         """The state at node k."""
@@ -102,9 +98,7 @@ class Transcription(eqx.Module):
     def step(self, z, u, k):
         """The end of the step from node k at z (n,) with controls u (parts, m), and the `StepStatus` of the step."""
         state = self.state(z, k)
-        held = u, state.t, self.macro_dt / self.parts
-        system = self.controlled.replace(params={**self.system.params, CONTROL: held})
-        end, info = macro_step(system, self.scheme, state, self.macro_dt, self.solver)
+        end, info = macro_step(self.driven(u, state.t), self.scheme, state, self.macro_dt, self.solver)
         return phase_vector(end), info.status
 
     def steps(self, z, u, follow):
@@ -209,10 +203,7 @@ def held(t, u, t_start, length):
     weight each control by its duration.
 
     Args:
-        t: time.
-        u: (k, m) controls that follow each other.
-        t_start: start of the first one.
-        length: duration of each.
+        u: (k, m) controls that follow each other, each of duration `length`, the first from t_start on.
     """
     sides = (t - t_start) / length + jnp.array([-BORDER_WIDTH, BORDER_WIDTH])
     return jnp.mean(u[jnp.clip(jnp.floor(sides).astype(int), 0, len(u) - 1)], axis=0)

@@ -1,6 +1,6 @@
 """Quantities that a discrete trajectory should conserve, and measurements of them."""
 
-from vmri_jax.diagnostics.linear import frequencies, null_space_condition, step_condition, symplectic_defect, tangents
+from vmri_jax.diagnostics.linear import frequencies, step_condition, symplectic_defect, tangents
 from vmri_jax.diagnostics.orders import OrderFit, fit_order, observed_order
 from vmri_jax.diagnostics.shadow import ShadowEnergy, shadow_energy
 from vmri_jax.mechanics.invariants import (
@@ -25,7 +25,6 @@ __all__ = [
     "fit_order",
     "frequencies",
     "momentum_map",
-    "null_space_condition",
     "observed_order",
     "oscillatory_energies",
     "rotation_about",

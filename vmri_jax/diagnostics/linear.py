@@ -16,8 +16,8 @@ from vmri_jax.steppers.solvers import Newton
 
 
 def phase_vector(state: State):
-    """``z = (q_s, q_f, p_s, p_f)``, joined, (2 n,)."""
-    return jnp.concatenate([state.q_s, state.q_f, state.p_s, state.p_f])
+    """``z = (q_s, q_f, p_s, p_f)``, joined, (2 n,), or (k, 2 n) for k states."""
+    return jnp.concatenate([state.q_s, state.q_f, state.p_s, state.p_f], axis=-1)
 
 
 def phase_splits(state: State) -> tuple[int, int, int]:
@@ -125,7 +125,7 @@ def step_condition(system: Movable, scheme: Scheme, state: State | None = None, 
         sweeps: number of sweeps.
     """
     system, state = start_of("step_condition", system, state)
-    a = np.asarray(_newton_matrix(system, scheme, state, macro_dt))
+    a = np.asarray(newton_matrix(system, scheme, state, macro_dt))
     for _ in range(sweeps):
         rows, columns = np.linalg.norm(a, axis=1), np.linalg.norm(a, axis=0)
         if not (np.isfinite(a).all() and rows.all() and columns.all()):
@@ -134,31 +134,9 @@ def step_condition(system: Movable, scheme: Scheme, state: State | None = None, 
     return float(np.linalg.cond(a))
 
 
-def null_space_condition(system: Movable, scheme: Scheme, state: State | None = None, *, macro_dt) -> float:
-    """Condition number of the Newton matrix of a macro step on its free motions, without any scaling.
-
-    The matrix is ``P_0^T A P_1`` with the matrix A of the momentum equations and bases of null spaces, ``G_0 P_0 = 0`` at the start and
-    ``G_1 P_1 = 0`` at the end of an interval, which removes the multipliers: the matrix of the solver `solvers.NullSpace`. A is the dense Newton matrix of the first iteration, which starts from
-    straight motion.
-
-    Args:
-        system, scheme, state, macro_dt: as in `simulate`.
-    """
-    from scipy.linalg import null_space  # here: its import takes a tenth of a second
-
-    system, state = start_of("null_space_condition", system, state)
-    whole = np.asarray(_newton_matrix(system, scheme, state, macro_dt))
-    n, r = scheme.num_micro, scheme.degree
-    n_g, n_gs = system.num_constraints(state.q_s, state.q_f)
-    sizes = r * state.q_s.size, r * n_gs, n * r * state.q_f.size, n * r * n_g
-    held = np.repeat([False, True, False, True], sizes)  # the order of `Unknowns`
-    left, right = null_space(whole[np.ix_(~held, held)].T), null_space(whole[np.ix_(held, ~held)])
-    reduced = left.T @ whole[np.ix_(~held, ~held)] @ right
-    return float(np.linalg.cond(reduced)) if np.isfinite(reduced).all() else np.inf
-
-
 @jax.jit
-def _newton_matrix(system, scheme, state, macro_dt):
+def newton_matrix(system: System, scheme: Scheme, state: State, macro_dt):
+    """The dense Newton matrix of a macro step in the first iteration, which starts from straight motion."""
     equations = StepEquations(system, scheme, state.t, state.q_s, state.q_f, state.p_s, state.p_f, macro_dt)
     v_s, v_f = velocity(system, state.q_s, state.q_f, state.p_s, state.p_f)
     n_g, n_gs = system.num_constraints(state.q_s, state.q_f)

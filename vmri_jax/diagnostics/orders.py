@@ -13,10 +13,6 @@ class OrderFit(NamedTuple):
     points: int
 
 
-STUDENT = (np.nan, 12.71, 4.30, 3.18, 2.78, 2.57, 2.45, 2.36, 2.31, 2.26, 2.23)
-"""Quantiles 0.975 of Student's t distribution for 0, 1, ... degrees of freedom; about 2 beyond."""
-
-
 def fit_order(macro_dt, errors, plateau: float = 10.0, floor: float = 0.0) -> OrderFit:
     """Order of convergence: least-squares slope of log error over log step, without the round-off plateau.
 
@@ -32,6 +28,8 @@ def fit_order(macro_dt, errors, plateau: float = 10.0, floor: float = 0.0) -> Or
     Raises:
         ValueError: fewer than two usable errors.
     """
+    from scipy.special import stdtrit  # here: its import takes a tenth of a second
+
     h, e = np.asarray(macro_dt, dtype=float), np.asarray(errors, dtype=float)
     good = np.isfinite(e) & (e > 0)
     if good.sum() < 2:
@@ -51,7 +49,7 @@ def fit_order(macro_dt, errors, plateau: float = 10.0, floor: float = 0.0) -> Or
     if not free:
         return OrderFit(float(np.diff(y)[0] / np.diff(x)[0]), np.nan, 2)
     (slope, _), covariance = np.polyfit(x, y, 1, cov=True)
-    quantile = STUDENT[free] if free < len(STUDENT) else 2.0
+    quantile = stdtrit(free, 0.975)  # of Student's t distribution
     return OrderFit(float(slope), float(quantile * np.sqrt(covariance[0, 0])), len(x))
 
 

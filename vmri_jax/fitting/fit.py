@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import cached_property, partial
+from functools import partial
 from typing import Any, cast
 
 import jax
@@ -123,7 +123,7 @@ def _model(problem, parameters: Mapping) -> Callable[[Mapping], Problem]:
             f"fit: problem is {type(base).__name__}; give a Problem, a scene, or a function from parameters to a Problem."
         )
     params = base.system.params
-    known = _by_name(params) if isinstance(params, Mapping) else {}
+    known, structure = _by_name(params if isinstance(params, Mapping) else {})
     for name, unknown in parameters.items():
         if name not in known and name not in START:
             raise ValueError(
@@ -140,28 +140,16 @@ def _model(problem, parameters: Mapping) -> Callable[[Mapping], Problem]:
     def model(values: Mapping) -> Problem:
         inside = {name: value for name, value in values.items() if name in known}
         start = {name: value for name, value in values.items() if name not in known}
-        system = base.system.replace(params=_with(params, inside)) if inside else base.system
+        system = base.system.replace(params=structure.unflatten((known | inside).values())) if inside else base.system
         return replace(base, system=system, **start)
 
     return model
 
 
-def _by_name(params: Mapping, above: str = "") -> dict[str, Any]:
-    """The numbers in nested dictionaries by name, ``"bonds.stiffness"``."""
-    named: dict[str, Any] = {}
-    for key, value in params.items():
-        named |= _by_name(value, f"{above}{key}.") if isinstance(value, Mapping) else {f"{above}{key}": value}
-    return named
-
-
-def _with(params: Mapping, values: Mapping[str, Any], above: str = "") -> dict:
-    """Nested dictionaries with other numbers, see `_by_name`."""
-    return {
-        key: _with(value, values, f"{above}{key}.")
-        if isinstance(value, Mapping)
-        else values.get(f"{above}{key}", value)
-        for key, value in params.items()
-    }
+def _by_name(params: Mapping) -> tuple[dict[str, Any], Any]:
+    """The numbers in nested dictionaries by name, ``"bonds.stiffness"``, and the structure that makes the dictionaries from them."""
+    numbers, structure = jax.tree.flatten_with_path(params, is_leaf=lambda value: not isinstance(value, Mapping))
+    return {jax.tree_util.keystr(path, simple=True, separator="."): number for path, number in numbers}, structure
 
 
 def _check(data: list, segments: int, starts: int, max_steps: int) -> None:
@@ -180,6 +168,7 @@ class _Search:
 
     def __init__(self, shooting: Shooting, max_steps: int):
         self.shooting, self.max_steps = shooting, max_steps
+        self.compiled_jacobian = jax.jit(self.jacobian)
         self.size = shooting.unknowns.size
         self.count = len(shooting.values)
         if self.count < self.size:
@@ -245,17 +234,8 @@ class _Search:
         by_parameters = jax.jacfwd(lambda u: self.shooting.unknowns.vector(self.shooting.unknowns.at(u)))(u)
         return whole[:, : self.size] / jnp.diagonal(by_parameters), whole[:, self.size :]
 
-    @cached_property
-    def compiled_jacobian(self) -> Callable:
-        """`jacobian`, compiled."""
-        return jax.jit(self.jacobian)
-
     def check_dependence(self, tell: Progress) -> None:
-        """Refuse parameters that no measured value depends on.
-
-        Raises:
-            ValueError: with the names of these parameters.
-        """
+        """Refuse parameters that no measured value depends on."""
         tell("compiling and running the derivatives by the parameters", 1, NUM_PHASES)
         point = np.zeros(self.size), self.part_starts / self.scale, self.shooting.values
         by_parameters = np.asarray(self.compiled_jacobian(*point)[0])

@@ -102,15 +102,12 @@ class Fit:
         """
         if not 0 < level < 1:
             raise ValueError(f"intervals: level is {level}; it must lie between 0 and 1, e.g. 0.95.")
-        q = self._quantile(level)
+        tail = (1 + level) / 2
+        q = stats.norm.ppf(tail) if self.shooting.knows_sigma else stats.t.ppf(tail, max(self.freedom, 1))
         return {
             label: (float(x - q * s), float(x + q * s))
             for (label, s), x in zip(self.standard_errors.items(), self.values, strict=True)
         }
-
-    def _quantile(self, level: float) -> float:
-        known = self.shooting.knows_sigma
-        return float(stats.norm.ppf((1 + level) / 2) if known else stats.t.ppf((1 + level) / 2, max(self.freedom, 1)))
 
     @property
     def probability(self) -> float:

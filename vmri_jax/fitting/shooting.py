@@ -101,12 +101,7 @@ class Shooting:
         return np.asarray(jax.vmap(partial(_phase, problem))(nodes))
 
     def predict(self, u, starts):
-        """Predicted values (m,), and gaps (segments - 1, 2 n): the end of each part minus the start of the next one.
-
-        Args:
-            u: search variables of the parameters.
-            starts: (segments - 1, 2 n) positions and velocities where the parts after the first one start.
-        """
+        """Predicted values (m,), and gaps (segments - 1, 2 n): the end of each part minus the start of the next one."""
         if self.segments == 1:  # the start follows from u: JAX's own derivative needs tangents for u alone
             problem = self.model(self.unknowns.at(u))
             observed, ends = jax.tree.map(lambda a: a[None], self._run(problem, problem.state()))

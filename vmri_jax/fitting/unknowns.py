@@ -62,18 +62,14 @@ class Unknown:
     def at(self, u):
         """The parameter for a search variable of the same shape; 0 is the start."""
         if self.lower is None and self.upper is None:
-            return self.start + self._step() * u
+            size = np.where(self.start == 0, 1.0, np.abs(self.start))
+            return self.start + (size if self.scale is None else self.scale) * u
         if self.upper is None:
             return self.lower + (self.start - self.lower) * jnp.exp(u)
         if self.lower is None:
             return self.upper - (self.upper - self.start) * jnp.exp(u)
         part = (self.start - self.lower) / (self.upper - self.lower)
         return self.lower + (self.upper - self.lower) * jax.nn.sigmoid(np.log(part / (1 - part)) + u)
-
-    def _step(self):
-        if self.scale is not None:
-            return self.scale
-        return np.where(self.start == 0, 1.0, np.abs(self.start))
 
 
 class Unknowns:

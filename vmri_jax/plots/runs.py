@@ -8,7 +8,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 
-from vmri_jax.mechanics.invariants import oscillatory_energies
 from vmri_jax.plots.theme import DARK, LIGHT, ROUNDOFF_FLOOR, NotebookFigure, Theme, legend_beside, new_figure
 from vmri_jax.running.saved_run import SavedRun
 
@@ -73,34 +72,10 @@ def plot_trajectory(trajectory: SavedRun, title: str = "", theme: Theme = LIGHT)
     return figure
 
 
-def plot_oscillatory_energies(trajectory: SavedRun, omega, title: str = "", theme: Theme = LIGHT) -> NotebookFigure:
-    """Energies ``I_i = (p_fi^2 + omega^2 q_fi^2) / 2`` of the stiff springs and their sum, the adiabatic invariant.
-
-    Args:
-        trajectory: a run of a system whose fast variables are oscillators of unit mass.
-        omega: their angular frequency.
-        title: title above the panel.
-        theme: colours.
-    """
-    t = np.asarray(trajectory.t)
-    energies = np.asarray(oscillatory_energies(omega, trajectory.states.q_f, trajectory.states.p_f))
-    with new_figure(7.2, 3.4, title, theme) as figure:
-        axes = figure.subplots()
-        axes.plot(t, energies.sum(axis=1), color=theme.ink, linewidth=1.0, label=r"$I = \sum I_i$")
-        coordinates(axes, t, energies, [f"$I_{{{i + 1}}}$" for i in range(energies.shape[1])], theme)
-        axes.set(xlabel="time $t$", ylabel="oscillatory energy")
-        limit_times(axes, t)
-        axes.set_ylim(bottom=0)
-    return figure
-
-
 def position_panels(run: SavedRun) -> list[tuple[np.ndarray, list[str], str, np.ndarray | None]]:
-    """For slow and fast positions, as far as there are any: values (k, n), names, label of the axis, and errors (k, n) or None.
+    """For slow and fast positions of a run, if there are any: values (k, n), names, label of the axis, and errors (k, n) or None.
 
     Directors of rigid bodies are left out.
-
-    Args:
-        run: one run, not a batch.
     """
     names, error = run.names, run.error
     slow, fast = (None, None) if error is None else (error.q_s, error.q_f)

@@ -181,13 +181,7 @@ def legend_below(figure: Figure, size: float = 9.0) -> None:
 
 
 def legend_beside(axes: Axes, title: str | None = None, size: float = 9.0) -> None:
-    """Names of the curves to the right of a panel.
-
-    Args:
-        axes: the panel.
-        title: title above the names.
-        size: size of the letters, in points.
-    """
+    """Names of the curves to the right of a panel, in letters of `size` points."""
     look = {"handlelength": 1.2, "fontsize": size, "title_fontsize": size, "labelspacing": 0.3}
     axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), title=title, **look)
 

@@ -6,14 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from vmri_jax.diagnostics.linear import frequencies_of
 from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.mechanics.system import label
 from vmri_jax.running.origin import names_of
 from vmri_jax.schemes.composition import Composition, stage_scheme
 from vmri_jax.schemes.scheme import Scheme
-from vmri_jax.stability.labels import swapped
 from vmri_jax.stability.linear import SmallMotions, small_motions
 from vmri_jax.stability.map import TOLERANCE, Window, measure
 from vmri_jax.stability.multipliers import multipliers
@@ -40,6 +38,9 @@ LONGER_FOR_CAUSE = 0.01
 value may blame a limit that is not yet reached."""
 MOST_SCANS = 5
 """Most scans, each over smaller steps than the previous one, until one of them contains a safe step."""
+SWAPPED_RATIO = 2.0
+"""Ratio of the highest frequency of slow variables to the highest frequency of fast variables, above which their labels are probably swapped;
+a larger value overlooks more swapped labels."""
 
 
 @dataclass(frozen=True)
@@ -120,10 +121,7 @@ class Advice(ResultTable):
             **super().content(),
         }
 
-    @property
-    def caption(self) -> str:
-        """The verdict."""
-        return self.verdict
+    caption = verdict
 
     def __str__(self) -> str:
         lines = [f"{f.severity}: {f.kind}: {f.sentence}" for f in self.findings]
@@ -184,7 +182,7 @@ def advise(
         upper, lower = lower, lower / 3
         windows = _scan(motions, scheme, lower, upper, upper, tolerance) + windows
 
-    findings = [*step_findings, *_labels(motions, names), *_stages(scheme), *_motion(motions)]
+    findings = [*step_findings, *_further_findings(motions, scheme, names)]
     return Advice(
         macro_dt=macro_dt,
         growth=growth,
@@ -192,8 +190,8 @@ def advise(
         windows=tuple(windows),
         scanned=(lower, SCANNED_STEPS[1] * macro_dt),
         safe_macro_dt=safe,
-        fast_frequencies=motions.fast_frequencies,
-        slow_frequencies=motions.slow_frequencies,
+        fast_frequencies=motions.frequencies("fast"),
+        slow_frequencies=motions.frequencies("slow"),
     )
 
 
@@ -247,23 +245,22 @@ def _stability_limit(motions: SmallMotions, scheme: Scheme | Composition, macro_
     of_stage = " of the longest stage" if isinstance(scheme, Composition) else ""
     micro_dt = longest / stage.num_micro
     cases = [
-        ("fast", motions.fast_frequencies, "the micro step", micro_dt, fast_limit(stage)),
-        ("slow", motions.slow_frequencies, "the macro step", longest, slow_limit(stage)),
+        ("fast", "fast", "the micro step", micro_dt, fast_limit(stage)),
+        ("slow", "slow", "the macro step", longest, slow_limit(stage)),
     ]
-    labels = {"fast": "fast", "slow": "slow"}
     for name, _ in motions.system.potentials:
-        labels[f"potential {name}"] = f"further {name}" if name in labels else label(name)
-        placed, key = stage.rule_of(name), f"potential {name}"
+        placed, words = stage.rule_of(name), f"further {name}" if name in ("fast", "slow") else label(name)
         span = stage.num_micro if placed.grid == "macro" else placed.every
-        step = f"the step of {span} micro intervals"
-        cases.append((key, frequencies_of(motions.further[key]), step, span * micro_dt, kick_limit(placed)))
-    for key, frequencies, step_name, step, limit in cases:
+        step_name = f"the step of {span} micro intervals"
+        cases.append((f"potential {name}", words, step_name, span * micro_dt, kick_limit(placed)))
+    for key, words, step_name, step, limit in cases:
         alone = multipliers(motions.only(key), scheme, [macro_dt * (1 + LONGER_FOR_CAUSE)])
         if alone.radius[0] > 1 + TOLERANCE:
             bound = f"; its quadrature rule is stable below {limit:.4g}" if np.isfinite(limit) else ""
+            frequency = motions.frequencies(key)[0]
             return (
-                f"The step is unstable for the {labels[key]} potential alone: its frequency {frequencies[0]:.4g} times {step_name}{of_stage} "
-                f"is {frequencies[0] * step:.4g}{bound}."
+                f"The step is unstable for the {words} potential alone: its frequency {frequency:.4g} times {step_name}{of_stage} "
+                f"is {frequency * step:.4g}{bound}."
             )
     return ""
 
@@ -295,7 +292,7 @@ def _turn(motions: SmallMotions, scheme: Scheme | Composition, macro_dt: float, 
     """Angle by which vibration i turns in a macro step: the phase of the micro steps if W carries the vibration, else ``omega H``."""
     frequencies, modes = motions.modes
     exact = float(frequencies[i] * macro_dt)
-    if modes[:, i] @ motions.fast @ modes[:, i] < frequencies[i] ** 2 / 2:
+    if modes[:, i] @ motions.hessians["fast"] @ modes[:, i] < frequencies[i] ** 2 / 2:
         return exact
     stage = stage_scheme(scheme)
     phases = [phase(stage, exact * part / stage.num_micro) for part in _stage_lengths(scheme)]
@@ -303,26 +300,25 @@ def _turn(motions: SmallMotions, scheme: Scheme | Composition, macro_dt: float, 
     return turn if np.isfinite(turn) else exact
 
 
-def _labels(motions: SmallMotions, names: Names | None) -> Iterator[Finding]:
-    """A warning if slow variables carry the fastest vibrations."""
+def _further_findings(motions: SmallMotions, scheme: Scheme | Composition, names: Names | None) -> Iterator[Finding]:
+    """A warning if slow variables carry the fastest vibrations; notes on backward steps, and on a state that is itself unstable."""
     sentence_and_ratio = swapped(motions, names)
     if sentence_and_ratio is not None:
         yield Finding("warning", "labels", *sentence_and_ratio)
-
-
-def _stages(scheme: Scheme | Composition) -> Iterator[Finding]:
-    """A note if a composition has backward steps."""
     parts = _stage_lengths(scheme)
-    if (parts > 0).all():
-        return
-    longest = float(np.abs(parts).max())
-    yield Finding(
-        "note",
-        "stages",
-        f"The {len(parts)} stages of the composition make steps of {parts.min():.3g} to {parts.max():.3g} macro steps, some "
-        f"backwards: the largest stable macro step of the composition is about that of its scheme divided by {longest:.3g}.",
-        longest,
-    )
+    if not (parts > 0).all():
+        longest = float(np.abs(parts).max())
+        sentence = (
+            f"The {len(parts)} stages of the composition make steps of {parts.min():.3g} to {parts.max():.3g} macro steps, some "
+            f"backwards: the largest stable macro step of the composition is about that of its scheme divided by {longest:.3g}."
+        )
+        yield Finding("note", "stages", sentence, longest)
+    if motions.growing.size:
+        rate = float(np.real(motions.growing).max())
+        sentence = (
+            f"Motion about this state grows by itself, like exp({rate:.3g} t); that is left out of what is measured."
+        )
+        yield Finding("note", "motion", sentence, rate)
 
 
 def _stage_lengths(scheme: Scheme | Composition) -> np.ndarray:
@@ -330,14 +326,30 @@ def _stage_lengths(scheme: Scheme | Composition) -> np.ndarray:
     return np.asarray(scheme.coefficients) if isinstance(scheme, Composition) else np.ones(1)
 
 
-def _motion(motions: SmallMotions) -> Iterator[Finding]:
-    """A note if the state itself is unstable."""
-    if not motions.growing.size:
-        return
-    rate = float(np.real(motions.growing).max())
-    yield Finding(
-        "note",
-        "motion",
-        f"Motion about this state grows by itself, like exp({rate:.3g} t); that is left out of what is measured.",
-        rate,
+def swapped(motions: SmallMotions, names: Names | None = None) -> tuple[str, float] | None:
+    """Advice if slow variables vibrate faster than fast ones, and the ratio of their highest frequencies; else None."""
+    frequencies, _ = motions.modes
+    n_s, n_f, shares = motions.rest.q_s.size, motions.rest.q_f.size, motions.kinetic_shares
+    slow = shares[:n_s].sum(axis=0) > 0.5
+    slow_highest, fast_highest = frequencies[slow].max(initial=0.0), frequencies[~slow].max(initial=0.0)
+    if not n_f or slow_highest <= SWAPPED_RATIO * fast_highest or slow_highest == 0:
+        return None
+    carried = shares[:n_s, frequencies > slow_highest / SWAPPED_RATIO].sum(axis=1)
+    labels = (names or Names()).of_coordinates(n_s, n_f).slow_coordinates
+    sentence = (
+        f"The fastest vibration, of frequency {slow_highest:.4g}, is one of the slow variables "
+        f"{', '.join(labels[i] for i in np.flatnonzero(carried > 0.1))}; vibrations of the fast variables reach {fast_highest:.4g}. "
+        "Swap the labels: make these variables fast and put their energy into fast_potential, and the soft ones slow."
     )
+    return sentence, float(slow_highest / fast_highest) if fast_highest else np.inf
+
+
+def swapped_at_start(trajectory) -> str:
+    """The sentence of `swapped` about the first node of a failed run; empty if its labels are right or its system is not known."""
+    if not trajectory.states.q_s.shape[-1] or not trajectory.states.q_f.shape[-1]:
+        return ""  # nothing to swap: small motions of all coordinates would take seconds to compile
+    try:
+        advice = swapped(small_motions(trajectory.origin.system(), trajectory[0]), trajectory.names)
+    except (ValueError, TypeError, IndexError):  # no expansion at the start: the error of the run says more about it
+        return ""
+    return advice[0] if advice else ""

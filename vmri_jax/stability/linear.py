@@ -5,12 +5,14 @@ expansion of the system; elsewhere the expansion describes the *frozen* problem:
 In both cases the expansion is a `System`, to which every scheme applies unchanged.
 """
 
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.linalg import null_space
 
 from vmri_jax.diagnostics.linear import frequencies_of, phase_splits
 from vmri_jax.mechanics.arrays import QUICK
@@ -61,24 +63,21 @@ class SmallMotions:
     system: the expansion to second order; its equilibrium is zero, its `params` are the coefficients.
     shapes: N, (n_s + n_f, d).
     embed, read: matrices (2 n, 2 d) from (eta, pi) to (q_s, q_f, p_s, p_f), and (2 d, 2 n) back.
-    slow: (d, d) Hessian of V with its share of the constraint forces.
-    fast: (d, d) Hessian of W.
+    hessians: (d, d) Hessians of the potentials: of V with its share of the constraint forces ("slow"), of W ("fast"), and of each further
+        potential ("potential " and its name).
     stiffness: (d, d) minus the derivative of all forces in eta: of potentials, constraints, the kinetic energy, and F.
     damping: (d, d) matrix of the velocities, gyroscopic and dissipative.
     rest: the state of zero displacement and momentum of the expansion.
-    further: (d, d) Hessians of further potentials, by "potential " and their name.
     """
 
     system: System
     shapes: np.ndarray
     embed: np.ndarray
     read: np.ndarray
-    slow: np.ndarray
-    fast: np.ndarray
+    hessians: dict[str, np.ndarray]
     stiffness: np.ndarray
     damping: np.ndarray
     rest: State
-    further: dict[str, np.ndarray] = field(default_factory=dict)
 
     @cached_property
     def rates(self) -> np.ndarray:
@@ -92,15 +91,9 @@ class SmallMotions:
         """The rates of motions of the system that grow, whatever the scheme."""
         return self.rates[np.real(self.rates) > LEAST_GROWTH * np.abs(self.rates).max(initial=0.0)]
 
-    @property
-    def slow_frequencies(self) -> np.ndarray:
-        """(d,) frequencies of the slow potential alone, the largest first; zero where it is not convex."""
-        return frequencies_of(self.slow)
-
-    @property
-    def fast_frequencies(self) -> np.ndarray:
-        """(d,) frequencies of the fast potential alone, the largest first, which micro steps must resolve; zero where it is not convex."""
-        return frequencies_of(self.fast)
+    def frequencies(self, name: str) -> np.ndarray:
+        """(d,) frequencies of one potential alone, a key of `hessians`, the largest first; zero where it is not convex."""
+        return frequencies_of(self.hessians[name])
 
     @cached_property
     def modes(self) -> tuple[np.ndarray, np.ndarray]:
@@ -118,19 +111,19 @@ class SmallMotions:
     @property
     def omega(self) -> float:
         """The largest frequency of W alone; if W has none, the largest rate of all motions."""
-        fast = self.fast_frequencies.max(initial=0.0)
+        fast = self.frequencies("fast").max(initial=0.0)
         return float(fast if fast > 0 else np.abs(self.rates).max(initial=0.0))
 
     def only(self, name: str) -> "SmallMotions":
-        """The small motions under one potential alone: "slow" (V), "fast" (W), or a key of `further`."""
-        hessians = {"slow": self.slow, "fast": self.fast, **self.further}
-        removed = [key for key in hessians if key != name]
+        """The small motions under one potential alone, a key of `hessians`."""
+        removed = {key: hessian for key, hessian in self.hessians.items() if key != name}
         zeros = {key: jax.tree.map(np.zeros_like, self.system.params[key]) for key in removed}
-        stiffness = self.stiffness - sum(hessians[key] for key in removed)
-        hessians |= {key: np.zeros_like(hessians[key]) for key in removed}
-        system = self.system.replace(params=self.system.params | zeros)
-        slow, fast = hessians.pop("slow"), hessians.pop("fast")
-        return replace(self, system=system, stiffness=stiffness, slow=slow, fast=fast, further=hessians)
+        return replace(
+            self,
+            system=self.system.replace(params=self.system.params | zeros),
+            stiffness=self.stiffness - sum(removed.values()),
+            hessians=self.hessians | {key: np.zeros_like(hessian) for key, hessian in removed.items()},
+        )
 
 
 def small_motions(system: Movable, state: State | None = None) -> SmallMotions:
@@ -169,8 +162,8 @@ def small_motions(system: Movable, state: State | None = None) -> SmallMotions:
     def reduced(matrix):
         return shapes.T @ matrix @ shapes
 
-    further = {name: terms[name] for name, _ in _further_potentials(system)}
-    potentials = sum((terms["slow"], terms["fast"], *further.values()))
+    hessians = {name: terms[name] for name in _potentials(system)}
+    potentials = sum(hessians.values())
     gyroscopic = reduced(coupling)
     zero = np.zeros_like(shapes)
     return SmallMotions(
@@ -178,23 +171,19 @@ def small_motions(system: Movable, state: State | None = None) -> SmallMotions:
         shapes=shapes,
         embed=np.block([[shapes, zero], [coupling @ shapes - mass @ shapes @ gyroscopic, mass @ shapes]]),
         read=np.block([[shapes.T @ mass, zero.T], [zero.T, shapes.T]]),
-        slow=reduced(terms["slow"] + slow_bending),
-        fast=reduced(terms["fast"]),
+        hessians={
+            name: reduced(hessian) for name, hessian in (hessians | {"slow": terms["slow"] + slow_bending}).items()
+        },
         stiffness=reduced(potentials + bending - terms["kinetic"][:n, :n] - terms["force_q"]),
         damping=gyroscopic - gyroscopic.T - reduced(terms["force_v"]),
         rest=State(jnp.asarray(state.t, dtype=float), *np.split(np.zeros(2 * n), phase_splits(state))),
-        further={name: reduced(hessian) for name, hessian in further.items()},
     )
 
 
 def _shapes(mass: np.ndarray, jacobian: np.ndarray) -> np.ndarray:
     """N (n, d) with ``N^T M N = 1`` and ``G N = 0``: a basis T of the null space of G, divided by the Cholesky factor of ``T^T M T``."""
-    tangents = np.eye(len(mass))
-    if len(jacobian):
-        _, sizes, rows = np.linalg.svd(jacobian)
-        tangents = rows[
-            np.count_nonzero(sizes > 1e-10 * sizes.max(initial=0.0)) :
-        ].T  # dependent constraints count once
+    # dependent constraints count once
+    tangents = null_space(jacobian, rcond=1e-10) if len(jacobian) else np.eye(len(mass))
     if not tangents.shape[1]:
         raise ValueError(
             f"small_motions: the {len(jacobian)} constraints leave none of the {len(mass)} coordinates free; nothing moves."
@@ -222,7 +211,7 @@ def _expanded_system(system: System, state: State, terms: dict, multiplier, slow
     has_constant_force = np.abs(constant_force).max(initial=0.0) > 1e-12 * np.abs(G.T @ multiplier).max(initial=0.0)
     return System(
         system.kinetic if system.has_constant_mass else _kinetic,
-        None if system.slow_potential is None else _slow_potential,
+        None if system.slow_potential is None else _Potential("slow"),
         None if system.fast_potential is None else _fast_potential,
         None if system.constraint is None else _constraint,
         None if system.slow_constraint is None else _slow_constraint,
@@ -234,15 +223,20 @@ def _expanded_system(system: System, state: State, terms: dict, multiplier, slow
             "constraint": (G[:n_g], curvature[:n_g]),
             "slow_constraint": (G[n_g:, :n_s], curvature[n_g:, :n_s, :n_s]),
             "force": (constant_force, terms["force_q"], terms["force_v"]),
-            **{name: terms[name] for name, _ in _further_potentials(system)},
+            **{name: (np.zeros(len(G.T)), terms[name]) for name in list(_potentials(system))[2:]},
         },
-        potentials=[(name, _FurtherPotential(f"potential {name}")) for name, _ in system.potentials],
+        potentials=[(name, _Potential(f"potential {name}")) for name, _ in system.potentials],
     )
 
 
-def _further_potentials(system: System):
-    """The further potentials, with their keys among the terms."""
-    return [(f"potential {name}", function) for name, function in system.potentials]
+def _potentials(system: System) -> dict[str, Callable]:
+    """V, W and the further potentials as functions of (q_s, q_f, params), by their keys among the terms; zero without V or W."""
+    V, W = system.slow_potential, system.fast_potential
+    return {
+        "slow": lambda q_s, q_f, params: jnp.zeros(()) if V is None else V(q_s, q_f, params),
+        "fast": lambda q_s, q_f, params: jnp.zeros(()) if W is None else W(q_f, params),
+        **{f"potential {name}": function for name, function in system.potentials},
+    }
 
 
 @partial(jax.jit, compiler_options=QUICK)
@@ -256,13 +250,8 @@ def _expansion(system: System, state: State) -> dict:
     q = jnp.concatenate([state.q_s, state.q_f])
     v = jnp.concatenate(velocity(system, state.q_s, state.q_f, state.p_s, state.p_f))
 
-    def slow(q):
-        if system.slow_potential is None:
-            return jnp.zeros(())
-        return system.slow_potential(q[:n_s], q[n_s:], system.params)
-
-    def fast(q):
-        return jnp.zeros(()) if system.fast_potential is None else system.fast_potential(q[n_s:], system.params)
+    def of_positions(potential):
+        return lambda q: potential(q[:n_s], q[n_s:], system.params)
 
     def energy(q):
         return potential_energy(system, q[:n_s], q[n_s:])
@@ -281,24 +270,20 @@ def _expansion(system: System, state: State) -> dict:
         return jnp.concatenate(system.forces(state.t, q[:n_s], q[n_s:], v[:n_s], v[n_s:]))
 
     z = jnp.concatenate([q, v])
+    potentials = {name: of_positions(potential) for name, potential in _potentials(system).items()}
     # The gradient (dT/dq, dT/dv) and its rate of change along q' = v, v' = 0.
     gradient, rate = jax.jvp(jax.grad(kinetic), (z,), (jnp.concatenate([v, jnp.zeros_like(v)]),))
     force_q, force_v = jax.jacfwd(force, argnums=(0, 1))(q, v)
     return {
         "kinetic": jax.hessian(kinetic)(z.at[q.size :].set(0.0)),
-        "slow_gradient": jax.grad(slow)(q),
-        "slow": jax.hessian(slow)(q),
-        "fast": jax.hessian(fast)(q),
+        **{name: jax.hessian(potential)(q) for name, potential in potentials.items()},
+        "slow_gradient": jax.grad(potentials["slow"])(q),
         "jacobian": jax.jacrev(constraints)(q),
         "curvature": jax.jacfwd(jax.jacrev(constraints))(q),
         "centripetal": jax.jacfwd(jax.jacfwd(constraints_in_motion))(0.0),
         "force_q": force_q,
         "force_v": force_v,
         "impetus": gradient[: q.size] - rate[q.size :] - jax.grad(energy)(q) + force(q, v),
-        **{
-            name: jax.hessian(lambda q, f=f: f(q[:n_s], q[n_s:], system.params))(q)
-            for name, f in _further_potentials(system)
-        },
     }
 
 
@@ -307,25 +292,20 @@ def _kinetic(q_s, q_f, v_s, v_f, params):
     return z @ params["kinetic"] @ z / 2
 
 
-def _slow_potential(q_s, q_f, params):
-    q = jnp.concatenate([q_s, q_f])
-    gradient, hessian = params["slow"]
-    return gradient @ q + q @ hessian @ q / 2
-
-
 def _fast_potential(q_f, params):
     return q_f @ params["fast"] @ q_f / 2
 
 
 @dataclass(frozen=True)
-class _FurtherPotential:
-    """A further potential ``q^T H q / 2``; `name` is the key of its Hessian H in the params."""
+class _Potential:
+    """A potential ``gradient . q + q^T H q / 2``; `name` is the key of its gradient and Hessian H in the params."""
 
     name: str
 
     def __call__(self, q_s, q_f, params):
         q = jnp.concatenate([q_s, q_f])
-        return q @ params[self.name] @ q / 2
+        gradient, hessian = params[self.name]
+        return gradient @ q + q @ hessian @ q / 2
 
 
 def _constraint(q_s, q_f, params):

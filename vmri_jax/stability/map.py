@@ -1,9 +1,7 @@
 """Stability maps: the stable macro steps of a scheme, over ``omega H`` and over schemes or coupling strengths."""
 
-import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,7 +13,6 @@ from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.stability.linear import SmallMotions, small_motions
 from vmri_jax.stability.multipliers import multipliers
-from vmri_jax.stability.windows import find_windows
 from vmri_jax.study.table import Column, ResultTable
 
 TOLERANCE = 1e-6
@@ -25,6 +22,9 @@ POINTS_IN_WINDOW = np.linspace(0.0, 1.0, 9)
 """Points of a window at which its growth is measured, in widths from its start."""
 RESOLUTION = 1e-7
 """Accuracy of the ends of windows, as a part of the range of omega H; narrower windows are left out. A larger value takes less time."""
+POINTS_PER_CALL = 64
+"""Samples that all brackets together get in a call of `label`, the number that `multipliers` computes at a time for small systems; more samples
+divide brackets faster, and each costs an eigenvalue problem."""
 
 
 class Window(NamedTuple):
@@ -71,15 +71,9 @@ class StabilityMap(ResultTable):
         """(n,) macro steps."""
         return self.omega_H / self.omega
 
-    @property
-    def growth(self) -> np.ndarray:
-        """(m, n) growth per macro step, ``radius - 1``, zero where stable."""
-        return np.where(self.radius > 1 + self.tolerance, self.radius - 1, 0.0)
-
     def windows(self, row=None) -> list[Window]:
         """Intervals of omega H that are unstable, for one row (the first by default)."""
-        if row is None:
-            return list(self.unstable[0])
+        row = self.rows[0] if row is None else row
         if row not in self.rows:
             raise ValueError(f"windows: there is no row {row!r}; there are {', '.join(map(repr, self.rows))}.")
         return list(self.unstable[self.rows.index(row)])
@@ -101,16 +95,8 @@ class StabilityMap(ResultTable):
         ]
 
     def content(self) -> dict[str, Any]:
-        """All fields, for `to_json`; `from_json` is the inverse."""
+        """All fields, for `to_json`."""
         return asdict(self) | {"omega_H": self.omega_H.tolist(), "radius": self.radius.tolist()}
-
-    @classmethod
-    def from_json(cls, path: str | Path) -> "StabilityMap":
-        """A map written by `to_json`."""
-        content = json.loads(Path(path).read_text())
-        unstable = tuple(tuple(Window(*window) for window in row) for row in content.pop("unstable"))
-        arrays = {name: np.array(content.pop(name), dtype=float) for name in ("omega_H", "radius")}
-        return cls(**content | arrays | {"rows": tuple(content["rows"]), "unstable": unstable})
 
 
 def stability_map(
@@ -193,6 +179,46 @@ def measure(
     inside = np.array([a + (b - a) * POINTS_IN_WINDOW for a, b in edges])
     peaks = multipliers(motions, scheme, inside.reshape(-1)).radius.reshape(inside.shape).max(axis=1) - 1
     return spectra.radius, [Window(*ends, float(peak)) for ends, peak in zip(edges, peaks, strict=True)]
+
+
+def find_windows(
+    label: Callable[[np.ndarray], Sequence], x: np.ndarray, labels: Sequence, resolution: float
+) -> list[tuple[float, float]]:
+    """Unstable intervals of x between its first and last value.
+
+    Between neighbouring samples with different labels lies an end of a window, or a whole window. All such brackets are
+    divided at the same time, until they are shorter than `resolution`; shorter windows are left out.
+
+    Args:
+        label: function of an array of samples that returns a label for each: None for unstable, else any value to compare.
+        x: (k,) increasing samples to start from.
+        labels: their labels.
+        resolution: length of a bracket at which its division ends.
+    """
+    edges = [x[0]] if labels[0] is None else []
+    samples = zip(x, x[1:], labels, labels[1:], strict=False)
+    brackets = [(a, b, label_a, label_b) for a, b, label_a, label_b in samples if label_a != label_b]
+    while brackets:
+        count = max(1, POINTS_PER_CALL // len(brackets))
+        fractions = np.arange(1, count + 1) / (count + 1)
+        inner = np.array([a + (b - a) * fractions for a, b, _, _ in brackets])
+        inner_labels = iter(label(inner.reshape(-1)))
+        divided = []
+        for (a, b, label_a, label_b), points in zip(brackets, inner, strict=True):
+            nodes = [a, *points, b]
+            node_labels = [label_a, *(next(inner_labels) for _ in points), label_b]
+            pieces = zip(nodes, nodes[1:], node_labels, node_labels[1:], strict=False)
+            divided += [piece for piece in pieces if piece[2] != piece[3]]
+        brackets = [piece for piece in divided if piece[1] - piece[0] > resolution]
+        # Of a short bracket with an unstable side, the stable end: the window includes the bracket. Two different stable labels hide a
+        # window shorter than the resolution.
+        for a, b, label_a, label_b in divided:
+            if b - a <= resolution and None in (label_a, label_b):
+                edges.append(a if label_b is None else b)
+    if labels[-1] is None:
+        edges.append(x[-1])
+    edges = [float(edge) for edge in sorted(edges)]
+    return list(zip(edges[::2], edges[1::2], strict=True))
 
 
 def _grid(omega_H) -> np.ndarray:

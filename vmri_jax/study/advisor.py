@@ -1,30 +1,43 @@
-"""Advice: the scheme, num_micro and macro step that reach an accepted error in the least time, from the search of `search.py`."""
+"""Advice: the scheme, num_micro and macro step that reach an accepted error in the least time, from the search of `search.py`.
+
+The recommended setting is checked by runs from another start: at one start its error may be small by chance, as where the leading
+term of the error changes sign near t_end.
+"""
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
+import jax
 import numpy as np
 
 from vmri_jax.accuracy.families import Family, families
-from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
+from vmri_jax.accuracy.steps import check_error
+from vmri_jax.mechanics.projection import legendre, project_momentum
+from vmri_jax.mechanics.state import HasProblem, Problem, State, problem_of
 from vmri_jax.running.progress import shows_progress
 from vmri_jax.steppers.results import SimulationError
 from vmri_jax.steppers.solvers import Newton
-from vmri_jax.study.another_start import Verification, another_start, first_verified
+from vmri_jax.study.program import Program
 from vmri_jax.study.reference_solution import ReferenceSolution, reference_solution
-from vmri_jax.study.search import Search, Setting
-from vmri_jax.study.table import ResultTable
-from vmri_jax.study.work import WorkPrecision, WorkRow, duration
+from vmri_jax.study.search import TIMED_RUNS, Search, Setting
+from vmri_jax.study.table import ResultTable, interruptible
+from vmri_jax.study.work import WorkPrecision, WorkRow, duration, work_row
 
 MIN_ERROR_OVER_REFERENCE = 10.0
 """Least ratio of the accepted error to the error of the reference; at a smaller ratio the error of the reference decides which
 runs keep the accepted error, a larger one refuses searches that would succeed."""
 SETTINGS_PRINTED = 5
 """Number of settings, the recommended one included, that a recommendation and `vmri tune` print."""
-ROUND_OFF_UNITS = 100
-"""Round-off of a position after a run, in units of machine epsilon times the largest position; a larger number refuses more errors."""
+RELATIVE_VELOCITY_CHANGE = 0.01
+"""Standard deviation of the change of velocities over the largest velocity. The motion is another one with the same time scales; a
+larger change may lead to a motion of another kind, with another error."""
+MAX_ERROR_RATIO = 2.0
+"""Ratio of the error from the other start to the error in the search above which the setting was good by chance; a larger
+ratio accepts more such settings."""
+MAX_CHECKS = 4
+"""Settings that are checked, the fastest first, until one passes; each costs a compilation."""
 
 
 class NothingReached(ValueError):
@@ -33,6 +46,15 @@ class NothingReached(ValueError):
     def __init__(self, message: str, runs: WorkPrecision):
         self.runs = runs
         super().__init__(message)
+
+
+@dataclass(frozen=True)
+class Verification:
+    """A run from another start: its error and time, and the ratio of the error to the error in the search."""
+
+    error_q: float
+    seconds: float
+    error_ratio: float
 
 
 @dataclass(frozen=True)
@@ -95,22 +117,11 @@ class Recommendation(ResultTable):
         return self.setting.num_steps
 
 
-def round_off(problem: Problem) -> tuple[float, float]:
-    """The largest position at the start, and the error of positions that round-off alone causes in a run."""
-    size = float(max(np.abs(problem.q_s).max(initial=0), np.abs(problem.q_f).max(initial=0), 1e-300))
-    return size, ROUND_OFF_UNITS * np.finfo(float).eps * size
-
-
 def check_target(error: float, t_end: float, problem: Problem) -> None:
     """Refuse errors and times that no run can meet."""
     if not (np.isfinite(t_end) and t_end > 0):
         raise ValueError(f"tune: t_end is {t_end}; it must be a positive number.")
-    size, floor = round_off(problem)
-    if not (np.isfinite(error) and error > floor):
-        raise ValueError(
-            f"tune: error is {error:g}; the largest position is {size:.3g}, so that round-off alone is about "
-            f"{floor:.0e}. Give a larger error, in the unit of the positions."
-        )
+    check_error("tune: error", error, problem)
 
 
 @shows_progress
@@ -165,7 +176,7 @@ def tune(
     # the first search does without.
     for fallback in (False, True):
         search = Search(problem, t_end, families() if menu is None else menu, reference, solver, fallback)
-        with search.interruptible():
+        with interruptible(search.rows):
             settings = search.cheapest(error, progress, exhaustive)
         if settings:
             break
@@ -181,7 +192,7 @@ def tune(
         progress("another start", 1, 1)
         mean_speed = float(np.abs(reference.q - reference.q[0]).max()) / t_end
         try:
-            with search.interruptible():
+            with interruptible(search.rows):
                 other = another_start(problem, mean_speed)
                 other_reference = reference_solution(other, t_end, num_saves=reference.num_saves)
                 setting, verification = first_verified(settings, other, other_reference, t_end, solver)
@@ -193,3 +204,35 @@ def tune(
     progress("done", 1, 1)
     runners_up = tuple(s for s in settings if s is not setting)
     return Recommendation(error, setting, runners_up, verification, search.rows())
+
+
+def another_start(problem: Problem, speed: float) -> Problem:
+    """The problem with velocities that differ by about a hundredth and satisfy its constraints, moving ones included.
+
+    Random numbers are added to the velocities; the momenta of the sums are projected onto the hidden constraints
+    ``G v + dg/dt = 0``. `speed` is the mean speed of the run: the size of velocities where the run starts at rest.
+    """
+    system, state, random = problem.system, problem.state(), np.random.default_rng(1)
+    velocities = problem.v_s, problem.v_f
+    size = RELATIVE_VELOCITY_CHANGE * max(speed, *(float(np.abs(v).max(initial=0.0)) for v in velocities))
+    changed = [np.asarray(v) + size * random.normal(size=np.shape(v)) for v in velocities]
+    momenta = legendre(system, state.q_s, state.q_f, *changed)
+    *_, v_s, v_f = jax.jit(project_momentum)(system, State(state.t, state.q_s, state.q_f, *momenta), velocities)
+    return replace(problem, q_s=state.q_s, q_f=state.q_f, v_s=v_s, v_f=v_f, project=False)
+
+
+def first_verified(
+    settings: Sequence[Setting], problem: Problem, reference: ReferenceSolution, t_end: float, solver: Newton | None
+) -> tuple[Setting, Verification]:
+    """The first setting whose error is not small by chance, the fastest one first; the very first setting if all are."""
+    checks: list[Verification] = []
+    for setting in settings[:MAX_CHECKS]:
+        program = Program(problem, setting.scheme, t_end, reference.num_saves, solver)
+        seconds = program.seconds(setting.num_steps, TIMED_RUNS)
+        row = work_row(setting.row.scheme, program, setting.num_steps, reference).timed(seconds)
+        # a search in which nothing moves has errors of exactly 0
+        error_ratio = row.error_q / setting.row.error_q if setting.row.error_q else 1.0
+        checks.append(Verification(row.error_q, row.seconds, error_ratio))
+        if checks[-1].error_ratio <= MAX_ERROR_RATIO:
+            return setting, checks[-1]
+    return settings[0], checks[0]

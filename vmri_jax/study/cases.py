@@ -40,11 +40,7 @@ def cases_of(
     num_saves: int,
     progress: Progress,
 ) -> list[Case]:
-    """The cases of `convergence_study`, see there for the arguments.
-
-    Raises:
-        ValueError: no set of parameters; references with other labels or of another shape.
-    """
+    """The cases of `convergence_study`; refuses references with other labels or of another shape."""
     if params is not None and not params:
         raise ValueError("convergence_study: params is empty; give a set of parameters by label, or leave it out.")
     problems = (

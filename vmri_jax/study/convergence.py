@@ -10,14 +10,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax import diagnostics, plots
 from vmri_jax.diagnostics import OrderFit
 from vmri_jax.executors.executor import mapped
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
-from vmri_jax.running.batch import simulate_batch
 from vmri_jax.running.export import extra
 from vmri_jax.running.interrupts import Interrupted
 from vmri_jax.running.progress import shows_progress
@@ -219,8 +217,7 @@ def convergence_study(
 ) -> ConvergenceStudy:
     """Run every scheme with every macro step to `t_end` and compare with a reference.
 
-    Each scheme is compiled once for all its step sizes. Runs with several sets of parameters are computed side by side.
-    A run that fails becomes a row of NaN with its status.
+    Each scheme is compiled once for all its step sizes and sets of parameters. A run that fails becomes a row of NaN with its status.
 
     Args:
         problem: system and start; a `Problem` or a scene.
@@ -249,31 +246,25 @@ def convergence_study(
     steps = [_num_steps(t_end, dt, num_saves) for dt in macro_dt]
     if not steps:
         raise ValueError("convergence_study: macro_dt is empty; give the macro steps to run.")
-    total = len(schemes) * len(steps)
+    total = len(schemes) * len(steps) * (1 if params is None else len(params))
     told = lambda message, *_: progress(message, 0, total)  # noqa: E731
     cases = cases_of(problem, params, reference, t_end, num_saves, told)
-    problems = [case.problem for case in cases]
-
-    # one task for each scheme and step, which runs all cases side by side
-    labels = [(label, num_steps) for label in schemes for num_steps in steps]
+    labels = [(label, case, num_steps) for label in schemes for case in cases for num_steps in steps]
     stopped = None
     try:
         runs = mapped(
             "convergence_study",
-            _runs,
-            [(problems, schemes[label], num_steps, t_end, num_saves, solver) for label, num_steps in labels],
+            _run,
+            [(case.problem, schemes[label], t_end, num_saves, solver, num_steps) for label, case, num_steps in labels],
             executor,
-            lambda done, i: progress(f"{labels[i][0]}, H = {t_end / labels[i][1]:g}", done, total),
+            lambda done, i: progress(f"{labels[i][0]}, H = {t_end / labels[i][2]:g}", done, total),
         )
     except Interrupted as interrupted:
         runs, stopped = interrupted.done, interrupted
-    done = {label: trajectories for label, trajectories in zip(labels, runs, strict=True) if trajectories is not None}
     rows = [
-        _row(label, scheme, t_end / num_steps, case, momentum_maps, done[label, num_steps][k])
-        for label, scheme in schemes.items()
-        for k, case in enumerate(cases)
-        for num_steps in steps
-        if (label, num_steps) in done
+        _row(label, schemes[label], t_end / num_steps, case, momentum_maps, run)
+        for (label, case, num_steps), run in zip(labels, runs, strict=True)
+        if run is not None
     ]
     study = ConvergenceStudy(tuple(rows), {case.label: case.reference for case in cases})
     if stopped is not None:
@@ -282,26 +273,8 @@ def convergence_study(
     return study
 
 
-def _runs(
-    problems: Sequence[Problem], scheme, num_steps: int, t_end: float, num_saves: int, solver
-) -> list[Trajectory]:
-    """A trajectory of each problem; several problems run as one batch."""
-    if len(problems) == 1:
-        return [Program(problems[0], scheme, t_end, num_saves, solver)(num_steps)]
-    states = jax.tree.map(lambda *a: jnp.stack(a), *(problem.state() for problem in problems))
-    params = jax.tree.map(lambda *a: jnp.stack([jnp.asarray(x) for x in a]), *(p.system.params for p in problems))
-    batch = simulate_batch(
-        problems[0].system,
-        scheme,
-        states,
-        macro_dt=t_end / num_steps,
-        num_steps=num_steps,
-        save_every=num_steps // num_saves,
-        params=params,
-        solver=solver,
-        warn=False,
-    )
-    return [jax.tree.map(lambda a, i=i: a[i], batch) for i in range(len(problems))]
+def _run(problem: Problem, scheme, t_end: float, num_saves: int, solver, num_steps: int) -> Trajectory:
+    return Program(problem, scheme, t_end, num_saves, solver)(num_steps)
 
 
 def _num_steps(t_end: float, macro_dt: float, num_saves: int) -> int:

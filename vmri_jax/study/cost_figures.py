@@ -19,12 +19,7 @@ MIN_LABELLED_SHARE = 0.06
 
 
 def draw_num_micro(answers: Sequence[Any], theme: plots.Theme) -> Figure:
-    """Time against num_micro, one panel per error, with a curve for each family that keeps the error with several num_micro.
-
-    Args:
-        answers: the answers of a `CostReport`.
-        theme: colours.
-    """
+    """Time against num_micro, a panel for each answer of a `CostReport`, a curve for each family with several num_micro."""
     answers = [answer for answer in answers if answer.all]
     varied = [
         [name for name, count in Counter(s.family.name for s in answer.all).items() if count >= MIN_POINTS][:MAX_CURVES]
@@ -50,12 +45,7 @@ def draw_num_micro(answers: Sequence[Any], theme: plots.Theme) -> Figure:
 
 
 def draw_shares(shares: Mapping[str, float], theme: plots.Theme) -> Figure:
-    """One bar for the time of a run, cut into the parts that functions of the system take.
-
-    Args:
-        shares: parts of the time by name, from `vmri_jax.study.prices.shares`; they sum to 1.
-        theme: colours.
-    """
+    """One bar for the time of a run, cut into the parts of `vmri_jax.study.prices.shares`, which sum to 1."""
     with plots.new_figure(7.2, 1.1, "", theme) as figure:
         axes = figure.subplots()
         left = 0.0

@@ -13,12 +13,12 @@ import numpy as np
 
 from vmri_jax import diagnostics, plots
 from vmri_jax.accuracy.families import Family, families
-from vmri_jax.accuracy.steps import with_accuracy
+from vmri_jax.accuracy.steps import round_off, with_accuracy
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
 from vmri_jax.running.files import make_writable_folder
 from vmri_jax.running.progress import Progress, part, shows_progress
 from vmri_jax.steppers.results import SimulationError
-from vmri_jax.study.advisor import MIN_ERROR_OVER_REFERENCE, round_off
+from vmri_jax.study.advisor import MIN_ERROR_OVER_REFERENCE
 from vmri_jax.study.cost_figures import draw_num_micro, draw_shares
 from vmri_jax.study.html import embedded, write_page
 from vmri_jax.study.peers import can_run_dopri8, dopri8_stairs
@@ -27,7 +27,7 @@ from vmri_jax.study.program import Program
 from vmri_jax.study.reference_solution import ReferenceSolution, reference_solution
 from vmri_jax.study.search import Search, Setting, stopwatch
 from vmri_jax.study.staircase import MICRO, SINGLE, Stair, confirm, confirmed, staircases, with_shares
-from vmri_jax.study.table import Column, ResultTable
+from vmri_jax.study.table import Column, ResultTable, interruptible
 from vmri_jax.study.work import WorkPrecision, WorkRow, duration, work_row
 
 TEMPLATE = Path(__file__).parent / "cost.html.j2"
@@ -56,20 +56,6 @@ class Answer:
     all: tuple[Setting, ...] = ()
 
 
-@dataclass(frozen=True)
-class Extras:
-    """Runs on a page that are not from the search.
-
-    accuracy: the run that ``simulate(..., accuracy=accuracy_error)`` takes; None where it refuses the error or fails.
-    accuracy_error: the middle one of the errors of the page.
-    peers: staircases of other programs by name.
-    """
-
-    accuracy: WorkRow | None = None
-    accuracy_error: float = math.nan
-    peers: dict[str, list[Stair]] = field(default_factory=dict)
-
-
 class PageFailed(RuntimeError):
     """The search came to its end, but its page could not be drawn or written; its results are in `.report` and in cost.csv."""
 
@@ -92,12 +78,14 @@ class CostReport(ResultTable):
     path: of the page, cost.html; its figures and runs lie beside it.
     name: of the system.
     t_end: simulated time.
-    answers: by error, the largest first.
+    rows: the answers by error, the largest first.
     runs: every run of the search.
     shares: parts of the time of the middle answer by function, see `vmri_jax.study.prices.shares`.
     not_tried: families that the search had no time to compile.
     stairs: the staircase of each kind of schemes, see `vmri_jax.study.staircase`.
-    extras: runs that are made when the search is over.
+    accuracy: the run that ``simulate(..., accuracy=accuracy_error)`` takes; None where it refuses the error or fails.
+    accuracy_error: the middle one of the errors.
+    peers: staircases of other programs by name.
     """
 
     columns = (
@@ -110,17 +98,14 @@ class CostReport(ResultTable):
     path: Path
     name: str
     t_end: float
-    answers: tuple[Answer, ...]
+    rows: tuple[Answer, ...]
     runs: WorkPrecision
     shares: dict[str, float]
     not_tried: tuple[str, ...] = ()
     stairs: dict[str, list[Stair]] = field(default_factory=dict)
-    extras: Extras = field(default_factory=Extras)
-
-    @property
-    def rows(self) -> tuple[Answer, ...]:
-        """The answers."""
-        return self.answers
+    accuracy: WorkRow | None = None
+    accuracy_error: float = math.nan
+    peers: dict[str, list[Stair]] = field(default_factory=dict)
 
     @property
     def caption(self) -> str:
@@ -146,7 +131,7 @@ class CostReport(ResultTable):
 
     def records(self) -> list[dict[str, Any]]:
         """A dictionary for each answer: the error and the columns of its run."""
-        return [{"error": a.error, **(asdict(a.setting.row) if a.setting else {})} for a in self.answers]
+        return [{"error": a.error, **(asdict(a.setting.row) if a.setting else {})} for a in self.rows]
 
 
 def default_t_end(problem: Problem) -> float:
@@ -200,13 +185,13 @@ def cost_report(
         )
     search = Search(problem, t_end, families() if menu is None else menu, reference)
     answers, elapsed = [], stopwatch()
-    with search.interruptible():  # around the drawing as well, so that Ctrl-C there keeps the runs, too
+    with interruptible(search.rows):  # around the drawing as well, so that Ctrl-C there keeps the runs, too
         for i, error in enumerate(sorted(errors, reverse=True)):
             seconds_left = BUDGET - elapsed()
             settings = search.cheapest(error, part(progress, i, len(errors)), budget=seconds_left / 2)
             answers.append(Answer(error, settings[0] if settings else None, tuple(settings)))
             with suppress(PageFailed):  # the last call below raises it
-                _write(search, answers, problem, name, out)
+                _write(search, answers, name, out)
         progress("runs with smaller steps", 1, 1)
         confirm(search)
         progress("measuring times", 1, 1)
@@ -218,22 +203,22 @@ def cost_report(
         answers = _confirmed(search, answers)
         progress("shares of errors", 1, 1)
         stairs = with_shares(search, staircases(search.rows().rows))
-        report = _write(search, answers, problem, name, out, stairs=stairs, extras=_extras(search, answers, progress))
+        report = _write(search, answers, name, out, stairs=stairs, **_later_runs(search, answers, progress))
     progress("done", 1, 1)
     return report
 
 
-def _extras(search: Search, answers: Sequence[Answer], progress: Progress) -> Extras:
-    """The run of ``simulate(..., accuracy=...)`` for the middle error, and runs of diffrax where it can run the problem."""
-    middle_error = answers[len(answers) // 2].error
-    progress(f"accuracy {middle_error:.0e}", 1, 1)
-    extras = Extras(_of_accuracy(search, middle_error), middle_error)
+def _later_runs(search: Search, answers: Sequence[Answer], progress: Progress) -> dict[str, Any]:
+    """Fields of the report: the run with the middle error as its accuracy, and runs of diffrax where it can run the problem."""
+    error = answers[len(answers) // 2].error
+    progress(f"accuracy {error:.0e}", 1, 1)
+    runs = {"accuracy": _of_accuracy(search, error), "accuracy_error": error}
     if not can_run_dopri8(search.problem):
-        return extras
+        return runs
     progress("diffrax", 1, 1)
     least = min(answer.error for answer in answers)
     stairs = dopri8_stairs(search.problem, search.t_end, search.reference, least)
-    return replace(extras, peers={"diffrax Dopri8": stairs})
+    return runs | {"peers": {"diffrax Dopri8": stairs}}
 
 
 def _of_accuracy(search: Search, error: float) -> WorkRow | None:
@@ -251,11 +236,7 @@ def _of_accuracy(search: Search, error: float) -> WorkRow | None:
 
 
 def _default_errors(problem: Problem, reference: ReferenceSolution, t_end: float) -> list[float]:
-    """RELATIVE_ERRORS times a power of ten near how far the system moves, without errors too near round-off or the error of the reference.
-
-    Raises:
-        ValueError: no error remains, as where nothing moves.
-    """
+    """RELATIVE_ERRORS of a power of ten near how far the system moves, without errors that the reference cannot tell."""
     moved = float(np.abs(reference.q[-1] - reference.q[0]).max())
     least = max(MIN_ERROR_OVER_REFERENCE * reference.error_q, round_off(problem)[1])
     motion = 10.0 ** math.floor(math.log10(max(moved, 1e-300)))
@@ -269,34 +250,25 @@ def _default_errors(problem: Problem, reference: ReferenceSolution, t_end: float
     return errors
 
 
-def _write(
-    search: Search,
-    answers: Sequence[Answer],
-    problem: Problem,
-    name: str,
-    out: Path,
-    *,
-    stairs: dict[str, list[Stair]] | None = None,
-    extras: Extras | None = None,
-) -> CostReport:
-    """Write the page of the answers so far, and hand back its report."""
+def _write(search: Search, answers: Sequence[Answer], name: str, out: Path, **later: Any) -> CostReport:
+    """Write the page of the answers so far, and hand back its report; `later` has its fields from runs after the search."""
     answers = _fastest_that_keep(answers)
     runs, middle = search.rows(), answers[len(answers) // 2].setting
-    price = prices(problem) if middle is not None else {}
+    price = prices(search.problem) if middle is not None else {}
+    fields: dict[str, Any] = {"stairs": staircases(runs.rows), **later}
     report = CostReport(
         path=out / "cost.html",
         name=name,
         t_end=search.t_end,
-        answers=tuple(answers),
+        rows=tuple(answers),
         runs=runs,
         shares=shares(price, middle.row) if middle is not None else {},
         not_tried=tuple(search.not_tried()),
-        stairs=staircases(runs.rows) if stairs is None else stairs,
-        extras=extras or Extras(),
+        **fields,
     )
     runs.to_csv(out / "cost.csv")
     try:
-        _draw(report, problem, price)
+        _draw(report, search.problem, price)
     except Exception as error:
         raise PageFailed(report) from error
     return report
@@ -335,7 +307,7 @@ def _draw(report: CostReport, problem: Problem, price: dict[str, float]) -> None
     for end, theme in (("", plots.LIGHT), ("_dark", plots.DARK)):
         plots.save(staircase_figure(title, theme), report.path.parent / f"cost{end}.png", theme)
     n_g, n_gs = problem.system.num_constraints(problem.q_s, problem.q_f)
-    reached = [answer for answer in report.answers if answer.setting is not None]
+    reached = [answer for answer in report.rows if answer.setting is not None]
     write_page(
         report.path,
         TEMPLATE,
@@ -346,23 +318,23 @@ def _draw(report: CostReport, problem: Problem, price: dict[str, float]) -> None
         multirate=_multirate(report),
         duration=duration,
         work_precision=embedded(partial(staircase_figure, "")),
-        by_num_micro=embedded(partial(draw_num_micro, report.answers)),
+        by_num_micro=embedded(partial(draw_num_micro, report.rows)),
         shares_figure=embedded(partial(draw_shares, report.shares)),
     )
 
 
 def _draw_stairs(report: CostReport, price: dict[str, float], title: str, theme: plots.Theme) -> plots.NotebookFigure:
     """The staircases with marks for the answers and the choice of `accuracy=`, other programs, and the bound."""
-    rows = [answer.setting.row for answer in report.answers if answer.setting is not None]
+    rows = [answer.setting.row for answer in report.rows if answer.setting is not None]
     errors = {(s.row.scheme, s.row.num_steps): s.error for of_kind in report.stairs.values() for s in of_kind}
     marked = [
         plots.Marked("answers", row.seconds, errors.get((row.scheme, row.num_steps), row.error_q)) for row in rows
     ]
-    extras, chosen = report.extras, report.extras.accuracy
+    chosen = report.accuracy
     if chosen is not None:
-        marked.append(plots.Marked(f"accuracy={extras.accuracy_error:.0e}", chosen.seconds, chosen.error_q, star=True))
+        marked.append(plots.Marked(f"accuracy={report.accuracy_error:.0e}", chosen.seconds, chosen.error_q, star=True))
     look = {"known_to": report.runs.reference.error_q, "title": title, "theme": theme}
-    return plots.plot_staircases(report.stairs, extras.peers, marked, bound_of(report.stairs, price), **look)
+    return plots.plot_staircases(report.stairs, report.peers, marked, bound_of(report.stairs, price), **look)
 
 
 def bound_of(stairs: dict[str, list[Stair]], price: dict[str, float]) -> plots.Bound | None:
@@ -390,7 +362,7 @@ def _growth(reached: Sequence[Answer]) -> float:
 def _multirate(report: CostReport) -> list[tuple[float, str, int, float]]:
     """For each answer: its error, family and num_micro, and the time of the family with one micro step over the time of the answer."""
     gains = []
-    for answer in report.answers:
+    for answer in report.rows:
         if answer.setting is None:
             continue
         family = answer.setting.family.name

@@ -14,7 +14,7 @@ import jinja2
 from matplotlib.figure import Figure
 
 from vmri_jax import plots
-from vmri_jax.study.timing import processor
+from vmri_jax.study.machine import processor
 
 STYLE_FOLDER = Path(__file__).parent
 

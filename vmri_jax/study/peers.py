@@ -32,12 +32,7 @@ def can_run_dopri8(problem: Problem) -> bool:
 
 
 def dopri8_runs(problem: Problem, t_end: float) -> Iterator[tuple[int, Callable[[], np.ndarray]]]:
-    """Runs of Dopri8 with smaller and smaller tolerances ``2^-power``: the power, and a function that gives q at the end, slow coordinates first.
-
-    Args:
-        problem: a problem that `can_run_dopri8`.
-        t_end: simulated time.
-    """
+    """Runs of Dopri8 with smaller and smaller tolerances ``2^-power``: the power, and a function that gives q at the end, slow first."""
     import diffrax  # pyright: ignore[reportMissingImports]
 
     system, n_s = problem.system, problem.q_s.size
@@ -78,9 +73,6 @@ def dopri8_stairs(problem: Problem, t_end: float, reference: ReferenceSolution, 
     """The staircase of Dopri8: confirmed errors of q at t_end and times over falling tolerances.
 
     Args:
-        problem: a problem that `can_run_dopri8`.
-        t_end: simulated time.
-        reference: the solution that errors are measured against.
         least: smallest error of interest; tolerances fall until an error is a tenth of it, so that smaller steps confirm it.
     """
     runs, errors = {}, {}

@@ -47,12 +47,7 @@ def prices(problem: Problem) -> dict[str, float]:
 
 
 def shares(price: dict[str, float], row: WorkRow) -> dict[str, float]:
-    """Parts of the time of a run by function: evaluations times price over the time of the run; with the remainder they sum to 1.
-
-    Args:
-        price: seconds of each function, from `prices`.
-        row: the run.
-    """
+    """Parts of the time of a run by function, evaluations times `prices`; with the remainder they sum to 1."""
     counts = {SLOW: row.slow_evaluations, FAST: row.fast_evaluations}
     counts |= {gradient_of(name): count for name, count in row.evaluations.items()}
     counts[CONSTRAINTS] = row.fast_evaluations or row.slow_evaluations  # about one evaluation for each fast gradient

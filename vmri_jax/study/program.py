@@ -2,26 +2,24 @@
 
 import time
 from dataclasses import replace
-from functools import cached_property
 
 import numpy as np
 
+from vmri_jax.diagnostics.linear import phase_vector
 from vmri_jax.mechanics.state import Problem
-from vmri_jax.running.arguments import Steps, check_run
-from vmri_jax.running.simulation import Simulation, prepare
+from vmri_jax.running.simulation import prepare
 from vmri_jax.running.timing import MIN_SECONDS, interleaved
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
-from vmri_jax.steppers import solvers
 from vmri_jax.steppers.solvers import Newton
 
 
 class Program:
     """``program(num_steps)`` simulates `problem` over `t_end` in num_steps macro steps.
 
-    A program is a run of `vmri_jax.prepare` whose step size follows from the number of steps. The first call compiles it, once
-    for all problems of the same structure. A run that fails raises nothing: its trajectory has the result.
+    A program is a run of `vmri_jax.prepare` whose step size follows from the number of steps; it is compiled once for all problems of
+    the same structure. A run that fails raises nothing: its trajectory has the result.
 
     Args:
         problem: system and start.
@@ -32,7 +30,7 @@ class Program:
         fallback: whether "auto" may take its second method, which takes long to compile, where the first one fails.
 
     Attributes:
-        compile_seconds: time of compiling, NaN before the first call.
+        compile_seconds: time of compiling.
     """
 
     def __init__(
@@ -45,18 +43,12 @@ class Program:
         fallback: bool = True,
     ):
         self.problem, self.scheme, self.t_end, self.num_saves = problem, scheme, float(t_end), num_saves
-        self.solver, self.state, self.fallback = solver or solvers.Auto(), problem.state(), fallback
-        steps = Steps(self.t_end / num_saves, num_steps=num_saves)
-        check_run(problem.system, scheme, self.state, self.solver, steps)
-        self.compile_seconds = float("nan")
-
-    @cached_property
-    def _run(self) -> Simulation:
+        self.state = problem.state()
         start = time.perf_counter()
-        steps = {"macro_dt": self.t_end / self.num_saves, "num_steps": self.num_saves}
-        run = prepare(self.problem.system, self.scheme, self.state, **steps, solver=self.solver)
+        steps = {"macro_dt": self.t_end / num_saves, "num_steps": num_saves}
+        run = prepare(problem.system, scheme, self.state, **steps, solver=solver)
         self.compile_seconds = time.perf_counter() - start
-        return replace(run, may_fall_back=self.fallback)
+        self._run = replace(run, may_fall_back=fallback)
 
     def _steps(self, num_steps: int) -> dict:
         """The arguments of a run with this number of steps."""
@@ -83,7 +75,5 @@ class Program:
 
 def joined(trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray]:
     """q and p, each (num_saves + 1, n_s + n_f), at the saved nodes, slow coordinates first."""
-    return (
-        np.concatenate([trajectory.states.q_s, trajectory.states.q_f], axis=-1),
-        np.concatenate([trajectory.states.p_s, trajectory.states.p_f], axis=-1),
-    )
+    q, p = np.split(np.asarray(phase_vector(trajectory.states)), 2, axis=-1)
+    return q, p

@@ -1,7 +1,6 @@
 """Reference solutions: fine solutions that the errors of runs are measured against, with their own errors."""
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -41,27 +40,6 @@ class ReferenceSolution:
         """Largest error of q and of p over nodes and coordinates; NaN for a run that failed."""
         q, p = joined(trajectory)
         return float(np.abs(q - self.q).max()), float(np.abs(p - self.p).max())
-
-    def save(self, path: str | Path) -> None:
-        """Write a .npz file."""
-        with Path(path).open("wb") as file:
-            np.savez_compressed(file, q=self.q, p=self.p, error_q=self.error_q, error_p=self.error_p)
-
-    @classmethod
-    def load(cls, path: str | Path) -> "ReferenceSolution":
-        """Read a file written by `save`.
-
-        Raises:
-            FileNotFoundError: no such file.
-            ValueError: a file that `save` did not write.
-        """
-        try:
-            with np.load(path, allow_pickle=False) as data:
-                return cls(data["q"], data["p"], float(data["error_q"]), float(data["error_p"]))
-        except FileNotFoundError:
-            raise FileNotFoundError(f"{path} does not exist; give a file written by ReferenceSolution.save.") from None
-        except Exception as error:
-            raise ValueError(f"{path} is not a file written by ReferenceSolution.save ({error}).") from error
 
 
 @shows_progress

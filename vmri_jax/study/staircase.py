@@ -68,11 +68,7 @@ def kind_of(row: WorkRow) -> str:
 
 
 def confirmed(rows: Sequence[WorkRow]) -> list[Stair]:
-    """The runs that runs with more steps confirm, with their confirmed errors.
-
-    Args:
-        rows: runs of any number of schemes.
-    """
+    """The runs, of any number of schemes, that runs with more steps confirm, with their confirmed errors."""
     stairs = []
     for _, group in groupby(sorted(rows, key=lambda r: (r.scheme, r.num_steps)), key=lambda r: r.scheme):
         runs = list(group)  # of one scheme, the fewest steps first
@@ -103,11 +99,7 @@ def staircases(rows: Sequence[WorkRow]) -> dict[str, list[Stair]]:
 
 
 def confirm(search: Search) -> None:
-    """Run the best schemes of each kind with more steps, where no run confirms them yet.
-
-    Args:
-        search: the search whose runs are confirmed; it keeps the new runs.
-    """
+    """Run the best schemes of each kind with more steps, where no run of the search confirms them yet."""
     _try_single_steps(search)
     settings = search.settings.values()
     schemes = {s.row.scheme: (s.family, s.num_micro) for s in settings}
@@ -134,13 +126,9 @@ def _try_single_steps(search: Search) -> None:
 
 
 def with_shares(search: Search, stairs_by_kind: dict[str, list[Stair]]) -> dict[str, list[Stair]]:
-    """The staircases with the fast shares of some runs: in each kind, the runs of the scheme with the most runs on the staircase.
+    """The result of `staircases` with fast shares: in each kind, of the runs of the scheme with the most runs on the staircase.
 
     One scheme only, because a fast share needs a second program, with twice the micro steps.
-
-    Args:
-        search: the search that made the runs.
-        stairs_by_kind: the result of `staircases`.
     """
     schemes = {s.row.scheme: (s.family, s.num_micro) for s in search.settings.values()}
     with_fast_shares = {}

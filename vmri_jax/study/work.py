@@ -12,14 +12,15 @@ from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
 from vmri_jax.mechanics.system import label
 from vmri_jax.running.interrupts import Interrupted
 from vmri_jax.running.progress import shows_progress
+from vmri_jax.running.timing import interleaved
 from vmri_jax.schemes.composition import Composition, stage_scheme
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.results import Method, Result
 from vmri_jax.steppers.solvers import Newton
+from vmri_jax.study.machine import machine
 from vmri_jax.study.program import Program
 from vmri_jax.study.reference_solution import ReferenceSolution, reference_solution
 from vmri_jax.study.table import Column, ResultTable
-from vmri_jax.study.timing import interleaved, machine
 
 FINEST_ERROR = 1e-10
 """Error of positions below which a ladder of steps ends; a smaller value adds finer runs, which round-off may spoil."""
@@ -122,11 +123,6 @@ class WorkPrecision(ResultTable):
             if np.isfinite(row.error_q) and (not front or row.error_q < front[-1].error_q):
                 front.append(row)
         return front
-
-    def cheapest(self, error: float, scheme: str | None = None) -> WorkRow | None:
-        """The fastest run (of one scheme) with at most this error of the positions; None if no run keeps it."""
-        rows = [r for r in self.rows if r.error_q <= error and scheme in (None, r.scheme)]
-        return min(rows, key=lambda row: row.seconds, default=None)
 
     def shown(self) -> list[WorkRow]:
         """The Pareto front."""
