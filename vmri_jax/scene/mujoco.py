@@ -10,7 +10,7 @@
 | equalities joint, tendon (fixed) | `JointCoupling` |
 | gravity, gravcomp | `Gravity`, `Potential` |
 
-MuJoCo's equalities are soft; here they are constraints, satisfied to round-off. The use of every field of a model is in `mujoco_fields`.
+MuJoCo's equalities are soft; here they are constraints, satisfied to round-off. The parts of a model that the reader refuses are in `mujoco_fields`.
 """
 
 from collections.abc import Collection, Iterator
