@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 import vmri_jax as vm
+from tests.scene.mujoco_model_fields import IDLE, READ, REFUSED_FIELDS
 from vmri_jax.scene import Fixed, Scene, Spherical
 from vmri_jax.scene.body_motions import accelerations as motions
 from vmri_jax.scene.body_motions import state_of
-from vmri_jax.scene.mujoco_fields import IDLE, READ, REFUSED
+from vmri_jax.scene.mujoco_fields import REFUSED
 from vmri_jax.scene.mujoco_model import Compiled
 
 mujoco = pytest.importorskip("mujoco")
@@ -466,7 +467,7 @@ def test_a_joint_may_be_called_like_a_body():
 
 
 def fields(model):
-    """Names of all fields of a compiled model, as in `mujoco_fields`."""
+    """Names of all fields of a compiled model, as in `mujoco_model_fields`."""
     for name in dir(model):
         if name in ("opt", "vis", "stat"):
             yield from (f"{name}.{part}" for part in fields(getattr(model, name)))
@@ -487,7 +488,7 @@ def treatments(name):
     table = [
         ("read", READ),
         ("idle", IDLE),
-        ("refused", {kind: " ".join([*r.fields, r.parts]) for kind, r in REFUSED.items()}),
+        ("refused", REFUSED_FIELDS),
     ]
     entries = [(how, why, entry) for how, group in table for why, text in group.items() for entry in text.split()]
     exact = [(how, why) for how, why, entry in entries if entry == name]
@@ -497,7 +498,7 @@ def treatments(name):
 def test_every_field_is_read_or_refused_or_without_influence():
     names = list(fields(arm()))
     assert {name: treatments(name) for name in names if len(treatments(name)) != 1} == {}
-    every = " ".join([*READ.values(), *IDLE.values(), *(" ".join([*r.fields, r.parts]) for r in REFUSED.values())])
+    every = " ".join([*READ.values(), *IDLE.values(), *REFUSED_FIELDS.values()])
     assert [entry for entry in every.split() if not any(fnmatchcase(name, entry) for name in names)] == []
     counts = Counter(treatments(name)[0][0] for name in names)
     said = f"{len(names)} fields of a model: {counts['read']} are read, {counts['refused']} refused when they are not at their default, "

@@ -10,14 +10,14 @@
 | equalities joint, tendon (fixed) | `JointCoupling` |
 | gravity, gravcomp | `Gravity`, `Potential` |
 
-MuJoCo's equalities are soft; here they are constraints, satisfied to round-off. The use of every field of a model is in `mujoco_fields`.
+MuJoCo's equalities are soft; here they are constraints, satisfied to round-off. The parts of a model that the reader refuses are in `mujoco_fields`.
 """
 
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -30,9 +30,8 @@ from vmri_jax.scene.effects.fields import Gravity
 from vmri_jax.scene.effects.joint_base import Joint
 from vmri_jax.scene.effects.joint_effects import JointDamper, JointLimit, JointSpring, RotorInertia
 from vmri_jax.scene.effects.joints import Fixed, Prismatic, Revolute, Spherical
-from vmri_jax.scene.mujoco_couplings import couplings
+from vmri_jax.scene.mujoco_equalities import close, couplings, loops
 from vmri_jax.scene.mujoco_fields import CONSTRAINTS
-from vmri_jax.scene.mujoco_loops import close, loops
 from vmri_jax.scene.mujoco_model import Compiled
 from vmri_jax.scene.rigid import RigidBody
 
@@ -44,14 +43,7 @@ OLDEST_VERSION = 4
 
 
 def bodies_and_effects(
-    model: Any,
-    *,
-    qpos: Any,
-    qvel: Any,
-    key: str | int | None,
-    ignore: Collection[str],
-    limits: Literal["refuse", "spring"],
-    coordinates: Literal["joint", "directors"],
+    model: Any, qpos: Any, qvel: Any, key: str | int | None, ignore: Collection[str], limits: str, coordinates: str
 ) -> tuple[list[RigidBody | Frame], list[Effect]]:
     """Bodies and effects of the scene of a model, see `Scene.from_mujoco`."""
     try:
@@ -151,7 +143,12 @@ class _Reader:
             axes, arm = self.data.ximat[b].reshape(3, 3), position - centre
             inertia += axes @ np.diag(model.body_inertia[b]) @ axes.T
             inertia += m * (arm @ arm * np.eye(3) - np.outer(arm, arm))
-        spin, velocity = self._motion(root)
+        motion, mujoco = (
+            np.zeros(6),
+            self.compiled.mujoco,
+        )  # angular velocity, and velocity of the centre of mass, in space
+        mujoco.mj_objectVelocity(model, self.data, mujoco.mjtObj.mjOBJ_BODY, root, motion, 0)
+        spin, velocity = motion[:3], motion[3:]
         velocity = velocity + np.cross(spin, centre - self.data.xipos[root])
         return RigidBody(name, mass, inertia, centre, velocity=velocity, spin=spin)
 
@@ -203,10 +200,7 @@ class _Reader:
         ``d / (T z)^2``. Negative numbers are (-k, -c), with the acceleration ``k d``. The inertia is ``1 / dof_invweight0``.
 
         Args:
-            ignored: whether the scene may leave out limits of ball joints and of tendons.
-
-        Raises:
-            ValueError: limits of ball joints or of tendons, unless they are ignored.
+            ignored: whether the scene may leave out limits of ball joints and of tendons, which are refused otherwise.
         """
         compiled, model = self.compiled, self.compiled.model
         if compiled.off(CONSTRAINTS, "LIMIT"):
@@ -247,9 +241,3 @@ class _Reader:
             point = self.data.xipos[b] - body.position  # at the start the axes of the body are the axes of space
             name = f"{compiled.name('body', b)} gravity compensation"
             yield Potential(lift, ((body.name, point.tolist()),), {"force": force}, name=name)
-
-    def _motion(self, body: int) -> tuple[np.ndarray, np.ndarray]:
-        """Angular velocity, and velocity of the centre of mass, in space."""
-        mujoco, velocity = self.compiled.mujoco, np.zeros(6)
-        mujoco.mj_objectVelocity(self.compiled.model, self.data, mujoco.mjtObj.mjOBJ_BODY, body, velocity, 0)
-        return velocity[:3], velocity[3:]

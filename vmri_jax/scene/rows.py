@@ -1,4 +1,4 @@
-"""The rows of a scene's constraints: their names, and their values and Jacobian at any positions."""
+"""The rows of a scene's constraints: names, also of coordinates, values and Jacobian at any positions."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -11,10 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.mechanics.arrays import is_concrete, quickly_compiled
-from vmri_jax.scene.body import LARGEST_POINT, AnyBody, Bodies, moving
+from vmri_jax.mechanics.names import Names
+from vmri_jax.scene.body import LARGEST_POINT, Bodies, label_of, moving
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.effects.freedoms import ANGLES
-from vmri_jax.scene.labels import element_label
 from vmri_jax.scene.layout import join
 from vmri_jax.scene.rates import positions
 from vmri_jax.scene.sorting import Home, Placed, Sorting
@@ -89,11 +89,7 @@ class ConstraintRows:
         params = {i: part.effect.parameters(bodies) for i, part in constraints}
         if not constraints or not is_concrete((sorting.positions, sorting.joints, params)):
             return None
-        columns = {
-            name: place.start + np.arange(place.size) + (layout.ends[0] if place.part == "f" else 0)
-            for name, place in layout.bodies.items()
-        }
-        start = np.concatenate(sorting.positions)
+        start, columns = np.concatenate(sorting.positions), layout.columns
         q_bodies, jacobian = to_bodies(start)
         # the diagonal of J^T M J with J = dQ/dq
         of_bodies = join(bodies, layout, "s", "masses"), join(bodies, layout, "f", "masses")
@@ -104,12 +100,12 @@ class ConstraintRows:
             number = 0
             for names, element in _elements(part, bodies, columns, params[i]):
                 elements.append(element)
-                size = _evaluated(element, q_bodies, 0.0)[0].size
+                size = _value_and_jacobian(element.term, element.params, q_bodies[element.columns], 0.0)[0].size
                 for j in range(size):
                     name = names if size == 1 else f"{names} [{j}]"
                     rows.append(Row(name, i, number, part.effect, part.home, number not in part.dropped))
                     number += 1
-        scales = _scales(sorting, _extent(bodies))
+        scales = _scales(sorting)
         return cls(tuple(rows), tuple(elements), start, masses, scales, layout.sizes[0], to_bodies)
 
     def evaluate(self, t: float, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -117,7 +113,7 @@ class ConstraintRows:
         q_bodies, by_coordinates = self.to_bodies(q)
         values, by_bodies, first = np.empty(len(self.rows)), np.zeros((len(self.rows), q_bodies.size)), 0
         for element in self.elements:
-            value, entries = _evaluated(element, q_bodies, t)
+            value, entries = _value_and_jacobian(element.term, element.params, q_bodies[element.columns], t)
             values[first : first + value.size] = value
             by_bodies[first : first + value.size, element.columns] = entries
             first += value.size
@@ -137,11 +133,6 @@ class ConstraintRows:
         lengths = np.linalg.norm(self.jacobian * self.scales, axis=1)
         return np.where(lengths > 0, lengths, 1.0)
 
-    @property
-    def timed(self) -> bool:
-        """Whether a row depends on time."""
-        return any(row.effect.timed for row in self.rows)
-
     def numbers(self, home: Home | None = None) -> list[int]:
         """Numbers of the kept rows, all or only the rows with a certain home."""
         return [i for i, row in enumerate(self.rows) if row.kept and home in (None, row.home)]
@@ -151,23 +142,24 @@ class ConstraintRows:
         return [self.rows[i].name for i in numbers]
 
 
+def _label(effect: Effect, element: Sequence[str]) -> str:
+    """The label of an element: the name of its effect and the names of its bodies."""
+    return f"{effect.name} {'-'.join(map(label_of, element))}"
+
+
 def _elements(part: Placed, bodies: Bodies, columns: dict[str, np.ndarray], params: dict[str, Any]):
     """Labels and elements of an effect, in the order of its terms."""
     effect = part.effect
     elements = effect.elements(bodies)
     for i in chain(*effect.by_size(part.elements, bodies)):
         of_element = np.concatenate([columns[name] for name in moving(elements[i])])
-        yield element_label(effect, elements[i]), _Element(*effect.element_term(i, bodies, params), of_element)
-
-
-def _evaluated(element: _Element, q: np.ndarray, t: float) -> tuple[np.ndarray, np.ndarray]:
-    """Values (m,) of an element at positions q of all bodies, and their derivatives with respect to the coordinates of its own bodies."""
-    values, jacobian = _value_and_jacobian(element.term, q[element.columns], element.params, t)
-    return np.asarray(values), np.asarray(jacobian)
+        yield _label(effect, elements[i]), _Element(*effect.element_term(i, bodies, params), of_element)
 
 
 @partial(quickly_compiled, static_argnames="term")
-def _value_and_jacobian(term: EffectTerm, q, params, t):
+def _value_and_jacobian(term: EffectTerm, params, q, t):
+    """Values (m,) of an element, and their derivatives by the coordinates q of its bodies."""
+
     def values(q):
         value = jnp.reshape(term.value(q, None, params, t), (-1,))
         return value, value
@@ -176,30 +168,54 @@ def _value_and_jacobian(term: EffectTerm, q, params, t):
     return value, jacobian
 
 
-def _extent(bodies: Bodies) -> float:
-    """Extent of the scene: the largest distance of a body from the mean of all positions along an axis.
+def _scales(sorting: Sorting) -> np.ndarray:
+    """(n,) change of each coordinate in a large motion, see `ConstraintRows`.
 
-    If all bodies are at the same place, the largest coordinate of this place, or 1 at the origin.
+    The extent of the scene is the largest distance of a body from the mean of all positions along an axis. If all bodies are at the same
+    place, it is the largest coordinate of this place, or 1 at the origin.
     """
-    points = positions(bodies)
-    return float(np.abs(points - points.mean(axis=0)).max() or np.abs(points).max() or 1.0)
-
-
-def _scales(sorting: Sorting, extent: float) -> np.ndarray:
-    """(n,) change of each coordinate in a large motion, see `ConstraintRows`."""
-    of_joints = {
-        place: np.full(1, 1.0 if freedom in ANGLES else extent)
-        for (_, _, freedom), place in sorting.layout.freedoms.items()
-    }
-    places = sorted(sorting.layout.coordinates.items(), key=lambda item: (item[1].part == "f", item[1].start))
+    points, layout = positions(sorting.bodies), sorting.layout
+    extent = float(np.abs(points - points.mean(axis=0)).max() or np.abs(points).max() or 1.0)
+    scales = {place: np.full(1, 1.0 if key[2] in ANGLES else extent) for key, place in layout.freedoms.items()}
+    for name, body in sorting.bodies.items():
+        if name in layout.coordinates and layout.coordinates[name] not in scales:
+            q = np.asarray(body.coordinates)
+            of_points = np.where(np.arange(q.size) < LARGEST_POINT, extent, 1.0)
+            scales[layout.coordinates[name]] = np.maximum(np.abs(q), 1.0) if body.block else of_points
     return np.concatenate(
-        [of_joints[place] if place in of_joints else _scales_of(sorting.bodies[name], extent) for name, place in places]
+        [scales[place] for place in sorted(scales, key=lambda place: (place.part == "f", place.start))]
     )
 
 
-def _scales_of(body: AnyBody, extent: float) -> np.ndarray:
-    """Change of each coordinate of a body in a large motion."""
-    q = np.asarray(body.coordinates)
-    if body.block:
-        return np.maximum(np.abs(q), 1.0)
-    return np.where(np.arange(q.size) < LARGEST_POINT, extent, 1.0)
+def names_of(sorting: Sorting) -> Names:
+    """Bodies and constraints by name, in the order of the coordinates and of the rows.
+
+    The rows of an effect with a single element have the name of the effect; with several elements the names of the bodies follow.
+    """
+    sizes: dict[Any, dict[str, int]] = {"s": {}, "f": {}, "constraint": {}, "slow_constraint": {}}
+    for name, place in sorting.layout.coordinates.items():
+        sizes[place.part][name] = place.size
+    for part in sorting.placed:
+        if part.home in HOMES:
+            sizes[part.home] |= _kept_rows(sorting, part)
+    blocks, rigid = (
+        [name for name, body in sorting.bodies.items() if getattr(body, kind)] for kind in ("block", "rigid")
+    )
+    carried = {name: place for name, place in sorting.places.items() if name not in sorting.layout.coordinates}
+    rows = sizes["constraint"], sizes["slow_constraint"]
+    return Names(sizes["s"], sizes["f"], *rows, blocks, rigid, carried, sorting.layout.kinematics)
+
+
+def _kept_rows(sorting: Sorting, part: Placed) -> dict[str, int]:
+    """Number of kept rows of each element of an effect by its label, in the order of the terms of the effect."""
+    bodies, effect = sorting.bodies, part.effect
+    elements, params = effect.elements(bodies), effect.parameters(bodies)
+    t = (jnp.zeros(()),) if effect.timed else ()
+    rows, first = {}, 0
+    for i in chain(*effect.by_size(part.elements, bodies)):
+        size = jax.eval_shape(effect.function, *t, *effect.element_arguments(i, bodies, params)).size
+        kept = sum(row not in part.dropped for row in range(first, first + size))
+        if kept:
+            rows[effect.name if len(elements) == 1 else _label(effect, elements[i])] = kept
+        first += size
+    return rows

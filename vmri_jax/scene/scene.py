@@ -23,10 +23,10 @@ from vmri_jax.scene.drawing import drawing
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.effects.joint_base import along_run, joint_named
 from vmri_jax.scene.functions import RESERVED, Actuation
-from vmri_jax.scene.labels import names_of
 from vmri_jax.scene.ledger import Ledger, ledger
 from vmri_jax.scene.redundancy import check_constraints, dropped_rows, without_redundant
 from vmri_jax.scene.rigid import Rigidity
+from vmri_jax.scene.rows import names_of
 from vmri_jax.scene.sorting import Sorting, sort
 from vmri_jax.scene.trees import Branch, check_frames, grow, shallow
 from vmri_jax.scene.velocities import joint_starts, with_rates
@@ -76,6 +76,8 @@ class Scene:
     redundant: Literal["refuse", "drop"] = "refuse"
     coordinates: Literal["joint", "directors", "auto"] = "directors"
     joint_starts: Mapping[tuple[str, int, str], tuple[Any, Any]] = field(default_factory=dict, repr=False)
+    # the problem after the first call of `problem`: building a scene of a hundred joints takes a second
+    _problems: list[Problem] = field(default_factory=list, init=False, repr=False)
 
     def __repr__(self) -> str:
         effects = [effect.name for effect in self.effects]
@@ -112,12 +114,8 @@ class Scene:
                 raise ValueError(
                     f"Scene: an effect is called {name!r}, where the params keep {content}; give it another name."
                 )
-        potentials = [effect.name for effect in self.effects if effect.kind == "potential"]
         for effect in self.everything:
             effect.check(self.by_name, self.project)
-            for name in effect.refers_to:
-                if name not in potentials:
-                    raise ValueError(f"{effect.name}: {unknown('potential', name, potentials)}")
         check_frames(self.by_name, self.branches)
         check_constraints(self.sorting)
 
@@ -156,9 +154,7 @@ class Scene:
         """
         from vmri_jax.scene.mujoco import bodies_and_effects  # the package mujoco is an optional dependency
 
-        bodies, effects = bodies_and_effects(
-            model, qpos=qpos, qvel=qvel, key=key, ignore=ignore, limits=limits, coordinates=coordinates
-        )
+        bodies, effects = bodies_and_effects(model, qpos, qvel, key, ignore, limits, coordinates)
         return cls(bodies, effects, redundant="drop", project=True, coordinates=coordinates)
 
     @cached_property
@@ -239,11 +235,6 @@ class Scene:
         if is_concrete((problem.system, self.start)):  # traced arrays must not outlive their trace
             self._problems.append(problem)
         return problem
-
-    @cached_property
-    def _problems(self) -> list[Problem]:
-        """The problem after the first call of `problem`: building a scene of a hundred joints takes a second."""
-        return []
 
     def state(self) -> State:
         """The consistent initial state, see `initial_state`."""

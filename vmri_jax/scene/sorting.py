@@ -183,13 +183,7 @@ def _bodies_and_jacobian(kinematics: Kinematics, q, joints):
 def _nearest_rates(jacobian, rates, masses) -> tuple[Any, Any]:
     """The velocities v of the scene for which ``J v`` is nearest to the velocities V of the bodies, ``J^T M J v = J^T M V``.
 
-    Args:
-        jacobian: J = dQ/dq.
-        rates: V of (Q_s, Q_f) one after the other.
-        masses: M, likewise.
-
-    Returns:
-        v, and the part ``V - J v`` that the joints do not allow, relative to V in the norm of the kinetic energy.
+    With v comes the part ``V - J v`` that the joints do not allow, relative to V in the norm of the kinetic energy.
     """
     xp = library(jacobian, rates, masses)
     v = xp.linalg.solve(jacobian.T @ (masses[:, None] * jacobian), jacobian.T @ (masses * rates))
@@ -197,22 +191,16 @@ def _nearest_rates(jacobian, rates, masses) -> tuple[Any, Any]:
     return v, xp.sqrt(xp.sum(masses * violation**2) / xp.where(square > 0, square, 1.0))
 
 
-class Owners(NamedTuple):
-    """The bodies whose coordinates an element of an effect depends on.
-
-    all: all these bodies.
-    between: the bodies in `all` whose coordinates move the bodies of the element against each other, not together.
-    """
-
-    all: tuple[str, ...]
-    between: tuple[str, ...]
+Owners = tuple[tuple[str, ...], tuple[str, ...]]
+"""The bodies whose coordinates an element of an effect depends on: all of them, and those that move the bodies of the element against each
+other, not together."""
 
 
 def _owners(effect: Effect, bodies: Bodies, branches: Sequence[Branch]) -> list[Owners]:
     """The bodies whose coordinates each element of an effect depends on.
 
-    Every body of an element depends on a chain of bodies, from itself to the root of its tree. `Owners.all` is the union of these chains;
-    `Owners.between` is this union without the bodies that are in every chain.
+    Every body of an element depends on a chain of bodies, from itself to the root of its tree. All bodies are the union of these chains; the
+    bodies that move the element against itself are this union without the bodies that are in every chain.
     """
     on_joints = {branch.child: branch for branch in branches}
     carried = {(branch.joint.name, branch.element): branch.child for branch in branches}
@@ -226,7 +214,7 @@ def _owners(effect: Effect, bodies: Bodies, branches: Sequence[Branch]) -> list[
         names_of_all = tuple(dict.fromkeys(name for chain in chains for name in chain))
         # a body that carries all bodies of the element moves them together
         shared = set.intersection(*map(set, chains)) if len(chains) > 1 else set()
-        owners.append(Owners(names_of_all, tuple(name for name in names_of_all if name not in shared) or names_of_all))
+        owners.append((names_of_all, tuple(name for name in names_of_all if name not in shared) or names_of_all))
     return owners
 
 
@@ -244,10 +232,6 @@ def _chain(name: str, branches: Mapping[str, Branch]) -> list[str]:
 
 def sort(bodies: Bodies, effects: Sequence[Effect], branches: Sequence[Branch] = ()) -> Sorting:
     """Paces of all bodies and homes of all effects.
-
-    Args:
-        effects: in the order in which their terms are added.
-        branches: bodies that are functions of the freedoms of joints, parents before children.
 
     Raises:
         ValueError: a decision between slow and fast that depends on traced numbers; joints that leave no freedom.
@@ -351,8 +335,6 @@ def _home(effect: Effect, i: int, slow: tuple[str, ...], size: int, measured, li
     Args:
         slow: the slow bodies that the element touches.
         size: number of all bodies that it touches.
-        measured: rates of effects by name.
-        limit: border between slow and fast, rad/s; None if there is none.
     """
     if effect.kind == "kinetic":
         return "kinetic", Reason("depends on velocities")

@@ -8,12 +8,24 @@ from dataclasses import dataclass
 from functools import reduce
 from itertools import pairwise
 from operator import add
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from vmri_jax.mechanics.rows import Rows
 from vmri_jax.scene.body import GROUND_COORDINATES
+
+
+@dataclass(frozen=True)
+class Applied:
+    """A function with its first arguments filled in; compared by value, which `functools.partial` is not."""
+
+    function: Callable
+    arguments: tuple[Any, ...]
+
+    def __call__(self, *arguments):
+        return self.function(*self.arguments, *arguments)
 
 
 def split(q):
@@ -185,24 +197,18 @@ class _OfSeveral:
 
 @dataclass(frozen=True)
 class SomeRows(_OfSeveral):
-    """The values of some terms of a constraint one after the other, without the rows with the numbers `dropped`."""
+    """The values of some terms of a constraint one after the other, without the rows `dropped`, or these rows `alone`."""
 
     dropped: tuple[int, ...]
+    alone: bool = False
 
     def value(self, q_s, q_f, params, t=None):
-        """The values of the rows that are kept, by static slices."""
+        """The values of the rows, by static slices."""
         values = concatenated([term.value(q_s, q_f, params, t) for term in self.terms])
+        if self.alone:
+            return concatenated([values[k : k + 1] for k in self.dropped])
         ends = [-1, *self.dropped, values.shape[0]]
         return concatenated([values[low + 1 : high] for low, high in pairwise(ends)])
-
-
-class DroppedRows(SomeRows):
-    """The values of the rows that `SomeRows` leaves out."""
-
-    def value(self, q_s, q_f, params, t=None):
-        """The values of the dropped rows, by static slices."""
-        values = concatenated([term.value(q_s, q_f, params, t) for term in self.terms])
-        return concatenated([values[k : k + 1] for k in self.dropped])
 
 
 @dataclass(frozen=True)
@@ -224,11 +230,7 @@ class TangentDamping(_OfSeveral):
 
 
 def choose(params, select: Sequence[int], split: Sequence[str]):
-    """The parameters of some elements.
-
-    Args:
-        split: names of parameters that may have an entry for each element.
-    """
+    """The parameters of some elements; parameters in `split` may have an entry for each element."""
     return params | {name: pick(params[name], select) for name in split if name in params and jnp.ndim(params[name])}
 
 

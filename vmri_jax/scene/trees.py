@@ -69,16 +69,6 @@ class Link(NamedTuple):
     step: int
 
     @property
-    def is_first(self) -> bool:
-        """Whether the frame hangs on a body, not on a frame of the same joint."""
-        return self.step == 0
-
-    @property
-    def is_last(self) -> bool:
-        """Whether the frame is the child of the branch."""
-        return self.step + 1 >= len(self.branch.joint.moves)
-
-    @property
     def coordinate(self) -> int | None:
         """Number of the move among the moves of the joint; None if the joint has no freedom."""
         count = len(self.branch.joint.moves)
@@ -102,11 +92,6 @@ class Link(NamedTuple):
         kinds = ("turn", "screw") if kind == "turn" else ("slide",)
         sign = 1.0 if self.branch.forward else -1.0
         return sign if self.move is not None and self.move.kind in kinds else 0.0
-
-    @property
-    def pitch(self):
-        """How far the frame moves along the axis per turn, m; zero unless the joint is a screw."""
-        return self.branch.joint.pitch_of(self.branch.element)
 
 
 def grow(bodies: Bodies, effects: Sequence[Effect]) -> tuple[Branch, ...]:
@@ -164,14 +149,7 @@ def _root_rank(name: str, bodies: Bodies) -> tuple:
 
 
 def check_frames(bodies: Bodies, branches: Sequence[Branch]) -> None:
-    """Refuse frames that hang on no joint, or that carry no body.
-
-    Args:
-        branches: of all trees; () if all bodies have directors.
-
-    Raises:
-        ValueError: with the name of the frame.
-    """
+    """Refuse frames that hang on no joint, or that carry no body; there are no branches if all bodies have directors."""
     hanging, carrying = ({getattr(branch, end) for branch in branches} for end in ("child", "parent"))
     for name, body in bodies.items():
         if not isinstance(body, Frame):
@@ -206,13 +184,8 @@ def make_layout(
 ) -> tuple[Layout, tuple[Link | None, ...]]:
     """The places of all coordinates, of slow bodies in q_s and of fast bodies in q_f, in the order of the bodies.
 
-    A body on a joint has the freedoms of this joint as coordinates.
-
-    Args:
-        branches: bodies on joints, parents before children.
-
-    Returns:
-        The layout, and the links of the frames of its kinematics, in the order of these frames.
+    A body on a joint has the freedoms of this joint as coordinates. With the layout come the links of the frames of its kinematics, in the
+    order of these frames.
     """
     ends: dict[Part, int] = {"s": 0, "f": 0}
     on_joints = {branch.child: branch for branch in branches}
@@ -238,8 +211,6 @@ def _with_kinematics(bodies: Bodies, branches: Sequence[Branch], places, coordin
 
     Args:
         places: of the bodies on no joint.
-        coordinates, freedoms: as of `Layout`.
-        sizes: (n_s, n_f).
     """
     grids: dict[str, Grid] = {name: place.part for name, place in places.items()}
     grids[GROUND] = "s"
@@ -293,10 +264,7 @@ def _frames(grid: Grid, first: int, branches: Sequence[Branch], bodies: Bodies, 
     Paths from a root to a leaf are padded with None to the same length.
 
     Args:
-        grid: the part of the coordinates: slow, fast, or both.
         first: index of the first of these frames.
-        branches: parents before children.
-        freedoms: as of `Layout`.
         numbers: indices of the bodies that the branches may hang on.
     """
     branch_of = {branch.child: branch for branch in branches}

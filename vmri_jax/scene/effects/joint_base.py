@@ -50,10 +50,8 @@ class Joint(Effect):
         return tuple(tuple(map(str, element)) for element in super().elements(bodies))
 
     def parameters(self, bodies):
-        return {name: squeeze(library(values).stack(values)) for name, values in self._frames(bodies).items()}
-
-    def points(self, bodies):
-        return {}
+        frames = {name: squeeze(library(values).stack(values)) for name, values in self._frames(bodies).items()}
+        return super().parameters(bodies) | frames
 
     def label(self, i: int, bodies: Bodies) -> str:
         """The name of the joint, followed by the names of both bodies of the i-th pair if the joint has several pairs."""
@@ -80,7 +78,7 @@ class Joint(Effect):
 
     def check_parameters(self, bodies):
         super().check_parameters(bodies)
-        for (a, b), points in zip(self._pairs(bodies), self.joining_points(bodies), strict=True):
+        for (a, b), points in zip(super().elements(bodies), self.joining_points(bodies), strict=True):
             if not is_concrete(points):
                 continue
             distance = np.linalg.norm(points[1] - points[0])
@@ -102,25 +100,16 @@ class Joint(Effect):
             f"{self.name} {'-'.join(element)} in {name}": (name, points[role][i])
             for i, element in enumerate(self.elements(bodies))
             for role, name in zip("ab", element, strict=True)
-            if self._sticks_out(name, points[role][i], bodies)
+            # a line to a point outside the drawn shape of a body is drawn from the centre
+            if isinstance(body := body_of(bodies, name), RigidBody) and not body.covers(points[role][i])
         }
 
     def drawing(self, bodies):
         return {"links": [[name, end] for end, (name, _) in self.drawn_points(bodies).items()]}
 
-    @staticmethod
-    def _sticks_out(name: str, point, bodies) -> bool:
-        """Whether the point of the joint lies outside the drawn shape of a body, so that a line to it is drawn from the centre."""
-        body = body_of(bodies, name)
-        return isinstance(body, RigidBody) and not body.covers(point)
-
-    def _pairs(self, bodies):
-        """The pairs (a, b) as the user wrote them: `Attachment` where a name came with a point."""
-        return super().elements(bodies)
-
     def joining_points(self, bodies):
         """For each pair the point of the joint in space as a has it and as b has it, at the start: [((3,), (3,)), ...]."""
-        pairs = self._pairs(bodies)
+        pairs = super().elements(bodies)  # as the user wrote them: `Attachment` where a name came with a point
         if self.at is not None:
             if any(isinstance(name, Attachment) for pair in pairs for name in pair):
                 raise ValueError(
@@ -151,15 +140,12 @@ class Joint(Effect):
         for i, element in enumerate(elements):
             for role, name, point in zip("ab", element, points[i], strict=True):
                 body = body_of(bodies, name)
-                if not body.rigid:
-                    if triads is not None:
-                        raise ValueError(
-                            f"{self.name}: {name} is a point, which has no axes; a point can be joined by Spherical alone."
-                        )
-                    components.setdefault(f"point_{role}", []).append(np.zeros(3))
-                    continue
+                if not body.rigid and triads is not None:
+                    raise ValueError(
+                        f"{self.name}: {name} is a point, which has no axes; a point can be joined by Spherical alone."
+                    )
                 # X = R^T (x - phi): the point in the axes of the body
-                offset = (point - body.position) @ body.rotation
+                offset = (point - body.position) @ body.rotation if body.rigid else np.zeros(3)
                 components.setdefault(f"point_{role}", []).append(body.weights(offset))
                 if triads is not None:
                     try:
@@ -172,12 +158,7 @@ class Joint(Effect):
 
 @effect_class
 class AboutAxis(Joint):
-    """Joints with an axis.
-
-    Args:
-        between, at: as of `Joint`.
-        axis: (3,) direction in space at the start, of any length; or a direction for each of k pairs, (k, 3).
-    """
+    """Joints with an axis: (3,) its direction in space at the start, of any length; or a direction for each of k pairs, (k, 3)."""
 
     axis: Any = (0.0, 0.0, 1.0)
 
@@ -203,12 +184,7 @@ class AboutAxis(Joint):
 
 
 def joint_named(about: str, name: str, effects: Iterable[Effect]) -> Joint:
-    """The joint with a name among effects; `about` begins the message.
-
-    Raises:
-        TypeError: a name that is no string.
-        ValueError: no joint has this name.
-    """
+    """The joint with a name among effects; `about` begins the message if there is none."""
     joints = {effect.name: effect for effect in effects if isinstance(effect, Joint)}
     if not isinstance(name, str):
         raise TypeError(
@@ -221,11 +197,7 @@ def joint_named(about: str, name: str, effects: Iterable[Effect]) -> Joint:
 
 
 def freedom_of(joint: Joint, of: str, about: str = "") -> Freedom:
-    """The freedom of a joint with the name `of`; with "auto" its only freedom. `about` begins the message.
-
-    Raises:
-        ValueError: the joint has no freedom of this name, or with "auto" none or several.
-    """
+    """The freedom of a joint with the name `of`; with "auto" its only freedom. `about` begins the message if there is none, or several."""
     fitting: list[Freedom] = [freedom for freedom in joint.freedoms if of in (freedom, "auto")]
     if len(fitting) == 1:
         return fitting[0]
@@ -234,11 +206,7 @@ def freedom_of(joint: Joint, of: str, about: str = "") -> Freedom:
 
 
 def along_run(joint: Joint, run, bodies: Bodies, of: str, pair: int) -> np.ndarray:
-    """The freedom of a joint along a run, (k,) rad or m, angles without jumps of 2 pi; see `Scene.joint_motion`.
-
-    Raises:
-        IndexError: no such pair.
-    """
+    """The freedom of a joint along a run, (k,) rad or m, angles without jumps of 2 pi; see `Scene.joint_motion`."""
     freedom, element = freedom_of(joint, of), joint.elements(bodies)[pair]
     _, params = joint.element_arguments(pair, bodies, joint.parameters(bodies))
     q = tuple(GROUND_COORDINATES if body == GROUND else np.asarray(run.position(body)) for body in element)
