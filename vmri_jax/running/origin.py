@@ -3,7 +3,7 @@
 import pickle
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax
@@ -15,6 +15,9 @@ from vmri_jax.mechanics.rows import Part
 from vmri_jax.mechanics.state import HasProblem, Problem, opened
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.settings import Settings
+
+SavedRun: TypeAlias = Any
+"""A `vmri_jax.Trajectory` in annotations of modules that its own module imports."""
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=["bare", "params"], meta_fields=["names", "settings"])

@@ -19,8 +19,7 @@ from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.summary import has_values, summary
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.micro_nodes import Nodes, why_not, with_micro_nodes
-from vmri_jax.running.origin import Origin, at_nodes
-from vmri_jax.running.saved_run import SavedRun
+from vmri_jax.running.origin import Origin, SavedRun, at_nodes
 
 RANDOM_RATIO = 0.5
 """Von Neumann ratio, mean squared difference of neighbours over variance, above which the values at the nodes count as random: the nodes do
@@ -230,8 +229,7 @@ class Quantities(ABC):
         """
         from vmri_jax.plots import plot_trajectory  # here: its import takes half a second
 
-        run: Any = self.whole()
-        return plot_trajectory(run, title)
+        return plot_trajectory(self.whole(), title)
 
 
 def _concrete(method: str, run: SavedRun) -> SavedRun:
