@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.kernels import Full, Sparsity, sparsity
+from vmri_jax.kernels.band import Full, Sparsity, sparsity
 from vmri_jax.mechanics.arrays import is_concrete
 from vmri_jax.mechanics.masses import ConstantMass, Diagonal
 from vmri_jax.mechanics.system import System

@@ -6,7 +6,8 @@ import jax
 import jax.numpy as jnp
 
 from vmri_jax import kernels
-from vmri_jax.kernels import Full, Sparsity
+from vmri_jax.kernels.band import Full, Sparsity
+from vmri_jax.kernels.saddle import saddle
 from vmri_jax.mechanics.structure import has_constant_hessian
 from vmri_jax.mechanics.system import System
 
@@ -106,7 +107,7 @@ def _velocity_and_impulse(system: System, q_s, q_f, constraints, p, guess):
     def direction(data, v):
         system, q_s, q_f, jacobian, rates, p = data
         gradient, times_hessian = jax.linearize(jax.grad(lambda v: kinetic(system, q_s, q_f, v)), v)
-        matrix = kernels.saddle(jax.vmap(times_hessian)(jnp.eye(v.size)), jacobian.T, jacobian)
+        matrix = saddle(jax.vmap(times_hessian)(jnp.eye(v.size)), jacobian.T, jacobian)
         rows = jnp.concatenate([p - gradient, -(jacobian @ v + rates)])
         d, mu = jnp.split(kernels.solve(matrix, rows[:, None])[:, 0], [v.size])
         return d, jacobian.T @ mu

@@ -26,7 +26,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from vmri_jax.kernels import inverse, matmul, max_abs, regularized
+from vmri_jax.kernels import inverse, matmul, max_abs
+from vmri_jax.kernels.saddle import regularized
 from vmri_jax.mechanics.structure import curved_directions
 from vmri_jax.schemes.discrete_lagrangian import Term, lagrangian
 from vmri_jax.schemes.equations import StepEquations, Unknowns

@@ -23,7 +23,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from vmri_jax.kernels import DIAGONAL_MATRICES, Full, Sparsity, inverse, matvec, regularized, solve
+from vmri_jax.kernels import DIAGONAL_MATRICES, inverse, matvec, solve
+from vmri_jax.kernels.band import Full, Sparsity
+from vmri_jax.kernels.saddle import regularized
 from vmri_jax.mechanics.constraint_pattern import fast_rows
 from vmri_jax.mechanics.masses import ConstantMass, Diagonal
 from vmri_jax.mechanics.structure import has_constant_hessian, has_diagonal_hessian, is_linear

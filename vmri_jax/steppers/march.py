@@ -30,8 +30,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from vmri_jax.kernels import inverse_in_loop, matmul, matvec, max_abs, saddle
-from vmri_jax.schemes.equations import StepEquations, Unknowns
+from vmri_jax.kernels import inverse_in_loop, matmul, matvec, max_abs
+from vmri_jax.kernels.saddle import saddle
+from vmri_jax.schemes.equations import StepEquations, Unknowns, sum_before
 from vmri_jax.schemes.intervals import Arriving, Intervals, IntervalUnknowns
 
 

@@ -7,7 +7,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from vmri_jax.kernels import BandInverse, FullInverse, Sparsity, max_abs
+from vmri_jax.kernels import max_abs
+from vmri_jax.kernels.band import BandInverse, FullInverse, Sparsity
 from vmri_jax.mechanics.arrays import Numbers
 from vmri_jax.schemes.discrete_lagrangian import Term, lagrangian
 from vmri_jax.schemes.equations import StepEquations, slow_basis_at_control_nodes

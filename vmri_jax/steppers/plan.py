@@ -22,7 +22,8 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
-from vmri_jax.kernels import COLLOCATES, DEFERS_PROJECTION, DRIFTS, Sparsity
+from vmri_jax.kernels import COLLOCATES, DEFERS_PROJECTION, DRIFTS
+from vmri_jax.kernels.band import Sparsity
 from vmri_jax.mechanics.constraint_pattern import all_rows
 from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.mechanics.structure import depends_on

@@ -17,7 +17,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from vmri_jax.kernels import Full, Sparsity, max_abs
+from vmri_jax.kernels import max_abs
+from vmri_jax.kernels.band import Full, Sparsity
 from vmri_jax.schemes.equations import StepEquations, Unknowns, multiplier_scales
 from vmri_jax.steppers.accept import Accepted
 from vmri_jax.steppers.interval import constant_mass, weighted_sum

@@ -29,7 +29,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from vmri_jax.kernels import BandInverse, FullInverse, inverse, matmul, max_abs, solve
+from vmri_jax.kernels import inverse, matmul, max_abs, solve
+from vmri_jax.kernels.band import BandInverse, FullInverse
 from vmri_jax.schemes.discrete_lagrangian import QuadraticKinetic, lagrangian
 from vmri_jax.schemes.equations import StepEquations, Unknowns, slow_basis_at_control_nodes
 from vmri_jax.schemes.path import control_nodes, lagrange_basis, lagrange_derivative

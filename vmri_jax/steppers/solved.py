@@ -10,7 +10,8 @@ import jax.numpy as jnp
 from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Float
 
-from vmri_jax.kernels import Sparsity, max_abs
+from vmri_jax.kernels import max_abs
+from vmri_jax.kernels.band import Sparsity
 from vmri_jax.mechanics.arrays import Numbers
 from vmri_jax.mechanics.checks import CONSTRAINT_TOLERANCE
 from vmri_jax.mechanics.projection import project_momentum
