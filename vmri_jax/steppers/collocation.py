@@ -37,7 +37,7 @@ from vmri_jax.steppers.interval import constant_mass
 from vmri_jax.steppers.results import RUNNING, Method
 from vmri_jax.steppers.solved import Solution, Solver, status_of
 from vmri_jax.steppers.solvers import Newton
-from vmri_jax.steppers.time_modes import TimeModes, product, taken, times_i
+from vmri_jax.steppers.time_modes import TimeModes, product, times_i
 
 
 class JoinedEquations:
@@ -195,7 +195,7 @@ class Saddles(NamedTuple):
 
         def of_parts(z):
             """(modes, rows, columns) as (columns, rows, k)."""
-            return taken(jnp.swapaxes(z, 0, 2), modes.mode)
+            return jnp.swapaxes(z, 0, 2)[..., modes.mode]
 
         bent = matmul(along, bend)
         denominator = inverse(np.eye(d) - 2 * re * bent + (re**2 + im**2) * matmul(bent, bent))
