@@ -226,9 +226,8 @@ class Saddles(NamedTuple):
         # (1 - gamma L Q)^-1 z = |1 - gamma L Q|^-2 (1 - conj(gamma) L Q) z
         z = z - self._times_gamma(matmul(self.bend, z), -1)
         products = (a * row for a, row in zip(self.denominator, z, strict=True))
-        z = reduce(
-            jnp.add, products, jnp.zeros_like(z)
-        )  # written out: inside jnp.sum XLA would recompute z for every row
+        # written out: inside jnp.sum XLA would recompute z for every row
+        z = reduce(jnp.add, products, jnp.zeros_like(z))
         # nu = schur (g - G y - gamma G Q z), then gamma z with the part of nu, then x = y + Q gamma z + M^-1 G^T nu
         nu = product(self.schur, g - matmul(self.push_bend, self._times_gamma(z)))
         z = self._times_gamma(z + product(self.pull_bend, nu))
@@ -260,9 +259,8 @@ class Evaluated(NamedTuple):
     result: Int[Array, ""]
 
 
-def at_nodes(function):
-    """`function` mapped over the nodes, the last axis."""
-    return jax.vmap(function, in_axes=-1, out_axes=-1)
+at_nodes = partial(jax.vmap, in_axes=-1, out_axes=-1)
+"""Maps a function over the nodes, the last axis."""
 
 
 def only_if(wanted, function, x):

@@ -110,9 +110,8 @@ class Rattle(Solver):
             x = last.x - last.dx
             return judged(x, last.mu + last.dmu, constraints(equations.t + h, q + x), last.iterations + 1)
 
-        first = corrected(
-            judged(x, mu, g, 0)
-        )  # nearly all steps need one correction: outside of the loop it is cheaper
+        # nearly all steps need one correction: outside of the loop it is cheaper
+        first = corrected(judged(x, mu, g, 0))
         done = newton.iterate(corrected, first, done=1)
 
         impulse = force(done.mu) / h  # p+ = p - G_0^T mu / h
