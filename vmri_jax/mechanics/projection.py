@@ -90,15 +90,7 @@ def _time_rates(system: System, t, q_s, q_f):
 
 
 def _velocity_and_impulse(system: System, q_s, q_f, constraints, p, guess):
-    """The v that minimises ``T(v) - p . v`` over ``G v + dg/dt = 0``, and ``G^T mu``; NaN if Newton's iteration does not converge.
-
-    Args:
-        system: with its kinetic energy.
-        q_s, q_f: positions.
-        constraints: G and dg/dt.
-        p: momenta of all variables.
-        guess: velocities from which the iteration starts.
-    """
+    """The v that minimises ``T(v) - p . v`` over ``G v + dg/dt = 0``, and ``G^T mu``, with `constraints` (G, dg/dt); NaN without convergence."""
 
     def kinetic(system, q_s, q_f, v):
         return system.kinetic(q_s, q_f, v[: q_s.size], v[q_s.size :], system.params)
