@@ -160,8 +160,7 @@ def _mapped(function, repeated: tuple[bool, ...], structure, static: tuple, arra
 
     mapped = at_node
     for axis in range(jax.tree.leaves(nodes)[0].ndim):
-        lanes = [
-            None if axis == 0 or shared else 0 for shared in repeated
-        ]  # axis 0, the innermost map, runs over the nodes
+        # axis 0, the innermost map, runs over the nodes
+        lanes = [None if axis == 0 or shared else 0 for shared in repeated]
         mapped = jax.vmap(mapped, (lanes, 0))
     return mapped(arrays, nodes)

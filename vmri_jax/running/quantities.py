@@ -243,14 +243,7 @@ def _concrete(method: str, run: SavedRun) -> SavedRun:
 
 
 def _of_body(run: SavedRun, body: str, carried: Callable, slow=None, fast=None):
-    """Values (..., k, size) of a body.
-
-    Args:
-        run: the run.
-        body: its name.
-        carried: function of (system, state, kinematics) for bodies in joint coordinates, whose values are functions of the coordinates.
-        slow, fast: values of all coordinates, for every other body.
-    """
+    """Values (..., k, size) of a body: of `slow` and `fast`, values of all coordinates, or of `carried` for a body in joint coordinates."""
     names = run.names
     if body in names.carried:
         slow, fast = tuple(at_nodes(carried, run.origin, run.states, names.kinematics))
@@ -258,12 +251,7 @@ def _of_body(run: SavedRun, body: str, carried: Callable, slow=None, fast=None):
 
 
 def _part(values: Any, place: Place):
-    """Values of one body.
-
-    Args:
-        values: (slow, fast), values of all bodies.
-        place: part and place of the body.
-    """
+    """Values of one body, out of the values (slow, fast) of all bodies."""
     part, start, size = place
     return values[part == "f"][..., start : start + size]
 
