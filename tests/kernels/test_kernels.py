@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from vmri_jax import kernels
 from vmri_jax.kernels import cpu as algebra
 from vmri_jax.kernels import plain
+from vmri_jax.kernels.band import Band, Full, sparsity
 
 
 def definite(n: int):
@@ -79,8 +79,8 @@ def test_a_band_in_any_order_is_inverted_like_the_full_matrix(n, width, nodes):
     a = np.where(blocks, 0.1 * rng.normal(size=blocks.shape), 0.0) + np.diag(1 + rng.random(n * nodes))
     g = rng.normal(size=n * nodes)
 
-    found = kernels.sparsity(pattern, nodes)
-    assert isinstance(found, kernels.Full if width == 8 else kernels.Band)
+    found = sparsity(pattern, nodes)
+    assert isinstance(found, Full if width == 8 else Band)
     products = jnp.asarray(found.seeds @ a.T)
     expected = np.linalg.solve(a, g)
     assert np.abs(found.inverse(products).times(jnp.asarray(g)) - expected).max() < 1e-13

@@ -114,8 +114,8 @@ def loops(a, b, n, flag):
     ],
 )
 def test_what_an_argument_reaches_through_loops(changed, reaches):
-    jaxpr = jax.make_jaxpr(jax.jit(loops))(1.0, 2.0, 3, True)
-    assert reached(jaxpr.eqns[0], [k == changed for k in range(4)]) == reaches
+    jaxpr = jax.make_jaxpr(jax.jit(loops))(1.0, 2.0, 3, True).jaxpr
+    assert reached(jaxpr, [k == changed for k in range(4)]) == reaches
 
 
 NEW = Primitive("operation_of_a_later_version")

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import vmri_jax as vm
-from vmri_jax.kernels import Band, Full
+from vmri_jax.kernels.band import Band, Full
 from vmri_jax.mechanics import constraint_pattern
 
 LINKS = 16

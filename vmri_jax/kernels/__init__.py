@@ -1,51 +1,33 @@
 """Small dense algebra and settings of the steppers: the only place for code that is written for speed alone.
 
 Two modules define the same functions and constants: `plain`, the textbook form, and `cpu`, the tuned form. The environment variable VMRI_KERNELS (``plain`` or
-``cpu``, the default) chooses one when the package is imported, see `chosen`. `band` inverts matrices with many zeros. `inverse_in_loop`
+``cpu``, the default) chooses one when the package is imported. `band` inverts matrices with many zeros. `inverse_in_loop`
 comes from `cpu` in both cases.
 """
 
-from vmri_jax.kernels.band import Band, BandInverse, Full, FullInverse, Sparsity, sparsity
-from vmri_jax.kernels.chosen import (
-    COLLOCATES,
-    CONTRACTION,
-    DEFERS_PROJECTION,
-    DIAGONAL_MATRICES,
-    DRIFTS,
-    LARGEST_RENEWED,
-    LINEARISES_FORCES,
-    SLOW_ORDER,
-    inverse,
-    matmul,
-    matvec,
-    max_abs,
-    solve,
-)
-from vmri_jax.kernels.cpu import inverse_in_loop
-from vmri_jax.kernels.saddle import REGULARIZATION, regularized, saddle
+import os
 
-__all__ = [
-    "COLLOCATES",
-    "CONTRACTION",
-    "DEFERS_PROJECTION",
-    "DIAGONAL_MATRICES",
-    "DRIFTS",
-    "LARGEST_RENEWED",
-    "LINEARISES_FORCES",
-    "REGULARIZATION",
-    "SLOW_ORDER",
-    "Band",
-    "BandInverse",
-    "Full",
-    "FullInverse",
-    "Sparsity",
-    "inverse",
-    "inverse_in_loop",
-    "matmul",
-    "matvec",
-    "max_abs",
-    "regularized",
-    "saddle",
-    "solve",
-    "sparsity",
-]
+from vmri_jax.kernels import cpu, plain
+
+CHOICES = {"plain": plain, "cpu": cpu}
+
+_name = os.environ.get("VMRI_KERNELS", "cpu")
+if _name not in CHOICES:
+    raise ValueError(f"VMRI_KERNELS is {_name!r}; it must be one of {', '.join(CHOICES)}.")
+_chosen = CHOICES[_name]
+
+inverse = _chosen.inverse
+inverse_in_loop = cpu.inverse_in_loop
+matmul = _chosen.matmul
+matvec = _chosen.matvec
+max_abs = _chosen.max_abs
+solve = _chosen.solve
+
+COLLOCATES = _chosen.COLLOCATES
+CONTRACTION = _chosen.CONTRACTION
+DEFERS_PROJECTION = _chosen.DEFERS_PROJECTION
+DIAGONAL_MATRICES = _chosen.DIAGONAL_MATRICES
+DRIFTS = _chosen.DRIFTS
+LARGEST_RENEWED = _chosen.LARGEST_RENEWED
+LINEARISES_FORCES = _chosen.LINEARISES_FORCES
+SLOW_ORDER = _chosen.SLOW_ORDER

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from vmri_jax.kernels import chosen
+from vmri_jax import kernels
 from vmri_jax.kernels.saddle import regularized
 
 LARGEST_HALF_WIDTH = 0.2
@@ -30,7 +30,7 @@ class FullInverse(NamedTuple):
 
     def times(self, g):
         """The product with g (n,)."""
-        return chosen.matvec(self.matrix, g)
+        return kernels.matvec(self.matrix, g)
 
 
 @dataclass(frozen=True)
@@ -46,11 +46,11 @@ class Full:
 
     def inverse(self, products) -> FullInverse:
         """The inverse of a matrix, from its products (n, n) with the seeds, one product in each row."""
-        return FullInverse(chosen.inverse(regularized(products)).T)
+        return FullInverse(kernels.inverse(regularized(products)).T)
 
     def solve(self, products, g):
         """The x (n,) with ``A x = g``, for the matrix A with these products."""
-        return chosen.solve(regularized(products.T), g[:, None])[:, 0]
+        return kernels.solve(regularized(products.T), g[:, None])[:, 0]
 
 
 class BandInverse(NamedTuple):
@@ -131,7 +131,7 @@ class Band:
             inverse_before, upper_before = before
             lower, diagonal, upper = row
             lower = lower @ inverse_before
-            inverse = chosen.inverse(diagonal - lower @ upper_before)
+            inverse = kernels.inverse(diagonal - lower @ upper_before)
             return (inverse, upper), (inverse, inverse @ upper, lower)
 
         zero = jnp.zeros((b, b))

@@ -1,13 +1,11 @@
 """Sparsity of ``G M^-1 G^T``, from the coordinates that constraints share; it is determined once, before a run."""
 
-from functools import partial
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.kernels import Full, Sparsity, sparsity
+from vmri_jax.kernels.band import Full, Sparsity, sparsity
 from vmri_jax.mechanics.arrays import is_concrete
 from vmri_jax.mechanics.masses import ConstantMass, Diagonal
 from vmri_jax.mechanics.system import System
@@ -43,16 +41,12 @@ def fast_rows(system: System, q_s, q_f, degree: int) -> Sparsity:
 def _shared(system: System, n_s: int, n_f: int, nodes: int | None = None) -> Sparsity:
     """Sparsity of the matrix: two rows have a common entry if both constraints change with some coordinate, at a random position.
 
-    A dependence that this test misses costs iterations, not accuracy: the matrix serves Newton's iteration alone.
-
-    Args:
-        system: with constraints.
-        n_s, n_f: numbers of coordinates.
-        nodes: number of nodes, for g with the fast coordinates; None for all constraints with all coordinates.
+    A dependence that this test misses costs iterations, not accuracy: the matrix serves Newton's iteration alone. With a number of `nodes` it
+    is the matrix of g with the fast coordinates, else of all constraints with all coordinates.
     """
     rng = np.random.default_rng(0)
-    arrays, functions = eqx.partition(system, eqx.is_array_like)
-    system = eqx.combine(jax.tree.map(partial(_known, rng), arrays), functions)
+    # random numbers in place of traced ones
+    system = jax.tree.map(lambda leaf: leaf if is_concrete(leaf) else rng.uniform(0.5, 1.5, np.shape(leaf)), system)
     q, moves = rng.normal(size=n_s + n_f), np.diag(rng.normal(size=n_s + n_f))
     with jax.ensure_compile_time_eval():
         touched, finite = _touched(system, n_s, q, moves if nodes is None else moves[n_s:], nodes is None)
@@ -71,8 +65,3 @@ def _touched(system: System, n_s: int, q, moves, slow_too: bool):
     before = constraints(q)
     after = jax.lax.map(lambda move: constraints(q + move), moves)
     return jnp.abs(after - before) > LEAST_CHANGE * jnp.max(jnp.abs(before)), jnp.isfinite(before)
-
-
-def _known(rng, leaf):
-    """The leaf itself, or random numbers of its shape if it is traced."""
-    return leaf if is_concrete(leaf) else rng.uniform(0.5, 1.5, np.shape(leaf))

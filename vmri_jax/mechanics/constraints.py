@@ -1,7 +1,5 @@
 """Checks of constraints and masses at one configuration (kept, independent, regular), and projection of positions onto the constraints."""
 
-from typing import NamedTuple
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -28,24 +26,13 @@ MICRO_GRID = (
 )
 
 
-class Rank(NamedTuple):
-    """Rank of a matrix.
-
-    rank: number of independent rows.
-    dependent: indices of the rows in a linear dependence.
-    """
-
-    rank: int
-    dependent: list[int]
-
-
-def rank_of(rows) -> Rank:
-    """Rank and dependent rows of a matrix (k, n), with each row scaled to length one."""
+def rank_of(rows) -> tuple[int, list[int]]:
+    """Rank of a matrix (k, n), with each row scaled to length one, and the indices of the rows in a linear dependence."""
     rows = np.asarray(rows)
     size = np.linalg.norm(rows, axis=1, keepdims=True)
     left, values, _ = np.linalg.svd(rows / np.where(size > 0, size, 1))
     rank = int(np.count_nonzero(values > RANK))
-    return Rank(rank, np.flatnonzero(np.linalg.norm(left[:, rank:], axis=1) > LEAST_COEFFICIENT).tolist())
+    return rank, np.flatnonzero(np.linalg.norm(left[:, rank:], axis=1) > LEAST_COEFFICIENT).tolist()
 
 
 def is_rank_deficient(rows, scaled_with=None, tolerance: float = RANK):
@@ -150,7 +137,7 @@ def check_constraints(
         arguments = (state.q_s,) if name == "slow_constraint" else (state.q_s, state.q_f)
         return _rows_in_words(getattr(system, name), rows, *arguments, system.params)
 
-    values, slow, fast, alone = jax.device_get(_values_and_jacobians(system, state.t, state.q_s, state.q_f))
+    values, implied, slow, fast, alone = jax.device_get(_values_and_jacobians(system, state.t, state.q_s, state.q_f))
     if not np.isfinite(values).all():
         raise ValueError(f"{place}: the constraints are {values} there, which is not finite.")
     worst, n_g = int(np.abs(values).argmax()), len(values) - len(alone)
@@ -161,7 +148,7 @@ def check_constraints(
             f"{tolerance:.0e}); {advice}"
         )
     if system.implied is not None:
-        _check_implied(np.asarray(_implied_values(system, state.t, state.q_s, state.q_f)), place)
+        _check_implied(implied, place)
     if not (np.isfinite(slow).all() and np.isfinite(fast).all() and np.isfinite(alone).all()):
         raise ValueError("System: the Jacobian of the constraints is not finite at these positions (a norm at zero?).")
     size = np.linalg.norm(np.concatenate([slow, fast], axis=1), axis=1)
@@ -173,24 +160,19 @@ def check_constraints(
             "variables that they hold fast."
         )
     _check_counts(fast, alone)
-    if rank_of(alone).dependent or rank_of(fast).dependent:
+    if any(dependent for _, dependent in map(rank_of, (alone, fast))):
         # At a singular configuration (a linkage folded flat) rows are dependent there and nowhere else, and runs pass it: only rows that are
         # dependent at a generic configuration nearby are refused.
-        _, _, fast, alone = jax.device_get(_values_and_jacobians(system, state.t, *_nearby(state.q_s, state.q_f)))
+        *_, fast, alone = jax.device_get(_values_and_jacobians(system, state.t, *_nearby(state.q_s, state.q_f)))
         _check_rank("slow_constraint", alone, "slow variables.", in_words)
         _check_rank("constraint", fast, f"fast variables. {MICRO_GRID}", in_words)
 
 
 @jax.jit
 def _values_and_jacobians(system, t, q_s, q_f):
-    """Values of all constraints, and the Jacobians dg/dq_s, dg/dq_f and dg_slow/dq_s."""
+    """Values of all constraints and of the implied rows, and the Jacobians dg/dq_s, dg/dq_f and dg_slow/dq_s."""
     jacobians = *jax.jacrev(system.g, argnums=(1, 2))(t, q_s, q_f), jax.jacrev(system.g_slow, argnums=1)(t, q_s)
-    return system.constraints(t, q_s, q_f), *jacobians
-
-
-@jax.jit
-def _implied_values(system, t, q_s, q_f):
-    return system.g_implied(t, q_s, q_f)
+    return system.constraints(t, q_s, q_f), system.g_implied(t, q_s, q_f), *jacobians
 
 
 def _check_implied(values, place: str) -> None:

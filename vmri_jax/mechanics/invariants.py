@@ -27,6 +27,12 @@ def potential_energy(system: System, q_s, q_f):
     return sum(system.all_potentials(q_s, q_f).values())
 
 
+def lagrangian(system: System, n_s: int, q, v):
+    """``T - V - W - sum_i V_i`` at positions and velocities (n_s + n_f,)."""
+    q_s, q_f = q[:n_s], q[n_s:]
+    return system.kinetic(q_s, q_f, v[:n_s], v[n_s:], system.params) - potential_energy(system, q_s, q_f)
+
+
 def energy(system: System, q_s, q_f, p_s, p_f):
     """Hamiltonian ``p . v - T(q, v) + V(q_s, q_f) + W(q_f) + sum_i V_i(q_s, q_f)`` with v the velocity of p.
 

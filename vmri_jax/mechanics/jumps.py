@@ -8,13 +8,14 @@ It divides the piece of a line with the largest change of a force repeatedly: th
 change of a discontinuous force does not.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.mechanics.invariants import potential_energy
+from vmri_jax.mechanics.invariants import lagrangian
 from vmri_jax.mechanics.motion import motion
 from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.state import State
@@ -126,13 +127,9 @@ def _on_line(system, state, line, s):
     now, (dt, dq, dv) = motion(system, state), line
     q, v, n_s = jnp.append(state.q_s, state.q_f), jnp.append(now.v_s, now.v_f), state.q_s.size
 
-    def lagrangian(q, v):
-        q_s, q_f = q[:n_s], q[n_s:]
-        return system.kinetic(q_s, q_f, v[:n_s], v[n_s:], system.params) - potential_energy(system, q_s, q_f)
-
     def force(s):
         here, velocity = q + s * dq, v + s * dv
         outside = system.forces(state.t + s * dt, here[:n_s], here[n_s:], velocity[:n_s], velocity[n_s:])
-        return jax.grad(lagrangian)(here, velocity) + jnp.concatenate(outside), velocity
+        return jax.grad(partial(lagrangian, system, n_s))(here, velocity) + jnp.concatenate(outside), velocity
 
     return jax.vmap(force)(s)

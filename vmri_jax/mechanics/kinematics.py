@@ -17,7 +17,6 @@ directors among the coordinates.
 Source: R. Featherstone, Rigid Body Dynamics Algorithms, Springer (2008), chapter 4.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Literal, NamedTuple
@@ -90,7 +89,9 @@ class Frames:
         rows = joints["constant"]
         if self.coordinates is None:
             return rows
-        x = taken(self.coordinates.take(q_s, q_f).reshape(-1), self.moving, np.zeros(()))[:, None, None]
+        # the last number, -1, is the coordinate of fixed frames
+        x = jnp.append(self.coordinates.take(q_s, q_f), 0.0)
+        x = x[np.array(self.moving)][:, None, None]
         rows = rows + jnp.cos(x) * joints["cosine"] + jnp.sin(x) * joints["sine"]
         return rows + x * joints["way"] if self.slides else rows
 
@@ -211,29 +212,9 @@ def after(rows, bodies):
     return matmul(rows, bodies[:, 1:]) + jnp.pad(bodies[:, :1], ((0, 0), (0, 3), (0, 0)))
 
 
-def taken(rows, numbers: Sequence[int], otherwise: Any = None):
-    """``rows[numbers]`` of an array (n, ...), by slices.
-
-    Args:
-        rows: the array.
-        numbers: static indices.
-        otherwise: entry for the index -1.
-    """
-    if list(numbers) == list(range(len(rows))):
-        return rows
-    pieces, first = [], 0
-    for last in range(1, len(numbers) + 1):
-        step = 0 if numbers[first] < 0 else 1
-        if last == len(numbers) or numbers[last] != numbers[last - 1] + step:
-            low, count = int(numbers[first]), last - first
-            pieces.append(jnp.broadcast_to(otherwise, (count, *rows.shape[1:])) if low < 0 else rows[low : low + count])
-            first = last
-    return jnp.concatenate(pieces)
-
-
 def _coordinates(rows, frames: Frames):
     """Coordinates of the frames that are bodies, one body after the other."""
     if any(len(kept) < 3 for kept in frames.directors):
         pieces = [rows[i, [0, *(k + 1 for k in kept)]] for i, kept in zip(frames.bodies, frames.directors, strict=True)]
         return jnp.concatenate(pieces).reshape(-1)
-    return taken(rows, frames.bodies).reshape(-1)
+    return rows[np.array(frames.bodies)].reshape(-1)

@@ -10,12 +10,13 @@ where gamma is the second derivative of g in time without acceleration.
 """
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from vmri_jax.mechanics.invariants import potential_energy, velocity
+from vmri_jax.mechanics.invariants import lagrangian, velocity
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
 
@@ -41,10 +42,6 @@ def motion(system: System, state: State) -> Motion:
     v_s, v_f = velocity(system, state.q_s, state.q_f, state.p_s, state.p_f)
     q, v = jnp.append(state.q_s, state.q_f), jnp.append(v_s, v_f)
 
-    def lagrangian(q, v):
-        q_s, q_f = q[:n_s], q[n_s:]
-        return system.kinetic(q_s, q_f, v[:n_s], v[n_s:], system.params) - potential_energy(system, q_s, q_f)
-
     def constraints(t, q):
         return system.constraints(t, q[:n_s], q[n_s:])
 
@@ -53,9 +50,10 @@ def motion(system: System, state: State) -> Motion:
         return jax.jvp(constraints, (t, q), (jnp.ones_like(t), v))[1]
 
     t = jnp.asarray(state.t)
-    momentum = jax.grad(lagrangian, argnums=1)
+    of_motion = partial(lagrangian, system, n_s)
+    momentum = jax.grad(of_motion, argnums=1)
     mass = jax.jacfwd(momentum, argnums=1)(q, v)
-    forces = jax.grad(lagrangian)(q, v) - jax.jvp(lambda q: momentum(q, v), (q,), (v,))[1]
+    forces = jax.grad(of_motion)(q, v) - jax.jvp(lambda q: momentum(q, v), (q,), (v,))[1]
     if system.force is not None:
         forces += jnp.concatenate(system.forces(t, state.q_s, state.q_f, v_s, v_f))
     jacobian = jax.jacrev(constraints, argnums=1)(t, q)

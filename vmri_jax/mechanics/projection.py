@@ -6,7 +6,8 @@ import jax
 import jax.numpy as jnp
 
 from vmri_jax import kernels
-from vmri_jax.kernels import Full, Sparsity
+from vmri_jax.kernels.band import Full, Sparsity
+from vmri_jax.kernels.saddle import saddle
 from vmri_jax.mechanics.structure import has_constant_hessian
 from vmri_jax.mechanics.system import System
 
@@ -89,15 +90,7 @@ def _time_rates(system: System, t, q_s, q_f):
 
 
 def _velocity_and_impulse(system: System, q_s, q_f, constraints, p, guess):
-    """The v that minimises ``T(v) - p . v`` over ``G v + dg/dt = 0``, and ``G^T mu``; NaN if Newton's iteration does not converge.
-
-    Args:
-        system: with its kinetic energy.
-        q_s, q_f: positions.
-        constraints: G and dg/dt.
-        p: momenta of all variables.
-        guess: velocities from which the iteration starts.
-    """
+    """The v that minimises ``T(v) - p . v`` over ``G v + dg/dt = 0``, and ``G^T mu``, with `constraints` (G, dg/dt); NaN without convergence."""
 
     def kinetic(system, q_s, q_f, v):
         return system.kinetic(q_s, q_f, v[: q_s.size], v[q_s.size :], system.params)
@@ -106,7 +99,7 @@ def _velocity_and_impulse(system: System, q_s, q_f, constraints, p, guess):
     def direction(data, v):
         system, q_s, q_f, jacobian, rates, p = data
         gradient, times_hessian = jax.linearize(jax.grad(lambda v: kinetic(system, q_s, q_f, v)), v)
-        matrix = kernels.saddle(jax.vmap(times_hessian)(jnp.eye(v.size)), jacobian.T, jacobian)
+        matrix = saddle(jax.vmap(times_hessian)(jnp.eye(v.size)), jacobian.T, jacobian)
         rows = jnp.concatenate([p - gradient, -(jacobian @ v + rates)])
         d, mu = jnp.split(kernels.solve(matrix, rows[:, None])[:, 0], [v.size])
         return d, jacobian.T @ mu

@@ -113,8 +113,8 @@ class Rows:
                 piece = q[start : start + self.size]
                 pieces.append(jnp.tile(piece, count) if same else piece)
             else:
-                piece = q[start : start + self.stride * count]
-                pieces.append(self._first(piece, count))
+                whole = q[start : start + self.stride * count].reshape(count, self.stride)
+                pieces.append(whole[:, : self.size].reshape(-1))
         flat = jnp.concatenate(pieces)
         return flat if self.single else flat.reshape(-1, self.size)
 
@@ -129,19 +129,11 @@ class Rows:
             Vectors (n_s,), (n_f,) with the rows added at their places.
         """
         rows, first = jnp.broadcast_to(rows, (sum(run.count for run in self.runs), self.size)), 0
-        sums = {"s": jnp.zeros(n_s), "f": jnp.zeros(n_f)}
+        sums, beyond = {"s": jnp.zeros(n_s), "f": jnp.zeros(n_f)}, self.stride - self.size
         for part, start, count, same in self.runs:
             piece = rows[first : first + count]
-            piece = jnp.sum(piece, axis=0) if same else self._whole(piece).reshape(-1)
+            piece = jnp.sum(piece, axis=0) if same else jnp.pad(piece, ((0, 0), (0, beyond))).reshape(-1)
             after = sums[part].shape[0] - start - piece.shape[0]
             sums[part] += jnp.pad(piece, (start, after))
             first += count
         return tuple(sums.values())
-
-    def _first(self, piece, count: int):
-        """The first `size` coordinates of `count` neighbouring bodies, as a vector."""
-        return piece if self.size == self.stride else piece.reshape(count, self.stride)[:, : self.size].reshape(-1)
-
-    def _whole(self, rows):
-        """(n, stride) with zeros for the coordinates that are not taken."""
-        return rows if self.size == self.stride else jnp.pad(rows, ((0, 0), (0, self.stride - self.size)))

@@ -30,25 +30,9 @@ def called(eqn) -> tuple[Any, Any] | None:
     return getattr(inner, "jaxpr", inner), getattr(inner, "consts", ())
 
 
-def reached(eqn, inputs: list[bool]) -> list[bool]:
-    """Whether each output of an equation of a jaxpr can depend on an input that is marked in `inputs`."""
-    rule, inner = _LOOPS.get(eqn.primitive.name), called(eqn)
-    if rule is not None:
-        return rule(eqn, inputs)
-    return _outputs_reached(inner[0], inputs) if inner else _everything(eqn, inputs)
-
-
-def _everything(eqn, inputs: list[bool]) -> list[bool]:
-    """All outputs depend on all inputs: the rule for unknown operations."""
-    return [any(inputs)] * len(eqn.outvars)
-
-
-def _outputs_reached(jaxpr, inputs: list[bool]) -> list[bool]:
-    known = dict(zip(map(id, jaxpr.invars), inputs, strict=True))
-    for eqn in jaxpr.eqns:
-        outputs = reached(eqn, [known.get(id(v), False) for v in eqn.invars])
-        known.update(zip(map(id, eqn.outvars), outputs, strict=True))
-    return [known.get(id(v), False) for v in jaxpr.outvars]
+def reached(jaxpr, inputs: list[bool]) -> list[bool]:
+    """Whether each output of a jaxpr can depend on an input that is marked in `inputs`."""
+    return [dependence > _CONSTANT for dependence in _classes(jaxpr, [_MIXED if on else _CONSTANT for on in inputs])]
 
 
 def _by_while(eqn, inputs: list[bool]) -> list[bool]:
@@ -57,12 +41,12 @@ def _by_while(eqn, inputs: list[bool]) -> list[bool]:
         of_cond, of_body = eqn.params["cond_nconsts"], eqn.params["body_nconsts"]
         cond, body = eqn.params["cond_jaxpr"].jaxpr, eqn.params["body_jaxpr"].jaxpr
     except KeyError:
-        return _everything(eqn, inputs)
+        return [any(inputs)] * len(eqn.outvars)
     cond_consts, body_consts = inputs[:of_cond], inputs[of_cond : of_cond + of_body]
 
     def once(carry):
-        end = _outputs_reached(cond, cond_consts + carry)[0]
-        return [end or on for on in _outputs_reached(body, body_consts + carry)]
+        end = reached(cond, cond_consts + carry)[0]
+        return [end or on for on in reached(body, body_consts + carry)]
 
     return _over_and_over(once, inputs[of_cond + of_body :])
 
@@ -74,8 +58,8 @@ def _by_scan(eqn, inputs: list[bool]) -> list[bool]:
     num_xs = sum(a.aval.shape != b.aval.shape for a, b in zip(eqn.invars, inner.invars, strict=True))
     first = len(inputs) - num_xs - num_carry
     consts, carry, xs = inputs[:first], inputs[first : first + num_carry], inputs[first + num_carry :]
-    carry = _over_and_over(lambda carry: _outputs_reached(inner, consts + carry + xs)[:num_carry], carry)
-    return carry + _outputs_reached(inner, consts + carry + xs)[num_carry:]
+    carry = _over_and_over(lambda carry: reached(inner, consts + carry + xs)[:num_carry], carry)
+    return carry + reached(inner, consts + carry + xs)[num_carry:]
 
 
 def _over_and_over(once: Callable, carry: list[bool]) -> list[bool]:
@@ -87,7 +71,7 @@ def _over_and_over(once: Callable, carry: list[bool]) -> list[bool]:
 def _by_cond(eqn, inputs: list[bool]) -> list[bool]:
     """Branches: if the index depends on a marked input, all outputs do."""
     index, *operands = inputs
-    cases = [_outputs_reached(branch.jaxpr, operands) for branch in eqn.params["branches"]]
+    cases = [reached(branch.jaxpr, operands) for branch in eqn.params["branches"]]
     return [index or any(case) for case in zip(*cases, strict=True)]
 
 
@@ -100,7 +84,7 @@ def depends_on(function: Callable, *args) -> tuple[bool, ...]:
     if jaxpr.effects:
         return (True,) * len(args)
     of_argument = np.repeat(np.arange(len(args)), [jax.tree.structure(a).num_leaves for a in args])
-    return tuple(any(_outputs_reached(jaxpr, (of_argument == i).tolist())) for i in range(len(args)))
+    return tuple(any(reached(jaxpr, (of_argument == i).tolist())) for i in range(len(args)))
 
 
 def entries_seen(function: Callable, q) -> np.ndarray:
@@ -170,12 +154,8 @@ def _independent(rows: np.ndarray) -> np.ndarray:
 def _combinations(n: int, jaxpr, inputs: list, wanted: list, used: list) -> list:
     """The outputs of a jaxpr as linear combinations of n numbers: coefficients (..., n), None for an output that is no known combination.
 
-    Args:
-        n: number of the numbers.
-        jaxpr: its known operations are those in `_LINEAR`.
-        inputs: of the jaxpr, as coefficients or None.
-        wanted: variables of the outputs that matter.
-        used: gets the combinations that enter any other operation.
+    `inputs` are coefficients or None, `wanted` the variables of the outputs that matter; `used` gets the combinations that enter any operation
+    that is not in `_LINEAR`.
     """
     known = dict(zip(map(id, jaxpr.invars), inputs, strict=True))
     eqns, needed = _needed(jaxpr, wanted)
@@ -257,13 +237,16 @@ def _classes(jaxpr, classes: list[int]) -> list[int]:
     known = dict(zip(map(id, jaxpr.invars), classes, strict=True))
     for eqn in jaxpr.eqns:
         inputs = [known.get(id(v), _CONSTANT) for v in eqn.invars]
-        inner = called(eqn)
-        if max(inputs, default=_CONSTANT) == _CONSTANT:
-            outputs = [_CONSTANT] * len(eqn.outvars)
-        elif inner is not None:
+        inner, loop = called(eqn), _LOOPS.get(eqn.primitive.name)
+        largest = max(inputs, default=_CONSTANT)
+        if inner is not None:
             outputs = _classes(inner[0], inputs)
-        elif eqn.primitive.name in ELEMENTWISE_PRIMITIVES and _MIXED not in inputs:
-            outputs = [_ELEMENT] * len(eqn.outvars)
+        elif loop is not None:
+            outputs = [
+                _MIXED if on else _CONSTANT for on in loop(eqn, [dependence > _CONSTANT for dependence in inputs])
+            ]
+        elif largest == _CONSTANT or eqn.primitive.name in ELEMENTWISE_PRIMITIVES:
+            outputs = [largest] * len(eqn.outvars)
         else:
             outputs = [_MIXED] * len(eqn.outvars)
         known.update(zip(map(id, eqn.outvars), outputs, strict=True))

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 
 from vmri_jax.plots.theme import DARK, LIGHT, ROUNDOFF_FLOOR, NotebookFigure, Theme, legend_beside, new_figure
-from vmri_jax.running.saved_run import SavedRun
+from vmri_jax.running.origin import SavedRun
 
 MOST_NAMED = 12
 """Most curves of a panel that the legend names; of more curves it names this number, evenly chosen. A larger number makes the legend higher

@@ -14,13 +14,11 @@ the steps from the last to the first and needs the state at which each step star
 import warnings
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.custom_derivatives import SymbolicZero
-from jax.flatten_util import ravel_pytree
 
 from vmri_jax.mechanics import invariants
 from vmri_jax.mechanics.arrays import is_concrete
@@ -94,7 +92,7 @@ def _real_leaves(arrays) -> tuple[Callable, dict]:
     def of_real(run):
         return lambda real: run(jax.tree.unflatten(structure, [real.get(i, leaf) for i, leaf in enumerate(leaves)]))
 
-    return of_real, {i: leaf for i, leaf in enumerate(leaves) if _is_real(leaf)}
+    return of_real, {i: jnp.asarray(leaf) for i, leaf in enumerate(leaves) if _is_real(leaf)}
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0, 1))
@@ -137,15 +135,6 @@ _differentiated_by.defvjp(
 )
 
 
-class _Interval(NamedTuple):
-    """From one saved node to the next: the states at both, and cotangents of the node at the end and of its micro nodes."""
-
-    start: State
-    end: State
-    by_end: tuple
-    by_micro: jax.Array
-
-
 @partial(jax.custom_vjp, nondiff_argnums=(0, 1, 2))
 def reversible(run, engine: Engine, save_every: int, arrays) -> Trajectory:
     """``run(arrays)``, whose derivative in reverse mode steps back with -macro_dt from saved node to saved node.
@@ -177,18 +166,10 @@ def _back(engine: Engine, save_every: int, leaves, macro_dt, nodes: State, cotan
     """All steps back: cotangents of the floating-point leaves by number, of the start, and of the macro step.
 
     Jitted for itself: a gradient outside of `jax.jit` would compile these loops at every call.
-
-    Args:
-        engine, save_every: of the run.
-        leaves, macro_dt: of its `Arrays`.
-        nodes: saved states.
-        cotangents: of the fields of the saved nodes, and of the micro nodes.
     """
     at_nodes, at_micro = cotangents
-    real = {i: jnp.asarray(leaf) for i, leaf in enumerate(leaves) if _is_real(leaf)}
-
-    def complete(real: dict) -> list:
-        return [real.get(i, leaf) for i, leaf in enumerate(leaves)]
+    of_real, real = _real_leaves(leaves)
+    complete = of_real(list)
 
     def step(real, state: State, macro_dt):
         stepper = engine.stepper(complete(real), state, reverse_only=True)
@@ -202,28 +183,30 @@ def _back(engine: Engine, save_every: int, leaves, macro_dt, nodes: State, cotan
 
     back = engine.stepper(leaves, jax.tree.map(lambda a: a[0], nodes))
 
-    def interval_back(carry, interval: _Interval):
+    def interval_back(carry, interval):
         by_real, by_state, by_dt = carry
+        # saved nodes, and cotangents of the node at the end and of its micro nodes
+        start, end, by_end, by_micro = interval
         # The saved node at the end contributes its own cotangent before the steps that lead to it.
-        by_real, by_state = _plus((by_real, by_state), jax.vjp(node, real, interval.end)[1](interval.by_end))
+        by_real, by_state = _plus((by_real, by_state), jax.vjp(node, real, end)[1](by_end))
 
         def step_back(number, carry):
             (state, memory), by_real, by_state, by_dt = carry
             if save_every == 1:  # the start of the step is a saved node: nothing has to be reversed
-                state = interval.start
+                state = start
             else:
                 state, info, memory = back.step(state, memory, -macro_dt)
                 state, memory = back.project(state, memory)
                 solved = info.result <= Result.CONVERGED_AT_ROUNDOFF
                 state = jax.tree.map(lambda a: jnp.where(solved, a, jnp.nan), state)
             # Only the last step of the interval saves micro nodes.
-            by_micro = jnp.where(number == 0, interval.by_micro, 0.0)
-            by_real_of_step, by_state, by_dt_of_step = jax.vjp(step, real, state, macro_dt)[1]((by_state, by_micro))
+            by_end_of_step = by_state, jnp.where(number == 0, by_micro, 0.0)
+            by_real_of_step, by_state, by_dt_of_step = jax.vjp(step, real, state, macro_dt)[1](by_end_of_step)
             return (state, memory), *_plus((by_real,), (by_real_of_step,)), by_state, by_dt + by_dt_of_step
 
-        carry = (interval.end, back.init(interval.end, -macro_dt)), by_real, by_state, by_dt
+        carry = (end, back.init(end, -macro_dt)), by_real, by_state, by_dt
         (state, _), *carry = jax.lax.fori_loop(0, save_every, step_back, carry)
-        return tuple(carry), _distance(state, interval.start)
+        return tuple(carry), _distance(state, start)
 
     times = back.scheme.micro_times
     by_micro = jnp.zeros((engine.num_saves, len(times), nodes.q_f.shape[1]))
@@ -234,7 +217,7 @@ def _back(engine: Engine, save_every: int, leaves, macro_dt, nodes: State, cotan
         at_nodes = (at_nodes[0].at[1:].add(t_micro.sum(1)), *at_nodes[1:])
         by_dt -= jnp.sum(t_micro * (1 - times))
     before, after = (jax.tree.map(lambda a, part=part: a[part], nodes) for part in (slice(-1), slice(1, None)))
-    xs = _Interval(before, after, tuple(a[1:] for a in at_nodes), by_micro)
+    xs = before, after, tuple(a[1:] for a in at_nodes), by_micro
     first = jax.tree.map(lambda a: a[0], nodes)
     carry = jax.tree.map(jnp.zeros_like, (real, first)), by_dt
     (by_real, by_state, by_dt), gaps = jax.lax.scan(interval_back, (*carry[0], by_dt), xs, reverse=True)
@@ -284,14 +267,14 @@ def forward(run, arrays) -> Trajectory:
 
 
 def _run_and_jacobian(run, arrays):
-    """The trajectory, and for reverse mode: the arrays, the rows of each array in the Jacobian, the Jacobian of all real outputs."""
+    """The trajectory, and for reverse mode: the arrays, and the Jacobian of all real outputs by the wanted leaves, by number."""
     marked, structure = jax.tree.flatten(arrays, is_leaf=lambda leaf: hasattr(leaf, "perturbed"))
     values = [leaf.value for leaf in marked]
     wanted = {i: jnp.asarray(leaf.value) for i, leaf in enumerate(marked) if leaf.perturbed and _is_real(leaf.value)}
-    flat, unravel = ravel_pytree(wanted)
-    if flat.size > MOST_TANGENTS:
+    numbers = sum(leaf.size for leaf in wanted.values())
+    if numbers > MOST_TANGENTS:
         warnings.warn(
-            f"adjoint='forward' computes one tangent run for each of the {flat.size} numbers that you differentiate by; "
+            f"adjoint='forward' computes one tangent run for each of the {numbers} numbers that you differentiate by; "
             "the cost of 'checkpoint' and 'reversible' does not depend on their number.",
             stacklevel=2,
         )
@@ -300,28 +283,21 @@ def _run_and_jacobian(run, arrays):
         trajectory = run(jax.tree.unflatten(structure, [wanted.get(i, value) for i, value in enumerate(values)]))
         return list(filter(_is_real, jax.tree.leaves(trajectory))), trajectory
 
-    def directional_derivative(direction):
-        _, tangents, trajectory = jax.jvp(real_outputs, (wanted,), (unravel(direction),), has_aux=True)
-        return tangents, trajectory
-
-    derivatives, trajectory = jax.vmap(directional_derivative, out_axes=(0, None))(jnp.eye(flat.size))
-    by_leaf = unravel(jnp.arange(flat.size, dtype=float))
-    rows_of_leaves = [by_leaf[i].astype(int) if i in by_leaf else None for i in range(len(values))]
-    return trajectory, (jax.tree.unflatten(structure, values), rows_of_leaves, derivatives)
+    derivatives, trajectory = jax.jacfwd(real_outputs, has_aux=True)(wanted)
+    return trajectory, (jax.tree.unflatten(structure, values), derivatives)
 
 
 def _contracted(run, residuals, cotangent: Trajectory):
-    arrays, rows_of_leaves, derivatives = residuals
-    real = [
-        jnp.zeros(d.shape[1:]) if isinstance(c, SymbolicZero) else c
-        for c, d in zip(filter(_is_real, jax.tree.leaves(cotangent)), derivatives, strict=True)
-    ]
-    flat = jnp.sum(jnp.stack([jnp.tensordot(d, c, c.ndim) for c, d in zip(real, derivatives, strict=True)]), axis=0)
+    arrays, derivatives = residuals
+    by_outputs = zip(filter(_is_real, jax.tree.leaves(cotangent)), derivatives, strict=True)
+    known = [(c, by_leaf) for c, by_leaf in by_outputs if not isinstance(c, SymbolicZero)]
+
+    def cotangent_of(i: int, value):
+        by_value = [jnp.tensordot(c, by_leaf[i], c.ndim) for c, by_leaf in known if i in by_leaf]
+        return sum(by_value) if by_value else _no_cotangent(value)
+
     values, structure = jax.tree.flatten(arrays)
-    by_values = [
-        _no_cotangent(v) if rows is None else flat[rows] for v, rows in zip(values, rows_of_leaves, strict=True)
-    ]
-    return (jax.tree.unflatten(structure, by_values),)
+    return (jax.tree.unflatten(structure, [cotangent_of(i, value) for i, value in enumerate(values)]),)
 
 
 forward.defvjp(_run_and_jacobian, _contracted, symbolic_zeros=True)

@@ -215,11 +215,7 @@ def _in_chunks(run: Simulation, engine: Engine, batch: dict, width: int, devices
 
 @lru_cache(maxsize=32)
 def _side_by_side(engine: Engine, varies_params: bool, varies_steps: bool, devices: int):
-    """``program(leaves, params, state, macro_dt, save_every)``: a run of `engine` for each lane.
-
-    Args:
-        varies_params, varies_steps: whether each lane has its own parameters, its own macro step.
-    """
+    """``program(leaves, params, state, macro_dt, save_every)``: a run of `engine` for each lane, with or without parameters and steps of its own."""
 
     def lane(leaves, params, state, macro_dt, save_every):
         return jax.tree.leaves(engine.trajectory(Arrays(leaves + params, state, macro_dt), save_every))

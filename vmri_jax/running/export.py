@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from vmri_jax.running.files import replaced
+from vmri_jax.running.origin import SavedRun
 from vmri_jax.running.quantities import Quantities
-from vmri_jax.running.saved_run import SavedRun
 from vmri_jax.steppers.results import Result
 
 DIMENSIONS = {

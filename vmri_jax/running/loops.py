@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from math import ceil, log, prod
 
 import jax
@@ -87,9 +88,8 @@ def _keeps_root(body: Callable) -> Callable:
     return jax.checkpoint(body, policy=jax.checkpoint_policies.save_only_these_names(ROOT), prevent_cse=False)
 
 
-def _keeps_start(body: Callable) -> Callable:
-    """The body, for which reverse mode keeps the carry at its start alone."""
-    return jax.checkpoint(body, prevent_cse=False)
+_keeps_start = partial(jax.checkpoint, prevent_cse=False)
+"""The body of a loop, for which reverse mode keeps the carry at its start alone."""
 
 
 def _as_body(step: Callable) -> Callable:

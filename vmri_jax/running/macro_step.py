@@ -3,7 +3,7 @@
 import jax
 
 from vmri_jax.mechanics.checks import check_type
-from vmri_jax.mechanics.state import State
+from vmri_jax.mechanics.state import A_SYSTEM, State
 from vmri_jax.mechanics.system import System
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
@@ -35,9 +35,7 @@ def macro_step(
     Raises:
         TypeError: no System, or no State.
     """
-    check_type(
-        "macro_step: system", system, System, "a vmri_jax.System; of a scene its .system(), of a problem its .system"
-    )
+    check_type("macro_step: system", system, System, A_SYSTEM)
     check_type("macro_step: state", state, State, "a State, e.g. problem.state()")
     return _macro_step(system, scheme, state, macro_dt, solver or solvers.Auto())
 

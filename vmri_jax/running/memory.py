@@ -3,13 +3,12 @@
 import psutil
 
 from vmri_jax.mechanics.state import State
+from vmri_jax.running.saved import numbers_per_node
 
 BYTES_PER_NUMBER = 8
 UNCHECKED_BYTES = 100e6
 """Bytes of a trajectory up to which free memory is not looked up: the look-up takes some ten microseconds, as long as a short run. With a
 larger value more runs may fill a small machine."""
-OTHER_NUMBERS_PER_NODE = 7
-"""Numbers of a saved node besides positions and momenta: time, energy, two constraint residuals, and three of the solver."""
 
 
 def check_memory(caller: str, state: State, num_micro: int, num_saves: int, save_micro: bool, lanes: int = 1) -> None:
@@ -26,9 +25,7 @@ def check_memory(caller: str, state: State, num_micro: int, num_saves: int, save
     Raises:
         ValueError: the trajectory is larger than the free memory.
     """
-    numbers = 2 * (state.q_s.size + state.q_f.size) + OTHER_NUMBERS_PER_NODE
-    if save_micro:
-        numbers += num_micro * (state.q_f.size + 1)
+    numbers = numbers_per_node(state, num_micro if save_micro else 0)
     needed = BYTES_PER_NUMBER * numbers * (num_saves + 1) * lanes
     if needed < UNCHECKED_BYTES:
         return

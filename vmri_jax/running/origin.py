@@ -3,7 +3,7 @@
 import pickle
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax
@@ -15,6 +15,9 @@ from vmri_jax.mechanics.rows import Part
 from vmri_jax.mechanics.state import HasProblem, Problem, opened
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.settings import Settings
+
+SavedRun: TypeAlias = Any
+"""A `vmri_jax.Trajectory` in annotations of modules that its own module imports."""
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=["bare", "params"], meta_fields=["names", "settings"])
@@ -157,8 +160,7 @@ def _mapped(function, repeated: tuple[bool, ...], structure, static: tuple, arra
 
     mapped = at_node
     for axis in range(jax.tree.leaves(nodes)[0].ndim):
-        lanes = [
-            None if axis == 0 or shared else 0 for shared in repeated
-        ]  # axis 0, the innermost map, runs over the nodes
+        # axis 0, the innermost map, runs over the nodes
+        lanes = [None if axis == 0 or shared else 0 for shared in repeated]
         mapped = jax.vmap(mapped, (lanes, 0))
     return mapped(arrays, nodes)

@@ -19,8 +19,7 @@ from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.summary import has_values, summary
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.micro_nodes import Nodes, why_not, with_micro_nodes
-from vmri_jax.running.origin import Origin, at_nodes
-from vmri_jax.running.saved_run import SavedRun
+from vmri_jax.running.origin import Origin, SavedRun, at_nodes
 
 RANDOM_RATIO = 0.5
 """Von Neumann ratio, mean squared difference of neighbours over variance, above which the values at the nodes count as random: the nodes do
@@ -230,8 +229,7 @@ class Quantities(ABC):
         """
         from vmri_jax.plots import plot_trajectory  # here: its import takes half a second
 
-        run: Any = self.whole()
-        return plot_trajectory(run, title)
+        return plot_trajectory(self.whole(), title)
 
 
 def _concrete(method: str, run: SavedRun) -> SavedRun:
@@ -245,14 +243,7 @@ def _concrete(method: str, run: SavedRun) -> SavedRun:
 
 
 def _of_body(run: SavedRun, body: str, carried: Callable, slow=None, fast=None):
-    """Values (..., k, size) of a body.
-
-    Args:
-        run: the run.
-        body: its name.
-        carried: function of (system, state, kinematics) for bodies in joint coordinates, whose values are functions of the coordinates.
-        slow, fast: values of all coordinates, for every other body.
-    """
+    """Values (..., k, size) of a body: of `slow` and `fast`, values of all coordinates, or of `carried` for a body in joint coordinates."""
     names = run.names
     if body in names.carried:
         slow, fast = tuple(at_nodes(carried, run.origin, run.states, names.kinematics))
@@ -260,12 +251,7 @@ def _of_body(run: SavedRun, body: str, carried: Callable, slow=None, fast=None):
 
 
 def _part(values: Any, place: Place):
-    """Values of one body.
-
-    Args:
-        values: (slow, fast), values of all bodies.
-        place: part and place of the body.
-    """
+    """Values of one body, out of the values (slow, fast) of all bodies."""
     part, start, size = place
     return values[part == "f"][..., start : start + size]
 

@@ -45,7 +45,7 @@ class Saved(NamedTuple):
     @classmethod
     def none(cls, state: State, room: int, num_micro: int | None) -> "Saved":
         """Arrays without nodes. `num_micro` is None unless micro nodes are saved."""
-        row = _empty_row(_numbers_per_row(state))
+        row = _empty_row(numbers_per_node(state))
         micros = None if num_micro is None else jnp.full((room, num_micro, state.q_f.shape[0]), jnp.nan)
         return cls(jnp.broadcast_to(row, (room + 1, row.size)), micros)
 
@@ -88,8 +88,10 @@ class Saved(NamedTuple):
         return Trajectory(State(t, q_s, q_f, p_s, p_f), energy[:, 0], constraint_residual, info, **status, micro=micro)
 
 
-def _numbers_per_row(state: State) -> int:
-    return 2 * (state.q_s.size + state.q_f.size) + SCALARS_PER_NODE + SOLVER_NUMBERS
+def numbers_per_node(state: State, num_micro: int = 0) -> int:
+    """Numbers of a saved node, with `num_micro` micro nodes."""
+    row = 2 * (state.q_s.size + state.q_f.size) + SCALARS_PER_NODE + SOLVER_NUMBERS
+    return row + num_micro * (state.q_f.size + 1)
 
 
 def _empty_row(numbers: int) -> np.ndarray:
@@ -99,5 +101,4 @@ def _empty_row(numbers: int) -> np.ndarray:
 
 def room_of_a_piece(state: State, num_micro: int, save_micro: bool) -> int:
     """Saved intervals that fit into a piece of a run: the same for runs of all lengths, so that they share one program."""
-    numbers = _numbers_per_row(state) + (num_micro * (state.q_f.size + 1) if save_micro else 0)
-    return max(NUMBERS_PER_PIECE // numbers, 1)
+    return max(NUMBERS_PER_PIECE // numbers_per_node(state, num_micro if save_micro else 0), 1)

@@ -6,7 +6,7 @@ import numpy as np
 
 from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.summary import coordinates, listed
-from vmri_jax.running.saved_run import SavedRun
+from vmri_jax.running.origin import SavedRun
 from vmri_jax.steppers.results import Result
 
 

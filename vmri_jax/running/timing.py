@@ -22,7 +22,6 @@ def interleaved(
     runs: Mapping[str, Callable[[], object]],
     repeats: int,
     min_seconds: float = MIN_SECONDS,
-    tell: Tell = silent,
     clock: Callable[[], float] = time.perf_counter,
 ) -> dict[str, list[float]]:
     """Seconds per call of every run, `repeats` samples each, after one call that is not counted.
@@ -34,12 +33,10 @@ def interleaved(
         runs: callables by name; the clock stops when their results are ready (`jax.block_until_ready`).
         repeats: samples of each run.
         min_seconds: seconds of a sample, the mean of several calls.
-        tell: called with the name of each run before its first call.
         clock: `time.process_time` where other processes share the core.
     """
     calls, seconds = {}, {name: [] for name in runs}
     for name, run in runs.items():
-        tell(name)
         seconds_per_call(run, 1, clock)
         calls[name] = max(1, round(min_seconds / seconds_per_call(run, 1, clock)))
     names = list(runs)

@@ -210,7 +210,8 @@ def _advice(sorting: Sorting, rows: ConstraintRows, micro: list[int]) -> str:
     """Advice about constraints on the micro grid that the fast bodies cannot satisfy."""
     fast = [name for name, place in sorting.layout.coordinates.items() if place.part == "f"]
     jacobian = rows.jacobian[micro]
-    involved = jacobian[rank_of(jacobian[:, rows.num_slow :]).dependent]
+    _, dependent = rank_of(jacobian[:, rows.num_slow :])
+    involved = jacobian[dependent]
     touched = {
         name
         for name, place in sorting.layout.coordinates.items()
@@ -232,7 +233,7 @@ def _refuse(rows: ConstraintRows, numbers: list[int], first: int, advice: Callab
         advice: end of the message.
     """
     names, jacobian = rows.names(numbers), rows.jacobian[numbers][:, first:]
-    involved = rank_of(jacobian).dependent
+    _, involved = rank_of(jacobian)
     if not involved:
         return
     all_named = [names[i] for i in involved]
@@ -241,5 +242,5 @@ def _refuse(rows: ConstraintRows, numbers: list[int], first: int, advice: Callab
     among = "among " if len(named) < len(involved) else ""
     raise ValueError(
         f"Scene: over-constrained at the start: {_listed(named)} are {among}{len(involved)} constraints of "
-        f"rank {rank_of(jacobian[involved]).rank}; {advice()}."
+        f"rank {rank_of(jacobian[involved])[0]}; {advice()}."
     )

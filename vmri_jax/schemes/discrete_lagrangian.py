@@ -127,13 +127,16 @@ class QuadraticKinetic:
         slopes = lagrange_derivative(self.nodes.degree, theta)
         return jnp.sum(weights[:, None, None] * (slopes[:, :, None] * slopes[:, None, :]), axis=0)
 
-    def rows(self, slow, fast):
-        """The derivatives ``sum_j k_ij M Delta_j``: by the slow increments (r, n_s) times H, by the fast ones (..., r, n_f) times h."""
-        slow, fast = self.mass.momentum(slow, fast)
-        return matmul(self.slow_form[1:, 1:], slow), matmul(self.fast_form[1:, 1:], fast)
+    def slow_rows(self, slow):
+        """The derivatives ``sum_j k_ij M Delta_j`` by the slow increments (r, n_s), times H."""
+        return matmul(self.slow_form[1:, 1:], self.mass.slow_mass.times(slow))
+
+    def fast_rows(self, fast):
+        """The derivatives ``sum_j k_ij M Delta_j`` by the fast increments (..., r, n_f), times h."""
+        return matmul(self.fast_form[1:, 1:], self.mass.fast_mass.times(fast))
 
     def __call__(self, path: Path):
-        slow, fast = self.rows(path.slow, path.fast)
+        slow, fast = self.slow_rows(path.slow), self.fast_rows(path.fast)
         return (jnp.sum(path.slow * slow) + self.nodes.num_micro * jnp.sum(path.fast * fast)) / (2 * path.macro_dt)
 
     at_nodes_inside = __call__

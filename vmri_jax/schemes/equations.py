@@ -130,17 +130,23 @@ class StepEquations(eqx.Module):
     def evaluate(self, x: Unknowns):
         """Residual of the equations (times h in the momentum rows), and momenta ``D_last A`` at the end of the step."""
         slow, fast = self.slots(x)
-        path = self.path(x)
-        q_s, q_f = path.control_points()
+        g, g_slow = self.constraints(x)
         # momentum that arrives at each micro interval, times h: p_f, then D_last of the interval before
         incoming = jnp.concatenate([self.micro_dt * self.p_f[None], fast[:-1, -1]])
         residual = Unknowns(
             slow=slow[:-1].at[0].add(self.micro_dt * self.p_s),
-            slow_multiplier=jax.vmap(self.system.g_slow)(path.slow_control_times()[1:], path.slow_control_points()[1:]),
+            slow_multiplier=g_slow,
             fast=fast[:, :-1].at[:, 0].add(incoming),
-            multiplier=jax.vmap(self.system.g)(path.control_times()[1:], q_s[1:], q_f[1:]).reshape(x.multiplier.shape),
+            multiplier=g.reshape(x.multiplier.shape),
         )
         return residual, (slow[-1] / self.micro_dt, fast[-1, -1] / self.micro_dt)
+
+    def constraints(self, x: Unknowns):
+        """Values of g (num_micro r, n_g) and of g_s (r, n_gs) at all control nodes but the first."""
+        path = self.path(x)
+        q_s, q_f = path.control_points()
+        g = jax.vmap(self.system.g)(path.control_times()[1:], q_s[1:], q_f[1:])
+        return g, jax.vmap(self.system.g_slow)(path.slow_control_times()[1:], path.slow_control_points()[1:])
 
     def residual(self, x: Unknowns) -> Unknowns:
         """Left-hand sides of the equations at x."""
@@ -184,12 +190,6 @@ def multiplier_scales(scheme: Scheme, macro_dt, before: Number = 0.0):
     shared = w[:-1] + (1 + first * (before / macro_dt - 1)) * starts * w[-1]
     slow_shared = w_slow[:-1] + before / macro_dt * np.eye(1, w_slow.size - 1)[0] * w_slow[-1]
     return h**2 * shared[..., None], macro_dt**2 * slow_shared[:, None]
-
-
-def physical_multipliers(scheme: Scheme, macro_dt, multiplier, slow_multiplier):
-    """Multipliers lambda (num_micro, r, n_g) and nu (r, n_gs) of ``g`` and ``g_s`` from the scaled unknowns."""
-    scale, slow_scale = multiplier_scales(scheme, macro_dt)
-    return multiplier / scale, slow_multiplier / slow_scale
 
 
 def slow_basis_at_control_nodes(num_micro: int, degree: int) -> np.ndarray:

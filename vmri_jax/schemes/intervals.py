@@ -20,6 +20,7 @@ Terms of slow variables alone, such as `System.slow_kinetic`, belong to no inter
 These are the equations of `vmri_jax.schemes.equations`, in the order in which a march over the intervals meets them.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -173,11 +174,7 @@ class Intervals:
     def __init__(self, equations: StepEquations):
         self.equations = equations
         terms = lagrangian(equations.system, equations.scheme).terms
-        self._masses = None  # kinetic energy of constant masses: their operators and quadratic forms, slow and fast
-        for term in terms:
-            if isinstance(term, QuadraticKinetic):
-                slow, fast = term.mass.slow_mass, term.mass.fast_mass
-                self._masses = (slow, term.slow_form[1:, 1:]), (fast, term.fast_form[1:, 1:])
+        self._kinetic = next((term for term in terms if isinstance(term, QuadraticKinetic)), None)
         inner = [term for term in terms if isinstance(term, Term) and term.inside.groups]
         of_slow = [all(name.endswith("_s") for name in term.arguments) for term in inner]
         self._slow_terms = [term for term, alone in zip(inner, of_slow, strict=True) if alone]
@@ -216,9 +213,8 @@ class Intervals:
         path = IntervalPath(self.seen.take(equations.q_s), slow, arriving.q_f, x.fast)
         d = jax.grad(self._action)(path, path, x.multiplier, m)
         d_fast = d.fast
-        if self._masses is not None:
-            mass, form = self._masses[1]
-            d_fast += matmul(form, mass.times(x.fast))
+        if self._kinetic is not None:
+            d_fast += self._kinetic.fast_rows(x.fast)
         # h (p + D_{F_0} A_m), then h D_{F_j} A_m, 0 < j <= r; the last one is the momentum that is handed on
         slots = jnp.concatenate([(arriving.p_f + d.fast_start - d_fast.sum(0))[None], d_fast])
         residual = IntervalUnknowns(slots[:-1], self._constraints(path, m, slice(1, None)))
@@ -230,23 +226,18 @@ class Intervals:
         equations = self.equations
         total = jnp.zeros(())
         for term, nodes in self._terms:
-
-            def of_term(path, term=term, nodes=nodes):
-                values = jax.vmap(term.integrand)(*nodes.sample(path, equations, self.seen, m, term.arguments))
-                return term.sign * term.times_step(equations.macro_dt) * jnp.sum(of_interval(nodes.weights, m) * values)
-
-            total += _where_there_are_nodes(nodes, m, of_term, path)
+            total += _where_there_are_nodes(nodes, m, partial(self._of_term, term, nodes, m), path)
         for nodes in self._force_nodes:
-
-            def of_force(paths, nodes=nodes):
-                path, held = paths
-                return self._virtual_work(path, held, nodes, m)
-
-            total += _where_there_are_nodes(nodes, m, of_force, (path, held))
+            total += _where_there_are_nodes(nodes, m, partial(self._virtual_work, nodes, m), path, held)
         total *= equations.micro_dt
         if equations.system.constraint is not None:
             total -= jnp.sum(mu * self._constraints(path, m, slice(0, -1)))
         return total
+
+    def _of_term(self, term: Term, nodes: IntervalNodes, m, path: IntervalPath):
+        equations = self.equations
+        values = jax.vmap(term.integrand)(*nodes.sample(path, equations, self.seen, m, term.arguments))
+        return term.sign * term.times_step(equations.macro_dt) * jnp.sum(of_interval(nodes.weights, m) * values)
 
     def _slow_action(self, slow_start, slow):
         """h times the action of the terms of slow variables alone, ``h H sum_i w_i T_s(S(c_i H), S'(c_i H))``."""
@@ -255,7 +246,7 @@ class Intervals:
         path = Path(equations.t, equations.macro_dt, slow_start, slow, none, none[:, None])
         return equations.micro_dt * sum(term.at_nodes_inside(path) for term in self._slow_terms)
 
-    def _virtual_work(self, path: IntervalPath, held: IntervalPath, nodes: IntervalNodes, m):
+    def _virtual_work(self, nodes: IntervalNodes, m, path: IntervalPath, held: IntervalPath):
         """``H sum_i w_i F(t_i, q_i, v_i) . q_i``."""
         equations = self.equations
         at_nodes = nodes.sample(held, equations, self.seen, m, ("t", "q_s", "q_f", "v_s", "v_f"))
@@ -288,9 +279,8 @@ class Intervals:
         start, d = (
             self.seen.put(a, jnp.zeros((*a.shape[:-1], equations.q_s.size))) for a in (arriving.start, arriving.slow)
         )
-        if self._masses is not None:
-            mass, form = self._masses[0]
-            d += matmul(form, mass.times(slow)) / equations.scheme.num_micro
+        if self._kinetic is not None:
+            d += self._kinetic.slow_rows(slow) / equations.scheme.num_micro
         if self._slow_terms:
             by_start, by_slow = jax.grad(self._slow_action, argnums=(0, 1))(equations.q_s, slow)
             start, d = start + by_start, d + by_slow
@@ -304,8 +294,8 @@ class Intervals:
         return (rows, jax.vmap(equations.system.g_slow)(times[1:], nodes[1:])), p_s
 
 
-def _where_there_are_nodes(nodes: IntervalNodes, m, function, path):
-    """``function(path)``, or zero without evaluation in intervals where the rule has no nodes."""
+def _where_there_are_nodes(nodes: IntervalNodes, m, function, *paths):
+    """``function(*paths)``, or zero without evaluation in intervals where the rule has no nodes."""
     if nodes.has_nodes.all():
-        return function(path)
-    return jax.lax.cond(jnp.asarray(nodes.has_nodes)[m], function, lambda _: jnp.zeros(()), path)
+        return function(*paths)
+    return jax.lax.cond(jnp.asarray(nodes.has_nodes)[m], function, lambda *_: jnp.zeros(()), *paths)

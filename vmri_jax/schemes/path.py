@@ -179,16 +179,13 @@ def velocity_nodes(placed: PlacedRule, num_micro: int, degree: int) -> Nodes:
     Raises:
         ValueError: a macro rule with a node on the border of two micro intervals.
     """
-    if placed.grid == "micro":
-        groups = tuple(_on_every_interval(placed, i, num_micro) for i in range(len(placed.rule.nodes)))
-    else:
-        groups = tuple(_on_one_interval(placed.rule, i, num_micro) for i in range(len(placed.rule.nodes)))
-        for g in groups:
-            if g.c == 0.0 and g.first > 0:
-                raise ValueError(
-                    f"macro rule: node {g.first / num_micro} falls on the border of two of the {num_micro} micro intervals, "
-                    "where the velocity is not defined; place this term with micro(...) or choose another rule."
-                )
+    groups = tuple(_group(placed, i, num_micro) for i in range(len(placed.rule.nodes)))
+    for g in groups:
+        if g.c == 0.0 and g.first > 0:
+            raise ValueError(
+                f"macro rule: node {g.first / num_micro} falls on the border of two of the {num_micro} micro intervals, "
+                "where the velocity is not defined; place this term with micro(...) or choose another rule."
+            )
     return Nodes(groups, num_micro, degree)
 
 
@@ -209,23 +206,20 @@ def position_nodes(placed: PlacedRule, num_micro: int, degree: int) -> tuple[Any
     has_start, has_end = rule.nodes[0] <= NODE_TOLERANCE, rule.nodes[-1] >= 1 - NODE_TOLERANCE
     start = rule.weights[0] / size if has_start else None
     end = rule.weights[-1] / size if has_end else None
-    inside = range(has_start, len(rule.nodes) - has_end)
-    if placed.grid == "macro":
-        groups = [_on_one_interval(rule, i, num_micro) for i in inside]
-    else:
-        groups = [_on_every_interval(placed, i, num_micro) for i in inside]
-        if size > 1 and (has_start or has_end):
-            meeting = sum(w for w in (start, end) if w is not None)
-            groups.insert(0, NodeGroup(0.0, every, num_micro, jnp.full(size - 1, meeting), every))
+    groups = [_group(placed, i, num_micro) for i in range(has_start, len(rule.nodes) - has_end)]
+    if size > 1 and (has_start or has_end):
+        meeting = sum(w for w in (start, end) if w is not None)
+        groups.insert(0, NodeGroup(0.0, every, num_micro, jnp.full(size - 1, meeting), every))
     return start, Nodes(tuple(groups), num_micro, degree), end
 
 
-def _on_every_interval(placed: PlacedRule, i: int, num_micro: int) -> NodeGroup:
+def _group(placed: PlacedRule, i: int, num_micro: int) -> NodeGroup:
     """Node i of the rule, in each of its copies."""
-    node, weight, copies = placed.rule.nodes[i], placed.rule.weights[i], placed.copies(num_micro)
-    weights = jnp.full(copies, weight / copies)
-    m, c = _interval_of(node, placed.every)
-    return NodeGroup(c, m, num_micro, weights, placed.every)
+    if placed.grid == "macro":
+        return _on_one_interval(placed.rule, i, num_micro)
+    copies = placed.copies(num_micro)
+    m, c = _interval_of(placed.rule.nodes[i], placed.every)
+    return NodeGroup(c, m, num_micro, jnp.full(copies, placed.rule.weights[i] / copies), placed.every)
 
 
 def _on_one_interval(rule: Rule, i: int, num_micro: int) -> NodeGroup:

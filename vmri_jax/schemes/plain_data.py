@@ -10,6 +10,8 @@ from vmri_jax.schemes.scheme import Scheme
 
 RULES = ("kinetic", "slow", "fast", "constraint", "slow_constraint", "force")
 """Placed rules of every scheme."""
+PLACEMENT = ("grid", "mollified", "gradient_corrected", "every")
+"""Fields of a placed rule besides the rule."""
 
 
 def to_plain(scheme: Scheme | Composition) -> dict[str, Any]:
@@ -40,18 +42,10 @@ def from_plain(data: dict[str, Any]) -> Scheme | Composition:
 
 def _plain_rule(placed: PlacedRule) -> dict[str, Any]:
     """A rule with its grid."""
-    return {
-        "nodes": list(placed.rule.nodes),
-        "weights": np.asarray(placed.rule.weights).tolist(),
-        "grid": placed.grid,
-        "mollified": placed.mollified,
-        "gradient_corrected": placed.gradient_corrected,
-        "every": placed.every,
-    }
+    rule = {"nodes": list(placed.rule.nodes), "weights": np.asarray(placed.rule.weights).tolist()}
+    return rule | {name: getattr(placed, name) for name in PLACEMENT}
 
 
 def _placed_rule(data: dict[str, Any]) -> PlacedRule:
     """The inverse of `_plain_rule`."""
-    rule = Rule(data["nodes"], np.asarray(data["weights"]))
-    kind = {name: data[name] for name in ("grid", "mollified", "gradient_corrected", "every")}
-    return PlacedRule(rule, **kind)
+    return PlacedRule(Rule(data["nodes"], np.asarray(data["weights"])), **{name: data[name] for name in PLACEMENT})

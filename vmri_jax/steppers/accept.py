@@ -15,7 +15,7 @@ Solvers compute the next correction from the residual, or extrapolate it from th
 that no longer shrink near round-off (`Accepted.at_floor`).
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -89,20 +89,6 @@ class Accepted(NamedTuple):
         roundoff = (ROUNDOFF * jnp.finfo(float).eps * floor for floor in (*floors, largest))
         return cls(newton.tolerance / SAFETY, *roundoff)
 
-    def allowed(self, motions, iterations) -> tuple[Any, Any]:
-        """The largest accepted corrections (slow, fast): the right-hand sides of the formula at the top of this module.
-
-        Args:
-            motions: largest increments (slow, fast).
-            iterations: iterations so far.
-        """
-        numbers = jnp.finfo(float)
-        at_rest = numbers.eps * jnp.maximum(*motions) + numbers.tiny
-        late = (iterations >= ITERATIONS_BEFORE_TIED_ROUNDOFF) * 1
-        floors = self.slow[late], self.fast[late]
-        slow, fast = (self.tolerance * size + floor + at_rest for size, floor in zip(motions, floors, strict=True))
-        return slow, fast
-
     def at_floor(self, size, before, floor=FLOOR):
         """Whether corrections no longer shrink, from `before` to `size`, and are at most `floor` units ``eps max |positions|``, or `FLOOR`
         units of the round-off of constraints.
@@ -119,13 +105,19 @@ class Accepted(NamedTuple):
         return size <= floor / ROUNDOFF * self.roundoff  # `roundoff` counts ROUNDOFF of these units
 
     def ratio(self, changes, motions, iterations):
-        """Ratio of the next corrections (slow, fast) to the allowed ones, the larger of the two: at most 1 if both are accepted.
+        """Ratio of the next corrections (slow, fast) to the right-hand sides of the formula at the top of this module, the larger of the two.
 
         Args:
             changes: largest next corrections (slow, fast).
-            motions, iterations: as in `allowed`.
+            motions: largest increments (slow, fast).
+            iterations: iterations so far.
         """
-        return jnp.maximum(*(c / size for c, size in zip(changes, self.allowed(motions, iterations), strict=True)))
+        numbers = jnp.finfo(float)
+        at_rest = numbers.eps * jnp.maximum(*motions) + numbers.tiny
+        late = (iterations >= ITERATIONS_BEFORE_TIED_ROUNDOFF) * 1
+        floors = self.slow[late], self.fast[late]
+        allowed = (self.tolerance * size + floor + at_rest for size, floor in zip(motions, floors, strict=True))
+        return jnp.maximum(*(change / largest for change, largest in zip(changes, allowed, strict=True)))
 
 
 def constraint_length(equations: StepEquations):

@@ -26,7 +26,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from vmri_jax.kernels import inverse, matmul, max_abs, regularized
+from vmri_jax.kernels import inverse, matmul, max_abs
+from vmri_jax.kernels.saddle import regularized
 from vmri_jax.mechanics.structure import curved_directions
 from vmri_jax.schemes.discrete_lagrangian import Term, lagrangian
 from vmri_jax.schemes.equations import StepEquations, Unknowns
@@ -36,7 +37,7 @@ from vmri_jax.steppers.interval import constant_mass
 from vmri_jax.steppers.results import RUNNING, Method
 from vmri_jax.steppers.solved import Solution, Solver, status_of
 from vmri_jax.steppers.solvers import Newton
-from vmri_jax.steppers.time_modes import TimeModes, product, taken, times_i
+from vmri_jax.steppers.time_modes import TimeModes, product, times_i
 
 
 class JoinedEquations:
@@ -194,7 +195,7 @@ class Saddles(NamedTuple):
 
         def of_parts(z):
             """(modes, rows, columns) as (columns, rows, k)."""
-            return taken(jnp.swapaxes(z, 0, 2), modes.mode)
+            return jnp.swapaxes(z, 0, 2)[..., modes.mode]
 
         bent = matmul(along, bend)
         denominator = inverse(np.eye(d) - 2 * re * bent + (re**2 + im**2) * matmul(bent, bent))
@@ -225,9 +226,8 @@ class Saddles(NamedTuple):
         # (1 - gamma L Q)^-1 z = |1 - gamma L Q|^-2 (1 - conj(gamma) L Q) z
         z = z - self._times_gamma(matmul(self.bend, z), -1)
         products = (a * row for a, row in zip(self.denominator, z, strict=True))
-        z = reduce(
-            jnp.add, products, jnp.zeros_like(z)
-        )  # written out: inside jnp.sum XLA would recompute z for every row
+        # written out: inside jnp.sum XLA would recompute z for every row
+        z = reduce(jnp.add, products, jnp.zeros_like(z))
         # nu = schur (g - G y - gamma G Q z), then gamma z with the part of nu, then x = y + Q gamma z + M^-1 G^T nu
         nu = product(self.schur, g - matmul(self.push_bend, self._times_gamma(z)))
         z = self._times_gamma(z + product(self.pull_bend, nu))
@@ -259,9 +259,8 @@ class Evaluated(NamedTuple):
     result: Int[Array, ""]
 
 
-def at_nodes(function):
-    """`function` mapped over the nodes, the last axis."""
-    return jax.vmap(function, in_axes=-1, out_axes=-1)
+at_nodes = partial(jax.vmap, in_axes=-1, out_axes=-1)
+"""Maps a function over the nodes, the last axis."""
 
 
 def only_if(wanted, function, x):

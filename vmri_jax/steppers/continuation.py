@@ -2,7 +2,7 @@
 
 A step may have several solutions; the physical one is connected to the straight motion of a short step. If plain iteration from the
 guess fails, the solver solves the equations of a shorter step, then of longer and longer ones, each from the scaled solution of the one
-before and with damping (Deuflhard, *Newton Methods for Nonlinear Problems*, 2011, chapters 3 and 5). The stride doubles after a success
+before (Deuflhard, *Newton Methods for Nonlinear Problems*, 2011, chapter 5). The stride doubles after a success
 and halves after a failure. Plain iteration and continuation are one loop, compiled once; a step that converges at once takes one turn.
 
 The first attempt is the whole step from the prediction of the steps before, the second the whole step from straight motion, all further
@@ -107,21 +107,18 @@ def stretched(x: Unknowns, factor) -> Unknowns:
     return Unknowns(slow=factor * x.slow, fast=factor * x.fast, **multipliers)
 
 
-def has_dependent_constraints(equations: StepEquations):
-    """Whether dg/dq_f or dg_s/dq_s at the start of the step has linearly dependent rows.
-
-    The fast variables alone must be able to satisfy g on the micro grid, the slow ones g_s.
-    """
-    system, q_s, q_f = equations.system, equations.q_s, equations.q_f
-    g_s, g_f = jax.jacrev(system.g, argnums=(1, 2))(equations.t, q_s, q_f)
-    g_slow = jax.jacrev(system.g_slow, argnums=1)(equations.t, q_s)
-    return is_rank_deficient(g_f, g_s, RANK) | is_rank_deficient(g_slow, tolerance=RANK)
-
-
 def with_dependent_constraints(equations: StepEquations, status: StepStatus) -> StepStatus:
     """The status of a step, with RANK_DEFICIENT as the result if it failed and constraints are dependent."""
-    if not equations.system.is_constrained:
+    system, q_s, q_f = equations.system, equations.q_s, equations.q_f
+    if not system.is_constrained:
         return status
+
+    def has_dependent_constraints():
+        # the fast variables alone must be able to satisfy g on the micro grid, the slow ones g_s
+        g_s, g_f = jax.jacrev(system.g, argnums=(1, 2))(equations.t, q_s, q_f)
+        g_slow = jax.jacrev(system.g_slow, argnums=1)(equations.t, q_s)
+        return is_rank_deficient(g_f, g_s, RANK) | is_rank_deficient(g_slow, tolerance=RANK)
+
     failed = (status.result > Result.CONVERGED_AT_ROUNDOFF) & starts_finite(equations)
-    dependent = jax.lax.cond(failed, lambda: has_dependent_constraints(equations), lambda: jnp.asarray(False))
+    dependent = jax.lax.cond(failed, has_dependent_constraints, lambda: jnp.asarray(False))
     return status._replace(result=jnp.where(dependent, Result.RANK_DEFICIENT, status.result))

@@ -1,12 +1,11 @@
 """Newton's iteration over all unknowns of a macro step at once; where it fails, over parts of the step (`continuation`)."""
 
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Int
 
 from vmri_jax.kernels import max_abs
 from vmri_jax.mechanics.arrays import Number
@@ -23,8 +22,6 @@ MARGIN = 100.0
 with a smaller one the test trusts an update that is small by chance."""
 PLAIN_ITERATIONS = 15
 """Most Newton iterations of each attempt at the whole step, before parts of the step are tried. A larger number makes failing runs slower."""
-LEAST_DAMPING = 1 / 64
-"""Smallest damping factor of an update. If the next update is still not smaller, the iteration has failed; a smaller value delays that."""
 
 
 @dataclass(frozen=True)
@@ -49,23 +46,22 @@ class Coupled(Solver):
         """(x, `Result`, iterations)."""
         newton = self.newton
         if newton.fixed_iterations is not None:
-            return self._iterate(equations, guess, newton.max_iterations, damped=False)
+            x, result, iterations = self._iterate(equations, guess, newton.max_iterations)
+            return x, ended(result), iterations
 
         def iterate(equations, guess, limit, is_first):
-            x, result, k = self._iterate(equations, guess, limit, ~is_first)
+            x, result, k = self._iterate(equations, guess, limit)
             return x, x, result, k
 
         done = solve_in_parts(equations, guess, guess, iterate, newton.max_iterations, PLAIN_ITERATIONS)
         return done.solution, done.result, done.iterations
 
-    def _iterate(self, equations: StepEquations, guess: Unknowns, limit, damped):
+    def _iterate(self, equations: StepEquations, guess: Unknowns, limit):
         """Newton's iteration from a guess: (x, `Result`, iterations).
 
         Converged when the sum of all further updates is accepted (`Accepted`). With ``theta = |d_k| / |d_(k-1)|``, every further update
         is expected to shrink by ``s = theta min(1, MARGIN theta)``: quadratic convergence with a margin, linear convergence at worst.
         The sum is ``|d_k| s / (1 - s)``.
-
-        If `damped`, an update is taken back and halved when the next update is not smaller (natural monotonicity test).
         """
         newton, accepted = self.newton, Accepted.of(equations, self.newton)
 
@@ -74,23 +70,13 @@ class Coupled(Solver):
             residual = equations.residual(last.x)
             d = dense.solve(dense.factor(equations, last.x), residual)
             x = jax.tree.map(jnp.add, last.x, d)
-            changes, motions = _slow_and_fast(d), _slow_and_fast(x)
-            size = accepted.ratio(changes, motions, last.iterations + 1)
-            # the step to last.x with damping lambda is taken back unless |d_(k+1)| < (1 - lambda / 4) |d_k|
-            back = damped & ~(size < (1 - last.damping / 4) * last.size)
-            damping = jnp.where(back, last.damping / 2, jnp.minimum(2 * last.damping, 1.0))
+            changes, motions, iterations = _slow_and_fast(d), _slow_and_fast(x), last.iterations + 1
+            size = accepted.ratio(changes, motions, iterations)
             is_roundoff = accepted.is_roundoff(jnp.maximum(*changes))
-            result = _result(
-                last, size, damping, residual, is_roundoff=is_roundoff, is_last=last.iterations + 1 >= limit, back=back
-            )
-            base, d = jax.tree.map(partial(jnp.where, back), (last.base, last.update), (last.x, d))
-            x = jax.tree.map(lambda a, b: a + damping * b, base, d)
-            return Iterate(x, base, d, jnp.where(back, last.size, size), damping, last.iterations + 1, result)
+            result = _result(last, size, residual, is_roundoff=is_roundoff, is_last=iterations >= limit)
+            return Iterate(x, size, iterations, result)
 
-        start = Iterate(guess, guess, guess, jnp.inf, jnp.ones(()), jnp.asarray(0), jnp.asarray(RUNNING))
-        done = newton.iterate(iterate, start)
-        if newton.fixed_iterations is not None:
-            done = done._replace(result=ended(done.result))
+        done = newton.iterate(iterate, Iterate(guess, jnp.asarray(jnp.inf), jnp.asarray(0), jnp.asarray(RUNNING)))
         return done.x, done.result, done.iterations
 
     def describe(self) -> list[str]:
@@ -98,18 +84,10 @@ class Coupled(Solver):
 
 
 class Iterate(NamedTuple):
-    """An iterate ``x = base + damping update``.
-
-    base: the last iterate that was not taken back.
-    update: the Newton update d of `base`.
-    size: size of `update`, as the ratio to the accepted correction.
-    """
+    """An iterate; `size` is the size of the update that led to it, as the ratio to the accepted correction."""
 
     x: Unknowns
-    base: Unknowns
-    update: Unknowns
     size: Number
-    damping: Float[Array, ""]
     iterations: Int[Array, ""]
     result: Int[Array, ""]
 
@@ -119,31 +97,20 @@ def _slow_and_fast(x: Unknowns):
     return max_abs(x.slow), max_abs(x.fast)
 
 
-def _result(last: Iterate, size, damping, residual: Unknowns, *, is_roundoff, is_last, back):
-    """`Result` of an iteration, or RUNNING.
-
-    Args:
-        last: the iterate before.
-        size: size of the new update, as the ratio to the accepted correction.
-        damping: of the next update.
-        residual: at the iterate before.
-        is_roundoff: whether the new update is round-off of the positions.
-        is_last: whether no iterations are left.
-        back: whether the iterate before is taken back.
-    """
+def _result(last: Iterate, size, residual: Unknowns, *, is_roundoff, is_last):
+    """`Result` of an iteration, or RUNNING, from the iterate before, its residual and the `size` of the new update as in `Iterate`."""
     # sum of all further updates, |d_k| s / (1 - s) with s = theta min(1, MARGIN theta)
     theta = size / jnp.maximum(last.size, jnp.finfo(float).tiny)
     s = theta * jnp.minimum(1.0, MARGIN * theta)
     predicted = jnp.where(theta < 1, size * s / (1 - s), jnp.inf)
-    # without two full updates theta is unknown: the update itself bounds the error
-    error = jnp.where((last.iterations == 0) | (last.damping < 1), size, predicted)
+    # without two updates theta is unknown: the update itself bounds the error
+    error = jnp.where(last.iterations == 0, size, predicted)
 
     exhausted = jnp.where(size > last.size, Result.DIVERGED, Result.STAGNATED)
     result = jnp.where(is_last, exhausted, RUNNING)
-    result = jnp.where(damping < LEAST_DAMPING, Result.DIVERGED, result)
     result = jnp.where((theta > 0.5) & is_roundoff, Result.CONVERGED_AT_ROUNDOFF, result)
     result = jnp.where(error <= 1, Result.CONVERGED, result)
 
     functions_finite = jnp.isfinite(max_abs(residual.slow) + max_abs(residual.fast))
     broken = jnp.where(functions_finite, Result.SINGULAR, Result.NON_FINITE)
-    return jnp.where(jnp.isfinite(size) | (back & (result == RUNNING)), result, broken)
+    return jnp.where(jnp.isfinite(size), result, broken)

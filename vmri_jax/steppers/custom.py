@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import jax
 import numpy as np
@@ -14,36 +13,20 @@ from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
 from vmri_jax.schemes.discrete_lagrangian import lagrangian
 from vmri_jax.schemes.scheme import Scheme
-from vmri_jax.steppers.kicked import Kicked
+from vmri_jax.steppers.kicked import Kicked, KickedState
 from vmri_jax.steppers.solved import Solved, Solver
-from vmri_jax.steppers.stepper import StepInfo, Stepper
+from vmri_jax.steppers.stepper import Stepper
 
 
-@dataclass(frozen=True)
-class Projecting(Stepper):
-    """A stepper without a method `project`, with the projection of momenta onto the hidden constraints added."""
+@dataclass(frozen=True, kw_only=True)
+class Projecting(Kicked):
+    """Kicks around a stepper without a method `project`, with the projection of momenta onto the hidden constraints added."""
 
-    inner: Stepper
     system: System
 
-    def init(self, state: State, macro_dt) -> Any:
-        return self.inner.init(state, macro_dt)
-
-    def renew(self, state: State, memory, macro_dt) -> Any:
-        return self.inner.renew(state, memory, macro_dt)
-
-    def advance(self, state: State, memory, macro_dt) -> tuple[State, StepInfo, Any]:
-        return self.inner.advance(state, memory, macro_dt)
-
-    def project(self, state: State, memory) -> tuple[State, Any]:
+    def project(self, state: State, memory: KickedState) -> tuple[State, KickedState]:
         p_s, p_f, _, _ = project_momentum(self.system, state)
         return State(state.t, state.q_s, state.q_f, p_s, p_f), memory
-
-    def continued(self, memory, last, state: State, macro_dt) -> Any:
-        return self.inner.continued(memory, last, state, macro_dt)
-
-    def describe(self) -> list[str]:
-        return self.inner.describe()
 
 
 def whole_step(
@@ -74,7 +57,7 @@ def whole_step(
     if not isinstance(made, Kicked):
         made = Kicked((), made)
     if system.is_constrained and type(made.inner).project is Stepper.project:
-        made = replace(made, inner=Projecting(made.inner, system))
+        made = Projecting(made.kicks, made.inner, made.average, system=system)
     made = replace(made, projects=system.is_constrained)
     _check_shapes(made, system, scheme, state)
     return made
@@ -89,15 +72,14 @@ def _check_shapes(stepper: Stepper, system: System, scheme: Scheme, state: State
         return end, info
 
     end, info = jax.eval_shape(step, state)
-    expected = {f"State.{name}": np.shape(getattr(state, name)) for name in ("t", "q_s", "q_f", "p_s", "p_f")}
     micro = scheme.num_micro
-    expected |= {"StepInfo.q_f_micro": (micro, n_f), "StepInfo.multiplier": (micro, r, n_g)}
-    expected |= {"StepInfo.slow_multiplier": (r, n_gs)}
-    for name, shape in expected.items():
-        owner, field = name.split(".")
-        returned = np.shape(getattr(end if owner == "State" else info, field))
+    of_info = {"q_f_micro": (micro, n_f), "multiplier": (micro, r, n_g), "slow_multiplier": (r, n_gs)}
+    expected = [(end, name, np.shape(value)) for name, value in vars(state).items()]
+    expected += [(info, name, shape) for name, shape in of_info.items()]
+    for owner, name, shape in expected:
+        returned = np.shape(getattr(owner, name))
         if returned != shape:
             raise ValueError(
-                f"plan: advance of the stepper of solvers.Custom returns {name} of shape {returned}; it must be {shape} for num_micro = {micro}, "
+                f"plan: advance of the stepper of solvers.Custom returns {type(owner).__name__}.{name} of shape {returned}; it must be {shape} for num_micro = {micro}, "
                 f"degree = {r}, {n_g} constraints and {n_gs} slow ones."
             )

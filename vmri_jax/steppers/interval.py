@@ -23,7 +23,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from vmri_jax.kernels import DIAGONAL_MATRICES, Full, Sparsity, inverse, matvec, regularized, solve
+from vmri_jax.kernels import DIAGONAL_MATRICES, inverse, matvec, solve
+from vmri_jax.kernels.band import Full, Sparsity
+from vmri_jax.kernels.saddle import regularized
 from vmri_jax.mechanics.constraint_pattern import fast_rows
 from vmri_jax.mechanics.masses import ConstantMass, Diagonal
 from vmri_jax.mechanics.structure import has_constant_hessian, has_diagonal_hessian, is_linear
@@ -138,22 +140,18 @@ class Interval:
         terms = implicit_terms(system, scheme)
         of_fast = [term for term in terms if term.arguments == ("q_f",)]
         sums = bool(of_fast) and all(has_diagonal_hessian(term.integrand, q_f) for term in of_fast)
-        sums = sums and all(
-            term.name in ("V", "W") for term in terms
-        )  # further potentials may be stiff: K must contain them
+        # further potentials may be stiff: K must contain them
+        sums = sums and all(term.name in ("V", "W") for term in terms)
         linear = all(is_linear(partial(_of_fast, term, q_s), q_f) for term in terms)
         linear &= scheme.degree == 1 or q_f.size > SMALL  # few variables and a high degree: one full matrix is cheaper
         is_diagonal = DIAGONAL_MATRICES and isinstance(constant_mass(system).fast_mass, Diagonal) and (linear or sums)
-        is_constant = True
-        if is_diagonal:
-            terms = of_fast
-        elif system.force is not None or (scheme.degree > 1 and system.constraint is not None):
-            is_constant = False
+        is_explicit = scheme.degree == 1 and not terms and system.force is None
+        varies = system.force is not None or (scheme.degree > 1 and system.constraint is not None)
         q = {"q_s": q_s, "q_f": q_f}
-        is_constant = is_constant and all(
-            has_constant_hessian(term.integrand, *(q[a] for a in term.arguments)) for term in terms
+        is_constant = (is_diagonal or not varies) and all(
+            has_constant_hessian(term.integrand, *(q[a] for a in term.arguments))
+            for term in (of_fast if is_diagonal else terms)
         )
-        is_explicit = scheme.degree == 1 and not implicit_terms(system, scheme) and system.force is None
         full = Full(scheme.degree * system.num_constraints(q_s, q_f)[0])
         sparsity = fast_rows(system, q_s, q_f, scheme.degree) if is_diagonal else full
         return cls(is_explicit, is_diagonal, is_constant, sparsity)
@@ -184,7 +182,7 @@ def _full_matrix(local: StepEquations, path: Path) -> FullMatrix:
     def slots(increments):
         varied = replace(path, fast=increments[None])
         d = jax.grad(local.without_kinetic)(varied, varied)
-        d_fast = d.fast[0] + kinetic.rows(path.slow, increments)[1]
+        d_fast = d.fast[0] + kinetic.fast_rows(increments)
         return jnp.concatenate([d.fast_start - d_fast.sum(0), d_fast])
 
     block = jax.jacfwd(slots)(path.fast[0])
@@ -201,9 +199,8 @@ def _diagonal_matrix(local: StepEquations, path: Path) -> DiagonalMatrix:
         elif term.inside.groups and term.arguments == ("q_f",):
             q = term.inside.sample(path, ("q_f",))["q_f"]
             gradient = jax.vmap(jax.grad(term.integrand))
-            curvature = jax.jvp(gradient, (q,), (jnp.ones_like(q),))[
-                1
-            ]  # W'' times ones: its diagonal, since W is a sum over coordinates
+            # W'' times ones: its diagonal, since W is a sum over coordinates
+            curvature = jax.jvp(gradient, (q,), (jnp.ones_like(q),))[1]
             basis = lagrange_basis(r, np.array([group.c for group in term.inside.groups]))
             weights = term.sign * local.macro_dt**2 * term.inside.weights
             block += jnp.einsum("k,ki,kj,ka->ija", weights, basis, basis[:, 1:], curvature)

@@ -80,8 +80,7 @@ class Kicked(Stepper):
         def between(carry, _):
             state, inner, worst = carry
             state, info, memory = step(state, inner, 1.0)
-            along = info.q_f_micro, info.multiplier
-            return (state, memory.inner, worst.worse(info.status)), tuple(a[0] if len(a) == 1 else a for a in along)
+            return (state, memory.inner, worst.worse(info.status)), (info.q_f_micro, info.multiplier)
 
         inner = memory.inner
         state = kicked(state, self.kicks, memory.gradients, macro_dt, start=1.0)
@@ -162,9 +161,8 @@ def steps_in_words(count: int, stepper: Kicked) -> str:
 
 
 def _all_steps(before, last):
-    """Values along all steps: those of the steps before, (count - 1, k, ...) or (count - 1, ...) for k = 1, then of the last, (k, ...)."""
-    if len(last) > 1:
-        before = before.reshape(before.shape[0] * len(last), *last.shape[1:])
+    """Values along all steps: of the steps before, (count - 1, k, ...), then of the last, (k, ...)."""
+    before = before.reshape(before.shape[0] * len(last), *last.shape[1:])
     return jnp.concatenate([before, last])
 
 

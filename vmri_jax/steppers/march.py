@@ -30,31 +30,17 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from vmri_jax.kernels import inverse_in_loop, matmul, matvec, max_abs, saddle
-from vmri_jax.schemes.equations import StepEquations, Unknowns
+from vmri_jax.kernels import inverse_in_loop, matmul, matvec, max_abs
+from vmri_jax.kernels.saddle import saddle
+from vmri_jax.schemes.equations import StepEquations, Unknowns, sum_before
 from vmri_jax.schemes.intervals import Arriving, Intervals, IntervalUnknowns
 
 
-class IntervalMatrices(NamedTuple):
-    """The linearised equations of a micro interval: k unknowns, r n_v slow increments that the interval sees, o gradients (`Handed`).
-
-    inverse: ``(dR/dx)^-1`` of the residual R by the unknowns x of the interval.
-    by_position, by_slow: derivative of R with respect to the position that arrives and to the slow increments.
-    hands_on, hands_on_by_position, hands_on_by_slow: derivative of the gradients that are handed on, with respect to the same variables.
-    """
-
-    inverse: Float[Array, "k k"]
-    by_position: Float[Array, "k n_f"]
-    by_slow: Float[Array, "k r*n_v"]
-    hands_on: Float[Array, "o k"]
-    hands_on_by_position: Float[Array, "o n_f"]
-    hands_on_by_slow: Float[Array, "o r*n_v"]
-
-
 class Matrices(NamedTuple):
-    """The matrices of an exact pass, which further passes keep.
+    """The matrices of an exact pass, which further passes keep: k unknowns of an interval, r n_v slow increments that it sees.
 
-    inverse, hands_on: as in `IntervalMatrices`, with the intervals as first axis.
+    inverse: ``(dR/dx)^-1`` of the residual R of an interval by its unknowns x.
+    hands_on: derivative of the o gradients that are handed on (`Handed`) by these unknowns.
     response: ``dx_m/dz``, for the slow increments that intervals see.
     slow: ``S^-1``, the inverse of the slow equations after elimination of the intervals.
     """
@@ -131,7 +117,8 @@ class MarchEquations:
             x[: self.num_fast].reshape(self.r, self.n_f), x[self.num_fast :].reshape(self.r, self.n_g)
         )
         residual, on = self.intervals.evaluate(m, unknowns, self._apart(arriving), slow.reshape(self.r, self.n_v))
-        return jnp.concatenate([residual.fast.reshape(-1), residual.multiplier.reshape(-1)]), _together(on).gradients
+        rows = jnp.concatenate([residual.fast.reshape(-1), residual.multiplier.reshape(-1)])
+        return rows, jnp.concatenate([on.p_f, on.start, on.slow.reshape(-1)])
 
     def slow_equations(self, z, arriving: Handed):
         """Residual (b,) of the slow equations, and the slow momentum at the end."""
@@ -142,19 +129,6 @@ class MarchEquations:
     def _apart(self, arriving: Handed) -> Arriving:
         p_f, start, slow = jnp.split(arriving.gradients, [self.n_f, self.n_f + self.n_v])
         return Arriving(arriving.position, p_f, start, slow.reshape(self.r, self.n_v))
-
-    def interval_matrices(self, m, x, arriving: Handed, slow) -> IntervalMatrices:
-        """The derivatives of interval m with respect to its unknowns, the arriving position and the slow increments."""
-
-        def residual_and_gradients(x, position, slow):
-            return self.interval(m, x, Handed(position, arriving.gradients), slow)
-
-        by_x, by_position, by_slow = zip(
-            *jax.jacfwd(residual_and_gradients, argnums=(0, 1, 2))(x, arriving.position, slow), strict=True
-        )
-        return IntervalMatrices(
-            self.inverse(by_x[0], self.num_fast), by_position[0], by_slow[0], by_x[1], by_position[1], by_slow[1]
-        )
 
     def slow_inverse(self, z, arriving: Handed, sensitivities: Handed):
         """The inverse (b, b) of the total derivative S of the slow residual, and `slow_equations`, whose values it shares.
@@ -179,36 +153,9 @@ class MarchEquations:
         """The inverse of a matrix whose first `size` unknowns are increments, and the remaining ones multipliers."""
         return self.inverted(matrix[:size, :size], matrix[:size, size:], matrix[size:, :size], self.r)
 
-    def answer(self, matrices: IntervalMatrices, residual, arriving: Handed, slow=None):
-        """The linearised interval solved for dx: returns dx, and the change of the position and gradients that are handed on.
-
-            dx = -(dR/dx)^-1 (residual + dR/dq dq + dR/dp dp + dR/ds ds)
-
-        All arrays have one column for each direction.
-
-        Args:
-            matrices: of the interval.
-            residual: R, or its change by other arguments.
-            arriving: dq and dp, changes of the position and of the gradients that arrive.
-            slow: ds, changes of the slow increments; None for none.
-        """
-        rows = residual + matmul(matrices.by_position, arriving.position)
-        gradients = matmul(matrices.hands_on_by_position, arriving.position)
-        if slow is not None:
-            rows, gradients = rows + matmul(matrices.by_slow, slow), gradients + matmul(matrices.hands_on_by_slow, slow)
-        # h p_f is added to the first momentum equation: dR/dp is the unit matrix there, zero elsewhere
-        rows = rows.at[: self.n_f].add(arriving.gradients[: self.n_f])
-        dx = -matmul(matrices.inverse, rows)
-        return dx, self.handed(arriving, dx, matmul(matrices.hands_on, dx) + gradients)
-
     def last_increment(self, x):
         """The fast increment (n_f, ...) from the start of the interval to its end, out of the unknowns (k, ...)."""
         return x[self.num_fast - self.n_f : self.num_fast]
-
-    def handed(self, arriving: Handed, dx, gradients):
-        """The change of the quantities that are handed on: the interval replaces the momentum, and adds to the slow gradients."""
-        position = arriving.position + self.last_increment(dx)
-        return Handed(position, gradients.at[self.n_f :].add(arriving.gradients[self.n_f :]))
 
     def corrected(self, inverse, hands_on, x, residual, arriving: Handed, gradients) -> tuple[Any, Handed]:
         """The correction ``d = -(dR/dx)^-1 R`` of an interval, and its end position and gradients, corrected to first order."""
@@ -229,10 +176,6 @@ class MarchEquations:
         dz = -matvec(matrices.slow, residual)
         dx = jnp.sum(matrices.response * self.seen(dz), axis=-1)
         return Passed(z, x, dz, dx, end, p_s, worst.add(residual, dz, worst.moved))
-
-
-def _together(on: Arriving) -> Handed:
-    return Handed(on.q_f, jnp.concatenate([on.p_f, on.start, on.slow.reshape(-1)]))
 
 
 def inverse_with_multipliers(a, b, c, nodes: int):
@@ -286,7 +229,7 @@ class Passed(NamedTuple):
     worst: Worst
 
 
-def exact_pass(march: MarchEquations, z, x, last, from_last) -> tuple[Matrices, Passed]:
+def exact_pass(march: MarchEquations, z, x, last, from_last, corrects: bool = True) -> tuple[Matrices, Passed]:
     """A pass that computes all matrices; every interval starts from the corrected end of the interval before.
 
     Args:
@@ -294,6 +237,7 @@ def exact_pass(march: MarchEquations, z, x, last, from_last) -> tuple[Matrices, 
         z, x: unknowns.
         last: (k,) unknowns of the last interval of the step before.
         from_last: whether each interval starts from the unknowns of the interval before, instead of those in x.
+        corrects: whether the intervals correct their unknowns; if not, the matrices belong to z and x.
     """
     slow, unit = march.seen(z), jnp.eye(march.num_seen)
 
@@ -317,6 +261,7 @@ def exact_pass(march: MarchEquations, z, x, last, from_last) -> tuple[Matrices, 
         )
 
         # d_m = -(dR_m/dx_m)^-1 R_m
+        residual = residual if corrects else jnp.zeros_like(residual)
         d, on = march.corrected(inverse, hands_on, x, residual, arriving, gradients)
         carry = on, sensitivities, x + d, worst.add(residual, d, max_abs(d[: march.num_fast]))
         return carry, (x + d, inverse, hands_on, response)
@@ -348,52 +293,46 @@ def further_pass(march: MarchEquations, matrices: Matrices, z, x, last, from_las
     return march.passed(matrices, z, x, worst, end, march.slow_equations(z, end))
 
 
-class Factors(NamedTuple):
-    """The Newton matrix ``dR/d(z, x)`` of a macro step after block elimination of the intervals, in order.
+def factor(march: MarchEquations, z, x) -> tuple[Matrices, Any]:
+    """The matrix ``dR/d(z, x)`` after block elimination of the intervals, for the derivative of the solution.
 
-    intervals: derivatives of every interval, with the intervals as first axis.
-    response, slow: as in `Matrices`.
+    Returns:
+        The `Matrices` at z and x, and the derivatives (num_micro, k, n_f) and (num_micro, o, n_f) of the residual of every interval and of the
+        gradients that it hands on, with respect to the position that arrives.
     """
+    slow, gradients = march.seen(z), march.start().gradients  # R is linear in the gradients that arrive
 
-    intervals: IntervalMatrices
-    response: Float[Array, "num_micro k r*n_v"]
-    slow: Float[Array, "b b"]
+    def by_position(unknowns):
+        m, x, position = unknowns
+        return jax.jacfwd(lambda position: march.interval(m, x, Handed(position, gradients), slow))(position)
 
-
-def factor(march: MarchEquations, z, x) -> Factors:
-    """The matrix ``dR/d(z, x)`` at the solution, factored, for the derivative of the solution."""
-    slow, unit = march.seen(z), jnp.eye(march.num_seen)
-
-    def interval(carry, unknowns):
-        arriving, sensitivities = carry
-        m, x = unknowns
-        gradients = march.interval(m, x, arriving, slow)[1]
-        matrices = march.interval_matrices(m, x, arriving, slow)
-        response, sensitivities = march.answer(matrices, jnp.zeros((x.size, march.num_seen)), sensitivities, unit)
-        return (Handed(arriving.position + march.last_increment(x), gradients), sensitivities), (matrices, response)
-
-    start = march.start()
-    none = Handed(*(jnp.zeros((a.size, march.num_seen)) for a in start))
-    (end, sensitivities), (matrices, response) = jax.lax.scan(interval, (start, none), (jnp.arange(march.n), x))
-    return Factors(matrices, response, march.slow_inverse(z, end, sensitivities)[0])
+    positions = march.equations.q_f + sum_before(march.last_increment(x.T).T)
+    matrices, _ = exact_pass(march, z, x, x[-1], from_last=False, corrects=False)
+    return matrices, jax.lax.map(by_position, (jnp.arange(march.n), x, positions))
 
 
-def solve(march: MarchEquations, factors: Factors, rows_z, rows_x):
+def solve(march: MarchEquations, factors: tuple[Matrices, Any], rows_z, rows_x):
     """(dz, dx) with ``dR/d(z, x) (dz, dx) = -(rows_z, rows_x)``; linear in the rows, and JAX can transpose it.
 
     Forward elimination with z fixed, then ``S dz = -(rows_z + change of R_s)``, then back substitution ``dx + (dx/dz) dz``.
     """
 
-    def interval(arriving, matrices_and_rows):
-        matrices, rows = matrices_and_rows
-        dx, arriving = march.answer(matrices, rows[:, None], arriving)
-        return arriving, dx[:, 0]
+    (matrices, by_positions), n_f = factors, march.n_f
 
-    none = Handed(*(jnp.zeros((a.size, 1)) for a in march.start()))
-    end, dx = jax.lax.scan(interval, none, (factors.intervals, rows_x))
+    def interval(arriving, of_interval):
+        rows, inverse, hands_on, by_position, hands_on_by_position = of_interval
+        # dx = -(dR/dx)^-1 (rows + dR/dq dq + dR/dp dp); h p_f is added to the first momentum equation: dR/dp is the unit matrix there
+        rows = (rows + matvec(by_position, arriving.position)).at[:n_f].add(arriving.gradients[:n_f])
+        dx = -matvec(inverse, rows)
+        gradients = matvec(hands_on, dx) + matvec(hands_on_by_position, arriving.position)
+        # the interval replaces the momentum, and adds to the slow gradients
+        gradients = gradients.at[n_f:].add(arriving.gradients[n_f:])
+        return Handed(arriving.position + march.last_increment(dx), gradients), dx
+
+    intervals = rows_x, matrices.inverse, matrices.hands_on, *by_positions
+    end, dx = jax.lax.scan(interval, jax.tree.map(jnp.zeros_like, march.start()), intervals)
     # The slow equations are linear in the arriving quantities: their derivative may be taken at any point.
-    along = Handed(*(a[:, 0] for a in end))
     zero = jnp.zeros_like(rows_z)
-    change = jax.jvp(lambda a: march.slow_equations(zero, a)[0], (march.start(),), (along,))[1]
-    dz = -matvec(factors.slow, rows_z + change)
-    return dz, dx + jnp.sum(factors.response * march.seen(dz), axis=-1)
+    change = jax.jvp(lambda a: march.slow_equations(zero, a)[0], (march.start(),), (end,))[1]
+    dz = -matvec(matrices.slow, rows_z + change)
+    return dz, dx + jnp.sum(matrices.response * march.seen(dz), axis=-1)

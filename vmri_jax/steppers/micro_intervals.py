@@ -7,7 +7,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from vmri_jax.kernels import BandInverse, FullInverse, Sparsity, max_abs
+from vmri_jax.kernels import max_abs
+from vmri_jax.kernels.band import BandInverse, FullInverse, Sparsity
 from vmri_jax.mechanics.arrays import Numbers
 from vmri_jax.schemes.discrete_lagrangian import Term, lagrangian
 from vmri_jax.schemes.equations import StepEquations, slow_basis_at_control_nodes
@@ -109,36 +110,30 @@ class MicroSweep(NamedTuple):
         system, scheme = interval_problem(equations.system, equations.scheme)
         at_rest = jnp.zeros_like(q_s), jnp.zeros_like(arriving.q_f)
         local = StepEquations(system, scheme, equations.t + m * h, q_s, arriving.q_f, *at_rest, h)
-        done = correct(self, local, steps, arriving.p_f, guess)
+        unknowns, p_f, d_start, d_steps, moved = correct(self, local, steps, arriving.p_f, guess)
 
         # Chain rule: with the slow increments S of the macro step and the rows b_j of the basis, the slow path of this interval starts
         # at q_s + b_0 S and has the increments (b_j - b_0) S.
-        d_start = arriving.d_start + done.d_start
-        d_increments = arriving.d_increments + basis[0][:, None] * done.d_start
-        d_increments += jnp.sum((basis[1:] - basis[0])[..., None] * done.d_steps[:, None], axis=0)
-        q_f, p_f = arriving.q_f + done.unknowns.increments[-1], done.p_f
+        d_increments = arriving.d_increments + basis[0][:, None] * d_start
+        d_increments += jnp.sum((basis[1:] - basis[0])[..., None] * d_steps[:, None], axis=0)
+        d_start, q_f = arriving.d_start + d_start, arriving.q_f + unknowns.increments[-1]
         # Kicks ``p_f <- p_f + h w dL/dq_f`` at the node where this interval ends and the next one starts; those at the end of the macro
         # step are taken outside.
+        end = equations.q_s + weighted_sum(basis[-1], slow), q_f
+        kicks = []  # weights and gradients
         for term in lagrangian(system, scheme).kicks if n > 1 else ():
-            weight = jnp.where(m < n - 1, h * kick_weight(term, h), 0.0)
-            d_s, d_f = term.gradient(equations.q_s + weighted_sum(basis[-1], slow), q_f)
-            d_start, p_f = d_start + weight * d_s, p_f + weight * d_f
-            d_increments += basis[-1][:, None] * (weight * d_s)
+            kicks.append((jnp.where(m < n - 1, h * kick_weight(term, h), 0.0), term.gradient(*end)))
         for term in lagrangian(equations.system, equations.scheme).kicks:
             if term.every > 1:  # only at the nodes where two copies of the rule meet
                 meets = ((m + 1) % term.every == 0) & (m < n - 1)
-                weight = h * kick_weight(term, equations.macro_dt)
-                d_s, d_f = _gradient_where(meets, term, equations.q_s + weighted_sum(basis[-1], slow), q_f)
-                d_start, p_f = d_start + weight * d_s, p_f + weight * d_f
-                d_increments += basis[-1][:, None] * (weight * d_s)
+                gradient = jax.lax.cond(meets, term.gradient, lambda *q: jax.tree.map(jnp.zeros_like, q), *end)
+                kicks.append((h * kick_weight(term, equations.macro_dt), gradient))
+        for weight, (d_s, d_f) in kicks:
+            d_start, p_f = d_start + weight * d_s, p_f + weight * d_f
+            d_increments += basis[-1][:, None] * (weight * d_s)
 
-        totals = SweepTotals(q_f, p_f, d_start, d_increments, jnp.maximum(arriving.moved, done.moved))
-        return done.unknowns, totals
-
-
-def _gradient_where(condition, term: Term, q_s, q_f):
-    """The gradient of a term, or zero without evaluation if the condition does not hold."""
-    return jax.lax.cond(condition, term.gradient, lambda *q: jax.tree.map(jnp.zeros_like, q), q_s, q_f)
+        totals = SweepTotals(q_f, p_f, d_start, d_increments, jnp.maximum(arriving.moved, moved))
+        return unknowns, totals
 
 
 def kick_weight(term: Term, h):
@@ -146,23 +141,7 @@ def kick_weight(term: Term, h):
     return term.times_step(h) * sum(w for w in (term.start, term.end) if w is not None)
 
 
-class Corrected(NamedTuple):
-    """A micro interval after its correction.
-
-    unknowns: corrected, with S.
-    p_f: momentum times h at the end of the interval.
-    d_start, d_steps: gradients of h times the action of the interval, by the start and by the increments of its slow path.
-    moved: largest correction of a fast increment.
-    """
-
-    unknowns: FastUnknowns
-    p_f: Float[Array, "n_f"]
-    d_start: Float[Array, "n_s"]
-    d_steps: Float[Array, "r n_s"]
-    moved: Float[Array, ""]
-
-
-def correct(sweep: MicroSweep, local: StepEquations, steps, p_f, guess: FastUnknowns) -> Corrected:
+def correct(sweep: MicroSweep, local: StepEquations, steps, p_f, guess: FastUnknowns):
     """One Newton step on the equations of one micro interval, for the fast increments x and the multipliers mu,
 
         K dx - G_0^T dmu = -R        R = rows - G_0^T mu        G_1 dx = -g
@@ -177,6 +156,10 @@ def correct(sweep: MicroSweep, local: StepEquations, steps, p_f, guess: FastUnkn
         steps: (r, n_s) increments of the slow path over the interval.
         p_f: momentum times h that arrives.
         guess: unknowns before the correction; without the matrix S it is computed here.
+
+    Returns:
+        (unknowns with S, p_f times h at the end, gradients of h times the action by the start and by the increments of the slow path,
+        largest correction of a fast increment).
     """
     (increments, mu, schur), matrix = guess, sweep.matrix
     system, (r, n_g) = local.system, mu.shape
@@ -188,9 +171,8 @@ def correct(sweep: MicroSweep, local: StepEquations, steps, p_f, guess: FastUnkn
     seeds = jnp.zeros((0, r * n_g)) if schur is not None else sweep.sparsity.seeds
     pulled_s, pulled_f = jax.vmap(pull)(jnp.concatenate([mu[None], seeds.reshape(len(seeds), r, n_g)]))
     pull_s, pull_f, columns = pulled_s[0], pulled_f[0], pulled_f[1:]
-    if (
-        sweep.is_explicit
-    ):  # K x = -(h p_f - G_0^T mu): the momentum equations hold exactly, and only the constraints have a residual
+    # K x = -(h p_f - G_0^T mu): the momentum equations hold exactly, and only the constraints have a residual
+    if sweep.is_explicit:
         increments = -matrix.solve(p_f - pull_f)
 
     def gradient(increments):
@@ -199,7 +181,7 @@ def correct(sweep: MicroSweep, local: StepEquations, steps, p_f, guess: FastUnkn
 
     # d: gradients of h times the action of the interval, without kinetic energy and constraints; change: their derivative by x
     d, change = jax.linearize(gradient, increments)
-    d_fast = d.fast[0] + lagrangian(system, local.scheme).kinetic.rows(steps, increments)[1]
+    d_fast = d.fast[0] + lagrangian(system, local.scheme).kinetic.fast_rows(increments)
     g, push = jax.linearize(lambda x: jax.vmap(system.g)(times[1:], slow_nodes[1:], local.q_f + x), increments)
     if not sweep.is_explicit:
         # momentum equations at the nodes 0..r-1: h p_f + h D_{F_0} L, h D_{F_j} L
@@ -221,10 +203,6 @@ def correct(sweep: MicroSweep, local: StepEquations, steps, p_f, guess: FastUnkn
     # h p_f = h D_{F_r} L + K_r dx with the last row K_r of the approximate K: its error is of the size of the next correction.
     coupling, impulse = change(dx), -(pull_s + pull_dmu_s)
     later = jnp.concatenate([impulse[1:], jnp.zeros_like(impulse[:1])])
-    return Corrected(
-        FastUnknowns(increments + dx, mu + dmu, schur),
-        p_f=d_fast[-1] + matrix.outgoing(dx),
-        d_start=d.slow_start + coupling.slow_start + impulse.sum(0),
-        d_steps=d.slow + coupling.slow + later,
-        moved=max_abs(dx),
-    )
+    d_start, d_steps = d.slow_start + coupling.slow_start + impulse.sum(0), d.slow + coupling.slow + later
+    unknowns = FastUnknowns(increments + dx, mu + dmu, schur)
+    return unknowns, d_fast[-1] + matrix.outgoing(dx), d_start, d_steps, max_abs(dx)

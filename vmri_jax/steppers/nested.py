@@ -101,10 +101,8 @@ class Nested(Solver):
         matrix = self.interval.matrix if self.interval.is_constant else self.interval.no_matrix
         increments = control_nodes(r)[1:, None] * (equations.macro_dt * velocity[0])
         slow = PolynomialPredictor.constant(jnp.concatenate([increments.reshape(-1), jnp.zeros(r * n_gs)]))
-        fewest, last = (
-            jnp.asarray(0),
-            jnp.asarray(2 * EXTRA_PASSES),
-        )  # with these numbers the first step renews the matrix
+        # with these numbers the first step renews the matrix
+        fewest, last = jnp.asarray(0), jnp.asarray(2 * EXTRA_PASSES)
         return NestedState(matrix(equations), slow, jnp.zeros((r, n_g)), jnp.ones(()), fewest, last)
 
     def renew(self, equations: StepEquations, memory: NestedState) -> NestedState:
@@ -227,13 +225,7 @@ class _Passes:
     ) -> Pass:
         """A pass with slow unknowns z, with their next update d, and with the `Result` of the iteration so far.
 
-        Args:
-            z: slow increments and slow multipliers.
-            fast, totals: of the micro intervals.
-            inertia: of the tied masses.
-            error: slow_model_error.
-            still_moves: expected next correction of the fast increments.
-            passes: number of passes so far.
+        `error` is its slow_model_error, `still_moves` the expected next correction of the fast increments.
         """
         equations, inverse_fast = self.equations, self.mass.fast_mass.inverse().times
         slow, slow_multiplier = self._apart(z)

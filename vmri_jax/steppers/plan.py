@@ -18,11 +18,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax.numpy as jnp
 
-from vmri_jax.kernels import COLLOCATES, DEFERS_PROJECTION, DRIFTS, Sparsity
+from vmri_jax.kernels import COLLOCATES, DEFERS_PROJECTION, DRIFTS
+from vmri_jax.kernels.band import Sparsity
 from vmri_jax.mechanics.constraint_pattern import all_rows
 from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.mechanics.structure import depends_on
@@ -37,10 +38,9 @@ from vmri_jax.steppers.composed import Composed
 from vmri_jax.steppers.coupled import Coupled
 from vmri_jax.steppers.custom import whole_step
 from vmri_jax.steppers.decoupled import Decoupled
-from vmri_jax.steppers.free_flight import FreeFlight
+from vmri_jax.steppers.direct import FreeFlight, Linear
 from vmri_jax.steppers.interval import SMALL, Interval, implicit_terms
 from vmri_jax.steppers.kicked import Kicked, Repeated, average_over_fast_motion
-from vmri_jax.steppers.linear import Linear
 from vmri_jax.steppers.marched import Marched
 from vmri_jax.steppers.nested import Nested
 from vmri_jax.steppers.rattle import Rattle
@@ -48,6 +48,10 @@ from vmri_jax.steppers.solved import Fallback, Solved, Solver
 from vmri_jax.steppers.solvers import Newton
 from vmri_jax.steppers.stepper import StepInfo, Stepper, indented
 from vmri_jax.steppers.subsystems import fast_part, frozen_slow, slow_part
+
+Parts = tuple[list[PlacedPotential], dict[int, list[PlacedPotential]]]
+"""Potentials of the slow variables, on the macro grid, and of the fast variables, by the number k of micro intervals that a copy of their rule
+spans; the keys k increase, start with 1, and each is a multiple of the one before."""
 
 
 @dataclass(frozen=True)
@@ -163,7 +167,8 @@ def _defers_projection(stepper: Stepper) -> bool:
     A drift (RATTLE) depends on the momentum through ``h p - G_0^T mu`` alone. A projection ``p - G_0^T nu`` at the start changes mu, and
     not the motion. So only momenta that are saved need it.
     """
-    solvers = [_first(solver) for solver in _solvers(stepper, constrained=True)]
+    solvers = _solvers(stepper, constrained=True)
+    solvers = [solver.first if isinstance(solver, Fallback) else solver for solver in solvers]
     return DEFERS_PROJECTION and bool(solvers) and all(isinstance(solver, Rattle) for solver in solvers)
 
 
@@ -175,16 +180,13 @@ def _solvers(stepper: Stepper, constrained: bool = False) -> list[Solver]:
     return [solver for part in inner for solver in _solvers(part, constrained)]
 
 
-def _first(solver: Solver) -> Solver:
-    return solver.first if isinstance(solver, Fallback) else solver
-
-
 def _whole_step(system: System, scheme: Scheme, choice: _Choice, q_s, q_f) -> Kicked:
     """Kicks, and the stepper between them."""
     kicks = lagrangian(system, scheme).kicks
     average = _average(system, scheme, choice)
-    if is_decoupled(system, scheme, q_s, q_f):
-        between = _decoupled(system, scheme, choice, q_s, q_f)
+    parts = _apart(system, scheme, q_s, q_f)
+    if parts is not None:
+        between = _decoupled(system, scheme, choice, q_s, q_f, parts)
         # Kicks of terms at the macro nodes alone stay here. All other terms, on the micro grid or with further nodes inside, belong to the
         # slow or the fast part, with their kicks.
         kicks = tuple(term for term in kicks if term.grid == "macro" and not term.inside.groups)
@@ -259,61 +261,45 @@ def _is_linear(system: System, scheme: Scheme, interval: Interval, q_s) -> bool:
     return alone and interval.is_constant and (complete or not interval.is_diagonal)
 
 
-def is_decoupled(system: System, scheme: Scheme, q_s, q_f) -> bool:
-    """Whether no term but kicks couples slow and fast variables."""
-    if scheme.degree > 1 or system.force is not None or not system.has_constant_mass:
-        return False
-    if scheme.num_micro == 1 and not q_s.shape[0]:
-        return False  # fast variables on one interval: nothing to take apart, as in the parts of a decoupled system
-    inside = _Inside.of(system, scheme, q_s, q_f)
-    return inside is not None and not depends_on(lambda q: system.g(jnp.zeros(()), q, q_f), q_s)[0]
+def _apart(system: System, scheme: Scheme, q_s, q_f) -> Parts | None:
+    """The potentials with nodes inside the macro interval, if no term but kicks couples slow and fast variables.
 
-
-class _Inside(NamedTuple):
-    """The potentials with nodes inside the macro interval, if each depends on slow variables alone or on fast variables alone.
-
-    slow: potentials of slow variables, on the macro grid.
-    fast: potentials of fast variables, by the number k of micro intervals that a copy of their rule spans; the keys k increase, start
-        with 1, and each is a multiple of the one before.
+    None if the variables must be solved for together: a term depends on slow and fast variables, or a potential has nodes between the steps
+    of its part (a slow potential on the micro grid, copies of rules whose lengths do not divide each other).
     """
-
-    slow: list[PlacedPotential]
-    fast: dict[int, list[PlacedPotential]]
-
-    @classmethod
-    def of(cls, system: System, scheme: Scheme, q_s, q_f) -> "_Inside | None":
-        """None if the variables must be solved for together: a potential depends on slow and fast variables, or has nodes between the steps
-        of its part (a slow potential on the micro grid, copies of rules whose lengths do not divide each other)."""
-        slow, fast = [], {1: []}
-        for potential in placed_potentials(system, scheme):
-            placed = potential.placed
-            if placed.only_kicks:
-                continue
-            value = partial(potential.value, params=system.params)
-            if placed.grid == "macro":
-                if potential.name == "W" or depends_on(partial(value, q_s), q_f)[0]:
-                    return None
-                slow.append(potential)
-            elif potential.name == "V" and placed.every == 1:
+    if scheme.degree > 1 or system.force is not None or not system.has_constant_mass:
+        return None
+    if scheme.num_micro == 1 and not q_s.shape[0]:
+        return None  # fast variables on one interval: nothing to take apart, as in the parts of a decoupled system
+    slow, fast = [], {1: []}
+    for potential in placed_potentials(system, scheme):
+        placed = potential.placed
+        if placed.only_kicks:
+            continue
+        value = partial(potential.value, params=system.params)
+        if placed.grid == "macro":
+            if potential.name == "W" or depends_on(partial(value, q_s), q_f)[0]:
                 return None
-            else:
-                may_see_slow = "q_s" in potential.arguments and q_s.size > 0
-                sees_slow = may_see_slow and depends_on(partial(value, q_f=q_f), q_s)[0]
-                if sees_slow or (placed.every > 1 and not placed.only_ends):
-                    return None
-                fast.setdefault(placed.every, []).append(potential)
-        fast = dict(sorted(fast.items()))
-        chain = all(longer % shorter == 0 for shorter, longer in pairwise(fast))
-        return cls(slow, fast) if chain else None
+            slow.append(potential)
+        elif potential.name == "V" and placed.every == 1:
+            return None
+        else:
+            may_see_slow = "q_s" in potential.arguments and q_s.size > 0
+            sees_slow = may_see_slow and depends_on(partial(value, q_f=q_f), q_s)[0]
+            if sees_slow or (placed.every > 1 and not placed.only_ends):
+                return None
+            fast.setdefault(placed.every, []).append(potential)
+    fast = dict(sorted(fast.items()))
+    is_chain = all(longer % shorter == 0 for shorter, longer in pairwise(fast))
+    coupled = not is_chain or depends_on(lambda q: system.g(jnp.zeros(()), q, q_f), q_s)[0]
+    return None if coupled else (slow, fast)
 
 
-def _decoupled(system: System, scheme: Scheme, choice: _Choice, q_s, q_f) -> Decoupled:
-    inside, none = _Inside.of(system, scheme, q_s, q_f), jnp.zeros(0)
-    assert inside is not None
-    slow, slow_scheme = slow_part(system, scheme, *_named(inside.slow, "V"), num_fast=q_f.size)
+def _decoupled(system: System, scheme: Scheme, choice: _Choice, q_s, q_f, potentials: Parts) -> Decoupled:
+    (of_slow, of_fast), none = potentials, jnp.zeros(0)
+    slow, slow_scheme = slow_part(system, scheme, *_named(of_slow, "V"), num_fast=q_f.size)
     parts = {
-        every: fast_part(system, scheme, *_named(potentials, "W"), num_slow=q_s.size)
-        for every, potentials in inside.fast.items()
+        every: fast_part(system, scheme, *_named(further, "W"), num_slow=q_s.size) for every, further in of_fast.items()
     }
     fast, length = _whole_step(*parts.pop(1), choice, none, q_f), 1
     for every, part in parts.items():

@@ -17,7 +17,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from vmri_jax.kernels import Full, Sparsity, max_abs
+from vmri_jax.kernels import max_abs
+from vmri_jax.kernels.band import Full, Sparsity
 from vmri_jax.schemes.equations import StepEquations, Unknowns, multiplier_scales
 from vmri_jax.steppers.accept import Accepted
 from vmri_jax.steppers.interval import constant_mass, weighted_sum
@@ -109,9 +110,8 @@ class Rattle(Solver):
             x = last.x - last.dx
             return judged(x, last.mu + last.dmu, constraints(equations.t + h, q + x), last.iterations + 1)
 
-        first = corrected(
-            judged(x, mu, g, 0)
-        )  # nearly all steps need one correction: outside of the loop it is cheaper
+        # nearly all steps need one correction: outside of the loop it is cheaper
+        first = corrected(judged(x, mu, g, 0))
         done = newton.iterate(corrected, first, done=1)
 
         impulse = force(done.mu) / h  # p+ = p - G_0^T mu / h

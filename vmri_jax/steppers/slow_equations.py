@@ -29,7 +29,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from vmri_jax.kernels import BandInverse, FullInverse, inverse, matmul, max_abs, solve
+from vmri_jax.kernels import inverse, matmul, max_abs, solve
+from vmri_jax.kernels.band import BandInverse, FullInverse
 from vmri_jax.schemes.discrete_lagrangian import QuadraticKinetic, lagrangian
 from vmri_jax.schemes.equations import StepEquations, Unknowns, slow_basis_at_control_nodes
 from vmri_jax.schemes.path import control_nodes, lagrange_basis, lagrange_derivative
@@ -81,9 +82,8 @@ class SlowEquations(NamedTuple):
         jacobian = jax.jacrev(equations.system.g, argnums=1)(equations.t, equations.q_s, equations.q_f)
         if not jacobian.size:
             return None
-        jacobian = jax.lax.optimization_barrier(
-            jacobian
-        )  # keeps round-off independent of the expression of the constraint
+        # keeps round-off independent of the expression of the constraint
+        jacobian = jax.lax.optimization_barrier(jacobian)
         basis = slow_basis_at_control_nodes(equations.scheme.num_micro, r)[0]
         forces, values = (b[:, None, :, None] * jacobian[:, None, :] for b in (basis[:-1, :-1], basis[1:, 1:]))
         responses = jax.vmap(self._by_masses)(forces.reshape(-1, r, n_s))
@@ -113,7 +113,7 @@ class SlowEquations(NamedTuple):
         jacobian = jax.vmap(jax.jacrev(system.g_slow, argnums=1))(times[:-1], nodes)
         pull = jnp.sum(x.slow_multiplier[..., None] / n * jacobian, axis=1)
         # R: h p_s + h D_{S_0} A, h D_{S_i} A; nu is scaled by n = num_micro (`multiplier_scales`)
-        d = increments + self.kinetic.rows(x.slow, x.fast)[0] / n
+        d = increments + self.kinetic.slow_rows(x.slow) / n
         rows = jnp.concatenate([(start - d.sum(0) + equations.micro_dt * equations.p_s)[None], d[:-1]]) - pull
         dx, d_nu = solve_saddle(lambda rows: self._by_masses(rows, inertia), jacobian, push, rows, g)
         # impulse: p_s+ - p_s = D_{S_0} A + ... + D_{S_r} A, times h; d cancels in the sum

@@ -10,13 +10,14 @@ import jax.numpy as jnp
 from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Float
 
-from vmri_jax.kernels import Sparsity, max_abs
+from vmri_jax.kernels import max_abs
+from vmri_jax.kernels.band import Sparsity
 from vmri_jax.mechanics.arrays import Numbers
 from vmri_jax.mechanics.checks import CONSTRAINT_TOLERANCE
 from vmri_jax.mechanics.projection import project_momentum
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
-from vmri_jax.schemes.equations import StepEquations, Unknowns, physical_multipliers
+from vmri_jax.schemes.equations import StepEquations, Unknowns, multiplier_scales
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.interval import constant_mass
 from vmri_jax.steppers.newton.implicit import differentiable, differentiable_reverse_only
@@ -145,7 +146,8 @@ class Solved(Stepper):
         derivative = differentiable_reverse_only if self.reverse_only else differentiable
         x, (q_f, p_s, p_f) = derivative(equations, *root)
 
-        lambdas = physical_multipliers(self.scheme, macro_dt, x.multiplier, x.slow_multiplier)
+        scale, slow_scale = multiplier_scales(self.scheme, macro_dt)
+        lambdas = x.multiplier / scale, x.slow_multiplier / slow_scale
         q_f_micro = jnp.concatenate([equations.path(x).fast_start[1:], q_f[None]])
         info = StepInfo(*StepStatus(*status), q_f_micro, *lambdas)
         end = State(state.t + macro_dt, state.q_s + x.slow[-1], q_f, p_s, p_f)
@@ -182,9 +184,8 @@ class Fallback(Solver):
     def solve(self, equations: StepEquations, guess: Unknowns, memory) -> tuple[Solution, Any]:
         solution, learned = self.first.solve(equations, guess, memory)
         converged = solution.status.result <= Result.CONVERGED_AT_ROUNDOFF
-        memory = jax.tree.map(
-            partial(jnp.where, converged), learned, memory
-        )  # a failed step leaves the memory as it was
+        # a failed step leaves the memory as it was
+        memory = jax.tree.map(partial(jnp.where, converged), learned, memory)
         return jax.lax.cond(
             converged,
             lambda: solution,
@@ -230,8 +231,4 @@ def largest_constraint(equations: StepEquations, x: Unknowns):
     """Largest absolute value of g and g_s at the control nodes of the step, the first one excluded."""
     if not equations.system.is_constrained:
         return jnp.zeros(())
-    path = equations.path(x)
-    q_s, q_f = path.control_points()
-    g = jax.vmap(equations.system.g)(path.control_times()[1:], q_s[1:], q_f[1:])
-    g_slow = jax.vmap(equations.system.g_slow)(path.slow_control_times()[1:], path.slow_control_points()[1:])
-    return jnp.maximum(max_abs(g), max_abs(g_slow))
+    return jnp.maximum(*map(max_abs, equations.constraints(x)))

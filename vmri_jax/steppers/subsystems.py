@@ -20,58 +20,22 @@ from vmri_jax.steppers.interval import constant_mass
 
 
 @dataclass(frozen=True)
-class PotentialOfSlow:
-    """V, if it does not depend on the fast variables, as a function of the slow variables."""
+class OfPart:
+    """A function of a system that depends on one part alone, as a function of the fast variables of that part.
 
-    potential: Callable
-    num_fast: int
+    whole: a potential, or a constraint.
+    num_slow, num_fast: numbers of slow and of fast variables that `whole` gets as zeros besides the variables of the part; None for no argument.
+    """
 
-    def __call__(self, q, params):
-        return self.potential(q, jnp.zeros(self.num_fast), params)
+    whole: Callable | Rheonomic
+    num_slow: int | None = None
+    num_fast: int | None = None
 
-
-@dataclass(frozen=True)
-class FurtherOfSlow:
-    """A further potential that does not depend on the fast variables, as a potential of the slow part."""
-
-    potential: Callable
-    num_fast: int
-
-    def __call__(self, _, q, params):
-        return self.potential(q, jnp.zeros(self.num_fast), params)
-
-
-@dataclass(frozen=True)
-class FurtherOfFast:
-    """A further potential that does not depend on the slow variables, as a potential of the fast part."""
-
-    potential: Callable
-    num_slow: int
-
-    def __call__(self, _, q, params):
-        return self.potential(jnp.zeros(self.num_slow), q, params)
-
-
-@dataclass(frozen=True)
-class ConstraintOfSlow:
-    """g_s as a constraint of the fast variables of the slow part."""
-
-    constraint: Callable | Rheonomic
-
-    def __call__(self, t, _, q, params):
-        function, arguments = with_time(self.constraint, t, q, params)
-        return function(*arguments)
-
-
-@dataclass(frozen=True)
-class ConstraintOfFast:
-    """g, if it does not depend on the slow variables, as a constraint of the fast part."""
-
-    constraint: Callable | Rheonomic
-    num_slow: int
-
-    def __call__(self, t, _, q, params):
-        function, arguments = with_time(self.constraint, t, jnp.zeros(self.num_slow), q, params)
+    def __call__(self, *arguments):
+        q, params = arguments[-2:]
+        slow, fast = ([] if number is None else [jnp.zeros(number)] for number in (self.num_slow, self.num_fast))
+        # the first argument of a constraint is the time
+        function, arguments = with_time(self.whole, arguments[0], *slow, q, *fast, params)
         return function(*arguments)
 
 
@@ -88,10 +52,10 @@ def slow_part(
     """
     alone = System(
         ConstantMass(jnp.zeros(0), constant_mass(system).slow),
-        fast_potential=None if potential is None else PotentialOfSlow(potential, num_fast),
-        constraint=None if system.slow_constraint is None else Rheonomic(ConstraintOfSlow(system.slow_constraint)),
+        fast_potential=None if potential is None else OfPart(potential, num_fast=num_fast),
+        constraint=None if system.slow_constraint is None else Rheonomic(OfPart(system.slow_constraint)),
         params=system.params,
-        potentials={item.name: FurtherOfSlow(item.function, num_fast) for item in further},
+        potentials={item.name: OfPart(item.function, num_fast=num_fast) for item in further},
     )
     return alone, _single(PlacedRule(scheme.slow.rule, scheme.slow.grid), further)
 
@@ -110,39 +74,32 @@ def fast_part(
     alone = System(
         ConstantMass(jnp.zeros(0), constant_mass(system).fast),
         fast_potential=potential,
-        constraint=None if system.constraint is None else Rheonomic(ConstraintOfFast(system.constraint, num_slow)),
+        constraint=None if system.constraint is None else Rheonomic(OfPart(system.constraint, num_slow)),
         params=system.params,
-        potentials={item.name: FurtherOfFast(item.function, num_slow) for item in further},
+        potentials={item.name: OfPart(item.function, num_slow) for item in further},
     )
     return alone, _single(replace(scheme.fast, every=1), further)
 
 
 @dataclass(frozen=True)
-class PotentialAtRest:
-    """W with the parameters ``(params, q_s)``."""
+class AtRest:
+    """W, or g with the slow variables at rest, as a function with the parameters ``(params, q_s)``."""
 
-    potential: Callable
+    whole: Callable
+    sees_slow: bool
 
-    def __call__(self, q, params):
-        return self.potential(q, params[0])
-
-
-@dataclass(frozen=True)
-class ConstraintAtRest:
-    """g with the slow variables at rest, and the parameters ``(params, q_s)``."""
-
-    constraint: Callable
-
-    def __call__(self, _, q, params):
-        return self.constraint(params[1], q, params[0])
+    def __call__(self, *arguments):
+        q, (params, q_s) = arguments[-2:]
+        slow = [q_s] if self.sees_slow else []
+        return self.whole(*slow, q, params)
 
 
 def frozen_slow(system: System, scheme: Scheme, q_s) -> tuple[System, Scheme]:
     """The system of the fast variables under W and g with the slow variables at rest in q_s, and the scheme of one micro interval."""
     alone = System(
         ConstantMass(jnp.zeros(0), constant_mass(system).fast),
-        fast_potential=None if system.fast_potential is None else PotentialAtRest(system.fast_potential),
-        constraint=None if system.constraint is None else ConstraintAtRest(system.constraint),  # pyright: ignore[reportArgumentType]
+        fast_potential=None if system.fast_potential is None else AtRest(system.fast_potential, sees_slow=False),
+        constraint=None if system.constraint is None else AtRest(system.constraint, sees_slow=True),  # pyright: ignore[reportArgumentType]
         params=(system.params, q_s),
     )
     rule = micro(scheme.kinetic.rule)

@@ -71,12 +71,6 @@ def _form(basis, degree: int, nodes) -> np.ndarray:
     return values.T @ (interpolatory_weights(nodes)[:, None] * values)
 
 
-def taken(a, index: np.ndarray):
-    """``a[..., index]`` for a static index, by slices."""
-    runs = np.split(index, np.flatnonzero(np.diff(index) != 1) + 1)
-    return jnp.concatenate([a[..., run[0] : run[-1] + 1] for run in runs], axis=-1)
-
-
 def times_i(z):
     """``i z`` for complex z, stored as all real parts before all imaginary ones."""
     re, im = jnp.split(z, 2, axis=-1)

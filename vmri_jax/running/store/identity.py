@@ -65,13 +65,13 @@ def changed_conditions(attributes: dict, stored: dict) -> list[str]:
 def describe(name: str, value) -> dict[str, str]:
     """All leaves of a value as text, by the path to each leaf, which begins with `name`."""
     if dataclasses.is_dataclass(value) and not isinstance(value, TracedOnce):
-        parts = [describe(f"{name}.{field.name}", getattr(value, field.name)) for field in dataclasses.fields(value)]
-        return {key: text for part in parts for key, text in part.items()}
-    if isinstance(value, dict) and any(map(dataclasses.is_dataclass, value.values())):  # quadrature rules of potentials
-        parts = [describe(f"{name}[{key!r}]", part) for key, part in value.items()]
-        return {key: text for part in parts for key, text in part.items()}
-    leaves, _ = jax.tree_util.tree_flatten_with_path(value)
-    return {name + jax.tree_util.keystr(path): _text(leaf) for path, leaf in leaves}
+        parts = {f"{name}.{field.name}": getattr(value, field.name) for field in dataclasses.fields(value)}
+    elif isinstance(value, dict) and any(map(dataclasses.is_dataclass, value.values())):  # rules of potentials
+        parts = {f"{name}[{key!r}]": part for key, part in value.items()}
+    else:
+        leaves, _ = jax.tree_util.tree_flatten_with_path(value)
+        return {name + jax.tree_util.keystr(path): _text(leaf) for path, leaf in leaves}
+    return {key: text for name, part in parts.items() for key, text in describe(name, part).items()}
 
 
 def _text(leaf) -> str:

@@ -14,6 +14,7 @@ from vmri_jax.running.arguments import Steps
 from vmri_jax.running.files import clear_partial, is_new
 from vmri_jax.running.interrupts import Interrupted, interrupts_noted
 from vmri_jax.running.progress import Progress, ShowsProgress, progress_to
+from vmri_jax.running.saved import numbers_per_node
 from vmri_jax.running.simulation import Simulation, simulation
 from vmri_jax.running.store import layout
 from vmri_jax.running.store.identity import changed_conditions, differences, environment, identity
@@ -196,7 +197,7 @@ def _lengthen(stored: StoredTrajectory, num_steps: int) -> None:
 
 def _chunk(run: Simulation) -> int:
     """Saved intervals per chunk where the user gives none."""
-    num_micro, n_s, n_f = run.scheme.num_micro, run.state.q_s.shape[0], run.state.q_f.shape[0]
-    numbers = 2 * (n_s + n_f) + 8 + (num_micro * (n_f + 1) if run.save_micro else 0)  # of a saved node, 8 bytes each
+    num_micro = run.scheme.num_micro
+    numbers = numbers_per_node(run.state, num_micro if run.save_micro else 0)  # 8 bytes each
     wanted = max(run.num_saves // CHUNKS_PER_RUN, LEAST_MICRO_STEPS // (num_micro * run.save_every))
     return max(1, min(wanted, run.num_saves, MOST_BYTES // (8 * numbers)))

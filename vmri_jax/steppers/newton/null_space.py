@@ -21,46 +21,34 @@ part I, Comput. Methods Appl. Mech. Engng 194 (2005); S. Leyendecker, J. E. Mars
 constrained dynamical systems, ZAMM 88 (2008).
 """
 
-from typing import NamedTuple
-
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jax.scipy.linalg import block_diag
 
 
-class Motions(NamedTuple):
-    """Free directions, and a right inverse, of constraints with the Jacobian G (n_g, n).
+def motions(jacobian):
+    """Bases P (..., n, n - n_g) of the null space, and right inverses W (..., n, n_g), of independent rows G (..., n_g, n).
 
-    basis: P, orthonormal columns with ``G P = 0``.
-    right_inverse: W, ``G W = 1``, its columns orthogonal to those of P.
+    The columns of P are orthonormal, and orthogonal to the columns of W.
     """
-
-    basis: Float[Array, "*nodes n n-n_g"]
-    right_inverse: Float[Array, "*nodes n n_g"]
-
-
-def motions(jacobian) -> Motions:
-    """Null space and right inverse of independent rows (..., n_g, n)."""
     n_g, n = jacobian.shape[-2:]
     if n_g == 0:
         eye = jnp.broadcast_to(jnp.eye(n), (*jacobian.shape[:-2], n, n))
-        return Motions(eye, eye[..., :0])
+        return eye, eye[..., :0]
     q, triangle = jnp.linalg.qr(jnp.swapaxes(jacobian, -1, -2), mode="complete")
     # G^T = (Y, P) (R; 0): G = R^T Y^T with the first n_g columns Y, and W = Y R^-T, since Y^T Y = 1
     square = jnp.swapaxes(triangle[..., :n_g, :], -1, -2)
     eye = jnp.broadcast_to(jnp.eye(n_g), square.shape)
-    return Motions(q[..., n_g:], q[..., :n_g] @ jax.scipy.linalg.solve_triangular(square, eye, lower=True))
+    return q[..., n_g:], q[..., :n_g] @ jax.scipy.linalg.solve_triangular(square, eye, lower=True)
 
 
-def inverse(a, g_0, g_1):
-    """Inverse of ``[[A, -G_0^T], [G_1, 0]]`` with r nodes each, (..., r n + r n_g, r n + r n_g).
-
-    Args:
-        a: (..., r n, r n).
-        g_0, g_1: (..., r, n_g, n) Jacobians at the nodes where multipliers act and where increments end.
-    """
-    (p_0, w_0), (p_1, w_1) = (Motions(*map(_block_diagonal, motions(g))) for g in (g_0, g_1))
-    p_0, w_0 = (jnp.swapaxes(m, -1, -2) for m in (p_0, w_0))
+def inverse_without_multipliers(a, b, c, nodes: int):
+    """Inverse of ``[[A, B], [C, 0]]`` with ``B = -G_0^T`` and ``C = G_1``, block diagonal with one block for each of the nodes."""
+    if not b.shape[-1]:
+        return jnp.linalg.inv(a)
+    at_nodes = (motions(_diagonal_blocks(g, nodes)) for g in (-b.T, c))
+    (p_0, w_0), (p_1, w_1) = ([block_diag(*blocks) for blocks in of_g] for of_g in at_nodes)
+    p_0, w_0 = p_0.T, w_0.T
     # For the right-hand sides (b, c): dq = free b + held c with free = P_1 (P_0^T A P_1)^-1 P_0^T, and dmu = W_0^T (A dq - b)
     free = p_1 @ jnp.linalg.inv(p_0 @ a @ p_1) @ p_0
     held = w_1 - free @ (a @ w_1)
@@ -69,21 +57,7 @@ def inverse(a, g_0, g_1):
     return jnp.concatenate([top, bottom], axis=-2)
 
 
-def inverse_without_multipliers(a, b, c, nodes: int):
-    """Inverse of ``[[A, B], [C, 0]]`` with ``B = -G_0^T`` and ``C = G_1``, block diagonal with one block for each of the nodes."""
-    if not b.shape[-1]:
-        return jnp.linalg.inv(a)
-    return inverse(a, -_diagonal_blocks(b.T, nodes), _diagonal_blocks(c, nodes))
-
-
 def _diagonal_blocks(whole, nodes: int):
     """(r, n, m) blocks on the diagonal of a matrix (r n, r m)."""
     n, m = (size // nodes for size in whole.shape)
     return jnp.stack([whole[i * n : (i + 1) * n, i * m : (i + 1) * m] for i in range(nodes)])
-
-
-def _block_diagonal(blocks):
-    """(..., r n, r m) of (..., r, n, m)."""
-    *batch, r, n, m = blocks.shape
-    whole = jnp.einsum("...jnm,ji->...jnim", blocks, jnp.eye(r))
-    return whole.reshape(*batch, r * n, r * m)

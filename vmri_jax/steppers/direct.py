@@ -1,4 +1,4 @@
-"""Linear equations of fast variables alone on one interval: one product with a matrix that is computed once per run."""
+"""Steps without iteration: free flight, and linear equations of fast variables alone on one interval."""
 
 from dataclasses import dataclass
 
@@ -9,14 +9,30 @@ from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
 from vmri_jax.schemes.equations import StepEquations
 from vmri_jax.schemes.scheme import Scheme
-from vmri_jax.steppers.interval import Interval, Matrix
+from vmri_jax.steppers.interval import Interval, Matrix, constant_mass
 from vmri_jax.steppers.results import Method
 from vmri_jax.steppers.stepper import StepInfo, Stepper, StepStatus
 
 
 @dataclass(frozen=True)
+class FreeFlight(Stepper):
+    """Straight motion at constant momentum, ``q+ = q + H M^-1 p``, for kinetic energy of constant masses alone."""
+
+    system: System
+
+    def advance(self, state: State, memory: tuple, macro_dt) -> tuple[State, StepInfo, tuple]:
+        v_s, v_f = constant_mass(self.system).velocity(state.p_s, state.p_f)
+        q_s, q_f = state.q_s + macro_dt * v_s, state.q_f + macro_dt * v_f
+        info = StepInfo(*StepStatus.direct(Method.EXPLICIT), q_f[None], jnp.zeros((1, 1, 0)), jnp.zeros((1, 0)))
+        return State(state.t + macro_dt, q_s, q_f, state.p_s, state.p_f), info, memory
+
+    def describe(self) -> list[str]:
+        return ["free flight: q + H v, nothing to solve"]
+
+
+@dataclass(frozen=True)
 class Linear(Stepper):
-    """The step ``x = -K^-1 r(0)``, with the residual r at zero increments; the memory is K."""
+    """The step ``x = -K^-1 r(0)``, with the residual r at zero increments; the memory is K, computed once per run."""
 
     system: System
     scheme: Scheme
