@@ -162,7 +162,9 @@ def test_cases_side_by_side(tmp_path):
         single = convergence_study(alone, schemes, STEPS, 1.0, num_saves=5, reference=study.references[case])
         np.testing.assert_allclose(study.errors("composed", "p", case)[1], single.errors("composed", "p")[1], rtol=1e-3)
     data = study.to_xarray()
+    assert len(study.to_pandas()) == 12
     assert data.error_q.dims == ("scheme", "case", "macro_dt")
+    assert data.macro_dt.values.tolist() == sorted(STEPS, reverse=True)
     assert (
         float(data.error_q.sel(scheme="impulse", case="stiff", macro_dt=0.01))
         == study.errors("impulse", case="stiff")[1][1]

@@ -16,7 +16,6 @@ from vmri_jax import diagnostics, plots
 from vmri_jax.diagnostics import OrderFit
 from vmri_jax.executors.executor import mapped
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
-from vmri_jax.running.export import extra
 from vmri_jax.running.interrupts import Interrupted
 from vmri_jax.running.progress import shows_progress
 from vmri_jax.running.trajectory import Trajectory
@@ -186,18 +185,9 @@ class ConvergenceStudy(ResultTable):
 
     def to_xarray(self):
         """An `xarray.Dataset` over (scheme, case, macro_dt); needs the extra ``vmri_jax[xarray]``."""
-        xarray = extra("xarray", "to_xarray")
         steps = sorted({row.macro_dt for row in self.rows}, reverse=True)
-        axes = {"scheme": self.schemes, "case": self.cases, "macro_dt": steps}
-        shape = tuple(len(values) for values in axes.values())
-        names = ("error_q", "error_p", "energy_error", "energy_drift", "energy_band", "momentum_error")
-        data: dict[str, Any] = {name: np.full(shape, np.nan) for name in (*names, "constraint_residual", "iterations")}
-        data |= {name: np.full(shape, "", dtype="U24") for name in ("method", "result")}
-        for row in self.rows:
-            index = tuple(values.index(getattr(row, axis)) for axis, values in axes.items())
-            for name, array in data.items():
-                array[index] = getattr(row, name)
-        return xarray.Dataset({name: (tuple(axes), array) for name, array in data.items()}, coords=axes)
+        data = self.to_pandas().set_index(["scheme", "case", "macro_dt"]).to_xarray()
+        return data.reindex(scheme=self.schemes, case=self.cases, macro_dt=steps)
 
 
 @shows_progress

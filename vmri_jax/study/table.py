@@ -13,6 +13,7 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
+from vmri_jax.running.export import extra
 from vmri_jax.running.interrupts import Interrupted
 from vmri_jax.running.printed import PrintedTable
 
@@ -52,6 +53,10 @@ class ResultTable:
     def lines(self) -> list[dict[str, Any]]:
         """The lines of the CSV file: the records, unless a subclass writes several lines per row."""
         return self.records()
+
+    def to_pandas(self):
+        """The lines of the CSV file as a `pandas.DataFrame`; needs the extra ``vmri_jax[xarray]``, which brings pandas."""
+        return extra("pandas", "to_pandas").DataFrame(self.lines())
 
     def content(self) -> dict[str, Any]:
         """The content of the JSON file: the rows; a subclass adds its further fields."""
