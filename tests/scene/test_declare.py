@@ -125,3 +125,28 @@ def test_kinds_of_fields():
         Scene(bodies, [Wind(direction=np.ones(3))])
     with pytest.raises(ValueError, match="everything: between is \\('a',\\); give at least two bodies"):
         Scene(bodies, [Everything(("a",))])
+
+
+def test_incomplete_classes_of_effects_say_what_they_lack():
+    def function(q, params):
+        return jnp.sum((q[0] - q[1]) ** 2)
+
+    body = {
+        "kind": "potential",
+        "function": staticmethod(function),
+        "pairs": names(2),
+        "__annotations__": {"pairs": Any},
+    }
+    classes = {
+        "has no decorator; write @effect_class": type("Bare", (Effect,), dict(body)),
+        "has no kind; write kind = one of 'kinetic'": effect_class(type("Kindless", (Effect,), {**body, "kind": None})),
+        "has no field with names of bodies": effect_class(
+            type("Alone", (Effect,), {name: body[name] for name in ("kind", "function")})
+        ),
+        "function without @staticmethod": effect_class(type("Bound", (Effect,), {**body, "function": function})),
+    }
+    for message, cls in classes.items():
+        with pytest.raises(TypeError, match=f"the class of effects {cls.__name__} .*{message}"):
+            cls(("a", "b"))
+    magnets: Any = effect_class(type("Magnets", (Effect,), dict(body)))
+    assert magnets(("a", "b")).name == "magnets"

@@ -2,9 +2,10 @@
 
 from abc import ABC
 from collections.abc import Mapping, Sequence
-from dataclasses import field, fields, replace
+from dataclasses import Field, field, fields, replace
+from inspect import getattr_static, isfunction
 from itertools import pairwise
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, get_args
 
 import jax
 import jax.numpy as jnp
@@ -55,7 +56,7 @@ class Effect(ABC):
     The argument `bodies` of the methods holds all bodies of the scene by name.
 
     Args:
-        name: of this effect in its scene; by default `default_name` of its class.
+        name: of this effect in its scene; by default `default_name` of its class, or the name of the class in small letters.
         rate: how often a potential is evaluated: "slow" (as part of V), "fast" (on the micro grid, with the rule of W), a whole number k
             (on every k-th micro node), or "auto" (the scene decides by stiffness). A potential with the rate "fast" or k makes its bodies fast, except bodies
             with the pace "slow": the positions of these slow bodies are then solved for by iteration over the macro step. Of a kinetic effect "slow",
@@ -87,11 +88,32 @@ class Effect(ABC):
     name: str = field(default="", kw_only=True)
     rate: Literal["slow", "fast", "auto"] | int = field(default="auto", kw_only=True)
 
+    def __new__(cls, *args, **kwargs):
+        """A new effect, of a class that is complete.
+
+        Raises:
+            TypeError: the class has no decorator, no `kind`, no field with names of bodies, or a `function` that would get the effect itself.
+        """
+        about = f"the class of effects {cls.__name__}"
+        if any(isinstance(value, Field) for value in vars(cls).values()):  # the decorator replaces them
+            raise TypeError(f"{about} has no decorator; write @effect_class of vmri_jax.scene.declare above it.")
+        if getattr(cls, "kind", None) not in get_args(Kind):
+            raise TypeError(f"{about} has no kind; write kind = one of {', '.join(map(repr, get_args(Kind)))} in it.")
+        if cls.elements is Effect.elements and not any("names" in f.metadata for f in fields(cls)):
+            raise TypeError(
+                f"{about} has no field with names of bodies; declare one, bodies: Any = names(2) for pairs."
+            )
+        if isfunction(getattr_static(cls, "function", None)):
+            raise TypeError(
+                f"{about} has a function without @staticmethod; write it above the function, which gets no self."
+            )
+        return super().__new__(cls)
+
     def __post_init__(self):
         for argument in fields(self):
             object.__setattr__(self, argument.name, lasting(getattr(self, argument.name)))
         if not self.name:
-            object.__setattr__(self, "name", self.default_name)
+            object.__setattr__(self, "name", self.default_name or type(self).__name__.lower())
         for argument in fields(self):
             if "of_time" in argument.metadata:
                 about, function = f"{self.name}: {argument.name}", getattr(self, argument.name)
