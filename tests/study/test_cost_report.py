@@ -15,12 +15,12 @@ def test_cost_report(tmp_path):
     """Above 20 s of compiling: the schemes of the search, with twice their micro steps for the shares, and the trials of an accuracy."""
     report = cost_report(PROBLEM, "spring", tmp_path, t_end=1.0, errors=(1e-5, 1e-3), menu=SHORT_MENU)
     text = report.path.read_text()
-    assert [answer.error for answer in report.answers] == [1e-3, 1e-5]
+    assert [answer.error for answer in report.rows] == [1e-3, 1e-5]
     assert "What accuracy costs" in text
     assert not report.not_tried
     printed = " ".join(str(report).split())  # whatever the width of the terminal
     assert "Runs to t = 1, with errors of the positions there. The reference solution is good to" in printed
-    setting = report.answers[1].setting
+    setting = report.rows[1].setting
     assert setting is not None
     assert setting.command("spring") in text.replace("&#34;", '"')
     assert sum(report.shares.values()) == pytest.approx(1)

@@ -119,10 +119,7 @@ class Advice(ResultTable):
             **super().content(),
         }
 
-    @property
-    def caption(self) -> str:
-        """The verdict."""
-        return self.verdict
+    caption = verdict
 
     def __str__(self) -> str:
         lines = [f"{f.severity}: {f.kind}: {f.sentence}" for f in self.findings]

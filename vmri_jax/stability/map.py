@@ -78,8 +78,7 @@ class StabilityMap(ResultTable):
 
     def windows(self, row=None) -> list[Window]:
         """Intervals of omega H that are unstable, for one row (the first by default)."""
-        if row is None:
-            return list(self.unstable[0])
+        row = self.rows[0] if row is None else row
         if row not in self.rows:
             raise ValueError(f"windows: there is no row {row!r}; there are {', '.join(map(repr, self.rows))}.")
         return list(self.unstable[self.rows.index(row)])

@@ -78,7 +78,7 @@ class CostReport(ResultTable):
     path: of the page, cost.html; its figures and runs lie beside it.
     name: of the system.
     t_end: simulated time.
-    answers: by error, the largest first.
+    rows: the answers by error, the largest first.
     runs: every run of the search.
     shares: parts of the time of the middle answer by function, see `vmri_jax.study.prices.shares`.
     not_tried: families that the search had no time to compile.
@@ -98,7 +98,7 @@ class CostReport(ResultTable):
     path: Path
     name: str
     t_end: float
-    answers: tuple[Answer, ...]
+    rows: tuple[Answer, ...]
     runs: WorkPrecision
     shares: dict[str, float]
     not_tried: tuple[str, ...] = ()
@@ -106,11 +106,6 @@ class CostReport(ResultTable):
     accuracy: WorkRow | None = None
     accuracy_error: float = math.nan
     peers: dict[str, list[Stair]] = field(default_factory=dict)
-
-    @property
-    def rows(self) -> tuple[Answer, ...]:
-        """The answers."""
-        return self.answers
 
     @property
     def caption(self) -> str:
@@ -136,7 +131,7 @@ class CostReport(ResultTable):
 
     def records(self) -> list[dict[str, Any]]:
         """A dictionary for each answer: the error and the columns of its run."""
-        return [{"error": a.error, **(asdict(a.setting.row) if a.setting else {})} for a in self.answers]
+        return [{"error": a.error, **(asdict(a.setting.row) if a.setting else {})} for a in self.rows]
 
 
 def default_t_end(problem: Problem) -> float:
@@ -265,7 +260,7 @@ def _write(search: Search, answers: Sequence[Answer], name: str, out: Path, **la
         path=out / "cost.html",
         name=name,
         t_end=search.t_end,
-        answers=tuple(answers),
+        rows=tuple(answers),
         runs=runs,
         shares=shares(price, middle.row) if middle is not None else {},
         not_tried=tuple(search.not_tried()),
@@ -312,7 +307,7 @@ def _draw(report: CostReport, problem: Problem, price: dict[str, float]) -> None
     for end, theme in (("", plots.LIGHT), ("_dark", plots.DARK)):
         plots.save(staircase_figure(title, theme), report.path.parent / f"cost{end}.png", theme)
     n_g, n_gs = problem.system.num_constraints(problem.q_s, problem.q_f)
-    reached = [answer for answer in report.answers if answer.setting is not None]
+    reached = [answer for answer in report.rows if answer.setting is not None]
     write_page(
         report.path,
         TEMPLATE,
@@ -323,14 +318,14 @@ def _draw(report: CostReport, problem: Problem, price: dict[str, float]) -> None
         multirate=_multirate(report),
         duration=duration,
         work_precision=embedded(partial(staircase_figure, "")),
-        by_num_micro=embedded(partial(draw_num_micro, report.answers)),
+        by_num_micro=embedded(partial(draw_num_micro, report.rows)),
         shares_figure=embedded(partial(draw_shares, report.shares)),
     )
 
 
 def _draw_stairs(report: CostReport, price: dict[str, float], title: str, theme: plots.Theme) -> plots.NotebookFigure:
     """The staircases with marks for the answers and the choice of `accuracy=`, other programs, and the bound."""
-    rows = [answer.setting.row for answer in report.answers if answer.setting is not None]
+    rows = [answer.setting.row for answer in report.rows if answer.setting is not None]
     errors = {(s.row.scheme, s.row.num_steps): s.error for of_kind in report.stairs.values() for s in of_kind}
     marked = [
         plots.Marked("answers", row.seconds, errors.get((row.scheme, row.num_steps), row.error_q)) for row in rows
@@ -367,7 +362,7 @@ def _growth(reached: Sequence[Answer]) -> float:
 def _multirate(report: CostReport) -> list[tuple[float, str, int, float]]:
     """For each answer: its error, family and num_micro, and the time of the family with one micro step over the time of the answer."""
     gains = []
-    for answer in report.answers:
+    for answer in report.rows:
         if answer.setting is None:
             continue
         family = answer.setting.family.name
