@@ -19,8 +19,7 @@ from vmri_jax.study import (
     tune,
     work_precision,
 )
-from vmri_jax.study.advisor import NothingReached
-from vmri_jax.study.another_start import another_start
+from vmri_jax.study.advisor import NothingReached, another_start
 from vmri_jax.study.search import NUM_MICRO, Search
 
 SHORT_MENU = [family for family in families() if family.name in ("fully explicit", "fully explicit, suzuki4")]
