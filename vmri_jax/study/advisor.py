@@ -22,7 +22,7 @@ from vmri_jax.steppers.solvers import Newton
 from vmri_jax.study.program import Program
 from vmri_jax.study.reference_solution import ReferenceSolution, reference_solution
 from vmri_jax.study.search import TIMED_RUNS, Search, Setting
-from vmri_jax.study.table import ResultTable
+from vmri_jax.study.table import ResultTable, interruptible
 from vmri_jax.study.work import WorkPrecision, WorkRow, duration, work_row
 
 MIN_ERROR_OVER_REFERENCE = 10.0
@@ -176,7 +176,7 @@ def tune(
     # the first search does without.
     for fallback in (False, True):
         search = Search(problem, t_end, families() if menu is None else menu, reference, solver, fallback)
-        with search.interruptible():
+        with interruptible(search.rows):
             settings = search.cheapest(error, progress, exhaustive)
         if settings:
             break
@@ -192,7 +192,7 @@ def tune(
         progress("another start", 1, 1)
         mean_speed = float(np.abs(reference.q - reference.q[0]).max()) / t_end
         try:
-            with search.interruptible():
+            with interruptible(search.rows):
                 other = another_start(problem, mean_speed)
                 other_reference = reference_solution(other, t_end, num_saves=reference.num_saves)
                 setting, verification = first_verified(settings, other, other_reference, t_end, solver)

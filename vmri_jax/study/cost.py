@@ -9,7 +9,6 @@ import numpy as np
 
 from vmri_jax import plots
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
-from vmri_jax.running.interrupts import Interrupted
 from vmri_jax.running.progress import shows_progress
 from vmri_jax.running.timing import interleaved
 from vmri_jax.running.trajectory import Trajectory
@@ -17,7 +16,7 @@ from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers import solvers
 from vmri_jax.steppers.results import Method, Result
 from vmri_jax.study.program import Program
-from vmri_jax.study.table import Column, ResultTable
+from vmri_jax.study.table import Column, ResultTable, interruptible
 
 
 @dataclass(frozen=True)
@@ -144,7 +143,7 @@ def cost_study(
     def study() -> CostStudy:
         return CostStudy(tuple(_row(label, *run, seconds.get(str(i), [np.nan])) for i, run in enumerate(runs)))
 
-    try:
+    with interruptible(study):
         for method in methods:
             solver = solvers.named(method)()
             for n in num_micro:
@@ -155,8 +154,6 @@ def cost_study(
         progress(f"{label} measuring times".strip(), total - 1, total)
         calls = {str(i): program.timed(n) for i, (_, program, n, run) in enumerate(runs) if run.success}
         seconds = interleaved(calls, repeats, min_seconds, clock=clock)
-    except KeyboardInterrupt:
-        raise Interrupted(study(), len(runs), None, "runs") from None
     progress("done", total, total)
     return study()
 

@@ -27,7 +27,7 @@ from vmri_jax.study.program import Program
 from vmri_jax.study.reference_solution import ReferenceSolution, reference_solution
 from vmri_jax.study.search import Search, Setting, stopwatch
 from vmri_jax.study.staircase import MICRO, SINGLE, Stair, confirm, confirmed, staircases, with_shares
-from vmri_jax.study.table import Column, ResultTable
+from vmri_jax.study.table import Column, ResultTable, interruptible
 from vmri_jax.study.work import WorkPrecision, WorkRow, duration, work_row
 
 TEMPLATE = Path(__file__).parent / "cost.html.j2"
@@ -185,7 +185,7 @@ def cost_report(
         )
     search = Search(problem, t_end, families() if menu is None else menu, reference)
     answers, elapsed = [], stopwatch()
-    with search.interruptible():  # around the drawing as well, so that Ctrl-C there keeps the runs, too
+    with interruptible(search.rows):  # around the drawing as well, so that Ctrl-C there keeps the runs, too
         for i, error in enumerate(sorted(errors, reverse=True)):
             seconds_left = BUDGET - elapsed()
             settings = search.cheapest(error, part(progress, i, len(errors)), budget=seconds_left / 2)

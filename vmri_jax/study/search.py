@@ -7,15 +7,13 @@ settings in turn.
 """
 
 import time
-from collections.abc import Callable, Collection, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from vmri_jax import diagnostics
 from vmri_jax.accuracy.families import Family
-from vmri_jax.running.interrupts import Interrupted
 from vmri_jax.running.progress import Progress, silent
 from vmri_jax.steppers.solvers import Newton
 from vmri_jax.study.program import Program
@@ -233,15 +231,6 @@ class Search:
         timed = [replace(s, row=row) for s, row in zip(settings, rows, strict=True)]
         self.settings |= {s.key: s for s in timed}
         return timed
-
-    @contextmanager
-    def interruptible(self) -> Iterator[None]:
-        """Within this context Ctrl-C raises `Interrupted`, which carries all runs so far."""
-        try:
-            yield
-        except KeyboardInterrupt:
-            rows = self.rows()
-            raise Interrupted(rows, len(rows.rows), None, "runs") from None
 
     def not_tried(self) -> list[str]:
         """Names of the families without any run: the search had no time left for them."""

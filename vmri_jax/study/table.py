@@ -3,7 +3,8 @@
 import csv
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -12,6 +13,7 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
+from vmri_jax.running.interrupts import Interrupted
 from vmri_jax.running.printed import PrintedTable
 
 
@@ -92,6 +94,16 @@ class ResultTable:
     def to_json(self, path: str | Path) -> None:
         """Write a JSON file. NaN becomes null, infinite numbers become "inf" and "-inf"."""
         Path(path).write_text(json.dumps(_plain(self.content()), indent=1))
+
+
+@contextmanager
+def interruptible(rows: Callable[[], ResultTable]) -> Iterator[None]:
+    """Within this context Ctrl-C raises `Interrupted`, which carries the rows so far."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        done = rows()
+        raise Interrupted(done, len(done.rows), None, "runs") from None
 
 
 def rich_table(columns: Sequence[Column], rows: Sequence[Any], caption: str = "", ruled: bool = False) -> Table:
