@@ -36,9 +36,9 @@ def test_first_impulse_resonances(num_micro):
 def test_combination_resonance_of_the_fully_implicit_scheme():
     """Growth of 8.4e-4 per step at omega h = 0.1, num_micro 57; a run grows as the map says."""
     found = stability_map(linear_model(), fully_implicit(57), [CASE_3 - 0.02, CASE_3, CASE_3 + 0.02])
-    growth = found.growth[0]
+    growth = found.radius[0] - 1
     assert growth[1] == pytest.approx(8.4e-4, abs=2e-5)
-    assert growth[0] == growth[2] == 0
+    assert max(growth[0], growth[2]) <= found.tolerance
     [(start, stop, peak)] = found.windows()
     assert peak == pytest.approx(8.44e-4, rel=0.02)
     assert start < CASE_3 < stop < start + 0.01
@@ -54,7 +54,7 @@ def test_combination_resonance_of_the_fully_implicit_scheme():
 def test_windows_narrower_than_the_grid():
     """Galerkin of degree 2 near omega H = 2 pi: a window of 2e-4 between two stable grid points."""
     found = stability_map(linear_model(), galerkin(5, 2), np.linspace(6.1, 6.4, 4))
-    assert found.growth.max() == 0.0
+    assert found.radius.max() <= 1 + found.tolerance
     [(start, stop, growth)] = found.windows()
     assert 5e-5 < stop - start < 5e-4
     assert start == pytest.approx(1.9964 * np.pi, abs=1e-3)

@@ -71,11 +71,6 @@ class StabilityMap(ResultTable):
         """(n,) macro steps."""
         return self.omega_H / self.omega
 
-    @property
-    def growth(self) -> np.ndarray:
-        """(m, n) growth per macro step, ``radius - 1``, zero where stable."""
-        return np.where(self.radius > 1 + self.tolerance, self.radius - 1, 0.0)
-
     def windows(self, row=None) -> list[Window]:
         """Intervals of omega H that are unstable, for one row (the first by default)."""
         row = self.rows[0] if row is None else row

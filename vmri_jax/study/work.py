@@ -124,11 +124,6 @@ class WorkPrecision(ResultTable):
                 front.append(row)
         return front
 
-    def cheapest(self, error: float, scheme: str | None = None) -> WorkRow | None:
-        """The fastest run (of one scheme) with at most this error of the positions; None if no run keeps it."""
-        rows = [r for r in self.rows if r.error_q <= error and scheme in (None, r.scheme)]
-        return min(rows, key=lambda row: row.seconds, default=None)
-
     def shown(self) -> list[WorkRow]:
         """The Pareto front."""
         return self.pareto()
