@@ -43,9 +43,7 @@ class Family:
     def coarsest(self, num_micro: int, frequency: float, t_end: float) -> int:
         """Fewest macro steps up to `t_end` worth a trial: their micro steps h just resolve the fastest vibration, ``omega h`` = degree."""
         scheme = self.make(num_micro)
-        longest = 1.0
-        if isinstance(scheme, Composition):
-            longest = float(np.abs(scheme.coefficients).max())
+        longest = float(np.abs(scheme.coefficients).max()) if isinstance(scheme, Composition) else 1.0
         return max(1, int(frequency * t_end * longest / (num_micro * scheme.degree)))
 
 

@@ -9,6 +9,7 @@ settings in turn.
 import time
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
+from operator import attrgetter
 
 import numpy as np
 
@@ -36,6 +37,7 @@ MAX_PROGRAMS = 64
 """Compiled schemes that a search holds in memory; with a smaller number the search compiles schemes twice."""
 TIMED_RUNS = 5
 """Runs whose median is the time of a setting in stage 3; more of them make the order of the settings surer."""
+_seconds = attrgetter("row.seconds")
 
 
 @dataclass(frozen=True)
@@ -70,10 +72,6 @@ def stopwatch() -> Callable[[], float]:
     """
     wall_start, processor_start = time.monotonic(), time.process_time()
     return lambda: min(time.monotonic() - wall_start, time.process_time() - processor_start)
-
-
-def _seconds(setting: Setting) -> float:
-    return setting.row.seconds
 
 
 class Search:
