@@ -8,12 +8,24 @@ from dataclasses import dataclass
 from functools import reduce
 from itertools import pairwise
 from operator import add
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from vmri_jax.mechanics.rows import Rows
 from vmri_jax.scene.body import GROUND_COORDINATES
+
+
+@dataclass(frozen=True)
+class Applied:
+    """A function with its first arguments filled in; compared by value, which `functools.partial` is not."""
+
+    function: Callable
+    arguments: tuple[Any, ...]
+
+    def __call__(self, *arguments):
+        return self.function(*self.arguments, *arguments)
 
 
 def split(q):

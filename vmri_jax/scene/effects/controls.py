@@ -1,7 +1,7 @@
 """Controls: forces and torques on bodies and in joints that an optimisation sets, see `vmri_jax.control.minimize`."""
 
 from collections.abc import Callable
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import KW_ONLY
 from typing import Any, Literal
 
 import jax
@@ -11,34 +11,29 @@ from vmri_jax.mechanics.names import AXES
 from vmri_jax.scene.body import Attachment, body_of, entry, is_entry, label_of
 from vmri_jax.scene.declare import effect_class, names, vector
 from vmri_jax.scene.effect import Effect
+from vmri_jax.scene.effects.freedoms import FREEDOMS
 from vmri_jax.scene.effects.joint_base import Joint
-from vmri_jax.scene.effects.joint_effects import Along, InJoint
-from vmri_jax.scene.terms import split
+from vmri_jax.scene.effects.joint_effects import InJoint
+from vmri_jax.scene.terms import Applied, split
 
 Load = Literal["force", "torque"]
 
 
-@dataclass(frozen=True)
-class LoadOf:
-    """The generalised force of controls u on a body; compared by value.
+def load_on(load: Load, axes: Literal["space", "body"], q, u, params):
+    """The generalised force of controls u on a body.
 
     A force F at the point X puts ``f_i = X_i F`` on the director d_i, a torque M ``f_i = M x d_i / 2``.
     """
-
-    load: Load
-    axes: Literal["space", "body"]
-
-    def __call__(self, q, u, params):
-        (q,) = q
-        u = u * params["along"] / jnp.linalg.norm(params["along"]) if "along" in params else u
-        if "point" not in params:
-            return (u,)
-        _, d = split(q)
-        if self.axes == "body":
-            u = u @ d
-        if self.load == "torque":
-            return (jnp.concatenate([jnp.zeros(3), (jnp.cross(u, d) / 2).ravel()]),)
-        return (jnp.concatenate([u, (params["point"][: len(d), None] * u).ravel()]),)
+    (q,) = q
+    u = u * params["along"] / jnp.linalg.norm(params["along"]) if "along" in params else u
+    if "point" not in params:
+        return (u,)
+    _, d = split(q)
+    if axes == "body":
+        u = u @ d
+    if load == "torque":
+        return (jnp.concatenate([jnp.zeros(3), (jnp.cross(u, d) / 2).ravel()]),)
+    return (jnp.concatenate([u, (params["point"][: len(d), None] * u).ravel()]),)
 
 
 @effect_class
@@ -91,7 +86,7 @@ class Controlled(Effect):
 
     @property
     def function(self) -> Callable:
-        return LoadOf(self.load, self.axes)
+        return Applied(load_on, (self.load, self.axes))
 
     def elements(self, bodies):
         if not is_entry(self.body):
@@ -134,12 +129,10 @@ class Controlled(Effect):
         return tuple(f"{self.name}{axis}" for axis in axes)
 
 
-class ControlAlong(Along):
-    """``u dx/dq`` along the freedom x of a joint."""
-
-    def __call__(self, q, u, params):
-        x, pull = jax.vjp(lambda q: self.x(q, params), q)
-        return pull(u.reshape(x.shape))[0]
+def control_along(law, freedom: str, q, u, params):
+    """``u dx/dq`` along a freedom x of a joint; no law takes part."""
+    x, pull = jax.vjp(lambda q: FREEDOMS[freedom](q, params), q)
+    return pull(u.reshape(x.shape))[0]
 
 
 @effect_class
@@ -151,7 +144,7 @@ class ControlledJoint(InJoint):
     """
 
     kind = "control"
-    along = ControlAlong
+    along = staticmethod(control_along)
 
     def check_bodies(self, bodies):
         super().check_bodies(bodies)

@@ -2,7 +2,7 @@
 
 from abc import abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from typing import Any, ClassVar
 
 import jax.numpy as jnp
@@ -15,32 +15,21 @@ from vmri_jax.scene.declare import effect_class, real_tree
 from vmri_jax.scene.effect import MOST_ROLES, START, Effect
 from vmri_jax.scene.effects.freedoms import FREEDOMS, Freedom
 from vmri_jax.scene.effects.joint_base import freedom_of, joint_named
-from vmri_jax.scene.terms import EffectTerm, OnBodies
+from vmri_jax.scene.terms import Applied, EffectTerm, OnBodies
 
 
-@dataclass(frozen=True)
-class EquationOfBodies:
-    """``g(x, params)`` with the freedoms x as functions of the coordinates of both bodies of each joint; compared by value."""
-
-    law: Callable
-    freedoms: tuple[Freedom, ...]
-
-    def __call__(self, q, params):
-        x = [
-            FREEDOMS[freedom](q[2 * i : 2 * i + 2], of_joint)
-            for i, (freedom, of_joint) in enumerate(zip(self.freedoms, params["joints"], strict=True))
-        ]
-        return self.law(jnp.stack(x), params["law"])
+def equation_of_bodies(law, freedoms: tuple[Freedom, ...], q, params):
+    """``g(x, params)`` with the freedoms x as functions of the coordinates of both bodies of each joint."""
+    x = [
+        FREEDOMS[freedom](q[2 * i : 2 * i + 2], of_joint)
+        for i, (freedom, of_joint) in enumerate(zip(freedoms, params["joints"], strict=True))
+    ]
+    return law(jnp.stack(x), params["law"])
 
 
-@dataclass(frozen=True)
-class EquationOfCoordinates:
-    """``g(x, params)`` with freedoms x that are all coordinates of the scene; compared by value."""
-
-    law: Callable
-
-    def __call__(self, q, params):
-        return self.law(jnp.concatenate(q), params["law"])
+def equation_of_coordinates(law, q, params):
+    """``g(x, params)`` with freedoms x that are all coordinates of the scene."""
+    return law(jnp.concatenate(q), params["law"])
 
 
 @effect_class
@@ -85,7 +74,7 @@ class _Coupling(Effect):
 
     @property
     def function(self):
-        return EquationOfBodies(self.law, tuple(freedom for _, freedom in self.joints))
+        return Applied(equation_of_bodies, (self.law, tuple(freedom for _, freedom in self.joints)))
 
     def parameters(self, bodies):
         return {"law": self.numbers(), "joints": tuple(joint.parameters(bodies) for joint, _ in self.joints)}
@@ -95,7 +84,7 @@ class _Coupling(Effect):
         if not all(key in layout.freedoms for key in keys):
             return super().terms(select, bodies, layout, potentials)
         roles = tuple(OnBodies(Rows.of([layout.freedoms[key]])) for key in keys)
-        return (EffectTerm(self.name, EquationOfCoordinates(self.law), roles),)
+        return (EffectTerm(self.name, Applied(equation_of_coordinates, (self.law,)), roles),)
 
     def check_bodies(self, bodies):
         """Nothing: the joints check their bodies themselves."""

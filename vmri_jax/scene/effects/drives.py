@@ -1,7 +1,7 @@
 """External forces: constant, harmonic, any function of time, and a force that turns with two bodies."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import Any
 
 import jax.numpy as jnp
@@ -11,6 +11,7 @@ from vmri_jax.scene.body import end_of
 from vmri_jax.scene.declare import effect_class, names, number, of_time, positive, real_tree, vector
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.effects.points import BetweenPoints
+from vmri_jax.scene.terms import Applied
 
 
 @effect_class
@@ -63,15 +64,10 @@ class HarmonicDrive(Effect):
         return (params["amplitude"] * jnp.cos(params["frequency"] * t + params["phase"])[..., None],)
 
 
-@dataclass(frozen=True)
-class OfTime:
-    """``F = f(t)``, the same on all bodies; compared by value."""
-
-    history: Callable
-
-    def __call__(self, t, q, v, params):
-        (q,) = q
-        return (jnp.broadcast_to(self.history(t, params), q.shape),)
+def same_on_all(history, t, q, v, params):
+    """``F = f(t)``, the same on all bodies."""
+    (q,) = q
+    return (jnp.broadcast_to(history(t, params), q.shape),)
 
 
 @effect_class
@@ -93,7 +89,7 @@ class Drive(Effect):
 
     @property
     def function(self):
-        return OfTime(self.history)
+        return Applied(same_on_all, (self.history,))
 
     def parameters(self, bodies):
         return real_tree(f"{self.name}: params", self.params)

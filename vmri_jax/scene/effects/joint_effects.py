@@ -1,7 +1,7 @@
 """Effects along a freedom of a joint: springs, limits, dampers, rotors, drives, prescribed motions."""
 
 from collections.abc import Callable
-from dataclasses import KW_ONLY, dataclass, field, replace
+from dataclasses import KW_ONLY, field, replace
 from typing import Any, ClassVar, Literal
 
 import jax
@@ -13,63 +13,39 @@ from vmri_jax.scene.effect import START, Effect
 from vmri_jax.scene.effects.freedoms import ANGLES, COORDINATE, FREEDOMS, Freedom
 from vmri_jax.scene.effects.joint_base import Joint, freedom_of, joint_named
 from vmri_jax.scene.effects.springs import elastic_energy
-from vmri_jax.scene.terms import EffectTerm, OnBodies
+from vmri_jax.scene.terms import Applied, EffectTerm, OnBodies
 
 
-@dataclass(frozen=True)
-class Along:
-    """A law of a freedom x as a function of coordinates; compared by value.
-
-    Args:
-        law: function of x, its rate x', the time or params.
-        freedom: name of x in `FREEDOMS`.
-    """
-
-    law: Any
-    freedom: str
-
-    def x(self, q, params):
-        """The value of the freedom, (...)."""
-        return FREEDOMS[self.freedom](q, params)
-
-
-class EnergyOf(Along):
+def energy_of(law, freedom: str, q, params):
     """``law(x, params)``."""
-
-    def __call__(self, q, params):
-        return self.law(self.x(q, params), params)
+    return law(FREEDOMS[freedom](q, params), params)
 
 
-class EnergyOfRate(Along):
+def energy_of_rate(law, freedom: str, q, v, params):
     """``law(x', params)``."""
-
-    def __call__(self, q, v, params):
-        return self.law(jax.jvp(lambda q: self.x(q, params), (q,), (v,))[1], params)
+    return law(jax.jvp(lambda q: FREEDOMS[freedom](q, params), (q,), (v,))[1], params)
 
 
-class ForceAlong(Along):
+def force_along(law, freedom: str, t, q, v, params):
     """``F = f dx/dq`` with ``f = law(t, x, x', params)``.
 
     For the angle of a hinge f is a torque about its axis: b gets it, and a its opposite.
     """
 
-    def __call__(self, t, q, v, params):
-        def freedom(q):
-            return self.x(q, params)
+    def value(q):
+        return FREEDOMS[freedom](q, params)
 
-        x, rate = jax.jvp(freedom, (q,), (v,))
-        return jax.vjp(freedom, q)[1](jnp.broadcast_to(self.law(t, x, rate, params), x.shape))[0]
+    x, rate = jax.jvp(value, (q,), (v,))
+    return jax.vjp(value, q)[1](jnp.broadcast_to(law(t, x, rate, params), x.shape))[0]
 
 
-class PrescribedMotion(Along):
+def prescribed_motion(law, freedom: str, t, q, params):
     """``x - a(t)`` with the law a; for an angle x ``sin x cos a - cos x sin a``, which is homogeneous in the directors."""
-
-    def __call__(self, t, q, params):
-        a = self.law(t, params["path"])
-        if self.freedom not in ANGLES:
-            return self.x(q, params) - a
-        sine, cosine = ANGLES[self.freedom](q, params)
-        return sine * jnp.cos(a) - cosine * jnp.sin(a)
+    a = law(t, params["path"])
+    if freedom not in ANGLES:
+        return FREEDOMS[freedom](q, params) - a
+    sine, cosine = ANGLES[freedom](q, params)
+    return sine * jnp.cos(a) - cosine * jnp.sin(a)
 
 
 @effect_class
@@ -93,7 +69,7 @@ class InJoint(Effect):
     law: ClassVar[Any] = None
     """Energy, force or path as a function of x."""
     along: ClassVar[Any]
-    """The class derived from `Along` that makes of the law a function of coordinates."""
+    """The function ``(law, freedom, ...)`` that makes of the law a function of coordinates; the freedom x by its name in `FREEDOMS`."""
 
     def bound(self, effects):
         """A copy with the joint itself instead of its name."""
@@ -106,7 +82,7 @@ class InJoint(Effect):
 
     @property
     def function(self):
-        return self.along(self.law, self.freedom)
+        return Applied(self.along, (self.law, self.freedom))
 
     def elements(self, bodies):
         return self.joint.elements(bodies)
@@ -123,7 +99,8 @@ class InJoint(Effect):
             return terms
         numbers = None if len(carrying) == len(self.elements(bodies)) else tuple(carrying)
         roles = (OnBodies(Rows.of([layout.freedoms[keys[i]] for i in carrying])),)
-        return (*terms, EffectTerm(self.name, self.along(self.law, COORDINATE), roles, numbers, self.split, self.timed))
+        function = Applied(self.along, (self.law, COORDINATE))
+        return (*terms, EffectTerm(self.name, function, roles, numbers, self.split, self.timed))
 
     def parameters(self, bodies):
         return super().parameters(bodies) | self.joint.parameters(bodies)
@@ -150,7 +127,7 @@ class JointSpring(InJoint):
 
     kind = "potential"
     default_name = "joint_springs"
-    along = EnergyOf
+    along = staticmethod(energy_of)
 
     @staticmethod
     def law(x, params):
@@ -181,7 +158,7 @@ class JointLimit(InJoint):
 
     kind = "potential"
     default_name = "joint_limits"
-    along = EnergyOf
+    along = staticmethod(energy_of)
 
     @staticmethod
     def law(x, params):
@@ -211,7 +188,7 @@ class JointDamper(InJoint):
 
     kind = "force"
     default_name = "joint_dampers"
-    along = ForceAlong
+    along = staticmethod(force_along)
 
     @staticmethod
     def law(t, x, rate, params):
@@ -232,21 +209,16 @@ class RotorInertia(InJoint):
 
     kind = "kinetic"
     default_name = "rotors"
-    along = EnergyOfRate
+    along = staticmethod(energy_of_rate)
 
     @staticmethod
     def law(rate, params):
         return jnp.sum(params["inertia"] * rate**2) / 2
 
 
-@dataclass(frozen=True)
-class OfHistory:
-    """``f(t)``; compared by value."""
-
-    history: Callable
-
-    def __call__(self, t, x, rate, params):
-        return self.history(t, params["history"])
+def of_history(history, t, x, rate, params):
+    """``f(t)``."""
+    return history(t, params["history"])
 
 
 @effect_class
@@ -264,11 +236,11 @@ class JointDrive(InJoint):
 
     kind = "force"
     default_name = "joint_drive"
-    along = ForceAlong
+    along = staticmethod(force_along)
 
     @property
     def law(self):
-        return OfHistory(self.history)
+        return Applied(of_history, (self.history,))
 
     def parameters(self, bodies):
         return super().parameters(bodies) | {"history": real_tree(f"{self.name}: params", self.params)}
@@ -294,7 +266,7 @@ class JointMotion(InJoint):
 
     kind = "constraint"
     default_name = "joint_motion"
-    along = PrescribedMotion
+    along = staticmethod(prescribed_motion)
     timed = True
 
     @property

@@ -4,7 +4,7 @@ Each computes the vector x between both ends; ``law(x, params)`` of a derived cl
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import Any, ClassVar
 
 import jax
@@ -14,6 +14,7 @@ import numpy as np
 from vmri_jax.scene.body import end_of, label_of
 from vmri_jax.scene.declare import effect_class, names, of_time, real_tree, vector
 from vmri_jax.scene.effect import Effect
+from vmri_jax.scene.terms import Applied
 
 
 def distance(q, params=None):
@@ -93,16 +94,10 @@ class ToFixedPoint(ToPoint):
         return {"anchors": anchors}
 
 
-@dataclass(frozen=True)
-class AlongPath:
-    """``law(q - a(t), params)``, as a function of time; compared by value."""
-
-    law: Callable
-    path: Callable
-
-    def __call__(self, t, q, *arguments):
-        (q,), params = q, arguments[-1]
-        return self.law(q - self.path(t, params["path"]), params)
+def along_path(law, path, t, q, *arguments):
+    """``law(q - a(t), params)``, as a function of time."""
+    (q,), params = q, arguments[-1]
+    return law(q - path(t, params["path"]), params)
 
 
 @effect_class
@@ -117,7 +112,7 @@ class ToPath(ToPoint):
 
     @property
     def function(self):
-        return AlongPath(self.law, self.path)
+        return Applied(along_path, (self.law, self.path))
 
     def parameters(self, bodies):
         return super().parameters(bodies) | {"path": real_tree(f"{self.name}: params", self.params)}
