@@ -128,5 +128,5 @@ def test_traced_scenes_are_refused():
         hinge = Revolute(("ground", "bar"), at=[0.0, 0.0, 0.0], axis=Z, name="hinge")
         return Scene([body], [hinge]).with_rates({"hinge": 1.0}).bodies[0].spin[2]
 
-    with pytest.raises(TypeError, match=r"traces numbers of the scene; call with_rates outside"):
+    with pytest.raises(TypeError, match=r"traces numbers of the scene or rates; call with_rates outside"):
         jax.grad(speed)(1.0)

@@ -44,18 +44,15 @@ class Layout:
     @property
     def ends(self) -> tuple[int, int]:
         """Lengths of Q_s and Q_f."""
-        slow, fast = (
-            max(
-                (
-                    place.start + place.size
-                    for place in (*self.coordinates.values(), *self.bodies.values())
-                    if place.part == part
-                ),
-                default=0,
-            )
-            for part in ("s", "f")
-        )
+        places = [*self.coordinates.values(), *self.bodies.values()]
+        slow, fast = (max((p.start + p.size for p in places if p.part == part), default=0) for part in ("s", "f"))
         return slow, fast
+
+    @property
+    def columns(self) -> dict[str, np.ndarray]:
+        """Numbers of the coordinates of every body in (Q_s, Q_f), taken as one vector."""
+        first = {"s": 0, "f": self.ends[0]}
+        return {name: first[part] + start + np.arange(size) for name, (part, start, size) in self.bodies.items()}
 
 
 def join(bodies: Bodies, layout: Layout, part: Part, quantity: Literal["coordinates", "rates", "masses"]) -> Any:

@@ -122,16 +122,17 @@ def find_opening(rows: ConstraintRows) -> Opening | None:
     start = _onto_surface(rows, kept, 0.0, np.zeros(rows.start.size), np.inf)
     if start is None:
         return None  # positions far off the constraints: the initial state refuses them with a message of its own
-    worst, length = np.abs(start.values[dropped]), 0.0
+    x, values = start
+    worst, length = np.abs(values[dropped]), 0.0
     if worst.max() <= FOLLOWS:
         random = np.random.default_rng(0)
         for _ in range(MOTIONS):
             time, motion = random.normal() * rows.timed, random.normal(size=rows.start.size)
             motion -= basis @ (basis.T @ motion)
             for _ in range(NUM_LENGTHS):
-                end = _onto_surface(rows, kept, step * time, start.x + step * motion, CONTRACTION)
+                end = _onto_surface(rows, kept, step * time, x + step * motion, CONTRACTION)
                 if end is not None:
-                    worst, length = np.maximum(worst, np.abs(end.values[dropped])), max(length, step)
+                    worst, length = np.maximum(worst, np.abs(end[1][dropped])), max(length, step)
                     break
                 step /= SHORTENING
     opened = np.flatnonzero(worst > FOLLOWS)
@@ -140,30 +141,23 @@ def find_opening(rows: ConstraintRows) -> Opening | None:
     return Opening([dropped[i] for i in opened], worst[opened].tolist(), length)
 
 
-class _Place(NamedTuple):
-    """A point on the surface.
-
-    x: distances of coordinates from the start, relative to their scales.
-    values: of all rows, relative to their sizes.
-    """
-
-    x: np.ndarray
-    values: np.ndarray
-
-
-def _onto_surface(rows: ConstraintRows, kept: list[int], t: float, x: np.ndarray, contraction: float) -> _Place | None:
+def _onto_surface(rows: ConstraintRows, kept: list[int], t: float, x: np.ndarray, contraction: float):
     """The point where the kept rows vanish, by Newton's iteration from x; None if it fails.
 
     Args:
         kept: numbers of the kept rows.
+        x: (n,) distances of coordinates from the start, relative to their scales.
         contraction: largest ratio of consecutive corrections; beyond it the iteration fails.
+
+    Returns:
+        x there, and the values of all rows (k,), relative to their sizes.
     """
     previous = np.inf
     for _ in range(ITERATIONS):
         values, jacobian = rows.evaluate(t, rows.start + rows.scales * x)
         values = values / rows.sizes
         if np.abs(values[kept]).max(initial=0.0) <= REACHED:
-            return _Place(x, values)
+            return x, values
         scaled = jacobian[kept] * rows.scales / rows.sizes[kept, None]
         correction = np.linalg.lstsq(scaled, values[kept], rcond=None)[0]
         size = np.linalg.norm(correction)

@@ -1,4 +1,4 @@
-"""The rows of a scene's constraints: their names, and their values and Jacobian at any positions."""
+"""The rows of a scene's constraints: names, also of coordinates, values and Jacobian at any positions."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -11,10 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.mechanics.arrays import is_concrete, quickly_compiled
-from vmri_jax.scene.body import LARGEST_POINT, AnyBody, Bodies, moving
+from vmri_jax.mechanics.names import Names
+from vmri_jax.scene.body import LARGEST_POINT, AnyBody, Bodies, label_of, moving
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.effects.freedoms import ANGLES
-from vmri_jax.scene.labels import element_label
 from vmri_jax.scene.layout import join
 from vmri_jax.scene.rates import positions
 from vmri_jax.scene.sorting import Home, Placed, Sorting
@@ -89,11 +89,7 @@ class ConstraintRows:
         params = {i: part.effect.parameters(bodies) for i, part in constraints}
         if not constraints or not is_concrete((sorting.positions, sorting.joints, params)):
             return None
-        columns = {
-            name: place.start + np.arange(place.size) + (layout.ends[0] if place.part == "f" else 0)
-            for name, place in layout.bodies.items()
-        }
-        start = np.concatenate(sorting.positions)
+        start, columns = np.concatenate(sorting.positions), layout.columns
         q_bodies, jacobian = to_bodies(start)
         # the diagonal of J^T M J with J = dQ/dq
         of_bodies = join(bodies, layout, "s", "masses"), join(bodies, layout, "f", "masses")
@@ -151,13 +147,18 @@ class ConstraintRows:
         return [self.rows[i].name for i in numbers]
 
 
+def _label(effect: Effect, element: Sequence[str]) -> str:
+    """The label of an element: the name of its effect and the names of its bodies."""
+    return f"{effect.name} {'-'.join(map(label_of, element))}"
+
+
 def _elements(part: Placed, bodies: Bodies, columns: dict[str, np.ndarray], params: dict[str, Any]):
     """Labels and elements of an effect, in the order of its terms."""
     effect = part.effect
     elements = effect.elements(bodies)
     for i in chain(*effect.by_size(part.elements, bodies)):
         of_element = np.concatenate([columns[name] for name in moving(elements[i])])
-        yield element_label(effect, elements[i]), _Element(*effect.element_term(i, bodies, params), of_element)
+        yield _label(effect, elements[i]), _Element(*effect.element_term(i, bodies, params), of_element)
 
 
 def _evaluated(element: _Element, q: np.ndarray, t: float) -> tuple[np.ndarray, np.ndarray]:
@@ -203,3 +204,37 @@ def _scales_of(body: AnyBody, extent: float) -> np.ndarray:
     if body.block:
         return np.maximum(np.abs(q), 1.0)
     return np.where(np.arange(q.size) < LARGEST_POINT, extent, 1.0)
+
+
+def names_of(sorting: Sorting) -> Names:
+    """Bodies and constraints by name, in the order of the coordinates and of the rows.
+
+    The rows of an effect with a single element have the name of the effect; with several elements the names of the bodies follow.
+    """
+    sizes: dict[Any, dict[str, int]] = {"s": {}, "f": {}, "constraint": {}, "slow_constraint": {}}
+    for name, place in sorting.layout.coordinates.items():
+        sizes[place.part][name] = place.size
+    for part in sorting.placed:
+        if part.home in HOMES:
+            sizes[part.home] |= _kept_rows(sorting, part)
+    blocks, rigid = (
+        [name for name, body in sorting.bodies.items() if getattr(body, kind)] for kind in ("block", "rigid")
+    )
+    carried = {name: place for name, place in sorting.places.items() if name not in sorting.layout.coordinates}
+    rows = sizes["constraint"], sizes["slow_constraint"]
+    return Names(sizes["s"], sizes["f"], *rows, blocks, rigid, carried, sorting.layout.kinematics)
+
+
+def _kept_rows(sorting: Sorting, part: Placed) -> dict[str, int]:
+    """Number of kept rows of each element of an effect by its label, in the order of the terms of the effect."""
+    bodies, effect = sorting.bodies, part.effect
+    elements, params = effect.elements(bodies), effect.parameters(bodies)
+    t = (jnp.zeros(()),) if effect.timed else ()
+    rows, first = {}, 0
+    for i in chain(*effect.by_size(part.elements, bodies)):
+        size = jax.eval_shape(effect.function, *t, *effect.element_arguments(i, bodies, params)).size
+        kept = sum(row not in part.dropped for row in range(first, first + size))
+        if kept:
+            rows[effect.name if len(elements) == 1 else _label(effect, elements[i])] = kept
+        first += size
+    return rows

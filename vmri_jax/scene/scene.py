@@ -23,10 +23,10 @@ from vmri_jax.scene.drawing import drawing
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.effects.joint_base import along_run, joint_named
 from vmri_jax.scene.functions import RESERVED, Actuation
-from vmri_jax.scene.labels import names_of
 from vmri_jax.scene.ledger import Ledger, ledger
 from vmri_jax.scene.redundancy import check_constraints, dropped_rows, without_redundant
 from vmri_jax.scene.rigid import Rigidity
+from vmri_jax.scene.rows import names_of
 from vmri_jax.scene.sorting import Sorting, sort
 from vmri_jax.scene.trees import Branch, check_frames, grow, shallow
 from vmri_jax.scene.velocities import joint_starts, with_rates

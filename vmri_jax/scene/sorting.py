@@ -197,22 +197,16 @@ def _nearest_rates(jacobian, rates, masses) -> tuple[Any, Any]:
     return v, xp.sqrt(xp.sum(masses * violation**2) / xp.where(square > 0, square, 1.0))
 
 
-class Owners(NamedTuple):
-    """The bodies whose coordinates an element of an effect depends on.
-
-    all: all these bodies.
-    between: the bodies in `all` whose coordinates move the bodies of the element against each other, not together.
-    """
-
-    all: tuple[str, ...]
-    between: tuple[str, ...]
+Owners = tuple[tuple[str, ...], tuple[str, ...]]
+"""The bodies whose coordinates an element of an effect depends on: all of them, and those that move the bodies of the element against each
+other, not together."""
 
 
 def _owners(effect: Effect, bodies: Bodies, branches: Sequence[Branch]) -> list[Owners]:
     """The bodies whose coordinates each element of an effect depends on.
 
-    Every body of an element depends on a chain of bodies, from itself to the root of its tree. `Owners.all` is the union of these chains;
-    `Owners.between` is this union without the bodies that are in every chain.
+    Every body of an element depends on a chain of bodies, from itself to the root of its tree. All bodies are the union of these chains; the
+    bodies that move the element against itself are this union without the bodies that are in every chain.
     """
     on_joints = {branch.child: branch for branch in branches}
     carried = {(branch.joint.name, branch.element): branch.child for branch in branches}
@@ -226,7 +220,7 @@ def _owners(effect: Effect, bodies: Bodies, branches: Sequence[Branch]) -> list[
         names_of_all = tuple(dict.fromkeys(name for chain in chains for name in chain))
         # a body that carries all bodies of the element moves them together
         shared = set.intersection(*map(set, chains)) if len(chains) > 1 else set()
-        owners.append(Owners(names_of_all, tuple(name for name in names_of_all if name not in shared) or names_of_all))
+        owners.append((names_of_all, tuple(name for name in names_of_all if name not in shared) or names_of_all))
     return owners
 
 

@@ -40,14 +40,13 @@ def with_rates(
     The constraints and the rates are rows ``C v = b``. Of all solutions, v is the nearest to the present velocities v_0 in the norm
     of the kinetic energy: with ``M = R R^T``, ``x = R^T (v - v_0)`` is the shortest solution of ``C R^-T x = b - C v_0``.
     """
-    if not is_concrete((sorting.start, system)):
+    if not is_concrete((sorting.start, system, rates)):
         raise TypeError(
-            "Scene.with_rates: jax.jit, grad or vmap traces numbers of the scene; call with_rates outside of these."
+            "Scene.with_rates: jax.jit, grad or vmap traces numbers of the scene or rates; call with_rates outside of these."
         )
     q_s, q_f, v_s, v_f = sorting.start
     q, v, n_s = jnp.concatenate([q_s, q_f]), np.concatenate([v_s, v_f]), q_s.size
-    first = {"s": 0, "f": sorting.layout.ends[0]}
-    columns = {name: place.start + first[place.part] for name, place in sorting.places.items()}
+    columns = sorting.layout.columns
     bodies, of_bodies = sorting.to_bodies(np.asarray(q))
 
     def constraints(t, q):
@@ -78,11 +77,7 @@ def with_rates(
         )
     # the velocities of bodies belong to their positions as the user gave them, where joint coordinates are zero
     body_rates = sorting.to_bodies(np.concatenate(sorting.assembled))[1] @ v
-    moved = [
-        body.with_rates(body_rates[columns[name] : columns[name] + body.size]) for name, body in sorting.bodies.items()
-    ]
-    if not sorting.layout.freedoms:
-        return moved, {}
+    moved = [body.with_rates(body_rates[columns[name]]) for name, body in sorting.bodies.items()]
     return moved, {key: (np.asarray(q[i]), v[i]) for key, i in _freedom_numbers(sorting).items()}
 
 
@@ -103,15 +98,7 @@ def joint_starts(sorting: Sorting, effects: Sequence[Effect], starts: Mapping[st
         name, count = joint.name, len(joint.elements(sorting.bodies))
         value, rate = start if isinstance(start, tuple) else (start, 0.0)
         about = f"Scene.with_joints: the start of {name}"
-        numbers = [real_array(about, number) for number in (value, rate)]
-        for number in numbers:
-            if number.shape not in ((), (count,)):
-                for_pairs = f", or one for each pair, ({count},)" if count > 1 else ""
-                raise ValueError(
-                    f"{about} has shape {number.shape}; give one number, or a pair (value, rate){for_pairs}."
-                )
-            if is_concrete(number) and not np.isfinite(number).all():
-                raise ValueError(f"{about} is {number}; it must be finite.")
+        numbers = [_for_pairs(about, number, count, "one number, or a pair (value, rate)") for number in (value, rate)]
         for i in range(count):
             key = name, i, freedom
             if key not in sorting.layout.freedoms:
@@ -222,26 +209,25 @@ def _rates(effects: Sequence[Effect], bodies: Bodies, rates: Mapping[str, Any]):
         )
     for joint, freedom, numbers in _by_freedom("Scene.with_rates", effects, rates):
         about, count = f"Scene.with_rates: the rate of {joint.name}", len(joint.elements(bodies))
-        values = real_array(about, numbers)
-        if values.shape not in ((), (count,)):
-            raise ValueError(f"{about} has shape {values.shape}; give one number, or one for each pair, ({count},).")
-        if not is_concrete(values) or not np.isfinite(values).all():
-            raise ValueError(f"{about} is {values}; it must be finite.")
-        yield joint, freedom, np.broadcast_to(values, (count,))
+        yield joint, freedom, np.broadcast_to(_for_pairs(about, numbers, count, "one number"), (count,))
 
 
-def _freedoms(joint: Joint, freedom: str, bodies: Bodies, columns: Mapping[str, int], q):
-    """Values of a freedom, (n,) of the n pairs of a joint, by the coordinates q of all bodies.
+def _for_pairs(about: str, numbers: Any, count: int, form: str):
+    """Finite numbers, () or (count,) for the pairs of a joint; `form` is the form of a single one, for messages."""
+    values = real_array(about, numbers)
+    if values.shape not in ((), (count,)):
+        for_pairs = f", or one for each pair, ({count},)" if count > 1 else ""
+        raise ValueError(f"{about} has shape {values.shape}; give {form}{for_pairs}.")
+    if is_concrete(values) and not np.isfinite(values).all():
+        raise ValueError(f"{about} is {values}; it must be finite.")
+    return values
 
-    Args:
-        columns: number of the first coordinate of each body in q.
-    """
+
+def _freedoms(joint: Joint, freedom: str, bodies: Bodies, columns: Mapping[str, np.ndarray], q):
+    """Values of a freedom, (n,) of the n pairs of a joint, by the coordinates q of all bodies and their `columns` in q."""
     params, values = joint.parameters(bodies), []
     for i, element in enumerate(joint.elements(bodies)):
         _, element_params = joint.element_arguments(i, bodies, params)
-        parts = [
-            GROUND_COORDINATES if name == GROUND else q[columns[name] : columns[name] + bodies[name].size]
-            for name in element
-        ]
+        parts = [GROUND_COORDINATES if name == GROUND else q[columns[name]] for name in element]
         values.append(FREEDOMS[freedom](tuple(map(jnp.asarray, parts)), element_params))
     return jnp.stack(values)
