@@ -50,7 +50,8 @@ class Joint(Effect):
         return tuple(tuple(map(str, element)) for element in super().elements(bodies))
 
     def parameters(self, bodies):
-        return {name: squeeze(library(values).stack(values)) for name, values in self._frames(bodies).items()}
+        frames = {name: squeeze(library(values).stack(values)) for name, values in self._frames(bodies).items()}
+        return super().parameters(bodies) | frames
 
     def points(self, bodies):
         return {}
@@ -172,12 +173,7 @@ class Joint(Effect):
 
 @effect_class
 class AboutAxis(Joint):
-    """Joints with an axis.
-
-    Args:
-        between, at: as of `Joint`.
-        axis: (3,) direction in space at the start, of any length; or a direction for each of k pairs, (k, 3).
-    """
+    """Joints with an axis: (3,) its direction in space at the start, of any length; or a direction for each of k pairs, (k, 3)."""
 
     axis: Any = (0.0, 0.0, 1.0)
 
@@ -203,12 +199,7 @@ class AboutAxis(Joint):
 
 
 def joint_named(about: str, name: str, effects: Iterable[Effect]) -> Joint:
-    """The joint with a name among effects; `about` begins the message.
-
-    Raises:
-        TypeError: a name that is no string.
-        ValueError: no joint has this name.
-    """
+    """The joint with a name among effects; `about` begins the message if there is none."""
     joints = {effect.name: effect for effect in effects if isinstance(effect, Joint)}
     if not isinstance(name, str):
         raise TypeError(
@@ -221,11 +212,7 @@ def joint_named(about: str, name: str, effects: Iterable[Effect]) -> Joint:
 
 
 def freedom_of(joint: Joint, of: str, about: str = "") -> Freedom:
-    """The freedom of a joint with the name `of`; with "auto" its only freedom. `about` begins the message.
-
-    Raises:
-        ValueError: the joint has no freedom of this name, or with "auto" none or several.
-    """
+    """The freedom of a joint with the name `of`; with "auto" its only freedom. `about` begins the message if there is none, or several."""
     fitting: list[Freedom] = [freedom for freedom in joint.freedoms if of in (freedom, "auto")]
     if len(fitting) == 1:
         return fitting[0]
@@ -234,11 +221,7 @@ def freedom_of(joint: Joint, of: str, about: str = "") -> Freedom:
 
 
 def along_run(joint: Joint, run, bodies: Bodies, of: str, pair: int) -> np.ndarray:
-    """The freedom of a joint along a run, (k,) rad or m, angles without jumps of 2 pi; see `Scene.joint_motion`.
-
-    Raises:
-        IndexError: no such pair.
-    """
+    """The freedom of a joint along a run, (k,) rad or m, angles without jumps of 2 pi; see `Scene.joint_motion`."""
     freedom, element = freedom_of(joint, of), joint.elements(bodies)[pair]
     _, params = joint.element_arguments(pair, bodies, joint.parameters(bodies))
     q = tuple(GROUND_COORDINATES if body == GROUND else np.asarray(run.position(body)) for body in element)

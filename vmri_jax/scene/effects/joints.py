@@ -142,25 +142,14 @@ class Screw(AboutAxis):
     moves = (Move("screw", N),)
     freedoms = ("turn",)
 
-    def parameters(self, bodies):
-        return super().parameters(bodies) | {"pitch": self._pitch(len(self.elements(bodies)))}
-
     def check_parameters(self, bodies):
         super().check_parameters(bodies)
-        pitch = self._pitch(len(self.elements(bodies)))
+        pitch = self.parameters(bodies)["pitch"]
         self.require(pitch != 0, "pitch", pitch, "it must not be zero; take Revolute if b does not move along the axis")
 
     def pitch_of(self, i):
         pitch = real_array(f"{self.name}: pitch", self.pitch)
         return pitch[i] if pitch.ndim else pitch
-
-    def _pitch(self, count: int):
-        pitch = real_array(f"{self.name}: pitch", self.pitch)
-        if pitch.shape not in ((), (count,)):
-            raise ValueError(
-                f"{self.name}: pitch has shape {pitch.shape}; give one number, or one for each of {count} pairs."
-            )
-        return pitch
 
     @staticmethod
     def function(q, params):
