@@ -202,11 +202,7 @@ def frame(up: tuple[float, ...] | None, dimension: int) -> np.ndarray:
 
 
 def check_index(name: str, part: str, index: int, n_s: int, n_f: int) -> None:
-    """Refuse a coordinate of a body or block that the run does not have.
-
-    Raises:
-        ValueError: with the body and the coordinate.
-    """
+    """Refuse a coordinate of a body or block that the run does not have."""
     size, pace = (n_s, "slow") if part == "s" else (n_f, "fast")
     if index >= size:
         raise ValueError(

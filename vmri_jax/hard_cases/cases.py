@@ -200,9 +200,6 @@ def resolved(problem: Problem) -> Resolved:
     """A problem with five micro steps of ``omega h = 0.2`` for its largest frequency at the start.
 
     If nothing vibrates, ``omega = max(|q'| / |q|, sqrt(|q''| / |q|))``, the rate at which positions change by their size.
-
-    Raises:
-        ValueError: the problem is refused by `initial_state`.
     """
     state = problem.state()
     turning = np.abs(np.imag(small_motions(problem.system, state).rates)).max(initial=0.0)  # also by magnetic fields

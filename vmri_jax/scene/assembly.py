@@ -14,11 +14,7 @@ from vmri_jax.scene.terms import DroppedRows, SomeRows
 
 
 def build(sorting: Sorting, placed: Sequence[Placed]) -> System:
-    """The system of bodies and effects; a function without effects is None.
-
-    Args:
-        placed: the effects, all of the sorting or some.
-    """
+    """The system of the bodies and of some or all effects; a function without effects is None."""
     bodies, layout = sorting.bodies, sorting.layout
     potentials: dict[str, tuple] = {}
     terms: dict[Any, list] = {}

@@ -203,10 +203,7 @@ class _Reader:
         ``d / (T z)^2``. Negative numbers are (-k, -c), with the acceleration ``k d``. The inertia is ``1 / dof_invweight0``.
 
         Args:
-            ignored: whether the scene may leave out limits of ball joints and of tendons.
-
-        Raises:
-            ValueError: limits of ball joints or of tendons, unless they are ignored.
+            ignored: whether the scene may leave out limits of ball joints and of tendons, which are refused otherwise.
         """
         compiled, model = self.compiled, self.compiled.model
         if compiled.off(CONSTRAINTS, "LIMIT"):

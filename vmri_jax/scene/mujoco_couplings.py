@@ -26,11 +26,7 @@ def polynomial(x, params):
 
 
 def couplings(compiled: Compiled, data: Any) -> Iterator[JointCoupling]:
-    """The couplings that the model does not switch off.
-
-    Raises:
-        ValueError: an equality that the start violates.
-    """
+    """The couplings that the model does not switch off, none of which the start may violate."""
     model = compiled.model
     for i in compiled.equalities:
         if not compiled.ties(i):

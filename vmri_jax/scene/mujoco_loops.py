@@ -62,11 +62,7 @@ class Loop(NamedTuple):
 
 
 def loops(compiled: Compiled, data: Any) -> list[Loop]:
-    """The active equalities connect and weld between bodies that can move against each other.
-
-    Args:
-        data: `mujoco.MjData` with the positions of bodies.
-    """
+    """The active equalities connect and weld between bodies that can move against each other."""
     closed = []
     for i in compiled.equalities:
         if compiled.closes(i):
@@ -77,11 +73,7 @@ def loops(compiled: Compiled, data: Any) -> list[Loop]:
 
 
 def close(compiled: Compiled, data: Any) -> None:
-    """Move joints so that small gaps close, in place.
-
-    Raises:
-        ValueError: a loop whose gap is too wide, or that does not close.
-    """
+    """Move joints so that small gaps close, in place; refuse wide gaps."""
     model, mujoco, extent = compiled.model, compiled.mujoco, float(compiled.model.stat.extent)
     _refuse_gaps(compiled, loops(compiled, data), WIDEST_GAP, "is open at the start by")
     for _ in range(ITERATIONS):

@@ -59,11 +59,7 @@ class Opening(NamedTuple):
 
 
 def check_constraints(sorting: Sorting) -> None:
-    """Refuse redundant constraints, dropped rows that do not follow from the others, and constraints that the fast bodies cannot satisfy.
-
-    Raises:
-        ValueError: with the names of the constraints that are too many.
-    """
+    """Refuse redundant constraints, dropped rows that do not follow from the others, and constraints that the fast bodies cannot satisfy."""
     rows = ConstraintRows.of(sorting)
     if rows is None:
         return

@@ -239,10 +239,6 @@ def _chain(name: str, branches: Mapping[str, Branch]) -> list[str]:
 def sort(bodies: Bodies, effects: Sequence[Effect], branches: Sequence[Branch] = ()) -> Sorting:
     """Paces of all bodies and homes of all effects.
 
-    Args:
-        effects: in the order in which their terms are added.
-        branches: bodies that are functions of the freedoms of joints, parents before children.
-
     Raises:
         ValueError: a decision between slow and fast that depends on traced numbers; joints that leave no freedom.
     """

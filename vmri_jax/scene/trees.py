@@ -164,14 +164,7 @@ def _root_rank(name: str, bodies: Bodies) -> tuple:
 
 
 def check_frames(bodies: Bodies, branches: Sequence[Branch]) -> None:
-    """Refuse frames that hang on no joint, or that carry no body.
-
-    Args:
-        branches: of all trees; () if all bodies have directors.
-
-    Raises:
-        ValueError: with the name of the frame.
-    """
+    """Refuse frames that hang on no joint, or that carry no body; there are no branches if all bodies have directors."""
     hanging, carrying = ({getattr(branch, end) for branch in branches} for end in ("child", "parent"))
     for name, body in bodies.items():
         if not isinstance(body, Frame):
@@ -206,13 +199,8 @@ def make_layout(
 ) -> tuple[Layout, tuple[Link | None, ...]]:
     """The places of all coordinates, of slow bodies in q_s and of fast bodies in q_f, in the order of the bodies.
 
-    A body on a joint has the freedoms of this joint as coordinates.
-
-    Args:
-        branches: bodies on joints, parents before children.
-
-    Returns:
-        The layout, and the links of the frames of its kinematics, in the order of these frames.
+    A body on a joint has the freedoms of this joint as coordinates. With the layout come the links of the frames of its kinematics, in the
+    order of these frames.
     """
     ends: dict[Part, int] = {"s": 0, "f": 0}
     on_joints = {branch.child: branch for branch in branches}

@@ -120,12 +120,6 @@ def with_closed_loops(sorting: Sorting, starts: dict[Key, tuple[Any, Any]]) -> d
     The named coordinates go to their values in steps. In each step Newton's iteration on ``g(q) = 0`` moves the other joint coordinates
     x, ``dx = -(dg/dx)^+ g``. At the end the rates of x solve ``dg/dq v = 0``. Rows that bodies with directors can satisfy, such as the
     rows of a ball joint, are left to the projection of the initial state.
-
-    Args:
-        starts: value and rate by the keys of `Layout.freedoms`.
-
-    Raises:
-        ValueError: a loop that does not close.
     """
     rows = ConstraintRows.of(sorting)
     if rows is None or not is_concrete((sorting.start, starts)):

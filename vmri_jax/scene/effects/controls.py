@@ -137,11 +137,7 @@ def control_along(law, freedom: str, q, u, params):
 
 @effect_class
 class ControlledJoint(InJoint):
-    """The force or torque of `Controlled` in a joint.
-
-    Args:
-        joint, of: as of `InJoint`.
-    """
+    """The force or torque of `Controlled` in a joint."""
 
     kind = "control"
     along = staticmethod(control_along)
