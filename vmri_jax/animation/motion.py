@@ -129,16 +129,18 @@ def motion(
     count = len(t) if finite.all() else int(np.argmin(finite))
     if count == 0:
         raise ValueError("motion: the trajectory has no node with finite positions; there is nothing to draw.")
-    slow, fast, *_ = drawing.extended(q_s[:count], q_f[:count], 0 * q_s[:count], 0 * q_f[:count])
+    t, q_s, q_f = t[:count], q_s[:count], q_f[:count]
+    slow, fast, *_ = drawing.extended(q_s, q_f, 0 * q_s, 0 * q_f)
     drawing = with_bars(drawing, slow, fast)
     offset, matrix = drawing.maps(slow.shape[1], fast.shape[1])
-    nodes, q = t[:count], np.concatenate([q_s, q_f], axis=1)[:count]
-    v = _differences(nodes, q) if system is None else _velocities(system, trajectory, count)
-    t, q, v = _with_micro_nodes(trajectory, nodes, q, v)
-    if system is None and len(t) > len(nodes):  # differences between macro nodes miss the fast motion
-        v[:, q_s.shape[1] :] = CubicSpline(t, q[:, q_s.shape[1] :])(t, 1)
-    n_s = q_s.shape[1]
-    slow, fast, v_slow, v_fast = drawing.extended(q[:, :n_s], q[:, n_s:], v[:, :n_s], v[:, n_s:])
+    v_s, v_f = _differences(t, q_s, q_f) if system is None else _velocities(system, trajectory, count)
+    nodes = all_nodes = Nodes(t, q_s, q_f, v_s, v_f)
+    if (micro := trajectory.micro) is not None and not why_not(t, micro.t[: count - 1]):
+        all_nodes = with_micro_nodes(nodes, micro.t[: count - 1], micro.q_f[: count - 1])
+    if system is None and len(all_nodes.t) > count:  # differences between macro nodes miss the fast motion
+        all_nodes = all_nodes._replace(v_f=CubicSpline(all_nodes.t, all_nodes.q_f)(all_nodes.t, 1))
+    t, *phase = all_nodes
+    slow, fast, v_slow, v_fast = drawing.extended(*phase)
     q, v = np.concatenate([slow, fast], axis=1), np.concatenate([v_slow, v_fast], axis=1)
     energies, relative = _energies(trajectory, count, system)
     residual = np.asarray(trajectory.constraint_residual, dtype=float)[:count].reshape(count, -1)
@@ -147,10 +149,10 @@ def motion(
         t,
         offset + np.einsum("iaq,kq->kia", matrix, q),
         np.einsum("iaq,kq->kia", matrix, v),
-        np.stack([np.interp(t, nodes, column) for column in energies.values()], axis=1),
+        np.stack([np.interp(t, nodes.t, column) for column in energies.values()], axis=1),
         tuple(energies),
         relative,
-        np.stack([np.interp(t, nodes, column) for column in residual.T], axis=1),
+        np.stack([np.interp(t, nodes.t, column) for column in residual.T], axis=1),
         _ending(trajectory, count),
     )
 
@@ -181,19 +183,15 @@ def _energies(trajectory: Trajectory, count: int, system: System | None) -> tupl
     return {name: change / (abs(energy[0]) if relative else 1.0)}, relative
 
 
-def _differences(t, values) -> np.ndarray:
+def _differences(t, *values) -> list[np.ndarray]:
     """Central differences, and one-sided differences of second order at the ends; zero for a single node."""
     if len(t) == 1:
-        return np.zeros_like(values)
-    return np.gradient(values, t, axis=0, edge_order=2 if len(t) > 2 else 1)
+        return [np.zeros_like(x) for x in values]
+    return [np.gradient(x, t, axis=0, edge_order=2 if len(t) > 2 else 1) for x in values]
 
 
-def _velocities(system: System, trajectory: Trajectory, count: int) -> np.ndarray:
-    """(count, n_s + n_f) velocities from the momenta of the first nodes.
-
-    Raises:
-        ValueError: the system is not the one that was simulated.
-    """
+def _velocities(system: System, trajectory: Trajectory, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """(count, n_s) and (count, n_f) velocities from the momenta of the first nodes; the system must be the one of the run."""
     phase = [jnp.asarray(a)[:count] for a in tuple(vars(trajectory.states).values())[1:]]
     try:
         start_energy = float(diagnostics.energy(system, *(a[0] for a in phase)))
@@ -207,7 +205,7 @@ def _velocities(system: System, trajectory: Trajectory, count: int) -> np.ndarra
             f"motion: the system has the energy {start_energy:.6g} at the start, the run {run_energy:.6g}; give the system that was simulated, with "
             "its parameters."
         )
-    return np.concatenate([v_s, v_f], axis=1)
+    return np.asarray(v_s), np.asarray(v_f)
 
 
 def _ending(trajectory: Trajectory, count: int) -> str:
@@ -217,19 +215,3 @@ def _ending(trajectory: Trajectory, count: int) -> str:
     result = Result(int(trajectory.result))
     where = f"in macro step {failed}, " if failed >= 0 else ""
     return f"The run failed {where}after t = {float(trajectory.t[count - 1]):.6g} ({result.name}); it is drawn up to there."
-
-
-def _with_micro_nodes(trajectory: Trajectory, t, q, v) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Times, positions and velocities with the micro nodes inserted, if the run kept them for all macro steps and their times increase."""
-    steps = len(t) - 1
-    micro = trajectory.micro
-    if micro is None or why_not(t, micro.t[:steps]):
-        return t, q, v
-    n_s = np.shape(trajectory.states.q_s)[1]
-    nodes = Nodes(t, q[:, :n_s], q[:, n_s:], v[:, :n_s], v[:, n_s:])
-    all_nodes = with_micro_nodes(nodes, micro.t[:steps], micro.q_f[:steps])
-    return (
-        all_nodes.t,
-        np.concatenate([all_nodes.q_s, all_nodes.q_f], axis=1),
-        np.concatenate([all_nodes.v_s, all_nodes.v_f], axis=1),
-    )

@@ -118,12 +118,6 @@ def _signal(motion: Motion, label: str, pace: str, of: Callable[[np.ndarray], np
     values = of(motion.points)
     if len(values) < 3 or np.ptp(values) <= 1e-9 * np.abs(values).max():
         return []
-    return [Signal(label, pace, of, float(np.std(values)), _speed(motion.t, values))]
-
-
-def _speed(t: np.ndarray, values: np.ndarray) -> float:
-    """Standard deviation of the differences from node to node over the time between them.
-
-    Central differences would be zero for a signal that turns by pi between nodes.
-    """
-    return float(np.std(np.diff(values) / np.diff(t)))
+    # differences from node to node: central differences would be zero for a signal that turns by pi between nodes
+    rates = np.diff(values) / np.diff(motion.t)
+    return [Signal(label, pace, of, float(np.std(values)), float(np.std(rates)))]

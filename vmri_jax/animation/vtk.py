@@ -28,7 +28,10 @@ def write_vtk(motion: Motion, path: str | Path) -> None:
         ImportError: without the package meshio.
         OSError: files cannot be written.
     """
-    meshio = _meshio()
+    try:
+        import meshio
+    except ImportError:
+        raise ImportError("VTK files need the package meshio; install it with: pip install 'vmri_jax[vtk]'") from None
     path = Path(path)
     check_place(path)
     folder = path.with_suffix("")
@@ -82,11 +85,3 @@ def _cells(drawing: Drawing) -> tuple[list, dict]:
         "fast": [np.array([int(fast) for *_, fast in items]) for items in cells_by_type.values()],
     }
     return cells, data
-
-
-def _meshio():
-    try:
-        import meshio
-    except ImportError:
-        raise ImportError("VTK files need the package meshio; install it with: pip install 'vmri_jax[vtk]'") from None
-    return meshio
