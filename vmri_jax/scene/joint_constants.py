@@ -38,7 +38,7 @@ def joint_constants(bodies: Bodies, links: Sequence[Link | None]) -> dict[str, A
         return xp.concatenate([(point - rotated)[:, None], matrix], axis=1)
 
     turns, slides = (np.array([link.amount(kind) for link in frames])[:, None, None] for kind in ("turn", "slide"))
-    pitches = [link.pitch / (2 * np.pi) for link in frames]
+    pitches = [link.branch.joint.pitch_of(link.branch.element) / (2 * np.pi) for link in frames]
     screws = library(pitches).stack(pitches)[:, None]
     # M = F_b^T T(x) F_a = f_2^T a_2 + cos x (f_0^T a_0 + f_1^T a_1) + sin x (f_0^T a_1 - f_1^T a_0); without a turn cos x = 1
     across, along = dyads(0, 0) + dyads(1, 1), dyads(2, 2)
@@ -66,8 +66,8 @@ def _ends(bodies: Bodies, links: Sequence[Link]) -> dict[str, Any]:
         point, triad = points[branch.joint.name][branch.element], triads[branch.joint.name][branch.element]
         of_parent, of_child = (0, 1) if branch.forward else (1, 0)
         for role, name, number, is_body in (
-            ("a", branch.parent, of_parent, link.is_first),
-            ("b", branch.child, of_child, link.is_last),
+            ("a", branch.parent, of_parent, link.step == 0),
+            ("b", branch.child, of_child, link.step + 1 == branch.size),
         ):
             body = body_of(bodies, name)
             # a root has only the directors in `wide`, a carried body all three, as rows of its frame

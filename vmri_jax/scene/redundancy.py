@@ -121,9 +121,9 @@ def find_opening(rows: ConstraintRows) -> Opening | None:
     x, values = start
     worst, length = np.abs(values[dropped]), 0.0
     if worst.max() <= FOLLOWS:
-        random = np.random.default_rng(0)
+        random, timed = np.random.default_rng(0), any(row.effect.timed for row in rows.rows)
         for _ in range(MOTIONS):
-            time, motion = random.normal() * rows.timed, random.normal(size=rows.start.size)
+            time, motion = random.normal() * timed, random.normal(size=rows.start.size)
             motion -= basis @ (basis.T @ motion)
             for _ in range(NUM_LENGTHS):
                 end = _onto_surface(rows, kept, step * time, x + step * motion, CONTRACTION)

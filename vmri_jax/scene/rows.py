@@ -100,7 +100,7 @@ class ConstraintRows:
             number = 0
             for names, element in _elements(part, bodies, columns, params[i]):
                 elements.append(element)
-                size = _evaluated(element, q_bodies, 0.0)[0].size
+                size = _value_and_jacobian(element.term, element.params, q_bodies[element.columns], 0.0)[0].size
                 for j in range(size):
                     name = names if size == 1 else f"{names} [{j}]"
                     rows.append(Row(name, i, number, part.effect, part.home, number not in part.dropped))
@@ -113,7 +113,7 @@ class ConstraintRows:
         q_bodies, by_coordinates = self.to_bodies(q)
         values, by_bodies, first = np.empty(len(self.rows)), np.zeros((len(self.rows), q_bodies.size)), 0
         for element in self.elements:
-            value, entries = _evaluated(element, q_bodies, t)
+            value, entries = _value_and_jacobian(element.term, element.params, q_bodies[element.columns], t)
             values[first : first + value.size] = value
             by_bodies[first : first + value.size, element.columns] = entries
             first += value.size
@@ -132,11 +132,6 @@ class ConstraintRows:
         """(k,) change of each row in a large motion: the length of its gradient by coordinates over `scales`; 1 if this is zero."""
         lengths = np.linalg.norm(self.jacobian * self.scales, axis=1)
         return np.where(lengths > 0, lengths, 1.0)
-
-    @property
-    def timed(self) -> bool:
-        """Whether a row depends on time."""
-        return any(row.effect.timed for row in self.rows)
 
     def numbers(self, home: Home | None = None) -> list[int]:
         """Numbers of the kept rows, all or only the rows with a certain home."""
@@ -161,14 +156,10 @@ def _elements(part: Placed, bodies: Bodies, columns: dict[str, np.ndarray], para
         yield _label(effect, elements[i]), _Element(*effect.element_term(i, bodies, params), of_element)
 
 
-def _evaluated(element: _Element, q: np.ndarray, t: float) -> tuple[np.ndarray, np.ndarray]:
-    """Values (m,) of an element at positions q of all bodies, and their derivatives with respect to the coordinates of its own bodies."""
-    values, jacobian = _value_and_jacobian(element.term, q[element.columns], element.params, t)
-    return np.asarray(values), np.asarray(jacobian)
-
-
 @partial(quickly_compiled, static_argnames="term")
-def _value_and_jacobian(term: EffectTerm, q, params, t):
+def _value_and_jacobian(term: EffectTerm, params, q, t):
+    """Values (m,) of an element, and their derivatives by the coordinates q of its bodies."""
+
     def values(q):
         value = jnp.reshape(term.value(q, None, params, t), (-1,))
         return value, value

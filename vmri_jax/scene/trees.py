@@ -69,16 +69,6 @@ class Link(NamedTuple):
     step: int
 
     @property
-    def is_first(self) -> bool:
-        """Whether the frame hangs on a body, not on a frame of the same joint."""
-        return self.step == 0
-
-    @property
-    def is_last(self) -> bool:
-        """Whether the frame is the child of the branch."""
-        return self.step + 1 >= len(self.branch.joint.moves)
-
-    @property
     def coordinate(self) -> int | None:
         """Number of the move among the moves of the joint; None if the joint has no freedom."""
         count = len(self.branch.joint.moves)
@@ -102,11 +92,6 @@ class Link(NamedTuple):
         kinds = ("turn", "screw") if kind == "turn" else ("slide",)
         sign = 1.0 if self.branch.forward else -1.0
         return sign if self.move is not None and self.move.kind in kinds else 0.0
-
-    @property
-    def pitch(self):
-        """How far the frame moves along the axis per turn, m; zero unless the joint is a screw."""
-        return self.branch.joint.pitch_of(self.branch.element)
 
 
 def grow(bodies: Bodies, effects: Sequence[Effect]) -> tuple[Branch, ...]:

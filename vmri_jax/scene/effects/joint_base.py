@@ -53,9 +53,6 @@ class Joint(Effect):
         frames = {name: squeeze(library(values).stack(values)) for name, values in self._frames(bodies).items()}
         return super().parameters(bodies) | frames
 
-    def points(self, bodies):
-        return {}
-
     def label(self, i: int, bodies: Bodies) -> str:
         """The name of the joint, followed by the names of both bodies of the i-th pair if the joint has several pairs."""
         elements = self.elements(bodies)
@@ -81,7 +78,7 @@ class Joint(Effect):
 
     def check_parameters(self, bodies):
         super().check_parameters(bodies)
-        for (a, b), points in zip(self._pairs(bodies), self.joining_points(bodies), strict=True):
+        for (a, b), points in zip(super().elements(bodies), self.joining_points(bodies), strict=True):
             if not is_concrete(points):
                 continue
             distance = np.linalg.norm(points[1] - points[0])
@@ -103,25 +100,16 @@ class Joint(Effect):
             f"{self.name} {'-'.join(element)} in {name}": (name, points[role][i])
             for i, element in enumerate(self.elements(bodies))
             for role, name in zip("ab", element, strict=True)
-            if self._sticks_out(name, points[role][i], bodies)
+            # a line to a point outside the drawn shape of a body is drawn from the centre
+            if isinstance(body := body_of(bodies, name), RigidBody) and not body.covers(points[role][i])
         }
 
     def drawing(self, bodies):
         return {"links": [[name, end] for end, (name, _) in self.drawn_points(bodies).items()]}
 
-    @staticmethod
-    def _sticks_out(name: str, point, bodies) -> bool:
-        """Whether the point of the joint lies outside the drawn shape of a body, so that a line to it is drawn from the centre."""
-        body = body_of(bodies, name)
-        return isinstance(body, RigidBody) and not body.covers(point)
-
-    def _pairs(self, bodies):
-        """The pairs (a, b) as the user wrote them: `Attachment` where a name came with a point."""
-        return super().elements(bodies)
-
     def joining_points(self, bodies):
         """For each pair the point of the joint in space as a has it and as b has it, at the start: [((3,), (3,)), ...]."""
-        pairs = self._pairs(bodies)
+        pairs = super().elements(bodies)  # as the user wrote them: `Attachment` where a name came with a point
         if self.at is not None:
             if any(isinstance(name, Attachment) for pair in pairs for name in pair):
                 raise ValueError(

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from vmri_jax.mechanics.rows import Rows
 from vmri_jax.scene.declare import effect_class, number, of_time, positive, real_tree
 from vmri_jax.scene.effect import START, Effect
+from vmri_jax.scene.effects.contact import penalty
 from vmri_jax.scene.effects.freedoms import ANGLES, COORDINATE, FREEDOMS, Freedom
 from vmri_jax.scene.effects.joint_base import Joint, freedom_of, joint_named
 from vmri_jax.scene.effects.springs import elastic_energy
@@ -162,9 +163,7 @@ class JointLimit(InJoint):
 
     @staticmethod
     def law(x, params):
-        s = params["smoothing"]
-        depths = (s * jax.nn.softplus(depth / s) for depth in (params["lower"] - x, x - params["upper"]))
-        return sum(elastic_energy(params["stiffness"], depth) for depth in depths)
+        return penalty(x - params["lower"], params) + penalty(params["upper"] - x, params)
 
     def curvature(self, bodies):
         return None if self.freedom in ANGLES else self.stiffness
