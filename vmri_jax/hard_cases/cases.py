@@ -99,19 +99,15 @@ class Resolved:
             steps *= LONGER_RUN
             before, (trajectory, change) = change, self._energy(steps)
             trend = change.drifts and abs(change.drift) > DRIFT_RATIO * abs(before.drift)
-        e = np.asarray(trajectory.energy)
+        e, shadow = np.asarray(trajectory.energy), drift_meter(self.problem, self.scheme, self.macro_dt, SHADOW_STEPS)
         return Outcome(
             f"{steps:.0e} steps: {status(trajectory)}, relative band {change.band:.1e}, drift {change.drift:.0e} per 1e5 steps "
-            f"({change.share:.0%} of the band over the run){self._shadow()}",
+            f"({change.share:.0%} of the band over the run)"
+            + ("" if shadow is None else f"; first {SHADOW_STEPS} steps: {shadow}"),
             trajectory.success and not trend,
             {"band": change.band, "drift_per_1e5": change.drift},
             {"t": trajectory.t, "energy error": e - e[0]},
         )
-
-    def _shadow(self) -> str:
-        """The shadow energy of the first steps in words; empty if there is none."""
-        shadow = drift_meter(self.problem, self.scheme, self.macro_dt, SHADOW_STEPS)
-        return "" if shadow is None else f"; first {SHADOW_STEPS} steps: {shadow}"
 
     def _energy(self, steps: int) -> tuple[Trajectory, Energy]:
         trajectory = long_run(self.problem, self.scheme, self.macro_dt, steps)

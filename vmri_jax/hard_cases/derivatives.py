@@ -10,7 +10,6 @@ compared with differences of the gradient in the same way, and must be symmetric
 
 from collections.abc import Callable, Iterator
 from functools import partial
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -35,14 +34,6 @@ ROUND_OFF = 1e-14
 """Round-off of a difference of values, as a part of the value; a larger value hides errors of small derivatives."""
 
 
-class Term(NamedTuple):
-    """A function of the system as a function of a vector, ``function(z) -> (m,)``, and (k, n) points z at which to compare its derivatives."""
-
-    name: str
-    function: Callable
-    points: np.ndarray
-
-
 def derivatives(problem: Problem, scheme: Scheme, macro_dt: float) -> Outcome:
     """The largest relative difference of derivatives, and the functions whose derivatives are wrong."""
     worst = {}
@@ -65,8 +56,11 @@ def derivatives(problem: Problem, scheme: Scheme, macro_dt: float) -> Outcome:
     )
 
 
-def _terms(problem: Problem, scheme: Scheme, macro_dt: float) -> Iterator[Term]:
-    """The functions of the system, with points at the start and along a short run up to a failure."""
+def _terms(problem: Problem, scheme: Scheme, macro_dt: float) -> Iterator[tuple[str, Callable, np.ndarray]]:
+    """The functions of the system by name, each as a function of a vector, ``function(z) -> (m,)``, with (k, n) points z.
+
+    The points are the start and nodes of a short run up to a failure.
+    """
     system, n_s = problem.system, problem.q_s.size
     along = run(problem, scheme, macro_dt, 20, save_every=5)
     speeds = jax.jit(jax.vmap(lambda *z: jnp.concatenate(velocity(system, *z))))
@@ -76,22 +70,17 @@ def _terms(problem: Problem, scheme: Scheme, macro_dt: float) -> Iterator[Term]:
     n = points.shape[1] // 2
     params = system.params
     if (slow := system.slow_potential) is not None:
-        yield Term("slow_potential", lambda q: slow(q[:n_s], q[n_s:], params)[None], points[:, :n])
+        yield "slow_potential", lambda q: slow(q[:n_s], q[n_s:], params)[None], points[:, :n]
     if (fast := system.fast_potential) is not None:
-        yield Term("fast_potential", lambda q: fast(q, params)[None], points[:, n_s:n])
+        yield "fast_potential", lambda q: fast(q, params)[None], points[:, n_s:n]
     for name, potential in system.potentials:
-        function = partial(_of_joined, potential, n_s, params)
-        yield Term(f"potential {name!r}", function, points[:, :n])
+        values = partial(lambda potential, q: potential(q[:n_s], q[n_s:], params)[None], potential)
+        yield f"potential {name!r}", values, points[:, :n]
     if not system.has_constant_mass:
         parts = (n_s, n, n + n_s)
-        yield Term("kinetic", lambda z: system.kinetic(*jnp.split(z, parts), params)[None], points)
+        yield "kinetic", lambda z: system.kinetic(*jnp.split(z, parts), params)[None], points
     if system.is_constrained:
-        yield Term("the constraints", lambda q: system.constraints(t, q[:n_s], q[n_s:]), points[:, :n])
-
-
-def _of_joined(potential: Callable, n_s: int, params, q):
-    """(1,) value of a potential, as a function of all positions q."""
-    return potential(q[:n_s], q[n_s:], params)[None]
+        yield "the constraints", lambda q: system.constraints(t, q[:n_s], q[n_s:]), points[:, :n]
 
 
 def _differences(function: Callable, points: np.ndarray) -> tuple[float, float, float]:

@@ -50,13 +50,11 @@ class Energy:
     """Change of the energy of a run since its start.
 
     band: largest deviation from the start.
-    jump: largest change from one saved node to the next.
     drift: slope of a straight line, per 1e5 steps.
     share: change along that line over the whole run, as a share of the band.
     """
 
     band: float
-    jump: float
     drift: float
     share: float
 
@@ -67,17 +65,14 @@ class Energy:
 
 
 def energy(trajectory: Trajectory, num_steps: int, scale: float = 1.0) -> Energy:
-    """Band, largest jump and drift of the energy over a run of `num_steps` steps, in units of `scale`.
-
-    All are infinite where the run failed.
-    """
+    """Band and drift of the energy over a run of `num_steps` steps, in units of `scale`; infinite where the run failed."""
     e = (np.asarray(trajectory.energy) - float(trajectory.energy[0])) / scale
     if not np.isfinite(e).all():
-        return Energy(np.inf, np.inf, np.inf, np.inf)
+        return Energy(np.inf, np.inf, np.inf)
     band = float(np.abs(e).max())
     change = float(np.polyfit(np.linspace(0.0, 1.0, len(e)), e, 1)[0])
     share = abs(change) / band if band else 0.0
-    return Energy(band, float(np.abs(np.diff(e)).max()), change / num_steps * 1e5, share)
+    return Energy(band, change / num_steps * 1e5, share)
 
 
 def energy_scale(problem: Problem, trajectory: Trajectory) -> float:
