@@ -30,9 +30,8 @@ from vmri_jax.scene.effects.fields import Gravity
 from vmri_jax.scene.effects.joint_base import Joint
 from vmri_jax.scene.effects.joint_effects import JointDamper, JointLimit, JointSpring, RotorInertia
 from vmri_jax.scene.effects.joints import Fixed, Prismatic, Revolute, Spherical
-from vmri_jax.scene.mujoco_couplings import couplings
+from vmri_jax.scene.mujoco_equalities import close, couplings, loops
 from vmri_jax.scene.mujoco_fields import CONSTRAINTS
-from vmri_jax.scene.mujoco_loops import close, loops
 from vmri_jax.scene.mujoco_model import Compiled
 from vmri_jax.scene.rigid import RigidBody
 

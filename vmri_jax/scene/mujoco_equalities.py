@@ -1,18 +1,30 @@
-"""The equalities connect and weld of a model of MuJoCo, which close its loops: both ends of each, and the gap between them.
+"""The equalities of a model of MuJoCo: connect and weld, which close loops, and couplings of two joints or of two fixed tendons.
 
 MuJoCo's equalities are soft, so that a configuration from a simulation of MuJoCo has gaps. Newton's iteration on MuJoCo's coordinates
-closes them,
+closes the gaps of loops,
 
     J dq = -r,    r = (x_1 - x_2, rotation vector of R_1 R_2^T),    J = (J_x1 - J_x2, J_w1 - J_w2),
 
 with the points x and frames R of both ends (frames of welds only) and their Jacobians; ``dq`` is the shortest solution.
+
+A coupling is a polynomial,
+
+    y - y_0 = a_0 + a_1 (x - x_0) + ... + a_4 (x - x_0)^4.
+
+y and x are the coordinates of the joints, or the lengths of the tendons: sums of joint coordinates with constant ratios. y_0 and
+x_0 are their values at qpos0. Without a second joint or tendon the equality is ``y = y_0 + a_0``.
+
+Source: MuJoCo's documentation, "XML reference", equality.
 """
 
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from vmri_jax.scene.effects.couplings import JointCoupling
 from vmri_jax.scene.mujoco_model import Compiled
 
 WIDEST_GAP = 1e-3
@@ -28,6 +40,11 @@ ITERATIONS = 50
 RANK = 1e-10
 """Singular values of the Jacobian below this fraction of the largest count as zero, so that dependent rows do no harm. A larger value
 ignores motions that close a gap."""
+ADVICE = (
+    "Here equalities hold exactly: give a qpos where they do, as one at which MuJoCo's simulation comes to rest, or switch the equality off "
+    "in the model."
+)
+"""End of messages about equalities that the start violates."""
 
 
 class End(NamedTuple):
@@ -96,12 +113,8 @@ def _refuse_gaps(compiled: Compiled, closing: list[Loop], widest: float, phrase:
             distances = np.linalg.norm(loop.gap.reshape(-1, 3), axis=1)
             angle = f" and {distances[1]:.3g} rad" if loop.welded else ""
             gaps.append(f"{compiled.name('equality', loop.number)} {phrase} {distances[0]:.3g} m{angle}")
-    if not gaps:
-        return
-    raise ValueError(
-        f"Scene.from_mujoco: {'; '.join(gaps)}. Here equalities hold exactly: give a qpos where they do, as one at which MuJoCo's "
-        "simulation comes to rest, or switch the equality off in the model."
-    )
+    if gaps:
+        raise ValueError(f"Scene.from_mujoco: {'; '.join(gaps)}. {ADVICE}")
 
 
 def _size(loop: Loop, extent: float) -> float:
@@ -140,3 +153,48 @@ def _jacobian(compiled: Compiled, data: Any, loop: Loop) -> np.ndarray:
         compiled.mujoco.mj_jac(compiled.model, data, of_point, of_rotation, end.point, end.body)
         sides.append(np.concatenate([of_point, of_rotation]) if loop.welded else of_point)
     return sides[0] - sides[1]
+
+
+def polynomial(x, params):
+    """``y - sum_k a_k z^k``, where y and z are sums ``r . x + c`` of the joint coordinates x."""
+    y, z = params["ratios"] @ x + params["offsets"]
+    return y - jnp.polyval(params["coefficients"][::-1], z)
+
+
+def couplings(compiled: Compiled, data: Any) -> Iterator[JointCoupling]:
+    """The couplings that the model does not switch off, none of which the start may violate."""
+    model = compiled.model
+    for i in compiled.equalities:
+        if not compiled.ties(i):
+            continue
+        sides = [_ratios(compiled, i, int(number)) for number in (model.eq_obj1id[i], model.eq_obj2id[i])]
+        joints = sorted({j for side in sides for j in side})
+        ratios = np.array([[side.get(j, 0.0) for j in joints] for side in sides])
+        places = model.jnt_qposadr[joints]
+        coefficients = np.where(np.any(ratios[1]), model.eq_data[i, :5], [model.eq_data[i, 0], 0, 0, 0, 0])
+        params = {
+            "ratios": ratios,
+            "offsets": ratios @ (data.qpos[places] - model.qpos0[places]),  # a scene counts coordinates from the start
+            "coefficients": coefficients,
+        }
+        name = compiled.name("equality", i)
+        violation = abs(float(polynomial(jnp.zeros(len(joints)), params)))
+        if violation > WIDEST_GAP:
+            raise ValueError(f"Scene.from_mujoco: {name} is violated by {violation:.3g} at the start. {ADVICE}")
+        yield JointCoupling([compiled.name("joint", j) for j in joints], polynomial, params, name=name)
+
+
+def _ratios(compiled: Compiled, i: int, number: int) -> dict[int, float]:
+    """The ratios of the joints on a side of an equality, by number of the joint; {} for an equality without this side.
+
+    Args:
+        i: number of the equality.
+        number: of the joint or tendon on this side; negative if there is none.
+    """
+    model = compiled.model
+    if number < 0:
+        return {}
+    if model.eq_type[i] == compiled.mujoco.mjtEq.mjEQ_JOINT:
+        return {number: 1.0}
+    wraps = model.tendon_adr[number] + np.arange(model.tendon_num[number])
+    return {int(model.wrap_objid[w]): float(model.wrap_prm[w]) for w in wraps}
