@@ -40,9 +40,6 @@ def with_bars(drawing: Drawing, q_s: np.ndarray, q_f: np.ndarray) -> Drawing:
 
     Args:
         q_s, q_f: (k, n_s) and (k, n_f) positions along the run.
-
-    Raises:
-        ValueError: a body or block uses a coordinate that the run does not have.
     """
     if not drawing.blocks:
         return drawing

@@ -32,12 +32,7 @@ class Curves:
         return HEIGHT if self.slow or self.fast else 0.0
 
     def draw(self, figure: Figure, moments: Sequence[float] | np.ndarray) -> None:
-        """Draw the curves at the lower end of a figure.
-
-        Args:
-            figure: in the style of the theme.
-            moments: times of the pictures; dots mark them on the slow curve.
-        """
+        """Draw the curves at the lower end of a figure in the style of the theme; dots mark the moments of the pictures."""
         span = float(self.motion.t[0]), float(self.motion.t[-1])
         panels = [] if self.slow is None else [(self.slow, span, "t")]
         if self.fast is not None:

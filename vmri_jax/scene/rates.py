@@ -63,11 +63,7 @@ class Linearised(NamedTuple):
 
 
 def measure(bodies: Bodies, effects: Sequence[Effect]) -> dict[str, Rates]:
-    """Rates of potentials and kinetic effects by name.
-
-    Raises:
-        ValueError: energies that are not smooth at the start, or a kinetic energy that is not positive there.
-    """
+    """Rates of potentials and kinetic effects by name."""
     sizes = [body.motions.shape[1] for body in bodies.values()]
     columns = dict(zip(bodies, np.split(np.arange(sum(sizes)), np.cumsum(sizes)[:-1]), strict=True))
     # M = A^T diag(m) A with the motions A of each body, plus d2L/dv2 of kinetic effects
@@ -99,12 +95,7 @@ def border(rates: Sequence[np.ndarray], slow: float = 0.0, fast: float = np.inf)
 
 
 def _rates(effect: Effect, bodies, elements: Sequence[Linearised], mass: np.ndarray, size: float) -> Rates:
-    """Frequencies and rates of the elements of an effect.
-
-    Args:
-        mass: of all bodies.
-        size: L, the size of the scene.
-    """
+    """Frequencies and rates of the elements of an effect, with the mass matrix of all bodies and the size L of the scene."""
     declared = effect.curvature(bodies)
     curvatures = np.broadcast_to(-np.inf if declared is None else declared, len(elements))
     frequency, rate = np.zeros(len(elements)), np.zeros(len(elements))
@@ -142,11 +133,7 @@ def _scaled(root: np.ndarray, matrix: np.ndarray) -> np.ndarray:
 
 
 def _linearise(effect: Effect, bodies: Bodies, columns: Mapping[str, np.ndarray]) -> list[Linearised]:
-    """The elements of an effect at the start.
-
-    Args:
-        columns: numbers of the velocities of each body among the velocities of all bodies.
-    """
+    """The elements of an effect at the start; `columns` of each body, see `Linearised`."""
     params, linearised = effect.parameters(bodies), []
     for i, element in enumerate(map(moving, effect.elements(bodies))):
         term, element_params = effect.element_term(i, bodies, params)

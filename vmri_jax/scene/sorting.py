@@ -183,13 +183,7 @@ def _bodies_and_jacobian(kinematics: Kinematics, q, joints):
 def _nearest_rates(jacobian, rates, masses) -> tuple[Any, Any]:
     """The velocities v of the scene for which ``J v`` is nearest to the velocities V of the bodies, ``J^T M J v = J^T M V``.
 
-    Args:
-        jacobian: J = dQ/dq.
-        rates: V of (Q_s, Q_f) one after the other.
-        masses: M, likewise.
-
-    Returns:
-        v, and the part ``V - J v`` that the joints do not allow, relative to V in the norm of the kinetic energy.
+    With v comes the part ``V - J v`` that the joints do not allow, relative to V in the norm of the kinetic energy.
     """
     xp = library(jacobian, rates, masses)
     v = xp.linalg.solve(jacobian.T @ (masses[:, None] * jacobian), jacobian.T @ (masses * rates))
@@ -341,8 +335,6 @@ def _home(effect: Effect, i: int, slow: tuple[str, ...], size: int, measured, li
     Args:
         slow: the slow bodies that the element touches.
         size: number of all bodies that it touches.
-        measured: rates of effects by name.
-        limit: border between slow and fast, rad/s; None if there is none.
     """
     if effect.kind == "kinetic":
         return "kinetic", Reason("depends on velocities")

@@ -236,11 +236,7 @@ class TangentDamping(_OfSeveral):
 
 
 def choose(params, select: Sequence[int], split: Sequence[str]):
-    """The parameters of some elements.
-
-    Args:
-        split: names of parameters that may have an entry for each element.
-    """
+    """The parameters of some elements; parameters in `split` may have an entry for each element."""
     return params | {name: pick(params[name], select) for name in split if name in params and jnp.ndim(params[name])}
 
 

@@ -211,8 +211,6 @@ def _with_kinematics(bodies: Bodies, branches: Sequence[Branch], places, coordin
 
     Args:
         places: of the bodies on no joint.
-        coordinates, freedoms: as of `Layout`.
-        sizes: (n_s, n_f).
     """
     grids: dict[str, Grid] = {name: place.part for name, place in places.items()}
     grids[GROUND] = "s"
@@ -266,10 +264,7 @@ def _frames(grid: Grid, first: int, branches: Sequence[Branch], bodies: Bodies, 
     Paths from a root to a leaf are padded with None to the same length.
 
     Args:
-        grid: the part of the coordinates: slow, fast, or both.
         first: index of the first of these frames.
-        branches: parents before children.
-        freedoms: as of `Layout`.
         numbers: indices of the bodies that the branches may hang on.
     """
     branch_of = {branch.child: branch for branch in branches}
