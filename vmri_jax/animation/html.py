@@ -7,11 +7,9 @@ import jinja2
 import numpy as np
 
 from vmri_jax import plots
-from vmri_jax.animation.drawing import Drawing
 from vmri_jax.animation.geometry import JOINT_END, LAMP, helix
 from vmri_jax.animation.layout import Connection, Ground, Layout, layout, nice
 from vmri_jax.animation.motion import Motion
-from vmri_jax.animation.parts import Solid
 from vmri_jax.running.files import check_place
 
 MOST_COORDINATES = 600_000
@@ -66,19 +64,21 @@ def _data(motion: Motion, sizes: Layout) -> dict:
     turns = {connection.turns for connection in sizes.connections if connection.kind == "spring"}
     many = len(sizes.connections) > 20  # fewer points then: the script draws every helix in every picture
     constrained = bool(np.nanmax(motion.residual, initial=0.0) > 0)
+    title = f"{motion.energy_names[0]} {'ΔE / |E₀|' if motion.relative else 'ΔE'}"
+    index = {body.name: i for i, body in enumerate(drawing.bodies)}
     return {
         "t": _packed(t, np.float64),
         "points": _packed(motion.points),
         "velocities": _packed(motion.velocities),
         "energy": [_packed(column) for column in motion.energy.T],
         "energy_names": motion.energy_names if len(motion.energy_names) > 1 else [""],
-        "energy_title": _energy_title(motion),
+        "energy_title": title if len(motion.energy_names) == 1 else "since the start:",
         "residual": [_packed(column) for column in motion.residual.T] if constrained else None,
         "bodies": [
             {"name": body.name, "pace": body.pace, "color": body.color, "radius": float(radius), "shown": body.shown}
             for body, radius in zip(drawing.bodies, sizes.radii, strict=True)
         ],
-        "solids": [_solid(drawing, solid) for solid in drawing.solids],
+        "solids": [vars(solid) | {"points": [index[name] for name in solid.points]} for solid in drawing.solids],
         "connections": [_plain(connection) for connection in sizes.connections],
         "planes": [_plain(ground) | {"grid": _packed(ground.grid), "bears": ground.bears} for ground in sizes.grounds],
         "spheres": [
@@ -102,19 +102,6 @@ def _data(motion: Motion, sizes: Layout) -> dict:
         "caption": drawing.caption,
         "ending": motion.ending,
     }
-
-
-def _energy_title(motion: Motion) -> str:
-    name, *further_names = motion.energy_names
-    if further_names:
-        return "since the start:"
-    return f"{name} {'ΔE / |E₀|' if motion.relative else 'ΔE'}"
-
-
-def _solid(drawing: Drawing, solid: Solid) -> dict:
-    """The data of a solid, with the numbers of its four bodies."""
-    index = {body.name: i for i, body in enumerate(drawing.bodies)}
-    return vars(solid) | {"points": [index[name] for name in solid.points]}
 
 
 def _plain(record: Connection | Ground) -> dict:

@@ -10,7 +10,7 @@ from vmri_jax.mechanics.system import ConstantMass, Rheonomic, System
 from vmri_jax.scene.functions import FUNCTIONS, IMPLIED, Actuation
 from vmri_jax.scene.layout import Layout, join
 from vmri_jax.scene.sorting import Placed, Sorting
-from vmri_jax.scene.terms import DroppedRows, SomeRows
+from vmri_jax.scene.terms import SomeRows
 
 
 def build(sorting: Sorting, placed: Sequence[Placed]) -> System:
@@ -25,7 +25,7 @@ def build(sorting: Sorting, placed: Sequence[Placed]) -> System:
             potentials[name] = (*potentials.get(name, ()), *of_effect)
         terms.setdefault(part.home, []).extend([SomeRows(of_effect, part.dropped)] if part.dropped else of_effect)
         if part.dropped:
-            terms.setdefault("implied", []).append(DroppedRows(of_effect, part.dropped))
+            terms.setdefault("implied", []).append(SomeRows(of_effect, part.dropped, alone=True))
     # with joint coordinates the masses depend on positions, so that T is a function even without kinetic effects
     if layout.kinematics is not None:
         terms.setdefault("kinetic", [])

@@ -17,7 +17,7 @@ from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -43,14 +43,7 @@ OLDEST_VERSION = 4
 
 
 def bodies_and_effects(
-    model: Any,
-    *,
-    qpos: Any,
-    qvel: Any,
-    key: str | int | None,
-    ignore: Collection[str],
-    limits: Literal["refuse", "spring"],
-    coordinates: Literal["joint", "directors"],
+    model: Any, qpos: Any, qvel: Any, key: str | int | None, ignore: Collection[str], limits: str, coordinates: str
 ) -> tuple[list[RigidBody | Frame], list[Effect]]:
     """Bodies and effects of the scene of a model, see `Scene.from_mujoco`."""
     try:

@@ -76,6 +76,8 @@ class Scene:
     redundant: Literal["refuse", "drop"] = "refuse"
     coordinates: Literal["joint", "directors", "auto"] = "directors"
     joint_starts: Mapping[tuple[str, int, str], tuple[Any, Any]] = field(default_factory=dict, repr=False)
+    # the problem after the first call of `problem`: building a scene of a hundred joints takes a second
+    _problems: list[Problem] = field(default_factory=list, init=False, repr=False)
 
     def __repr__(self) -> str:
         effects = [effect.name for effect in self.effects]
@@ -156,9 +158,7 @@ class Scene:
         """
         from vmri_jax.scene.mujoco import bodies_and_effects  # the package mujoco is an optional dependency
 
-        bodies, effects = bodies_and_effects(
-            model, qpos=qpos, qvel=qvel, key=key, ignore=ignore, limits=limits, coordinates=coordinates
-        )
+        bodies, effects = bodies_and_effects(model, qpos, qvel, key, ignore, limits, coordinates)
         return cls(bodies, effects, redundant="drop", project=True, coordinates=coordinates)
 
     @cached_property
@@ -239,11 +239,6 @@ class Scene:
         if is_concrete((problem.system, self.start)):  # traced arrays must not outlive their trace
             self._problems.append(problem)
         return problem
-
-    @cached_property
-    def _problems(self) -> list[Problem]:
-        """The problem after the first call of `problem`: building a scene of a hundred joints takes a second."""
-        return []
 
     def state(self) -> State:
         """The consistent initial state, see `initial_state`."""

@@ -197,24 +197,18 @@ class _OfSeveral:
 
 @dataclass(frozen=True)
 class SomeRows(_OfSeveral):
-    """The values of some terms of a constraint one after the other, without the rows with the numbers `dropped`."""
+    """The values of some terms of a constraint one after the other, without the rows `dropped`, or these rows `alone`."""
 
     dropped: tuple[int, ...]
+    alone: bool = False
 
     def value(self, q_s, q_f, params, t=None):
-        """The values of the rows that are kept, by static slices."""
+        """The values of the rows, by static slices."""
         values = concatenated([term.value(q_s, q_f, params, t) for term in self.terms])
+        if self.alone:
+            return concatenated([values[k : k + 1] for k in self.dropped])
         ends = [-1, *self.dropped, values.shape[0]]
         return concatenated([values[low + 1 : high] for low, high in pairwise(ends)])
-
-
-class DroppedRows(SomeRows):
-    """The values of the rows that `SomeRows` leaves out."""
-
-    def value(self, q_s, q_f, params, t=None):
-        """The values of the dropped rows, by static slices."""
-        values = concatenated([term.value(q_s, q_f, params, t) for term in self.terms])
-        return concatenated([values[k : k + 1] for k in self.dropped])
 
 
 @dataclass(frozen=True)
