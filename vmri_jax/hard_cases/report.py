@@ -65,10 +65,7 @@ class Report(ResultTable):
         """All fields of every row but the arrays for its picture."""
         return [
             {
-                "number": row.case.number,
-                "title": row.case.title,
-                "setup": row.case.setup,
-                "criterion": row.case.criterion,
+                **{name: getattr(row.case, name) for name in ("number", "title", "setup", "criterion")},
                 "measured": row.outcome.measured,
                 "passed": row.outcome.passed,
                 "values": dict(row.outcome.values),

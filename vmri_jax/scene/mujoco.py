@@ -143,7 +143,12 @@ class _Reader:
             axes, arm = self.data.ximat[b].reshape(3, 3), position - centre
             inertia += axes @ np.diag(model.body_inertia[b]) @ axes.T
             inertia += m * (arm @ arm * np.eye(3) - np.outer(arm, arm))
-        spin, velocity = self._motion(root)
+        motion, mujoco = (
+            np.zeros(6),
+            self.compiled.mujoco,
+        )  # angular velocity, and velocity of the centre of mass, in space
+        mujoco.mj_objectVelocity(model, self.data, mujoco.mjtObj.mjOBJ_BODY, root, motion, 0)
+        spin, velocity = motion[:3], motion[3:]
         velocity = velocity + np.cross(spin, centre - self.data.xipos[root])
         return RigidBody(name, mass, inertia, centre, velocity=velocity, spin=spin)
 
@@ -236,9 +241,3 @@ class _Reader:
             point = self.data.xipos[b] - body.position  # at the start the axes of the body are the axes of space
             name = f"{compiled.name('body', b)} gravity compensation"
             yield Potential(lift, ((body.name, point.tolist()),), {"force": force}, name=name)
-
-    def _motion(self, body: int) -> tuple[np.ndarray, np.ndarray]:
-        """Angular velocity, and velocity of the centre of mass, in space."""
-        mujoco, velocity = self.compiled.mujoco, np.zeros(6)
-        mujoco.mj_objectVelocity(self.compiled.model, self.data, mujoco.mjtObj.mjOBJ_BODY, body, velocity, 0)
-        return velocity[:3], velocity[3:]

@@ -12,7 +12,7 @@ import numpy as np
 
 from vmri_jax.mechanics.arrays import is_concrete, quickly_compiled
 from vmri_jax.mechanics.names import Names
-from vmri_jax.scene.body import LARGEST_POINT, AnyBody, Bodies, label_of, moving
+from vmri_jax.scene.body import LARGEST_POINT, Bodies, label_of, moving
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.effects.freedoms import ANGLES
 from vmri_jax.scene.layout import join
@@ -105,7 +105,7 @@ class ConstraintRows:
                     name = names if size == 1 else f"{names} [{j}]"
                     rows.append(Row(name, i, number, part.effect, part.home, number not in part.dropped))
                     number += 1
-        scales = _scales(sorting, _extent(bodies))
+        scales = _scales(sorting)
         return cls(tuple(rows), tuple(elements), start, masses, scales, layout.sizes[0], to_bodies)
 
     def evaluate(self, t: float, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -168,33 +168,23 @@ def _value_and_jacobian(term: EffectTerm, params, q, t):
     return value, jacobian
 
 
-def _extent(bodies: Bodies) -> float:
-    """Extent of the scene: the largest distance of a body from the mean of all positions along an axis.
+def _scales(sorting: Sorting) -> np.ndarray:
+    """(n,) change of each coordinate in a large motion, see `ConstraintRows`.
 
-    If all bodies are at the same place, the largest coordinate of this place, or 1 at the origin.
+    The extent of the scene is the largest distance of a body from the mean of all positions along an axis. If all bodies are at the same
+    place, it is the largest coordinate of this place, or 1 at the origin.
     """
-    points = positions(bodies)
-    return float(np.abs(points - points.mean(axis=0)).max() or np.abs(points).max() or 1.0)
-
-
-def _scales(sorting: Sorting, extent: float) -> np.ndarray:
-    """(n,) change of each coordinate in a large motion, see `ConstraintRows`."""
-    of_joints = {
-        place: np.full(1, 1.0 if freedom in ANGLES else extent)
-        for (_, _, freedom), place in sorting.layout.freedoms.items()
-    }
-    places = sorted(sorting.layout.coordinates.items(), key=lambda item: (item[1].part == "f", item[1].start))
+    points, layout = positions(sorting.bodies), sorting.layout
+    extent = float(np.abs(points - points.mean(axis=0)).max() or np.abs(points).max() or 1.0)
+    scales = {place: np.full(1, 1.0 if key[2] in ANGLES else extent) for key, place in layout.freedoms.items()}
+    for name, body in sorting.bodies.items():
+        if name in layout.coordinates and layout.coordinates[name] not in scales:
+            q = np.asarray(body.coordinates)
+            of_points = np.where(np.arange(q.size) < LARGEST_POINT, extent, 1.0)
+            scales[layout.coordinates[name]] = np.maximum(np.abs(q), 1.0) if body.block else of_points
     return np.concatenate(
-        [of_joints[place] if place in of_joints else _scales_of(sorting.bodies[name], extent) for name, place in places]
+        [scales[place] for place in sorted(scales, key=lambda place: (place.part == "f", place.start))]
     )
-
-
-def _scales_of(body: AnyBody, extent: float) -> np.ndarray:
-    """Change of each coordinate of a body in a large motion."""
-    q = np.asarray(body.coordinates)
-    if body.block:
-        return np.maximum(np.abs(q), 1.0)
-    return np.where(np.arange(q.size) < LARGEST_POINT, extent, 1.0)
 
 
 def names_of(sorting: Sorting) -> Names:

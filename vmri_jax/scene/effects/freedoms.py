@@ -63,32 +63,22 @@ def tilt_by_sine(q, params):
     return dot(of_b[..., M_PRIME, :], n), dot(of_b[..., N, :], n)
 
 
-def turn(q, params):
-    """The angle by which b has turned about the axis from the given position, rad, between -pi and pi, (...)."""
-    return jnp.arctan2(*turn_by_sine(q, params))
-
-
 def slide(q, params):
     """How far b has moved along the axis from the given position, ``n . D``, m, (...)."""
     return dot(triads(q, params)[0][..., N, :], gap(q, params))
 
 
-def coordinate(q, params):
-    """The value (...) of a freedom that is itself a coordinate of the scene, from ``q = ((..., 1),)``."""
-    return jnp.squeeze(q[0], -1)
-
-
 ANGLES: dict[str, Any] = {"turn": turn_by_sine, "tilt": tilt_by_sine}
 """For each freedom that is an angle, the function that gives its sine and cosine."""
 COORDINATE = "coordinate"
-"""In `FREEDOMS`, the name of any freedom that is a coordinate of the scene."""
+"""In `FREEDOMS`, the name of any freedom that is a coordinate of the scene, ``q = ((..., 1),)``."""
 FREEDOMS: dict[str, Any] = {
-    "turn": turn,
+    "turn": lambda q, params: jnp.arctan2(*turn_by_sine(q, params)),
     "slide": slide,
     "tilt": lambda q, params: jnp.arctan2(*tilt_by_sine(q, params)),
     "along": lambda q, params: across(q, params)[..., 0],
     "across": lambda q, params: across(q, params)[..., 1],
-    COORDINATE: coordinate,
+    COORDINATE: lambda q, params: jnp.squeeze(q[0], -1),
 }
 """For each freedom, the function ``(q, params) -> (...)`` of the coordinates of both bodies that gives its value against the given position: rad,
 between -pi and pi, or m."""
