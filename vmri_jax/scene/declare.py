@@ -46,9 +46,6 @@ class Names:
         Args:
             argument: an element ``("a", "b")``, a list of elements ``[("a", "b"), ("b", "c")]``, or None.
             about: names of effect and field, for messages.
-
-        Raises:
-            ValueError: an element with another number of bodies, or no element.
         """
         if argument is None and self.may_be_all:
             argument = tuple(name for name, body in bodies.items() if not isinstance(body, Frame))
@@ -97,11 +94,6 @@ class Parameter:
             about: names of effect and field, for messages.
             argument: the numbers of the user.
             bodies: the first body of every element.
-
-        Raises:
-            TypeError: an argument that is no real number.
-            ValueError: arrays of float32, a number of entries that is not the number of elements, vectors of another dimension than
-                the bodies.
         """
         value = jnp.asarray(real_array(about, argument))
         count, size = len(bodies), bodies[0].size

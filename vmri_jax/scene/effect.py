@@ -114,11 +114,6 @@ class Effect(ABC):
         declared = [name for name, parameter in self.declared.items() if parameter.shape in ("number", "vector")]
         return (*declared, *self.masses, *self.derived, *POINTS)
 
-    @property
-    def refers_to(self) -> tuple[str, ...]:
-        """Names of the potentials that this effect builds on."""
-        return ()
-
     def bound(self, effects: Sequence["Effect"]) -> "Effect":
         """A copy in which names of other effects, such as joints, are replaced by these effects.
 

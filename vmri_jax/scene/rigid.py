@@ -101,11 +101,7 @@ class RigidBody(AnyBody):
             object.__setattr__(self, name, value)
 
     def _principal(self, inertia) -> tuple[Any, np.ndarray]:
-        """Principal moments (3,), and the principal axes as columns, in the axes of the body.
-
-        Args:
-            inertia: (3,) principal moments, or (3, 3) tensor.
-        """
+        """Principal moments (3,), and the principal axes as columns, in the axes of the body, of the argument `inertia` as an array."""
         about = f"RigidBody {self.name}: inertia"
         axes = np.eye(3)
         if inertia.shape == (3, 3) and is_concrete(inertia):

@@ -114,12 +114,8 @@ class Scene:
                 raise ValueError(
                     f"Scene: an effect is called {name!r}, where the params keep {content}; give it another name."
                 )
-        potentials = [effect.name for effect in self.effects if effect.kind == "potential"]
         for effect in self.everything:
             effect.check(self.by_name, self.project)
-            for name in effect.refers_to:
-                if name not in potentials:
-                    raise ValueError(f"{effect.name}: {unknown('potential', name, potentials)}")
         check_frames(self.by_name, self.branches)
         check_constraints(self.sorting)
 

@@ -1,9 +1,11 @@
 """Forces against motion: linear damping, quadratic drag, dashpots between points, Rayleigh damping."""
 
+from dataclasses import replace
 from typing import Any
 
 import jax.numpy as jnp
 
+from vmri_jax.mechanics.names import unknown
 from vmri_jax.scene.declare import array, effect_class, names, positive
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.effects.points import BetweenPoints
@@ -124,9 +126,14 @@ class RayleighDamping(Effect):
     def masses(self):
         return () if self.mass is None else ("mass_of",)
 
-    @property
-    def refers_to(self):
-        return () if self.of is None else (self.of,) if isinstance(self.of, str) else tuple(self.of)
+    def bound(self, effects):
+        """The effect with the names of its potentials in a tuple."""
+        potentials = [effect.name for effect in effects if effect.kind == "potential"]
+        names = potentials if self.of is None else [self.of] if isinstance(self.of, str) else self.of
+        for name in names:
+            if name not in potentials:
+                raise ValueError(f"{self.name}: {unknown('potential', name, potentials)}")
+        return replace(self, of=tuple(names))
 
     def elements(self, bodies):
         return tuple((name,) for name in bodies)
@@ -138,6 +145,5 @@ class RayleighDamping(Effect):
 
     def terms(self, select, bodies, layout, potentials):
         terms = () if self.mass is None else super().terms(select, bodies, layout, potentials)
-        names = [name for name in potentials if self.of is None or name in self.refers_to]
-        damped = tuple(term for name in names for term in potentials[name])
+        damped = tuple(term for name in potentials if name in self.of for term in potentials[name])
         return terms if self.stiffness is None or not damped else (*terms, TangentDamping(damped, self.name))

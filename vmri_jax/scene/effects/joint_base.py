@@ -140,15 +140,12 @@ class Joint(Effect):
         for i, element in enumerate(elements):
             for role, name, point in zip("ab", element, points[i], strict=True):
                 body = body_of(bodies, name)
-                if not body.rigid:
-                    if triads is not None:
-                        raise ValueError(
-                            f"{self.name}: {name} is a point, which has no axes; a point can be joined by Spherical alone."
-                        )
-                    components.setdefault(f"point_{role}", []).append(np.zeros(3))
-                    continue
+                if not body.rigid and triads is not None:
+                    raise ValueError(
+                        f"{self.name}: {name} is a point, which has no axes; a point can be joined by Spherical alone."
+                    )
                 # X = R^T (x - phi): the point in the axes of the body
-                offset = (point - body.position) @ body.rotation
+                offset = (point - body.position) @ body.rotation if body.rigid else np.zeros(3)
                 components.setdefault(f"point_{role}", []).append(body.weights(offset))
                 if triads is not None:
                     try:
