@@ -192,8 +192,8 @@ def _nearest_rates(jacobian, rates, masses) -> tuple[Any, Any]:
 
 
 Owners = tuple[tuple[str, ...], tuple[str, ...]]
-"""The bodies whose coordinates an element of an effect depends on: all of them, and those that move the bodies of the element against each
-other, not together."""
+"""The bodies whose coordinates an element of an effect depends on: all, and the ones among these that move the bodies of the element
+against each other, not together."""
 
 
 def _owners(effect: Effect, bodies: Bodies, branches: Sequence[Branch]) -> list[Owners]:
