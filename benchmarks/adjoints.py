@@ -24,7 +24,7 @@ SHORT, LONG = 1_000, 1_000_000
 
 @dataclass(frozen=True)
 class Case:
-    """A system whose squared positions at the end are differentiated by its parameters and the momenta of the start."""
+    """A system whose squared positions at the end are differentiated with respect to its parameters and the momenta of the start."""
 
     name: str
     problem: Callable[[], vm.Problem]
@@ -133,7 +133,7 @@ def _row(case: Case, gradient: str, steps: int, seconds: float, program) -> dict
 
 
 def _diffrax(case: Case, problem: vm.Problem, calls: dict, tell: Tell) -> list[dict]:
-    """Its gradient by the momenta at a tolerance of 1e-8, the equations by automatic differentiation of the same Lagrangian."""
+    """Its gradient with respect to the momenta at a tolerance of 1e-8, the equations by automatic differentiation of the same Lagrangian."""
     try:
         import diffrax  # pyright: ignore[reportMissingImports]
     except ImportError:

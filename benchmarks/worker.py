@@ -210,7 +210,7 @@ def _other_params(system) -> dict:
 
 
 class Gradient(Timed):
-    """Reverse-mode derivative of the squared fast positions at the end by the momenta of the start."""
+    """Reverse-mode derivative of the squared fast positions at the end with respect to the momenta of the start."""
 
     def __init__(self, case: Case):
         problem, scheme = case.problem(), case.made_scheme()

@@ -95,7 +95,7 @@ def sample(scheme: Scheme, placed: PlacedRule, slow, fast, macro_dt) -> Samples:
     def values(polynomials, arguments):
         return np.stack([polynomial(arguments) for polynomial in polynomials], axis=1)
 
-    # q_s(theta) = sum_j l_j(theta) S_j and its derivative by t = H theta; the fast path alike, on intervals of length H / num_micro
+    # q_s(theta) = sum_j l_j(theta) S_j and its derivative with respect to t = H theta; the fast path alike, on intervals of length H / num_micro
     return Samples(
         theta,
         values(basis, theta) @ slow,
@@ -261,7 +261,7 @@ def step(system: System, scheme: Scheme | Composition, state: State, macro_dt) -
         return micro_dt * free - jnp.sum(x.multiplier * g[:-1]) - jnp.sum(x.slow_multiplier * g_slow[:-1])
 
     def slots(x: Unknowns):
-        """h D A: derivatives by every slow and every fast control point, with the forces of the path held fixed."""
+        """h D A: derivatives with respect to every slow and every fast control point, with the forces of the path held fixed."""
         return jax.grad(action)(path(x), path(x), x)
 
     # h (p + D_first A) = 0,    h D_inner A = 0,    g = 0 and g_s = 0 at all control nodes but the first

@@ -71,7 +71,7 @@ def norm_at_zero(full: bool) -> Outcome:
         )
     zero = values.pop("gradient_0")
     return Outcome(
-        f"derivative of the positions by log k, largest entry: {', '.join(said)}",
+        f"derivative of the positions with respect to log k, largest entry: {', '.join(said)}",
         np.isfinite(list(values.values())).all() and np.isnan(zero),
         values,
     )

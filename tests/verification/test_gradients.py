@@ -63,7 +63,7 @@ def final_position(case: str, solver: solvers.Newton | None = None):
 
 @cache
 def gradient_program(case: str):
-    """Value and gradient by all arguments in one compiled program, and the arguments of the case."""
+    """Value and gradient with respect to all arguments in one compiled program, and the arguments of the case."""
     function, at = final_position(case, solvers.Auto() if case == FALLS_BACK else None)
     return jax.jit(jax.value_and_grad(function, argnums=(0, 1, 2, 3))), at
 

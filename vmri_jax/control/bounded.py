@@ -33,7 +33,7 @@ last iterations would be errors of PIQP."""
 class Limits(NamedTuple):
     """All inequalities at some nodes and controls.
 
-    C, D, value: derivatives by the node at the end of an interval and by its controls, and the value.
+    C, D, value: derivatives with respect to the node at the end of an interval and to its controls, and the value.
     lower, upper: bounds of the change of the controls.
     """
 

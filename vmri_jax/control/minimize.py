@@ -64,7 +64,7 @@ def minimize(
     Args:
         problem: system and start, a scene with `vmri_jax.scene.Controlled` effects or a problem; its ``system.params`` is a
             dict or None.
-        cost: C, cost per time, ``cost(state, u) -> ()``, with a positive second derivative by u.
+        cost: C, cost per time, ``cost(state, u) -> ()``, with a positive second derivative in u.
         scheme, macro_dt, num_steps, solver: as in `simulate`. Forces act on the grid of the scheme for forces.
         actuate: generalised forces of the controls, ``actuate(q_s, q_f, u, params) -> (f_s, f_f)``; None for
             a scene, which has its own.

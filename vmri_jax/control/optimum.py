@@ -20,7 +20,7 @@ class Optimum:
         bounds: (m,) lower and upper bounds of the controls.
         trajectory: the motion at all macro nodes.
         cost: of the motion.
-        multipliers: (e,) derivatives of the least cost by the values that the goal is set to.
+        multipliers: (e,) derivatives of the least cost with respect to the values that the goal is set to.
         miss: largest absolute value of the goal equations.
         over: largest violation of a limit, 0 for none.
         gap: largest distance between the end of a step and the next node, relative to the largest node.

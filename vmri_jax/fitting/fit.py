@@ -236,7 +236,7 @@ class _Search:
 
     def check_dependence(self, tell: Progress) -> None:
         """Refuse parameters that no measured value depends on."""
-        tell("compiling and running the derivatives by the parameters", 1, NUM_PHASES)
+        tell("compiling and running the derivatives with respect to the parameters", 1, NUM_PHASES)
         point = np.zeros(self.size), self.part_starts / self.scale, self.shooting.values
         by_parameters = np.asarray(self.compiled_jacobian(*point)[0])
         dead = np.flatnonzero(~by_parameters.any(axis=0))

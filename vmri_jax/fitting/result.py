@@ -184,7 +184,7 @@ class Bootstrap:
         labels: names of the p numbers.
         truth: (p,) parameters that the measurements were made with.
         estimates: (repeats, p) fitted parameters.
-        errors: (repeats, p) their standard errors.
+        errors: (repeats, p) their standard errors, for the sigma that the measurements were made with.
     """
 
     labels: list[str]
@@ -200,7 +200,7 @@ class Bootstrap:
 
 
 def without_starts(by_parameters, by_starts):
-    """The Jacobian (m, p) by the parameters, projected on the complement of the range of the Jacobian (m, k) by the starts of the parts.
+    """The Jacobian (m, p) with respect to the parameters, projected on the complement of the range of the Jacobian (m, k) with respect to the starts.
 
     Changes of the predictions that other starts make as well say nothing about the parameters.
     """

@@ -249,7 +249,7 @@ class System(eqx.Module):
 
 
 def _rates(values, is_rheonomic: bool, configuration, velocities):
-    """The rate of ``values(t, q_s, q_f)``, with its derivative by the time if it depends on time."""
+    """The rate of ``values(t, q_s, q_f)``, with its derivative with respect to time if it depends on time."""
     t, *positions = configuration
     if is_rheonomic:
         return jax.jvp(values, configuration, (jnp.ones_like(t), *velocities))[1]

@@ -129,7 +129,7 @@ class ConstraintRows:
 
     @cached_property
     def sizes(self) -> np.ndarray:
-        """(k,) change of each row in a large motion: the length of its gradient by coordinates over `scales`; 1 if this is zero."""
+        """(k,) change of each row in a large motion: the length of its gradient with respect to coordinates over `scales`; 1 if this is zero."""
         lengths = np.linalg.norm(self.jacobian * self.scales, axis=1)
         return np.where(lengths > 0, lengths, 1.0)
 
@@ -158,7 +158,7 @@ def _elements(part: Placed, bodies: Bodies, columns: dict[str, np.ndarray], para
 
 @partial(quickly_compiled, static_argnames="term")
 def _value_and_jacobian(term: EffectTerm, params, q, t):
-    """Values (m,) of an element, and their derivatives by the coordinates q of its bodies."""
+    """Values (m,) of an element, and their derivatives with respect to the coordinates q of its bodies."""
 
     def values(q):
         value = jnp.reshape(term.value(q, None, params, t), (-1,))

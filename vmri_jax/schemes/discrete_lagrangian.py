@@ -274,7 +274,7 @@ def discrete_lagrangian(system: System, scheme: Scheme) -> Callable:
         fast: (num_micro r + 1, n_f) fast control points, shared ones once.
         macro_dt: length H of the macro interval.
 
-    Its derivatives by the control points are ``jax.grad(L_d, argnums=(0, 1))``; the discrete Legendre transforms are the first and
+    Its derivatives with respect to the control points are ``jax.grad(L_d, argnums=(0, 1))``; the discrete Legendre transforms are the first and
     the last of these, see `discrete_legendre`.
     """
     if scheme.slow.mollified:

@@ -1,6 +1,6 @@
 """One interval with a path of degree r > 1: all variables at once, by simplified Newton steps in modes of time.
 
-With the Hessian of the potentials by the fast variables and the Jacobian of the constraints taken at one point, in the middle of
+With the Hessian of the potentials in the fast variables and the Jacobian of the constraints taken at one point, in the middle of
 the step, the Newton matrix is
 
     [A (x) M - h^2 B (x) W'',  -1 (x) G^T;  1 (x) G,  0]        (x): Kronecker product

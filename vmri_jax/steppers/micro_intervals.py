@@ -20,7 +20,7 @@ class SweepTotals(NamedTuple):
     """Quantities that a pass accumulates over the micro intervals; they arrive at the next interval, and at last at the slow equations.
 
     q_f, p_f: position and momentum times h at the end of the last interval.
-    d_start, d_increments: gradients of h times the action by the start and by the increments of the slow path, without the slow
+    d_start, d_increments: gradients of h times the action with respect to the start and the increments of the slow path, without the slow
         kinetic energy.
     moved: largest correction of a fast increment.
     """
@@ -158,7 +158,7 @@ def correct(sweep: MicroSweep, local: StepEquations, steps, p_f, guess: FastUnkn
         guess: unknowns before the correction; without the matrix S it is computed here.
 
     Returns:
-        (unknowns with S, p_f times h at the end, gradients of h times the action by the start and by the increments of the slow path,
+        (unknowns with S, p_f times h at the end, gradients of h times the action with respect to the start and the increments of the slow path,
         largest correction of a fast increment).
     """
     (increments, mu, schur), matrix = guess, sweep.matrix
@@ -179,7 +179,7 @@ def correct(sweep: MicroSweep, local: StepEquations, steps, p_f, guess: FastUnkn
         path = local.path_of(steps, increments[None])
         return jax.grad(local.without_kinetic)(path, path)
 
-    # d: gradients of h times the action of the interval, without kinetic energy and constraints; change: their derivative by x
+    # d: gradients of h times the action of the interval, without kinetic energy and constraints; change: their derivative with respect to x
     d, change = jax.linearize(gradient, increments)
     d_fast = d.fast[0] + lagrangian(system, local.scheme).kinetic.fast_rows(increments)
     g, push = jax.linearize(lambda x: jax.vmap(system.g)(times[1:], slow_nodes[1:], local.q_f + x), increments)

@@ -16,7 +16,7 @@ S is the inverse of ``G K^-1 G^T`` of the first interval, in the fast variables 
 For r = 1 and explicit fast equations (``K = -M_f``) the matrix is ``-(M_s + G_s^T (G_f M_f^-1 G_f^T)^-1 G_s) / n``: the second term is the
 inertia of the fast masses that constraints tie to the slow variables.
 
-Without constraints this matrix leaves out the derivative of the slow forces by the slow path. Over a long macro step that derivative
+Without constraints this matrix leaves out the derivative of the slow forces with respect to the slow path. Over a long macro step that derivative
 is as large as the masses, and `SlowEquations.with_forces` solves for an update with it.
 """
 
@@ -101,7 +101,7 @@ class SlowEquations(NamedTuple):
 
         Args:
             x: unknowns of the macro step.
-            start, increments: (n_s,), (r, n_s) gradients of h times the action by the start and by the increments of the slow path,
+            start, increments: (n_s,), (r, n_s) gradients of h times the action with respect to the start and the increments of the slow path,
                 without the slow kinetic energy and the slow constraint.
             inertia: of the tied masses, None without constraints.
         """
