@@ -189,7 +189,7 @@ def test_starts_of_joints_need_joint_coordinates():
 
 def test_velocities_that_joints_do_not_allow_are_refused():
     torn = satellite().replace("panel", velocity=[0.0, 0.0, 1.0])
-    with pytest.raises(ValueError, match="nearest ones that fit the joints"):
+    with pytest.raises(ValueError, match="nearest velocities that fit the joints"):
         torn.problem()
     assert replace(torn, project=True).problem().v_f.size == 1
 

@@ -132,7 +132,7 @@ def test_what_hangs_on_the_ground_at_both_ends_is_one_tree():
     scene = Scene(bodies, [*joints[:2], slide, Gravity([0, -9.81, 0])], coordinates="joint", redundant="drop")
     assert [branch.parent for branch in scene.branches] == ["ground", "ground"]
     assert sum(x.size for x in scene.start[:2]) == 2
-    with pytest.raises(ValueError, match="nearest ones that fit the joints"):
+    with pytest.raises(ValueError, match="nearest velocities that fit the joints"):
         scene.replace("left", velocity=X).problem()  # no body floats
     assert Scene(bodies[:1], joints[:1], coordinates="joint").branches[0].parent == "ground"
 

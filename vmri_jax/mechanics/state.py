@@ -123,7 +123,7 @@ def tell_of_velocities(
         constraints: name of the constraints in the message.
         at_rest: whether all velocities of the user are zero; moving constraints may demand others, which are then taken.
     """
-    message = f"{caller}: the velocities differ by {violation:.2%} (in the norm of the kinetic energy) from the nearest ones that fit {constraints}"
+    message = f"{caller}: the velocities differ by {violation:.2%} (in the norm of the kinetic energy) from the nearest velocities that fit {constraints}"
     scenes = "for a scene, with_rates({joint: rate}) gives all velocities that belong to the rate of a joint"
     if project and violation > REPORTED_PROJECTION and not at_rest:
         warnings.warn(f"{message}, and project=True has replaced them; {scenes}.", stacklevel=3)
