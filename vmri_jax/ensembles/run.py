@@ -154,7 +154,7 @@ def ensemble(
         num_micro: number of micro steps, for schemes given by name or by a function.
         vary: a function ``(problem, row) -> problem`` that makes the problem of a run from the values of its row by column, for example
             ``lambda problem, row: replace(problem, v_s=row["speed"] * problem.v_s)``. Columns, besides steps and schemes, then have names
-            of your choice. It may change the values of parameters and of the start, and is traced: its operations are those of JAX.
+            of your choice. It may change the values of parameters and of the start, and is traced, so that its operations must be operations of JAX.
         save: quantities that are kept of each run: names from `vmri_jax.ensembles.QUANTITIES`, or functions of a trajectory,
             ``my_file.py:function``.
         num_saves: number of saved nodes of a run after the start, equally spaced, from which the quantities are computed.

@@ -56,7 +56,7 @@ class Work:
     num_micro, solver, project: as in `ensemble`.
     save: names of the quantities that are kept.
     num_saves: number of saved nodes after the start.
-    vary: makes the problem of a run from the problem and a row; None where names of columns say what they set.
+    vary: makes the problem of a run from the problem and a row; None where the names of columns say which numbers they set.
     sources: digests of the user's files, by path.
     """
 

@@ -311,7 +311,7 @@ def _consistent(system, t, q_s, q_f, v_s, v_f):
     """The state with projected momenta, and the violation of the hidden constraints, between 0 and 1.
 
     The violation is ``|v - v'| / max(|v|, |v'|)`` in the norm of the kinetic energy, with the projected velocities v': constraints may take
-    velocity away, and moving ones may add it. The values of the user's functions are checked while JAX traces this function.
+    velocity away, and moving constraints may add it. The values of the user's functions are checked while JAX traces this function.
     """
     check_system(system, q_s, q_f)
     momenta = legendre(system, q_s, q_f, v_s, v_f)
