@@ -5,7 +5,6 @@ import os
 from dataclasses import replace
 from pathlib import Path
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -320,65 +319,6 @@ def test_bad_input_is_refused_before_anything_is_written(tmp_path, changes, erro
     with pytest.raises(error, match=message):
         few(tmp_path / "runs.zarr", **changes)
     assert not any(tmp_path.iterdir())
-
-
-def test_a_function_of_rows_makes_the_problems(tmp_path):
-    design = Table({"speed": [0.5, 2.0, 1.0], "frequency": [20.0, 50.0, 30.0], "num_micro": [3, 3, 4]})
-    runs = few(tmp_path / "runs.zarr", system=chain(50.0), design=design, num_micro=None, vary=own.faster)
-    data = runs.open()
-    assert data.speed.values.tolist() == [0.5, 2.0, 1.0]
-    problem = chain(20.0)
-    run = vm.simulate(replace(problem, v_s=0.5 * problem.v_s), vm.explicit_slow(3), macro_dt=0.02, num_steps=10)
-    assert np.allclose(data.q_f[0], run.q_f[-1], rtol=0, atol=1e-14)
-    by_name = few(tmp_path / "named.zarr", system=chain(50.0), design={"omega": [20.0]}).open()
-    whole = few(
-        tmp_path / "one.zarr", system=chain(50.0), design={"speed": [1.0], "frequency": [20.0]}, vary=own.faster
-    )
-    assert np.array_equal(whole.open().q_f.values.ravel(), by_name.q_f.values.ravel())
-
-
-def test_a_function_of_rows_with_dictionaries(tmp_path):
-    vary = lambda problem, row: replace(problem, q_f={"hook": problem.q_f[:2], "load": jnp.stack([row["x"], -1.2])})  # noqa: E731
-    arguments = {"macro_dt": 0.02, "num_steps": 10}
-    runs = vm.ensemble(
-        own.hung, vm.explicit_slow(3), {"x": [0.7, 1.0]}, vary=vary, out=tmp_path / "r.zarr", **arguments
-    )
-    run = vm.simulate(own.hung, vm.explicit_slow(3), **arguments)
-    assert np.allclose(runs.open().q_f.sel(x=1.0), run.states.q_f[-1], rtol=0, atol=1e-14)
-
-
-@pytest.mark.parametrize(
-    ("vary", "error", "message"),
-    [
-        (lambda problem, row: row, TypeError, r"vary\(problem, row\) is dict; give dataclasses\.replace"),
-        (
-            lambda problem, row: replace(
-                problem, system=problem.system.replace(params=problem.system.params | {"more": 1.0})
-            ),
-            ValueError,
-            "the structure or shape of one of them",
-        ),
-        (
-            lambda problem, row: replace(
-                problem, system=problem.system.replace(kinetic=vm.ConstantMass(np.full(3, 2.0), np.full(3, 2.0)))
-            ),
-            ValueError,
-            "the system besides its params",
-        ),
-    ],
-)
-def test_functions_of_rows_that_are_refused(tmp_path, vary, error, message):
-    with pytest.raises(error, match=message):
-        few(tmp_path / "runs.zarr", system=chain(50.0), design={"speed": [1.0]}, vary=vary)
-    assert not any(tmp_path.iterdir())
-
-
-def test_another_function_of_rows_does_not_go_on_with_a_store(tmp_path):
-    design = {"speed": [1.0], "frequency": [20.0]}
-    out = few(tmp_path / "runs.zarr", system=chain(50.0), design=design, vary=own.faster).path
-    slower = lambda problem, row: own.faster(problem, row | {"speed": row["speed"] / 2})  # noqa: E731
-    with pytest.raises(ValueError, match="operations of vary"):
-        few(out, system=chain(50.0), design=design, vary=slower, resume=True)
 
 
 def test_several_schemes_need_a_column_in_a_table(tmp_path):

@@ -1,4 +1,6 @@
-"""Columns of a design: a function ``(problem, row) -> problem`` makes the problem of a run. Without such a function the name of a column says which number it sets:
+"""Columns of a design: a function ``(problem, row) -> problem`` makes the problem of a run.
+
+Without such a function the name of a column says which number it sets:
 
 omega, springs.stiffness, masses[2]     a parameter of the system, or one number of it
 q_s, v_f, ...                           a whole vector of the start
