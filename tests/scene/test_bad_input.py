@@ -1,6 +1,8 @@
 # pyright: reportArgumentType=false
 """Scenes that are wrong say what is wrong, with which names, before anything is computed."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,6 +16,7 @@ from vmri_jax.scene import (
     Constraint,
     Coulomb,
     Drive,
+    Effect,
     Force,
     Gravity,
     Guide,
@@ -30,6 +33,7 @@ from vmri_jax.scene import (
     SpringAnchor,
     Torsion,
 )
+from vmri_jax.scene.declare import effect_class, names
 
 
 def still(t, params):
@@ -321,3 +325,48 @@ def test_functions_of_other_arguments(make, message):
 def test_functions_that_return_something_else(effect, message):
     with pytest.raises(ValueError, match=message):
         Scene([A], [effect])
+
+
+def test_functions_of_classes_are_named_where_they_return_wrong_values():
+    """A force that is no tuple has the right number of rows between two bodies in the plane, and would be taken apart by coordinates."""
+
+    @effect_class
+    class Tether(Effect):
+        pair: Any = names(2)
+        kind = "force"
+
+        @staticmethod
+        def function(t, q, v, params):
+            return v[1] - v[0]
+
+    @effect_class
+    class Attraction(Effect):
+        pairs: Any = names(2)
+        kind = "potential"
+
+        @staticmethod
+        def function(q, params):
+            return jnp.sum((q[0] - q[1]) ** 2, axis=-1)
+
+    @effect_class
+    class Rail(Effect):
+        body: Any = names()
+        kind = "constraint"
+
+        @staticmethod
+        def function(q, params):
+            return q[0][..., 1] - 3.0
+
+    bodies = [Body(name, 1.0, [float(x), 0.0]) for x, name in enumerate("abc")]
+    with pytest.raises(ValueError, match=r"tether: function returns shape \(2,\); it must return a tuple with a force"):
+        Scene(bodies, [Tether(("a", "b"))])
+    with pytest.raises(ValueError, match=r"attraction: function returns shape \(2,\); .* the sum over all elements"):
+        Scene(bodies, [Attraction([("a", "b"), ("b", "c")])])
+    with pytest.raises(
+        ValueError, match=r"rail: the positions at the start violate this constraint by 3; move the bodies"
+    ):
+        Scene(bodies, [Rail("a")])
+    with pytest.raises(ValueError, match=r"springs: between is \(0, 1\); give 2 names of bodies"):
+        Scene(bodies, [Spring((0, 1), 5.0)])
+    with pytest.raises(TypeError, match=r"coulomb: charges is list; give a dictionary of charges"):
+        Scene(bodies, [Coulomb([1.0, 2.0])])

@@ -216,3 +216,13 @@ def test_a_single_element_has_one_reason():
     found = reasons(Potential(well, ("a", "b", "f"), {"k": 1.0}), Coulomb({"g": 1.0, "h": 1.0}, 1.0, rate="slow"))
     assert found["well", "slow_potential"] == "touches a, b, which are slow"
     assert found["coulomb", "slow_potential"] == "as given"
+
+
+def test_a_stiff_spring_is_fast_however_slow_a_declared_fast_one_is():
+    """A spring of 10 rad/s that is declared fast, beside one of 1e4 rad/s, more than a thousand times as fast."""
+    bodies = [
+        Body(name, 1.0, place)
+        for name, place in zip("abcd", ([0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]), strict=True)
+    ]
+    springs = [Spring(("a", "b"), 50.0, rate="fast", name="soft"), Spring(("c", "d"), 6e7, name="stiff")]
+    assert set(paces(Scene(bodies, [Gravity(), *springs])).values()) == {"fast"}

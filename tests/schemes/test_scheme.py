@@ -78,7 +78,9 @@ def test_unknown_rule_name_is_refused():
 
 def test_kinetic_rule_that_misses_a_velocity_is_refused():
     rule = micro(quadrature.gauss(2))
-    with pytest.raises(ValueError, match=r"kinetic rule .* does not see every velocity of a path of degree 3"):
+    with pytest.raises(
+        ValueError, match=r"kinetic rule .* gives no positive kinetic energy to some motion of a path of degree 3"
+    ):
         Scheme(2, 3, kinetic=rule, slow=rule, fast=rule)
 
 

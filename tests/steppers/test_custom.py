@@ -130,3 +130,65 @@ def test_bad_input(fpu):
         match=r"advance of .* returns StepInfo.q_f_micro of shape \(1, 3\); it must be \(2, 3\) for num_micro = 2",
     ):
         vm.simulate(fpu, vm.fully_explicit(2), solver=EXACT, **STEPS)
+
+
+def test_a_subclass_of_kicked_keeps_its_methods_with_constraints():
+    """Its `advance` is called, and the momenta are projected although the stepper between its kicks has no `project`."""
+    pendulum, scheme, calls = double_pendulum(), vm.fully_implicit(2), []
+
+    class Counted(Kicked):
+        def advance(self, state, memory, macro_dt):
+            calls.append("advance")
+            return super().advance(state, memory, macro_dt)
+
+    def counted(system, scheme):
+        return Counted((), without_projection(system, scheme))
+
+    ours = vm.simulate(pendulum, scheme, solver=vm.solvers.Custom(counted), **STEPS)
+    theirs = vm.simulate(pendulum, scheme, solver=vm.solvers.Arrowhead(), **STEPS)
+    assert calls
+    assert ours.constraint_residual.max() < 1e-12
+    np.testing.assert_allclose(ours.states.p_f, theirs.states.p_f, atol=1e-12)
+
+
+@dataclasses.dataclass(frozen=True)
+class Verlet(Stepper):
+    """Velocity Verlet of the FPU chain, which carries its forces from step to step, and says a wrong time."""
+
+    system: vm.System
+
+    def _forces(self, state):
+        def energy(q_s, q_f):
+            params = self.system.params
+            assert self.system.slow_potential
+            assert self.system.fast_potential
+            return self.system.slow_potential(q_s, q_f, params) + self.system.fast_potential(q_f, params)
+
+        return jax.grad(energy, (0, 1))(state.q_s, state.q_f)
+
+    def init(self, state, macro_dt):
+        return self._forces(state)
+
+    def advance(self, state, memory, macro_dt):
+        p_s, p_f = state.p_s - macro_dt / 2 * memory[0], state.p_f - macro_dt / 2 * memory[1]
+        end = vm.State(jnp.zeros(()), state.q_s + macro_dt * p_s, state.q_f + macro_dt * p_f, p_s, p_f)
+        forces = self._forces(end)
+        end = dataclasses.replace(end, p_s=p_s - macro_dt / 2 * forces[0], p_f=p_f - macro_dt / 2 * forces[1])
+        nothing = {"multiplier": jnp.zeros((1, 1, 0)), "slow_multiplier": jnp.zeros((1, 0))}
+        return end, StepInfo(*StepStatus.direct(vm.Method.EXPLICIT), q_f_micro=end.q_f[None], **nothing), forces
+
+    def describe(self):
+        return ["velocity Verlet"]
+
+
+def verlet(system, scheme):
+    return Verlet(system)
+
+
+def test_stages_of_a_composition_start_with_their_own_memory(fpu):
+    """Memory that depends on the state, and a wrong time: compositions of the stepper equal compositions of the library's scheme."""
+    for scheme in (vm.fully_explicit(1), vm.compose(vm.fully_explicit(1), "suzuki4")):
+        ours = vm.simulate(fpu, scheme, solver=vm.solvers.Custom(verlet), **STEPS)
+        theirs = vm.simulate(fpu, scheme, **STEPS)
+        np.testing.assert_allclose(ours.states.q_f, theirs.states.q_f, atol=1e-14)
+        np.testing.assert_allclose(ours.states.t, theirs.states.t, atol=1e-15)

@@ -23,7 +23,7 @@ V               rule of nodes 0, 1 with weights 0.3, 0.7 on the macro interval
 W               rule of nodes 0, 1 with weights 0.3, 0.7 on every micro interval
 gradients of V  1 per macro step
 gradients of W  5 per macro step
-solves          none per macro step; with constraints that join slow and fast variables 1
+solves          none without constraints and forces; 1 per macro step with constraints between slow and fast
 a step:
   kicks of V at both ends
     slow variables, one step:
@@ -71,7 +71,7 @@ bends               trapezoidal rule on every 8 micro intervals
 gradients of V      1 per macro step
 gradients of W      32 per macro step
 gradients of bends  4 per macro step
-solves              none per macro step; with constraints that join slow and fast variables 1
+solves              none without constraints and forces; 1 per macro step with constraints between slow and fast
 a step:
   kicks of V at both ends
     slow variables, one step:

@@ -63,8 +63,8 @@ def nothing_fast(scheme: Scheme | Composition, num_fast: int) -> str:
     if num_fast or stage_scheme(scheme).num_micro == 1:
         return ""
     return (
-        "no body of the scene is fast, so that all micro steps but one resolve nothing. Take num_micro=1; or say which potential is slow, "
-        'rate="slow", or which bodies are fast, pace="fast".'
+        "no body of the scene is fast, so that all micro steps but one resolve nothing. Take num_micro=1; or say which potential is fast, "
+        'rate="fast", or which bodies are fast, pace="fast".'
     )
 
 

@@ -42,8 +42,8 @@ class Model(NamedTuple):
 class Arrays(NamedTuple):
     """The numbers that a run is computed from, flattened once: to flatten a system at every call would take longer than a short run.
 
-    model: leaves of a `Model`. `system` is its last field and `params` the last field of a `System` with leaves, so that the leaves of the
-        parameters come last.
+    model: leaves of a `Model`. `system` is its last field, and `params` is the last of the fields of a `System` that have leaves, so that the
+        leaves of the parameters come last.
     state: the five arrays of the state at the start.
     macro_dt: macro step H.
     """
@@ -338,9 +338,9 @@ def _step_of(stepper: Plan, times: _Times, save_micro: bool):
 def _node(system: System, tolerance, cursor: _Cursor) -> tuple[Node, _Cursor]:
     """The saved node, and the status after a check of its energy and constraints.
 
-    A node can fail here although its steps succeeded, for three reasons: the energy is NaN although its gradient is finite (a logarithm beyond
-    its pole); a lane of a batch started off its constraints; or the rows of ``system.implied``, redundant constraints that the solver leaves out, are
-    violated.
+    A node can fail here although its steps succeeded, for four reasons: the energy is NaN although its gradient is finite (a logarithm beyond
+    its pole); a lane of a batch started off its constraints; the rows of ``system.implied``, redundant constraints that the solver leaves out, are
+    violated; or a stepper of the user leaves the constraints.
     """
     state = cursor.state
     phase = state.q_s, state.q_f, state.p_s, state.p_f

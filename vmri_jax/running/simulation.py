@@ -7,7 +7,7 @@
 | `vmri_jax.running.traced` | `Engine.stored`, `Engine.checkpointed`, with derivatives | `simulate` under transformations |
 
 *The fallback*: with `solvers.Auto` a piece whose first solver fails is computed again by `solvers.Arrowhead`, whose Newton matrices are exact,
-with the same tolerance and limit of iterations; so are all pieces after it. Names with `exact` belong to the fallback.
+with the same tolerance and limit of iterations; all pieces after it are computed by `Arrowhead` alone. Names with `exact` belong to the fallback.
 """
 
 import warnings

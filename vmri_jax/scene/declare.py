@@ -60,7 +60,9 @@ class Names:
             return tuple(combinations(map(entry, items), 2))
         if self.count > 1 and flat:
             items = (items,)
-        elements = tuple((item,) if is_entry(item) else tuple(item) for item in items)
+        elements = tuple(
+            tuple(item) if isinstance(item, Iterable) and not is_entry(item) else (item,) for item in items
+        )
         wrong = any(len(element) != self.count or not all(map(is_entry, element)) for element in elements)
         if not elements or wrong:
             expected = "the name of a body" if self.count == 1 else f"{self.count} names of bodies"

@@ -18,6 +18,7 @@ from vmri_jax.mechanics.rows import Place, Rows
 from vmri_jax.scene.body import GROUND, Attachment, Bodies, body_of, end_of, label_of, moving
 from vmri_jax.scene.declare import Elements, Parameter, effect_class, lasting, squeeze
 from vmri_jax.scene.layout import Layout
+from vmri_jax.scene.returned import check_function
 from vmri_jax.scene.terms import EffectTerm, InRigidBodies, OnBodies, OnGround, Role, choose
 
 Kind = Literal["kinetic", "potential", "constraint", "force", "control"]
@@ -221,6 +222,7 @@ class Effect(ABC):
         """
         self.check_bodies(bodies)
         self.check_parameters(bodies)
+        check_function(self, bodies, moved)
         if self.kind == "constraint" and not moved:
             self.check_start(bodies)
 

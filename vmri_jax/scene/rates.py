@@ -87,7 +87,7 @@ def border(rates: Sequence[np.ndarray], slow: float = 0.0, fast: float = np.inf)
     ordered = np.sort([rate for of_effect in rates for rate in of_effect if rate > 0])
     if not ordered.size:
         return None
-    ordered = np.maximum(ordered, ordered[-1] / SPAN)
+    ordered = np.maximum(ordered, min(ordered[-1], fast) / SPAN)
     gaps = [(high / low, np.sqrt(high * low)) for low, high in pairwise(ordered) if slow <= low and high <= fast]
     widest, middle = max(gaps, default=(1.0, 0.0))
     declared = slow > 0 or fast < np.inf  # then the user says that there are two time scales: any gap will do

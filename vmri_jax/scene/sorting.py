@@ -18,8 +18,8 @@ Of several lines that fit, the first one counts:
 
 The kinetic energy T_s of bodies that depend on slow coordinates alone is on the macro grid.
 
-A body with the pace "auto" is fast if one of these effects moves it against another body: a kinetic effect or a potential with the rate
-"fast" or k, or a stiff one with the rate "auto". A stiff potential that touches a body with the pace "slow" does not count, since it is
+A body with the pace "auto" is fast if one of these effects moves it against another body: a potential or kinetic effect that has the rate
+"fast", a potential with the rate k, or a stiff potential or kinetic effect that has the rate "auto". A stiff potential that touches a body with the pace "slow" does not count, since it is
 part of V. An effect is stiff if its frequency is above the border between slow and fast, see `vmri_jax.scene.rates`. Without a border no
 effect makes bodies fast by its frequency, and every potential between fast bodies with a frequency above zero is stiff.
 """
@@ -200,7 +200,7 @@ def _owners(effect: Effect, bodies: Bodies, branches: Sequence[Branch]) -> list[
     """The bodies whose coordinates each element of an effect depends on.
 
     Every body of an element depends on a chain of bodies, from itself to the root of its tree. All bodies are the union of these chains; the
-    bodies that move the element against itself are this union without the bodies that are in every chain.
+    bodies that move the bodies of the element against each other are this union without the bodies that are in every chain.
     """
     on_joints = {branch.child: branch for branch in branches}
     carried = {(branch.joint.name, branch.element): branch.child for branch in branches}

@@ -1,4 +1,4 @@
-"""Terms: effects as functions of q_s and q_f, and the functions of a `System` as sums of terms.
+"""Terms: effects as functions of the coordinates of bodies, of which `vmri_jax.scene.functions` makes the functions of a `System`.
 
 All classes here are compared by value: scenes of the same structure give equal functions, which JAX compiles only once.
 """

@@ -57,7 +57,8 @@ class Description:
             + (f", in {self.stages} stages" if self.stages > 1 else ""),
             **self.rules,
             **{f"gradients of {name}": f"{count} {per}" for name, count in gradients.items() if name in self.rules},
-            "solves": f"{self.solves or 'none'} {per}; with constraints that join slow and fast variables {self.constrained_solves}",
+            "solves": (f"{self.solves} {per}" if self.solves else "none without constraints and forces")
+            + f"; {self.constrained_solves} {per} with constraints between slow and fast",
         }
         width = max(16, *(len(name) + 2 for name in rows))
         return "\n".join(f"{name:<{width}}{value}" for name, value in rows.items())

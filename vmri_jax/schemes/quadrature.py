@@ -45,9 +45,9 @@ class Rule(eqx.Module):
     def __init__(self, nodes, weights):
         self.nodes = tuple(real_array("Rule: nodes", nodes, 1).tolist())
         self.weights = real_array("Rule: weights", weights)
-        if self.weights.shape != (len(self.nodes),):
+        if not self.nodes or self.weights.shape != (len(self.nodes),):
             raise ValueError(
-                f"Rule: got {len(self.nodes)} nodes and weights of shape {self.weights.shape}; give one weight per node."
+                f"Rule: got {len(self.nodes)} nodes and weights of shape {self.weights.shape}; give one weight per node, and at least one node."
             )
         if any(not -NODE_TOLERANCE <= node <= 1 + NODE_TOLERANCE for node in self.nodes):
             raise ValueError(f"Rule: nodes {self.nodes} must lie in [0, 1], the unit interval.")
@@ -134,6 +134,7 @@ def interpolatory(nodes) -> Rule:
     Args:
         nodes: increasing numbers in [0, 1].
     """
+    Rule(nodes, np.ones(len(nodes)))  # refuses wrong nodes
     return Rule(nodes, interpolatory_weights(nodes))
 
 

@@ -255,13 +255,13 @@ def _positive_integer(name: str, value) -> int:
 
 
 def _check_kinetic(rule: Rule, degree: int) -> None:
-    """Refuse rules that leave an increment of the path without mass, ``sum_i w_i l_j'(c_i) l_k'(c_i)`` singular."""
+    """Refuse rules by which a motion of the path has no positive kinetic energy: ``sum_i w_i l_j'(c_i) l_k'(c_i)`` is not positive definite."""
     slopes = lagrange_derivative(degree, np.array(rule.nodes))[:, 1:]
     weights = np.asarray(rule.weights) if is_concrete(rule) else np.ones(len(rule.nodes))
     if np.linalg.eigvalsh(slopes.T @ (weights[:, None] * slopes)).min() <= 1e-9:
         raise ValueError(
-            f"Scheme: the kinetic rule with nodes {list(rule.nodes)} does not see every velocity of a path of degree {degree}; "
-            f"give one that does, e.g. micro(gauss({degree}))."
+            f"Scheme: the kinetic rule with nodes {list(rule.nodes)} gives no positive kinetic energy to some motion of a path of "
+            f"degree {degree}: it has too few nodes, or a negative weight. Give another, e.g. micro(gauss({degree}))."
         )
 
 
@@ -319,7 +319,7 @@ def mollified_impulse(num_micro: int, alpha=0.5) -> Scheme:
 def fully_explicit(num_micro: int, alpha=0.5) -> Scheme:
     """V as a kick at the macro nodes, W as kicks at the micro nodes (impulse method, r-RESPA at alpha = 1/2).
 
-    Order 2 and symmetric at alpha = 1/2, else order 1. Explicit for constant mass without constraints: V once and
+    Order 2 and symmetric at alpha = 1/2, else order 1. Explicit for constant mass without constraints and forces: V once and
     W num_micro times per macro step, no Newton. Stable only for omega h < 2. The first choice if the fast motion is the motion of rigid
     links: under `fully_implicit`, too, their steps are bounded by omega h < 2.
 

@@ -3,10 +3,10 @@
 A step may have several solutions; the physical one is connected to the straight motion of a short step. If plain iteration from the
 guess fails, the solver solves the equations of a shorter step, then of longer and longer ones, each from the scaled solution of the one
 before (Deuflhard, *Newton Methods for Nonlinear Problems*, 2011, chapter 5). The stride doubles after a success
-and halves after a failure. Plain iteration and continuation are one loop, compiled once; a step that converges at once takes one turn.
+and halves after a part that ends early, by a singular matrix or a NaN; a part that uses up all iterations ends the continuation. Plain iteration and continuation are one loop, compiled once; a step that converges at once takes one turn.
 
-The first attempt is the whole step from the prediction of the steps before, the second the whole step from straight motion, all further
-attempts are parts of the step.
+The first attempt is the whole step from the prediction of the steps before (of the march; `Coupled` starts it from straight motion), the
+second the whole step from straight motion, all further attempts are parts of the step.
 """
 
 from collections.abc import Callable
@@ -73,7 +73,7 @@ def solve_in_parts(
 
     Args:
         equations: of the step.
-        guess: straight motion, from which all attempts but the first one start.
+        guess: straight motion, from which attempts start until a part is solved; then they start from its scaled solution.
         solution: any pytree of the type of solutions.
         iterate: ``(equations of the part, guess, most iterations, whether it is the first attempt) -> (solution, its unknowns,
             Result, iterations)``.

@@ -54,13 +54,20 @@ def whole_step(
     check_type("plan: the stepper of solvers.Custom", made, Stepper, "a vmri_jax.steppers.stepper.Stepper")
     if isinstance(made, Solved):
         made = Kicked(lagrangian(system, scheme).kicks, made, average)
-    if not isinstance(made, Kicked):
+    if type(made) is not Kicked:  # a subclass may have an `advance` of its own
         made = Kicked((), made)
-    if system.is_constrained and type(made.inner).project is Stepper.project:
+    if system.is_constrained and not _projects(made.inner):
         made = Projecting(made.kicks, made.inner, made.average, system=system)
     made = replace(made, projects=system.is_constrained)
     _check_shapes(made, system, scheme, state)
     return made
+
+
+def _projects(stepper: Stepper) -> bool:
+    """Whether a stepper projects momenta itself: by a method `project` of its class, or of the stepper between its kicks."""
+    if type(stepper).project is Kicked.project:
+        return _projects(stepper.inner)  # pyright: ignore[reportAttributeAccessIssue]
+    return type(stepper).project is not Stepper.project
 
 
 def _check_shapes(stepper: Stepper, system: System, scheme: Scheme, state: State) -> None:

@@ -1,7 +1,7 @@
 """Kicks: potentials at the ends of an interval, which only shift the momenta before and after the motion inside."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import jax
@@ -52,7 +52,8 @@ class Kicked(Stepper):
     def advance(self, state: State, memory: KickedState, macro_dt) -> tuple[State, StepInfo, KickedState]:
         inner = self.inner.renew(state, memory.inner, macro_dt)
         state = kicked(state, self.kicks, memory.gradients, macro_dt, start=1.0)
-        state, info, inner = self.inner.advance(state, inner, macro_dt)
+        end, info, inner = self.inner.advance(state, inner, macro_dt)
+        state = replace(end, t=state.t + macro_dt)  # whatever time a stepper of the user returns
         gradients = self._gradients(state, macro_dt)
         memory = KickedState(gradients, inner)
         state = kicked(state, self.kicks, gradients, macro_dt, end=1.0)

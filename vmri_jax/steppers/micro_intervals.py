@@ -155,7 +155,7 @@ def correct(sweep: MicroSweep, local: StepEquations, steps, p_f, guess: FastUnkn
         local: the interval as a problem of its own, from the positions at its start.
         steps: (r, n_s) increments of the slow path over the interval.
         p_f: momentum times h that arrives.
-        guess: unknowns before the correction; without the matrix S it is computed here.
+        guess: unknowns before the correction; S is computed here if they come without it.
 
     Returns:
         (unknowns with S, p_f times h at the end, gradients of h times the action with respect to the start and the increments of the slow path,

@@ -98,12 +98,13 @@ class Rattle(Solver):
         x = jnp.concatenate(straight) - move(mu)  # M^-1 (h p - G_0^T mu)
         g, push = jax.linearize(lambda x: constraints(equations.t + h, q + x), x)
         schur = self.sparsity.inverse(jax.vmap(push)(columns))  # (G_1 M^-1 G_0^T)^-1
-        accepted, motions = Accepted.of(equations, newton), tuple(map(max_abs, straight))
+        accepted = Accepted.of(equations, newton)
 
         def judged(x, mu, g, iterations) -> Correction:
             dmu = schur.times(g)
             dx = move(dmu)
-            ratio = accepted.ratio((max_abs(dx[:n_s]), max_abs(dx[n_s:])), motions, iterations)
+            changes, motions = ((max_abs(a[:n_s]), max_abs(a[n_s:])) for a in (dx, x))
+            ratio = accepted.ratio(changes, motions, iterations)
             return Correction(x, mu, g, dx, dmu, jnp.asarray(iterations), newton.status(ratio, iterations))
 
         def corrected(last: Correction) -> Correction:

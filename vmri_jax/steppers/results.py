@@ -36,7 +36,7 @@ _MESSAGES = {
         "the step converged to the round-off floor of its own numbers, which lies above the Newton tolerance."
     ),
     Result.STAGNATED: (
-        "the iteration of the step used up its iterations; its corrections still shrank, or did not grow. Likely "
+        "the iteration of the step used up its iterations without converging. Likely "
         "causes: the step is too large for the motion or for the fast forces, or the constraints are nearly dependent. Try a smaller "
         "macro_dt or a larger num_micro, or raise max_iterations (or fixed_iterations) of the solver."
     ),
@@ -64,8 +64,8 @@ _MESSAGES = {
         "Remove rows, make the variables they need fast, or start elsewhere."
     ),
     Result.CONSTRAINT_VIOLATED: (
-        "the increments converged, but the constraints are not kept. Likely causes: rows that contradict each other, or rows of "
-        "very different size (scale them to order one)."
+        "the increments converged, but the constraints are not kept. Likely causes: rows that contradict each other, rows of "
+        "very different size (scale them to order one), or a stepper of your own (solvers.Custom) that does not hold them."
     ),
     Result.NOT_IMPLIED: (
         'the constraints that are solved for are kept, but rows that were left out as redundant (redundant="drop" of a scene, '

@@ -11,9 +11,6 @@ from collections.abc import Callable
 from dataclasses import field
 from typing import Any, Literal
 
-import jax.numpy as jnp
-
-from vmri_jax.mechanics.checks import describe, shape_of
 from vmri_jax.mechanics.functions import NO_TIME, NO_VELOCITY, check_arguments
 from vmri_jax.scene.body import end_of, entry, is_entry
 from vmri_jax.scene.declare import effect_class, real_tree
@@ -36,7 +33,7 @@ class CustomEffect(Effect):
         bodies: names of the bodies, in the order in which the function takes them. The function gets all coordinates of a rigid body;
             with ``(name, [x, y, z])`` the position of this point in it, and with ``("ground", [x, y, z])`` a fixed point.
         params: of the function: numbers, arrays, or lists and dictionaries of them. They may change without a new compilation, and
-            derivatives may be taken by them.
+            runs have derivatives with respect to them.
         name: the name of the function by default.
         drawn_as: "link" or "spring", drawn between each of the bodies and the next; None draws nothing.
 
@@ -82,38 +79,6 @@ class CustomEffect(Effect):
                 f"{self.name}: params is {self.params!r}; with points in rigid bodies it must be a dictionary."
             )
         return params | points if points else params
-
-    def check_parameters(self, bodies):
-        super().check_parameters(bodies)
-        params, t = self.parameters(bodies), jnp.zeros(())
-        q, _ = self.element_arguments(0, bodies, params)
-        q = tuple(map(jnp.asarray, q))
-        arguments = {
-            "potential": (q,),
-            "constraint": (t, q) if self.timed else (q,),
-            "kinetic": (q, q),  # velocities have the shapes of positions
-            "force": (t, q, q),
-        }
-        value = shape_of(f"{self.name}: function", self.function, *arguments[self.kind], params)
-        self._check_value(value, [x.shape for x in q])
-
-    def _check_value(self, value: Any, sizes: list[tuple[int, ...]]) -> None:
-        """Refuse an energy that is no scalar, constraint values that are no vector, and another number of forces than bodies."""
-        shape = getattr(value, "shape", None)
-        if self.kind == "force":
-            fits = isinstance(value, tuple | list) and [getattr(x, "shape", None) for x in value] == sizes
-            expected = (
-                f"a tuple with a force for each body, of shapes {', '.join(map(str, sizes))}: (force,) of a single body"
-            )
-        elif self.kind == "constraint":
-            fits, expected = (
-                shape is not None and len(shape) < 2,
-                "a vector (k,) of values that are kept zero, or one value ()",
-            )
-        else:
-            fits, expected = shape == (), "an energy, a scalar of shape ()"
-        if not fits:
-            raise ValueError(f"{self.name}: function returns {describe(value)}; it must return {expected}.")
 
     def check_bodies(self, bodies):
         super().check_bodies(bodies)

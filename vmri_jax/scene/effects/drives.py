@@ -77,7 +77,7 @@ class Drive(Effect):
     Args:
         bodies: a name, or a list of names; each gets this force.
         history: ``history(t, params) -> (d,)``, N; define it at module level: functions are compared by identity.
-        params: of `history`. They may change without a new compilation, and derivatives may be taken by them.
+        params: of `history`. They may change without a new compilation, and runs have derivatives with respect to them.
     """
 
     bodies: Any = names()

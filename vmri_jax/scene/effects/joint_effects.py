@@ -227,7 +227,7 @@ class JointDrive(InJoint):
     Args:
         joint, of: as of `InJoint`.
         history: ``history(t, params) -> ()``, N m or N; define it at module level: functions are compared by identity.
-        params: of `history`. They may change without a new compilation, and derivatives may be taken by them.
+        params: of `history`. They may change without a new compilation, and runs have derivatives with respect to them.
     """
 
     history: Callable = of_time()
@@ -254,7 +254,7 @@ class JointMotion(InJoint):
     Args:
         joint, of: as of `InJoint`.
         path: a, ``path(t, params) -> ()``, rad or m from the given position, zero at t = 0; define it at module level.
-        params: of `path`. They may change without a new compilation, and derivatives may be taken by them.
+        params: of `path`. They may change without a new compilation, and runs have derivatives with respect to them.
 
     Raises:
         ValueError: (of the scene) a path that does not start at zero.

@@ -1,6 +1,6 @@
 """Forces between all pairs of points: Newton's gravity, Coulomb, Lennard-Jones."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import field
 from typing import Any
 
@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.mechanics.arrays import is_concrete
+from vmri_jax.mechanics.checks import check_type
 from vmri_jax.mechanics.names import unknown
 from vmri_jax.scene.declare import array, effect_class, names, number, positive, real_tree, squeeze
 from vmri_jax.scene.effect import Effect
@@ -122,6 +123,9 @@ class Coulomb(_Nonbonded):
         return params["constant"] * jnp.sum(params["charge_a"] * params["charge_b"] / distance(q))
 
     def elements(self, bodies):
+        check_type(
+            f"{self.name}: charges", self.charges, Mapping, "a dictionary of charges by name of the body, {'a': 1e-6}"
+        )
         pairs = super().elements(self.charges if self.between is None else bodies)
         for name in (name for pair in pairs for name in pair):
             if name not in self.charges:

@@ -1,0 +1,73 @@
+"""Checks of the function of an effect before the scene is sorted, so that messages name the effect: its value, and constraints at the start."""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from vmri_jax.mechanics.arrays import is_concrete
+from vmri_jax.mechanics.checks import describe, shape_of
+from vmri_jax.scene.body import Bodies, end_of
+from vmri_jax.scene.terms import choose
+
+LIBRARY = "vmri_jax."
+"""Beginning of the names of modules whose functions are not checked: the tests of the package do that."""
+START = 1e-9
+"""Largest value of a constraint at the start, in its unit, as of `initial_state`. A larger one would start runs off the constraints."""
+
+
+def check_function(effect: Any, bodies: Bodies, moved: bool) -> None:
+    """Refuse a function of the user that returns a wrong value, and a constraint of the user that the start violates.
+
+    The function gets each group of equal elements, as the terms of the system do.
+
+    Args:
+        moved: as of `Effect.check`.
+
+    Raises:
+        ValueError: an energy that is no scalar, constraint values that are no vector, forces of other numbers or shapes than the roles, or
+            constraint values at the start that are not zero.
+    """
+    if effect.kind == "control" or getattr(effect.function, "__module__", LIBRARY).startswith(LIBRARY):
+        return
+    for group in effect.by_size(range(len(effect.elements(bodies))), bodies):
+        q, arguments = _arguments(effect, bodies, group)
+        value = shape_of(f"{effect.name}: function", effect.function, *arguments)
+        _check_value(effect, value, [x.shape for x in q], len(group))
+        if effect.kind == "constraint" and not moved and is_concrete(arguments):
+            violation = float(np.abs(effect.function(*arguments)).max(initial=0.0))
+            if violation > START:
+                raise ValueError(
+                    f"{effect.name}: the positions at the start violate this constraint by {violation:.3g}; move the bodies, or let the scene "
+                    "do so, Scene(..., project=True)."
+                )
+
+
+def _arguments(effect: Any, bodies: Bodies, group: list[int]) -> tuple[tuple, tuple]:
+    """The positions of some elements at the start, and all arguments of the function for them; velocities are zero."""
+    elements, params = effect.elements(bodies), effect.parameters(bodies)
+    if len(elements) > 1:
+        params = choose(params, group, effect.split)
+    roles = zip(*(elements[i] for i in group), strict=True)
+    q = tuple(jnp.stack([end_of(bodies, name, effect.whole).position for name in role]) for role in roles)
+    q = q if len(group) > 1 else tuple(x[0] for x in q)
+    t, v = (jnp.zeros(()),), tuple(map(jnp.zeros_like, q))
+    before = {"force": (*t, q, v), "kinetic": (q, v)}.get(effect.kind, (*t, q) if effect.timed else (q,))
+    return q, (*before, params)
+
+
+def _check_value(effect: Any, value: Any, sizes: list[tuple[int, ...]], count: int) -> None:
+    """Refuse a value of a function of `count` elements, as shapes, whose roles have the shapes `sizes`."""
+    shape = getattr(value, "shape", None)
+    if effect.kind == "force":
+        fits = isinstance(value, tuple | list) and [getattr(x, "shape", None) for x in value] == sizes
+        expected = (
+            f"a tuple with a force for each body, of shapes {', '.join(map(str, sizes))}: (force,) of a single body"
+        )
+    elif effect.kind == "constraint":
+        fits = shape is not None and (len(shape) < 2 or count > 1)
+        expected = "a vector (k,) of values that are kept zero, or one value ()"
+    else:
+        fits, expected = shape == (), "an energy, a scalar of shape (), the sum over all elements"
+    if not fits:
+        raise ValueError(f"{effect.name}: function returns {describe(value)}; it must return {expected}.")
