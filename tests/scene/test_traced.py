@@ -72,6 +72,7 @@ def scaled(item, x, **changes):
     )
 
 
+@pytest.mark.filterwarnings("ignore:initial_state. all velocities are zero")  # effects that move bodies at rest
 @pytest.mark.parametrize("effect", EFFECTS, ids=lambda effect: effect.name)
 def test_every_effect_may_be_traced(effect):
     gravity, spring = BASE.effects
