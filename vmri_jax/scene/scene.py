@@ -154,7 +154,9 @@ class Scene:
         """
         from vmri_jax.scene.mujoco import bodies_and_effects  # the package mujoco is an optional dependency
 
-        bodies, effects = bodies_and_effects(model, qpos, qvel, key, ignore, limits, coordinates)
+        bodies, effects = bodies_and_effects(
+            model, qpos, qvel, key=key, ignore=ignore, limits=limits, coordinates=coordinates
+        )
         return cls(bodies, effects, redundant="drop", project=True, coordinates=coordinates)
 
     @cached_property
