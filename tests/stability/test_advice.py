@@ -132,3 +132,25 @@ def test_a_further_potential_that_its_rate_does_not_resolve_is_named():
     advice = advise(system, scheme, vm.State(0.0, zero, zero, zero, zero + 0.1), macro_dt=0.16)
     assert "the bends potential alone: its frequency 50 times the step of 8 micro intervals is 4" in str(advice)
     assert "stable below 2" in str(advice)
+
+
+@pytest.mark.parametrize(("turn", "warned"), [(6.2, True), (2 * 6.25, True), (5.0, False), (0.1, False)])
+def test_kicks_of_a_weight_that_meet_its_spring_in_phase(turn, warned):
+    """A weight on a spring: the amplitude of the finding is that of the run, which swings about a displaced place."""
+    macro_dt = 0.1
+
+    def weight(q_s, q_f, params):
+        return 9.81 * q_f[0]
+
+    def spring(q_f, params):
+        return params["k"] / 2 * q_f[0] ** 2
+
+    masses = vm.ConstantMass(jnp.zeros(0), jnp.ones(1))
+    system = vm.System(masses, weight, spring, params={"k": jnp.asarray((turn / macro_dt) ** 2)})
+    problem, scheme = vm.Problem(system, [], [0.0]), vm.explicit_slow(200)
+    findings = [f for f in vm.advise(problem, scheme, macro_dt=macro_dt).findings if f.kind == "kicks in phase"]
+    assert bool(findings) == warned
+    if findings:
+        run = vm.simulate(problem, scheme, macro_dt=macro_dt, num_steps=2000)
+        assert findings[0].number == pytest.approx(float(jnp.abs(run.q_f).max()) / 2, rel=0.02)
+    assert not vm.advise(problem, vm.fully_implicit(200), macro_dt=macro_dt).findings

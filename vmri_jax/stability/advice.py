@@ -37,6 +37,11 @@ more windows. A window is near if it is within both distances."""
 LONGER_FOR_CAUSE = 0.01
 """Part by which the step is lengthened to find the cause: V and W together become unstable at a slightly shorter step than each alone. A larger
 value may blame a limit that is not yet reached."""
+RADIANS_IN_PHASE = 0.2
+"""Distance of the turn of a vibration in a macro step from a multiple of 2 pi, below which kicks of a constant force are said to be in phase: they
+make the vibration 10 times as large as kicks at odd multiples of pi do. A larger value warns of more steps."""
+LEAST_FORCE = 1e-6
+"""Smallest part of the constant slow force in a vibration for which its kicks are judged; a smaller value warns of round-off."""
 MOST_SCANS = 5
 """Most scans, each over smaller steps than the previous one, until one of them contains a safe step."""
 
@@ -46,9 +51,9 @@ class Finding:
     """One result of `advise`.
 
     severity: "error" if the step is unstable, "warning" if an unstable step is near or slow and fast are swapped, or "note".
-    kind: "impulse resonance", "combination resonance", "stability limit", "labels", "stages" or "motion".
+    kind: "impulse resonance", "combination resonance", "stability limit", "kicks in phase", "labels", "stages" or "motion".
     sentence: the result in words.
-    number: its measure: growth per step of an error, relative distance of a window, ratio of frequencies, longest
+    number: its measure: growth per step of an error, relative distance of a window, ratio of frequencies, amplitude, longest
         stage, growth rate.
     """
 
@@ -144,6 +149,8 @@ def advise(
     * impulse resonance: the slow potential is on the macro grid, and the phases of two vibrations (or twice the phase of one) add up to a
       multiple of 2 pi per macro step, counted as the micro steps turn them (midpoint rule: 2 atan(omega h / 2) per micro step);
     * combination resonance: the same with V on the micro grid, where the slow path, one polynomial per macro step, couples the vibrations;
+    * kicks in phase: a constant part of the slow force, such as a weight, meets a vibration that turns by a multiple of 2 pi per macro step;
+      no disturbance grows, but the vibration becomes large;
     * labels: the fastest vibration is one of the slow variables;
     * stages, motion (notes): a composition with backward steps; a state that is itself unstable.
 
@@ -180,7 +187,8 @@ def advise(
         upper, lower = lower, lower / 3
         windows = _scan(motions, scheme, lower, upper, upper, tolerance) + windows
 
-    findings = [*step_findings, *_further_findings(motions, scheme, names)]
+    kicks = _kicks_in_phase(motions, scheme, macro_dt)
+    findings = [*step_findings, *kicks, *_further_findings(motions, scheme, names)]
     return Advice(
         macro_dt=macro_dt,
         growth=growth,
@@ -286,11 +294,48 @@ def _resonance(motions: SmallMotions, scheme: Scheme | Composition, macro_dt: fl
     )
 
 
+def _kicks_in_phase(motions: SmallMotions, scheme: Scheme | Composition, macro_dt: float) -> Iterator[Finding]:
+    """A warning for each vibration that kicks of the constant slow force f meet in phase.
+
+    Between kicks H f the vibration turns by phi. The periodic motion has ``p = H f / 2`` after a kick and the amplitude
+
+        A = H f / (2 omega |sin(phi / 2)|),    where a constant force holds it at f / omega^2.
+    """
+    if isinstance(scheme, Composition) or not scheme.slow.only_kicks or scheme.slow.mollified:
+        return
+    frequencies, modes = motions.modes
+    forces = modes.T @ motions.slow_force
+    for i in np.flatnonzero(np.abs(forces) > LEAST_FORCE * np.linalg.norm(forces)):
+        if not frequencies[i] or not _is_fast(motions, i):
+            continue
+        turn = _turn(motions, scheme, macro_dt, i)
+        times = round(turn / (2 * np.pi))
+        if times < 1 or abs(turn - 2 * np.pi * times) > RADIANS_IN_PHASE:
+            continue
+        largest = np.abs(motions.shapes @ modes[:, i]).max()
+        held = largest * abs(forces[i]) / frequencies[i] ** 2
+        with np.errstate(divide="ignore"):
+            amplitude = held * frequencies[i] * macro_dt / 2 / abs(np.sin(turn / 2))
+        yield Finding(
+            "warning",
+            "kicks in phase",
+            f"The vibration of frequency {frequencies[i]:.4g} turns by {turn / np.pi:.4g} pi in a macro step, close to a multiple of 2 pi, and the "
+            f"slow force has a constant part along it: its kicks add up to an amplitude of {amplitude:.2g}, where the force itself moves it by "
+            f"{held:.2g}. Take another step.",
+            float(amplitude),
+        )
+
+
+def _is_fast(motions: SmallMotions, i) -> bool:
+    """Whether W has more than half of the stiffness of vibration i."""
+    frequencies, modes = motions.modes
+    return bool(modes[:, i] @ motions.hessians["fast"] @ modes[:, i] >= frequencies[i] ** 2 / 2)
+
+
 def _turn(motions: SmallMotions, scheme: Scheme | Composition, macro_dt: float, i) -> float:
     """Angle by which vibration i turns in a macro step: the phase of the micro steps if W carries the vibration, else ``omega H``."""
-    frequencies, modes = motions.modes
-    exact = float(frequencies[i] * macro_dt)
-    if modes[:, i] @ motions.hessians["fast"] @ modes[:, i] < frequencies[i] ** 2 / 2:
+    exact = float(motions.modes[0][i] * macro_dt)
+    if not _is_fast(motions, i):
         return exact
     stage = stage_scheme(scheme)
     phases = [phase(stage, exact * part / stage.num_micro) for part in _stage_lengths(scheme)]

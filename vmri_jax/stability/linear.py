@@ -67,6 +67,7 @@ class SmallMotions:
         potential ("potential " and its name).
     stiffness: (d, d) minus the derivative of all forces in eta: of potentials, constraints, the kinetic energy, and F.
     damping: (d, d) matrix of the velocities, gyroscopic and dissipative.
+    slow_force: (d,) force of V at the state, which is constant in the expansion.
     rest: the state of zero displacement and momentum of the expansion.
     """
 
@@ -77,6 +78,7 @@ class SmallMotions:
     hessians: dict[str, np.ndarray]
     stiffness: np.ndarray
     damping: np.ndarray
+    slow_force: np.ndarray
     rest: State
 
     @cached_property
@@ -176,6 +178,7 @@ def small_motions(system: Movable, state: State | None = None) -> SmallMotions:
         },
         stiffness=reduced(potentials + bending - terms["kinetic"][:n, :n] - terms["force_q"]),
         damping=gyroscopic - gyroscopic.T - reduced(terms["force_v"]),
+        slow_force=-shapes.T @ terms["slow_gradient"],
         rest=State(jnp.asarray(state.t, dtype=float), *np.split(np.zeros(2 * n), phase_splits(state))),
     )
 
