@@ -1,5 +1,6 @@
 """Checks of the function of an effect before the scene is sorted, so that messages name the effect: its value, and constraints at the start."""
 
+from functools import partial
 from typing import Any
 
 import jax.numpy as jnp
@@ -28,7 +29,10 @@ def check_function(effect: Any, bodies: Bodies, moved: bool) -> None:
         ValueError: an energy that is no scalar, constraint values that are no vector, forces of other numbers or shapes than the roles, or
             constraint values at the start that are not zero.
     """
-    if effect.kind == "control" or getattr(effect.function, "__module__", LIBRARY).startswith(LIBRARY):
+    function = effect.function
+    while isinstance(function, partial):
+        function = function.func
+    if effect.kind == "control" or getattr(function, "__module__", "").startswith(LIBRARY):
         return
     for group in effect.by_size(range(len(effect.elements(bodies))), bodies):
         q, arguments = _arguments(effect, bodies, group)
