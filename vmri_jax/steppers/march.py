@@ -32,7 +32,7 @@ from jaxtyping import Array, Bool, Float
 
 from vmri_jax.kernels import inverse_in_loop, matmul, matvec, max_abs
 from vmri_jax.kernels.saddle import saddle
-from vmri_jax.schemes.equations import StepEquations, Unknowns, sum_before
+from vmri_jax.schemes.equations import StepEquations, Unknowns
 from vmri_jax.schemes.intervals import Arriving, Intervals, IntervalUnknowns
 
 
@@ -229,17 +229,30 @@ class Passed(NamedTuple):
     worst: Worst
 
 
-def exact_pass(march: MarchEquations, z, x, last, from_last, corrects: bool = True) -> tuple[Matrices, Passed]:
+def exact_pass(march: MarchEquations, z, x, last, from_last) -> tuple[Matrices, Passed]:
     """A pass that computes all matrices; every interval starts from the corrected end of the interval before.
 
     Args:
         march: the equations.
         z, x: unknowns.
         last: (k,) unknowns of the last interval of the step before.
-        from_last: whether each interval starts from the unknowns of the interval before, instead of those in x.
-        corrects: whether the intervals correct their unknowns; if not, the matrices belong to z and x.
+        from_last: whether each interval starts from the unknowns of the interval before, instead of its unknowns in x.
     """
-    slow, unit = march.seen(z), jnp.eye(march.num_seen)
+    matrices, passed, _ = _linearised(march, z, x, last, from_last)
+    return matrices, passed
+
+
+def _linearised(
+    march: MarchEquations, z, x, last, from_last, at_solution: bool = False
+) -> tuple[Matrices, Passed, list]:
+    """`exact_pass`, or with `at_solution` the matrices at z and x, which no interval then corrects.
+
+    Returns:
+        The matrices, the pass, and with `at_solution` the derivatives (num_micro, k, n_f) and (num_micro, o, n_f) of the residual of every
+        interval and of the gradients that it hands on, with respect to the position that arrives; else an empty list.
+    """
+    slow, unit, n_f = march.seen(z), jnp.eye(march.num_seen), march.n_f
+    num_positions = n_f if at_solution else 0
 
     def interval(carry, unknowns):
         arriving, sensitivities, last, worst = carry
@@ -249,10 +262,18 @@ def exact_pass(march: MarchEquations, z, x, last, from_last, corrects: bool = Tr
 
         # Columns: the unknowns of the interval, then the slow increments together with the sensitivities d(arriving)/dz of the intervals before.
         # One vmap for both kinds of columns: the tangents of the action are most of the program, and two calls would compile them twice.
-        by_unknowns = jnp.eye(x.size, x.size + march.num_seen)
-        by_slow = jax.tree.map(lambda a: jnp.pad(a, ((0, 0), (x.size, 0))), (sensitivities, unit))
-        by_both, on_by_both = jax.vmap(push, in_axes=-1, out_axes=-1)(by_unknowns, *by_slow)
-        (by_x, by_z), (hands_on, hands_on_by_z) = (jnp.split(a, [x.size], axis=1) for a in (by_both, on_by_both))
+        # Further columns at the solution: the arriving position alone.
+        ends = x.size, x.size + march.num_seen
+        by_unknowns = jnp.eye(x.size, ends[1] + num_positions)
+        columns = jax.tree.map(lambda a: jnp.pad(a, ((0, 0), (x.size, num_positions))), (sensitivities, unit))
+        if at_solution:
+            by_arriving, by_slow = columns
+            position = by_arriving.position.at[:, ends[1] :].set(jnp.eye(n_f))
+            columns = by_arriving._replace(position=position), by_slow
+        by_all = jax.vmap(push, in_axes=-1, out_axes=-1)(by_unknowns, *columns)
+        (by_x, by_z, *by_position), (hands_on, hands_on_by_z, *hands_on_by_position) = (
+            jnp.split(a, ends[: 1 + at_solution], axis=1) for a in by_all
+        )
         inverse = march.inverse(by_x, march.num_fast)
         # dx_m/dz = -(dR_m/dx_m)^-1 dR_m/dz, with the dependence of the arriving quantities on z inside dR_m/dz
         response = -matmul(inverse, by_z)
@@ -261,19 +282,21 @@ def exact_pass(march: MarchEquations, z, x, last, from_last, corrects: bool = Tr
         )
 
         # d_m = -(dR_m/dx_m)^-1 R_m
-        residual = residual if corrects else jnp.zeros_like(residual)
-        d, on = march.corrected(inverse, hands_on, x, residual, arriving, gradients)
-        carry = on, sensitivities, x + d, worst.add(residual, d, max_abs(d[: march.num_fast]))
-        return carry, (x + d, inverse, hands_on, response)
+        if at_solution:
+            on = Handed(arriving.position + march.last_increment(x), gradients)
+        else:
+            d, on = march.corrected(inverse, hands_on, x, residual, arriving, gradients)
+            x, worst = x + d, worst.add(residual, d, max_abs(d[: march.num_fast]))
+        return (on, sensitivities, x, worst), (x, inverse, hands_on, response, *by_position, *hands_on_by_position)
 
     start = march.start()
     none = Handed(*(jnp.zeros((a.size, march.num_seen)) for a in start))
     carry = start, none, last, Worst.none()
     (end, sensitivities, _, worst), stacked = jax.lax.scan(interval, carry, (jnp.arange(march.n), x))
-    x, inverse, hands_on, response = stacked
+    x, inverse, hands_on, response, *by_positions = stacked
     slow_inverse, slow_values = march.slow_inverse(z, end, sensitivities)
     matrices = Matrices(inverse, hands_on, response, slow_inverse)
-    return matrices, march.passed(matrices, z, x, worst, end, slow_values)
+    return matrices, march.passed(matrices, z, x, worst, end, slow_values), by_positions
 
 
 def further_pass(march: MarchEquations, matrices: Matrices, z, x, last, from_last) -> Passed:
@@ -293,25 +316,13 @@ def further_pass(march: MarchEquations, matrices: Matrices, z, x, last, from_las
     return march.passed(matrices, z, x, worst, end, march.slow_equations(z, end))
 
 
-def factor(march: MarchEquations, z, x) -> tuple[Matrices, Any]:
-    """The matrix ``dR/d(z, x)`` after block elimination of the intervals, for the derivative of the solution.
-
-    Returns:
-        The `Matrices` at z and x, and the derivatives (num_micro, k, n_f) and (num_micro, o, n_f) of the residual of every interval and of the
-        gradients that it hands on, with respect to the position that arrives.
-    """
-    slow, gradients = march.seen(z), march.start().gradients  # R is linear in the gradients that arrive
-
-    def by_position(unknowns):
-        m, x, position = unknowns
-        return jax.jacfwd(lambda position: march.interval(m, x, Handed(position, gradients), slow))(position)
-
-    positions = march.equations.q_f + sum_before(march.last_increment(x.T).T)
-    matrices, _ = exact_pass(march, z, x, x[-1], from_last=False, corrects=False)
-    return matrices, jax.lax.map(by_position, (jnp.arange(march.n), x, positions))
+def factor(march: MarchEquations, z, x) -> tuple[Matrices, list]:
+    """The matrix ``dR/d(z, x)`` after block elimination of the intervals, for the derivative of the solution: see `_linearised`."""
+    matrices, _, by_positions = _linearised(march, z, x, x[-1], from_last=False, at_solution=True)
+    return matrices, by_positions
 
 
-def solve(march: MarchEquations, factors: tuple[Matrices, Any], rows_z, rows_x):
+def solve(march: MarchEquations, factors: tuple[Matrices, list], rows_z, rows_x):
     """(dz, dx) with ``dR/d(z, x) (dz, dx) = -(rows_z, rows_x)``; linear in the rows, and JAX can transpose it.
 
     Forward elimination with z fixed, then ``S dz = -(rows_z + change of R_s)``, then back substitution ``dx + (dx/dz) dz``.
