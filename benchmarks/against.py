@@ -83,7 +83,7 @@ GROUPS = {
     "call": _calls("call", CALL) + _calls("prepared", PREPARED),
     "first": FIRST,
     "gradient": GRADIENTS,
-    "readme": [Entry(Case("readme", "crane", "fully_implicit 10"))],
+    "readme": [Entry(Case("readme", "README", "fully_implicit 10"))],
 }
 FRESH = ("first", "gradient")
 """Groups in which every sample is a new process."""
@@ -190,7 +190,8 @@ def _claims(group: str, entry: Entry, outcome: Outcome) -> list[Claim]:
         claims.append(Claim(f"{what}, seconds", quartiles(samples[AFTER]), at_most=entry.seconds))
     if group == "readme":
         for side in (BEFORE, AFTER):
-            found = ratio(samples[side], samples[f"{side}, configured"])
-            most = README if side == AFTER else None
-            claims.append(Claim(f"README of {side}, as printed over configured", found, at_most=most))
+            if {side, f"{side}, configured"} <= set(samples):
+                over_configured = ratio(samples[side], samples[f"{side}, configured"])
+                most = README if side == AFTER else None
+                claims.append(Claim(f"README of {side}, as printed over configured", over_configured, at_most=most))
     return claims

@@ -92,7 +92,8 @@ class Timed:
 
     def keep(self, short, whole, node: int = -1) -> None:
         """A node of the first run, by default its end, and the worst status of the second."""
-        q = np.concatenate([np.asarray(short.q_s), np.asarray(short.q_f)], axis=-1)
+        nodes = short.states  # vectors, also where a run has dictionaries
+        q = np.concatenate([np.asarray(nodes.q_s), np.asarray(nodes.q_f)], axis=-1)
         self.end = q[..., node, :]
         self.result = vm.Result(int(np.max(np.asarray(whole.result)))).name
 
