@@ -47,9 +47,9 @@ def lost_energy(run: Trajectory, system: System, macro_dt: float) -> str:
     if not change[worst] > ROUNDOFF_OF_ENERGY * np.abs(energy).max():
         return ""
     nodes = np.unique(np.append(np.linspace(0, len(energy) - 1, NODES_CHECKED).astype(int), worst))
-    p_s, p_f = (np.asarray(p)[nodes] for p in (run.states.p_s, run.states.p_f))
-    v_s, v_f = map(np.asarray, system.kinetic.velocity(p_s, p_f))
-    kinetic = np.max(np.sum(p_s * v_s, axis=1) + np.sum(p_f * v_f, axis=1)) / 2
+    slow = _kinetic(np.asarray(system.kinetic.slow), np.asarray(run.states.p_s)[nodes])
+    fast = _kinetic(np.asarray(system.kinetic.fast), np.asarray(run.states.p_f)[nodes])
+    kinetic = (slow + fast).max()
     if not change[worst] > REPORTED_CHANGE * kinetic or not change[worst] > _kinetic_of_roundoff(
         run, system.kinetic, macro_dt
     ):
@@ -62,6 +62,16 @@ def lost_energy(run: Trajectory, system: System, macro_dt: float) -> str:
         f"and the largest kinetic energy is {kinetic:.3g}. Take smaller steps, or ask vmri_jax.stability.advise(problem, "
         "scheme, macro_dt=...) which are stable."
     )
+
+
+def _kinetic(mass: np.ndarray, p: np.ndarray) -> np.ndarray:
+    """``p M^-1 p / 2`` at every node; the mass matrix M is given by its diagonal (n,) or whole (n, n).
+
+    In NumPy: `ConstantMass.velocity` would add a tenth to the time of a short run.
+    """
+    if mass.ndim == 1:
+        return (p**2 / mass).sum(axis=1) / 2
+    return np.einsum("ki,ik->k", p, np.linalg.solve(mass, p.T)) / 2
 
 
 def _kinetic_of_roundoff(run: Trajectory, mass: ConstantMass, macro_dt: float) -> float:
