@@ -79,9 +79,9 @@ def test_a_band_in_any_order_is_inverted_like_the_full_matrix(n, width, nodes):
     a = np.where(blocks, 0.1 * rng.normal(size=blocks.shape), 0.0) + np.diag(1 + rng.random(n * nodes))
     g = rng.normal(size=n * nodes)
 
-    found = sparsity(pattern, nodes)
-    assert isinstance(found, Full if width == 8 else Band)
-    products = jnp.asarray(found.seeds @ a.T)
+    structure = sparsity(pattern, nodes)
+    assert isinstance(structure, Full if width == 8 else Band)
+    products = jnp.asarray(structure.seeds @ a.T)
     expected = np.linalg.solve(a, g)
-    assert np.abs(found.inverse(products).times(jnp.asarray(g)) - expected).max() < 1e-13
-    assert np.abs(found.solve(products, jnp.asarray(g)) - expected).max() < 1e-13
+    assert np.abs(structure.inverse(products).times(jnp.asarray(g)) - expected).max() < 1e-13
+    assert np.abs(structure.solve(products, jnp.asarray(g)) - expected).max() < 1e-13

@@ -136,7 +136,7 @@ def test_a_further_potential_that_its_rate_does_not_resolve_is_named():
 
 @pytest.mark.parametrize(("turn", "warned"), [(6.2, True), (2 * 6.25, True), (5.0, False), (0.1, False)])
 def test_kicks_of_a_weight_that_meet_its_spring_in_phase(turn, warned):
-    """A weight on a spring: the amplitude of the finding is that of the run, which swings about a displaced place."""
+    """A weight on a spring: the finding has the amplitude with which the run swings about a displaced place."""
     macro_dt = 0.1
 
     def weight(q_s, q_f, params):

@@ -30,7 +30,7 @@ SCHEMES = ("scheme", "num_micro")
 START = ("t", "q_s", "q_f", "v_s", "v_f")
 
 Row = Mapping[str, Any]
-"""The values of one row of a design, by column."""
+"""The value of each column in a row of a design."""
 Vary = Callable[[Problem, Row], Problem]
 """A function that makes the problem of a run from a problem and a row."""
 

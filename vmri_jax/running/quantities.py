@@ -251,7 +251,7 @@ def _of_body(run: SavedRun, body: str, carried: Callable, slow=None, fast=None):
 
 
 def _part(values: Any, place: Place):
-    """Values of one body, out of the values (slow, fast) of all bodies."""
+    """Values of a single body, out of the values (slow, fast) of all bodies."""
     part, start, size = place
     return values[part == "f"][..., start : start + size]
 

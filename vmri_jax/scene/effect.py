@@ -301,7 +301,7 @@ class Effect(ABC):
         return EffectTerm(self.name, self.function, roles, select, self.split, self.timed)
 
     def _role(self, parameter: str, names: Sequence[str], bodies: Bodies, places: Mapping[str, Place]) -> Role:
-        """The map from q_s and q_f to the coordinates of the bodies of a role, all of one kind, or to the points in them, a parameter."""
+        """The map from q_s and q_f to the coordinates of the bodies of a role, all of the same kind, or to points in them, which are a parameter."""
         size, attached = end_of(bodies, names[0], self.whole).size, isinstance(names[0], Attachment)
         if names[0] == GROUND:
             return OnGround(len(names), size, parameter if attached else None)

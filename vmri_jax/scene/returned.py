@@ -13,7 +13,7 @@ from vmri_jax.scene.terms import choose
 
 LIBRARY = "vmri_jax."
 """Beginning of the names of modules whose functions are not checked: the tests of the package do that."""
-START = 1e-9
+LARGEST_VIOLATION = 1e-9
 """Largest value of a constraint at the start, in its unit, as of `initial_state`. A larger one would start runs off the constraints."""
 
 
@@ -40,7 +40,7 @@ def check_function(effect: Any, bodies: Bodies, moved: bool) -> None:
         _check_value(effect, value, [x.shape for x in q], len(group))
         if effect.kind == "constraint" and not moved and is_concrete(arguments):
             violation = float(np.abs(effect.function(*arguments)).max(initial=0.0))
-            if violation > START:
+            if violation > LARGEST_VIOLATION:
                 raise ValueError(
                     f"{effect.name}: the positions at the start violate this constraint by {violation:.3g}; move the bodies, or let the scene "
                     "do so, Scene(..., project=True)."

@@ -137,7 +137,7 @@ class Scheme(eqx.Module):
         """Order of convergence, ``min(2 degree, order of the rules of T, all potentials and the forces)``; needs concrete weights.
 
         A rule that spans several micro intervals counts as order 2 at most. Potentials and forces of slow variables alone have the full order
-        of their rule; the scheme does not know what they depend on.
+        of their rule; a scheme does not know the variables of potentials and forces.
         """
         placed = self.kinetic, self.slow, self.fast, self.force, *self.potentials.values()
         return min(2 * self.degree, *(placed.order(self.num_micro) for placed in placed))

@@ -94,7 +94,7 @@ class SmallMotions:
         return self.rates[np.real(self.rates) > LEAST_GROWTH * np.abs(self.rates).max(initial=0.0)]
 
     def frequencies(self, name: str) -> np.ndarray:
-        """(d,) frequencies of one potential alone, a key of `hessians`, the largest first; zero where it is not convex."""
+        """(d,) frequencies of a single potential, a key of `hessians`, the largest first; zero where it is not convex."""
         return frequencies_of(self.hessians[name])
 
     @cached_property

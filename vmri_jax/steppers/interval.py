@@ -123,7 +123,7 @@ class Interval:
 
     is_explicit: whether the fast increments are explicit functions of the multipliers, ``x = M_f^-1 (h p_f - G_0^T mu)``.
     is_diagonal: whether K is taken as one matrix per fast coordinate: M_f is diagonal, and inside the interval either all potentials are
-        linear in q_f, or there are only V and W, and those of them that take q_f alone are sums over the coordinates. K then leaves
+        linear in q_f, or there are only V and W, and each function of q_f alone among V and W is a sum over the coordinates. K then leaves
         out forces and potentials that depend on slow variables: this costs passes, not accuracy.
     is_constant: whether K is the same for a whole run.
     sparsity: of ``G K^-1 G^T``.
