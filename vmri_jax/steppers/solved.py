@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from vmri_jax.kernels import max_abs
 from vmri_jax.kernels.band import Sparsity
-from vmri_jax.mechanics.arrays import Numbers
+from vmri_jax.mechanics.arrays import Numbers, library
 from vmri_jax.mechanics.checks import CONSTRAINT_TOLERANCE
 from vmri_jax.mechanics.projection import project_momentum
 from vmri_jax.mechanics.state import State
@@ -29,6 +29,11 @@ ROOT = "root"
 CONSTRAINT_OVER_TOLERANCE = 100
 """Constraints are kept if ``|g| <= max(CONSTRAINT_TOLERANCE, CONSTRAINT_OVER_TOLERANCE tolerance)``. The tolerance is relative to the motion, the value
 of a constraint has its own unit: a smaller factor would refuse converged steps of loose tolerances."""
+
+
+def allowed_residual(tolerance):
+    """Largest constraint value of a step that keeps its constraints, with this tolerance of Newton's iteration."""
+    return library(tolerance).maximum(CONSTRAINT_TOLERANCE, CONSTRAINT_OVER_TOLERANCE * tolerance)
 
 
 class Solution(NamedTuple):
@@ -213,7 +218,7 @@ def status_of(equations: StepEquations, result, method, iterations, *, rows, g, 
         tolerance: of Newton; a loose one raises the accepted constraint value.
     """
     if equations.system.is_constrained:
-        violated = g > jnp.maximum(CONSTRAINT_TOLERANCE, CONSTRAINT_OVER_TOLERANCE * tolerance)
+        violated = g > allowed_residual(tolerance)
         contradicts = (result <= Result.CONVERGED_AT_ROUNDOFF) & violated
         result = jnp.where(contradicts, Result.CONSTRAINT_VIOLATED, result)
     # residual = max(rows / (h max |p|), max |g|), where `rows` is h |R|; with `rows` itself where all momenta are zero
