@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from vmri_jax.kernels.saddle import least_norm
 from vmri_jax.mechanics.arrays import Numbers
 from vmri_jax.mechanics.by_name import constraint_sizes
 from vmri_jax.mechanics.functions import Rheonomic
@@ -23,6 +24,9 @@ from vmri_jax.mechanics.projection import legendre, mass_diagonal
 from vmri_jax.mechanics.system import System
 from vmri_jax.mechanics.terms_of_rows import sizes_of_terms
 
+START = 1e-9
+"""Largest value of a row at the start, relative to its terms. A larger one would start runs off the constraints; a smaller one would refuse numbers
+that are written with ten digits."""
 CONSTRAINT_TOLERANCE = 1e-6
 """Largest value of a row that is kept along a run, relative to its terms. A smaller value would refuse starts that are rounded to six digits."""
 CONSTRAINT_OVER_TOLERANCE = 100
@@ -96,17 +100,22 @@ class Rows(NamedTuple):
         """(k,) the values up to which rows count as kept, see the top of this module."""
         return tolerance * self.terms + ROUNDING * np.finfo(float).eps * (self.terms + self.positions)
 
+    @classmethod
+    def of(cls, function, q) -> "Rows":
+        """The rows (k,) of a function of q (n,)."""
+        jacobian = jax.jacrev(function)(q)
+        return cls(function(q), sizes_of_terms(function, q), jacobian, jnp.abs(jacobian) @ jnp.abs(q))
+
 
 def rows_at(system: System, t, q_s, q_f) -> Rows:
     """The `Rows` of a system."""
-    q, n_s = jnp.concatenate([q_s, q_f]), q_s.shape[0]
+    n_s = q_s.shape[0]
 
     def rows(q):
         configuration = t, q[:n_s], q[n_s:]
         return jnp.concatenate([system.constraints(*configuration), system.g_implied(*configuration)])
 
-    jacobian = jax.jacrev(rows)(q)
-    return Rows(rows(q), sizes_of_terms(rows, q), jacobian, jnp.abs(jacobian) @ jnp.abs(q))
+    return Rows.of(rows, jnp.concatenate([q_s, q_f]))
 
 
 def are_kept(system: System, state, tolerance):
@@ -138,15 +147,10 @@ def project_positions(system: System, t, q_s, q_f):
     mass, jacobian = jax.jacfwd(momentum)(jnp.zeros_like(q0)), jax.jacrev(constraints)(q0)
     root = jnp.sqrt(jnp.diagonal(mass))
     directions = jnp.linalg.solve(mass / (root[:, None] * root), (jacobian / root).T) / root[:, None]
-    # rows over the square roots of the diagonal of G D: their units cancel
-    sizes = jnp.sqrt(jnp.sum(jacobian * directions.T, axis=1))
-    sizes = jnp.where(sizes > 0, sizes, 1.0)
-    directions = directions / sizes
 
     # q <- q - D (G D)^+ g
     def corrected(_, q):
-        g, products = constraints(q) / sizes, jax.jacrev(constraints)(q) @ directions / sizes[:, None]
-        return q - directions @ jnp.linalg.lstsq(products, g)[0]
+        return q - directions @ least_norm(jax.jacrev(constraints)(q) @ directions, constraints(q))
 
     # a loop, since its body is compiled once
     q = jax.lax.fori_loop(0, PROJECTION_STEPS, corrected, q0)

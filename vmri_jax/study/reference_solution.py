@@ -83,8 +83,8 @@ def reference_solution(
             error_q, error_p = (float(np.abs(a - b).max()) for a, b in zip(coarse, fine, strict=True))
             if best is None or error_q < best.error_q:
                 best = ReferenceSolution(*fine, error_q, error_p)
-            # a difference that no longer falls has reached round-off or the floor of a chaotic motion; above 1e-6 the steps may still be too large
-            settled = error_q > last_error / 2 and error_q < 1e-6 * max(1.0, np.abs(fine[0]).max())
+            # a difference that no longer falls has reached round-off or the floor of a chaotic motion; above 1e-6 of the positions the steps may still be too large
+            settled = error_q > last_error / 2 and error_q < 1e-6 * np.abs(fine[0]).max()
             if fixed or settled or error_q <= ROUNDOFF * np.abs(fine[0]).max():
                 return best
             last_error = error_q
