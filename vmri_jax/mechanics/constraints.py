@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from vmri_jax.kernels.saddle import least_norm
-from vmri_jax.mechanics.arrays import Numbers
+from vmri_jax.mechanics.arrays import Numbers, quickly_compiled
 from vmri_jax.mechanics.by_name import constraint_sizes
 from vmri_jax.mechanics.functions import Rheonomic
 from vmri_jax.mechanics.masses import correlation
@@ -190,7 +190,7 @@ def check_mass(system: System, q_s, q_f) -> None:
         )
 
 
-@jax.jit
+@quickly_compiled
 def _mass_matrix(system, q_s, q_f, v_s, v_f):
     n_s = v_s.size
     return jax.hessian(lambda v: system.kinetic(q_s, q_f, v[:n_s], v[n_s:], system.params))(jnp.append(v_s, v_f))
@@ -263,7 +263,7 @@ def check_constraints(
         _check_rank("constraint", fast, f"fast variables. {MICRO_GRID}", in_words)
 
 
-@jax.jit
+@quickly_compiled
 def _rows_and_masses(system, t, q_s, q_f):
     """The `Rows`, and the diagonal of the mass matrix with 1 in place of 0."""
     masses = jnp.concatenate(mass_diagonal(system, q_s, q_f))
