@@ -25,7 +25,6 @@ from jaxtyping import Array, Float
 
 from vmri_jax.kernels import max_abs
 from vmri_jax.mechanics.arrays import Number
-from vmri_jax.mechanics.masses import ConstantMass
 from vmri_jax.mechanics.projection import mass_diagonal
 from vmri_jax.schemes.equations import StepEquations
 
@@ -103,23 +102,11 @@ class Accepted(NamedTuple):
     def of(cls, equations: StepEquations, newton) -> "Accepted":
         """The accepted corrections of a step, from the positions at its start."""
         slow, fast = Weights.of(equations).largest(equations.q_s, equations.q_f)
-        to_slow = to_fast = 0.0
-        # A constraint g(q_s, q_f) moves the slow variables by M_s^-1 G_s^T mu and the fast ones by M_f^-1 G_f^T mu: round-off of q_f
-        # becomes one of q_s, smaller by the ratio of the masses, and vice versa:
-        #     floor_s = 4 eps max(|q_s|, min(1, max M_f / min M_s) |q_f|)
-        if equations.system.constraint is not None and equations.q_s.size and equations.q_f.size:
-            to_slow = to_fast = 1.0
-            masses = equations.system.kinetic
-            if isinstance(masses, ConstantMass):
-                # Row sums stand for the masses; of diagonal matrices they are the masses. If row sums of a full matrix are zero or below, the
-                # ratio counts as 1, or the tie adds no round-off.
-                m_s, m_f = (mass.times(jnp.ones(mass.size)) for mass in (masses.slow_mass, masses.fast_mass))
-                to_slow, to_fast = (jnp.minimum(1.0, jnp.max(a) / jnp.min(b)) for a, b in ((m_f, m_s), (m_s, m_f)))
-        floors = (
-            jnp.stack([slow, jnp.maximum(slow, to_slow * fast)]),
-            jnp.stack([fast, jnp.maximum(fast, to_fast * slow)]),
-        )
-        roundoff = (ROUNDOFF * jnp.finfo(float).eps * floor for floor in (*floors, jnp.maximum(slow, fast)))
+        largest = jnp.maximum(slow, fast)
+        # a constraint g(q_s, q_f) carries the round-off of q_f to q_s, and vice versa
+        tied = (largest, largest) if equations.system.constraint is not None else (slow, fast)
+        floors = jnp.stack([slow, tied[0]]), jnp.stack([fast, tied[1]]), largest
+        roundoff = (ROUNDOFF * jnp.finfo(float).eps * floor for floor in floors)
         return cls(newton.tolerance / SAFETY, *roundoff)
 
     def at_floor(self, size, before, floor=FLOOR):
