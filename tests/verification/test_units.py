@@ -9,6 +9,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import vmri_jax as vm
+from vmri_jax import kernels
 from vmri_jax.scene import Anchor, Body, Gravity, Revolute, RigidBody, RigidLink, Scene, Spring
 from vmri_jax.systems import fermi_pasta_ulam, simple_atomic_model, triple_spherical_pendulum
 
@@ -266,3 +267,12 @@ def test_a_satellite_in_polar_coordinates():
     end = solve_ivp(rates, (0, 5800), [7.0e6, 0.0, 0.0, 1.08e-3], method="DOP853", rtol=1e-12, atol=1e-12).y[:, -1]
     assert abs(run.q_s["r"][-1] / end[0] - 1) < 1e-5
     assert abs(run.q_s["phi"][-1] - end[1]) < 1e-4
+
+
+@pytest.mark.parametrize("n", [3, 8, 12])
+def test_eliminations(n):
+    a = np.random.default_rng(n).normal(size=(n, n))
+    a, b = a @ a.T + np.eye(n), np.ones((n, 1))
+    for size in (2.0**-60, 2.0**60):
+        np.testing.assert_array_equal(kernels.inverse(size * a) * size, kernels.inverse(a))
+        np.testing.assert_array_equal(kernels.solve(size * a, b) * size, kernels.solve(a, b))
