@@ -1,0 +1,94 @@
+"""Whole turns of the angles of joints: a coordinate counts them, directors do not.
+
+The directors of two bodies give the sine and the cosine of the angle between them. An effect to which turns matter takes such an angle up to
+`REACH` alone; along a run turns are counted from one saved node to the next.
+"""
+
+from collections.abc import Iterator
+from typing import Any
+
+import jax
+import numpy as np
+
+from vmri_jax.mechanics.arrays import is_concrete
+from vmri_jax.scene.body import moving
+from vmri_jax.scene.effects.freedoms import ANGLES, REACH, Freedom
+from vmri_jax.scene.effects.joint_base import Joint, OfFreedoms, freedom_of
+from vmri_jax.scene.sorting import Sorting
+from vmri_jax.scene.velocities import steps_of
+
+ADVICE = 'give the scene coordinates="joint", or where all joints of a loop have such effects leave one of these out'
+
+
+def along_run(sorting: Sorting, joint: Joint, run: Any, of: str, pair: int) -> np.ndarray:
+    """The freedom of a joint along a run, (k,) rad or m, whole turns included; see `Scene.joint_motion`."""
+    freedom, elements = freedom_of(joint, of), joint.elements(sorting.bodies)
+    pair = range(len(elements))[pair]  # raises IndexError
+    place = sorting.layout.freedoms.get((joint.name, pair, freedom))
+    label = next((name for name, other in sorting.layout.coordinates.items() if other == place), "")
+    if label in run.names.bodies:
+        return np.asarray(run.position(label))[..., 0]
+
+    def value(coordinates):
+        return joint.values(freedom, [pair], sorting.bodies, coordinates)[0]
+
+    q = {name: run.position(name) for name in moving(elements[pair])}
+    if freedom not in ANGLES:
+        return np.asarray(value(q))
+    angle, rate = map(np.asarray, jax.jvp(value, (q,), ({name: run.velocity(name) for name in q},)))
+    dt, rates = np.diff(run.t), (rate[..., 1:], rate[..., :-1])
+    fastest, steps = np.maximum(*np.abs(rates)), np.diff(np.unwrap(angle))
+    # an angle that moves by a quarter of a turn more or less than both rates say is faster in between
+    unknown = np.argwhere((fastest * dt >= np.pi) | (np.abs(steps - dt * np.mean(rates, axis=0)) >= np.pi / 2))
+    if unknown.size:
+        node = unknown[0, -1]
+        raise ValueError(
+            f"Scene.joint_motion: {joint.label(pair, sorting.bodies)} may turn by half a turn or more between the saved nodes {node} and "
+            f"{node + 1}, and its angle comes from directors, which know no whole turns. Save nodes less than "
+            f'{np.pi / 2 / np.nanmax(fastest):.2g} s apart, save_every=..., or give the scene coordinates="joint".'
+        )
+    turns = np.round((at_start(sorting, joint, pair, freedom) - angle[..., :1]) / (2 * np.pi))
+    return np.unwrap(angle) + 2 * np.pi * turns
+
+
+def check_reach(sorting: Sorting) -> None:
+    """Refuse values of an angle, such as limits and starts, that effects which count turns cannot take from directors."""
+    for effect, i, joint, pair, freedom in from_directors(sorting):
+        params = effect.parameters(sorting.bodies)
+        values = {name: params[name][i] if np.ndim(params[name]) else params[name] for name in effect.marks}
+        values["the start"] = at_start(sorting, joint, pair, freedom)
+        expected = (
+            f"the angle of {joint.label(pair, sorting.bodies)} comes from directors, which know no whole turns, and has to stay within "
+            f"{REACH:.4g} rad; {ADVICE}"
+        )
+        for quantity, value in values.items():
+            effect.require(abs(value) < REACH, quantity, value, expected)
+
+
+def from_directors(sorting: Sorting) -> Iterator[tuple[OfFreedoms, int, Joint, int, Freedom]]:
+    """(effect, number of its element, joint, number of its pair, freedom) for all angles that effects which count turns take from directors."""
+    joints = {part.effect.name: part.effect for part in sorting.placed if isinstance(part.effect, Joint)}
+    for part in sorting.placed:
+        effect = part.effect
+        for i in part.elements if isinstance(effect, OfFreedoms) and effect.counts_turns else ():
+            for name, pair, freedom in effect.freedoms_of(i):
+                if freedom in ANGLES and (name, pair, freedom) not in sorting.layout.freedoms:
+                    yield effect, i, joints[name], pair, freedom
+
+
+def at_start(sorting: Sorting, joint: Joint, pair: int, freedom: str) -> Any:
+    """The angle of a joint without a coordinate at the start, rad.
+
+    It is zero at the positions of the bodies as the user gave them. From there turns are counted along the straight line to the start in
+    joint coordinates.
+    """
+    starts, begin = sorting.joint_starts, np.concatenate(sorting.assembled) if is_concrete(sorting.positions) else None
+    if not starts or begin is None:
+        return 0.0
+    way = np.concatenate(sorting.positions) - begin
+    names, columns, angles = moving(joint.elements(sorting.bodies)[pair]), sorting.layout.columns, []
+    for fraction in np.linspace(0.0, 1.0, 1 + steps_of(starts, (value for value, _ in starts.values()))):
+        bodies = sorting.to_bodies(begin + fraction * way)[0]
+        coordinates = {name: bodies[columns[name]] for name in names}
+        angles.append(joint.values(freedom, [pair], sorting.bodies, coordinates)[0])
+    return float(np.unwrap(angles)[-1])
