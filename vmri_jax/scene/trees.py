@@ -10,6 +10,7 @@ decide among equals: the order in which bodies and joints are listed has no infl
 
 from collections.abc import Mapping, Sequence
 from heapq import heappop, heappush
+from itertools import count
 from typing import Any, Literal, NamedTuple
 
 from vmri_jax.mechanics.arrays import is_concrete
@@ -138,10 +139,14 @@ def grow(bodies: Bodies, effects: Sequence[Effect], everywhere: bool = True) -> 
 def _offers(bodies: Bodies, effects: Sequence[Effect], ranks: Mapping) -> dict[str, list[tuple]]:
     """For each body all branches that may hang on it, as (sort key, best first; sort key among equals; branch)."""
     by_parent: dict[str, list[tuple]] = {}
+    number = count()
     for joint in (effect for effect in effects if isinstance(effect, Joint) and effect.carries):
         for i, (a, b) in enumerate(joint.elements(bodies)):
             if a != b and all(name == GROUND or (name in bodies and bodies[name].rigid) for name in (a, b)):
-                order, names = (ranks.get((joint.name, i), UNUSED), len(joint.moves)), (joint.name, *sorted((a, b)), i)
+                order, names = (
+                    (ranks.get((joint.name, i), UNUSED), len(joint.moves)),
+                    (joint.name, *sorted((a, b)), next(number)),
+                )
                 by_parent.setdefault(a, []).append((order, names, Branch(b, a, joint, i, True)))
                 by_parent.setdefault(b, []).append((order, names, Branch(a, b, joint, i, False)))
     return by_parent

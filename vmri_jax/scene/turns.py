@@ -4,7 +4,6 @@ The directors of two bodies give the sine and the cosine of the angle between th
 `REACH` alone; along a run turns are counted from one saved node to the next.
 """
 
-from collections.abc import Iterator
 from typing import Any
 
 import jax
@@ -12,12 +11,10 @@ import numpy as np
 
 from vmri_jax.mechanics.arrays import is_concrete
 from vmri_jax.scene.body import moving
-from vmri_jax.scene.effects.freedoms import ANGLES, REACH, Freedom
+from vmri_jax.scene.effects.freedoms import ANGLES, REACH
 from vmri_jax.scene.effects.joint_base import Joint, OfFreedoms, freedom_of
 from vmri_jax.scene.sorting import Sorting
 from vmri_jax.scene.velocities import steps_of
-
-ADVICE = 'give the scene coordinates="joint", or where all joints of a loop have such effects leave one of these out'
 
 
 def along_run(sorting: Sorting, joint: Joint, run: Any, of: str, pair: int) -> np.ndarray:
@@ -53,27 +50,25 @@ def along_run(sorting: Sorting, joint: Joint, run: Any, of: str, pair: int) -> n
 
 def check_reach(sorting: Sorting) -> None:
     """Refuse values of an angle, such as limits and starts, that effects which count turns cannot take from directors."""
-    for effect, i, joint, pair, freedom in from_directors(sorting):
-        params = effect.parameters(sorting.bodies)
-        values = {name: params[name][i] if np.ndim(params[name]) else params[name] for name in effect.marks}
-        values["the start"] = at_start(sorting, joint, pair, freedom)
-        expected = (
-            f"the angle of {joint.label(pair, sorting.bodies)} comes from directors, which know no whole turns, and has to stay within "
-            f"{REACH:.4g} rad; {ADVICE}"
-        )
-        for quantity, value in values.items():
-            effect.require(abs(value) < REACH, quantity, value, expected)
-
-
-def from_directors(sorting: Sorting) -> Iterator[tuple[OfFreedoms, int, Joint, int, Freedom]]:
-    """(effect, number of its element, joint, number of its pair, freedom) for all angles that effects which count turns take from directors."""
     joints = {part.effect.name: part.effect for part in sorting.placed if isinstance(part.effect, Joint)}
     for part in sorting.placed:
         effect = part.effect
-        for i in part.elements if isinstance(effect, OfFreedoms) and effect.counts_turns else ():
-            for name, pair, freedom in effect.freedoms_of(i):
-                if freedom in ANGLES and (name, pair, freedom) not in sorting.layout.freedoms:
-                    yield effect, i, joints[name], pair, freedom
+        if not (isinstance(effect, OfFreedoms) and effect.counts_turns):
+            continue
+        params = effect.parameters(sorting.bodies)
+        keys = [(i, *key) for i in part.elements for key in effect.freedoms_of(i)]
+        for i, name, pair, freedom in keys:
+            if freedom not in ANGLES or (name, pair, freedom) in sorting.layout.freedoms:
+                continue
+            values = {mark: params[mark][i] if np.ndim(params[mark]) else params[mark] for mark in effect.marks}
+            values["the start"] = at_start(sorting, joints[name], pair, freedom)
+            for quantity, value in values.items():
+                expected = (
+                    f"the angle of {joints[name].label(pair, sorting.bodies)} comes from directors, which know no whole turns, and has to "
+                    f'stay within {REACH:.4g} rad: give the scene coordinates="joint", or where all joints of a loop have such effects '
+                    "leave one of these out"
+                )
+                effect.require(abs(value) < REACH, quantity, value, expected)
 
 
 def at_start(sorting: Sorting, joint: Joint, pair: int, freedom: str) -> Any:
