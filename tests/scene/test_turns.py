@@ -212,11 +212,15 @@ def test_gears_start_with_their_turns():
     np.testing.assert_allclose(geared.start[0], [7.0, 1.75], atol=1e-12)
 
 
+def sprung(stiffness):
+    return JointSpring("hinge", stiffness), JointLimit("other", -4.15, 4.15, stiffness=500.0, smoothing=0.02)
+
+
 def test_springs_and_limits_beyond_half_a_turn():
     """A spring of 2 N m/rad at 8 rad/s turns by 8 / sqrt(2) = 5.657 rad, a limit at 4.15 rad turns back at about 4.2 rad."""
-    effects = JointSpring("hinge", 2.0), JointLimit("other", -4.15, 4.15, stiffness=500.0, smoothing=0.02)
+    effects = sprung(2.0)
     scene = wheels(*effects, spin=(8.0, 2.0))
-    run = vm.simulate(scene, ONE, macro_dt=0.01, t_end=5.0)
+    run = vm.simulate(scene, ONE, macro_dt=0.01, num_steps=500, save_every=5)
     largest = [np.abs(scene.joint_motion(run, name)).max() for name in ("hinge", "other")]
     assert largest == pytest.approx([5.657, 4.2], abs=0.04)
     with pytest.raises(ValueError, match=r'joint_limits: lower is -4.15; the angle of other.*coordinates="joint"'):
@@ -234,21 +238,27 @@ def test_a_run_by_directors_ends_before_half_a_turn():
     assert np.arctan2(*reached[::-1]) == pytest.approx(REACH, abs=0.1)
 
 
-@pytest.mark.parametrize("coordinates", ["joint", "directors"])
-def test_turns_of_a_run_are_counted(coordinates):
-    """100 rad/s for a second, saved every 0.05 s and every 0.01 s."""
-    scene, steps = wheels(coordinates=coordinates, spin=(100.0, 0.0)), {"num_steps": 1000, "save_every": 10}
-    run = vm.simulate(scene, ONE, macro_dt=0.001, **steps)
-    lag = {"joint": 1e-9, "directors": 0.1}[coordinates]  # of the scheme, which by directors turns by 0.1 rad a step
-    assert scene.joint_motion(run, "hinge")[-1] == pytest.approx(100.0, abs=lag)
-    if coordinates == "joint":
-        assert scene.joint_motion(run[::50], "hinge")[-1] == pytest.approx(100.0, abs=lag)
-        scene = scene.with_joints({"hinge": (7.0, 100.0)})
-        run = vm.simulate(scene, ONE, macro_dt=0.001, **steps)
-        np.testing.assert_allclose(scene.joint_motion(run, "hinge")[[0, -1]], [7.0, 107.0], atol=lag)
-    else:
-        with pytest.raises(ValueError, match=r"hinge may turn by half a turn or more .* nodes 0 and 1.*save_every"):
-            scene.joint_motion(run[::5], "hinge")
+SPINNING = {"macro_dt": 0.001, "num_steps": 1000, "save_every": 10}
+"""A second, in nodes 0.01 s apart."""
+
+
+def test_turns_are_coordinates():
+    """100 rad/s for a second; a spring as soft as none makes the program that of the springs above."""
+    scene = wheels(*sprung(1e-12), spin=(100.0, 0.0))
+    for start in (0.0, 7.0):
+        turned = scene.with_joints({"hinge": (start, 100.0)})
+        run = vm.simulate(turned, ONE, **SPINNING)
+        angle = turned.joint_motion(run[::50], "hinge")
+        np.testing.assert_allclose(angle, start + np.array([0.0, 50.0, 100.0]), atol=1e-8)
+
+
+def test_turns_of_directors_are_counted_from_node_to_node():
+    scene = wheels(coordinates="directors", spin=(100.0, 0.0))
+    run = vm.simulate(scene, ONE, **SPINNING)
+    # the scheme is ahead by 0.17 rad, as it turns by 0.1 rad in a step
+    assert scene.joint_motion(run, "hinge")[-1] == pytest.approx(100.0, abs=0.2)
+    with pytest.raises(ValueError, match=r"hinge may turn by half a turn or more .* nodes 0 and 1.*save_every"):
+        scene.joint_motion(run[::5], "hinge")
 
 
 def test_long_and_dense_scenes_keep_the_angles_that_effects_need(monkeypatch):
