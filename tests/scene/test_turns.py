@@ -223,6 +223,8 @@ def test_springs_and_limits_beyond_half_a_turn():
     run = vm.simulate(scene, ONE, macro_dt=0.01, num_steps=500, save_every=5)
     largest = [np.abs(scene.joint_motion(run, name)).max() for name in ("hinge", "other")]
     assert largest == pytest.approx([5.657, 4.2], abs=0.04)
+    with pytest.raises(ValueError, match=r"joint_springs: the largest angle of the run is 5\.6.*directors"):
+        scene.without("joint_limits").by_directors(run)
     with pytest.raises(ValueError, match=r'joint_limits: lower is -4.15; the angle of other.*coordinates="joint"'):
         wheels(*effects, coordinates="directors")
     with pytest.raises(ValueError, match=r"joint_springs: neutral is 7.0; the angle of hinge comes from directors"):

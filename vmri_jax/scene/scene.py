@@ -31,7 +31,7 @@ from vmri_jax.scene.rigid import Rigidity
 from vmri_jax.scene.rows import names_of
 from vmri_jax.scene.sorting import Sorting, sort
 from vmri_jax.scene.trees import Branch, check_frames, grow
-from vmri_jax.scene.turns import along_run, check_reach
+from vmri_jax.scene.turns import along_run, check_reach, check_run
 from vmri_jax.scene.velocities import joint_starts, with_rates
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
@@ -274,7 +274,8 @@ class Scene:
             run: of this scene.
 
         Raises:
-            ValueError: the scene has frames without mass, which cannot move by directors.
+            ValueError: the scene has frames without mass, which cannot move by directors; an angle whose turns an effect counts goes beyond 5/6
+                of half a turn, or a limit.
         """
         frames = [body.name for body in self.bodies if isinstance(body, Frame)]
         if frames:
@@ -286,6 +287,7 @@ class Scene:
         bodies = [replace(body, pace="slow") for body in self.bodies]
         effects = [replace(effect, rate="auto") for effect in self.effects]
         twin = replace(self, bodies=bodies, effects=effects, coordinates="directors", joint_starts={})
+        check_run(self.sorting, run, twin.sorting)
         arrays: dict[str, Any] = {}
         for letter, of_body in (("q", run.position), ("p", run.momentum)):
             for part in ("s", "f"):

@@ -111,14 +111,14 @@ def grow(bodies: Bodies, effects: Sequence[Effect], everywhere: bool = True) -> 
     """
     ranks = _ranks(bodies, effects)
     by_parent = _offers(bodies, effects, ranks)
-    branches, trees, deepest = [], {}, {}
+    branches, tree_of, deepest = [], {}, {}
     for root in sorted(by_parent, key=lambda name: (*_root_rank(name, bodies), name)):
         waiting: list[tuple] = [((), 0, (), root, root, None)]
         while waiting:
             _, depth, _, name, tree, branch = heappop(waiting)
-            if name in trees:
+            if name in tree_of:
                 continue
-            trees[name], deepest[tree] = tree, max(depth, deepest.get(tree, 0))
+            tree_of[name], deepest[tree] = tree, max(depth, deepest.get(tree, 0))
             branches += [branch] if branch else []
             for order, names, following in by_parent[name]:
                 # each body on the ground is the root of a tree of its own: the ground does not couple their coordinates
@@ -130,7 +130,7 @@ def grow(bodies: Bodies, effects: Sequence[Effect], everywhere: bool = True) -> 
     return tuple(
         branch
         for branch in branches
-        if (num_loops <= MOST_LOOPS and deepest[trees[branch.child]] <= LONGEST)
+        if (num_loops <= MOST_LOOPS and deepest[tree_of[branch.child]] <= LONGEST)
         or ranks.get((branch.joint.name, branch.element)) == COUNTED
         or any(isinstance(bodies.get(name), Frame) for name in (branch.child, branch.parent))
     )

@@ -4,6 +4,7 @@ The directors of two bodies give the sine and the cosine of the angle between th
 `REACH` alone; along a run turns are counted from one saved node to the next.
 """
 
+from collections.abc import Iterator
 from typing import Any
 
 import jax
@@ -11,7 +12,7 @@ import numpy as np
 
 from vmri_jax.mechanics.arrays import is_concrete
 from vmri_jax.scene.body import moving
-from vmri_jax.scene.effects.freedoms import ANGLES, REACH
+from vmri_jax.scene.effects.freedoms import ANGLES, REACH, Freedom
 from vmri_jax.scene.effects.joint_base import Joint, OfFreedoms, freedom_of
 from vmri_jax.scene.sorting import Sorting
 from vmri_jax.scene.velocities import steps_of
@@ -33,10 +34,10 @@ def along_run(sorting: Sorting, joint: Joint, run: Any, of: str, pair: int) -> n
     if freedom not in ANGLES:
         return np.asarray(value(q))
     angle, rate = map(np.asarray, jax.jvp(value, (q,), ({name: run.velocity(name) for name in q},)))
-    dt, rates = np.diff(run.t), (rate[..., 1:], rate[..., :-1])
-    fastest, steps = np.maximum(*np.abs(rates)), np.diff(np.unwrap(angle))
+    counted, dt, rates = np.unwrap(angle), np.diff(run.t), (rate[..., 1:], rate[..., :-1])
+    fastest, excess = np.maximum(*np.abs(rates)), np.abs(np.diff(counted) - dt * np.mean(rates, axis=0))
     # an angle that moves by a quarter of a turn more or less than both rates say is faster in between
-    unknown = np.argwhere((fastest * dt >= np.pi) | (np.abs(steps - dt * np.mean(rates, axis=0)) >= np.pi / 2))
+    unknown = np.argwhere((fastest * dt >= np.pi) | (excess >= np.pi / 2))
     if unknown.size:
         node = unknown[0, -1]
         raise ValueError(
@@ -45,30 +46,46 @@ def along_run(sorting: Sorting, joint: Joint, run: Any, of: str, pair: int) -> n
             f'{np.pi / 2 / np.nanmax(fastest):.2g} s apart, save_every=..., or give the scene coordinates="joint".'
         )
     turns = np.round((at_start(sorting, joint, pair, freedom) - angle[..., :1]) / (2 * np.pi))
-    return np.unwrap(angle) + 2 * np.pi * turns
+    return counted + 2 * np.pi * turns
 
 
 def check_reach(sorting: Sorting) -> None:
-    """Refuse values of an angle, such as limits and starts, that effects which count turns cannot take from directors."""
+    """Refuse limits, neutral angles and starts that effects which count turns cannot take from directors."""
+    params: dict[str, dict[str, Any]] = {}
+    for effect, i, joint, pair, freedom in _from_directors(sorting):
+        if effect.name not in params:
+            params[effect.name] = effect.parameters(sorting.bodies)
+        for mark in effect.marks:
+            value = params[effect.name][mark]
+            _require_reach(effect, mark, value[i] if np.ndim(value) else value, joint)
+        _require_reach(effect, "the start", at_start(sorting, joint, pair, freedom), joint)
+
+
+def check_run(sorting: Sorting, run: Any, twin: Sorting) -> None:
+    """Refuse a run with angles that effects of the same scene by directors, `twin`, could not take from these."""
+    for effect, _, joint, pair, freedom in _from_directors(twin):
+        angle = np.nanmax(np.abs(along_run(sorting, joint, run, freedom, pair)))
+        _require_reach(effect, "the largest angle of the run", angle, joint)
+
+
+def _from_directors(sorting: Sorting) -> Iterator[tuple[OfFreedoms, int, Joint, int, Freedom]]:
+    """(effect, number of its element, joint, number of its pair, freedom) for all angles that effects which count turns take from directors."""
     joints = {part.effect.name: part.effect for part in sorting.placed if isinstance(part.effect, Joint)}
     for part in sorting.placed:
         effect = part.effect
-        if not (isinstance(effect, OfFreedoms) and effect.counts_turns):
-            continue
-        params = effect.parameters(sorting.bodies)
-        keys = [(i, *key) for i in part.elements for key in effect.freedoms_of(i)]
-        for i, name, pair, freedom in keys:
-            if freedom not in ANGLES or (name, pair, freedom) in sorting.layout.freedoms:
-                continue
-            values = {mark: params[mark][i] if np.ndim(params[mark]) else params[mark] for mark in effect.marks}
-            values["the start"] = at_start(sorting, joints[name], pair, freedom)
-            for quantity, value in values.items():
-                expected = (
-                    f"the angle of {joints[name].label(pair, sorting.bodies)} comes from directors, which know no whole turns, and has to "
-                    f'stay within {REACH:.4g} rad: give the scene coordinates="joint", or where all joints of a loop have such effects '
-                    "leave one of these out"
-                )
-                effect.require(abs(value) < REACH, quantity, value, expected)
+        for i in part.elements if isinstance(effect, OfFreedoms) and effect.counts_turns else ():
+            for name, pair, freedom in effect.freedoms_of(i):
+                if freedom in ANGLES and (name, pair, freedom) not in sorting.layout.freedoms:
+                    yield effect, i, joints[name], pair, freedom
+
+
+def _require_reach(effect: OfFreedoms, quantity: str, value: Any, joint: Joint) -> None:
+    """Refuse an angle of `REACH` or more."""
+    expected = (
+        f"the angle of {joint.name} comes from directors, which know no whole turns, and has to stay within {REACH:.4g} rad: give the scene "
+        'coordinates="joint", or where all joints of a loop have such effects leave one of these out'
+    )
+    effect.require(abs(value) < REACH, quantity, value, expected)
 
 
 def at_start(sorting: Sorting, joint: Joint, pair: int, freedom: str) -> Any:
