@@ -42,6 +42,9 @@ FIRST_MICRO = 5
 MOST_COORDINATES = 60
 """Most coordinates of a system for which a single interval of high degree is tried, and for which resonances are looked up. The matrices of
 both have a row for each coordinate: with 200 of them they take minutes, and schemes with kicks are faster."""
+MOST_GROWTH = 64
+"""Most steps of a run over the steps of the run before. With a larger number a search whose accuracy is out of reach, as with jumps of forces, ends with
+fewer steps than it could take; with a smaller one it repeats runs more often."""
 MANY_STEPS = 100_000
 """Macro steps that short events demand, above which a warning tells of them; a smaller value warns of runs that take less than a second."""
 MOST_REPEATS = 5
@@ -151,7 +154,8 @@ def _accurate(search: Search, best: Trial, accuracy: float) -> Trial:
     for _ in range(MOST_REPEATS):
         if not np.isfinite(best.error):
             break
-        num_steps = _beside_resonances(search, best, max(best.steps_for(AIMED_PART * accuracy, order), fewest))
+        wanted = min(best.steps_for(AIMED_PART * accuracy, order), MOST_GROWTH * best.run.num_steps)
+        num_steps = _beside_resonances(search, best, max(wanted, fewest))
         if num_steps > max(MOST_STEPS, search.fewest_steps(best.run.scheme)):
             break
         before, best = best, search.trial(best.family, best.num_micro, num_steps, best.run.may_fall_back, accuracy)

@@ -91,9 +91,8 @@ def events(system: System, state, t_end: float) -> Events:
 
     def values(t: np.ndarray) -> np.ndarray:
         padded = np.append(t, np.full(-len(t) % chunk, t[-1])).reshape(-1, chunk)
-        return np.nan_to_num(
-            np.concatenate([np.asarray(program(part)) for part in padded])[: len(t)], posinf=0, neginf=0
-        )
+        f = np.concatenate([np.asarray(program(part)) for part in padded])[: len(t)]
+        return f if np.isfinite(f).all() else np.where(np.isfinite(f), f, 0.0)
 
     varying = max(1, np.count_nonzero(np.ptp(values(t_0 + (t_end - t_0) * _unit_times(chunk)), axis=0)))
     t = t_0 + (t_end - t_0) * _unit_times(int(np.clip(MOST_NUMBERS // varying, chunk, SAMPLES)))
