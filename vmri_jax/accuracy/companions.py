@@ -10,9 +10,9 @@ separate them: the first halves H and h, the second halves h alone. With ``r = 2
     half the macro step:        S H^p + F h^p = r (x_{H,h} - x_{H/2,h/2})
     twice the micro steps:              F h^p = r (x_{H,h} - x_{H,h/2})
 
-A pulse of a force in time can last the same in steps of H and of H / 2, and too long or too short in both. In systems that are driven in time, and
-where an estimate is small beyond belief, a third companion takes about 1.6 times the steps, which has few nodes in common with the run;
-the larger estimate of each node counts. Steps with fewer than `NODES_OF_EVENT` nodes in an event of `vmri_jax.mechanics.driving` are not certified
+A jump of a force can act at the same node in steps of H and of H / 2, too early or too late in both. In systems that are driven in time, and where an
+estimate is small beyond belief, a third companion takes about 1.6 times the steps, with few nodes in common with the run, and a fourth one 2.6
+times where forces jump, with the order p = 1; the largest estimate of each node counts. Steps with fewer than `NODES_OF_EVENT` nodes in an event of `vmri_jax.mechanics.driving` are not certified
 from this event on.
 
 This is an estimate, not a bound. If the error falls with an order q below p, as for vibrations that the steps do not resolve, the true error
@@ -21,6 +21,7 @@ which count in part to both shares. The error of a node is *certified* if the es
 all nodes before it are small against the extent of the motion.
 """
 
+import math
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
@@ -51,10 +52,12 @@ LENGTH_TOLERANCE = 0.01
 NODES_OF_EVENT = 4
 """Least nodes of forces, or of moving constraints, in an event. With fewer nodes the errors of a run and its companions say nothing about each
 other; with more of them driven systems take more steps than their accuracy needs."""
-THIRD_PARTS = 1.6
-"""Steps of the third companion over the steps of the run. 1.6 = 8 / 5 has few nodes in common with the steps H and H / 2."""
-FEWEST_DIVIDED = 5
-"""Least number of macro steps that the third companion divides anew, the denominator of `THIRD_PARTS`; with a larger number fewer nodes are compared."""
+FURTHER_PARTS = (1.6, 2.6)
+"""Steps of further companions over the steps of the run, near multiples of the golden ratio: hardly any of their nodes is near a node of the run.
+Forces that jump take both, other driven systems the first one. More companions take longer."""
+FEWEST_DIVIDED = 20
+"""Least number of macro steps between nodes that a further companion has in common with the run. With a smaller number a jump may act at the same
+node in all runs, so that none tells the error; with a larger one fewer nodes are compared."""
 
 
 class UncertifiedWarning(UserWarning):
@@ -120,22 +123,25 @@ def extrapolated(order: int, trajectory: Trajectory, finer: Trajectory) -> np.nd
 def estimated_errors(
     run: Simulation, trajectory: Trajectory, halved: Trajectory, drives: Events, accuracy: float = 0.0
 ) -> np.ndarray:
-    """(k, n_s + n_f) errors of the positions, from the companion with half the macro step, and from a third one if the system is driven or its
-    errors are not believed: below `DOUBTED` of the accuracy. They are infinite if the third companion fails."""
-    halved_errors = extrapolated(run.order, trajectory, halved)
-    if not drives.names and np.abs(halved_errors).max(initial=0.0) > DOUBTED * accuracy:
-        return halved_errors
+    """(k, n_s + n_f) errors of the positions, from the companion with half the macro step, and from further ones if the system is driven or its
+    errors are not believed: below `DOUBTED` of the accuracy. They are infinite if a further companion fails."""
+    order = 1 if drives.jump else run.order
+    result = ratio(order) * (_positions(trajectory) - _positions(halved))
+    if not drives.names and np.abs(result).max(initial=0.0) > DOUBTED * accuracy:
+        return result
     # `whole` macro steps of the run are `parts` steps of the companion, from one compared node to the next, `stride` saved nodes later.
     strides = [s for s in range(1, run.num_saves + 1) if run.num_saves % s == 0]
     stride = next((s for s in strides if s * run.save_every >= FEWEST_DIVIDED), run.num_saves)
     whole = stride * run.save_every
-    parts = max(round(THIRD_PARTS * whole), 3)
-    finer = companion(run, run.scheme, parts, whole)
-    if int(finer.failed_at) >= 0:
-        return np.full_like(halved_errors, np.inf)
-    difference = ratio(run.order, parts / whole) * (_positions(trajectory)[::stride] - _positions(finer))
-    third_errors = np.concatenate([difference[:1], np.repeat(difference[1:], stride, axis=0)])
-    return np.where(np.abs(third_errors) > np.abs(halved_errors), third_errors, halved_errors)
+    for factor in FURTHER_PARTS if drives.jump else FURTHER_PARTS[:1]:
+        parts = next(k for k in range(max(round(factor * whole), 3), 10 * whole + 4) if math.gcd(k, whole) == 1)
+        finer = companion(run, run.scheme, parts, whole)
+        if int(finer.failed_at) >= 0:
+            return np.full_like(result, np.inf)
+        difference = ratio(order, parts / whole) * (_positions(trajectory)[::stride] - _positions(finer))
+        further = np.concatenate([difference[:1], np.repeat(difference[1:], stride, axis=0)])
+        result = np.where(np.abs(further) > np.abs(result), further, result)
+    return result
 
 
 def node_distance(scheme: Scheme | Composition, drives: Events) -> float:

@@ -150,7 +150,7 @@ def with_accuracy(
 
 def _accurate(search: Search, best: Trial, accuracy: float) -> Trial:
     """A trial of the scheme of `best` with an error of at most `accuracy`, or the last trial if `MOST_REPEATS` of them miss it."""
-    fewest, order = 1, float(best.run.order)
+    fewest, order = 1, 1.0 if search.drives.jump else float(best.run.order)
     for _ in range(MOST_REPEATS):
         if not np.isfinite(best.error):
             break
@@ -162,7 +162,7 @@ def _accurate(search: Search, best: Trial, accuracy: float) -> Trial:
         if best.error <= accuracy:
             break
         fewest = best.run.num_steps + 1
-        # Jumps and kinks of a force lower the order: later runs take the order between the last two.
+        # Kinks of a force lower the order: later runs take the order between the last two.
         falls, grows = np.log(before.error / best.error), np.log(best.run.num_steps / before.run.num_steps)
         order = float(np.clip(falls / grows, 1.0, best.run.order)) if grows > 0 else 1.0
     return best

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vmri_jax.accuracy.companions import (
+    FEWEST_DIVIDED,
     certified_nodes,
     companion,
     estimated_errors,
@@ -142,6 +143,7 @@ class Search:
         save_every = -(-num_steps // saves)
         if self.num_saves is None:
             saves = -(-num_steps // save_every)
+            saves = -(-saves // FEWEST_DIVIDED) * FEWEST_DIVIDED if self.drives.names else saves
         return saves * save_every, save_every
 
     def run(self, family: Family, num_micro: int, num_steps: int) -> Simulation:

@@ -26,6 +26,8 @@ LEAST_HEIGHT = 1e-6
 """Least height of an event, as a part of the range of its entry; a smaller value takes round-off for events."""
 REFINEMENTS, PARTS = 3, 16
 """Rounds of refinement about events that last less than `COARSE` samples, and the parts of a refined interval: 16^3 times finer samples."""
+LEAST_JUMP = 1e-3
+"""Change of an entry in a part of 16^3 of a sample, relative to its range, that counts as a jump: smooth pulses change by at most 1 / 16^3."""
 COARSE = 8
 """Samples of an event below which its length is measured again. With fewer samples the length is known less well."""
 GOLDEN = (np.sqrt(5) - 1) / 2
@@ -38,11 +40,13 @@ class Events(NamedTuple):
         names: of the terms that depend on time, see `driven`.
         times: (k,) times of the turning points.
         lengths: (k,) how long the events last, in the unit of time.
+        jump: whether an entry jumps.
     """
 
     names: tuple[str, ...] = ()
     times: np.ndarray = np.zeros(0)
     lengths: np.ndarray = np.zeros(0)
+    jump: bool = False
 
     @property
     def shortest(self) -> float:
@@ -97,18 +101,38 @@ def events(system: System, state, t_end: float) -> Events:
     varying = max(1, np.count_nonzero(np.ptp(values(t_0 + (t_end - t_0) * _unit_times(chunk)), axis=0)))
     t = t_0 + (t_end - t_0) * _unit_times(int(np.clip(MOST_NUMBERS // varying, chunk, SAMPLES)))
     f, distance = values(t), (t_end - t_0) / len(t)
+    jump = _jumps(values, t, f)
     for _ in range(REFINEMENTS):
-        drives = _events(names, t, f)
+        drives = _events(names, t, f, jump)
         if drives.shortest > COARSE * distance:
             return drives
-        distance /= PARTS
         # Insert times where neighbouring samples differ most.
-        change = (np.abs(np.diff(f, axis=0)) / np.maximum(np.ptp(f, axis=0), np.finfo(float).tiny)).max(axis=1)
-        parted = np.argpartition(change, -(chunk // PARTS))[-(chunk // PARTS) :]
+        distance /= PARTS
+        parted = _steepest(f, chunk // PARTS)
         new = (t[parted, None] + np.diff(t)[parted, None] * np.arange(1, PARTS) / PARTS).reshape(-1)
         order = np.argsort(np.append(t, new), kind="stable")
         t, f = np.append(t, new)[order], np.concatenate([f, values(new)])[order]
-    return _events(names, t, f)
+    return _events(names, t, f, jump)
+
+
+def _steepest(f: np.ndarray, num: int) -> np.ndarray:
+    """(num,) the intervals in which an entry of f (k, m) changes most, relative to its range."""
+    change = (np.abs(np.diff(f, axis=0)) / np.maximum(np.ptp(f, axis=0), np.finfo(float).tiny)).max(axis=1)
+    return np.argpartition(change, -num)[-num:]
+
+
+def _jumps(values, t: np.ndarray, f: np.ndarray) -> bool:
+    """Whether an entry changes by more than `LEAST_JUMP` of its range in the 16^3-th part of one of the steepest intervals."""
+    steepest, span = _steepest(f, PARTS), np.maximum(np.ptp(f, axis=0), np.finfo(float).tiny)
+    begin, end, change = t[steepest], t[steepest + 1], np.abs(np.diff(f, axis=0)[steepest] / span).max(initial=0.0)
+    for _ in range(REFINEMENTS):
+        if change < LEAST_JUMP:
+            return False
+        times = np.linspace(begin, end, PARTS + 1)  # (PARTS + 1, intervals)
+        changes = (np.abs(np.diff(values(times.reshape(-1)).reshape(*times.shape, -1), axis=0)) / span).max(axis=2)
+        part, interval = changes.argmax(axis=0), np.arange(times.shape[1])
+        begin, end, change = times[part, interval], times[part + 1, interval], changes.max()
+    return bool(change >= LEAST_JUMP)
 
 
 @partial(jax.jit, static_argnames="names")
@@ -145,12 +169,12 @@ def _unit_times(num: int) -> np.ndarray:
     return times
 
 
-def _events(names: tuple[str, ...], t: np.ndarray, f: np.ndarray) -> Events:
+def _events(names: tuple[str, ...], t: np.ndarray, f: np.ndarray, jump: bool) -> Events:
     """The events of all entries f (k, m) at times t (k,)."""
     pairs = [(np.zeros(0), np.zeros(0)), *(_events_of(t, entry) for entry in f.T if np.ptp(entry) > 0)]
     times, lengths = map(np.concatenate, zip(*pairs, strict=True))
     order = np.argsort(times)
-    return Events(names, times[order], lengths[order])
+    return Events(names, times[order], lengths[order], jump)
 
 
 def _events_of(t: np.ndarray, f: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
