@@ -32,6 +32,7 @@ from vmri_jax.running.progress import Working
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes.scheme import Scheme, fully_explicit, fully_implicit
 from vmri_jax.stability import advise
+from vmri_jax.stability.drive import drive_period
 from vmri_jax.stability.linear import small_motions
 from vmri_jax.steppers import solvers
 
@@ -193,7 +194,7 @@ class Resolved:
 
 
 def resolved(problem: Problem) -> Resolved:
-    """A problem with five micro steps of ``omega h = 0.2`` for its largest frequency at the start.
+    """A problem with five micro steps of ``omega h = 0.2`` for its largest frequency at the start, or for the frequency of its drive if larger.
 
     If nothing vibrates, ``omega = max(|q'| / |q|, sqrt(|q''| / |q|))``, the rate at which positions change by their size.
     """
@@ -206,6 +207,7 @@ def resolved(problem: Problem) -> Resolved:
         size = max(np.abs(q).max(), 1e-300)
         velocity, acceleration = (np.abs(np.diff(q, k, axis=0)).max() / dt**k for k in (1, 2))
         omega = float(max(velocity / size, np.sqrt(acceleration / size), 1e-3))
+    omega = max(omega, 2 * np.pi / (drive_period(problem.system, state, 1 / omega) or np.inf))
     return Resolved(problem, fully_implicit(NUM_MICRO), NUM_MICRO * PHASE / omega, omega)
 
 

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.mechanics.system import label
 from vmri_jax.running.origin import names_of
@@ -122,17 +121,9 @@ class Advice(ResultTable):
 
     def content(self) -> dict[str, Any]:
         """Findings, windows and frequencies."""
-        return {
-            "verdict": self.verdict,
-            "macro_dt": self.macro_dt,
-            "growth": self.growth,
-            "safe_macro_dt": self.safe_macro_dt,
-            "scanned": self.scanned,
-            "windows": [window._asdict() for window in self.windows],
-            "fast_frequencies": self.fast_frequencies.tolist(),
-            "slow_frequencies": self.slow_frequencies.tolist(),
-            **super().content(),
-        }
+        fields = {name: value for name, value in vars(self).items() if name != "findings"}
+        windows = [window._asdict() for window in self.windows]
+        return {"verdict": self.verdict, **fields, "windows": windows, **super().content()}
 
     caption = verdict
 
@@ -239,7 +230,7 @@ def _judged_at_rest(motions: SmallMotions, scheme, macro_dt: float, tolerance: f
     if swap is not None:
         findings.append(Finding("warning", "labels", *swap))
     rate = float(np.real(motions.growing).max(initial=0.0))
-    if motions.frozen and (rate or step_findings):
+    if motions.frozen and (rate or step_findings or motions.driven):
         findings.append(Finding("note", "motion", motions.frozen, 0.0))
     elif rate:
         sentence = f"Motion about this state grows by itself, like exp({rate:.3g} t); that is left out of the growth that is measured."

@@ -4,6 +4,7 @@ Disturbances of a motion under a periodic drive are multiplied by the monodromy 
 multipliers of M lie on the unit circle or inside. A run with macro steps H has a matrix of its own, the product of N steps with ``N H = m T``.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import partial
@@ -20,7 +21,7 @@ from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
 from vmri_jax.schemes.composition import Composition, stage_scheme
 from vmri_jax.schemes.scheme import Scheme
-from vmri_jax.stability.monodromy import Monodromy, monodromy
+from vmri_jax.stability.monodromy import monodromy
 
 SAMPLES = 1024
 """Times at which the drive is compared with itself, one period later or earlier; with fewer of them narrow pulses are missed."""
@@ -85,31 +86,30 @@ def drive_period(system: System, state: State, scale: float) -> float | None:
     start, random = float(state.t), np.random.default_rng(0)
     for span in scale * SPANS:
         step, times = span / SAMPLES, start + np.arange(SAMPLES) * span / SAMPLES
-        values = np.asarray(_drive(system, state, times)[0])
-        amplitude = np.ptp(values, axis=0)
-        moving = np.isfinite(amplitude) & (amplitude > 1e-9 * np.abs(values).max(axis=0))
-        # One signal of all terms, each in units of its amplitude, with weights by which no two of them cancel.
-        weights = np.where(moving, np.cos(1.0 + np.arange(moving.size)), 0.0) / np.where(moving, amplitude, 1.0)
-
-        def difference(lag, times, weights=weights):
-            """Differences of the signal from itself a lag later, and their rates of change with the lag."""
-            (before, _), (after, rate) = (_drive(system, state, t) for t in (times, times + lag))
-            return (np.asarray(after) - np.asarray(before)) @ weights, np.nan_to_num(rate) @ weights
-
-        def is_period(lag, times=start + 16 * span * random.random(SAMPLES), difference=difference):
-            return np.abs(difference(lag, times)[0]).max() < SAME
-
-        signal = np.nan_to_num(values) @ weights
-        windows = np.lib.stride_tricks.sliding_window_view(signal, SAMPLES // 2)
+        signal = _signal(system, state, times)
+        before, anywhere = signal(times)[0], start + 16 * span * random.random(SAMPLES)
+        windows = np.lib.stride_tricks.sliding_window_view(before, SAMPLES // 2)
         apart = np.square(windows - windows[0]).mean(axis=1)
         lowest = (apart[1:-1] <= apart[:-2]) & (apart[1:-1] < apart[2:]) & (apart[1:-1] < 0.1 * apart.max())
         for lag in step * (1 + np.flatnonzero(lowest)[:CANDIDATES]):
-            for _ in range(6):  # Gauss and Newton
-                residual, rate = difference(lag, times)
-                lag -= residual @ rate / max(rate @ rate, 1e-300)
-            if lag > step and is_period(lag):
-                return float(next((lag / n for n in (6, 4, 3, 2) if is_period(lag / n)), lag))
+            for _ in range(6):  # Gauss and Newton: the lag with the least sum of squares
+                after, rate = signal(times + lag)
+                lag -= (after - before) @ rate / max(rate @ rate, 1e-300)
+            later = anywhere + lag * random.integers(1, 1000, (5, SAMPLES)) / np.array([[6], [4], [3], [2], [1]])
+            apart = [np.abs(signal(t)[0] - signal(anywhere)[0]).max() for t in later]
+            if lag > step and apart[-1] < SAME:
+                return float(next(lag / n for n, most in zip((6, 4, 3, 2, 1), apart, strict=True) if most < SAME))
     return None
+
+
+def _signal(system: System, state: State, times: np.ndarray) -> Callable[[np.ndarray], tuple]:
+    """One function of times (k,) for all terms, each in units of its amplitude at the given times, and its rate of change, (k,) both."""
+    values = np.nan_to_num(_drive(system, state, times)[0], posinf=0.0, neginf=0.0)
+    amplitude = np.ptp(values, axis=0)
+    moves = amplitude > 1e-9 * np.abs(values).max(axis=0)
+    # weights by which no two terms cancel
+    weights = np.where(moves, np.cos(1.0 + np.arange(moves.size)), 0.0) / np.where(moves, amplitude, 1.0)
+    return lambda times: tuple(np.nan_to_num(part) @ weights for part in _drive(system, state, times))
 
 
 @quickly_compiled
@@ -138,36 +138,29 @@ def growth_of_run(system: System, scheme: Scheme | Composition, state: State, ma
         product = monodromy(system, scheme, state, macro_dt=macro_dt, num_steps=steps)
     except RuntimeError:
         return np.inf
-    return _growth(product, steps * macro_dt / period)
-
-
-def _growth(product: Monodromy, periods: float) -> float:
-    """Growth per period of the largest multiplier."""
     if not np.isfinite(product.matrix).all():
         return np.inf
-    with np.errstate(over="ignore"):
-        growth = np.abs(product.multipliers).max(initial=0.0) ** (1 / periods) - 1
-    return float(growth) if growth > LEAST_GROWTH else 0.0
+    growth = float(np.abs(product.multipliers).max(initial=0.0) ** (period / (steps * macro_dt)) - 1)
+    return growth if growth > LEAST_GROWTH else 0.0
 
 
 def driven_motion(
     system: System, scheme: Scheme | Composition, state: State, macro_dt: float, period: float
 ) -> DrivenMotion:
     """The growth over a period of the drive, from steps of T/n, which are halved until two of them agree."""
-    n, tried, motion = max(1, int(np.ceil(period / macro_dt - 1e-6))), {}, None
-    micro = stage_scheme(scheme).num_micro
-    while n <= MOST_STEPS and motion is None:
-        growth = tried[period / n] = growth_of_run(system, scheme, state, period / n, period)
-        before = tried.get(2 * period / n, np.inf)
-        if n * micro >= CONVERGED_STEPS and abs(growth - before) <= 0.1 * growth < np.inf:
-            motion = growth
+    n, micro, tried = max(1, int(np.ceil(period / macro_dt - 1e-6))), stage_scheme(scheme).num_micro, {}
+    while True:
+        dt = period / n
+        growth = tried[dt] = growth_of_run(system, scheme, state, dt, period)
+        if n * micro >= CONVERGED_STEPS and abs(growth - tried.get(2 * dt, np.inf)) <= 0.1 * growth < np.inf:
+            break
         n *= 2
-    if motion is None:
-        return DrivenMotion(period, np.nan, True, ())
-    product = monodromy(system, scheme, state, macro_dt=2 * period / n, num_steps=n // 2)
-    again = monodromy(system, scheme, product.end, macro_dt=2 * period / n, num_steps=n // 2)
-    traces = [np.trace(m.start_basis @ m.end_basis.T @ m.matrix) for m in (product, again)]
-    repeats = bool(abs(traces[1] - traces[0]) < 1e-6 * max(abs(traces[0]), len(product.matrix)))
-    found = DrivenMotion(period, motion, repeats, ())
-    steps = [dt for dt, growth in tried.items() if found.agrees(growth) and period / dt * micro >= LEAST_STEPS]
-    return replace(found, steps=tuple(steps))
+        if n > MOST_STEPS:
+            return DrivenMotion(period, np.nan, True, ())
+    once = monodromy(system, scheme, state, macro_dt=dt, num_steps=n)
+    again = monodromy(system, scheme, once.end, macro_dt=dt, num_steps=n)
+    first, second = (np.sum(product.multipliers) for product in (once, again))
+    repeats = bool(abs(second - first) < 1e-6 * max(abs(first), len(once.matrix)))
+    motion = DrivenMotion(period, growth, repeats, ())
+    steps = [dt for dt, growth in tried.items() if motion.agrees(growth) and period / dt * micro >= LEAST_STEPS]
+    return replace(motion, steps=tuple(steps))

@@ -73,8 +73,8 @@ class SmallMotions:
     damping: (d, d) matrix of the velocities, gyroscopic and dissipative.
     slow_force: (d,) force of V at the state, which is constant in the expansion.
     rest: the state of zero displacement and momentum of the expansion.
-    frozen: why the expansion does not tell whether the motion is stable, in sentences: terms that depend on time, or a state that is no
-        equilibrium; empty at an equilibrium.
+    driven: names of the terms that depend on time.
+    moves: whether the state is no equilibrium.
     """
 
     system: System
@@ -86,7 +86,8 @@ class SmallMotions:
     damping: np.ndarray
     slow_force: np.ndarray
     rest: State
-    frozen: str = ""
+    driven: tuple[str, ...] = ()
+    moves: bool = False
 
     @cached_property
     def rates(self) -> np.ndarray:
@@ -99,6 +100,22 @@ class SmallMotions:
     def growing(self) -> np.ndarray:
         """The rates of motions of the expansion that grow, whatever the scheme."""
         return self.rates[np.real(self.rates) > LEAST_GROWTH * np.abs(self.rates).max(initial=0.0)]
+
+    @property
+    def frozen(self) -> str:
+        """Why the expansion does not tell whether the motion is stable, in sentences; empty at an equilibrium."""
+        if self.driven:
+            terms = f"{' and the '.join(self.driven)} depend{'s' if len(self.driven) == 1 else ''}".replace("_", " ")
+            return (
+                f"The {terms} on time: the motion is linearised at t = {float(self.rest.t):.4g} alone, as if time stood still there. Whether "
+                "it is stable, a run over many periods of the drive decides."
+            )
+        if self.moves:
+            return (
+                "The state is no equilibrium: the motion is linearised there as if constant forces held it at rest. Whether it is stable, its "
+                "multipliers over a period decide, vm.stability.monodromy(..., num_steps=...), or a long run."
+            )
+        return ""
 
     def frequencies(self, name: str) -> np.ndarray:
         """(d,) frequencies of a single potential, a key of `hessians`, the largest first; zero where it is not convex."""
@@ -182,9 +199,7 @@ def small_motions(system: Movable, state: State | None = None) -> SmallMotions:
         read=np.block([[shapes.T @ mass, zero.T], [zero.T, shapes.T]]),
         hessians={
             name: reduced(hessian)
-            for name, hessian in (
-                hessians | {"slow": terms["slow"] + slow_bending, "force": -terms["force_q"]}
-            ).items()
+            for name, hessian in (hessians | {"slow": terms["slow"] + slow_bending, "force": -terms["force_q"]}).items()
         },
         stiffness=reduced(potentials + bending - terms["kinetic"][:n, :n] - terms["force_q"]),
         damping=gyroscopic - gyroscopic.T - reduced(terms["force_v"]),
@@ -194,23 +209,7 @@ def small_motions(system: Movable, state: State | None = None) -> SmallMotions:
     q, v = (np.sqrt(np.abs(x @ mass @ x)) for x in (np.concatenate([state.q_s, state.q_f]), terms["velocity"]))
     omega, acceleration = np.abs(motions.rates).max(initial=0.0), np.linalg.norm(shapes.T @ terms["impetus"])
     moves = v > LEAST_MOTION * omega * q or acceleration > LEAST_MOTION * omega**2 * q
-    return replace(motions, frozen=_frozen(driven(system, state), float(state.t), moves))
-
-
-def _frozen(terms: tuple[str, ...], t: float, moves) -> str:
-    """`SmallMotions.frozen` of a system whose `terms` depend on time."""
-    if terms:
-        names = f"The {' and the '.join(terms)} depend{'s' if len(terms) == 1 else ''} on time".replace("_", " ")
-        return (
-            f"{names}: the motion is linearised at t = {t:.4g} alone, as if time stood still there. Whether it is stable, a run over many "
-            "periods of the drive decides."
-        )
-    if moves:
-        return (
-            "The state is no equilibrium: the motion is linearised there as if constant forces held it at rest. Whether it is stable, its "
-            "multipliers over a period decide, vm.stability.monodromy(..., num_steps=...), or a long run."
-        )
-    return ""
+    return replace(motions, driven=driven(system, state), moves=bool(moves))
 
 
 def _shapes(mass: np.ndarray, jacobian: np.ndarray) -> np.ndarray:

@@ -96,7 +96,7 @@ class StabilityMap(ResultTable):
 
     def content(self) -> dict[str, Any]:
         """All fields, for `to_json`."""
-        return asdict(self) | {"omega_H": self.omega_H.tolist(), "radius": self.radius.tolist()}
+        return asdict(self)
 
 
 def stability_map(

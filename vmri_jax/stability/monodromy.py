@@ -92,4 +92,3 @@ def monodromy(
         closure=float(np.linalg.norm(last - first) / max(np.linalg.norm(first), np.linalg.norm(last), 1e-300)),
         symplectic_defect=float(np.abs(defect).max() / max(1.0, np.abs(M).max() ** 2)),
     )
-

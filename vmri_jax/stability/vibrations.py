@@ -98,12 +98,12 @@ def vibrations(system: Movable, state: State | None = None) -> Vibrations:
         largest = {labels[i]: float(parts[i]) for i in np.argsort(-parts)}
         period = 2 * np.pi / frequency if frequency > 0 else np.inf
         rows.append(Vibration(frequency, period, float(parts[n_s:].sum()), largest))
-    rate, note = float(np.real(motions.growing).max(initial=0.0)), motions.frozen
-    if note:
-        rate, step = 0.0, 1 / max(np.abs(motions.rates).max(initial=0.0), 1e-300)
+    rate, note = float(np.real(motions.growing).max(initial=0.0)), ""
+    if motions.frozen and (rate or motions.driven):
+        rate, note, step = 0.0, motions.frozen, 1 / max(np.abs(motions.rates).max(initial=0.0), 1e-300)
         if (period := drive_period(system, state, step)) is not None:
             motion = driven_motion(system, fully_implicit(1), state, step, period)
-            rate, note = float(np.log1p(motion.growth) / period), f"{note.split('. Whether')[0]}. {motion}"
+            rate, note = float(np.log1p(motion.growth) / period), f"{note.split(' Whether')[0]} {motion}"
     elif rate:
         note = f"Motion about this state grows by itself, like exp({rate:.3g} t)."
     return Vibrations(tuple(rows), rate, note)
