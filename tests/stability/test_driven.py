@@ -101,7 +101,7 @@ def test_a_drive_without_a_period_is_said_to_be_frozen():
     problem = driven_by([0.0, 0.0], [0.0, 0.0], pulse=1.0)
     advice = vm.advise(problem, vm.fully_explicit(1), macro_dt=0.1)
     assert "The force depends on time: the motion is linearised at t = 0 alone" in str(advice)
-    assert "stable for small motions about this state, held there as if it were an equilibrium" in advice.verdict
+    assert "stable for small motions about this state, held at rest" in advice.verdict
 
 
 def test_disturbances_of_a_linear_system_repeat_themselves():

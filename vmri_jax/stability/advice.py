@@ -44,8 +44,6 @@ LEAST_FORCE = 1e-6
 """Smallest part of the constant slow force in a vibration for which its kicks are judged; a smaller value warns of round-off."""
 MOST_SCANS = 5
 """Most scans, each over smaller steps than the previous one, until one of them contains a safe step."""
-AT_REST = "for small motions about this state"
-"""Motions that are judged at an equilibrium."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +73,7 @@ class Advice(ResultTable):
     windows: unstable intervals of macro_dt in the range `scanned`.
     scanned: least and largest macro step of all scans.
     safe_macro_dt: the stable step nearest to macro_dt without a near window, macro_dt itself if it is such a step; NaN if no scan has one. Of a
-        system with a periodic drive a part of the period.
+        periodic drive a part of the period.
     fast_frequencies, slow_frequencies: (d,) frequencies of the fast and of the slow potential at the state, the largest first.
     about: the motions that are judged, in words.
     """
@@ -109,15 +107,12 @@ class Advice(ResultTable):
             return f"macro_dt = {self.macro_dt:.6g} is {state} {self.about}."
         driven = any(finding.kind == "drive" for finding in self.findings)
         state = "unstable" if self.growth else "too long for the drive" if driven else "close to an instability"
-        where = f" {self.about}" if self.growth and self.about != AT_REST else ""
+        nearest = f"the nearest safe step is {self.safe_macro_dt:.6g}"
         if np.isnan(self.safe_macro_dt):
-            return f"macro_dt = {self.macro_dt:.6g} is {state}{where}, and no safe step was found; take another scheme."
-        return f"macro_dt = {self.macro_dt:.6g} is {state}{where}; the nearest safe step is {self.safe_macro_dt:.6g}."
+            nearest = "no safe step was found, take another scheme"
+        return f"macro_dt = {self.macro_dt:.6g} is {state}{f' {self.about}' if self.growth else ''}; {nearest}."
 
-    @property
-    def rows(self) -> tuple[Finding, ...]:
-        """The findings."""
-        return self.findings
+    rows = property(lambda self: self.findings, doc="The findings.")
 
     def content(self) -> dict[str, Any]:
         """Findings, windows and frequencies."""
@@ -128,8 +123,7 @@ class Advice(ResultTable):
     caption = verdict
 
     def __str__(self) -> str:
-        lines = [f"{f.severity}: {f.kind}: {f.sentence}" for f in self.findings]
-        return "\n".join([*lines, self.verdict])
+        return "\n".join([*(f"{f.severity}: {f.kind}: {f.sentence}" for f in self.findings), self.verdict])
 
 
 def advise(
@@ -142,9 +136,9 @@ def advise(
 ) -> Advice:
     """Judge a macro step before a long run, from the multipliers of the step of small motions about the state.
 
-    Under a periodic drive, from the multipliers of the run and of the motion over a period of it (see `drive_period`). Elsewhere instability is
-    measured, too: the derivative of the step of the frozen problem (see `small_motions`) has
-    a multiplier outside the unit circle, at macro_dt or in a window of steps near it. Formulas only name the cause:
+    Under a periodic drive: from the multipliers of the run and of the motion over a period. Elsewhere instability is measured, too: the
+    derivative of the step of the frozen problem (see `small_motions`) has a multiplier outside the unit circle, at macro_dt or in a window of
+    steps near it. Formulas only name the cause:
 
     * stability limit: the step is unstable for the fast or the slow potential alone; ``omega h`` or ``omega H`` exceeds
       the limit of its quadrature rule (2 for kicks at the ends);
@@ -176,15 +170,14 @@ def advise(
         raise ValueError(f"advise: macro_dt is {macro_dt}; it must be a positive number.")
     macro_dt, motions = float(macro_dt), small_motions(system, state)
     period = drive_period(system, state, macro_dt)
-    judged = (
-        _judged_at_rest(motions, scheme, macro_dt, tolerance, names)
-        if period is None
-        else _judged_over_a_period(system, scheme, state, macro_dt, period)
-    )
-    judged["findings"] += list(_stages(scheme))
-    judged["findings"].sort(key=lambda finding: ("error", "warning", "note").index(finding.severity))
+    if period is None:
+        judged = _judged_at_rest(motions, scheme, macro_dt, tolerance, names)
+    else:
+        judged = _judged_over_a_period(system, scheme, state, macro_dt, period)
+    findings = [*judged.pop("findings"), *_stages(scheme)]
+    judged["findings"] = tuple(sorted(findings, key=lambda f: ("error", "warning", "note").index(f.severity)))
     frequencies = {f"{name}_frequencies": motions.frequencies(name) for name in ("fast", "slow")}
-    return Advice(macro_dt=macro_dt, **judged | {"findings": tuple(judged["findings"])}, **frequencies)
+    return Advice(macro_dt=macro_dt, **judged, **frequencies)
 
 
 def _judged_over_a_period(system, scheme, state: State, macro_dt: float, period: float) -> dict[str, Any]:
@@ -195,9 +188,8 @@ def _judged_over_a_period(system, scheme, state: State, macro_dt: float, period:
     per_step = float(np.expm1(np.log1p(growth) * macro_dt / period))
     findings = [Finding("note", "motion", str(motion), np.log1p(motion.growth) / period)]
     if not fits:
-        severity = "error" if growth > motion.growth else "warning"
         sentence = f"In a run with this step disturbances {in_words(growth)} in a period of the drive."
-        findings.append(Finding(severity, "drive", sentence, per_step))
+        findings.append(Finding("error" if growth > motion.growth else "warning", "drive", sentence, per_step))
     if steps < LEAST_STEPS:
         sentence = f"A period of the drive, {period:.4g}, has {steps:.2g} micro steps; take at least {LEAST_STEPS}."
         findings.append(Finding("warning", "drive", sentence, steps))
@@ -215,8 +207,8 @@ def _judged_at_rest(motions: SmallMotions, scheme, macro_dt: float, tolerance: f
     """Fields of the `Advice` from the multipliers of a step of small motions, at macro_dt and at steps near it."""
     lower, upper = SCANNED_STEPS[0] * macro_dt, SCANNED_STEPS[1] * macro_dt
     windows = _scan(motions, scheme, lower, upper, macro_dt, tolerance)
-    radius = float(multipliers(motions, scheme, [macro_dt]).radius[0])
-    growth = radius - 1 if radius > 1 + tolerance else 0.0
+    growth = float(multipliers(motions, scheme, [macro_dt]).radius[0]) - 1
+    growth = growth if growth > tolerance else 0.0
     step_findings = list(_step_findings(motions, scheme, macro_dt, growth, windows))
     safe = macro_dt
     for _ in range(MOST_SCANS if step_findings else 0):
@@ -226,8 +218,7 @@ def _judged_at_rest(motions: SmallMotions, scheme, macro_dt: float, tolerance: f
         upper, lower = lower, lower / 3
         windows = _scan(motions, scheme, lower, upper, upper, tolerance) + windows
     findings = [*step_findings, *_kicks_in_phase(motions, scheme, macro_dt)]
-    swap = swapped(motions, names)
-    if swap is not None:
+    if (swap := swapped(motions, names)) is not None:
         findings.append(Finding("warning", "labels", *swap))
     rate = float(np.real(motions.growing).max(initial=0.0))
     if motions.frozen and (rate or step_findings or motions.driven):
@@ -241,7 +232,7 @@ def _judged_at_rest(motions: SmallMotions, scheme, macro_dt: float, tolerance: f
         "windows": tuple(windows),
         "scanned": (lower, SCANNED_STEPS[1] * macro_dt),
         "safe_macro_dt": safe,
-        "about": AT_REST + (", held there as if it were an equilibrium" if motions.frozen else ""),
+        "about": "for small motions about this state" + (", held at rest" if motions.frozen else ""),
     }
 
 
