@@ -103,7 +103,7 @@ def simulate(
         if int(trajectory.failed_at) < 0:
             for concern in trajectory.concerns():
                 warnings.warn(type(concern)(f"simulate: {concern}"), stacklevel=2)
-            return with_error(run, trajectory, of, shares=error, halved=best.halved)
+            return with_error(run, trajectory, of, shares=error, trial=(best.halved, best.errors))
         if throw:
             raise simulation_error(trajectory, run.macro_dt, run.save_every, run.scheme.num_micro)
         return trajectory

@@ -17,7 +17,7 @@ from vmri_jax.control.transcription import Transcription
 from vmri_jax.mechanics.arrays import whole_number
 from vmri_jax.mechanics.checks import check_number
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
-from vmri_jax.running.observables import observables
+from vmri_jax.running.observables import observables, with_tolerance
 from vmri_jax.running.origin import Origin, names_of
 from vmri_jax.running.progress import ShowsProgress, progress_to
 from vmri_jax.running.trajectory import Run, RunInfo, Trajectory, trajectory_of, with_origin
@@ -154,7 +154,7 @@ def _trajectory(setup: Transcription, z, status: StepStatus) -> Trajectory:
     """The run with nodes z (N, n) after the start."""
     count = len(z)
     nodes = jax.vmap(setup.state)(jnp.concatenate([setup.z_start[None], z]), jnp.arange(count + 1))
-    table = jax.jit(jax.vmap(partial(observables, setup.system)))(nodes)
+    table = jax.jit(jax.vmap(partial(observables, setup.system)))(with_tolerance(nodes, 0.0))
     failed = np.flatnonzero(np.asarray(status.result) > Result.CONVERGED_AT_ROUNDOFF)
     run = Run(
         nodes,

@@ -18,7 +18,7 @@ from vmri_jax.mechanics.arrays import Numbers, options_of_runs
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.loops import MOST_STORED_STEPS, PLAIN, Loops, Recursive, Stored
-from vmri_jax.running.observables import observables
+from vmri_jax.running.observables import observables, with_tolerance
 from vmri_jax.running.saved import Saved
 from vmri_jax.running.trajectory import MicroNodes, Run, RunInfo
 from vmri_jax.schemes.composition import Composition
@@ -88,7 +88,7 @@ class Engine:
 
     @cached_property
     def whole(self):
-        """``whole(arrays, save_every, saves)``: a run from its first step, as the arrays of its `Run`, and its `Observables` (k, 8).
+        """``whole(arrays, save_every, saves)``: a run from its first step, as the arrays of its `Run`, and its `Observables` (k, 9).
 
         Only the first `saves` of the saved intervals are computed. A call of a prepared run is short: observables of a program of their own would add
         a third to it.
@@ -96,7 +96,8 @@ class Engine:
 
         def whole(arrays: Arrays, *counts):
             run = self.run(arrays, *counts)
-            return jax.tree.leaves(run), jax.vmap(partial(observables, self.model(arrays.model).system))(run.states)
+            nodes = with_tolerance(run.states, self.model(arrays.model).solver.tolerance)
+            return jax.tree.leaves(run), jax.vmap(partial(observables, self.model(arrays.model).system))(nodes)
 
         return jax.jit(whole, compiler_options=options_of_runs())
 

@@ -5,14 +5,15 @@ and lengths (`evaluated`), in prepared and traced runs as a part of their progra
 its domain, `concerns` says what is wrong with the motion of a run whose steps all succeeded.
 """
 
-from typing import NamedTuple
+from functools import partial
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from vmri_jax.kernels import max_abs
 from vmri_jax.mechanics.arrays import Numbers, library
+from vmri_jax.mechanics.constraints import are_kept
 from vmri_jax.mechanics.invariants import constraint_residual, energy_parts, velocity_and_masses
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
@@ -63,7 +64,7 @@ class Observables(NamedTuple):
 
     energy: Hamiltonian.
     position, velocity: largest |g| and largest |G v + dg/dt|, implied rows included.
-    solved: largest |g| without the implied rows.
+    solved, implied: 1 where the rows that are solved for, and the implied rows, are kept, see `are_kept`; else 0.
     kinetic: ``p . v - T``.
     terms: ``|T| + |V| + |W| + sum_i |V_i|``.
     rounding: ``q . M q / 2``, whose part eps^2 / H^2 is the kinetic energy of velocities that come from round-off of the positions.
@@ -74,6 +75,7 @@ class Observables(NamedTuple):
     position: Float[Numbers, "*k"]
     velocity: Float[Numbers, "*k"]
     solved: Float[Numbers, "*k"]
+    implied: Float[Numbers, "*k"]
     kinetic: Float[Numbers, "*k"]
     terms: Float[Numbers, "*k"]
     rounding: Float[Numbers, "*k"]
@@ -81,33 +83,47 @@ class Observables(NamedTuple):
 
     @classmethod
     def of(cls, table) -> "Observables":
-        """The columns of a table (..., k, 8)."""
+        """The columns of a table (..., k, 9)."""
         return cls(*(table[..., i] for i in range(len(cls._fields))))
 
     def so_far(self) -> np.ndarray:
-        """(1, 8) the energy of the first node of a run, and the largest of all other columns: a node in place of all nodes."""
+        """(1, 9) the energy of the first node of a run, and the largest of all other columns: a node in place of all nodes."""
         return np.array([[self.energy[0], *(column.max() for column in self[1:-1]), self.volume[-1]]])
 
 
-def observables(system: System, state: State):
-    """The `Observables` of a state, as an array (8,)."""
+def observables(system: System, node: tuple[State, Any]):
+    """The `Observables` of a state, as an array (9,).
+
+    Args:
+        node: the state, and the tolerance of the solver.
+    """
+    state, tolerance = node
     phase = state.q_s, state.q_f, state.p_s, state.p_f
     velocities, masses = velocity_and_masses(system, *phase)
     parts = list(energy_parts(system, *phase, velocities).values())
     position, rate = constraint_residual(system, state, velocities)
-    solved = position
-    if system.implied is not None:
-        solved = max_abs(system.constraints(state.t, state.q_s, state.q_f))
     if masses is None:
         rounding, volume = system.kinetic(state.q_s, state.q_f, state.q_s, state.q_f, system.params), 0.0
     else:
         q = jnp.concatenate([state.q_s, state.q_f])
         rounding, volume = q @ masses @ q / 2, 2 * jnp.sum(jnp.log(jnp.diagonal(jnp.linalg.cholesky(masses))))
-    terms = sum(map(jnp.abs, parts))
-    return jnp.stack([*map(jnp.asarray, (sum(parts), position, rate, solved, parts[0], terms, rounding, volume))])
+    terms, kept = sum(map(jnp.abs, parts)), are_kept(system, state, tolerance)
+    return jnp.stack(
+        [
+            *map(
+                partial(jnp.asarray, dtype=float),
+                (sum(parts), position, rate, *kept, parts[0], terms, rounding, volume),
+            )
+        ]
+    )
 
 
-def failures(run, table, allowed, save_every: int, step: int = 0):
+def with_tolerance(states: State, tolerance) -> tuple[State, Any]:
+    """The arguments of `observables` at all nodes; one tolerance for all."""
+    return states, library((states, tolerance)).broadcast_to(tolerance, states.t.shape)
+
+
+def failures(run, table, save_every: int, step: int = 0):
     """A run, or a batch of runs, whose nodes from its failure on are NaN; a node that cannot be right is a failure.
 
     A node may be wrong although its steps succeeded, for four reasons: the energy is not finite although its gradient is (a logarithm beyond its pole);
@@ -116,8 +132,7 @@ def failures(run, table, allowed, save_every: int, step: int = 0):
 
     Args:
         run: a `Run`.
-        table: its `Observables` (..., k, 8).
-        allowed: largest residual of the constraints.
+        table: its `Observables` (..., k, 9).
         save_every: macro steps from one saved node to the next.
         step: macro steps before the first node.
 
@@ -125,7 +140,7 @@ def failures(run, table, allowed, save_every: int, step: int = 0):
         The run and its table.
     """
     module, now = library((run, table)), Observables.of(table)
-    wrong = ~(module.isfinite(now.energy) & (now.position <= allowed))
+    wrong = ~(module.isfinite(now.energy) & (now.solved > 0) & (now.implied > 0))
     if module is np and not wrong.any():
         return run, table
     node = wrong.argmax(axis=-1)
@@ -133,7 +148,7 @@ def failures(run, table, allowed, save_every: int, step: int = 0):
     breaks = wrong.any(axis=-1) & ((run.failed_at < 0) | (last_step < run.failed_at))
     energy, solved = (module.take_along_axis(a, node[..., None], axis=-1)[..., 0] for a in (now.energy, now.solved))
     # If the solved rows are kept, the implied rows are to blame.
-    violated = module.where(solved <= allowed, int(Result.NOT_IMPLIED), int(Result.CONSTRAINT_VIOLATED))
+    violated = module.where(solved > 0, int(Result.NOT_IMPLIED), int(Result.CONSTRAINT_VIOLATED))
     cause = module.where(module.isfinite(energy), violated, int(Result.NON_FINITE))
     result, failed_at = module.where(breaks, cause, run.result), module.where(breaks, last_step, run.failed_at)
     first = module.where(
@@ -161,7 +176,7 @@ def concerns(table: np.ndarray, t, system: System, macro_dt, save_every: int) ->
     where they do, only steps that are all saved tell.
 
     Args:
-        table: the `Observables` (..., k, 8).
+        table: the `Observables` (..., k, 9).
         t: (..., k) times.
         system: the system, of which only the structure counts.
         macro_dt: macro step H, or one for each lane.

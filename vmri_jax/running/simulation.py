@@ -35,7 +35,7 @@ from vmri_jax.running.engine import Arrays, Engine, Model, PieceStart, engine
 from vmri_jax.running.failures import simulation_error
 from vmri_jax.running.interrupts import Interrupted, interrupts_noted
 from vmri_jax.running.memory import check_memory
-from vmri_jax.running.observables import concerns, failures, observables
+from vmri_jax.running.observables import concerns, failures, observables, with_tolerance
 from vmri_jax.running.origin import Origin, evaluated, names_of
 from vmri_jax.running.progress import ShowsProgress, Working, progress_to
 from vmri_jax.running.saved import room_of_a_piece
@@ -45,7 +45,6 @@ from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers import solvers
 from vmri_jax.steppers.plan import Plan, plan, with_rules_for
 from vmri_jax.steppers.results import Method, Result
-from vmri_jax.steppers.solved import allowed_residual
 from vmri_jax.steppers.solvers import Newton
 
 PARTS_OF_A_BAR = 50
@@ -160,7 +159,7 @@ class Simulation:
         return Arrays(leaves, start, macro_dt), save_every, self.num_saves
 
     def observed(self, run: Run, model: list, step: int = 0, params: list | None = None) -> tuple[Run, Any]:
-        """A run and its `Observables` (..., k, 8), both NaN from a failure on; failures that the nodes show are in its status.
+        """A run and its `Observables` (..., k, 9), both NaN from a failure on; failures that the nodes show are in its status.
 
         Args:
             run: of the engine.
@@ -173,14 +172,16 @@ class Simulation:
         if lanes:
             leaves = [np.broadcast_to(leaf, (*lanes, *np.shape(leaf))) for leaf in leaves]
             leaves[len(leaves) - len(params or []) :] = params or []
-        table = evaluated(observables, structure, leaves, run.states)
-        return failures(run, table, allowed_residual(self.solver.tolerance), self.save_every, step)
+        table = evaluated(observables, structure, leaves, with_tolerance(run.states, self.solver.tolerance))
+        return failures(run, table, self.save_every, step)
 
     def at_start(self) -> np.ndarray:
-        """(1, 8) the `Observables` of the start."""
+        """(1, 9) the `Observables` of the start."""
         structure, count = self._system
         start = jax.tree.map(lambda a: np.asarray(a)[None], self.state)
-        return evaluated(observables, structure, self.arrays.model[-count:], start)
+        return evaluated(
+            observables, structure, self.arrays.model[-count:], with_tolerance(start, self.solver.tolerance)
+        )
 
     def traced(self, run: Run) -> Trajectory:
         """The trajectory of a run some of whose arrays are tracers: its observables are a part of the trace."""
@@ -209,7 +210,7 @@ class Simulation:
     def _whole(self, falls_back: bool, arguments: tuple) -> tuple[Run, np.ndarray]:
         """The run by one program, as of `observed`."""
         leaves, table = self._program(falls_back)(*arguments)
-        return failures(Run.of(leaves), np.asarray(table), allowed_residual(self.solver.tolerance), arguments[1])
+        return failures(Run.of(leaves), np.asarray(table), arguments[1])
 
     def _program(self, falls_back: bool):
         """The compiled run, see `Engine.whole`."""

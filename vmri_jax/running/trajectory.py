@@ -40,7 +40,7 @@ class RunInfo(NamedTuple):
     Attributes:
         method: largest code of the methods of the steps, mostly of the most expensive one, see `Method`.
         iterations: most Newton iterations of a step; 0 for explicit steps.
-        residual: largest residual after a step: of the equations relative to the momentum, or of the constraints.
+        residual: largest residual of the momentum equations after a step, relative to the momentum.
     """
 
     method: Int[Numbers, "k-1"]
@@ -311,7 +311,7 @@ def with_origin(trajectory: Trajectory, origin: Origin) -> Trajectory:
 
 
 def trajectory_of(run: Run, table) -> Trajectory:
-    """The trajectory of a run with its `Observables` (..., k, 8)."""
+    """The trajectory of a run with its `Observables` (..., k, 9)."""
     now = Observables.of(table)
     return Trajectory(run.states, now.energy, table[..., 1:3], run.info, run.result, run.failed_at, run.micro)
 
