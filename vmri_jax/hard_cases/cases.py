@@ -34,6 +34,7 @@ from vmri_jax.running.progress import Working
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes.scheme import Scheme, fully_explicit, fully_implicit
 from vmri_jax.stability import advise
+from vmri_jax.stability.drive import drive_period
 from vmri_jax.stability.linear import small_motions
 from vmri_jax.steppers import solvers
 
@@ -196,7 +197,7 @@ class Resolved:
 
 
 def resolved(problem: Problem) -> Resolved:
-    """A problem with five micro steps of ``omega h = 0.2`` for its largest frequency at the start.
+    """A problem with five micro steps of ``omega h = 0.2`` for its largest frequency at the start, or for the frequency of its drive if larger.
 
     If nothing vibrates, ``omega = max(|q'_i| / |q_i|, sqrt(|q''_i| / |q_i|))``, the rate at which positions change by their size; 1 for a body
     at rest without forces.
@@ -211,6 +212,7 @@ def resolved(problem: Problem) -> Resolved:
         )
         sizes = np.where(q > 0, q, q.max() or 1.0)
         omega = float(max((v / sizes).max(), np.sqrt(a / sizes).max())) or 1.0
+    omega = max(omega, 2 * np.pi / (drive_period(problem.system, state, 1 / omega) or np.inf))
     return Resolved(problem, fully_implicit(NUM_MICRO), NUM_MICRO * PHASE / omega, omega)
 
 

@@ -15,7 +15,7 @@ from vmri_jax.mechanics.names import Names
 from vmri_jax.scene.body import LARGEST_POINT, Bodies, label_of, moving
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.effects.freedoms import ANGLES
-from vmri_jax.scene.layout import join
+from vmri_jax.scene.layout import Key, join
 from vmri_jax.scene.rates import positions
 from vmri_jax.scene.sorting import Home, Placed, Sorting
 from vmri_jax.scene.terms import EffectTerm
@@ -50,7 +50,7 @@ class _Element(NamedTuple):
     """An element of a constraint as a function of the coordinates of its bodies.
 
     term, params: see `Effect.element_term`.
-    columns: numbers of these coordinates in (Q_s, Q_f), taken as one vector.
+    columns: numbers of these coordinates, and of the freedoms that are coordinates, in (Q_s, Q_f), taken as one vector.
     """
 
     term: EffectTerm
@@ -152,13 +152,14 @@ def _label(effect: Effect, element: Sequence[str]) -> str:
     return f"{effect.name} {'-'.join(map(label_of, element))}"
 
 
-def _elements(part: Placed, bodies: Bodies, columns: dict[str, np.ndarray], params: dict[str, Any]):
+def _elements(part: Placed, bodies: Bodies, columns: dict[str | Key, np.ndarray], params: dict[str, Any]):
     """Labels and elements of an effect, in the order of its terms."""
     effect = part.effect
     elements = effect.elements(bodies)
     for i in chain(*effect.by_size(part.elements, bodies)):
-        of_element = np.concatenate([columns[name] for name in moving(elements[i])])
-        yield _label(effect, elements[i]), _Element(*effect.element_term(i, bodies, params), of_element)
+        freedoms = [key for key in effect.freedoms_of(i) if key in columns]
+        of_element = np.concatenate([columns[name] for name in (*moving(elements[i]), *freedoms)])
+        yield _label(effect, elements[i]), _Element(*effect.element_term(i, bodies, params, freedoms), of_element)
 
 
 @partial(quickly_compiled, static_argnames="term")

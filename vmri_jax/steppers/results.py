@@ -49,8 +49,9 @@ _MESSAGES = {
     ),
     Result.NON_FINITE: (
         "a NaN or infinity appeared. Likely causes: an explicit scheme beyond its stability limit (omega h < 2), a function "
-        "evaluated outside its domain (a norm at zero, a logarithm or root of a negative number). Try a smaller macro_dt, or look at the "
-        "state just before the failure."
+        "evaluated outside its domain (a norm at zero, a logarithm or root of a negative number), an angle of directors near half a turn, "
+        'which a spring, a limit or a gear cannot tell from another turn (give the scene coordinates="joint"). Try a smaller macro_dt, or look '
+        "at the state just before the failure."
     ),
     Result.SINGULAR: (
         "the Newton matrix is singular although the functions are finite. Likely causes: a kinetic energy that does not see "
