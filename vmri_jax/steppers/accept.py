@@ -135,9 +135,9 @@ class Accepted(NamedTuple):
         numbers = jnp.finfo(float)
         at_rest = numbers.eps * jnp.maximum(*motions) + numbers.tiny
         late = (iterations >= ITERATIONS_BEFORE_TIED_ROUNDOFF) * 1
-        floors = self.slow[late], self.fast[late]
-        allowed = (self.tolerance * size + floor + at_rest for size, floor in zip(motions, floors, strict=True))
-        return jnp.maximum(*(change / largest for change, largest in zip(changes, allowed, strict=True)))
+        # where a correction is larger than the motion, as from rest at the origin, the ratio is 1 / tolerance and does not overflow
+        pairs = zip(changes, map(jnp.maximum, motions, changes), (self.slow[late], self.fast[late]), strict=True)
+        return jnp.maximum(*(change / (self.tolerance * size + floor + at_rest) for change, size, floor in pairs))
 
 
 def constraint_length(equations: StepEquations, weights: Weights = NO_WEIGHTS):
