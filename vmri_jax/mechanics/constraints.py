@@ -18,6 +18,9 @@ LEAST_COEFFICIENT = 1e-6
 """Rows with at least this coefficient in a normalised linear dependence are named in messages. A larger value leaves rows out."""
 LEAST_FAST_PART = 1e-12
 """Least ratio ``|dg/dq_f| / |dg/dq|`` of a constraint that counts as dependent on fast variables. A larger value refuses weak dependences."""
+VANISHING_GRADIENT = 1e-6
+"""Ratio of the gradient of a constraint to its gradient at a generic configuration nearby, below which the gradient counts as zero. A larger value
+refuses constraints that are nearly singular at the start."""
 PROJECTION_STEPS = 20
 """Gauss-Newton steps onto the constraints. They converge quadratically from close positions; a larger number takes longer."""
 MICRO_GRID = (
@@ -151,8 +154,13 @@ def check_constraints(
         _check_implied(implied, place)
     if not (np.isfinite(slow).all() and np.isfinite(fast).all() and np.isfinite(alone).all()):
         raise ValueError("System: the Jacobian of the constraints is not finite at these positions (a norm at zero?).")
-    size = np.linalg.norm(np.concatenate([slow, fast], axis=1), axis=1)
-    slow_only = np.flatnonzero(np.linalg.norm(fast, axis=1) <= LEAST_FAST_PART * size)
+    whole = np.concatenate([slow, fast], axis=1)
+    *_, slow_nearby, fast_nearby, alone_nearby = jax.device_get(
+        _values_and_jacobians(system, state.t, *_nearby(state.q_s, state.q_f))
+    )
+    _check_gradients("constraint", whole, np.concatenate([slow_nearby, fast_nearby], axis=1), in_words)
+    _check_gradients("slow_constraint", alone, alone_nearby, in_words)
+    slow_only = np.flatnonzero(np.linalg.norm(fast, axis=1) <= LEAST_FAST_PART * np.linalg.norm(whole, axis=1))
     if slow_only.size:
         raise ValueError(
             f"System: row(s) {in_words(slow_only, 'constraint')} of constraint do not depend on the fast variables q_f. {MICRO_GRID} "
@@ -163,9 +171,19 @@ def check_constraints(
     if any(dependent for _, dependent in map(rank_of, (alone, fast))):
         # At a singular configuration (a linkage folded flat) rows are dependent there and nowhere else, and runs pass it: only rows that are
         # dependent at a generic configuration nearby are refused.
-        *_, fast, alone = jax.device_get(_values_and_jacobians(system, state.t, *_nearby(state.q_s, state.q_f)))
-        _check_rank("slow_constraint", alone, "slow variables.", in_words)
-        _check_rank("constraint", fast, f"fast variables. {MICRO_GRID}", in_words)
+        _check_rank("slow_constraint", alone_nearby, "slow variables.", in_words)
+        _check_rank("constraint", fast_nearby, f"fast variables. {MICRO_GRID}", in_words)
+
+
+def _check_gradients(name: str, rows, nearby, in_words) -> None:
+    """Refuse constraints whose gradient is zero at the start and not nearby: no force along the gradient can hold them."""
+    size, size_nearby = (np.linalg.norm(a, axis=1) for a in (rows, nearby))
+    vanish = np.flatnonzero((size_nearby > 0) & (size <= VANISHING_GRADIENT * size_nearby))
+    if vanish.size:
+        raise ValueError(
+            f"System: the gradient of row(s) {in_words(vanish, name)} of {name} vanishes at these positions, where the constraint is 0, and no "
+            "force along it can hold the constraint. If it is a square, take its root: |x| - L in place of (|x| - L)**2."
+        )
 
 
 @jax.jit
