@@ -67,7 +67,7 @@ def initial_state(
         t: start time.
         project: move positions onto the constraints, and velocities onto the hidden constraints, instead of refusing them. A warning tells
             of velocities of which the projection leaves little.
-        tolerance: largest value of a satisfied constraint, relative to the terms that cancel in it, ``|d| + L`` of ``|d| - L``.
+        tolerance: largest value of a satisfied constraint, relative to its size, mostly of the terms that cancel in it: ``|d| + L`` of ``|d| - L``.
 
     Raises:
         ValueError: float32 data or 64-bit mode off, wrong shapes, not finite, positions that violate a constraint (with

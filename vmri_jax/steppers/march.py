@@ -75,8 +75,9 @@ class MarchEquations:
 
     def __init__(self, equations: StepEquations, inverted=None, weights: Weights = NO_WEIGHTS):
         self.equations, self.intervals = equations, Intervals(equations)
-        self.weights = Weights(*(w if w is None else jnp.tile(w, equations.scheme.degree) for w in weights))
-        self.of_momenta = self.weights.of_momenta()
+        self.weights = weights
+        self.of_increments = Weights(*(w if w is None else jnp.tile(w, equations.scheme.degree) for w in weights))
+        self.of_momenta = self.of_increments.of_momenta()
         self.inverted = inverted or inverse_with_multipliers
         self.n, self.r = equations.scheme.num_micro, equations.scheme.degree
         self.n_s, self.n_f = equations.q_s.size, equations.q_f.size
@@ -100,11 +101,11 @@ class MarchEquations:
 
     def slow_size(self, z):
         """Largest slow increment in z, or in its correction."""
-        return largest(z[: self.num_slow], self.weights.slow)
+        return largest(z[: self.num_slow], self.of_increments.slow)
 
     def fast_size(self, x):
         """Largest fast increment in the unknowns (..., k) of intervals, or in their corrections."""
-        return largest(x[..., : self.num_fast], self.weights.fast)
+        return largest(x[..., : self.num_fast], self.of_increments.fast)
 
     def seen(self, z):
         """(r n_v,) the slow increments in z that intervals see."""
