@@ -18,6 +18,7 @@ from vmri_jax.diagnostics.linear import frequencies_of, phase_splits
 from vmri_jax.mechanics.arrays import QUICK
 from vmri_jax.mechanics.driving import driven
 from vmri_jax.mechanics.invariants import potential_energy, velocity
+from vmri_jax.mechanics.masses import correlation
 from vmri_jax.mechanics.state import Movable, Problem, State, start_of
 from vmri_jax.mechanics.system import ConstantMass, System
 
@@ -215,7 +216,11 @@ def small_motions(system: Movable, state: State | None = None) -> SmallMotions:
 def _shapes(mass: np.ndarray, jacobian: np.ndarray) -> np.ndarray:
     """N (n, d) with ``N^T M N = 1`` and ``G N = 0``: a basis T of the null space of G, divided by the Cholesky factor of ``T^T M T``."""
     # dependent constraints count once
-    tangents = null_space(jacobian, rcond=1e-10) if len(jacobian) else np.eye(len(mass))
+    root = np.sqrt(np.diagonal(mass))[:, None]  # rows of one unit and length one
+    scaled = jacobian / root.T
+    lengths = np.linalg.norm(scaled, axis=1, keepdims=True)
+    scaled = scaled / np.where(lengths > 0, lengths, 1.0)
+    tangents = null_space(scaled, rcond=1e-10) / root if len(jacobian) else np.eye(len(mass))
     if not tangents.shape[1]:
         raise ValueError(
             f"small_motions: the {len(jacobian)} constraints leave none of the {len(mass)} coordinates free; nothing moves."
@@ -230,7 +235,10 @@ def _multipliers_at_rest(terms: dict, mass: np.ndarray) -> tuple[np.ndarray, np.
     """
     G = terms["jacobian"]
     weighted = G @ np.linalg.inv(mass)
-    gram = np.linalg.pinv(weighted @ G.T, rcond=1e-12, hermitian=True)
+    gram = weighted @ G.T
+    diagonal = np.diagonal(gram)
+    root = np.sqrt(np.where(diagonal > 0, diagonal, 1.0))[:, None]
+    gram = np.linalg.pinv(correlation(gram), rcond=1e-12, hermitian=True) / root / root.T
     multiplier = gram @ (weighted @ terms["impetus"] + terms["centripetal"])
     return multiplier, -gram @ (weighted @ terms["slow_gradient"])
 
@@ -240,7 +248,7 @@ def _expanded_system(system: System, state: State, terms: dict, multiplier, slow
     n_s, n_g = state.q_s.size, system.num_constraints(state.q_s, state.q_f)[0]
     G, curvature = terms["jacobian"], terms["curvature"]
     constant_force = G.T @ (multiplier - slow_multiplier)  # balances the constraint forces that V does not
-    has_constant_force = np.abs(constant_force).max(initial=0.0) > 1e-12 * np.abs(G.T @ multiplier).max(initial=0.0)
+    has_constant_force = np.any(np.abs(constant_force) > 1e-12 * (np.abs(G.T) @ np.abs(multiplier)))
     return System(
         system.kinetic if system.has_constant_mass else _kinetic,
         None if system.slow_potential is None else _Potential("slow"),
