@@ -155,9 +155,9 @@ def _ranks(bodies: Bodies, effects: Sequence[Effect]) -> dict[tuple[str, int], i
     ranks: dict[tuple[str, int], int] = {}
     for effect in (effect for effect in effects if isinstance(effect, OfFreedoms)):
         for i in range(len(effect.elements(bodies))):
-            for *pair, freedom in effect.freedoms_of(i):
+            for joint, pair, freedom in effect.freedoms_of(i):
                 rank = COUNTED if effect.counts_turns and freedom in ANGLES else USED
-                ranks[tuple(pair)] = min(rank, ranks.get(tuple(pair), rank))
+                ranks[joint, pair] = min(rank, ranks.get((joint, pair), rank))
     return ranks
 
 
