@@ -68,7 +68,7 @@ class ConstraintRows:
         start: (n,) coordinates at the start.
         masses: (n,) of the coordinates; 1 for traced masses, since they only weigh the choice of the rows to drop.
         scales: (n,) change of each coordinate in a large motion: the extent of the scene for positions, 1 for
-            directors of rigid bodies and angles of joints, and for general coordinates their value, at least 1.
+            directors of rigid bodies and angles of joints, and for general coordinates their largest value, or 1 if all are zero.
         num_slow: number of slow coordinates.
         to_bodies: (Q_s, Q_f) as one vector at q, and its Jacobian dQ/dq.
     """
@@ -128,6 +128,11 @@ class ConstraintRows:
         return self.evaluate(0.0, self.start)[1]
 
     @cached_property
+    def by_masses(self) -> np.ndarray:
+        """`jacobian` with the columns over the square roots of masses, so that the entries of a row have one unit."""
+        return self.jacobian / np.sqrt(np.where(self.masses > 0, self.masses, 1.0))
+
+    @cached_property
     def sizes(self) -> np.ndarray:
         """(k,) change of each row in a large motion: the length of its gradient with respect to coordinates over `scales`; 1 if this is zero."""
         lengths = np.linalg.norm(self.jacobian * self.scales, axis=1)
@@ -182,7 +187,8 @@ def _scales(sorting: Sorting) -> np.ndarray:
         if name in layout.coordinates and layout.coordinates[name] not in scales:
             q = np.asarray(body.coordinates)
             of_points = np.where(np.arange(q.size) < LARGEST_POINT, extent, 1.0)
-            scales[layout.coordinates[name]] = np.maximum(np.abs(q), 1.0) if body.block else of_points
+            of_block = np.full(q.size, np.abs(q).max() or 1.0)
+            scales[layout.coordinates[name]] = of_block if body.block else of_points
     return np.concatenate(
         [scales[place] for place in sorted(scales, key=lambda place: (place.part == "f", place.start))]
     )

@@ -72,13 +72,18 @@ def with_rates(
         values.append(numbers)
     c, b = np.concatenate(rows), np.concatenate(values)
     root = np.linalg.cholesky(np.asarray(jax.jacfwd(momentum)(jnp.asarray(v))))  # M = R R^T
+    # rows of C R^-T and b in units of their lengths: all have the unit of R^T v, whose squared length is twice the kinetic energy
+    c_by_root = np.linalg.solve(root, c.T).T
+    lengths = np.linalg.norm(c_by_root, axis=1)
+    lengths[lengths == 0] = 1.0
+    c, b, c_by_root = c / lengths[:, None], b / lengths, c_by_root / lengths[:, None]
     size = np.abs([b, c @ v]).max()
-    v = v + np.linalg.solve(root.T, np.linalg.lstsq(np.linalg.solve(root, c.T).T, b - c @ v, rcond=None)[0])
-    error = np.abs(c @ v - b).max()
-    if error > RATE_ERROR * size:
+    v = v + np.linalg.solve(root.T, np.linalg.lstsq(c_by_root, b - c @ v, rcond=None)[0])
+    errors = np.abs(c @ v - b)
+    if errors.max() > RATE_ERROR * size:
         raise ValueError(
             f"Scene.with_rates: no velocities have these rates of {', '.join(rates)} and keep the constraints: the nearest ones differ by "
-            f"{error:.3g}. Give fewer rates: the rate of a joint follows from those of others, or the joint cannot move here."
+            f"{(errors * lengths).max():.3g}. Give fewer rates: the rate of a joint follows from those of others, or the joint cannot move here."
         )
     # the velocities of bodies belong to their positions as the user gave them, where joint coordinates are zero
     body_rates = sorting.to_bodies(np.concatenate(sorting.assembled))[1] @ v
@@ -149,7 +154,8 @@ def with_closed_loops(sorting: Sorting, starts: dict[Key, tuple[Any, Any]]) -> d
         )
     v[held] = [float(rate) for _, rate in starts.values()]
     jacobian = rows.evaluate(0.0, q)[1][numbers]
-    v[free] -= np.linalg.lstsq(jacobian[:, free], jacobian @ v, rcond=RANK)[0]
+    scaled, scales = jacobian / rows.sizes[numbers, None], rows.scales[free]
+    v[free] -= scales * np.linalg.lstsq(scaled[:, free] * scales, scaled @ v, rcond=RANK)[0]
     return starts | {key: (q[i], v[i]) for key, i in columns.items() if key not in starts and jacobian[:, i].any()}
 
 
@@ -188,7 +194,8 @@ def _close(rows: ConstraintRows, numbers: np.ndarray, q: np.ndarray, free: Seque
             return None
         worst = int(np.argmax(sizes))
         gap = rows.rows[numbers[worst]].name, float(abs(values[worst]))
-        q[free] -= np.linalg.lstsq(jacobian[:, free], values, rcond=RANK)[0]
+        scaled, scales = jacobian[:, free] / rows.sizes[numbers, None], rows.scales[free]
+        q[free] -= scales * np.linalg.lstsq(scaled * scales, values / rows.sizes[numbers], rcond=RANK)[0]
     return gap
 
 

@@ -65,8 +65,8 @@ _MESSAGES = {
         "Remove rows, make the variables they need fast, or start elsewhere."
     ),
     Result.CONSTRAINT_VIOLATED: (
-        "the increments converged, but the constraints are not kept. Likely causes: rows that contradict each other, rows of "
-        "very different size (scale them to order one), or a stepper of your own (solvers.Custom) that does not hold them."
+        "the increments converged, but the constraints are not kept. Likely causes: rows that contradict each other, or a "
+        "stepper of your own (solvers.Custom) that does not hold them."
     ),
     Result.NOT_IMPLIED: (
         'the constraints that are solved for are kept, but rows that were left out as redundant (redundant="drop" of a scene, '
