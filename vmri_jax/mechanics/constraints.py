@@ -48,6 +48,9 @@ LEAST_COEFFICIENT = 1e-6
 """Rows with at least this coefficient in a normalised linear dependence are named in messages. A larger value leaves rows out."""
 LEAST_FAST_PART = 1e-12
 """Least ratio ``|dg/dq_f| / |dg/dq|`` of a constraint that counts as dependent on fast variables. A larger value refuses weak dependences."""
+VANISHING_GRADIENT = 1e-6
+"""Ratio of the gradient of a constraint to its gradient at a generic configuration nearby, below which the gradient counts as zero. A larger value
+refuses constraints that are nearly singular at the start."""
 NEARBY = 1e-2
 """Distance to a configuration nearby, relative to the distance over which rows change by their size. From a larger one rows may be others."""
 PROJECTION_STEPS = 20
@@ -241,6 +244,7 @@ def check_constraints(
         raise ValueError(f"{place}: the constraints are {solved} there, which is not finite.")
     if not (np.isfinite(rows.gradients).all()):
         raise ValueError("System: the Jacobian of the constraints is not finite at these positions (a norm at zero?).")
+    _check_gradients(system, state, rows, masses, in_words)
     allowed = rows.allowed(tolerance)[: n_g + n_gs]
     violated = np.abs(solved) > allowed
     if violated.any():
@@ -273,6 +277,23 @@ def check_constraints(
         _, fast, alone = gradients(rows)
         _check_rank("slow_constraint", alone, "slow variables.", in_words)
         _check_rank("constraint", fast, f"fast variables. {MICRO_GRID}", in_words)
+
+
+def _check_gradients(system: System, state, rows: Rows, masses, in_words) -> None:
+    """Refuse rows whose gradient is zero at the state, but not at a generic configuration `NEARBY` relative to its positions."""
+    weights, q, n_s = np.sqrt(masses), np.concatenate([state.q_s, state.q_f]), np.size(state.q_s)
+    change = NEARBY * np.abs(weights * q).max() * np.random.default_rng(0).normal(size=q.size) / weights
+    nearby, _ = jax.device_get(_rows_and_masses(system, state.t, *np.split(q + change, [n_s])))
+    size, size_nearby = (np.linalg.norm(a.jacobian / weights, axis=1) for a in (rows, nearby))
+    vanishes = (size_nearby > 0) & (size <= VANISHING_GRADIENT * size_nearby)
+    n_g, n_gs = system.num_constraints(state.q_s, state.q_f)
+    parts = {"constraint": vanishes[:n_g], "slow_constraint": vanishes[n_g : n_g + n_gs]}
+    for name, rows_of_name in parts.items():
+        if rows_of_name.any():
+            raise ValueError(
+                f"System: the gradient of row(s) {in_words(np.flatnonzero(rows_of_name), name)} of {name} vanishes at these positions, and no force "
+                "along it can hold the constraint. A square, (|x| - L)**2, has such a gradient wherever it is 0: take its root, |x| - L."
+            )
 
 
 @quickly_compiled

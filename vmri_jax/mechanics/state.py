@@ -94,7 +94,7 @@ def initial_state(
     if project:
         q_s, q_f = _projected_positions(system, t, q_s, q_f)
     state, violation = _consistent(system, t, q_s, q_f, v_s, v_f)
-    if is_concrete(state):
+    if is_concrete((system, state)):
         advice = (
             "projection did not reach the constraints; start closer to them."
             if project
