@@ -5,13 +5,15 @@ import inspect
 import warnings
 from collections import Counter
 from collections.abc import Callable
-from functools import lru_cache
+from functools import lru_cache, partial, wraps
 
 import jax
 
+from vmri_jax.mechanics.surroundings import Watched
+
 COPIES_UNTIL_WARNING = 5
-"""Number of functions from one piece of code, each compiled anew, at which the user is warned. A larger number warns late; a smaller one warns about
-programs that define a few variants on purpose."""
+"""Number of surroundings of one piece of code, each compiled anew, at which the user is warned. A larger number warns late; a smaller one warns
+about programs that define a few variants on purpose."""
 NO_TIME = (
     "Energies and masses that depend on time are out of scope. Take instead a force that depends on time, {force}, or a constraint that "
     "moves with time, {moving}."
@@ -27,34 +29,33 @@ TIME_AND_VELOCITIES = ("t", "v_s", "v_f")
 """Names of arguments that only forces, kinetic energies and `Rheonomic` constraints get."""
 
 
-@dataclasses.dataclass(frozen=True)
-class TracedOnce:
-    """A function of arrays that JAX traces once per process for given shapes of its arguments.
+class TracedOnce(Watched):
+    """A function of arrays that JAX traces once per process for given shapes of its arguments, and for what it reads from around it.
 
-    Later programs inline the traced operations, as if they had called the function. Two instances are equal if their functions are.
+    Later programs inline the traced operations, as if they had called the function.
     """
 
-    function: Callable
-
     def __call__(self, *arguments):
-        return _traced(self.function)(*arguments)
-
-    def __repr__(self) -> str:
-        return repr(self.function)
+        return _traced(TracedOnce(self.function, self.reading))(*arguments)
 
 
 class CompiledAgainWarning(UserWarning):
-    """The program creates the same function repeatedly, and JAX compiles every program that contains it again."""
+    """A function reads other numbers from around it again and again, and JAX compiles every program that contains it again."""
 
 
 @lru_cache(maxsize=1024)
-def _traced(function: Callable) -> Callable:
-    _count(function)
-    return jax.jit(function, inline=True)
+def _traced(function: TracedOnce) -> Callable:
+    _count(function.function)
+
+    @wraps(function.function, updated=())
+    def operations(*arguments):
+        return Watched.__call__(function, *arguments)
+
+    return jax.jit(operations, inline=True)
 
 
 def _count(function: Callable) -> None:
-    """Count the functions that one piece of code has created, and warn once about `COPIES_UNTIL_WARNING` of them."""
+    """Count the surroundings in which one piece of code is traced, and warn once about `COPIES_UNTIL_WARNING` of them."""
     function = getattr(function, "function", function)  # of `vmri_jax.mechanics.by_name.ByName`
     code = getattr(function, "__code__", None)
     if code is None:
@@ -62,9 +63,9 @@ def _count(function: Callable) -> None:
     _made[code] += 1
     if _made[code] == COPIES_UNTIL_WARNING:
         warnings.warn(
-            f"the function {function.__name__} (line {code.co_firstlineno} of {code.co_filename}) has been made {COPIES_UNTIL_WARNING} times, and "
-            "everything that contains it was compiled as often, since functions are compared by identity. Define it once, outside of "
-            "the loop, and hand over what varies as params.",
+            f"the function {function.__name__} (line {code.co_firstlineno} of {code.co_filename}) has been traced {COPIES_UNTIL_WARNING} times, and "
+            "everything that contains it compiled as often, since it reads other values from around it each time. Hand over what varies "
+            "as params.",
             CompiledAgainWarning,
             stacklevel=2,
         )
@@ -113,6 +114,7 @@ def check_arguments(place: str, function: Callable, arguments: str, instead: str
     raise TypeError(f"{place} is {name}{signature}; it is called with ({arguments}). {advice}")
 
 
+@partial(jax.tree_util.register_dataclass, data_fields=["function"], meta_fields=[])
 @dataclasses.dataclass(frozen=True)
 class Rheonomic:
     """A holonomic constraint that depends on time: a function with the time as its first argument.
