@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from vmri_jax.mechanics.arrays import quickly_compiled
 from vmri_jax.mechanics.by_name import constraint_sizes
 from vmri_jax.mechanics.checks import CONSTRAINT_TOLERANCE
 from vmri_jax.mechanics.functions import Rheonomic
@@ -106,7 +107,7 @@ def check_mass(system: System, q_s, q_f) -> None:
         )
 
 
-@jax.jit
+@quickly_compiled
 def _mass_matrix(system, q_s, q_f, v_s, v_f):
     n_s = v_s.size
     return jax.hessian(lambda v: system.kinetic(q_s, q_f, v[:n_s], v[n_s:], system.params))(jnp.append(v_s, v_f))
@@ -168,7 +169,7 @@ def check_constraints(
         _check_rank("constraint", fast, f"fast variables. {MICRO_GRID}", in_words)
 
 
-@jax.jit
+@quickly_compiled
 def _values_and_jacobians(system, t, q_s, q_f):
     """Values of all constraints and of the implied rows, and the Jacobians dg/dq_s, dg/dq_f and dg_slow/dq_s."""
     jacobians = *jax.jacrev(system.g, argnums=(1, 2))(t, q_s, q_f), jax.jacrev(system.g_slow, argnums=1)(t, q_s)

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from vmri_jax.mechanics import by_name
-from vmri_jax.mechanics.arrays import Number, Numbers, is_concrete, of_one_type, require_x64
+from vmri_jax.mechanics.arrays import Number, Numbers, is_concrete, of_one_type, quickly_compiled, require_x64
 from vmri_jax.mechanics.checks import check_arrays, check_flags, check_number, check_params, check_system, check_type
 from vmri_jax.mechanics.constraints import check_constraints, check_mass, project_positions
 from vmri_jax.mechanics.functions import with_time
@@ -306,7 +306,7 @@ def start_of(caller: str, system, state=None) -> tuple[System, State]:
     return system, state
 
 
-@jax.jit
+@quickly_compiled
 def _consistent(system, t, q_s, q_f, v_s, v_f):
     """The state with projected momenta, and the violation of the hidden constraints, between 0 and 1.
 
@@ -323,4 +323,4 @@ def _consistent(system, t, q_s, q_f, v_s, v_f):
     return State(t, q_s, q_f, p_s, p_f), jnp.sqrt(jnp.clip(part, 0.0, 1.0))
 
 
-_projected_positions = jax.jit(project_positions)
+_projected_positions = quickly_compiled(project_positions)

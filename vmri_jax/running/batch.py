@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import PartitionSpec
 
-from vmri_jax.mechanics.arrays import is_concrete, real_array, whole_number
+from vmri_jax.mechanics.arrays import is_concrete, options_of_runs, real_array, whole_number
 from vmri_jax.mechanics.checks import check_params
 from vmri_jax.mechanics.state import Movable, State, opened, start_of
 from vmri_jax.mechanics.system import System
@@ -227,4 +227,4 @@ def _side_by_side(engine: Engine, varies_params: bool, varies_steps: bool, devic
         spread = PartitionSpec("lanes")
         specs = tuple(spread if has_axis else PartitionSpec() for has_axis in has_lanes)
         program = jax.shard_map(program, mesh=mesh, in_specs=specs, out_specs=spread, check_vma=False)
-    return jax.jit(program)
+    return jax.jit(program, compiler_options=options_of_runs())

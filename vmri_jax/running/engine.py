@@ -16,7 +16,7 @@ from jaxtyping import Int
 
 from vmri_jax.kernels import max_abs
 from vmri_jax.mechanics import invariants
-from vmri_jax.mechanics.arrays import Numbers
+from vmri_jax.mechanics.arrays import Numbers, options_of_runs
 from vmri_jax.mechanics.checks import CONSTRAINT_TOLERANCE
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
@@ -95,7 +95,7 @@ class Engine:
 
         Only the first `saves` of the saved intervals are computed.
         """
-        return jax.jit(lambda *run: jax.tree.leaves(self.trajectory(*run)))
+        return jax.jit(lambda *run: jax.tree.leaves(self.trajectory(*run)), compiler_options=options_of_runs())
 
     @cached_property
     def stored(self):
@@ -130,7 +130,7 @@ class Engine:
             times = _Times(begin.t_start, macro_dt, save_every)
             return self._by_while_loop(stepper, _Cursor.before(start, memory, begin.step), saved, times, saves)
 
-        return jax.jit(piece, donate_argnums=0)
+        return jax.jit(piece, donate_argnums=0, compiler_options=options_of_runs())
 
     def next_piece(
         self, arrays: Arrays, begin: PieceStart, save_every: int, saves: int
