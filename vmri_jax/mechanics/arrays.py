@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from vmri_jax.mechanics.surroundings import Watched
+from vmri_jax.mechanics.functions import TracedOnce
 
 Numbers: TypeAlias = Any
 """Arrays in annotations: ``Float[Numbers, "n_s"]`` is an array of n_s floats, of JAX or of NumPy."""
@@ -73,11 +73,11 @@ def of_one_type(tree):
     with what they read from around them now."""
 
     def settled(leaf):
-        if isinstance(leaf, Watched):
+        if isinstance(leaf, TracedOnce):
             return leaf.now()
         return leaf if _is_traced(leaf) else np.asarray(leaf)
 
-    return jax.tree.map(settled, tree, is_leaf=lambda leaf: isinstance(leaf, Watched))
+    return jax.tree.map(settled, tree, is_leaf=lambda leaf: isinstance(leaf, TracedOnce))
 
 
 def require_x64() -> None:

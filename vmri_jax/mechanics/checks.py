@@ -5,7 +5,7 @@ import linecache
 import re
 import traceback
 from collections.abc import Callable
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 
 import jax
@@ -14,9 +14,9 @@ import numpy as np
 
 from vmri_jax.mechanics.arrays import check_precision, is_concrete, real_array
 from vmri_jax.mechanics.arrays import require_x64 as require_x64
-from vmri_jax.mechanics.functions import with_time
+from vmri_jax.mechanics.functions import TracedOnce, traced_once, with_time
 from vmri_jax.mechanics.masses import ConstantMass
-from vmri_jax.mechanics.surroundings import Watched, name_of
+from vmri_jax.mechanics.surroundings import name_of
 from vmri_jax.mechanics.system import KineticFunction, System
 
 CONSTRAINT_TOLERANCE = 1e-6
@@ -163,17 +163,17 @@ def shape_of(name: str, function, *args):
         ) from error
     if not isinstance(function, ConstantMass):
         function = function.function if isinstance(function, KineticFunction) else function
-        is_watched = isinstance(function, Watched)
-        watched = Watched(function.function, function.reading) if is_watched else Watched(function).now()
         leaves, structure = jax.tree.flatten(args)
-        fault = _fault(watched, structure, tuple((np.shape(leaf), jnp.result_type(leaf)) for leaf in leaves))
+        fault = _fault(
+            traced_once(function), structure, tuple((np.shape(leaf), jnp.result_type(leaf)) for leaf in leaves)
+        )
         if fault:
             raise ValueError(f"{name} {fault}.")
     return shape
 
 
 @lru_cache(maxsize=1024)
-def _fault(function: Watched, structure, types: tuple[tuple[tuple[int, ...], np.dtype], ...]) -> str:
+def _fault(function: TracedOnce, structure, types: tuple[tuple[tuple[int, ...], np.dtype], ...]) -> str:
     """Faults of a function that none of its values shows, in words; empty for none. Cached, since tracing takes milliseconds.
 
     A function that takes ``q[3]`` of three entries: JAX returns the last entry instead, NumPy raises an IndexError; its other errors do not
@@ -182,12 +182,12 @@ def _fault(function: Watched, structure, types: tuple[tuple[tuple[int, ...], np.
     arguments = jax.tree.unflatten(structure, [np.zeros(*of_leaf) for of_leaf in types])
     try:
         with np.errstate(all="ignore"):
-            jax.eval_shape(lambda: function(*arguments))
+            jax.eval_shape(lambda: function.called(*arguments))
     except IndexError as error:
         return f"takes an entry that is not there{_line_of(error)}: {error}"
     except Exception:
         pass
-    if operations(function, *arguments) != operations(function, *arguments):
+    if function.is_of_user and operations(function.called, *arguments) != operations(function.called, *arguments):
         return (
             f"is {name_of(function)}, which is not pure: two calls with the same arguments do not do the same. JAX calls it once for a whole run. "
             "A state belongs in coordinates; noise is drawn before the run, and handed over in params"
@@ -197,9 +197,8 @@ def _fault(function: Watched, structure, types: tuple[tuple[tuple[int, ...], np.
 
 def operations(function: Callable, *arguments) -> str:
     """A digest of the operations that a function traces to, with their constants."""
-    closed = jax.make_jaxpr(lambda *arguments: function(*arguments))(
-        *arguments
-    )  # a new function, which JAX has not traced yet
+    untraced = partial(function)  # JAX keeps the traces of a function
+    closed = jax.make_jaxpr(untraced)(*arguments)
     text = re.sub(r"0x[0-9a-f]+", "", str(closed.jaxpr))  # addresses in memory
     return f"digest {digest(text.encode(), *(np.asarray(constant).tobytes() for constant in closed.consts))}"
 

@@ -4,12 +4,12 @@ import dataclasses
 import inspect
 import warnings
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from functools import lru_cache, partial, wraps
 
 import jax
 
-from vmri_jax.mechanics.surroundings import Watched
+from vmri_jax.mechanics.surroundings import Surroundings, name_of
 
 COPIES_UNTIL_WARNING = 5
 """Number of surroundings of one piece of code, each compiled anew, at which the user is warned. A larger number warns late; a smaller one warns
@@ -29,14 +29,76 @@ TIME_AND_VELOCITIES = ("t", "v_s", "v_f")
 """Names of arguments that only forces, kinetic energies and `Rheonomic` constraints get."""
 
 
-class TracedOnce(Watched):
-    """A function of arrays that JAX traces once per process for given shapes of its arguments, and for what it reads from around it.
+@jax.tree_util.register_pytree_node_class
+@dataclasses.dataclass(frozen=True, eq=False)
+class TracedOnce:
+    """A function of arrays that JAX traces once per process, for given shapes of its arguments and for what it reads from around it.
 
-    Later programs inline the traced operations, as if they had called the function.
+    Later programs inline the traced operations, as if they had called the function. Two instances are equal if the codes of their functions
+    and their surroundings are. A pytree node without arrays, whose structure is what the function reads.
+
+    Args:
+        function: of the user.
+        seen: key of its `Surroundings` when a run was made; None for what the function reads now. With `seen` new traces after a change are
+            refused: they would mix old and new numbers.
     """
 
+    function: Callable
+    seen: Hashable = None
+
     def __call__(self, *arguments):
-        return _traced(TracedOnce(self.function, self.reading))(*arguments)
+        return _traced(self if self.seen is not None else self.now())(*arguments)
+
+    def called(self, *arguments):
+        """The value of the function, by its Python code."""
+        around = Surroundings(self.function)
+        if self.seen not in (None, around.key):
+            raise ValueError(
+                f"{name_of(self)} reads something else from around it than when its run was made. Make the run again; what varies is better "
+                "handed over in params."
+            )
+        value = self.function(*arguments)
+        around.before(Surroundings(self.function))
+        return value
+
+    def now(self) -> "TracedOnce":
+        """The function with what it reads at present, for a run."""
+        last = vars(self).get("last")
+        if last is None or not last[0].hold():
+            around = Surroundings(self.function)
+            last = vars(self)["last"] = around, TracedOnce(self.function, around.key)
+        return last[1]
+
+    @property
+    def is_of_user(self) -> bool:
+        """Whether the function, or a function that it reads, has code of the user."""
+        return Surroundings(self.function).have_code
+
+    @property
+    def _key(self) -> Hashable:
+        return self.now().seen if self.seen is None else self.seen
+
+    def __eq__(self, other) -> bool:
+        return isinstance(other, TracedOnce) and self._key == other._key
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+    def __repr__(self) -> str:
+        return repr(self.function)
+
+    def __reduce__(self):  # code cannot be pickled; another process reads what is there
+        return TracedOnce, (self.function,)
+
+    def tree_flatten(self):
+        """No arrays; the structure is what the function reads, and whether it keeps that."""
+        return (), (self.seen is None, self.now() if self.seen is None else self)
+
+    @classmethod
+    def tree_unflatten(cls, structure, _):
+        """The inverse of `tree_flatten`."""
+        reads_now, function = structure
+        return cls(function.function) if reads_now else function
 
 
 class CompiledAgainWarning(UserWarning):
@@ -49,7 +111,7 @@ def _traced(function: TracedOnce) -> Callable:
 
     @wraps(function.function, updated=())
     def operations(*arguments):
-        return Watched.__call__(function, *arguments)
+        return function.called(*arguments)
 
     return jax.jit(operations, inline=True)
 

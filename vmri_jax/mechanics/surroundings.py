@@ -2,8 +2,8 @@
 
 JAX runs the Python code of a function once and keeps its operations, with the numbers that the function read from globals, closures or
 attributes at that time. `Surroundings` are all values that a function reads, as one value that can be compared: functions of the same code
-with equal surroundings share their programs, and a changed number, helper or array makes a new program. A `Watched` function brings its
-surroundings into every program: it is a pytree node without arrays, and JAX compares the structure of all arguments at every call.
+with equal surroundings share their programs, and a changed number, helper or array makes a new program. `vmri_jax.mechanics.functions`
+brings them into every program, as the structure of an argument, which JAX compares at every call.
 
 Code and objects of libraries (Python, installed packages, this package) count as constant, but for objects that can be called or have no
 hash. Containers and fields of dataclasses are compared as a whole; attributes of other objects, classes and modules of the user by the
@@ -22,7 +22,7 @@ from itertools import pairwise
 from operator import attrgetter
 from pathlib import Path
 from types import CodeType, FunctionType, MethodType, ModuleType
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
@@ -34,85 +34,11 @@ APPENDING = ("append", "extend", "add", "update")
 """Methods that write to a log: a name before one of them is not read."""
 _NUMBERS = frozenset((bool, int, float, complex))
 _CONSTANTS = frozenset((str, bytes, type(None), type(...), CodeType))
-_PARTS = {
-    MethodType: ("__func__", "__self__"),
-    partial: ("func", "args", "keywords"),
-    cached_property: ("func",),
-    property: ("fget",),
-    staticmethod: ("__func__",),
-    classmethod: ("__func__",),
-}
-"""Attributes of Python's own kinds of functions."""
+_METHODS = frozenset((MethodType, partial, cached_property, property, staticmethod, classmethod))
+_INSIDE_METHODS = ("__func__", "__self__", "func", "args", "keywords", "fget")
 _MISSING = object()
 _unchanged: dict[Hashable, Hashable] = {}
 """Surroundings after functions wrote to them while they were traced (counters, tables filled on demand), and the surroundings before."""
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Watched:
-    """A function of the user, compared by its code and by what it reads from around it; a pytree node without arrays.
-
-    Args:
-        function: of the user.
-        seen: key of its `Surroundings` when a run was made; None for what the function reads now. With `seen` the function refuses to be
-            called after a change: the run would mix old and new numbers.
-    """
-
-    function: Callable
-    seen: Hashable = None
-
-    @property
-    def reading(self) -> Hashable:
-        """The key of its surroundings: when its run was made, else now."""
-        return self.now().seen if self.seen is None else self.seen
-
-    def now(self) -> "Watched":
-        """The function with what it reads at present, for a run."""
-        last = vars(self).get("last")
-        if last is None or not last[0].hold():
-            around = Surroundings(self.function)
-            last = vars(self)["last"] = around, type(self)(self.function, around.key)
-        return last[1]
-
-    def __eq__(self, other) -> bool:
-        return type(other) is type(self) and self.reading == other.reading
-
-    def __hash__(self) -> int:
-        return hash(self.reading)
-
-    def __call__(self, *arguments):
-        before = Surroundings(self.function).key
-        if self.seen not in (None, before):
-            raise ValueError(
-                f"{name_of(self.function)} reads something else from around it than when its run was made. Make the run again; what varies is "
-                "better handed over in params."
-            )
-        value = self.function(*arguments)
-        after = Surroundings(self.function).key
-        if after != before:
-            _unchanged[after] = before
-        return value
-
-    def __repr__(self) -> str:
-        return repr(self.function)
-
-    def __reduce__(self):  # code cannot be pickled; another process reads what is there
-        return type(self), (self.function,)
-
-    def __init_subclass__(cls):
-        _register(cls)
-
-
-def _register(kind: type[Watched]) -> None:
-    """Make a class of watched functions a pytree node; what the function reads is its structure."""
-    jax.tree_util.register_pytree_node(
-        kind,
-        lambda watched: ((), (watched.seen is None, watched.now() if watched.seen is None else watched)),
-        lambda structure, _: kind(structure[1].function) if structure[0] else structure[1],
-    )
-
-
-_register(Watched)
 
 
 class Surroundings:
@@ -120,6 +46,7 @@ class Surroundings:
 
     Attributes:
         key: the code of the function and all that it reads, hashable; equal for equal surroundings.
+        have_code: whether there is code of the user.
 
     Raises:
         ValueError: the function reads a number that a transformation of JAX traces; programs outlive the transformation.
@@ -131,13 +58,18 @@ class Surroundings:
         self._attributes: dict[str, None] = {}
         self._namespaces: list[Mapping[str, Any]] = []
         self._reads: list[tuple[Callable, tuple, Any]] = []
-        self._mutable = False
+        self._mutable = self.have_code = False
         key = self._of(function), *self._of_namespaces()
         self.key: Hashable = _unchanged.get(key, key) if _unchanged else key
 
     def hold(self) -> bool:
         """Whether the function certainly reads the same values, compared by identity: much faster than another walk."""
         return not self._mutable and all(get(*arguments) is value for get, arguments, value in self._reads)
+
+    def before(self, written: "Surroundings") -> None:
+        """Count surroundings to which the function itself wrote as these."""
+        if written.key != self.key:
+            _unchanged[written.key] = self.key
 
     def _read(self, name: str, get: Callable, *arguments) -> tuple[str, Hashable]:
         """The name and the key of a value that ``get(*arguments)`` has now, noted for `hold`."""
@@ -156,10 +88,10 @@ class Surroundings:
         if id(value) in self._visited:
             return self._visited[id(value)][0]
         self._visited[id(value)] = len(self._visited), value
-        if kind in _PARTS:
-            return kind, *(self._of(getattr(value, name)) for name in _PARTS[kind])
         if kind is FunctionType:
             return self._of_function(value)
+        if kind in _METHODS:
+            return kind, *(self._of(getattr(value, name)) for name in _INSIDE_METHODS if hasattr(value, name))
         if kind is ModuleType or isinstance(value, type):
             return self._of_namespace(value)
         if isinstance(value, (np.ndarray, np.generic, jax.Array)):
@@ -174,13 +106,14 @@ class Surroundings:
         of_library = is_of_library(function.__module__)
         if of_library and not cells:
             return function
-        names = names_in(code)
+        around, read, attributes = names_in(code)
         key = [self._read(name, attrgetter(name), function) for name in ("__code__", "__defaults__", "__kwdefaults__")]
-        around = dict(zip(code.co_freevars, cells, strict=True))
-        key += [self._read(name, attrgetter("cell_contents"), around[name]) for name in around if name in names.cells]
+        cells = [(name, cell) for name, cell in zip(code.co_freevars, cells, strict=True) if name in read]
+        key += [self._read(name, attrgetter("cell_contents"), cell) for name, cell in cells]
         if not of_library:
-            self._attributes |= names.attributes
-            key += [self._read(name, function.__globals__.get, name, _MISSING) for name in names.globals]
+            self.have_code = True
+            self._attributes |= attributes
+            key += [self._read(name, function.__globals__.get, name, _MISSING) for name in around]
         return tuple(key)
 
     def _of_array(self, array) -> Hashable:
@@ -191,10 +124,9 @@ class Surroundings:
             )
         numbers = np.asarray(array if isinstance(array.dtype, np.dtype) else jax.random.key_data(array))
         self._mutable |= not isinstance(array, jax.Array)
-        if numbers.dtype.hasobject:
-            return self._of(numbers.tolist())
-        content = numbers.tobytes()
-        content = content if len(content) <= LARGEST_COPIED else hashlib.sha256(content).digest()
+        content = self._of(numbers.tolist()) if numbers.dtype.hasobject else numbers.tobytes()
+        if numbers.nbytes > LARGEST_COPIED and isinstance(content, bytes):
+            content = hashlib.sha256(content).digest()
         return isinstance(array, jax.Array), numbers.dtype.str, numbers.shape, content
 
     def _of_namespace(self, value) -> Hashable:
@@ -204,26 +136,26 @@ class Surroundings:
         self._namespaces.append(vars(value))
         if isinstance(value, ModuleType):
             return value.__name__
-        operators = [name for name, item in vars(value).items() if name.startswith("__") and _is_written(item)]
+        # dataclasses writes its methods from text
+        methods = {name: item.__code__.co_filename for name, item in vars(value).items() if type(item) is FunctionType}
+        operators = [name for name, file in methods.items() if name.startswith("__") and file != "<string>"]
         key = [self._read(name, vars(value).get, name) for name in operators]
         return value.__qualname__, *map(self._of, value.__bases__), *key
 
     def _of_object(self, value) -> Hashable:
         """An object by its fields and attributes; an object of a library by itself, unless it can be called or has no hash."""
         kind, inside = type(value), getattr(value, "__dict__", None)
-        if isinstance(value, Watched) and value.seen is not None:
-            return value.seen
-        is_data, of_library = dataclasses.is_dataclass(kind), is_of_library(kind.__module__)
-        if of_library and not is_data:
+        is_data = dataclasses.is_dataclass(kind)
+        if is_of_library(kind.__module__) and not is_data:
             if kind.__hash__ is not None and not (callable(value) and inside):
                 return value
             self._mutable = True
             return kind, repr(value) if inside is None else self._of(inside)
-        if not is_data:
+        names = [name for base in kind.__mro__ for name in getattr(base, "__slots__", ()) if hasattr(value, name)]
+        if is_data:
+            names = [field.name for field in dataclasses.fields(kind)]
+        else:
             self._namespaces.append(inside or {})
-        fields = dataclasses.fields(kind) if is_data else ()
-        slots = [name for base in kind.__mro__ for name in getattr(base, "__slots__", ())]
-        names = [field.name for field in fields] or [name for name in slots if hasattr(value, name)]
         return self._of(kind), *(self._read(name, getattr, value, name, _MISSING) for name in names)
 
     def _of_namespaces(self) -> list[Hashable]:
@@ -239,31 +171,19 @@ class Surroundings:
         return key
 
 
-class NamesRead(NamedTuple):
-    """Names that code reads: globals, cells of closures, and attributes, also those in texts, for `getattr`."""
-
-    globals: tuple[str, ...]
-    cells: frozenset[str]
-    attributes: dict[str, None]
-
-
 @lru_cache(maxsize=4096)
-def names_in(code: CodeType) -> NamesRead:
-    """The names that code reads, with the functions inside of it; in a fixed order."""
+def names_in(code: CodeType) -> tuple[tuple[str, ...], frozenset[str], dict[str, None]]:
+    """Names that code reads, with the functions inside of it: globals, cells of closures, and attributes, also those in texts for `getattr`."""
     read = [now for now, after in pairwise(dis.get_instructions(code)) if after.argval not in APPENDING]
     inner = [names_in(constant) for constant in code.co_consts if isinstance(constant, CodeType)]
     texts = [text for text in code.co_consts if isinstance(text, str) and text.isidentifier()]
     around = [now.argval for now in read if "GLOBAL" in now.opname or now.opname == "LOAD_NAME"]
-    return NamesRead(
-        tuple(dict.fromkeys([*around, *(name for names in inner for name in names.globals)])),
-        frozenset(now.argval for now in read if "DEREF" in now.opname).union(*(names.cells for names in inner)),
-        dict.fromkeys([*code.co_names, *texts, *(name for names in inner for name in names.attributes)]),
+    cells = frozenset(now.argval for now in read if "DEREF" in now.opname)
+    return (
+        tuple(dict.fromkeys([*around, *(name for names, _, _ in inner for name in names)])),
+        cells.union(*(names for _, names, _ in inner)),
+        dict.fromkeys([*code.co_names, *texts, *(name for _, _, names in inner for name in names)]),
     )
-
-
-def _is_written(method) -> bool:
-    """Whether a method has code of the user; `dataclasses` writes methods from text."""
-    return isinstance(method, FunctionType) and method.__code__.co_filename != "<string>"
 
 
 @lru_cache(maxsize=4096)
@@ -277,6 +197,6 @@ def is_of_library(module: str | None) -> bool:
 
 def name_of(function) -> str:
     """The name of a function of a system; the name of its class if the function has none."""
-    while hasattr(function, "function"):  # `Watched`, `Rheonomic`, `KineticFunction`, `ByName`
+    while hasattr(function, "function"):  # `TracedOnce`, `Rheonomic`, `KineticFunction`, `ByName`
         function = function.function
     return getattr(function, "__name__", type(function).__name__)

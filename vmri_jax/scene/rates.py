@@ -20,7 +20,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from vmri_jax.mechanics.arrays import quickly_compiled
-from vmri_jax.mechanics.surroundings import Watched
+from vmri_jax.mechanics.functions import TracedOnce
 from vmri_jax.scene.body import LARGEST_POINT, Bodies, label_of, moving
 from vmri_jax.scene.effect import Effect
 
@@ -140,7 +140,7 @@ def _linearise(effect: Effect, bodies: Bodies, columns: Mapping[str, np.ndarray]
         q = jnp.concatenate([bodies[name].coordinates for name in element])
         v = jnp.concatenate([bodies[name].rates for name in element])
         is_kinetic = effect.kind == "kinetic"
-        function = Watched(term.kinetic if is_kinetic else term.value)
+        function = TracedOnce(term.kinetic if is_kinetic else term.value)
         force, *matrices = map(np.asarray, _derivatives(function, is_kinetic, q, v, element_params))
         each = [bodies[name].motions for name in element]
         motions = block_diag(*each)
@@ -160,7 +160,7 @@ def _linearise(effect: Effect, bodies: Bodies, columns: Mapping[str, np.ndarray]
 
 
 @partial(quickly_compiled, static_argnames="kinetic")
-def _derivatives(function: Watched, kinetic: bool, q, v, params):
+def _derivatives(function: TracedOnce, kinetic: bool, q, v, params):
     """The force, K, G and d2L/dv2 of an element, whose value or kinetic energy is `function`, in the coordinates of its bodies."""
     # the derivatives of L = -V(q) by velocities are zero: tracing and compiling them would take time for nothing
     if not kinetic:

@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.mechanics.arrays import is_concrete, quickly_compiled
+from vmri_jax.mechanics.functions import TracedOnce
 from vmri_jax.mechanics.names import Names
-from vmri_jax.mechanics.surroundings import Watched
 from vmri_jax.scene.body import LARGEST_POINT, Bodies, label_of, moving
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.effects.freedoms import ANGLES
@@ -53,7 +53,7 @@ class _Element(NamedTuple):
     columns: numbers of these coordinates in (Q_s, Q_f), taken as one vector.
     """
 
-    value: Watched
+    value: TracedOnce
     params: dict[str, Any]
     columns: np.ndarray
 
@@ -154,11 +154,11 @@ def _elements(part: Placed, bodies: Bodies, columns: dict[str, np.ndarray], para
     for i in chain(*effect.by_size(part.elements, bodies)):
         of_element = np.concatenate([columns[name] for name in moving(elements[i])])
         term, element_params = effect.element_term(i, bodies, params)
-        yield _label(effect, elements[i]), _Element(Watched(term.value), element_params, of_element)
+        yield _label(effect, elements[i]), _Element(TracedOnce(term.value), element_params, of_element)
 
 
 @quickly_compiled
-def _value_and_jacobian(function: Watched, params, q, t):
+def _value_and_jacobian(function: TracedOnce, params, q, t):
     """Values (m,) of an element, and their derivatives with respect to the coordinates q of its bodies."""
 
     def values(q):

@@ -29,7 +29,7 @@ import jax
 import jax.numpy as jnp
 
 from vmri_jax.mechanics.arrays import is_concrete, real_array
-from vmri_jax.mechanics.surroundings import Watched
+from vmri_jax.mechanics.functions import TracedOnce
 from vmri_jax.steppers.results import RUNNING, Result
 
 if TYPE_CHECKING:
@@ -140,7 +140,7 @@ class Custom(Newton):
     """
 
     method = "custom"
-    stepper: Watched = eqx.field(kw_only=True)
+    stepper: TracedOnce = eqx.field(kw_only=True)
 
     def __init__(self, stepper: Callable[..., "Stepper | Solver"], tolerance: float = 1e-12):
         if not callable(stepper):
@@ -148,7 +148,7 @@ class Custom(Newton):
                 f"Custom: stepper is {stepper!r}; give a function of (system, scheme) that makes a Stepper."
             )
         self.stepper, self.tolerance, self.max_iterations, self.fixed_iterations = (
-            Watched(stepper),
+            TracedOnce(stepper),
             tolerance,
             100,
             None,

@@ -9,9 +9,8 @@ import jax
 import numpy as np
 
 from vmri_jax.mechanics.checks import digest, operations
-from vmri_jax.mechanics.functions import with_time
+from vmri_jax.mechanics.functions import TracedOnce, with_time
 from vmri_jax.mechanics.state import State
-from vmri_jax.mechanics.surroundings import Watched
 from vmri_jax.mechanics.system import KineticFunction, Potentials, System
 from vmri_jax.running.simulation import Simulation
 
@@ -63,19 +62,19 @@ def changed_conditions(attributes: dict, stored: dict) -> list[str]:
 
 def describe(name: str, value) -> dict[str, str]:
     """All leaves of a value as text, by the path to each leaf, which begins with `name`."""
-    if dataclasses.is_dataclass(value) and not isinstance(value, Watched):
+    if dataclasses.is_dataclass(value) and not isinstance(value, TracedOnce):
         parts = {f"{name}.{field.name}": getattr(value, field.name) for field in dataclasses.fields(value)}
     elif isinstance(value, dict) and any(map(dataclasses.is_dataclass, value.values())):  # rules of potentials
         parts = {f"{name}[{key!r}]": part for key, part in value.items()}
     else:
         value = tuple(value) if isinstance(value, Potentials) else value  # with its names
-        leaves, _ = jax.tree_util.tree_flatten_with_path(value, is_leaf=lambda leaf: isinstance(leaf, Watched))
+        leaves, _ = jax.tree_util.tree_flatten_with_path(value, is_leaf=lambda leaf: isinstance(leaf, TracedOnce))
         return {name + jax.tree_util.keystr(path): _text(leaf) for path, leaf in leaves}
     return {key: text for name, part in parts.items() for key, text in describe(name, part).items()}
 
 
 def _text(leaf) -> str:
-    if isinstance(leaf, Watched):
+    if isinstance(leaf, TracedOnce):
         leaf = leaf.function
     if callable(leaf):
         return f"{getattr(leaf, '__module__', '')}.{getattr(leaf, '__qualname__', type(leaf).__name__)}"
