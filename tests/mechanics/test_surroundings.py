@@ -15,7 +15,9 @@ import numpy as np
 import pytest
 
 import vmri_jax as vm
-from vmri_jax.mechanics.functions import TracedOnce
+from vmri_jax.control.transcription import Transcription
+from vmri_jax.ensembles.quantities import of_lanes, quantity
+from vmri_jax.mechanics.functions import TracedOnce, traced_once
 from vmri_jax.running.trajectory import from_arrays
 
 STRENGTH = 1.0
@@ -354,6 +356,11 @@ def test_functions_that_are_not_pure_are_refused(kind):
         problem(IMPURE[kind]).state()
 
 
+def test_a_function_of_a_run_that_is_not_pure_is_refused():
+    with pytest.raises(ValueError, match="of returns other numbers for the same run"):
+        vm.simulate(problem(), SCHEME, **STEPS, error=True, of=lambda run: run.q_s[-1] + rng.normal())
+
+
 class Controller:
     """A force that counts its calls."""
 
@@ -396,9 +403,27 @@ def test_functions_that_close_over_traced_numbers_are_refused_everywhere(kind, h
         TRANSFORMATIONS[kind](end)
 
 
+def of_run(run):
+    return STRENGTH * run.q_s[-1]
+
+
+def test_quantities_that_ensembles_keep_say_what_their_functions_say_now():
+    program = of_lanes([quantity(f"{__name__}:of_run")])
+    run = vm.simulate(problem(), SCHEME, **STEPS)
+    lanes = jax.tree.map(lambda a: jnp.asarray(a)[None], run)
+    for here.STRENGTH in (1.0, 2.0):
+        np.testing.assert_array_equal(program(lanes)["of_run"][0], here.STRENGTH * run.q_s[-1])
+
+
 def test_the_functions_of_control_and_of_solvers_are_watched():
     custom = vm.solvers.Custom(by_global)
-    before = jax.tree.structure(custom)
-    assert jax.tree.structure(vm.solvers.Custom(by_global)) == before
-    here.STRENGTH = 2.0
-    assert jax.tree.structure(custom) != before
+    functions = map(traced_once, (by_global,) * 5)
+    optimal = Transcription(
+        problem().system, problem().state(), SCHEME, vm.solvers.Auto(), 0.1, *functions, (0.0, 1.0), 1
+    )
+    for value in (custom, optimal):
+        here.STRENGTH = 1.0
+        before = jax.tree.structure(value)
+        assert jax.tree.structure(value) == before
+        here.STRENGTH = 2.0
+        assert jax.tree.structure(value) != before

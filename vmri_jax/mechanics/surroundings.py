@@ -149,8 +149,10 @@ class Surroundings:
         if is_of_library(kind.__module__) and not is_data:
             if kind.__hash__ is not None and not (callable(value) and inside):
                 return value
+            if inside is not None:
+                return kind, *(self._read(name, inside.get, name, _MISSING) for name in list(inside))
             self._mutable = True
-            return kind, repr(value) if inside is None else self._of(inside)
+            return kind, repr(value)
         names = [name for base in kind.__mro__ for name in getattr(base, "__slots__", ()) if hasattr(value, name)]
         if is_data:
             names = [field.name for field in dataclasses.fields(kind)]
