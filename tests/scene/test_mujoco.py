@@ -296,6 +296,23 @@ def test_a_start_that_leaves_a_loop_open_is_refused_with_the_gap():
     assert not Scene.from_mujoco(arm(weld, flags='equality="disable"')).dropped
 
 
+def test_angles_of_an_import_count_their_turns():
+    """A spring relaxed at 6 rad and limits at 4.15 rad, from a keyframe at 3.5 rad; directors would lose the turns."""
+    joint = '<joint name="h" axis="0 0 1" limited="true" range="-4.15 4.15" stiffness="2" springref="6"/>'
+    body = f'<body name="b">{joint}<geom type="sphere" size=".1" pos=".5 0 0"/></body>'
+    key = '<keyframe><key name="away" qpos="3.5"/></keyframe>'
+    text = f'<mujoco><compiler angle="radian"/><worldbody>{body}</worldbody>{key}</mujoco>'
+    model = mujoco.MjModel.from_xml_string(text)
+    scene = Scene.from_mujoco(model, key="away", limits="spring")
+    numbers = {effect.name: scene.params[effect.name] for effect in scene.effects}
+    assert numbers["h spring"]["neutral"] == pytest.approx(2.5)
+    assert [numbers["h limit"][side] for side in ("lower", "upper")] == pytest.approx([-7.65, 0.65])
+    with pytest.raises(
+        ValueError, match=r'h limit: lower is -7\.65; the angle of h comes from directors.*coordinates="joint"'
+    ):
+        Scene.from_mujoco(model, key="away", limits="spring", coordinates="directors")
+
+
 def test_a_small_gap_is_closed_by_the_joints():
     """An arm at 30 degrees is welded to the world by sites, one turned by these; its start is off by 1e-5 rad."""
     turned = "<site name='s' pos='0 0 1' euler='0 30 0'/>"

@@ -102,7 +102,7 @@ def simulate(
             best, settings = with_accuracy(system, scheme, state, solver, accuracy, **length, of=of, progress=tell)
         run, trajectory = best.run, replace(best.trajectory, origin=replace(best.run.origin, settings=settings))
         if int(trajectory.failed_at) < 0:
-            return with_error(run, trajectory, of, shares=error, halved=best.halved)
+            return with_error(run, trajectory, of, shares=error, trial=(best.halved, best.errors))
         if throw:
             raise simulation_error(trajectory, run.macro_dt, run.save_every, run.scheme.num_micro)
         return trajectory

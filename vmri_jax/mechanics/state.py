@@ -14,7 +14,7 @@ from jaxtyping import Float
 from vmri_jax.mechanics import by_name
 from vmri_jax.mechanics.arrays import Number, Numbers, is_concrete, of_one_type, quickly_compiled, require_x64
 from vmri_jax.mechanics.checks import check_arrays, check_flags, check_number, check_params, check_system, check_type
-from vmri_jax.mechanics.constraints import check_constraints, check_mass, project_positions
+from vmri_jax.mechanics.constraints import START, check_constraints, check_mass, project_positions
 from vmri_jax.mechanics.functions import with_time
 from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.projection import legendre, project_momentum
@@ -57,7 +57,7 @@ class State:
 
 
 def initial_state(
-    system: System, q_s, q_f, v_s, v_f, t: Number = 0.0, *, project: bool = False, tolerance=1e-9
+    system: System, q_s, q_f, v_s, v_f, t: Number = 0.0, *, project: bool = False, tolerance=START
 ) -> State:
     """Consistent state from positions and velocities: ``p = dT/dv``, projected onto the hidden constraints.
 
@@ -67,7 +67,7 @@ def initial_state(
         t: start time.
         project: move positions onto the constraints, and velocities onto the hidden constraints, instead of refusing them. A warning tells
             of velocities of which the projection leaves little.
-        tolerance: largest constraint value, in the unit of the constraint, of a satisfied constraint.
+        tolerance: largest value of a satisfied constraint, relative to the terms that cancel in it, ``|d| + L`` of ``|d| - L``.
 
     Raises:
         ValueError: float32 data or 64-bit mode off, wrong shapes, not finite, positions that violate a constraint (with
