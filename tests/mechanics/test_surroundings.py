@@ -417,10 +417,10 @@ def test_quantities_that_ensembles_keep_say_what_their_functions_say_now():
 
 def test_the_functions_of_control_and_of_solvers_are_watched():
     custom = vm.solvers.Custom(by_global)
-    functions = map(traced_once, (by_global,) * 5)
+    f = traced_once(by_global)
     optimal = Transcription(
-        problem().system, problem().state(), SCHEME, vm.solvers.Auto(), 0.1, *functions, (0.0, 1.0), 1
-    )
+        problem().system, problem().state(), SCHEME, vm.solvers.Auto(), 0.1, f, f, f, f, f, (0, 1), 1
+    )  # pyright: ignore[reportArgumentType]
     for value in (custom, optimal):
         here.STRENGTH = 1.0
         before = jax.tree.structure(value)

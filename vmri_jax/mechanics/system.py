@@ -110,7 +110,7 @@ class System(eqx.Module):
     force: TracedOnce | None = None
     params: Any = None
     implied: TracedOnce | Rheonomic | None = None
-    potentials: "Potentials" = ()
+    potentials: Potentials = Potentials()
 
     def __init__(
         self,
