@@ -13,7 +13,7 @@ from vmri_jax.accuracy.simulate import simulate
 from vmri_jax.diagnostics.shadow import ShadowEnergy
 from vmri_jax.mechanics.constraints import rows_at
 from vmri_jax.mechanics.state import Problem, State
-from vmri_jax.running.lost_energy import LostEnergyWarning
+from vmri_jax.running.observables import LostEnergyWarning
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.steppers.results import Result
 from vmri_jax.study.program import joined

@@ -4,7 +4,6 @@ import warnings
 from functools import lru_cache
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.sharding import PartitionSpec
 
@@ -17,7 +16,7 @@ from vmri_jax.running.engine import Arrays, Engine
 from vmri_jax.running.memory import check_memory
 from vmri_jax.running.progress import Working
 from vmri_jax.running.simulation import Simulation, simulation
-from vmri_jax.running.trajectory import Trajectory, from_arrays, with_origin
+from vmri_jax.running.trajectory import Run, Trajectory, trajectory_of, with_origin
 from vmri_jax.schemes.composition import Composition, stage_scheme
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.results import Result
@@ -109,8 +108,8 @@ def simulate_batch(
         "macro_dt": None if dt.ndim == 0 else dt * (scheme.num_micro if micro_dt is not None else 1),
     }
     with Working("simulate_batch: compiled if it is the first of its kind, then stepped"):
-        trajectory = _in_chunks(run, run.engine, batch, width, devices)
-    unsolved = (np.asarray(trajectory.failed_at) >= 0) & (np.asarray(trajectory.result) != Result.NOT_IMPLIED)
+        done, table = _in_chunks(run, run.engine, batch, width, devices)
+    unsolved = (done.failed_at >= 0) & (done.result != Result.NOT_IMPLIED)
     failed = np.flatnonzero(unsolved)
     if failed.size and run.plan.has_fallback:
         # Failed lanes are padded to a power of two with copies of the last one, so that few programs serve all numbers of failures.
@@ -120,19 +119,22 @@ def simulate_batch(
             f"simulate_batch: {failed.size} of {lanes} lanes, which the first solver does not solve, with solvers.Arrowhead"
         ):
             again = _in_chunks(run, run.exact_engine, jax.tree.map(lambda a: a[padded], batch), width, devices)
-        trajectory = jax.tree.map(lambda a, b: a.at[failed].set(b[: failed.size]), trajectory, again)
+        for old, new in zip(jax.tree.leaves((done, table)), jax.tree.leaves(again), strict=True):
+            old[failed] = new[: failed.size]
     if warn:
-        _warn_of_failures(trajectory)
-    return with_origin(trajectory, run.origin.repeated((lanes,), params))
+        _warn_of_failures(done)
+    macro_steps = run.macro_dt if batch["macro_dt"] is None else batch["macro_dt"]
+    run.warn("simulate_batch", table, done.states.t, macro_steps)
+    return with_origin(jax.device_put(trajectory_of(done, table)), run.origin.repeated((lanes,), params))
 
 
-def _warn_of_failures(trajectory: Trajectory) -> None:
+def _warn_of_failures(run: Run) -> None:
     """Warn about failed lanes, with the failing step and the status of the first one."""
-    failed_at = np.asarray(trajectory.failed_at)
+    failed_at = run.failed_at
     failed = np.flatnonzero(failed_at >= 0)
     if failed.size:
         first = int(failed[0])
-        result = Result(int(trajectory.result[first]))
+        result = Result(int(run.result[first]))
         warnings.warn(
             f"simulate_batch: {failed.size} of {failed_at.size} lanes failed and are NaN from there on; .result and .failed_at say "
             f"which. The first is lane {first}, at macro step {failed_at[first]} ({result.name}): {result.message}",
@@ -196,8 +198,8 @@ def lanes_at_once(run: Simulation) -> int:
     return 2 ** int(np.log2(np.clip(NUMBERS_PER_CHUNK / numbers_per_lane, FEWEST_LANES, MOST_LANES)))
 
 
-def _in_chunks(run: Simulation, engine: Engine, batch: dict, width: int, devices: int) -> Trajectory:
-    """All lanes, `width` at a time; the last chunk is padded with copies of its last lane, so that one program computes all chunks."""
+def _in_chunks(run: Simulation, engine: Engine, batch: dict, width: int, devices: int) -> tuple[Run, np.ndarray]:
+    """All lanes, as of `Simulation.observed`, `width` at a time; the last chunk is padded with copies of its last lane, so that one program computes all chunks."""
     lanes = len(batch["state"][0])
     width = min(width, -(-lanes // devices) * devices)
     program = _side_by_side(engine, batch["params"] is not None, batch["macro_dt"] is not None, devices)
@@ -210,7 +212,8 @@ def _in_chunks(run: Simulation, engine: Engine, batch: dict, width: int, devices
         leaves = run.arrays.model  # the parameters come last, see `Arrays`
         shared = leaves[: len(leaves) - num_params]
         pieces.append(program(shared, piece["params"] or [], piece["state"], macro_dt, run.save_every))
-    return from_arrays([jnp.asarray(np.concatenate(parts)[:lanes]) for parts in zip(*pieces, strict=True)])
+    whole = [np.concatenate(parts)[:lanes] for parts in zip(*pieces, strict=True)]
+    return run.observed(Run.of(whole), run.arrays.model, params=batch["params"])
 
 
 @lru_cache(maxsize=32)
@@ -218,7 +221,7 @@ def _side_by_side(engine: Engine, varies_params: bool, varies_steps: bool, devic
     """``program(leaves, params, state, macro_dt, save_every)``: a run of `engine` for each lane, with or without parameters and steps of its own."""
 
     def lane(leaves, params, state, macro_dt, save_every):
-        return jax.tree.leaves(engine.trajectory(Arrays(leaves + params, state, macro_dt), save_every))
+        return jax.tree.leaves(engine.run(Arrays(leaves + params, state, macro_dt), save_every))
 
     has_lanes = (False, varies_params, True, varies_steps, False)
     program = jax.vmap(lane, [0 if has_axis else None for has_axis in has_lanes])
