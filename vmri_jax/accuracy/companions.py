@@ -213,6 +213,10 @@ def check_function_of_run(of: Callable | None, error: bool, run: Simulation) -> 
     value = of(resting(run))
     if np.asarray(value).dtype.kind not in "fiu":
         raise TypeError(f"simulate: of returned {value!r} for a run; it must return a number or an array of numbers.")
+    if not np.array_equal(value, of(resting(run)), equal_nan=True):
+        raise ValueError(
+            "simulate: of returns other numbers for the same run; it must be pure, or differences of runs say nothing."
+        )
 
 
 def resting(run: Simulation) -> Trajectory:

@@ -12,6 +12,7 @@ from vmri_jax.control.search import Point, Search
 from vmri_jax.control.transcription import Transcription
 from vmri_jax.diagnostics.linear import phase_vector
 from vmri_jax.mechanics.arrays import real_array, whole_number
+from vmri_jax.mechanics.functions import traced_once
 from vmri_jax.mechanics.state import start_of
 from vmri_jax.running.simulation import prepare
 from vmri_jax.schemes.composition import Composition
@@ -92,11 +93,11 @@ def transcribed(
         scheme,
         solver or solvers.Auto(),
         np.asarray(float(macro_dt)),
-        actuate,
-        cost,
-        final_cost or free,
-        goal or unaimed,
-        limits,
+        traced_once(actuate),
+        traced_once(cost),
+        traced_once(final_cost or free),
+        traced_once(goal or unaimed),
+        None if limits is None else traced_once(limits),
         _bounds(bounds, num_controls),
         scheme.num_micro if grid == "micro" else 1,
     )

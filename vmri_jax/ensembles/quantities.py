@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from vmri_jax.catalogue import imported
+from vmri_jax.mechanics.functions import TracedOnce
 from vmri_jax.mechanics.names import near
 from vmri_jax.mechanics.state import Problem, State
 from vmri_jax.running.export import DIMENSIONS
@@ -210,4 +211,6 @@ def of_lanes(quantities: Sequence[Quantity]) -> Callable[[Trajectory], dict[str,
     def of_lane(run: Trajectory):
         return {name: array.value for name, array in kept(quantities, run).items()}
 
-    return jax.jit(jax.vmap(of_lane))
+    program = jax.jit(lambda functions, run: jax.vmap(of_lane)(run))  # the functions tell JAX when to trace anew
+    functions = [TracedOnce(item.function) for item in quantities]
+    return lambda run: program(functions, run)

@@ -101,10 +101,10 @@ def constraints(trajectory: Trajectory) -> tuple[float, float]:
 
 
 def relative_constraints(problem: Problem, trajectory: Trajectory) -> float:
-    """Largest ``|g|`` at the saved nodes of a run, relative to the terms of its row; NaN if the run failed."""
+    """Largest ``|g|`` at the saved nodes of a run, relative to the size of its row; NaN if the run failed."""
     states = trajectory.states
     rows = jax.jit(jax.vmap(partial(rows_at, problem.system)))(states.t, states.q_s, states.q_f)
-    return float(np.max(np.abs(rows.values) / rows.terms))
+    return float(np.max(np.abs(rows.values) / rows.sizes))
 
 
 def nodes(trajectory: Trajectory) -> np.ndarray:

@@ -67,7 +67,7 @@ def initial_state(
         t: start time.
         project: move positions onto the constraints, and velocities onto the hidden constraints, instead of refusing them. A warning tells
             of velocities of which the projection leaves little.
-        tolerance: largest value of a satisfied constraint, relative to the terms that cancel in it, ``|d| + L`` of ``|d| - L``.
+        tolerance: largest value of a satisfied constraint, relative to its size, mostly of the terms that cancel in it: ``|d| + L`` of ``|d| - L``.
 
     Raises:
         ValueError: float32 data or 64-bit mode off, wrong shapes, not finite, positions that violate a constraint (with
@@ -94,7 +94,7 @@ def initial_state(
     if project:
         q_s, q_f = _projected_positions(system, t, q_s, q_f)
     state, violation = _consistent(system, t, q_s, q_f, v_s, v_f)
-    if is_concrete(state):
+    if is_concrete((system, state)):
         advice = (
             "projection did not reach the constraints; start closer to them."
             if project

@@ -179,6 +179,8 @@ class Engine:
             return self._by_scan(stepper, cursor, times, loops)
         empty = self._empty(start, stepper.scheme.num_micro)
         loop = self._by_while_loop(stepper, cursor, empty, times, saves)
+        if saves is not None:  # else all nodes are written
+            loop = loop._replace(saved=loop.saved.ended(saves, loop.number))
         nodes = start.t + jnp.arange(self.num_saves + 1) * save_every * macro_dt
         return self._run(stepper.scheme, loop, nodes, macro_dt)
 

@@ -34,10 +34,9 @@ class Saved(NamedTuple):
 
     @classmethod
     def none(cls, state: State, room: int, num_micro: int | None) -> "Saved":
-        """Arrays without nodes. `num_micro` is None unless micro nodes are saved."""
-        row = _empty_row(numbers_per_node(state))
-        micros = None if num_micro is None else jnp.full((room, num_micro, state.q_f.shape[0]), jnp.nan)
-        return cls(jnp.broadcast_to(row, (room + 1, row.size)), micros)
+        """Arrays without nodes; zeros, since `jax_debug_nans` stops a program that returns NaN. `num_micro` is None unless micro nodes are saved."""
+        micros = None if num_micro is None else jnp.zeros((room, num_micro, state.q_f.shape[0]))
+        return cls(jnp.zeros((room + 1, numbers_per_node(state))), micros)
 
     def write(self, number, state: State, info: RunInfo, micro) -> "Saved":
         """The arrays with node `number` written into them; node 0, the start, has no micro nodes before it."""
@@ -56,6 +55,14 @@ class Saved(NamedTuple):
             return Saved(rows, None)
         micros = np.array(np.asarray(self.micros)[:saves])
         micros[max(written - 1, 0) :] = np.nan
+        return Saved(rows, micros)
+
+    def ended(self, saves, written) -> "Saved":
+        """The arrays of JAX with NaN in the nodes from number `written` to `saves`, which a failed run has not reached."""
+        number = jnp.arange(len(self.rows))
+        is_missing = (number >= written) & (number <= saves)
+        rows = jnp.where(is_missing[:, None], _empty_row(self.rows.shape[1]), self.rows)
+        micros = None if self.micros is None else jnp.where(is_missing[1:, None, None], jnp.nan, self.micros)
         return Saved(rows, micros)
 
     def run(self, num_slow: int, times, status: dict[str, Any], before_end) -> Run:

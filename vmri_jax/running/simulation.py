@@ -24,7 +24,7 @@ import numpy as np
 
 from vmri_jax.configure import warn_if_slow
 from vmri_jax.mechanics.arrays import is_concrete, of_one_type
-from vmri_jax.mechanics.checks import check_closures, check_params, check_system
+from vmri_jax.mechanics.checks import check_params, check_system
 from vmri_jax.mechanics.constraints import check_constraints, check_mass
 from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.state import Movable, State, opened, start_of
@@ -387,7 +387,8 @@ def prepare(
         other = run(other_state, macro_dt=0.02, params=other_params)
 
     A call costs some ten microseconds besides its steps, and raises `SimulationError` if a step fails, as `simulate` does. The first call
-    that needs the fallback of `solvers.Auto` compiles it, which takes as long as `prepare`. Arguments as of `simulate`.
+    that needs the fallback of `solvers.Auto` compiles it, which takes as long as `prepare`. The run keeps what the functions of the system
+    read from around them (globals, closures, attributes) when it was prepared. Arguments as of `simulate`.
 
     Returns:
         The `Simulation`.
@@ -446,7 +447,6 @@ class _Checked:
 def _check_once(checked: _Checked) -> None:
     """Check a system at a state. The check takes longer than a short run; the cache skips it for an equal `key`."""
     check_system(checked.system, checked.state.q_s, checked.state.q_f)
-    check_closures(checked.system, checked.state.q_s, checked.state.q_f)
     check_mass(checked.system, checked.state.q_s, checked.state.q_f)
     if checked.constraints:
         check_constraints(checked.system, checked.state, checked.state_name)

@@ -61,7 +61,8 @@ def stream(
 
     A chunk counts when all of it is on disk, together with a checkpoint of everything that the next steps depend on, the
     state and the memory of the solver: on the same machine with the same versions, a resumed run is identical
-    to an uninterrupted one to the last bit. One chunk is held in memory at a time.
+    to an uninterrupted one to the last bit. One chunk is held in memory at a time. The run keeps what its functions read from around them at its
+    start; a resumed run whose functions do other operations is refused.
 
     Args:
         system, scheme, state, macro_dt, micro_dt, t_end, save_every, save_micro, solver: as in `simulate`.
