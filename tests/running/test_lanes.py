@@ -141,7 +141,20 @@ def test_one_compilation_for_all_chunks_and_step_sizes(fpu):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"macro_dt": np.ones(2)}, r"macro_dt has shape \(2,\); give a number, or one for each of the 3 lanes"),
+        (
+            {"macro_dt": np.ones(2)},
+            r"states.p_f has 3, macro_dt has 2; give params, states or steps with one value for",
+        ),
+        (
+            {"macro_dt": np.ones((3, 1))},
+            r"macro_dt has shape \(3, 1\); give \(\) for all lanes, or an axis of lanes in",
+        ),
+        (
+            {"num_steps": None, "t_end": 1.0, "macro_dt": np.array([0.1, 0.2, 0.1])},
+            "t_end with steps or start times that d",
+        ),
+        ({"params": {"omga": [1.0, 2.0, 3.0]}}, "there is no parameter 'omga'. Did you mean omega. There are omega"),
+        ({"params": {"omega": np.ones((3, 2))}}, r"params\['omega'\] has shape \(3, 2\); give \(\) for all lanes"),
         ({"macro_dt": np.array([0.1, -0.1, 0.1])}, "every macro_dt must be a positive number"),
         ({"num_steps": 0}, "num_steps is 0; it must be an integer of at least 1"),
         ({"devices": 99}, "devices is 99, but JAX has"),
@@ -154,7 +167,9 @@ def test_bad_input_is_refused(fpu, changes, message):
 
 
 def test_states_without_a_batch_axis_are_refused(fpu):
-    with pytest.raises(ValueError, match="give t \\(batch,\\) and all others \\(batch, n\\)"):
+    with pytest.raises(
+        ValueError, match="no argument has an axis of lanes; give params, states or steps with one value"
+    ):
         simulate_batch(fpu.system, fully_explicit(4), fpu.state(), macro_dt=0.1, num_steps=1)
 
 

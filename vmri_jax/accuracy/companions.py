@@ -67,21 +67,36 @@ def with_error(
             stacklevel=3,
         )
         return trajectory
+    refined = companion(run, scheme.with_num_micro(2 * stage_scheme(scheme).num_micro), 1) if shares else None
+    error = run_error(order, trajectory, halved, refined, of)
+    if not error.is_certified:
+        warnings.warn(f"simulate: {_uncertified(error, trajectory)}", UncertifiedWarning, stacklevel=3)
+    return replace(trajectory, error=error)
+
+
+def run_error(
+    order: int,
+    trajectory: Trajectory,
+    halved: Trajectory,
+    refined: Trajectory | None = None,
+    of: Callable | None = None,
+) -> RunError:
+    """The error of a run of a scheme of this order from its companions; without the shares if there is no refined one.
+
+    Args:
+        halved: companion with half the macro step.
+        refined: companion with twice the micro steps.
+        of: function of a run, whose error is estimated, too.
+    """
     total = extrapolated(order, trajectory, halved)
-    fast = np.full_like(total, np.nan)
-    if shares:
-        refined = companion(run, scheme.with_num_micro(2 * stage_scheme(scheme).num_micro), 1)
-        fast = extrapolated(order, trajectory, refined)
+    fast = np.full_like(total, np.nan) if refined is None else extrapolated(order, trajectory, refined)
     certified, growth = certified_nodes(trajectory, total)
     until = np.asarray(trajectory.t)[certified][-1]
     total, slow, fast = (np.where(certified[:, None], a, np.nan) for a in (total, total - fast, fast))
     of_error = None if of is None else _of_error(of, order, trajectory, halved, certified)
     q_s, q_f = np.split(total, [trajectory.states.q_s.shape[-1]], axis=1)
     shares_at_nodes = largest_of(slow), largest_of(fast)
-    error = RunError(q_s, q_f, *shares_at_nodes, of_error, np.asarray(until), np.asarray(growth))
-    if not certified.all():
-        warnings.warn(f"simulate: {_uncertified(error, trajectory)}", UncertifiedWarning, stacklevel=3)
-    return replace(trajectory, error=error)
+    return RunError(q_s, q_f, *shares_at_nodes, of_error, np.asarray(until), np.asarray(growth))
 
 
 def ratio(order: int) -> float:

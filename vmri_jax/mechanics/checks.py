@@ -13,7 +13,8 @@ from vmri_jax.mechanics.arrays import check_precision, is_concrete, real_array
 from vmri_jax.mechanics.arrays import require_x64 as require_x64
 from vmri_jax.mechanics.functions import TracedOnce, with_time
 from vmri_jax.mechanics.masses import ConstantMass
-from vmri_jax.mechanics.system import System
+from vmri_jax.mechanics.order import order_of, ordered
+from vmri_jax.mechanics.system import KineticFunction, System
 
 CONSTRAINT_TOLERANCE = 1e-6
 """Largest constraint value, in the unit of the constraint, of a constraint that is kept. Loose Newton tolerances raise it. A smaller value would
@@ -146,6 +147,9 @@ def shape_of(name: str, function, *args):
         ValueError: the function cannot be traced, differentiated, or evaluated.
     """
 
+    if not isinstance(function, TracedOnce | KineticFunction | ConstantMass):  # these have the order of their system
+        function = ordered(function, order_of(args[-1]))
+
     def differentiated_twice(*args):
         *moving, params = args
 
@@ -184,7 +188,7 @@ def _check_indices(name: str, function, args) -> None:
     """
     if isinstance(function, ConstantMass):
         return
-    raw = getattr(function, "function", function)  # of `KineticFunction` and `TracedOnce`
+    raw = function.function if isinstance(function, KineticFunction) else function
     raw = raw.function if isinstance(raw, TracedOnce) else raw
     leaves, structure = jax.tree.flatten(args)
     missing = _missing_entry(raw, structure, tuple(np.shape(leaf) for leaf in leaves))

@@ -1,8 +1,15 @@
-"""Batches of runs: a lane for each start, step size or parameter set of one system; lanes do not influence each other."""
+"""Batches of runs: a lane for each start, step size or parameter set of one system; lanes do not influence each other.
 
-import warnings
+Every array of a batch has the lanes as its first axis. An array that all lanes share is a view without copies, see `shared`: compiled programs
+get it once.
+"""
+
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,13 +17,15 @@ from jax.sharding import PartitionSpec
 
 from vmri_jax.mechanics.arrays import is_concrete, real_array, whole_number
 from vmri_jax.mechanics.checks import check_params
-from vmri_jax.mechanics.state import Movable, State, opened, start_of
+from vmri_jax.mechanics.names import unknown
+from vmri_jax.mechanics.state import Movable, State, initial_state, opened, start_of
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.arguments import Steps
 from vmri_jax.running.engine import Arrays, Engine
 from vmri_jax.running.memory import check_memory
+from vmri_jax.running.origin import is_repeated
 from vmri_jax.running.progress import Working
-from vmri_jax.running.simulation import Simulation, simulation
+from vmri_jax.running.simulation import FALLING_BACK, STEPPING, Simulation, simulation
 from vmri_jax.running.trajectory import Trajectory, from_arrays, with_origin
 from vmri_jax.schemes.composition import Composition, stage_scheme
 from vmri_jax.schemes.scheme import Scheme
@@ -32,151 +41,209 @@ MOST_LANES = 1024
 """Most lanes of a chunk; with more, the last chunk of a batch may be mostly padding."""
 
 
-class FailedLanesWarning(UserWarning):
-    """Lanes of a batch failed: they are NaN after the failing step; all other lanes are right."""
+@dataclass(frozen=True)
+class Batch:
+    """Runs side by side, with checked arguments.
 
-
-def simulate_batch(
-    system: Movable,
-    scheme: Scheme | Composition,
-    states: State,
-    *,
-    macro_dt=None,
-    micro_dt=None,
-    num_steps: int | None = None,
-    t_end: float | None = None,
-    save_every: int = 1,
-    save_micro: bool = False,
-    params=None,
-    solver: Newton | None = None,
-    chunk: int | None = None,
-    devices: int = 1,
-    warn: bool = True,
-) -> Trajectory:
-    """Simulate a batch of states, each lane as `simulate` would; the arrays returned have a leading batch axis.
-
-    Lanes are computed side by side (`jax.vmap`), in chunks that fit into the cache. Unlike `simulate`, a failed step never raises: its
-    lane is NaN after the step and has its status in ``.result`` and ``.failed_at``; other lanes do not change. A
-    `FailedLanesWarning` says how many lanes failed. Lanes that the first solver of `Auto` does not solve are run again with `Arrowhead`,
-    whose program is compiled at the first such lane.
-
-    Args:
-        system: a `System`, `Problem` or scene.
-        scheme: a scheme or composition.
-        states: a `State` whose arrays have a leading batch axis, e.g. ``jax.vmap(make)(q_s, ...)`` or
-            ``jax.tree.map(lambda *a: jnp.stack(a), *list_of_states)``.
-        macro_dt, micro_dt: step size, a number or one per lane; exactly one of them.
-        num_steps, t_end, save_every, save_micro, solver: as in `simulate`; t_end with one step size for all.
-        params: a pytree like ``system.params`` with a leading batch axis, if parameters differ between lanes.
-        chunk: lanes that are computed side by side; chosen from the size of the problem if None.
-        devices: CPU devices over which chunks are spread, see `vmri_jax.configure`.
-        warn: give a `FailedLanesWarning` where lanes failed; False for a program that looks at the statuses itself.
-
-    Raises:
-        ValueError, TypeError: bad arguments, before anything is computed.
+    Attributes:
+        run: the run of the first lane.
+        params: (lanes, ...) leaves of the parameters of all lanes.
+        state: (lanes, ...) arrays of the starts.
+        macro_dt: (lanes,) macro steps.
+        width: lanes that are computed side by side.
+        devices: CPU devices that share the lanes.
     """
-    if not is_concrete((states, macro_dt, micro_dt, params)):
+
+    run: Simulation
+    params: list[Any]
+    state: tuple[Any, ...]
+    macro_dt: Any
+    width: int
+    devices: int
+
+    def __call__(self) -> Trajectory:
+        """The runs; lanes that the first solver of the plan does not solve are computed again by its fallback."""
+        run, lanes = self.run, len(self.macro_dt)
+        with Working(f"simulate_batch, {lanes} lanes", running=STEPPING):
+            trajectory = self._in_chunks(run.engine)
+        unsolved = (np.asarray(trajectory.failed_at) >= 0) & (np.asarray(trajectory.result) != Result.NOT_IMPLIED)
+        failed = np.flatnonzero(unsolved)
+        if failed.size and run.plan.has_fallback:
+            # Failed lanes are padded to a power of two with copies of the last one, so that few programs serve all numbers of failures.
+            padded_size = 2 ** int(failed.size - 1).bit_length()
+            padded = failed[np.minimum(np.arange(padded_size), failed.size - 1)]
+            with Working(f"simulate_batch, {failed.size} of {lanes} lanes: {FALLING_BACK}"):
+                again = self._taken(padded)._in_chunks(run.exact_engine)
+            trajectory = jax.tree.map(lambda a, b: a.at[failed].set(b[: failed.size]), trajectory, again)
+        params = jax.tree.unflatten(jax.tree.structure(run.system.params), self.params)
+        return with_origin(trajectory, run.origin.repeated((lanes,), params))
+
+    def halved(self) -> "Batch":
+        """The same runs with half the macro step, and the same saved nodes."""
+        run = self.run
+        counts = {"num_steps": 2 * run.num_steps, "save_every": 2 * run.save_every}
+        half = replace(run, macro_dt=run.macro_dt / 2, **counts, save_micro=False)
+        macro_dt = shared(half.macro_dt, len(self.macro_dt)) if is_repeated(self.macro_dt) else self.macro_dt / 2
+        return replace(self, run=half, macro_dt=macro_dt)
+
+    def _taken(self, index: np.ndarray) -> "Batch":
+        """The lanes with these numbers."""
+
+        def taken(a):
+            return shared(a[0], len(index)) if is_repeated(a) else a[index]
+
+        return replace(
+            self,
+            params=[taken(a) for a in self.params],
+            state=tuple(map(taken, self.state)),
+            macro_dt=taken(self.macro_dt),
+        )
+
+    def _in_chunks(self, engine: Engine) -> Trajectory:
+        """All lanes, `width` at a time; the last chunk is padded with copies of its last lane, so that one program computes all chunks."""
+        lanes = len(self.macro_dt)
+        width = min(self.width, -(-lanes // self.devices) * self.devices)
+        of_params, of_steps = tuple(not is_repeated(a) for a in self.params), not is_repeated(self.macro_dt)
+        of_state = not all(map(is_repeated, self.state)) or not (any(of_params) or of_steps)
+        program = _side_by_side(engine, of_params, of_state, of_steps, self.devices)
+        leaves = self.run.arrays.model  # the parameters come last, see `Arrays`
+        leaves, pieces = leaves[: len(leaves) - len(self.params)], []
+        for start in range(0, lanes, width):
+            part = self._taken(np.minimum(np.arange(start, start + width), lanes - 1))
+            params = [a if has_lanes else a[0] for a, has_lanes in zip(part.params, of_params, strict=True)]
+            state = tuple(a if of_state else a[0] for a in part.state)
+            macro_dt = part.macro_dt if of_steps else part.macro_dt[0]
+            pieces.append(program(leaves, params, state, macro_dt, self.run.save_every))
+        return from_arrays([jnp.asarray(np.concatenate(parts)[:lanes]) for parts in zip(*pieces, strict=True)])
+
+
+def batch(
+    moving: Movable,
+    scheme: Scheme | Composition,
+    states: State | None,
+    steps: Steps,
+    params,
+    solver: Newton | None,
+    chunk: int | None,
+    devices: int,
+) -> Batch:
+    """The `Batch` with these arguments of `simulate_batch`; bad arguments raise."""
+    if not is_concrete((states, steps.macro_dt, steps.micro_dt, params)):
         raise ValueError(
             "simulate_batch: arguments are tracers; call it outside of jax.jit, vmap and grad, or take jax.vmap of simulate."
         )
-    lanes = _check_states(states)
-    first = jax.tree.map(lambda a: np.asarray(a)[0], states)
-    problem = opened(system)
-    system, _ = start_of("simulate_batch", problem, first)
-    if params is not None:
-        _check_params(system, params, lanes)
-    if t_end is not None and any(np.ndim(step) for step in (macro_dt, micro_dt) if step is not None):
-        raise ValueError(
-            "simulate_batch: t_end with a step size for each lane; give num_steps, the same for all lanes."
-        )
-    steps = Steps(_first(macro_dt), _first(micro_dt), num_steps, t_end, save_every, save_micro)
-    run = simulation(problem, scheme, first, solver, steps)
-    name, dt = ("macro_dt", macro_dt) if micro_dt is None else ("micro_dt", micro_dt)
-    dt = np.asarray(real_array(f"simulate_batch: {name}", dt))
-    if dt.shape not in ((), (lanes,)):
-        raise ValueError(
-            f"simulate_batch: {name} has shape {dt.shape}; give a number, or one for each of the {lanes} lanes."
-        )
-    if not (np.all(np.isfinite(dt)) and np.all(dt > 0)):
-        raise ValueError(f"simulate_batch: every {name} must be a positive number, got {dt}.")
-    _check_devices(devices, chunk)
-    run.check("simulate_batch: the positions of the first state", constraints=params is None)
-    check_memory("simulate_batch", run.state, scheme.num_micro, run.num_saves, save_micro, lanes)
-    width = (lanes_at_once(run) if chunk is None else chunk) * devices
-    batch = {
-        "params": None if params is None else [np.asarray(leaf) for leaf in jax.tree.leaves(params)],
-        "state": tuple(np.asarray(a, dtype=float) for a in vars(states).values()),
-        "macro_dt": None if dt.ndim == 0 else dt * (scheme.num_micro if micro_dt is not None else 1),
+    problem = opened(moving)
+    system, start = start_of("simulate_batch", problem, states)
+    known = dict(zip(_names(system.params), map(np.shape, jax.tree.leaves(system.params)), strict=True))
+    new = {} if params is None else dict(_named(params, known))
+    check_params(new)
+    sizes = {name: getattr(steps, name) for name in ("macro_dt", "micro_dt") if getattr(steps, name) is not None}
+    arrays = {f"params[{name!r}]": (value, known[name]) for name, value in new.items()}
+    arrays |= {
+        f"states.{name}": (value, np.shape(value)[-1:] if name != "t" else ()) for name, value in vars(start).items()
     }
-    with Working("simulate_batch: compiled if it is the first of its kind, then stepped"):
-        trajectory = _in_chunks(run, run.engine, batch, width, devices)
-    unsolved = (np.asarray(trajectory.failed_at) >= 0) & (np.asarray(trajectory.result) != Result.NOT_IMPLIED)
-    failed = np.flatnonzero(unsolved)
-    if failed.size and run.plan.has_fallback:
-        # Failed lanes are padded to a power of two with copies of the last one, so that few programs serve all numbers of failures.
-        padded_size = 2 ** int(failed.size - 1).bit_length()
-        padded = failed[np.minimum(np.arange(padded_size), failed.size - 1)]
-        with Working(
-            f"simulate_batch: {failed.size} of {lanes} lanes, which the first solver does not solve, with solvers.Arrowhead"
-        ):
-            again = _in_chunks(run, run.exact_engine, jax.tree.map(lambda a: a[padded], batch), width, devices)
-        trajectory = jax.tree.map(lambda a, b: a.at[failed].set(b[: failed.size]), trajectory, again)
-    if warn:
-        _warn_of_failures(trajectory)
-    return with_origin(trajectory, run.origin.repeated((lanes,), params))
-
-
-def _warn_of_failures(trajectory: Trajectory) -> None:
-    """Warn about failed lanes, with the failing step and the status of the first one."""
-    failed_at = np.asarray(trajectory.failed_at)
-    failed = np.flatnonzero(failed_at >= 0)
-    if failed.size:
-        first = int(failed[0])
-        result = Result(int(trajectory.result[first]))
-        warnings.warn(
-            f"simulate_batch: {failed.size} of {failed_at.size} lanes failed and are NaN from there on; .result and .failed_at say "
-            f"which. The first is lane {first}, at macro step {failed_at[first]} ({result.name}): {result.message}",
-            FailedLanesWarning,
-            stacklevel=3,
-        )
-
-
-def _first(dt):
-    """The step size of the first lane."""
-    if dt is None or not np.size(real_array("simulate_batch: the step size", dt)):
-        return dt
-    return np.ravel(dt)[0]
-
-
-def _check_params(system: System, params, lanes: int) -> None:
-    """Refuse parameters of another structure than ``system.params``, or without a batch axis."""
-    check_params(params)
-    expected, structure = jax.tree.structure(system.params), jax.tree.structure(params)
-    if expected != structure:
+    arrays |= {name: (real_array(f"simulate_batch: {name}", size), ()) for name, size in sizes.items()}
+    arrays = _with_lanes(arrays)
+    t, *_ = state = tuple(arrays[f"states.{name}"] for name in vars(start))
+    lanes = len(t)
+    if steps.t_end is not None and not all(
+        is_repeated(arrays[name]) or np.ptp(arrays[name]) == 0 for name in (*sizes, "states.t")
+    ):
         raise ValueError(
-            f"simulate_batch: params is {structure}; give the pytree of system.params, {expected}, with a batch axis."
+            "simulate_batch: t_end with steps or start times that differ; give num_steps, the same for all lanes."
         )
-    wanted = [(lanes, *np.shape(leaf)) for leaf in jax.tree.leaves(system.params)]
-    shapes = [np.shape(leaf) for leaf in jax.tree.leaves(params)]
-    if shapes != wanted:
-        raise ValueError(
-            f"simulate_batch: the arrays of params have shapes {shapes}; give one per lane of each parameter, {wanted}."
-        )
+    for name in sizes:
+        if not (np.all(np.isfinite(arrays[name])) and np.all(arrays[name] > 0)):
+            raise ValueError(f"simulate_batch: every {name} must be a positive number, got {sizes[name]}.")
+    _check_devices(devices, chunk)
+    leaves = [
+        arrays[f"params[{name!r}]"] if name in new else shared(leaf, lanes)
+        for name, leaf in zip(known, jax.tree.leaves(system.params), strict=True)
+    ]
+    if states is None and new and not (system.has_constant_mass and not system.is_constrained):
+        # momenta M v, and their projection onto constraints, depend on parameters
+        all_params = jax.tree.unflatten(jax.tree.structure(system.params), leaves)
+        fixed = tuple(getattr(problem, name) for name in ("t", "q_s", "q_f", "v_s", "v_f"))
+        states = consistent_states(system, all_params, fixed, problem.project, starts_differ=False)
+        state = tuple(map(np.asarray, vars(states).values()))
+    first = State(*(a[0] for a in state))
+    run = simulation(problem, scheme, first, solver, replace(steps, **{name: arrays[name][0] for name in sizes}))
+    run.check("simulate_batch: the positions of the first state", constraints=not new)
+    check_memory("simulate_batch", run.state, scheme.num_micro, run.num_saves, steps.save_micro, lanes)
+    (dt,) = (arrays[name] for name in sizes)
+    macro_dt = shared(run.macro_dt, lanes) if is_repeated(dt) else dt * (1 if "macro_dt" in sizes else scheme.num_micro)
+    return Batch(run, leaves, state, macro_dt, (lanes_at_once(run) if chunk is None else chunk) * devices, devices)
 
 
-def _check_states(states) -> int:
-    """The number of lanes."""
-    if not isinstance(states, State):
-        raise TypeError(
-            f"simulate_batch: states is {type(states).__name__}; give a State whose arrays have a batch axis."
+def shared(value, lanes: int) -> np.ndarray:
+    """(lanes, ...) view of a value that all lanes share, see `is_repeated`."""
+    return np.broadcast_to(np.asarray(value), (lanes, *np.shape(value)))
+
+
+@eqx.filter_jit
+def consistent_states(system: System, params, start: tuple, project: bool, starts_differ: bool = True) -> State:
+    """Consistent states of all lanes, from starts (t, q_s, q_f, v_s, v_f) and parameters.
+
+    Args:
+        params: of all lanes; None for the parameters of the system.
+        starts_differ: whether the arrays of the start have an axis of lanes.
+    """
+
+    def of_lane(lane_params, lane_start):
+        t, q_s, q_f, v_s, v_f = lane_start
+        lane_system = system if lane_params is None else system.replace(params=lane_params)
+        return initial_state(lane_system, q_s, q_f, v_s, v_f, t, project=project)
+
+    return jax.vmap(of_lane, (None if params is None else 0, 0 if starts_differ else None))(params, start)
+
+
+def _names(params) -> list[str]:
+    """Names of all parameters, with dots in names of nested ones."""
+    return [
+        jax.tree_util.keystr(path, simple=True, separator=".")
+        for path, _ in jax.tree_util.tree_leaves_with_path(params)
+    ]
+
+
+def _named(values, known: Collection[str], path: tuple[str, ...] = ()) -> Iterator[tuple[str, Any]]:
+    """Name and value of each parameter in a part of the parameters, nested or with dots in its names.
+
+    Raises:
+        ValueError: a name that is not known, with the known ones.
+    """
+    name = ".".join(path)
+    if name in known:
+        yield name, np.asarray(values)
+        return
+    entries, _ = jax.tree_util.tree_flatten_with_path(values, is_leaf=lambda node: node is not values)
+    if entries[:1] == [((), values)] or (name and not any(other.startswith(f"{name}.") for other in known)):
+        raise ValueError(f"simulate_batch: params: {unknown('parameter', name, known)}")
+    for (key,), entry in entries:
+        yield from _named(entry, known, (*path, jax.tree_util.keystr((key,), simple=True)))
+
+
+def _with_lanes(arrays: dict[str, tuple[Any, tuple[int, ...]]]) -> dict[str, np.ndarray]:
+    """Arrays (lanes, *shape), of arrays with or without an axis of lanes and the shape without it, by name.
+
+    Raises:
+        ValueError: arrays of other shapes, axes of different lengths, or no axis of lanes at all.
+    """
+    values = {name: np.asarray(value) for name, (value, _) in arrays.items()}
+    for name, (_, shape) in arrays.items():
+        if values[name].shape != shape and values[name].shape[1:] != shape:
+            raise ValueError(
+                f"simulate_batch: {name} has shape {values[name].shape}; give {shape} for all lanes, or an axis of lanes in front of it."
+            )
+    lengths = {name: len(value) for name, value in values.items() if value.ndim > len(arrays[name][1])}
+    if len(set(lengths.values())) != 1 or 0 in lengths.values():
+        listed = (
+            ", ".join(f"{name} has {length}" for name, length in lengths.items()) or "no argument has an axis of lanes"
         )
-    shapes = {name: np.shape(value) for name, value in vars(states).items()}
-    lanes = shapes["q_s"][:1]
-    if any(len(s) != (1 if name == "t" else 2) or s[:1] != lanes for name, s in shapes.items()) or lanes == (0,):
         raise ValueError(
-            f"simulate_batch: the arrays of states have shapes {shapes}; give t (batch,) and all others (batch, n)."
+            f"simulate_batch: {listed}; give params, states or steps with one value for each lane, all of the same number."
         )
-    return lanes[0]
+    (lanes,) = set(lengths.values())
+    return {name: value if name in lengths else shared(value, lanes) for name, value in values.items()}
 
 
 def _check_devices(devices, chunk) -> None:
@@ -196,35 +263,22 @@ def lanes_at_once(run: Simulation) -> int:
     return 2 ** int(np.log2(np.clip(NUMBERS_PER_CHUNK / numbers_per_lane, FEWEST_LANES, MOST_LANES)))
 
 
-def _in_chunks(run: Simulation, engine: Engine, batch: dict, width: int, devices: int) -> Trajectory:
-    """All lanes, `width` at a time; the last chunk is padded with copies of its last lane, so that one program computes all chunks."""
-    lanes = len(batch["state"][0])
-    width = min(width, -(-lanes // devices) * devices)
-    program = _side_by_side(engine, batch["params"] is not None, batch["macro_dt"] is not None, devices)
-    pieces = []
-    for start in range(0, lanes, width):
-        index = np.minimum(np.arange(start, start + width), lanes - 1)
-        piece = jax.tree.map(lambda a, index=index: a[index], batch)
-        macro_dt = run.macro_dt if piece["macro_dt"] is None else piece["macro_dt"]
-        num_params = 0 if piece["params"] is None else len(piece["params"])
-        leaves = run.arrays.model  # the parameters come last, see `Arrays`
-        shared = leaves[: len(leaves) - num_params]
-        pieces.append(program(shared, piece["params"] or [], piece["state"], macro_dt, run.save_every))
-    return from_arrays([jnp.asarray(np.concatenate(parts)[:lanes]) for parts in zip(*pieces, strict=True)])
-
-
 @lru_cache(maxsize=32)
-def _side_by_side(engine: Engine, varies_params: bool, varies_steps: bool, devices: int):
-    """``program(leaves, params, state, macro_dt, save_every)``: a run of `engine` for each lane, with or without parameters and steps of its own."""
+def _side_by_side(engine: Engine, of_params: tuple[bool, ...], of_state: bool, of_steps: bool, devices: int):
+    """``program(leaves, params, state, macro_dt, save_every)``: a run of `engine` for each lane; flags say which arguments have an axis of lanes."""
 
     def lane(leaves, params, state, macro_dt, save_every):
         return jax.tree.leaves(engine.trajectory(Arrays(leaves + params, state, macro_dt), save_every))
 
-    has_lanes = (False, varies_params, True, varies_steps, False)
-    program = jax.vmap(lane, [0 if has_axis else None for has_axis in has_lanes])
+    def for_each(lanes, whole):
+        """`lanes` for arguments with an axis of lanes, `whole` for all others."""
+        params = [lanes if has_axis else whole for has_axis in of_params]
+        return whole, params, lanes if of_state else whole, lanes if of_steps else whole, whole
+
+    program = jax.vmap(lane, for_each(0, None))
     if devices > 1:
         mesh = jax.sharding.Mesh(np.array(jax.devices()[:devices]), ("lanes",))
         spread = PartitionSpec("lanes")
-        specs = tuple(spread if has_axis else PartitionSpec() for has_axis in has_lanes)
-        program = jax.shard_map(program, mesh=mesh, in_specs=specs, out_specs=spread, check_vma=False)
+        in_specs = for_each(spread, PartitionSpec())
+        program = jax.shard_map(program, mesh=mesh, in_specs=in_specs, out_specs=spread, check_vma=False)
     return jax.jit(program)

@@ -14,6 +14,7 @@ from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.rows import Part
 from vmri_jax.mechanics.state import HasProblem, Problem, opened
 from vmri_jax.mechanics.system import System
+from vmri_jax.running.progress import Working
 from vmri_jax.running.settings import Settings
 
 SavedRun: TypeAlias = Any
@@ -142,12 +143,13 @@ def at_nodes(function, origin: Origin, nodes, *static):
     origin.system(axes - 1)  # raises if the system is not known
     arrays, structure = jax.tree.flatten((origin.bare, origin.params))
     # Arrays that all lanes share go in once: mapped over the lanes they would be copied for each.
-    repeated = tuple(_is_repeated(array, axes - 1) for array in arrays)
+    repeated = tuple(is_repeated(array, axes - 1) for array in arrays)
     arrays = [array[(0,) * (axes - 1)] if shared else array for array, shared in zip(arrays, repeated, strict=True)]
-    return _mapped(function, repeated, structure, static, arrays, nodes)
+    with Working("quantities of the run"):
+        return _mapped(function, repeated, structure, static, arrays, nodes)
 
 
-def _is_repeated(array, axes: int) -> bool:
+def is_repeated(array, axes: int = 1) -> bool:
     """Whether an array of NumPy is a view with zero strides along the lanes, as `Origin.repeated` makes it."""
     return isinstance(array, np.ndarray) and axes > 0 and not any(array.strides[:axes])
 

@@ -46,8 +46,8 @@ from vmri_jax.steppers.solvers import Newton
 
 PARTS_OF_A_BAR = 50
 """Parts of a run with a progress bar. More parts move the bar more smoothly, and each costs a call of some 30 microseconds."""
-STEPPING = "the run: compiling its program if it is new, then taking its steps"
-"""Line about a run that takes more than two seconds."""
+STEPPING = "stepping"
+"""The work of a run that is compiled, for lines about runs that take more than two seconds."""
 FALLING_BACK = "a step was not solved: computing its part of the run again with exact matrices (solvers.Arrowhead), as accurate but slower"
 """Line about a fallback that takes more than two seconds."""
 
@@ -108,7 +108,7 @@ class Simulation:
         """
         arguments = self._arguments(state, macro_dt, params, num_steps)
         origin = self.origin if params is None else replace(self.origin, params=params)
-        with Working(STEPPING):
+        with Working("the run", running=STEPPING):
             trajectory = with_origin(from_arrays(self._program(False)(*arguments)), origin)
         if int(trajectory.failed_at) < 0:
             return trajectory
@@ -244,7 +244,8 @@ class Simulation:
         positions = (self.state.t, self.state.q_s, self.state.q_f) if constraints else ()
         numbers = tuple(np.asarray(number).tobytes() for number in (*self.arrays.model, *positions))
         key = self._model[1], self.state.q_s.shape, self.state.q_f.shape, numbers
-        _check_once(_Checked(key, self.system, self.state, state_name, constraints))
+        with Working("checks of the system"):
+            _check_once(_Checked(key, self.system, self.state, state_name, constraints))
 
     def start(self, state: State | None = None, step: int = 0, fell_back: bool = False) -> Checkpoint:
         """The checkpoint before the first step; or before step number `step` at another state, with blank memory."""
@@ -289,7 +290,7 @@ class Simulation:
     def in_pieces(self, progress: ShowsProgress = False) -> Trajectory:
         """The whole run; with a progress bar Ctrl-C raises `Interrupted` with the trajectory computed so far."""
         if progress is False:
-            with Working(STEPPING):
+            with Working("the run", running=STEPPING):
                 return self._joined(self.advance(self.start(), self.num_saves)[0])
         size, checkpoint, pieces = -(-self.num_saves // PARTS_OF_A_BAR), self.start(), []
         with interrupts_noted() as interrupted, progress_to("simulate", progress) as tell:
@@ -341,7 +342,7 @@ def prepare(
     check_memory("prepare", run.state, scheme.num_micro, run.num_saves, save_micro)
     on_device = ("system", "scheme", "solver", "state", "macro_dt")
     run = replace(run, **jax.device_put({name: getattr(run, name) for name in on_device}))
-    with Working("prepare: compiling the run"):
+    with Working("prepare: the program of the run"):
         jax.block_until_ready(run._program(False)(run.arrays, 0, 0))  # no steps: it only compiles
     return run
 
@@ -350,7 +351,8 @@ def simulation(moving: Movable, scheme, state: State | None, solver: Newton | No
     """The `Simulation` with these arguments of `simulate`; bad arguments raise."""
     warn_if_slow()
     problem = opened(moving)
-    system, state = start_of("simulate", problem, state)
+    with Working("the start of the run"):
+        system, state = start_of("simulate", problem, state)
     macro_dt, num_steps, save_every = check_run(system, scheme, state, solver, steps)
     # Scenes only: `opened` returns problems as they are.
     advice = nothing_fast(scheme, state.q_f.size) if moving is not problem else ""
