@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from dataclasses import replace
 
 import equinox as eqx
 import jax
@@ -222,3 +223,55 @@ def test_tracers_are_refused(fpu):
 
     with pytest.raises(ValueError, match=r"simulate_batch: arguments are tracers; .*jax\.vmap of simulate"):
         jax.grad(end)(50.0)
+
+
+SWEEP = {"scheme": fully_explicit(3), "macro_dt": 0.02, "t_end": 0.4}
+
+
+def test_a_sweep_in_one_line(chain):
+    """From the problem, with the error of each lane; params whole, for all lanes, are those of the problem."""
+    batch = simulate_batch(chain, params={"omega": [30.0, 50.0]}, error=True, **SWEEP)
+    assert batch.error.largest.shape == (2,)
+    for lane, omega in enumerate((30.0, 50.0)):
+        problem = replace(chain, system=chain.system.replace(params={"omega": np.asarray(omega)}))
+        alone = simulate(problem, error=True, **SWEEP)
+        assert largest_difference(batch.q_f[lane], alone.q_f) < 1e-13  # measured 1e-17
+        assert batch.error.largest[lane] == pytest.approx(alone.error.largest, rel=1e-9)
+        assert batch.lane(lane).error.is_certified
+    assert "positions are wrong by about" in repr(batch)
+
+
+def length(q_s, q_f, params):
+    return jnp.array([(q_f @ q_f - params["rods"]["length"] ** 2) / 2])
+
+
+def heavy(q_s, q_f, params):
+    return params["rods"]["mass"] * params["gravity"][1] * q_f[1]
+
+
+def rod() -> vm.Problem:
+    params = {"rods": {"mass": 2.0, "length": 1.0}, "gravity": np.array([0.0, 9.81])}
+    system = vm.System(vm.ConstantMass([], [2.0, 2.0]), heavy, constraint=length, params=params)
+    return vm.Problem(system, q_s=[], q_f=[1.0, 0.0], v_f=[0.0, 1.0])
+
+
+def test_params_nested_partial_and_shared():
+    """Momenta of the start fit the constraint of each lane; an array of the shape of the parameter holds for all lanes."""
+    heavier = {"rods": {"mass": [2.0, 6.0, 2.0]}, "gravity": np.array([0.0, 4.0])}
+    batch = simulate_batch(rod(), fully_implicit(2), params=heavier, macro_dt=0.01, num_steps=3)
+    assert (np.asarray(batch.failed_at) == -1).all()
+    assert largest_difference(batch.q_f[0], batch.q_f[2]) == 0
+    assert largest_difference(batch.q_f[0], batch.q_f[1]) > 1e-4
+    assert batch.origin.params["gravity"].shape == (3, 2)
+    with_dots = simulate_batch(
+        rod(),
+        fully_implicit(2),
+        params={"rods.mass": [6.0, 6.0, 6.0]} | {"gravity": heavier["gravity"]},
+        macro_dt=0.01,
+        num_steps=3,
+    )
+    assert largest_difference(with_dots.q_f[0], batch.q_f[1]) == 0
+    with pytest.raises(
+        ValueError, match=r"no parameter 'rods.maas'. Did you mean rods.mass. There are gravity, rods.length, rods.m"
+    ):
+        simulate_batch(rod(), fully_implicit(2), params={"rods": {"maas": [1.0]}}, macro_dt=0.01, num_steps=3)

@@ -74,7 +74,7 @@ def simulate(
         throw: raise `SimulationError` (which carries the partial trajectory) if a step fails; else return the trajectory,
             NaN after the failure.
         progress: True for a bar, or a function of (what, done, total), with an accuracy called before every trial run. With False a run
-            that takes more than two seconds prints occasional lines on the error stream.
+            that takes more than two seconds prints a line on the error stream at least every 5 s, which says whether it is tracing, compiling or stepping.
         adjoint: method of differentiation, see `vmri_jax.running.adjoints`: "stored" in all modes, "checkpoint" and
             "reversible" in reverse mode with little memory, "forward" for few parameters; "auto" chooses by length and symmetry.
         error: estimate the error of the positions and its slow and fast share, ``run.error``, a `RunError`. This takes two more runs: one
