@@ -87,7 +87,7 @@ def wheels() -> Scene:
         )
         effects.append(Revolute(("hub", f"wheel {axis}"), 0.1 * e, axis=e, name=f"bearing {axis}"))
         effects.append(Controlled(f"bearing {axis}", "torque"))
-    return Scene(bodies, effects)
+    return Scene(bodies, effects, coordinates="directors")
 
 
 def reoriented(state):

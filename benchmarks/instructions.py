@@ -3,13 +3,14 @@
 import re
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import jax
 import jax.numpy as jnp
 
 import vmri_jax as vm
+from benchmarks.chains import Coordinates
 from benchmarks.measure import Ratio, Tell, silent
 from benchmarks.programs import problem
 from benchmarks.report import Claim, Report, growing
@@ -68,13 +69,14 @@ class Program:
         return jax.jit(jax.value_and_grad(last)).lower(problem.state()).compile()
 
 
-def gallery(name: str) -> vm.Problem:
+def gallery(name: str, coordinates: Coordinates) -> vm.Problem:
     """The problem of a scene of the gallery."""
-    return gallery_scene(name).problem()
+    return replace(gallery_scene(name), coordinates=coordinates).problem()
 
 
 FPU, TSP, SAM = (partial(problem, name) for name in ("FPU l=3", "TSP", "SAM"))
-SATELLITE, SQUEEZER, ENGINE = (partial(gallery, name) for name in ("rigid_satellite", "squeezer", "engine"))
+SATELLITE = partial(gallery, "rigid_satellite", "joint")
+SQUEEZER, ENGINE = (partial(gallery, name, "directors") for name in ("squeezer", "engine"))
 PROGRAMS: dict[str, Program] = {
     "double pendulum in angles, fully_implicit(1)": Program(double_pendulum, vm.fully_implicit(1), 2850),
     "double pendulum in angles, galerkin(1, 3)": Program(double_pendulum, vm.galerkin(1, 3), 3140),

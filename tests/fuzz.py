@@ -25,7 +25,8 @@ from rich.table import Table
 
 import vmri_jax as vm
 from tests.verification import random_systems as rs
-from vmri_jax.mechanics.checks import CONSTRAINT_TOLERANCE, is_refusal
+from vmri_jax.mechanics.checks import is_refusal
+from vmri_jax.mechanics.constraints import CONSTRAINT_TOLERANCE
 from vmri_jax.running.progress import progress_shown
 from vmri_jax.running.timing import Tell, silent
 

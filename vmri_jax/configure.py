@@ -27,10 +27,9 @@ FAST_LOOPS = (
 - instructions fill the vector registers (long chains 1.3 times);
 - sums over many lanes stay in the kernel instead of calling a library (batches of high order 2.6 times).
 XLA ignores names of passes that it does not know."""
-SECONDS_WORTH_KEEPING = 0.2
-"""Seconds of compilation from which JAX keeps a program in the cache on disk, well above the milliseconds that reading it takes.
-With a larger value every process compiles more programs itself; a smaller value fills the folder with programs that compile as fast
-as they are read."""
+SECONDS_WORTH_KEEPING = 0.0
+"""Seconds of compilation from which JAX keeps a program in the cache on disk. With 0.2 s every process compiles hundreds of small programs
+anew: 0.7 to 2 s of the time to the first result of a scene."""
 ALREADY_STARTED = "configure: JAX has already started, its settings can no longer change; call vm.configure() before any array is made."
 
 

@@ -15,7 +15,7 @@ READ = {
         body_jntnum""",
     "springs, dampers and armature in joints": "jnt_stiffness dof_damping qpos_spring dof_armature",
     'limits of joints, for limits="spring"': "jnt_range jnt_solref dof_invweight0",
-    "the start, where no qpos is given": "qpos0 nkey key_qpos key_qvel",
+    "the start, where no qpos is given": "qpos0 nkey key_qpos key_qvel key_ctrl key_act key_mpos key_mquat",
     "gravity and its compensation": "opt.gravity body_gravcomp",
     "equalities connect, weld, and of joints and fixed tendons": """tendon_adr tendon_num wrap_type wrap_objid wrap_prm neq eq_type eq_objtype eq_obj1id eq_obj2id eq_active0 eq_data
         nsite site_bodyid site_pos site_quat""",
@@ -24,7 +24,7 @@ READ = {
     "flags that switch features off": """opt.disableflags opt.enableflags opt.disableactuator opt.disableflags.CONSTRAINT
         opt.disableflags.EQUALITY opt.disableflags.FRICTIONLOSS opt.disableflags.LIMIT opt.disableflags.CONTACT
         opt.disableflags.SPRING opt.disableflags.DAMPER opt.disableflags.GRAVITY opt.disableflags.FILTERPARENT
-        opt.disableflags.ACTUATION""",
+        opt.disableflags.ACTUATION opt.disableflags.CLAMPCTRL""",
 }
 """Fields that the reader uses itself or through MuJoCo's kinematics, by their content."""
 
@@ -42,7 +42,7 @@ IDLE = {
     "memory": "narena nbuffer njmax nconmax nhistory",
     "how MuJoCo integrates and solves; here a scheme and its step are chosen": """opt.timestep opt.integrator opt.cone opt.jacobian
         opt.solver opt.iterations opt.tolerance opt.impratio opt.ls_iterations opt.ls_tolerance opt.noslip_iterations
-        opt.noslip_tolerance opt.ccd_iterations opt.ccd_tolerance opt.sdf_initpoints opt.sdf_iterations opt.disableflags.CLAMPCTRL
+        opt.noslip_tolerance opt.ccd_iterations opt.ccd_tolerance opt.sdf_initpoints opt.sdf_iterations
         opt.disableflags.WARMSTART opt.disableflags.REFSAFE opt.disableflags.MIDPHASE opt.disableflags.EULERDAMP
         opt.disableflags.AUTORESET opt.disableflags.NATIVECCD opt.disableflags.ISLAND opt.disableflags.MULTICCD
         opt.enableflags.ENERGY opt.enableflags.FWDINV opt.enableflags.INVDISCRETE opt.enableflags.DIAGEXACT""",

@@ -59,7 +59,9 @@ def test_a_force_at_a_point_of_a_body():
 
 def test_a_torque_in_a_joint_has_its_opposite():
     bearing = Revolute(("hub", "wheel"), [1.0, 0.0, 0.0], axis=[1.0, 0.0, 0.0], name="bearing")
-    found = rates_of_momenta(Scene([HUB, WHEEL], [bearing, Controlled("bearing", "torque")], project=True), [2.5])
+    found = rates_of_momenta(
+        Scene([HUB, WHEEL], [bearing, Controlled("bearing", "torque")], project=True, coordinates="directors"), [2.5]
+    )
     np.testing.assert_allclose(found["wheel"][1], [2.5, 0.0, 0.0], atol=1e-13)
     np.testing.assert_allclose(found["hub"][1], [-2.5, 0.0, 0.0], atol=1e-13)
     np.testing.assert_allclose(found["hub"][0], 0.0, atol=1e-13)
@@ -67,7 +69,9 @@ def test_a_torque_in_a_joint_has_its_opposite():
 
 def test_a_force_in_a_slide():
     slide = Prismatic(("ground", "wheel"), [1.0, 0.0, 0.0], axis=[0.0, 1.0, 0.0], name="slide")
-    force, _ = rates_of_momenta(Scene([WHEEL], [slide, Controlled("slide", "force")]), [2.0])["wheel"]
+    force, _ = rates_of_momenta(Scene([WHEEL], [slide, Controlled("slide", "force")], coordinates="directors"), [2.0])[
+        "wheel"
+    ]
     np.testing.assert_allclose(force, [0.0, 2.0, 0.0], atol=1e-13)
 
 

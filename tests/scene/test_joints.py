@@ -39,7 +39,7 @@ def two_bodies(**of_b):
 
 def free(joint):
     """Number of relative motions that a joint leaves to two bodies."""
-    scene = Scene(two_bodies(), [joint], project=True)
+    scene = Scene(two_bodies(), [joint], project=True, coordinates="directors")
     return 12 - (scene.system().num_constraints(*scene.start[:2])[1] - 12)
 
 
@@ -71,7 +71,8 @@ def test_what_a_joint_leaves_free(name):
 )
 def test_a_joint_holds_what_it_says_and_leaves_the_rest(name):
     joint, _ = JOINTS[name]
-    scene = Scene(two_bodies(spin=[1.0, -2.0, 0.5], velocity=[0.1, 0.2, -0.3]), [joint], project=True)
+    bodies = two_bodies(spin=[1.0, -2.0, 0.5], velocity=[0.1, 0.2, -0.3])
+    scene = Scene(bodies, [joint], project=True, coordinates="directors")
     problem = scene.problem()
     state = problem.state()
     assert np.abs(all_constraints(problem.system, state)[0]).max() < 1e-15  # frames agree at the start
@@ -92,7 +93,7 @@ def test_a_joint_holds_what_it_says_and_leaves_the_rest(name):
 
 
 def test_the_motion_of_joints_is_read_by_name():
-    scene = Scene(two_bodies(), [Cylindrical(("a", "b"), AT, Y, name="pipe")], project=True)
+    scene = Scene(two_bodies(), [Cylindrical(("a", "b"), AT, Y, name="pipe")], project=True, coordinates="directors")
     run = vm.simulate(scene, ONE, macro_dt=0.05, num_steps=10)
     assert scene.joint_motion(run, "pipe", "slide").shape == scene.joint_motion(run, "pipe", "turn").shape == (11,)
     with pytest.raises(ValueError, match=r"of is 'auto'; pipe leaves turn and slide free"):

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import vmri_jax as vm
+from benchmarks import random_models
 from tests.scene.mujoco_model_fields import IDLE, READ, REFUSED_FIELDS
 from vmri_jax.scene import Fixed, Scene, Spherical
 from vmri_jax.scene.body_motions import accelerations as motions
@@ -293,6 +294,23 @@ def test_a_start_that_leaves_a_loop_open_is_refused_with_the_gap():
     with pytest.raises(ValueError, match=r"w is open at the start by 0\.1 m and 0\.175 rad"):
         Scene.from_mujoco(arm(weld))
     assert not Scene.from_mujoco(arm(weld, flags='equality="disable"')).dropped
+
+
+def test_angles_of_an_import_count_their_turns():
+    """A spring relaxed at 6 rad and limits at 4.15 rad, from a keyframe at 3.5 rad; directors would lose the turns."""
+    joint = '<joint name="h" axis="0 0 1" limited="true" range="-4.15 4.15" stiffness="2" springref="6"/>'
+    body = f'<body name="b">{joint}<geom type="sphere" size=".1" pos=".5 0 0"/></body>'
+    key = '<keyframe><key name="away" qpos="3.5"/></keyframe>'
+    text = f'<mujoco><compiler angle="radian"/><worldbody>{body}</worldbody>{key}</mujoco>'
+    model = mujoco.MjModel.from_xml_string(text)
+    scene = Scene.from_mujoco(model, key="away", limits="spring")
+    numbers = {effect.name: scene.params[effect.name] for effect in scene.effects}
+    assert numbers["h spring"]["neutral"] == pytest.approx(2.5)
+    assert [numbers["h limit"][side] for side in ("lower", "upper")] == pytest.approx([-7.65, 0.65])
+    with pytest.raises(
+        ValueError, match=r'h limit: lower is -7\.65; the angle of h comes from directors.*coordinates="joint"'
+    ):
+        Scene.from_mujoco(model, key="away", limits="spring", coordinates="directors")
 
 
 def test_a_small_gap_is_closed_by_the_joints():
@@ -603,3 +621,51 @@ def test_the_program_of_the_page_runs(capsys):
     (program,) = re.findall(r"```py\n(.*?)```", PAGE.read_text(), re.DOTALL)
     exec(program, {})
     assert f"It prints `{capsys.readouterr().out.strip()}`." in PAGE.read_text()
+
+
+# Actuators, as MuJoCo computes their forces
+
+HELD = '<actuator><motor name="m" joint="hinge" {}/></actuator>'
+ACTS = {
+    "control of a keyframe": (HELD.format("") + '<keyframe><key ctrl="-1.5"/></keyframe>', "", 0, "actuator m"),
+    "no control of zero": (HELD.format('ctrllimited="true" ctrlrange="1 2"'), "", None, "actuator m"),
+    "no force of zero": (HELD.format('forcelimited="true" forcerange="1 2"'), "", None, "actuator m"),
+    "no torque of zero": (HELD.format(""), 'actuatorfrcrange="1 2"', None, "joint hinge"),
+    "activation of a keyframe": (
+        '<actuator><general name="m" joint="hinge" dyntype="integrator"/></actuator><keyframe><key act="0.3"/></keyframe>',
+        "",
+        0,
+        "actuator m",
+    ),
+    "servo at its target": (MOTOR, "", None, "actuator m"),
+    "force on a site": ('<actuator><motor name="m" site="tip" ctrlrange="1 2" ctrllimited="true"/></actuator>', "", None, "actuator m"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", ACTS)
+def test_actuators_with_a_force_are_refused(case):
+    more, joint, key, named = ACTS[case]
+    with pytest.raises(ValueError, match=rf"actuators \({named}\)"):
+        Scene.from_mujoco(arm(more, joint=joint), key=key)
+
+
+@pytest.mark.parametrize("key", [None, 0])
+def test_actuators_without_a_force_are_passed_over(key):
+    more = HELD.format('ctrllimited="true" ctrlrange="-1 1"') + '<keyframe><key qpos="0.1" ctrl="0"/></keyframe>'
+    assert [effect.name for effect in Scene.from_mujoco(arm(more), key=key).effects] == ["hinge", "gravity"]
+
+
+def test_a_keyframe_moves_mocap_bodies():
+    body = '<body name="m" mocap="true" pos=".3 0 1"/>'
+    more = '<equality><connect name="e" body1="arm" body2="m" anchor=".3 0 0"/></equality><keyframe><key mpos="0.3 0 1.4"/></keyframe>'
+    assert Scene.from_mujoco(arm(more, body=body), ignore=["mocap bodies"]).bodies
+    with pytest.raises(ValueError, match=r"e is open at the start by 0\.4 m"):
+        Scene.from_mujoco(arm(more, body=body), ignore=["mocap bodies"], key=0)
+
+
+@pytest.mark.parametrize("seed", [0, 4, 7])
+def test_random_models_accelerate_as_in_mujoco_or_are_refused(seed):
+    """Measured: 1e-14 at most; seed 0 is refused. ``python -m benchmarks models --full`` compares 300."""
+    row = random_models.compare(seed)
+    assert row.get("difference", 0.0) < random_models.LARGEST_DIFFERENCE
+    assert ("refused" in row) == (seed == 0)

@@ -51,7 +51,7 @@ def swinging(x) -> Scene:
     moments, up = np.array([1.0, 2.0, 2.5]), np.array([0.0, 0.0, 1.0])
     bar = RigidBody("bar", 2.0 * x, x * moments, x * up, x * np.array([0.1, 0.3, 0.2]), spin=x * up, pace="slow")
     hinge = Revolute(("ground", ("bar", x * -up)), axis=x * np.array([0.1, 1.0, 0.2]), name="hinge")
-    return Scene([bar], [hinge, JointSpring("hinge", x, 0.1 * x, rate="slow")], project=True)
+    return Scene([bar], [hinge, JointSpring("hinge", x, 0.1 * x, rate="slow")], project=True, coordinates="directors")
 
 
 def test_scenes_of_rigid_bodies_may_be_traced():

@@ -99,7 +99,7 @@ def test_motions_that_are_given_count():
 def test_every_pair_of_a_joint_has_a_rate():
     links = [RigidBody(f"link {k}", 1.0, Box((1.0, 0.1, 0.1)), [k + 0.5, 0.0, 0.0]) for k in range(2)]
     pairs = Revolute([("ground", "link 0"), ("link 0", "link 1")], [[0, 0, 0], [1, 0, 0]], axis=Z, name="hinges")
-    chain = Scene(links, [pairs]).with_rates({"hinges": [1.0, -3.0]})
+    chain = Scene(links, [pairs], coordinates="directors").with_rates({"hinges": [1.0, -3.0]})
     np.testing.assert_allclose([body.spin for body in chain.bodies], [Z, -2.0 * Z], atol=1e-12)
     np.testing.assert_allclose(rotation(chain.start[0][:12]), np.eye(3), atol=1e-15)
 

@@ -19,7 +19,7 @@ from vmri_jax.study import (
     tune,
     work_precision,
 )
-from vmri_jax.study.advisor import NothingReached, another_start
+from vmri_jax.study.advisor import NothingReached, another_start, first_verified
 from vmri_jax.study.search import NUM_MICRO, Search
 
 SHORT_MENU = [family for family in families() if family.name in ("fully explicit", "fully explicit, suzuki4")]
@@ -64,8 +64,22 @@ def test_steps_are_as_few_as_possible(found):
     assert chosen is fewest or chosen.seconds < fewest.seconds
 
 
-def test_from_another_start_it_does_about_as_well(found):
+def test_from_another_start_it_keeps_the_error(found):
+    assert found.verification.error_q <= 1e-5
     assert 0.2 < found.verification.error_ratio < 5
+
+
+def test_a_setting_that_misses_from_another_start_is_replaced(reference):
+    """A lucky setting, whose error at its start is said to be 0, gets the steps with which it keeps the error from another start."""
+    search = Search(PROBLEM, 1.0, SHORT_MENU[:1], reference)
+    coarse = search.run(SHORT_MENU[0], 5, 100)
+    error = coarse.row.error_q / 3
+    lucky = dataclasses.replace(coarse, row=dataclasses.replace(coarse.row, error_q=0.0))
+    other = another_start(PROBLEM, 1.0)
+    setting, check = first_verified(search, [lucky], error, other, reference_solution(other, 1.0, num_saves=1))
+    assert setting.num_steps > 100
+    assert setting.num_micro == 5
+    assert max(setting.row.error_q, check.error_q) <= error
 
 
 def test_the_front_falls(found):

@@ -19,10 +19,20 @@ def test_cost_report(tmp_path):
     assert "What accuracy costs" in text
     assert not report.not_tried
     printed = " ".join(str(report).split())  # whatever the width of the terminal
-    assert "Runs to t = 1, with errors of the positions there. The reference solution is good to" in printed
+    assert (
+        "Runs to t = 1, with the largest errors of the positions on the way. The reference solution is good to"
+        in printed
+    )
     setting = report.rows[1].setting
     assert setting is not None
     assert setting.command("spring") in text.replace("&#34;", '"')
+    for answer in report.rows:  # what the page says of micro steps agrees with the setting that it recommends
+        sentence = (
+            "more than one micro step"
+            if answer.setting.num_micro == 1
+            else f"{answer.setting.num_micro} micro steps are"
+        )
+        assert f"At {answer.error:.0e}, {answer.setting.family.name}: {sentence}" in " ".join(text.split())
     assert sum(report.shares.values()) == pytest.approx(1)
     assert report.accuracy is not None
     assert report.accuracy.error_q <= report.accuracy_error

@@ -2,17 +2,20 @@
 
 import warnings
 from dataclasses import replace
+from functools import cache
 
 import jax
 import numpy as np
 
-from vmri_jax.accuracy.companions import UncertifiedWarning, run_error
+from vmri_jax.accuracy.companions import UncertifiedWarning, estimated_errors, extrapolated, finer, run_error
 from vmri_jax.mechanics.checks import check_flags
+from vmri_jax.mechanics.driving import Events, driven, events
 from vmri_jax.mechanics.state import Movable, State
 from vmri_jax.running.arguments import Steps
-from vmri_jax.running.batch import batch
+from vmri_jax.running.batch import Batch, batch
 from vmri_jax.running.origin import UNKNOWN
 from vmri_jax.running.progress import Working
+from vmri_jax.running.run_error import RunError
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
@@ -65,8 +68,8 @@ def simulate_batch(
         chunk: lanes that are computed side by side; chosen from the size of the problem if None.
         devices: CPU devices over which chunks are spread, see `vmri_jax.configure`.
         warn: give warnings about lanes; False for a program that looks at the statuses itself.
-        error: estimate the error of the positions of each lane from runs with half the macro step, ``run.error``, a `RunError` whose arrays have the
-            axis of lanes; without slow and fast share. It takes twice the computation more, and no further program.
+        error: estimate the error of the positions of each lane as `simulate` does, ``run.error``, a `RunError` whose arrays have the axis of lanes;
+            without slow and fast share. It takes runs with half the macro step, by the same program, and further ones in driven systems.
 
     Raises:
         ValueError, TypeError: bad arguments, before anything is computed.
@@ -77,18 +80,39 @@ def simulate_batch(
         lanes = batch(system, scheme, states, steps, params, solver, chunk, devices)
     trajectory = lanes()
     if error:
-        trajectory = _with_errors(trajectory, lanes.halved()(), lanes.run.order)
+        trajectory = _with_errors(lanes, trajectory)
     for kind, message in ((FailedLanesWarning, _failures(trajectory)), (UncertifiedWarning, _uncertified(trajectory))):
         if warn and message:
             warnings.warn(f"simulate_batch: {message}", kind, stacklevel=2)
     return trajectory
 
 
-def _with_errors(trajectory: Trajectory, halved: Trajectory, order: int) -> Trajectory:
-    """The trajectory of a batch with the error of each lane, from the runs with half the macro step."""
-    coarse, fine = (jax.tree.map(np.asarray, replace(runs, origin=UNKNOWN)) for runs in (trajectory, halved))
-    errors = [run_error(order, coarse.lane(i), fine.lane(i)) for i in range(len(coarse.t))]
+def _with_errors(lanes: Batch, trajectory: Trajectory) -> Trajectory:
+    """The trajectory of a batch with the error of each lane, from batches of companions."""
+
+    @cache
+    def companions(parts: int, whole: int = 1) -> Trajectory:
+        return _plain(lanes.with_steps(finer(lanes.run, lanes.run.scheme, parts, whole))())
+
+    def error(i: int) -> RunError:
+        run, coarse, halved = lanes.lane(i), plain.lane(i), companions(2).lane(i)
+        drives = events(run.system, run.state, float(coarse.t[-1])) if is_driven else Events()
+        if max(coarse.failed_at, halved.failed_at) >= 0:
+            total = extrapolated(run.order, coarse, halved)
+        else:
+            total = estimated_errors(
+                run, coarse, halved, drives, companion_of=lambda *steps: companions(*steps).lane(i)
+            )
+        return run_error(run, coarse, halved, total, drives)
+
+    plain, is_driven = _plain(trajectory), driven(lanes.run.system, lanes.run.state)
+    errors = [error(i) for i in range(len(trajectory.t))]
     return replace(trajectory, error=jax.tree.map(lambda *arrays: np.stack(arrays), *errors))
+
+
+def _plain(trajectory: Trajectory) -> Trajectory:
+    """The trajectory with arrays of NumPy and without its origin, for loops over lanes."""
+    return jax.tree.map(np.asarray, replace(trajectory, origin=UNKNOWN))
 
 
 def _failures(trajectory: Trajectory) -> str:

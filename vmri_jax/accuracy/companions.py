@@ -10,12 +10,18 @@ separate them: the first halves H and h, the second halves h alone. With ``r = 2
     half the macro step:        S H^p + F h^p = r (x_{H,h} - x_{H/2,h/2})
     twice the micro steps:              F h^p = r (x_{H,h} - x_{H,h/2})
 
+A jump of a force can act at the same node in steps of H and of H / 2, too early or too late in both. In systems that are driven in time, and where an
+estimate is small beyond belief, a third companion takes about 1.6 times the steps, with few nodes in common with the run, and a fourth one 2.6
+times where forces jump, with the order p = 1; the largest estimate of each node counts. Steps with fewer than `NODES_OF_EVENT` nodes in an event of `vmri_jax.mechanics.driving` are not certified
+from this event on.
+
 This is an estimate, not a bound. If the error falls with an order q below p, as for vibrations that the steps do not resolve, the true error
 is ``(1 - 2^-p) / (1 - 2^-q)`` times the estimate: 1.5 times for p = 2 and q = 1. Above order 2 an error also has mixed terms ``H^a h^b``,
 which count in part to both shares. The error of a node is *certified* if the estimates at this node and at
 all nodes before it are small against the extent of the motion.
 """
 
+import math
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
@@ -23,6 +29,7 @@ from dataclasses import replace
 import numpy as np
 
 from vmri_jax.mechanics.arrays import of_one_type
+from vmri_jax.mechanics.driving import Events, events
 from vmri_jax.running.run_error import RunError, largest_of
 from vmri_jax.running.simulation import Simulation
 from vmri_jax.running.trajectory import Trajectory, from_named_arrays
@@ -37,6 +44,21 @@ CHAOTIC_GROWTH = 32.0
 """Growth of the error in the second half of a time, above which the motion is called chaotic. Errors of regular motions grow like t or t^2, by
 2 or 4, errors of chaotic motions like exp(L t). A larger value overlooks chaos that begins late."""
 
+DOUBTED = 1e-5
+"""Error, as a part of the accuracy that is asked for, below which an estimate is not believed without a third companion: a run at rest has no error
+until its force begins. A larger value takes one more run where a scheme is exact."""
+LENGTH_TOLERANCE = 0.01
+"""Relative error of the lengths of events, so that steps chosen for an event see it; a larger value certifies steps with fewer nodes."""
+NODES_OF_EVENT = 4
+"""Least nodes of forces, or of moving constraints, in an event. With fewer nodes the errors of a run and its companions say nothing about each
+other; with more of them driven systems take more steps than their accuracy needs."""
+FURTHER_PARTS = (1.6, 2.6)
+"""Steps of further companions over the steps of the run, near multiples of the golden ratio: hardly any of their nodes is near a node of the run.
+Forces that jump take both, other driven systems the first one. More companions take longer."""
+FEWEST_DIVIDED = 20
+"""Least number of macro steps between nodes that a further companion has in common with the run. With a smaller number a jump may act at the same
+node in all runs, so that none tells the error; with a larger one fewer nodes are compared."""
+
 
 class UncertifiedWarning(UserWarning):
     """The error of a run is not certified over all of its length."""
@@ -47,7 +69,7 @@ def with_error(
     trajectory: Trajectory,
     of: Callable | None = None,
     shares: bool = True,
-    halved: Trajectory | None = None,
+    trial: tuple[Trajectory, np.ndarray] | None = None,
 ) -> Trajectory:
     """The trajectory with its `RunError`; warns if the error is not certified over the whole run.
 
@@ -55,10 +77,10 @@ def with_error(
         trajectory: of the run, without a failed step.
         of: function of a run, whose error is estimated, too.
         shares: whether to estimate the slow and the fast share, too. Their companion has twice the micro steps, another program.
-        halved: the companion with half the macro step, if it has been computed.
+        trial: the companion with half the macro step and the errors (k, n_s + n_f), if they have been computed.
     """
-    scheme, order = run.scheme, run.order
-    halved = companion(run, scheme, 2) if halved is None else halved
+    scheme = run.scheme
+    halved = companion(run, scheme, 2) if trial is None else trial[0]
     if int(halved.failed_at) >= 0:
         failed = float(halved.t[0]) + int(halved.failed_at) * float(run.macro_dt) / 2
         warnings.warn(
@@ -67,30 +89,38 @@ def with_error(
             stacklevel=3,
         )
         return trajectory
+    drives = events(run.system, run.state, float(trajectory.t[-1])) if trial is None else Events()
+    total = estimated_errors(run, trajectory, halved, drives) if trial is None else trial[1]
     refined = companion(run, scheme.with_num_micro(2 * stage_scheme(scheme).num_micro), 1) if shares else None
-    error = run_error(order, trajectory, halved, refined, of)
+    error = run_error(run, trajectory, halved, total, drives, refined, of)
     if not error.is_certified:
-        warnings.warn(f"simulate: {_uncertified(error, trajectory)}", UncertifiedWarning, stacklevel=3)
+        unseen = first_unseen(run, drives)
+        reason = _uncertified(error, trajectory) if unseen > trajectory.t[-1] else _stepped_over(run, drives, unseen)
+        warnings.warn(f"simulate: {reason}", UncertifiedWarning, stacklevel=3)
     return replace(trajectory, error=error)
 
 
 def run_error(
-    order: int,
+    run: Simulation,
     trajectory: Trajectory,
     halved: Trajectory,
+    total: np.ndarray,
+    drives: Events,
     refined: Trajectory | None = None,
     of: Callable | None = None,
 ) -> RunError:
-    """The error of a run of a scheme of this order from its companions; without the shares if there is no refined one.
+    """The error of a run, NaN where it is not certified; without the shares if there is no companion with twice the micro steps.
 
     Args:
         halved: companion with half the macro step.
+        total: (k, n_s + n_f) estimated errors of the positions.
         refined: companion with twice the micro steps.
         of: function of a run, whose error is estimated, too.
     """
-    total = extrapolated(order, trajectory, halved)
+    order = run.order
     fast = np.full_like(total, np.nan) if refined is None else extrapolated(order, trajectory, refined)
     certified, growth = certified_nodes(trajectory, total)
+    certified[1:] &= np.asarray(trajectory.t)[1:] <= first_unseen(run, drives)
     until = np.asarray(trajectory.t)[certified][-1]
     total, slow, fast = (np.where(certified[:, None], a, np.nan) for a in (total, total - fast, fast))
     of_error = None if of is None else _of_error(of, order, trajectory, halved, certified)
@@ -99,14 +129,70 @@ def run_error(
     return RunError(q_s, q_f, *shares_at_nodes, of_error, np.asarray(until), np.asarray(growth))
 
 
-def ratio(order: int) -> float:
-    """``r = 2^p / (2^p - 1)`` of a scheme of order p."""
-    return 1.0 / (1.0 - 2.0**-order)
+def ratio(order: int, parts: float = 2) -> float:
+    """``r = k^p / (k^p - 1)`` of a scheme of order p and a companion with k times the steps."""
+    return 1.0 / (1.0 - parts**-order)
 
 
 def extrapolated(order: int, trajectory: Trajectory, finer: Trajectory) -> np.ndarray:
     """(k, n_s + n_f) ``r (x - x')``: the part of the error of the positions x that vanishes with the steps halved in the companion x'."""
     return ratio(order) * (_positions(trajectory) - _positions(finer))
+
+
+def estimated_errors(
+    run: Simulation,
+    trajectory: Trajectory,
+    halved: Trajectory,
+    drives: Events,
+    accuracy: float = 0.0,
+    companion_of: Callable[[int, int], Trajectory] | None = None,
+) -> np.ndarray:
+    """(k, n_s + n_f) errors of the positions, from the companion with half the macro step, and from further ones if the system is driven or its
+    errors are not believed: below `DOUBTED` of the accuracy. They are infinite if a further companion fails.
+
+    Args:
+        companion_of: ``companion_of(parts, whole)``, as of `companion`, for a lane of a batch; None for `companion` itself.
+    """
+    order = 1 if drives.jump else run.order
+    result = ratio(order) * (_positions(trajectory) - _positions(halved))
+    if not drives.names and np.abs(result).max(initial=0.0) > DOUBTED * accuracy:
+        return result
+    # `whole` macro steps of the run are `parts` steps of the companion, from one compared node to the next, `stride` saved nodes later.
+    strides = [s for s in range(1, run.num_saves + 1) if run.num_saves % s == 0]
+    stride = next((s for s in strides if s * run.save_every >= FEWEST_DIVIDED), run.num_saves)
+    whole = stride * run.save_every
+    for factor in FURTHER_PARTS if drives.jump else FURTHER_PARTS[:1]:
+        parts = next(k for k in range(max(round(factor * whole), 3), 10 * whole + 4) if math.gcd(k, whole) == 1)
+        further = companion_of(parts, whole) if companion_of else companion(run, run.scheme, parts, whole)
+        if int(further.failed_at) >= 0:
+            return np.full_like(result, np.inf)
+        difference = ratio(order, parts / whole) * (_positions(trajectory)[::stride] - _positions(further))
+        errors = np.concatenate([difference[:1], np.repeat(difference[1:], stride, axis=0)])
+        result = np.where(np.abs(errors) > np.abs(result), errors, result)
+    return result
+
+
+def node_distance(scheme: Scheme | Composition, drives: Events) -> float:
+    """Largest distance in time of the nodes at which a scheme sees the terms that depend on time, in units of the macro step."""
+    stage = stage_scheme(scheme)
+    longest = float(np.abs(scheme.coefficients).max()) if isinstance(scheme, Composition) else 1.0
+    return longest * max(getattr(stage, name).largest_gap(stage.num_micro) for name in drives.names)
+
+
+def fewest_steps(scheme: Scheme | Composition, drives: Events, length: float) -> int:
+    """Fewest macro steps in a time with `NODES_OF_EVENT` nodes in the shortest event."""
+    if not drives.names:
+        return 1
+    return int(np.ceil(NODES_OF_EVENT * node_distance(scheme, drives) * length / drives.shortest))
+
+
+def first_unseen(run: Simulation, drives: Events) -> float:
+    """Time of the first event with fewer than `NODES_OF_EVENT` nodes of the run; infinite without such an event."""
+    if not drives.names:
+        return np.inf
+    least = NODES_OF_EVENT * node_distance(run.scheme, drives) * float(run.macro_dt)
+    starts = (drives.times - drives.lengths)[drives.lengths < least * (1 - LENGTH_TOLERANCE)]
+    return float(starts.min(initial=np.inf))
 
 
 def _of_error(
@@ -162,22 +248,38 @@ def resting(run: Simulation) -> Trajectory:
     return replace(from_named_arrays(arrays), origin=run.origin)
 
 
-def companion(run: Simulation, scheme: Scheme | Composition, parts: int) -> Trajectory:
-    """The run with another scheme and every macro step divided into equal parts, at the same saved nodes; it may fail."""
-    finer = replace(
+def companion(run: Simulation, scheme: Scheme | Composition, parts: int, whole: int = 1) -> Trajectory:
+    """The run with another scheme and every `whole` macro steps divided into equal parts; it may fail.
+
+    Its saved nodes are the saved nodes of the run, or those that are multiples of `whole` steps, a multiple of `save_every`.
+    """
+    return finer(run, scheme, parts, whole).in_pieces()
+
+
+def finer(run: Simulation, scheme: Scheme | Composition, parts: int, whole: int = 1) -> Simulation:
+    """The run that makes a `companion`."""
+    return replace(
         run,
         scheme=scheme if scheme is run.scheme else of_one_type(scheme),
-        macro_dt=run.macro_dt / parts,
-        num_steps=run.num_steps * parts,
-        save_every=run.save_every * parts,
+        macro_dt=run.macro_dt / (parts / whole),
+        num_steps=run.num_steps // whole * parts,
+        save_every=max(run.save_every // whole, 1) * parts,
         save_micro=False,
     )
-    return finer.in_pieces()
 
 
 def _positions(trajectory: Trajectory) -> np.ndarray:
     """(k, n_s + n_f) positions, slow first."""
     return np.concatenate([trajectory.states.q_s, trajectory.states.q_f], axis=1)
+
+
+def _stepped_over(run: Simulation, drives: Events, unseen: float) -> str:
+    """Events that the steps of a run do not see, and advice."""
+    step = drives.shortest / (NODES_OF_EVENT * node_distance(run.scheme, drives))
+    return (
+        f"from t = {unseen:.4g} on no error is certified: {' and '.join(drives.names)} of the system changes and changes back within "
+        f"{drives.shortest:.2g}, which steps of {float(run.macro_dt):.4g} see too seldom or not at all; take macro_dt = {step:.2g} or less, or accuracy="
+    )
 
 
 def _uncertified(error: RunError, trajectory: Trajectory) -> str:

@@ -10,14 +10,13 @@ from vmri_jax.accuracy.steps import with_accuracy
 from vmri_jax.mechanics.arrays import whole_number
 from vmri_jax.mechanics.checks import check_flags, check_system
 from vmri_jax.mechanics.state import Movable, State
-from vmri_jax.running.adjoints import check_adjoint
+from vmri_jax.running.adjoints import check_adjoint, traced_run
 from vmri_jax.running.arguments import Steps
 from vmri_jax.running.failures import simulation_error
 from vmri_jax.running.lost_energy import LostEnergyWarning, lost_energy
 from vmri_jax.running.memory import check_memory
 from vmri_jax.running.progress import ShowsProgress, progress_to
 from vmri_jax.running.simulation import simulation
-from vmri_jax.running.traced import traced_run
 from vmri_jax.running.trajectory import Trajectory, with_origin
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
@@ -74,9 +73,9 @@ def simulate(
         throw: raise `SimulationError` (which carries the partial trajectory) if a step fails; else return the trajectory,
             NaN after the failure.
         progress: True for a bar, or a function of (what, done, total), with an accuracy called before every trial run. With False a run
-            that takes more than two seconds prints a line on the error stream at least every 5 s, which says whether it is tracing, compiling or stepping.
-        adjoint: method of differentiation, see `vmri_jax.running.adjoints`: "stored" in all modes, "checkpoint" and
-            "reversible" in reverse mode with little memory, "forward" for few parameters; "auto" chooses by length and symmetry.
+            that takes more than two seconds prints lines on the error stream, whether it is tracing, compiling or stepping.
+        adjoint: which states a run keeps for derivatives, see `vmri_jax.running.adjoints`: "stored" for all modes, "checkpoint" for reverse
+            mode in little memory; "auto" chooses by length.
         error: estimate the error of the positions and its slow and fast share, ``run.error``, a `RunError`. This takes two more runs: one
             with half the macro step, one with twice the micro steps, which needs another program. A failed run has no error.
         of: with `error` or `accuracy`, a function of a run (without micro nodes) whose error is estimated, too, ``run.error.of``. It returns
@@ -103,7 +102,7 @@ def simulate(
             best, settings = with_accuracy(system, scheme, state, solver, accuracy, **length, of=of, progress=tell)
         run, trajectory = best.run, replace(best.trajectory, origin=replace(best.run.origin, settings=settings))
         if int(trajectory.failed_at) < 0:
-            return with_error(run, trajectory, of, shares=error, halved=best.halved)
+            return with_error(run, trajectory, of, shares=error, trial=(best.halved, best.errors))
         if throw:
             raise simulation_error(trajectory, run.macro_dt, run.save_every, run.scheme.num_micro)
         return trajectory
@@ -115,7 +114,7 @@ def simulate(
         raise ValueError(
             f"simulate: num_saves is {num_saves} without an accuracy; give an accuracy, or save_every with a step."
         )
-    check_adjoint(adjoint, scheme)
+    check_adjoint(adjoint)
     run = simulation(system, scheme, state, solver, Steps(macro_dt, micro_dt, num_steps, t_end, save_every, save_micro))
     if not run.is_concrete:
         if error:

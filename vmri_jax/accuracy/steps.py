@@ -23,6 +23,7 @@ from vmri_jax.accuracy.families import Family, of_degree, of_order_2
 from vmri_jax.accuracy.trials import AIMED_PART, MOST_SAVED, MOST_STEPS, Search, Trial, unit_of
 from vmri_jax.mechanics.arrays import is_concrete
 from vmri_jax.mechanics.checks import check_number
+from vmri_jax.mechanics.driving import events
 from vmri_jax.mechanics.invariants import velocity
 from vmri_jax.mechanics.masses import ConstantMass
 from vmri_jax.mechanics.state import Movable, Problem, State, start_of
@@ -41,6 +42,11 @@ FIRST_MICRO = 5
 MOST_COORDINATES = 60
 """Most coordinates of a system for which a single interval of high degree is tried, and for which resonances are looked up. The matrices of
 both have a row for each coordinate: with 200 of them they take minutes, and schemes with kicks are faster."""
+MOST_GROWTH = 64
+"""Most steps of a run over the steps of the run before. With a larger number a search whose accuracy is out of reach, as with jumps of forces, ends with
+fewer steps than it could take; with a smaller one it repeats runs more often."""
+MANY_STEPS = 100_000
+"""Macro steps that short events demand, above which a warning tells of them; a smaller value warns of runs that take less than a second."""
 MOST_REPEATS = 5
 """Runs that may miss the accuracy before the search gives up; a larger value makes searches for an accuracy out of reach take longer."""
 RESONANT_GROWTH = 1e-6
@@ -100,11 +106,13 @@ def with_accuracy(
         check_function_of_run(of, True, run)
         return run
 
-    search = Search(make, length, num_saves, progress)
+    drives = events(opened_system, start, t_end)
+    search = Search(make, length, num_saves, progress, drives)
     menu = _menu(scheme, opened_system, start, accuracy, length)
     trials = search.first_trials(menu)
     extent = max(extent_of(trial.trajectory) for trial in trials)
-    if accuracy > extent:
+    # Driven systems: positions at few saved nodes may hide the motion, and all trials see the events.
+    if accuracy > extent and not drives.names:
         raise ValueError(
             f"simulate: accuracy is {accuracy:g}, and no position moves by more than {extent:.3g} until t = {t_end:g}: any run is as "
             "accurate. Give a smaller one, in the unit of the positions."
@@ -115,6 +123,13 @@ def with_accuracy(
     if can_choose and np.isfinite(best.error) and best.error > 0:
         best = search.with_best_num_micro(best, accuracy)
     best = _accurate(search, best, accuracy)
+    fewest = search.fewest_steps(best.run.scheme)
+    if fewest > MANY_STEPS:
+        warnings.warn(
+            f"simulate: {' and '.join(drives.names)} of the system changes and changes back within {drives.shortest:.2g}, so that the run takes "
+            f"at least {fewest} macro steps until t = {t_end:g}; a run in parts, with its steps for each part, takes fewer.",
+            stacklevel=3,
+        )
     if not best.error <= accuracy:
         reached = (
             f"its error is {best.error:.1e}" if np.isfinite(best.error) else "no error is certified over its length"
@@ -135,17 +150,21 @@ def with_accuracy(
 
 def _accurate(search: Search, best: Trial, accuracy: float) -> Trial:
     """A trial of the scheme of `best` with an error of at most `accuracy`, or the last trial if `MOST_REPEATS` of them miss it."""
-    fewest = 1
+    fewest, order = 1, 1.0 if search.drives.jump else float(best.run.order)
     for _ in range(MOST_REPEATS):
         if not np.isfinite(best.error):
             break
-        num_steps = _beside_resonances(search, best, max(best.steps_for(AIMED_PART * accuracy), fewest))
-        if num_steps > MOST_STEPS:
+        wanted = min(best.steps_for(AIMED_PART * accuracy, order), MOST_GROWTH * best.run.num_steps)
+        num_steps = _beside_resonances(search, best, max(wanted, fewest))
+        if num_steps > max(MOST_STEPS, search.fewest_steps(best.run.scheme)):
             break
-        best = search.trial(best.family, best.num_micro, num_steps, best.run.may_fall_back)
+        before, best = best, search.trial(best.family, best.num_micro, num_steps, best.run.may_fall_back, accuracy)
         if best.error <= accuracy:
             break
         fewest = best.run.num_steps + 1
+        # Kinks of a force lower the order: later runs take the order between the last two.
+        falls, grows = np.log(before.error / best.error), np.log(best.run.num_steps / before.run.num_steps)
+        order = float(np.clip(falls / grows, 1.0, best.run.order)) if grows > 0 else 1.0
     return best
 
 

@@ -9,8 +9,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vmri_jax.accuracy.companions import certified_nodes, companion, extrapolated
+from vmri_jax.accuracy.companions import (
+    FEWEST_DIVIDED,
+    certified_nodes,
+    companion,
+    estimated_errors,
+    extrapolated,
+    fewest_steps,
+)
 from vmri_jax.accuracy.families import Family
+from vmri_jax.mechanics.driving import Events
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.progress import Progress, silent
 from vmri_jax.running.run_error import largest_of
@@ -76,9 +84,9 @@ class Trial:
         """Measured seconds of a macro step."""
         return _seconds_of_steps(self.run)[0]
 
-    def steps_for(self, error: float) -> int:
-        """Macro steps for this error, ``n (e / error)^(1 / p)``."""
-        return max(1, int(np.ceil(self.run.num_steps * (self.error / error) ** (1 / self.run.order))))
+    def steps_for(self, error: float, order: float | None = None) -> int:
+        """Macro steps for this error, ``n (e / error)^(1 / p)``, with the order of the scheme if None is given."""
+        return max(1, int(np.ceil(self.run.num_steps * (self.error / error) ** (1 / (order or self.run.order)))))
 
     def time_for(self, error: float) -> float:
         """Seconds of a run with this error; infinite if the error of the trial is not certified."""
@@ -113,6 +121,7 @@ class Search:
         length: simulated time, in the unit of time of the system.
         num_saves: saved intervals; None for at most `MOST_SAVED`.
         progress: called before every trial run.
+        drives: events of the system in this time; all runs have steps that see them.
     """
 
     def __init__(
@@ -121,8 +130,9 @@ class Search:
         length: float,
         num_saves: int | None,
         progress: Progress = silent,
+        drives: Events = Events(),  # noqa: B008 (immutable)
     ):
-        self.make, self.length, self.num_saves, self.progress = make, length, num_saves, progress
+        self.make, self.length, self.num_saves, self.progress, self.drives = make, length, num_saves, progress, drives
         self.runs: dict[tuple[str, int], Simulation] = {}
         self.num_trials = 0
         self.prices: Prices | None = None
@@ -133,16 +143,21 @@ class Search:
         save_every = -(-num_steps // saves)
         if self.num_saves is None:
             saves = -(-num_steps // save_every)
+            saves = -(-saves // FEWEST_DIVIDED) * FEWEST_DIVIDED if self.drives.names else saves
         return saves * save_every, save_every
 
     def run(self, family: Family, num_micro: int, num_steps: int) -> Simulation:
-        """The run with at least `num_steps` macro steps."""
+        """The run with at least `num_steps` macro steps, and with steps that see all events."""
         key = family.python, num_micro
         if key not in self.runs:
             self.runs[key] = self.make(family.make(num_micro))
-        num_steps, save_every = self.rounded(num_steps)
+        num_steps, save_every = self.rounded(max(num_steps, self.fewest_steps(self.runs[key].scheme)))
         dt = np.asarray(self.length / num_steps)
         return replace(self.runs[key], macro_dt=dt, num_steps=num_steps, save_every=save_every)
+
+    def fewest_steps(self, scheme: Scheme | Composition) -> int:
+        """Fewest macro steps that see all events."""
+        return fewest_steps(scheme, self.drives, self.length)
 
     def first_trials(self, menu: Sequence[tuple[Family, int]]) -> list[Trial]:
         """A trial of each scheme.
@@ -155,10 +170,13 @@ class Search:
             return trials
         return [self.trial(*scheme, FEWEST_STEPS, falls_back=True) for scheme in menu]
 
-    def trial(self, family: Family, num_micro: int, num_steps: int, falls_back: bool = False) -> Trial:
+    def trial(
+        self, family: Family, num_micro: int, num_steps: int, falls_back: bool = False, accuracy: float | None = None
+    ) -> Trial:
         """The first trial with a certified error, of 1, 2, 4, ... times the macro steps; the last trial if the search runs out of time or steps.
 
-        `falls_back` tells whether the fallback is tried where the first solver fails, see `Simulation`.
+        `falls_back` tells whether the fallback is tried where the first solver fails, see `Simulation`. With an accuracy the errors are also from
+        a third companion where it is needed, see `estimated_errors`.
         """
         while True:
             run = replace(self.run(family, num_micro, num_steps), may_fall_back=falls_back)
@@ -168,8 +186,11 @@ class Search:
             before = time.perf_counter()
             trajectory, halved = run.in_pieces(), companion(run, run.scheme, 2)
             seconds = time.perf_counter() - before
-            errors = extrapolated(run.order, trajectory, halved)
             done = max(int(trajectory.failed_at), int(halved.failed_at)) < 0
+            if done and accuracy is not None:
+                errors = estimated_errors(run, trajectory, halved, self.drives, accuracy)
+            else:
+                errors = extrapolated(run.order, trajectory, halved)
             certified = bool(done and certified_nodes(trajectory, errors)[0].all())
             # The seconds of the first trial include compiling, which later trials do not repeat.
             is_late = seconds > MOST_TRIAL_SECONDS and run.num_steps > FEWEST_STEPS

@@ -97,6 +97,7 @@ def stability(
         if out is not None:
             plots.save(plot_stability(maps, system or "one slow and one stiff spring"), out)
     table = plain_table("scheme", "num_micro", "unstable where omega H / pi is in")
+    table.caption = next(iter(maps.values())).note or None
     for name, stability_of_scheme in maps.items():
         for n, windows in stability_of_scheme.shown():
             table.add_row(name, str(n), windows_text(windows))

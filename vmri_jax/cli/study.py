@@ -38,7 +38,7 @@ app = typer.Typer()
 )
 def tune(
     system: options.System,
-    error: Annotated[float, typer.Option(help="Largest accepted error of a position at the end, in its unit.")],
+    error: Annotated[float, typer.Option(help="Largest accepted error of a position in the run, in its unit.")],
     t_end: Annotated[float, typer.Option(help="Simulated time.")],
     exhaustive: Annotated[bool, typer.Option("--exhaustive", help="Search without shortcuts.")] = False,
     out: Annotated[Path | None, typer.Option(help="Write all runs of the search here, .csv or .json.")] = None,
@@ -63,10 +63,6 @@ def tune(
     if verification is not None:
         console.print(
             f"\nFrom another start the choice has an error of {verification.error_q:.1e} and takes {duration(verification.seconds)}."
-        )
-    if any(setting.row.seconds < choice.setting.row.seconds for setting in choice.others):
-        console.print(
-            "Faster settings kept the error by luck: from another start their error is more than twice as large."
         )
     console.print(f"\n[bold]{escape(choice.setting.command(system))}[/bold]", soft_wrap=True)
     with refusals():

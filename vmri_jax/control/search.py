@@ -43,7 +43,7 @@ def measured(setup: Transcription, point: Point):
     """Cost, sum of all violations, largest node and control, and largest value of a limit."""
     over = setup.over(point.z, point.u)
     violation = sum(jnp.sum(jnp.abs(x)) for x in (point.gaps, point.goal, jnp.maximum(over, 0.0)))
-    sizes = (jnp.maximum(jnp.max(jnp.abs(a)), 1e-12) for a in (point.z, point.u))
+    sizes = (jnp.maximum(jnp.max(jnp.abs(a)), jnp.finfo(float).tiny) for a in (point.z, point.u))
     return setup.total(point.z, point.u), violation, *sizes, jnp.max(over, initial=0.0)
 
 
@@ -84,7 +84,7 @@ class Search:
         while accepted is None and part >= SHORTEST_PART:
             z, u = point.z + part * dz, point.u + part * du
             # the last term allows for round-off: near the optimum the merit changes by less
-            allowed = before + SUFFICIENT_DECREASE * part * min(expected, 0.0) + 1e-12 * (1 + abs(before))
+            allowed = before + SUFFICIENT_DECREASE * part * min(expected, 0.0) + 1e-12 * (abs(cost) + rho * violation)
             trials = [self.with_gaps(z, u), self.motion(u)]
             measures = [measured(self.setup, trial) for trial in trials]
             merits = [float(cost + rho * violation) for cost, violation, *_ in measures]

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from vmri_jax.mechanics.arrays import quickly_compiled
 from vmri_jax.mechanics.invariants import all_constraints, potential_energy, velocity
 from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.mechanics.system import System
@@ -12,6 +13,7 @@ from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.equations import StepEquations
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.newton import dense
+from vmri_jax.steppers.results import Result
 from vmri_jax.steppers.solvers import Newton
 
 
@@ -102,16 +104,42 @@ def symplectic_defect(
         state: fulfils the constraints; None for the start of the problem.
     """
     system, state = start_of("symplectic_defect", system, state)
-    z, splits = phase_vector(state), phase_splits(state)
+    _, M, at_start, at_end, _, _ = derivative_along(system, scheme, state, macro_dt, solver, 1)
+    J = symplectic_form(at_start.shape[1] // 2)
+    return jnp.max(jnp.abs(M.T @ (at_end @ J @ at_end.T) @ M - at_start @ J @ at_start.T))
 
-    def step(z):
-        start = State(state.t, *jnp.split(z, splits))
-        return phase_vector(macro_step(system, scheme, start, macro_dt, solver)[0])
 
-    M = jax.jit(jax.jacfwd(step))(z)
-    J = symplectic_form(z.size // 2)
+@quickly_compiled
+def derivative_along(system: System, scheme: Scheme | Composition, state: State, macro_dt, solver, num_steps):
+    """Derivative of num_steps macro steps, ``M = DPhi(z_(N-1)) ... DPhi(z_0)``, between tangent spaces of the constraint manifold.
+
+    Returns:
+        The end z_N (2 n,), M (k, k), orthonormal bases (k, 2 n) of the tangent spaces at the start and at the end, the number of steps that
+        were taken, and the status of the last one: a step that fails is the last.
+    """
+    splits = phase_splits(state)
+
+    def step(z, t):
+        end, info = macro_step(system, scheme, State(t, *jnp.split(z, splits)), macro_dt, solver)
+        z = phase_vector(end)
+        return z, (z, info.result)
+
+    def advance(carry):
+        z, matrix, basis, k, _ = carry
+        t = state.t + k * macro_dt
+        derivative, (z, result) = jax.jacfwd(lambda z: step(z, t), has_aux=True)(z)
+        end_basis = tangents(system, t + macro_dt, z, splits)
+        return z, end_basis @ derivative @ (basis.T @ matrix), end_basis, k + 1, jnp.asarray(result, int)
+
+    def goes_on(carry):
+        *_, k, result = carry
+        return (k < num_steps) & (result <= Result.CONVERGED_AT_ROUNDOFF)
+
+    z = phase_vector(state)
     basis = tangents(system, state.t, z, splits)
-    return jnp.max(jnp.abs(basis @ (M.T @ J @ M - J) @ basis.T))
+    start = z, jnp.eye(len(basis)), basis, jnp.zeros((), int), jnp.zeros((), int)
+    z, matrix, end_basis, k, result = jax.lax.while_loop(goes_on, advance, start)
+    return z, matrix, basis, end_basis, k, result
 
 
 def step_condition(system: Movable, scheme: Scheme, state: State | None = None, *, macro_dt, sweeps: int = 10) -> float:

@@ -178,8 +178,8 @@ class _Search:
         u_start = np.zeros(self.size)
         self.part_starts = shooting.starts(u_start)
         # The starts of the parts are scaled by the largest value of each coordinate along the first run.
-        scale = np.concatenate([self.part_starts, np.asarray(shooting.start(u_start))[None]])
-        self.scale = np.maximum(np.abs(scale).max(axis=0), 1e-3 * np.abs(scale).max() + 1e-12)
+        scale = np.abs(np.concatenate([self.part_starts, np.asarray(shooting.start(u_start))[None]])).max(axis=0)
+        self.scale = np.where(scale > 0, scale, scale.max() or 1.0)
 
     def residual(self, x, values, weight):
         """Misses of all values in standard deviations, and weighted gaps between the parts.

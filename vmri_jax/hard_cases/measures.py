@@ -11,6 +11,7 @@ import numpy as np
 from vmri_jax import diagnostics
 from vmri_jax.accuracy.simulate import simulate
 from vmri_jax.diagnostics.shadow import ShadowEnergy
+from vmri_jax.mechanics.constraints import rows_at
 from vmri_jax.mechanics.state import Problem, State
 from vmri_jax.running.lost_energy import LostEnergyWarning
 from vmri_jax.running.trajectory import Trajectory
@@ -97,6 +98,13 @@ def constraints(trajectory: Trajectory) -> tuple[float, float]:
         return np.inf, np.inf
     position, velocity = np.asarray(trajectory.constraint_residual).max(axis=0)
     return float(position), float(velocity)
+
+
+def relative_constraints(problem: Problem, trajectory: Trajectory) -> float:
+    """Largest ``|g|`` at the saved nodes of a run, relative to the terms of its row; NaN if the run failed."""
+    states = trajectory.states
+    rows = jax.jit(jax.vmap(partial(rows_at, problem.system)))(states.t, states.q_s, states.q_f)
+    return float(np.max(np.abs(rows.values) / rows.terms))
 
 
 def nodes(trajectory: Trajectory) -> np.ndarray:

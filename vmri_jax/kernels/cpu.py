@@ -79,8 +79,8 @@ def solve(a, b):
 
 def _eliminated(k, rows):
     """Turn k of `solve` in place: row k becomes r_k / a_kk, row i becomes r_i - a_ik r_k / a_kk."""
-    unit = jnp.arange(rows.shape[0])[:, None] == k
-    return rows - (rows[:, k, None] - unit) * (rows[k] / rows[k, k])
+    row = rows[k] / rows[k, k]
+    return jnp.where(jnp.arange(rows.shape[0])[:, None] == k, row, rows - rows[:, k, None] * row)
 
 
 def inverse(a):
@@ -113,7 +113,7 @@ def _exchanged(k, a):
     """
     rows, columns = (jnp.arange(m) == k for m in a.shape[-2:])
     row = jnp.where(columns, 1.0, a[..., k, None, :]) / a[..., k, k, None, None]
-    return jnp.where(columns, rows[:, None] * 1.0, a) - (a[..., :, k, None] - rows[:, None]) * row
+    return jnp.where(rows[:, None], row, jnp.where(columns, 0.0, a) - a[..., :, k, None] * row)
 
 
 def _first_exchanged(a):

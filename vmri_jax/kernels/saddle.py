@@ -18,6 +18,13 @@ def regularized(a):
     return a * (1 + REGULARIZATION * np.eye(a.shape[-1]))
 
 
+def least_norm(a, rows):
+    """``a^+ rows`` for a = ``G M^-1 G^T`` (n, n) with a diagonal of ones, in which the units of rows cancel: of dependent rows the least multipliers."""
+    diagonal = jnp.diagonal(a)
+    root = jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1.0))
+    return jnp.linalg.lstsq(a / root[:, None] / root, rows / root)[0] / root
+
+
 def saddle(a, b, c):
     """``[[a, b], [c, e]]`` over any leading axes, with ``e = -REGULARIZATION diag(c diag(a)^-1 b)`` in place of 0, see `regularized`."""
     diagonal = jnp.diagonal(a, axis1=-2, axis2=-1)[..., None]

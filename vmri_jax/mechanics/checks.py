@@ -16,10 +16,6 @@ from vmri_jax.mechanics.masses import ConstantMass
 from vmri_jax.mechanics.order import order_of, ordered
 from vmri_jax.mechanics.system import KineticFunction, System
 
-CONSTRAINT_TOLERANCE = 1e-6
-"""Largest constraint value, in the unit of the constraint, of a constraint that is kept. Loose Newton tolerances raise it. A smaller value would
-refuse starts that are rounded to six digits."""
-
 
 def check_arrays(**arrays):
     """Arrays as float64 vectors, of JAX if they are, else of NumPy; velocities shaped like their positions; finite where concrete."""

@@ -15,8 +15,8 @@ MOST_ROWS_OF_FULL_MATRIX = 80
 takes 0.9 of the time of the full matrix at 77 rows, and 0.3 of it at 88 (`python -m benchmarks chains --full`). A larger number makes steps of
 short chains slower; a smaller one makes the first run of small systems some seconds longer."""
 LEAST_CHANGE = 1e-6
-"""Least change of a constraint, relative to the largest constraint value, that counts as a dependence. A larger value misses weak dependences, which
-costs iterations; a smaller one takes round-off for a dependence."""
+"""Least change of a constraint, relative to its largest change, that counts as a dependence. A larger value misses weak dependences, which costs
+iterations; a smaller one takes round-off for a dependence."""
 
 
 def all_rows(system: System, q_s, q_f) -> Sparsity:
@@ -56,12 +56,12 @@ def _shared(system: System, n_s: int, n_f: int, nodes: int | None = None) -> Spa
 
 @eqx.filter_jit
 def _touched(system: System, n_s: int, q, moves, slow_too: bool):
-    """(k, m) whether each of m constraints changes with each of the moves (k, n), and (m,) whether it is finite."""
+    """(k, m) whether each of m constraints changes to first order with each of the moves (k, n), and (m,) whether it is finite."""
 
     def constraints(q):
         values = system.constraints if slow_too else system.g
         return values(jnp.zeros(()), q[:n_s], q[n_s:])
 
-    before = constraints(q)
-    after = jax.lax.map(lambda move: constraints(q + move), moves)
-    return jnp.abs(after - before) > LEAST_CHANGE * jnp.max(jnp.abs(before)), jnp.isfinite(before)
+    values, change = jax.linearize(constraints, q)
+    changes = jnp.abs(jax.lax.map(change, moves))
+    return changes > LEAST_CHANGE * jnp.max(changes, axis=0), jnp.isfinite(values) & jnp.isfinite(changes).all(axis=0)

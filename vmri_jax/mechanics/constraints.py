@@ -1,23 +1,53 @@
-"""Checks of constraints and masses at one configuration (kept, independent, regular), and projection of positions onto the constraints."""
+"""Checks of constraints and masses at one configuration (kept, independent, regular), and projection of positions onto the constraints.
+
+Every number is judged in its own unit. A row ``g_i(t, q)`` of the constraints is known up to its rounding, and counts as kept below
+
+    allowed_i = tolerance terms_i + ROUNDING eps (terms_i + sum_j |dg_i/dq_j| |q_j|)
+
+where terms_i is the size of the terms that cancel in it, ``|d| + L`` of ``|d| - L`` (`sizes_of_terms`). Gradients of rows are compared in the
+norm of the kinetic energy, and mass matrices with a diagonal of ones.
+"""
+
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
+from vmri_jax.kernels.saddle import least_norm
+from vmri_jax.mechanics.arrays import Numbers, quickly_compiled
 from vmri_jax.mechanics.by_name import constraint_sizes
-from vmri_jax.mechanics.checks import CONSTRAINT_TOLERANCE
 from vmri_jax.mechanics.functions import Rheonomic
-from vmri_jax.mechanics.projection import legendre
+from vmri_jax.mechanics.masses import correlation
+from vmri_jax.mechanics.projection import legendre, mass_diagonal
 from vmri_jax.mechanics.system import System
+from vmri_jax.mechanics.terms_of_rows import sizes_of_terms
 
+START = 1e-9
+"""Largest value of a row at the start, relative to its terms. A larger one would start runs off the constraints; a smaller one would refuse numbers
+that are written with ten digits."""
+CONSTRAINT_TOLERANCE = 1e-6
+"""Largest value of a row that is kept along a run, relative to its terms. A smaller value would refuse starts that are rounded to six digits."""
+CONSTRAINT_OVER_TOLERANCE = 100
+"""Loose Newton tolerances raise the value of a row that is kept, relative to its terms, to this factor times the tolerance. A smaller factor would
+refuse converged steps."""
+ROUNDING = 100
+"""Value of a row in units of its rounding, ``eps (terms + |G| |q|)``, that always counts as zero: a row has tens of operations. A smaller value
+refuses starts far from the origin, a larger one lets short rods there have the wrong length."""
 RANK = 1e-8
 """Largest singular value of a dependence among rows of length one. A larger value refuses nearly dependent constraints that can be solved."""
 LEAST_EIGENVALUE = 1e-12
-"""Smallest eigenvalue of a regular mass matrix, relative to the largest one. A larger value refuses large mass ratios."""
+"""Smallest eigenvalue of a regular mass matrix with a diagonal of ones, relative to the largest one. A larger value refuses nearly singular ones."""
+SPEED = 1e-5
+"""Velocity, in units of the user, at which the mass matrix is checked: it is the same at all velocities unless T is not quadratic. T may then be
+singular at rest, or have a largest velocity, which this value has to stay below."""
 LEAST_COEFFICIENT = 1e-6
 """Rows with at least this coefficient in a normalised linear dependence are named in messages. A larger value leaves rows out."""
 LEAST_FAST_PART = 1e-12
 """Least ratio ``|dg/dq_f| / |dg/dq|`` of a constraint that counts as dependent on fast variables. A larger value refuses weak dependences."""
+NEARBY = 1e-2
+"""Distance to a configuration nearby, relative to the distance over which rows change by their terms. From a larger one rows may be others."""
 PROJECTION_STEPS = 20
 """Gauss-Newton steps onto the constraints. They converge quadratically from close positions; a larger number takes longer."""
 MICRO_GRID = (
@@ -52,6 +82,56 @@ def is_rank_deficient(rows, scaled_with=None, tolerance: float = RANK):
     return jnp.isfinite(whole).all() & (too_many | (values[-1] <= tolerance))
 
 
+class Rows(NamedTuple):
+    """The rows at a configuration: those that are solved for, then the implied ones.
+
+    values: g.
+    terms: sizes of the terms that cancel in g.
+    jacobian: dg/dq with respect to (q_s, q_f).
+    positions: ``sum_j |dg_i/dq_j| |q_j|``.
+    """
+
+    values: Float[Numbers, "k"]
+    terms: Float[Numbers, "k"]
+    jacobian: Float[Numbers, "k n"]
+    positions: Float[Numbers, "k"]
+
+    def allowed(self, tolerance):
+        """(k,) the values up to which rows count as kept, see the top of this module."""
+        return tolerance * self.terms + ROUNDING * np.finfo(float).eps * (self.terms + self.positions)
+
+    @classmethod
+    def of(cls, function, q) -> "Rows":
+        """The rows (k,) of a function of q (n,)."""
+        jacobian = jax.jacrev(function)(q)
+        return cls(function(q), sizes_of_terms(function, q), jacobian, jnp.abs(jacobian) @ jnp.abs(q))
+
+
+def rows_at(system: System, t, q_s, q_f) -> Rows:
+    """The `Rows` of a system."""
+    n_s = q_s.shape[0]
+
+    def rows(q):
+        configuration = t, q[:n_s], q[n_s:]
+        return jnp.concatenate([system.constraints(*configuration), system.g_implied(*configuration)])
+
+    return Rows.of(rows, jnp.concatenate([q_s, q_f]))
+
+
+def are_kept(system: System, state, tolerance):
+    """Whether a state of a run keeps the rows that are solved for, and the implied ones.
+
+    Args:
+        state: a `State`.
+        tolerance: of the solver.
+    """
+    rows = rows_at(system, state.t, state.q_s, state.q_f)
+    tolerance = jnp.maximum(CONSTRAINT_TOLERANCE, CONSTRAINT_OVER_TOLERANCE * tolerance)
+    kept = jnp.abs(rows.values) <= rows.allowed(tolerance)
+    solved = sum(system.num_constraints(state.q_s, state.q_f))
+    return jnp.all(kept[:solved]), jnp.all(kept[solved:])
+
+
 def project_positions(system: System, t, q_s, q_f):
     """Positions moved onto the constraints at a time, along ``M^-1 G^T`` of the start: to first order the nearest point in the mass metric."""
     n_s = q_s.shape[0]
@@ -63,13 +143,14 @@ def project_positions(system: System, t, q_s, q_f):
     def momentum(v):
         return jnp.concatenate(legendre(system, q_s, q_f, v[:n_s], v[n_s:]))
 
-    mass = jax.jacfwd(momentum)(jnp.zeros_like(q0))
-    directions = jnp.linalg.solve(mass, jax.jacrev(constraints)(q0).T)
+    # D = M^-1 G^T at the start, with rows of coordinates over the square roots of masses: all have the same unit
+    mass, jacobian = jax.jacfwd(momentum)(jnp.zeros_like(q0)), jax.jacrev(constraints)(q0)
+    root = jnp.sqrt(jnp.diagonal(mass))
+    directions = jnp.linalg.solve(mass / (root[:, None] * root), (jacobian / root).T) / root[:, None]
 
-    # q <- q - D (G D)^+ g with D = M^-1 G^T at the start
+    # q <- q - D (G D)^+ g
     def corrected(_, q):
-        g = constraints(q)
-        return q - directions @ jnp.linalg.lstsq(jax.jacrev(constraints)(q) @ directions, g)[0]
+        return q - directions @ least_norm(jax.jacrev(constraints)(q) @ directions, constraints(q))
 
     # a loop, since its body is compiled once
     q = jax.lax.fori_loop(0, PROJECTION_STEPS, corrected, q0)
@@ -87,12 +168,14 @@ def check_mass(system: System, q_s, q_f) -> None:
     if system.has_constant_mass:
         return
     with jax.ensure_compile_time_eval():  # velocities may be traced, positions are not
-        mass = np.asarray(_mass_matrix(system, q_s, q_f, *_nearby(np.zeros_like(q_s), np.zeros_like(q_f))))
+        random = np.random.default_rng(0)
+        velocities = (SPEED * random.normal(size=np.size(q)) for q in (q_s, q_f))
+        mass = np.asarray(_mass_matrix(system, q_s, q_f, *velocities))
     if not np.isfinite(mass).all():
         raise ValueError(
             "System: the mass matrix d2T/dv2 of kinetic is not finite at these positions (a norm at zero?)."
         )
-    values, vectors = np.linalg.eigh(mass)
+    values, vectors = np.linalg.eigh(correlation(mass))
     without = (
         np.abs(vectors[:, values <= LEAST_EIGENVALUE * np.abs(values).max()]).max(axis=1, initial=0.0)
         > LEAST_COEFFICIENT
@@ -102,11 +185,12 @@ def check_mass(system: System, q_s, q_f) -> None:
         names = [f"q_s[{i}]" if i < n_s else f"q_f[{i - n_s}]" for i in np.flatnonzero(without)]
         raise ValueError(
             f"System: the mass matrix d2T/dv2 of kinetic is not positive definite at these positions, along {', '.join(names)} "
-            f"(eigenvalues from {values[0]:.3g} to {values[-1]:.3g}). Give every coordinate a mass, one that constraints move too."
+            f"(with a diagonal of ones, its eigenvalues go from {values[0]:.3g} to {values[-1]:.3g}). Give every coordinate a mass, one that "
+            "constraints move too."
         )
 
 
-@jax.jit
+@quickly_compiled
 def _mass_matrix(system, q_s, q_f, v_s, v_f):
     n_s = v_s.size
     return jax.hessian(lambda v: system.kinetic(q_s, q_f, v[:n_s], v[n_s:], system.params))(jnp.append(v_s, v_f))
@@ -124,7 +208,7 @@ def check_constraints(
     Args:
         state: a `State`.
         place: name of the positions in messages.
-        tolerance: largest constraint value, in the unit of the constraint, of a satisfied constraint.
+        tolerance: largest value of a satisfied constraint, relative to its terms.
         advice: remedy in the message if a value is larger.
 
     Raises:
@@ -137,20 +221,30 @@ def check_constraints(
         arguments = (state.q_s,) if name == "slow_constraint" else (state.q_s, state.q_f)
         return _rows_in_words(getattr(system, name), rows, *arguments, system.params)
 
-    values, implied, slow, fast, alone = jax.device_get(_values_and_jacobians(system, state.t, state.q_s, state.q_f))
-    if not np.isfinite(values).all():
-        raise ValueError(f"{place}: the constraints are {values} there, which is not finite.")
-    worst, n_g = int(np.abs(values).argmax()), len(values) - len(alone)
-    if abs(values[worst]) > tolerance:
+    n_s, (n_g, n_gs) = np.size(state.q_s), system.num_constraints(state.q_s, state.q_f)
+    rows, masses = jax.device_get(_rows_and_masses(system, state.t, state.q_s, state.q_f))
+    solved = rows.values[: n_g + n_gs]
+    if not np.isfinite(solved).all():
+        raise ValueError(f"{place}: the constraints are {solved} there, which is not finite.")
+    if not (np.isfinite(rows.jacobian).all()):
+        raise ValueError("System: the Jacobian of the constraints is not finite at these positions (a norm at zero?).")
+    allowed = rows.allowed(tolerance)[: n_g + n_gs]
+    violated = np.abs(solved) > allowed
+    if violated.any():
+        worst = int(np.argmax(np.abs(solved) / np.where(violated, allowed, np.inf)))
         row = in_words([worst], "constraint") if worst < n_g else in_words([worst - n_g], "slow_constraint")
         raise ValueError(
-            f"{place} violate {'constraint' if worst < n_g else 'slow_constraint'}, row {row.strip('[]')}, by {abs(values[worst]):.3e} (tolerance "
-            f"{tolerance:.0e}); {advice}"
+            f"{place} violate {'constraint' if worst < n_g else 'slow_constraint'}, row {row.strip('[]')}, by {abs(solved[worst]):.3e} (allowed: "
+            f"{allowed[worst]:.0e}, {tolerance:.0e} of its terms and round-off); {advice}"
         )
-    if system.implied is not None:
-        _check_implied(implied, place)
-    if not (np.isfinite(slow).all() and np.isfinite(fast).all() and np.isfinite(alone).all()):
-        raise ValueError("System: the Jacobian of the constraints is not finite at these positions (a norm at zero?).")
+    _check_implied(rows, n_g + n_gs, place)
+
+    def gradients(rows: Rows):
+        """dg/dq_s, dg/dq_f and dg_slow/dq_s per square root of a mass, so that all entries of a row have one unit."""
+        scaled = rows.jacobian / np.sqrt(masses)
+        return scaled[:n_g, :n_s], scaled[:n_g, n_s:], scaled[n_g : n_g + n_gs, :n_s]
+
+    slow, fast, alone = gradients(rows)
     size = np.linalg.norm(np.concatenate([slow, fast], axis=1), axis=1)
     slow_only = np.flatnonzero(np.linalg.norm(fast, axis=1) <= LEAST_FAST_PART * size)
     if slow_only.size:
@@ -163,25 +257,26 @@ def check_constraints(
     if any(dependent for _, dependent in map(rank_of, (alone, fast))):
         # At a singular configuration (a linkage folded flat) rows are dependent there and nowhere else, and runs pass it: only rows that are
         # dependent at a generic configuration nearby are refused.
-        *_, fast, alone = jax.device_get(_values_and_jacobians(system, state.t, *_nearby(state.q_s, state.q_f)))
+        rows, _ = jax.device_get(_rows_and_masses(system, state.t, *_nearby(state, rows, masses)))
+        _, fast, alone = gradients(rows)
         _check_rank("slow_constraint", alone, "slow variables.", in_words)
         _check_rank("constraint", fast, f"fast variables. {MICRO_GRID}", in_words)
 
 
-@jax.jit
-def _values_and_jacobians(system, t, q_s, q_f):
-    """Values of all constraints and of the implied rows, and the Jacobians dg/dq_s, dg/dq_f and dg_slow/dq_s."""
-    jacobians = *jax.jacrev(system.g, argnums=(1, 2))(t, q_s, q_f), jax.jacrev(system.g_slow, argnums=1)(t, q_s)
-    return system.constraints(t, q_s, q_f), system.g_implied(t, q_s, q_f), *jacobians
+@quickly_compiled
+def _rows_and_masses(system, t, q_s, q_f):
+    """The `Rows`, and the diagonal of the mass matrix with 1 in place of 0."""
+    masses = jnp.concatenate(mass_diagonal(system, q_s, q_f))
+    return rows_at(system, t, q_s, q_f), jnp.where(masses > 0, masses, 1.0)
 
 
-def _check_implied(values, place: str) -> None:
-    opened = np.flatnonzero(~(np.abs(values) <= CONSTRAINT_TOLERANCE))
+def _check_implied(rows: Rows, solved: int, place: str) -> None:
+    values, allowed = rows.values[solved:], rows.allowed(CONSTRAINT_TOLERANCE)[solved:]
+    opened = np.flatnonzero(~(np.abs(values) <= allowed))
     if opened.size:
         raise ValueError(
             f"System: implied does not follow from the constraints: {place} keep these, and row(s) {opened.tolist()} of implied are "
-            f"{values[opened]} there (tolerance {CONSTRAINT_TOLERANCE:.0e}). Take parameters for which they follow, or hold them "
-            "as constraint."
+            f"{values[opened]} there (allowed: {allowed[opened]}). Take parameters for which they follow, or hold them as constraint."
         )
 
 
@@ -218,8 +313,11 @@ def _check_rank(name: str, jacobian, of: str, in_words) -> None:
         )
 
 
-def _nearby(q_s, q_f):
-    """A generic configuration about a hundredth of the size of these positions away, always the same."""
-    random = np.random.default_rng(0)
-    size = 1e-2 * max(1e-3, *(float(np.abs(q).max(initial=0.0)) for q in (q_s, q_f)))
-    return tuple(q + size * random.normal(size=q.shape) for q in (q_s, q_f))
+def _nearby(state, rows: Rows, masses):
+    """A generic configuration at a distance `NEARBY` from a state, always the same; the distance over which a row changes by its terms is 1."""
+    lengths = np.linalg.norm(rows.jacobian / np.sqrt(masses), axis=1)
+    size = NEARBY * np.min(rows.terms[lengths > 0] / lengths[lengths > 0], initial=np.inf)
+    change = (
+        np.where(np.isfinite(size), size, 0.0) * np.random.default_rng(0).normal(size=masses.size) / np.sqrt(masses)
+    )
+    return np.split(np.concatenate([state.q_s, state.q_f]) + change, [np.size(state.q_s)])

@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from vmri_jax.mechanics.arrays import quickly_compiled
 from vmri_jax.mechanics.invariants import lagrangian
 from vmri_jax.mechanics.motion import motion
 from vmri_jax.mechanics.names import Names
@@ -118,10 +119,10 @@ def _changes(forces: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(changes), changes, 0.0)
 
 
-_motion = jax.jit(motion)
+_motion = quickly_compiled(motion)
 
 
-@jax.jit
+@quickly_compiled
 def _on_line(system, state, line, s):
     """Forces and velocities (k, n) on a line."""
     now, (dt, dq, dv) = motion(system, state), line

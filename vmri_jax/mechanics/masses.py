@@ -77,9 +77,18 @@ def mass_array(name: str, mass):
         raise ValueError(f"ConstantMass: {name} = {values} is not finite.")
     if mass.ndim == 1 and np.any(values <= 0):
         raise ValueError(f"ConstantMass: {name} = {values}; every mass must be positive.")
-    if mass.ndim == 2 and (not np.allclose(values, values.T) or np.any(np.linalg.eigvalsh(values) <= 0)):
-        raise ValueError(f"ConstantMass: {name} must be a symmetric positive definite matrix.")
+    if mass.ndim == 2:
+        scaled = correlation(values)
+        if not np.allclose(scaled, scaled.T) or np.any(np.linalg.eigvalsh(scaled) <= 0):
+            raise ValueError(f"ConstantMass: {name} must be a symmetric positive definite matrix.")
     return mass
+
+
+def correlation(matrix: np.ndarray) -> np.ndarray:
+    """A matrix over the square roots of its diagonal, ``M_ij / sqrt(M_ii M_jj)``: the units of its coordinates cancel."""
+    diagonal = np.diagonal(matrix)
+    root = np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
+    return matrix / root[:, None] / root
 
 
 class ConstantMass(eqx.Module):

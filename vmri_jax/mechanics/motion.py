@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from vmri_jax.kernels.saddle import least_norm
 from vmri_jax.mechanics.invariants import lagrangian, velocity
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
@@ -37,7 +38,7 @@ class Motion(NamedTuple):
 
 
 def motion(system: System, state: State) -> Motion:
-    """Velocities, accelerations and multipliers of a state; of dependent constraints the multipliers of least norm."""
+    """Velocities, accelerations and multipliers of a state; of dependent constraints the least multipliers."""
     n_s = state.q_s.size
     v_s, v_f = velocity(system, state.q_s, state.q_f, state.p_s, state.p_f)
     q, v = jnp.append(state.q_s, state.q_f), jnp.append(v_s, v_f)
@@ -61,7 +62,7 @@ def motion(system: System, state: State) -> Motion:
 
     # a = free - responses lambda with free = M^-1 forces, responses = M^-1 G^T; G a = -gamma gives lambda
     free, responses = jnp.linalg.solve(mass, forces), jnp.linalg.solve(mass, jacobian.T)
-    multipliers = jnp.linalg.lstsq(jacobian @ responses, jacobian @ free + gamma)[0]
+    multipliers = least_norm(jacobian @ responses, jacobian @ free + gamma)
     a = free - responses @ multipliers
     return Motion(v_s, v_f, a[:n_s], a[n_s:], multipliers)
 

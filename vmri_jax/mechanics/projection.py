@@ -16,7 +16,7 @@ MAX_ITERATIONS = 50
 SMALL_STEP = 1e-9
 """Newton step, relative to the velocities, at which the line search ends: the two further steps bring it to round-off. A smaller value costs steps."""
 ON_CONSTRAINTS = 1e-9
-"""Largest violation of the hidden constraints, relative to the velocities, of an iterate whose energy is compared. A larger value compares energies of
+"""Largest violation of the hidden constraints, relative to the terms of a row, of an iterate whose energy is compared. A larger value compares energies of
 velocities that violate the constraints."""
 LARGEST_LAST_STEP = 1e-6
 """Largest last Newton step, relative to the velocities, of a converged iteration. A larger value accepts iterates that have not converged."""
@@ -27,6 +27,23 @@ def legendre(system: System, q_s, q_f, v_s, v_f):
     if system.has_constant_mass:
         return system.kinetic.momentum(v_s, v_f)
     return jax.grad(system.kinetic, argnums=(2, 3))(q_s, q_f, v_s, v_f, system.params)
+
+
+def mass_diagonal(system: System, q_s, q_f):
+    """Diagonal of the mass matrix ``d2T/dv2`` at rest: (n_s,) and (n_f,)."""
+    if system.has_constant_mass:
+        masses = system.kinetic.slow, system.kinetic.fast
+        return tuple(mass if mass.ndim == 1 else jnp.diagonal(mass) for mass in masses)
+    n_s, n = q_s.shape[0], q_s.shape[0] + q_f.shape[0]
+
+    def second(direction):
+        def kinetic(step):
+            v = step * direction
+            return system.kinetic(q_s, q_f, v[:n_s], v[n_s:], system.params)
+
+        return jax.jvp(lambda step: jax.jvp(kinetic, (step,), (1.0,))[1], (0.0,), (1.0,))[1]
+
+    return tuple(jnp.split(jax.vmap(second)(jnp.eye(n)), [n_s]))
 
 
 def project_momentum(system: System, state, guess=None, sparsity: Sparsity | None = None):
@@ -102,30 +119,32 @@ def _velocity_and_impulse(system: System, q_s, q_f, constraints, p, guess):
         matrix = saddle(jax.vmap(times_hessian)(jnp.eye(v.size)), jacobian.T, jacobian)
         rows = jnp.concatenate([p - gradient, -(jacobian @ v + rates)])
         d, mu = jnp.split(kernels.solve(matrix, rows[:, None])[:, 0], [v.size])
-        return d, jacobian.T @ mu
+        # |d| / |v| in the norm of the mass matrix T''
+        squared = (d @ times_hessian(d)) / jnp.maximum(v @ times_hessian(v), jnp.finfo(float).tiny)
+        return d, jacobian.T @ mu, jnp.sqrt(squared)
 
     def search(carry):
         v, k, _ = carry
         system, q_s, q_f, jacobian, rates, p = constants
-        d, _ = direction(constants, v)
-        small = kernels.max_abs(d) <= SMALL_STEP * kernels.max_abs(v)
+        d, _, size = direction(constants, v)
         # line search: the longest step that decreases T - p . v; off the constraints every finite step is a progress
         merit = jax.vmap(lambda v: kinetic(system, q_s, q_f, v) - p @ v)(v + fractions[:, None] * d)
-        on_constraints = kernels.max_abs(jacobian @ v + rates) <= ON_CONSTRAINTS * kernels.max_abs(v)
+        sizes = jnp.abs(jacobian) @ jnp.abs(v) + jnp.abs(rates)
+        on_constraints = jnp.all(jnp.abs(jacobian @ v + rates) <= ON_CONSTRAINTS * sizes)
         better = jnp.isfinite(merit) & ((merit < merit[-1]) | ~on_constraints)
-        stop = small | ~jnp.any(better)
+        stop = (size <= SMALL_STEP) | ~jnp.any(better)
         return jnp.where(stop, v, v + fractions[jnp.argmax(better)] * d), k + 1, stop
 
     data = (system, q_s, q_f, *constraints, p)
     if has_constant_hessian(lambda v: kinetic(system, q_s, q_f, v), guess):
-        return direction(data, jnp.zeros_like(p))  # T is quadratic in v: Newton's first step is the solution
+        return direction(data, jnp.zeros_like(p))[:2]  # T is quadratic in v: Newton's first step is the solution
     constants, guess = jax.lax.stop_gradient((data, guess))
     fractions = jnp.append(0.5 ** jnp.arange(12.0), 0.0)
     start = (guess, 0, jnp.asarray(False))
     v = jax.lax.while_loop(lambda carry: ~carry[2] & (carry[1] < MAX_ITERATIONS), search, start)[0]
     # Newton's map has the derivative zero by v at its fixed point: two steps outside of the loop carry first and second derivatives
     for _ in range(2):
-        d, impulse = direction(data, v)
+        d, impulse, size = direction(data, v)
         v = v + d
-    converged = kernels.max_abs(d) <= LARGEST_LAST_STEP * kernels.max_abs(v) + 1e-300
+    converged = size <= LARGEST_LAST_STEP
     return jnp.where(converged, v, jnp.nan), jnp.where(converged, impulse, jnp.nan)

@@ -12,9 +12,9 @@ import numpy as np
 from jaxtyping import Float
 
 from vmri_jax.mechanics import by_name
-from vmri_jax.mechanics.arrays import Number, Numbers, is_concrete, of_one_type, require_x64
+from vmri_jax.mechanics.arrays import Number, Numbers, is_concrete, of_one_type, quickly_compiled, require_x64
 from vmri_jax.mechanics.checks import check_arrays, check_flags, check_number, check_params, check_system, check_type
-from vmri_jax.mechanics.constraints import check_constraints, check_mass, project_positions
+from vmri_jax.mechanics.constraints import START, check_constraints, check_mass, project_positions
 from vmri_jax.mechanics.functions import with_time
 from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.projection import legendre, project_momentum
@@ -65,7 +65,7 @@ def initial_state(
     t: Number | None = None,
     *,
     project: bool | None = None,
-    tolerance=1e-9,
+    tolerance=START,
 ) -> State:
     """Consistent state from positions and velocities: ``p = dT/dv``, projected onto the hidden constraints.
 
@@ -80,7 +80,7 @@ def initial_state(
         t: start time; None for the time of the problem, or 0.
         project: move positions onto the constraints, and velocities onto the hidden constraints, instead of refusing them. A warning tells
             of velocities of which the projection leaves little. None for the choice of the problem, of a system for no projection.
-        tolerance: largest constraint value, in the unit of the constraint, of a satisfied constraint.
+        tolerance: largest value of a satisfied constraint, relative to the terms that cancel in it, ``|d| + L`` of ``|d| - L``.
 
     Raises:
         TypeError: a system without positions.
@@ -333,7 +333,7 @@ def start_of(caller: str, system, state=None) -> tuple[System, State]:
     return system, state
 
 
-@jax.jit
+@quickly_compiled
 def _consistent(system, t, q_s, q_f, v_s, v_f):
     """The state with projected momenta, and the violation of the hidden constraints, between 0 and 1.
 
@@ -350,4 +350,4 @@ def _consistent(system, t, q_s, q_f, v_s, v_f):
     return State(t, q_s, q_f, p_s, p_f), jnp.sqrt(jnp.clip(part, 0.0, 1.0))
 
 
-_projected_positions = jax.jit(project_positions)
+_projected_positions = quickly_compiled(project_positions)

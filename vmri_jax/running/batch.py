@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import PartitionSpec
 
-from vmri_jax.mechanics.arrays import is_concrete, real_array, whole_number
+from vmri_jax.mechanics.arrays import is_concrete, options_of_runs, real_array, whole_number
 from vmri_jax.mechanics.checks import check_params
 from vmri_jax.mechanics.names import unknown
 from vmri_jax.mechanics.state import Movable, State, initial_state, opened, start_of
@@ -78,13 +78,19 @@ class Batch:
         params = jax.tree.unflatten(jax.tree.structure(run.system.params), self.params)
         return with_origin(trajectory, run.origin.repeated((lanes,), params))
 
-    def halved(self) -> "Batch":
-        """The same runs with half the macro step, and the same saved nodes."""
-        run = self.run
-        counts = {"num_steps": 2 * run.num_steps, "save_every": 2 * run.save_every}
-        half = replace(run, macro_dt=run.macro_dt / 2, **counts, save_micro=False)
-        macro_dt = shared(half.macro_dt, len(self.macro_dt)) if is_repeated(self.macro_dt) else self.macro_dt / 2
-        return replace(self, run=half, macro_dt=macro_dt)
+    def lane(self, i: int) -> Simulation:
+        """The run of a lane."""
+        params = jax.tree.unflatten(jax.tree.structure(self.run.system.params), [a[i] for a in self.params])
+        state = State(*(a[i] for a in self.state))
+        return replace(self.run, system=self.run.system.with_params(params), state=state, macro_dt=self.macro_dt[i])
+
+    def with_steps(self, run: Simulation) -> "Batch":
+        """The batch with the steps of another run of its first lane, in the same ratio for all lanes."""
+        same = is_repeated(self.macro_dt)
+        macro_dt = (
+            shared(run.macro_dt, len(self.macro_dt)) if same else self.macro_dt * (run.macro_dt / self.macro_dt[0])
+        )
+        return replace(self, run=run, macro_dt=macro_dt)
 
     def _taken(self, index: np.ndarray) -> "Batch":
         """The lanes with these numbers."""
@@ -281,4 +287,4 @@ def _side_by_side(engine: Engine, of_params: tuple[bool, ...], of_state: bool, o
         spread = PartitionSpec("lanes")
         in_specs = for_each(spread, PartitionSpec())
         program = jax.shard_map(program, mesh=mesh, in_specs=in_specs, out_specs=spread, check_vma=False)
-    return jax.jit(program)
+    return jax.jit(program, compiler_options=options_of_runs())

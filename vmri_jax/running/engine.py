@@ -14,10 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Int
 
-from vmri_jax.kernels import max_abs
 from vmri_jax.mechanics import invariants
-from vmri_jax.mechanics.arrays import Numbers
-from vmri_jax.mechanics.checks import CONSTRAINT_TOLERANCE
+from vmri_jax.mechanics.arrays import Numbers, options_of_runs
+from vmri_jax.mechanics.constraints import are_kept
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.loops import MOST_STORED_STEPS, PLAIN, Loops, Recursive, Stored
@@ -27,7 +26,6 @@ from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.plan import Plan, plan
 from vmri_jax.steppers.results import Result
-from vmri_jax.steppers.solved import CONSTRAINT_OVER_TOLERANCE
 from vmri_jax.steppers.solvers import Newton
 
 
@@ -95,7 +93,7 @@ class Engine:
 
         Only the first `saves` of the saved intervals are computed.
         """
-        return jax.jit(lambda *run: jax.tree.leaves(self.trajectory(*run)))
+        return jax.jit(lambda *run: jax.tree.leaves(self.trajectory(*run)), compiler_options=options_of_runs())
 
     @cached_property
     def stored(self):
@@ -130,7 +128,7 @@ class Engine:
             times = _Times(begin.t_start, macro_dt, save_every)
             return self._by_while_loop(stepper, _Cursor.before(start, memory, begin.step), saved, times, saves)
 
-        return jax.jit(piece, donate_argnums=0)
+        return jax.jit(piece, donate_argnums=0, compiler_options=options_of_runs())
 
     def next_piece(
         self, arrays: Arrays, begin: PieceStart, save_every: int, saves: int
@@ -345,13 +343,9 @@ def _node(system: System, tolerance, cursor: _Cursor) -> tuple[Node, _Cursor]:
     state = cursor.state
     phase = state.q_s, state.q_f, state.p_s, state.p_f
     energy, residual = invariants.energy_and_constraint_residual(system, state)
-    allowed = jnp.maximum(CONSTRAINT_TOLERANCE, CONSTRAINT_OVER_TOLERANCE * tolerance)
-    finite, kept = jnp.isfinite(energy), residual[0] <= allowed
-    breaks = (cursor.failed_at < 0) & ~(finite & kept)
-    violated = Result.CONSTRAINT_VIOLATED
-    if system.implied is not None:  # the residual includes the implied rows: blame them if the solved rows are kept
-        solved = max_abs(system.constraints(state.t, state.q_s, state.q_f))
-        violated = jnp.where(solved <= allowed, Result.NOT_IMPLIED, violated)
+    finite, (solved, implied) = jnp.isfinite(energy), are_kept(system, state, tolerance)
+    breaks = (cursor.failed_at < 0) & ~(finite & solved & implied)
+    violated = jnp.where(solved, Result.NOT_IMPLIED, Result.CONSTRAINT_VIOLATED)
     cause = jnp.where(finite, violated, Result.NON_FINITE)
     result = jnp.where(breaks, cause, cursor.result)
     failed_at = jnp.where(breaks, jnp.maximum(cursor.step - 1, 0), cursor.failed_at)

@@ -4,7 +4,7 @@
 |---|---|---|
 | ``run()`` | `Engine.whole`, compiled for its number of saved nodes | `prepare` |
 | ``run.in_pieces()``, ``run.advance(...)`` | `Engine.piece`, one program for runs of all lengths | `simulate`, `stream` |
-| `vmri_jax.running.traced` | `Engine.stored`, `Engine.checkpointed`, with derivatives | `simulate` under transformations |
+| `vmri_jax.running.adjoints` | `Engine.stored`, `Engine.checkpointed`, with derivatives | `simulate` under transformations |
 
 *The fallback*: with `solvers.Auto` a piece whose first solver fails is computed again by `solvers.Arrowhead`, whose Newton matrices are exact,
 with the same tolerance and limit of iterations; all pieces after it are computed by `Arrowhead` alone. Names with `exact` belong to the fallback.

@@ -64,7 +64,7 @@ def energy_in_words(energy: np.ndarray, kept: bool | None) -> str:
     if kept is False:
         last = energy[np.isfinite(energy)]
         return f"{start[0]:.6g} at the start, {last[-1] if last.size else np.nan:.6g} at the end; run.work() says why"
-    relative = f", {largest / abs(start[0]):.1e} of it" if abs(start[0]) > 1e-12 else ""
+    relative = f", {largest / abs(start[0]):.1e} of it" if abs(start[0]) > np.finfo(float).eps * largest else ""
     return f"{start[0]:.6g} at the start, changed by at most {largest:.2e}{relative}"
 
 

@@ -39,7 +39,7 @@ class RunInfo(NamedTuple):
     Attributes:
         method: largest code of the methods of the steps, mostly of the most expensive one, see `Method`.
         iterations: most Newton iterations of a step; 0 for explicit steps.
-        residual: largest residual after a step: of the equations relative to the momentum, or of the constraints.
+        residual: largest residual of the momentum equations after a step, relative to the momentum.
     """
 
     method: Int[Numbers, "k-1"]

@@ -17,7 +17,7 @@ from vmri_jax.mechanics.names import unknown
 from vmri_jax.mechanics.rows import Place, Rows
 from vmri_jax.scene.body import GROUND, Attachment, Bodies, body_of, end_of, label_of, moving
 from vmri_jax.scene.declare import Elements, Parameter, effect_class, lasting, squeeze
-from vmri_jax.scene.layout import Layout
+from vmri_jax.scene.layout import Key, Layout
 from vmri_jax.scene.returned import check_function
 from vmri_jax.scene.terms import EffectTerm, InRigidBodies, OnBodies, OnGround, Role, choose
 
@@ -187,21 +187,27 @@ class Effect(ABC):
         q = tuple(end_of(bodies, name, self.whole).position for name in self.elements(bodies)[i])
         return q, self._element_params(i, bodies, params)
 
-    def element_term(self, i: int, bodies: Bodies, params: dict[str, Any]) -> tuple[EffectTerm, dict[str, Any]]:
+    def element_term(
+        self, i: int, bodies: Bodies, params: dict[str, Any], freedoms: Sequence[Key] = ()
+    ) -> tuple[EffectTerm, dict[str, Any]]:
         """Element i as a term of the coordinates of its moving bodies, one after the other, and its part of the params of all elements.
 
         The term takes these coordinates as q_s, and no q_f: whether a body is slow or fast does not matter for a single element.
+
+        Args:
+            freedoms: the freedoms among `freedoms_of` the element that are coordinates of the scene; these follow the bodies in q_s.
         """
         places, end = {}, 0
         for name in moving(self.elements(bodies)[i]):
             places[name] = Place("s", end, bodies[name].size)
             end += bodies[name].size
+        of_freedoms = {key: Place("s", end + k, 1) for k, key in enumerate(freedoms)}
+        (term,) = self.terms((i,), bodies, Layout(places, {}, of_freedoms), {})
         # without the name and number of the element, equal terms share a compiled program
-        term = replace(self._term((i,), bodies, places), name=ALONE, select=None)
-        return term, {ALONE: self._element_params(i, bodies, params)}
+        return replace(term, name=ALONE, select=None), {ALONE: self._element_params(i, bodies, params)}
 
-    def pairs_of_joints(self, i: int) -> tuple[tuple[str, int], ...]:
-        """(joint, number of its pair) for all joints whose freedoms element i is a function of; () if it depends on other coordinates."""
+    def freedoms_of(self, i: int) -> tuple[Key, ...]:
+        """The freedoms of joints that element i is a function of; () if it depends on other coordinates."""
         return ()
 
     def _element_params(self, i: int, bodies: Bodies, params: dict[str, Any]) -> dict[str, Any]:

@@ -10,6 +10,9 @@ from vmri_jax.mechanics.kinematics import Kinematics
 from vmri_jax.mechanics.rows import Part, Place
 from vmri_jax.scene.body import Bodies
 
+Key = tuple[str, int, str]
+"""Name of a joint, number of its pair of bodies, and name of a freedom of the joint."""
+
 
 class DecidedPace(NamedTuple):
     """Whether a body is slow or fast, and why."""
@@ -26,13 +29,13 @@ class Layout:
         bodies: by name of the body, the place in Q_s or Q_f of its coordinates as a point or rigid body, see `Kinematics`. A body that is
             no function of joint coordinates has the same place in q_s or q_f.
         coordinates: by name, the place in q_s or q_f of the coordinates of a body or of a freedom of a joint.
-        freedoms: places of the freedoms of joints in q_s or q_f, by (joint, number of its pair of bodies, freedom).
+        freedoms: places of the freedoms of joints in q_s or q_f.
         kinematics: the map from q to Q; None if Q = q.
     """
 
     bodies: dict[str, Place]
     coordinates: dict[str, Place]
-    freedoms: dict[tuple[str, int, str], Place] = field(default_factory=dict)
+    freedoms: dict[Key, Place] = field(default_factory=dict)
     kinematics: Kinematics | None = None
 
     @property
@@ -49,10 +52,10 @@ class Layout:
         return slow, fast
 
     @property
-    def columns(self) -> dict[str, np.ndarray]:
-        """Numbers of the coordinates of every body in (Q_s, Q_f), taken as one vector."""
-        first = {"s": 0, "f": self.ends[0]}
-        return {name: first[part] + start + np.arange(size) for name, (part, start, size) in self.bodies.items()}
+    def columns(self) -> dict[str | Key, np.ndarray]:
+        """Numbers of the coordinates of every body, and of every freedom of a joint, in (Q_s, Q_f), taken as one vector."""
+        first, places = {"s": 0, "f": self.ends[0]}, {**self.bodies, **self.freedoms}
+        return {name: first[part] + start + np.arange(size) for name, (part, start, size) in places.items()}
 
 
 def join(bodies: Bodies, layout: Layout, part: Part, quantity: Literal["coordinates", "rates", "masses"]) -> Any:

@@ -65,25 +65,27 @@ def bodies_and_effects(
         raise TypeError(f"Scene.from_mujoco: model is {type(model).__name__}; give a path, or a mujoco.MjModel.")
     if limits not in ("refuse", "spring"):
         raise ValueError(f"Scene.from_mujoco: limits is {limits!r}; it must be 'refuse' or 'spring'.")
-    compiled = Compiled(mujoco, model, coordinates)
+    compiled = Compiled(mujoco, model, coordinates, _start(mujoco, model, qpos, qvel, key))
     compiled.refuse([*ignore, "limits"] if limits == "spring" and not isinstance(ignore, str) else ignore)
-    reader = _Reader(compiled, _start(compiled, qpos, qvel, key))
+    close(compiled, compiled.data)
+    reader = _Reader(compiled, compiled.data)
     bodies = reader.bodies()
     springs = list(reader.limits("limits" in ignore)) if limits == "spring" else []
     coupled = couplings(compiled, reader.data)
     return bodies, [*reader.joints(), *springs, *reader.equalities(), *coupled, *reader.gravity(bodies)]
 
 
-def _start(compiled: Compiled, qpos: Any, qvel: Any, key: str | int | None) -> Any:
-    """`mujoco.MjData` at the start, its loops closed."""
-    data = compiled.mujoco.MjData(compiled.model)
+def _start(mujoco: Any, model: Any, qpos: Any, qvel: Any, key: str | int | None) -> Any:
+    """`mujoco.MjData` at the start, of a keyframe with its controls, activations and poses of mocap bodies."""
+    data = mujoco.MjData(model)
     if key is not None:
         if qpos is not None or qvel is not None:
             raise ValueError(
                 "Scene.from_mujoco: key and qpos or qvel are given; both define the start. Give one of them."
             )
-        number = _keyframe(compiled.model, key)
-        qpos, qvel = compiled.model.key_qpos[number], compiled.model.key_qvel[number]
+        number = _keyframe(model, key)
+        mujoco.mj_resetDataKeyframe(model, data, number)
+        qpos, qvel = model.key_qpos[number], model.key_qvel[number]
     for name, value in (("qpos", qpos), ("qvel", qvel)):
         if value is None:
             continue
@@ -93,8 +95,7 @@ def _start(compiled: Compiled, qpos: Any, qvel: Any, key: str | int | None) -> A
         if not np.isfinite(value).all():
             raise ValueError(f"Scene.from_mujoco: {name} is {value}, which is not finite.")
         target[:] = value
-    compiled.mujoco.mj_forward(compiled.model, data)
-    close(compiled, data)
+    mujoco.mj_forward(model, data)
     return data
 
 

@@ -19,6 +19,9 @@ SOFTEST_IMPEDANCE = 0.9
 constraint does not replace; a larger value here refuses equalities with default numbers."""
 ELEMENTS = {"jnt": "joint", "dof": "joint", "body": "body", "tendon": "tendon", "actuator": "actuator"}
 """For each prefix of fields with a row for each element, the word for these elements."""
+STATES_ASKED = (0.1, 1.0)
+"""Standard deviations, in m, rad, m/s and rad/s, of random changes of the start at which MuJoCo is asked for the forces of actuators: a force
+that is zero at the start, as of a servo at its target, is not zero there. More states take longer."""
 NAMED = 8
 """Most elements that a message names; with more it is hard to read."""
 
@@ -31,11 +34,13 @@ class Compiled:
         mujoco: the package.
         model: `mujoco.MjModel`.
         coordinates: of the scene: by "directors" a body can have one joint.
+        data: `mujoco.MjData` at the start, with the controls and activations there; None for the model's own start.
     """
 
     mujoco: Any
     model: Any
     coordinates: str = "joint"
+    data: Any = None
 
     def off(self, *flags: str) -> bool:
         """Whether opt.disableflags has one of these flags, or all flags in one of these strings ("SPRING DAMPER")."""
@@ -175,30 +180,41 @@ class Compiled:
         return ", ".join(names[:NAMED] + unnamed)
 
     def _actuators(self) -> str:
-        """Actuators with a force at zero control, unless their group is disabled, and all actuators with armature or damping."""
-        fields = REFUSED["actuators"].fields
-        groups = np.asarray(self.model.actuator_group)
-        # disableactuator has a bit for each of the groups 0 to 30; other groups cannot be disabled
-        disabled = (
-            (groups >= 0) & (groups < 31) & ((int(self.model.opt.disableactuator) >> groups.clip(0, 30)) & 1 == 1)
+        """Actuators with a force, joints with a force of actuators (a range without zero), and all actuators with armature or damping."""
+        model = self.model
+        forces, rates, loads = self._actuation()
+        parts = (
+            (forces, model.actuator_outadr, model.actuator_outnum),
+            (rates, model.actuator_actadr, model.actuator_actnum),
         )
-        acting = np.zeros(len(groups), dtype=bool) if self.off("ACTUATION") else ~disabled & ~self._exert_nothing()
-        for name, flags in fields.items():
+        acting = np.zeros(model.nactuator, dtype=bool)
+        for values, addresses, sizes in parts:
+            acting |= np.array([values[a : a + n].any() for a, n in zip(addresses, sizes, strict=True)], dtype=bool)
+        for name, flags in REFUSED["actuators"].fields.items():
             if name != "nactuator" and not self.off(*flags):
-                acting = acting | _rows(getattr(self.model, name))
+                acting |= _rows(getattr(model, name))
+        limited = model.dof_jntid[loads & (model.jnt_actfrclimited[model.dof_jntid] != 0)]
+        if len(limited) and not acting.any():
+            return self._listed("joint", limited)
         return self._listed("actuator", np.flatnonzero(acting))
 
-    def _exert_nothing(self) -> np.ndarray:
-        """(nactuator,) whether the force is a multiple of the control, or of an integral of it from zero or a filter of it."""
-        model, mujoco = self.model, self.mujoco
-        gains = [int(kind) for kind in (mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtGain.mjGAIN_AFFINE)]
-        dynamics = mujoco.mjtDyn
-        linear = [dynamics.mjDYN_NONE, dynamics.mjDYN_INTEGRATOR, dynamics.mjDYN_FILTER, dynamics.mjDYN_FILTEREXACT]
-        return (
-            np.isin(model.actuator_gaintype, gains)
-            & np.isin(model.actuator_dyntype, [int(kind) for kind in linear])
-            & ~_rows(model.actuator_biasprm)
-        )
+    def _actuation(self) -> list[np.ndarray]:
+        """Whether MuJoCo computes forces of actuators (nout,), rates of activations (na,), and forces on velocities (nv,) that are not zero.
+
+        It computes them for the controls and activations of the start, there and at states that differ in all coordinates and velocities:
+        an actuator whose force is zero in all of these states exerts none.
+        """
+        model, mujoco, random = self.model, self.mujoco, np.random.default_rng(0)
+        data, acting = mujoco.MjData(model), []
+        start = data if self.data is None else self.data
+        qpos, qvel, act, ctrl = (np.array(a) for a in (start.qpos, start.qvel, start.act, start.ctrl))
+        for size in (0.0, *STATES_ASKED):
+            data.qpos[:], data.act[:], data.ctrl[:] = qpos, act, ctrl
+            mujoco.mj_integratePos(model, data.qpos, size * random.normal(size=model.nv), 1.0)
+            data.qvel[:] = qvel + size * random.normal(size=model.nv)
+            mujoco.mj_forward(model, data)
+            acting.append([np.array(values) != 0 for values in (data.actuator_force, data.act_dot, data.qfrc_actuator)])
+        return [np.any(kind, axis=0) for kind in zip(*acting, strict=True)]
 
     def _contact(self) -> str:
         pairs = self.touching()

@@ -80,7 +80,7 @@ def without_redundant(sorting: Sorting) -> Sorting:
     rows = ConstraintRows.of(sorting)
     if rows is None:
         return sorting
-    scaled = rows.jacobian / np.sqrt(rows.masses)
+    scaled = rows.by_masses
     lengths = np.linalg.norm(scaled, axis=1, keepdims=True)
     scaled /= np.where(lengths > 0, lengths, 1.0)
     # remove the span of the rigidity rows from the other rows, then rank these: the last ones in the order of pivots depend on the first
@@ -209,7 +209,7 @@ def _listed(names: Sequence[str]) -> str:
 def _advice(sorting: Sorting, rows: ConstraintRows, micro: list[int]) -> str:
     """Advice about constraints on the micro grid that the fast bodies cannot satisfy."""
     fast = [name for name, place in sorting.layout.coordinates.items() if place.part == "f"]
-    jacobian = rows.jacobian[micro]
+    jacobian = rows.by_masses[micro]
     _, dependent = rank_of(jacobian[:, rows.num_slow :])
     involved = jacobian[dependent]
     touched = {
@@ -232,7 +232,7 @@ def _refuse(rows: ConstraintRows, numbers: list[int], first: int, advice: Callab
         first: number of the first coordinate that counts: 0, or that of the first fast coordinate.
         advice: end of the message.
     """
-    names, jacobian = rows.names(numbers), rows.jacobian[numbers][:, first:]
+    names, jacobian = rows.names(numbers), rows.by_masses[numbers][:, first:]
     _, involved = rank_of(jacobian)
     if not involved:
         return

@@ -5,16 +5,16 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 
 from vmri_jax.mechanics.arrays import is_concrete
 from vmri_jax.mechanics.checks import describe, shape_of
+from vmri_jax.mechanics.constraints import START, Rows
 from vmri_jax.scene.body import Bodies, end_of
 from vmri_jax.scene.terms import choose
 
 LIBRARY = "vmri_jax."
 """Beginning of the names of modules whose functions are not checked: the tests of the package do that."""
-LARGEST_VIOLATION = 1e-9
-"""Largest value of a constraint at the start, in its unit, as of `initial_state`. A larger one would start runs off the constraints."""
 
 
 def check_function(effect: Any, bodies: Bodies, moved: bool) -> None:
@@ -39,12 +39,19 @@ def check_function(effect: Any, bodies: Bodies, moved: bool) -> None:
         value = shape_of(f"{effect.name}: function", effect.function, *arguments)
         _check_value(effect, value, [x.shape for x in q], len(group))
         if effect.kind == "constraint" and not moved and is_concrete(arguments):
-            violation = float(np.abs(effect.function(*arguments)).max(initial=0.0))
-            if violation > LARGEST_VIOLATION:
+            rows = _rows(effect.function, *arguments)
+            if np.any(np.abs(rows.values) > rows.allowed(START)):
                 raise ValueError(
-                    f"{effect.name}: the positions at the start violate this constraint by {violation:.3g}; move the bodies, or let the scene "
-                    "do so, Scene(..., project=True)."
+                    f"{effect.name}: the positions at the start violate this constraint by {np.abs(rows.values).max():.3g}; move the "
+                    "bodies, or let the scene do so, Scene(..., project=True)."
                 )
+
+
+def _rows(constraint, *arguments) -> Rows:
+    """The `Rows` of a constraint of positions, its last argument but one."""
+    *before, q, params = arguments
+    flat, by_role = ravel_pytree(q)
+    return Rows.of(lambda flat: jnp.ravel(constraint(*before, by_role(flat), params)), flat)
 
 
 def _arguments(effect: Any, bodies: Bodies, group: list[int]) -> tuple[tuple, tuple]:

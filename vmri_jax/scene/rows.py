@@ -15,7 +15,7 @@ from vmri_jax.mechanics.names import Names
 from vmri_jax.scene.body import LARGEST_POINT, Bodies, label_of, moving
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.effects.freedoms import ANGLES
-from vmri_jax.scene.layout import join
+from vmri_jax.scene.layout import Key, join
 from vmri_jax.scene.rates import positions
 from vmri_jax.scene.sorting import Home, Placed, Sorting
 from vmri_jax.scene.terms import EffectTerm
@@ -50,7 +50,7 @@ class _Element(NamedTuple):
     """An element of a constraint as a function of the coordinates of its bodies.
 
     term, params: see `Effect.element_term`.
-    columns: numbers of these coordinates in (Q_s, Q_f), taken as one vector.
+    columns: numbers of these coordinates, and of the freedoms that are coordinates, in (Q_s, Q_f), taken as one vector.
     """
 
     term: EffectTerm
@@ -68,7 +68,7 @@ class ConstraintRows:
         start: (n,) coordinates at the start.
         masses: (n,) of the coordinates; 1 for traced masses, since they only weigh the choice of the rows to drop.
         scales: (n,) change of each coordinate in a large motion: the extent of the scene for positions, 1 for
-            directors of rigid bodies and angles of joints, and for general coordinates their value, at least 1.
+            directors of rigid bodies and angles of joints, and for general coordinates their largest value, or 1 if all are zero.
         num_slow: number of slow coordinates.
         to_bodies: (Q_s, Q_f) as one vector at q, and its Jacobian dQ/dq.
     """
@@ -128,6 +128,11 @@ class ConstraintRows:
         return self.evaluate(0.0, self.start)[1]
 
     @cached_property
+    def by_masses(self) -> np.ndarray:
+        """`jacobian` with the columns over the square roots of masses, so that the entries of a row have one unit."""
+        return self.jacobian / np.sqrt(np.where(self.masses > 0, self.masses, 1.0))
+
+    @cached_property
     def sizes(self) -> np.ndarray:
         """(k,) change of each row in a large motion: the length of its gradient with respect to coordinates over `scales`; 1 if this is zero."""
         lengths = np.linalg.norm(self.jacobian * self.scales, axis=1)
@@ -147,13 +152,14 @@ def _label(effect: Effect, element: Sequence[str]) -> str:
     return f"{effect.name} {'-'.join(map(label_of, element))}"
 
 
-def _elements(part: Placed, bodies: Bodies, columns: dict[str, np.ndarray], params: dict[str, Any]):
+def _elements(part: Placed, bodies: Bodies, columns: dict[str | Key, np.ndarray], params: dict[str, Any]):
     """Labels and elements of an effect, in the order of its terms."""
     effect = part.effect
     elements = effect.elements(bodies)
     for i in chain(*effect.by_size(part.elements, bodies)):
-        of_element = np.concatenate([columns[name] for name in moving(elements[i])])
-        yield _label(effect, elements[i]), _Element(*effect.element_term(i, bodies, params), of_element)
+        freedoms = [key for key in effect.freedoms_of(i) if key in columns]
+        of_element = np.concatenate([columns[name] for name in (*moving(elements[i]), *freedoms)])
+        yield _label(effect, elements[i]), _Element(*effect.element_term(i, bodies, params, freedoms), of_element)
 
 
 @partial(quickly_compiled, static_argnames="term")
@@ -181,7 +187,8 @@ def _scales(sorting: Sorting) -> np.ndarray:
         if name in layout.coordinates and layout.coordinates[name] not in scales:
             q = np.asarray(body.coordinates)
             of_points = np.where(np.arange(q.size) < LARGEST_POINT, extent, 1.0)
-            scales[layout.coordinates[name]] = np.maximum(np.abs(q), 1.0) if body.block else of_points
+            of_block = np.full(q.size, np.abs(q).max() or 1.0)
+            scales[layout.coordinates[name]] = of_block if body.block else of_points
     return np.concatenate(
         [scales[place] for place in sorted(scales, key=lambda place: (place.part == "f", place.start))]
     )

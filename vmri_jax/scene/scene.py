@@ -21,14 +21,17 @@ from vmri_jax.scene.assembly import actuation, build
 from vmri_jax.scene.body import AnyBody, Frame
 from vmri_jax.scene.drawing import drawing
 from vmri_jax.scene.effect import Effect
-from vmri_jax.scene.effects.joint_base import along_run, joint_named
+from vmri_jax.scene.effects.freedoms import Freedom
+from vmri_jax.scene.effects.joint_base import joint_named
 from vmri_jax.scene.functions import RESERVED, Actuation
+from vmri_jax.scene.layout import Key
 from vmri_jax.scene.ledger import Ledger, ledger
 from vmri_jax.scene.redundancy import check_constraints, dropped_rows, without_redundant
 from vmri_jax.scene.rigid import Rigidity
 from vmri_jax.scene.rows import names_of
 from vmri_jax.scene.sorting import Sorting, sort
-from vmri_jax.scene.trees import Branch, check_frames, grow, shallow
+from vmri_jax.scene.trees import Branch, check_frames, grow
+from vmri_jax.scene.turns import along_run, check_reach, check_run
 from vmri_jax.scene.velocities import joint_starts, with_rates
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
@@ -58,24 +61,25 @@ class Scene:
         redundant: for constraints that depend on others, as in a planar loop of hinges: "refuse" raises an error with their names,
             "drop" leaves out as many rows as there are dependences, see `dropped`. The dropped rows must follow from the others along the
             motion, not only at the start: the scene tries random motions, and runs watch the rows, see `System.implied`.
-        coordinates: of rigid bodies. "directors": a centre and directors for each body, joints are constraints. "joint": bodies in trees
-            are functions of the freedoms of their joints; each freedom is a coordinate, zero at the positions in `bodies`, and the joint has no
-            constraint rows. Roots of trees other than the ground keep directors; joints that close loops and `Spherical` joints keep
-            their rows. "auto": joint coordinates for trees short enough that these are faster, see `vmri_jax.scene.trees.LONGEST`.
+        coordinates: of rigid bodies. "joint": bodies in trees are functions of the freedoms of their joints; each freedom is a coordinate,
+            zero at the positions in `bodies`, and the joint has no constraint rows. Roots of trees other than the ground keep directors;
+            joints that close loops and `Spherical` joints keep their rows. "directors": a centre and directors for each body, joints are
+            constraints. "auto": joint coordinates, but directors for mechanisms with chains or loops so many that these are faster, see
+            `vmri_jax.scene.trees.LONGEST` and `MOST_LOOPS`; the angle of a joint with a spring, a limit or a gear is a coordinate there, too.
         joint_starts: values and rates of joint coordinates at the start; `with_joints` sets them.
 
     Raises:
         TypeError: an object of another class in `bodies` or `effects`.
         ValueError: 64-bit mode is off, no bodies, a name that occurs twice, arguments that an effect refuses (see its class), redundant
-            constraints.
+            constraints, a limit or a neutral angle that an angle of directors cannot reach.
     """
 
     bodies: Any
     effects: Any = ()
     project: bool = False
     redundant: Literal["refuse", "drop"] = "refuse"
-    coordinates: Literal["joint", "directors", "auto"] = "directors"
-    joint_starts: Mapping[tuple[str, int, str], tuple[Any, Any]] = field(default_factory=dict, repr=False)
+    coordinates: Literal["joint", "directors", "auto"] = "auto"
+    joint_starts: Mapping[Key, tuple[Any, Any]] = field(default_factory=dict, repr=False)
     # the problem after the first call of `problem`: building a scene of a hundred joints takes a second
     _problems: list[Problem] = field(default_factory=list, init=False, repr=False)
 
@@ -118,6 +122,7 @@ class Scene:
             effect.check(self.by_name, self.project)
         check_frames(self.by_name, self.branches)
         check_constraints(self.sorting)
+        check_reach(self.sorting)
 
     @classmethod
     def from_mujoco(
@@ -169,8 +174,8 @@ class Scene:
         """The bodies that are functions of the freedoms of joints, each with its joint and the body that it hangs on."""
         if self.coordinates == "directors":
             return ()
-        branches = grow(self.by_name, self.effects)
-        return branches if self.coordinates == "joint" else shallow(branches)
+        bound = [effect.bound(self.effects) for effect in self.effects]
+        return grow(self.by_name, bound, everywhere=self.coordinates == "joint")
 
     @cached_property
     def everything(self) -> tuple[Effect, ...]:
@@ -242,8 +247,10 @@ class Scene:
         """The consistent initial state, see `initial_state`."""
         return initial_state(self.system(), *self.start, project=self.project)
 
-    def joint_motion(self, run, joint: str, of: Literal["turn", "slide", "auto"] = "auto", pair: int = 0) -> np.ndarray:
-        """How far a joint has turned (rad) or moved along its axis (m) from the given position, (k,).
+    def joint_motion(self, run, joint: str, of: Freedom | Literal["auto"] = "auto", pair: int = 0) -> np.ndarray:
+        """How far a joint has turned (rad, whole turns included) or moved along its axis (m) from the given position, (k,).
+
+        The coordinate of the joint where it has one. Where it has none, turns are counted from node to node by the angle and its rate.
 
         Args:
             run: of this scene.
@@ -252,10 +259,11 @@ class Scene:
             pair: number of the pair of bodies, if the joint has several.
 
         Raises:
-            ValueError: no joint of this name, or a joint without this freedom.
+            ValueError: no joint of this name, or a joint without this freedom; a joint without a coordinate that may turn by half a turn or
+                more between two nodes.
             IndexError: no such pair.
         """
-        return along_run(joint_named("Scene.joint_motion", joint, self.effects), run, self.by_name, of, pair)
+        return along_run(self.sorting, joint_named("Scene.joint_motion", joint, self.effects), run, of, pair)
 
     def by_directors(self, run: Trajectory) -> Trajectory:
         """The same run with bodies described by their centres and directors, where joints have rows, multipliers and reaction forces.
@@ -266,7 +274,8 @@ class Scene:
             run: of this scene.
 
         Raises:
-            ValueError: the scene has frames without mass, which cannot move by directors.
+            ValueError: the scene has frames without mass, which cannot move by directors; an angle whose turns an effect counts goes beyond 5/6
+                of half a turn, or a limit.
         """
         frames = [body.name for body in self.bodies if isinstance(body, Frame)]
         if frames:
@@ -278,6 +287,7 @@ class Scene:
         bodies = [replace(body, pace="slow") for body in self.bodies]
         effects = [replace(effect, rate="auto") for effect in self.effects]
         twin = replace(self, bodies=bodies, effects=effects, coordinates="directors", joint_starts={})
+        check_run(self.sorting, run, twin.sorting)
         arrays: dict[str, Any] = {}
         for letter, of_body in (("q", run.position), ("p", run.momentum)):
             for part in ("s", "f"):
@@ -364,7 +374,7 @@ class Scene:
         Raises:
             TypeError: no mapping.
             ValueError: no joint of this name; a joint without this freedom, or without joint coordinates; numbers that are not finite; a
-                loop that does not close with these values.
+                loop that does not close with these values, or whose last joint, without a coordinate, would turn too far for its effects.
         """
         return replace(self, joint_starts={**self.joint_starts, **joint_starts(self.sorting, self.effects, joints)})
 

@@ -206,7 +206,7 @@ def _owners(effect: Effect, bodies: Bodies, branches: Sequence[Branch]) -> list[
     carried = {(branch.joint.name, branch.element): branch.child for branch in branches}
     owners = []
     for i, names in enumerate(effect.elements(bodies)):
-        pairs = effect.pairs_of_joints(i)
+        pairs = [key[:2] for key in effect.freedoms_of(i)]
         if pairs and all(pair in carried for pair in pairs):
             chains = [[carried[pair]] for pair in pairs]
         else:

@@ -2,9 +2,10 @@
 
 A joint whose freedoms are coordinates without a singularity may carry a body. In each loop of such joints one joint closes the loop: it
 carries no body, and its rows stay constraints. Prim's algorithm chooses these joints. It grows a spanning tree from the ground, and from
-a body of each mechanism that is not tied to the ground: a body with the pace "slow", then the one with most directors, then the heaviest. It adds the joint with the
-fewest freedoms first, so that the joints left over have the fewest rows, and among equals the joint nearest to the root, so that trees
-are not deep.
+a body of each mechanism that is not tied to the ground: a body with the pace "slow", then the one with most directors, then the heaviest.
+It adds joints in this order: joints whose whole turns an effect counts, since an angle of directors has none; joints in which another
+effect acts; joints with few freedoms, so that the joints left over have few rows; joints near the root, so that trees are not deep. Names
+decide among equals: the order in which bodies and joints are listed has no influence.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,16 +16,23 @@ from typing import Any, Literal, NamedTuple
 from vmri_jax.mechanics.arrays import is_concrete
 from vmri_jax.mechanics.kinematics import Frames, Grid, Kinematics, Move
 from vmri_jax.mechanics.rows import Part, Place, Rows
-from vmri_jax.scene.body import GROUND, Bodies, Frame, body_of
+from vmri_jax.scene.body import GROUND, Bodies, Frame
 from vmri_jax.scene.effect import Effect
-from vmri_jax.scene.effects.joint_base import Joint
-from vmri_jax.scene.layout import DecidedPace, Layout
+from vmri_jax.scene.effects.freedoms import ANGLES
+from vmri_jax.scene.effects.joint_base import Joint, OfFreedoms
+from vmri_jax.scene.layout import DecidedPace, Key, Layout
 from vmri_jax.scene.rigid import RigidBody
 
 LONGEST = 50
 """Most bodies between the root and a leaf of a tree for which coordinates="auto" chooses joint coordinates. The kinetic energy couples all
 joints of a tree, so that the time of a step grows nearly with the third power of this length; by directors it grows in proportion. On a
 hinged chain of 30 bars a step in joint coordinates takes 0.45 of the time by directors, on 100 bars 2.9 times as long."""
+MOST_LOOPS = 10
+"""Most loops of a scene for which coordinates="auto" chooses joint coordinates: each loop ties all its joints together. In a row of six
+four-bars a step in joint coordinates takes 0.13 of the time by directors; it grows with the power 3.3 of the number of loops, by directors in
+proportion, so that they cross near fourteen loops, and compiling takes longer in joint coordinates."""
+COUNTED, USED, UNUSED = range(3)
+"""Ranks of a pair of bodies in a joint: an effect counts whole turns of its angle, an effect acts in it, none does."""
 
 
 class Branch(NamedTuple):
@@ -46,7 +54,7 @@ class Branch(NamedTuple):
         return max(1, len(self.joint.moves))
 
     @property
-    def keys(self) -> list[tuple[str, int, str]]:
+    def keys(self) -> list[Key]:
         """The freedoms of the joint as keys of `Layout.freedoms`."""
         return [(self.joint.name, self.element, freedom) for freedom in self.joint.freedoms]
 
@@ -83,7 +91,7 @@ class Link(NamedTuple):
         return None if self.coordinate is None else self.branch.joint.moves[self.coordinate]
 
     @property
-    def key(self) -> tuple[str, int, str] | None:
+    def key(self) -> Key | None:
         """The freedom of this frame as a key of `Layout.freedoms`."""
         return None if self.coordinate is None else self.branch.keys[self.coordinate]
 
@@ -94,49 +102,65 @@ class Link(NamedTuple):
         return sign if self.move is not None and self.move.kind in kinds else 0.0
 
 
-def grow(bodies: Bodies, effects: Sequence[Effect]) -> tuple[Branch, ...]:
-    """The branches of all trees, parents before children."""
-    edges: dict[str, list[tuple]] = {}
+def grow(bodies: Bodies, effects: Sequence[Effect], everywhere: bool = True) -> tuple[Branch, ...]:
+    """The branches of all trees, parents before children.
+
+    Args:
+        effects: bound, see `Effect.bound`.
+        everywhere: False leaves out branches where directors are faster, see `LONGEST` and `MOST_LOOPS`.
+    """
+    ranks = _ranks(bodies, effects)
+    by_parent = _offers(bodies, effects, ranks)
+    branches, tree_of, deepest = [], {}, {}
+    for root in sorted(by_parent, key=lambda name: (*_root_rank(name, bodies), name)):
+        waiting: list[tuple] = [((), 0, (), root, root, None)]
+        while waiting:
+            _, depth, _, name, tree, branch = heappop(waiting)
+            if name in tree_of:
+                continue
+            tree_of[name], deepest[tree] = tree, max(depth, deepest.get(tree, 0))
+            branches += [branch] if branch else []
+            for order, names, following in by_parent[name]:
+                # each body on the ground is the root of a tree of its own: the ground does not couple their coordinates
+                child = following.child
+                heappush(waiting, (order, depth + 1, names, child, child if name == GROUND else tree, following))
+    if everywhere:
+        return tuple(branches)
+    num_loops = sum(map(len, by_parent.values())) // 2 - len(branches)
+    return tuple(
+        branch
+        for branch in branches
+        if (num_loops <= MOST_LOOPS and deepest[tree_of[branch.child]] <= LONGEST)
+        or ranks.get((branch.joint.name, branch.element)) == COUNTED
+        or any(isinstance(bodies.get(name), Frame) for name in (branch.child, branch.parent))
+    )
+
+
+def _offers(bodies: Bodies, effects: Sequence[Effect], ranks: Mapping) -> dict[str, list[tuple]]:
+    """For each body all branches that may hang on it, as (sort key, best first; sort key among equals; branch)."""
+    by_parent: dict[str, list[tuple]] = {}
+    number = count()
     for joint in (effect for effect in effects if isinstance(effect, Joint) and effect.carries):
         for i, (a, b) in enumerate(joint.elements(bodies)):
-            if body_of(bodies, a).rigid and body_of(bodies, b).rigid:
-                edges.setdefault(a, []).append((b, joint, i, True))
-                edges.setdefault(b, []).append((a, joint, i, False))
-    branches, reached, order = [], set(), count()
-    for root in (GROUND, *sorted(edges, key=lambda name: _root_rank(name, bodies))):
-        if root not in edges or root in reached:
-            continue
-        reached.add(root)
-        waiting: list[tuple] = []
-
-        def offer(parent: str, depth: int, waiting=waiting):
-            """Put the joints of a body that has been reached into the heap, fewest freedoms first, then least depth."""
-            for child, joint, i, forward in edges[parent]:
-                if child not in reached:
-                    heappush(waiting, (len(joint.moves), depth, next(order), Branch(child, parent, joint, i, forward)))
-
-        offer(root, 1)
-        while waiting:
-            _, depth, _, branch = heappop(waiting)
-            if branch.child not in reached:
-                reached.add(branch.child)
-                branches.append(branch)
-                offer(branch.child, depth + 1)
-    return tuple(branches)
+            if a != b and all(name == GROUND or (name in bodies and bodies[name].rigid) for name in (a, b)):
+                order, names = (
+                    (ranks.get((joint.name, i), UNUSED), len(joint.moves)),
+                    (joint.name, *sorted((a, b)), next(number)),
+                )
+                by_parent.setdefault(a, []).append((order, names, Branch(b, a, joint, i, True)))
+                by_parent.setdefault(b, []).append((order, names, Branch(a, b, joint, i, False)))
+    return by_parent
 
 
-def shallow(branches: Sequence[Branch]) -> tuple[Branch, ...]:
-    """The branches of trees with at most `LONGEST` bodies between the root and any leaf; parents come before children, here and below."""
-    depths: dict[str, int] = {}
-    roots: dict[str, str] = {}
-    for branch in branches:
-        depths[branch.child] = depths.get(branch.parent, 0) + 1
-        # each body on the ground is the root of a tree of its own: the ground does not couple their coordinates
-        roots[branch.child] = branch.child if branch.parent == GROUND else roots.get(branch.parent, branch.parent)
-    deepest: dict[str, int] = {}
-    for name, depth in depths.items():
-        deepest[roots[name]] = max(depth, deepest.get(roots[name], 0))
-    return tuple(branch for branch in branches if deepest[roots[branch.child]] <= LONGEST)
+def _ranks(bodies: Bodies, effects: Sequence[Effect]) -> dict[tuple[str, int], int]:
+    """`COUNTED` or `USED` for each (joint, number of its pair) in which an effect acts."""
+    ranks: dict[tuple[str, int], int] = {}
+    for effect in (effect for effect in effects if isinstance(effect, OfFreedoms)):
+        for i in range(len(effect.elements(bodies))):
+            for *pair, freedom in effect.freedoms_of(i):
+                rank = COUNTED if effect.counts_turns and freedom in ANGLES else USED
+                ranks[tuple(pair)] = min(rank, ranks.get(tuple(pair), rank))
+    return ranks
 
 
 def _root_rank(name: str, bodies: Bodies) -> tuple:

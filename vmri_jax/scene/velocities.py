@@ -1,6 +1,7 @@
 """Starts from joints: velocities of all bodies from the rates of a few joints, and closed loops from the values of a few joints."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import chain
 from typing import Any
 
 import jax
@@ -11,20 +12,21 @@ from vmri_jax.mechanics.arrays import is_concrete, real_array
 from vmri_jax.mechanics.constraints import RANK
 from vmri_jax.mechanics.projection import legendre
 from vmri_jax.mechanics.system import System
-from vmri_jax.scene.body import GROUND, GROUND_COORDINATES, AnyBody, Bodies
+from vmri_jax.scene.body import AnyBody, Bodies, moving
 from vmri_jax.scene.effect import Effect
-from vmri_jax.scene.effects.freedoms import FREEDOMS
+from vmri_jax.scene.effects.freedoms import ANGLES
 from vmri_jax.scene.effects.joint_base import Joint, freedom_of, joint_named
+from vmri_jax.scene.layout import Key
 from vmri_jax.scene.rows import ConstraintRows
 from vmri_jax.scene.sorting import Sorting
 
-Key = tuple[str, int, str]
-"""Name of a joint, number of its pair of bodies, and name of the freedom, as in `Layout.freedoms`."""
 RATE_ERROR = 1e-8
 """Largest error of rates, relative to the largest rate, that counts as round-off. A larger value accepts rates that contradict each other."""
 STEPS = 20
-"""Steps from the start of a joint to its new value; loops are closed after each. With fewer steps a loop may fold over into its other
-configuration; more take longer."""
+"""Steps from the start of a joint to its new value, at least; loops are closed after each. With fewer steps a loop may fold over into its
+other configuration; more take longer."""
+LONGEST_STEP = 0.35
+"""Longest of these steps of an angle, rad: other joints of the loop count their turns from step to step. A longer step may lose a turn."""
 CLOSED = 1e-12
 """A loop is closed when the values of its rows, relative to their sizes, are below this value, which is near round-off. A larger value
 leaves a visible gap, which the initial state refuses."""
@@ -60,20 +62,28 @@ def with_rates(
     rows = [np.asarray(jax.jacfwd(constraints, 1)(t, q))]
     values = [-np.asarray(jax.jacfwd(constraints)(t, q))]
     for joint, freedom, numbers in _rates(effects, sorting.bodies, rates):
+        pairs = joint.elements(sorting.bodies)
         gradient = jax.jacfwd(
-            lambda q, joint=joint, freedom=freedom: _freedoms(joint, freedom, sorting.bodies, columns, q)
+            lambda q, joint=joint, freedom=freedom, pairs=pairs: joint.values(
+                freedom, range(len(pairs)), sorting.bodies, {name: q[columns[name]] for name in moving(chain(*pairs))}
+            )
         )
         rows.append(np.asarray(gradient(jnp.asarray(bodies))) @ of_bodies)
         values.append(numbers)
     c, b = np.concatenate(rows), np.concatenate(values)
     root = np.linalg.cholesky(np.asarray(jax.jacfwd(momentum)(jnp.asarray(v))))  # M = R R^T
+    # rows of C R^-T and b in units of their lengths: all have the unit of R^T v, whose squared length is twice the kinetic energy
+    c_by_root = np.linalg.solve(root, c.T).T
+    lengths = np.linalg.norm(c_by_root, axis=1)
+    lengths[lengths == 0] = 1.0
+    c, b, c_by_root = c / lengths[:, None], b / lengths, c_by_root / lengths[:, None]
     size = np.abs([b, c @ v]).max()
-    v = v + np.linalg.solve(root.T, np.linalg.lstsq(np.linalg.solve(root, c.T).T, b - c @ v, rcond=None)[0])
-    error = np.abs(c @ v - b).max()
-    if error > RATE_ERROR * size:
+    v = v + np.linalg.solve(root.T, np.linalg.lstsq(c_by_root, b - c @ v, rcond=None)[0])
+    errors = np.abs(c @ v - b)
+    if errors.max() > RATE_ERROR * size:
         raise ValueError(
             f"Scene.with_rates: no velocities have these rates of {', '.join(rates)} and keep the constraints: the nearest ones differ by "
-            f"{error:.3g}. Give fewer rates: the rate of a joint follows from those of others, or the joint cannot move here."
+            f"{(errors * lengths).max():.3g}. Give fewer rates: the rate of a joint follows from those of others, or the joint cannot move here."
         )
     # the velocities of bodies belong to their positions as the user gave them, where joint coordinates are zero
     body_rates = sorting.to_bodies(np.concatenate(sorting.assembled))[1] @ v
@@ -105,9 +115,7 @@ def joint_starts(sorting: Sorting, effects: Sequence[Effect], starts: Mapping[st
                 raise ValueError(
                     f"Scene.with_joints: {joint.label(i, sorting.bodies)} has no coordinate of its own: "
                     + (
-                        "it closes a loop; set the other joints of the loop."
-                        if sorting.layout.freedoms
-                        else 'give the scene coordinates="joint".'
+                        'it closes a loop, where you may set the other joints, or its bodies have directors: then give the scene coordinates="joint".'
                     )
                 )
             by_key[key] = tuple(number if number.ndim == 0 else number[i] for number in numbers)
@@ -130,7 +138,7 @@ def with_closed_loops(sorting: Sorting, starts: dict[Key, tuple[Any, Any]]) -> d
     numbers = _of_joints_alone(sorting, rows)
     begin, end = q[held], np.array([float(value) for value, _ in starts.values()])
     reached, gap = begin, None
-    for fraction in np.linspace(0.0, 1.0, STEPS + 1)[1:]:
+    for fraction in np.linspace(0.0, 1.0, steps_of(starts, end - begin) + 1)[1:]:
         moved = q.copy()
         moved[held] = begin + fraction * (end - begin)
         gap = _close(rows, numbers, moved, free)
@@ -146,8 +154,15 @@ def with_closed_loops(sorting: Sorting, starts: dict[Key, tuple[Any, Any]]) -> d
         )
     v[held] = [float(rate) for _, rate in starts.values()]
     jacobian = rows.evaluate(0.0, q)[1][numbers]
-    v[free] -= np.linalg.lstsq(jacobian[:, free], jacobian @ v, rcond=RANK)[0]
+    scaled, scales = jacobian / rows.sizes[numbers, None], rows.scales[free]
+    v[free] -= scales * np.linalg.lstsq(scaled[:, free] * scales, scaled @ v, rcond=RANK)[0]
     return starts | {key: (q[i], v[i]) for key, i in columns.items() if key not in starts and jacobian[:, i].any()}
+
+
+def steps_of(keys: Iterable[Key], changes: Iterable[float]) -> int:
+    """Number of steps in which freedoms change by these values."""
+    angles = [abs(change) for (*_, freedom), change in zip(keys, changes, strict=True) if freedom in ANGLES]
+    return max(STEPS, int(np.ceil(max(angles, default=0.0) / LONGEST_STEP)))
 
 
 def _of_joints_alone(sorting: Sorting, rows: ConstraintRows) -> np.ndarray:
@@ -179,7 +194,8 @@ def _close(rows: ConstraintRows, numbers: np.ndarray, q: np.ndarray, free: Seque
             return None
         worst = int(np.argmax(sizes))
         gap = rows.rows[numbers[worst]].name, float(abs(values[worst]))
-        q[free] -= np.linalg.lstsq(jacobian[:, free], values, rcond=RANK)[0]
+        scaled, scales = jacobian[:, free] / rows.sizes[numbers, None], rows.scales[free]
+        q[free] -= scales * np.linalg.lstsq(scaled * scales, values / rows.sizes[numbers], rcond=RANK)[0]
     return gap
 
 
@@ -215,13 +231,3 @@ def _for_pairs(about: str, numbers: Any, count: int, form: str):
     if is_concrete(values) and not np.isfinite(values).all():
         raise ValueError(f"{about} is {values}; it must be finite.")
     return values
-
-
-def _freedoms(joint: Joint, freedom: str, bodies: Bodies, columns: Mapping[str, np.ndarray], q):
-    """Values of a freedom, (n,) of the n pairs of a joint, by the coordinates q of all bodies and their `columns` in q."""
-    params, values = joint.parameters(bodies), []
-    for i, element in enumerate(joint.elements(bodies)):
-        _, element_params = joint.element_arguments(i, bodies, params)
-        parts = [GROUND_COORDINATES if name == GROUND else q[columns[name]] for name in element]
-        values.append(FREEDOMS[freedom](tuple(map(jnp.asarray, parts)), element_params))
-    return jnp.stack(values)

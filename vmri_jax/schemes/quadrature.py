@@ -244,6 +244,11 @@ class PlacedRule(eqx.Module):
         """
         return min(self.rule.order, 2) if self.copies(num_micro) < num_micro else self.rule.order
 
+    def largest_gap(self, num_micro: int) -> float:
+        """Largest distance of neighbouring nodes of all macro steps, in units of the macro step."""
+        nodes = np.array(self.composite(num_micro).nodes)
+        return float(np.diff(nodes, append=1 + nodes[0]).max())
+
     @property
     def is_local(self) -> bool:
         """Whether every micro interval has a copy of the rule of its own."""

@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.mechanics.system import label
 from vmri_jax.running.origin import names_of
 from vmri_jax.schemes.composition import Composition, stage_scheme
 from vmri_jax.schemes.scheme import Scheme
+from vmri_jax.stability.drive import LEAST_STEPS, drive_period, driven_motion, growth_of_run, in_words
 from vmri_jax.stability.labels import swapped
 from vmri_jax.stability.linear import SmallMotions, small_motions
 from vmri_jax.stability.map import TOLERANCE, Window, measure
@@ -51,10 +51,10 @@ class Finding:
     """One result of `advise`.
 
     severity: "error" if the step is unstable, "warning" if an unstable step is near or slow and fast are swapped, or "note".
-    kind: "impulse resonance", "combination resonance", "stability limit", "kicks in phase", "labels", "stages" or "motion".
+    kind: "impulse resonance", "combination resonance", "stability limit", "kicks in phase", "labels", "stages", "drive" or "motion".
     sentence: the result in words.
     number: its measure: growth per step of an error, relative distance of a window, ratio of frequencies, amplitude, longest
-        stage, growth rate.
+        stage, micro steps in a period of the drive, growth rate of the motion.
     """
 
     severity: str
@@ -72,8 +72,10 @@ class Advice(ResultTable):
     findings: results in words, the most severe first.
     windows: unstable intervals of macro_dt in the range `scanned`.
     scanned: least and largest macro step of all scans.
-    safe_macro_dt: the stable step nearest to macro_dt without a near window, macro_dt itself if it is such a step; NaN if no scan has one.
+    safe_macro_dt: the stable step nearest to macro_dt without a near window, macro_dt itself if it is such a step; NaN if no scan has one. Of a
+        periodic drive a part of the period.
     fast_frequencies, slow_frequencies: (d,) frequencies of the fast and of the slow potential at the state, the largest first.
+    about: the motions that are judged, in words.
     """
 
     columns = (
@@ -89,6 +91,7 @@ class Advice(ResultTable):
     safe_macro_dt: float
     fast_frequencies: np.ndarray
     slow_frequencies: np.ndarray
+    about: str
 
     @property
     def ok(self) -> bool:
@@ -99,36 +102,28 @@ class Advice(ResultTable):
     def verdict(self) -> str:
         """Whether the step is stable, and the nearest safe step, in a sentence."""
         if self.safe_macro_dt == self.macro_dt:
-            return f"macro_dt = {self.macro_dt:.6g} is stable for small motions about this state."
-        state = "unstable" if self.growth else "close to an instability"
+            grows = any(finding.kind == "motion" and finding.number > 0 for finding in self.findings)
+            state = "as unstable as the motion itself" if grows else "stable"
+            return f"macro_dt = {self.macro_dt:.6g} is {state} {self.about}."
+        driven = any(finding.kind == "drive" for finding in self.findings)
+        state = "unstable" if self.growth else "too long for the drive" if driven else "close to an instability"
+        nearest = f"the nearest safe step is {self.safe_macro_dt:.6g}"
         if np.isnan(self.safe_macro_dt):
-            return f"macro_dt = {self.macro_dt:.6g} is {state}, and no safe step was found; take another scheme."
-        return f"macro_dt = {self.macro_dt:.6g} is {state}; the nearest safe step is {self.safe_macro_dt:.6g}."
+            nearest = "no safe step was found, take another scheme"
+        return f"macro_dt = {self.macro_dt:.6g} is {state}{f' {self.about}' if self.growth else ''}; {nearest}."
 
-    @property
-    def rows(self) -> tuple[Finding, ...]:
-        """The findings."""
-        return self.findings
+    rows = property(lambda self: self.findings, doc="The findings.")
 
     def content(self) -> dict[str, Any]:
         """Findings, windows and frequencies."""
-        return {
-            "verdict": self.verdict,
-            "macro_dt": self.macro_dt,
-            "growth": self.growth,
-            "safe_macro_dt": self.safe_macro_dt,
-            "scanned": self.scanned,
-            "windows": [window._asdict() for window in self.windows],
-            "fast_frequencies": self.fast_frequencies.tolist(),
-            "slow_frequencies": self.slow_frequencies.tolist(),
-            **super().content(),
-        }
+        fields = {name: value for name, value in vars(self).items() if name != "findings"}
+        windows = [window._asdict() for window in self.windows]
+        return {"verdict": self.verdict, **fields, "windows": windows, **super().content()}
 
     caption = verdict
 
     def __str__(self) -> str:
-        lines = [f"{f.severity}: {f.kind}: {f.sentence}" for f in self.findings]
-        return "\n".join([*lines, self.verdict])
+        return "\n".join([*(f"{f.severity}: {f.kind}: {f.sentence}" for f in self.findings), self.verdict])
 
 
 def advise(
@@ -141,8 +136,9 @@ def advise(
 ) -> Advice:
     """Judge a macro step before a long run, from the multipliers of the step of small motions about the state.
 
-    Instability is always measured: the derivative of the step of the frozen problem (see `small_motions`) has
-    a multiplier outside the unit circle, at macro_dt or in a window of steps near it. Formulas only name the cause:
+    Under a periodic drive: from the multipliers of the run and of the motion over a period. Elsewhere instability is measured, too: the
+    derivative of the step of the frozen problem (see `small_motions`) has a multiplier outside the unit circle, at macro_dt or in a window of
+    steps near it. Formulas only name the cause:
 
     * stability limit: the step is unstable for the fast or the slow potential alone; ``omega h`` or ``omega H`` exceeds
       the limit of its quadrature rule (2 for kicks at the ends);
@@ -152,7 +148,7 @@ def advise(
     * kicks in phase: a constant part of the slow force, such as a weight, meets a vibration that turns by a multiple of 2 pi per macro step;
       no disturbance grows, but the vibration becomes large;
     * labels: the fastest vibration is one of the slow variables;
-    * stages, motion (notes): a composition with backward steps; a state that is itself unstable.
+    * stages, motion (notes): a composition with backward steps; a motion that is itself unstable, or that the frozen problem does not judge.
 
     It takes one compilation and some hundred eigenvalue problems. All motions are small here. Large motions, such as in a hot molecule,
     change the frequencies along a trajectory and meet resonances that a single state does not show: call `advise` at several states of a
@@ -173,11 +169,46 @@ def advise(
     if not (np.ndim(macro_dt) == 0 and np.isfinite(macro_dt) and macro_dt > 0):
         raise ValueError(f"advise: macro_dt is {macro_dt}; it must be a positive number.")
     macro_dt, motions = float(macro_dt), small_motions(system, state)
+    period = drive_period(system, state, macro_dt)
+    if period is None:
+        judged = _judged_at_rest(motions, scheme, macro_dt, tolerance, names)
+    else:
+        judged = _judged_over_a_period(system, scheme, state, macro_dt, period)
+    findings = [*judged.pop("findings"), *_stages(scheme)]
+    judged["findings"] = tuple(sorted(findings, key=lambda f: ("error", "warning", "note").index(f.severity)))
+    frequencies = {f"{name}_frequencies": motions.frequencies(name) for name in ("fast", "slow")}
+    return Advice(macro_dt=macro_dt, **judged, **frequencies)
+
+
+def _judged_over_a_period(system, scheme, state: State, macro_dt: float, period: float) -> dict[str, Any]:
+    """Fields of the `Advice` about a system with a periodic drive: the run and the motion over a period of it."""
+    motion = driven_motion(system, scheme, state, macro_dt, period)
+    growth = growth_of_run(system, scheme, state, macro_dt, period)
+    fits, steps = motion.agrees(growth), stage_scheme(scheme).num_micro * period / macro_dt
+    per_step = float(np.expm1(np.log1p(growth) * macro_dt / period))
+    findings = [Finding("note", "motion", str(motion), np.log1p(motion.growth) / period)]
+    if not fits:
+        sentence = f"In a run with this step disturbances {in_words(growth)} in a period of the drive."
+        findings.append(Finding("error" if growth > motion.growth else "warning", "drive", sentence, per_step))
+    if steps < LEAST_STEPS:
+        sentence = f"A period of the drive, {period:.4g}, has {steps:.2g} micro steps; take at least {LEAST_STEPS}."
+        findings.append(Finding("warning", "drive", sentence, steps))
+    return {
+        "growth": 0.0 if fits else per_step,
+        "findings": findings,
+        "windows": (),
+        "scanned": (min((macro_dt, *motion.steps)), macro_dt),
+        "safe_macro_dt": macro_dt if fits and steps >= LEAST_STEPS else next(iter(motion.steps), np.nan),
+        "about": f"over a period of the drive, {period:.4g}",
+    }
+
+
+def _judged_at_rest(motions: SmallMotions, scheme, macro_dt: float, tolerance: float, names) -> dict[str, Any]:
+    """Fields of the `Advice` from the multipliers of a step of small motions, at macro_dt and at steps near it."""
     lower, upper = SCANNED_STEPS[0] * macro_dt, SCANNED_STEPS[1] * macro_dt
     windows = _scan(motions, scheme, lower, upper, macro_dt, tolerance)
-    radius = float(multipliers(motions, scheme, [macro_dt]).radius[0])
-    growth = radius - 1 if radius > 1 + tolerance else 0.0
-
+    growth = float(multipliers(motions, scheme, [macro_dt]).radius[0]) - 1
+    growth = growth if growth > tolerance else 0.0
     step_findings = list(_step_findings(motions, scheme, macro_dt, growth, windows))
     safe = macro_dt
     for _ in range(MOST_SCANS if step_findings else 0):
@@ -186,19 +217,23 @@ def advise(
             break
         upper, lower = lower, lower / 3
         windows = _scan(motions, scheme, lower, upper, upper, tolerance) + windows
-
-    kicks = _kicks_in_phase(motions, scheme, macro_dt)
-    findings = [*step_findings, *kicks, *_further_findings(motions, scheme, names)]
-    return Advice(
-        macro_dt=macro_dt,
-        growth=growth,
-        findings=tuple(sorted(findings, key=lambda f: ("error", "warning", "note").index(f.severity))),
-        windows=tuple(windows),
-        scanned=(lower, SCANNED_STEPS[1] * macro_dt),
-        safe_macro_dt=safe,
-        fast_frequencies=motions.frequencies("fast"),
-        slow_frequencies=motions.frequencies("slow"),
-    )
+    findings = [*step_findings, *_kicks_in_phase(motions, scheme, macro_dt)]
+    if (swap := swapped(motions, names)) is not None:
+        findings.append(Finding("warning", "labels", *swap))
+    rate = float(np.real(motions.growing).max(initial=0.0))
+    if motions.frozen and (rate or step_findings or motions.driven):
+        findings.append(Finding("note", "motion", motions.frozen, 0.0))
+    elif rate:
+        sentence = f"Motion about this state grows by itself, like exp({rate:.3g} t); that is left out of the growth that is measured."
+        findings.append(Finding("note", "motion", sentence, rate))
+    return {
+        "growth": growth,
+        "findings": findings,
+        "windows": tuple(windows),
+        "scanned": (lower, SCANNED_STEPS[1] * macro_dt),
+        "safe_macro_dt": safe,
+        "about": "for small motions about this state" + (", held at rest" if motions.frozen else ""),
+    }
 
 
 def _step_findings(motions: SmallMotions, scheme, macro_dt: float, growth: float, windows) -> Iterator[Finding]:
@@ -251,21 +286,23 @@ def _stability_limit(motions: SmallMotions, scheme: Scheme | Composition, macro_
     of_stage = " of the longest stage" if isinstance(scheme, Composition) else ""
     micro_dt = longest / stage.num_micro
     cases = [
-        ("fast", "fast", "the micro step", micro_dt, fast_limit(stage)),
-        ("slow", "slow", "the macro step", longest, slow_limit(stage)),
+        ("fast", "fast potential", "the micro step", micro_dt, fast_limit(stage)),
+        ("slow", "slow potential", "the macro step", longest, slow_limit(stage)),
     ]
+    if motions.hessians["force"].any():
+        cases.append(("force", "force", "the micro step", micro_dt, np.inf))
     for name, _ in motions.system.potentials:
         placed, words = stage.rule_of(name), f"further {name}" if name in ("fast", "slow") else label(name)
         span = stage.num_micro if placed.grid == "macro" else placed.every
         step_name = f"the step of {span} micro intervals"
-        cases.append((f"potential {name}", words, step_name, span * micro_dt, kick_limit(placed)))
+        cases.append((f"potential {name}", f"{words} potential", step_name, span * micro_dt, kick_limit(placed)))
     for key, words, step_name, step, limit in cases:
+        frequency = motions.frequencies(key)[0]
         alone = multipliers(motions.only(key), scheme, [macro_dt * (1 + LONGER_FOR_CAUSE)])
-        if alone.radius[0] > 1 + TOLERANCE:
+        if alone.radius[0] > 1 + TOLERANCE and frequency > 0:
             bound = f"; its quadrature rule is stable below {limit:.4g}" if np.isfinite(limit) else ""
-            frequency = motions.frequencies(key)[0]
             return (
-                f"The step is unstable for the {words} potential alone: its frequency {frequency:.4g} times {step_name}{of_stage} "
+                f"The step is unstable for the {words} alone: its frequency {frequency:.4g} times {step_name}{of_stage} "
                 f"is {frequency * step:.4g}{bound}."
             )
     return ""
@@ -280,6 +317,8 @@ def _resonance(motions: SmallMotions, scheme: Scheme | Composition, macro_dt: fl
     energy = np.abs(modes.T @ eta) ** 2 * frequencies**2 + np.abs(modes.T @ pi) ** 2
     pair = np.argsort(-energy)[:2]
 
+    if not frequencies[pair[0]] > 0:
+        return "stability limit", "The step is unstable for all terms together, and for none of them alone."
     kind = "impulse resonance" if stage_scheme(scheme).slow.grid == "macro" else "combination resonance"
     a, b = pair[0], pair[-1]
     turns = [_turn(motions, scheme, macro_dt, i) / np.pi for i in (a, b)]
@@ -343,11 +382,8 @@ def _turn(motions: SmallMotions, scheme: Scheme | Composition, macro_dt: float, 
     return turn if np.isfinite(turn) else exact
 
 
-def _further_findings(motions: SmallMotions, scheme: Scheme | Composition, names: Names | None) -> Iterator[Finding]:
-    """A warning if slow variables carry the fastest vibrations; notes on backward steps, and on a state that is itself unstable."""
-    sentence_and_ratio = swapped(motions, names)
-    if sentence_and_ratio is not None:
-        yield Finding("warning", "labels", *sentence_and_ratio)
+def _stages(scheme: Scheme | Composition) -> Iterator[Finding]:
+    """A note on backward steps of a composition."""
     parts = _stage_lengths(scheme)
     if not (parts > 0).all():
         longest = float(np.abs(parts).max())
@@ -356,12 +392,6 @@ def _further_findings(motions: SmallMotions, scheme: Scheme | Composition, names
             f"backwards: the largest stable macro step of the composition is about that of its scheme divided by {longest:.3g}."
         )
         yield Finding("note", "stages", sentence, longest)
-    if motions.growing.size:
-        rate = float(np.real(motions.growing).max())
-        sentence = (
-            f"Motion about this state grows by itself, like exp({rate:.3g} t); that is left out of what is measured."
-        )
-        yield Finding("note", "motion", sentence, rate)
 
 
 def _stage_lengths(scheme: Scheme | Composition) -> np.ndarray:

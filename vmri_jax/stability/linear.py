@@ -16,13 +16,18 @@ from scipy.linalg import null_space
 
 from vmri_jax.diagnostics.linear import frequencies_of, phase_splits
 from vmri_jax.mechanics.arrays import QUICK
+from vmri_jax.mechanics.driving import driven
 from vmri_jax.mechanics.invariants import potential_energy, velocity
+from vmri_jax.mechanics.masses import correlation
 from vmri_jax.mechanics.state import Movable, Problem, State, start_of
 from vmri_jax.mechanics.system import ConstantMass, System
 
 LEAST_GROWTH = 1e-6
 """Growth rate up to which a motion does not grow, as a part of the largest rate: round-off of the eigenvalues. A larger value takes slowly
 growing motions for instabilities of the step."""
+LEAST_MOTION = 1e-8
+"""Velocity v and acceleration a up to which a state is an equilibrium, in units of omega |q| and omega^2 |q|, with the largest rate omega and norms
+of the kinetic energy: round-off, and residuals of solved equilibria. A larger value takes slow motions for equilibria."""
 
 
 def soft_spring(q_s, q_f, params):
@@ -63,12 +68,14 @@ class SmallMotions:
     system: the expansion to second order; its equilibrium is zero, its `params` are the coefficients.
     shapes: N, (n_s + n_f, d).
     embed, read: matrices (2 n, 2 d) from (eta, pi) to (q_s, q_f, p_s, p_f), and (2 d, 2 n) back.
-    hessians: (d, d) Hessians of the potentials: of V with its share of the constraint forces ("slow"), of W ("fast"), and of each further
-        potential ("potential " and its name).
+    hessians: (d, d) Hessians of the potentials: of V with its share of the constraint forces ("slow"), of W ("fast"), of each further
+        potential ("potential " and its name), and minus the derivative of F in eta ("force").
     stiffness: (d, d) minus the derivative of all forces in eta: of potentials, constraints, the kinetic energy, and F.
     damping: (d, d) matrix of the velocities, gyroscopic and dissipative.
     slow_force: (d,) force of V at the state, which is constant in the expansion.
     rest: the state of zero displacement and momentum of the expansion.
+    driven: names of the terms that depend on time.
+    moves: whether the state is no equilibrium.
     """
 
     system: System
@@ -80,6 +87,8 @@ class SmallMotions:
     damping: np.ndarray
     slow_force: np.ndarray
     rest: State
+    driven: tuple[str, ...] = ()
+    moves: bool = False
 
     @cached_property
     def rates(self) -> np.ndarray:
@@ -90,8 +99,24 @@ class SmallMotions:
 
     @property
     def growing(self) -> np.ndarray:
-        """The rates of motions of the system that grow, whatever the scheme."""
+        """The rates of motions of the expansion that grow, whatever the scheme."""
         return self.rates[np.real(self.rates) > LEAST_GROWTH * np.abs(self.rates).max(initial=0.0)]
+
+    @property
+    def frozen(self) -> str:
+        """Why the expansion does not tell whether the motion is stable, in sentences; empty at an equilibrium."""
+        if self.driven:
+            terms = f"{' and the '.join(self.driven)} depend{'s' if len(self.driven) == 1 else ''}".replace("_", " ")
+            return (
+                f"The {terms} on time: the motion is linearised at t = {float(self.rest.t):.4g} alone, as if time stood still there. Whether "
+                "it is stable, a run over many periods of the drive decides."
+            )
+        if self.moves:
+            return (
+                "The state is no equilibrium: the motion is linearised there as if constant forces held it at rest. Whether it is stable, its "
+                "multipliers over a period decide, vm.stability.monodromy(..., num_steps=...), or a long run."
+            )
+        return ""
 
     def frequencies(self, name: str) -> np.ndarray:
         """(d,) frequencies of a single potential, a key of `hessians`, the largest first; zero where it is not convex."""
@@ -117,7 +142,7 @@ class SmallMotions:
         return float(fast if fast > 0 else np.abs(self.rates).max(initial=0.0))
 
     def only(self, name: str) -> "SmallMotions":
-        """The small motions under one potential alone, a key of `hessians`."""
+        """The small motions under one potential or the force alone, a key of `hessians`."""
         removed = {key: hessian for key, hessian in self.hessians.items() if key != name}
         zeros = {key: jax.tree.map(np.zeros_like, self.system.params[key]) for key in removed}
         return replace(
@@ -168,25 +193,34 @@ def small_motions(system: Movable, state: State | None = None) -> SmallMotions:
     potentials = sum(hessians.values())
     gyroscopic = reduced(coupling)
     zero = np.zeros_like(shapes)
-    return SmallMotions(
+    motions = SmallMotions(
         system=_expanded_system(system, state, terms, multiplier, slow_multiplier),
         shapes=shapes,
         embed=np.block([[shapes, zero], [coupling @ shapes - mass @ shapes @ gyroscopic, mass @ shapes]]),
         read=np.block([[shapes.T @ mass, zero.T], [zero.T, shapes.T]]),
         hessians={
-            name: reduced(hessian) for name, hessian in (hessians | {"slow": terms["slow"] + slow_bending}).items()
+            name: reduced(hessian)
+            for name, hessian in (hessians | {"slow": terms["slow"] + slow_bending, "force": -terms["force_q"]}).items()
         },
         stiffness=reduced(potentials + bending - terms["kinetic"][:n, :n] - terms["force_q"]),
         damping=gyroscopic - gyroscopic.T - reduced(terms["force_v"]),
         slow_force=-shapes.T @ terms["slow_gradient"],
         rest=State(jnp.asarray(state.t, dtype=float), *np.split(np.zeros(2 * n), phase_splits(state))),
     )
+    q, v = (np.sqrt(np.abs(x @ mass @ x)) for x in (np.concatenate([state.q_s, state.q_f]), terms["velocity"]))
+    omega, acceleration = np.abs(motions.rates).max(initial=0.0), np.linalg.norm(shapes.T @ terms["impetus"])
+    moves = v > LEAST_MOTION * omega * q or acceleration > LEAST_MOTION * omega**2 * q
+    return replace(motions, driven=driven(system, state), moves=bool(moves))
 
 
 def _shapes(mass: np.ndarray, jacobian: np.ndarray) -> np.ndarray:
     """N (n, d) with ``N^T M N = 1`` and ``G N = 0``: a basis T of the null space of G, divided by the Cholesky factor of ``T^T M T``."""
     # dependent constraints count once
-    tangents = null_space(jacobian, rcond=1e-10) if len(jacobian) else np.eye(len(mass))
+    root = np.sqrt(np.diagonal(mass))[:, None]  # rows of one unit and length one
+    scaled = jacobian / root.T
+    lengths = np.linalg.norm(scaled, axis=1, keepdims=True)
+    scaled = scaled / np.where(lengths > 0, lengths, 1.0)
+    tangents = null_space(scaled, rcond=1e-10) / root if len(jacobian) else np.eye(len(mass))
     if not tangents.shape[1]:
         raise ValueError(
             f"small_motions: the {len(jacobian)} constraints leave none of the {len(mass)} coordinates free; nothing moves."
@@ -201,7 +235,10 @@ def _multipliers_at_rest(terms: dict, mass: np.ndarray) -> tuple[np.ndarray, np.
     """
     G = terms["jacobian"]
     weighted = G @ np.linalg.inv(mass)
-    gram = np.linalg.pinv(weighted @ G.T, rcond=1e-12, hermitian=True)
+    gram = weighted @ G.T
+    diagonal = np.diagonal(gram)
+    root = np.sqrt(np.where(diagonal > 0, diagonal, 1.0))[:, None]
+    gram = np.linalg.pinv(correlation(gram), rcond=1e-12, hermitian=True) / root / root.T
     multiplier = gram @ (weighted @ terms["impetus"] + terms["centripetal"])
     return multiplier, -gram @ (weighted @ terms["slow_gradient"])
 
@@ -211,7 +248,7 @@ def _expanded_system(system: System, state: State, terms: dict, multiplier, slow
     n_s, n_g = state.q_s.size, system.num_constraints(state.q_s, state.q_f)[0]
     G, curvature = terms["jacobian"], terms["curvature"]
     constant_force = G.T @ (multiplier - slow_multiplier)  # balances the constraint forces that V does not
-    has_constant_force = np.abs(constant_force).max(initial=0.0) > 1e-12 * np.abs(G.T @ multiplier).max(initial=0.0)
+    has_constant_force = np.any(np.abs(constant_force) > 1e-12 * (np.abs(G.T) @ np.abs(multiplier)))
     return System(
         system.kinetic if system.has_constant_mass else _kinetic,
         None if system.slow_potential is None else _Potential("slow"),
@@ -225,7 +262,8 @@ def _expanded_system(system: System, state: State, terms: dict, multiplier, slow
             "fast": terms["fast"][n_s:, n_s:],
             "constraint": (G[:n_g], curvature[:n_g]),
             "slow_constraint": (G[n_g:, :n_s], curvature[n_g:, :n_s, :n_s]),
-            "force": (constant_force, terms["force_q"], terms["force_v"]),
+            "force": terms["force_q"],
+            "other_force": (constant_force, terms["force_v"]),
             **{name: (np.zeros(len(G.T)), terms[name]) for name in list(_potentials(system))[2:]},
         },
         potentials=[(name, _Potential(f"potential {name}")) for name, _ in system.potentials],
@@ -284,6 +322,7 @@ def _expansion(system: System, state: State) -> dict:
         "jacobian": jax.jacrev(constraints)(q),
         "curvature": jax.jacfwd(jax.jacrev(constraints))(q),
         "centripetal": jax.jacfwd(jax.jacfwd(constraints_in_motion))(0.0),
+        "velocity": v,
         "force_q": force_q,
         "force_v": force_v,
         "impetus": gradient[: q.size] - rate[q.size :] - jax.grad(energy)(q) + force(q, v),
@@ -324,7 +363,7 @@ def _quadratic(q, jacobian, curvature):
 
 
 def _force(t, q_s, q_f, v_s, v_f, params):
-    constant, by_q, by_v = params["force"]
+    constant, by_v = params["other_force"]
     n_s = q_s.size
-    force = constant + by_q @ jnp.concatenate([q_s, q_f]) + by_v @ jnp.concatenate([v_s, v_f])
+    force = constant + params["force"] @ jnp.concatenate([q_s, q_f]) + by_v @ jnp.concatenate([v_s, v_f])
     return force[:n_s], force[n_s:]

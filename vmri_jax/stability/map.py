@@ -52,6 +52,7 @@ class StabilityMap(ResultTable):
         infinite where the step failed.
     unstable: the windows of omega_H of each row in which radius > 1 + tolerance; they may be far narrower than the grid.
     tolerance: growth per step that counts as instability.
+    note: why the map does not tell whether the motion is stable, see `SmallMotions.frozen`; empty at an equilibrium.
     """
 
     columns = (
@@ -65,6 +66,9 @@ class StabilityMap(ResultTable):
     radius: np.ndarray
     unstable: tuple[tuple[Window, ...], ...]
     tolerance: float
+    note: str = ""
+
+    caption = property(lambda self: self.note, doc="The note.")
 
     @property
     def macro_dt(self) -> np.ndarray:
@@ -96,7 +100,7 @@ class StabilityMap(ResultTable):
 
     def content(self) -> dict[str, Any]:
         """All fields, for `to_json`."""
-        return asdict(self) | {"omega_H": self.omega_H.tolist(), "radius": self.radius.tolist()}
+        return asdict(self)
 
 
 def stability_map(
@@ -156,6 +160,7 @@ def stability_map(
         radius=np.array([radius for radius, _ in measured]),
         unstable=tuple(tuple(Window(omega * a, omega * b, g) for a, b, g in windows) for _, windows in measured),
         tolerance=tolerance,
+        note=next(iter(rows.values()))[0].frozen,
     )
 
 

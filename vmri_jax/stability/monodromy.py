@@ -1,19 +1,15 @@
 """Monodromy: the derivative of many steps along a trajectory, and its multipliers."""
 
 from dataclasses import dataclass
-from functools import partial
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.diagnostics.linear import phase_splits, phase_vector, symplectic_form, tangents
-from vmri_jax.mechanics.arrays import QUICK, is_concrete, whole_number
+from vmri_jax.diagnostics.linear import derivative_along, phase_splits, phase_vector, symplectic_form
+from vmri_jax.mechanics.arrays import is_concrete, whole_number
 from vmri_jax.mechanics.state import Movable, State, start_of
-from vmri_jax.running.macro_step import macro_step
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
-from vmri_jax.steppers import solvers
 from vmri_jax.steppers.results import Result
 from vmri_jax.steppers.solvers import Newton
 
@@ -80,11 +76,10 @@ def monodromy(
     if is_concrete(macro_dt) and not (np.ndim(macro_dt) == 0 and np.isfinite(macro_dt) and macro_dt > 0):
         raise ValueError(f"monodromy: macro_dt is {macro_dt}; it must be a positive number.")
     start = State(*(jnp.asarray(a, dtype=float) for a in (state.t, state.q_s, state.q_f, state.p_s, state.p_f)))
-    product = _product(system, scheme, start, macro_dt, solver or solvers.Auto(), num_steps)
-    last, M, at_start, at_end, results = (np.asarray(a) for a in product)
-    failed = np.flatnonzero(results > Result.CONVERGED_AT_ROUNDOFF)
-    if failed.size:
-        raise RuntimeError(f"monodromy: macro step {failed[0]} failed: {Result(int(results[failed[0]])).message}")
+    product = derivative_along(system, scheme, start, macro_dt, solver, num_steps)
+    last, M, at_start, at_end, steps, result = (np.asarray(a) for a in product)
+    if result > Result.CONVERGED_AT_ROUNDOFF:
+        raise RuntimeError(f"monodromy: macro step {steps - 1} failed: {Result(int(result)).message}")
     first = np.asarray(phase_vector(start))
     J = symplectic_form(first.size // 2)
     defect = M.T @ (at_end @ J @ at_end.T) @ M - at_start @ J @ at_start.T
@@ -94,31 +89,6 @@ def monodromy(
         end_basis=at_end,
         start=start,
         end=State(start.t + num_steps * macro_dt, *jnp.split(last, phase_splits(start))),
-        closure=float(np.linalg.norm(last - first) / max(np.linalg.norm(first), np.linalg.norm(last))),
+        closure=float(np.linalg.norm(last - first) / max(np.linalg.norm(first), np.linalg.norm(last), 1e-300)),
         symplectic_defect=float(np.abs(defect).max() / max(1.0, np.abs(M).max() ** 2)),
     )
-
-
-@partial(jax.jit, static_argnames="num_steps", compiler_options=QUICK)
-def _product(system, scheme, state, macro_dt, solver, num_steps: int):
-    """End (2 n,), product of the derivatives, tangent bases at the start and at the end, status of every step."""
-    splits = phase_splits(state)
-
-    def step(z, t):
-        end, info = macro_step(system, scheme, State(t, *jnp.split(z, splits)), macro_dt, solver)
-        z = phase_vector(end)
-        return z, (z, info.result)
-
-    def step_with_derivative(carry, k):
-        z, basis, matrix = carry
-        t = state.t + k * macro_dt
-        derivative, (z, result) = jax.jacfwd(lambda z: step(z, t), has_aux=True)(z)
-        end_basis = tangents(system, t + macro_dt, z, splits)
-        return (z, end_basis, end_basis @ derivative @ (basis.T @ matrix)), result
-
-    z = phase_vector(state)
-    basis = tangents(system, state.t, z, splits)
-    (z, end_basis, matrix), results = jax.lax.scan(
-        step_with_derivative, (z, basis, jnp.eye(len(basis))), jnp.arange(num_steps)
-    )
-    return z, matrix, basis, end_basis, results

@@ -11,6 +11,8 @@ import numpy as np
 from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.running.origin import names_of
+from vmri_jax.schemes.scheme import fully_implicit
+from vmri_jax.stability.drive import drive_period, driven_motion
 from vmri_jax.stability.linear import small_motions
 from vmri_jax.study.table import Column, ResultTable
 
@@ -48,7 +50,9 @@ class Vibrations(ResultTable):
     """The vibrations about a state, the fastest first.
 
     rows: all vibrations.
-    growth_rate: largest rate r of a motion of the system that grows like ``exp(r t)``; 0 if none grows.
+    growth_rate: largest rate r of a motion of the system that grows like ``exp(r t)``; 0 if none grows. Under a periodic drive on the average
+        over a period; 0 also where the linearisation does not tell.
+    note: the point of linearisation and the growth in words, where the state is no equilibrium or something grows.
     """
 
     columns = (
@@ -59,6 +63,7 @@ class Vibrations(ResultTable):
     )
     rows: tuple[Vibration, ...]
     growth_rate: float
+    note: str
 
     def shown(self) -> tuple[Vibration, ...]:
         """The rows of the printed table, the fastest vibrations."""
@@ -69,10 +74,7 @@ class Vibrations(ResultTable):
         """The number of rows that the table leaves out, and whether the state is unstable."""
         omitted = len(self.rows) - ROWS_SHOWN
         more = f"{omitted} slower ones are in .rows and .to_csv(path). " if omitted > 0 else ""
-        grows = (
-            f"Motion about this state grows by itself, like exp({self.growth_rate:.3g} t)." if self.growth_rate else ""
-        )
-        return (more + grows).strip()
+        return (more + self.note).strip()
 
 
 def vibrations(system: Movable, state: State | None = None) -> Vibrations:
@@ -96,5 +98,12 @@ def vibrations(system: Movable, state: State | None = None) -> Vibrations:
         largest = {labels[i]: float(parts[i]) for i in np.argsort(-parts)}
         period = 2 * np.pi / frequency if frequency > 0 else np.inf
         rows.append(Vibration(frequency, period, float(parts[n_s:].sum()), largest))
-    growing = np.real(motions.growing)
-    return Vibrations(tuple(rows), float(growing.max(initial=0.0)))
+    rate, note = float(np.real(motions.growing).max(initial=0.0)), ""
+    if motions.frozen and (rate or motions.driven):
+        rate, note, step = 0.0, motions.frozen, 1 / max(np.abs(motions.rates).max(initial=0.0), 1e-300)
+        if (period := drive_period(system, state, step)) is not None:
+            motion = driven_motion(system, fully_implicit(1), state, step, period)
+            rate, note = float(np.log1p(motion.growth) / period), f"{note.split(' Whether')[0]} {motion}"
+    elif rate:
+        note = f"Motion about this state grows by itself, like exp({rate:.3g} t)."
+    return Vibrations(tuple(rows), rate, note)

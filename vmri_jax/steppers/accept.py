@@ -6,6 +6,7 @@ A solver may omit the next correction c of the slow (or of the fast) increments 
 
 The slow variables have their increments over the macro step and their positions on the right-hand side, the fast variables their
 increments over a micro interval and their positions. A solver may take the largest free motion ``|h M^-1 p|`` for the size of the increments.
+Maxima compare numbers of one unit: if masses are constant, slow and fast variables as they are; else numbers times `Weights`.
 
 - The omitted corrections are the error of a step, and errors of steps accumulate: the tenth is a safety factor for that.
 - Positions are known up to their round-off.
@@ -15,7 +16,7 @@ Solvers compute the next correction from the residual, or extrapolate it from th
 that no longer shrink near round-off (`Accepted.at_floor`).
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +25,7 @@ from jaxtyping import Array, Float
 
 from vmri_jax.kernels import max_abs
 from vmri_jax.mechanics.arrays import Number
-from vmri_jax.mechanics.masses import ConstantMass
+from vmri_jax.mechanics.projection import mass_diagonal
 from vmri_jax.schemes.equations import StepEquations
 
 ROUNDOFF = 4.0
@@ -47,14 +48,47 @@ MARGIN = 10.0
 an iteration whose correction is small by chance ends too early."""
 
 
+class Weights(NamedTuple):
+    """Factors that give all variables the same unit: the square roots of their masses, of a kinetic energy that is a function.
+
+    Variables with constant masses have no factors, None: with the square roots of masses a light body would be computed to fewer digits than
+    a heavy one. They have one unit, of which the library knows nothing.
+    """
+
+    slow: Any
+    fast: Any
+
+    @classmethod
+    def of(cls, equations: StepEquations) -> "Weights":
+        """The weights at the start of a step."""
+        if equations.system.has_constant_mass:
+            return NO_WEIGHTS
+        return cls(*map(jnp.sqrt, mass_diagonal(equations.system, equations.q_s, equations.q_f)))
+
+    def of_momenta(self) -> "Weights":
+        """The weights of momenta and of the rows of momentum equations."""
+        return Weights(*(w if w is None else 1 / w for w in self))
+
+    def largest(self, slow, fast):
+        """The largest slow and the largest fast number, (..., n) each, with these weights."""
+        return largest(slow, self.slow), largest(fast, self.fast)
+
+
+NO_WEIGHTS = Weights(None, None)
+
+
+def largest(numbers, weights=None):
+    """The largest absolute value of numbers times weights."""
+    return max_abs(numbers if weights is None else numbers * weights)
+
+
 class Accepted(NamedTuple):
     """Accepted corrections of the increments: a part relative to the motion over the step, and a part for round-off of the positions.
 
     tolerance: `Newton.tolerance` over `SAFETY`.
     slow, fast: accepted round-off. First entry: of these variables, used in the first `ITERATIONS_BEFORE_TIED_ROUNDOFF` iterations. Second
         entry, used later: with the round-off of the variables that constraints tie to them.
-    roundoff: `ROUNDOFF` units of round-off of all positions, ``4 eps max |q|``, for `at_floor`. If the kinetic energy is a function,
-        ``4 eps max(1, |q|)``: coordinates may be angles, and an angle near zero has the round-off of one radian.
+    roundoff: `ROUNDOFF` units of round-off of all positions, ``4 eps max |q|``, for `at_floor`.
     constraints: the same with `constraint_length` in place of the positions; zero where a solver does not use `at_floor`.
     """
 
@@ -67,26 +101,12 @@ class Accepted(NamedTuple):
     @classmethod
     def of(cls, equations: StepEquations, newton) -> "Accepted":
         """The accepted corrections of a step, from the positions at its start."""
-        slow, fast = max_abs(equations.q_s), max_abs(equations.q_f)
-        to_slow = to_fast = 0.0
+        slow, fast = Weights.of(equations).largest(equations.q_s, equations.q_f)
         largest = jnp.maximum(slow, fast)
-        largest = largest if equations.system.has_constant_mass else jnp.maximum(largest, 1.0)
-        # A constraint g(q_s, q_f) moves the slow variables by M_s^-1 G_s^T mu and the fast ones by M_f^-1 G_f^T mu: round-off of q_f
-        # becomes one of q_s, smaller by the ratio of the masses, and vice versa:
-        #     floor_s = 4 eps max(|q_s|, min(1, max M_f / min M_s) |q_f|)
-        if equations.system.constraint is not None and equations.q_s.size and equations.q_f.size:
-            to_slow = to_fast = 1.0
-            masses = equations.system.kinetic
-            if isinstance(masses, ConstantMass):
-                # Row sums stand for the masses; of diagonal matrices they are the masses. If row sums of a full matrix are zero or below, the
-                # ratio counts as 1, or the tie adds no round-off.
-                m_s, m_f = (mass.times(jnp.ones(mass.size)) for mass in (masses.slow_mass, masses.fast_mass))
-                to_slow, to_fast = (jnp.minimum(1.0, jnp.max(a) / jnp.min(b)) for a, b in ((m_f, m_s), (m_s, m_f)))
-        floors = (
-            jnp.stack([slow, jnp.maximum(slow, to_slow * fast)]),
-            jnp.stack([fast, jnp.maximum(fast, to_fast * slow)]),
-        )
-        roundoff = (ROUNDOFF * jnp.finfo(float).eps * floor for floor in (*floors, largest))
+        # a constraint g(q_s, q_f) carries the round-off of q_f to q_s, and vice versa
+        tied = (largest, largest) if equations.system.constraint is not None else (slow, fast)
+        floors = jnp.stack([slow, tied[0]]), jnp.stack([fast, tied[1]]), largest
+        roundoff = (ROUNDOFF * jnp.finfo(float).eps * floor for floor in floors)
         return cls(newton.tolerance / SAFETY, *roundoff)
 
     def at_floor(self, size, before, floor=FLOOR):
@@ -131,11 +151,14 @@ def constraint_length(equations: StepEquations):
         return jnp.zeros(())
     q = jnp.concatenate([equations.q_s, equations.q_f])
     e = np.random.default_rng(0).normal(size=q.size)
+    e, weights = e / np.linalg.norm(e), Weights.of(equations)
+    if weights.slow is not None:
+        e = e / jnp.concatenate(weights)
 
     def along(q):
-        return jax.jvp(lambda q: system.constraints(equations.t, q[:n_s], q[n_s:]), (q,), (e / np.linalg.norm(e),))[1]
+        return jax.jvp(lambda q: system.constraints(equations.t, q[:n_s], q[n_s:]), (q,), (e,))[1]
 
-    slope, curvature = (jnp.abs(a) for a in jax.jvp(along, (q,), (e / np.linalg.norm(e),)))
+    slope, curvature = (jnp.abs(a) for a in jax.jvp(along, (q,), (e,)))
     is_curved = curvature > 0
     return jnp.max(jnp.where(is_curved, slope / jnp.where(is_curved, curvature, 1.0), 0.0))
 

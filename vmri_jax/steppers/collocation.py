@@ -317,8 +317,7 @@ class Collocation(Solver):
             Method.COLLOCATION,
             last.iterations,
             rows=max_abs(rows),
-            g=max_abs(forces.g),
-            tolerance=newton.tolerance,
+            end=end,
         )
         return Solution(unknowns, end, status), memory
 

@@ -20,6 +20,7 @@ from jaxtyping import Array, Float, Int
 
 from vmri_jax.kernels import max_abs
 from vmri_jax.mechanics.constraints import is_rank_deficient
+from vmri_jax.mechanics.projection import mass_diagonal
 from vmri_jax.schemes.equations import StepEquations, Unknowns
 from vmri_jax.steppers.results import RUNNING, Result
 from vmri_jax.steppers.stepper import StepStatus
@@ -27,7 +28,7 @@ from vmri_jax.steppers.stepper import StepStatus
 SHORTEST_PART = 1 / 64
 """Smallest stride, relative to the step. Continuation has failed if it would need a smaller one; a smaller value makes failing runs slower."""
 RANK = 1e-7
-"""Constraint gradients, scaled to length one, count as dependent if their smallest singular value is below this number. A larger
+"""Constraint gradients, in the norm of the kinetic energy and scaled to length one, count as dependent if their smallest singular value is below this number. A larger
 value names nearly dependent constraints as the cause of a failed step."""
 
 
@@ -115,8 +116,12 @@ def with_dependent_constraints(equations: StepEquations, status: StepStatus) -> 
 
     def has_dependent_constraints():
         # the fast variables alone must be able to satisfy g on the micro grid, the slow ones g_s
-        g_s, g_f = jax.jacrev(system.g, argnums=(1, 2))(equations.t, q_s, q_f)
-        g_slow = jax.jacrev(system.g_slow, argnums=1)(equations.t, q_s)
+        jacobians = (
+            *jax.jacrev(system.g, argnums=(1, 2))(equations.t, q_s, q_f),
+            jax.jacrev(system.g_slow, 1)(equations.t, q_s),
+        )
+        m_s, m_f = mass_diagonal(system, q_s, q_f)
+        g_s, g_f, g_slow = (g / jnp.sqrt(m) for g, m in zip(jacobians, (m_s, m_f, m_s), strict=True))
         return is_rank_deficient(g_f, g_s, RANK) | is_rank_deficient(g_slow, tolerance=RANK)
 
     failed = (status.result > Result.CONVERGED_AT_ROUNDOFF) & starts_finite(equations)

@@ -10,7 +10,7 @@ from jaxtyping import Array, Int
 from vmri_jax.kernels import max_abs
 from vmri_jax.mechanics.arrays import Number
 from vmri_jax.schemes.equations import StepEquations, Unknowns
-from vmri_jax.steppers.accept import Accepted
+from vmri_jax.steppers.accept import Accepted, Weights
 from vmri_jax.steppers.continuation import solve_in_parts, with_dependent_constraints
 from vmri_jax.steppers.newton import dense
 from vmri_jax.steppers.results import RUNNING, Method, Result
@@ -36,11 +36,10 @@ class Coupled(Solver):
     def solve(self, equations: StepEquations, guess: Unknowns, memory) -> tuple[Solution, Any]:
         x, result, iterations = self._root(equations, guess)
         residual, (p_s, p_f) = equations.evaluate(x)
-        rows = jnp.maximum(max_abs(residual.slow), max_abs(residual.fast))
-        g = jnp.maximum(max_abs(residual.multiplier), max_abs(residual.slow_multiplier))
-        status = status_of(equations, result, Method.DENSE, iterations, rows=rows, g=g, tolerance=self.newton.tolerance)
-        status = with_dependent_constraints(equations, status)
-        return Solution(x, (equations.q_f + x.fast[:, -1].sum(0), p_s, p_f), status), memory
+        rows = jnp.maximum(*Weights.of(equations).of_momenta().largest(residual.slow, residual.fast))
+        end = equations.q_f + x.fast[:, -1].sum(0), p_s, p_f
+        status = status_of(equations, result, Method.DENSE, iterations, rows=rows, end=end)
+        return Solution(x, end, with_dependent_constraints(equations, status)), memory
 
     def _root(self, equations: StepEquations, guess: Unknowns):
         """(x, `Result`, iterations)."""
@@ -63,14 +62,17 @@ class Coupled(Solver):
         is expected to shrink by ``s = theta min(1, MARGIN theta)``: quadratic convergence with a margin, linear convergence at worst.
         The sum is ``|d_k| s / (1 - s)``.
         """
-        newton, accepted = self.newton, Accepted.of(equations, self.newton)
+        newton, accepted, weights = self.newton, Accepted.of(equations, self.newton), Weights.of(equations)
+
+        def slow_and_fast(x: Unknowns):
+            return weights.largest(x.slow, x.fast)
 
         def iterate(last: Iterate) -> Iterate:
             # d = -(dR/dx)^-1 R
             residual = equations.residual(last.x)
             d = dense.solve(dense.factor(equations, last.x), residual)
             x = jax.tree.map(jnp.add, last.x, d)
-            changes, motions, iterations = _slow_and_fast(d), _slow_and_fast(x), last.iterations + 1
+            changes, motions, iterations = slow_and_fast(d), slow_and_fast(x), last.iterations + 1
             size = accepted.ratio(changes, motions, iterations)
             is_roundoff = accepted.is_roundoff(jnp.maximum(*changes))
             result = _result(last, size, residual, is_roundoff=is_roundoff, is_last=iterations >= limit)
@@ -90,11 +92,6 @@ class Iterate(NamedTuple):
     size: Number
     iterations: Int[Array, ""]
     result: Int[Array, ""]
-
-
-def _slow_and_fast(x: Unknowns):
-    """Largest slow and largest fast increment."""
-    return max_abs(x.slow), max_abs(x.fast)
 
 
 def _result(last: Iterate, size, residual: Unknowns, *, is_roundoff, is_last):

@@ -34,6 +34,7 @@ from vmri_jax.kernels import inverse_in_loop, matmul, matvec, max_abs
 from vmri_jax.kernels.saddle import saddle
 from vmri_jax.schemes.equations import StepEquations, Unknowns
 from vmri_jax.schemes.intervals import Arriving, Intervals, IntervalUnknowns
+from vmri_jax.steppers.accept import NO_WEIGHTS, Weights, largest
 
 
 class Matrices(NamedTuple):
@@ -69,10 +70,13 @@ class MarchEquations:
     Args:
         equations: of the macro step.
         inverted: function of (A, B, C, number of nodes) that inverts the matrix ``[[A, B], [C, 0]]``.
+        weights: of the variables, for the sizes of corrections and residuals.
     """
 
-    def __init__(self, equations: StepEquations, inverted=None):
+    def __init__(self, equations: StepEquations, inverted=None, weights: Weights = NO_WEIGHTS):
         self.equations, self.intervals = equations, Intervals(equations)
+        self.weights = Weights(*(w if w is None else jnp.tile(w, equations.scheme.degree) for w in weights))
+        self.of_momenta = self.weights.of_momenta()
         self.inverted = inverted or inverse_with_multipliers
         self.n, self.r = equations.scheme.num_micro, equations.scheme.degree
         self.n_s, self.n_f = equations.q_s.size, equations.q_f.size
@@ -93,6 +97,14 @@ class MarchEquations:
             x[:, : self.num_fast].reshape(self.n, self.r, self.n_f),
             x[:, self.num_fast :].reshape(self.n, self.r, self.n_g),
         )
+
+    def slow_size(self, z):
+        """Largest slow increment in z, or in its correction."""
+        return largest(z[: self.num_slow], self.weights.slow)
+
+    def fast_size(self, x):
+        """Largest fast increment in the unknowns (..., k) of intervals, or in their corrections."""
+        return largest(x[..., : self.num_fast], self.weights.fast)
 
     def seen(self, z):
         """(r n_v,) the slow increments in z that intervals see."""
@@ -175,7 +187,13 @@ class MarchEquations:
         residual, p_s = slow_values
         dz = -matvec(matrices.slow, residual)
         dx = jnp.sum(matrices.response * self.seen(dz), axis=-1)
-        return Passed(z, x, dz, dx, end, p_s, worst.add(residual, dz, worst.moved))
+        rows = largest(residual[: self.num_slow], self.of_momenta.slow)
+        return Passed(z, x, dz, dx, end, p_s, worst.add(residual, dz, rows, worst.moved))
+
+    def worse(self, worst: "Worst", residual, d) -> "Worst":
+        """The maxima with one more interval included, from its residual and its correction d."""
+        rows = largest(residual[: self.num_fast], self.of_momenta.fast)
+        return worst.add(residual, d, rows, self.fast_size(d))
 
 
 def inverse_with_multipliers(a, b, c, nodes: int):
@@ -187,7 +205,7 @@ class Worst(NamedTuple):
     """Maxima over the intervals of a pass.
 
     moved: largest correction of a fast increment.
-    rows: largest entry of a residual before the corrections; momentum equations are times h.
+    rows: largest residual of the momentum equations before the corrections, times h.
     is_singular: whether a finite residual had a correction that is not finite.
     """
 
@@ -200,15 +218,15 @@ class Worst(NamedTuple):
         """The value before the first interval."""
         return cls(jnp.zeros(()), jnp.zeros(()), jnp.asarray(False))
 
-    def add(self, residual, correction, moved) -> "Worst":
+    def add(self, residual, correction, rows, moved) -> "Worst":
         """The maxima with one more interval included.
 
         Args:
             residual, correction: of the interval (or of the slow equations).
+            rows: largest residual of its momentum equations.
             moved: largest correction of a fast increment in it.
         """
-        rows = max_abs(residual)
-        singular = jnp.isfinite(rows) & ~jnp.isfinite(max_abs(correction))
+        singular = jnp.isfinite(max_abs(residual)) & ~jnp.isfinite(max_abs(correction))
         return Worst(jnp.maximum(self.moved, moved), jnp.maximum(self.rows, rows), self.is_singular | singular)
 
 
@@ -286,7 +304,7 @@ def _linearised(
             on = Handed(arriving.position + march.last_increment(x), gradients)
         else:
             d, on = march.corrected(inverse, hands_on, x, residual, arriving, gradients)
-            x, worst = x + d, worst.add(residual, d, max_abs(d[: march.num_fast]))
+            x, worst = x + d, march.worse(worst, residual, d)
         return (on, sensitivities, x, worst), (x, inverse, hands_on, response, *by_position, *hands_on_by_position)
 
     start = march.start()
@@ -309,7 +327,7 @@ def further_pass(march: MarchEquations, matrices: Matrices, z, x, last, from_las
         x = jnp.where(from_last, last, x)
         residual, gradients = march.interval(m, x, arriving, slow)
         d, on = march.corrected(inverse, hands_on, x, residual, arriving, gradients)
-        return (on, x + d, worst.add(residual, d, max_abs(d[: march.num_fast]))), x + d
+        return (on, x + d, march.worse(worst, residual, d)), x + d
 
     intervals = jnp.arange(march.n), x, matrices.inverse, matrices.hands_on
     (end, _, worst), x = jax.lax.scan(interval, (march.start(), last, Worst.none()), intervals)

@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from vmri_jax.kernels import CONTRACTION, max_abs
+from vmri_jax.kernels import CONTRACTION
 from vmri_jax.schemes.equations import StepEquations, Unknowns
-from vmri_jax.steppers.accept import FLOOR_OF_NEWTON, Accepted, expected
+from vmri_jax.steppers.accept import FLOOR_OF_NEWTON, Accepted, Weights, expected
 from vmri_jax.steppers.continuation import solve_in_parts, with_dependent_constraints
 from vmri_jax.steppers.march import (
     MarchEquations,
@@ -24,7 +24,7 @@ from vmri_jax.steppers.march import (
 from vmri_jax.steppers.newton import null_space
 from vmri_jax.steppers.predictors import PolynomialPredictor
 from vmri_jax.steppers.results import RUNNING, Method, Result
-from vmri_jax.steppers.solved import Solution, Solver, ended, largest_constraint, status_of
+from vmri_jax.steppers.solved import Solution, Solver, ended, status_of
 from vmri_jax.steppers.solvers import Newton
 
 PLAIN_PASSES = 30
@@ -122,7 +122,7 @@ class Marched(Solver):
         return self._solution(march, done, parts.result, parts.iterations), self._learned(march, memory, done)
 
     def _march(self, equations: StepEquations) -> MarchEquations:
-        return MarchEquations(equations, INVERSES[self.linear_solver])
+        return MarchEquations(equations, INVERSES[self.linear_solver], Weights.of(equations))
 
     def _iterate(
         self, march: MarchEquations, guess: Unknowns, start: Progress, memory: MarchMemory, limit, is_first: Any = True
@@ -138,10 +138,10 @@ class Marched(Solver):
         )
 
         def judged(now: Passed, before: Progress) -> Progress:
-            slow, fast = max_abs(now.dz[: march.num_slow]), now.worst.moved
+            slow, fast = march.slow_size(now.dz), now.worst.moved
             # dz is the next slow correction itself; the next fast one is expected from the last two, or without a pair from the last one
             still_moves = jnp.where(before.passes > 0, expected(fast, before.passed.worst.moved), fast)
-            motions = max_abs(now.z[: march.num_slow]), max_abs(now.x[:, : march.num_fast])
+            motions = march.slow_size(now.z), march.fast_size(now.x)
             passes, size = before.passes + 1, jnp.maximum(slow, fast)
             ratio = accepted.ratio((slow, still_moves), motions, passes)
             at_floor = accepted.at_floor(size, before.size)
@@ -191,9 +191,8 @@ class Marched(Solver):
         # The residual after the last correction is not evaluated. Estimate: it has shrunk like the fast corrections,
         # |R| = |R before the correction| min(1, expected correction / last correction).
         shrinks = done.still_moves / jnp.maximum(passed.worst.moved, jnp.finfo(float).tiny)
-        rows, g = passed.worst.rows * jnp.minimum(shrinks, 1.0), largest_constraint(equations, x)
-        method = Method[self.linear_solver.upper()]
-        status = status_of(equations, result, method, passes, rows=rows, g=g, tolerance=self.newton.tolerance)
+        rows, method = passed.worst.rows * jnp.minimum(shrinks, 1.0), Method[self.linear_solver.upper()]
+        status = status_of(equations, result, method, passes, rows=rows, end=end)
         return Solution(x, end, with_dependent_constraints(equations, status))
 
     def _learned(self, march: MarchEquations, memory: MarchMemory, done: Progress) -> MarchMemory:

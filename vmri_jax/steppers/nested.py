@@ -32,7 +32,7 @@ from vmri_jax.steppers.micro_intervals import FastUnknowns, MicroSweep, SweepTot
 from vmri_jax.steppers.predictors import PolynomialPredictor
 from vmri_jax.steppers.results import Method
 from vmri_jax.steppers.slow_equations import ConstraintInertia, SlowEquations
-from vmri_jax.steppers.solved import Solution, Solver, largest_constraint, status_of
+from vmri_jax.steppers.solved import Solution, Solver, status_of
 from vmri_jax.steppers.solvers import Newton
 
 EXTRA_PASSES = 1
@@ -130,10 +130,7 @@ class Nested(Solver):
         x = Unknowns(done.slow, done.slow_multiplier, done.fast.increments, done.fast.multiplier)
         per_h = 1 / equations.micro_dt
         end = done.totals.q_f, equations.p_s + per_h * done.impulse, per_h * done.totals.p_f
-        g = largest_constraint(equations, x)
-        status = status_of(
-            equations, done.result, Method.NESTED, done.passes, rows=done.rows, g=g, tolerance=newton.tolerance
-        )
+        status = status_of(equations, done.result, Method.NESTED, done.passes, rows=done.rows, end=end)
 
         learned = NestedState(
             memory.matrix,

@@ -122,9 +122,8 @@ class Rattle(Solver):
             done.result,
             Method.RATTLE,
             done.iterations,
-            rows=0.0,
-            g=max_abs(done.g),
-            tolerance=newton.tolerance,
+            rows=max_abs(force(done.dmu)),
+            end=end,
         )
         n_g, _ = system.num_constraints(equations.q_s, equations.q_f)
         x, mu = done.x[None], done.mu[None]

@@ -49,8 +49,9 @@ _MESSAGES = {
     ),
     Result.NON_FINITE: (
         "a NaN or infinity appeared. Likely causes: an explicit scheme beyond its stability limit (omega h < 2), a function "
-        "evaluated outside its domain (a norm at zero, a logarithm or root of a negative number). Try a smaller macro_dt, or look at the "
-        "state just before the failure."
+        "evaluated outside its domain (a norm at zero, a logarithm or root of a negative number), an angle of directors near half a turn, "
+        'which a spring, a limit or a gear cannot tell from another turn (give the scene coordinates="joint"). Try a smaller macro_dt, or look '
+        "at the state just before the failure."
     ),
     Result.SINGULAR: (
         "the Newton matrix is singular although the functions are finite. Likely causes: a kinetic energy that does not see "
@@ -64,8 +65,8 @@ _MESSAGES = {
         "Remove rows, make the variables they need fast, or start elsewhere."
     ),
     Result.CONSTRAINT_VIOLATED: (
-        "the increments converged, but the constraints are not kept. Likely causes: rows that contradict each other, rows of "
-        "very different size (scale them to order one), or a stepper of your own (solvers.Custom) that does not hold them."
+        "the increments converged, but the constraints are not kept. Likely causes: rows that contradict each other, or a "
+        "stepper of your own (solvers.Custom) that does not hold them."
     ),
     Result.NOT_IMPLIED: (
         'the constraints that are solved for are kept, but rows that were left out as redundant (redundant="drop" of a scene, '

@@ -10,15 +10,14 @@ import jax.numpy as jnp
 from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Float
 
-from vmri_jax.kernels import max_abs
 from vmri_jax.kernels.band import Sparsity
 from vmri_jax.mechanics.arrays import Numbers
-from vmri_jax.mechanics.checks import CONSTRAINT_TOLERANCE
 from vmri_jax.mechanics.projection import project_momentum
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
 from vmri_jax.schemes.equations import StepEquations, Unknowns, multiplier_scales
 from vmri_jax.schemes.scheme import Scheme
+from vmri_jax.steppers.accept import Weights
 from vmri_jax.steppers.interval import constant_mass
 from vmri_jax.steppers.newton.implicit import differentiable, differentiable_reverse_only
 from vmri_jax.steppers.results import RUNNING, Result
@@ -26,9 +25,6 @@ from vmri_jax.steppers.stepper import StepInfo, Stepper, StepStatus, indented
 
 ROOT = "root"
 """Name of the solution and the status of a step for `jax.checkpoint`: a policy that saves this name lets derivatives reuse the solution."""
-CONSTRAINT_OVER_TOLERANCE = 100
-"""Constraints are kept if ``|g| <= max(CONSTRAINT_TOLERANCE, CONSTRAINT_OVER_TOLERANCE tolerance)``. The tolerance is relative to the motion, the value
-of a constraint has its own unit: a smaller factor would refuse converged steps of loose tolerances."""
 
 
 class Solution(NamedTuple):
@@ -202,33 +198,22 @@ class Fallback(Solver):
         return [*self.first.describe(), "where that does not converge:", *indented(self.exact.describe())]
 
 
-def status_of(equations: StepEquations, result, method, iterations, *, rows, g, tolerance) -> StepStatus:
-    """The status of a step. Converged increments with violated constraints get CONSTRAINT_VIOLATED: the constraints contradict each other.
+def status_of(equations: StepEquations, result, method, iterations, *, rows, end) -> StepStatus:
+    """The status of a step, with the residual relative to the momenta.
 
     Args:
         equations: of the step.
         result, method, iterations: as in `StepInfo`.
-        rows: largest residual of the momentum equations, times h.
-        g: largest constraint value.
-        tolerance: of Newton; a loose one raises the accepted constraint value.
+        rows: largest residual of the momentum equations, times h, with the weights of momenta.
+        end: (q_f, p_s, p_f) at the end of the step.
     """
-    if equations.system.is_constrained:
-        violated = g > jnp.maximum(CONSTRAINT_TOLERANCE, CONSTRAINT_OVER_TOLERANCE * tolerance)
-        contradicts = (result <= Result.CONVERGED_AT_ROUNDOFF) & violated
-        result = jnp.where(contradicts, Result.CONSTRAINT_VIOLATED, result)
-    # residual = max(rows / (h max |p|), max |g|), where `rows` is h |R|; with `rows` itself where all momenta are zero
-    momentum = jnp.maximum(max_abs(equations.p_s), max_abs(equations.p_f)) * equations.micro_dt
-    residual = jnp.maximum(rows / jnp.where(momentum > 0, momentum, 1.0), g)
+    weights, (_, p_s, p_f) = Weights.of(equations).of_momenta(), end
+    momenta = *weights.largest(equations.p_s, equations.p_f), *weights.largest(p_s, p_f)
+    momentum = equations.micro_dt * jnp.max(jnp.stack(momenta))
+    residual = jnp.where(momentum > 0, rows / jnp.where(momentum > 0, momentum, 1.0), 0.0)
     return StepStatus(result, jnp.asarray(int(method)), iterations, residual)
 
 
 def ended(result):
     """The final `Result` of an iteration with a fixed number of turns: STAGNATED if it is still RUNNING."""
     return jnp.where(result == RUNNING, Result.STAGNATED, result)
-
-
-def largest_constraint(equations: StepEquations, x: Unknowns):
-    """Largest absolute value of g and g_s at the control nodes of the step, the first one excluded."""
-    if not equations.system.is_constrained:
-        return jnp.zeros(())
-    return jnp.maximum(*map(max_abs, equations.constraints(x)))

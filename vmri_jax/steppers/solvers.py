@@ -41,8 +41,8 @@ class Newton(eqx.Module):
 
     Args:
         tolerance: the iteration ends when the next correction is below ``tolerance / 10 * max |increments|`` plus the round-off of the
-            positions, for slow and for fast variables each (`vmri_jax.steppers.accept`). A step whose constraints are violated by more than
-            max(1e-6, 100 tolerance) has failed.
+            positions, for slow and for fast variables each (`vmri_jax.steppers.accept`). A saved node fails if the value of a constraint is above
+            ``max(1e-6, 100 tolerance)`` of the terms that cancel in it.
         max_iterations: a step that needs more iterations has failed; for the march and for `Nested` the passes count.
         fixed_iterations: number of iterations of every step, without a loop that depends on the data; the result is checked at the end, and
             a step that has not converged has failed, without a fallback. None: as many iterations as the tolerance needs.
@@ -136,7 +136,7 @@ class Custom(Newton):
             `vmri_jax.steppers.solved.Solver` for the equations between the kicks; of a composition it gets the scheme of a stage. Define it
             at module level: programs are compiled once per function, and a new function is compiled anew. It is called while JAX traces the
             run, so that runs, batches, files and gradients work as with other solvers.
-        tolerance: a saved node fails if the value of a constraint is above ``max(1e-6, 100 tolerance)``.
+        tolerance: a saved node fails if the value of a constraint is above ``max(1e-6, 100 tolerance)`` of its terms.
     """
 
     method = "custom"

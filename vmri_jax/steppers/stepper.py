@@ -20,9 +20,8 @@ class StepInfo(eqx.Module):
     result: status code, see `Result`.
     method: code of the solver, see `Method`; with "auto" ARROWHEAD says that the cheaper solvers are not possible, or did not converge.
     iterations: most Newton iterations or passes of a solve in the step; 0 for explicit steps.
-    residual: ``max(|R| / max |p|, max |g|)``, with the residual R of the momentum equations and the constraint values g; 0 for linear
-        equations. `Nested` and the march estimate R after their last correction, RATTLE takes R = 0, all others
-        evaluate it.
+    residual: ``max |R| / max |p|`` with the residual R of the momentum equations; 0 for linear equations. `Nested` and the march estimate R
+        after their last correction, RATTLE takes the next impulse of the constraints, all others evaluate it.
     q_f_micro: fast positions at the micro nodes, the start excluded.
     multiplier, slow_multiplier: Lagrange multipliers at the control nodes, with r the degree of the scheme. A composition of s
         stages joins those of its stages: ``(s num_micro, r, n_g)`` and ``(s r, n_gs)``.

@@ -46,7 +46,7 @@ REPEATS = 5
 class Answer:
     """The cheapest setting for an error.
 
-    error: largest accepted error of the positions at t_end.
+    error: largest accepted error of the positions in the run.
     setting: the cheapest setting; None if no setting keeps the error.
     all: all settings that the search found to keep the error, the fastest first.
     """
@@ -110,7 +110,7 @@ class CostReport(ResultTable):
     @property
     def caption(self) -> str:
         """The simulated time, the smallest error that the reference solution can tell, and the schemes that were not tried."""
-        sentences = [f"Runs to t = {self.t_end:g}, with errors of the positions there."]
+        sentences = [f"Runs to t = {self.t_end:g}, with the largest errors of the positions on the way."]
         known_to = self.runs.reference.error_q
         if known_to:
             least = MIN_ERROR_OVER_REFERENCE * known_to
@@ -162,7 +162,7 @@ def cost_report(
         name: of the system, for the title and the commands: a built-in one or ``my_file.py:my_problem``.
         out: folder, made if it does not exist.
         t_end: simulated time, by default `default_t_end`.
-        errors: largest accepted ``|q - q_ref|`` at t_end; by default `RELATIVE_ERRORS` times how far the system moves.
+        errors: largest accepted ``|q - q_ref|`` over ten nodes of the run; by default `RELATIVE_ERRORS` times how far the system moves.
         menu: families to choose from, by default `families()`.
         progress: True for a bar, or a function (what, done, total) that is told about every run.
 
@@ -176,7 +176,7 @@ def cost_report(
     out = Path(out)
     make_writable_folder(out)
     t_end = default_t_end(problem) if t_end is None else t_end
-    reference = reference_solution(problem, t_end, num_saves=1, progress=progress)
+    reference = reference_solution(problem, t_end, progress=progress)
     if errors is None:
         errors = _default_errors(problem, reference, t_end)
     if not errors or min(errors) <= 0:
@@ -237,15 +237,15 @@ def _of_accuracy(search: Search, error: float) -> WorkRow | None:
 
 def _default_errors(problem: Problem, reference: ReferenceSolution, t_end: float) -> list[float]:
     """RELATIVE_ERRORS of a power of ten near how far the system moves, without errors that the reference cannot tell."""
-    moved = float(np.abs(reference.q[-1] - reference.q[0]).max())
+    moved = float(np.abs(reference.q - reference.q[0]).max())
     least = max(MIN_ERROR_OVER_REFERENCE * reference.error_q, round_off(problem)[1])
     motion = 10.0 ** math.floor(math.log10(max(moved, 1e-300)))
     errors = [motion * error for error in RELATIVE_ERRORS if motion * error > least]
     if not errors:
         raise ValueError(
-            f"cost_report: at t_end = {t_end:g} the positions are those of the start up to {moved:.1e}, and errors below {least:.1e} "
-            "cannot be told from round-off or from the error of the reference solution: the system is at rest, back at its start, or "
-            "chaotic. Give a start that moves, another t_end, or the errors that you accept."
+            f"cost_report: until t_end = {t_end:g} the positions are those of the start up to {moved:.1e}, and errors below {least:.1e} "
+            "cannot be told from round-off or from the error of the reference solution: the system is at rest or chaotic. Give a start that "
+            "moves, another t_end, or the errors that you accept."
         )
     return errors
 
@@ -360,13 +360,14 @@ def _growth(reached: Sequence[Answer]) -> float:
 
 
 def _multirate(report: CostReport) -> list[tuple[float, str, int, float]]:
-    """For each answer: its error, family and num_micro, and the time of the family with one micro step over the time of the answer."""
-    gains = []
-    for answer in report.rows:
-        if answer.setting is None:
-            continue
-        family = answer.setting.family.name
-        single = [s.row.seconds for s in answer.all if s.family.name == family and s.num_micro == 1]
-        if single:
-            gains.append((answer.error, family, answer.setting.num_micro, single[0] / answer.setting.row.seconds))
+    """For each answer: its error, family and num_micro, and the time of the family's single steps over the time of the answer.
+
+    Single steps count if runs with more steps confirm that they keep the error, as of the answers: they never beat an answer.
+    """
+    stairs, gains = confirmed(report.runs.rows), []
+    for error, setting in ((answer.error, answer.setting) for answer in report.rows if answer.setting is not None):
+        single = setting.family.label(1)
+        seconds = [stair.seconds for stair in stairs if stair.row.scheme == single and stair.error <= error]
+        if seconds:
+            gains.append((error, setting.family.name, setting.num_micro, min(seconds) / setting.row.seconds))
     return gains

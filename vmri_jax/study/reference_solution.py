@@ -5,6 +5,8 @@ from typing import Any
 
 import numpy as np
 
+from vmri_jax.accuracy.companions import fewest_steps
+from vmri_jax.mechanics.driving import events
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
 from vmri_jax.running.failures import simulation_error
 from vmri_jax.running.progress import shows_progress
@@ -63,6 +65,8 @@ def reference_solution(
         degree: polynomial degree of the path, with Gauss quadrature on every term.
         progress: True for a bar, or a function (what, done, total) that is told about every run.
 
+    Events of forces are seen by every run, see `vmri_jax.mechanics.driving`.
+
     Returns:
         The finer of the two successive runs with the least difference in q; error_q and error_p are the largest
         differences between these two.
@@ -73,7 +77,9 @@ def reference_solution(
     problem = problem_of("reference_solution", problem)
     program = Program(problem, galerkin(1, degree, "gauss"), t_end, num_saves)
     fixed = num_steps is not None
-    n = num_steps if fixed else num_saves * max(1, 32 // num_saves)
+    drives = events(problem.system, program.state, float(program.state.t) + t_end)
+    fewest = max(32, fewest_steps(program.scheme, drives, t_end))  # steps that see the events of forces
+    n = num_steps if fixed else num_saves * -(-fewest // num_saves)
     coarse, best, last_error = None, None, np.inf
     while True:
         progress(f"reference solution, {n} steps", 0, 1)
@@ -83,12 +89,12 @@ def reference_solution(
             error_q, error_p = (float(np.abs(a - b).max()) for a, b in zip(coarse, fine, strict=True))
             if best is None or error_q < best.error_q:
                 best = ReferenceSolution(*fine, error_q, error_p)
-            # a difference that no longer falls has reached round-off or the floor of a chaotic motion; above 1e-6 the steps may still be too large
-            settled = error_q > last_error / 2 and error_q < 1e-6 * max(1.0, np.abs(fine[0]).max())
+            # a difference that no longer falls has reached round-off or the floor of a chaotic motion; above 1e-6 of the positions the steps may still be too large
+            settled = error_q > last_error / 2 and error_q < 1e-6 * np.abs(fine[0]).max()
             if fixed or settled or error_q <= ROUNDOFF * np.abs(fine[0]).max():
                 return best
             last_error = error_q
-        if (fixed and (fine is None or n > num_steps)) or n >= MAX_STEPS:
+        if (fixed and (fine is None or n > num_steps)) or n >= max(MAX_STEPS, 2 * fewest):
             break
         coarse, n = fine, 2 * n
     if best is not None:

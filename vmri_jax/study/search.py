@@ -37,7 +37,7 @@ MAX_PROGRAMS = 64
 """Compiled schemes that a search holds in memory; with a smaller number the search compiles schemes twice."""
 TIMED_RUNS = 5
 """Runs whose median is the time of a setting in stage 3; more of them make the order of the settings surer."""
-_seconds = attrgetter("row.seconds")
+by_seconds = attrgetter("row.seconds")
 
 
 @dataclass(frozen=True)
@@ -200,16 +200,16 @@ class Search:
             for num_micro in NUM_MICRO if exhaustive else (family.first,):
                 attempt(family, num_micro, i)
         # stage 2: num_micro of the best families
-        firsts = [] if exhaustive else sorted(reached.values(), key=_seconds)[:FINALISTS]
+        firsts = [] if exhaustive else sorted(reached.values(), key=by_seconds)[:FINALISTS]
         for done, first in enumerate(firsts, start=len(self.menu)):
             attempt(first.family, 1, done)  # `climb` may stop above 1, where slow and fast variables share their grid
             climb(first, [n for n in NUM_MICRO if n > first.num_micro], done)
             climb(first, [n for n in reversed(NUM_MICRO) if n < first.num_micro], done)
         # stage 3: times in turn
-        ranked = sorted(reached.values(), key=_seconds)
+        ranked = sorted(reached.values(), key=by_seconds)
         timed = self._timed(ranked[: 2 * FINALISTS])
         timed += self._timed(self._rivals(error, timed))
-        return sorted(timed, key=_seconds) + ranked[2 * FINALISTS :]
+        return sorted(timed, key=by_seconds) + ranked[2 * FINALISTS :]
 
     def _rivals(self, error: float, timed: Sequence[Setting]) -> list[Setting]:
         """Settings outside `timed` that keep the error, and whose first estimate of a time is below the best time in `timed`."""

@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
+import numpy as np
 from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
@@ -141,7 +142,9 @@ def _filled(columns: Sequence[Column], rows: Sequence[Any]) -> tuple[list[Column
 
 
 def _plain(value: Any) -> Any:
-    """The value in types that JSON knows: NaN becomes None, infinite numbers become strings."""
+    """The value in types that JSON knows: NaN becomes None, infinite numbers become strings, arrays become lists."""
+    if isinstance(value, np.ndarray):
+        return _plain(value.tolist())
     if isinstance(value, Mapping):
         return {key: _plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

@@ -23,11 +23,11 @@ from vmri_jax.study.reference_solution import ReferenceSolution, reference_solut
 from vmri_jax.study.table import Column, ResultTable
 
 FINEST_ERROR = 1e-10
-"""Error of positions below which a ladder of steps ends; a smaller value adds finer runs, which round-off may spoil."""
+"""Error of positions, relative to the largest one, below which a ladder of steps ends; a smaller value adds finer runs, which round-off may spoil."""
 SLOWEST = 2.0
 """Seconds of a run after which a ladder of steps ends; a larger value adds slower runs."""
 RESOLVED_ERROR = 1e-6
-"""Error of positions below which a ladder ends when errors stop falling; a larger value may end it at steps that resolve nothing yet."""
+"""Error of positions, relative to the largest one, below which a ladder ends when errors stop falling; a larger value may end it at steps that resolve nothing yet."""
 LEAST_GAIN = 1.5
 """Ratio of the least error so far to the next error below which errors have stopped falling; a larger ratio ends ladders earlier."""
 
@@ -299,6 +299,7 @@ def _goes_on(rows: Sequence[WorkRow], reference: ReferenceSolution) -> bool:
     """Whether twice the steps of the last run may give a smaller error in acceptable time."""
     last, errors = rows[-1], [row.error_q for row in rows[:-1] if np.isfinite(row.error_q)]
     least = min(errors, default=np.inf)
-    stopped_falling = least < RESOLVED_ERROR and not last.error_q < least / LEAST_GAIN  # true for NaN, too
-    reached = last.error_q < max(FINEST_ERROR, reference.error_q)
+    size = np.abs(reference.q).max()
+    stopped_falling = least < RESOLVED_ERROR * size and not last.error_q < least / LEAST_GAIN  # true for NaN, too
+    reached = last.error_q < max(FINEST_ERROR * size, reference.error_q)
     return not (reached or last.seconds > SLOWEST or stopped_falling)

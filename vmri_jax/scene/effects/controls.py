@@ -140,6 +140,7 @@ class ControlledJoint(InJoint):
     """The force or torque of `Controlled` in a joint."""
 
     kind = "control"
+    counts_turns = False
     along = staticmethod(control_along)
 
     def check_bodies(self, bodies):

@@ -3,6 +3,7 @@
 from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import field, replace
+from itertools import islice
 from typing import Any, ClassVar
 
 import jax.numpy as jnp
@@ -12,28 +13,23 @@ from vmri_jax.mechanics.checks import describe, shape_of
 from vmri_jax.mechanics.functions import NO_VELOCITY, check_arguments
 from vmri_jax.mechanics.rows import Rows
 from vmri_jax.scene.declare import effect_class, real_tree
-from vmri_jax.scene.effect import MOST_ROLES, START, Effect
-from vmri_jax.scene.effects.freedoms import FREEDOMS, Freedom
-from vmri_jax.scene.effects.joint_base import freedom_of, joint_named
+from vmri_jax.scene.effect import MOST_ROLES, START
+from vmri_jax.scene.effects.freedoms import COORDINATE, FREEDOMS
+from vmri_jax.scene.effects.joint_base import OfFreedoms, freedom_of, joint_named
 from vmri_jax.scene.terms import Applied, EffectTerm, OnBodies
 
 
-def equation_of_bodies(law, freedoms: tuple[Freedom, ...], q, params):
-    """``g(x, params)`` with the freedoms x as functions of the coordinates of both bodies of each joint."""
-    x = [
-        FREEDOMS[freedom](q[2 * i : 2 * i + 2], of_joint)
-        for i, (freedom, of_joint) in enumerate(zip(freedoms, params["joints"], strict=True))
-    ]
+def equation(law, freedoms: tuple[str, ...], q, params):
+    """``g(x, params)`` with the freedoms x, by their names in `FREEDOMS`, of coordinates or of both bodies of each joint."""
+    x, roles = [], iter(q)
+    for freedom, of_joint in zip(freedoms, params["joints"], strict=True):
+        ends = islice(roles, 1 if freedom == COORDINATE else 2)
+        x.append(FREEDOMS[freedom](tuple(ends), of_joint))
     return law(jnp.stack(x), params["law"])
 
 
-def equation_of_coordinates(law, q, params):
-    """``g(x, params)`` with freedoms x that are all coordinates of the scene."""
-    return law(jnp.concatenate(q), params["law"])
-
-
 @effect_class
-class _Coupling(Effect):
+class _Coupling(OfFreedoms):
     """An equation between freedoms of joints, see `JointCoupling`."""
 
     joints: Any
@@ -41,8 +37,6 @@ class _Coupling(Effect):
     law: ClassVar[Any]
     """The equation ``g(x, params)`` of the freedoms x (n,)."""
     kind = "constraint"
-    whole = True
-    same_size = False
 
     @abstractmethod
     def numbers(self) -> Any:
@@ -69,22 +63,26 @@ class _Coupling(Effect):
     def elements(self, bodies):
         return (tuple(name for joint, _ in self.joints for name in joint.elements(bodies)[0]),)
 
-    def pairs_of_joints(self, i):
-        return tuple((joint.name, 0) for joint, _ in self.joints)
+    def freedoms_of(self, i):
+        return tuple((joint.name, 0, freedom) for joint, freedom in self.joints)
 
     @property
     def function(self):
-        return Applied(equation_of_bodies, (self.law, tuple(freedom for _, freedom in self.joints)))
+        return Applied(equation, (self.law, tuple(self.by_directors(freedom) for _, freedom in self.joints)))
 
     def parameters(self, bodies):
         return {"law": self.numbers(), "joints": tuple(joint.parameters(bodies) for joint, _ in self.joints)}
 
     def terms(self, select, bodies, layout, potentials):
-        keys = [(joint.name, 0, freedom) for joint, freedom in self.joints]
-        if not all(key in layout.freedoms for key in keys):
-            return super().terms(select, bodies, layout, potentials)
-        roles = tuple(OnBodies(Rows.of([layout.freedoms[key]])) for key in keys)
-        return (EffectTerm(self.name, Applied(equation_of_coordinates, (self.law,)), roles),)
+        roles, freedoms = [], []
+        for (joint, freedom), key in zip(self.joints, self.freedoms_of(0), strict=True):
+            is_coordinate = key in layout.freedoms
+            freedoms.append(COORDINATE if is_coordinate else self.by_directors(freedom))
+            if is_coordinate:
+                roles.append(OnBodies(Rows.of([layout.freedoms[key]])))
+            else:
+                roles += [self._role("", (name,), bodies, layout.bodies) for name in joint.elements(bodies)[0]]
+        return (EffectTerm(self.name, Applied(equation, (self.law, tuple(freedoms))), tuple(roles)),)
 
     def check_bodies(self, bodies):
         """Nothing: the joints check their bodies themselves."""
@@ -109,7 +107,7 @@ class _Coupling(Effect):
 
 @effect_class
 class JointCoupling(_Coupling):
-    """An equation between the freedoms x of joints, ``g(x, params) = 0``; angles are between -pi and pi unless they are coordinates.
+    """An equation between the freedoms x of joints, ``g(x, params) = 0``.
 
         def cam(x, params):
             turn, lift = x

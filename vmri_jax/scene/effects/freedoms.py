@@ -6,6 +6,7 @@ For the letters see `vmri_jax.scene.effects.joints`.
 from typing import Any, Literal
 
 import jax.numpy as jnp
+import numpy as np
 
 from vmri_jax.scene.terms import place, split
 
@@ -70,6 +71,9 @@ def slide(q, params):
 
 ANGLES: dict[str, Any] = {"turn": turn_by_sine, "tilt": tilt_by_sine}
 """For each freedom that is an angle, the function that gives its sine and cosine."""
+REACH = 5 * np.pi / 6
+"""rad: an effect that counts whole turns may take an angle from directors up to this size. Directors know angles up to whole turns; the gap of
+a third of a turn between REACH and -REACH is too wide to be jumped over by a run with six steps in a turn. A larger value narrows the gap."""
 COORDINATE = "coordinate"
 """In `FREEDOMS`, the name of any freedom that is a coordinate of the scene, ``q = ((..., 1),)``."""
 FREEDOMS: dict[str, Any] = {
@@ -82,3 +86,16 @@ FREEDOMS: dict[str, Any] = {
 }
 """For each freedom, the function ``(q, params) -> (...)`` of the coordinates of both bodies that gives its value against the given position: rad,
 between -pi and pi, or m."""
+
+
+def within_reach(angle):
+    """The angle, rad; beyond `REACH` NaN with all its derivatives, which ends a run in place of a wrong number of turns."""
+    return angle * jnp.where(jnp.abs(angle) < REACH, 1.0, jnp.nan)
+
+
+IN_REACH = {freedom: f"{freedom} within reach" for freedom in ANGLES}
+"""For each angle, the name in `FREEDOMS` of the same angle `within_reach`."""
+FREEDOMS |= {
+    name: lambda q, params, angle=FREEDOMS[freedom]: within_reach(angle(q, params))
+    for freedom, name in IN_REACH.items()
+}

@@ -3,7 +3,8 @@
 For the letters see `vmri_jax.scene.effects.joints`.
 """
 
-from collections.abc import Iterable
+from abc import abstractmethod
+from collections.abc import Iterable, Mapping
 from typing import Any, ClassVar
 
 import jax.numpy as jnp
@@ -15,7 +16,8 @@ from vmri_jax.mechanics.names import unknown
 from vmri_jax.scene.body import GROUND, GROUND_COORDINATES, Attachment, Bodies, body_of, label_of
 from vmri_jax.scene.declare import effect_class, names, squeeze
 from vmri_jax.scene.effect import START, Effect
-from vmri_jax.scene.effects.freedoms import FREEDOMS, PARALLEL, Freedom, aligned, gap
+from vmri_jax.scene.effects.freedoms import FREEDOMS, IN_REACH, PARALLEL, Freedom, aligned, gap
+from vmri_jax.scene.layout import Key
 from vmri_jax.scene.rigid import RigidBody
 
 
@@ -61,6 +63,14 @@ class Joint(Effect):
     def pitch_of(self, i: int):
         """How far b moves along the axis per turn of the i-th pair, m; zero unless the joint is a screw."""
         return np.zeros(())
+
+    def values(self, freedom: str, pairs: Iterable[int], bodies: Bodies, coordinates: Mapping[str, Any]):
+        """A freedom of some pairs, (pairs, ...) rad or m, by the coordinates (..., n) of bodies by name; an angle is between -pi and pi."""
+        params, elements, values = self.parameters(bodies), self.elements(bodies), []
+        for i in pairs:
+            ends = (GROUND_COORDINATES if name == GROUND else coordinates[name] for name in elements[i])
+            values.append(FREEDOMS[freedom](tuple(map(jnp.asarray, ends)), self._element_params(i, bodies, params)))
+        return jnp.stack(values)
 
     def frame(self, count: int) -> list | None:
         """(n, 3, 3) axes (m, m', n) of the joint in space, for all pairs, where the freedoms are zero; None if the joint has no axis."""
@@ -205,13 +215,24 @@ def freedom_of(joint: Joint, of: str, about: str = "") -> Freedom:
     raise ValueError(f"{about}of is {of!r}; {joint.name} leaves {free} free.")
 
 
-def along_run(joint: Joint, run, bodies: Bodies, of: str, pair: int) -> np.ndarray:
-    """The freedom of a joint along a run, (k,) rad or m, angles without jumps of 2 pi; see `Scene.joint_motion`."""
-    freedom, element = freedom_of(joint, of), joint.elements(bodies)[pair]
-    _, params = joint.element_arguments(pair, bodies, joint.parameters(bodies))
-    q = tuple(GROUND_COORDINATES if body == GROUND else np.asarray(run.position(body)) for body in element)
-    values = np.asarray(FREEDOMS[freedom](q, params))
-    return np.unwrap(values) if freedom == "turn" else values
+@effect_class
+class OfFreedoms(Effect):
+    """Base class of effects that are functions of freedoms of joints alone."""
+
+    whole = True
+    same_size = False
+    counts_turns: ClassVar[bool] = True
+    """Whether another number of whole turns of an angle changes the effect. A joint with such an effect is the last one that a loop is cut
+    at; where its angle comes from directors all the same, it is `within_reach`."""
+    marks: ClassVar[tuple[str, ...]] = ()
+    """Names of parameters that are values of the freedom, such as limits."""
+
+    @abstractmethod
+    def freedoms_of(self, i: int) -> tuple[Key, ...]: ...
+
+    def by_directors(self, freedom: Freedom) -> str:
+        """The name in `FREEDOMS` of a freedom that is no coordinate of the scene."""
+        return IN_REACH.get(freedom, freedom) if self.counts_turns else freedom
 
 
 def _triad(axis):

@@ -9,10 +9,10 @@ import jax.numpy as jnp
 
 from vmri_jax.mechanics.rows import Rows
 from vmri_jax.scene.declare import effect_class, number, of_time, positive, real_tree
-from vmri_jax.scene.effect import START, Effect
+from vmri_jax.scene.effect import START
 from vmri_jax.scene.effects.contact import penalty
 from vmri_jax.scene.effects.freedoms import ANGLES, COORDINATE, FREEDOMS, Freedom
-from vmri_jax.scene.effects.joint_base import Joint, freedom_of, joint_named
+from vmri_jax.scene.effects.joint_base import Joint, OfFreedoms, freedom_of, joint_named
 from vmri_jax.scene.effects.springs import elastic_energy
 from vmri_jax.scene.terms import Applied, EffectTerm, OnBodies
 
@@ -50,11 +50,12 @@ def prescribed_motion(law, freedom: str, t, q, params):
 
 
 @effect_class
-class InJoint(Effect):
+class InJoint(OfFreedoms):
     """Base class of effects along the freedom x of a joint: the angle or displacement of b against a from the given position.
 
     Args:
-        joint: name of a joint in the scene with an angle or a displacement.
+        joint: name of a joint in the scene with an angle or a displacement. Angles count their turns where they are coordinates, see
+            `Scene`; of directors an effect takes them up to 5/6 of half a turn, where a run ends.
         of: name of the freedom, if the joint has several; "auto" for the only freedom.
 
     Raises:
@@ -64,8 +65,6 @@ class InJoint(Effect):
     joint: Any
     of: Freedom | Literal["auto"] = field(default="auto", kw_only=True)
 
-    whole = True
-    same_size = False
     derived = Joint.derived
     law: ClassVar[Any] = None
     """Energy, force or path as a function of x."""
@@ -83,17 +82,17 @@ class InJoint(Effect):
 
     @property
     def function(self):
-        return Applied(self.along, (self.law, self.freedom))
+        return Applied(self.along, (self.law, self.by_directors(self.freedom)))
 
     def elements(self, bodies):
         return self.joint.elements(bodies)
 
-    def pairs_of_joints(self, i):
-        return ((self.joint.name, i),)
+    def freedoms_of(self, i):
+        return ((self.joint.name, i, self.freedom),)
 
     def terms(self, select, bodies, layout, potentials):
         # pairs that carry a body have x as a coordinate; those that close loops have x as a function of the coordinates of both bodies
-        keys = {i: (self.joint.name, i, self.freedom) for i in select}
+        keys = {i: self.freedoms_of(i)[0] for i in select}
         carrying = [i for i in select if keys[i] in layout.freedoms]
         terms = super().terms([i for i in select if i not in carrying], bodies, layout, potentials)
         if not carrying:
@@ -115,8 +114,6 @@ class InJoint(Effect):
 class JointSpring(InJoint):
     """Springs in joints, ``V = sum k/2 (x - x_0)^2``.
 
-    An angle that is no joint coordinate is between -pi and pi: such a spring must not turn further.
-
     Args:
         joint, of: as of `InJoint`.
         stiffness: k, N m/rad or N/m, positive; one number, or one for each pair of the joint.
@@ -127,6 +124,7 @@ class JointSpring(InJoint):
     neutral: Any = number(default=0.0)
 
     kind = "potential"
+    marks = ("neutral",)
     default_name = "joint_springs"
     along = staticmethod(energy_of)
 
@@ -158,6 +156,7 @@ class JointLimit(InJoint):
     smoothing: Any = positive()
 
     kind = "potential"
+    marks = ("lower", "upper")
     default_name = "joint_limits"
     along = staticmethod(energy_of)
 
@@ -186,6 +185,7 @@ class JointDamper(InJoint):
     coefficient: Any = positive()
 
     kind = "force"
+    counts_turns = False
     default_name = "joint_dampers"
     along = staticmethod(force_along)
 
@@ -207,6 +207,7 @@ class RotorInertia(InJoint):
     inertia: Any = positive()
 
     kind = "kinetic"
+    counts_turns = False
     default_name = "rotors"
     along = staticmethod(energy_of_rate)
 
@@ -234,6 +235,7 @@ class JointDrive(InJoint):
     params: Any = field(default_factory=dict)
 
     kind = "force"
+    counts_turns = False
     default_name = "joint_drive"
     along = staticmethod(force_along)
 
@@ -264,6 +266,7 @@ class JointMotion(InJoint):
     params: Any = field(default_factory=dict)
 
     kind = "constraint"
+    counts_turns = False
     default_name = "joint_motion"
     along = staticmethod(prescribed_motion)
     timed = True

@@ -46,6 +46,10 @@ def inverse_without_multipliers(a, b, c, nodes: int):
     """Inverse of ``[[A, B], [C, 0]]`` with ``B = -G_0^T`` and ``C = G_1``, block diagonal with one block for each of the nodes."""
     if not b.shape[-1]:
         return jnp.linalg.inv(a)
+    # unknowns times the square roots of masses: bases of free motions compare numbers of one unit
+    root = 1 / jnp.sqrt(jnp.abs(jnp.diagonal(a)))
+    scale = jnp.append(root, jnp.ones(b.shape[-1]))
+    a, b, c = root[:, None] * a * root, root[:, None] * b, c * root
     at_nodes = (motions(_diagonal_blocks(g, nodes)) for g in (-b.T, c))
     (p_0, w_0), (p_1, w_1) = ([block_diag(*blocks) for blocks in of_g] for of_g in at_nodes)
     p_0, w_0 = p_0.T, w_0.T
@@ -54,7 +58,7 @@ def inverse_without_multipliers(a, b, c, nodes: int):
     held = w_1 - free @ (a @ w_1)
     top = jnp.concatenate([free, held], axis=-1)
     bottom = jnp.concatenate([w_0 @ (a @ free) - w_0, w_0 @ (a @ held)], axis=-1)
-    return jnp.concatenate([top, bottom], axis=-2)
+    return scale[:, None] * jnp.concatenate([top, bottom], axis=-2) * scale
 
 
 def _diagonal_blocks(whole, nodes: int):

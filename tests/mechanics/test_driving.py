@@ -1,0 +1,102 @@
+"""Which terms of a system depend explicitly on time, and what happens in them."""
+
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import vmri_jax as vm
+from vmri_jax.mechanics.driving import driven, events
+from vmri_jax.mechanics.state import State
+
+
+def spring(q_s, q_f, params):
+    return jnp.sum(q_s**2) / 2
+
+
+def damped(t, q_s, q_f, v_s, v_f, params):
+    return -v_s, -v_f
+
+
+def kicked(t, q_s, q_f, v_s, v_f, params):
+    return jnp.where(t > 1e9, 1.0, 0.0) - v_s, -v_f
+
+
+def frozen(t, q_s, q_f, v_s, v_f, params):
+    return jax.lax.cond(jax.lax.stop_gradient(t) > 3, lambda q: q, lambda q: -q, q_s), q_f
+
+
+def on_a_disc(t, q_s, q_f, params):
+    return q_f[:1] - jnp.cos(t)
+
+
+def at_rest(t, q_s, params):
+    return q_s[:1]
+
+
+@pytest.mark.parametrize(
+    ("terms", "names"),
+    [
+        ({}, ()),
+        ({"force": damped}, ()),
+        ({"force": kicked}, ("force",)),
+        ({"force": frozen}, ("force",)),
+        ({"slow_constraint": vm.Rheonomic(at_rest)}, ()),
+        ({"force": kicked, "constraint": vm.Rheonomic(on_a_disc)}, ("force", "constraint")),
+    ],
+)
+def test_terms_that_depend_on_time(terms, names):
+    system = vm.System(vm.ConstantMass(slow=[1.0, 1.0], fast=[1.0]), spring, **terms)
+    assert driven(system, SimpleNamespace(q_s=jnp.ones(2), q_f=jnp.ones(1))) == names
+
+
+def parametric(t, q_s, q_f, v_s, v_f, params):
+    """A sine wave, a rectangle, a Gauss pulse, and a step, on springs whose positions are zero at the start."""
+    center, width = params
+    s = (t - center) / width
+    drives = jnp.sin(jnp.pi * s), (s > 0) & (s < 1), jnp.exp(-jnp.minimum(s**2, 600.0) / 2), s > 0
+    return q_s * jnp.stack([jnp.asarray(drive, float) for drive in drives]), q_f
+
+
+def state_at(t: float) -> State:
+    return State(np.asarray(t), np.zeros(4), np.zeros(1), np.zeros(4), np.zeros(1))
+
+
+@pytest.mark.parametrize(("center", "width", "t_0", "t_end"), [(3.3, 1e-3, 0.0, 10.0), (1.03, 0.03, 1.0, 6.0)])
+def test_events_of_each_kind(center, width, t_0, t_end):
+    """Lengths: half a period, the rectangle, and the width of the Gauss pulse at half its height."""
+    system = vm.System(vm.ConstantMass(np.ones(4), [1.0]), force=parametric, params=(center, width))
+    drives = events(system, state_at(t_0), t_end)
+    assert drives.names == ("force",)
+    waves = np.sum((drives.times > t_0) & (drives.times < t_end)) - 2
+    assert waves == pytest.approx((t_end - t_0) / width, abs=2)
+    lengths = np.sort(drives.lengths)
+    assert lengths[0] == pytest.approx(width, rel=0.02)
+    assert lengths[-1] == pytest.approx(2 * np.sqrt(2 * np.log(2)) * width, rel=0.02)
+    assert float(drives.times[np.argmax(drives.lengths)]) == pytest.approx(center, abs=0.1 * width)
+    assert drives.shortest == lengths[0]
+
+
+def test_a_jump_is_no_event():
+    system = vm.System(vm.ConstantMass(np.ones(4), [1.0]), force=kicked)
+    assert events(system.replace(force=None), state_at(0.0), 1.0).names == ()
+    drives = events(system, state_at(1e9 - 1.0), 1e9 + 1.0)
+    assert drives.names == ("force",)
+    assert drives.shortest == np.inf
+
+
+def test_a_constraint_that_moves_has_events():
+    """A foot goes up and down within 20 ms: twice as short in its velocity."""
+    system = vm.System(vm.ConstantMass([1.0], [1.0]), constraint=vm.Rheonomic(foot))
+    state = State(np.zeros(()), np.zeros(1), np.zeros(1), np.zeros(1), np.zeros(1))
+    drives = events(system, state, 4.0)
+    assert drives.names == ("constraint",)
+    np.testing.assert_allclose(drives.times, 2.0, atol=0.02)
+    assert 0.006 < drives.shortest < 0.01
+
+
+def foot(t, q_s, q_f, params):
+    s = (t - 2.0) / 0.02
+    return q_f - 0.1 * jnp.where(jnp.abs(s) < 0.5, jnp.cos(jnp.pi * s) ** 2, 0.0)

@@ -1,0 +1,269 @@
+"""Whole turns of the angles of joints: effects that count them, loops, starts, and how they are read from runs."""
+
+from itertools import permutations
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import vmri_jax as vm
+from vmri_jax.scene import (
+    Box,
+    Controlled,
+    Gear,
+    JointCoupling,
+    JointDamper,
+    JointDrive,
+    JointLimit,
+    JointMotion,
+    JointSpring,
+    Revolute,
+    RigidBody,
+    RotorInertia,
+    Scene,
+    trees,
+)
+from vmri_jax.scene.effects.freedoms import REACH
+from vmri_jax.scene.effects.joint_base import OfFreedoms
+from vmri_jax.scene.turns import at_start
+from vmri_jax.steppers.results import Result
+
+Z = np.array([0.0, 0.0, 1.0])
+ONE = vm.fully_implicit(1)
+
+
+def torque(t, params):
+    return 3.0 * jnp.ones_like(t)
+
+
+def path(t, params):
+    return 2.0 * t
+
+
+def same(x, params):
+    return x[0] - x[1]
+
+
+EFFECTS: dict[str, tuple[Any, bool]] = {
+    "spring": (lambda name: JointSpring(name, 2.0, 0.3), True),
+    "limit": (lambda name: JointLimit(name, -0.5, 0.4, stiffness=50.0, smoothing=0.02), True),
+    "gear": (lambda name: Gear([name, "other"], [1.0, -2.0]), True),
+    "coupling": (lambda name: JointCoupling([name, "other"], same), True),
+    "damper": (lambda name: JointDamper(name, 0.7), False),
+    "rotor": (lambda name: RotorInertia(name, 1.5), False),
+    "drive": (lambda name: JointDrive(name, torque), False),
+    "motion": (lambda name: JointMotion(name, path), False),
+    "control": (lambda name: Controlled(name, "torque"), False),
+}
+"""Every effect in a joint, and whether it counts whole turns of the angle."""
+
+
+def test_every_effect_in_a_joint_is_here():
+    classes = {type(make("hinge")) for make, _ in EFFECTS.values()}
+    known = {of for of in all_subclasses(OfFreedoms) if of.__module__.startswith("vmri_jax") and of.default_name}
+    assert known <= classes
+
+
+def all_subclasses(of):
+    return {of, *(each for child in of.__subclasses__() for each in all_subclasses(child))}
+
+
+def wheels(*effects, coordinates: Any = "auto", spin=(0.0, 0.0)):
+    """Two wheels of unit inertia on hinges."""
+    bodies = [
+        RigidBody(name, 1.0, [1.0] * 3, [x, 0, 0], spin=rate * Z)
+        for name, x, rate in zip(("wheel", "second"), (0.0, 3.0), spin, strict=True)
+    ]
+    hinges = [
+        Revolute(("ground", name), [x, 0, 0], Z, name=joint)
+        for name, x, joint in (("wheel", 0.0, "hinge"), ("second", 3.0, "other"))
+    ]
+    return Scene(bodies, [*hinges, *effects], coordinates=coordinates)
+
+
+def turned(scene, angles):
+    """q_s of both wheels at these angles, and dq_s/dangle (n, 2)."""
+    if scene.branches:
+        return np.asarray(angles), np.eye(2)
+
+    def coordinates(angles):
+        c, s = jnp.cos(angles), jnp.sin(angles)
+        wheels = [jnp.stack([x, 0, 0, c[i], s[i], 0, -s[i], c[i], 0, 0, 0, 1]) for i, x in enumerate((0.0, 3.0))]
+        return jnp.concatenate(wheels)
+
+    return coordinates(jnp.asarray(angles)), np.asarray(jax.jacfwd(coordinates)(jnp.asarray(angles)))
+
+
+def seen(scene, angles, rate=0.8):
+    """What the effects of a scene do to the angles: forces of potentials, forces, controls, energy of rotors, rows of couplings."""
+    q, motions = turned(scene, angles)
+    v, none, system = motions @ np.array([rate, 0.0]), jnp.zeros(0), scene.system()
+    numbers = [system.kinetic(q, none, v, none, system.params) if not system.has_constant_mass else v @ v / 4]
+    if system.slow_potential is not None:
+        numbers += [*(jax.grad(system.slow_potential)(q, none, system.params) @ motions)]
+    if system.force is not None:
+        numbers += [*(system.forces(0.3, q, none, v, none)[0] @ motions)]
+    if scene.actuation is not None:
+        numbers += [*(scene.actuation(q, none, jnp.array([2.0]), system.params)[0] @ motions)]
+    rows = system.constraints(0.3, q, none)
+    own = [i for name, rows in scene.names.rows.items() if name in ("gear", "coupling", "joint_motion") for i in rows]
+    return np.array([*numbers, *(rows[i] for i in own)], dtype=float)
+
+
+@pytest.mark.parametrize("name", EFFECTS)
+def test_effects_know_turns_or_need_none(name):
+    """In joint coordinates, and by directors within reach or without turns: the same; beyond reach NaN, which ends a run."""
+    make, counts = EFFECTS[name]
+    joint, directors = (wheels(make("hinge"), coordinates=kind) for kind in ("auto", "directors"))
+    assert (len(joint.branches), len(directors.branches)) == (2, 0)
+    for angle in (0.7, -2.5):
+        here, there = seen(joint, [angle, 0.2]), seen(directors, [angle, 0.2])
+        if name == "motion":  # the row of directors is the sine of the difference
+            here[-1] = np.sin(here[-1])
+        np.testing.assert_allclose(there, here, atol=1e-12)
+    for angle in (0.7 + 2 * np.pi, 2.7, -3.0):
+        here, there = seen(joint, [angle, 0.2]), seen(directors, [angle, 0.2])
+        if counts:
+            assert np.isfinite(here).all()
+            assert np.isnan(there).any() == (abs(angle) < np.pi)  # an angle past the gap is an end of its run already
+        else:
+            here[-1] = np.sin(here[-1]) if name == "motion" else here[-1]
+            np.testing.assert_allclose(there, here, atol=1e-12)
+
+
+CRANK, COUPLER, ROCKER = 0.5, 2.0, 1.5
+HINGES = ("hA", "hB", "hC", "hD")
+
+
+def rod(name, start, end):
+    way = end - start
+    shape = Box((float(np.linalg.norm(way)), 0.05, 0.05))
+    return RigidBody(name, 1.0, shape, (start + end) / 2, [0.0, 0.0, np.arctan2(way[1], way[0])])
+
+
+def crank_rocker(*effects, order=range(4), names=HINGES):
+    """A four-bar linkage whose crank turns all the way round."""
+    a, b, d = np.zeros(3), np.array([0.0, CRANK, 0.0]), np.array([2.0, 0.0, 0.0])
+    way = d - b
+    length = np.linalg.norm(way)
+    along = (COUPLER**2 - ROCKER**2 + length**2) / 2 / length
+    c = b + along * way / length + np.sqrt(COUPLER**2 - along**2) * np.array([-way[1], way[0], 0.0]) / length
+    pairs = ("ground", "crank"), ("crank", "coupler"), ("coupler", "rocker"), ("ground", "rocker")
+    joints = [Revolute(pair, p, Z, name=name) for pair, p, name in zip(pairs, (a, b, c, d), names, strict=True)]
+    bodies = [rod("crank", a, b), rod("coupler", b, c), rod("rocker", c, d)]
+    listed = [joints[i] for i in order]
+    return Scene(bodies, [*listed, *effects], redundant="drop")
+
+
+def cut(scene):
+    """Names of the joints that close loops."""
+    return set(HINGES) - {branch.joint.name for branch in scene.branches}
+
+
+@pytest.mark.parametrize("name", [name for name in EFFECTS if name not in ("gear", "coupling")])
+def test_a_joint_with_an_effect_is_not_cut_in_any_order(name):
+    scene, make = crank_rocker(), EFFECTS[name][0]
+    cuts = set()
+    for hinge in HINGES:
+        bound = make(hinge).bound(scene.effects)
+        for order in permutations(scene.effects):
+            branches = trees.grow(scene.by_name, [*order, bound])
+            cuts.add((hinge, *(h for h in HINGES if h not in {branch.joint.name for branch in branches})))
+    assert len(cuts) == 4  # one for each hinge, whatever the order
+    assert all(hinge != closed for hinge, closed in cuts)
+
+
+def test_turns_go_before_other_effects():
+    """Where every joint has an effect, the joint with the drive alone is cut."""
+    springs = [JointSpring(h, 0.2, name=f"spring {h}") for h in ("hA", "hB", "hD")]
+    assert cut(crank_rocker(*springs, JointDrive("hC", torque))) == {"hC"}
+    assert cut(crank_rocker(JointSpring("hC", 0.2), order=(3, 1, 0, 2))) != {"hC"}
+
+
+def test_a_spring_in_a_loop_counts_its_turns():
+    """The angle of the crank at the end is that of DOP853 with one angle."""
+    scene = crank_rocker(JointSpring("hB", 0.2), order=(1, 2, 3, 0)).with_rates({"hA": 12.0})
+    run = vm.simulate(scene, ONE, macro_dt=0.002, t_end=3.0)
+    assert scene.joint_motion(run, "hA")[-1] == pytest.approx(12.186, abs=1e-3)  # measured 12.18589
+    angles = {hinge: scene.joint_motion(run, hinge) for hinge in HINGES}  # one of them without a coordinate
+    np.testing.assert_allclose(angles["hA"] + angles["hB"] + angles["hC"], angles["hD"], atol=1e-9)
+
+
+def test_starts_of_loops_count_the_turns_of_all_joints():
+    scene = crank_rocker().with_joints({"hA": 7.0})
+    (closed,) = cut(scene)
+    x = dict(zip(scene.names.slow, np.asarray(scene.start[0]), strict=True))
+    x[closed] = at_start(scene.sorting, next(e for e in scene.effects if e.name == closed), 0, "turn")
+    assert x["hA"] == 7.0
+    assert x["hA"] + x["hB"] + x["hC"] == pytest.approx(x["hD"], abs=1e-9)
+    assert max(abs(x["hB"]), abs(x["hC"])) > 5.0
+    names = ("hA", "pin", "hC", "hD")  # equal joints are cut by name: here the one that turns with the crank
+    sprung = crank_rocker(*(JointSpring(hinge, 0.2, name=f"spring {hinge}") for hinge in names), names=names)
+    with pytest.raises(
+        ValueError, match=r"spring pin: the start is -[67].*angle of pin comes .*leave one of these out"
+    ):
+        sprung.with_joints({"hA": 7.0})
+
+
+def test_gears_start_with_their_turns():
+    geared = wheels(Gear(["hinge", "other"], [1.0, -4.0])).with_joints({"hinge": 7.0})
+    np.testing.assert_allclose(geared.start[0], [7.0, 1.75], atol=1e-12)
+
+
+def sprung(stiffness):
+    return JointSpring("hinge", stiffness), JointLimit("other", -4.15, 4.15, stiffness=500.0, smoothing=0.02)
+
+
+def test_springs_and_limits_beyond_half_a_turn():
+    """A spring of 2 N m/rad at 8 rad/s turns by 8 / sqrt(2) = 5.657 rad, a limit at 4.15 rad turns back at about 4.2 rad."""
+    effects = sprung(2.0)
+    scene = wheels(*effects, spin=(8.0, 2.0))
+    run = vm.simulate(scene, ONE, macro_dt=0.01, num_steps=500, save_every=5)
+    largest = [np.abs(scene.joint_motion(run, name)).max() for name in ("hinge", "other")]
+    assert largest == pytest.approx([5.657, 4.2], abs=0.04)
+    with pytest.raises(ValueError, match=r"joint_springs: the largest angle of the run is 5\.6.*directors"):
+        scene.without("joint_limits").by_directors(run)
+    with pytest.raises(ValueError, match=r'joint_limits: lower is -4.15; the angle of other.*coordinates="joint"'):
+        wheels(*effects, coordinates="directors")
+    with pytest.raises(ValueError, match=r"joint_springs: neutral is 7.0; the angle of hinge comes from directors"):
+        wheels(JointSpring("hinge", 2.0, 7.0), coordinates="directors")
+
+
+def test_a_run_by_directors_ends_before_half_a_turn():
+    scene = wheels(JointSpring("hinge", 2.0), coordinates="directors", spin=(8.0, 0.0))
+    run = vm.simulate(scene, ONE, macro_dt=0.01, num_steps=100, throw=False)
+    assert Result(int(run.result)) == Result.NON_FINITE
+    assert 'coordinates="joint"' in str(run.result)
+    reached = run.position("wheel")[int(run.failed_at), 3:5]
+    assert np.arctan2(*reached[::-1]) == pytest.approx(REACH, abs=0.1)
+
+
+SPINNING = {"macro_dt": 0.001, "num_steps": 1000, "save_every": 10}
+"""A second, in nodes 0.01 s apart."""
+
+
+def test_turns_are_coordinates():
+    """100 rad/s for a second; a spring as soft as none makes the program that of the springs above."""
+    scene = wheels(*sprung(1e-12), spin=(100.0, 0.0))
+    for start in (0.0, 7.0):
+        turned = scene.with_joints({"hinge": (start, 100.0)})
+        run = vm.simulate(turned, ONE, **SPINNING)
+        angle = turned.joint_motion(run[::50], "hinge")
+        np.testing.assert_allclose(angle, start + np.array([0.0, 50.0, 100.0]), atol=1e-8)
+
+
+def test_turns_of_directors_are_counted_from_node_to_node():
+    scene = wheels(coordinates="directors", spin=(100.0, 0.0))
+    run = vm.simulate(scene, ONE, **SPINNING)
+    # the scheme is ahead by 0.17 rad, as it turns by 0.1 rad in a step
+    assert scene.joint_motion(run, "hinge")[-1] == pytest.approx(100.0, abs=0.2)
+    with pytest.raises(ValueError, match=r"hinge may turn by half a turn or more .* nodes 0 and 1.*save_every"):
+        scene.joint_motion(run[::5], "hinge")
+
+
+def test_long_and_dense_scenes_keep_the_angles_that_effects_need(monkeypatch):
+    monkeypatch.setattr(trees, "MOST_LOOPS", 0)
+    assert [branch.joint.name for branch in crank_rocker(JointSpring("hB", 0.2)).branches] == ["hB"]
+    assert crank_rocker(JointDrive("hB", torque)).branches == ()

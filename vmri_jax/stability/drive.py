@@ -1,0 +1,166 @@
+"""Systems that are driven in time: the period T of the drive, and the growth of disturbances over a period.
+
+Disturbances of a motion under a periodic drive are multiplied by the monodromy matrix M in every period (Floquet): they stay bounded if all
+multipliers of M lie on the unit circle or inside. A run with macro steps H has a matrix of its own, the product of N steps with ``N H = m T``.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vmri_jax.diagnostics.linear import phase_splits
+from vmri_jax.mechanics.arrays import quickly_compiled
+from vmri_jax.mechanics.driving import driven
+from vmri_jax.mechanics.invariants import velocity
+from vmri_jax.mechanics.state import State
+from vmri_jax.mechanics.system import System
+from vmri_jax.schemes.composition import Composition, stage_scheme
+from vmri_jax.schemes.scheme import Scheme
+from vmri_jax.stability.monodromy import monodromy
+
+SAMPLES = 1024
+"""Times at which the drive is compared with itself, one period later or earlier; with fewer of them narrow pulses are missed."""
+SPANS = 8.0 ** np.arange(-1, 5)
+"""Lengths of the sampled intervals, in macro steps: periods of 1/500 to 2000 macro steps are seen. Longer ones take longer to measure."""
+CANDIDATES = 8
+"""Lags that are tried as the period in an interval; more of them find drives with many harmonics."""
+SAME = 1e-7
+"""Difference of the drive from itself a period later, as a part of its amplitude. A larger value takes drives for periodic that change slowly."""
+MOST_PERIODS = 16
+"""Most periods m of the drive that a whole number of macro steps is compared with; more of them take longer."""
+LEAST_GROWTH = 1e-4
+"""Growth per period that counts: round-off of the product of thousands of steps is below. A larger value overlooks slow growth."""
+LEAST_STEPS = 4
+"""Micro steps that a period of the drive needs at least; with fewer of them steps pass over it. A larger value warns of steps that are right."""
+CONVERGED_STEPS, MOST_STEPS = 32, 20_000
+"""Micro steps in a period from which halved steps confirm the growth of the motion, and macro steps at which halving ends; more take longer."""
+
+
+@dataclass(frozen=True)
+class DrivenMotion:
+    """The growth of disturbances of a driven motion over a period of the drive.
+
+    period: T.
+    growth: of disturbances per period, 0 if they do not grow; NaN if smaller and smaller steps do not agree about it.
+    repeats: whether the next period has the same multipliers.
+    steps: steps T/n that were tried and are stable as far as the motion is, the largest first.
+    """
+
+    period: float
+    growth: float
+    repeats: bool
+    steps: tuple[float, ...]
+
+    def agrees(self, growth: float) -> bool:
+        """Whether disturbances of a run with this growth per period grow if those of the motion do, and about as fast."""
+        return self.growth / 3 <= growth <= 3 * self.growth
+
+    def __str__(self) -> str:
+        grows = in_words(self.growth) if np.isfinite(self.growth) else "are not resolved by any step that was tried"
+        once = "" if self.repeats else " The motion does not repeat itself after it; a run over many periods decides."
+        return f"Over a period of the drive, {self.period:.4g}, disturbances of the motion {grows}.{once}"
+
+
+def in_words(growth: float) -> str:
+    """The growth of disturbances per period as the end of a sentence."""
+    return f"grow {1 + growth:.4g}-fold" if growth > 0 else "do not grow"
+
+
+def drive_period(system: System, state: State, scale: float) -> float | None:
+    """The smallest period of all terms that depend on time and of their derivatives, with positions and velocities of the state.
+
+    Args:
+        system, state: as of the run.
+        scale: a time, such as the macro step; periods of 1/500 to 2000 times this are seen.
+
+    Returns:
+        The period; None if nothing depends on time, or no period is seen, as for pulses, chirps, and drives with jumps.
+    """
+    if not driven(system, state) or not 0 < scale < np.inf:
+        return None
+    start, random = float(state.t), np.random.default_rng(0)
+    for span in scale * SPANS:
+        step, times = span / SAMPLES, start + np.arange(SAMPLES) * span / SAMPLES
+        signal = _signal(system, state, times)
+        before, anywhere = signal(times)[0], start + 16 * span * random.random(SAMPLES)
+        windows = np.lib.stride_tricks.sliding_window_view(before, SAMPLES // 2)
+        apart = np.square(windows - windows[0]).mean(axis=1)
+        lowest = (apart[1:-1] <= apart[:-2]) & (apart[1:-1] < apart[2:]) & (apart[1:-1] < 0.1 * apart.max())
+        for lag in step * (1 + np.flatnonzero(lowest)[:CANDIDATES]):
+            for _ in range(6):  # Gauss and Newton: the lag with the least sum of squares
+                after, rate = signal(times + lag)
+                lag -= (after - before) @ rate / max(rate @ rate, 1e-300)
+            later = anywhere + lag * random.integers(1, 1000, (5, SAMPLES)) / np.array([[6], [4], [3], [2], [1]])
+            apart = [np.abs(signal(t)[0] - signal(anywhere)[0]).max() for t in later]
+            if lag > step and apart[-1] < SAME:
+                return float(next(lag / n for n, most in zip((6, 4, 3, 2, 1), apart, strict=True) if most < SAME))
+    return None
+
+
+def _signal(system: System, state: State, times: np.ndarray) -> Callable[[np.ndarray], tuple]:
+    """One function of times (k,) for all terms, each in units of its amplitude at the given times, and its rate of change, (k,) both."""
+    values = np.nan_to_num(_drive(system, state, times)[0], posinf=0.0, neginf=0.0)
+    amplitude = np.ptp(values, axis=0)
+    moves = amplitude > 1e-9 * np.abs(values).max(axis=0)
+    # weights by which no two terms cancel
+    weights = np.where(moves, np.cos(1.0 + np.arange(moves.size)), 0.0) / np.where(moves, amplitude, 1.0)
+    return lambda times: tuple(np.nan_to_num(part) @ weights for part in _drive(system, state, times))
+
+
+@quickly_compiled
+def _drive(system: System, state: State, times):
+    """Forces and constraints at k times with their derivative along one direction of (q, v), and the rates of change of both, (k, m) each."""
+    z = jnp.concatenate([state.q_s, state.q_f, *velocity(system, state.q_s, state.q_f, state.p_s, state.p_f)])
+    direction = jnp.cos(2.0 + jnp.arange(z.size))
+
+    def terms(t, z):
+        q_s, q_f, v_s, v_f = jnp.split(z, phase_splits(state))
+        return jnp.concatenate([*system.forces(t, q_s, q_f, v_s, v_f), system.constraints(t, q_s, q_f)])
+
+    def terms_and_derivatives(t):
+        return jnp.concatenate(jax.jvp(partial(terms, t), (z,), (direction,)))
+
+    return jax.vmap(lambda t: jax.jvp(terms_and_derivatives, (t,), (jnp.ones(()),)))(times)
+
+
+def growth_of_run(system: System, scheme: Scheme | Composition, state: State, macro_dt: float, period: float) -> float:
+    """Growth of disturbances of a run per period of the drive, 0 if they do not grow; infinite if a step fails.
+
+    Macro steps that are no part of the period are followed over up to `MOST_PERIODS` periods.
+    """
+    steps = max(1, Fraction(period / macro_dt).limit_denominator(MOST_PERIODS).numerator)
+    try:
+        product = monodromy(system, scheme, state, macro_dt=macro_dt, num_steps=steps)
+    except RuntimeError:
+        return np.inf
+    if not np.isfinite(product.matrix).all():
+        return np.inf
+    growth = float(np.abs(product.multipliers).max(initial=0.0) ** (period / (steps * macro_dt)) - 1)
+    return growth if growth > LEAST_GROWTH else 0.0
+
+
+def driven_motion(
+    system: System, scheme: Scheme | Composition, state: State, macro_dt: float, period: float
+) -> DrivenMotion:
+    """The growth over a period of the drive, from steps of T/n, which are halved until two of them agree."""
+    n, micro, tried = max(1, int(np.ceil(period / macro_dt - 1e-6))), stage_scheme(scheme).num_micro, {}
+    while True:
+        dt = period / n
+        growth = tried[dt] = growth_of_run(system, scheme, state, dt, period)
+        if n * micro >= CONVERGED_STEPS and abs(growth - tried.get(2 * dt, np.inf)) <= 0.1 * growth < np.inf:
+            break
+        n *= 2
+        if n > MOST_STEPS:
+            return DrivenMotion(period, np.nan, True, ())
+    once = monodromy(system, scheme, state, macro_dt=dt, num_steps=n)
+    again = monodromy(system, scheme, once.end, macro_dt=dt, num_steps=n)
+    first, second = (np.sum(product.multipliers) for product in (once, again))
+    repeats = bool(abs(second - first) < 1e-6 * max(abs(first), len(once.matrix)))
+    motion = DrivenMotion(period, growth, repeats, ())
+    steps = [dt for dt, growth in tried.items() if motion.agrees(growth) and period / dt * micro >= LEAST_STEPS]
+    return replace(motion, steps=tuple(steps))
