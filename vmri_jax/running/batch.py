@@ -30,7 +30,6 @@ from vmri_jax.running.trajectory import Trajectory, from_arrays, with_origin
 from vmri_jax.schemes.composition import Composition, stage_scheme
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.results import Result
-from vmri_jax.steppers.solvers import Newton
 
 NUMBERS_PER_CHUNK = 4096
 """Positions at all nodes of a macro step, summed over the lanes of a chunk: 32 kB of float64, the first-level cache of a core. Chunks with
@@ -47,23 +46,19 @@ class Batch:
 
     Attributes:
         run: the run of the first lane.
-        params: (lanes, ...) leaves of the parameters of all lanes.
-        state: (lanes, ...) arrays of the starts.
-        macro_dt: (lanes,) macro steps.
+        arrays: (lanes, ...) the numbers of all lanes.
         width: lanes that are computed side by side.
         devices: CPU devices that share the lanes.
     """
 
     run: Simulation
-    params: list[Any]
-    state: tuple[Any, ...]
-    macro_dt: Any
+    arrays: Arrays
     width: int
     devices: int
 
     def __call__(self) -> Trajectory:
         """The runs; lanes that the first solver of the plan does not solve are computed again by its fallback."""
-        run, lanes = self.run, len(self.macro_dt)
+        run, lanes = self.run, len(self.arrays.macro_dt)
         with Working(f"simulate_batch, {lanes} lanes", running=STEPPING):
             trajectory = self._in_chunks(run.engine)
         unsolved = (np.asarray(trajectory.failed_at) >= 0) & (np.asarray(trajectory.result) != Result.NOT_IMPLIED)
@@ -73,53 +68,36 @@ class Batch:
             padded_size = 2 ** int(failed.size - 1).bit_length()
             padded = failed[np.minimum(np.arange(padded_size), failed.size - 1)]
             with Working(f"simulate_batch, {failed.size} of {lanes} lanes: {FALLING_BACK}"):
-                again = self._taken(padded)._in_chunks(run.exact_engine)
+                again = replace(self, arrays=_taken(self.arrays, padded))._in_chunks(run.exact_engine)
             trajectory = jax.tree.map(lambda a, b: a.at[failed].set(b[: failed.size]), trajectory, again)
-        params = jax.tree.unflatten(jax.tree.structure(run.system.params), self.params)
-        return with_origin(trajectory, run.origin.repeated((lanes,), params))
+        structure = jax.tree.structure(run.system.params)
+        params = self.arrays.model[len(self.arrays.model) - structure.num_leaves :]
+        return with_origin(trajectory, run.origin.repeated((lanes,), jax.tree.unflatten(structure, params)))
 
     def lane(self, i: int) -> Simulation:
         """The run of a lane."""
-        params = jax.tree.unflatten(jax.tree.structure(self.run.system.params), [a[i] for a in self.params])
-        state = State(*(a[i] for a in self.state))
-        return replace(self.run, system=self.run.system.with_params(params), state=state, macro_dt=self.macro_dt[i])
+        model, state, macro_dt = jax.tree.map(lambda a: a[i], self.arrays)
+        system = self.run.engine.model(model).system
+        return replace(self.run, system=system, state=State(*state), macro_dt=macro_dt)
 
     def with_steps(self, run: Simulation) -> "Batch":
         """The batch with the steps of another run of its first lane, in the same ratio for all lanes."""
-        same = is_repeated(self.macro_dt)
-        macro_dt = (
-            shared(run.macro_dt, len(self.macro_dt)) if same else self.macro_dt * (run.macro_dt / self.macro_dt[0])
-        )
-        return replace(self, run=run, macro_dt=macro_dt)
-
-    def _taken(self, index: np.ndarray) -> "Batch":
-        """The lanes with these numbers."""
-
-        def taken(a):
-            return shared(a[0], len(index)) if is_repeated(a) else a[index]
-
-        return replace(
-            self,
-            params=[taken(a) for a in self.params],
-            state=tuple(map(taken, self.state)),
-            macro_dt=taken(self.macro_dt),
-        )
+        macro_dt = self.arrays.macro_dt
+        all_alike = shared(run.macro_dt, len(macro_dt))
+        macro_dt = all_alike if is_repeated(macro_dt) else macro_dt * (run.macro_dt / macro_dt[0])
+        return replace(self, run=run, arrays=self.arrays._replace(macro_dt=macro_dt))
 
     def _in_chunks(self, engine: Engine) -> Trajectory:
         """All lanes, `width` at a time; the last chunk is padded with copies of its last lane, so that one program computes all chunks."""
-        lanes = len(self.macro_dt)
+        lanes = len(self.arrays.macro_dt)
         width = min(self.width, -(-lanes // self.devices) * self.devices)
-        of_params, of_steps = tuple(not is_repeated(a) for a in self.params), not is_repeated(self.macro_dt)
-        of_state = not all(map(is_repeated, self.state)) or not (any(of_params) or of_steps)
-        program = _side_by_side(engine, of_params, of_state, of_steps, self.devices)
-        leaves = self.run.arrays.model  # the parameters come last, see `Arrays`
-        leaves, pieces = leaves[: len(leaves) - len(self.params)], []
+        differs = tuple(not is_repeated(a) for a in jax.tree.leaves(self.arrays))
+        program = _side_by_side(engine, jax.tree.structure(self.arrays), differs, self.devices)
+        pieces = []
         for start in range(0, lanes, width):
-            part = self._taken(np.minimum(np.arange(start, start + width), lanes - 1))
-            params = [a if has_lanes else a[0] for a, has_lanes in zip(part.params, of_params, strict=True)]
-            state = tuple(a if of_state else a[0] for a in part.state)
-            macro_dt = part.macro_dt if of_steps else part.macro_dt[0]
-            pieces.append(program(leaves, params, state, macro_dt, self.run.save_every))
+            part = _taken(self.arrays, np.minimum(np.arange(start, start + width), lanes - 1))
+            part = jax.tree.map(lambda a: a[0] if is_repeated(a) else a, part)
+            pieces.append(program(part, self.run.save_every))
         return from_arrays([jnp.asarray(np.concatenate(parts)[:lanes]) for parts in zip(*pieces, strict=True)])
 
 
@@ -129,8 +107,8 @@ def batch(
     states: State | None,
     steps: Steps,
     params,
-    solver: Newton | None,
-    chunk: int | None,
+    solver,
+    chunk,
     devices: int,
 ) -> Batch:
     """The `Batch` with these arguments of `simulate_batch`; bad arguments raise."""
@@ -138,47 +116,42 @@ def batch(
         raise ValueError(
             "simulate_batch: arguments are tracers; call it outside of jax.jit, vmap and grad, or take jax.vmap of simulate."
         )
+    _check_devices(devices, chunk)
     problem = opened(moving)
     system, start = start_of("simulate_batch", problem, states)
-    known = dict(zip(_names(system.params), map(np.shape, jax.tree.leaves(system.params)), strict=True))
-    new = {} if params is None else dict(_named(params, known))
-    check_params(new)
-    sizes = {name: getattr(steps, name) for name in ("macro_dt", "micro_dt") if getattr(steps, name) is not None}
-    arrays = {f"params[{name!r}]": (value, known[name]) for name, value in new.items()}
-    arrays |= {
-        f"states.{name}": (value, np.shape(value)[-1:] if name != "t" else ()) for name, value in vars(start).items()
-    }
-    arrays |= {name: (real_array(f"simulate_batch: {name}", size), ()) for name, size in sizes.items()}
-    arrays = _with_lanes(arrays)
-    t, *_ = state = tuple(arrays[f"states.{name}"] for name in vars(start))
-    lanes = len(t)
-    if steps.t_end is not None and not all(
-        is_repeated(arrays[name]) or np.ptp(arrays[name]) == 0 for name in (*sizes, "states.t")
-    ):
+    dt = {name: getattr(steps, name) for name in ("macro_dt", "micro_dt") if getattr(steps, name) is not None}
+    params, start, dt = _with_lanes(system.params, params, start, dt)
+    for name, sizes in dt.items():
+        if not (np.all(np.isfinite(sizes)) and np.all(sizes > 0)):
+            raise ValueError(f"simulate_batch: every {name} must be a positive number, got {sizes}.")
+    if steps.t_end is not None and any(np.ptp(array) > 0 for array in (start.t, *dt.values())):
         raise ValueError(
             "simulate_batch: t_end with steps or start times that differ; give num_steps, the same for all lanes."
         )
-    for name in sizes:
-        if not (np.all(np.isfinite(arrays[name])) and np.all(arrays[name] > 0)):
-            raise ValueError(f"simulate_batch: every {name} must be a positive number, got {sizes[name]}.")
-    _check_devices(devices, chunk)
-    leaves = [
-        arrays[f"params[{name!r}]"] if name in new else shared(leaf, lanes)
-        for name, leaf in zip(known, jax.tree.leaves(system.params), strict=True)
-    ]
-    if states is None and new and not (system.has_constant_mass and not system.is_constrained):
+    differs = not all(map(is_repeated, params))
+    if states is None and differs and not (system.has_constant_mass and not system.is_constrained):
         # momenta M v, and their projection onto constraints, depend on parameters
-        all_params = jax.tree.unflatten(jax.tree.structure(system.params), leaves)
+        of_lanes = jax.tree.unflatten(jax.tree.structure(system.params), params)
         fixed = tuple(getattr(problem, name) for name in ("t", "q_s", "q_f", "v_s", "v_f"))
-        states = consistent_states(system, all_params, fixed, problem.project, starts_differ=False)
-        state = tuple(map(np.asarray, vars(states).values()))
-    first = State(*(a[0] for a in state))
-    run = simulation(problem, scheme, first, solver, replace(steps, **{name: arrays[name][0] for name in sizes}))
-    run.check("simulate_batch: the positions of the first state", constraints=not new)
+        start = consistent_states(system, of_lanes, fixed, problem.project, starts_differ=False)
+    state = tuple(map(np.asarray, vars(start).values()))
+    first, steps = State(*(a[0] for a in state)), replace(steps, **{name: sizes[0] for name, sizes in dt.items()})
+    run, lanes = simulation(problem, scheme, first, solver, steps), len(state[0])
+    run.check("simulate_batch: the positions of the first state", constraints=not differs)
     check_memory("simulate_batch", run.state, scheme.num_micro, run.num_saves, steps.save_micro, lanes)
-    (dt,) = (arrays[name] for name in sizes)
-    macro_dt = shared(run.macro_dt, lanes) if is_repeated(dt) else dt * (1 if "macro_dt" in sizes else scheme.num_micro)
-    return Batch(run, leaves, state, macro_dt, (lanes_at_once(run) if chunk is None else chunk) * devices, devices)
+    ((name, sizes),) = dt.items()
+    factor = scheme.num_micro if name == "micro_dt" else 1
+    macro_dt = shared(run.macro_dt, lanes) if is_repeated(sizes) else factor * sizes
+    model = run.arrays.model  # the parameters come last, see `Arrays`
+    model = [shared(leaf, lanes) for leaf in model[: len(model) - len(params)]] + params
+    return Batch(
+        run, Arrays(model, state, macro_dt), (lanes_at_once(run) if chunk is None else chunk) * devices, devices
+    )
+
+
+def _taken(arrays: Arrays, index: np.ndarray) -> Arrays:
+    """The lanes with these numbers."""
+    return jax.tree.map(lambda a: shared(a[0], len(index)) if is_repeated(a) else a[index], arrays)
 
 
 def shared(value, lanes: int) -> np.ndarray:
@@ -228,19 +201,32 @@ def _named(values, known: Collection[str], path: tuple[str, ...] = ()) -> Iterat
         yield from _named(entry, known, (*path, jax.tree_util.keystr((key,), simple=True)))
 
 
-def _with_lanes(arrays: dict[str, tuple[Any, tuple[int, ...]]]) -> dict[str, np.ndarray]:
-    """Arrays (lanes, *shape), of arrays with or without an axis of lanes and the shape without it, by name.
+def _with_lanes(all_params, params, start: State, dt: dict[str, Any]) -> tuple[list, State, dict[str, Any]]:
+    """Parameters, starts and step sizes of all lanes, with the lanes as their first axis.
+
+    Args:
+        all_params: of the system.
+        params: of the user, some of them with an axis of lanes.
 
     Raises:
         ValueError: arrays of other shapes, axes of different lengths, or no axis of lanes at all.
     """
-    values = {name: np.asarray(value) for name, (value, _) in arrays.items()}
-    for name, (_, shape) in arrays.items():
-        if values[name].shape != shape and values[name].shape[1:] != shape:
+    values = dict(zip(_names(all_params), jax.tree.leaves(all_params), strict=True))
+    new = {} if params is None else dict(_named(params, values))
+    check_params(new)
+    arrays = {f"params[{name!r}]": (new.get(name, value), np.shape(value)) for name, value in values.items()}
+    arrays |= {
+        f"states.{name}": (value, np.shape(value)[-1:] if name != "t" else ()) for name, value in vars(start).items()
+    }
+    arrays |= {name: (real_array(f"simulate_batch: {name}", sizes), ()) for name, sizes in dt.items()}
+    lengths = {}
+    for name, (value, shape) in arrays.items():
+        if np.ndim(value) > len(shape) and np.shape(value)[1:] == shape:
+            lengths[name] = len(value)
+        elif np.shape(value) != shape:
             raise ValueError(
-                f"simulate_batch: {name} has shape {values[name].shape}; give {shape} for all lanes, or an axis of lanes in front of it."
+                f"simulate_batch: {name} has shape {np.shape(value)}; give {shape} for all lanes, or an axis of lanes in front of it."
             )
-    lengths = {name: len(value) for name, value in values.items() if value.ndim > len(arrays[name][1])}
     if len(set(lengths.values())) != 1 or 0 in lengths.values():
         listed = (
             ", ".join(f"{name} has {length}" for name, length in lengths.items()) or "no argument has an axis of lanes"
@@ -249,7 +235,13 @@ def _with_lanes(arrays: dict[str, tuple[Any, tuple[int, ...]]]) -> dict[str, np.
             f"simulate_batch: {listed}; give params, states or steps with one value for each lane, all of the same number."
         )
     (lanes,) = set(lengths.values())
-    return {name: value if name in lengths else shared(value, lanes) for name, value in values.items()}
+    whole = {
+        name: np.asarray(value) if name in lengths else shared(value, lanes) for name, (value, _) in arrays.items()
+    }
+    if all(map(is_repeated, whole.values())):  # the user gave such views, and `jax.vmap` wants an axis
+        whole["states.t"] = np.array(whole["states.t"])
+    starts = (whole[f"states.{name}"] for name in vars(start))
+    return [whole[f"params[{name!r}]"] for name in values], State(*starts), {name: whole[name] for name in dt}
 
 
 def _check_devices(devices, chunk) -> None:
@@ -270,21 +262,17 @@ def lanes_at_once(run: Simulation) -> int:
 
 
 @lru_cache(maxsize=32)
-def _side_by_side(engine: Engine, of_params: tuple[bool, ...], of_state: bool, of_steps: bool, devices: int):
-    """``program(leaves, params, state, macro_dt, save_every)``: a run of `engine` for each lane; flags say which arguments have an axis of lanes."""
+def _side_by_side(engine: Engine, structure, differs: tuple[bool, ...], devices: int):
+    """``program(arrays, save_every)``: a run of `engine` for each lane; `differs` says which of the arrays have an axis of lanes."""
 
-    def lane(leaves, params, state, macro_dt, save_every):
-        return jax.tree.leaves(engine.trajectory(Arrays(leaves + params, state, macro_dt), save_every))
+    def lane(arrays: Arrays, save_every):
+        return jax.tree.leaves(engine.trajectory(arrays, save_every))
 
-    def for_each(lanes, whole):
-        """`lanes` for arguments with an axis of lanes, `whole` for all others."""
-        params = [lanes if has_axis else whole for has_axis in of_params]
-        return whole, params, lanes if of_state else whole, lanes if of_steps else whole, whole
-
-    program = jax.vmap(lane, for_each(0, None))
+    program = jax.vmap(lane, (jax.tree.unflatten(structure, [0 if differ else None for differ in differs]), None))
     if devices > 1:
         mesh = jax.sharding.Mesh(np.array(jax.devices()[:devices]), ("lanes",))
         spread = PartitionSpec("lanes")
-        in_specs = for_each(spread, PartitionSpec())
+        specs = jax.tree.unflatten(structure, [spread if differ else PartitionSpec() for differ in differs])
+        in_specs = specs, PartitionSpec()
         program = jax.shard_map(program, mesh=mesh, in_specs=in_specs, out_specs=spread, check_vma=False)
     return jax.jit(program, compiler_options=options_of_runs())
