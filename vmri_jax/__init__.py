@@ -40,7 +40,8 @@ Inside of a step
 Settings, errors and warnings
     configure, __version__
     SimulationError, AccuracyNotReached, Interrupted
-    CompiledAgainWarning, FailedLanesWarning, LostEnergyWarning, NotConfiguredWarning, UncertifiedWarning
+    CompiledAgainWarning, FailedLanesWarning, LostEnergyWarning, NotConfiguredWarning, SingularCoordinatesWarning,
+    UncertifiedWarning
 """
 
 from importlib import import_module
@@ -58,8 +59,8 @@ from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.state import Problem, State, initial_state
 from vmri_jax.mechanics.system import ConstantMass, Rheonomic, System
 from vmri_jax.running.interrupts import Interrupted
-from vmri_jax.running.lost_energy import LostEnergyWarning
 from vmri_jax.running.macro_step import macro_step
+from vmri_jax.running.observables import LostEnergyWarning, SingularCoordinatesWarning
 from vmri_jax.running.run_error import RunError
 from vmri_jax.running.settings import Settings
 from vmri_jax.running.simulation import Simulation, prepare
@@ -147,6 +148,7 @@ __all__ = [
     "Settings",
     "Simulation",
     "SimulationError",
+    "SingularCoordinatesWarning",
     "State",
     "StepInfo",
     "StoredTrajectory",

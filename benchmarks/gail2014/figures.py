@@ -10,9 +10,10 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import vmri_jax as vm
+from benchmarks.gail2014.cost import CostStudy, cost_study, plot_cost
 from vmri_jax import plots
 from vmri_jax.running.progress import Progress, part
-from vmri_jax.study import ConvergenceStudy, CostStudy, convergence_study, cost_study, reference_solution
+from vmri_jax.study import ConvergenceStudy, convergence_study, reference_solution
 
 ORDER_TOLERANCE = 0.2
 UPTURN = 1.5
@@ -170,7 +171,7 @@ class CostFigure:
         return Findings(
             seen="; ".join(_seen_cost(panel, studies[panel.title]) for panel in self.panels) + ".",
             checks=tuple(check for panel in self.panels for check in _cost_checks(panel, studies[panel.title])),
-            draw=lambda title, theme: plots.plot_cost(studies, minima, title, theme),
+            draw=lambda title, theme: plot_cost(studies, minima, title, theme),
             study=reduce(add, studies.values()),
         )
 

@@ -107,7 +107,9 @@ def test_steps_over_a_pulse_are_not_certified():
         match=r"from t = 3\.298 on no error is certified: force of the system.*take macro_dt = 0\.00059",
     ):
         run = vm.simulate(problem, vm.fully_explicit(1), macro_dt=0.1, t_end=LENGTH, error=True)
-    assert float(run.error.certified_until) == pytest.approx(3.2)
+    assert (
+        2.0 <= float(run.error.certified_until) <= 3.2
+    )  # the third companion has a node in common with the run every 2.0
     smaller = vm.simulate(problem, vm.fully_explicit(1), macro_dt=0.0005, t_end=LENGTH, save_every=200, error=True)
     true = np.abs(smaller.q_s[:, 0] - motion(np.asarray(smaller.t), problem.system.params)).max()
     assert smaller.error.largest == pytest.approx(true, rel=0.1)  # 0.2 % measured
@@ -121,27 +123,24 @@ def test_events_demand_many_steps(monkeypatch):
         vm.simulate(oscillator(RECTANGLE, 7.123, 0.03, 20.0), vm.fully_explicit(1), accuracy=1e-1, t_end=LENGTH)
 
 
-def load(q_s, q_f, params):
-    return 9e3 * (q_s["z"] - q_f["u"]) ** 2
-
-
-def tyre(q_f, params):
-    return 1e5 * q_f["u"] ** 2
+def springs(q_s, q_f, params):
+    return 9e3 * (q_f["z"] - q_f["u"]) ** 2 + 1e5 * q_f["u"] ** 2
 
 
 def road(t, q_s, q_f, v_s, v_f, params):
-    damper, s = 40.0 * (v_s["z"] - v_f["u"]), (t - 1.03) / 0.03
-    return {"z": -damper}, {"u": damper + 2e5 * 0.05 * jnp.where((s > 0) & (s < 1), jnp.sin(jnp.pi * s) ** 2, 0.0)}
+    damper, s = 40.0 * (v_f["z"] - v_f["u"]), (t - 1.03) / 0.03
+    bump = 0.05 * jnp.where((s > 0) & (s < 1), jnp.sin(jnp.pi * s) ** 2, 0.0)
+    return {}, {"z": -damper, "u": damper + 2e5 * bump}
 
 
 @pytest.mark.parametrize("num_saves", [None, 20])
 def test_a_car_at_rest_crosses_a_bump(num_saves):
-    """The first steps are at rest, so that long steps have no error; at twenty saved nodes the car has hardly moved."""
-    system = vm.System(vm.ConstantMass(slow={"z": 300.0}, fast={"u": 40.0}), load, tyre, force=road)
-    car = vm.Problem(system, q_s={"z": 0.0}, q_f={"u": 0.0})
-    run = vm.simulate(car, vm.fully_explicit(4), accuracy=1e-4, t_end=5.0, num_saves=num_saves)
+    """The car is at rest at first, so that long steps have no error; at twenty saved nodes it has hardly moved."""
+    system = vm.System(vm.ConstantMass(slow={}, fast={"z": 300.0, "u": 40.0}), springs, force=road)
+    car = vm.Problem(system, q_s={}, q_f={"z": 0.0, "u": 0.0})
+    run = vm.simulate(car, vm.fully_explicit(1), accuracy=1e-4, t_end=5.0, num_saves=num_saves)
     assert 1e-6 < run.error.largest <= 1e-4
-    assert float(run.q_s["z"][-1]) == pytest.approx(-3.9413e-3, abs=2e-5)
+    assert float(run.q_f["z"][-1]) == pytest.approx(-3.9413e-3, abs=2e-5)
 
 
 def test_an_estimate_of_zero_is_doubted():

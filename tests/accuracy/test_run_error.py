@@ -153,7 +153,7 @@ def test_chaotic_motion_is_not_certified():
 
 
 def test_steps_that_do_not_see_the_motion_are_not_certified():
-    with pytest.warns(UncertifiedWarning, match="take smaller steps"):
+    with pytest.warns(UncertifiedWarning, match="Take smaller steps"):
         run = vm.simulate(SYSTEMS["slow_alone"], vm.fully_explicit(1), macro_dt=0.6, num_steps=40, error=True)
     assert not run.error.is_certified
 

@@ -45,3 +45,15 @@ def test_refused_rows_have_the_names_that_the_constraint_gives_them(moves):
     problem = vm.Problem(system, q_s={"a": np.zeros(1), "b": np.zeros(1)}, q_f={"c": np.zeros(1)})
     with pytest.raises(ValueError, match=r"row\(s\) 1 \(rail\) of constraint do not depend on the fast variables"):
         vm.simulate(problem, vm.fully_implicit(2), macro_dt=0.1, num_steps=2)
+
+
+@pytest.mark.parametrize("x", [[0.6, -0.8], [0.6, -0.8 - 1e-9]])
+def test_a_square_has_no_gradient_where_it_is_zero(x):
+    """Also where the start is as exact as its digits."""
+
+    def squared(q_s, q_f, params):
+        return {"rod": (jnp.linalg.norm(q_f["x"]) - 1.0) ** 2}
+
+    system = vm.System(vm.ConstantMass(slow={}, fast={"x": 1.0}), constraint=squared)
+    with pytest.raises(ValueError, match=r"gradient of row\(s\) 0 \(rod\) of constraint vanishes .* take its root"):
+        vm.Problem(system, q_s={}, q_f={"x": x}).state()

@@ -11,7 +11,7 @@ from vmri_jax.mechanics.functions import TracedOnce, traced_once
 
 
 @pytest.mark.parametrize("name", ["fpu", "tsp"])
-def test_the_code_of_a_function_runs_once_in_the_check_and_once_for_all_programs(name, request):
+def test_the_code_of_a_function_runs_three_times_in_the_check_and_once_for_all_programs(name, request):
     problem = request.getfixturevalue(name)
     calls = []
 
@@ -24,7 +24,7 @@ def test_the_code_of_a_function_runs_once_in_the_check_and_once_for_all_programs
     state = type(problem)(system, problem.q_s, problem.q_f, problem.v_s, problem.v_f).state()
     for scheme in (fully_implicit(2), explicit_slow(3)):
         simulate(system, scheme, state, macro_dt=0.01, num_steps=2)
-    assert sorted(calls) == sorted(2 * [name for name in names if getattr(system, name)])
+    assert sorted(calls) == sorted(4 * [name for name in names if getattr(system, name)])
 
 
 def make_many():
@@ -33,7 +33,7 @@ def make_many():
 
 
 def test_functions_made_in_a_loop_are_told_once():
-    message = r"<lambda> \(line \d+ of .*test_functions.py\) has been made 5 times"
+    message = r"<lambda> \(line \d+ of .*test_functions.py\) has been traced 5 times"
     with pytest.warns(CompiledAgainWarning, match=message) as told:
         make_many()
     assert len(told) == 1

@@ -342,20 +342,3 @@ def test_a_failure_says_what_to_ask_next(fpu):
     [note] = caught.value.__notes__
     assert "advise(problem, scheme, macro_dt=1)" in note
     assert "swapped" in note
-
-
-@pytest.mark.parametrize("transformed", [jax.grad, lambda end: lambda k: jax.vmap(end)(jnp.array([k, 2 * k]))])
-def test_traced_numbers_that_are_not_in_params_are_refused(transformed):
-    def end(k):
-        def soft(q_s, q_f, params):
-            return k * q_s[0] ** 2 / 2
-
-        def stiff(q_f, params):
-            return 50.0 * q_f[0] ** 2
-
-        system = vm.System(vm.ConstantMass([1.0], [1.0]), soft, stiff)
-        problem = vm.Problem(system, q_s=[1.0], q_f=[0.1])
-        return vm.simulate(problem, vm.explicit_slow(5), macro_dt=0.01, num_steps=10).q_s[-1, 0]
-
-    with pytest.raises(ValueError, match=r"a function of the system uses a number .* Hand it over in the params"):
-        transformed(end)(2.0)

@@ -149,7 +149,7 @@ def test_frames_that_cannot_move_are_refused():
     frame, pan = Frame("yoke", [0, 0, 0]), Revolute(("ground", "yoke"), [0, 0, 0], name="pan")
     tilt = Revolute(("yoke", "plate"), [0, 0, 0], axis=[1, 0, 0], name="tilt")
     with pytest.raises(ValueError, match=r'yoke is a frame without mass.*coordinates="joint"'):
-        Scene([frame, PLATE], [pan, tilt])
+        Scene([frame, PLATE], [pan, tilt], coordinates="directors")
     with pytest.raises(ValueError, match=r"the frame yoke carries no body"):
         Scene([frame, PLATE], [pan, replace(tilt, between=("ground", "plate"))], coordinates="joint")
     with pytest.raises(ValueError, match=r"no joint carries the frame yoke, and it has no mass"):

@@ -1,5 +1,6 @@
 """Whole turns of the angles of joints: effects that count them, loops, starts, and how they are read from runs."""
 
+from collections.abc import Sequence
 from itertools import permutations
 from typing import Any
 
@@ -143,7 +144,7 @@ def rod(name, start, end):
     return RigidBody(name, 1.0, shape, (start + end) / 2, [0.0, 0.0, np.arctan2(way[1], way[0])])
 
 
-def crank_rocker(*effects, order=range(4), names=HINGES):
+def crank_rocker(*effects, order: Sequence[int] = range(4), names=HINGES):
     """A four-bar linkage whose crank turns all the way round."""
     a, b, d = np.zeros(3), np.array([0.0, CRANK, 0.0]), np.array([2.0, 0.0, 0.0])
     way = d - b

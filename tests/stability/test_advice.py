@@ -62,7 +62,7 @@ def test_stages_of_a_composition(fpu):
     advice = advise(fpu, compose(fully_explicit(1), "yoshida4"), macro_dt=1.6 / 50)
     assert kinds(advice) == ["stability limit"]
     assert "longest stage" in str(advice)
-    assert kinds(advice, "note") == ["stages"]
+    assert kinds(advice, "note") == ["motion", "stages"]  # the chain starts in motion
     [note] = [finding for finding in advice.findings if finding.kind == "stages"]
     assert note.number == pytest.approx(1.7024, abs=1e-4)
     assert 1.3 / 50 < advice.safe_macro_dt < 1.573 / 50
@@ -102,8 +102,12 @@ def test_swapped_labels_are_named_where_a_run_diverges(fpu):
 
 def test_a_state_that_is_unstable_by_itself():
     """Coupling of the wrong sign: the growth is the motion's, not the scheme's."""
-    problem = linear_model(kappa=-25.0)
-    advice = advise(problem, fully_explicit(1), macro_dt=0.01)
+    problem, zero = linear_model(kappa=-25.0), jnp.zeros(1)
+    moving = advise(problem, fully_explicit(1), macro_dt=0.01)
+    assert "no equilibrium" in moving.findings[0].sentence
+    assert "is stable for small motions about this state, held at rest" in moving.verdict
+    advice = advise(problem.system, fully_explicit(1), State(0.0, zero, zero, zero, zero), macro_dt=0.01)
+    assert "as unstable as the motion itself" in advice.verdict
     assert advice.ok
     assert advice.growth == 0
     assert kinds(advice, "note") == ["motion"]

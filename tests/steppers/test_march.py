@@ -152,3 +152,15 @@ def test_equal_masses_converge():
     passes = run.info.iterations
     assert passes.mean() < 13  # measured 11
     assert passes.max() < 25  # measured 22
+
+
+def test_momenta_have_their_full_precision(tsp):
+    """The heavy slow bob turns round-off of positions into impulses on the light ones, unless momenta are sums of impulses. Measured over 300 steps:
+    4e-14; 3e-13 with momenta from the increments of the last correction."""
+
+    def end(solver):
+        return simulate(tsp, fully_explicit(1), macro_dt=0.002, num_steps=300, save_every=100, solver=solver)[-1]
+
+    drift = end(solvers.Auto())
+    for solver in (solvers.Arrowhead(), solvers.Dense()):
+        assert ends_differ(end(solver), drift) < 1e-13

@@ -15,7 +15,6 @@ from vmri_jax.study import (
     ReferenceSolution,
     convergence_study,
     cost_report,
-    cost_study,
     work_precision,
 )
 from vmri_jax.study.program import joined
@@ -65,20 +64,6 @@ def test_work_and_precision_keeps_its_rows(reference, words, rows):
     kept = caught.value.done.rows
     assert [row.num_steps for row in kept] == [2, 4, 8][:rows]
     assert all(row.seconds > 0 and np.isfinite(row.error_q) for row in kept)
-
-
-def test_cost_studies_keep_their_rows():
-    with pytest.raises(vm.Interrupted) as caught:
-        cost_study(
-            *(one_coordinate(), vm.fully_explicit, [1]),
-            micro_dt=0.01,
-            t_end=T_END,
-            methods=("auto",),
-            progress=ctrl_c("measuring times"),
-        )
-    (row,) = caught.value.done.rows
-    assert row.result == "CONVERGED"
-    assert np.isnan(row.us_per_micro_step)
 
 
 def test_cost_reports_keep_their_runs_while_the_page_is_drawn(monkeypatch, tmp_path, reference):

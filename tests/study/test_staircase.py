@@ -11,7 +11,6 @@ from tests.small_systems import no_constraint
 from vmri_jax.accuracy.families import of_order_2
 from vmri_jax.study import reference_solution, work_precision
 from vmri_jax.study.cost_report import bound_of
-from vmri_jax.study.peers import can_run_dopri8, dopri8_stairs
 from vmri_jax.study.prices import FAST, REMAINDER, SLOW, prices, shares
 from vmri_jax.study.reference_solution import ReferenceSolution
 from vmri_jax.study.search import Search
@@ -128,16 +127,3 @@ def test_tables_list_further_potentials(tmp_path):
 def test_tables_without_further_potentials_have_no_column_for_them():
     study = WorkPrecision((ROW,), 1.0, EXACT)
     assert "further gradients" not in study.markdown()
-
-
-# --- another program -------------------------------------------------------------------------------------------------
-def test_diffrax_reaches_smaller_errors_with_more_time():
-    problem = no_constraint()
-    pytest.importorskip("diffrax")
-    assert can_run_dopri8(problem)
-    stairs = dopri8_stairs(problem, 1.0, reference_solution(problem, 1.0, num_saves=1), 1e-6)
-    assert stairs[0].error > 1e-5 > stairs[-1].error
-
-
-def test_diffrax_is_for_potentials_and_constant_masses_alone(tsp):
-    assert not can_run_dopri8(tsp)

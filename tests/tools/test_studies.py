@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-import vmri_jax as vm
 from tests.tools.table import MACRO_DT, SCHEME, T_END, Cell, cells, check
 from vmri_jax import plots, study
 
@@ -34,15 +33,7 @@ def work_precision(cell: Cell) -> None:
         plots.save(rows.plot(work=work), cell.folder / "work.png")
 
 
-def cost_study(cell: Cell) -> None:
-    rows = study.cost_study(
-        cell.moving, vm.fully_explicit, [1], micro_dt=MACRO_DT, t_end=T_END, methods=["auto"], repeats=1, min_seconds=0
-    )
-    assert str(rows)
-    plots.save(rows.plot(), cell.folder / "cost.png")
-
-
-TOOLS = {tool.__name__: tool for tool in (reference_solution, convergence_study, work_precision, cost_study)}
+TOOLS = {tool.__name__: tool for tool in (reference_solution, convergence_study, work_precision)}
 REFUSED = {}
 
 

@@ -15,7 +15,7 @@ from vmri_jax.systems import fermi_pasta_ulam, simple_atomic_model, triple_spher
 
 SCALES = [(60, 0, 0), (-60, 17, 23), (0, -60, 60), (23, 60, -60)]
 """Exponents of 2 of the units of length, time and mass."""
-ROUNDED = {"sam": 1e-12}
+ROUNDED = {"sam": 1e-15}
 """Largest relative differences of runs that are not equal bit for bit."""
 
 

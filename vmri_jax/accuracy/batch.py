@@ -13,10 +13,9 @@ from vmri_jax.mechanics.driving import Events, driven, events
 from vmri_jax.mechanics.state import Movable, State
 from vmri_jax.running.arguments import Steps
 from vmri_jax.running.batch import Batch, batch
-from vmri_jax.running.origin import UNKNOWN
 from vmri_jax.running.progress import Working
 from vmri_jax.running.run_error import RunError
-from vmri_jax.running.trajectory import Trajectory
+from vmri_jax.running.trajectory import Trajectory, trajectory_of, with_origin
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.results import Result
@@ -78,21 +77,27 @@ def simulate_batch(
     steps = Steps(macro_dt, micro_dt, num_steps, t_end, save_every, save_micro)
     with Working("simulate_batch: the starts"):
         lanes = batch(system, scheme, states, steps, params, solver, chunk, devices)
-    trajectory = lanes()
-    if error:
-        trajectory = _with_errors(lanes, trajectory)
+    done, table = lanes()
+    plain = trajectory_of(done, table)
+    errors = _errors(lanes, plain) if error else None
+    trajectory = replace(with_origin(jax.device_put(plain), lanes.origin), error=errors)
+    lanes.run.warn("simulate_batch", table, done.states.t, lanes.arrays.macro_dt)
     for kind, message in ((FailedLanesWarning, _failures(trajectory)), (UncertifiedWarning, _uncertified(trajectory))):
         if warn and message:
             warnings.warn(f"simulate_batch: {message}", kind, stacklevel=2)
     return trajectory
 
 
-def _with_errors(lanes: Batch, trajectory: Trajectory) -> Trajectory:
-    """The trajectory of a batch with the error of each lane, from batches of companions."""
+def _errors(lanes: Batch, plain: Trajectory) -> RunError:
+    """The errors of all lanes, from batches of companions.
+
+    Args:
+        plain: the runs, with arrays of NumPy and without an origin.
+    """
 
     @cache
     def companions(parts: int, whole: int = 1) -> Trajectory:
-        return _plain(lanes.with_steps(finer(lanes.run, lanes.run.scheme, parts, whole))())
+        return trajectory_of(*lanes.with_steps(finer(lanes.run, lanes.run.scheme, parts, whole))())
 
     def error(i: int) -> RunError:
         run, coarse, halved = lanes.lane(i), plain.lane(i), companions(2).lane(i)
@@ -101,18 +106,12 @@ def _with_errors(lanes: Batch, trajectory: Trajectory) -> Trajectory:
             total = extrapolated(run.order, coarse, halved)
         else:
             total = estimated_errors(
-                run, coarse, halved, drives, companion_of=lambda *steps: companions(*steps).lane(i)
+                run, coarse, halved, drives, companion_of=lambda *counts: companions(*counts).lane(i)
             )
         return run_error(run, coarse, halved, total, drives)
 
-    plain, is_driven = _plain(trajectory), driven(lanes.run.system, lanes.run.state)
-    errors = [error(i) for i in range(len(trajectory.t))]
-    return replace(trajectory, error=jax.tree.map(lambda *arrays: np.stack(arrays), *errors))
-
-
-def _plain(trajectory: Trajectory) -> Trajectory:
-    """The trajectory with arrays of NumPy and without its origin, for loops over lanes."""
-    return jax.tree.map(np.asarray, replace(trajectory, origin=UNKNOWN))
+    is_driven = driven(lanes.run.system, lanes.run.state)
+    return jax.tree.map(lambda *arrays: np.stack(arrays), *map(error, range(len(plain.t))))
 
 
 def _failures(trajectory: Trajectory) -> str:

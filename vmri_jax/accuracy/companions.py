@@ -30,6 +30,7 @@ import numpy as np
 
 from vmri_jax.mechanics.arrays import of_one_type
 from vmri_jax.mechanics.driving import Events, events
+from vmri_jax.running.observables import SingularCoordinatesWarning
 from vmri_jax.running.run_error import RunError, largest_of
 from vmri_jax.running.simulation import Simulation
 from vmri_jax.running.trajectory import Trajectory, from_named_arrays
@@ -41,8 +42,9 @@ LARGEST_CERTIFIED = 0.1
 """Largest certified error, as a part of the extent of the motion; from the first node with a larger one, no error is certified. Above it the
 leading term of the error no longer dominates, so that a larger value certifies meaningless numbers."""
 CHAOTIC_GROWTH = 32.0
-"""Growth of the error in the second half of a time, above which the motion is called chaotic. Errors of regular motions grow like t or t^2, by
-2 or 4, errors of chaotic motions like exp(L t). A larger value overlooks chaos that begins late."""
+"""Growth of the error in the second half of a time, above which the motion may be chaotic: it is if the difference of two runs with smaller steps
+grows as much. Errors of regular motions grow like t or t^2, by 2 or 4, errors of chaotic motions like exp(L t). A larger value overlooks chaos that
+begins late."""
 
 DOUBTED = 1e-5
 """Error, as a part of the accuracy that is asked for, below which an estimate is not believed without a third companion: a run at rest has no error
@@ -95,7 +97,11 @@ def with_error(
     error = run_error(run, trajectory, halved, total, drives, refined, of)
     if not error.is_certified:
         unseen = first_unseen(run, drives)
-        reason = _uncertified(error, trajectory) if unseen > trajectory.t[-1] else _stepped_over(run, drives, unseen)
+        reason = (
+            _stepped_over(run, drives, unseen)
+            if unseen <= trajectory.t[-1]
+            else _uncertified(error, trajectory, run, halved)
+        )
         warnings.warn(f"simulate: {reason}", UncertifiedWarning, stacklevel=3)
     return replace(trajectory, error=error)
 
@@ -235,6 +241,10 @@ def check_function_of_run(of: Callable | None, error: bool, run: Simulation) -> 
     value = of(resting(run))
     if np.asarray(value).dtype.kind not in "fiu":
         raise TypeError(f"simulate: of returned {value!r} for a run; it must return a number or an array of numbers.")
+    if not np.array_equal(value, of(resting(run)), equal_nan=True):
+        raise ValueError(
+            "simulate: of returns other numbers for the same run; it must be pure, or differences of runs say nothing."
+        )
 
 
 def resting(run: Simulation) -> Trajectory:
@@ -273,6 +283,21 @@ def _positions(trajectory: Trajectory) -> np.ndarray:
     return np.concatenate([trajectory.states.q_s, trajectory.states.q_f], axis=1)
 
 
+def _is_chaotic(error: RunError, trajectory: Trajectory, run: Simulation, halved: Trajectory) -> bool:
+    """Whether small differences grow like exp(L t) by the motion itself.
+
+    Steps that are too large let errors grow as well, so that two runs with smaller steps are compared: a half and a quarter of the macro step. Forces and
+    moving constraints may pump a regular motion; of such motions nothing is said.
+    """
+    if not (float(error.growth) > CHAOTIC_GROWTH and trajectory.keeps_energy) or trajectory.concerns():
+        return False
+    quartered = companion(run, run.scheme, 4)
+    envelope = np.maximum.accumulate(largest_of(_positions(halved) - _positions(quartered)))
+    t = np.asarray(trajectory.t)
+    half, last = np.searchsorted(t, [(t[0] + error.certified_until) / 2, error.certified_until])
+    return bool(envelope[last] > CHAOTIC_GROWTH * envelope[half])  # False for NaN, where a companion failed
+
+
 def _stepped_over(run: Simulation, drives: Events, unseen: float) -> str:
     """Events that the steps of a run do not see, and advice."""
     step = drives.shortest / (NODES_OF_EVENT * node_distance(run.scheme, drives))
@@ -282,19 +307,19 @@ def _stepped_over(run: Simulation, drives: Events, unseen: float) -> str:
     )
 
 
-def _uncertified(error: RunError, trajectory: Trajectory) -> str:
+def _uncertified(error: RunError, trajectory: Trajectory, run: Simulation, halved: Trajectory) -> str:
     """The reason why an error is not certified, and advice."""
-    t = float(error.certified_until)
-    energy = np.asarray(trajectory.energy)
-    kept = (
-        f" The energy has changed by at most {np.abs(energy - energy[0]).max():.1e}." if trajectory.keeps_energy else ""
-    )
-    if float(error.growth) > CHAOTIC_GROWTH:
+    t, energy = float(error.certified_until), np.asarray(trajectory.energy)
+    change = np.abs(energy - energy[0]).max()
+    kept = f" The energy has changed by at most {change:.1e}." if trajectory.keeps_energy else ""
+    if _is_chaotic(error, trajectory, run, halved):
         return (
             f"the motion is chaotic, small errors have grown {float(error.growth):.0f} times in the second half of the time until t = {t:.4g}: "
             f"from there on an error of positions means nothing.{kept}"
         )
+    reasons = [f" {concern}" for concern in trajectory.concerns() if isinstance(concern, SingularCoordinatesWarning)]
+    advice = "".join(reasons) or " Take smaller steps, or a scheme of higher order."
     return (
         f"from t = {t:.4g} on positions are wrong by more than {LARGEST_CERTIFIED:.0%} of the extent of the motion, and no error is "
-        f"certified; take smaller steps, or a scheme of higher order.{kept}"
+        f"certified.{advice}{kept}"
     )

@@ -13,11 +13,10 @@ from vmri_jax.mechanics.state import Movable, State
 from vmri_jax.running.adjoints import check_adjoint, traced_run
 from vmri_jax.running.arguments import Steps
 from vmri_jax.running.failures import simulation_error
-from vmri_jax.running.lost_energy import LostEnergyWarning, lost_energy
 from vmri_jax.running.memory import check_memory
 from vmri_jax.running.progress import ShowsProgress, progress_to
 from vmri_jax.running.simulation import simulation
-from vmri_jax.running.trajectory import Trajectory, with_origin
+from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.solvers import Newton
@@ -58,8 +57,8 @@ def simulate(
     transformed function: ``run.position("load")``. Under ``jax.vmap`` the solver `solvers.Auto` computes its fallback for every lane: take
     `simulate_batch`, or ``solver=vm.solvers.Nested()``.
 
-    With constant masses and conserved energy, a run with given steps warns with `LostEnergyWarning` if the energy changes by more than half
-    of the largest kinetic energy.
+    A run whose system keeps its energy warns with `LostEnergyWarning` if the energy changes by more than half of the largest kinetic energy, and a run
+    across a pole of its coordinates with `SingularCoordinatesWarning`; ``run.concerns()`` has these sentences, also after a run in a transformation.
 
     Args:
         system: a `Problem` or a scene; or a `System`, with a state.
@@ -102,6 +101,8 @@ def simulate(
             best, settings = with_accuracy(system, scheme, state, solver, accuracy, **length, of=of, progress=tell)
         run, trajectory = best.run, replace(best.trajectory, origin=replace(best.run.origin, settings=settings))
         if int(trajectory.failed_at) < 0:
+            for concern in trajectory.concerns():
+                warnings.warn(type(concern)(f"simulate: {concern}"), stacklevel=2)
             return with_error(run, trajectory, of, shares=error, trial=(best.halved, best.errors))
         if throw:
             raise simulation_error(trajectory, run.macro_dt, run.save_every, run.scheme.num_micro)
@@ -122,16 +123,13 @@ def simulate(
                 "simulate: error=True compares runs with numbers; call simulate outside of jax.jit, vmap and grad."
             )
         check_system(run.system, run.state.q_s, run.state.q_f)
-        return with_origin(traced_run(run, adjoint), run.origin)
+        return traced_run(run, adjoint)
     run.check()
     check_memory("simulate", run.state, scheme.num_micro, run.num_saves, save_micro)
     check_function_of_run(of, error, run)
-    trajectory = run.in_pieces(progress)
+    trajectory = run.in_pieces(progress, "simulate")
     if throw and int(trajectory.failed_at) >= 0:
         raise simulation_error(trajectory, run.macro_dt, save_every, scheme.num_micro)
-    lost = lost_energy(trajectory, run.system, float(run.macro_dt)) if int(trajectory.failed_at) < 0 else ""
-    if lost:
-        warnings.warn(f"simulate: {lost}", LostEnergyWarning, stacklevel=2)
     return with_error(run, trajectory, of) if error and int(trajectory.failed_at) < 0 else trajectory
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any, Literal
 
 import jax
@@ -13,13 +14,13 @@ from vmri_jax.control.asked import actuation_of, started, transcribed
 from vmri_jax.control.optimum import Optimum
 from vmri_jax.control.search import Search
 from vmri_jax.control.transcription import Transcription
-from vmri_jax.mechanics import invariants
 from vmri_jax.mechanics.arrays import whole_number
 from vmri_jax.mechanics.checks import check_number
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
+from vmri_jax.running.observables import observables, with_tolerance
 from vmri_jax.running.origin import Origin, names_of
 from vmri_jax.running.progress import ShowsProgress, progress_to
-from vmri_jax.running.trajectory import RunInfo, Trajectory, with_origin
+from vmri_jax.running.trajectory import Run, RunInfo, Trajectory, trajectory_of, with_origin
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.results import Result
@@ -153,13 +154,12 @@ def _trajectory(setup: Transcription, z, status: StepStatus) -> Trajectory:
     """The run with nodes z (N, n) after the start."""
     count = len(z)
     nodes = jax.vmap(setup.state)(jnp.concatenate([setup.z_start[None], z]), jnp.arange(count + 1))
-    energy, residual = jax.vmap(lambda s: invariants.energy_and_constraint_residual(setup.system, s))(nodes)
+    table = jax.jit(jax.vmap(partial(observables, setup.system)))(with_tolerance(nodes, 0.0))
     failed = np.flatnonzero(np.asarray(status.result) > Result.CONVERGED_AT_ROUNDOFF)
-    return Trajectory(
+    run = Run(
         nodes,
-        energy=energy,
-        constraint_residual=residual,
         info=RunInfo(status.method, status.iterations, status.residual),
         result=status.result[failed[0]] if failed.size else jnp.max(status.result),
         failed_at=np.asarray(failed[0] if failed.size else -1),
     )
+    return trajectory_of(run, table)

@@ -9,7 +9,6 @@ M. Cannon, S. Leyendecker, IFAC-PapersOnLine 53 (2020), on two grids.
 """
 
 from collections.abc import Callable, Mapping
-from functools import lru_cache
 from typing import Any
 
 import equinox as eqx
@@ -22,6 +21,7 @@ from vmri_jax.control.bounded import Limits
 from vmri_jax.control.riccati import Final, Stages
 from vmri_jax.diagnostics.linear import phase_splits, phase_vector
 from vmri_jax.mechanics.arrays import Numbers
+from vmri_jax.mechanics.functions import TracedOnce
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.macro_step import macro_step
@@ -58,11 +58,11 @@ class Transcription(eqx.Module):
     scheme: Scheme | Composition
     solver: Newton
     macro_dt: Float[Numbers, ""]
-    actuate: Callable = eqx.field(static=True)
-    cost: Callable = eqx.field(static=True)
-    final_cost: Callable = eqx.field(static=True)
-    goal: Callable = eqx.field(static=True)
-    limits: Callable | None = eqx.field(static=True)
+    actuate: TracedOnce
+    cost: TracedOnce
+    final_cost: TracedOnce
+    goal: TracedOnce
+    limits: TracedOnce | None
     bounds: tuple[np.ndarray, np.ndarray]
     parts: int = eqx.field(static=True)
 
@@ -182,9 +182,8 @@ class Transcription(eqx.Module):
         return stages, Final(S, s, jax.jacfwd(goal)(z[-1]), goal(z[-1]))
 
 
-@lru_cache(maxsize=32)
 def _forces(system_force: Callable | None, actuate: Callable) -> Callable:
-    """The sum of the forces of a system and of its controls, cached: JAX compiles again for a new function object."""
+    """The sum of the forces of a system and of its controls."""
 
     def force(t, q_s, q_f, v_s, v_f, params: Mapping[str, Any]):
         f_s, f_f = actuate(q_s, q_f, held(t, *params[CONTROL]), params)

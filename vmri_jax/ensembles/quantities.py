@@ -7,11 +7,12 @@ import jax
 import jax.numpy as jnp
 
 from vmri_jax.catalogue import imported
+from vmri_jax.mechanics.functions import TracedOnce
 from vmri_jax.mechanics.names import near
 from vmri_jax.mechanics.state import Problem, State
 from vmri_jax.running.export import DIMENSIONS
 from vmri_jax.running.simulation import Simulation
-from vmri_jax.running.trajectory import RunInfo, Trajectory, with_origin
+from vmri_jax.running.trajectory import RunInfo, Trajectory
 
 LEVELS = (0.05, 0.5, 0.95)
 """Probabilities of the quantiles over the saved nodes: the median, and an interval with 90 % of them."""
@@ -184,7 +185,7 @@ def what_is_kept(quantities: Sequence[Quantity], run: Simulation) -> dict[str, K
     arrays: dict[str, Kept] = {}
 
     def shapes():
-        trajectory = with_origin(run.engine.trajectory(run.arrays, run.save_every), run.origin)
+        trajectory = run.traced(run.engine.run(run.arrays, run.save_every))
         arrays.update(kept(quantities, trajectory))
         return {name: array.value for name, array in arrays.items()}
 
@@ -223,4 +224,6 @@ def of_lanes(quantities: Sequence[Quantity]) -> Callable[[Trajectory], dict[str,
     def of_lane(run: Trajectory):
         return {name: array.value for name, array in kept(quantities, run).items()}
 
-    return jax.jit(jax.vmap(of_lane))
+    program = jax.jit(lambda functions, run: jax.vmap(of_lane)(run))  # the functions tell JAX when to trace anew
+    functions = [TracedOnce(item.function) for item in quantities]
+    return lambda run: program(functions, run)

@@ -250,7 +250,7 @@ def cases_for(problem: Problem | HasProblem) -> tuple[Case, ...]:
         (
             "constraints for long",
             step,
-            "position constraint below 1e-10 of its terms",
+            "position constraint below 1e-10 of its size",
             cases.constraints,
             unconstrained,
         ),

@@ -13,7 +13,7 @@ from vmri_jax.accuracy.simulate import simulate
 from vmri_jax.diagnostics.shadow import ShadowEnergy
 from vmri_jax.mechanics.constraints import rows_at
 from vmri_jax.mechanics.state import Problem, State
-from vmri_jax.running.lost_energy import LostEnergyWarning
+from vmri_jax.running.observables import LostEnergyWarning
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.steppers.results import Result
 from vmri_jax.study.program import joined
@@ -101,10 +101,10 @@ def constraints(trajectory: Trajectory) -> tuple[float, float]:
 
 
 def relative_constraints(problem: Problem, trajectory: Trajectory) -> float:
-    """Largest ``|g|`` at the saved nodes of a run, relative to the terms of its row; NaN if the run failed."""
+    """Largest ``|g|`` at the saved nodes of a run, relative to the size of its row; NaN if the run failed."""
     states = trajectory.states
     rows = jax.jit(jax.vmap(partial(rows_at, problem.system)))(states.t, states.q_s, states.q_f)
-    return float(np.max(np.abs(rows.values) / rows.terms))
+    return float(np.max(np.abs(rows.values) / rows.sizes))
 
 
 def nodes(trajectory: Trajectory) -> np.ndarray:

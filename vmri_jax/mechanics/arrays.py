@@ -9,6 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from vmri_jax.mechanics.functions import TracedOnce
+
 Numbers: TypeAlias = Any
 """Arrays in annotations: ``Float[Numbers, "n_s"]`` is an array of n_s floats, of JAX or of NumPy."""
 Number: TypeAlias = Float[Numbers, ""] | float
@@ -67,8 +69,15 @@ def quickly_compiled(function: Callable, static_argnames: str | Sequence[str] = 
 
 
 def of_one_type(tree):
-    """A pytree with all numbers as NumPy arrays, tracers unchanged: JAX would trace functions anew for each type of number."""
-    return jax.tree.map(lambda leaf: leaf if _is_traced(leaf) else np.asarray(leaf), tree)
+    """A pytree for a run: numbers as NumPy arrays, tracers unchanged, since JAX would trace functions anew for each type of number; and functions
+    with what they read from around them now."""
+
+    def settled(leaf):
+        if isinstance(leaf, TracedOnce):
+            return leaf.now()
+        return leaf if _is_traced(leaf) else np.asarray(leaf)
+
+    return jax.tree.map(settled, tree, is_leaf=lambda leaf: isinstance(leaf, TracedOnce))
 
 
 def require_x64() -> None:

@@ -1,8 +1,11 @@
 """Checks of user input before any computation; messages name the value, the expected value and a remedy."""
 
+import hashlib
 import linecache
+import re
 import traceback
-from functools import lru_cache
+from collections.abc import Callable
+from functools import lru_cache, partial
 from pathlib import Path
 
 import jax
@@ -11,9 +14,10 @@ import numpy as np
 
 from vmri_jax.mechanics.arrays import check_precision, is_concrete, real_array
 from vmri_jax.mechanics.arrays import require_x64 as require_x64
-from vmri_jax.mechanics.functions import TracedOnce, with_time
+from vmri_jax.mechanics.functions import TracedOnce, traced_once, with_time
 from vmri_jax.mechanics.masses import ConstantMass
 from vmri_jax.mechanics.order import order_of, ordered
+from vmri_jax.mechanics.surroundings import name_of
 from vmri_jax.mechanics.system import KineticFunction, System
 
 
@@ -115,22 +119,6 @@ def check_system(system: System, q_s, q_f) -> None:
             _check_float64("force", part)
 
 
-def check_closures(system: System, q_s, q_f) -> None:
-    """Refuse functions that close over tracers of a transformation of JAX: a program compiled with them could not be used again."""
-
-    def all_functions():
-        zero = jnp.zeros(())
-        energies = [system.kinetic(q_s, q_f, q_s, q_f, system.params)]
-        energies += system.all_potentials(q_s, q_f).values()
-        return energies, system.constraints(zero, q_s, q_f), system.forces(zero, q_s, q_f, q_s, q_f)
-
-    if not is_concrete(jax.make_jaxpr(all_functions)().consts):
-        raise ValueError(
-            "simulate: a function of the system uses a number that jax.grad, vmap or jvp traces, and that is not among its arguments. "
-            "Hand it over in the params: System(..., params={'k': k}), and params['k'] in the function."
-        )
-
-
 def shape_of(name: str, function, *args):
     """Shape and type of the value of a user function, by tracing; two derivatives in forward mode, by all arguments but params, must exist.
 
@@ -173,36 +161,54 @@ def shape_of(name: str, function, *args):
             f"{[getattr(a, 'shape', type(a).__name__) for a in args[:-1]]} and {'params=None' if args[-1] is None else 'the params'}"
             f"{_line_of(error)}: {type(error).__name__}: {error}"
         ) from error
-    _check_indices(name, function, args)
+    if not isinstance(function, ConstantMass):
+        function = function.function if isinstance(function, KineticFunction) else function
+        leaves, structure = jax.tree.flatten(args)
+        fault = _fault(
+            traced_once(function), structure, tuple((np.shape(leaf), jnp.result_type(leaf)) for leaf in leaves)
+        )
+        if fault:
+            raise ValueError(f"{name} {fault}.")
     return shape
 
 
-def _check_indices(name: str, function, args) -> None:
-    """Refuse a function that takes ``q[3]`` of three entries: JAX returns the last entry instead, NumPy raises an IndexError.
-
-    The function is traced once more with NumPy arrays. All other errors are ignored: NumPy arrays lack some operations of JAX arrays.
-    """
-    if isinstance(function, ConstantMass):
-        return
-    raw = function.function if isinstance(function, KineticFunction) else function
-    raw = raw.function if isinstance(raw, TracedOnce) else raw
-    leaves, structure = jax.tree.flatten(args)
-    missing = _missing_entry(raw, structure, tuple(np.shape(leaf) for leaf in leaves))
-    if missing:
-        raise ValueError(f"{name} takes an entry that is not there{missing}.")
-
-
 @lru_cache(maxsize=1024)
-def _missing_entry(function, structure, shapes: tuple[tuple[int, ...], ...]) -> str:
-    """Line and message of NumPy's IndexError; empty if every entry exists. Cached, since tracing takes milliseconds."""
+def _fault(function: TracedOnce, structure, types: tuple[tuple[tuple[int, ...], np.dtype], ...]) -> str:
+    """Faults of a function that none of its values shows, in words; empty for none. Cached, since tracing takes milliseconds.
+
+    A function that takes ``q[3]`` of three entries: JAX returns the last entry instead, NumPy raises an IndexError; its other errors do not
+    count, since NumPy arrays lack some operations of JAX arrays. And a function that is not pure: two traces of it differ.
+    """
+    arguments = jax.tree.unflatten(structure, [np.zeros(*of_leaf) for of_leaf in types])
     try:
         with np.errstate(all="ignore"):
-            jax.eval_shape(lambda: function(*jax.tree.unflatten(structure, [np.zeros(shape) for shape in shapes])))
+            jax.eval_shape(lambda: function.called(*arguments))
     except IndexError as error:
-        return f"{_line_of(error)}: {error}"
+        return f"takes an entry that is not there{_line_of(error)}: {error}"
     except Exception:
-        return ""
+        pass
+    if function.is_of_user and operations(function.called, *arguments) != operations(function.called, *arguments):
+        return (
+            f"is {name_of(function)}, which is not pure: two calls with the same arguments do not do the same. JAX calls it once for a whole run. "
+            "A state belongs in coordinates; noise is drawn before the run, and handed over in params"
+        )
     return ""
+
+
+def operations(function: Callable, *arguments) -> str:
+    """A digest of the operations that a function traces to, with their constants."""
+    untraced = partial(function)  # JAX keeps the traces of a function
+    closed = jax.make_jaxpr(untraced)(*arguments)
+    text = re.sub(r"0x[0-9a-f]+", "", str(closed.jaxpr))  # addresses in memory
+    return f"digest {digest(text.encode(), *(np.asarray(constant).tobytes() for constant in closed.consts))}"
+
+
+def digest(*parts: bytes) -> str:
+    """A short text that tells different bytes apart."""
+    total = hashlib.sha256()
+    for part in parts:
+        total.update(part)
+    return total.hexdigest()[:16]
 
 
 def _line_of(error: Exception) -> str:

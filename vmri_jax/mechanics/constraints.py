@@ -1,11 +1,13 @@
 """Checks of constraints and masses at one configuration (kept, independent, regular), and projection of positions onto the constraints.
 
-Every number is judged in its own unit. A row ``g_i(t, q)`` of the constraints is known up to its rounding, and counts as kept below
+Every number is judged in its own unit. A row ``g_i(t, q)`` of the constraints counts as kept below
 
-    allowed_i = tolerance terms_i + ROUNDING eps (terms_i + sum_j |dg_i/dq_j| |q_j|)
+    allowed_i = tolerance size_i + ROUNDING eps (terms_i + reach_i)
+    size_i = max(terms_i, min(|G_i|^2 / |hess g_i|, reach_i))        reach_i = sum_j |dg_i/dq_j| / w_j max_k |w_k q_k|
 
-where terms_i is the size of the terms that cancel in it, ``|d| + L`` of ``|d| - L`` (`sizes_of_terms`). Gradients of rows are compared in the
-norm of the kinetic energy, and mass matrices with a diagonal of ones.
+with the size terms_i of the terms that cancel in it, ``|d| + L`` of ``|d| - L`` (`sizes_of_terms`), and its change over its radius of curvature. The
+weights w, square roots of the masses, give all coordinates one unit: lengths of gradients and reach_i, the change of a row over the largest
+position, which bounds its round-off, are taken with them. Mass matrices are judged with a diagonal of ones.
 """
 
 from typing import NamedTuple
@@ -25,15 +27,15 @@ from vmri_jax.mechanics.system import System
 from vmri_jax.mechanics.terms_of_rows import sizes_of_terms
 
 START = 1e-9
-"""Largest value of a row at the start, relative to its terms. A larger one would start runs off the constraints; a smaller one would refuse numbers
+"""Largest value of a row at the start, relative to its size. A larger one would start runs off the constraints; a smaller one would refuse numbers
 that are written with ten digits."""
 CONSTRAINT_TOLERANCE = 1e-6
-"""Largest value of a row that is kept along a run, relative to its terms. A smaller value would refuse starts that are rounded to six digits."""
+"""Largest value of a row that is kept along a run, relative to its size. A smaller value would refuse starts that are rounded to six digits."""
 CONSTRAINT_OVER_TOLERANCE = 100
-"""Loose Newton tolerances raise the value of a row that is kept, relative to its terms, to this factor times the tolerance. A smaller factor would
+"""Loose Newton tolerances raise the value of a row that is kept, relative to its size, to this factor times the tolerance. A smaller factor would
 refuse converged steps."""
 ROUNDING = 100
-"""Value of a row in units of its rounding, ``eps (terms + |G| |q|)``, that always counts as zero: a row has tens of operations. A smaller value
+"""Value of a row in units of its rounding, ``eps (terms + reach)``, that always counts as zero: a row has tens of operations. A smaller value
 refuses starts far from the origin, a larger one lets short rods there have the wrong length."""
 RANK = 1e-8
 """Largest singular value of a dependence among rows of length one. A larger value refuses nearly dependent constraints that can be solved."""
@@ -46,8 +48,11 @@ LEAST_COEFFICIENT = 1e-6
 """Rows with at least this coefficient in a normalised linear dependence are named in messages. A larger value leaves rows out."""
 LEAST_FAST_PART = 1e-12
 """Least ratio ``|dg/dq_f| / |dg/dq|`` of a constraint that counts as dependent on fast variables. A larger value refuses weak dependences."""
+VANISHING_GRADIENT = 1e-6
+"""Ratio of the gradient of a constraint to its gradient at a generic configuration nearby, below which the gradient counts as zero. A larger value
+refuses constraints that are nearly singular at the start."""
 NEARBY = 1e-2
-"""Distance to a configuration nearby, relative to the distance over which rows change by their terms. From a larger one rows may be others."""
+"""Distance to a configuration nearby, relative to the distance over which rows change by their size. From a larger one rows may be others."""
 PROJECTION_STEPS = 20
 """Gauss-Newton steps onto the constraints. They converge quadratically from close positions; a larger number takes longer."""
 MICRO_GRID = (
@@ -83,28 +88,33 @@ def is_rank_deficient(rows, scaled_with=None, tolerance: float = RANK):
 
 
 class Rows(NamedTuple):
-    """The rows at a configuration: those that are solved for, then the implied ones.
+    """The rows at a configuration: those that are solved for, then the implied ones; see the top of this module.
 
     values: g.
-    terms: sizes of the terms that cancel in g.
-    jacobian: dg/dq with respect to (q_s, q_f).
-    positions: ``sum_j |dg_i/dq_j| |q_j|``.
+    sizes: size_i.
+    rounding: ``terms_i + reach_i``.
+    gradients: ``dg_i/dq_j / w_j`` with respect to (q_s, q_f).
     """
 
     values: Float[Numbers, "k"]
-    terms: Float[Numbers, "k"]
-    jacobian: Float[Numbers, "k n"]
-    positions: Float[Numbers, "k"]
+    sizes: Float[Numbers, "k"]
+    rounding: Float[Numbers, "k"]
+    gradients: Float[Numbers, "k n"]
 
     def allowed(self, tolerance):
-        """(k,) the values up to which rows count as kept, see the top of this module."""
-        return tolerance * self.terms + ROUNDING * np.finfo(float).eps * (self.terms + self.positions)
+        """(k,) the values up to which rows count as kept."""
+        return tolerance * self.sizes + ROUNDING * np.finfo(float).eps * self.rounding
 
     @classmethod
-    def of(cls, function, q) -> "Rows":
+    def of(cls, function, q, weights=1.0) -> "Rows":
         """The rows (k,) of a function of q (n,)."""
-        jacobian = jax.jacrev(function)(q)
-        return cls(function(q), sizes_of_terms(function, q), jacobian, jnp.abs(jacobian) @ jnp.abs(q))
+        direction = np.random.default_rng(0).normal(size=q.size) / weights
+        gradients, bends = (a / weights for a in jax.jvp(jax.jacrev(function), (q,), (direction,)))
+        terms, reach = sizes_of_terms(function, q), jnp.sum(jnp.abs(gradients), axis=1) * jnp.max(jnp.abs(weights * q))
+        # |hess g e| of a random direction e for the norm of the Hessian
+        squared, bend = jnp.sum(gradients**2, axis=1), jnp.linalg.norm(bends, axis=1)
+        radius = jnp.where(bend > 0, squared / jnp.where(bend > 0, bend, 1.0), 0.0)
+        return cls(function(q), jnp.maximum(terms, jnp.minimum(radius, reach)), terms + reach, gradients)
 
 
 def rows_at(system: System, t, q_s, q_f) -> Rows:
@@ -115,7 +125,13 @@ def rows_at(system: System, t, q_s, q_f) -> Rows:
         configuration = t, q[:n_s], q[n_s:]
         return jnp.concatenate([system.constraints(*configuration), system.g_implied(*configuration)])
 
-    return Rows.of(rows, jnp.concatenate([q_s, q_f]))
+    return Rows.of(rows, jnp.concatenate([q_s, q_f]), weights_of(system, q_s, q_f))
+
+
+def weights_of(system: System, q_s, q_f):
+    """(n_s + n_f,) the weights w: square roots of masses, 1 for a coordinate without a mass."""
+    masses = jnp.concatenate(mass_diagonal(system, q_s, q_f))
+    return jnp.sqrt(jnp.where(masses > 0, masses, 1.0))
 
 
 def are_kept(system: System, state, tolerance):
@@ -208,7 +224,7 @@ def check_constraints(
     Args:
         state: a `State`.
         place: name of the positions in messages.
-        tolerance: largest value of a satisfied constraint, relative to its terms.
+        tolerance: largest value of a satisfied constraint, relative to its size.
         advice: remedy in the message if a value is larger.
 
     Raises:
@@ -222,12 +238,13 @@ def check_constraints(
         return _rows_in_words(getattr(system, name), rows, *arguments, system.params)
 
     n_s, (n_g, n_gs) = np.size(state.q_s), system.num_constraints(state.q_s, state.q_f)
-    rows, masses = jax.device_get(_rows_and_masses(system, state.t, state.q_s, state.q_f))
+    rows, weights = jax.device_get(_rows_and_weights(system, state.t, state.q_s, state.q_f))
     solved = rows.values[: n_g + n_gs]
     if not np.isfinite(solved).all():
         raise ValueError(f"{place}: the constraints are {solved} there, which is not finite.")
-    if not (np.isfinite(rows.jacobian).all()):
+    if not (np.isfinite(rows.gradients).all()):
         raise ValueError("System: the Jacobian of the constraints is not finite at these positions (a norm at zero?).")
+    _check_gradients(system, state, rows, masses, in_words)
     allowed = rows.allowed(tolerance)[: n_g + n_gs]
     violated = np.abs(solved) > allowed
     if violated.any():
@@ -235,14 +252,13 @@ def check_constraints(
         row = in_words([worst], "constraint") if worst < n_g else in_words([worst - n_g], "slow_constraint")
         raise ValueError(
             f"{place} violate {'constraint' if worst < n_g else 'slow_constraint'}, row {row.strip('[]')}, by {abs(solved[worst]):.3e} (allowed: "
-            f"{allowed[worst]:.0e}, {tolerance:.0e} of its terms and round-off); {advice}"
+            f"{allowed[worst]:.0e}, {tolerance:.0e} of its size, and round-off); {advice}"
         )
     _check_implied(rows, n_g + n_gs, place)
 
     def gradients(rows: Rows):
-        """dg/dq_s, dg/dq_f and dg_slow/dq_s per square root of a mass, so that all entries of a row have one unit."""
-        scaled = rows.jacobian / np.sqrt(masses)
-        return scaled[:n_g, :n_s], scaled[:n_g, n_s:], scaled[n_g : n_g + n_gs, :n_s]
+        """dg/dq_s, dg/dq_f and dg_slow/dq_s over the weights."""
+        return rows.gradients[:n_g, :n_s], rows.gradients[:n_g, n_s:], rows.gradients[n_g : n_g + n_gs, :n_s]
 
     slow, fast, alone = gradients(rows)
     size = np.linalg.norm(np.concatenate([slow, fast], axis=1), axis=1)
@@ -257,17 +273,32 @@ def check_constraints(
     if any(dependent for _, dependent in map(rank_of, (alone, fast))):
         # At a singular configuration (a linkage folded flat) rows are dependent there and nowhere else, and runs pass it: only rows that are
         # dependent at a generic configuration nearby are refused.
-        rows, _ = jax.device_get(_rows_and_masses(system, state.t, *_nearby(state, rows, masses)))
+        rows, _ = jax.device_get(_rows_and_weights(system, state.t, *_nearby(state, rows, weights)))
         _, fast, alone = gradients(rows)
         _check_rank("slow_constraint", alone, "slow variables.", in_words)
         _check_rank("constraint", fast, f"fast variables. {MICRO_GRID}", in_words)
 
 
+def _check_gradients(system: System, state, rows: Rows, masses, in_words) -> None:
+    """Refuse rows whose gradient is zero at the state, but not at a generic configuration `NEARBY` relative to its positions."""
+    weights, q, n_s = np.sqrt(masses), np.concatenate([state.q_s, state.q_f]), np.size(state.q_s)
+    change = NEARBY * np.abs(weights * q).max() * np.random.default_rng(0).normal(size=q.size) / weights
+    nearby, _ = jax.device_get(_rows_and_masses(system, state.t, *np.split(q + change, [n_s])))
+    size, size_nearby = (np.linalg.norm(a.jacobian / weights, axis=1) for a in (rows, nearby))
+    vanishes = (size_nearby > 0) & (size <= VANISHING_GRADIENT * size_nearby)
+    n_g, n_gs = system.num_constraints(state.q_s, state.q_f)
+    parts = {"constraint": vanishes[:n_g], "slow_constraint": vanishes[n_g : n_g + n_gs]}
+    for name, rows_of_name in parts.items():
+        if rows_of_name.any():
+            raise ValueError(
+                f"System: the gradient of row(s) {in_words(np.flatnonzero(rows_of_name), name)} of {name} vanishes at these positions, and no force "
+                "along it can hold the constraint. A square, (|x| - L)**2, has such a gradient wherever it is 0: take its root, |x| - L."
+            )
+
+
 @quickly_compiled
-def _rows_and_masses(system, t, q_s, q_f):
-    """The `Rows`, and the diagonal of the mass matrix with 1 in place of 0."""
-    masses = jnp.concatenate(mass_diagonal(system, q_s, q_f))
-    return rows_at(system, t, q_s, q_f), jnp.where(masses > 0, masses, 1.0)
+def _rows_and_weights(system, t, q_s, q_f):
+    return rows_at(system, t, q_s, q_f), weights_of(system, q_s, q_f)
 
 
 def _check_implied(rows: Rows, solved: int, place: str) -> None:
@@ -313,11 +344,9 @@ def _check_rank(name: str, jacobian, of: str, in_words) -> None:
         )
 
 
-def _nearby(state, rows: Rows, masses):
-    """A generic configuration at a distance `NEARBY` from a state, always the same; the distance over which a row changes by its terms is 1."""
-    lengths = np.linalg.norm(rows.jacobian / np.sqrt(masses), axis=1)
-    size = NEARBY * np.min(rows.terms[lengths > 0] / lengths[lengths > 0], initial=np.inf)
-    change = (
-        np.where(np.isfinite(size), size, 0.0) * np.random.default_rng(0).normal(size=masses.size) / np.sqrt(masses)
-    )
+def _nearby(state, rows: Rows, weights):
+    """A generic configuration at a distance `NEARBY` from a state, always the same; the distance over which a row changes by its size is 1."""
+    lengths = np.linalg.norm(rows.gradients, axis=1)
+    size = NEARBY * np.min(rows.sizes[lengths > 0] / lengths[lengths > 0], initial=np.inf)
+    change = np.where(np.isfinite(size), size, 0.0) * np.random.default_rng(0).normal(size=weights.size) / weights
     return np.split(np.concatenate([state.q_s, state.q_f]) + change, [np.size(state.q_s)])

@@ -93,14 +93,25 @@ def events(system: System, state, t_end: float) -> Events:
     size = jax.eval_shape(program, jnp.zeros(1)).shape[1]
     chunk = 2 ** int(np.log2(np.clip(CHUNK // size, PARTS, SAMPLES // PARTS)))
 
-    def values(t: np.ndarray) -> np.ndarray:
+    def chunks(t: np.ndarray):
         padded = np.append(t, np.full(-len(t) % chunk, t[-1])).reshape(-1, chunk)
-        f = np.concatenate([np.asarray(program(part)) for part in padded])[: len(t)]
-        return f if np.isfinite(f).all() else np.where(np.isfinite(f), f, 0.0)
+        return (np.nan_to_num(np.asarray(program(part)), posinf=0.0, neginf=0.0) for part in padded)
 
-    varying = max(1, np.count_nonzero(np.ptp(values(t_0 + (t_end - t_0) * _unit_times(chunk)), axis=0)))
-    t = t_0 + (t_end - t_0) * _unit_times(int(np.clip(MOST_NUMBERS // varying, chunk, SAMPLES)))
-    f, distance = values(t), (t_end - t_0) / len(t)
+    def values(t: np.ndarray) -> np.ndarray:
+        return np.concatenate([part[:, varying] for part in chunks(t)])[: len(t)]
+
+    coarse = next(chunks(t_0 + (t_end - t_0) * _unit_times(chunk)))
+    num = int(np.clip(MOST_NUMBERS // max(1, np.count_nonzero(np.ptp(coarse, axis=0))), chunk, SAMPLES))
+    t = t_0 + (t_end - t_0) * _unit_times(num)
+    # Of the entries of many bodies, few vary: the others are not kept.
+    parts = [(columns := np.flatnonzero((part != coarse[0]).any(axis=0)), part[:, columns]) for part in chunks(t)]
+    varying = np.unique(np.concatenate([columns for columns, _ in parts]))
+    f = np.concatenate([np.broadcast_to(coarse[0, varying], (chunk, len(varying)))] * len(parts))
+    for i, (columns, part) in enumerate(parts):
+        f[i * chunk : (i + 1) * chunk, np.searchsorted(varying, columns)] = part
+    f, distance = f[: len(t)], (t_end - t_0) / len(t)
+    if not len(varying):
+        return Events(names)
     jump = _jumps(values, t, f)
     for _ in range(REFINEMENTS):
         drives = _events(names, t, f, jump)

@@ -4,16 +4,17 @@ import dataclasses
 import inspect
 import warnings
 from collections import Counter
-from collections.abc import Callable
-from functools import lru_cache
+from collections.abc import Callable, Hashable
+from functools import lru_cache, partial, wraps
 
 import jax
 
 from vmri_jax.mechanics.order import Order, ordered
+from vmri_jax.mechanics.surroundings import Surroundings, name_of
 
 COPIES_UNTIL_WARNING = 5
-"""Number of functions from one piece of code, each compiled anew, at which the user is warned. A larger number warns late; a smaller one warns about
-programs that define a few variants on purpose."""
+"""Number of surroundings of one piece of code, each compiled anew, at which the user is warned. A larger number warns late; a smaller one warns
+about programs that define a few variants on purpose."""
 NO_TIME = (
     "Energies and masses that depend on time are out of scope. Take instead a force that depends on time, {force}, or a constraint that "
     "moves with time, {moving}."
@@ -29,34 +30,95 @@ TIME_AND_VELOCITIES = ("t", "v_s", "v_f")
 """Names of arguments that only forces, kinetic energies and `Rheonomic` constraints get."""
 
 
-@dataclasses.dataclass(frozen=True)
+@jax.tree_util.register_pytree_node_class
+@dataclasses.dataclass(frozen=True, eq=False)
 class TracedOnce:
-    """A function of arrays that JAX traces once per process for given shapes of its arguments.
+    """A function of arrays that JAX traces once per process, for given shapes of its arguments and for what it reads from around it.
 
-    Later programs inline the traced operations, as if they had called the function. Two instances are equal if their functions are.
+    Later programs inline the traced operations, as if they had called the function. Two instances are equal if the codes of their functions
+    and their surroundings are. A pytree node without arrays, whose structure is what the function reads.
+
+    Args:
+        function: of the user.
+        seen: key of its `Surroundings` when a run was made; None for what the function reads now. With `seen` new traces after a change are
+            refused: they would mix old and new numbers.
     """
 
     function: Callable
+    seen: Hashable = None
 
     def __call__(self, *arguments):
-        return _traced(self.function)(*arguments)
+        return _traced(self if self.seen is not None else self.now())(*arguments)
+
+    def called(self, *arguments):
+        """The value of the function, by its Python code."""
+        around = Surroundings(self.function)
+        if self.seen not in (None, around.key):
+            raise ValueError(
+                f"{name_of(self)} reads something else from around it than when its run was made. Make the run again; what varies is better "
+                "handed over in params."
+            )
+        value = self.function(*arguments)
+        around.before(Surroundings(self.function))
+        return value
+
+    def now(self) -> "TracedOnce":
+        """The function with what it reads at present, for a run."""
+        last = vars(self).get("last")
+        if last is None or not last[0].hold():
+            around = Surroundings(self.function)
+            last = vars(self)["last"] = around, TracedOnce(self.function, around.key)
+        return last[1]
+
+    @property
+    def is_of_user(self) -> bool:
+        """Whether the function, or a function that it reads, has code of the user."""
+        return Surroundings(self.function).have_code
+
+    @property
+    def _key(self) -> Hashable:
+        return self.now().seen if self.seen is None else self.seen
+
+    def __eq__(self, other) -> bool:
+        return isinstance(other, TracedOnce) and self._key == other._key
+
+    def __hash__(self) -> int:
+        return hash(self._key)
 
     def __repr__(self) -> str:
         return repr(self.function)
 
+    def __reduce__(self):  # code cannot be pickled; another process reads what is there
+        return TracedOnce, (self.function,)
+
+    def tree_flatten(self):
+        """No arrays; the structure is what the function reads, and whether it keeps that."""
+        return (), (self.seen is None, self.now() if self.seen is None else self)
+
+    @classmethod
+    def tree_unflatten(cls, structure, _):
+        """The inverse of `tree_flatten`."""
+        reads_now, function = structure
+        return cls(function.function) if reads_now else function
+
 
 class CompiledAgainWarning(UserWarning):
-    """The program creates the same function repeatedly, and JAX compiles every program that contains it again."""
+    """A function reads other numbers from around it again and again, and JAX compiles every program that contains it again."""
 
 
 @lru_cache(maxsize=1024)
-def _traced(function: Callable) -> Callable:
-    _count(function)
-    return jax.jit(function, inline=True)
+def _traced(function: TracedOnce) -> Callable:
+    _count(function.function)
+
+    @wraps(function.function, updated=())
+    def operations(*arguments):
+        return function.called(*arguments)
+
+    return jax.jit(operations, inline=True)
 
 
 def _count(function: Callable) -> None:
-    """Count the functions that one piece of code has created, and warn once about `COPIES_UNTIL_WARNING` of them."""
+    """Count the surroundings in which one piece of code is traced, and warn once about `COPIES_UNTIL_WARNING` of them."""
     while hasattr(function, "function"):  # of `InOrder` and `vmri_jax.mechanics.by_name.ByName`
         function = function.function
     code = getattr(function, "__code__", None)
@@ -65,9 +127,9 @@ def _count(function: Callable) -> None:
     _made[code] += 1
     if _made[code] == COPIES_UNTIL_WARNING:
         warnings.warn(
-            f"the function {function.__name__} (line {code.co_firstlineno} of {code.co_filename}) has been made {COPIES_UNTIL_WARNING} times, and "
-            "everything that contains it was compiled as often, since functions are compared by identity. Define it once, outside of "
-            "the loop, and hand over what varies as params.",
+            f"the function {function.__name__} (line {code.co_firstlineno} of {code.co_filename}) has been traced {COPIES_UNTIL_WARNING} times, and "
+            "everything that contains it compiled as often, since it reads other values from around it each time. Hand over what varies "
+            "as params.",
             CompiledAgainWarning,
             stacklevel=2,
         )
@@ -118,6 +180,7 @@ def check_arguments(place: str, function: Callable, arguments: str, instead: str
     raise TypeError(f"{place} is {name}{signature}; it is called with ({arguments}). {advice}")
 
 
+@partial(jax.tree_util.register_dataclass, data_fields=["function"], meta_fields=[])
 @dataclasses.dataclass(frozen=True)
 class Rheonomic:
     """A holonomic constraint that depends on time: a function with the time as its first argument.

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from vmri_jax.kernels import max_abs
 from vmri_jax.mechanics.projection import project_momentum
 from vmri_jax.mechanics.state import State
+from vmri_jax.mechanics.structure import has_constant_hessian
 from vmri_jax.mechanics.system import System
 
 
@@ -54,14 +55,6 @@ def oscillatory_energies(omega, q_f, p_f):
     return (p_f**2 + omega**2 * q_f**2) / 2
 
 
-def energy_and_constraint_residual(system: System, state: State):
-    """`energy` and `constraint_residual` of a state, with its velocities solved for once."""
-    phase = state.q_s, state.q_f, state.p_s, state.p_f
-    velocities = velocity(system, *phase)
-    energy = reduce(add, energy_parts(system, *phase, velocities).values())
-    return energy, constraint_residual(system, state, velocities)
-
-
 def constraint_residual(system: System, state: State, velocities=None):
     """Largest ``|g|`` (position level) and largest ``|G v + dg/dt|`` (velocity level), shape (2,).
 
@@ -96,6 +89,26 @@ def velocity(system: System, q_s, q_f, p_s, p_f):
     """
     free = system.replace(constraint=None, slow_constraint=None, implied=None)
     return project_momentum(free, State(jnp.zeros(()), q_s, q_f, p_s, p_f))[2:]
+
+
+def velocity_and_masses(system: System, q_s, q_f, p_s, p_f):
+    """`velocity`, and the mass matrix ``d^2 T / dv^2`` (n, n); None for constant masses."""
+    if system.has_constant_mass:
+        return velocity(system, q_s, q_f, p_s, p_f), None
+    n_s, p = q_s.size, jnp.concatenate([p_s, p_f])
+
+    def kinetic(v):
+        return system.kinetic(q_s, q_f, v[:n_s], v[n_s:], system.params)
+
+    is_quadratic = has_constant_hessian(kinetic, p)
+    v = jnp.zeros_like(p) if is_quadratic else jnp.concatenate(velocity(system, q_s, q_f, p_s, p_f))
+    gradient, times_masses = jax.linearize(jax.grad(kinetic), v)
+    masses = jax.vmap(times_masses)(jnp.eye(p.size))
+    if (
+        is_quadratic
+    ):  # p = M v + dT/dv(0); a library's solver: it is one instruction, and large matrices are not unrolled
+        v = jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(masses), True), p - gradient)
+    return (v[:n_s], v[n_s:]), masses
 
 
 def momentum_map(generator, q_s, q_f, p_s, p_f):

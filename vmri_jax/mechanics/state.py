@@ -80,7 +80,7 @@ def initial_state(
         t: start time; None for the time of the problem, or 0.
         project: move positions onto the constraints, and velocities onto the hidden constraints, instead of refusing them. A warning tells
             of velocities of which the projection leaves little. None for the choice of the problem, of a system for no projection.
-        tolerance: largest value of a satisfied constraint, relative to the terms that cancel in it, ``|d| + L`` of ``|d| - L``.
+        tolerance: largest value of a satisfied constraint, relative to its size, mostly of the terms that cancel in it: ``|d| + L`` of ``|d| - L``.
 
     Raises:
         TypeError: a system without positions.
@@ -122,7 +122,7 @@ def initial_state(
     if project:
         q_s, q_f = _projected_positions(system, t, q_s, q_f)
     state, violation = _consistent(system, t, q_s, q_f, v_s, v_f)
-    if is_concrete(state):
+    if is_concrete((system, state)):
         advice = (
             "projection did not reach the constraints; start closer to them."
             if project

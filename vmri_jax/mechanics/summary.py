@@ -57,14 +57,6 @@ def coordinates(names: Sequence[str]) -> str:
     return f"{len(names)} coordinate{'s' if len(names) > 1 else ''}: {listed(names)}"
 
 
-def name_of(function) -> str:
-    """The name of a function of a system; the name of its class if the function has none."""
-    inner = function
-    while hasattr(inner, "function"):  # `TracedOnce`, `Rheonomic`, `KineticFunction`, `ByName`
-        inner = inner.function
-    return getattr(inner, "__name__", type(inner).__name__)
-
-
 def parameters(params: Any) -> str:
     """Parameters by name, numbers by value and arrays by shape."""
     if not isinstance(params, Mapping):

@@ -19,7 +19,8 @@ from vmri_jax.mechanics.functions import (
 )
 from vmri_jax.mechanics.masses import ConstantMass
 from vmri_jax.mechanics.order import Order, order_of
-from vmri_jax.mechanics.summary import name_of, numbers, parameters, summary
+from vmri_jax.mechanics.summary import numbers, parameters, summary
+from vmri_jax.mechanics.surroundings import name_of
 
 ARGUMENTS = {
     "kinetic": "q_s, q_f, v_s, v_f, params",
@@ -46,6 +47,17 @@ _INSTEAD = {
 }
 
 
+class Potentials(tuple[tuple[str | int, TracedOnce], ...]):
+    """Pairs of a name and a function; as a pytree the names are structure."""
+
+
+jax.tree_util.register_pytree_node(
+    Potentials,
+    lambda potentials: ([function for _, function in potentials], tuple(name for name, _ in potentials)),
+    lambda names, functions: Potentials(zip(names, functions, strict=True)),
+)
+
+
 class KineticFunction(eqx.Module):
     """Kinetic energy given by functions, ``T(q_s, q_f, v_s, v_f, params) + T_s(q_s, v_s, params)``.
 
@@ -54,8 +66,8 @@ class KineticFunction(eqx.Module):
         slow: T_s, the part that depends on slow variables alone; None without such a part.
     """
 
-    function: TracedOnce = eqx.field(static=True)
-    slow: TracedOnce | None = eqx.field(static=True, default=None)
+    function: TracedOnce
+    slow: TracedOnce | None = None
 
     def __call__(self, q_s, q_f, v_s, v_f, params):
         energy = self.function(q_s, q_f, v_s, v_f, params)
@@ -87,20 +99,21 @@ class System(eqx.Module):
             otherwise, so that ``{"fast": V_1}`` is a potential on the micro grid that may join slow and fast variables. The name k, a
             whole number, has the trapezoidal rule on every k-th micro node. Kept as pairs of a name and a function.
 
-    Functions are compared by identity: define them at module level (not inside a loop) and pass what varies
-    through `params`, and everything is compiled once. They are kept as `TracedOnce`, so that ``system.force`` is called
-    like the function itself, which is ``system.force.function``, or the innermost ``function`` of it.
+    A run uses what its functions read from around them when it is made: globals, helpers, closures, attributes, see
+    `vmri_jax.mechanics.surroundings`. Functions with the same code and surroundings are the same; for others everything is compiled again, so
+    that what varies belongs in `params`. They are kept as `TracedOnce`, so that ``system.force`` is called like the function itself,
+    which is the innermost ``function`` of it.
     """
 
     kinetic: Any
-    slow_potential: TracedOnce | None = eqx.field(static=True, default=None)
-    fast_potential: TracedOnce | None = eqx.field(static=True, default=None)
-    constraint: TracedOnce | Rheonomic | None = eqx.field(static=True, default=None)
-    slow_constraint: TracedOnce | Rheonomic | None = eqx.field(static=True, default=None)
-    force: TracedOnce | None = eqx.field(static=True, default=None)
+    slow_potential: TracedOnce | None = None
+    fast_potential: TracedOnce | None = None
+    constraint: TracedOnce | Rheonomic | None = None
+    slow_constraint: TracedOnce | Rheonomic | None = None
+    force: TracedOnce | None = None
     params: Any = None
-    implied: TracedOnce | Rheonomic | None = eqx.field(static=True, default=None)
-    potentials: tuple[tuple[str | int, TracedOnce], ...] = eqx.field(static=True, default=())
+    implied: TracedOnce | Rheonomic | None = None
+    potentials: Potentials = Potentials()
 
     def __init__(
         self,
@@ -280,7 +293,7 @@ def label(name: str | int) -> str:
     return f"V_{name}" if isinstance(name, int) else name
 
 
-def _named_potentials(potentials, order: Order | None) -> tuple[tuple[str | int, TracedOnce], ...]:
+def _named_potentials(potentials, order: Order | None) -> "Potentials":
     """Pairs of a name and a function, from a mapping or from pairs."""
     try:
         named = dict(potentials)
@@ -304,7 +317,7 @@ def _named_potentials(potentials, order: Order | None) -> tuple[tuple[str | int,
                 f"System: potentials[{name!r}] is {function!r}; it must be a function of (q_s, q_f, params)."
             )
         _check_function("potentials", function)
-    return tuple((name, traced_once(function, order)) for name, function in named.items())
+    return Potentials((name, traced_once(function, order)) for name, function in named.items())
 
 
 def _constrain(function, t, *arguments):

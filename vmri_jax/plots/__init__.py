@@ -9,7 +9,7 @@ from vmri_jax.plots.ensembles import plot_ensemble
 from vmri_jax.plots.fits import plot_fit
 from vmri_jax.plots.runs import plot_forces, plot_trajectory
 from vmri_jax.plots.staircases import Bound, Marked, plot_staircases
-from vmri_jax.plots.studies import plot_convergence, plot_cost, plot_work_precision
+from vmri_jax.plots.studies import plot_convergence, plot_work_precision
 from vmri_jax.plots.theme import (
     DARK,
     LIGHT,
@@ -41,7 +41,6 @@ __all__ = [
     "panel_grid",
     "plot_control",
     "plot_convergence",
-    "plot_cost",
     "plot_ensemble",
     "plot_fit",
     "plot_forces",

@@ -4,7 +4,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.colors import to_hex, to_rgb
 from matplotlib.ticker import EngFormatter
 
@@ -55,7 +54,6 @@ class Bound(NamedTuple):
 
 def plot_staircases(
     kinds: Mapping[str, Sequence[Any]],
-    peers: Mapping[str, Sequence[Any]] | None = None,
     marked: Sequence[Marked] = (),
     bound: Bound | None = None,
     *,
@@ -69,14 +67,13 @@ def plot_staircases(
 
     Args:
         kinds: staircases of `vmri_jax.study.staircase` by kind, the fastest run first, at most four; a kind without runs reserves its colour and marker.
-        peers: staircases of other programs, by name.
         marked: runs to mark.
         bound: lower bound of the times with micro steps.
         known_to: error of the reference solution.
         title: title above the panel.
         theme: colours.
     """
-    blue, orange, green, purple, gold, pale = theme.curves
+    blue, orange, green, purple, gold, *_ = theme.curves
     colors = purple, green, gold, theme.ink
     with new_figure(7.2, 4.4, title, theme) as figure:
         axes = figure.subplots()
@@ -84,15 +81,14 @@ def plot_staircases(
         for color, marker, (kind, stairs) in zip(colors, MARKERS, kinds.items(), strict=False):
             if not stairs:
                 continue
-            _steps(axes, stairs, color=color, linewidth=1.6, zorder=2)
+            x, y = [stair.seconds for stair in stairs], positive([stair.error for stair in stairs])
+            axes.step(x, y, where="post", color=color, linewidth=1.6, zorder=2)
             for stair in stairs:
                 face = _mixed(blue, orange, stair.fast_share) if np.isfinite(stair.fast_share) else theme.paper
                 axes.plot(
                     stair.seconds, *positive([stair.error]), marker, color=color, markerfacecolor=face, markersize=6.5
                 )
             axes.plot([], [], marker=marker, color=color, linewidth=1.6, markerfacecolor=theme.paper, label=kind)
-        for name, stairs in (peers or {}).items():
-            _steps(axes, stairs, color=pale, linestyle="--", linewidth=1.3, label=name, zorder=1.5)
         if bound is not None and bound.kind in kinds:
             stairs = kinds[bound.kind]
             x, y = [bound.factor * stair.seconds for stair in stairs], positive([stair.error for stair in stairs])
@@ -117,11 +113,6 @@ def plot_staircases(
         axes.xaxis.set_major_formatter(EngFormatter("s"))
         legend_below(figure)
     return figure
-
-
-def _steps(axes: Axes, stairs: Sequence[Any], **look) -> None:
-    """Draw a staircase."""
-    axes.step([s.seconds for s in stairs], positive([s.error for s in stairs]), where="post", **look)
 
 
 def _mixed(slow: str, fast: str, share: float) -> str:

@@ -1,12 +1,11 @@
-"""Figures of studies: convergence, error against work, computing time."""
+"""Figures of studies: convergence, and error against work."""
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.ticker import EngFormatter, FixedLocator, NullLocator
+from matplotlib.ticker import EngFormatter
 
 from vmri_jax.plots.theme import (
     LIGHT,
@@ -17,7 +16,6 @@ from vmri_jax.plots.theme import (
     log_ticks,
     mark_reference,
     new_figure,
-    panel_grid,
     positive,
 )
 
@@ -103,56 +101,6 @@ def plot_work_precision(study: Any, title: str = "", work: str = "seconds", them
             axes.xaxis.set_major_formatter(EngFormatter("s"))
         legend_below(figure)
     return figure
-
-
-def plot_cost(
-    studies: Mapping[str, Any],
-    paper_minima: Mapping[str, int] | None = None,
-    title: str = "",
-    theme: Theme = LIGHT,
-) -> NotebookFigure:
-    """Computing time per micro step against num_micro, one panel per study, the cheapest point of each curve circled.
-
-    Args:
-        studies: by the title of their panel, e.g. of `vmri_jax.study.cost_study`.
-        paper_minima: num_micro to mark, by the title of the panel.
-        title: title above the panels.
-        theme: colours.
-    """
-    columns = 2 if len(studies) == 4 else min(3, len(studies))
-    height = 0.6 + 2.7 * math.ceil(len(studies) / columns)
-    with new_figure(max(5.2, 0.6 + 3.0 * columns), height, title, theme) as figure:
-        grid = panel_grid(figure, len(studies), columns)
-        for axes, (name, study) in zip(grid, studies.items(), strict=True):
-            _cost_panel(axes, study, (paper_minima or {}).get(name), theme)
-            axes.set(title=name)
-        for axes in grid[-columns:]:
-            axes.set(xlabel="micro steps per macro step")
-        for axes in grid[::columns]:
-            axes.set(ylabel="µs per micro step")
-        legend_below(figure)
-    return figure
-
-
-def _cost_panel(axes: Axes, study: Any, paper_minimum: int | None, theme: Theme) -> None:
-    one_label = len({label for label, _ in study.curves}) == 1
-    curves = [study.curve(label, method) for label, method in study.curves]
-    for i, ((label, method), (num_micro, cost)) in enumerate(zip(study.curves, curves, strict=True)):
-        name = method if one_label else f"{label}, {method}"
-        look = curve_look(i, theme)
-        axes.loglog(num_micro, cost, markersize=4, label=name, **look)
-        if np.isfinite(cost).any():
-            best = np.nanargmin(cost)
-            axes.plot(num_micro[best], cost[best], "o", markersize=11, markerfacecolor="none", color=look["color"])
-    if paper_minimum is not None:
-        axes.axvline(paper_minimum, color=theme.ink, linestyle=":", linewidth=1.1, label="minimum in the paper")
-    ticks = np.unique(np.concatenate([num_micro for num_micro, _ in curves]))
-    if len(ticks) > 7:
-        ticks = np.array([1, 4, 12, 40, 100])
-    axes.xaxis.set_major_locator(FixedLocator(ticks.tolist()))
-    axes.xaxis.set_minor_locator(NullLocator())
-    axes.xaxis.set_major_formatter("{x:.0f}")
-    log_ticks(axes.yaxis, np.concatenate([cost for _, cost in curves]))
 
 
 def _guide_triangle(axes: Axes, study: Any, quantity: str, order: int, theme: Theme) -> None:

@@ -18,7 +18,7 @@ import jax
 
 from vmri_jax.running.engine import Arrays, Engine
 from vmri_jax.running.simulation import Simulation
-from vmri_jax.running.trajectory import Trajectory
+from vmri_jax.running.trajectory import Run, Trajectory
 
 ADJOINTS = ("auto", "stored", "checkpoint")
 LONGEST_STORED_RUN = 10_000
@@ -39,21 +39,21 @@ def traced_run(run: Simulation, adjoint: str) -> Trajectory:
     if adjoint == "auto":
         adjoint = "stored" if run.num_steps <= LONGEST_STORED_RUN else "checkpoint"
     if run.plan.has_fallback:
-        return _with_fallback(run.engine, run.exact_engine, adjoint, run.save_every, run.arrays)
-    return _differentiable(run.engine, adjoint, run.save_every)(run.arrays)
+        return run.traced(_with_fallback(run.engine, run.exact_engine, adjoint, run.save_every, run.arrays))
+    return run.traced(_differentiable(run.engine, adjoint, run.save_every)(run.arrays))
 
 
-def _differentiable(engine: Engine, adjoint: str, save_every: int) -> Callable[[Arrays], Trajectory]:
+def _differentiable(engine: Engine, adjoint: str, save_every: int) -> Callable[[Arrays], Run]:
     """The run as a function of its arrays, with this adjoint."""
     program = engine.stored if adjoint == "stored" else engine.checkpointed
     return lambda arrays: program(arrays, save_every)
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0, 1, 2, 3))
-def _with_fallback(first: Engine, exact: Engine, adjoint: str, save_every: int, arrays: Arrays) -> Trajectory:
+def _with_fallback(first: Engine, exact: Engine, adjoint: str, save_every: int, arrays: Arrays) -> Run:
     """The run with the first solver of its plan, or with the fallback if the first solver fails."""
-    trajectory = first.stored(arrays, save_every)
-    return jax.lax.cond(trajectory.failed_at < 0, lambda: trajectory, lambda: exact.stored(arrays, save_every))
+    run = first.stored(arrays, save_every)
+    return jax.lax.cond(run.failed_at < 0, lambda: run, lambda: exact.stored(arrays, save_every))
 
 
 @_with_fallback.defjvp

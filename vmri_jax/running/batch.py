@@ -11,7 +11,6 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.sharding import PartitionSpec
 
@@ -23,10 +22,10 @@ from vmri_jax.mechanics.system import System
 from vmri_jax.running.arguments import Steps
 from vmri_jax.running.engine import Arrays, Engine
 from vmri_jax.running.memory import check_memory
-from vmri_jax.running.origin import is_repeated
+from vmri_jax.running.origin import Origin, is_repeated
 from vmri_jax.running.progress import Working
 from vmri_jax.running.simulation import FALLING_BACK, STEPPING, Simulation, simulation
-from vmri_jax.running.trajectory import Trajectory, from_arrays, with_origin
+from vmri_jax.running.trajectory import Run
 from vmri_jax.schemes.composition import Composition, stage_scheme
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.results import Result
@@ -56,23 +55,28 @@ class Batch:
     width: int
     devices: int
 
-    def __call__(self) -> Trajectory:
-        """The runs; lanes that the first solver of the plan does not solve are computed again by its fallback."""
+    def __call__(self) -> tuple[Run, np.ndarray]:
+        """The runs and their observables, see `Simulation.observed`; lanes that the first solver does not solve are computed again by the fallback."""
         run, lanes = self.run, len(self.arrays.macro_dt)
         with Working(f"simulate_batch, {lanes} lanes", running=STEPPING):
-            trajectory = self._in_chunks(run.engine)
-        unsolved = (np.asarray(trajectory.failed_at) >= 0) & (np.asarray(trajectory.result) != Result.NOT_IMPLIED)
-        failed = np.flatnonzero(unsolved)
+            done, table = self._in_chunks(run.engine)
+        failed = np.flatnonzero((done.failed_at >= 0) & (done.result != Result.NOT_IMPLIED))
         if failed.size and run.plan.has_fallback:
             # Failed lanes are padded to a power of two with copies of the last one, so that few programs serve all numbers of failures.
             padded_size = 2 ** int(failed.size - 1).bit_length()
             padded = failed[np.minimum(np.arange(padded_size), failed.size - 1)]
             with Working(f"simulate_batch, {failed.size} of {lanes} lanes: {FALLING_BACK}"):
                 again = replace(self, arrays=_taken(self.arrays, padded))._in_chunks(run.exact_engine)
-            trajectory = jax.tree.map(lambda a, b: a.at[failed].set(b[: failed.size]), trajectory, again)
-        structure = jax.tree.structure(run.system.params)
+            for old, new in zip(jax.tree.leaves((done, table)), jax.tree.leaves(again), strict=True):
+                old[failed] = new[: failed.size]
+        return done, table
+
+    @property
+    def origin(self) -> Origin:
+        """The origin of its trajectories."""
+        structure = jax.tree.structure(self.run.system.params)
         params = self.arrays.model[len(self.arrays.model) - structure.num_leaves :]
-        return with_origin(trajectory, run.origin.repeated((lanes,), jax.tree.unflatten(structure, params)))
+        return self.run.origin.repeated((len(self.arrays.macro_dt),), jax.tree.unflatten(structure, params))
 
     def lane(self, i: int) -> Simulation:
         """The run of a lane."""
@@ -87,7 +91,7 @@ class Batch:
         macro_dt = all_alike if is_repeated(macro_dt) else macro_dt * (run.macro_dt / macro_dt[0])
         return replace(self, run=run, arrays=self.arrays._replace(macro_dt=macro_dt))
 
-    def _in_chunks(self, engine: Engine) -> Trajectory:
+    def _in_chunks(self, engine: Engine) -> tuple[Run, np.ndarray]:
         """All lanes, `width` at a time; the last chunk is padded with copies of its last lane, so that one program computes all chunks."""
         lanes = len(self.arrays.macro_dt)
         width = min(self.width, -(-lanes // self.devices) * self.devices)
@@ -98,7 +102,8 @@ class Batch:
             part = _taken(self.arrays, np.minimum(np.arange(start, start + width), lanes - 1))
             part = jax.tree.map(lambda a: a[0] if is_repeated(a) else a, part)
             pieces.append(program(part, self.run.save_every))
-        return from_arrays([jnp.asarray(np.concatenate(parts)[:lanes]) for parts in zip(*pieces, strict=True)])
+        whole = [np.concatenate(parts)[:lanes] for parts in zip(*pieces, strict=True)]
+        return self.run.observed(Run.of(whole), self.arrays.model)
 
 
 def batch(
@@ -266,7 +271,7 @@ def _side_by_side(engine: Engine, structure, differs: tuple[bool, ...], devices:
     """``program(arrays, save_every)``: a run of `engine` for each lane; `differs` says which of the arrays have an axis of lanes."""
 
     def lane(arrays: Arrays, save_every):
-        return jax.tree.leaves(engine.trajectory(arrays, save_every))
+        return jax.tree.leaves(engine.run(arrays, save_every))
 
     program = jax.vmap(lane, (jax.tree.unflatten(structure, [0 if differ else None for differ in differs]), None))
     if devices > 1:

@@ -1,4 +1,4 @@
-"""The engine of all runs: a loop of macro steps inside a loop over saved nodes, compiled once per structure.
+"""The engine of all runs: a loop of macro steps inside a loop over saved nodes, compiled once per structure. It returns states and statuses alone.
 
 Names: `save_every` macro steps lie between two saved nodes; `num_saves` saved intervals fit into the arrays of an engine; a call computes
 the first `saves` of them.
@@ -14,14 +14,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Int
 
-from vmri_jax.mechanics import invariants
 from vmri_jax.mechanics.arrays import Numbers, options_of_runs
-from vmri_jax.mechanics.constraints import are_kept
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.loops import MOST_STORED_STEPS, PLAIN, Loops, Recursive, Stored
-from vmri_jax.running.saved import Node, Saved
-from vmri_jax.running.trajectory import MicroNodes, RunInfo, Trajectory
+from vmri_jax.running.observables import observables, with_tolerance
+from vmri_jax.running.saved import Saved
+from vmri_jax.running.trajectory import MicroNodes, Run, RunInfo
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.plan import Plan, plan
@@ -89,18 +88,25 @@ class Engine:
 
     @cached_property
     def whole(self):
-        """``whole(arrays, save_every, saves)``: a run from its first step, as the arrays of its `Trajectory`.
+        """``whole(arrays, save_every, saves)``: a run from its first step, as the arrays of its `Run`, and its `Observables` (k, 9).
 
-        Only the first `saves` of the saved intervals are computed.
+        Only the first `saves` of the saved intervals are computed. A call of a prepared run is short: observables of a program of their own would add
+        a third to it.
         """
-        return jax.jit(lambda *run: jax.tree.leaves(self.trajectory(*run)), compiler_options=options_of_runs())
+
+        def whole(arrays: Arrays, *counts):
+            run = self.run(arrays, *counts)
+            nodes = with_tolerance(run.states, self.model(arrays.model).solver.tolerance)
+            return jax.tree.leaves(run), jax.vmap(partial(observables, self.model(arrays.model).system))(nodes)
+
+        return jax.jit(whole, compiler_options=options_of_runs())
 
     @cached_property
     def stored(self):
-        """``stored(arrays, save_every)``: `trajectory` with `save_every` static, to be differentiated in any mode."""
+        """``stored(arrays, save_every)``: `run` with `save_every` static, to be differentiated in any mode."""
 
         def stored(arrays: Arrays, save_every):
-            return self.trajectory(arrays, save_every, loops=Stored())
+            return self.run(arrays, save_every, loops=Stored())
 
         return jax.jit(stored, static_argnums=1)
 
@@ -110,7 +116,7 @@ class Engine:
 
         def checkpointed(arrays: Arrays, save_every):
             loops = Stored() if self.num_saves * save_every <= MOST_STORED_STEPS else Recursive(save_every)
-            return self.trajectory(arrays, save_every, loops=loops, reverse_only=True)
+            return self.run(arrays, save_every, loops=loops, reverse_only=True)
 
         return jax.jit(checkpointed, static_argnums=1)
 
@@ -131,22 +137,22 @@ class Engine:
         return jax.jit(piece, donate_argnums=0, compiler_options=options_of_runs())
 
     def next_piece(
-        self, arrays: Arrays, begin: PieceStart, save_every: int, saves: int
-    ) -> tuple[Trajectory, State, Any]:
-        """`piece` with its trajectory in arrays of NumPy, and the state and memory at its end."""
+        self, arrays: Arrays, begin: PieceStart, save_every: int, saves: int, is_alive: bool = True
+    ) -> tuple[Run, State, Any]:
+        """`piece` as a `Run` in arrays of NumPy, and the state and memory at its end; without steps, NaN, unless the run is alive."""
         scheme = self.model(arrays.model).scheme
         free = self._free[tuple(a.shape for a in arrays.state)]
         try:
             room = free.pop()
         except IndexError:  # the first piece, or all arrays are in use by other threads
             room = self._empty(arrays.start(), scheme.num_micro)
-        loop = self.piece(room, arrays, begin, save_every, saves)
+        loop = self.piece(room, arrays, begin, save_every, saves if is_alive else -1)
         saved = loop.saved.first(saves, int(loop.number))
         free.append(loop.saved)
         macro_dt = np.asarray(arrays.macro_dt)
         times = np.asarray(begin.t_start) + (begin.step + np.arange(saves + 1) * save_every) * macro_dt
-        trajectory = self._trajectory(scheme, loop._replace(saved=saved), times, macro_dt)
-        return trajectory, loop.cursor.state, loop.cursor.memory
+        run = self._run(scheme, loop._replace(saved=saved), times, macro_dt)
+        return run, loop.cursor.state, loop.cursor.memory
 
     @cached_property
     def _free(self) -> defaultdict[tuple, list[Saved]]:
@@ -157,9 +163,9 @@ class Engine:
         """Zeros in the shapes of the memory of the stepper, for a `PieceStart` that is the first."""
         return _blank_memory(self, tuple((a.shape, a.dtype) for a in (*arrays.model, *arrays.state)))
 
-    def trajectory(
+    def run(
         self, arrays: Arrays, save_every, saves=None, loops: Loops | None = None, reverse_only: bool = False
-    ) -> Trajectory:
+    ) -> Run:
         """A run from its first step, not jitted; of all saved intervals, or of the first `saves` of them.
 
         Args:
@@ -173,8 +179,10 @@ class Engine:
             return self._by_scan(stepper, cursor, times, loops)
         empty = self._empty(start, stepper.scheme.num_micro)
         loop = self._by_while_loop(stepper, cursor, empty, times, saves)
+        if saves is not None:  # else all nodes are written
+            loop = loop._replace(saved=loop.saved.ended(saves, loop.number))
         nodes = start.t + jnp.arange(self.num_saves + 1) * save_every * macro_dt
-        return self._trajectory(stepper.scheme, loop, nodes, macro_dt)
+        return self._run(stepper.scheme, loop, nodes, macro_dt)
 
     def model(self, leaves: list) -> Model:
         """The `Model` with these leaves."""
@@ -206,27 +214,24 @@ class Engine:
             is_later = number > 0  # turn 0 saves the start, so that the code for nodes is compiled once
             moved, info, micro = interval(cursor, jnp.where(is_later, times.save_every, 0))
             cursor = jax.tree.map(lambda a, b: a if a is b else jnp.where(is_later, a, b), moved, cursor)
-            node, cursor = _node(stepper.system, stepper.solver.tolerance, cursor)
-            return _Loop(number + 1, cursor, saved.write(number, node, info, micro))
+            return _Loop(number + 1, cursor, saved.write(number, cursor.state, info, micro))
 
         return jax.lax.while_loop(goes_on, save, _Loop(jnp.asarray(0), cursor, saved))
 
-    def _by_scan(self, stepper: Plan, cursor: "_Cursor", times: "_Times", loops: Loops) -> Trajectory:
+    def _by_scan(self, stepper: Plan, cursor: "_Cursor", times: "_Times", loops: Loops) -> Run:
         """A whole run from its first step, by loops that reverse mode can differentiate."""
-        system, tolerance = stepper.system, stepper.solver.tolerance
         interval = self._interval(stepper, cursor.state, times, loops)
 
         def save(cursor: _Cursor, _):
             cursor, info, micro = interval(cursor, times.save_every)
-            node, cursor = _node(system, tolerance, cursor)
-            return cursor, (node, info, micro)
+            return cursor, (cursor.state, info, micro)
 
-        first, cursor = _node(system, tolerance, cursor)
-        cursor, (nodes, info, micros) = loops.scan(save, cursor, self.num_saves)
-        nodes = jax.tree.map(lambda a, b: jnp.concatenate([jnp.asarray(a)[None], b]), first, nodes)
+        first = cursor.state
+        cursor, (states, info, micros) = loops.scan(save, cursor, self.num_saves)
+        states = jax.tree.map(lambda a, b: jnp.concatenate([jnp.asarray(a)[None], b]), first, states)
         before_end = _before_end(stepper.scheme, times.macro_dt)
-        micro = None if micros is None else MicroNodes(nodes.state.t[1:, None] - before_end, micros)
-        return Trajectory(*nodes, info=info, result=cursor.result, failed_at=cursor.failed_at, micro=micro)
+        micro = None if micros is None else MicroNodes(states.t[1:, None] - before_end, micros)
+        return Run(states, info, cursor.result, cursor.failed_at, micro)
 
     def _interval(self, stepper: Plan, state: State, times: "_Times", loops: Loops):
         """``cursor, info, micro = interval(cursor, count)``: the `count` macro steps between two saved nodes."""
@@ -246,10 +251,10 @@ class Engine:
     def _empty(self, state: State, num_micro: int) -> Saved:
         return Saved.none(state, self.num_saves, num_micro if self.save_micro else None)
 
-    def _trajectory(self, scheme, loop: "_Loop", times, macro_dt) -> Trajectory:
+    def _run(self, scheme, loop: "_Loop", times, macro_dt) -> Run:
         status = {"result": loop.cursor.result, "failed_at": loop.cursor.failed_at}
         before_end = _before_end(scheme, macro_dt) if self.save_micro else None
-        return loop.saved.trajectory(loop.cursor.state.q_s.shape[0], times, status, before_end)
+        return loop.saved.run(loop.cursor.state.q_s.shape[0], times, status, before_end)
 
 
 engine = lru_cache(maxsize=32)(Engine)
@@ -331,24 +336,3 @@ def _step_of(stepper: Plan, times: _Times, save_micro: bool):
         return _Cursor(state, memory, cursor.step + 1, result, failed_at), worst, micro
 
     return step
-
-
-def _node(system: System, tolerance, cursor: _Cursor) -> tuple[Node, _Cursor]:
-    """The saved node, and the status after a check of its energy and constraints.
-
-    A node can fail here although its steps succeeded, for four reasons: the energy is NaN although its gradient is finite (a logarithm beyond
-    its pole); a lane of a batch started off its constraints; the rows of ``system.implied``, redundant constraints that the solver leaves out, are
-    violated; or a stepper of the user leaves the constraints.
-    """
-    state = cursor.state
-    phase = state.q_s, state.q_f, state.p_s, state.p_f
-    energy, residual = invariants.energy_and_constraint_residual(system, state)
-    finite, (solved, implied) = jnp.isfinite(energy), are_kept(system, state, tolerance)
-    breaks = (cursor.failed_at < 0) & ~(finite & solved & implied)
-    violated = jnp.where(solved, Result.NOT_IMPLIED, Result.CONSTRAINT_VIOLATED)
-    cause = jnp.where(finite, violated, Result.NON_FINITE)
-    result = jnp.where(breaks, cause, cursor.result)
-    failed_at = jnp.where(breaks, jnp.maximum(cursor.step - 1, 0), cursor.failed_at)
-    *phase, energy, residual = (jnp.where(failed_at < 0, a, jnp.nan) for a in (*phase, energy, residual))
-    node = Node(State(jnp.asarray(state.t), *phase), energy, residual)
-    return node, cursor._replace(result=result, failed_at=failed_at)

@@ -75,7 +75,9 @@ def _levels(body: Callable, carry, count: int):
     for size in reversed(sizes):
         part = _keeps_start(_part_of(part, size))
     carry, ys = jax.lax.scan(part, carry, jnp.arange(outermost))
-    return carry, jax.tree.map(lambda y: y.reshape(-1, *y.shape[1 + len(sizes) :])[:count], ys)
+    # the length as a number: parts without variables have outputs of size 0, from which it cannot be inferred
+    turns = outermost * prod(sizes)
+    return carry, jax.tree.map(lambda y: y.reshape(turns, *y.shape[1 + len(sizes) :])[:count], ys)
 
 
 def _part_of(step: Callable, size: int) -> Callable:

@@ -1,14 +1,18 @@
 """A single macro step, without a run."""
 
+import equinox as eqx
 import jax
+import jax.numpy as jnp
 
 from vmri_jax.mechanics.checks import check_type
+from vmri_jax.mechanics.constraints import are_kept
 from vmri_jax.mechanics.state import A_SYSTEM, State
 from vmri_jax.mechanics.system import System
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers import solvers
 from vmri_jax.steppers.plan import plan
+from vmri_jax.steppers.results import Result
 from vmri_jax.steppers.solvers import Newton
 from vmri_jax.steppers.stepper import StepInfo
 
@@ -44,4 +48,7 @@ def macro_step(
 def _macro_step(system, scheme, state, macro_dt, solver):
     planned = plan(system, scheme, state, solver)
     state, info, memory = planned.step(state, planned.init(state, macro_dt), macro_dt)
+    if system.is_constrained:  # rows that contradict each other leave increments that converge
+        fails = (info.result <= Result.CONVERGED_AT_ROUNDOFF) & ~are_kept(system, state, solver.tolerance)[0]
+        info = eqx.tree_at(lambda info: info.result, info, jnp.where(fails, Result.CONSTRAINT_VIOLATED, info.result))
     return planned.project(state, memory)[0] if planned.defers_projection else state, info

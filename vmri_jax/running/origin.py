@@ -2,13 +2,14 @@
 
 import pickle
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any, TypeAlias
 
-import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 
+from vmri_jax.mechanics.arrays import is_concrete, options_of_runs
 from vmri_jax.mechanics.checks import check_system
 from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.rows import Part
@@ -19,6 +20,13 @@ from vmri_jax.running.settings import Settings
 
 SavedRun: TypeAlias = Any
 """A `vmri_jax.Trajectory` in annotations of modules that its own module imports."""
+
+NODES_AT_ONCE = 16
+"""Nodes of a block, evaluated side by side. With fewer nodes XLA uses no vector instructions; with 64 the matrices of scenes no longer fit into the
+first-level cache, and a run of a few nodes takes longer."""
+NUMBERS_PER_CALL = 4096
+"""Numbers in the nodes of a call, 32 kB. A larger value makes calls for short runs slower, which copy all of them; a smaller value divides long runs
+into more calls of some 20 microseconds each."""
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=["bare", "params"], meta_fields=["names", "settings"])
@@ -128,7 +136,7 @@ def names_of(moving: Any) -> Names | None:
 
 
 def at_nodes(function, origin: Origin, nodes, *static):
-    """``function(system, node, *static)`` at every node.
+    """``function(system, node, *static)`` at every node; of concrete numbers by one program for runs of all lengths.
 
     Args:
         function: a function at module level, so that it is compiled once for each system structure.
@@ -139,14 +147,37 @@ def at_nodes(function, origin: Origin, nodes, *static):
     Raises:
         ValueError: the system is not known.
     """
-    axes = jax.tree.leaves(nodes)[0].ndim
-    origin.system(axes - 1)  # raises if the system is not known
-    arrays, structure = jax.tree.flatten((origin.bare, origin.params))
-    # Arrays that all lanes share go in once: mapped over the lanes they would be copied for each.
-    repeated = tuple(is_repeated(array, axes - 1) for array in arrays)
-    arrays = [array[(0,) * (axes - 1)] if shared else array for array, shared in zip(arrays, repeated, strict=True)]
+    origin.system(np.ndim(jax.tree.leaves(nodes)[0]) - 1)  # raises if the system is not known
+    arrays, structure = jax.tree.flatten(origin.bare.with_params(origin.params))
     with Working("quantities of the run"):
-        return _mapped(function, repeated, structure, static, arrays, nodes)
+        values = evaluated(function, structure, arrays, nodes, *static)
+    return jax.device_put(values) if is_concrete(values) else values
+
+
+def evaluated(function, structure, arrays: list, nodes, *static):
+    """`at_nodes` of the system with this structure and these leaves, which have the axes of lanes in a batch; concrete values as arrays of NumPy.
+
+    A call of the program gets a room of nodes, of which it evaluates the first blocks; long runs take several calls.
+    """
+    shape = np.shape(jax.tree.leaves(nodes)[0])
+    axes, count = len(shape), int(np.prod(shape))
+    # Arrays that all lanes share go in once: for each node they would be copied.
+    is_shared = [axes == 1 or is_repeated(array, axes - 1) for array in arrays]
+    shared = [array[(0,) * (axes - 1)] if once else None for array, once in zip(arrays, is_shared, strict=True)]
+    of_lanes = _in_a_row([None if once else array for array, once in zip(arrays, is_shared, strict=True)], axes - 1)
+    of_nodes, node = _in_a_row(nodes, axes), np.arange(count)
+    if not is_concrete((arrays, nodes)):
+        values = _at_all(function, structure, static, True)(shared, _rows(of_lanes, node // shape[-1]), of_nodes)
+        return jax.tree.map(lambda a: a.reshape(*shape, *a.shape[1:]), values)
+    numbers = sum(int(np.prod(leaf.shape[1:])) for leaf in jax.tree.leaves((of_lanes, of_nodes)))
+    room = max(NUMBERS_PER_CALL // numbers // NODES_AT_ONCE, 1) * NODES_AT_ONCE
+    program, pieces = _at_all(function, structure, static, False), []
+    for first in range(0, count, room):
+        node, size = np.minimum(np.arange(first, first + room), count - 1), min(room, count - first)
+        parts = _rows(of_lanes, node // shape[-1]), _rows(of_nodes, node)  # the last node fills up the room
+        values = program(shared, *parts, -(-size // NODES_AT_ONCE))
+        pieces.append(jax.tree.map(lambda a, size=size: np.asarray(a)[:size], values))
+    return jax.tree.map(lambda *a: np.concatenate(a).reshape(*shape, *a[0].shape[1:]), *pieces)
 
 
 def is_repeated(array, axes: int = 1) -> bool:
@@ -154,15 +185,38 @@ def is_repeated(array, axes: int = 1) -> bool:
     return isinstance(array, np.ndarray) and axes > 0 and not any(array.strides[:axes])
 
 
-@eqx.filter_jit
-def _mapped(function, repeated: tuple[bool, ...], structure, static: tuple, arrays: list, nodes):
-    def at_node(arrays, node):
-        bare, params = jax.tree.unflatten(structure, arrays)
-        return function(bare.with_params(params), node, *static)
+def _in_a_row(tree, axes: int):
+    """The arrays with their first axes joined to one."""
+    as_array = np.asarray if is_concrete(tree) else jnp.asarray
+    return jax.tree.map(lambda a: as_array(a).reshape(int(np.prod(a.shape[:axes])), *a.shape[axes:]), tree)
 
-    mapped = at_node
-    for axis in range(jax.tree.leaves(nodes)[0].ndim):
-        # axis 0, the innermost map, runs over the nodes
-        lanes = [None if axis == 0 or shared else 0 for shared in repeated]
-        mapped = jax.vmap(mapped, (lanes, 0))
-    return mapped(arrays, nodes)
+
+def _rows(tree, rows: np.ndarray):
+    return jax.tree.map(lambda a: a[rows], tree)
+
+
+@lru_cache(maxsize=64)
+def _at_all(function, structure, static: tuple, traced: bool):
+    """``program(shared, of_lanes, of_nodes, blocks)``: values at the nodes of the first blocks, zeros for all others; traced at all nodes."""
+
+    def at_node(shared, of_lane, node):
+        arrays = [lane if array is None else array for array, lane in zip(shared, of_lane, strict=True)]
+        return function(jax.tree.unflatten(structure, arrays), node, *static)
+
+    at_block = jax.vmap(jax.jit(at_node), (None, 0, 0))  # jitted, so that shapes and values take one trace
+
+    def program(shared, of_lanes, of_nodes, blocks):
+        def block(i, values):
+            part = jax.tree.map(lambda a: slice_in_dim(a, i * NODES_AT_ONCE, NODES_AT_ONCE), (of_lanes, of_nodes))
+            new = at_block(shared, *part)
+            return jax.tree.map(lambda a, b: update_in_dim(a, b, i * NODES_AT_ONCE, 0), values, new)
+
+        slice_in_dim, update_in_dim = jax.lax.dynamic_slice_in_dim, jax.lax.dynamic_update_slice_in_dim
+        shapes = jax.eval_shape(at_block, shared, of_lanes, of_nodes)
+        return jax.lax.fori_loop(0, blocks, block, jax.tree.map(lambda of: jnp.zeros(of.shape, of.dtype), shapes))
+
+    return (
+        jax.jit(lambda *arrays: at_block(*arrays[:3]))
+        if traced
+        else jax.jit(program, compiler_options=options_of_runs())
+    )

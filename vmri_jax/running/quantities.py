@@ -19,6 +19,7 @@ from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.summary import has_values, summary
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.micro_nodes import Nodes, why_not, with_micro_nodes
+from vmri_jax.running.observables import LostEnergyWarning, concerns, observables, with_tolerance
 from vmri_jax.running.origin import Origin, SavedRun, at_nodes
 
 RANDOM_RATIO = 0.5
@@ -228,6 +229,18 @@ class Quantities(ABC):
         forces, constraints = simpson[::stride].T
         energy = np.asarray(run.energy)
         return Work(forces, constraints, energy - energy[0] - forces - constraints, uncertainty)
+
+    def concerns(self) -> list[LostEnergyWarning]:
+        """What is wrong with the motion: the warnings that `simulate` gives; for a run in a transformation of JAX they are asked for afterwards.
+
+        Failures are in the status of the run. Macro steps between saved nodes are not known: they count as one step.
+
+        Raises:
+            ValueError: the run does not know its system.
+        """
+        run = _concrete("concerns", self.whole())
+        table, t = np.asarray(at_nodes(observables, run.origin, with_tolerance(run.states, 0.0))), np.asarray(run.t)
+        return concerns(table, t, run.origin.system(t.ndim - 1), np.mean(np.diff(t), axis=-1), 1)
 
     def plot(self, title: str = ""):
         """Positions, energy and constraints against time, a matplotlib `Figure`; more in `vmri_jax.plots`.

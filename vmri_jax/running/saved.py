@@ -1,4 +1,4 @@
-"""Saved nodes of a run while it is computed, one row of numbers for each node, and the trajectory made from the rows.
+"""Saved nodes of a run while it is computed, one row of numbers for each node, and the run made from the rows.
 
 A node is a single write into a single array: XLA on CPU would take longer for one write into each field.
 """
@@ -13,29 +13,19 @@ from jaxtyping import Float
 
 from vmri_jax.mechanics.arrays import Numbers
 from vmri_jax.mechanics.state import State
-from vmri_jax.running.trajectory import MicroNodes, RunInfo, Trajectory
+from vmri_jax.running.trajectory import MicroNodes, Run, RunInfo
 
 NUMBERS_PER_PIECE = 2**17
 """Numbers in the nodes of a piece of a run, a megabyte. A larger value takes more memory in processes with many systems; a smaller one
 divides long runs into more calls of some 30 microseconds each."""
-SCALARS_PER_NODE = 4
-"""Numbers of a node besides positions and momenta: time, energy, two constraint residuals."""
 SOLVER_NUMBERS = len(RunInfo._fields)
 """Numbers of a row for the work of the solver since the previous node."""
-
-
-class Node(NamedTuple):
-    """The fields of a `Trajectory` that belong to a node."""
-
-    state: State
-    energy: Float[Numbers, "*k"]
-    constraint_residual: Float[Numbers, "*k 2"]
 
 
 class Saved(NamedTuple):
     """Arrays for the nodes of a run, of JAX or of NumPy.
 
-    rows: a row for each node: its `Node`, and the `RunInfo` since the previous node.
+    rows: a row for each node: its `State`, and the `RunInfo` since the previous node.
     micros: fast positions at micro nodes; None unless micro nodes are saved.
     """
 
@@ -44,14 +34,13 @@ class Saved(NamedTuple):
 
     @classmethod
     def none(cls, state: State, room: int, num_micro: int | None) -> "Saved":
-        """Arrays without nodes. `num_micro` is None unless micro nodes are saved."""
-        row = _empty_row(numbers_per_node(state))
-        micros = None if num_micro is None else jnp.full((room, num_micro, state.q_f.shape[0]), jnp.nan)
-        return cls(jnp.broadcast_to(row, (room + 1, row.size)), micros)
+        """Arrays without nodes; zeros, since `jax_debug_nans` stops a program that returns NaN. `num_micro` is None unless micro nodes are saved."""
+        micros = None if num_micro is None else jnp.zeros((room, num_micro, state.q_f.shape[0]))
+        return cls(jnp.zeros((room + 1, numbers_per_node(state))), micros)
 
-    def write(self, number, node: Node, info: RunInfo, micro) -> "Saved":
+    def write(self, number, state: State, info: RunInfo, micro) -> "Saved":
         """The arrays with node `number` written into them; node 0, the start, has no micro nodes before it."""
-        row = jnp.concatenate([jnp.ravel(jnp.asarray(a, float)) for a in jax.tree.leaves((node, info))])
+        row = jnp.concatenate([jnp.ravel(jnp.asarray(a, float)) for a in jax.tree.leaves((state, info))])
         rows = jax.lax.dynamic_update_index_in_dim(self.rows, row, number, 0)
         micros = self.micros
         if micros is not None:
@@ -68,8 +57,16 @@ class Saved(NamedTuple):
         micros[max(written - 1, 0) :] = np.nan
         return Saved(rows, micros)
 
-    def trajectory(self, num_slow: int, times, status: dict[str, Any], before_end) -> Trajectory:
-        """All nodes as a trajectory.
+    def ended(self, saves, written) -> "Saved":
+        """The arrays of JAX with NaN in the nodes from number `written` to `saves`, which a failed run has not reached."""
+        number = jnp.arange(len(self.rows))
+        is_missing = (number >= written) & (number <= saves)
+        rows = jnp.where(is_missing[:, None], _empty_row(self.rows.shape[1]), self.rows)
+        micros = None if self.micros is None else jnp.where(is_missing[1:, None, None], jnp.nan, self.micros)
+        return Saved(rows, micros)
+
+    def run(self, num_slow: int, times, status: dict[str, Any], before_end) -> Run:
+        """All nodes as a run.
 
         Args:
             num_slow: n_s.
@@ -78,19 +75,19 @@ class Saved(NamedTuple):
             before_end: (num_micro,) times from the micro nodes of a macro step to its end.
         """
         module = jnp if isinstance(self.rows, jax.Array) else np
-        num_fast = (self.rows.shape[1] - SCALARS_PER_NODE - SOLVER_NUMBERS) // 2 - num_slow
-        ends = list(accumulate((1, num_slow, num_fast, num_slow, num_fast, 1, 2)))
-        t, q_s, q_f, p_s, p_f, energy, constraint_residual, work = module.split(self.rows, ends, axis=1)
+        num_fast = (self.rows.shape[1] - 1 - SOLVER_NUMBERS) // 2 - num_slow
+        ends = list(accumulate((1, num_slow, num_fast, num_slow, num_fast)))
+        t, q_s, q_f, p_s, p_f, work = module.split(self.rows, ends, axis=1)
         t = module.where(module.isnan(t[:, 0]), times, t[:, 0])
         method, iterations, residual = work[1:].T
         info = RunInfo(method.astype(int), iterations.astype(int), residual)
         micro = None if self.micros is None else MicroNodes(t[1:, None] - before_end, self.micros)
-        return Trajectory(State(t, q_s, q_f, p_s, p_f), energy[:, 0], constraint_residual, info, **status, micro=micro)
+        return Run(State(t, q_s, q_f, p_s, p_f), info, **status, micro=micro)
 
 
 def numbers_per_node(state: State, num_micro: int = 0) -> int:
     """Numbers of a saved node, with `num_micro` micro nodes."""
-    row = 2 * (state.q_s.size + state.q_f.size) + SCALARS_PER_NODE + SOLVER_NUMBERS
+    row = 1 + 2 * (state.q_s.size + state.q_f.size) + SOLVER_NUMBERS
     return row + num_micro * (state.q_f.size + 1)
 
 

@@ -6,6 +6,8 @@
 | ``run.in_pieces()``, ``run.advance(...)`` | `Engine.piece`, one program for runs of all lengths | `simulate`, `stream` |
 | `vmri_jax.running.adjoints` | `Engine.stored`, `Engine.checkpointed`, with derivatives | `simulate` under transformations |
 
+All of them return a `Run`, states and statuses; `Simulation.observed` makes its `Trajectory`, with energy, constraints and failures of the nodes.
+
 *The fallback*: with `solvers.Auto` a piece whose first solver fails is computed again by `solvers.Arrowhead`, whose Newton matrices are exact,
 with the same tolerance and limit of iterations; all pieces after it are computed by `Arrowhead` alone. Names with `exact` belong to the fallback.
 """
@@ -22,7 +24,7 @@ import numpy as np
 
 from vmri_jax.configure import warn_if_slow
 from vmri_jax.mechanics.arrays import is_concrete, of_one_type
-from vmri_jax.mechanics.checks import check_closures, check_params, check_system
+from vmri_jax.mechanics.checks import check_params, check_system
 from vmri_jax.mechanics.constraints import check_constraints, check_mass
 from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.state import Movable, State, opened, start_of
@@ -33,10 +35,11 @@ from vmri_jax.running.engine import Arrays, Engine, Model, PieceStart, engine
 from vmri_jax.running.failures import simulation_error
 from vmri_jax.running.interrupts import Interrupted, interrupts_noted
 from vmri_jax.running.memory import check_memory
-from vmri_jax.running.origin import Origin, names_of
+from vmri_jax.running.observables import concerns, failures, observables, with_tolerance
+from vmri_jax.running.origin import Origin, evaluated, names_of
 from vmri_jax.running.progress import ShowsProgress, Working, progress_to
 from vmri_jax.running.saved import room_of_a_piece
-from vmri_jax.running.trajectory import Trajectory, from_arrays, join, with_origin
+from vmri_jax.running.trajectory import Run, Trajectory, join, trajectory_of, with_origin
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers import solvers
@@ -108,16 +111,16 @@ class Simulation:
         """
         arguments = self._arguments(state, macro_dt, params, num_steps)
         origin = self.origin if params is None else replace(self.origin, params=params)
+        arrays, save_every, _ = arguments
         with Working("the run", running=STEPPING):
-            trajectory = with_origin(from_arrays(self._program(False)(*arguments)), origin)
-        if int(trajectory.failed_at) < 0:
-            return trajectory
-        if self._fallback_helps(trajectory):
+            run, table = self._whole(False, arguments)
+        if self._fallback_helps(run):
             with Working(FALLING_BACK):
-                trajectory = with_origin(from_arrays(self._program(True)(*arguments)), origin)
+                run, table = self._whole(True, arguments)
+        trajectory = with_origin(trajectory_of(run, table), origin)
         if throw and int(trajectory.failed_at) >= 0:
-            arrays, save_every, _ = arguments
             raise simulation_error(trajectory, arrays.macro_dt, save_every, self.scheme.num_micro)
+        self.warn("run", table, run.states.t, arrays.macro_dt, save_every)
         return trajectory
 
     def compiled(self) -> jax.stages.Compiled:
@@ -131,9 +134,9 @@ class Simulation:
         """
         arrays, *counts = self._arguments(state, macro_dt, params, num_steps)
         arguments = jax.device_put(arrays), *counts
-        program = self._program(self._fallback_helps(from_arrays(self._program(False)(*arguments))))
+        program = self._program(self._fallback_helps(self._whole(False, arguments)[0]))
         program(*arguments)
-        return lambda: program(*arguments)[0].block_until_ready()  # the arrays of one program are ready together
+        return lambda: program(*arguments)[1].block_until_ready()  # the arrays of one program are ready together
 
     def _arguments(self, state, macro_dt, params, num_steps) -> tuple[Arrays, int, int]:
         """The arguments of the programs of the engine."""
@@ -155,6 +158,40 @@ class Simulation:
         macro_dt = self.macro_dt if macro_dt is None else np.asarray(macro_dt, dtype=float)
         return Arrays(leaves, start, macro_dt), save_every, self.num_saves
 
+    def observed(self, run: Run, model: list, step: int = 0) -> tuple[Run, Any]:
+        """A run and its `Observables` (..., k, 9), both NaN from a failure on; failures that the nodes show are in its status.
+
+        Args:
+            run: of the engine.
+            model: the leaves of its model, of which the last ones are the leaves of the system; in a batch with an axis of lanes.
+            step: macro steps before its first node.
+        """
+        structure, count = self._system
+        table = evaluated(
+            observables, structure, model[len(model) - count :], with_tolerance(run.states, self.solver.tolerance)
+        )
+        return failures(run, table, self.save_every, step)
+
+    def at_start(self) -> np.ndarray:
+        """(1, 9) the `Observables` of the start."""
+        structure, count = self._system
+        start = jax.tree.map(lambda a: np.asarray(a)[None], self.state)
+        return evaluated(
+            observables, structure, self.arrays.model[-count:], with_tolerance(start, self.solver.tolerance)
+        )
+
+    def traced(self, run: Run) -> Trajectory:
+        """The trajectory of a run some of whose arrays are tracers: its observables are a part of the trace."""
+        return with_origin(trajectory_of(*self.observed(run, self.arrays.model)), self.origin)
+
+    def warn(self, caller: str, table, t, macro_dt=None, save_every: int | None = None, stacklevel: int = 3) -> bool:
+        """Give the warnings about the motion of a run, or of a batch, see `concerns`, with its arguments; returns whether there are any."""
+        macro_dt, save_every = self.macro_dt if macro_dt is None else macro_dt, save_every or self.save_every
+        all_concerns = concerns(table, t, self.system, macro_dt, save_every)
+        for concern in all_concerns:
+            warnings.warn(type(concern)(f"{caller}: {concern}"), stacklevel=stacklevel)
+        return bool(all_concerns)
+
     def _leaves_with(self, params) -> list:
         """The leaves of the model with other parameters."""
         expected, expected_structure = jax.tree.flatten(self.system.params)
@@ -166,6 +203,11 @@ class Simulation:
             raise ValueError(f"params is {params!r}; give the pytree of system.params with other numbers in it.")
         leaves = self.arrays.model  # the parameters come last, see `Arrays`
         return leaves[: len(leaves) - len(expected)] + [np.asarray(leaf) for leaf in new]
+
+    def _whole(self, falls_back: bool, arguments: tuple) -> tuple[Run, np.ndarray]:
+        """The run by one program, as of `observed`."""
+        leaves, table = self._program(falls_back)(*arguments)
+        return failures(Run.of(leaves), np.asarray(table), arguments[1])
 
     def _program(self, falls_back: bool):
         """The compiled run, see `Engine.whole`."""
@@ -230,6 +272,12 @@ class Simulation:
         return jax.tree.flatten(Model(self.solver, self.scheme, self.system))
 
     @cached_property
+    def _system(self) -> tuple[Any, int]:
+        """Structure of the system, and the number of its leaves."""
+        leaves, structure = jax.tree.flatten(self.system)
+        return structure, len(leaves)
+
+    @cached_property
     def _exact_structure(self) -> Any:
         """Structure of the `Model` with the fallback."""
         return jax.tree.structure(Model(self.solver.exact(), self.scheme, self.system))
@@ -256,14 +304,13 @@ class Simulation:
     def _piece_engine(self, is_exact: bool) -> Engine:
         return self.engine_for(is_exact, room_of_a_piece(self.state, self.scheme.num_micro, self.save_micro))
 
-    def advance(self, checkpoint: Checkpoint, saves: int) -> tuple[list[Trajectory], Checkpoint]:
-        """The next `saves` saved intervals, in pieces; from the first piece that the first solver does not solve, with the fallback."""
+    def advance(self, checkpoint: Checkpoint, saves: int) -> tuple[list[tuple[Run, np.ndarray]], Checkpoint]:
+        """The next `saves` saved intervals, in pieces as of `observed`; from the first one that the first solver does not solve, with the fallback."""
         pieces, room = [], self._piece_engine(checkpoint.fell_back).num_saves
-        # Pieces after a failure start from NaN and end at once: the trajectory keeps its length.
         for done in range(0, saves, room):
             size = min(room, saves - done)
             piece, after = self._advance(checkpoint, size)
-            if not checkpoint.fell_back and self._fallback_helps(piece):
+            if not checkpoint.fell_back and self._fallback_helps(piece[0]):
                 with Working(FALLING_BACK):
                     again = self.start(checkpoint.state, checkpoint.step, fell_back=True)
                     piece, after = self._advance(again, size)
@@ -271,14 +318,18 @@ class Simulation:
             checkpoint = after
         return pieces, checkpoint
 
-    def _advance(self, checkpoint: Checkpoint, saves: int) -> tuple[Trajectory, Checkpoint]:
+    def _advance(self, checkpoint: Checkpoint, saves: int) -> tuple[tuple[Run, np.ndarray], Checkpoint]:
         step, state, memory, fell_back, is_first = checkpoint
+        is_alive = not np.isnan(state.t)  # after a failure nothing is computed, and the trajectory keeps its length
         arrays = self.arrays._replace(state=tuple(vars(state).values()))
         begin = PieceStart(memory, is_first, self.arrays.state[0], step)
-        piece, state, memory = self._piece_engine(fell_back).next_piece(arrays, begin, self.save_every, saves)
+        run, state, memory = self._piece_engine(fell_back).next_piece(arrays, begin, self.save_every, saves, is_alive)
+        piece = self.observed(run, arrays.model, step)
+        if not is_alive or int(piece[0].failed_at) >= 0:
+            state = replace(state, t=np.asarray(np.nan))
         return piece, Checkpoint(step + saves * self.save_every, state, memory, fell_back)
 
-    def _fallback_helps(self, piece: Trajectory) -> bool:
+    def _fallback_helps(self, piece: Run) -> bool:
         """Whether a step failed that the fallback may solve.
 
         It cannot help explicit and linear equations, the methods up to `Method.LINEAR`, nor a step that was solved but violates implied
@@ -287,11 +338,14 @@ class Simulation:
         failed = self.may_fall_back and int(piece.failed_at) >= 0 and int(piece.result) != Result.NOT_IMPLIED
         return failed and int(np.max(piece.info.method)) > Method.LINEAR and self.plan.has_fallback
 
-    def in_pieces(self, progress: ShowsProgress = False) -> Trajectory:
-        """The whole run; with a progress bar Ctrl-C raises `Interrupted` with the trajectory computed so far."""
+    def in_pieces(self, progress: ShowsProgress = False, caller: str = "") -> Trajectory:
+        """The whole run; with a progress bar Ctrl-C raises `Interrupted` with the trajectory computed so far.
+
+        With the name of a `caller` it warns about the motion, see `warn`.
+        """
         if progress is False:
             with Working("the run", running=STEPPING):
-                return self._joined(self.advance(self.start(), self.num_saves)[0])
+                return self._joined(self.advance(self.start(), self.num_saves)[0], caller)
         size, checkpoint, pieces = -(-self.num_saves // PARTS_OF_A_BAR), self.start(), []
         with interrupts_noted() as interrupted, progress_to("simulate", progress) as tell:
             for done in range(0, self.num_saves, size):
@@ -300,11 +354,15 @@ class Simulation:
                 pieces += new_pieces
                 if interrupted():
                     raise Interrupted(self._joined(pieces), checkpoint.step, self.num_steps, "macro steps")
-        return self._joined(pieces)
+        return self._joined(pieces, caller)
 
-    def _joined(self, pieces: list[Trajectory]) -> Trajectory:
+    def _joined(self, pieces: list[tuple[Run, np.ndarray]], caller: str = "") -> Trajectory:
         """One trajectory with arrays of JAX; `device_put`, since `jax.numpy.asarray` would compile a program for every length."""
-        return with_origin(jax.device_put(join(pieces)), self.origin)
+        whole = join([trajectory_of(*piece) for piece in pieces])
+        if caller:
+            tables = [table[1 if i else 0 :] for i, (_, table) in enumerate(pieces)]
+            self.warn(caller, np.concatenate(tables) if len(tables) > 1 else tables[0], whole.t, stacklevel=5)
+        return with_origin(jax.device_put(whole), self.origin)
 
 
 def prepare(
@@ -327,7 +385,8 @@ def prepare(
         other = run(other_state, macro_dt=0.02, params=other_params)
 
     A call costs some ten microseconds besides its steps, and raises `SimulationError` if a step fails, as `simulate` does. The first call
-    that needs the fallback of `solvers.Auto` compiles it, which takes as long as `prepare`. Arguments as of `simulate`.
+    that needs the fallback of `solvers.Auto` compiles it, which takes as long as `prepare`. The run keeps what the functions of the system
+    read from around them (globals, closures, attributes) when it was prepared. Arguments as of `simulate`.
 
     Returns:
         The `Simulation`.
@@ -387,7 +446,6 @@ class _Checked:
 def _check_once(checked: _Checked) -> None:
     """Check a system at a state. The check takes longer than a short run; the cache skips it for an equal `key`."""
     check_system(checked.system, checked.state.q_s, checked.state.q_f)
-    check_closures(checked.system, checked.state.q_s, checked.state.q_f)
     check_mass(checked.system, checked.state.q_s, checked.state.q_f)
     if checked.constraints:
         check_constraints(checked.system, checked.state, checked.state_name)

@@ -16,6 +16,7 @@ from vmri_jax.mechanics.summary import has_values, summary
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.export import MICRO, Exports
 from vmri_jax.running.files import replaced
+from vmri_jax.running.observables import Observables
 from vmri_jax.running.origin import UNKNOWN, Origin
 from vmri_jax.running.run_error import RunError
 from vmri_jax.running.settings import Settings
@@ -68,6 +69,22 @@ class MicroNodes(NamedTuple):
 
     t: Float[Numbers, "k-1 num_micro"]
     q_f: Float[Numbers, "k-1 num_micro n_f"]
+
+
+class Run(NamedTuple):
+    """The arrays that the programs of runs return, fields as of `Trajectory`: a run before anything is computed of its states."""
+
+    states: State
+    info: RunInfo
+    result: Int[Numbers, ""]
+    failed_at: Int[Numbers, ""]
+    micro: MicroNodes | None = None
+
+    @classmethod
+    def of(cls, arrays: list) -> "Run":
+        """The run with these leaves, with or without micro nodes."""
+        states, info, (result, failed_at, *micro) = State(*arrays[:5]), RunInfo(*arrays[5:8]), arrays[8:]
+        return cls(states, info, result, failed_at, MicroNodes(*micro) if micro else None)
 
 
 @jax.tree_util.register_dataclass
@@ -293,6 +310,12 @@ def with_origin(trajectory: Trajectory, origin: Origin) -> Trajectory:
     return replace(trajectory, result=result, origin=origin)
 
 
+def trajectory_of(run: Run, table) -> Trajectory:
+    """The trajectory of a run with its `Observables` (..., k, 9)."""
+    now = Observables.of(table)
+    return Trajectory(run.states, now.energy, table[..., 1:3], run.info, run.result, run.failed_at, run.micro)
+
+
 def ends_of(run: str, nodes: slice, count: int) -> tuple[int, int, int]:
     """First node, last node and stride of a slice.
 
@@ -372,14 +395,6 @@ def from_named_arrays(arrays: dict) -> Trajectory:
     micro = None if arrays.get(MICRO[0]) is None else MicroNodes(*(arrays[name] for name in MICRO))
     error: Any = None if arrays.get(ERROR[0]) is None else RunError(*(arrays.get(name) for name in ERROR))
     return Trajectory(states, info=info, micro=micro, error=error, **fields)
-
-
-def from_arrays(arrays: list) -> Trajectory:
-    """The trajectory with these leaves, with or without micro nodes."""
-    t, q_s, q_f, p_s, p_f, energy, constraint_residual, method, iterations, residual, result, failed_at, *micro = arrays
-    states, info = State(t, q_s, q_f, p_s, p_f), RunInfo(method, iterations, residual)
-    micro_nodes = MicroNodes(*micro) if micro else None
-    return Trajectory(states, energy, constraint_residual, info, result, failed_at, micro_nodes)
 
 
 _FIELDS = {*NODES, *STATUS, *MICRO, *RunInfo._fields}

@@ -270,9 +270,9 @@ class Frame(AnyBody):
             Revolute(("ground", "yoke"), [0, 0, 1], axis=[1, 0, 0], name="roll"),
             Revolute(("yoke", "thigh"), [0, 0, 1], axis=[0, 1, 0], name="pitch"),
         ]
-        Scene(bodies, joints, coordinates="joint")
+        Scene(bodies, joints)
 
-    A frame hangs on a body or on the ground by a joint and carries at least one body; the scene must have joint coordinates.
+    A frame hangs on a body or on the ground by a joint and carries at least one body; it always has joint coordinates.
 
     Args:
         name: of the frame in joints.

@@ -14,7 +14,7 @@ from vmri_jax.mechanics import invariants
 from vmri_jax.mechanics.masses import ConstantMass
 from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.state import Problem, State, initial_state
-from vmri_jax.mechanics.summary import name_of
+from vmri_jax.mechanics.surroundings import name_of
 from vmri_jax.mechanics.system import System, label
 from vmri_jax.running.printed import PrintedTable
 from vmri_jax.running.simulation import Simulation, prepare

@@ -20,9 +20,9 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from vmri_jax.mechanics.arrays import quickly_compiled
+from vmri_jax.mechanics.functions import TracedOnce
 from vmri_jax.scene.body import LARGEST_POINT, Bodies, label_of, moving
 from vmri_jax.scene.effect import Effect
-from vmri_jax.scene.terms import EffectTerm
 
 SEPARATION = 3.0
 """Smallest ratio of neighbouring rates that separates slow from fast: below it micro steps cost more than they save. With a larger value
@@ -139,7 +139,9 @@ def _linearise(effect: Effect, bodies: Bodies, columns: Mapping[str, np.ndarray]
         term, element_params = effect.element_term(i, bodies, params)
         q = jnp.concatenate([bodies[name].coordinates for name in element])
         v = jnp.concatenate([bodies[name].rates for name in element])
-        force, *matrices = map(np.asarray, _derivatives(term, effect.kind == "kinetic", q, v, element_params))
+        is_kinetic = effect.kind == "kinetic"
+        function = TracedOnce(term.kinetic if is_kinetic else term.value)
+        force, *matrices = map(np.asarray, _derivatives(function, is_kinetic, q, v, element_params))
         each = [bodies[name].motions for name in element]
         motions = block_diag(*each)
         force, (stiffness, gyroscopic, mass) = motions.T @ force, [motions.T @ matrix @ motions for matrix in matrices]
@@ -157,14 +159,14 @@ def _linearise(effect: Effect, bodies: Bodies, columns: Mapping[str, np.ndarray]
     return linearised
 
 
-@partial(quickly_compiled, static_argnames=("term", "kinetic"))
-def _derivatives(term: EffectTerm, kinetic: bool, q, v, params):
-    """The force, K, G and d2L/dv2 of an element in the coordinates of its bodies."""
+@partial(quickly_compiled, static_argnames="kinetic")
+def _derivatives(function: TracedOnce, kinetic: bool, q, v, params):
+    """The force, K, G and d2L/dv2 of an element, whose value or kinetic energy is `function`, in the coordinates of its bodies."""
     # the derivatives of L = -V(q) by velocities are zero: tracing and compiling them would take time for nothing
     if not kinetic:
 
         def gradient(q):
-            values = jax.grad(term.value)(q, None, params)
+            values = jax.grad(function)(q, None, params)
             return values, values
 
         stiffness, values = jax.jacfwd(gradient, has_aux=True)(q)
@@ -172,7 +174,7 @@ def _derivatives(term: EffectTerm, kinetic: bool, q, v, params):
         return -values, stiffness, zero, zero
 
     def lagrangian(q, v):
-        return term.kinetic(q, None, v, None, params)
+        return function(q, None, v, None, params)
 
     def force(q, v):
         """``f = L_q - L_vq v``."""

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from itertools import chain
 from typing import Any, NamedTuple
 
@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.mechanics.arrays import is_concrete, quickly_compiled
+from vmri_jax.mechanics.functions import TracedOnce
 from vmri_jax.mechanics.names import Names
 from vmri_jax.scene.body import LARGEST_POINT, Bodies, label_of, moving
 from vmri_jax.scene.effect import Effect
@@ -18,7 +19,6 @@ from vmri_jax.scene.effects.freedoms import ANGLES
 from vmri_jax.scene.layout import Key, join
 from vmri_jax.scene.rates import positions
 from vmri_jax.scene.sorting import Home, Placed, Sorting
-from vmri_jax.scene.terms import EffectTerm
 
 HOMES: tuple[Home, ...] = ("slow_constraint", "constraint")
 """The arguments of `System` that hold constraints, in the order of the grids macro, micro."""
@@ -49,11 +49,11 @@ class Row(NamedTuple):
 class _Element(NamedTuple):
     """An element of a constraint as a function of the coordinates of its bodies.
 
-    term, params: see `Effect.element_term`.
+    value, params: of its term, see `Effect.element_term`.
     columns: numbers of these coordinates, and of the freedoms that are coordinates, in (Q_s, Q_f), taken as one vector.
     """
 
-    term: EffectTerm
+    value: TracedOnce
     params: dict[str, Any]
     columns: np.ndarray
 
@@ -100,7 +100,7 @@ class ConstraintRows:
             number = 0
             for names, element in _elements(part, bodies, columns, params[i]):
                 elements.append(element)
-                size = _value_and_jacobian(element.term, element.params, q_bodies[element.columns], 0.0)[0].size
+                size = _value_and_jacobian(element.value, element.params, q_bodies[element.columns], 0.0)[0].size
                 for j in range(size):
                     name = names if size == 1 else f"{names} [{j}]"
                     rows.append(Row(name, i, number, part.effect, part.home, number not in part.dropped))
@@ -113,7 +113,7 @@ class ConstraintRows:
         q_bodies, by_coordinates = self.to_bodies(q)
         values, by_bodies, first = np.empty(len(self.rows)), np.zeros((len(self.rows), q_bodies.size)), 0
         for element in self.elements:
-            value, entries = _value_and_jacobian(element.term, element.params, q_bodies[element.columns], t)
+            value, entries = _value_and_jacobian(element.value, element.params, q_bodies[element.columns], t)
             values[first : first + value.size] = value
             by_bodies[first : first + value.size, element.columns] = entries
             first += value.size
@@ -159,15 +159,16 @@ def _elements(part: Placed, bodies: Bodies, columns: dict[str | Key, np.ndarray]
     for i in chain(*effect.by_size(part.elements, bodies)):
         freedoms = [key for key in effect.freedoms_of(i) if key in columns]
         of_element = np.concatenate([columns[name] for name in (*moving(elements[i]), *freedoms)])
-        yield _label(effect, elements[i]), _Element(*effect.element_term(i, bodies, params, freedoms), of_element)
+        term, element_params = effect.element_term(i, bodies, params, freedoms)
+        yield _label(effect, elements[i]), _Element(TracedOnce(term.value), element_params, of_element)
 
 
-@partial(quickly_compiled, static_argnames="term")
-def _value_and_jacobian(term: EffectTerm, params, q, t):
+@quickly_compiled
+def _value_and_jacobian(function: TracedOnce, params, q, t):
     """Values (m,) of an element, and their derivatives with respect to the coordinates q of its bodies."""
 
     def values(q):
-        value = jnp.reshape(term.value(q, None, params, t), (-1,))
+        value = jnp.reshape(function(q, None, params, t), (-1,))
         return value, value
 
     jacobian, value = jax.jacfwd(values, has_aux=True)(q)

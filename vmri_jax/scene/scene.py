@@ -259,8 +259,7 @@ class Scene:
             pair: number of the pair of bodies, if the joint has several.
 
         Raises:
-            ValueError: no joint of this name, or a joint without this freedom; a joint without a coordinate that may turn by half a turn or
-                more between two nodes.
+            ValueError: no such joint or freedom; a joint without a coordinate that may turn by half a turn or more between two nodes.
             IndexError: no such pair.
         """
         return along_run(self.sorting, joint_named("Scene.joint_motion", joint, self.effects), run, of, pair)
@@ -274,8 +273,7 @@ class Scene:
             run: of this scene.
 
         Raises:
-            ValueError: the scene has frames without mass, which cannot move by directors; an angle whose turns an effect counts goes beyond 5/6
-                of half a turn, or a limit.
+            ValueError: frames without mass, which cannot move by directors; angles too far for effects that take them from directors.
         """
         frames = [body.name for body in self.bodies if isinstance(body, Frame)]
         if frames:

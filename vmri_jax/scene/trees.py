@@ -8,6 +8,7 @@ effect acts; joints with few freedoms, so that the joints left over have few row
 decide among equals: the order in which bodies and joints are listed has no influence.
 """
 
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from heapq import heappop, heappush
 from itertools import count
@@ -138,17 +139,14 @@ def grow(bodies: Bodies, effects: Sequence[Effect], everywhere: bool = True) -> 
 
 def _offers(bodies: Bodies, effects: Sequence[Effect], ranks: Mapping) -> dict[str, list[tuple]]:
     """For each body all branches that may hang on it, as (sort key, best first; sort key among equals; branch)."""
-    by_parent: dict[str, list[tuple]] = {}
-    number = count()
+    by_parent, number = defaultdict(list), count()
     for joint in (effect for effect in effects if isinstance(effect, Joint) and effect.carries):
         for i, (a, b) in enumerate(joint.elements(bodies)):
             if a != b and all(name == GROUND or (name in bodies and bodies[name].rigid) for name in (a, b)):
-                order, names = (
-                    (ranks.get((joint.name, i), UNUSED), len(joint.moves)),
-                    (joint.name, *sorted((a, b)), next(number)),
-                )
-                by_parent.setdefault(a, []).append((order, names, Branch(b, a, joint, i, True)))
-                by_parent.setdefault(b, []).append((order, names, Branch(a, b, joint, i, False)))
+                order = ranks.get((joint.name, i), UNUSED), len(joint.moves)
+                names = joint.name, *sorted((a, b)), next(number)
+                by_parent[a].append((order, names, Branch(b, a, joint, i, True)))
+                by_parent[b].append((order, names, Branch(a, b, joint, i, False)))
     return by_parent
 
 
@@ -157,9 +155,9 @@ def _ranks(bodies: Bodies, effects: Sequence[Effect]) -> dict[tuple[str, int], i
     ranks: dict[tuple[str, int], int] = {}
     for effect in (effect for effect in effects if isinstance(effect, OfFreedoms)):
         for i in range(len(effect.elements(bodies))):
-            for *pair, freedom in effect.freedoms_of(i):
+            for joint, pair, freedom in effect.freedoms_of(i):
                 rank = COUNTED if effect.counts_turns and freedom in ANGLES else USED
-                ranks[tuple(pair)] = min(rank, ranks.get(tuple(pair), rank))
+                ranks[joint, pair] = min(rank, ranks.get((joint, pair), rank))
     return ranks
 
 

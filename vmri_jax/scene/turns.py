@@ -12,7 +12,7 @@ import numpy as np
 
 from vmri_jax.mechanics.arrays import is_concrete
 from vmri_jax.scene.body import moving
-from vmri_jax.scene.effects.freedoms import ANGLES, REACH, Freedom
+from vmri_jax.scene.effects.freedoms import ANGLES, REACH
 from vmri_jax.scene.effects.joint_base import Joint, OfFreedoms, freedom_of
 from vmri_jax.scene.sorting import Sorting
 from vmri_jax.scene.velocities import steps_of
@@ -68,12 +68,14 @@ def check_run(sorting: Sorting, run: Any, twin: Sorting) -> None:
         _require_reach(effect, "the largest angle of the run", angle, joint)
 
 
-def _from_directors(sorting: Sorting) -> Iterator[tuple[OfFreedoms, int, Joint, int, Freedom]]:
+def _from_directors(sorting: Sorting) -> Iterator[tuple[OfFreedoms, int, Joint, int, str]]:
     """(effect, number of its element, joint, number of its pair, freedom) for all angles that effects which count turns take from directors."""
     joints = {part.effect.name: part.effect for part in sorting.placed if isinstance(part.effect, Joint)}
     for part in sorting.placed:
         effect = part.effect
-        for i in part.elements if isinstance(effect, OfFreedoms) and effect.counts_turns else ():
+        if not (isinstance(effect, OfFreedoms) and effect.counts_turns):
+            continue
+        for i in part.elements:
             for name, pair, freedom in effect.freedoms_of(i):
                 if freedom in ANGLES and (name, pair, freedom) not in sorting.layout.freedoms:
                     yield effect, i, joints[name], pair, freedom

@@ -215,11 +215,20 @@ class Intervals:
         d_fast = d.fast
         if self._kinetic is not None:
             d_fast += self._kinetic.fast_rows(x.fast)
-        # h (p + D_{F_0} A_m), then h D_{F_j} A_m, 0 < j <= r; the last one is the momentum that is handed on
-        slots = jnp.concatenate([(arriving.p_f + d.fast_start - d_fast.sum(0))[None], d_fast])
-        residual = IntervalUnknowns(slots[:-1], self._constraints(path, m, slice(1, None)))
-        on = Arriving(arriving.q_f + x.fast[-1], slots[-1], arriving.start + d.slow_start, arriving.slow + d.slow)
+        # h p + h D_{F_0} A_m + ... + h D_{F_r} A_m: the start momentum plus all impulses. At a root that is h D_{F_r} A_m; but an error e of
+        # the increments, below the round-off of the positions, would change that by M e, and does not change the impulses of the inertia.
+        p_f = arriving.p_f + d.fast_start
+        # h (p + D_{F_0} A_m), then h D_{F_j} A_m, 0 < j < r
+        rows = jnp.concatenate([(p_f - d_fast.sum(0))[None], d_fast[:-1]])
+        residual = IntervalUnknowns(rows, self._constraints(path, m, slice(1, None)))
+        on = Arriving(arriving.q_f + x.fast[-1], p_f, arriving.start + d.slow_start, arriving.slow + d.slow)
         return residual, on
+
+    def impulses(self, m, x: IntervalUnknowns, arriving: Arriving, slow, multiplier) -> Arriving:
+        """Change of the quantities that interval m hands on if `multiplier` is added to its multipliers."""
+        path = IntervalPath(self.seen.take(self.equations.q_s), slow, arriving.q_f, x.fast)
+        (d,) = jax.vjp(partial(self._constraints, m=m, nodes=slice(0, -1)), path)[1](-multiplier)
+        return Arriving(jnp.zeros_like(arriving.q_f), d.fast_start, d.slow_start, d.slow)
 
     def _action(self, path: IntervalPath, held: IntervalPath, mu, m):
         """``h A_m`` without the kinetic energy of constant masses, with the work of forces along `held` on displacements of `path`."""

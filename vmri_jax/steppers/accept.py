@@ -99,9 +99,9 @@ class Accepted(NamedTuple):
     constraints: Number = 0.0
 
     @classmethod
-    def of(cls, equations: StepEquations, newton) -> "Accepted":
-        """The accepted corrections of a step, from the positions at its start."""
-        slow, fast = Weights.of(equations).largest(equations.q_s, equations.q_f)
+    def of(cls, equations: StepEquations, newton, weights: Weights = NO_WEIGHTS) -> "Accepted":
+        """The accepted corrections of a step, from the positions at its start, with the weights of corrections."""
+        slow, fast = weights.largest(equations.q_s, equations.q_f)
         largest = jnp.maximum(slow, fast)
         # a constraint g(q_s, q_f) carries the round-off of q_f to q_s, and vice versa
         tied = (largest, largest) if equations.system.constraint is not None else (slow, fast)
@@ -116,9 +116,9 @@ class Accepted(NamedTuple):
         is_roundoff = self.is_roundoff(size, floor) | (size <= FLOOR / ROUNDOFF * self.constraints)
         return (size > before / 2) & is_roundoff
 
-    def with_constraints(self, equations: StepEquations) -> "Accepted":
+    def with_constraints(self, equations: StepEquations, weights: Weights) -> "Accepted":
         """The same with the round-off of constraints."""
-        return self._replace(constraints=ROUNDOFF * jnp.finfo(float).eps * constraint_length(equations))
+        return self._replace(constraints=ROUNDOFF * jnp.finfo(float).eps * constraint_length(equations, weights))
 
     def is_roundoff(self, size, floor=FLOOR):
         """Whether a correction is at most `floor` units ``eps max |positions|``."""
@@ -135,12 +135,12 @@ class Accepted(NamedTuple):
         numbers = jnp.finfo(float)
         at_rest = numbers.eps * jnp.maximum(*motions) + numbers.tiny
         late = (iterations >= ITERATIONS_BEFORE_TIED_ROUNDOFF) * 1
-        floors = self.slow[late], self.fast[late]
-        allowed = (self.tolerance * size + floor + at_rest for size, floor in zip(motions, floors, strict=True))
-        return jnp.maximum(*(change / largest for change, largest in zip(changes, allowed, strict=True)))
+        # where a correction is larger than the motion, as from rest at the origin, the ratio is 1 / tolerance and does not overflow
+        pairs = zip(changes, map(jnp.maximum, motions, changes), (self.slow[late], self.fast[late]), strict=True)
+        return jnp.maximum(*(change / (self.tolerance * size + floor + at_rest) for change, size, floor in pairs))
 
 
-def constraint_length(equations: StepEquations):
+def constraint_length(equations: StepEquations, weights: Weights = NO_WEIGHTS):
     """Largest radius of curvature of the constraints at the start of a step, ``max_i |e . grad g_i| / |e^T (hess g_i) e|`` along a direction e.
 
     A constraint has the round-off of the lengths in it, which may be far larger than the positions: for ``g = |q - c| - R`` with q near the
@@ -151,7 +151,7 @@ def constraint_length(equations: StepEquations):
         return jnp.zeros(())
     q = jnp.concatenate([equations.q_s, equations.q_f])
     e = np.random.default_rng(0).normal(size=q.size)
-    e, weights = e / np.linalg.norm(e), Weights.of(equations)
+    e = e / np.linalg.norm(e)
     if weights.slow is not None:
         e = e / jnp.concatenate(weights)
 

@@ -36,9 +36,10 @@ class Coupled(Solver):
     def solve(self, equations: StepEquations, guess: Unknowns, memory) -> tuple[Solution, Any]:
         x, result, iterations = self._root(equations, guess)
         residual, (p_s, p_f) = equations.evaluate(x)
-        rows = jnp.maximum(*Weights.of(equations).of_momenta().largest(residual.slow, residual.fast))
+        weights = Weights.of(equations)
+        rows = jnp.maximum(*weights.of_momenta().largest(residual.slow, residual.fast))
         end = equations.q_f + x.fast[:, -1].sum(0), p_s, p_f
-        status = status_of(equations, result, Method.DENSE, iterations, rows=rows, end=end)
+        status = status_of(equations, result, Method.DENSE, iterations, rows=rows, end=end, weights=weights)
         return Solution(x, end, with_dependent_constraints(equations, status)), memory
 
     def _root(self, equations: StepEquations, guess: Unknowns):
@@ -62,7 +63,8 @@ class Coupled(Solver):
         is expected to shrink by ``s = theta min(1, MARGIN theta)``: quadratic convergence with a margin, linear convergence at worst.
         The sum is ``|d_k| s / (1 - s)``.
         """
-        newton, accepted, weights = self.newton, Accepted.of(equations, self.newton), Weights.of(equations)
+        newton, weights = self.newton, Weights.of(equations)
+        accepted = Accepted.of(equations, newton, weights)
 
         def slow_and_fast(x: Unknowns):
             return weights.largest(x.slow, x.fast)

@@ -75,8 +75,9 @@ class MarchEquations:
 
     def __init__(self, equations: StepEquations, inverted=None, weights: Weights = NO_WEIGHTS):
         self.equations, self.intervals = equations, Intervals(equations)
-        self.weights = Weights(*(w if w is None else jnp.tile(w, equations.scheme.degree) for w in weights))
-        self.of_momenta = self.weights.of_momenta()
+        self.weights = weights
+        self.of_increments = Weights(*(w if w is None else jnp.tile(w, equations.scheme.degree) for w in weights))
+        self.of_momenta = self.of_increments.of_momenta()
         self.inverted = inverted or inverse_with_multipliers
         self.n, self.r = equations.scheme.num_micro, equations.scheme.degree
         self.n_s, self.n_f = equations.q_s.size, equations.q_f.size
@@ -100,11 +101,11 @@ class MarchEquations:
 
     def slow_size(self, z):
         """Largest slow increment in z, or in its correction."""
-        return largest(z[: self.num_slow], self.weights.slow)
+        return largest(z[: self.num_slow], self.of_increments.slow)
 
     def fast_size(self, x):
         """Largest fast increment in the unknowns (..., k) of intervals, or in their corrections."""
-        return largest(x[..., : self.num_fast], self.weights.fast)
+        return largest(x[..., : self.num_fast], self.of_increments.fast)
 
     def seen(self, z):
         """(r n_v,) the slow increments in z that intervals see."""
@@ -125,12 +126,16 @@ class MarchEquations:
 
     def interval(self, m, x, arriving: Handed, slow):
         """Residual (k,) of interval m, and the gradients (o,) that it hands on."""
-        unknowns = IntervalUnknowns(
-            x[: self.num_fast].reshape(self.r, self.n_f), x[self.num_fast :].reshape(self.r, self.n_g)
-        )
-        residual, on = self.intervals.evaluate(m, unknowns, self._apart(arriving), slow.reshape(self.r, self.n_v))
+        residual, on = self.intervals.evaluate(m, self._named(x), self._apart(arriving), self._by_node(slow))
         rows = jnp.concatenate([residual.fast.reshape(-1), residual.multiplier.reshape(-1)])
-        return rows, jnp.concatenate([on.p_f, on.start, on.slow.reshape(-1)])
+        return rows, _gradients(on)
+
+    def _named(self, x) -> IntervalUnknowns:
+        fast, multiplier = jnp.split(x, [self.num_fast])
+        return IntervalUnknowns(fast.reshape(self.r, self.n_f), multiplier.reshape(self.r, self.n_g))
+
+    def _by_node(self, slow):
+        return slow.reshape(self.r, self.n_v)
 
     def slow_equations(self, z, arriving: Handed):
         """Residual (b,) of the slow equations, and the slow momentum at the end."""
@@ -169,10 +174,24 @@ class MarchEquations:
         """The fast increment (n_f, ...) from the start of the interval to its end, out of the unknowns (k, ...)."""
         return x[self.num_fast - self.n_f : self.num_fast]
 
-    def corrected(self, inverse, hands_on, x, residual, arriving: Handed, gradients) -> tuple[Any, Handed]:
-        """The correction ``d = -(dR/dx)^-1 R`` of an interval, and its end position and gradients, corrected to first order."""
+    def corrected(self, m, matrices, x, slow, arriving: Handed, values) -> tuple[Any, Handed]:
+        """The correction ``d = -(dR/dx)^-1 R`` of interval m, and its end position and gradients, corrected to first order.
+
+        The impulses of constraints are taken at x itself. Kept matrices would give them a direction of earlier positions, and the multipliers
+        follow the round-off of the constraints: momenta would get errors that no projection onto the hidden constraints removes.
+
+        Args:
+            matrices: ``(dR/dx)^-1``, and the derivative of the gradients that are handed on.
+            values: of `interval`.
+        """
+        (inverse, hands_on), (residual, gradients), n = matrices, values, self.num_fast
         d = -matvec(inverse, residual)
-        return d, Handed(arriving.position + self.last_increment(x + d), gradients + matvec(hands_on, d))
+        gradients += matvec(hands_on[:, :n], d[:n])
+        if self.n_g:
+            dmu = self._named(d).multiplier
+            named = self._named(x), self._apart(arriving), self._by_node(slow)
+            gradients += _gradients(self.intervals.impulses(m, *named, dmu))
+        return d, Handed(arriving.position + self.last_increment(x + d), gradients)
 
     def passed(self, matrices: Matrices, z, x, worst: "Worst", end: Handed, slow_values) -> "Passed":
         """The pass after its last interval: the slow correction ``dz = -S^-1 R_s``, and ``dx_m = (dx_m/dz) dz``.
@@ -194,6 +213,11 @@ class MarchEquations:
         """The maxima with one more interval included, from its residual and its correction d."""
         rows = largest(residual[: self.num_fast], self.of_momenta.fast)
         return worst.add(residual, d, rows, self.fast_size(d))
+
+
+def _gradients(on: Arriving):
+    """(o,) the gradients in one vector."""
+    return jnp.concatenate([on.p_f, on.start, on.slow.reshape(-1)])
 
 
 def inverse_with_multipliers(a, b, c, nodes: int):
@@ -303,7 +327,7 @@ def _linearised(
         if at_solution:
             on = Handed(arriving.position + march.last_increment(x), gradients)
         else:
-            d, on = march.corrected(inverse, hands_on, x, residual, arriving, gradients)
+            d, on = march.corrected(m, (inverse, hands_on), x, slow, arriving, (residual, gradients))
             x, worst = x + d, march.worse(worst, residual, d)
         return (on, sensitivities, x, worst), (x, inverse, hands_on, response, *by_position, *hands_on_by_position)
 
@@ -325,9 +349,9 @@ def further_pass(march: MarchEquations, matrices: Matrices, z, x, last, from_las
         arriving, last, worst = carry
         m, x, inverse, hands_on = unknowns_and_matrices
         x = jnp.where(from_last, last, x)
-        residual, gradients = march.interval(m, x, arriving, slow)
-        d, on = march.corrected(inverse, hands_on, x, residual, arriving, gradients)
-        return (on, x + d, march.worse(worst, residual, d)), x + d
+        values = march.interval(m, x, arriving, slow)
+        d, on = march.corrected(m, (inverse, hands_on), x, slow, arriving, values)
+        return (on, x + d, march.worse(worst, values[0], d)), x + d
 
     intervals = jnp.arange(march.n), x, matrices.inverse, matrices.hands_on
     (end, _, worst), x = jax.lax.scan(interval, (march.start(), last, Worst.none()), intervals)
@@ -353,9 +377,7 @@ def solve(march: MarchEquations, factors: tuple[Matrices, list], rows_z, rows_x)
         # dx = -(dR/dx)^-1 (rows + dR/dq dq + dR/dp dp); h p_f is added to the first momentum equation: dR/dp is the unit matrix there
         rows = (rows + matvec(by_position, arriving.position)).at[:n_f].add(arriving.gradients[:n_f])
         dx = -matvec(inverse, rows)
-        gradients = matvec(hands_on, dx) + matvec(hands_on_by_position, arriving.position)
-        # the interval replaces the momentum, and adds to the slow gradients
-        gradients = gradients.at[n_f:].add(arriving.gradients[n_f:])
+        gradients = arriving.gradients + matvec(hands_on, dx) + matvec(hands_on_by_position, arriving.position)
         return Handed(arriving.position + march.last_increment(dx), gradients), dx
 
     intervals = rows_x, matrices.inverse, matrices.hands_on, *by_positions

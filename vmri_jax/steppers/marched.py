@@ -128,7 +128,8 @@ class Marched(Solver):
         self, march: MarchEquations, guess: Unknowns, start: Progress, memory: MarchMemory, limit, is_first: Any = True
     ) -> Progress:
         """At most `limit` passes. The first attempt starts from the predicted slow unknowns, later attempts from the guess."""
-        accepted = Accepted.of(march.equations, self.newton).with_constraints(march.equations)
+        accepted = Accepted.of(march.equations, self.newton, march.weights)
+        accepted = accepted.with_constraints(march.equations, march.weights)
         fixed = self.newton.fixed_iterations
         z, x = march.flat(guess)
         z = jnp.where(is_first, memory.slow.next(march.num_slow), z)
@@ -192,7 +193,7 @@ class Marched(Solver):
         # |R| = |R before the correction| min(1, expected correction / last correction).
         shrinks = done.still_moves / jnp.maximum(passed.worst.moved, jnp.finfo(float).tiny)
         rows, method = passed.worst.rows * jnp.minimum(shrinks, 1.0), Method[self.linear_solver.upper()]
-        status = status_of(equations, result, method, passes, rows=rows, end=end)
+        status = status_of(equations, result, method, passes, rows=rows, end=end, weights=march.weights)
         return Solution(x, end, with_dependent_constraints(equations, status))
 
     def _learned(self, march: MarchEquations, memory: MarchMemory, done: Progress) -> MarchMemory:

@@ -199,10 +199,11 @@ def correct(sweep: MicroSweep, local: StepEquations, steps, p_f, guess: FastUnkn
     if n_g:
         dx += matrix.solve(pull_dmu_f)
 
-    # gradients at x + dx to first order, and the constraint impulses -G_s^T (mu + dmu) at the nodes 0..r-1. The momentum at the end is
-    # h p_f = h D_{F_r} L + K_r dx with the last row K_r of the approximate K: its error is of the size of the next correction.
+    # gradients at x + dx to first order, and the constraint impulses -G_s^T (mu + dmu) at the nodes 0..r-1
     coupling, impulse = change(dx), -(pull_s + pull_dmu_s)
     later = jnp.concatenate([impulse[1:], jnp.zeros_like(impulse[:1])])
     d_start, d_steps = d.slow_start + coupling.slow_start + impulse.sum(0), d.slow + coupling.slow + later
-    unknowns = FastUnknowns(increments + dx, mu + dmu, schur)
-    return unknowns, d_fast[-1] + matrix.outgoing(dx), d_start, d_steps, max_abs(dx)
+    # The momentum at the end is the start momentum plus all impulses, h p_f + h D_{F_0} L + ... + h D_{F_r} L. At the root that is h D_{F_r} L; but
+    # an error e of x, below the round-off of the positions, would change that by M e, and does not change the impulses of the inertia.
+    p_f += (d.fast_start + coupling.fast_start)[0] - (pull_f + pull_dmu_f).sum(0)
+    return FastUnknowns(increments + dx, mu + dmu, schur), p_f, d_start, d_steps, max_abs(dx)

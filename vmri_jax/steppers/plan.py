@@ -151,7 +151,7 @@ def plan(
     if isinstance(newton, solvers.Custom):
         stage = stage_scheme(scheme)
         average = _average(system, stage, replace(choice, newton=solvers.Auto(), falls_back=False))
-        stepper: Stepper = whole_step(newton.stepper(system, stage), system, stage, state, average, reverse_only)
+        stepper: Stepper = whole_step(newton.stepper.called(system, stage), system, stage, state, average, reverse_only)
     else:
         kicked = _whole_step(system, stage_scheme(scheme), choice, state.q_s, state.q_f)
         defers = _defers_projection(kicked)

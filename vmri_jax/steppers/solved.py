@@ -17,7 +17,7 @@ from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
 from vmri_jax.schemes.equations import StepEquations, Unknowns, multiplier_scales
 from vmri_jax.schemes.scheme import Scheme
-from vmri_jax.steppers.accept import Weights
+from vmri_jax.steppers.accept import NO_WEIGHTS, Weights
 from vmri_jax.steppers.interval import constant_mass
 from vmri_jax.steppers.newton.implicit import differentiable, differentiable_reverse_only
 from vmri_jax.steppers.results import RUNNING, Result
@@ -198,7 +198,9 @@ class Fallback(Solver):
         return [*self.first.describe(), "where that does not converge:", *indented(self.exact.describe())]
 
 
-def status_of(equations: StepEquations, result, method, iterations, *, rows, end) -> StepStatus:
+def status_of(
+    equations: StepEquations, result, method, iterations, *, rows, end, weights: Weights = NO_WEIGHTS
+) -> StepStatus:
     """The status of a step, with the residual relative to the momenta.
 
     Args:
@@ -206,8 +208,9 @@ def status_of(equations: StepEquations, result, method, iterations, *, rows, end
         result, method, iterations: as in `StepInfo`.
         rows: largest residual of the momentum equations, times h, with the weights of momenta.
         end: (q_f, p_s, p_f) at the end of the step.
+        weights: of the variables.
     """
-    weights, (_, p_s, p_f) = Weights.of(equations).of_momenta(), end
+    weights, (_, p_s, p_f) = weights.of_momenta(), end
     momenta = *weights.largest(equations.p_s, equations.p_f), *weights.largest(p_s, p_f)
     momentum = equations.micro_dt * jnp.max(jnp.stack(momenta))
     residual = jnp.where(momentum > 0, rows / jnp.where(momentum > 0, momentum, 1.0), 0.0)

@@ -29,6 +29,7 @@ import jax
 import jax.numpy as jnp
 
 from vmri_jax.mechanics.arrays import is_concrete, real_array
+from vmri_jax.mechanics.functions import TracedOnce
 from vmri_jax.steppers.results import RUNNING, Result
 
 if TYPE_CHECKING:
@@ -42,7 +43,7 @@ class Newton(eqx.Module):
     Args:
         tolerance: the iteration ends when the next correction is below ``tolerance / 10 * max |increments|`` plus the round-off of the
             positions, for slow and for fast variables each (`vmri_jax.steppers.accept`). A saved node fails if the value of a constraint is above
-            ``max(1e-6, 100 tolerance)`` of the terms that cancel in it.
+            ``max(1e-6, 100 tolerance)`` of its size (`vmri_jax.mechanics.constraints`).
         max_iterations: a step that needs more iterations has failed; for the march and for `Nested` the passes count.
         fixed_iterations: number of iterations of every step, without a loop that depends on the data; the result is checked at the end, and
             a step that has not converged has failed, without a fallback. None: as many iterations as the tolerance needs.
@@ -133,21 +134,25 @@ class Custom(Newton):
 
     Args:
         stepper: function ``stepper(system, scheme)`` that returns a `vmri_jax.steppers.stepper.Stepper` for the whole step, or a
-            `vmri_jax.steppers.solved.Solver` for the equations between the kicks; of a composition it gets the scheme of a stage. Define it
-            at module level: programs are compiled once per function, and a new function is compiled anew. It is called while JAX traces the
-            run, so that runs, batches, files and gradients work as with other solvers.
-        tolerance: a saved node fails if the value of a constraint is above ``max(1e-6, 100 tolerance)`` of its terms.
+            `vmri_jax.steppers.solved.Solver` for the equations between the kicks; of a composition it gets the scheme of a stage. It is
+            called while JAX traces the run, so that runs, batches, files and gradients work as with other solvers.
+        tolerance: a saved node fails if the value of a constraint is above ``max(1e-6, 100 tolerance)`` of its size.
     """
 
     method = "custom"
-    stepper: Callable[..., "Stepper | Solver"] = eqx.field(static=True, kw_only=True)
+    stepper: TracedOnce = eqx.field(kw_only=True)
 
     def __init__(self, stepper: Callable[..., "Stepper | Solver"], tolerance: float = 1e-12):
         if not callable(stepper):
             raise TypeError(
                 f"Custom: stepper is {stepper!r}; give a function of (system, scheme) that makes a Stepper."
             )
-        self.stepper, self.tolerance, self.max_iterations, self.fixed_iterations = stepper, tolerance, 100, None
+        self.stepper, self.tolerance, self.max_iterations, self.fixed_iterations = (
+            TracedOnce(stepper),
+            tolerance,
+            100,
+            None,
+        )
 
 
 def named(method: str) -> type[Newton]:

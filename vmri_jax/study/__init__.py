@@ -3,7 +3,6 @@
 from vmri_jax.accuracy.families import Family, families
 from vmri_jax.study.advisor import Recommendation, tune
 from vmri_jax.study.convergence import ConvergenceRow, ConvergenceStudy, convergence_study
-from vmri_jax.study.cost import CostRow, CostStudy, cost_study
 from vmri_jax.study.cost_report import CostReport, cost_report
 from vmri_jax.study.program import Program
 from vmri_jax.study.reference_solution import ReferenceSolution, reference_solution
@@ -15,8 +14,6 @@ __all__ = [
     "ConvergenceRow",
     "ConvergenceStudy",
     "CostReport",
-    "CostRow",
-    "CostStudy",
     "Family",
     "Program",
     "Recommendation",
@@ -26,7 +23,6 @@ __all__ = [
     "WorkRow",
     "convergence_study",
     "cost_report",
-    "cost_study",
     "families",
     "reference_solution",
     "tune",

@@ -16,12 +16,11 @@ from vmri_jax.accuracy.families import Family, families
 from vmri_jax.accuracy.steps import round_off, with_accuracy
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
 from vmri_jax.running.files import make_writable_folder
-from vmri_jax.running.progress import Progress, part, shows_progress
+from vmri_jax.running.progress import part, shows_progress
 from vmri_jax.steppers.results import SimulationError
 from vmri_jax.study.advisor import MIN_ERROR_OVER_REFERENCE
-from vmri_jax.study.cost_figures import draw_num_micro, draw_shares
+from vmri_jax.study.cost_figures import draw_shares
 from vmri_jax.study.html import embedded, write_page
-from vmri_jax.study.peers import can_run_dopri8, dopri8_stairs
 from vmri_jax.study.prices import FAST, SLOW, prices, shares
 from vmri_jax.study.program import Program
 from vmri_jax.study.reference_solution import ReferenceSolution, reference_solution
@@ -85,7 +84,6 @@ class CostReport(ResultTable):
     stairs: the staircase of each kind of schemes, see `vmri_jax.study.staircase`.
     accuracy: the run that ``simulate(..., accuracy=accuracy_error)`` takes; None where it refuses the error or fails.
     accuracy_error: the middle one of the errors.
-    peers: staircases of other programs by name.
     """
 
     columns = (
@@ -105,7 +103,6 @@ class CostReport(ResultTable):
     stairs: dict[str, list[Stair]] = field(default_factory=dict)
     accuracy: WorkRow | None = None
     accuracy_error: float = math.nan
-    peers: dict[str, list[Stair]] = field(default_factory=dict)
 
     @property
     def caption(self) -> str:
@@ -203,22 +200,12 @@ def cost_report(
         answers = _confirmed(search, answers)
         progress("shares of errors", 1, 1)
         stairs = with_shares(search, staircases(search.rows().rows))
-        report = _write(search, answers, name, out, stairs=stairs, **_later_runs(search, answers, progress))
+        middle = answers[len(answers) // 2].error
+        progress(f"accuracy {middle:.0e}", 1, 1)
+        chosen = {"accuracy": _of_accuracy(search, middle), "accuracy_error": middle}
+        report = _write(search, answers, name, out, stairs=stairs, **chosen)
     progress("done", 1, 1)
     return report
-
-
-def _later_runs(search: Search, answers: Sequence[Answer], progress: Progress) -> dict[str, Any]:
-    """Fields of the report: the run with the middle error as its accuracy, and runs of diffrax where it can run the problem."""
-    error = answers[len(answers) // 2].error
-    progress(f"accuracy {error:.0e}", 1, 1)
-    runs = {"accuracy": _of_accuracy(search, error), "accuracy_error": error}
-    if not can_run_dopri8(search.problem):
-        return runs
-    progress("diffrax", 1, 1)
-    least = min(answer.error for answer in answers)
-    stairs = dopri8_stairs(search.problem, search.t_end, search.reference, least)
-    return runs | {"peers": {"diffrax Dopri8": stairs}}
 
 
 def _of_accuracy(search: Search, error: float) -> WorkRow | None:
@@ -318,13 +305,12 @@ def _draw(report: CostReport, problem: Problem, price: dict[str, float]) -> None
         multirate=_multirate(report),
         duration=duration,
         work_precision=embedded(partial(staircase_figure, "")),
-        by_num_micro=embedded(partial(draw_num_micro, report.rows)),
         shares_figure=embedded(partial(draw_shares, report.shares)),
     )
 
 
 def _draw_stairs(report: CostReport, price: dict[str, float], title: str, theme: plots.Theme) -> plots.NotebookFigure:
-    """The staircases with marks for the answers and the choice of `accuracy=`, other programs, and the bound."""
+    """The staircases with marks for the answers and the choice of `accuracy=`, and the bound."""
     rows = [answer.setting.row for answer in report.rows if answer.setting is not None]
     errors = {(s.row.scheme, s.row.num_steps): s.error for of_kind in report.stairs.values() for s in of_kind}
     marked = [
@@ -334,7 +320,7 @@ def _draw_stairs(report: CostReport, price: dict[str, float], title: str, theme:
     if chosen is not None:
         marked.append(plots.Marked(f"accuracy={report.accuracy_error:.0e}", chosen.seconds, chosen.error_q, star=True))
     look = {"known_to": report.runs.reference.error_q, "title": title, "theme": theme}
-    return plots.plot_staircases(report.stairs, report.peers, marked, bound_of(report.stairs, price), **look)
+    return plots.plot_staircases(report.stairs, marked, bound_of(report.stairs, price), **look)
 
 
 def bound_of(stairs: dict[str, list[Stair]], price: dict[str, float]) -> plots.Bound | None:

@@ -1,19 +1,17 @@
 """The identity of a run: functions, parameters, scheme, step and start as text, so that a run can be compared with the run of a store."""
 
 import dataclasses
-import hashlib
 import os
 import platform
-import re
-from collections.abc import Callable
 from importlib.metadata import version
 
 import jax
 import numpy as np
 
+from vmri_jax.mechanics.checks import digest, operations
 from vmri_jax.mechanics.functions import TracedOnce, with_time
 from vmri_jax.mechanics.state import State
-from vmri_jax.mechanics.system import KineticFunction, System
+from vmri_jax.mechanics.system import KineticFunction, Potentials, System
 from vmri_jax.running.simulation import Simulation
 
 MOST_NUMBERS_PRINTED = 8
@@ -69,7 +67,8 @@ def describe(name: str, value) -> dict[str, str]:
     elif isinstance(value, dict) and any(map(dataclasses.is_dataclass, value.values())):  # rules of potentials
         parts = {f"{name}[{key!r}]": part for key, part in value.items()}
     else:
-        leaves, _ = jax.tree_util.tree_flatten_with_path(value)
+        value = tuple(value) if isinstance(value, Potentials) else value  # with its names
+        leaves, _ = jax.tree_util.tree_flatten_with_path(value, is_leaf=lambda leaf: isinstance(leaf, TracedOnce))
         return {name + jax.tree_util.keystr(path): _text(leaf) for path, leaf in leaves}
     return {key: text for name, part in parts.items() for key, text in describe(name, part).items()}
 
@@ -84,7 +83,7 @@ def _text(leaf) -> str:
     array = np.asarray(leaf)
     if array.size <= MOST_NUMBERS_PRINTED:
         return str(array.tolist())
-    return f"{array.dtype}{array.shape}, digest {_digest(array.tobytes())}"
+    return f"{array.dtype}{array.shape}, digest {digest(array.tobytes())}"
 
 
 def _operations(system: System, start: State) -> dict[str, str]:
@@ -103,17 +102,3 @@ def _operations(system: System, start: State) -> dict[str, str]:
         functions["kinetic"] = system.kinetic.function, (q_s, q_f, q_s, q_f, params)
         functions["slow_kinetic"] = system.slow_kinetic, (q_s, q_s, params)
     return {name: operations(function, *args) for name, (function, args) in functions.items() if function is not None}
-
-
-def operations(function: Callable, *arguments) -> str:
-    """A digest of the operations that a function traces to."""
-    closed = jax.make_jaxpr(function)(*arguments)
-    text = re.sub(r"0x[0-9a-f]+", "", str(closed.jaxpr))  # addresses in memory
-    return f"digest {_digest(text.encode(), *(np.asarray(c).tobytes() for c in closed.consts))}"
-
-
-def _digest(*parts: bytes) -> str:
-    total = hashlib.sha256()
-    for part in parts:
-        total.update(part)
-    return total.hexdigest()[:16]

@@ -8,11 +8,14 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from vmri_jax.mechanics.arrays import whole_number
 from vmri_jax.mechanics.state import Movable, State
 from vmri_jax.running.arguments import Steps
 from vmri_jax.running.files import clear_partial, is_new
 from vmri_jax.running.interrupts import Interrupted, interrupts_noted
+from vmri_jax.running.observables import Observables
 from vmri_jax.running.progress import Progress, ShowsProgress, progress_to
 from vmri_jax.running.saved import numbers_per_node
 from vmri_jax.running.simulation import Simulation, simulation
@@ -20,7 +23,7 @@ from vmri_jax.running.store import layout
 from vmri_jax.running.store.identity import changed_conditions, differences, environment, identity
 from vmri_jax.running.store.layout import Record
 from vmri_jax.running.store.stored import StoredTrajectory
-from vmri_jax.running.trajectory import join
+from vmri_jax.running.trajectory import join, trajectory_of
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.solvers import Newton
@@ -58,7 +61,8 @@ def stream(
 
     A chunk counts when all of it is on disk, together with a checkpoint of everything that the next steps depend on, the
     state and the memory of the solver: on the same machine with the same versions, a resumed run is identical
-    to an uninterrupted one to the last bit. One chunk is held in memory at a time.
+    to an uninterrupted one to the last bit. One chunk is held in memory at a time. The run keeps what its functions read from around them at its
+    start; a resumed run whose functions do other operations is refused.
 
     Args:
         system, scheme, state, macro_dt, micro_dt, t_end, save_every, save_micro, solver: as in `simulate`.
@@ -130,13 +134,19 @@ def _continue(stored: StoredTrajectory, run: Simulation, tell: Progress) -> Iter
     except ValueError as error:
         raise ValueError(f"{path} can be read, but its run cannot go on: {error}.") from error
     writer = layout.Writer(path, rows + 1, chunk)
+    # The start and the largest values so far, as a node before each chunk: energies are compared with the start of the run.
+    before, has_warned = run.at_start(), False
     # Every write but the last ends at a multiple of `chunk` rows, so that no file is written twice.
     ends = [*range((record.saved + 1) // chunk * chunk + chunk, rows + 1, chunk), rows + 1]
     sizes = [end - begin for begin, end in pairwise([record.saved + 1, *ends])]
     for size in sizes:
         tell("simulating", record.saved, rows)
         pieces, checkpoint = run.advance(checkpoint, size)
-        piece = join(pieces)
+        piece = join([trajectory_of(*part) for part in pieces])
+        table = np.concatenate([before, *(table for _, table in pieces)])
+        times = np.concatenate([[run.state.t], *(part.states.t for part, _ in pieces)])
+        has_warned = has_warned or run.warn("stream", table, times, stacklevel=4)
+        before = Observables.of(table).so_far()
         with _explained(path, checkpoint.step - size * run.save_every):
             writer.append(piece, record.saved)
             result = max(record.result, int(piece.result))  # failures have larger codes than successes

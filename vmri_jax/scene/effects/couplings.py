@@ -118,7 +118,6 @@ class JointCoupling(_Coupling):
     Args:
         joints: names of joints of the scene, each with a single pair of bodies; ``(name, freedom)`` for a joint with several freedoms.
         law: ``g(x, params) -> ()`` or (k,) with the freedoms x (n,) in the order of `joints`, rad and m from the given position; zero at x = 0.
-            Define the law at module level: functions are compared by identity.
         params: numbers, arrays or trees of them that the law gets. They may change without a new compilation, and runs have derivatives
             with respect to them.
 

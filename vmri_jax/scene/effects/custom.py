@@ -29,7 +29,7 @@ class CustomEffect(Effect):
     """An effect with a single element, whose function the user gives.
 
     Args:
-        function: see `Effect`; define it at module level: functions are compared by identity.
+        function: see `Effect`.
         bodies: names of the bodies, in the order in which the function takes them. The function gets all coordinates of a rigid body;
             with ``(name, [x, y, z])`` the position of this point in it, and with ``("ground", [x, y, z])`` a fixed point.
         params: of the function: numbers, arrays, or lists and dictionaries of them. They may change without a new compilation, and

@@ -76,7 +76,7 @@ class Drive(Effect):
 
     Args:
         bodies: a name, or a list of names; each gets this force.
-        history: ``history(t, params) -> (d,)``, N; define it at module level: functions are compared by identity.
+        history: ``history(t, params) -> (d,)``, N.
         params: of `history`. They may change without a new compilation, and runs have derivatives with respect to them.
     """
 

@@ -227,7 +227,7 @@ class JointDrive(InJoint):
 
     Args:
         joint, of: as of `InJoint`.
-        history: ``history(t, params) -> ()``, N m or N; define it at module level: functions are compared by identity.
+        history: ``history(t, params) -> ()``, N m or N.
         params: of `history`. They may change without a new compilation, and runs have derivatives with respect to them.
     """
 
@@ -255,7 +255,7 @@ class JointMotion(InJoint):
 
     Args:
         joint, of: as of `InJoint`.
-        path: a, ``path(t, params) -> ()``, rad or m from the given position, zero at t = 0; define it at module level.
+        path: a, ``path(t, params) -> ()``, rad or m from the given position, zero at t = 0.
         params: of `path`. They may change without a new compilation, and runs have derivatives with respect to them.
 
     Raises:

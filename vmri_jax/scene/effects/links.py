@@ -70,7 +70,7 @@ class MovingPivot(_Rigid, ToPath):
 
     Args:
         bodies: a name, or a list of names.
-        path: ``path(t, params) -> (d,)``, the point; define it at module level.
+        path: ``path(t, params) -> (d,)``, the point.
         length: l, positive; one number, or one for each. The distance at the start, t = 0, by default.
         params: of `path`.
 
@@ -89,7 +89,7 @@ class Guide(ToPath):
 
     Args:
         bodies: a name.
-        path: a, ``path(t, params) -> (d,)``; define it at module level.
+        path: a, ``path(t, params) -> (d,)``.
         params: of `path`.
 
     Raises:

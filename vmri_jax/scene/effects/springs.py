@@ -113,7 +113,7 @@ class MovingAnchor(ToPath):
 
     Args:
         bodies: a name, or a list of names.
-        path: ``path(t, params) -> (d,)``, the point; define it at module level.
+        path: ``path(t, params) -> (d,)``, the point.
         stiffness: k, N/m, positive; one number, or one for each body.
         params: of `path`.
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 import vmri_jax as vm
-from vmri_jax.study import cost_study
+from benchmarks.gail2014.cost import CostRow, CostStudy, cost_study, plot_cost
+from tests.test_plots import is_drawn, names_below, y_data
 
 
 @pytest.fixture(scope="module")
@@ -74,3 +75,45 @@ def test_bad_input(bad):
     arguments = {"num_micro": (1,), "micro_dt": 0.01, "t_end": 1.0} | bad
     with pytest.raises(ValueError, match="cost_study: num_micro"):
         cost_study(vm.systems.fermi_pasta_ulam(), vm.fully_implicit, **arguments)
+
+
+def cost(costs=(9.0, 3.0, 6.0), solver="dense"):
+    rows = [
+        CostRow("FPU", solver, n, 3 * n, 10, 1.0, value, 1.0, 2, solver.upper(), "CONVERGED")
+        for n, value in zip((1, 10, 100), costs, strict=True)
+    ]
+    return CostStudy(tuple(rows))
+
+
+def test_cost_circles_the_minimum_and_marks_the_paper():
+    figure = plot_cost({"FPU": cost() + cost((5.0, 4.0, 3.0), "arrowhead")}, {"FPU": 60})
+    lines = figure.axes[0].lines
+    circled = [np.asarray(line.get_xydata()).tolist() for line in lines if line.get_markersize() == 11]
+    assert circled == [[[10.0, 3.0]], [[100.0, 3.0]]]
+    assert names_below(figure) == ["dense", "arrowhead", "minimum in the paper"]
+    assert np.asarray(lines[-1].get_xdata()).tolist() == [60, 60]
+
+
+def test_a_cost_study_draws_itself():
+    (axes,) = (figure := (cost() + cost((5.0, 4.0, 3.0), "auto")).plot("Cost")).axes
+    assert names_below(figure) == ["dense", "auto"]
+    np.testing.assert_array_equal(y_data(axes.lines[0]), [9.0, 3.0, 6.0])
+
+
+def test_an_axis_of_costs_around_one_power_of_ten_has_several_labels():
+    figure = plot_cost({"FPU": cost((1.5, 2.5, 75.0))})
+    figure.canvas.draw()
+    low, high = figure.axes[0].get_ylim()
+    labels = figure.axes[0].get_yticklabels()
+    shown = [text.get_text() for text in labels if low <= text.get_position()[1] <= high]
+    assert shown == ["2", "5", "10", "20", "50"]
+
+
+def test_cost_leaves_failed_runs_out():
+    figure = plot_cost({"FPU": cost((np.nan, np.nan, np.nan))})
+    assert len(figure.axes[0].lines) == 1
+
+
+def test_costs_of_runs_that_all_failed_are_drawn():
+    row = CostRow("", "dense", 2, 8, 4, np.nan, np.nan, 1.0, 1, "DENSE", "NON_FINITE")
+    assert is_drawn(plot_cost({"failed": CostStudy((row,))}))

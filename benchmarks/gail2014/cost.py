@@ -1,11 +1,14 @@
 """Cost studies: computing time of a fixed simulated time against num_micro, at a constant micro step."""
 
+import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.ticker import FixedLocator, NullLocator
 
 from vmri_jax import plots
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
@@ -78,8 +81,8 @@ class CostStudy(ResultTable):
         return np.array([row.num_micro for row in rows]), np.array([row.us_per_micro_step for row in rows])
 
     def plot(self, title: str = "", theme: plots.Theme = plots.LIGHT):
-        """Computing time against num_micro, the cheapest point of each curve circled, see `vmri_jax.plots.plot_cost`."""
-        return plots.plot_cost({"": self}, title=title, theme=theme)
+        """Computing time against num_micro, the cheapest point of each curve circled, see `plot_cost`."""
+        return plot_cost({"": self}, title=title, theme=theme)
 
     def __add__(self, other: "CostStudy") -> "CostStudy":
         return CostStudy(self.rows + other.rows)
@@ -177,3 +180,53 @@ def _row(
         solved_by=Method(int(np.max(trajectory.info.method))).name,
         result=Result(int(trajectory.result)).name,
     )
+
+
+def plot_cost(
+    studies: Mapping[str, Any],
+    paper_minima: Mapping[str, int] | None = None,
+    title: str = "",
+    theme: plots.Theme = plots.LIGHT,
+) -> plots.NotebookFigure:
+    """Computing time per micro step against num_micro, one panel per study, the cheapest point of each curve circled.
+
+    Args:
+        studies: by the title of their panel, e.g. of `cost_study`.
+        paper_minima: num_micro to mark, by the title of the panel.
+        title: title above the panels.
+        theme: colours.
+    """
+    columns = 2 if len(studies) == 4 else min(3, len(studies))
+    height = 0.6 + 2.7 * math.ceil(len(studies) / columns)
+    with plots.new_figure(max(5.2, 0.6 + 3.0 * columns), height, title, theme) as figure:
+        grid = plots.panel_grid(figure, len(studies), columns)
+        for axes, (name, study) in zip(grid, studies.items(), strict=True):
+            _cost_panel(axes, study, (paper_minima or {}).get(name), theme)
+            axes.set(title=name)
+        for axes in grid[-columns:]:
+            axes.set(xlabel="micro steps per macro step")
+        for axes in grid[::columns]:
+            axes.set(ylabel="µs per micro step")
+        plots.legend_below(figure)
+    return figure
+
+
+def _cost_panel(axes: Axes, study: Any, paper_minimum: int | None, theme: plots.Theme) -> None:
+    one_label = len({label for label, _ in study.curves}) == 1
+    curves = [study.curve(label, method) for label, method in study.curves]
+    for i, ((label, method), (num_micro, cost)) in enumerate(zip(study.curves, curves, strict=True)):
+        name = method if one_label else f"{label}, {method}"
+        look = plots.curve_look(i, theme)
+        axes.loglog(num_micro, cost, markersize=4, label=name, **look)
+        if np.isfinite(cost).any():
+            best = np.nanargmin(cost)
+            axes.plot(num_micro[best], cost[best], "o", markersize=11, markerfacecolor="none", color=look["color"])
+    if paper_minimum is not None:
+        axes.axvline(paper_minimum, color=theme.ink, linestyle=":", linewidth=1.1, label="minimum in the paper")
+    ticks = np.unique(np.concatenate([num_micro for num_micro, _ in curves]))
+    if len(ticks) > 7:
+        ticks = np.array([1, 4, 12, 40, 100])
+    axes.xaxis.set_major_locator(FixedLocator(ticks.tolist()))
+    axes.xaxis.set_minor_locator(NullLocator())
+    axes.xaxis.set_major_formatter("{x:.0f}")
+    plots.log_ticks(axes.yaxis, np.concatenate([cost for _, cost in curves]))

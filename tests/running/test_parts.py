@@ -1,0 +1,124 @@
+"""Gradients of systems with an empty part, and with respect to lengths, against finite differences; sound runs under `jax_debug_nans`."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import vmri_jax as vm
+from vmri_jax.running import engine, loops
+
+
+def slow_spring(q_s, q_f, params):
+    return params * q_s @ q_s / 2
+
+
+def fast_spring(q_f, params):
+    return params * q_f @ q_f / 2
+
+
+def weight(q_s, q_f, params):
+    return params[0] * q_f[1]
+
+
+def rod(q_s, q_f, params):
+    return jnp.stack([q_f @ q_f - params[1] ** 2])
+
+
+def bead(q_s, q_f, v_s, v_f, params):
+    """On a parabola of the curvature `params`."""
+    return (1 + params**2 * q_f[0] ** 2) * v_f[0] ** 2 / 2
+
+
+def on_a_rod(gravity, length):
+    return vm.System(vm.ConstantMass([], [1.0, 1.0]), weight, constraint=rod, params=jnp.stack([gravity, length]))
+
+
+ONE = jnp.ones(())
+CASES = {  # system of a parameter, positions, scheme, adjoints
+    "no fast part": (
+        lambda k: vm.System(vm.ConstantMass([1.0], []), slow_spring, params=k),
+        ([1.0], []),
+        vm.fully_explicit(1),
+        ("stored", "checkpoint"),
+    ),
+    "no slow part": (
+        lambda k: vm.System(vm.ConstantMass([], [1.0]), fast_potential=fast_spring, params=k),
+        ([], [1.0]),
+        vm.fully_explicit(1),
+        ("stored", "checkpoint"),
+    ),
+    "solved": (
+        lambda k: vm.System(vm.ConstantMass([1.0], []), slow_spring, params=k),
+        ([1.0], []),
+        vm.fully_implicit(1),
+        ("checkpoint",),
+    ),
+    "rod": (lambda k: on_a_rod(k, ONE), ([], [0.6, -0.8]), vm.fully_explicit(1), ("checkpoint",)),
+    "T(q, v)": (
+        lambda k: vm.System(bead, fast_potential=fast_spring, params=k),
+        ([], [0.5]),
+        vm.fully_implicit(1),
+        ("checkpoint",),
+    ),
+}
+STEPS = {"macro_dt": 0.1, "num_steps": 5}
+
+
+@pytest.fixture(autouse=True)
+def debug_nans(monkeypatch):
+    """`jax_debug_nans`, which must not stop sound runs; and checkpoints of two levels in short runs."""
+    monkeypatch.setattr(loops, "PARTS_PER_LEVEL", 3)
+    monkeypatch.setattr(engine, "MOST_STORED_STEPS", 1)
+    engine.engine.cache_clear()  # programs with other levels
+    with jax.debug_nans(True):
+        yield
+    engine.engine.cache_clear()
+
+
+def assert_derivative(program, step=1e-5, tolerance=1e-8):
+    """Of a program with value and derivative, at one. Measured: 1e-11 to 1e-9."""
+    difference = (program(ONE + step)[0] - program(ONE - step)[0]) / (2 * step)
+    assert abs(difference) > 1e-2
+    np.testing.assert_allclose(program(ONE)[1], difference, rtol=tolerance)
+
+
+def last_position(system, start, scheme, adjoint="auto"):
+    run = vm.simulate(system, scheme, start, adjoint=adjoint, **STEPS)
+    return jnp.concatenate([run.q_s[-1], run.q_f[-1]])[0]
+
+
+@pytest.mark.parametrize(("name", "adjoint"), [(name, adjoint) for name in CASES for adjoint in CASES[name][-1]])
+def test_gradients_of_small_systems(name, adjoint):
+    system, (q_s, q_f), scheme, _ = CASES[name]
+    start = vm.Problem(system(1.0 * ONE), q_s, q_f).state()
+    assert_derivative(jax.jit(jax.value_and_grad(lambda k: last_position(system(k), start, scheme, adjoint))))
+
+
+@pytest.mark.parametrize("project", [False, True])
+def test_gradient_with_respect_to_the_length_of_a_rod(project):
+    """The start stays, and the first step moves it onto the constraint; or `project` does so at the start."""
+
+    def position(length):
+        problem = vm.Problem(on_a_rod(9.81 * ONE, length), [], [0.6, -0.8], project=project)
+        return last_position(problem, None, vm.fully_explicit(1))
+
+    # 1e-7: a start that stays may violate the constraint by 1e-6
+    assert_derivative(jax.jit(jax.value_and_grad(position)), step=1e-7, tolerance=1e-6)
+
+
+def test_derivatives_outside_of_jit():
+    """There the numbers that derivatives keep are outputs of programs, which `jax_debug_nans` looks at."""
+    system, start = on_a_rod(9.81 * ONE, ONE), vm.Problem(on_a_rod(9.81 * ONE, ONE), [], [0.6, -0.8]).state()
+    scheme = vm.fully_explicit(1)
+    backward = jax.grad(lambda k: last_position(system.replace(params=jnp.stack([k, ONE])), start, scheme))(ONE)
+    forward = jax.jacfwd(lambda k: last_position(system.replace(params=jnp.stack([k, ONE])), start, scheme))(ONE)
+    np.testing.assert_allclose(backward, forward, rtol=1e-12)
+
+
+def test_prepared_runs_and_batches():
+    problem, scheme = vm.Problem(on_a_rod(9.81 * ONE, ONE), [], [0.6, -0.8]), vm.fully_explicit(1)
+    prepared = vm.prepare(problem, scheme, save_micro=True, **STEPS)()
+    starts = jax.tree.map(lambda a: jnp.stack([a, a]), problem.state())
+    batch = vm.simulate_batch(problem.system, scheme, starts, **STEPS)
+    np.testing.assert_allclose(batch.q_f[1], prepared.q_f, atol=1e-14)

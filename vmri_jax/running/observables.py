@@ -1,0 +1,212 @@
+"""Observables of a run at its saved nodes, and the one place that looks at them: failures, and warnings about the motion.
+
+An observable is a function of the system and the state. It is evaluated after the steps: in pieces of a run, and in batches, by one program for all schemes
+and lengths (`evaluated`), in prepared and traced runs as a part of their program. All roads look at the same `Observables`: `failures` ends a run that has left its constraints or
+its domain, `concerns` says what is wrong with the motion of a run whose steps all succeeded.
+"""
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from vmri_jax.mechanics.arrays import Numbers, library
+from vmri_jax.mechanics.constraints import are_kept
+from vmri_jax.mechanics.invariants import constraint_residual, energy_parts, velocity_and_masses
+from vmri_jax.mechanics.state import State
+from vmri_jax.mechanics.system import System
+from vmri_jax.steppers.results import Result
+
+
+class LostEnergyWarning(UserWarning):
+    """The energy of a system that keeps it has changed by more than half of the largest kinetic energy of a run."""
+
+    @staticmethod
+    def sentence(t: float, change: float, kinetic: float) -> str:
+        """The sentence about a change of the energy at a time, and the largest kinetic energy."""
+        return (
+            f"the computed motion is wrong: the energy, which the system keeps, has changed by {change:.3g} at t = {t:.4g}, "
+            f"and the largest kinetic energy is {kinetic:.3g}. Take smaller steps, or ask vmri_jax.stability.advise(problem, "
+            "scheme, macro_dt=...) which are stable."
+        )
+
+
+class SingularCoordinatesWarning(LostEnergyWarning):
+    """A run has changed its energy where its coordinates are nearly singular, as angles near a pole are."""
+
+    @staticmethod
+    def sentence(t: float, change: float, kinetic: float) -> str:
+        return (
+            f"the coordinates are singular near t = {t:.4g}: the mass matrix changes by a factor from one saved node to the next, and the energy "
+            f"by {change:.3g}, with a largest kinetic energy of {kinetic:.3g}. Take other coordinates, or accuracy=."
+        )
+
+
+REPORTED_CHANGE = 0.5
+"""Change of the energy, as a part of the largest kinetic energy, above which the user is warned; a larger value misses slower instabilities."""
+ROUNDOFF_OF_ENERGY = 1e-9
+"""Change of the energy, as a part of the sum of the moduli of its terms, up to which it is round-off. A larger value hides losses in systems
+whose terms cancel."""
+ROUNDOFF_OF_STEP = 10 * np.finfo(float).eps
+"""Round-off of a position in a step, as a part of the position; a larger value hides slower motions."""
+UNRESOLVED = 2.0
+"""Change of log det M from one saved node to the next, above which the steps do not resolve the mass matrix M. Steps across a pole, where det M goes to
+zero with the square of the distance, change it by 2 log 3 = 2.2 or more. A larger value misses poles between two nodes."""
+CHANGE_AT_POLE = 1e-2
+"""Change of the energy between two saved nodes next to a pole, as a part of the largest kinetic energy, above which the user is warned. A larger value
+misses runs whose angles are wrong after the pole."""
+
+
+class Observables(NamedTuple):
+    """Numbers of a system and a state.
+
+    energy: Hamiltonian.
+    position, velocity: largest |g| and largest |G v + dg/dt|, implied rows included.
+    solved, implied: 1 where the rows that are solved for, and the implied rows, are kept, see `are_kept`; else 0.
+    kinetic: ``p . v - T``.
+    terms: ``|T| + |V| + |W| + sum_i |V_i|``.
+    rounding: ``q . M q / 2``, whose part eps^2 / H^2 is the kinetic energy of velocities that come from round-off of the positions.
+    volume: log det M of a mass matrix M that depends on positions; 0 for constant masses.
+    """
+
+    energy: Float[Numbers, "*k"]
+    position: Float[Numbers, "*k"]
+    velocity: Float[Numbers, "*k"]
+    solved: Float[Numbers, "*k"]
+    implied: Float[Numbers, "*k"]
+    kinetic: Float[Numbers, "*k"]
+    terms: Float[Numbers, "*k"]
+    rounding: Float[Numbers, "*k"]
+    volume: Float[Numbers, "*k"]
+
+    @classmethod
+    def of(cls, table) -> "Observables":
+        """The columns of a table (..., k, 9)."""
+        return cls(*(table[..., i] for i in range(len(cls._fields))))
+
+    def so_far(self) -> np.ndarray:
+        """(1, 9) the energy of the first node of a run, and the largest of all other columns: a node in place of all nodes."""
+        return np.array([[self.energy[0], *(column.max() for column in self[1:-1]), self.volume[-1]]])
+
+
+def observables(system: System, node: tuple[State, Any]):
+    """The `Observables` of a state, as an array (9,).
+
+    Args:
+        node: the state, and the tolerance of the solver.
+    """
+    state, tolerance = node
+    phase = state.q_s, state.q_f, state.p_s, state.p_f
+    velocities, masses = velocity_and_masses(system, *phase)
+    parts = list(energy_parts(system, *phase, velocities).values())
+    position, rate = constraint_residual(system, state, velocities)
+    if masses is None:
+        rounding, volume = system.kinetic(state.q_s, state.q_f, state.q_s, state.q_f, system.params), 0.0
+    else:
+        q = jnp.concatenate([state.q_s, state.q_f])
+        rounding, volume = q @ masses @ q / 2, 2 * jnp.sum(jnp.log(jnp.diagonal(jnp.linalg.cholesky(masses))))
+    terms, kept = sum(map(jnp.abs, parts)), are_kept(system, state, tolerance)
+    return jnp.stack(
+        [
+            *map(
+                partial(jnp.asarray, dtype=float),
+                (sum(parts), position, rate, *kept, parts[0], terms, rounding, volume),
+            )
+        ]
+    )
+
+
+def with_tolerance(states: State, tolerance) -> tuple[State, Any]:
+    """The arguments of `observables` at all nodes; one tolerance for all."""
+    return states, library((states, tolerance)).broadcast_to(tolerance, states.t.shape)
+
+
+def failures(run, table, save_every: int, step: int = 0):
+    """A run, or a batch of runs, whose nodes from its failure on are NaN; a node that cannot be right is a failure.
+
+    A node may be wrong although its steps succeeded, for four reasons: the energy is not finite although its gradient is (a logarithm beyond its pole);
+    a lane of a batch started off its constraints; the rows of ``system.implied``, redundant constraints that the solver leaves out, are violated; or
+    a stepper of the user leaves the constraints. The last step before the first such node counts as the failed one.
+
+    Args:
+        run: a `Run`.
+        table: its `Observables` (..., k, 9).
+        save_every: macro steps from one saved node to the next.
+        step: macro steps before the first node.
+
+    Returns:
+        The run and its table.
+    """
+    module, now = library((run, table)), Observables.of(table)
+    wrong = ~(module.isfinite(now.energy) & (now.solved > 0) & (now.implied > 0))
+    if module is np and not wrong.any():
+        return run, table
+    node = wrong.argmax(axis=-1)
+    last_step = step + module.maximum(node * save_every - 1, 0)
+    breaks = wrong.any(axis=-1) & ((run.failed_at < 0) | (last_step < run.failed_at))
+    energy, solved = (module.take_along_axis(a, node[..., None], axis=-1)[..., 0] for a in (now.energy, now.solved))
+    # If the solved rows are kept, the implied rows are to blame.
+    violated = module.where(solved > 0, int(Result.NOT_IMPLIED), int(Result.CONSTRAINT_VIOLATED))
+    cause = module.where(module.isfinite(energy), violated, int(Result.NON_FINITE))
+    result, failed_at = module.where(breaks, cause, run.result), module.where(breaks, last_step, run.failed_at)
+    first = module.where(
+        breaks, node, module.where(failed_at < 0, wrong.shape[-1], (failed_at - step) // save_every + 1)
+    )
+    is_lost = np.arange(wrong.shape[-1]) >= first[..., None]
+
+    def masked(array):
+        lost = is_lost[..., -array.shape[wrong.ndim - 1] :]  # arrays of micro nodes have no row for the start
+        return module.where(lost.reshape(*lost.shape, *(1,) * (array.ndim - lost.ndim)), module.nan, array)
+
+    states = State(run.states.t, *map(masked, list(vars(run.states).values())[1:]))
+    micro = None if run.micro is None else run.micro._replace(q_f=masked(run.micro.q_f))
+    return run._replace(states=states, result=result, failed_at=failed_at, micro=micro), masked(table)
+
+
+def concerns(table: np.ndarray, t, system: System, macro_dt, save_every: int) -> list[LostEnergyWarning]:
+    """What is wrong with the motion of a run, or of the lanes of a batch, whose steps all succeeded: warnings to be given; failed lanes are left out.
+
+    *Lost energy*: the system keeps its energy, and the energy has changed by more than half of the largest kinetic energy. A system at rest moves by
+    round-off: n steps H change velocities by up to ``sqrt(n) ROUNDOFF_OF_STEP |q| / H``, in random directions; changes below the kinetic energy of
+    these velocities, or below the round-off of the energy's terms, do not count.
+
+    *Singular coordinates*: the mass matrix changes by a factor between two nodes, and the energy changes beside them. Forces change the energy, too:
+    where they do, only steps that are all saved tell.
+
+    Args:
+        table: the `Observables` (..., k, 9).
+        t: (..., k) times.
+        system: the system, of which only the structure counts.
+        macro_dt: macro step H, or one for each lane.
+        save_every: macro steps from one saved node to the next.
+    """
+    keeps, may_be_singular = system.keeps_energy, not system.has_constant_mass
+    if not keeps and not (may_be_singular and save_every == 1):
+        return []
+    largest, least = Observables.of(table.max(axis=-2)), Observables.of(table.min(axis=-2))
+    part = CHANGE_AT_POLE if may_be_singular else REPORTED_CHANGE
+    if not np.any(largest.energy - least.energy > part * largest.kinetic):  # the usual case, within microseconds
+        return []
+    t, nodes = np.atleast_2d(t), Observables.of(table.reshape(-1, *table.shape[-2:]))
+    kinetic, change = nodes.kinetic.max(axis=1), np.abs(nodes.energy - nodes.energy[:, :1])
+    roundoff_of_steps = (t.shape[1] - 1) * save_every * (ROUNDOFF_OF_STEP / macro_dt) ** 2 * nodes.rounding.max(axis=1)
+    roundoff = np.maximum(ROUNDOFF_OF_ENERGY * nodes.terms.max(axis=1), roundoff_of_steps)
+    jumps = np.pad(np.abs(np.diff(nodes.volume)) > UNRESOLVED, ((0, 0), (1, 1)))
+    beside = jumps[:, 1:-1] | jumps[:, :-2] | jumps[:, 2:]
+    change_at_pole = np.where(beside, np.abs(np.diff(nodes.energy)), 0.0)
+    is_singular = change_at_pole.max(axis=1) > np.maximum(CHANGE_AT_POLE * kinetic, roundoff)
+    is_lost = keeps & ~is_singular & (change.max(axis=1) > np.maximum(REPORTED_CHANGE * kinetic, roundoff))
+    warnings_of_lanes: list[LostEnergyWarning] = []
+    for warning, wrong, sizes in (
+        (SingularCoordinatesWarning, is_singular, change_at_pole),
+        (LostEnergyWarning, is_lost, change),
+    ):
+        if wrong.any():
+            lane = int(wrong.argmax())
+            node = sizes[lane].argmax()
+            lanes = f"in {wrong.sum()} of {len(wrong)} lanes, the first of them lane {lane}, " if table.ndim > 2 else ""
+            sentence = warning.sentence(t[lane, node], sizes[lane, node], kinetic[lane])
+            warnings_of_lanes.append(warning(lanes + sentence))
+    return warnings_of_lanes
