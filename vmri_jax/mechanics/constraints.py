@@ -244,7 +244,7 @@ def check_constraints(
         raise ValueError(f"{place}: the constraints are {solved} there, which is not finite.")
     if not (np.isfinite(rows.gradients).all()):
         raise ValueError("System: the Jacobian of the constraints is not finite at these positions (a norm at zero?).")
-    _check_gradients(system, state, rows, masses, in_words)
+    _check_gradients(system, state, rows, weights, in_words)
     allowed = rows.allowed(tolerance)[: n_g + n_gs]
     violated = np.abs(solved) > allowed
     if violated.any():
@@ -279,12 +279,12 @@ def check_constraints(
         _check_rank("constraint", fast, f"fast variables. {MICRO_GRID}", in_words)
 
 
-def _check_gradients(system: System, state, rows: Rows, masses, in_words) -> None:
+def _check_gradients(system: System, state, rows: Rows, weights, in_words) -> None:
     """Refuse rows whose gradient is zero at the state, but not at a generic configuration `NEARBY` relative to its positions."""
-    weights, q, n_s = np.sqrt(masses), np.concatenate([state.q_s, state.q_f]), np.size(state.q_s)
+    q, n_s = np.concatenate([state.q_s, state.q_f]), np.size(state.q_s)
     change = NEARBY * np.abs(weights * q).max() * np.random.default_rng(0).normal(size=q.size) / weights
-    nearby, _ = jax.device_get(_rows_and_masses(system, state.t, *np.split(q + change, [n_s])))
-    size, size_nearby = (np.linalg.norm(a.jacobian / weights, axis=1) for a in (rows, nearby))
+    nearby, _ = jax.device_get(_rows_and_weights(system, state.t, *np.split(q + change, [n_s])))
+    size, size_nearby = (np.linalg.norm(a.gradients, axis=1) for a in (rows, nearby))
     vanishes = (size_nearby > 0) & (size <= VANISHING_GRADIENT * size_nearby)
     n_g, n_gs = system.num_constraints(state.q_s, state.q_f)
     parts = {"constraint": vanishes[:n_g], "slow_constraint": vanishes[n_g : n_g + n_gs]}
