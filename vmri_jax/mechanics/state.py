@@ -57,7 +57,7 @@ class State:
 
 
 def initial_state(
-    system: "Movable",
+    system: Any,
     q_s=None,
     q_f=None,
     v_s=None,

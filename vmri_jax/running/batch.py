@@ -122,7 +122,7 @@ def batch(
             "simulate_batch: arguments are tracers; call it outside of jax.jit, vmap and grad, or take jax.vmap of simulate."
         )
     _check_devices(devices, chunk)
-    problem = opened(moving)
+    problem: Any = opened(moving)
     system, start = start_of("simulate_batch", problem, states)
     dt = {name: getattr(steps, name) for name in ("macro_dt", "micro_dt") if getattr(steps, name) is not None}
     params, start, dt = _with_lanes(system.params, params, start, dt)
