@@ -1,7 +1,6 @@
 """All roads say the same about a run: the grid of roads and of causes, written once."""
 
 import warnings
-from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
