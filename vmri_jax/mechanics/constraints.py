@@ -244,6 +244,13 @@ def check_constraints(
         raise ValueError(f"{place}: the constraints are {solved} there, which is not finite.")
     if not (np.isfinite(rows.gradients).all()):
         raise ValueError("System: the Jacobian of the constraints is not finite at these positions (a norm at zero?).")
+
+    def gradients(rows: Rows):
+        """dg/dq_s, dg/dq_f and dg_slow/dq_s over the weights."""
+        return rows.gradients[:n_g, :n_s], rows.gradients[:n_g, n_s:], rows.gradients[n_g : n_g + n_gs, :n_s]
+
+    slow, fast, alone = gradients(rows)
+    _check_counts(fast, alone)
     _check_gradients(system, state, rows, weights, in_words)
     allowed = rows.allowed(tolerance)[: n_g + n_gs]
     violated = np.abs(solved) > allowed
@@ -256,11 +263,6 @@ def check_constraints(
         )
     _check_implied(rows, n_g + n_gs, place)
 
-    def gradients(rows: Rows):
-        """dg/dq_s, dg/dq_f and dg_slow/dq_s over the weights."""
-        return rows.gradients[:n_g, :n_s], rows.gradients[:n_g, n_s:], rows.gradients[n_g : n_g + n_gs, :n_s]
-
-    slow, fast, alone = gradients(rows)
     size = np.linalg.norm(np.concatenate([slow, fast], axis=1), axis=1)
     slow_only = np.flatnonzero(np.linalg.norm(fast, axis=1) <= LEAST_FAST_PART * size)
     if slow_only.size:
@@ -269,7 +271,6 @@ def check_constraints(
             "Give them as System(slow_constraint=...), a function of (q_s, params), which is held at the macro nodes; or make the "
             "variables that they hold fast."
         )
-    _check_counts(fast, alone)
     if any(dependent for _, dependent in map(rank_of, (alone, fast))):
         # At a singular configuration (a linkage folded flat) rows are dependent there and nowhere else, and runs pass it: only rows that are
         # dependent at a generic configuration nearby are refused.
