@@ -71,7 +71,7 @@ def _checked(work: Work, design: Design) -> list[Simulation]:
     jax.eval_shape(work.lane, _first_row(design))
     runs = [work.simulation(group) for group in all_groups(work, design)]
     runs[0].check("ensemble: the start", constraints=False)
-    over_nodes = [name for name, quantity in zip(work.save, work.quantities, strict=True) if quantity.over_nodes]
+    over_nodes = [str(name) for name, quantity in zip(work.save, work.quantities, strict=True) if quantity.over_nodes]
     if over_nodes and work.num_saves == 1:
         raise ValueError(
             f"ensemble: {', '.join(over_nodes)} looks at the saved nodes of a run, and only its end is saved; give num_saves, "
