@@ -113,7 +113,7 @@ def observables(system: System, node: tuple[State, Any]):
 
 def with_tolerance(states: State, tolerance) -> tuple[State, Any]:
     """The arguments of `observables` at all nodes; one tolerance for all."""
-    return states, library((states, tolerance)).broadcast_to(tolerance, states.t.shape)
+    return states, library((states, tolerance)).broadcast_to(tolerance, np.shape(states.t))
 
 
 def failures(run, table, save_every: int, step: int = 0):

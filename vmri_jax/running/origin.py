@@ -147,8 +147,7 @@ def at_nodes(function, origin: Origin, nodes, *static):
     Raises:
         ValueError: the system is not known.
     """
-    origin.system(np.ndim(jax.tree.leaves(nodes)[0]) - 1)  # raises if the system is not known
-    arrays, structure = jax.tree.flatten(origin.bare.with_params(origin.params))
+    arrays, structure = jax.tree.flatten(origin.system())  # raises if the system is not known
     with Working("quantities of the run"):
         values = evaluated(function, structure, arrays, nodes, *static)
     return jax.device_put(values) if is_concrete(values) else values

@@ -204,7 +204,7 @@ class Simulation:
         leaves = self.arrays.model  # the parameters come last, see `Arrays`
         return leaves[: len(leaves) - len(expected)] + [np.asarray(leaf) for leaf in new]
 
-    def _whole(self, falls_back: bool, arguments: tuple) -> tuple[Run, np.ndarray]:
+    def _whole(self, falls_back: bool, arguments: tuple) -> tuple[Run, Any]:
         """The run by one program, as of `observed`."""
         leaves, table = self._program(falls_back)(*arguments)
         return failures(Run.of(leaves), np.asarray(table), arguments[1])
