@@ -62,8 +62,8 @@ class Fit:
     again: Callable = field(repr=False)
 
     @classmethod
-    def of(cls, shooting: Shooting, u, misses, *, by_parameters, by_starts, **search: Any) -> "Fit":
-        """The fit at the end of a search, see `vmri_jax.fitting.fit`; `search` has the other fields by name."""
+    def of(cls, shooting: Shooting, u, misses, jacobians, **search: Any) -> "Fit":
+        """The fit at the end of a search; `jacobians` as of `_covariance`, and the other fields by name."""
         unknowns = shooting.unknowns
         parameters = {name: np.asarray(value) for name, value in unknowns.at(u).items()}
         numbers = np.asarray(unknowns.vector(parameters))
@@ -73,7 +73,7 @@ class Fit:
             # s^2 = sum of squares / (m - p)
             sigma = float(np.sqrt(np.sum(misses**2) / max(freedom, 1)))
             misses = misses / sigma
-        covariance, undetermined = _covariance(by_parameters, by_starts, numbers, unknowns.labels)
+        covariance, undetermined = _covariance(*jacobians, numbers, unknowns.labels)
         estimates = parameters, unknowns.labels, sigma**2 * covariance, misses, freedom, sigma, undetermined
         return cls(*estimates, shooting=shooting, **search)
 
