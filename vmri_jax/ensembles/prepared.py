@@ -26,17 +26,13 @@ MOST_CHUNK_BYTES = 2**26
 FEWEST_CHUNKS = 64
 """Target for the smallest number of chunks, so that workers share the runs evenly; batches that are computed side by side are not cut for
 it. A larger one makes chunks so small that writing their files takes most of the time."""
-MICRO_STEP_NANOSECONDS = {"explicit": 1.0, "implicit": 25.0, "constrained": 25.0}
+MICRO_STEP_NANOSECONDS = {"explicit": 1.0, "implicit": 25.0}
 """Rough nanoseconds of a micro step, for each coordinate of each run in a batch, by kind of step. They only choose the size of chunks: with
 larger ones chunks have fewer runs."""
 
 
 def prepared(work: Work, design: Design, chunk: int | None = None) -> tuple[dict[str, Kept], Chunks, Simulation]:
-    """The arrays of the store, the division of the runs, and the longest run, after a check of all arguments; nothing is computed.
-
-    Raises:
-        ValueError, TypeError: bad arguments.
-    """
+    """The arrays of the store, the division of the runs, and the longest run, after a check of all arguments; nothing is computed."""
     jax.eval_shape(work.lane, _first_row(design))
     runs = [work.simulation(group) for group in all_groups(work, design)]  # one of each group
     runs[0].check("ensemble: the start", constraints=False)
@@ -72,7 +68,7 @@ def _chunks(runs: list[Simulation], lanes: int, arrays: dict[str, Kept], chunk: 
     if chunk is not None:
         size = min(whole_number("ensemble: chunk", chunk, otherwise=", or None"), lanes)
         return Chunks(lanes, size, min(width, size))
-    kind = "constrained" if run.system.is_constrained else "implicit" if run.plan.has_fallback else "explicit"
+    kind = "implicit" if run.system.is_constrained or run.plan.has_fallback else "explicit"
     size_q = run.state.q_s.size + run.state.q_f.size
     seconds = 1e-9 * MICRO_STEP_NANOSECONDS[kind] * _micro_steps(run) * run.scheme.degree**2 * size_q
     array_bytes = sum(kept.value.dtype.itemsize * int(np.prod(kept.value.shape)) for kept in arrays.values())

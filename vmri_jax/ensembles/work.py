@@ -76,11 +76,7 @@ class Work:
         return {part.name: getattr(self, part.name) for part in fields(self)}  # without cached properties
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Refuse a worker on which a file of the user is missing, or differs from the file where the ensemble was started.
-
-        Raises:
-            FileNotFoundError, ValueError: with the file.
-        """
+        """Refuse a worker on which a file of the user is missing, or differs from the file where the ensemble was started."""
         self.__dict__.update(state)
         for file, digest_at_start in self.sources.items():
             if not Path(file).is_file():
@@ -240,10 +236,8 @@ class Work:
         start = float(self.problem.t)
         if names == {"t_end", "num_steps"}:
             return (float(values_by_name["t_end"]) - start) / values_by_name["num_steps"], values_by_name["num_steps"]
-        factor = scheme.num_micro if "micro_dt" in values_by_name else 1
-        macro_dt = factor * np.asarray(
-            values_by_name["micro_dt" if "micro_dt" in values_by_name else "macro_dt"], dtype=float
-        )
+        name, factor = ("micro_dt", scheme.num_micro) if "micro_dt" in values_by_name else ("macro_dt", 1)
+        macro_dt = factor * np.asarray(values_by_name[name], dtype=float)
         if not np.all(macro_dt > 0):
             raise ValueError(f"ensemble: a step is {np.min(macro_dt)}; steps must be positive.")
         macro_dt = float(macro_dt) if macro_dt.ndim == 0 else macro_dt

@@ -37,16 +37,7 @@ class Here(Executor):
 
 @contextmanager
 def executor_of(caller: str, executor: Any, processes: int | None = None) -> Iterator[Executor]:
-    """The `concurrent.futures.Executor` that computes the tasks of a call.
-
-    Args:
-        executor: None for this process, a `concurrent.futures.Executor`, or a `dask.distributed.Client`, which makes one.
-        processes: number of workers to start on this machine, or None.
-
-    Raises:
-        TypeError, ValueError: another executor, or both `executor` and `processes`.
-        ImportError: `processes` without Dask.
-    """
+    """The `concurrent.futures.Executor` that computes the tasks of a call; `executor` and `processes` are those of `ensemble`."""
     if executor is not None and processes is not None:
         raise ValueError(f"{caller}: executor and processes are given; choose one of them.")
     with ExitStack() as resources:
@@ -86,11 +77,8 @@ def as_done(
 
     Args:
         submit: starts one task. A task of this process has ended when `submit` returns, and is yielded before the next one starts.
-        interrupted: returns whether Ctrl-C was pressed. Python loses a `KeyboardInterrupt` that is raised in the finaliser of a future
-            of Dask; therefore a handler notes Ctrl-C, and this function polls it.
-
-    Raises:
-        KeyboardInterrupt: Ctrl-C was pressed.
+        interrupted: returns whether Ctrl-C was pressed, for a `KeyboardInterrupt`. Python loses one that is raised in the finaliser of a
+            future of Dask; therefore a handler notes Ctrl-C, and this function polls it.
     """
     waiting: dict[Future, int] = {}
     left = iter(numbers)

@@ -25,11 +25,7 @@ def known_versions() -> dict[str, str]:
 
 
 def packed(caller: str, task: Callable, *shared) -> bytes:
-    """A function and its first arguments as bytes that another process can read; `caller` begins the message of the error.
-
-    Raises:
-        ValueError: workers cannot import a function among them.
-    """
+    """A function and its first arguments as bytes that another process can read; refuses functions that workers cannot import."""
     try:
         data = pickle.dumps((task, shared))
         if b"__main__" in data:
@@ -66,11 +62,7 @@ def call_in_worker(data: bytes, *plain) -> tuple[Callable, bytes]:
 def in_worker(versions: dict[str, str], data: bytes, *plain):
     """Set up JAX in this process and return ``task(*shared, *plain)`` for the task that `packed` has packed.
 
-    Args:
-        versions: versions of packages of the process that started the work.
-
-    Raises:
-        NotAWorker: this process has other versions, or JAX has started in it with other settings.
+    Refuses a process with other `versions` than the one that started the work, or one where JAX has started with other settings.
     """
     here = known_versions()
     differ = [
@@ -93,7 +85,7 @@ def _unpacked(data: bytes) -> tuple[Callable, tuple]:
 
 @lru_cache(maxsize=1)
 def _prepare(process: int) -> None:
-    """Settings of JAX: one thread, 64-bit floats, fast loops, and compiled programs on disk in a folder for this kind of processor.
+    """One thread, 64-bit floats, fast loops, and compiled programs on disk in a folder for this kind of processor.
 
     `process` is the number of this process; a forked process has another one, and prepares itself again.
     """

@@ -48,9 +48,6 @@ def check_same(
         kind: "run" or "ensemble".
         attributes, stored: of the store that the user wants, and of the store on disk, with "identity", "made_with" and "chunk".
         chunk: size of a chunk that the user wants, or None.
-
-    Raises:
-        ValueError: with all differences.
     """
     here, there = attributes["identity"], stored["identity"]
     now, then = attributes["made_with"], stored["made_with"]

@@ -162,12 +162,7 @@ def read_attributes(path: Path) -> dict[str, Any]:
 
 
 def attributes_in(path: Path, format_name: str, contents: str, kind: str) -> dict[str, Any]:
-    """Attributes of a group of Zarr with an attribute "format"; `contents` and `kind` of the folder are for messages.
-
-    Raises:
-        FileNotFoundError: the path does not exist.
-        ValueError: the path is no such group, or a damaged one.
-    """
+    """Attributes of a group of Zarr with an attribute "format"; `contents` and `kind` of the folder are for messages."""
     if not path.exists():
         raise FileNotFoundError(f"{path} does not exist; give the folder of {contents}.")
     try:

@@ -101,9 +101,6 @@ class StoredTrajectory(Exports):
     def names(self) -> Names:
         return self[:1].names
 
-    def whole(self) -> Trajectory:
-        return self.load()
-
     def load(self) -> Trajectory:
         """All saved nodes.
 
@@ -111,6 +108,8 @@ class StoredTrajectory(Exports):
             ValueError: no chunk is complete yet, or a file is damaged.
         """
         return self[:]
+
+    whole = load
 
     def __len__(self) -> int:
         return self.record.saved + 1 if self.record.saved else 0
