@@ -117,7 +117,7 @@ def _model(problem, parameters: Mapping) -> Callable[[Mapping], Problem]:
         )
     if not isinstance(problem, Problem) and callable(problem) and not hasattr(problem, "problem"):
         return cast(Callable[[Mapping], Problem], problem)
-    base = problem_of("fit", problem)
+    base = problem_of("fit", cast(Problem, problem))
     params = base.system.params
     known, structure = _by_name(params if isinstance(params, Mapping) else {})
     for name, unknown in parameters.items():
