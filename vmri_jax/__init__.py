@@ -49,6 +49,7 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
 from vmri_jax import diagnostics
+from vmri_jax.accuracy.batch import FailedLanesWarning, simulate_batch
 from vmri_jax.accuracy.companions import UncertifiedWarning
 from vmri_jax.accuracy.simulate import simulate
 from vmri_jax.accuracy.steps import AccuracyNotReached
@@ -57,7 +58,6 @@ from vmri_jax.mechanics.functions import CompiledAgainWarning
 from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.state import Problem, State, initial_state
 from vmri_jax.mechanics.system import ConstantMass, Rheonomic, System
-from vmri_jax.running.batch import FailedLanesWarning, simulate_batch
 from vmri_jax.running.interrupts import Interrupted
 from vmri_jax.running.macro_step import macro_step
 from vmri_jax.running.observables import LostEnergyWarning, SingularCoordinatesWarning

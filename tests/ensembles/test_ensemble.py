@@ -5,6 +5,7 @@ import os
 from dataclasses import replace
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -57,10 +58,14 @@ def test_runs_are_those_of_simulate(tmp_path):
         assert one.iterations == int(run.info.iterations.max())
 
 
-@pytest.mark.parametrize("system", [own.hung, f"{OWN}:hung"], ids=["problem", "file"])
-def test_positions_as_dictionaries(tmp_path, system):
+@pytest.mark.parametrize(
+    ("system", "function"),
+    [(own.hung, own.lengths), (f"{OWN}:hung", f"{OWN}:lengths")],
+    ids=["problem", "file"],
+)
+def test_positions_as_dictionaries(tmp_path, system, function):
     """The store has vectors; functions of the user get a run with its dictionaries and names."""
-    save = ("end", "nodes", "extremes", "quantiles", f"{OWN}:lengths")
+    save = ("end", "nodes", "extremes", "quantiles", function)
     design = {"k": [30.0, 50.0]}
     runs = few(tmp_path / "runs.zarr", system=system, design=design, save=save, num_saves=5)
     one = runs.open().sel(k=50.0).load()
@@ -357,3 +362,20 @@ def test_constrained_systems(tmp_path, tsp):
 
 def _files(path: Path) -> dict[str, bytes]:
     return {str(file.relative_to(path)): file.read_bytes() for file in path.rglob("*") if file.is_file()}
+
+
+def test_functions_of_runs_are_kept_by_their_names(tmp_path):
+    def reach(run):
+        return jnp.max(run.q_f)
+
+    design, out = {"omega": [20.0]}, tmp_path / "runs.zarr"
+    few(out, design=design, save=reach)
+
+    def reach(run):  # another function of the same name
+        return jnp.min(run.q_f)
+
+    with pytest.raises(ValueError, match=r"another ensemble.*operations of reach"):
+        few(out, design=design, save=reach, resume=True)
+    for save in (lambda run: 1.0, 3.0):
+        with pytest.raises(ValueError, match=r"a function without a name|There are end, nodes"):
+            few(out, design=design, save=save, overwrite=True)

@@ -154,7 +154,10 @@ def unknown_force(t, q_s, q_f, v_s, v_f, params):
     [
         ({"q_f": {"hook": [3.0, -4.0]}}, "fast has the keys hook, load; give hook"),
         ({"v_f": {"laod": [0.0, 0.0]}}, "v_f has the keys laod; give hook, load"),
-        ({"v_f": {"load": [0.0, 0.0, 0.0]}}, r"v_f\['load'\] has shape \(3,\); the body has \(2,\)"),
+        (
+            {"v_f": {"load": [0.0, 0.0, 0.0]}},
+            r"v_f\['load'\] has shape \(3,\), and the position has \(2,\); give an array of shape \(2,\)",
+        ),
         ({"q_f": {1: [0.0]}}, "q_f has the key 1"),
         ({"q_s": [0.0]}, "masses by name, trolley, but the slow coordinates are a vector"),
         ({"q_s": [0.0], "v_s": {"trolley": 0.0}}, "v_s is a dictionary and q_s is none"),

@@ -7,7 +7,7 @@ import pytest
 from tests.user_systems import GRAVITY, LENGTH, MASS, double_pendulum, drag, hanging_weight, own_rod, swinging_rod
 from vmri_jax import ConstantMass, Rheonomic, State, System, fully_implicit, galerkin, initial_state, simulate
 from vmri_jax.mechanics.invariants import energy
-from vmri_jax.mechanics.motion import motion, powers, reaction_force
+from vmri_jax.mechanics.motion import motion, powers, reaction_forces
 
 
 def test_a_pendulum_by_the_formula():
@@ -16,7 +16,7 @@ def test_a_pendulum_by_the_formula():
     found = motion(system, state)
     tension = MASS * (1.0 + GRAVITY * 0.8 * LENGTH) / LENGTH**2  # m (v^2 - g y) / L^2
     assert float(found.multipliers[0]) == pytest.approx(tension, rel=1e-13)
-    pull, touched = reaction_force(system, state, [0])
+    (pull,), touched = reaction_forces(system, state, [[0]])
     assert touched.all()
     assert np.allclose(pull, -tension * state.q_f, rtol=1e-13)
     assert np.allclose(found.a_f, pull / MASS - np.array([0.0, GRAVITY]), rtol=1e-13)

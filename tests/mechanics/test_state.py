@@ -1,5 +1,7 @@
 """States: consistent starts, projections, and constraints that no micro grid can keep."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -251,3 +253,13 @@ def test_velocities_may_be_traced_where_the_kinetic_energy_is_a_function():
     expected, traced = momenta(problem.v_s, problem.v_f), jax.jit(momenta)(problem.v_s, problem.v_f)
     for a, b in zip(expected, traced, strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-14)
+
+
+def test_the_state_of_a_problem(fpu):
+    assert initial_state(fpu) == fpu.state()
+    moved = initial_state(fpu, v_s=2 * fpu.v_s, t=3.0)
+    assert moved == replace(fpu, v_s=2 * fpu.v_s, t=3.0).state()
+    resting = initial_state(fpu.system, fpu.q_s, fpu.q_f)
+    assert not np.any(resting.p_s)
+    with pytest.raises(TypeError, match="a System has no start; give q_s and q_f, or a Problem"):
+        initial_state(fpu.system)

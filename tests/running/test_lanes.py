@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from dataclasses import replace
 
 import equinox as eqx
 import jax
@@ -141,7 +142,20 @@ def test_one_compilation_for_all_chunks_and_step_sizes(fpu):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"macro_dt": np.ones(2)}, r"macro_dt has shape \(2,\); give a number, or one for each of the 3 lanes"),
+        (
+            {"macro_dt": np.ones(2)},
+            r"states.p_f has 3, macro_dt has 2; give params, states or steps with one value for",
+        ),
+        (
+            {"macro_dt": np.ones((3, 1))},
+            r"macro_dt has shape \(3, 1\); give \(\) for all lanes, or an axis of lanes in",
+        ),
+        (
+            {"num_steps": None, "t_end": 1.0, "macro_dt": np.array([0.1, 0.2, 0.1])},
+            "t_end with steps or start times that d",
+        ),
+        ({"params": {"omga": [1.0, 2.0, 3.0]}}, "there is no parameter 'omga'. Did you mean omega. There are omega"),
+        ({"params": {"omega": np.ones((3, 2))}}, r"params\['omega'\] has shape \(3, 2\); give \(\) for all lanes"),
         ({"macro_dt": np.array([0.1, -0.1, 0.1])}, "every macro_dt must be a positive number"),
         ({"num_steps": 0}, "num_steps is 0; it must be an integer of at least 1"),
         ({"devices": 99}, "devices is 99, but JAX has"),
@@ -154,7 +168,9 @@ def test_bad_input_is_refused(fpu, changes, message):
 
 
 def test_states_without_a_batch_axis_are_refused(fpu):
-    with pytest.raises(ValueError, match="give t \\(batch,\\) and all others \\(batch, n\\)"):
+    with pytest.raises(
+        ValueError, match="no argument has an axis of lanes; give params, states or steps with one value"
+    ):
         simulate_batch(fpu.system, fully_explicit(4), fpu.state(), macro_dt=0.1, num_steps=1)
 
 
@@ -207,3 +223,55 @@ def test_tracers_are_refused(fpu):
 
     with pytest.raises(ValueError, match=r"simulate_batch: arguments are tracers; .*jax\.vmap of simulate"):
         jax.grad(end)(50.0)
+
+
+SWEEP = {"scheme": fully_explicit(3), "macro_dt": 0.02, "t_end": 0.4}
+
+
+def test_a_sweep_in_one_line(chain):
+    """From the problem, with the error of each lane; params whole, for all lanes, are those of the problem."""
+    batch = simulate_batch(chain, params={"omega": [30.0, 50.0]}, error=True, **SWEEP)
+    assert batch.error.largest.shape == (2,)
+    for lane, omega in enumerate((30.0, 50.0)):
+        problem = replace(chain, system=chain.system.replace(params={"omega": np.asarray(omega)}))
+        alone = simulate(problem, error=True, **SWEEP)
+        assert largest_difference(batch.q_f[lane], alone.q_f) < 1e-13  # measured 1e-17
+        assert batch.error.largest[lane] == pytest.approx(alone.error.largest, rel=1e-9)
+        assert batch.lane(lane).error.is_certified
+    assert "positions are wrong by about" in repr(batch)
+
+
+def length(q_s, q_f, params):
+    return jnp.array([(q_f @ q_f - params["rods"]["length"] ** 2) / 2])
+
+
+def heavy(q_s, q_f, params):
+    return params["rods"]["mass"] * params["gravity"][1] * q_f[1]
+
+
+def rod() -> vm.Problem:
+    params = {"rods": {"mass": 2.0, "length": 1.0}, "gravity": np.array([0.0, 9.81])}
+    system = vm.System(vm.ConstantMass([], [2.0, 2.0]), heavy, constraint=length, params=params)
+    return vm.Problem(system, q_s=[], q_f=[1.0, 0.0], v_f=[0.0, 1.0])
+
+
+def test_params_nested_partial_and_shared():
+    """Momenta of the start fit the constraint of each lane; an array of the shape of the parameter holds for all lanes."""
+    heavier = {"rods": {"mass": [2.0, 6.0, 2.0]}, "gravity": np.array([0.0, 4.0])}
+    batch = simulate_batch(rod(), fully_implicit(2), params=heavier, macro_dt=0.01, num_steps=3)
+    assert (np.asarray(batch.failed_at) == -1).all()
+    assert largest_difference(batch.q_f[0], batch.q_f[2]) == 0
+    assert largest_difference(batch.q_f[0], batch.q_f[1]) > 1e-4
+    assert batch.origin.params["gravity"].shape == (3, 2)
+    with_dots = simulate_batch(
+        rod(),
+        fully_implicit(2),
+        params={"rods.mass": [6.0, 6.0, 6.0]} | {"gravity": heavier["gravity"]},
+        macro_dt=0.01,
+        num_steps=3,
+    )
+    assert largest_difference(with_dots.q_f[0], batch.q_f[1]) == 0
+    with pytest.raises(
+        ValueError, match=r"no parameter 'rods.maas'. Did you mean rods.mass. There are gravity, rods.length, rods.m"
+    ):
+        simulate_batch(rod(), fully_implicit(2), params={"rods": {"maas": [1.0]}}, macro_dt=0.01, num_steps=3)

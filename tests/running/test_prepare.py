@@ -89,7 +89,7 @@ def counted(q_f, params):
 
 
 def test_after_a_failure_no_step_is_taken(fpu):
-    """The first of 40 steps fails: the potential is evaluated for the energy of the start and in that step, no more."""
+    """The first of 40 steps fails: the potential is evaluated for the energies of the nodes and in that step, no more."""
     system, state = fpu.system.replace(fast_potential=counted), fpu.state()
     run = prepare(system, fully_explicit(1), state, macro_dt=0.01, num_steps=40)
     jax.effects_barrier()
@@ -97,7 +97,7 @@ def test_after_a_failure_no_step_is_taken(fpu):
     trajectory = run(State(state.t, 1e200 * state.q_s, state.q_f, state.p_s, state.p_f), throw=False)
     jax.effects_barrier()
     assert trajectory.failed_at == 0
-    assert 0 < STEPS_TAKEN["W"] <= 5  # 2; 82 if all steps were taken
+    assert 0 < STEPS_TAKEN["W"] <= 45  # 42, with the energies of 41 nodes; 82 if all steps were taken
     assert np.allclose(trajectory.t, 0.01 * np.arange(41), rtol=1e-15, atol=0)
 
 

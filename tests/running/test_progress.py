@@ -2,6 +2,8 @@
 
 import time
 
+import jax
+import numpy as np
 import pytest
 
 from vmri_jax.running import progress
@@ -49,3 +51,30 @@ def test_a_bar_says_it_alone(quick, capsys):
     with Working("", shown=False), Working("simulate"):
         time.sleep(0.3)
     assert capsys.readouterr().err == ""
+
+
+def test_lines_tell_tracing_and_compiling_from_stepping(quick, capsys):
+    def slowly_traced(x):
+        time.sleep(0.3)
+        return x
+
+    program = jax.jit(slowly_traced)
+    with Working("the run", running="stepping"):
+        program(np.zeros(2))
+        jax.monitoring.record_scalar("/jax/core/compile/backend_compile_duration", 0.0)
+        time.sleep(0.2)
+        jax.monitoring.record_event_duration_secs("/jax/core/compile/backend_compile_duration", 0.2)
+        time.sleep(0.2)
+    lines = [line.split("(")[-1] for line in capsys.readouterr().err.splitlines()]
+    assert list(dict.fromkeys(lines)) == ["tracing)", "compiling)", "stepping)"]
+
+
+def test_a_compiled_program_has_no_stages():
+    program, stages = jax.jit(lambda x: x + 1), []
+    program(np.zeros(3))
+    listener = lambda *event, **_: stages.append(event)  # noqa: E731
+    jax.monitoring.register_scalar_listener(listener)
+    program(np.zeros(3))
+    jax.monitoring.unregister_scalar_listener(listener)
+    assert not stages
+    assert progress.LONGEST_SILENCE <= 5.0

@@ -4,6 +4,7 @@ import copy
 import dataclasses
 import pickle
 from dataclasses import replace
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +14,7 @@ import pytest
 
 import vmri_jax as vm
 from tests.user_systems import GRAVITY, LENGTH, MASS, drag, hanging_weight, own_rod, swinging_rod
+from vmri_jax.plots.runs import _moduli
 from vmri_jax.scene import Anchor, Body, Gravity, LinearDamping, RigidLink, Scene, Spring
 
 
@@ -114,6 +116,39 @@ def test_a_scene_gives_its_names(hanging_run):
     assert set(forces) == {"hook", "load"}
     assert np.allclose(forces["hook"], -forces["load"], atol=1e-9)  # what a link does to one end it does to the other
     assert set(run.reaction_forces("anchors")) == {"hook"}
+
+
+def test_reaction_forces_are_drawn_by_constraint(hanging_run):
+    """A curve of the largest modulus over the bodies; a batch is refused."""
+    (axes,) = hanging_run.plot_forces("hanging").axes
+    curves = {line.get_label(): line.get_ydata() for line in axes.lines}
+    assert axes.get_ylabel() == "reaction force"
+    assert set(curves) == {"links", "anchors"}
+    pull = np.linalg.norm(hanging_run.reaction_forces("links")["load"], axis=1)
+    np.testing.assert_allclose(curves["links"], pull, rtol=1e-12)
+    with pytest.raises(ValueError, match=r"this is a batch of runs; take one of them, run.lane\(i\)"):
+        jax.tree.map(lambda a: np.asarray(a)[None], hanging_run).plot_forces()
+
+
+def test_torques_on_rigid_bodies_have_a_panel_of_their_own():
+    """A force f at the point d_1 of the body: f on the centre, and on the director; and a torque on an angle."""
+    force = np.array([[0.0, 2.0, 0.0], [0.0, 0.0, 3.0]])
+    run = SimpleNamespace(
+        names=SimpleNamespace(rigid=["hub"], numbered=["wheel"]),
+        position=lambda body: np.array([[5.0, 5.0, 5.0, 1.0, 0.0, 0.0]] * 2),
+        reaction_forces=lambda: {
+            "pin": {"hub": np.concatenate([force, force], axis=1)},
+            "gear": {"wheel": np.array([[-4.0], [4.0]])},
+            "rigid hub": {"hub": np.array([[0.0, 0.0, 0.0, 7.0, 0.0, 0.0]] * 2)},  # along the director
+        },
+    )
+    panels = _moduli(run)
+    assert {name: list(curves) for name, curves in panels.items()} == {
+        "reaction force": ["pin"],
+        "reaction torque": ["pin"],
+        "reaction generalised force": ["gear"],
+    }
+    np.testing.assert_allclose(panels["reaction torque"]["pin"], [2.0, 3.0])
 
 
 def test_a_system_without_names():

@@ -8,7 +8,7 @@ import pytest
 
 from tests.scene.random_trees import random_ring
 from tests.scene.test_joint_coordinates import assert_accelerates_as_by_directors, by_directors
-from vmri_jax.mechanics.motion import reaction_force
+from vmri_jax.mechanics.motion import reaction_forces
 from vmri_jax.scene import Box, Gravity, Prismatic, Revolute, RigidBody, Scene
 from vmri_jax.scene.body_motions import accelerations, state_of
 
@@ -78,8 +78,8 @@ def test_reaction_forces_of_a_slider_crank():
     equations[7, 6] = equations[8, 7] = 1.0
     forces, residual, *_ = np.linalg.lstsq(equations, known, rcond=None)
     assert residual < 1e-20
-    force_of = jax.jit(reaction_force)
+    forces_of = jax.jit(reaction_forces)
     for joint, name, mine in (("crank pin", "rod", forces[2:4]), ("cylinder", "piston", [0.0, forces[6]])):
-        theirs, _ = force_of(twin.system(), state, np.asarray(twin.names.rows[joint]))
+        (theirs,), _ = forces_of(twin.system(), state, [np.asarray(twin.names.rows[joint])])
         start = twin.places[name].start
         np.testing.assert_allclose(theirs[start : start + 2], mine, atol=1e-8)  # N, values of 10 to 100

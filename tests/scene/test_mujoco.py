@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 import vmri_jax as vm
-from benchmarks import random_models
 from tests.scene.mujoco_model_fields import IDLE, READ, REFUSED_FIELDS
 from vmri_jax.scene import Fixed, Scene, Spherical
 from vmri_jax.scene.body_motions import accelerations as motions
@@ -661,11 +660,3 @@ def test_a_keyframe_moves_mocap_bodies():
     assert Scene.from_mujoco(arm(more, body=body), ignore=["mocap bodies"]).bodies
     with pytest.raises(ValueError, match=r"e is open at the start by 0\.4 m"):
         Scene.from_mujoco(arm(more, body=body), ignore=["mocap bodies"], key=0)
-
-
-@pytest.mark.parametrize("seed", [0, 4, 7])
-def test_random_models_accelerate_as_in_mujoco_or_are_refused(seed):
-    """Measured: 1e-14 at most; seed 0 is refused. ``python -m benchmarks models --full`` compares 300."""
-    row = random_models.compare(seed)
-    assert row.get("difference", 0.0) < random_models.LARGEST_DIFFERENCE
-    assert ("refused" in row) == (seed == 0)

@@ -46,7 +46,7 @@ def test_a_cost_report_names_the_schemes_that_it_had_no_time_for(tmp_path, monke
     """Once a scheme has kept the error, a search without time compiles no other one."""
     module = import_module("vmri_jax.study.cost_report")
     monkeypatch.setattr(module, "BUDGET", -1.0)
-    monkeypatch.setattr(module, "_later_runs", lambda *_: {})
+    monkeypatch.setattr(module, "_of_accuracy", lambda *_: None)
     report = cost_report(PROBLEM, "spring", tmp_path, t_end=1.0, errors=(1e-3,), menu=SHORT_MENU)
     assert 0 < len(report.not_tried) < len(SHORT_MENU)
     for text in (str(report), report.path.read_text()):

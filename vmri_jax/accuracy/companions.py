@@ -81,7 +81,7 @@ def with_error(
         shares: whether to estimate the slow and the fast share, too. Their companion has twice the micro steps, another program.
         trial: the companion with half the macro step and the errors (k, n_s + n_f), if they have been computed.
     """
-    scheme, order = run.scheme, run.order
+    scheme = run.scheme
     halved = companion(run, scheme, 2) if trial is None else trial[0]
     if int(halved.failed_at) >= 0:
         failed = float(halved.t[0]) + int(halved.failed_at) * float(run.macro_dt) / 2
@@ -93,20 +93,10 @@ def with_error(
         return trajectory
     drives = events(run.system, run.state, float(trajectory.t[-1])) if trial is None else Events()
     total = estimated_errors(run, trajectory, halved, drives) if trial is None else trial[1]
-    fast = np.full_like(total, np.nan)
-    if shares:
-        refined = companion(run, scheme.with_num_micro(2 * stage_scheme(scheme).num_micro), 1)
-        fast = extrapolated(order, trajectory, refined)
-    certified, growth = certified_nodes(trajectory, total)
-    unseen = first_unseen(run, drives)
-    certified[1:] &= np.asarray(trajectory.t)[1:] <= unseen
-    until = np.asarray(trajectory.t)[certified][-1]
-    total, slow, fast = (np.where(certified[:, None], a, np.nan) for a in (total, total - fast, fast))
-    of_error = None if of is None else _of_error(of, order, trajectory, halved, certified)
-    q_s, q_f = np.split(total, [trajectory.states.q_s.shape[-1]], axis=1)
-    shares_at_nodes = largest_of(slow), largest_of(fast)
-    error = RunError(q_s, q_f, *shares_at_nodes, of_error, np.asarray(until), np.asarray(growth))
-    if not certified.all():
+    refined = companion(run, scheme.with_num_micro(2 * stage_scheme(scheme).num_micro), 1) if shares else None
+    error = run_error(run, trajectory, halved, total, drives, refined, of)
+    if not error.is_certified:
+        unseen = first_unseen(run, drives)
         reason = (
             _stepped_over(run, drives, unseen)
             if unseen <= trajectory.t[-1]
@@ -114,6 +104,35 @@ def with_error(
         )
         warnings.warn(f"simulate: {reason}", UncertifiedWarning, stacklevel=3)
     return replace(trajectory, error=error)
+
+
+def run_error(
+    run: Simulation,
+    trajectory: Trajectory,
+    halved: Trajectory,
+    total: np.ndarray,
+    drives: Events,
+    refined: Trajectory | None = None,
+    of: Callable | None = None,
+) -> RunError:
+    """The error of a run, NaN where it is not certified; without the shares if there is no companion with twice the micro steps.
+
+    Args:
+        halved: companion with half the macro step.
+        total: (k, n_s + n_f) estimated errors of the positions.
+        refined: companion with twice the micro steps.
+        of: function of a run, whose error is estimated, too.
+    """
+    order = run.order
+    fast = np.full_like(total, np.nan) if refined is None else extrapolated(order, trajectory, refined)
+    certified, growth = certified_nodes(trajectory, total)
+    certified[1:] &= np.asarray(trajectory.t)[1:] <= first_unseen(run, drives)
+    until = np.asarray(trajectory.t)[certified][-1]
+    total, slow, fast = (np.where(certified[:, None], a, np.nan) for a in (total, total - fast, fast))
+    of_error = None if of is None else _of_error(of, order, trajectory, halved, certified)
+    q_s, q_f = np.split(total, [trajectory.states.q_s.shape[-1]], axis=1)
+    shares_at_nodes = largest_of(slow), largest_of(fast)
+    return RunError(q_s, q_f, *shares_at_nodes, of_error, np.asarray(until), np.asarray(growth))
 
 
 def ratio(order: int, parts: float = 2) -> float:
@@ -127,10 +146,19 @@ def extrapolated(order: int, trajectory: Trajectory, finer: Trajectory) -> np.nd
 
 
 def estimated_errors(
-    run: Simulation, trajectory: Trajectory, halved: Trajectory, drives: Events, accuracy: float = 0.0
+    run: Simulation,
+    trajectory: Trajectory,
+    halved: Trajectory,
+    drives: Events,
+    accuracy: float = 0.0,
+    companion_of: Callable[[int, int], Trajectory] | None = None,
 ) -> np.ndarray:
     """(k, n_s + n_f) errors of the positions, from the companion with half the macro step, and from further ones if the system is driven or its
-    errors are not believed: below `DOUBTED` of the accuracy. They are infinite if a further companion fails."""
+    errors are not believed: below `DOUBTED` of the accuracy. They are infinite if a further companion fails.
+
+    Args:
+        companion_of: ``companion_of(parts, whole)``, as of `companion`, for a lane of a batch; None for `companion` itself.
+    """
     order = 1 if drives.jump else run.order
     result = ratio(order) * (_positions(trajectory) - _positions(halved))
     if not drives.names and np.abs(result).max(initial=0.0) > DOUBTED * accuracy:
@@ -141,12 +169,12 @@ def estimated_errors(
     whole = stride * run.save_every
     for factor in FURTHER_PARTS if drives.jump else FURTHER_PARTS[:1]:
         parts = next(k for k in range(max(round(factor * whole), 3), 10 * whole + 4) if math.gcd(k, whole) == 1)
-        finer = companion(run, run.scheme, parts, whole)
-        if int(finer.failed_at) >= 0:
+        further = companion_of(parts, whole) if companion_of else companion(run, run.scheme, parts, whole)
+        if int(further.failed_at) >= 0:
             return np.full_like(result, np.inf)
-        difference = ratio(order, parts / whole) * (_positions(trajectory)[::stride] - _positions(finer))
-        further = np.concatenate([difference[:1], np.repeat(difference[1:], stride, axis=0)])
-        result = np.where(np.abs(further) > np.abs(result), further, result)
+        difference = ratio(order, parts / whole) * (_positions(trajectory)[::stride] - _positions(further))
+        errors = np.concatenate([difference[:1], np.repeat(difference[1:], stride, axis=0)])
+        result = np.where(np.abs(errors) > np.abs(result), errors, result)
     return result
 
 
@@ -235,7 +263,12 @@ def companion(run: Simulation, scheme: Scheme | Composition, parts: int, whole: 
 
     Its saved nodes are the saved nodes of the run, or those that are multiples of `whole` steps, a multiple of `save_every`.
     """
-    finer = replace(
+    return finer(run, scheme, parts, whole).in_pieces()
+
+
+def finer(run: Simulation, scheme: Scheme | Composition, parts: int, whole: int = 1) -> Simulation:
+    """The run that makes a `companion`."""
+    return replace(
         run,
         scheme=scheme if scheme is run.scheme else of_one_type(scheme),
         macro_dt=run.macro_dt / (parts / whole),
@@ -243,7 +276,6 @@ def companion(run: Simulation, scheme: Scheme | Composition, parts: int, whole: 
         save_every=max(run.save_every // whole, 1) * parts,
         save_micro=False,
     )
-    return finer.in_pieces()
 
 
 def _positions(trajectory: Trajectory) -> np.ndarray:

@@ -72,7 +72,7 @@ def simulate(
         throw: raise `SimulationError` (which carries the partial trajectory) if a step fails; else return the trajectory,
             NaN after the failure.
         progress: True for a bar, or a function of (what, done, total), with an accuracy called before every trial run. With False a run
-            that takes more than two seconds prints occasional lines on the error stream.
+            that takes more than two seconds prints lines on the error stream, whether it is tracing, compiling or stepping.
         adjoint: which states a run keeps for derivatives, see `vmri_jax.running.adjoints`: "stored" for all modes, "checkpoint" for reverse
             mode in little memory; "auto" chooses by length.
         error: estimate the error of the positions and its slow and fast share, ``run.error``, a `RunError`. This takes two more runs: one

@@ -13,6 +13,7 @@ from vmri_jax.control.transcription import Transcription
 from vmri_jax.diagnostics.linear import phase_vector
 from vmri_jax.mechanics.arrays import real_array, whole_number
 from vmri_jax.mechanics.functions import traced_once
+from vmri_jax.mechanics.order import order_of
 from vmri_jax.mechanics.state import start_of
 from vmri_jax.running.simulation import prepare
 from vmri_jax.schemes.composition import Composition
@@ -73,6 +74,7 @@ def transcribed(
     if solver is None and plan(system, scheme, state).has_fallback:
         solver = solvers.Nested()
     u = np.zeros(num_controls)
+    actuate = traced_once(actuate, order_of(params))
     forces = jax.eval_shape(lambda: actuate(state.q_s, state.q_f, u, params))
     expected = (state.q_s.shape, state.q_f.shape)
     if not isinstance(forces, tuple) or tuple(getattr(f, "shape", None) for f in forces) != expected:

@@ -117,8 +117,11 @@ def numbers_in(rows: Rows) -> Rows:
     return columns
 
 
-def lane_function(problem: Problem, vary: Vary) -> Callable[[Row], Lanes]:
+def lane_function(problem: Problem, vary: Vary, columns: Collection[str]) -> Callable[[Row], Lanes]:
     """The function from a row to the parameters and the start of its run.
+
+    Args:
+        columns: names of the columns that change the problem, in their order in the design; JAX would sort them.
 
     Raises (when it is called):
         TypeError: `vary` returns no problem.
@@ -126,7 +129,7 @@ def lane_function(problem: Problem, vary: Vary) -> Callable[[Row], Lanes]:
     """
 
     def lane(row: Row) -> Lanes:
-        changed = vary(problem, row)
+        changed = vary(problem, {name: row[name] for name in columns})
         check_type(
             "ensemble: vary(problem, row)", changed, Problem, "dataclasses.replace(problem, q_s=...), for example"
         )

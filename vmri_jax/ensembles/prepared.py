@@ -1,15 +1,17 @@
 """Preparation of an ensemble: checks of all arguments, its chunks, the arrays of its store, and the record that identifies it."""
 
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
+from vmri_jax.accuracy.companions import resting
 from vmri_jax.ensembles.columns import Row, numbers_in
 from vmri_jax.ensembles.design import Design, Draws, Product
-from vmri_jax.ensembles.quantities import Kept, what_is_kept
+from vmri_jax.ensembles.quantities import Kept, Quantity, label_of, quantity, what_is_kept
 from vmri_jax.ensembles.task import Chunks
 from vmri_jax.ensembles.work import Work, all_groups
 from vmri_jax.mechanics.arrays import whole_number
@@ -17,6 +19,7 @@ from vmri_jax.mechanics.names import Names
 from vmri_jax.running.batch import lanes_at_once
 from vmri_jax.running.simulation import Simulation
 from vmri_jax.running.store.identity import changed_conditions, describe, differences, environment, identity, operations
+from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.steppers.results import Result
 
 CHUNK_SECONDS = 1.0
@@ -68,7 +71,7 @@ def _checked(work: Work, design: Design) -> list[Simulation]:
     jax.eval_shape(work.lane, _first_row(design))
     runs = [work.simulation(group) for group in all_groups(work, design)]
     runs[0].check("ensemble: the start", constraints=False)
-    over_nodes = [name for name, quantity in zip(work.save, work.quantities, strict=True) if quantity.over_nodes]
+    over_nodes = [str(name) for name, quantity in zip(work.save, work.quantities, strict=True) if quantity.over_nodes]
     if over_nodes and work.num_saves == 1:
         raise ValueError(
             f"ensemble: {', '.join(over_nodes)} looks at the saved nodes of a run, and only its end is saved; give num_saves, "
@@ -156,7 +159,10 @@ def _identity(work: Work, design: Design, run: Simulation) -> dict[str, str]:
         name: text for name, text in identity(run, run.state).items() if not name.startswith(("scheme", "macro_dt"))
     }
     identity_record |= schemes | {name: str(value) for name, value in work.steps.items()}
-    identity_record |= {"num_micro": str(work.num_micro), "save": ", ".join(Path(name).name for name in work.save)}
+    saved = [label_of(entry) if callable(entry) else Path(entry).name for entry in work.save]
+    identity_record |= {"num_micro": str(work.num_micro), "save": ", ".join(saved)}
+    for entry in filter(callable, work.save):
+        identity_record |= {f"operations of {label_of(entry)}": operations(_arrays_of(quantity(entry)), resting(run))}
     identity_record |= {"num_saves": str(work.num_saves), "project": str(work.project), "runs": str(len(design))}
     identity_record |= {f"file {Path(file).name}": digest for file, digest in work.sources.items()}
     if work.vary is not None:
@@ -164,6 +170,11 @@ def _identity(work: Work, design: Design, run: Simulation) -> dict[str, str]:
             "operations of vary": operations(work.lane, _first_row(design))
         }
     return identity_record | _describe_design(design)
+
+
+def _arrays_of(quantity: Quantity) -> Callable[[Trajectory], dict[str, Any]]:
+    """The function from a run to the arrays of a quantity."""
+    return lambda run: {name: array.value for name, array in quantity.function(run).items()}
 
 
 def _describe_design(design: Design) -> dict[str, str]:

@@ -18,6 +18,10 @@ LEVELS = (0.05, 0.5, 0.95)
 """Probabilities of the quantiles over the saved nodes: the median, and an interval with 90 % of them."""
 
 
+Saved = str | Callable[[Trajectory], Any]
+"""An entry of the argument ``save`` of `vmri_jax.ensemble`."""
+
+
 class Kept(NamedTuple):
     """An array of the store, for one run.
 
@@ -114,27 +118,31 @@ QUANTITIES = {
 }
 
 
-def quantity(name: str) -> Quantity:
-    """One of `QUANTITIES`, or a function of the user, ``my_file.py:function`` or ``my_package.my_module:function``.
+def quantity(saved: Saved) -> Quantity:
+    """One of `QUANTITIES` by name, or a function of the user: itself, ``my_file.py:function`` or ``my_package.my_module:function``.
 
-    A user's function takes the `Trajectory` of a single run and returns an array, or arrays by name, by operations of JAX.
+    A user's function takes the `Trajectory` of a single run and returns an array, which has the name of the function, or arrays by name, by
+    operations of JAX.
 
     Raises:
-        ValueError: an unknown name, or a name without a function.
+        ValueError: an unknown name, a name without a function, or a function without a name.
     """
-    if name in QUANTITIES:
-        return QUANTITIES[name]
-    if ":" not in name:
+    if isinstance(saved, str) and saved in QUANTITIES:
+        return QUANTITIES[saved]
+    if not callable(saved) and not (isinstance(saved, str) and ":" in saved):
         raise ValueError(
-            f"ensemble: save has {name!r}.{near(name, QUANTITIES)} There are {', '.join(QUANTITIES)}; your own functions are "
-            "my_file.py:function, or my_package.my_module:function."
+            f"ensemble: save has {saved!r}.{near(saved, QUANTITIES)} There are {', '.join(QUANTITIES)}; your own functions are given as they are, "
+            "or as my_file.py:function, or my_package.my_module:function."
         )
-    user_function = imported(name)
+    user_function, label = saved if callable(saved) else imported(saved), label_of(saved)
     if not callable(user_function):
         raise ValueError(
-            f"ensemble: save has {name!r}, which is {type(user_function).__name__}; give a function of a trajectory."
+            f"ensemble: save has {saved!r}, which is {type(user_function).__name__}; give a function of a trajectory."
         )
-    label = name.partition(":")[2]
+    if not label.isidentifier():
+        raise ValueError(
+            f"ensemble: save has {saved!r}, a function without a name for its array in the store; define it with def."
+        )
 
     def function(run: Trajectory) -> dict[str, Kept]:
         result = user_function(run)
@@ -145,6 +153,11 @@ def quantity(name: str) -> Quantity:
         return {key: Kept(array, axes[key], description) for key, array in arrays.items()}
 
     return Quantity(function, False)
+
+
+def label_of(saved: Saved) -> str:
+    """The name of a quantity of the user: the name of its function, without its file or module."""
+    return getattr(saved, "__name__", "") if callable(saved) else saved.partition(":")[2]
 
 
 def kept(quantities: Sequence[Quantity], run: Trajectory) -> dict[str, Kept]:

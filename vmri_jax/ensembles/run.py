@@ -13,6 +13,7 @@ from vmri_jax.ensembles import store
 from vmri_jax.ensembles.columns import Vary
 from vmri_jax.ensembles.design import Design, Draws, Product, Table
 from vmri_jax.ensembles.prepared import attributes_of, check_same, prepared
+from vmri_jax.ensembles.quantities import Saved
 from vmri_jax.ensembles.task import Chunks, Job, run_chunk, run_packed_chunk
 from vmri_jax.ensembles.work import AnyScheme, Work
 from vmri_jax.executors.executor import Here, as_done, executor_of
@@ -117,7 +118,7 @@ def ensemble(
     micro_dt: float | None = None,
     num_micro: int | None = None,
     vary: Vary | None = None,
-    save: str | Sequence[str] = "end",
+    save: Saved | Sequence[Saved] = "end",
     num_saves: int = 1,
     solver: Newton | None = None,
     project: bool | None = None,
@@ -155,8 +156,8 @@ def ensemble(
         vary: a function ``(problem, row) -> problem`` that makes the problem of a run from the values of its row by column, for example
             ``lambda problem, row: replace(problem, v_s=row["speed"] * problem.v_s)``. Columns, besides steps and schemes, then have names
             of your choice. It may change the values of parameters and of the start, and is traced, so that its operations must be operations of JAX.
-        save: quantities that are kept of each run: names from `vmri_jax.ensembles.QUANTITIES`, or functions of a trajectory,
-            ``my_file.py:function``.
+        save: quantities that are kept of each run: names from `vmri_jax.ensembles.QUANTITIES`, or functions of a trajectory, themselves or
+            as ``my_file.py:function``. A function returns an array, or a dictionary of arrays.
         num_saves: number of saved nodes of a run after the start, equally spaced, from which the quantities are computed.
         solver, project: as in `simulate` and `initial_state`.
         chunk: number of runs of a chunk; None for about a second of computation. The store keeps this number.
@@ -201,7 +202,7 @@ def ensemble(
         num_micro=num_micro,
         solver=solver,
         project=project,
-        save=(save,) if isinstance(save, str) else tuple(save),
+        save=tuple(save) if isinstance(save, list | tuple) else (save,),
         num_saves=whole_number("ensemble: num_saves", num_saves),
         vary=vary,
     ).with_sources()

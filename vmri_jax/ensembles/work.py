@@ -7,20 +7,19 @@ from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import numpy as np
 
+from vmri_jax.accuracy.batch import simulate_batch
 from vmri_jax.catalogue import find_problem, find_scheme
 from vmri_jax.ensembles.columns import SCHEMES, STEPS, Lanes, Row, Vary, by_name, lane_function, numbers_in
 from vmri_jax.ensembles.design import Design, Rows, unique_rows
-from vmri_jax.ensembles.quantities import Quantity, of_lanes, quantity
+from vmri_jax.ensembles.quantities import Quantity, Saved, of_lanes, quantity
 from vmri_jax.mechanics.names import near
-from vmri_jax.mechanics.state import Problem, State, initial_state
-from vmri_jax.mechanics.system import System
+from vmri_jax.mechanics.state import Problem
 from vmri_jax.running import arguments
 from vmri_jax.running.arguments import steps_until
-from vmri_jax.running.batch import simulate_batch
+from vmri_jax.running.batch import consistent_states
 from vmri_jax.running.simulation import Simulation, simulation
 from vmri_jax.running.trajectory import STATUS, Trajectory
 from vmri_jax.schemes.composition import Composition
@@ -54,7 +53,7 @@ class Work:
     columns: names of the columns of the design.
     steps: arguments of `ensemble` about steps by name: t_end, num_steps, macro_dt, micro_dt, as far as they are not columns.
     num_micro, solver, project: as in `ensemble`.
-    save: names of the quantities that are kept.
+    save: names of the quantities that are kept, or functions.
     num_saves: number of saved nodes after the start.
     vary: makes the problem of a run from the problem and a row; None where the names of columns say which numbers they set.
     sources: digests of the user's files, by path.
@@ -67,7 +66,7 @@ class Work:
     num_micro: int | None = None
     solver: Newton | None = None
     project: bool | None = None
-    save: tuple[str, ...] = ("end",)
+    save: tuple[Saved, ...] = ("end",)
     num_saves: int = 1
     vary: Vary | None = None
     sources: Mapping[str, str] = field(default_factory=dict)
@@ -114,7 +113,7 @@ class Work:
     def lane(self) -> Callable[[Row], Lanes]:
         """The function from the numbers of a row to the parameters and the start of its run."""
         names = [name for name in self.columns if name not in (*STEPS, *SCHEMES)]
-        return lane_function(self.problem, self.vary or by_name(self.problem, names))
+        return lane_function(self.problem, self.vary or by_name(self.problem, names), names)
 
     @cached_property
     def lanes(self) -> Callable[[Rows, int], Lanes]:
@@ -124,7 +123,7 @@ class Work:
     @cached_property
     def quantities(self) -> list[Quantity]:
         """The quantities that are kept."""
-        return [quantity(name) for name in self.save]
+        return list(map(quantity, self.save))
 
     @cached_property
     def told_apart(self) -> list[str]:
@@ -190,7 +189,7 @@ class Work:
         macro_dt = group.macro_dt[filled] if np.ndim(group.macro_dt) else group.macro_dt
         lanes = self.lanes(numbers_in(rows), len(filled))
         project = self.problem.project if self.project is None else self.project
-        states = _states(self.problem.system, lanes.params, lanes.start, project)
+        states = consistent_states(self.problem.system, lanes.params, lanes.start, project)
         trajectory = simulate_batch(
             self.problem,
             group.scheme,
@@ -276,27 +275,15 @@ def all_groups(work: Work, design: Design) -> Iterator[Group]:
     yield from work.groups(rows | {name: np.repeat(first[name], count) for name in step_columns}, count)
 
 
-@eqx.filter_jit
-def _states(system: System, params, start: tuple, project: bool) -> State:
-    """Consistent states, one for each row of the starts (t, q_s, q_f, v_s, v_f) and parameters."""
-
-    def of_lane(lane_params, lane_start):
-        t, q_s, q_f, v_s, v_f = lane_start
-        lane_system = system if lane_params is None else system.replace(params=lane_params)
-        return initial_state(lane_system, q_s, q_f, v_s, v_f, t, project=project)
-
-    return jax.vmap(of_lane, (None if params is None else 0, 0))(params, start)
-
-
 @lru_cache(maxsize=8)
-def _kept_of(save: tuple[str, ...], sources: tuple) -> Callable[[Trajectory], dict[str, Any]]:
+def _kept_of(save: tuple[Saved, ...], sources: tuple) -> Callable[[Trajectory], dict[str, Any]]:
     """The compiled function that computes the kept quantities, cached for the ensembles of a process.
 
     Args:
-        save: names of quantities.
+        save: names of quantities, or functions.
         sources: digests of the user's files, so that a changed file is read again.
     """
-    return of_lanes([quantity(name) for name in save])
+    return of_lanes(list(map(quantity, save)))
 
 
 def _whole(name: str, value) -> int:

@@ -29,7 +29,7 @@ class Measured:
     Attributes:
         t: (k,) times, nodes of the macro grid of the fit.
         values: (k, m) or (k,), NaN for a missing one.
-        sigma: standard deviation of the errors of the values, positive: a number, (m,) or (k, m). None if it is not known: the fit
+        sigma: standard deviation of the errors of the values, positive: a number, (m,) where k is not m, (1, m), (k, 1), or the shape of values. None if it is not known: the fit
             estimates it from its residuals; then sigma is None for all sets of measurements.
         observe: the measured quantity, ``observe(state) -> (m,)`` or ``()``; all positions by default.
 
@@ -49,7 +49,7 @@ class Measured:
             raise ValueError(
                 f"Measured: values have shape {values.shape} for times of shape {t.shape}; give one row for each time."
             )
-        values = values.reshape(len(t), -1)
+        shape, values = values.shape, values.reshape(len(t), -1)
         if not np.isfinite(t).all() or not np.isfinite(values).any():
             raise ValueError("Measured: t must be finite, and at least one value must be a number.")
         if self.sigma is not None:
@@ -58,13 +58,14 @@ class Measured:
                 raise ValueError(
                     f"Measured: sigma is {self.sigma}; it must be positive. Leave an unknown sigma out: the fit estimates it."
                 )
-            try:
-                sigma = np.broadcast_to(sigma, values.shape)
-            except ValueError:
+            k, m = values.shape
+            # (m,) of as many times as quantities could be one for each time
+            if sigma.shape not in ((), shape, (1, m), (k, 1)) and (sigma.shape != (m,) or k == m):
                 raise ValueError(
-                    f"Measured: sigma has shape {sigma.shape}; values have {values.shape}. Give a number, one for each quantity, "
-                    "or one for each value."
-                ) from None
+                    f"Measured: sigma has shape {sigma.shape}; values have {shape}. Give a number, one for each quantity, {(1, m)}, one for each "
+                    f"time, {(k, 1)}, or one for each value."
+                )
+            sigma = sigma.reshape(k, m) if sigma.shape == shape else np.broadcast_to(sigma, (k, m))
             object.__setattr__(self, "sigma", sigma)
         object.__setattr__(self, "t", t)
         object.__setattr__(self, "values", values)

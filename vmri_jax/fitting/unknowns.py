@@ -49,6 +49,10 @@ class Unknown:
             value = getattr(self, name)
             if value is not None:
                 value = np.asarray(real_array(f"Unknown: {name}", value))
+                if value.shape not in ((), start.shape):
+                    raise ValueError(
+                        f"Unknown: {name} has shape {value.shape}; give a number, or the shape of start, {start.shape}."
+                    )
                 object.__setattr__(self, name, np.broadcast_to(value, start.shape))
         too_small = self.lower is not None and not np.all(self.lower < start)
         too_large = self.upper is not None and not np.all(start < self.upper)

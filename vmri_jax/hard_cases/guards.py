@@ -4,11 +4,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from vmri_jax.accuracy.batch import simulate_batch
 from vmri_jax.accuracy.simulate import simulate
 from vmri_jax.hard_cases.case import Outcome
 from vmri_jax.hard_cases.measures import difference, run
 from vmri_jax.mechanics.state import Problem, State, initial_state
-from vmri_jax.running.batch import simulate_batch
 from vmri_jax.schemes.scheme import fully_implicit
 from vmri_jax.steppers.results import Result
 from vmri_jax.steppers.solvers import Newton

@@ -12,10 +12,12 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from vmri_jax.mechanics.arrays import library, real_array
 from vmri_jax.mechanics.functions import Rheonomic, TracedOnce, traced_once
 from vmri_jax.mechanics.masses import ConstantMass
+from vmri_jax.mechanics.order import InOrder, Order, in_order
 from vmri_jax.mechanics.system import ARGUMENTS, KineticFunction, System
 
 SLOW, FAST = ("q_s", "v_s"), ("q_f", "v_f")
@@ -56,13 +58,14 @@ class Layout:
         """Number of coordinates of each array."""
         return {name: math.prod(shape) for name, shape in self.shapes}
 
-    def flat(self, name: str, arrays: Mapping[str, Any], missing: float | None = None):
+    def flat(self, name: str, arrays: Mapping[str, Any], *, zeros: bool = False, per_row: bool = False):
         """The vector (n,) of a dictionary of arrays.
 
         Args:
             name: name of the dictionary in messages.
-            arrays: by name; a value is repeated over the shape of its body, as NumPy broadcasts.
-            missing: value for bodies without an entry; None requires an entry for every body.
+            arrays: by name, each of the shape of its position; one number only for one number.
+            zeros: whether bodies without an entry have zeros; else every body needs an entry.
+            per_row: whether a value may have the leading axes of its position alone, as masses do, see `ConstantMass`.
 
         Raises:
             ValueError: names or shapes of another configuration.
@@ -70,17 +73,28 @@ class Layout:
         bodies = dict(self.shapes)
         unknown = [body for body in arrays if body not in bodies]
         absent = [body for body in bodies if body not in arrays]
-        if unknown or (absent and missing is None):
+        if unknown or (absent and not zeros):
             raise ValueError(
                 f"{name} has the keys {', '.join(map(str, arrays)) or 'none'}; give {', '.join(bodies) or 'none'}."
             )
         pieces = []
         for body, shape in self.shapes:
-            value = real_array(f"{name}[{body!r}]", arrays.get(body, missing))
-            try:
-                pieces.append(library(value).broadcast_to(value, shape).reshape(-1))
-            except ValueError:
-                raise ValueError(f"{name}[{body!r}] has shape {value.shape}; the body has {shape}.") from None
+            value = real_array(f"{name}[{body!r}]", arrays.get(body, np.zeros(shape)))
+            seen = value.shape
+            if value.size == math.prod(shape) == 1:
+                value = value.reshape(shape)
+            elif per_row:  # the axes that the value lacks are the last ones, where NumPy would put them first
+                value = value.reshape(*seen, *(1,) * (len(shape) - value.ndim))
+            if value.shape != shape and not (per_row and _repeats(value.shape, shape)):
+                rows = (
+                    f"one number, an array {shape[:1]} with a number for each row, or"
+                    if per_row and shape
+                    else "an array of"
+                )
+                raise ValueError(
+                    f"{name}[{body!r}] has shape {seen}, and the position has {shape}; give {rows} shape {shape}."
+                )
+            pieces.append(library(value).broadcast_to(value, shape).reshape(-1))
         return library(pieces).concatenate([*pieces, library(pieces).zeros(0)])
 
     def by_name(self, vectors) -> dict[str, Any]:
@@ -115,7 +129,9 @@ class ByName:
         if isinstance(value, tuple):  # forces
             parts = zip(("F_s", "F_f"), value, (self.slow, self.fast), strict=False)
             return tuple(
-                layout.flat(f"System: force: {name}", part, 0.0) if layout and isinstance(part, Mapping) else part
+                layout.flat(f"System: force: {name}", part, zeros=True)
+                if layout and isinstance(part, Mapping)
+                else part
                 for name, part, layout in parts
             )
         return value
@@ -129,12 +145,16 @@ class ByName:
             names = [f"{side} has {', '.join(layout.sizes) or 'none'}" for side, layout in sides.items() if layout]
             raise KeyError(f"{error.args[0]!r} is not there; {' and '.join(names)}") from error
 
-    def row_sizes(self, *arguments) -> dict[str, int]:
-        """Number of rows of each constraint that the function returns by name, in its order; empty if it returns a vector."""
+    def row_sizes(self, order: Order | None, *arguments) -> dict[str, int]:
+        """Number of rows of each constraint that the function returns by name, in its order; empty if it returns a vector.
+
+        Args:
+            order: of the params.
+        """
         sizes: dict[str, int] = {}
 
         def note_sizes(*arguments):
-            value = self.by_name(*arguments)
+            value = self.by_name(*arguments[:-1], in_order(arguments[-1], order))
             if isinstance(value, Mapping):
                 sizes.update({name: jnp.size(rows) for name, rows in value.items()})
             return ()
@@ -178,15 +198,26 @@ def flat_system(system: System, slow: Layout | None, fast: Layout | None) -> Sys
     )
 
 
+def _repeats(shape: tuple[int, ...], whole: tuple[int, ...]) -> bool:
+    """Whether an array of the first shape may be repeated along its axes of length 1 to fill the second shape."""
+    return len(shape) == len(whole) and all(n in (1, full) for n, full in zip(shape, whole, strict=True))
+
+
 def constraint_sizes(function: Callable | None, *arguments) -> dict[str, int]:
     """Names and numbers of rows of a constraint that returns its rows by name; empty for other constraints."""
+    inner, order = _inner(function)
+    return inner.row_sizes(order, *arguments) if isinstance(inner, ByName) else {}
+
+
+def _inner(function) -> tuple[Any, Order | None]:
+    """The function in a `TracedOnce`, and the order of its params."""
     inner = function.function if isinstance(function, TracedOnce) else function
-    return inner.row_sizes(*arguments) if isinstance(inner, ByName) else {}
+    return (inner.function, inner.order) if isinstance(inner, InOrder) else (inner, None)
 
 
 def _wrapped(function, arguments: tuple[str, ...], slow: Layout | None, fast: Layout | None) -> TracedOnce:
-    inner = function.function if isinstance(function, TracedOnce) else function
-    return traced_once(inner if isinstance(inner, ByName) else ByName(inner, arguments, slow, fast))
+    inner, order = _inner(function)
+    return traced_once(inner if isinstance(inner, ByName) else ByName(inner, arguments, slow, fast), order)
 
 
 def _flat_mass(name: str, mass, layout: Layout | None):
@@ -197,4 +228,4 @@ def _flat_mass(name: str, mass, layout: Layout | None):
             f"ConstantMass: {name} has masses by name, {', '.join(mass)}, but the {name} coordinates are a vector; give both as dictionaries, "
             "or both as arrays."
         )
-    return layout.flat(f"ConstantMass: {name}", mass)
+    return layout.flat(f"ConstantMass: {name}", mass, per_row=True)

@@ -16,6 +16,7 @@ from vmri_jax.mechanics.arrays import check_precision, is_concrete, real_array
 from vmri_jax.mechanics.arrays import require_x64 as require_x64
 from vmri_jax.mechanics.functions import TracedOnce, traced_once, with_time
 from vmri_jax.mechanics.masses import ConstantMass
+from vmri_jax.mechanics.order import order_of, ordered
 from vmri_jax.mechanics.surroundings import name_of
 from vmri_jax.mechanics.system import KineticFunction, System
 
@@ -129,6 +130,9 @@ def shape_of(name: str, function, *args):
     Raises:
         ValueError: the function cannot be traced, differentiated, or evaluated.
     """
+
+    if not isinstance(function, TracedOnce | KineticFunction | ConstantMass):  # these have the order of their system
+        function = ordered(function, order_of(args[-1]))
 
     def differentiated_twice(*args):
         *moving, params = args

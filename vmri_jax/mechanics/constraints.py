@@ -283,11 +283,11 @@ def check_constraints(
 def _check_gradients(system: System, state, rows: Rows, weights, in_words) -> None:
     """Refuse rows whose gradient is zero at the state, but not at a generic configuration `NEARBY` relative to its positions."""
     q, n_s = np.concatenate([state.q_s, state.q_f]), np.size(state.q_s)
+    n_g, n_gs = system.num_constraints(state.q_s, state.q_f)
     change = NEARBY * np.abs(weights * q).max() * np.random.default_rng(0).normal(size=q.size) / weights
     nearby, _ = jax.device_get(_rows_and_weights(system, state.t, *np.split(q + change, [n_s])))
     size, size_nearby = (np.linalg.norm(a.gradients, axis=1) for a in (rows, nearby))
     vanishes = (size_nearby > 0) & (size <= VANISHING_GRADIENT * size_nearby)
-    n_g, n_gs = system.num_constraints(state.q_s, state.q_f)
     parts = {"constraint": vanishes[:n_g], "slow_constraint": vanishes[n_g : n_g + n_gs]}
     for name, rows_of_name in parts.items():
         if rows_of_name.any():

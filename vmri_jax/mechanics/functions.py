@@ -9,6 +9,7 @@ from functools import lru_cache, partial, wraps
 
 import jax
 
+from vmri_jax.mechanics.order import Order, ordered
 from vmri_jax.mechanics.surroundings import Surroundings, name_of
 
 COPIES_UNTIL_WARNING = 5
@@ -118,7 +119,8 @@ def _traced(function: TracedOnce) -> Callable:
 
 def _count(function: Callable) -> None:
     """Count the surroundings in which one piece of code is traced, and warn once about `COPIES_UNTIL_WARNING` of them."""
-    function = getattr(function, "function", function)  # of `vmri_jax.mechanics.by_name.ByName`
+    while hasattr(function, "function"):  # of `InOrder` and `vmri_jax.mechanics.by_name.ByName`
+        function = function.function
     code = getattr(function, "__code__", None)
     if code is None:
         return
@@ -136,9 +138,11 @@ def _count(function: Callable) -> None:
 _made: Counter = Counter()
 
 
-def traced_once(function: Callable) -> TracedOnce:
-    """`function` as `TracedOnce`, if it is not one already."""
-    return function if isinstance(function, TracedOnce) else TracedOnce(function)
+def traced_once(function: Callable, order: Order | None = None) -> TracedOnce:
+    """`function` as `TracedOnce`, with an order of its params; one that has an order keeps it."""
+    inner = function.function if isinstance(function, TracedOnce) else function
+    within = ordered(inner, order)
+    return function if isinstance(function, TracedOnce) and within is inner else TracedOnce(within)
 
 
 def check_arguments(place: str, function: Callable, arguments: str, instead: str = "") -> None:

@@ -96,7 +96,8 @@ class ConstantMass(eqx.Module):
 
     Args:
         slow, fast: (n,) masses per coordinate, or an (n, n) symmetric positive definite mass matrix. If q_s and q_f are dictionaries: a
-            dictionary with the mass of each body, a number or an array that is broadcast to the shape of the body.
+            dictionary with the mass of each body. An array with the leading axes of the position is per row: for positions (atoms, 3) a
+            number is the mass of all atoms, (atoms,) has a mass for each atom, and (atoms, 3) a mass for each coordinate.
 
     Raises:
         TypeError: masses that are not real numbers.

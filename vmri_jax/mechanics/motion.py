@@ -67,16 +67,17 @@ def motion(system: System, state: State) -> Motion:
     return Motion(v_s, v_f, a[:n_s], a[n_s:], multipliers)
 
 
-def reaction_force(system: System, state: State, rows: Sequence[int]):
-    """Force ``-G^T lambda`` (n_s + n_f,) of some rows of the constraints, and (n_s + n_f,) whether it acts on each coordinate.
+def reaction_forces(system: System, state: State, constraints: Sequence[Sequence[int]]):
+    """Forces ``-G^T lambda`` (m, n_s + n_f) of m constraints, and (m, n_s + n_f) whether each acts on each coordinate.
 
     Args:
-        rows: indices among the rows of `constraint` and `slow_constraint`, joined.
+        constraints: for each of them the indices of its rows among the rows of `constraint` and `slow_constraint`, joined.
     """
-    chosen = jnp.asarray(rows)
     jacobians = jax.jacrev(system.constraints, argnums=(1, 2))(state.t, state.q_s, state.q_f)
-    jacobian = jnp.concatenate(jacobians, axis=1)[chosen]
-    return -motion(system, state).multipliers[chosen] @ jacobian, jnp.any(jacobian != 0, axis=0)
+    jacobian, multipliers = jnp.concatenate(jacobians, axis=1), motion(system, state).multipliers
+    forces = [-multipliers[jnp.asarray(rows)] @ jacobian[jnp.asarray(rows)] for rows in constraints]
+    touched = [jnp.any(jacobian[jnp.asarray(rows)] != 0, axis=0) for rows in constraints]
+    return jnp.stack(forces), jnp.stack(touched)
 
 
 def powers(system: System, state: State):

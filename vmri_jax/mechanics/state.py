@@ -57,36 +57,64 @@ class State:
 
 
 def initial_state(
-    system: System, q_s, q_f, v_s, v_f, t: Number = 0.0, *, project: bool = False, tolerance=START
+    system: Any,
+    q_s=None,
+    q_f=None,
+    v_s=None,
+    v_f=None,
+    t: Number | None = None,
+    *,
+    project: bool | None = None,
+    tolerance=START,
 ) -> State:
     """Consistent state from positions and velocities: ``p = dT/dv``, projected onto the hidden constraints.
 
+        vm.initial_state(problem)
+        vm.initial_state(problem, v_f={"load": [0.0, 0.1]}, t=2.0)
+        vm.initial_state(system, q_s, q_f, v_s, v_f)
+
     Args:
-        system: masses, potentials, constraints and forces.
-        q_s, q_f, v_s, v_f: (n_s,), (n_f,) arrays of float64.
-        t: start time.
+        system: a `Problem` or a scene, or a `System`.
+        q_s, q_f, v_s, v_f: (n_s,), (n_f,) arrays of float64, or for a problem as of `Problem`; None for the arrays of the problem, of a system for
+            no velocity.
+        t: start time; None for the time of the problem, or 0.
         project: move positions onto the constraints, and velocities onto the hidden constraints, instead of refusing them. A warning tells
-            of velocities of which the projection leaves little.
+            of velocities of which the projection leaves little. None for the choice of the problem, of a system for no projection.
         tolerance: largest value of a satisfied constraint, relative to its size, mostly of the terms that cancel in it: ``|d| + L`` of ``|d| - L``.
 
     Raises:
+        TypeError: a system without positions.
         ValueError: float32 data or 64-bit mode off, wrong shapes, not finite, positions that violate a constraint (with
             the size of the violation), velocities against a constraint, constraints that the fast variables cannot satisfy, a
             kinetic energy without mass along some coordinate.
     """
     require_x64()
-    check_type("initial_state: system", system, System, A_SYSTEM)
+    start = {"q_s": q_s, "q_f": q_f, "v_s": v_s, "v_f": v_f, "t": t}
+    problem = opened(system)
+    if isinstance(problem, Problem):
+        changes = {name: value for name, value in start.items() if value is not None}
+        problem = replace(problem, **changes) if changes else problem
+        system, start = problem.system, {name: getattr(problem, name) for name in start}
+        project = problem.project if project is None else project
+    check_type("initial_state: system", system, System, f"a vmri_jax.Problem, a scene, or {A_SYSTEM}")
+    q_s, q_f, v_s, v_f, t = start.values()
+    if q_s is None or q_f is None:
+        raise TypeError(
+            "initial_state: a System has no start; give q_s and q_f, or a Problem(system, q_s, q_f, v_s, v_f) alone."
+        )
     check_params(system.params)
     system = of_one_type(system)
-    for name, value in {"q_s": q_s, "q_f": q_f, "v_s": v_s, "v_f": v_f}.items():
+    for name, value in start.items():
         if isinstance(value, Mapping):
             raise TypeError(
                 f"initial_state: {name} is a dictionary; give real numbers, or Problem(system, q_s, q_f, v_s, v_f).state(): a problem "
                 "knows the order of the bodies."
             )
+    project = False if project is None else project
     check_flags(project=project)
-    t = check_number("t", t)
+    t = check_number("t", 0.0 if t is None else t)
     check_number("tolerance", tolerance)
+    v_s, v_f = (np.zeros(np.shape(q)) if v is None else v for q, v in ((q_s, v_s), (q_f, v_f)))
     q_s, q_f, v_s, v_f = check_arrays(q_s=q_s, q_f=q_f, v_s=v_s, v_f=v_f)
     if is_concrete((system, q_s, q_f)) and not system.has_constant_mass:
         check_system(system, q_s, q_f)
@@ -210,7 +238,7 @@ class Problem:
                     raise TypeError(
                         f"Problem: v_{part} is a dictionary and q_{part} is none; give both as dictionaries, or both as arrays."
                     )
-                velocity = layout.flat(f"Problem: v_{part}", velocity, missing=0.0)
+                velocity = layout.flat(f"Problem: v_{part}", velocity, zeros=True)
             object.__setattr__(self, f"q_{part}", position)
             object.__setattr__(self, f"v_{part}", velocity)
             layouts.append(layout)
@@ -245,8 +273,7 @@ class Problem:
 
     def state(self, project: bool | None = None) -> State:
         """The consistent initial `State`, see `initial_state`; with None, `project` is the one of the problem."""
-        project = self.project if project is None else project
-        return initial_state(self.system, self.q_s, self.q_f, self.v_s, self.v_f, self.t, project=project)
+        return initial_state(self, project=project)
 
 
 class HasProblem(Protocol):

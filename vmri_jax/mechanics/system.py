@@ -18,6 +18,7 @@ from vmri_jax.mechanics.functions import (
     with_time,
 )
 from vmri_jax.mechanics.masses import ConstantMass
+from vmri_jax.mechanics.order import Order, order_of
 from vmri_jax.mechanics.summary import numbers, parameters, summary
 from vmri_jax.mechanics.surroundings import name_of
 
@@ -85,7 +86,9 @@ class System(eqx.Module):
             time are given as `Rheonomic` functions.
         force: ``F(t, q_s, q_f, v_s, v_f, params) -> (F_s, F_f)``, not derived from a potential.
         params: any pytree of arrays, handed to every function; traced, so that sweeps and gradients over it
-            never recompile.
+            never recompile. Dictionaries reach functions in the order in which they are written here; other params of the same names, in
+            `replace` or of single runs, are put into this order. JAX sorts the names of a dictionary that is an argument of a function in
+            jit, grad or vmap: make the system outside of it, and `replace` its params inside.
         implied: ``g_i(q_s, q_f, params) -> (n_i,)``, redundant rows that follow from the constraints, scaled to order one; or a
             `Rheonomic` function. Steps do not solve for them, and they have no multipliers. A run checks them at its saved nodes: they
             count in `constraint_residual`, and if one of them is not zero the run ends as `NOT_IMPLIED`.
@@ -99,7 +102,7 @@ class System(eqx.Module):
     A run uses what its functions read from around them when it is made: globals, helpers, closures, attributes, see
     `vmri_jax.mechanics.surroundings`. Functions with the same code and surroundings are the same; for others everything is compiled again, so
     that what varies belongs in `params`. They are kept as `TracedOnce`, so that ``system.force`` is called like the function itself,
-    which is ``system.force.function``.
+    which is the innermost ``function`` of it.
     """
 
     kinetic: Any
@@ -134,8 +137,9 @@ class System(eqx.Module):
             "force": force,
             "implied": implied,
         }
+        order = order_of(params)
         for name, function in functions.items():
-            setattr(self, name, _checked(name, function))
+            setattr(self, name, _checked(name, function, order))
         if not isinstance(kinetic, ConstantMass | KineticFunction):
             if not callable(kinetic):
                 raise TypeError(
@@ -143,8 +147,8 @@ class System(eqx.Module):
                     "kinetic(q_s, q_f, v_s, v_f, params)."
                 )
             _check_function("kinetic", kinetic)
-            slow: Any = _checked("slow_kinetic", slow_kinetic)
-            kinetic = KineticFunction(traced_once(kinetic), slow)
+            slow: Any = _checked("slow_kinetic", slow_kinetic, order)
+            kinetic = KineticFunction(traced_once(kinetic, order), slow)
         elif slow_kinetic is not None:
             raise ValueError(
                 "System: slow_kinetic is given besides a ConstantMass, which has the masses of all slow variables; give the whole kinetic "
@@ -152,7 +156,7 @@ class System(eqx.Module):
             )
         self.kinetic = kinetic
         self.params = params
-        self.potentials = _named_potentials(potentials or ())
+        self.potentials = _named_potentials(potentials or (), order)
 
     def __repr__(self) -> str:
         return summary("System", self.terms())
@@ -269,19 +273,19 @@ def _rates(values, is_rheonomic: bool, configuration, velocities):
     return jax.jvp(partial(values, t), tuple(positions), velocities)[1]
 
 
-def _checked(name: str, function):
-    """The function as `TracedOnce` or `Rheonomic`, after checks; None for None."""
+def _checked(name: str, function, order: Order | None):
+    """The function as `TracedOnce` or `Rheonomic`, after checks; None for None. `order` is of the params."""
     if function is None:
         return None
     if isinstance(function, Rheonomic) and name in ("constraint", "slow_constraint", "implied"):
         _check_function(name, function.function, "t, ")
-        return Rheonomic(traced_once(function.function))
+        return Rheonomic(traced_once(function.function, order))
     if isinstance(function, ConstantMass):
         raise TypeError(f"System: {name} is a ConstantMass; masses come first, System(ConstantMass(slow, fast), V, W).")
     if not callable(function):
         raise TypeError(f"System: {name} is {function!r}; it must be a function or None.")
     _check_function(name, function)
-    return traced_once(function)
+    return traced_once(function, order)
 
 
 def label(name: str | int) -> str:
@@ -289,7 +293,7 @@ def label(name: str | int) -> str:
     return f"V_{name}" if isinstance(name, int) else name
 
 
-def _named_potentials(potentials) -> "Potentials":
+def _named_potentials(potentials, order: Order | None) -> "Potentials":
     """Pairs of a name and a function, from a mapping or from pairs."""
     try:
         named = dict(potentials)
@@ -313,7 +317,7 @@ def _named_potentials(potentials) -> "Potentials":
                 f"System: potentials[{name!r}] is {function!r}; it must be a function of (q_s, q_f, params)."
             )
         _check_function("potentials", function)
-    return Potentials((name, traced_once(function)) for name, function in named.items())
+    return Potentials((name, traced_once(function, order)) for name, function in named.items())
 
 
 def _constrain(function, t, *arguments):

@@ -7,7 +7,7 @@ notebook shows it when it is the value of a cell. Colours follow Okabe and Ito, 
 from vmri_jax.plots.controls import plot_control
 from vmri_jax.plots.ensembles import plot_ensemble
 from vmri_jax.plots.fits import plot_fit
-from vmri_jax.plots.runs import plot_trajectory
+from vmri_jax.plots.runs import plot_forces, plot_trajectory
 from vmri_jax.plots.staircases import Bound, Marked, plot_staircases
 from vmri_jax.plots.studies import plot_convergence, plot_work_precision
 from vmri_jax.plots.theme import (
@@ -43,6 +43,7 @@ __all__ = [
     "plot_convergence",
     "plot_ensemble",
     "plot_fit",
+    "plot_forces",
     "plot_staircases",
     "plot_trajectory",
     "plot_work_precision",

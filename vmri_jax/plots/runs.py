@@ -16,6 +16,8 @@ MOST_NAMED = 12
 than the panel."""
 BAND_OPACITY = 0.25
 """Opacity of the bands of errors; a larger value hides the curves of other coordinates."""
+LEAST_SHOWN = 1e-9
+"""Least reaction that is drawn, as a part of the largest one in its unit; a smaller value draws curves of round-off."""
 LEAST_SPAN = 1e-13
 """Least span of an axis of energies, as a part of the largest value; a smaller one magnifies round-off to the height of the panel."""
 
@@ -70,6 +72,59 @@ def plot_trajectory(trajectory: SavedRun, title: str = "", theme: Theme = LIGHT)
         limit_times(axes[-1], t)
         figure.align_ylabels()
     return figure
+
+
+def plot_forces(trajectory: SavedRun, title: str = "", theme: Theme = LIGHT) -> NotebookFigure:
+    """Moduli of the reaction forces of all constraints against time, a curve for each constraint by name.
+
+    There is a panel for each unit: forces on points and on centres of rigid bodies; torques about these centres, ``sum_i d_i x F_i`` of the
+    forces on directors; forces on generalised coordinates, such as N m for an angle. The modulus is the largest over the bodies of the
+    constraint; the two bodies of a link have the same. Forces themselves are those of ``run.reaction_forces()``.
+
+    Args:
+        trajectory: a run of a system with constraints; of a scene in joint coordinates ``scene.by_directors(run)``.
+        title: title above the panels.
+        theme: colours.
+
+    Raises:
+        ValueError: a batch of runs, a system without constraints, or a run that does not know its system.
+    """
+    if np.ndim(trajectory.t) != 1:
+        raise ValueError("plot_forces: this is a batch of runs; take one of them, run.lane(i).")
+    t, panels = np.asarray(trajectory.t), _moduli(trajectory)
+    with new_figure(7.2, 0.4 + 1.85 * len(panels), title, theme) as figure:
+        axes = figure.subplots(len(panels), sharex=True, squeeze=False)[:, 0]
+        for panel, (quantity, curves) in zip(axes, panels.items(), strict=True):
+            coordinates(panel, t, np.stack(list(curves.values()), axis=1), list(curves), theme)
+            panel.set(ylabel=quantity, ylim=(0.0, None))
+        axes[-1].set(xlabel="time $t$")
+        limit_times(axes[-1], t)
+        figure.align_ylabels()
+    return figure
+
+
+def _moduli(run: SavedRun) -> dict[str, dict[str, np.ndarray]]:
+    """For each unit, the largest modulus (k,) of the reaction on a body of each constraint by name; reactions that are round-off are left out."""
+    names, panels = run.names, {"force": {}, "torque": {}, "generalised force": {}}
+    for constraint, by_body in run.reaction_forces().items():
+        for body, force in by_body.items():
+            reactions = {"generalised force" if body in names.numbered else "force": force}
+            if body in names.rigid:
+                # (k, directors, 3): the first three entries are of the centre
+                pulls, directors = (
+                    np.asarray(a)[:, 3:].reshape(len(force), -1, 3) for a in (force, run.position(body))
+                )
+                reactions = {"force": force[:, :3], "torque": np.cross(directors, pulls).sum(axis=1)}
+            for unit, reaction in reactions.items():
+                curves, modulus = panels[unit], np.linalg.norm(reaction, axis=1)
+                curves[constraint] = np.maximum(curves.get(constraint, 0.0), modulus)
+    for curves in panels.values():
+        largest = max((np.nanmax(curve, initial=0.0) for curve in curves.values()), default=0.0)
+        for name in [
+            name for name, curve in curves.items() if not np.nanmax(curve, initial=0.0) > LEAST_SHOWN * largest
+        ]:
+            del curves[name]
+    return {f"reaction {unit}": curves for unit, curves in panels.items() if curves}
 
 
 def position_panels(run: SavedRun) -> list[tuple[np.ndarray, list[str], str, np.ndarray | None]]:

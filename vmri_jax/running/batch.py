@@ -1,26 +1,34 @@
-"""Batches of runs: a lane for each start, step size or parameter set of one system; lanes do not influence each other."""
+"""Batches of runs: a lane for each start, step size or parameter set of one system; lanes do not influence each other.
 
-import warnings
+Every array of a batch has the lanes as its first axis. An array that all lanes share is a view without copies, see `shared`: compiled programs
+get it once.
+"""
+
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import Any
 
+import equinox as eqx
 import jax
 import numpy as np
 from jax.sharding import PartitionSpec
 
 from vmri_jax.mechanics.arrays import is_concrete, options_of_runs, real_array, whole_number
 from vmri_jax.mechanics.checks import check_params
-from vmri_jax.mechanics.state import Movable, State, opened, start_of
+from vmri_jax.mechanics.names import unknown
+from vmri_jax.mechanics.state import Movable, State, initial_state, opened, start_of
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.arguments import Steps
 from vmri_jax.running.engine import Arrays, Engine
 from vmri_jax.running.memory import check_memory
+from vmri_jax.running.origin import Origin, is_repeated
 from vmri_jax.running.progress import Working
-from vmri_jax.running.simulation import Simulation, simulation
-from vmri_jax.running.trajectory import Run, Trajectory, trajectory_of, with_origin
+from vmri_jax.running.simulation import FALLING_BACK, STEPPING, Simulation, simulation
+from vmri_jax.running.trajectory import Run
 from vmri_jax.schemes.composition import Composition, stage_scheme
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.results import Result
-from vmri_jax.steppers.solvers import Newton
 
 NUMBERS_PER_CHUNK = 4096
 """Positions at all nodes of a macro step, summed over the lanes of a chunk: 32 kB of float64, the first-level cache of a core. Chunks with
@@ -31,154 +39,214 @@ MOST_LANES = 1024
 """Most lanes of a chunk; with more, the last chunk of a batch may be mostly padding."""
 
 
-class FailedLanesWarning(UserWarning):
-    """Lanes of a batch failed: they are NaN after the failing step; all other lanes are right."""
+@dataclass(frozen=True)
+class Batch:
+    """Runs side by side, with checked arguments.
 
-
-def simulate_batch(
-    system: Movable,
-    scheme: Scheme | Composition,
-    states: State,
-    *,
-    macro_dt=None,
-    micro_dt=None,
-    num_steps: int | None = None,
-    t_end: float | None = None,
-    save_every: int = 1,
-    save_micro: bool = False,
-    params=None,
-    solver: Newton | None = None,
-    chunk: int | None = None,
-    devices: int = 1,
-    warn: bool = True,
-) -> Trajectory:
-    """Simulate a batch of states, each lane as `simulate` would; the arrays returned have a leading batch axis.
-
-    Lanes are computed side by side (`jax.vmap`), in chunks that fit into the cache. Unlike `simulate`, a failed step never raises: its
-    lane is NaN after the step and has its status in ``.result`` and ``.failed_at``; other lanes do not change. A
-    `FailedLanesWarning` says how many lanes failed. Lanes that the first solver of `Auto` does not solve are run again with `Arrowhead`,
-    whose program is compiled at the first such lane.
-
-    Args:
-        system: a `System`, `Problem` or scene.
-        scheme: a scheme or composition.
-        states: a `State` whose arrays have a leading batch axis, e.g. ``jax.vmap(make)(q_s, ...)`` or
-            ``jax.tree.map(lambda *a: jnp.stack(a), *list_of_states)``.
-        macro_dt, micro_dt: step size, a number or one per lane; exactly one of them.
-        num_steps, t_end, save_every, save_micro, solver: as in `simulate`; t_end with one step size for all.
-        params: a pytree like ``system.params`` with a leading batch axis, if parameters differ between lanes.
-        chunk: lanes that are computed side by side; chosen from the size of the problem if None.
-        devices: CPU devices over which chunks are spread, see `vmri_jax.configure`.
-        warn: give a `FailedLanesWarning` where lanes failed; False for a program that looks at the statuses itself.
-
-    Raises:
-        ValueError, TypeError: bad arguments, before anything is computed.
+    Attributes:
+        run: the run of the first lane.
+        arrays: (lanes, ...) the numbers of all lanes.
+        width: lanes that are computed side by side.
+        devices: CPU devices that share the lanes.
     """
-    if not is_concrete((states, macro_dt, micro_dt, params)):
+
+    run: Simulation
+    arrays: Arrays
+    width: int
+    devices: int
+
+    def __call__(self) -> tuple[Run, np.ndarray]:
+        """The runs and their observables, see `Simulation.observed`; lanes that the first solver does not solve are computed again by the fallback."""
+        run, lanes = self.run, len(self.arrays.macro_dt)
+        with Working(f"simulate_batch, {lanes} lanes", running=STEPPING):
+            done, table = self._in_chunks(run.engine)
+        failed = np.flatnonzero((done.failed_at >= 0) & (done.result != Result.NOT_IMPLIED))
+        if failed.size and run.plan.has_fallback:
+            # Failed lanes are padded to a power of two with copies of the last one, so that few programs serve all numbers of failures.
+            padded_size = 2 ** int(failed.size - 1).bit_length()
+            padded = failed[np.minimum(np.arange(padded_size), failed.size - 1)]
+            with Working(f"simulate_batch, {failed.size} of {lanes} lanes: {FALLING_BACK}"):
+                again = replace(self, arrays=_taken(self.arrays, padded))._in_chunks(run.exact_engine)
+            for old, new in zip(jax.tree.leaves((done, table)), jax.tree.leaves(again), strict=True):
+                old[failed] = new[: failed.size]
+        return done, table
+
+    @property
+    def origin(self) -> Origin:
+        """The origin of its trajectories."""
+        structure = jax.tree.structure(self.run.system.params)
+        params = self.arrays.model[len(self.arrays.model) - structure.num_leaves :]
+        return self.run.origin.repeated((len(self.arrays.macro_dt),), jax.tree.unflatten(structure, params))
+
+    def lane(self, i: int) -> Simulation:
+        """The run of a lane."""
+        model, state, macro_dt = jax.tree.map(lambda a: a[i], self.arrays)
+        system = self.run.engine.model(model).system
+        return replace(self.run, system=system, state=State(*state), macro_dt=macro_dt)
+
+    def with_steps(self, run: Simulation) -> "Batch":
+        """The batch with the steps of another run of its first lane, in the same ratio for all lanes."""
+        macro_dt = self.arrays.macro_dt
+        all_alike = shared(run.macro_dt, len(macro_dt))
+        macro_dt = all_alike if is_repeated(macro_dt) else macro_dt * (run.macro_dt / macro_dt[0])
+        return replace(self, run=run, arrays=self.arrays._replace(macro_dt=macro_dt))
+
+    def _in_chunks(self, engine: Engine) -> tuple[Run, np.ndarray]:
+        """All lanes, `width` at a time; the last chunk is padded with copies of its last lane, so that one program computes all chunks."""
+        lanes = len(self.arrays.macro_dt)
+        width = min(self.width, -(-lanes // self.devices) * self.devices)
+        differs = tuple(not is_repeated(a) for a in jax.tree.leaves(self.arrays))
+        program = _side_by_side(engine, jax.tree.structure(self.arrays), differs, self.devices)
+        pieces = []
+        for start in range(0, lanes, width):
+            part = _taken(self.arrays, np.minimum(np.arange(start, start + width), lanes - 1))
+            part = jax.tree.map(lambda a: a[0] if is_repeated(a) else a, part)
+            pieces.append(program(part, self.run.save_every))
+        whole = [np.concatenate(parts)[:lanes] for parts in zip(*pieces, strict=True)]
+        return self.run.observed(Run.of(whole), self.arrays.model)
+
+
+def batch(
+    moving: Movable,
+    scheme: Scheme | Composition,
+    states: State | None,
+    steps: Steps,
+    params,
+    solver,
+    chunk,
+    devices: int,
+) -> Batch:
+    """The `Batch` with these arguments of `simulate_batch`; bad arguments raise."""
+    if not is_concrete((states, steps.macro_dt, steps.micro_dt, params)):
         raise ValueError(
             "simulate_batch: arguments are tracers; call it outside of jax.jit, vmap and grad, or take jax.vmap of simulate."
         )
-    lanes = _check_states(states)
-    first = jax.tree.map(lambda a: np.asarray(a)[0], states)
-    problem = opened(system)
-    system, _ = start_of("simulate_batch", problem, first)
-    if params is not None:
-        _check_params(system, params, lanes)
-    if t_end is not None and any(np.ndim(step) for step in (macro_dt, micro_dt) if step is not None):
-        raise ValueError(
-            "simulate_batch: t_end with a step size for each lane; give num_steps, the same for all lanes."
-        )
-    steps = Steps(_first(macro_dt), _first(micro_dt), num_steps, t_end, save_every, save_micro)
-    run = simulation(problem, scheme, first, solver, steps)
-    name, dt = ("macro_dt", macro_dt) if micro_dt is None else ("micro_dt", micro_dt)
-    dt = np.asarray(real_array(f"simulate_batch: {name}", dt))
-    if dt.shape not in ((), (lanes,)):
-        raise ValueError(
-            f"simulate_batch: {name} has shape {dt.shape}; give a number, or one for each of the {lanes} lanes."
-        )
-    if not (np.all(np.isfinite(dt)) and np.all(dt > 0)):
-        raise ValueError(f"simulate_batch: every {name} must be a positive number, got {dt}.")
     _check_devices(devices, chunk)
-    run.check("simulate_batch: the positions of the first state", constraints=params is None)
-    check_memory("simulate_batch", run.state, scheme.num_micro, run.num_saves, save_micro, lanes)
-    width = (lanes_at_once(run) if chunk is None else chunk) * devices
-    batch = {
-        "params": None if params is None else [np.asarray(leaf) for leaf in jax.tree.leaves(params)],
-        "state": tuple(np.asarray(a, dtype=float) for a in vars(states).values()),
-        "macro_dt": None if dt.ndim == 0 else dt * (scheme.num_micro if micro_dt is not None else 1),
+    problem: Any = opened(moving)
+    system, start = start_of("simulate_batch", problem, states)
+    dt = {name: getattr(steps, name) for name in ("macro_dt", "micro_dt") if getattr(steps, name) is not None}
+    params, start, dt = _with_lanes(system.params, params, start, dt)
+    for name, sizes in dt.items():
+        if not (np.all(np.isfinite(sizes)) and np.all(sizes > 0)):
+            raise ValueError(f"simulate_batch: every {name} must be a positive number, got {sizes}.")
+    if steps.t_end is not None and any(np.ptp(array) > 0 for array in (start.t, *dt.values())):
+        raise ValueError(
+            "simulate_batch: t_end with steps or start times that differ; give num_steps, the same for all lanes."
+        )
+    differs = not all(map(is_repeated, params))
+    if states is None and differs and not (system.has_constant_mass and not system.is_constrained):
+        # momenta M v, and their projection onto constraints, depend on parameters
+        of_lanes = jax.tree.unflatten(jax.tree.structure(system.params), params)
+        fixed = tuple(getattr(problem, name) for name in ("t", "q_s", "q_f", "v_s", "v_f"))
+        start = consistent_states(system, of_lanes, fixed, problem.project, starts_differ=False)
+    state = tuple(map(np.asarray, vars(start).values()))
+    first, steps = State(*(a[0] for a in state)), replace(steps, **{name: sizes[0] for name, sizes in dt.items()})
+    run, lanes = simulation(problem, scheme, first, solver, steps), len(state[0])
+    run.check("simulate_batch: the positions of the first state", constraints=not differs)
+    check_memory("simulate_batch", run.state, scheme.num_micro, run.num_saves, steps.save_micro, lanes)
+    ((name, sizes),) = dt.items()
+    factor = scheme.num_micro if name == "micro_dt" else 1
+    macro_dt = shared(run.macro_dt, lanes) if is_repeated(sizes) else factor * sizes
+    model = run.arrays.model  # the parameters come last, see `Arrays`
+    model = [shared(leaf, lanes) for leaf in model[: len(model) - len(params)]] + params
+    return Batch(
+        run, Arrays(model, state, macro_dt), (lanes_at_once(run) if chunk is None else chunk) * devices, devices
+    )
+
+
+def _taken(arrays: Arrays, index: np.ndarray) -> Arrays:
+    """The lanes with these numbers."""
+    return jax.tree.map(lambda a: shared(a[0], len(index)) if is_repeated(a) else a[index], arrays)
+
+
+def shared(value, lanes: int) -> np.ndarray:
+    """(lanes, ...) view of a value that all lanes share, see `is_repeated`."""
+    return np.broadcast_to(np.asarray(value), (lanes, *np.shape(value)))
+
+
+@eqx.filter_jit
+def consistent_states(system: System, params, start: tuple, project: bool, starts_differ: bool = True) -> State:
+    """Consistent states of all lanes, from starts (t, q_s, q_f, v_s, v_f) and parameters.
+
+    Args:
+        params: of all lanes; None for the parameters of the system.
+        starts_differ: whether the arrays of the start have an axis of lanes.
+    """
+
+    def of_lane(lane_params, lane_start):
+        t, q_s, q_f, v_s, v_f = lane_start
+        lane_system = system if lane_params is None else system.replace(params=lane_params)
+        return initial_state(lane_system, q_s, q_f, v_s, v_f, t, project=project)
+
+    return jax.vmap(of_lane, (None if params is None else 0, 0 if starts_differ else None))(params, start)
+
+
+def _names(params) -> list[str]:
+    """Names of all parameters, with dots in names of nested ones."""
+    return [
+        jax.tree_util.keystr(path, simple=True, separator=".")
+        for path, _ in jax.tree_util.tree_leaves_with_path(params)
+    ]
+
+
+def _named(values, known: Collection[str], path: tuple[str, ...] = ()) -> Iterator[tuple[str, Any]]:
+    """Name and value of each parameter in a part of the parameters, nested or with dots in its names.
+
+    Raises:
+        ValueError: a name that is not known, with the known ones.
+    """
+    name = ".".join(path)
+    if name in known:
+        yield name, np.asarray(values)
+        return
+    entries, _ = jax.tree_util.tree_flatten_with_path(values, is_leaf=lambda node: node is not values)
+    if entries[:1] == [((), values)] or (name and not any(other.startswith(f"{name}.") for other in known)):
+        raise ValueError(f"simulate_batch: params: {unknown('parameter', name, known)}")
+    for (key,), entry in entries:
+        yield from _named(entry, known, (*path, jax.tree_util.keystr((key,), simple=True)))
+
+
+def _with_lanes(all_params, params, start: State, dt: dict[str, Any]) -> tuple[list, State, dict[str, Any]]:
+    """Parameters, starts and step sizes of all lanes, with the lanes as their first axis.
+
+    Args:
+        all_params: of the system.
+        params: of the user, some of them with an axis of lanes.
+
+    Raises:
+        ValueError: arrays of other shapes, axes of different lengths, or no axis of lanes at all.
+    """
+    values = dict(zip(_names(all_params), jax.tree.leaves(all_params), strict=True))
+    new = {} if params is None else dict(_named(params, values))
+    check_params(new)
+    arrays = {f"params[{name!r}]": (new.get(name, value), np.shape(value)) for name, value in values.items()}
+    arrays |= {
+        f"states.{name}": (value, np.shape(value)[-1:] if name != "t" else ()) for name, value in vars(start).items()
     }
-    with Working("simulate_batch: compiled if it is the first of its kind, then stepped"):
-        done, table = _in_chunks(run, run.engine, batch, width, devices)
-    unsolved = (done.failed_at >= 0) & (done.result != Result.NOT_IMPLIED)
-    failed = np.flatnonzero(unsolved)
-    if failed.size and run.plan.has_fallback:
-        # Failed lanes are padded to a power of two with copies of the last one, so that few programs serve all numbers of failures.
-        padded_size = 2 ** int(failed.size - 1).bit_length()
-        padded = failed[np.minimum(np.arange(padded_size), failed.size - 1)]
-        with Working(
-            f"simulate_batch: {failed.size} of {lanes} lanes, which the first solver does not solve, with solvers.Arrowhead"
-        ):
-            again = _in_chunks(run, run.exact_engine, jax.tree.map(lambda a: a[padded], batch), width, devices)
-        for old, new in zip(jax.tree.leaves((done, table)), jax.tree.leaves(again), strict=True):
-            old[failed] = new[: failed.size]
-    if warn:
-        _warn_of_failures(done)
-    macro_steps = run.macro_dt if batch["macro_dt"] is None else batch["macro_dt"]
-    run.warn("simulate_batch", table, done.states.t, macro_steps)
-    return with_origin(jax.device_put(trajectory_of(done, table)), run.origin.repeated((lanes,), params))
-
-
-def _warn_of_failures(run: Run) -> None:
-    """Warn about failed lanes, with the failing step and the status of the first one."""
-    failed_at = run.failed_at
-    failed = np.flatnonzero(failed_at >= 0)
-    if failed.size:
-        first = int(failed[0])
-        result = Result(int(run.result[first]))
-        warnings.warn(
-            f"simulate_batch: {failed.size} of {failed_at.size} lanes failed and are NaN from there on; .result and .failed_at say "
-            f"which. The first is lane {first}, at macro step {failed_at[first]} ({result.name}): {result.message}",
-            FailedLanesWarning,
-            stacklevel=3,
+    arrays |= {name: (real_array(f"simulate_batch: {name}", sizes), ()) for name, sizes in dt.items()}
+    lengths = {}
+    for name, (value, shape) in arrays.items():
+        if np.ndim(value) > len(shape) and np.shape(value)[1:] == shape:
+            lengths[name] = len(value)
+        elif np.shape(value) != shape:
+            raise ValueError(
+                f"simulate_batch: {name} has shape {np.shape(value)}; give {shape} for all lanes, or an axis of lanes in front of it."
+            )
+    if len(set(lengths.values())) != 1 or 0 in lengths.values():
+        listed = (
+            ", ".join(f"{name} has {length}" for name, length in lengths.items()) or "no argument has an axis of lanes"
         )
-
-
-def _first(dt):
-    """The step size of the first lane."""
-    if dt is None or not np.size(real_array("simulate_batch: the step size", dt)):
-        return dt
-    return np.ravel(dt)[0]
-
-
-def _check_params(system: System, params, lanes: int) -> None:
-    """Refuse parameters of another structure than ``system.params``, or without a batch axis."""
-    check_params(params)
-    expected, structure = jax.tree.structure(system.params), jax.tree.structure(params)
-    if expected != structure:
         raise ValueError(
-            f"simulate_batch: params is {structure}; give the pytree of system.params, {expected}, with a batch axis."
+            f"simulate_batch: {listed}; give params, states or steps with one value for each lane, all of the same number."
         )
-    wanted = [(lanes, *np.shape(leaf)) for leaf in jax.tree.leaves(system.params)]
-    shapes = [np.shape(leaf) for leaf in jax.tree.leaves(params)]
-    if shapes != wanted:
-        raise ValueError(
-            f"simulate_batch: the arrays of params have shapes {shapes}; give one per lane of each parameter, {wanted}."
-        )
-
-
-def _check_states(states) -> int:
-    """The number of lanes."""
-    if not isinstance(states, State):
-        raise TypeError(
-            f"simulate_batch: states is {type(states).__name__}; give a State whose arrays have a batch axis."
-        )
-    shapes = {name: np.shape(value) for name, value in vars(states).items()}
-    lanes = shapes["q_s"][:1]
-    if any(len(s) != (1 if name == "t" else 2) or s[:1] != lanes for name, s in shapes.items()) or lanes == (0,):
-        raise ValueError(
-            f"simulate_batch: the arrays of states have shapes {shapes}; give t (batch,) and all others (batch, n)."
-        )
-    return lanes[0]
+    (lanes,) = set(lengths.values())
+    whole = {
+        name: np.asarray(value) if name in lengths else shared(value, lanes) for name, (value, _) in arrays.items()
+    }
+    if all(map(is_repeated, whole.values())):  # the user gave such views, and `jax.vmap` wants an axis
+        whole["states.t"] = np.array(whole["states.t"])
+    starts = (whole[f"states.{name}"] for name in vars(start))
+    return [whole[f"params[{name!r}]"] for name in values], State(*starts), {name: whole[name] for name in dt}
 
 
 def _check_devices(devices, chunk) -> None:
@@ -198,36 +266,18 @@ def lanes_at_once(run: Simulation) -> int:
     return 2 ** int(np.log2(np.clip(NUMBERS_PER_CHUNK / numbers_per_lane, FEWEST_LANES, MOST_LANES)))
 
 
-def _in_chunks(run: Simulation, engine: Engine, batch: dict, width: int, devices: int) -> tuple[Run, np.ndarray]:
-    """All lanes, as of `Simulation.observed`, `width` at a time; the last chunk is padded with copies of its last lane, so that one program computes all chunks."""
-    lanes = len(batch["state"][0])
-    width = min(width, -(-lanes // devices) * devices)
-    program = _side_by_side(engine, batch["params"] is not None, batch["macro_dt"] is not None, devices)
-    pieces = []
-    for start in range(0, lanes, width):
-        index = np.minimum(np.arange(start, start + width), lanes - 1)
-        piece = jax.tree.map(lambda a, index=index: a[index], batch)
-        macro_dt = run.macro_dt if piece["macro_dt"] is None else piece["macro_dt"]
-        num_params = 0 if piece["params"] is None else len(piece["params"])
-        leaves = run.arrays.model  # the parameters come last, see `Arrays`
-        shared = leaves[: len(leaves) - num_params]
-        pieces.append(program(shared, piece["params"] or [], piece["state"], macro_dt, run.save_every))
-    whole = [np.concatenate(parts)[:lanes] for parts in zip(*pieces, strict=True)]
-    return run.observed(Run.of(whole), run.arrays.model, params=batch["params"])
-
-
 @lru_cache(maxsize=32)
-def _side_by_side(engine: Engine, varies_params: bool, varies_steps: bool, devices: int):
-    """``program(leaves, params, state, macro_dt, save_every)``: a run of `engine` for each lane, with or without parameters and steps of its own."""
+def _side_by_side(engine: Engine, structure, differs: tuple[bool, ...], devices: int):
+    """``program(arrays, save_every)``: a run of `engine` for each lane; `differs` says which of the arrays have an axis of lanes."""
 
-    def lane(leaves, params, state, macro_dt, save_every):
-        return jax.tree.leaves(engine.run(Arrays(leaves + params, state, macro_dt), save_every))
+    def lane(arrays: Arrays, save_every):
+        return jax.tree.leaves(engine.run(arrays, save_every))
 
-    has_lanes = (False, varies_params, True, varies_steps, False)
-    program = jax.vmap(lane, [0 if has_axis else None for has_axis in has_lanes])
+    program = jax.vmap(lane, (jax.tree.unflatten(structure, [0 if differ else None for differ in differs]), None))
     if devices > 1:
         mesh = jax.sharding.Mesh(np.array(jax.devices()[:devices]), ("lanes",))
         spread = PartitionSpec("lanes")
-        specs = tuple(spread if has_axis else PartitionSpec() for has_axis in has_lanes)
-        program = jax.shard_map(program, mesh=mesh, in_specs=specs, out_specs=spread, check_vma=False)
+        specs = jax.tree.unflatten(structure, [spread if differ else PartitionSpec() for differ in differs])
+        in_specs = specs, PartitionSpec()
+        program = jax.shard_map(program, mesh=mesh, in_specs=in_specs, out_specs=spread, check_vma=False)
     return jax.jit(program, compiler_options=options_of_runs())

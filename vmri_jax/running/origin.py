@@ -15,6 +15,7 @@ from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.rows import Part
 from vmri_jax.mechanics.state import HasProblem, Problem, opened
 from vmri_jax.mechanics.system import System
+from vmri_jax.running.progress import Working
 from vmri_jax.running.settings import Settings
 
 SavedRun: TypeAlias = Any
@@ -148,7 +149,8 @@ def at_nodes(function, origin: Origin, nodes, *static):
     """
     origin.system(np.ndim(jax.tree.leaves(nodes)[0]) - 1)  # raises if the system is not known
     arrays, structure = jax.tree.flatten(origin.bare.with_params(origin.params))
-    values = evaluated(function, structure, arrays, nodes, *static)
+    with Working("quantities of the run"):
+        values = evaluated(function, structure, arrays, nodes, *static)
     return jax.device_put(values) if is_concrete(values) else values
 
 
@@ -160,7 +162,7 @@ def evaluated(function, structure, arrays: list, nodes, *static):
     shape = np.shape(jax.tree.leaves(nodes)[0])
     axes, count = len(shape), int(np.prod(shape))
     # Arrays that all lanes share go in once: for each node they would be copied.
-    is_shared = [axes == 1 or _is_repeated(array, axes - 1) for array in arrays]
+    is_shared = [axes == 1 or is_repeated(array, axes - 1) for array in arrays]
     shared = [array[(0,) * (axes - 1)] if once else None for array, once in zip(arrays, is_shared, strict=True)]
     of_lanes = _in_a_row([None if once else array for array, once in zip(arrays, is_shared, strict=True)], axes - 1)
     of_nodes, node = _in_a_row(nodes, axes), np.arange(count)
@@ -178,7 +180,7 @@ def evaluated(function, structure, arrays: list, nodes, *static):
     return jax.tree.map(lambda *a: np.concatenate(a).reshape(*shape, *a[0].shape[1:]), *pieces)
 
 
-def _is_repeated(array, axes: int) -> bool:
+def is_repeated(array, axes: int = 1) -> bool:
     """Whether an array of NumPy is a view with zero strides along the lanes, as `Origin.repeated` makes it."""
     return isinstance(array, np.ndarray) and axes > 0 and not any(array.strides[:axes])
 

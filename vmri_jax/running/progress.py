@@ -1,7 +1,8 @@
 """Progress of long work, shown as a bar in a terminal and as lines elsewhere.
 
 Work that takes more than two seconds prints a line about its current task, even if the user did not ask for progress. A separate
-thread writes the lines, so that they appear while JAX compiles, too.
+thread writes the lines, so that they appear while JAX compiles, too. Lines say whether JAX is tracing or compiling, which events of `jax.monitoring`
+tell; a program that is compiled has no such events, so that its calls cost nothing.
 """
 
 import sys
@@ -11,6 +12,8 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import wraps
 from typing import ParamSpec, TypeVar, cast
+
+import jax.monitoring
 
 Progress = Callable[[str, int, int], None]
 """Called as ``progress(what, done, total)`` before every piece of work and once at the end: `what` names the piece, `done` of `total` pieces
@@ -23,11 +26,19 @@ ShowsProgress = bool | Progress
 
 SECONDS_BETWEEN_LINES = 2.0
 """Seconds before the first line, and between two lines with different texts; with a larger value the user waits longer in silence."""
-LONGEST_SILENCE = 60.0
-"""Most seconds between two lines. The wait before a line that repeats the last one doubles each time up to this value; a larger value
-shortens the log of a run that compiles for an hour."""
+LONGEST_SILENCE = 5.0
+"""Most seconds between two lines. The wait before a line that repeats the last one doubles each time up to this value; with a larger value a
+program seems to hang."""
 POLL_SECONDS = 0.5
 """Seconds between two checks of the thread; a larger value delays every line by as much."""
+
+
+STAGES = {
+    "/jax/core/compile/jaxpr_trace_duration": "tracing",
+    "/jax/core/compile/jaxpr_to_mlir_module_duration": "compiling",
+    "/jax/core/compile/backend_compile_duration": "compiling",
+}
+"""Work of JAX on a program, by the events that `jax.monitoring` records at its begin (as a scalar) and at its end (as a duration)."""
 
 
 class Working:
@@ -37,10 +48,15 @@ class Working:
             tell("the Jacobian at the start", 1, 3)
 
     Short work costs about a microsecond. Nested contexts share one line, the outermost name first.
+
+    Args:
+        name: of the work.
+        shown: whether to print lines.
+        running: kind of work while JAX neither traces nor compiles.
     """
 
-    def __init__(self, name: str, shown: bool = True):
-        self.name, self.shown, self.task, self.percent = name, shown, "", ""
+    def __init__(self, name: str, shown: bool = True, running: str = ""):
+        self.name, self.shown, self.running, self.task, self.percent = name, shown, running, "", ""
         self.begin = self.last = time.monotonic()
         self.wait, self.printed = SECONDS_BETWEEN_LINES, ""
 
@@ -63,7 +79,8 @@ class Working:
         if not all(work.shown for work in works):
             return
         tasks = "; ".join(filter(None, (": ".join(filter(None, (work.name, work.task))) for work in works)))
-        line = self.percent + tasks
+        stage = _stages[-1] if _stages else works[-1].running
+        line = self.percent + tasks + (f" ({stage})" if stage else "")
         is_new = line != self.printed
         if now - self.last < (SECONDS_BETWEEN_LINES if is_new else self.wait):
             return
@@ -73,6 +90,7 @@ class Working:
 
 
 _works: list[Working] = []
+_stages: list[str] = []
 _awake = threading.Event()
 _watchers: list[threading.Thread] = []
 
@@ -80,9 +98,22 @@ _watchers: list[threading.Thread] = []
 def _wake() -> None:
     """Wake the thread that prints, and start it if there is none, as at first use and after a fork of the process."""
     _awake.set()
+    if not _watchers:
+        jax.monitoring.register_scalar_listener(_stage_begins)
+        jax.monitoring.register_event_duration_secs_listener(_stage_ends)
     if not any(watcher.is_alive() for watcher in _watchers):
         _watchers[:] = [threading.Thread(target=_watch, name="vmri_jax progress", daemon=True)]
         _watchers[0].start()
+
+
+def _stage_begins(event: str, *_, **__) -> None:
+    if event in STAGES:
+        _stages.append(STAGES[event])
+
+
+def _stage_ends(event: str, *_, **__) -> None:
+    if event in STAGES and _stages:
+        _stages.pop()
 
 
 def _watch() -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from vmri_jax.mechanics import invariants
 from vmri_jax.mechanics.arrays import is_concrete
 from vmri_jax.mechanics.kinematics import JOINTS, Kinematics
-from vmri_jax.mechanics.motion import motion, powers, reaction_force
+from vmri_jax.mechanics.motion import motion, powers, reaction_forces
 from vmri_jax.mechanics.names import Names, unknown
 from vmri_jax.mechanics.projection import legendre
 from vmri_jax.mechanics.rows import Place
@@ -163,35 +163,43 @@ class Quantities(ABC):
         values = np.asarray(at_nodes(_multipliers, run.origin, _states(run, micro)))
         return {name: _shaped(run, values[..., rows], micro) for name, rows in run.names.rows.items()}
 
-    def reaction_forces(self, constraint: str, micro: bool = False) -> dict:
+    def reaction_forces(self, constraint: str | None = None, micro: bool = False) -> dict:
         """Forces ``-G^T lambda`` of a constraint on the bodies that it touches, (..., k, size) for each of them by name.
 
         Args:
-            constraint: its name; "constraint" or "slow_constraint" for all rows of a system without names.
+            constraint: its name; "constraint" or "slow_constraint" for all rows of a system without names. None for the forces of all
+                constraints, a dictionary of bodies for each constraint by name.
             micro: values at the micro nodes instead, see `multipliers`.
 
         Raises:
-            ValueError: no constraint of this name; see also `multipliers`.
+            ValueError: no constraint of this name, or no constraint at all; see also `multipliers`.
         """
         run = _concrete("reaction_forces", self.whole())
         names = run.names
-        if constraint not in names.rows:
+        rows = {name: tuple(rows) for name, rows in names.rows.items() if constraint in (None, name)}
+        if not rows:
             hint = (
                 " Joints that carry bodies have no rows; scene.by_directors(run) gives the run that has."
                 if names.carried
                 else ""
             )
-            raise ValueError(f"reaction_forces: {unknown('constraint', constraint, names.rows)}{hint}")
-        rows = tuple(names.rows[constraint])
-        forces, touched = at_nodes(reaction_force, run.origin, _states(run, micro), rows)
-        n_s = run.states.q_s.shape[-1]
-        parts = {"s": (forces[..., :n_s], touched[..., :n_s]), "f": (forces[..., n_s:], touched[..., n_s:])}
-        by_body = {}
-        for name, (part, start, size) in names.bodies.items():
-            force, touches = (np.asarray(a[..., start : start + size]) for a in parts[part])
-            if touches.any():
-                by_body[name] = _shaped(run, force, micro)
-        return by_body
+            missing = (
+                "the system has no constraints."
+                if constraint is None
+                else unknown("constraint", constraint, names.rows)
+            )
+            raise ValueError(f"reaction_forces: {missing}{hint}")
+        forces, touched = map(
+            np.asarray, at_nodes(reaction_forces, run.origin, _states(run, micro), tuple(rows.values()))
+        )
+        first = {"s": 0, "f": run.states.q_s.shape[-1]}
+        by_constraint: dict[str, dict] = {name: {} for name in rows}
+        for body, (part, start, size) in names.bodies.items():
+            columns = slice(first[part] + start, first[part] + start + size)
+            for i, by_body in enumerate(by_constraint.values()):
+                if touched[..., i, columns].any():
+                    by_body[body] = _shaped(run, forces[..., i, columns], micro)
+        return by_constraint if constraint is None else by_constraint[constraint]
 
     def work(self) -> Work:
         """Work of forces and of moving constraints since the start, and the balance with the energy.
@@ -243,6 +251,16 @@ class Quantities(ABC):
         from vmri_jax.plots import plot_trajectory  # here: its import takes half a second
 
         return plot_trajectory(self.whole(), title)
+
+    def plot_forces(self, title: str = ""):
+        """Reaction forces of all constraints against time, a matplotlib `Figure`; see `vmri_jax.plots.plot_forces`.
+
+        Args:
+            title: title above the panels.
+        """
+        from vmri_jax.plots import plot_forces
+
+        return plot_forces(self.whole(), title)
 
 
 def _concrete(method: str, run: SavedRun) -> SavedRun:

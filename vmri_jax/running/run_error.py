@@ -11,6 +11,8 @@ from vmri_jax.mechanics.arrays import Numbers
 class RunError(NamedTuple):
     """Estimated error of a run at its k saved nodes, by Richardson's extrapolation; NaN where it is not certified.
 
+    In a batch every array has a leading axis of lanes, and so have `is_certified` and `largest`.
+
     Attributes:
         q_s, q_f: (k, n_s), (k, n_f) positions of the run minus positions of the exact motion.
         slow, fast: (k,) largest modulus of the slow and of the fast share of the error over all coordinates. Shares have signs and add up
@@ -34,14 +36,15 @@ class RunError(NamedTuple):
         return largest_of(np.concatenate([self.q_s, self.q_f], axis=-1))
 
     @property
-    def is_certified(self) -> bool:
+    def is_certified(self) -> Any:
         """Whether the error of every node is certified."""
-        return bool(np.isfinite(self.positions).all())
+        return np.isfinite(self.positions).all(axis=-1)
 
     @property
-    def largest(self) -> float:
+    def largest(self) -> Any:
         """Largest error of a position over all nodes; infinite where a node is not certified."""
-        return float(self.positions.max(initial=0.0)) if self.is_certified else float("inf")
+        largest = np.where(self.is_certified, self.positions.max(axis=-1, initial=0.0), np.inf)
+        return largest if largest.ndim else float(largest)
 
     def part(self, nodes: slice) -> "RunError":
         """The error at some of the nodes; the error of the user's function stays whole unless it has a value for each node."""
@@ -61,7 +64,7 @@ class RunError(NamedTuple):
         total, slow, fast = (np.max(a[known], initial=0.0) for a in (self.positions, self.slow, self.fast))
         shares = "" if np.isnan(slow) else f", slow share {slow:.1e}, fast share {fast:.1e}"
         whole = f"positions are wrong by about {total:.1e}{shares}"
-        return whole if self.is_certified else f"until t = {float(self.certified_until):.4g} {whole}"
+        return whole if np.all(self.is_certified) else f"until t = {float(np.min(self.certified_until)):.4g} {whole}"
 
 
 def largest_of(values) -> np.ndarray:

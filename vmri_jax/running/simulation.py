@@ -49,8 +49,8 @@ from vmri_jax.steppers.solvers import Newton
 
 PARTS_OF_A_BAR = 50
 """Parts of a run with a progress bar. More parts move the bar more smoothly, and each costs a call of some 30 microseconds."""
-STEPPING = "the run: compiling its program if it is new, then taking its steps"
-"""Line about a run that takes more than two seconds."""
+STEPPING = "stepping"
+"""The work of a run that is compiled, for lines about runs that take more than two seconds."""
 FALLING_BACK = "a step was not solved: computing its part of the run again with exact matrices (solvers.Arrowhead), as accurate but slower"
 """Line about a fallback that takes more than two seconds."""
 
@@ -112,7 +112,7 @@ class Simulation:
         arguments = self._arguments(state, macro_dt, params, num_steps)
         origin = self.origin if params is None else replace(self.origin, params=params)
         arrays, save_every, _ = arguments
-        with Working(STEPPING):
+        with Working("the run", running=STEPPING):
             run, table = self._whole(False, arguments)
         if self._fallback_helps(run):
             with Working(FALLING_BACK):
@@ -158,21 +158,18 @@ class Simulation:
         macro_dt = self.macro_dt if macro_dt is None else np.asarray(macro_dt, dtype=float)
         return Arrays(leaves, start, macro_dt), save_every, self.num_saves
 
-    def observed(self, run: Run, model: list, step: int = 0, params: list | None = None) -> tuple[Run, Any]:
+    def observed(self, run: Run, model: list, step: int = 0) -> tuple[Run, Any]:
         """A run and its `Observables` (..., k, 9), both NaN from a failure on; failures that the nodes show are in its status.
 
         Args:
             run: of the engine.
-            model: the leaves of its model, of which the last ones are the leaves of the system.
+            model: the leaves of its model, of which the last ones are the leaves of the system; in a batch with an axis of lanes.
             step: macro steps before its first node.
-            params: leaves of parameters that differ between the lanes of a batch.
         """
         structure, count = self._system
-        leaves, lanes = model[len(model) - count :], np.shape(run.failed_at)
-        if lanes:
-            leaves = [np.broadcast_to(leaf, (*lanes, *np.shape(leaf))) for leaf in leaves]
-            leaves[len(leaves) - len(params or []) :] = params or []
-        table = evaluated(observables, structure, leaves, with_tolerance(run.states, self.solver.tolerance))
+        table = evaluated(
+            observables, structure, model[len(model) - count :], with_tolerance(run.states, self.solver.tolerance)
+        )
         return failures(run, table, self.save_every, step)
 
     def at_start(self) -> np.ndarray:
@@ -295,7 +292,8 @@ class Simulation:
         positions = (self.state.t, self.state.q_s, self.state.q_f) if constraints else ()
         numbers = tuple(np.asarray(number).tobytes() for number in (*self.arrays.model, *positions))
         key = self._model[1], self.state.q_s.shape, self.state.q_f.shape, numbers
-        _check_once(_Checked(key, self.system, self.state, state_name, constraints))
+        with Working("checks of the system"):
+            _check_once(_Checked(key, self.system, self.state, state_name, constraints))
 
     def start(self, state: State | None = None, step: int = 0, fell_back: bool = False) -> Checkpoint:
         """The checkpoint before the first step; or before step number `step` at another state, with blank memory."""
@@ -346,7 +344,7 @@ class Simulation:
         With the name of a `caller` it warns about the motion, see `warn`.
         """
         if progress is False:
-            with Working(STEPPING):
+            with Working("the run", running=STEPPING):
                 return self._joined(self.advance(self.start(), self.num_saves)[0], caller)
         size, checkpoint, pieces = -(-self.num_saves // PARTS_OF_A_BAR), self.start(), []
         with interrupts_noted() as interrupted, progress_to("simulate", progress) as tell:
@@ -403,7 +401,7 @@ def prepare(
     check_memory("prepare", run.state, scheme.num_micro, run.num_saves, save_micro)
     on_device = ("system", "scheme", "solver", "state", "macro_dt")
     run = replace(run, **jax.device_put({name: getattr(run, name) for name in on_device}))
-    with Working("prepare: compiling the run"):
+    with Working("prepare: the program of the run"):
         jax.block_until_ready(run._program(False)(run.arrays, 0, 0))  # no steps: it only compiles
     return run
 
@@ -412,7 +410,8 @@ def simulation(moving: Movable, scheme, state: State | None, solver: Newton | No
     """The `Simulation` with these arguments of `simulate`; bad arguments raise."""
     warn_if_slow()
     problem = opened(moving)
-    system, state = start_of("simulate", problem, state)
+    with Working("the start of the run"):
+        system, state = start_of("simulate", problem, state)
     macro_dt, num_steps, save_every = check_run(system, scheme, state, solver, steps)
     # Scenes only: `opened` returns problems as they are.
     advice = nothing_fast(scheme, state.q_f.size) if moving is not problem else ""

@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.mechanics.arrays import is_concrete, real_array
+from vmri_jax.mechanics.order import in_order, order_of
 from vmri_jax.scene.body import Bodies, Frame, Point, entry, is_entry
 
 Elements = tuple[tuple[str, ...], ...]
@@ -186,9 +187,9 @@ def lasting(value):
 
 
 def real_tree(about: str, tree):
-    """A pytree of real numbers as a pytree of arrays; the error for another leaf begins with `about` and its place in the tree."""
+    """A pytree of real numbers as a pytree of arrays, in the order of writing; the error for another leaf begins with `about` and its place."""
 
     def convert(path, leaf):
         return jnp.asarray(real_array(about + jax.tree_util.keystr(path), leaf))
 
-    return jax.tree_util.tree_map_with_path(convert, tree)
+    return in_order(jax.tree_util.tree_map_with_path(convert, tree), order_of(tree))

@@ -71,9 +71,7 @@ def _check_value(effect: Any, value: Any, sizes: list[tuple[int, ...]], count: i
     """Refuse a value of a function of `count` elements, as shapes, whose roles have the shapes `sizes`."""
     shape = getattr(value, "shape", None)
     if effect.kind == "force":
-        # a vector (d,) may stand for the same force on all elements, (n, d)
-        shapes = [getattr(x, "shape", None) for x in value] if isinstance(value, tuple | list) else []
-        fits = len(shapes) == len(sizes) and all(a in (b, b[-1:]) for a, b in zip(shapes, sizes, strict=True))
+        fits = isinstance(value, tuple | list) and [getattr(x, "shape", None) for x in value] == sizes
         expected = (
             f"a tuple with a force for each body, of shapes {', '.join(map(str, sizes))}: (force,) of a single body"
         )

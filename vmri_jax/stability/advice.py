@@ -176,8 +176,8 @@ def advise(
         judged = _judged_over_a_period(system, scheme, state, macro_dt, period)
     findings = [*judged.pop("findings"), *_stages(scheme)]
     judged["findings"] = tuple(sorted(findings, key=lambda f: ("error", "warning", "note").index(f.severity)))
-    frequencies = {f"{name}_frequencies": motions.frequencies(name) for name in ("fast", "slow")}
-    return Advice(macro_dt=macro_dt, **judged, **frequencies)
+    fast, slow = motions.frequencies("fast"), motions.frequencies("slow")
+    return Advice(macro_dt=macro_dt, fast_frequencies=fast, slow_frequencies=slow, **judged)
 
 
 def _judged_over_a_period(system, scheme, state: State, macro_dt: float, period: float) -> dict[str, Any]:

@@ -375,9 +375,11 @@ def solve(march: MarchEquations, factors: tuple[Matrices, list], rows_z, rows_x)
     def interval(arriving, of_interval):
         rows, inverse, hands_on, by_position, hands_on_by_position = of_interval
         # dx = -(dR/dx)^-1 (rows + dR/dq dq + dR/dp dp); h p_f is added to the first momentum equation: dR/dp is the unit matrix there
-        rows = (rows + matvec(by_position, arriving.position)).at[:n_f].add(arriving.gradients[:n_f])
-        dx = -matvec(inverse, rows)
+        on_left = (rows + matvec(by_position, arriving.position)).at[:n_f].add(arriving.gradients[:n_f])
+        dx = -matvec(inverse, on_left)
         gradients = arriving.gradients + matvec(hands_on, dx) + matvec(hands_on_by_position, arriving.position)
+        # the momentum h D_{F_r} A is the sum of all impulses less the fast rows of the interval, whose change is -rows
+        gradients = gradients.at[:n_f].add(rows[: march.num_fast].reshape(march.r, n_f).sum(0))
         return Handed(arriving.position + march.last_increment(dx), gradients), dx
 
     intervals = rows_x, matrices.inverse, matrices.hands_on, *by_positions

@@ -1,0 +1,177 @@
+"""All roads say the same about a run: the grid of roads and of causes, written once."""
+
+import warnings
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import vmri_jax as vm
+from vmri_jax.mechanics.arrays import is_concrete
+from vmri_jax.running.observables import observables
+from vmri_jax.running.origin import _at_all
+from vmri_jax.scene import JointSpring, Revolute, RigidBody, Scene
+
+EXPLICIT, MIDPOINT = vm.fully_explicit(1), vm.fully_implicit(1)
+
+
+# --- causes ----------------------------------------------------------------------------------------------------------
+def stiff(q_f, params):
+    return params["k"] * q_f[0] ** 2 / 2
+
+
+def kinetic(q_s, q_f, v_s, v_f, params):
+    return jnp.sum(v_f**2) / 2
+
+
+def beyond_its_pole(q_f, params):
+    """No number for negative q, though its force is: it acts on a point that passes q = 0."""
+    return 1e-9 * params["k"] * jnp.log(q_f[0])
+
+
+def line(q_s, q_f, params):
+    return q_f[:1]
+
+
+def tilted_line(q_s, q_f, params):
+    return q_f[:1] + 1e-3 * params["k"] * q_f[1:2]
+
+
+def in_angles(q_s, q_f, v_s, v_f, params):
+    return (v_f[0] ** 2 + jnp.sin(q_f[0]) ** 2 * v_f[1] ** 2) / 2
+
+
+def weight(q_f, params):
+    return -9.81 * params["k"] * jnp.cos(q_f[0])
+
+
+def push(t, q_s, q_f, v_s, v_f, params):
+    return jnp.zeros(0), jnp.cos(3.0 * t) * jnp.ones(1)
+
+
+def problem(masses, potential, q, v, k=1.0, **terms) -> vm.Problem:
+    return vm.Problem(vm.System(masses, None, potential, params={"k": np.array(k)}, **terms), [], q, [], v)
+
+
+def of_masses(*masses):
+    return vm.ConstantMass([], masses)
+
+
+CAUSES = {  # problem, scheme, macro step, steps, outcome
+    "lost energy": (problem(of_masses(1.0), stiff, [0.1], [0.0], 1e4), EXPLICIT, 0.0205, 40, vm.LostEnergyWarning),
+    "lost energy, T(q, v)": (problem(kinetic, stiff, [0.1], [0.0], 1e4), EXPLICIT, 0.0205, 40, vm.LostEnergyWarning),
+    "NaN": (problem(of_masses(1.0), beyond_its_pole, [0.105], [-1.0]), EXPLICIT, 0.01, 40, vm.Result.NON_FINITE),
+    "NaN, T(q, v)": (problem(kinetic, beyond_its_pole, [0.105], [-1.0]), EXPLICIT, 0.01, 40, vm.Result.NON_FINITE),
+    "off constraints": (
+        problem(of_masses(1.0, 1.0), None, [0.0, 0.0], [0.0, 1.0], constraint=line, implied=tilted_line),
+        EXPLICIT,
+        0.01,
+        40,
+        vm.Result.NOT_IMPLIED,
+    ),
+    # constant masses have no poles
+    "pole": (problem(in_angles, weight, [1.0, 0.0], [0.0, 0.001]), MIDPOINT, 0.002, 400, vm.SingularCoordinatesWarning),
+    "driven": (problem(of_masses(1.0), stiff, [0.0], [0.0], 9.0, force=push), EXPLICIT, 0.05, 400, None),
+    "driven, T(q, v)": (problem(kinetic, stiff, [0.0], [0.0], 9.0, force=push), EXPLICIT, 0.05, 400, None),
+}
+
+
+# --- roads -----------------------------------------------------------------------------------------------------------
+def by_simulate(moving, scheme, steps, out):
+    return vm.simulate(moving, scheme, **steps).result
+
+
+def by_prepare(moving, scheme, steps, out):
+    return vm.prepare(moving, scheme, **steps)().result
+
+
+def by_stream(moving, scheme, steps, out):
+    return vm.stream(moving, scheme, out=out, chunk=steps["num_steps"] // 2, **steps).result
+
+
+def by_batch(moving, scheme, steps, out):
+    states = jax.tree.map(lambda a: jnp.stack([a] * 2), moving.state())
+    return vm.simulate_batch(moving, scheme, states, warn=False, **steps).result[1]
+
+
+def by_lanes_with_parameters(moving, scheme, steps, out):
+    states = jax.tree.map(lambda a: jnp.stack([a] * 2), moving.state())
+    params = {"k": np.repeat(moving.system.params["k"], 2)}
+    return vm.simulate_batch(moving, scheme, states, params=params, warn=False, **steps).result[1]
+
+
+def by_ensemble(moving, scheme, steps, out):
+    design = {"k": float(moving.system.params["k"]) * np.array([0.999, 1.0])}
+    vm.ensemble(moving, scheme, design, out=out, num_saves=steps["num_steps"], **steps)
+    return int(vm.open_ensemble(out)["result"].values.ravel()[1])
+
+
+def by_trace(moving, scheme, steps, out):
+    """Nothing warns while JAX traces: the run is asked afterwards."""
+    run = jax.jit(lambda state: vm.simulate(moving.system, scheme, state, **steps))(moving.state()).of(moving)
+    for concern in run.concerns():
+        warnings.warn(concern, stacklevel=1)
+    return run.result
+
+
+ROADS = (by_simulate, by_prepare, by_stream, by_batch, by_lanes_with_parameters, by_ensemble, by_trace)
+
+
+@pytest.mark.parametrize("cause", CAUSES)
+@pytest.mark.parametrize("road", ROADS, ids=lambda road: road.__name__)
+def test_every_road_says_it(road, cause, tmp_path):
+    moving, scheme, macro_dt, num_steps, expected = CAUSES[cause]
+    with warnings.catch_warnings(record=True) as given:
+        warnings.simplefilter("always")
+        warnings.simplefilter("ignore", vm.CompiledAgainWarning)
+        try:
+            result = road(moving, scheme, {"macro_dt": macro_dt, "num_steps": num_steps}, tmp_path / "run.zarr")
+        except vm.SimulationError as error:
+            result = error.result
+    kinds = [warning.category for warning in given]
+    if isinstance(expected, vm.Result):
+        assert (int(result), kinds) == (expected, [])
+    else:
+        assert (int(result) <= 1, kinds) == (True, [expected] if expected else [])
+    if expected is vm.SingularCoordinatesWarning:
+        assert "the coordinates are singular near t = 0.53" in str(given[0].message)
+
+
+@pytest.mark.parametrize(("coordinates", "scheme"), [("joint", EXPLICIT), ("directors", EXPLICIT)])
+def test_scenes_say_it(coordinates, scheme):
+    """A stiff hinge beyond stability; of other causes scenes are systems. Imports are scenes."""
+    body = RigidBody("b", 1.0, [1.0, 1.0, 1.0], [0, 0, 0], spin=[0, 0, 0.1])
+    hinge = Revolute(("ground", "b"), at=[0, 0, 0], axis=[0, 0, 1.0], name="h")
+    scene = Scene([body], [hinge, JointSpring("h", 1e4)], coordinates=coordinates)
+    with pytest.warns(vm.LostEnergyWarning, match="the computed motion is wrong"):
+        vm.simulate(scene, scheme, macro_dt=0.0205, num_steps=40, throw=False)
+
+
+# --- programs --------------------------------------------------------------------------------------------------------
+CALLS = {"potential": 0}
+
+
+def counted(q_s, q_f, params):
+    CALLS["potential"] += not is_concrete(q_f)
+    return jnp.sum(q_f**2) / 2
+
+
+def test_the_steps_have_no_energy_and_one_program_observes_all():
+    """The gradient of V is the only copy of V in the program of steps; the observables are compiled once for two schemes and three lengths."""
+    system = vm.System(of_masses(1.0), counted)
+    moving = vm.Problem(system, [], [1.0])
+    _at_all.cache_clear()
+    for scheme, num_steps in ((EXPLICIT, 5), (vm.fully_explicit(2), 7), (EXPLICIT, 40)):
+        vm.simulate(moving, scheme, macro_dt=0.1, num_steps=num_steps)
+    assert _at_all.cache_info().misses == 1
+    structure = jax.tree.structure(system)
+    program = _at_all(observables, structure, (), False)
+    assert program._cache_size() == 1
+    prepared = vm.prepare(moving, EXPLICIT, macro_dt=0.1, num_steps=5)
+    engine, (arrays, save_every, saves) = prepared.engine, prepared._arguments(None, None, None, None)
+    CALLS["potential"] = 0
+    jax.make_jaxpr(lambda arrays: engine.run(arrays, save_every, saves))(arrays)
+    in_steps, CALLS["potential"] = CALLS["potential"], 0
+    jax.make_jaxpr(lambda arrays: engine.whole(arrays, save_every, saves))(arrays)
+    assert (in_steps, CALLS["potential"]) == (in_steps, in_steps + 1)

@@ -1,0 +1,141 @@
+"""`simulate_batch`: runs side by side, with an estimate of their errors on request."""
+
+import warnings
+from dataclasses import replace
+from functools import cache
+
+import jax
+import numpy as np
+
+from vmri_jax.accuracy.companions import UncertifiedWarning, estimated_errors, extrapolated, finer, run_error
+from vmri_jax.mechanics.checks import check_flags
+from vmri_jax.mechanics.driving import Events, driven, events
+from vmri_jax.mechanics.state import Movable, State
+from vmri_jax.running.arguments import Steps
+from vmri_jax.running.batch import Batch, batch
+from vmri_jax.running.progress import Working
+from vmri_jax.running.run_error import RunError
+from vmri_jax.running.trajectory import Trajectory, trajectory_of, with_origin
+from vmri_jax.schemes.composition import Composition
+from vmri_jax.schemes.scheme import Scheme
+from vmri_jax.steppers.results import Result
+from vmri_jax.steppers.solvers import Newton
+
+
+class FailedLanesWarning(UserWarning):
+    """Lanes of a batch failed: they are NaN after the failing step; all other lanes are right."""
+
+
+def simulate_batch(
+    system: Movable,
+    scheme: Scheme | Composition,
+    states: State | None = None,
+    *,
+    macro_dt=None,
+    micro_dt=None,
+    num_steps: int | None = None,
+    t_end: float | None = None,
+    save_every: int = 1,
+    save_micro: bool = False,
+    params=None,
+    solver: Newton | None = None,
+    chunk: int | None = None,
+    devices: int = 1,
+    warn: bool = True,
+    error: bool = False,
+) -> Trajectory:
+    """Simulate a lane for each set of parameters, start or step size, each as `simulate` would; arrays returned have a leading axis of lanes.
+
+        batch = vm.simulate_batch(car, scheme, params={"omega": omegas}, macro_dt=0.01, t_end=10.0)  # a lane for each omega
+        print(batch.lane(3))
+
+    Whatever has no axis of lanes holds for all lanes. Lanes are computed side by side (`jax.vmap`), in chunks that fit into the cache. Unlike
+    `simulate`, a failed step never raises: its
+    lane is NaN after the step and has its status in ``.result`` and ``.failed_at``; other lanes do not change. A
+    `FailedLanesWarning` says how many lanes failed. Lanes that the first solver of `Auto` does not solve are run again with `Arrowhead`,
+    whose program is compiled at the first such lane.
+
+    Args:
+        system: a `Problem` or a scene; or a `System`, with states.
+        scheme: a scheme or composition.
+        states: a `State` whose arrays have an axis of lanes, e.g. ``jax.vmap(make)(q_s, ...)`` or
+            ``jax.tree.map(lambda *a: jnp.stack(a), *list_of_states)``; None for positions and velocities of the problem in all lanes.
+        macro_dt, micro_dt: step size, a number or one per lane; exactly one of them.
+        num_steps, t_end, save_every, save_micro, solver: as in `simulate`; t_end with one step size and one time of the start for all.
+        params: some or all of ``system.params``, by name: ``{"springs": {"stiffness": k}}``, or "springs.stiffness". An array of the shape of the
+            parameter holds for all lanes; one with an axis of lanes in front of this shape has a value for each lane.
+        chunk: lanes that are computed side by side; chosen from the size of the problem if None.
+        devices: CPU devices over which chunks are spread, see `vmri_jax.configure`.
+        warn: give warnings about lanes; False for a program that looks at the statuses itself.
+        error: estimate the error of the positions of each lane as `simulate` does, ``run.error``, a `RunError` whose arrays have the axis of lanes;
+            without slow and fast share. It takes runs with half the macro step, by the same program, and further ones in driven systems.
+
+    Raises:
+        ValueError, TypeError: bad arguments, before anything is computed.
+    """
+    check_flags(warn=warn, error=error)
+    steps = Steps(macro_dt, micro_dt, num_steps, t_end, save_every, save_micro)
+    with Working("simulate_batch: the starts"):
+        lanes = batch(system, scheme, states, steps, params, solver, chunk, devices)
+    done, table = lanes()
+    plain = trajectory_of(done, table)
+    errors = _errors(lanes, plain) if error else None
+    trajectory = replace(with_origin(jax.device_put(plain), lanes.origin), error=errors)
+    lanes.run.warn("simulate_batch", table, done.states.t, lanes.arrays.macro_dt)
+    for kind, message in ((FailedLanesWarning, _failures(trajectory)), (UncertifiedWarning, _uncertified(trajectory))):
+        if warn and message:
+            warnings.warn(f"simulate_batch: {message}", kind, stacklevel=2)
+    return trajectory
+
+
+def _errors(lanes: Batch, plain: Trajectory) -> RunError:
+    """The errors of all lanes, from batches of companions.
+
+    Args:
+        plain: the runs, with arrays of NumPy and without an origin.
+    """
+
+    @cache
+    def companions(parts: int, whole: int = 1) -> Trajectory:
+        return trajectory_of(*lanes.with_steps(finer(lanes.run, lanes.run.scheme, parts, whole))())
+
+    def error(i: int) -> RunError:
+        run, coarse, halved = lanes.lane(i), plain.lane(i), companions(2).lane(i)
+        drives = events(run.system, run.state, float(coarse.t[-1])) if is_driven else Events()
+        if max(coarse.failed_at, halved.failed_at) >= 0:
+            total = extrapolated(run.order, coarse, halved)
+        else:
+            total = estimated_errors(
+                run, coarse, halved, drives, companion_of=lambda *counts: companions(*counts).lane(i)
+            )
+        return run_error(run, coarse, halved, total, drives)
+
+    is_driven = driven(lanes.run.system, lanes.run.state)
+    return jax.tree.map(lambda *arrays: np.stack(arrays), *map(error, range(len(plain.t))))
+
+
+def _failures(trajectory: Trajectory) -> str:
+    """The number of failed lanes, with the failing step and the status of the first one; empty if no lane failed."""
+    failed_at = np.asarray(trajectory.failed_at)
+    failed = np.flatnonzero(failed_at >= 0)
+    if not failed.size:
+        return ""
+    first = int(failed[0])
+    result = Result(int(trajectory.result[first]))
+    return (
+        f"{failed.size} of {failed_at.size} lanes failed and are NaN from there on; .result and .failed_at say "
+        f"which. The first is lane {first}, at macro step {failed_at[first]} ({result.name}): {result.message}"
+    )
+
+
+def _uncertified(trajectory: Trajectory) -> str:
+    """The number of lanes that did not fail and whose error is not certified, and the first one; empty if there are none."""
+    error = trajectory.error
+    certified = error is None or error.is_certified
+    lanes = np.flatnonzero((np.asarray(trajectory.failed_at) < 0) & ~np.asarray(certified))
+    if not lanes.size:
+        return ""
+    return (
+        f"the error of {lanes.size} of {len(error.slow)} lanes is not certified over the whole run, as run.error.largest says; the first is lane "
+        f"{lanes[0]}, certified until t = {error.certified_until[lanes[0]]:.4g}. Take smaller steps, or a scheme of higher order."
+    )
