@@ -209,7 +209,7 @@ def constraint_sizes(function: Callable | None, *arguments) -> dict[str, int]:
     return inner.row_sizes(order, *arguments) if isinstance(inner, ByName) else {}
 
 
-def _inner(function) -> tuple[Callable | None, Order | None]:
+def _inner(function) -> tuple[Any, Order | None]:
     """The function in a `TracedOnce`, and the order of its params."""
     inner = function.function if isinstance(function, TracedOnce) else function
     return (inner.function, inner.order) if isinstance(inner, InOrder) else (inner, None)

@@ -244,7 +244,12 @@ def check_constraints(
         raise ValueError(f"{place}: the constraints are {solved} there, which is not finite.")
     if not (np.isfinite(rows.gradients).all()):
         raise ValueError("System: the Jacobian of the constraints is not finite at these positions (a norm at zero?).")
-    _check_gradients(system, state, rows, weights, in_words)
+
+    def gradients(rows: Rows):
+        """dg/dq_s, dg/dq_f and dg_slow/dq_s over the weights."""
+        return rows.gradients[:n_g, :n_s], rows.gradients[:n_g, n_s:], rows.gradients[n_g : n_g + n_gs, :n_s]
+
+    slow, fast, alone = gradients(rows)
     allowed = rows.allowed(tolerance)[: n_g + n_gs]
     violated = np.abs(solved) > allowed
     if violated.any():
@@ -256,13 +261,8 @@ def check_constraints(
         )
     _check_implied(rows, n_g + n_gs, place)
 
-    def gradients(rows: Rows):
-        """dg/dq_s, dg/dq_f and dg_slow/dq_s over the weights."""
-        return rows.gradients[:n_g, :n_s], rows.gradients[:n_g, n_s:], rows.gradients[n_g : n_g + n_gs, :n_s]
-
-    slow, fast, alone = gradients(rows)
     size = np.linalg.norm(np.concatenate([slow, fast], axis=1), axis=1)
-    slow_only = np.flatnonzero(np.linalg.norm(fast, axis=1) <= LEAST_FAST_PART * size)
+    slow_only = np.flatnonzero((size > 0) & (np.linalg.norm(fast, axis=1) <= LEAST_FAST_PART * size))
     if slow_only.size:
         raise ValueError(
             f"System: row(s) {in_words(slow_only, 'constraint')} of constraint do not depend on the fast variables q_f. {MICRO_GRID} "
@@ -270,6 +270,7 @@ def check_constraints(
             "variables that they hold fast."
         )
     _check_counts(fast, alone)
+    _check_gradients(system, state, rows, weights, in_words)
     if any(dependent for _, dependent in map(rank_of, (alone, fast))):
         # At a singular configuration (a linkage folded flat) rows are dependent there and nowhere else, and runs pass it: only rows that are
         # dependent at a generic configuration nearby are refused.
@@ -283,8 +284,6 @@ def _check_gradients(system: System, state, rows: Rows, weights, in_words) -> No
     """Refuse rows whose gradient is zero at the state, but not at a generic configuration `NEARBY` relative to its positions."""
     q, n_s = np.concatenate([state.q_s, state.q_f]), np.size(state.q_s)
     n_g, n_gs = system.num_constraints(state.q_s, state.q_f)
-    if n_gs > n_s or n_g > q.size - n_s:
-        return  # refused by `_check_counts`
     change = NEARBY * np.abs(weights * q).max() * np.random.default_rng(0).normal(size=q.size) / weights
     nearby, _ = jax.device_get(_rows_and_weights(system, state.t, *np.split(q + change, [n_s])))
     size, size_nearby = (np.linalg.norm(a.gradients, axis=1) for a in (rows, nearby))

@@ -47,12 +47,10 @@ class Answer:
 
     error: largest accepted error of the positions in the run.
     setting: the cheapest setting; None if no setting keeps the error.
-    all: all settings that the search found to keep the error, the fastest first.
     """
 
     error: float
     setting: Setting | None
-    all: tuple[Setting, ...] = ()
 
 
 class PageFailed(RuntimeError):
@@ -186,7 +184,7 @@ def cost_report(
         for i, error in enumerate(sorted(errors, reverse=True)):
             seconds_left = BUDGET - elapsed()
             settings = search.cheapest(error, part(progress, i, len(errors)), budget=seconds_left / 2)
-            answers.append(Answer(error, settings[0] if settings else None, tuple(settings)))
+            answers.append(Answer(error, settings[0] if settings else None))
             with suppress(PageFailed):  # the last call below raises it
                 _write(search, answers, name, out)
         progress("runs with smaller steps", 1, 1)
