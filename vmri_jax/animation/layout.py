@@ -42,7 +42,7 @@ class Ground:
 
 @dataclass(frozen=True)
 class Connection:
-    """A link or spring from a body, by its number, to an other body or, if that is None, to a fixed point (3,)."""
+    """A link or spring from a body, by its number, to another body or, if `other` is None, to a fixed point (3,)."""
 
     kind: str
     body: int

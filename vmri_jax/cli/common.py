@@ -39,7 +39,7 @@ MANY = "Many runs, and what there is:  vmri sweep --example"
 
 @contextmanager
 def refusals() -> Iterator[None]:
-    """Show refusals of the library as panels, and other errors of their classes as faults of the program."""
+    """Show refusals of the library as panels, and any other error of their classes as a fault of the program."""
     try:
         yield
     except (ValueError, TypeError, ImportError) as error:

@@ -140,8 +140,10 @@ def simulate(
                     done = (steps - (0 if before is None else before.step)) * chosen.num_micro
                     lines = {"macro steps": f"{steps}, of {chosen.num_micro} micro steps each"}
                 else:  # the time includes trial runs, so that there is no time per micro step
-                    done, found = 0, trajectory.settings
-                    lines = {"chosen": f"{found.python}, macro_dt {found.macro_dt:.6g}, {found.num_steps} steps"}
+                    done, settings = 0, trajectory.settings
+                    lines = {
+                        "chosen": f"{settings.python}, macro_dt {settings.macro_dt:.6g}, {settings.num_steps} steps"
+                    }
                 print_named(
                     {
                         **lines,

@@ -211,7 +211,7 @@ def _chain(name: str, branches: Mapping[str, Branch]) -> list[str]:
 
 
 def sort(bodies: Bodies, effects: Sequence[Effect], branches: Sequence[Branch] = ()) -> Sorting:
-    """Paces of all bodies and homes of all effects; traced numbers that decide are refused, and fixed scenes."""
+    """Paces of all bodies and homes of all effects; refused if traced numbers decide, or nothing can move."""
     energies = [effect for effect in effects if effect.kind in ("potential", "kinetic")]
     owned = {effect.name: _owners(effect, bodies, branches) for effect in effects}
     measured = _measure(with_weight(bodies, branches), energies, owned)
