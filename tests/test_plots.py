@@ -23,8 +23,8 @@ from vmri_jax.study import (
     WorkRow,
     families,
 )
-from vmri_jax.study.cost_figures import draw_shares
 from vmri_jax.study.cost_report import Answer, _draw_stairs, _fastest_that_keep
+from vmri_jax.study.prices import draw_shares
 from vmri_jax.study.search import Setting
 from vmri_jax.study.staircase import Stair
 

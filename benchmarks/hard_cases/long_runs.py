@@ -6,6 +6,7 @@ import numpy as np
 import vmri_jax as vm
 from benchmarks.hard_cases.case import hard_case
 from vmri_jax.hard_cases import Outcome
+from vmri_jax.hard_cases.case import draw_energy
 from vmri_jax.hard_cases.measures import (
     constraints,
     difference,
@@ -17,7 +18,6 @@ from vmri_jax.hard_cases.measures import (
     run,
     status,
 )
-from vmri_jax.hard_cases.pictures import draw_energy
 
 CHAIN_DT = 0.03
 METERED = 20_000

@@ -8,7 +8,7 @@ import numpy as np
 
 from vmri_jax import diagnostics, textbook
 from vmri_jax.diagnostics import step_condition
-from vmri_jax.hard_cases.case import Case, Outcome
+from vmri_jax.hard_cases.case import Case, Outcome, draw_energy
 from vmri_jax.hard_cases.derivatives import derivatives
 from vmri_jax.hard_cases.guards import bad_lane, single_precision
 from vmri_jax.hard_cases.measures import (
@@ -25,7 +25,6 @@ from vmri_jax.hard_cases.measures import (
     run,
     status,
 )
-from vmri_jax.hard_cases.pictures import draw_energy
 from vmri_jax.mechanics.motion import motion
 from vmri_jax.mechanics.projection import legendre
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
@@ -233,12 +232,6 @@ def cases_for(problem: Problem | HasProblem) -> tuple[Case, ...]:
     unconstrained = "" if system.is_constrained else "the system has no constraints"
     one_way = _turns_one_way(problem)
 
-    def precision(full: bool) -> Outcome:
-        return single_precision(problem, cases.macro_dt)
-
-    def differences(full: bool) -> Outcome:
-        return derivatives(problem, cases.scheme, cases.macro_dt)
-
     def lane(full: bool) -> Outcome:
         return bad_lane(problem, cases.scheme, cases.macro_dt, 20, solvers.Auto(), lanes=64 if full else 16)
 
@@ -266,9 +259,19 @@ def cases_for(problem: Problem | HasProblem) -> tuple[Case, ...]:
             _has_no_limit(system),
         ),
         ("textbook", f"{step}; fully_explicit, {single}", "steps of vmri_jax.textbook to 1e-10", cases.textbook),
-        ("float32", "64-bit mode off, and float32 data", "refused with the one-line fix", precision),
+        (
+            "float32",
+            "64-bit mode off, and float32 data",
+            "refused with the one-line fix",
+            lambda _: single_precision(problem, cases.macro_dt),
+        ),
         ("one bad lane in a batch", step, LANE_CRITERION, lane),
-        ("derivatives", step, "gradients and Hessians are those of the functions, to 1e-4", differences),
+        (
+            "derivatives",
+            step,
+            "gradients and Hessians are those of the functions, to 1e-4",
+            lambda _: derivatives(problem, cases.scheme, cases.macro_dt),
+        ),
     ]
     pictures = {"energy for long": draw_energy}
     return tuple(

@@ -194,11 +194,7 @@ def find_windows(
     Between neighbouring samples with different labels lies an end of a window, or a whole window. All such brackets are
     divided at the same time, until they are shorter than `resolution`; shorter windows are left out.
 
-    Args:
-        label: function of an array of samples that returns a label for each: None for unstable, else any value to compare.
-        x: (k,) increasing samples to start from.
-        labels: their labels.
-        resolution: length of a bracket at which its division ends.
+    ``label(samples)`` has a label for each sample, None for unstable, else any value to compare; `labels` are the labels of x (k,).
     """
     edges = [x[0]] if labels[0] is None else []
     samples = zip(x, x[1:], labels, labels[1:], strict=False)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.diagnostics.linear import derivative_along, phase_splits, phase_vector, symplectic_form
+from vmri_jax.diagnostics.linear import change_of_form, derivative_along, phase_splits, phase_vector
 from vmri_jax.mechanics.arrays import is_concrete, whole_number
 from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.schemes.composition import Composition
@@ -81,8 +81,7 @@ def monodromy(
     if result > Result.CONVERGED_AT_ROUNDOFF:
         raise RuntimeError(f"monodromy: macro step {steps - 1} failed: {Result(int(result)).message}")
     first = np.asarray(phase_vector(start))
-    J = symplectic_form(first.size // 2)
-    defect = M.T @ (at_end @ J @ at_end.T) @ M - at_start @ J @ at_start.T
+    defect = change_of_form(M, at_start, at_end)
     return Monodromy(
         matrix=M,
         start_basis=at_start,

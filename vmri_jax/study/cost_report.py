@@ -19,9 +19,8 @@ from vmri_jax.running.files import make_writable_folder
 from vmri_jax.running.progress import part, shows_progress
 from vmri_jax.steppers.results import SimulationError
 from vmri_jax.study.advisor import MIN_ERROR_OVER_REFERENCE
-from vmri_jax.study.cost_figures import draw_shares
 from vmri_jax.study.html import embedded, write_page
-from vmri_jax.study.prices import FAST, SLOW, prices, shares
+from vmri_jax.study.prices import FAST, SLOW, draw_shares, prices, shares
 from vmri_jax.study.program import Program
 from vmri_jax.study.reference_solution import ReferenceSolution, reference_solution
 from vmri_jax.study.search import Search, Setting, stopwatch

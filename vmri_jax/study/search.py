@@ -77,13 +77,7 @@ def stopwatch() -> Callable[[], float]:
 class Search:
     """Runs of one problem, each made once: programs, errors and times by family, num_micro and number of steps.
 
-    Args:
-        problem: system and start.
-        t_end: simulated time.
-        menu: families to choose from.
-        reference: the solution that errors are measured against; runs save as many nodes.
-        solver: how implicit equations are solved.
-        fallback: see `Program`.
+    Runs save as many nodes as the reference solution. Arguments are as of `Program`.
     """
 
     def __init__(
@@ -165,11 +159,7 @@ class Search:
     ) -> list[Setting]:
         """Settings that keep the error, the fastest first; the best ones are timed in turn.
 
-        Args:
-            error: largest accepted ``|q - q_ref|``, in the unit of the positions.
-            progress: told about every scheme.
-            exhaustive: try every num_micro of every family, to check the staged search.
-            budget: seconds after which the search compiles no further scheme, once a setting keeps the error.
+        `budget` are the seconds after which the search compiles no further scheme, once a setting keeps the error.
         """
         reached: dict[tuple[str, int], Setting] = {}
         limit, elapsed = MAX_RUN_SECONDS, stopwatch()
