@@ -4,11 +4,11 @@ from collections.abc import Callable, Iterator
 from importlib.util import find_spec
 
 import numpy as np
-from vmri_jax.study.peers import can_run_dopri8, dopri8_runs
 
 import vmri_jax as vm
 from benchmarks import c_loops
 from benchmarks.dear.systems import BOND, STIFFNESS, bonds
+from vmri_jax.study.peers import can_run_dopri8, dopri8_runs
 
 Runs = Iterator[tuple[int, Callable[[], np.ndarray]]]
 """Number of macro steps, or -log2 of the tolerance, and a function that gives the positions at the end."""

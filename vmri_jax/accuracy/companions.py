@@ -137,7 +137,7 @@ def ratio(order: int, parts: float = 2) -> float:
 
 def extrapolated(order: int, trajectory: Trajectory, finer: Trajectory) -> np.ndarray:
     """(k, n_s + n_f) ``r (x - x')``: the part of the error of the positions x that vanishes with the steps halved in the companion x'."""
-    return ratio(order) * (_positions(trajectory) - _positions(finer))
+    return ratio(order) * (positions(trajectory) - positions(finer))
 
 
 def estimated_errors(
@@ -166,7 +166,7 @@ def estimated_errors(
         further = companion_of(parts, whole) if companion_of else companion(run, parts, whole)
         if int(further.failed_at) >= 0:
             return np.full_like(result, np.inf)
-        difference = ratio(order, parts / whole) * (_positions(trajectory)[::stride] - _positions(further))
+        difference = ratio(order, parts / whole) * (positions(trajectory)[::stride] - positions(further))
         errors = np.concatenate([difference[:1], np.repeat(difference[1:], stride, axis=0)])
         result = np.where(np.abs(errors) > np.abs(result), errors, result)
     return result
@@ -221,7 +221,7 @@ def certified_nodes(trajectory: Trajectory, error: np.ndarray) -> tuple[np.ndarr
 
 def extent_of(trajectory: Trajectory) -> float:
     """Largest difference between the largest and the smallest value of a coordinate in a run."""
-    return float(np.ptp(_positions(trajectory), axis=0).max(initial=0.0))
+    return float(np.ptp(positions(trajectory), axis=0).max(initial=0.0))
 
 
 def check_function_of_run(of: Callable | None, error: bool, run: Simulation) -> None:
@@ -271,7 +271,7 @@ def finer(run: Simulation, parts: int, whole: int = 1) -> Simulation:
     )
 
 
-def _positions(trajectory: Trajectory) -> np.ndarray:
+def positions(trajectory: Trajectory) -> np.ndarray:
     """(k, n_s + n_f) positions, slow first."""
     return np.concatenate([trajectory.states.q_s, trajectory.states.q_f], axis=1)
 
@@ -285,7 +285,7 @@ def _is_chaotic(error: RunError, trajectory: Trajectory, run: Simulation, halved
     if not (float(error.growth) > CHAOTIC_GROWTH and trajectory.keeps_energy) or trajectory.concerns():
         return False
     quartered = companion(run, 4)
-    envelope = np.maximum.accumulate(largest_of(_positions(halved) - _positions(quartered)))
+    envelope = np.maximum.accumulate(largest_of(positions(halved) - positions(quartered)))
     t = np.asarray(trajectory.t)
     half, last = np.searchsorted(t, [(t[0] + error.certified_until) / 2, error.certified_until])
     return bool(envelope[last] > CHAOTIC_GROWTH * envelope[half])  # False for NaN, where a companion failed

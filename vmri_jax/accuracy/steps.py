@@ -22,7 +22,7 @@ from vmri_jax.accuracy.companions import check_function_of_run, extent_of, fewes
 from vmri_jax.accuracy.families import Family, of_degree, of_order_2
 from vmri_jax.accuracy.trials import AIMED_PART, MOST_SAVED, MOST_STEPS, Search, Trial, unit_of
 from vmri_jax.mechanics.arrays import is_concrete
-from vmri_jax.mechanics.checks import check_number
+from vmri_jax.mechanics.checks import check_number, check_type
 from vmri_jax.mechanics.driving import events
 from vmri_jax.mechanics.invariants import velocity
 from vmri_jax.mechanics.masses import ConstantMass
@@ -87,10 +87,8 @@ def with_accuracy(
         TypeError: scheme is not a scheme.
         ValueError: an accuracy below round-off, or above the extent of the motion; arguments that `vmri_jax.simulate` refuses.
     """
-    if not isinstance(scheme, Scheme | Composition | None):
-        raise TypeError(
-            f"simulate: scheme is {type(scheme).__name__}; give a Scheme, e.g. fully_implicit(num_micro=10), or None."
-        )
+    a_scheme = "a Scheme, e.g. fully_implicit(num_micro=10), or None"
+    check_type("simulate: scheme", scheme, Scheme | Composition | None, a_scheme)
     opened_system, start = start_of("simulate", system, state)
     if not is_concrete((vars(start), opened_system.params, t_end)):
         raise ValueError(
@@ -133,9 +131,8 @@ def with_accuracy(
             stacklevel=3,
         )
     if not best.error <= accuracy:
-        reached = (
-            f"its error is {best.error:.1e}" if np.isfinite(best.error) else "no error is certified over its length"
-        )
+        uncertified = "no error is certified over its length"
+        reached = f"its error is {best.error:.1e}" if np.isfinite(best.error) else uncertified
         warnings.warn(
             f"simulate: accuracy {accuracy:g} is not reached with {best.run.num_steps} macro steps, {reached}; give a shorter t_end, a "
             "larger accuracy, or another scheme.",

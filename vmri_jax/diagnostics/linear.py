@@ -89,12 +89,7 @@ def frequencies_of(stiffness: np.ndarray) -> np.ndarray:
 
 
 def symplectic_defect(
-    system: Movable,
-    scheme: Scheme | Composition,
-    state: State | None = None,
-    *,
-    macro_dt,
-    solver: Newton | None = None,
+    system: Movable, scheme: Scheme | Composition, state: State | None = None, *, macro_dt, solver: Newton | None = None
 ):
     """Largest entry of ``M^T J M - J`` for the derivative M of one macro step, on the constraint manifold.
 

@@ -21,7 +21,7 @@ from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
 from vmri_jax.schemes.composition import Composition, stage_scheme
 from vmri_jax.schemes.scheme import Scheme
-from vmri_jax.stability.monodromy import monodromy
+from vmri_jax.stability.multipliers import monodromy
 
 SAMPLES = 1024
 """Times at which the drive is compared with itself, one period later or earlier; with fewer of them narrow pulses are missed."""

@@ -262,13 +262,12 @@ def _confirmed(search: Search, answers: Sequence[Answer]) -> list[Answer]:
     """The answers with the fastest setting whose confirmed error keeps the error; an answer without such a setting stays as it is."""
     settings = {(s.row.scheme, s.num_steps): s for s in search.settings.values()}
     stairs = confirmed([s.row for s in search.settings.values()])
-
-    def confirmed_answer(answer: Answer) -> Answer:
-        keeping = [stair for stair in stairs if stair.error <= answer.error]
-        row = min(keeping, key=lambda stair: stair.seconds).row if keeping else None
-        return answer if row is None else replace(answer, setting=settings[row.scheme, row.num_steps])
-
-    return [confirmed_answer(answer) for answer in answers]
+    best = []
+    for answer in answers:
+        rows = [stair.row for stair in stairs if stair.error <= answer.error]
+        row = min(rows, key=lambda row: row.seconds, default=None)
+        best.append(answer if row is None else replace(answer, setting=settings[row.scheme, row.num_steps]))
+    return best
 
 
 def _fastest_that_keep(answers: Sequence[Answer]) -> list[Answer]:

@@ -21,14 +21,9 @@ from vmri_jax.study.program import joined
 from vmri_jax.study.search import Search
 from vmri_jax.study.work import WorkRow, pareto_front
 
-SINGLE, MICRO, COMPOSED, INTERVALS = (
-    "single steps of order 2",
-    "micro steps of order 2",
-    "composed to order 4, 6, 8",
-    "intervals of high degree",
-)
+KINDS = "single steps of order 2", "micro steps of order 2", "composed to order 4, 6, 8", "intervals of high degree"
 """Kinds of schemes by their structure."""
-KINDS = (SINGLE, MICRO, COMPOSED, INTERVALS)
+SINGLE, MICRO, COMPOSED, INTERVALS = KINDS
 CONFIRMING_RATIO = 1.3
 """Least ratio of the steps of a confirming run to the steps of the run that it confirms. An error that is small by chance grows again
 within a few percent more steps; a larger ratio leaves fewer runs confirmed."""
