@@ -3,7 +3,7 @@
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -87,29 +87,23 @@ class Trial:
         return self.steps_for(error) * self.seconds if np.isfinite(self.error) else np.inf
 
 
+@dataclass
 class Search:
-    """Trial runs of several schemes from the same start over the same time.
+    """Trial runs of several schemes from the same start over the same time, the `length`.
 
-    Args:
-        make: function of a scheme that returns a `Simulation` of a single macro step.
-        length: simulated time, in the unit of time of the system.
-        num_saves: saved intervals; None for at most `MOST_SAVED`.
-        progress: called before every trial run.
-        drives: events of the system in this time; all runs have steps that see them.
+    make: function of a scheme that returns a `Simulation` of a single macro step.
+    num_saves: saved intervals; None for at most `MOST_SAVED`.
+    drives: events of the system in this time; all runs have steps that see them.
     """
 
-    def __init__(
-        self,
-        make: Callable[[Scheme | Composition], Simulation],
-        length: float,
-        num_saves: int | None,
-        progress: Progress = silent,
-        drives: Events = Events(),  # noqa: B008 (immutable)
-    ):
-        self.make, self.length, self.num_saves, self.progress, self.drives = make, length, num_saves, progress, drives
-        self.runs: dict[tuple[str, int], Simulation] = {}
-        self.num_trials = 0
-        self.relative_time: Callable[[int], float] | None = None
+    make: Callable[[Scheme | Composition], Simulation]
+    length: float
+    num_saves: int | None
+    progress: Progress = silent
+    drives: Events = Events()
+    runs: dict[tuple[str, int], Simulation] = field(default_factory=dict)
+    num_trials: int = 0
+    relative_time: Callable[[int], float] | None = None
 
     def rounded(self, num_steps: int) -> tuple[int, int]:
         """(num_steps, save_every): the number of macro steps, rounded up to a multiple of the saved intervals."""

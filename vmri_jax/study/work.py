@@ -250,12 +250,10 @@ def work_precision(
             tasks = [(ladder, repeats) for ladder in ladders]
             report = lambda done, i: progress(ladders[i].label, done, total)  # noqa: E731
             rows = [row for part in mapped("work_precision", _timed, tasks, executor, report) for row in part]
-    except Interrupted as stopped:
-        rows = [row for part in stopped.done if part is not None for row in part]
+    except KeyboardInterrupt as stopped:
+        parts = stopped.done if isinstance(stopped, Interrupted) else [[row for _, row in runs]]
+        rows = [row for part in parts if part is not None for row in part]
         raise Interrupted(WorkPrecision(tuple(rows), t_end, reference), len(rows), None, "runs") from None
-    except KeyboardInterrupt:
-        done = WorkPrecision(tuple(row for _, row in runs), t_end, reference)
-        raise Interrupted(done, len(runs), None, "runs") from None
     progress("done", 1, 1)
     return WorkPrecision(tuple(rows), t_end, reference)
 
