@@ -100,7 +100,7 @@ class Search:
     length: float
     num_saves: int | None
     progress: Progress = silent
-    drives: Events = Events()
+    drives: Events = Events()  # noqa: RUF009 (immutable)
     runs: dict[tuple[str, int], Simulation] = field(default_factory=dict)
     num_trials: int = 0
     relative_time: Callable[[int], float] | None = None

@@ -57,6 +57,7 @@ ROUND_OFF = 4 * np.finfo(float).eps
 """Round-off of a position in a step, as a part of the largest position; a larger value hides differences of momenta."""
 ENERGY_CRITERION = "the linear trend is at most half of the largest energy error, or flattens in a longer run, or the error is below 1e-9"
 EXPLICIT_CRITERION = "runs at omega h = 1; at 2.5 every NaN is reported as a failure"
+DERIVATIVE_CRITERION = "gradients and Hessians are those of the functions, to 1e-4"
 LANE_CRITERION = "the bad lane reports its failure, the others equal their single runs to 1e-12"
 
 
@@ -228,7 +229,7 @@ def cases_for(problem: Problem | HasProblem) -> tuple[Case, ...]:
         cases = resolved(problem)
     system = problem.system
     unconstrained = "" if system.is_constrained else "the system has no constraints"
-    outside = _outside(system)
+    outside, limitless = _outside(system), _has_no_limit(system)
     one_way = f"{outside}: the way back is another motion" if outside else _turns_one_way(problem)
 
     def lane(full: bool) -> Outcome:
@@ -244,13 +245,7 @@ def cases_for(problem: Problem | HasProblem) -> tuple[Case, ...]:
         ("loose Newton tolerance", f"{step}, 1e-4 to 1e-12", "error shrinks with the tolerance", cases.tolerance),
         ("tiny steps", f"{step} and smaller", "scaled condition flat", cases.tiny_steps),
         ("reversibility", step, "back at the start to 1e-6", cases.reversal, one_way),
-        (
-            "explicit limit",
-            f"fully_explicit, {single}",
-            EXPLICIT_CRITERION,
-            cases.explicit_limit,
-            _has_no_limit(system),
-        ),
+        ("explicit limit", f"fully_explicit, {single}", EXPLICIT_CRITERION, cases.explicit_limit, limitless),
         ("textbook", f"{step}; fully_explicit, {single}", "steps of vmri_jax.textbook to 1e-10", cases.textbook),
         (
             "float32",
@@ -259,12 +254,7 @@ def cases_for(problem: Problem | HasProblem) -> tuple[Case, ...]:
             lambda _: single_precision(problem, cases.macro_dt),
         ),
         ("one bad lane in a batch", step, LANE_CRITERION, lane),
-        (
-            "derivatives",
-            step,
-            "gradients and Hessians are those of the functions, to 1e-4",
-            lambda _: derivatives(problem, cases.scheme, cases.macro_dt),
-        ),
+        ("derivatives", step, DERIVATIVE_CRITERION, lambda _: derivatives(problem, cases.scheme, cases.macro_dt)),
     ]
     pictures = {"energy for long": draw_energy}
     return tuple(

@@ -42,11 +42,7 @@ REPEATS = 5
 
 @dataclass(frozen=True)
 class Answer:
-    """The cheapest setting for an error.
-
-    error: largest accepted error of the positions in the run.
-    setting: the cheapest setting; None if no setting keeps the error.
-    """
+    """The largest accepted error of the positions, and the cheapest setting for it; None if no setting keeps the error."""
 
     error: float
     setting: Setting | None

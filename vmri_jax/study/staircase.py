@@ -36,10 +36,8 @@ SINGLE_STEP_RUNS = 2
 
 @dataclass(frozen=True)
 class Stair:
-    """A run of a staircase.
+    """A run of a staircase with its confirmed error.
 
-    row: the run.
-    error: its confirmed error.
     fast_share: part of the error that more micro steps remove, between 0 and 1; NaN where it was not measured.
     """
 
