@@ -119,7 +119,7 @@ def height(q_s, q_f, params):
     return jnp.cos(q_f[0]) * jnp.cos(q_f[1])
 
 
-def top(spin=8.0) -> Driven:
+def top(spin=5.0) -> Driven:
     """It sleeps where ``C^2 spin^2 > 4 A``: above a spin of 4."""
     problem = vm.Problem(vm.System(turning, height), NONE, [1e-3, 0.0, 0.0], None, [0.0, 0.0, spin])
     return Driven(problem, 2 * np.pi / spin, 32, True, True, vm.fully_implicit(1))

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 import vmri_jax as vm
+from tests.small_systems import moving_constraints
 from tests.stability.driven_systems import NONE, SYSTEMS, mathieu
 from vmri_jax.hard_cases.cases import resolved
 from vmri_jax.stability import vibrations
@@ -110,6 +111,15 @@ def test_disturbances_of_a_linear_system_repeat_themselves():
     motion = driven_motion(driven.problem.system, driven.scheme, driven.problem.state(), 0.1, np.pi)
     assert motion.growth == 0
     assert motion.repeats
+
+
+@pytest.mark.full
+def test_a_motion_that_differs_from_period_to_period_is_not_called_unstable():
+    """A rod that turns over on a swinging circle; 209.4 steps in a period."""
+    advice = vm.advise(moving_constraints(), vm.fully_explicit(1), macro_dt=0.01)
+    assert advice.ok
+    assert "In the next one this is different: a run over many periods decides" in str(advice)
+    assert "is as good as smaller ones over a period of the drive, 2.094" in advice.verdict
 
 
 def test_hard_cases_resolve_the_drive():

@@ -5,7 +5,6 @@ and lengths (`evaluated`), in prepared and traced runs as a part of their progra
 its domain, `concerns` says what is wrong with the motion of a run whose steps all succeeded.
 """
 
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -108,14 +107,8 @@ def observables(system: System, node: tuple[State, Any]):
         q = jnp.concatenate([state.q_s, state.q_f])
         rounding, volume = q @ masses @ q / 2, 2 * jnp.sum(jnp.log(jnp.diagonal(jnp.linalg.cholesky(masses))))
     terms, kept = sum(map(jnp.abs, parts)), are_kept(system, state, tolerance)
-    return jnp.stack(
-        [
-            *map(
-                partial(jnp.asarray, dtype=float),
-                (sum(parts), position, rate, *kept, parts[0], terms, rounding, volume),
-            )
-        ]
-    )
+    values = sum(parts), position, rate, *kept, parts[0], terms, rounding, volume
+    return jnp.stack([jnp.asarray(value, dtype=float) for value in values])
 
 
 def with_tolerance(states: State, tolerance) -> tuple[State, Any]:
@@ -141,7 +134,7 @@ def failures(run, table, save_every: int, step: int = 0):
     """
     module, now = library((run, table)), Observables.of(table)
     wrong = ~(module.isfinite(now.energy) & (now.solved > 0) & (now.implied > 0))
-    if module is np and not wrong.any():
+    if module is np and not wrong.any() and np.all(run.failed_at < 0):
         return run, table
     node = wrong.argmax(axis=-1)
     last_step = step + module.maximum(node * save_every - 1, 0)

@@ -166,7 +166,7 @@ def evaluated(function, structure, arrays: list, nodes, *static):
     shared = [array[(0,) * (axes - 1)] if once else None for array, once in zip(arrays, is_shared, strict=True)]
     of_lanes = _in_a_row([None if once else array for array, once in zip(arrays, is_shared, strict=True)], axes - 1)
     of_nodes, node = _in_a_row(nodes, axes), np.arange(count)
-    if not is_concrete((arrays, nodes)):
+    if not is_concrete((arrays, nodes, jnp.zeros(()))):  # while JAX stages a program, all new arrays are tracers
         values = _at_all(function, structure, static, True)(shared, _rows(of_lanes, node // shape[-1]), of_nodes)
         return jax.tree.map(lambda a: a.reshape(*shape, *a.shape[1:]), values)
     numbers = sum(int(np.prod(leaf.shape[1:])) for leaf in jax.tree.leaves((of_lanes, of_nodes)))

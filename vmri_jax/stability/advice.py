@@ -11,7 +11,7 @@ from vmri_jax.mechanics.system import label
 from vmri_jax.running.origin import names_of
 from vmri_jax.schemes.composition import Composition, stage_lengths, stage_scheme
 from vmri_jax.schemes.scheme import Scheme
-from vmri_jax.stability.drive import LEAST_STEPS, drive_period, driven_motion, growth_of_run, in_words
+from vmri_jax.stability.drive import LEAST_STEPS, drive_period, driven_motion, growth_of_run, in_words, periods_of_run
 from vmri_jax.stability.linear import SmallMotions, small_motions
 from vmri_jax.stability.map import TOLERANCE, Window, measure
 from vmri_jax.stability.multipliers import multipliers
@@ -54,7 +54,7 @@ class Finding:
     kind: "impulse resonance", "combination resonance", "stability limit", "kicks in phase", "labels", "stages", "drive" or "motion".
     sentence: the result in words.
     number: its measure: growth per step of an error, relative distance of a window, ratio of frequencies, amplitude, longest
-        stage, micro steps in a period of the drive, growth rate of the motion.
+        stage, micro steps in a period of the drive, growth rate of the motion (NaN if each period has another one).
     """
 
     severity: str
@@ -102,14 +102,14 @@ class Advice(ResultTable):
     def verdict(self) -> str:
         """Whether the step is stable, and the nearest safe step, in a sentence."""
         if self.safe_macro_dt == self.macro_dt:
-            grows = any(finding.kind == "motion" and finding.number > 0 for finding in self.findings)
-            state = "as unstable as the motion itself" if grows else "stable"
+            growth = sum(finding.number for finding in self.findings if finding.kind == "motion")
+            grows = "as good as smaller ones" if np.isnan(growth) else "as unstable as the motion itself"
+            state = grows if growth else "stable"
             return f"macro_dt = {self.macro_dt:.6g} is {state} {self.about}."
         driven = any(finding.kind == "drive" for finding in self.findings)
         state = "unstable" if self.growth else "too long for the drive" if driven else "close to an instability"
         nearest = f"the nearest safe step is {self.safe_macro_dt:.6g}"
-        if np.isnan(self.safe_macro_dt):
-            nearest = "no safe step was found, take another scheme"
+        nearest = "no safe step was found, take another scheme" if np.isnan(self.safe_macro_dt) else nearest
         return f"macro_dt = {self.macro_dt:.6g} is {state}{f' {self.about}' if self.growth else ''}; {nearest}."
 
     rows = property(lambda self: self.findings, doc="The findings.")
@@ -183,10 +183,11 @@ def advise(
 def _judged_over_a_period(system, scheme, state: State, macro_dt: float, period: float) -> dict[str, Any]:
     """Fields of the `Advice` about a system with a periodic drive: the run and the motion over a period of it."""
     motion = driven_motion(system, scheme, state, macro_dt, period)
-    growth = growth_of_run(system, scheme, state, macro_dt, period)
-    fits, steps = motion.agrees(growth), stage_scheme(scheme).num_micro * period / macro_dt
+    growth, _ = growth_of_run(system, scheme, state, macro_dt, period, periods_of_run(macro_dt, period))
     per_step = float(np.expm1(np.log1p(growth) * macro_dt / period))
-    findings = [Finding("note", "motion", str(motion), np.log1p(motion.growth) / period)]
+    fits, steps = motion.agrees(growth), stage_scheme(scheme).num_micro * period / macro_dt
+    rate = np.log1p(motion.growth) / period if motion.repeats or not motion.growth else np.nan
+    findings = [Finding("note", "motion", str(motion), rate)]
     if not fits:
         sentence = f"In a run with this step disturbances {in_words(growth)} in a period of the drive."
         findings.append(Finding("error" if growth > motion.growth else "warning", "drive", sentence, per_step))

@@ -31,8 +31,8 @@ CANDIDATES = 8
 """Lags that are tried as the period in an interval; more of them find drives with many harmonics."""
 SAME = 1e-7
 """Difference of the drive from itself a period later, as a part of its amplitude. A larger value takes drives for periodic that change slowly."""
-MOST_PERIODS = 16
-"""Most periods m of the drive that a whole number of macro steps is compared with; more of them take longer."""
+STEPS_FOLLOWED = 64
+"""Macro steps that are followed at most where they are no part of the period, so that N steps are nearly m periods; more steps come nearer."""
 LEAST_GROWTH = 1e-4
 """Growth per period that counts: round-off of the product of thousands of steps is below. A larger value overlooks slow growth."""
 LEAST_STEPS = 4
@@ -47,7 +47,7 @@ class DrivenMotion:
 
     period: T.
     growth: of disturbances per period, 0 if they do not grow; NaN if smaller and smaller steps do not agree about it.
-    repeats: whether the next period has the same multipliers.
+    repeats: whether disturbances grow as much in the next period.
     steps: steps T/n that were tried and are stable as far as the motion is, the largest first.
     """
 
@@ -62,7 +62,7 @@ class DrivenMotion:
 
     def __str__(self) -> str:
         grows = in_words(self.growth) if np.isfinite(self.growth) else "are not resolved by any step that was tried"
-        once = "" if self.repeats else " The motion does not repeat itself after it; a run over many periods decides."
+        once = "" if self.repeats else " In the next one this is different: a run over many periods decides."
         return f"Over a period of the drive, {self.period:.4g}, disturbances of the motion {grows}.{once}"
 
 
@@ -124,39 +124,43 @@ def _drive(system: System, state: State, times):
     return jax.vmap(lambda t: jax.jvp(terms_and_derivatives, (t,), (jnp.ones(()),)))(times)
 
 
-def growth_of_run(system: System, scheme: Scheme | Composition, state: State, macro_dt: float, period: float) -> float:
-    """Growth of disturbances of a run per period of the drive, 0 if they do not grow; infinite if a step fails.
+def periods_of_run(macro_dt: float, period: float) -> int:
+    """The number m of periods of the drive after which a run is compared with the motion: nearly a whole number of macro steps."""
+    return Fraction(period / macro_dt).limit_denominator(max(1, int(STEPS_FOLLOWED * macro_dt / period))).denominator
 
-    Macro steps that are no part of the period are followed over up to `MOST_PERIODS` periods.
-    """
-    steps = max(1, Fraction(period / macro_dt).limit_denominator(MOST_PERIODS).numerator)
+
+def growth_of_run(system: System, scheme, state: State, macro_dt: float, period: float, periods: int) -> tuple:
+    """Growth of disturbances of a run per period, over a number of periods, 0 if they do not grow, infinite if a step fails; and the last state."""
+    steps = max(1, round(periods * period / macro_dt))
     try:
         product = monodromy(system, scheme, state, macro_dt=macro_dt, num_steps=steps)
     except RuntimeError:
-        return np.inf
+        return np.inf, state
     if not np.isfinite(product.matrix).all():
-        return np.inf
+        return np.inf, state
     growth = float(np.abs(product.multipliers).max(initial=0.0) ** (period / (steps * macro_dt)) - 1)
-    return growth if growth > LEAST_GROWTH else 0.0
+    return growth if growth > LEAST_GROWTH else 0.0, product.end
 
 
 def driven_motion(
     system: System, scheme: Scheme | Composition, state: State, macro_dt: float, period: float
 ) -> DrivenMotion:
-    """The growth over a period of the drive, from steps of T/n, which are halved until two of them agree."""
+    """The growth over a period of the drive, from steps of T/n, which are halved until two of them agree.
+
+    It is the mean over as many periods as a run with this macro step is followed.
+    """
     n, micro, tried = max(1, int(np.ceil(period / macro_dt - 1e-6))), stage_scheme(scheme).num_micro, {}
+    followed = period, periods_of_run(macro_dt, period)
     while True:
         dt = period / n
-        growth = tried[dt] = growth_of_run(system, scheme, state, dt, period)
+        growth, end = growth_of_run(system, scheme, state, dt, *followed)
+        tried[dt] = growth
         if n * micro >= CONVERGED_STEPS and abs(growth - tried.get(2 * dt, np.inf)) <= 0.1 * growth < np.inf:
             break
         n *= 2
         if n > MOST_STEPS:
             return DrivenMotion(period, np.nan, True, ())
-    once = monodromy(system, scheme, state, macro_dt=dt, num_steps=n)
-    again = monodromy(system, scheme, once.end, macro_dt=dt, num_steps=n)
-    first, second = (np.sum(product.multipliers) for product in (once, again))
-    repeats = bool(abs(second - first) < 1e-6 * max(abs(first), len(once.matrix)))
-    motion = DrivenMotion(period, growth, repeats, ())
+    again, _ = growth_of_run(system, scheme, end, dt, *followed)
+    motion = DrivenMotion(period, growth, abs(again - growth) <= 0.1 * growth, ())
     steps = [dt for dt, growth in tried.items() if motion.agrees(growth) and period / dt * micro >= LEAST_STEPS]
     return replace(motion, steps=tuple(steps))

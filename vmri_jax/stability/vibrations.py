@@ -53,8 +53,8 @@ class Vibrations(ResultTable):
     """The vibrations about a state, the fastest first.
 
     rows: all vibrations.
-    growth_rate: largest rate r of a motion of the system that grows like ``exp(r t)``; 0 if none grows. Under a periodic drive on the average
-        over a period; 0 also where the linearisation does not tell.
+    growth_rate: largest rate r of a motion of the system that grows like ``exp(r t)``; 0 if none grows, or where the linearisation does not tell.
+        Under a periodic drive the mean over its first period.
     note: the point of linearisation and the growth in words, where the state is no equilibrium or something grows.
     """
 

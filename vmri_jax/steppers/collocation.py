@@ -292,7 +292,7 @@ class Collocation(Solver):
             residual = last.x + moves
             dx, dmu = saddles.solve(-residual, -forces.g)
             x, mu, moved, iterations = last.x + dx, last.mu + dmu, slow_and_fast(dx), last.iterations + 1
-            next_moves = map(expected, moved, last.moved)
+            next_moves = tuple(map(expected, moved, last.moved))
             result = newton.status(accepted.ratio(next_moves, slow_and_fast(x), iterations), iterations)
             return Increments(x, mu, moved, iterations, result)
 
