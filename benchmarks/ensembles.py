@@ -4,7 +4,6 @@ import shutil
 import threading
 import time
 from collections.abc import Iterator
-from concurrent.futures import Future
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -24,8 +23,7 @@ from vmri_jax.ensembles import Axis, Draws, Ensemble, Product
 from vmri_jax.ensembles.prepared import prepared
 from vmri_jax.ensembles.store import committed
 from vmri_jax.ensembles.work import Work
-from vmri_jax.executors.executor import as_done, executor_of, local_workers
-from vmri_jax.executors.worker import call_in_worker, call_packed, known_versions, packed
+from vmri_jax.executors.executor import as_done, executor_of, local_workers, submitter
 
 PARTS = ("speed", "paper", "million", "study")
 COLUMNS = {
@@ -197,19 +195,16 @@ def _listing(path: Path) -> float:
 def _picked(lanes: int) -> int:
     """The chunk that the library takes for so many runs."""
     work = Work("fpu", {"scheme": SCHEME}, tuple(START), RUN)
-    return prepared(work, Draws(lanes, START)).chunks.size
+    _, chunks, _ = prepared(work, Draws(lanes, START))
+    return chunks.size
 
 
 def _sleep(client, count: int, seconds: float) -> float:
     """Time that so many tasks take that do nothing but sleep."""
-    call, versions = packed("sleep", (time.sleep, (seconds,))), known_versions()
     with executor_of("sleep", client) as tasks:
-
-        def submit(_: int) -> Future:
-            return tasks.submit(*call_in_worker(versions, call_packed, call))
-
+        submit = submitter("sleep", tasks, time.sleep, seconds)
         begin = time.perf_counter()
-        for _, future in as_done(submit, ((i,) for i in range(count))):
+        for _, future in as_done(lambda _: submit(), range(count)):
             future.result()
     return time.perf_counter() - begin
 

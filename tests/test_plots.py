@@ -23,8 +23,8 @@ from vmri_jax.study import (
     WorkRow,
     families,
 )
-from vmri_jax.study.cost_figures import draw_shares
 from vmri_jax.study.cost_report import Answer, _draw_stairs, _fastest_that_keep
+from vmri_jax.study.prices import draw_shares
 from vmri_jax.study.search import Setting
 from vmri_jax.study.staircase import Stair
 
@@ -251,7 +251,7 @@ def test_the_panels_of_a_cost_page_are_drawn_whatever_they_hold(count):
     """The page is drawn in the course of the search, before there are any answers."""
     family = families()[0]
     found = tuple(Setting(family, n, 4, work_row(1e-3)) for n in range(1, count + 1))
-    answers = (Answer(1e-2, found[0] if found else None, found), Answer(1e-4, None, ()))
+    answers = Answer(1e-2, found[0] if found else None), Answer(1e-4, None)
     report = CostReport(Path("cost.html"), "", 1.0, answers, WorkPrecision((), 1.0, EXACT), {})
     assert is_drawn(draw_shares(report.shares, plots.LIGHT))
     assert is_drawn(_draw_stairs(report, {}, "", plots.DARK))

@@ -2,13 +2,17 @@
 
 from collections.abc import Callable, Iterator
 from importlib.util import find_spec
+from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 import vmri_jax as vm
 from benchmarks import c_loops
 from benchmarks.dear.systems import BOND, STIFFNESS, bonds
-from vmri_jax.study.peers import can_run_dopri8, dopri8_runs
+from vmri_jax.mechanics.invariants import potential_energy
+from vmri_jax.mechanics.masses import ConstantMass
 
 Runs = Iterator[tuple[int, Callable[[], np.ndarray]]]
 """Number of macro steps, or -log2 of the tolerance, and a function that gives the positions at the end."""
@@ -18,6 +22,57 @@ HEYOKA_POWERS = (9, 50)
 """Tolerances 2^-9 to 2^-49: each is compiled anew, half a minute for 16 atoms."""
 HEYOKA_ATOMS = 32
 """Atoms up to which heyoka compiles all pairs of them; its expressions of 128 atoms have 8064 pairs and take minutes to compile."""
+LARGEST_POWER = 43
+"""Bound of the powers: tolerances stay above ``2^-43``, about 1e-13. Below, round-off of float64 lets errors fall no further."""
+STRIDE = 3
+"""Step from one power to the next, so that each tolerance is an eighth of the one before; a larger step leaves a coarser staircase."""
+MAX_STEPS = 200_000
+"""Steps after which diffrax gives up; a larger number lengthens only runs that are too slow to be compared."""
+
+
+def can_run_dopri8(problem: vm.Problem) -> bool:
+    """Whether diffrax is installed and the system has constant masses, no constraints, and no forces besides potentials."""
+    system = problem.system
+    plain = isinstance(system.kinetic, ConstantMass) and system.force is None
+    return plain and not any(system.num_constraints(problem.q_s, problem.q_f)) and find_spec("diffrax") is not None
+
+
+def dopri8_runs(problem: vm.Problem, t_end: float) -> Iterator[tuple[int, Callable[[], np.ndarray]]]:
+    """Runs of Dopri8 with smaller and smaller tolerances ``2^-power``: the power, and a function that gives q at the end, slow first."""
+    import diffrax  # pyright: ignore[reportMissingImports]
+
+    system, n_s = problem.system, problem.q_s.size
+    mass: Any = system.kinetic
+    start = tuple(
+        jnp.concatenate([jnp.asarray(a), jnp.asarray(b)])
+        for a, b in ((problem.q_s, problem.q_f), (problem.v_s, problem.v_f))
+    )
+    gradient = jax.grad(lambda q: potential_energy(system, q[:n_s], q[n_s:]))
+
+    def acceleration(q):
+        force = -gradient(q)
+        return jnp.concatenate(mass.velocity(force[:n_s], force[n_s:]))
+
+    term: Any = diffrax.ODETerm(lambda t, y, args: (y[1], acceleration(y[0])))
+
+    @jax.jit
+    def solve(tolerance):
+        controller = diffrax.PIDController(rtol=tolerance, atol=tolerance)
+        solution = diffrax.diffeqsolve(
+            term,
+            diffrax.Dopri8(),
+            0.0,
+            t_end,
+            None,
+            start,
+            stepsize_controller=controller,
+            max_steps=MAX_STEPS,
+            throw=False,
+        )
+        return solution.ys[0][-1]  # pyright: ignore[reportOptionalSubscript]
+
+    for power in range(7, LARGEST_POWER, STRIDE):
+        yield power, lambda tolerance=2.0**-power: np.asarray(solve(tolerance))
 
 
 def diffrax(problem: vm.Problem, t_end: float, num_micro: int) -> Runs:

@@ -3,7 +3,15 @@
 import inspect
 from collections.abc import Callable
 
+import numpy as np
+
 from vmri_jax.hard_cases import Case, Outcome
+from vmri_jax.running.trajectory import Trajectory
+
+
+def iterations(trajectory: Trajectory) -> int:
+    """The most iterations of a step."""
+    return int(np.max(np.asarray(trajectory.info.iterations)))
 
 
 def hard_case(number: int, title: str, draw=None) -> Callable[..., Case]:

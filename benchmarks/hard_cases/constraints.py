@@ -6,10 +6,11 @@ import jax.numpy as jnp
 import numpy as np
 
 import vmri_jax as vm
-from benchmarks.hard_cases.case import hard_case
+from benchmarks.hard_cases.case import hard_case, iterations
 from benchmarks.hard_cases.systems import four_bar, nearly_slow_constraint
+from vmri_jax.accuracy.companions import positions
 from vmri_jax.hard_cases import Outcome
-from vmri_jax.hard_cases.measures import constraints, difference, iterations, nodes, run, status
+from vmri_jax.hard_cases.measures import constraints, difference, run, status
 from vmri_jax.systems.triple_spherical_pendulum import first_rod, second_rod
 
 
@@ -82,7 +83,7 @@ def redundant_constraints(full: bool) -> Outcome:
         words = f"refused, rows {'named' if named else 'not named'}: {said.partition(' in the ')[0]}"
         return Outcome(words, named, {"named": named})
     runs = [run(problem, vm.fully_implicit(5), 0.05, 1000 if full else 200) for problem in (once, twice)]
-    apart = difference(*(nodes(trajectory) for trajectory in runs))
+    apart = difference(*(positions(trajectory) for trajectory in runs))
     return Outcome(
         f"positions with and without differ by {apart:.1e}; {status(runs[1])}",
         runs[1].success and apart < 1e-10,

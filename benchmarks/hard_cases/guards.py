@@ -3,7 +3,7 @@
 import vmri_jax as vm
 from benchmarks.hard_cases.case import hard_case
 from vmri_jax.hard_cases import Outcome
-from vmri_jax.hard_cases.guards import bad_lane, single_precision
+from vmri_jax.hard_cases.measures import bad_lane, single_precision
 
 
 @hard_case(27, "float32")

@@ -6,10 +6,11 @@ from functools import partial
 import numpy as np
 
 import vmri_jax as vm
-from benchmarks.hard_cases.case import hard_case
+from benchmarks.hard_cases.case import hard_case, iterations
+from vmri_jax.accuracy.companions import positions
 from vmri_jax.diagnostics import step_condition
 from vmri_jax.hard_cases import Outcome
-from vmri_jax.hard_cases.measures import constraints, difference, energy, iterations, nodes, run, status
+from vmri_jax.hard_cases.measures import constraints, difference, energy, run, status
 from vmri_jax.running.timing import interleaved
 
 EXACT = vm.solvers.Arrowhead()
@@ -143,7 +144,7 @@ def many_micro_steps(full: bool) -> Outcome:
 
     def end(num_micro, steps, solver=None):  # one saved node: one program for each num_micro
         scheme = vm.fully_implicit(num_micro)
-        return nodes(run(problem, scheme, macro_dt, steps, save_every=steps, solver=solver))[-1]
+        return positions(run(problem, scheme, macro_dt, steps, save_every=steps, solver=solver))[-1]
 
     steps = {n: (20 if full else 5) * micro[-1] // n for n in micro}  # as many micro steps for each
     runs = {f"{n}": partial(end, n, steps[n]) for n in micro}

@@ -5,7 +5,9 @@ import numpy as np
 
 import vmri_jax as vm
 from benchmarks.hard_cases.case import hard_case
+from vmri_jax.accuracy.companions import positions
 from vmri_jax.hard_cases import Outcome
+from vmri_jax.hard_cases.case import draw_energy
 from vmri_jax.hard_cases.measures import (
     constraints,
     difference,
@@ -13,11 +15,9 @@ from vmri_jax.hard_cases.measures import (
     energy,
     energy_scale,
     long_run,
-    nodes,
     run,
     status,
 )
-from vmri_jax.hard_cases.pictures import draw_energy
 
 CHAIN_DT = 0.03
 METERED = 20_000
@@ -150,7 +150,7 @@ def chaotic_pendulum(full: bool) -> Outcome:
     position, change = constraints(trajectory)[0], energy(trajectory, 1, scale)
     steps, ends = 0.02 / 2.0 ** np.arange(5 if full else 4), []
     for h in steps:
-        ends.append(nodes(run(problem, scheme, h, round(1 / h), save_every=round(1 / h)))[-1])
+        ends.append(positions(run(problem, scheme, h, round(1 / h), save_every=round(1 / h)))[-1])
     order = vm.diagnostics.observed_order(steps[:-2], [difference(a, ends[-1]) for a in ends[:-2]])
     return Outcome(
         f"t = {t_end:g}: {status(trajectory)}, |g| {position:.1e}, energy error {change.band:.1e} of the fall; order {order:.2f} "

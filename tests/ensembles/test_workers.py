@@ -200,14 +200,14 @@ def test_workers_without_the_package(tmp_path, cache):
 def test_workers_of_another_version(tmp_path, monkeypatch):
     versions = known_versions() | {"vmri_jax": "0.0.1"}
     with pytest.raises(NotAWorker, match=r"vmri_jax .* instead of 0\.0\.1.*give all workers the versions"):
-        in_worker(versions, print, b"")
+        in_worker(versions, b"")
 
 
 def test_processes_that_run_jax_already():
     jnp.zeros(1)
     program = (
         "import jax.numpy as jnp\njnp.zeros(1)\n"
-        "from vmri_jax.executors.worker import in_worker, known_versions\nin_worker(known_versions(), print, b'')"
+        "from vmri_jax.executors.worker import in_worker, known_versions\nin_worker(known_versions(), b'')"
     )
     environment = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, env=environment)

@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 
 from vmri_jax.cli import app as vmri
 from vmri_jax.hard_cases import Case, Outcome, run_cases
-from vmri_jax.hard_cases.pictures import draw_energy
+from vmri_jax.hard_cases.case import draw_energy
 from vmri_jax.running.progress import Working
 
 RAISES = "bad | luck"

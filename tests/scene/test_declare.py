@@ -105,7 +105,7 @@ class Wind(Effect):
 
     @staticmethod
     def function(t, q, v, params):
-        return (params["direction"],)
+        return (jnp.broadcast_to(params["direction"], q[0].shape),)
 
 
 def test_kinds_of_fields():

@@ -107,7 +107,7 @@ def test_every_pair_of_a_joint_has_a_rate():
 @pytest.mark.parametrize(
     ("rates", "error", "message"),
     [
-        (3.0, TypeError, 'rates is 3.0; give rates by the names of joints, {"bearing": 100.0}'),
+        (3.0, TypeError, 'Scene.with_rates: got 3.0; give numbers by the names of joints, {"hinge": 0.3}'),
         ({"bering": 1.0}, ValueError, "there is no joint 'bering'.*bearing"),
         ({"crank pin": 1.0}, ValueError, "crank pin leaves neither an angle nor a displacement"),
         ({"bearing": {"slide": 1.0}}, ValueError, "of is 'slide'; bearing leaves turn free"),

@@ -96,13 +96,13 @@ def test_the_fallback_stays_out_of_the_loop_in_a_compiled_function(tsp):
 
 
 def test_a_run_that_fails_late_is_made_again_with_exact_matrices(tsp):
-    """At this step the nested iteration solves seven steps, and not the eighth."""
+    """At this step the nested iteration solves eight steps, and not the ninth."""
     step = {"macro_dt": 0.2, "num_steps": 20, "throw": False}
     march, run, exact = (
         simulate(tsp, fully_implicit(10), solver=solvers.named(method)(max_iterations=40), **step)
         for method in ("nested", "auto", "arrowhead")
     )
-    assert int(march.failed_at) == 7
+    assert int(march.failed_at) == 8
     assert run.success
     assert np.all(run.info.method == Method.ARROWHEAD)
     assert largest_difference(run.q_f, exact.q_f) == 0.0

@@ -1,10 +1,24 @@
 """Newton's iteration: how it ends, and how many iterations hard steps take."""
 
+from dataclasses import replace
+
+import jax
 import jax.numpy as jnp
 import pytest
 
 from tests.support import compiled_step, largest_difference
-from vmri_jax import ConstantMass, Result, State, System, fully_implicit, initial_state, kernels, macro_step, simulate
+from vmri_jax import (
+    ConstantMass,
+    Result,
+    State,
+    System,
+    fully_implicit,
+    initial_state,
+    kernels,
+    macro_step,
+    simulate,
+    simulate_batch,
+)
 from vmri_jax.steppers import solvers
 from vmri_jax.steppers.marched import PLAIN_PASSES
 
@@ -117,12 +131,22 @@ def test_huge_steps_end_at_the_solution_that_is_meant(tsp):
 
 
 def test_continuation_finds_the_solution_that_plain_newton_misses(tsp):
-    """The whole step, from what the steps before lead to and from straight motion, has no solution that passes find."""
-    run = simulate(tsp.system, fully_implicit(10), tsp.state(), macro_dt=0.4, num_steps=40, solver=EXACT)
+    """The whole step, from what the steps before lead to and from straight motion, has no solution that passes find.
+
+    The motion is chaotic, so that round-off decides which start meets such a step: of 64 starts 34 end, and most of these need continuation.
+    """
+    state = tsp.state()
+    starts = [replace(state, p_s=(1 + 1e-3 * k) * state.p_s, p_f=(1 + 1e-3 * k) * state.p_f) for k in range(16)]
+    states = jax.tree.map(lambda *a: jnp.stack(list(map(jnp.asarray, a))), *starts)
+    sizes = {"macro_dt": 0.4, "num_steps": 40, "solver": EXACT}
+    run = simulate_batch(tsp.system, fully_implicit(10), states, **sizes, warn=False)
+    ended = run.failed_at < 0
+    assert int(ended.sum()) >= 6  # measured 10 and 11
     if kernels.CONTRACTION > 0:  # with exact matrices in every pass nothing is missed
-        assert int(run.info.iterations.max()) > PLAIN_PASSES
-    assert float(jnp.abs(run.energy - run.energy[0]).max()) < 800.0  # measured 613, of 12 000 that are exchanged
-    assert float(run.constraint_residual.max()) < 1e-11
+        assert int(run.info.iterations[ended].max()) > PLAIN_PASSES
+    change = jnp.abs(run.energy - run.energy[:, :1]).max(axis=1)[ended]
+    assert float(change.max()) < 800.0  # measured 601, of 12 000 that are exchanged
+    assert float(run.constraint_residual[ended].max()) < 1e-11
 
 
 def on_two_circles(q_s, q_f, params):

@@ -89,15 +89,11 @@ def simulate_batch(
 
 
 def _errors(lanes: Batch, plain: Trajectory) -> RunError:
-    """The errors of all lanes, from batches of companions.
-
-    Args:
-        plain: the runs, with arrays of NumPy and without an origin.
-    """
+    """The errors of all lanes, from batches of companions; `plain` are the runs, with arrays of NumPy and without an origin."""
 
     @cache
     def companions(parts: int, whole: int = 1) -> Trajectory:
-        return trajectory_of(*lanes.with_steps(finer(lanes.run, lanes.run.scheme, parts, whole))())
+        return trajectory_of(*lanes.with_steps(finer(lanes.run, parts, whole))())
 
     def error(i: int) -> RunError:
         run, coarse, halved = lanes.lane(i), plain.lane(i), companions(2).lane(i)
@@ -105,9 +101,8 @@ def _errors(lanes: Batch, plain: Trajectory) -> RunError:
         if max(coarse.failed_at, halved.failed_at) >= 0:
             total = extrapolated(run.order, coarse, halved)
         else:
-            total = estimated_errors(
-                run, coarse, halved, drives, companion_of=lambda *counts: companions(*counts).lane(i)
-            )
+            of_lane = lambda *counts: companions(*counts).lane(i)  # noqa: E731
+            total = estimated_errors(run, coarse, halved, drives, companion_of=of_lane)
         return run_error(run, coarse, halved, total, drives)
 
     is_driven = driven(lanes.run.system, lanes.run.state)

@@ -34,7 +34,7 @@ from vmri_jax.running.observables import SingularCoordinatesWarning
 from vmri_jax.running.run_error import RunError, largest_of
 from vmri_jax.running.simulation import Simulation
 from vmri_jax.running.trajectory import Trajectory, from_named_arrays
-from vmri_jax.schemes.composition import Composition, stage_scheme
+from vmri_jax.schemes.composition import Composition, stage_lengths, stage_scheme
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.results import Result
 
@@ -73,16 +73,12 @@ def with_error(
     shares: bool = True,
     trial: tuple[Trajectory, np.ndarray] | None = None,
 ) -> Trajectory:
-    """The trajectory with its `RunError`; warns if the error is not certified over the whole run.
+    """The trajectory of a run without a failed step, with its `RunError`; warns if the error is not certified over the whole run.
 
-    Args:
-        trajectory: of the run, without a failed step.
-        of: function of a run, whose error is estimated, too.
-        shares: whether to estimate the slow and the fast share, too. Their companion has twice the micro steps, another program.
-        trial: the companion with half the macro step and the errors (k, n_s + n_f), if they have been computed.
+    A `trial` has the companion with half the macro step and the errors (k, n_s + n_f), if they have been computed. The companion of the shares
+    has twice the micro steps, another program.
     """
-    scheme = run.scheme
-    halved = companion(run, scheme, 2) if trial is None else trial[0]
+    halved = companion(run, 2) if trial is None else trial[0]
     if int(halved.failed_at) >= 0:
         failed = float(halved.t[0]) + int(halved.failed_at) * float(run.macro_dt) / 2
         warnings.warn(
@@ -93,7 +89,10 @@ def with_error(
         return trajectory
     drives = events(run.system, run.state, float(trajectory.t[-1])) if trial is None else Events()
     total = estimated_errors(run, trajectory, halved, drives) if trial is None else trial[1]
-    refined = companion(run, scheme.with_num_micro(2 * stage_scheme(scheme).num_micro), 1) if shares else None
+    refined = None
+    if shares:
+        twice = run.scheme.with_num_micro(2 * stage_scheme(run.scheme).num_micro)
+        refined = companion(replace(run, scheme=of_one_type(twice)), 1)
     error = run_error(run, trajectory, halved, total, drives, refined, of)
     if not error.is_certified:
         unseen = first_unseen(run, drives)
@@ -115,13 +114,9 @@ def run_error(
     refined: Trajectory | None = None,
     of: Callable | None = None,
 ) -> RunError:
-    """The error of a run, NaN where it is not certified; without the shares if there is no companion with twice the micro steps.
+    """The error of a run, NaN where it is not certified, from the estimated errors of the positions, `total` (k, n_s + n_f).
 
-    Args:
-        halved: companion with half the macro step.
-        total: (k, n_s + n_f) estimated errors of the positions.
-        refined: companion with twice the micro steps.
-        of: function of a run, whose error is estimated, too.
+    `halved` is the companion with half the macro step, `refined` the one with twice the micro steps; without it there are no shares.
     """
     order = run.order
     fast = np.full_like(total, np.nan) if refined is None else extrapolated(order, trajectory, refined)
@@ -142,7 +137,7 @@ def ratio(order: int, parts: float = 2) -> float:
 
 def extrapolated(order: int, trajectory: Trajectory, finer: Trajectory) -> np.ndarray:
     """(k, n_s + n_f) ``r (x - x')``: the part of the error of the positions x that vanishes with the steps halved in the companion x'."""
-    return ratio(order) * (_positions(trajectory) - _positions(finer))
+    return ratio(order) * (positions(trajectory) - positions(finer))
 
 
 def estimated_errors(
@@ -156,11 +151,10 @@ def estimated_errors(
     """(k, n_s + n_f) errors of the positions, from the companion with half the macro step, and from further ones if the system is driven or its
     errors are not believed: below `DOUBTED` of the accuracy. They are infinite if a further companion fails.
 
-    Args:
-        companion_of: ``companion_of(parts, whole)``, as of `companion`, for a lane of a batch; None for `companion` itself.
+    ``companion_of(parts, whole)`` makes the companions of a lane of a batch.
     """
     order = 1 if drives.jump else run.order
-    result = ratio(order) * (_positions(trajectory) - _positions(halved))
+    result = extrapolated(order, trajectory, halved)
     if not drives.names and np.abs(result).max(initial=0.0) > DOUBTED * accuracy:
         return result
     # `whole` macro steps of the run are `parts` steps of the companion, from one compared node to the next, `stride` saved nodes later.
@@ -169,10 +163,10 @@ def estimated_errors(
     whole = stride * run.save_every
     for factor in FURTHER_PARTS if drives.jump else FURTHER_PARTS[:1]:
         parts = next(k for k in range(max(round(factor * whole), 3), 10 * whole + 4) if math.gcd(k, whole) == 1)
-        further = companion_of(parts, whole) if companion_of else companion(run, run.scheme, parts, whole)
+        further = companion_of(parts, whole) if companion_of else companion(run, parts, whole)
         if int(further.failed_at) >= 0:
             return np.full_like(result, np.inf)
-        difference = ratio(order, parts / whole) * (_positions(trajectory)[::stride] - _positions(further))
+        difference = ratio(order, parts / whole) * (positions(trajectory)[::stride] - positions(further))
         errors = np.concatenate([difference[:1], np.repeat(difference[1:], stride, axis=0)])
         result = np.where(np.abs(errors) > np.abs(result), errors, result)
     return result
@@ -181,7 +175,7 @@ def estimated_errors(
 def node_distance(scheme: Scheme | Composition, drives: Events) -> float:
     """Largest distance in time of the nodes at which a scheme sees the terms that depend on time, in units of the macro step."""
     stage = stage_scheme(scheme)
-    longest = float(np.abs(scheme.coefficients).max()) if isinstance(scheme, Composition) else 1.0
+    longest = float(np.abs(stage_lengths(scheme)).max())
     return longest * max(getattr(stage, name).largest_gap(stage.num_micro) for name in drives.names)
 
 
@@ -227,7 +221,7 @@ def certified_nodes(trajectory: Trajectory, error: np.ndarray) -> tuple[np.ndarr
 
 def extent_of(trajectory: Trajectory) -> float:
     """Largest difference between the largest and the smallest value of a coordinate in a run."""
-    return float(np.ptp(_positions(trajectory), axis=0).max(initial=0.0))
+    return float(np.ptp(positions(trajectory), axis=0).max(initial=0.0))
 
 
 def check_function_of_run(of: Callable | None, error: bool, run: Simulation) -> None:
@@ -258,19 +252,18 @@ def resting(run: Simulation) -> Trajectory:
     return replace(from_named_arrays(arrays), origin=run.origin)
 
 
-def companion(run: Simulation, scheme: Scheme | Composition, parts: int, whole: int = 1) -> Trajectory:
-    """The run with another scheme and every `whole` macro steps divided into equal parts; it may fail.
+def companion(run: Simulation, parts: int, whole: int = 1) -> Trajectory:
+    """The run with every `whole` macro steps divided into equal parts; it may fail.
 
     Its saved nodes are the saved nodes of the run, or those that are multiples of `whole` steps, a multiple of `save_every`.
     """
-    return finer(run, scheme, parts, whole).in_pieces()
+    return finer(run, parts, whole).in_pieces()
 
 
-def finer(run: Simulation, scheme: Scheme | Composition, parts: int, whole: int = 1) -> Simulation:
+def finer(run: Simulation, parts: int, whole: int = 1) -> Simulation:
     """The run that makes a `companion`."""
     return replace(
         run,
-        scheme=scheme if scheme is run.scheme else of_one_type(scheme),
         macro_dt=run.macro_dt / (parts / whole),
         num_steps=run.num_steps // whole * parts,
         save_every=max(run.save_every // whole, 1) * parts,
@@ -278,7 +271,7 @@ def finer(run: Simulation, scheme: Scheme | Composition, parts: int, whole: int 
     )
 
 
-def _positions(trajectory: Trajectory) -> np.ndarray:
+def positions(trajectory: Trajectory) -> np.ndarray:
     """(k, n_s + n_f) positions, slow first."""
     return np.concatenate([trajectory.states.q_s, trajectory.states.q_f], axis=1)
 
@@ -291,8 +284,8 @@ def _is_chaotic(error: RunError, trajectory: Trajectory, run: Simulation, halved
     """
     if not (float(error.growth) > CHAOTIC_GROWTH and trajectory.keeps_energy) or trajectory.concerns():
         return False
-    quartered = companion(run, run.scheme, 4)
-    envelope = np.maximum.accumulate(largest_of(_positions(halved) - _positions(quartered)))
+    quartered = companion(run, 4)
+    envelope = np.maximum.accumulate(largest_of(positions(halved) - positions(quartered)))
     t = np.asarray(trajectory.t)
     half, last = np.searchsorted(t, [(t[0] + error.certified_until) / 2, error.certified_until])
     return bool(envelope[last] > CHAOTIC_GROWTH * envelope[half])  # False for NaN, where a companion failed

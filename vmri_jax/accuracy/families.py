@@ -6,7 +6,7 @@ from functools import partial
 
 import numpy as np
 
-from vmri_jax.schemes.composition import Composition, compose
+from vmri_jax.schemes.composition import Composition, compose, stage_lengths
 from vmri_jax.schemes.scheme import Scheme, explicit_slow, fully_explicit, fully_implicit, galerkin, takahashi_imada
 
 
@@ -43,7 +43,7 @@ class Family:
     def coarsest(self, num_micro: int, frequency: float, t_end: float) -> int:
         """Fewest macro steps up to `t_end` worth a trial: their micro steps h just resolve the fastest vibration, ``omega h`` = degree."""
         scheme = self.make(num_micro)
-        longest = float(np.abs(scheme.coefficients).max()) if isinstance(scheme, Composition) else 1.0
+        longest = float(np.abs(stage_lengths(scheme)).max())
         return max(1, int(frequency * t_end * longest / (num_micro * scheme.degree)))
 
 

@@ -93,10 +93,9 @@ def simulate(
         Interrupted: Ctrl-C while `progress` is shown; it carries the trajectory computed so far.
     """
     check_flags(throw=throw, error=error)
+    steps = Steps(macro_dt, micro_dt, num_steps, t_end, save_every, save_micro)
     if accuracy is not None:
-        steps = {"macro_dt": macro_dt, "micro_dt": micro_dt, "num_steps": num_steps}
-        end = _end(steps, t_end, save_every, save_micro, adjoint, num_saves)
-        length = {"t_end": end, "num_saves": num_saves}
+        length = {"t_end": _end(steps, adjoint, num_saves), "num_saves": num_saves}
         with progress_to("simulate", progress) as tell:
             best, settings = with_accuracy(system, scheme, state, solver, accuracy, **length, of=of, progress=tell)
         run, trajectory = best.run, replace(best.trajectory, origin=replace(best.run.origin, settings=settings))
@@ -116,7 +115,7 @@ def simulate(
             f"simulate: num_saves is {num_saves} without an accuracy; give an accuracy, or save_every with a step."
         )
     check_adjoint(adjoint)
-    run = simulation(system, scheme, state, solver, Steps(macro_dt, micro_dt, num_steps, t_end, save_every, save_micro))
+    run = simulation(system, scheme, state, solver, steps)
     if not run.is_concrete:
         if error:
             raise ValueError(
@@ -133,19 +132,18 @@ def simulate(
     return with_error(run, trajectory, of) if error and int(trajectory.failed_at) < 0 else trajectory
 
 
-def _end(
-    steps: dict[str, Any], t_end: float | None, save_every: int, save_micro: bool, adjoint: str, num_saves
-) -> float:
+def _end(steps: Steps, adjoint: str, num_saves: int | None) -> float:
     """`t_end` of a run with an accuracy; refuses arguments of step size and saving, which the accuracy determines."""
-    refused = [name for name, value in steps.items() if value is not None]
-    refused += ["save_every"] * (save_every != 1) + ["save_micro"] * save_micro + ["adjoint"] * (adjoint != "auto")
+    refused = [name for name in ("macro_dt", "micro_dt", "num_steps") if getattr(steps, name) is not None]
+    others = {"save_every": steps.save_every != 1, "save_micro": steps.save_micro, "adjoint": adjoint != "auto"}
+    refused += [name for name, is_set in others.items() if is_set]
     if refused:
         raise ValueError(
             f"simulate: got {' and '.join(refused)} with an accuracy, which chooses steps and saved nodes; leave them out, or the "
             "accuracy."
         )
-    if t_end is None:
+    if steps.t_end is None:
         raise ValueError("simulate: an accuracy needs t_end, the time until which it is to be kept.")
     if num_saves is not None:
         whole_number("simulate: num_saves", num_saves)
-    return t_end
+    return steps.t_end

@@ -18,11 +18,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from vmri_jax.accuracy.companions import check_function_of_run, extent_of
+from vmri_jax.accuracy.companions import check_function_of_run, extent_of, fewest_steps
 from vmri_jax.accuracy.families import Family, of_degree, of_order_2
 from vmri_jax.accuracy.trials import AIMED_PART, MOST_SAVED, MOST_STEPS, Search, Trial, unit_of
 from vmri_jax.mechanics.arrays import is_concrete
-from vmri_jax.mechanics.checks import check_number
+from vmri_jax.mechanics.checks import check_number, check_type
 from vmri_jax.mechanics.driving import events
 from vmri_jax.mechanics.invariants import velocity
 from vmri_jax.mechanics.masses import ConstantMass
@@ -87,17 +87,17 @@ def with_accuracy(
         TypeError: scheme is not a scheme.
         ValueError: an accuracy below round-off, or above the extent of the motion; arguments that `vmri_jax.simulate` refuses.
     """
-    if not isinstance(scheme, Scheme | Composition | None):
-        raise TypeError(
-            f"simulate: scheme is {type(scheme).__name__}; give a Scheme, e.g. fully_implicit(num_micro=10), or None."
-        )
+    a_scheme = "a Scheme, e.g. fully_implicit(num_micro=10), or None"
+    check_type("simulate: scheme", scheme, Scheme | Composition | None, a_scheme)
     opened_system, start = start_of("simulate", system, state)
     if not is_concrete((vars(start), opened_system.params, t_end)):
         raise ValueError(
             "simulate: an accuracy compares runs with numbers; call simulate outside of jax.jit, vmap and grad."
         )
     length = float(t_end - start.t)
-    _check(accuracy, length, start)
+    check_error("simulate: accuracy", accuracy, start)
+    if not length > 0:
+        raise ValueError(f"simulate: t_end is {length:g} after the start; it must be later.")
 
     def make(scheme: Scheme | Composition) -> Simulation:
         run = simulation(system, scheme, state, solver, Steps(length, num_steps=1))
@@ -123,7 +123,7 @@ def with_accuracy(
     if can_choose and np.isfinite(best.error) and best.error > 0:
         best = search.with_best_num_micro(best, accuracy)
     best = _accurate(search, best, accuracy)
-    fewest = search.fewest_steps(best.run.scheme)
+    fewest = fewest_steps(best.run.scheme, drives, length)
     if fewest > MANY_STEPS:
         warnings.warn(
             f"simulate: {' and '.join(drives.names)} of the system changes and changes back within {drives.shortest:.2g}, so that the run takes "
@@ -131,9 +131,8 @@ def with_accuracy(
             stacklevel=3,
         )
     if not best.error <= accuracy:
-        reached = (
-            f"its error is {best.error:.1e}" if np.isfinite(best.error) else "no error is certified over its length"
-        )
+        uncertified = "no error is certified over its length"
+        reached = f"its error is {best.error:.1e}" if np.isfinite(best.error) else uncertified
         warnings.warn(
             f"simulate: accuracy {accuracy:g} is not reached with {best.run.num_steps} macro steps, {reached}; give a shorter t_end, a "
             "larger accuracy, or another scheme.",
@@ -142,9 +141,9 @@ def with_accuracy(
         )
     numbers = float(best.run.macro_dt), best.run.num_steps, best.run.save_every
     python = best.family.python.format(best.num_micro)
-    gain, prices = 1.0, search.prices
-    if prices is not None and best.num_micro > 1:
-        gain = prices.relative_time(1) / prices.relative_time(best.num_micro)
+    gain, time = 1.0, search.relative_time
+    if time is not None and best.num_micro > 1:
+        gain = time(1) / time(best.num_micro)
     return best, Settings(best.run.scheme, python, best.family.options, *numbers, gain)
 
 
@@ -156,7 +155,7 @@ def _accurate(search: Search, best: Trial, accuracy: float) -> Trial:
             break
         wanted = min(best.steps_for(AIMED_PART * accuracy, order), MOST_GROWTH * best.run.num_steps)
         num_steps = _beside_resonances(search, best, max(wanted, fewest))
-        if num_steps > max(MOST_STEPS, search.fewest_steps(best.run.scheme)):
+        if num_steps > max(MOST_STEPS, fewest_steps(best.run.scheme, search.drives, search.length)):
             break
         before, best = best, search.trial(best.family, best.num_micro, num_steps, best.run.may_fall_back, accuracy)
         if best.error <= accuracy:
@@ -166,13 +165,6 @@ def _accurate(search: Search, best: Trial, accuracy: float) -> Trial:
         falls, grows = np.log(before.error / best.error), np.log(best.run.num_steps / before.run.num_steps)
         order = float(np.clip(falls / grows, 1.0, best.run.order)) if grows > 0 else 1.0
     return best
-
-
-def _check(accuracy: float, length: float, start: State) -> None:
-    """Refuse accuracies below round-off, and an end before the start."""
-    check_error("simulate: accuracy", accuracy, start)
-    if not length > 0:
-        raise ValueError(f"simulate: t_end is {length:g} after the start; it must be later.")
 
 
 def check_error(name: str, error: float, start: State | Problem) -> None:

@@ -3,9 +3,8 @@
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 
@@ -60,15 +59,10 @@ searches with large accuracies slower."""
 
 @dataclass(frozen=True)
 class Trial:
-    """A run of a scheme and its error.
+    """A run of a scheme, its companion with half the macro step, and its errors.
 
-    Attributes:
-        family, num_micro: the scheme.
-        run: the simulation.
-        trajectory: its trajectory.
-        halved: trajectory of its companion with half the macro step.
-        errors: (k, n_s + n_f) errors of the positions.
-        error: the largest error; infinite unless all errors are certified.
+    errors: (k, n_s + n_f) errors of the positions.
+    error: the largest error; infinite unless all errors are certified.
     """
 
     family: Family
@@ -93,49 +87,23 @@ class Trial:
         return self.steps_for(error) * self.seconds if np.isfinite(self.error) else np.inf
 
 
-class Prices(NamedTuple):
-    """Measured prices and errors of a scheme of order p, by which numbers of micro steps N are compared.
-
-    macro_seconds, micro_seconds: a and b in the time ``a + b N`` of a macro step.
-    slow, fast: the shares S and F of the error ``S + F / N^p`` of the trial's macro step.
-    order: p.
-    """
-
-    macro_seconds: float
-    micro_seconds: float
-    slow: float
-    fast: float
-    order: int
-
-    def relative_time(self, num_micro: int) -> float:
-        """Time of a run with a given error, ``(a + b N) (S + F / N^p)^(1 / p)``, up to a factor that does not depend on N."""
-        error = self.slow + self.fast / num_micro**self.order
-        return (self.macro_seconds + num_micro * self.micro_seconds) * error ** (1 / self.order)
-
-
+@dataclass
 class Search:
-    """Trial runs of several schemes from the same start over the same time.
+    """Trial runs of several schemes from the same start over the same time, the `length`.
 
-    Args:
-        make: function of a scheme that returns a `Simulation` of a single macro step.
-        length: simulated time, in the unit of time of the system.
-        num_saves: saved intervals; None for at most `MOST_SAVED`.
-        progress: called before every trial run.
-        drives: events of the system in this time; all runs have steps that see them.
+    make: function of a scheme that returns a `Simulation` of a single macro step.
+    num_saves: saved intervals; None for at most `MOST_SAVED`.
+    drives: events of the system in this time; all runs have steps that see them.
     """
 
-    def __init__(
-        self,
-        make: Callable[[Scheme | Composition], Simulation],
-        length: float,
-        num_saves: int | None,
-        progress: Progress = silent,
-        drives: Events = Events(),  # noqa: B008 (immutable)
-    ):
-        self.make, self.length, self.num_saves, self.progress, self.drives = make, length, num_saves, progress, drives
-        self.runs: dict[tuple[str, int], Simulation] = {}
-        self.num_trials = 0
-        self.prices: Prices | None = None
+    make: Callable[[Scheme | Composition], Simulation]
+    length: float
+    num_saves: int | None
+    progress: Progress = silent
+    drives: Events = Events()  # noqa: RUF009 (immutable)
+    runs: dict[tuple[str, int], Simulation] = field(default_factory=dict)
+    num_trials: int = 0
+    relative_time: Callable[[int], float] | None = None
 
     def rounded(self, num_steps: int) -> tuple[int, int]:
         """(num_steps, save_every): the number of macro steps, rounded up to a multiple of the saved intervals."""
@@ -151,13 +119,10 @@ class Search:
         key = family.python, num_micro
         if key not in self.runs:
             self.runs[key] = self.make(family.make(num_micro))
-        num_steps, save_every = self.rounded(max(num_steps, self.fewest_steps(self.runs[key].scheme)))
+        fewest = fewest_steps(self.runs[key].scheme, self.drives, self.length)
+        num_steps, save_every = self.rounded(max(num_steps, fewest))
         dt = np.asarray(self.length / num_steps)
         return replace(self.runs[key], macro_dt=dt, num_steps=num_steps, save_every=save_every)
-
-    def fewest_steps(self, scheme: Scheme | Composition) -> int:
-        """Fewest macro steps that see all events."""
-        return fewest_steps(scheme, self.drives, self.length)
 
     def first_trials(self, menu: Sequence[tuple[Family, int]]) -> list[Trial]:
         """A trial of each scheme.
@@ -184,7 +149,7 @@ class Search:
             self.progress(f"trial of {family.label(num_micro)}, {run.num_steps} macro steps", self.num_trials, total)
             self.num_trials += 1
             before = time.perf_counter()
-            trajectory, halved = run.in_pieces(), companion(run, run.scheme, 2)
+            trajectory, halved = run.in_pieces(), companion(run, 2)
             seconds = time.perf_counter() - before
             done = max(int(trajectory.failed_at), int(halved.failed_at)) < 0
             if done and accuracy is not None:
@@ -215,9 +180,15 @@ class Search:
         micro_seconds = max(finer_seconds - seconds, least) / num_micro
         macro_seconds = max(seconds - num_micro * micro_seconds, least)
         slow = max(slow, LEAST_SHARE * fast)
-        self.prices = Prices(macro_seconds, micro_seconds, slow, num_micro**p * fast, p)
+        fast = num_micro**p * fast
+
+        def relative_time(num_micro: int) -> float:
+            """Time of a run with a given error, ``(a + b N) (S + F / N^p)^(1 / p)``, up to a factor that does not depend on N."""
+            return (macro_seconds + num_micro * micro_seconds) * (slow + fast / num_micro**p) ** (1 / p)
+
+        self.relative_time = relative_time
         # N^(p + 1) = (a / b) (F / S), rounded to a multiple of the unit of the rules
-        best = (macro_seconds / micro_seconds * self.prices.fast / slow) ** (1 / (p + 1))
+        best = (macro_seconds / micro_seconds * fast / slow) ** (1 / (p + 1))
         unit = unit_of(trial.run.system, stage_scheme(trial.run.scheme))
         best = unit * int(np.clip(round(best / unit), 1, max(1, MOST_MICRO // unit)))
         if max(best, num_micro) <= SAME_COST * min(best, num_micro):
@@ -237,6 +208,5 @@ def _seconds_of_steps(*runs: Simulation) -> np.ndarray:
     doubles = [replace(run, num_steps=2 * run.num_steps, save_every=2 * run.save_every) for run in runs]
     seconds = least_seconds([run.in_pieces for run in (*runs, *doubles)], SAMPLES)
     single, double = np.reshape(seconds, (2, len(runs)))
-    return np.maximum(double - single, 0.1 * double) / [
-        run.num_steps for run in runs
-    ]  # noise may make the difference negative
+    num_steps = [run.num_steps for run in runs]
+    return np.maximum(double - single, 0.1 * double) / num_steps  # noise may make the difference negative

@@ -8,8 +8,9 @@ import numpy as np
 from vmri_jax.mechanics.names import near
 
 
-def check_keys(data: Any, known: Sequence[str], needed: Sequence[str], where: str) -> None:
+def check_keys(data: Any, needed: Sequence[str], optional: Sequence[str], where: str) -> None:
     """Refuse data that is no dict, unknown entries, and missing entries."""
+    known = (*needed, *optional)
     if not isinstance(data, dict):
         raise ValueError(f"{where} is {type(data).__name__}; it must be a dict with {', '.join(known)}.")
     for key in data:

@@ -3,13 +3,12 @@
 from collections.abc import Sequence
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from vmri_jax import plots
 from vmri_jax.animation.motion import Motion
-from vmri_jax.animation.signals import Signal, fast_signal, slow_signal, window
+from vmri_jax.animation.signals import fast_signal, slow_signal, window
 
 HEIGHT = 1.65
 """Height of the panels with their labels, in inches."""
@@ -33,34 +32,26 @@ class Curves:
 
     def draw(self, figure: Figure, moments: Sequence[float] | np.ndarray) -> None:
         """Draw the curves at the lower end of a figure in the style of the theme; dots mark the moments of the pictures."""
-        span = float(self.motion.t[0]), float(self.motion.t[-1])
+        motion, theme, (width, height) = self.motion, self.theme, figure.get_size_inches()
+        span = float(motion.t[0]), float(motion.t[-1])
         panels = [] if self.slow is None else [(self.slow, span, "t")]
         if self.fast is not None:
-            panels.append((self.fast, window(self.motion, self.fast), "t, the shaded time"))
+            panels.append((self.fast, window(motion, self.fast), "t, the shaded time"))
+        panel_width = width / len(panels) if panels else width
+        size = (panel_width - LEFT - RIGHT) / width, (HEIGHT - BELOW - ABOVE) / height
         for k, (signal, part, time) in enumerate(panels):
-            axes = self._panel(figure, k, len(panels))
-            self._curve(axes, signal, part)
+            axes = figure.add_axes(((k * panel_width + LEFT) / width, BELOW / height, *size))
+            nodes = motion.between(*part)
+            times = np.linspace(*part, FEWEST_POINTS) if len(nodes.t) < FEWEST_POINTS else nodes.t
+            color = theme.curves[0 if signal.pace == "slow" else 1]
+            axes.plot(times, signal.of(motion.at(times)), color=color, linewidth=1.1)
+            axes.margins(x=0)
+            axes.tick_params(labelsize=8)
+            axes.yaxis.set_major_locator(MaxNLocator(4))
             axes.set_title(signal.label, fontsize=9)
             axes.set_xlabel(time, labelpad=1)
             if signal is self.slow:
                 marks = np.asarray(moments)
-                axes.plot(
-                    marks, signal.of(self.motion.at(marks)), "o", color=self.theme.ink, markersize=4, clip_on=False
-                )
+                axes.plot(marks, signal.of(motion.at(marks)), "o", color=theme.ink, markersize=4, clip_on=False)
                 if self.fast is not None:
-                    axes.axvspan(*window(self.motion, self.fast), color=self.theme.curves[1], alpha=0.35, zorder=0)
-
-    def _panel(self, figure: Figure, k: int, count: int) -> Axes:
-        width, height = figure.get_size_inches()
-        left = k * width / count + LEFT
-        wide, high = width / count - LEFT - RIGHT, HEIGHT - BELOW - ABOVE
-        return figure.add_axes((left / width, BELOW / height, wide / width, high / height))
-
-    def _curve(self, axes: Axes, signal: Signal, part: tuple[float, float]) -> None:
-        nodes = self.motion.between(*part)
-        times = np.linspace(*part, FEWEST_POINTS) if len(nodes.t) < FEWEST_POINTS else nodes.t
-        color = self.theme.curves[0 if signal.pace == "slow" else 1]
-        axes.plot(times, signal.of(self.motion.at(times)), color=color, linewidth=1.1)
-        axes.margins(x=0)
-        axes.tick_params(labelsize=8)
-        axes.yaxis.set_major_locator(MaxNLocator(4))
+                    axes.axvspan(*window(motion, self.fast), color=theme.curves[1], alpha=0.35, zorder=0)

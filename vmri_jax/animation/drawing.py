@@ -81,7 +81,7 @@ class Drawing:
                 data = json.loads(data)
             except json.JSONDecodeError as error:
                 raise ValueError(f"drawing: not valid JSON ({error}).") from error
-        check_keys(data, KEYS, (), "drawing")
+        check_keys(data, (), KEYS, "drawing")
 
         def all_of(key: str, read: Callable) -> tuple:
             return tuple(read(entry, f"drawing: {key}[{i}]") for i, entry in enumerate(entries(data, key, "drawing")))

@@ -29,13 +29,9 @@ def helix(turns: int, per_turn: int = 16) -> np.ndarray:
 
 
 def grid(center, sides, halves: tuple[float, float], step: float, fades: bool) -> np.ndarray:
-    """Pieces of the lines of a grid on a rectangle: one row (from, to, strength) of seven numbers each.
+    """Pieces of lines at a distance `step` on a rectangle with half lengths and unit vectors (2, 3) of its sides.
 
-    Args:
-        center, sides: (3,) and (2, 3), middle and unit vectors along the sides.
-        halves: half lengths of the sides.
-        step: distance of two lines.
-        fades: whether strengths fall from 1 in the middle to 0 outwards; else all are 1.
+    Each is a row (from, to, strength) of seven numbers; strengths are 1, or fall to 0 outwards if the grid `fades`.
     """
     rows = []
     for across in (0, 1):
@@ -53,12 +49,7 @@ def grid(center, sides, halves: tuple[float, float], step: float, fades: bool) -
 
 
 def joint(a, b, reach: tuple[float, float]):
-    """Start and end of a joint between two balls; None if the balls touch or an end lies within the other ball.
-
-    Args:
-        a, b: (3,) centres.
-        reach: their radii.
-    """
+    """Start and end of a joint between two balls with radii `reach`; None if an end lies within the other ball."""
     gap = b - a
     length = float(np.linalg.norm(gap))
     if length <= max(JOINT_END * sum(reach), *reach):
@@ -67,12 +58,7 @@ def joint(a, b, reach: tuple[float, float]):
 
 
 def spring(start, end, coil: float, turns: int) -> tuple[np.ndarray, np.ndarray]:
-    """Points (n, 3) of a helix with straight ends, and the unit vectors from the axis to the points of its turns.
-
-    Args:
-        start, end: (3,).
-        coil: radius of the helix.
-    """
+    """Points (n, 3) of a helix of radius `coil` with straight ends, and unit vectors from the axis to its turns."""
     along = (end - start) / np.linalg.norm(end - start)
     sideways = np.cross(along, [0.36, 0.48, 0.8])  # a direction in which few springs lie
     sideways /= np.linalg.norm(sideways)

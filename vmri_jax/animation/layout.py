@@ -8,7 +8,6 @@ import numpy as np
 from vmri_jax.animation.drawing import Drawing
 from vmri_jax.animation.geometry import grid
 from vmri_jax.animation.motion import Motion
-from vmri_jax.animation.parts import Body
 
 TURNS_RANGE = (4, 14)
 """Smallest and largest number of turns of a spring."""
@@ -23,15 +22,9 @@ LEVEL_COSINE = 0.9
 
 @dataclass(frozen=True)
 class Ground:
-    """A rectangle of a plane.
+    """A rectangle of a plane, with unit vectors (2, 3) along its sides, its corners (4, 3), and a `grid` (n, 7).
 
-    Attributes:
-        center: (3,).
-        normal: (3,) unit vector.
-        sides: (2, 3) unit vectors along its sides.
-        corners: (4, 3).
-        grid: (n, 7) pieces of lines, as of `vmri_jax.animation.geometry.grid`.
-        solid: True for a plane of the drawing, False for a floor below the scene that only shows depth.
+    It is solid if it is a plane of the drawing, not a floor below the scene that only shows depth.
     """
 
     center: np.ndarray
@@ -49,15 +42,7 @@ class Ground:
 
 @dataclass(frozen=True)
 class Connection:
-    """A link or spring from a body to another body, or to a fixed point.
-
-    Attributes:
-        kind: "link" or "spring".
-        body, other: numbers of the bodies; None if the connection ends at a point.
-        point: (3,) the fixed point, or None.
-        pace: "slow" or "fast".
-        turns: number of turns of a spring.
-    """
+    """A link or spring from a body, by its number, to another body or, if `other` is None, to a fixed point (3,)."""
 
     kind: str
     body: int
@@ -69,17 +54,12 @@ class Connection:
 
 @dataclass(frozen=True)
 class Layout:
-    """Sizes in the unit of the coordinates, and positions in coordinates of the picture.
+    """Sizes in the unit of the coordinates, positions in coordinates of the picture, and the first view.
 
-    Attributes:
-        size: diagonal of the box around bodies, solids, spheres and fixed points along the whole motion.
-        radii: radii of the bodies.
-        rod, coil, wire: radius of links, of springs, and of the wire of springs.
-        connections: links, springs and anchors.
-        spheres, sphere_radii: (n, 3) centres and (n,) radii of fixed spheres.
-        grounds: planes of the drawing, and a floor if none of them is level.
-        hull: (n, 3) points that the view has to contain.
-        azimuth, elevation: of the first view.
+    size: diagonal of the box around bodies, solids, spheres and fixed points along the whole motion.
+    rod, coil, wire: radius of links, of springs, and of the wire of springs.
+    grounds: planes of the drawing, and a floor if none of them is level.
+    hull: (n, 3) points that the view has to contain.
     """
 
     size: float
@@ -109,8 +89,8 @@ def layout(motion: Motion) -> Layout:
     size = float(np.linalg.norm(np.ptp(box, axis=0))) or 1.0
     lengths = [_median_length(connection, points) or size for connection in connections]
     small = min(0.02 * size, 0.3 * min(lengths, default=size))
-    radii = np.array([_radius(body, small) for body in drawing.bodies])
-    shown = [float(r) for r, body in zip(radii, drawing.bodies, strict=True) if body.shown == "ball"]
+    balls = [body.shown == "ball" for body in drawing.bodies]
+    radii = np.where(balls, [body.radius or small for body in drawing.bodies], HIDDEN_RADIUS * small)
     sprung = [length for c, length in zip(connections, lengths, strict=True) if c.kind == "spring"]
     coil = min(0.015 * size, 0.16 * min(sprung, default=size))
     turns = np.clip(np.rint(np.array(lengths) / (1.1 * coil)), *TURNS_RANGE).astype(int).tolist()
@@ -120,7 +100,7 @@ def layout(motion: Motion) -> Layout:
     return Layout(
         size,
         radii,
-        rod=min(0.0048 * size, 0.4 * min(shown, default=small)),
+        rod=min(0.0048 * size, 0.4 * min(radii[balls].tolist(), default=small)),
         coil=coil,
         wire=0.11 * coil,
         connections=[replace(c, turns=count) for c, count in zip(connections, turns, strict=True)],
@@ -131,12 +111,6 @@ def layout(motion: Motion) -> Layout:
         azimuth=math.radians(azimuth),
         elevation=math.radians(elevation),
     )
-
-
-def _radius(body: Body, small: float) -> float:
-    if body.shown != "ball":
-        return HIDDEN_RADIUS * small
-    return small if body.radius is None else body.radius
 
 
 def _connections(drawing: Drawing) -> list[Connection]:

@@ -12,15 +12,10 @@ from vmri_jax.animation.parts import KINDS, PACES, Block, Body, Joint, Solid
 from vmri_jax.mechanics.kinematics import Kinematics
 from vmri_jax.mechanics.names import near
 
-BLOCK_KEYS = ("name", "coordinates", "labels")
-BODY_KEYS = ("name", "coordinates", "offset", "radius", "color", "shown")
-SOLID_KEYS = ("name", "coordinates", "corners", "faces", "color")
-FORMS_OF_CENTRES = ("ball", "name", "")
-
 
 def read_body(data: Any, where: str) -> Body:
     """The point body of a dict; `where` names the dict in messages, here and below."""
-    check_keys(data, BODY_KEYS, ("name", "coordinates"), where)
+    check_keys(data, ("name", "coordinates"), ("offset", "radius", "color", "shown"), where)
     coordinates = data["coordinates"]
     if not isinstance(coordinates, list | tuple) or not 1 <= len(coordinates) <= 3:
         raise ValueError(f"{where}: coordinates is {coordinates!r}; it must be a list of 1 to 3 entries.")
@@ -31,14 +26,14 @@ def read_body(data: Any, where: str) -> Body:
     forms = tuple(_form(entry, where) for entry in coordinates)
     offset = numbers(data.get("offset") or [0.0] * len(forms), f"{where}: offset")
     shown = data.get("shown", "ball")
-    if shown not in FORMS_OF_CENTRES:
+    if shown not in ("ball", "name", ""):
         raise ValueError(f"{where}: shown is {shown!r}; it must be 'ball', 'name' or ''.")
     return Body(str(data["name"]), forms, offset, radius, color, shown)
 
 
 def read_solid(data: Any, where: str) -> tuple[Solid, list[Body]]:
     """The solid, and the four points that it moves with: its centre, and one along each director."""
-    check_keys(data, SOLID_KEYS, SOLID_KEYS[:4], where)
+    check_keys(data, ("name", "coordinates", "corners", "faces"), ("color",), where)
     name = str(data["name"])
     forms = [_form(coordinate, where) for coordinate in entries(data, "coordinates", where)]
     corners = np.array([numbers(corner, f"{where}: corners") for corner in entries(data, "corners", where)])
@@ -69,7 +64,7 @@ def read_solid(data: Any, where: str) -> tuple[Solid, list[Body]]:
 
 def read_block(data: Any, where: str) -> Block:
     """The block of coordinates, without a place in the picture, of a dict."""
-    check_keys(data, BLOCK_KEYS, BLOCK_KEYS[:2], where)
+    check_keys(data, ("name", "coordinates"), ("labels",), where)
     forms = [_form(entry, where) for entry in entries(data, "coordinates", where)]
     if not forms or any(len(form) != 1 or form[0][0] != 1.0 for form in forms):
         raise ValueError(f"{where}: coordinates is {data['coordinates']!r}; it must be a list of ['s' or 'f', index].")
@@ -107,7 +102,7 @@ def read_joint(kind: str, names: Sequence[str], entry: Any, where: str) -> Joint
 
 def read_anchor(names: Sequence[str], data: Any, where: str) -> Joint:
     """The line from a body to a fixed point of a dict; `names` of all bodies."""
-    check_keys(data, ("body", "point", "kind", "pace"), ("body", "point", "kind"), where)
+    check_keys(data, ("body", "point", "kind"), ("pace",), where)
     if data["kind"] not in KINDS:
         raise ValueError(f"{where}: kind is {data['kind']!r}; it must be {' or '.join(KINDS)}.")
     point = numbers(data["point"], f"{where}: point")
@@ -117,7 +112,7 @@ def read_anchor(names: Sequence[str], data: Any, where: str) -> Joint:
 
 def read_record(kind: type, readers: dict[str, Callable], data: Any, where: str) -> Any:
     """A `kind` from a dict with one entry for each reader, which checks and converts it."""
-    check_keys(data, list(readers), list(readers), where)
+    check_keys(data, list(readers), (), where)
     return kind(**{key: read(data[key], f"{where}: {key}") for key, read in readers.items()})
 
 
@@ -140,5 +135,5 @@ def read_carried(data: Any) -> tuple[Kinematics, dict[str, np.ndarray]] | None:
     """The map from joint coordinates to coordinates of the bodies, and the arrays of its joints."""
     if data is None:
         return None
-    check_keys(data, ("map", "joints"), ("map", "joints"), "drawing: kinematics")
+    check_keys(data, ("map", "joints"), (), "drawing: kinematics")
     return Kinematics.from_dict(data["map"]), {name: np.asarray(values) for name, values in data["joints"].items()}

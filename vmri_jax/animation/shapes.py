@@ -56,12 +56,10 @@ class Stage:
         *,
         names: bool = False,
     ) -> None:
-        """Draw one moment.
+        """Draw one moment in a figure in the style of the theme.
 
         Args:
-            figure: in the style of the theme.
             place: left, bottom, width and height of the panel, in parts of the figure.
-            time: the moment.
             trail: duration of the trail behind each body.
             names: whether to write names beside bodies where there is room.
         """
@@ -73,14 +71,17 @@ class Stage:
         points = self.motion.at([time])[0]
         self._draw_around(pen, points)
         past = self.motion.at(self._trail_times(max(float(self.motion.t[0]), time - trail), time))
-        bodies = self.motion.drawing.bodies
+        drawing, colors = self.motion.drawing, self._colors
+        bodies, index = drawing.bodies, {body.name: i for i, body in enumerate(drawing.bodies)}
         balls = [i for i, body in enumerate(bodies) if body.shown == "ball"]
         for i in balls:
-            pen.trail(past[:, i], self._colors[i], self.sizes.radii[i])
+            pen.trail(past[:, i], colors[i], self.sizes.radii[i])
         self._draw_joints(pen, points)
         for i in balls:
-            pen.ball(points[i], self.sizes.radii[i], self._colors[i])
-        self._draw_solids(pen, points)
+            pen.ball(points[i], self.sizes.radii[i], colors[i])
+        for solid, corners in zip(drawing.solids, drawing.corners(points), strict=True):
+            for face in solid.faces:
+                pen.face(corners[list(face)], solid.color or colors[index[solid.points[0]]])
         if names:
             named = [i for i, body in enumerate(bodies) if body.shown]
             pen.names(points[named], self.sizes.radii[named], [bodies[i].name for i in named])
@@ -121,13 +122,6 @@ class Stage:
                     pen.shadow(ground, [corners[list(face)] for face in solid.faces])
         for center, radius in zip(sizes.spheres, sizes.sphere_radii, strict=True):
             pen.ball(center, radius, self.theme.faint)
-
-    def _draw_solids(self, pen: "_Pen", points: np.ndarray) -> None:
-        drawing = self.motion.drawing
-        colors = {body.name: color for body, color in zip(drawing.bodies, self._colors, strict=True)}
-        for solid, corners in zip(drawing.solids, drawing.corners(points), strict=True):
-            for face in solid.faces:
-                pen.face(corners[list(face)], solid.color or colors[solid.points[0]])
 
     def _draw_joints(self, pen: "_Pen", points: np.ndarray) -> None:
         sizes = self.sizes
@@ -276,10 +270,7 @@ class _Pen:
         strength = 1.0 if self.theme is plots.LIGHT else 2.0
         for corners in faces:
             if np.cross(corners[1] - corners[0], corners[2] - corners[1]) @ ground.normal > 0:
-                places = self.camera.project(dropped(ground.center, ground.normal, corners))[0]
-                self.axes.add_patch(
-                    PathPatch(Path(places), facecolor="#000000", linewidth=0, alpha=0.1 * strength, zorder=-2)
-                )
+                self.polygons([dropped(ground.center, ground.normal, corners)], "#000000", 0.1 * strength, -2)
 
     def polygons(self, corners, color, alpha: float, zorder: float) -> None:
         """Polygons with equal numbers of corners, in one path: where they overlap they are no darker."""

@@ -20,14 +20,9 @@ PERIODS = 8
 
 @dataclass(frozen=True)
 class Signal:
-    """A function of the positions of the bodies.
+    """A function `of` positions of bodies, from points (k, n_bodies, 3) to values (k,), with the title of its panel.
 
-    Attributes:
-        label: its name, for the title of a panel.
-        pace: "slow" or "fast".
-        of: the function, from points (k, n_bodies, 3) to values (k,).
-        size: standard deviation along the motion.
-        speed: standard deviation of its rate.
+    size, speed: standard deviations along the motion of the values and of their rate.
     """
 
     label: str
@@ -55,7 +50,8 @@ def fast_signal(motion: Motion) -> Signal | None:
     Without such a spring, a coordinate of a fast body, chosen likewise.
     """
     for signals in (_lengths(motion), _coordinates(motion)):
-        fast = [s for s in signals if s.pace == "fast" and s.frequency * _step(motion) < MOST_RADIANS_PER_NODE]
+        step = float(np.median(np.diff(motion.t)))
+        fast = [s for s in signals if s.pace == "fast" and s.frequency * step < MOST_RADIANS_PER_NODE]
         if fast:
             return max(_seen(fast), key=lambda signal: signal.speed * signal.frequency)
     return None
@@ -71,10 +67,6 @@ def window(motion: Motion, signal: Signal) -> tuple[float, float]:
     return start, start + length
 
 
-def _step(motion: Motion) -> float:
-    return float(np.median(np.diff(motion.t)))
-
-
 def _seen(signals: list[Signal]) -> list[Signal]:
     largest = max((signal.size for signal in signals), default=0.0)
     return [signal for signal in signals if signal.size >= LEAST_RELATIVE_SIZE * largest]
@@ -88,7 +80,7 @@ def _coordinates(motion: Motion) -> list[Signal]:
         moved = [axis for axis, form in enumerate(body.forms) if form]
         for axis in moved:
             label = body.name if len(moved) == 1 else f"{body.name} {AXES[axis]}"
-            signals += _signal(motion, label, body.pace, _along(i, frame[:, axis]))
+            signals += _signal(motion, label, body.pace, lambda points, i=i, axis=axis: points[:, i] @ frame[:, axis])
     return signals
 
 
@@ -103,10 +95,6 @@ def _lengths(motion: Motion) -> list[Signal]:
         of = _distance(index[joint.bodies[0]], end)
         signals += _signal(motion, f"length of spring {' to '.join(joint.bodies)}", drawing.pace(joint), of)
     return signals
-
-
-def _along(body: int, direction: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-    return lambda points: points[:, body] @ direction
 
 
 def _distance(body: int, end: int | np.ndarray) -> Callable[[np.ndarray], np.ndarray]:

@@ -79,7 +79,12 @@ def _motion(run: Path, system: str | None, drawing: Path | None) -> Motion:
             f"{sizes[0]} and {sizes[1]}; give the system that was simulated."
         )
     if drawing is not None:
-        description = _read(drawing)
+        if not drawing.is_file():
+            raise ValueError(f"--drawing {drawing} does not exist.")
+        try:
+            description = json.loads(drawing.read_text(encoding="utf-8"))
+        except ValueError as error:
+            raise ValueError(f"--drawing {drawing} is not valid JSON ({error}).") from error
     if not description and problem is not None:
         description = problem.drawing or built_in(system or "", np.size(problem.q_s))
     parsed = Drawing.from_dict(description or bars(trajectory))
@@ -106,15 +111,6 @@ def _load(run: Path) -> tuple[Trajectory, str | dict]:
     trajectory = Trajectory.load(run)
     with np.load(run, allow_pickle=False) as arrays:
         return trajectory, str(arrays["drawing"]) if "drawing" in arrays else ""
-
-
-def _read(path: Path) -> dict:
-    if not path.is_file():
-        raise ValueError(f"--drawing {path} does not exist.")
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise ValueError(f"--drawing {path} is not valid JSON ({error}).") from error
 
 
 def _write(shown: Motion, out: Path, title: str, frames: int, seconds: float, theme: plots.Theme) -> None:

@@ -30,10 +30,7 @@ def check(system: options.System, case: Numbers = None, full: Full = False, out:
 
 
 def run_and_show(cases: Sequence[Case], numbers: Sequence[int], full: bool, out: Path | None) -> None:
-    """Run cases, print their table and write their files.
-
-    Exit code 1 if a criterion is not met, 2 for an unknown number, 130 after Ctrl-C.
-    """
+    """Run cases, show and write their results; exit code 1: a missed criterion, 2: a wrong number, 130: Ctrl-C."""
     stopped = None
     with refusals(), progress_shown() as tell:
         try:

@@ -39,13 +39,7 @@ MANY = "Many runs, and what there is:  vmri sweep --example"
 
 @contextmanager
 def refusals() -> Iterator[None]:
-    """Show refusals of the library as panels; show any other ValueError, TypeError or ImportError as a fault of the program.
-
-    Raises:
-        BadInput: an argument was wrong, or a file is missing or in the way.
-        typer.Exit: a file could not be written; a package of an extra is not installed.
-        ValueError, TypeError, ImportError: raised by another library, or by Python: no argument of the command is to blame.
-    """
+    """Show refusals of the library as panels, and any other error of their classes as a fault of the program."""
     try:
         yield
     except (ValueError, TypeError, ImportError) as error:

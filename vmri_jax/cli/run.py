@@ -136,12 +136,17 @@ def simulate(
                 saved.append(str(plot))
         finally:
             if stopped is None:
-                done = 0  # micro steps; the time of a run with an accuracy includes trial runs, so that it has no time per step
                 if steps is not None and chosen is not None:
                     done = (steps - (0 if before is None else before.step)) * chosen.num_micro
+                    lines = {"macro steps": f"{steps}, of {chosen.num_micro} micro steps each"}
+                else:  # the time includes trial runs, so that there is no time per micro step
+                    done, settings = 0, trajectory.settings
+                    lines = {
+                        "chosen": f"{settings.python}, macro_dt {settings.macro_dt:.6g}, {settings.num_steps} steps"
+                    }
                 print_named(
                     {
-                        **_steps_in_words(trajectory, chosen, steps),
+                        **lines,
                         "": "" if chosen is None else nothing_fast(chosen, problem.q_f.size),
                         "wall time": f"{seconds:.2f} s, of which {compiled:.2f} s compiling",
                         "per micro step": f"{1e6 * max(seconds - compiled, 0.0) / done:.3g} µs" if done else "",
@@ -156,8 +161,11 @@ def simulate(
                 code = _print_stop(stopped, saved, streamed)
     if stopped is not None:
         if code == 1:
-            step = {"macro-dt": macro_dt, "micro-dt": micro_dt, "scheme": scheme, "num-micro": num_micro}
-            _print_advice(system, step | {"alpha": alpha, "degree": degree, "rule": rule, "compose": compose})
+            given = {"--macro-dt": macro_dt, "--micro-dt": micro_dt, "--scheme": scheme, "--num-micro": num_micro}
+            words = [word for name, x in (given | of_scheme).items() if x is not None for word in (name, str(x))]
+            command = escape(shlex.join(["vmri", "advise", system, *words]))
+            text = "Whether this step is stable, which one near it is, and whether slow and fast are swapped"
+            Console(stderr=True).print(f"{text}:\n[bold]{command}[/bold]", soft_wrap=True)
         raise typer.Exit(code)
 
 
@@ -171,14 +179,6 @@ def _check_steps(steps: int | None, accuracy: float | None, t_end: float | None,
     if streamed and (error or accuracy is not None):
         option = "--error" if error else "--accuracy"
         raise ValueError(f"{option} compares runs that are in memory; give --out with a file that ends in .npz.")
-
-
-def _steps_in_words(trajectory, scheme, steps: int | None) -> dict[str, str]:
-    """The number of steps; for a run with an accuracy the scheme and steps that were chosen."""
-    if steps is not None:
-        return {"macro steps": f"{steps}, of {scheme.num_micro} micro steps each"}
-    chosen = trajectory.settings
-    return {"chosen": f"{chosen.python}, macro_dt {chosen.macro_dt:.6g}, {chosen.num_steps} steps"}
 
 
 def _print_again(chosen: Settings, system: str, method: str) -> None:
@@ -201,11 +201,7 @@ def _run(run, problem, scheme, arguments: dict):
 
 
 def _print_stop(stopped: SimulationError | Interrupted, saved: list[str], streamed: bool) -> int:
-    """Print where a run stopped, and the files of its trajectory.
-
-    Returns:
-        The exit code: 1 for a failure, 130 for Ctrl-C.
-    """
+    """Print where a run stopped, and its files; return the exit code, 1 for a failure and 130 for Ctrl-C."""
     kept = f"\n\nThe trajectory up to there is in {' and '.join(saved)}." if saved else ""
     if isinstance(stopped, SimulationError):
         labels = f"\n\n{stopped.labels}" if stopped.labels else ""
@@ -219,14 +215,6 @@ def _print_stop(stopped: SimulationError | Interrupted, saved: list[str], stream
             f"Go on with it:\n[bold]{escape(shlex.join(['vmri', *again, '--resume']))}[/bold]", soft_wrap=True
         )
     return 130
-
-
-def _print_advice(system: str, values: dict) -> None:
-    """Print the command that judges the step of a failed run, from its options by name; None for options that are not given."""
-    options = [word for name, value in values.items() if value is not None for word in (f"--{name}", str(value))]
-    command = shlex.join(["vmri", "advise", system, *options])
-    text = f"Whether this step is stable, which one near it is, and whether slow and fast are swapped:\n[bold]{escape(command)}[/bold]"
-    Console(stderr=True).print(text, soft_wrap=True)
 
 
 def _check_out(out: Path | None, resume: bool, overwrite: bool) -> bool:
@@ -260,21 +248,17 @@ def _summary(trajectory: Trajectory | StoredTrajectory, constrained: bool) -> di
     times, energies, largest = (np.array(column) for column in zip(*map(_extremes, pieces), strict=True))
     position, velocity, method, iterations = largest.max(axis=0)
     error = trajectory.error if isinstance(trajectory, Trajectory) else None
+    start = energies[0, 0]
+    change = np.abs(energies - start).max()
+    of_start = f"{change / abs(start):.2e} of the energy at the start" if abs(start) > 1e-12 else f"{change:.2e}"
+    energy = {"energy change": f"at most {of_start}"}
     return {
         "simulated time": f"{times[0, 0]:g} to {times[-1, 1]:g}",
         "Newton iterations": f"at most {int(iterations)} per step, {Method(int(method)).name.lower()}",
-        **(_energy_error(energies) if trajectory.keeps_energy else _energy_balance(trajectory)),
+        **(energy if trajectory.keeps_energy else _energy_balance(trajectory)),
         "error": "" if error is None else error.in_words(),
         "constraint residual": f"{position:.2e} in positions, {velocity:.2e} in velocities" if constrained else "",
     }
-
-
-def _energy_error(energies: np.ndarray) -> dict[str, str]:
-    """The largest change of the energy of a system that keeps it, from rows (start, lowest, highest) of all pieces of a run."""
-    start = energies[0, 0]
-    change = np.abs(energies - start).max()
-    energy = f"{change / abs(start):.2e} of the energy at the start" if abs(start) > 1e-12 else f"{change:.2e}"
-    return {"energy change": f"at most {energy}"}
 
 
 def _energy_balance(trajectory: Trajectory | StoredTrajectory) -> dict[str, str]:

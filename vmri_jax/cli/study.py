@@ -102,10 +102,7 @@ def cost(
 
 @contextmanager
 def _search(out: Path | None) -> Iterator[Progress]:
-    """A progress bar for a search, and a panel if the reference solution fails.
-
-    After Ctrl-C it prints the best of the runs up to then, and writes them to `out`.
-    """
+    """A progress bar for a search, a panel if the reference solution fails; after Ctrl-C the runs, also in `out`."""
     try:
         with progress_shown() as tell:
             yield tell

@@ -98,11 +98,7 @@ def _drawn(arguments: Mapping[str, Any]) -> str:
 
 
 def read_sweep(file: Path) -> dict[str, Any]:
-    """Arguments of `ensemble` from a file; paths in it are relative to its folder.
-
-    Raises:
-        FileNotFoundError, ValueError: the file does not exist, or an entry is wrong.
-    """
+    """Arguments of `ensemble` from a file, which is checked; paths in it are relative to its folder."""
     if not file.is_file():
         raise FileNotFoundError(f"{file} does not exist; write one with: vmri sweep --example")
     try:
@@ -115,20 +111,19 @@ def read_sweep(file: Path) -> dict[str, Any]:
             raise ValueError(f"{file}: {name} is missing; see the file of vmri sweep --example.")
     if ("axes" in entries) == ("draws" in entries):
         raise ValueError(f"{file}: give either [axes] or [draws].")
-    folder = file.resolve().parent
-    scheme = entries["scheme"]
+    if "axes" in entries:
+        design = Product({name: _axis(f"{file}: the axis {name}", axis) for name, axis in entries["axes"].items()})
+    else:
+        design = _draws(file, entries["draws"])
+    folder, scheme = file.resolve().parent, entries["scheme"]
     arguments = {name: entries[name] for name in SETTINGS if name in entries}
     arguments["save"] = [_located(name, folder) for name in np.atleast_1d(arguments.get("save", "end")).tolist()]
     return arguments | {
         "system": _located(entries["system"], folder),
         "scheme": scheme if isinstance(scheme, str) else {name: name for name in scheme},
         "out": folder / entries["out"],
-        "design": _axes(file, entries["axes"]) if "axes" in entries else _draws(file, entries["draws"]),
+        "design": design,
     }
-
-
-def _axes(file: Path, entries: Mapping[str, Any]) -> Product:
-    return Product({name: _axis(f"{file}: the axis {name}", axis) for name, axis in entries.items()})
 
 
 def _axis(subject: str, entry) -> Any:
@@ -148,17 +143,11 @@ def _draws(file: Path, entries: Mapping[str, Any]) -> Draws:
     _check_entries(f"{file}: draws", entries, DRAWS)
     if not {"count", "columns"} <= set(entries):
         raise ValueError(f"{file}: draws need a count and columns, [draws.columns].")
-    columns = {
-        name: Draw(
-            entry["distribution"][0],
-            tuple(entry["distribution"][1:]),
-            entry.get("unit", ""),
-            entry.get("description", ""),
-        )
-        if isinstance(entry, Mapping)
-        else entry
-        for name, entry in entries["columns"].items()
-    }
+    columns = dict(entries["columns"])
+    for name, entry in columns.items():
+        if isinstance(entry, Mapping):
+            kind, *numbers = entry["distribution"]
+            columns[name] = Draw(kind, tuple(numbers), entry.get("unit", ""), entry.get("description", ""))
     chosen = {name: entries[name] for name in ("seed", "method") if name in entries}
     return Draws(entries["count"], columns, **chosen)
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.control.optimum import Optimum
-from vmri_jax.control.search import Point, Search
+from vmri_jax.control.search import Point, rolled
 from vmri_jax.control.transcription import Transcription
 from vmri_jax.diagnostics.linear import phase_vector
 from vmri_jax.mechanics.arrays import real_array, whole_number
@@ -131,14 +131,9 @@ def _bounds(bounds, num_controls: int) -> tuple[np.ndarray, np.ndarray]:
     return lower, upper
 
 
-def started(search: Search, start, num_steps: int, num_controls: int, grid: str) -> Point:
-    """Nodes and controls of the first iteration, without their gaps and the miss of the goal; `start` as of `minimize`.
-
-    Raises:
-        ValueError: controls of another shape, an optimum of another problem, or a motion that fails.
-    """
-    setup, nodes = search.setup, None
-    shape = (num_steps, setup.parts, num_controls)
+def started(setup: Transcription, start, num_steps: int, num_controls: int, grid: str) -> Point:
+    """Nodes and controls of the first iteration, without their gaps and the miss of the goal; `start` as of `minimize`."""
+    nodes, shape = None, (num_steps, setup.parts, num_controls)
     if isinstance(start, Optimum):
         nodes, controls = _resampled(setup, start, num_steps)
     elif start is None:
@@ -152,7 +147,7 @@ def started(search: Search, start, num_steps: int, num_controls: int, grid: str)
     u = jnp.asarray(np.clip(controls, *setup.bounds))
     # Given controls start from the motion that they make, without gaps; the nodes of an optimum are interpolated, with gaps.
     if nodes is None:
-        nodes, _ = search.rolled(u)
+        nodes, _ = rolled(setup, u)
         if not np.isfinite(nodes).all():
             raise ValueError(
                 "minimize: the motion with the first controls fails; give other controls, start=..., or a smaller macro_dt."

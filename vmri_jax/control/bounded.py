@@ -49,12 +49,7 @@ class Unsolved(RuntimeError):
 
 
 def solve(stages: Stages, final: Final, limits: Limits) -> tuple[Solution, float]:
-    """The solution, and the largest absolute multiplier of its equations and limits.
-
-    Raises:
-        ImportError: without the package piqp.
-        Unsolved: the solver fails.
-    """
+    """The solution, and the largest absolute multiplier of its equations and limits; `Unsolved` if the solver fails."""
     stages, final, limits = jax.tree.map(np.asarray, (stages, final, limits))
     solution = _solved(stages, final, limits, None)
     if solution is None:

@@ -12,7 +12,7 @@ import numpy as np
 from vmri_jax.control import bounded
 from vmri_jax.control.asked import actuation_of, started, transcribed
 from vmri_jax.control.optimum import Optimum
-from vmri_jax.control.search import Search
+from vmri_jax.control.search import line_search, rolled, update
 from vmri_jax.control.transcription import Transcription
 from vmri_jax.mechanics.arrays import whole_number
 from vmri_jax.mechanics.checks import check_number
@@ -99,21 +99,20 @@ def minimize(
     aims: dict[str, Any] = {"cost": cost, "final_cost": final_cost, "goal": goal, "limits": limits, "bounds": bounds}
     steps: dict[str, Any] = {"scheme": scheme, "macro_dt": macro_dt, "num_steps": num_steps, "grid": grid}
     setup = transcribed(opened_problem, actuate, len(labels), **aims, **steps, solver=solver)
-    search = Search(setup)
-    point = started(search, start, num_steps, len(labels), grid)
+    point = started(setup, start, num_steps, len(labels), grid)
     rho, history, nu = 1.0, [], np.zeros(0)
     with progress_to("minimize", progress) as tell:
         tell("compiling the steps and their derivatives", 0, max_iterations)
         for count in range(1, max_iterations + 1):
             try:
-                change, steepest, stages, final = search.update(point)
+                change, steepest, stages, final = update(setup, point)
             except bounded.Unsolved:  # the points of earlier iterations are still worth returning
                 if not history:
                     raise
                 break
             # The merit  cost + rho sum |misses|  is exact for rho above the largest multiplier; twice that leaves a margin.
             nu, rho = change.nu, max(rho, 2 * steepest)
-            point, record = search.line_search(point._replace(gaps=stages.c, goal=final.g), change, rho)
+            point, record = line_search(setup, point._replace(gaps=stages.c, goal=final.g), change, rho)
             history.append(record)
             tell(
                 f"cost {record['cost']:.6g}, goal {record['miss']:.1e}, steps {record['gap']:.1e}",
@@ -128,7 +127,7 @@ def minimize(
     driven = setup.driven(u, setup.start.t)
     origin = replace(Origin.of(driven), names=names_of(opened_problem))
     # The last nodes may have gaps; the trajectory is the motion that the controls make.
-    trajectory = with_origin(_trajectory(setup, *search.rolled(u)), origin)
+    trajectory = with_origin(_trajectory(setup, *rolled(setup, u)), origin)
     controls, times = np.asarray(u), setup.times(num_steps)
     if grid == "macro":
         controls, times = controls[:, 0], times[:, 0]

@@ -53,72 +53,62 @@ def slope(setup: Transcription, point: Point, dz, du):
     return jax.jvp(setup.total, (point.z, point.u), (dz, du))[1]
 
 
-class Search:
-    """Updates of nodes and controls, and the search along them."""
+def update(setup: Transcription, point: Point) -> tuple[riccati.Solution, float, riccati.Stages, riccati.Final]:
+    """The solution of the linear-quadratic problem at a point, the largest absolute multiplier, and the problem."""
+    stages, final = linearised(setup, point.z, point.u)
+    if setup.bounded:
+        change, steepest = bounded.solve(stages, final, limited(setup, point.z, point.u))
+        return change, steepest, stages, final
+    change = by_sweep(stages, final)
+    return change, float(np.abs(change.nu).max(initial=0.0)), stages, final
 
-    def __init__(self, setup: Transcription):
-        self.setup = setup
 
-    def update(self, point: Point) -> tuple[riccati.Solution, float, riccati.Stages, riccati.Final]:
-        """The solution of the linear-quadratic problem at a point, the largest absolute multiplier, and the problem."""
-        stages, final = linearised(self.setup, point.z, point.u)
-        if self.setup.bounded:
-            change, steepest = bounded.solve(stages, final, limited(self.setup, point.z, point.u))
-            return change, steepest, stages, final
-        change = by_sweep(stages, final)
-        return change, float(np.abs(change.nu).max(initial=0.0)), stages, final
+def line_search(setup: Transcription, point: Point, change: riccati.Solution, rho: float) -> tuple[Point, dict]:
+    """The first point along an update with a sufficient decrease of the merit, and its entry in the history.
 
-    def line_search(self, point: Point, change: riccati.Solution, rho: float) -> tuple[Point, dict[str, float]]:
-        """The first point along an update with a sufficient decrease of the merit, and its entry in the history.
+    The merit is ``cost + rho (sum |gaps| + sum |goal| + sum max(limits, 0))``. The update is halved until one of two trials is
+    accepted: nodes and controls updated alike, which unstable motions need; and the motion of the updated controls, which has
+    no gaps and suits bodies that turn far. The point stays, and ``part`` is 0, if no part of the update is accepted.
+    """
+    dz, du = change.dz, jnp.reshape(change.du, point.u.shape)
+    cost, violation, size_z, size_u, _ = measured(setup, point)
+    before = float(cost + rho * violation)
+    # The whole update fulfils the linearised conditions: along it the violation decreases at the rate of its size.
+    expected = float(slope(setup, point, dz, du) - rho * violation)
+    part, accepted = 1.0, None
+    while accepted is None and part >= SHORTEST_PART:
+        z, u = point.z + part * dz, point.u + part * du
+        # the last term allows for round-off: near the optimum the merit changes by less
+        allowed = before + SUFFICIENT_DECREASE * part * min(expected, 0.0) + 1e-12 * (abs(cost) + rho * violation)
+        ends, _ = steps(setup, z, u, jnp.asarray(False))  # NaN where a step fails
+        trials = [_with_goal(setup, z, u, ends - z)]
+        motion, _ = rolled(setup, u)
+        trials.append(_with_goal(setup, motion, u, jnp.zeros_like(motion)))
+        measures = [measured(setup, trial) for trial in trials]
+        merits = [float(cost + rho * violation) for cost, violation, *_ in measures]
+        best = int(np.nanargmin([*merits, np.inf]))  # a motion that fails has the merit NaN
+        if best < len(trials) and merits[best] <= allowed:
+            accepted = trials[best]
+        else:
+            part /= 2
+    if accepted is None:
+        part, accepted = 0.0, point
+    cost, _, size_z, size_u, over = measured(setup, accepted)
+    record = {
+        "cost": cost,
+        "gap": np.abs(accepted.gaps).max() / size_z,
+        "miss": np.abs(accepted.goal).max(initial=0.0),
+        "over": over,
+        "update": max(np.abs(dz).max() / size_z, np.abs(du).max() / size_u),
+        "part": part,
+    }
+    return accepted, {name: float(value) for name, value in record.items()}
 
-        The merit is ``cost + rho (sum |gaps| + sum |goal| + sum max(limits, 0))``. The update is halved until one of two trials is
-        accepted: nodes and controls updated alike, which unstable motions need; and the motion of the updated controls, which has
-        no gaps and suits bodies that turn far. The point stays, and ``part`` is 0, if no part of the update is accepted.
-        """
-        dz, du = change.dz, jnp.reshape(change.du, point.u.shape)
-        cost, violation, size_z, size_u, _ = measured(self.setup, point)
-        before = float(cost + rho * violation)
-        # The whole update fulfils the linearised conditions: along it the violation decreases at the rate of its size.
-        expected = float(slope(self.setup, point, dz, du) - rho * violation)
-        part, accepted = 1.0, None
-        while accepted is None and part >= SHORTEST_PART:
-            z, u = point.z + part * dz, point.u + part * du
-            # the last term allows for round-off: near the optimum the merit changes by less
-            allowed = before + SUFFICIENT_DECREASE * part * min(expected, 0.0) + 1e-12 * (abs(cost) + rho * violation)
-            trials = [self.with_gaps(z, u), self.motion(u)]
-            measures = [measured(self.setup, trial) for trial in trials]
-            merits = [float(cost + rho * violation) for cost, violation, *_ in measures]
-            best = int(np.nanargmin([*merits, np.inf]))  # a motion that fails has the merit NaN
-            if best < len(trials) and merits[best] <= allowed:
-                accepted = trials[best]
-            else:
-                part /= 2
-        if accepted is None:
-            part, accepted = 0.0, point
-        cost, _, size_z, size_u, over = measured(self.setup, accepted)
-        record = {
-            "cost": cost,
-            "gap": np.abs(accepted.gaps).max() / size_z,
-            "miss": np.abs(accepted.goal).max(initial=0.0),
-            "over": over,
-            "update": max(np.abs(dz).max() / size_z, np.abs(du).max() / size_u),
-            "part": part,
-        }
-        return accepted, {name: float(value) for name, value in record.items()}
 
-    def with_gaps(self, z, u) -> Point:
-        """The point of nodes z and controls u; its gaps are NaN where a step fails."""
-        ends, _ = steps(self.setup, z, u, jnp.asarray(False))
-        return Point(z, u, ends - z, self._goal(z))
+def rolled(setup: Transcription, u):
+    """Nodes of the motion with controls u, NaN from the first failed step on, and the `StepStatus` of the steps."""
+    return steps(setup, jnp.zeros((len(u), setup.z_start.size)), u, jnp.asarray(True))
 
-    def rolled(self, u):
-        """Nodes of the motion with controls u, NaN from the first failed step on, and the `StepStatus` of the steps."""
-        return steps(self.setup, jnp.zeros((len(u), self.setup.z_start.size)), u, jnp.asarray(True))
 
-    def motion(self, u) -> Point:
-        """The point of controls u and the motion that they make, without gaps."""
-        z, _ = self.rolled(u)
-        return Point(z, u, jnp.zeros_like(z), self._goal(z))
-
-    def _goal(self, z):
-        return self.setup.goal(self.setup.state(z[-1], len(z)))
+def _with_goal(setup: Transcription, z, u, gaps) -> Point:
+    return Point(z, u, gaps, setup.goal(setup.state(z[-1], len(z))))

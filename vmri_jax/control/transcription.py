@@ -199,10 +199,7 @@ def held(t, u, t_start, length):
     """The control (m,) at time t.
 
     At the border of two intervals it is the mean of both controls, so that quadrature rules with nodes at the ends of intervals
-    weight each control by its duration.
-
-    Args:
-        u: (k, m) controls that follow each other, each of duration `length`, the first from t_start on.
+    weight each control by its duration. The controls u (k, m) follow each other, each of duration `length`, the first from t_start on.
     """
     sides = (t - t_start) / length + jnp.array([-BORDER_WIDTH, BORDER_WIDTH])
     return jnp.mean(u[jnp.clip(jnp.floor(sides).astype(int), 0, len(u) - 1)], axis=0)

@@ -28,9 +28,10 @@ def phase_splits(state: State) -> tuple[int, int, int]:
     return n_s, n, n + n_s
 
 
-def symplectic_form(n: int) -> np.ndarray:
-    """``J = [[0, 1], [-1, 0]]``, (2 n, 2 n)."""
-    return np.kron([[0.0, 1.0], [-1.0, 0.0]], np.eye(n))
+def change_of_form(M, at_start, at_end):
+    """``M^T J M - J`` with ``J = [[0, 1], [-1, 0]]``, for a derivative M (k, k) between tangent spaces with the bases (k, 2 n)."""
+    J = np.kron([[0.0, 1.0], [-1.0, 0.0]], np.eye(at_start.shape[1] // 2))
+    return M.T @ (at_end @ J @ at_end.T) @ M - at_start @ J @ at_start.T
 
 
 def tangents(system: System, t, z, splits):
@@ -88,12 +89,7 @@ def frequencies_of(stiffness: np.ndarray) -> np.ndarray:
 
 
 def symplectic_defect(
-    system: Movable,
-    scheme: Scheme | Composition,
-    state: State | None = None,
-    *,
-    macro_dt,
-    solver: Newton | None = None,
+    system: Movable, scheme: Scheme | Composition, state: State | None = None, *, macro_dt, solver: Newton | None = None
 ):
     """Largest entry of ``M^T J M - J`` for the derivative M of one macro step, on the constraint manifold.
 
@@ -105,8 +101,7 @@ def symplectic_defect(
     """
     system, state = start_of("symplectic_defect", system, state)
     _, M, at_start, at_end, _, _ = derivative_along(system, scheme, state, macro_dt, solver, 1)
-    J = symplectic_form(at_start.shape[1] // 2)
-    return jnp.max(jnp.abs(M.T @ (at_end @ J @ at_end.T) @ M - at_start @ J @ at_start.T))
+    return jnp.max(jnp.abs(change_of_form(M, at_start, at_end)))
 
 
 @quickly_compiled

@@ -38,9 +38,8 @@ def fit_order(macro_dt, errors, plateau: float = 10.0, floor: float = 0.0) -> Or
     h, e = h[good][order], e[good][order]
     slopes = np.diff(np.log(e)) / np.diff(np.log(h))
     flat = np.flatnonzero(slopes < slopes.max() / 2)
-    flat = flat[
-        flat > slopes.argmax()
-    ]  # flat slopes before the steepest one belong to steps that do not resolve the motion
+    # flat slopes before the steepest one belong to steps that do not resolve the motion
+    flat = flat[flat > slopes.argmax()]
     level = max(floor, e[flat[0] + 1 :].max() if flat.size else 0.0)
     keep = e > plateau * level
     keep[:2] = True

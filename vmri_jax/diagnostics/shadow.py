@@ -26,7 +26,7 @@ from vmri_jax.mechanics.invariants import velocity
 from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.trajectory import Trajectory
-from vmri_jax.schemes.composition import Composition, stage_scheme
+from vmri_jax.schemes.composition import Composition, stage_lengths, stage_scheme
 from vmri_jax.schemes.discrete_lagrangian import lagrangian
 from vmri_jax.schemes.equations import StepEquations
 from vmri_jax.schemes.scheme import Scheme
@@ -143,7 +143,6 @@ def _checked(system: Movable, scheme: Scheme | Composition, trajectory: Trajecto
 @jax.jit
 def _actions(system: System, scheme: Scheme | Composition, nodes: State, macro_dt):
     """Discrete Lagrangian of every step, largest distance of a step from the next node relative to its length, worst `Result`."""
-    parts = jnp.asarray(scheme.coefficients) if isinstance(scheme, Composition) else jnp.ones(1)
 
     def step(nodes):
         start, end = nodes
@@ -153,7 +152,7 @@ def _actions(system: System, scheme: Scheme | Composition, nodes: State, macro_d
             state, action_of_stage, result = _stage(system, stage_scheme(scheme), state, part * macro_dt)
             return (state, action + action_of_stage), result
 
-        (reached, action), results = jax.lax.scan(stage, (start, jnp.zeros(())), parts)
+        (reached, action), results = jax.lax.scan(stage, (start, jnp.zeros(())), jnp.asarray(stage_lengths(scheme)))
         q, q_end, q_start = (jnp.concatenate([s.q_s, s.q_f]) for s in (reached, end, start))
         # Positive for a system at rest, too.
         length = jnp.max(jnp.abs(q_end - q_start)) + 1e-9 * jnp.max(jnp.abs(q_end))

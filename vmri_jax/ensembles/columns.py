@@ -23,7 +23,6 @@ from vmri_jax.ensembles.design import Rows
 from vmri_jax.mechanics.checks import check_type, is_concrete
 from vmri_jax.mechanics.names import Names, near
 from vmri_jax.mechanics.state import Problem
-from vmri_jax.mechanics.system import System
 
 STEPS = ("macro_dt", "micro_dt", "num_steps")
 SCHEMES = ("scheme", "num_micro")
@@ -33,66 +32,57 @@ Row = Mapping[str, Any]
 """The value of each column in a row of a design."""
 Vary = Callable[[Problem, Row], Problem]
 """A function that makes the problem of a run from a problem and a row."""
+Lanes = tuple[Any, tuple[Any, ...]]
+"""Parameters of the structure of the system's, None if no row changes one, and starts (t, q_s, q_f, v_s, v_f); in runs side by side the first
+axis of every array."""
 
 
 class ColumnPlace(NamedTuple):
     """The numbers that a column replaces.
 
-    part: "params", or the part of the start: t, q_s, q_f, v_s, v_f.
-    leaf: number of the array among the parameters; 0 for a part of the start.
+    leaf: number of the array among the `_arrays` of the problem.
     index: of one number in the array, () for the whole array.
     """
 
-    part: str
     leaf: int
-    index: tuple[int, ...]
-
-
-class Lanes(NamedTuple):
-    """Runs side by side, the first axis of every array.
-
-    params: of the structure of the system's parameters; None if no row changes a parameter.
-    start: t, q_s, q_f, v_s, v_f.
-    """
-
-    params: Any
-    start: tuple[Any, ...]
+    index: tuple[int, ...] = ()
 
 
 def by_name(problem: Problem, columns: Collection[str]) -> Vary:
-    """The function ``(problem, row) -> problem`` that puts the value of each column in the place that its name says.
-
-    Raises:
-        ValueError: a name that the problem does not have, an index that does not exist, or two columns for one number.
-    """
-    known, places = _known(problem), {}
-    numbers: dict[tuple, str] = {}
-    for name in columns:
-        places[name] = place = _place(name, problem, known)
-        for number in np.ndindex(*_target(problem, place).shape) if not place.index else [place.index]:
-            first = numbers.setdefault((*place[:2], *number), name)
+    """The function ``(problem, row) -> problem`` that puts the value of each column in the place that its name says."""
+    arrays, _ = _arrays(problem)
+    num_params = len(arrays) - len(START)
+    known = _known(problem)
+    places = {name: _place(name, arrays, known) for name in columns}
+    owners: dict[tuple, str] = {}
+    for name, (leaf, index) in places.items():
+        for number in [index] if index else np.ndindex(np.shape(arrays[leaf])):
+            first = owners.setdefault((leaf, *number), name)
             if first != name:
-                raise ValueError(f"ensemble: the columns {first!r} and {name!r} both give {_shown(place, number)}.")
+                array = "a parameter" if leaf < num_params else START[leaf - num_params]
+                raise ValueError(
+                    f"ensemble: the columns {first!r} and {name!r} both give {array}{list(number) if number else ''}."
+                )
+    changes_params = any(place.leaf < num_params for place in places.values())
 
     def vary(problem: Problem, row: Row) -> Problem:
-        leaves, structure = jax.tree.flatten(problem.system.params)
-        start = {part: getattr(problem, part) for part in START}
+        leaves, structure = _arrays(problem)
         for name, place in places.items():
-            arrays, key = (leaves, place.leaf) if place.part == "params" else (start, place.part)
-            arrays[key] = _with_number(arrays[key], place.index, name, row[name])
-        if any(place.part == "params" for place in places.values()):
-            start["system"] = problem.system.replace(params=jax.tree.unflatten(structure, leaves))
-        return replace(problem, **start)
+            leaves[place.leaf] = _with_number(leaves[place.leaf], place.index, name, row[name])
+        params, start = jax.tree.unflatten(structure, leaves)
+        system = problem.system.replace(params=params) if changes_params else problem.system
+        return replace(problem, system=system, **dict(zip(START, start, strict=True)))
 
     return vary
 
 
-def _with_number(array, index: tuple[int, ...], name: str, value):
-    """The array with the value of a column at an index.
+def _arrays(problem: Problem) -> tuple[list, Any]:
+    """The arrays that columns can change, the parameters and then the parts of the start, and their structure."""
+    return jax.tree.flatten((problem.system.params, [getattr(problem, part) for part in START]))
 
-    Raises:
-        ValueError: the value has another shape than the numbers that it replaces.
-    """
+
+def _with_number(array, index: tuple[int, ...], name: str, value):
+    """The array with the value of a column at an index."""
     array = jnp.asarray(array, dtype=float)
     shape = array.shape[len(index) :]
     if np.shape(value) != shape:
@@ -103,11 +93,7 @@ def _with_number(array, index: tuple[int, ...], name: str, value):
 
 
 def numbers_in(rows: Rows) -> Rows:
-    """The columns of numbers that change the problem; steps and schemes are left out.
-
-    Raises:
-        ValueError: a column of labels.
-    """
+    """The columns of numbers that change the problem; steps and schemes are left out."""
     columns = {name: values for name, values in rows.items() if name not in (*STEPS, *SCHEMES)}
     for name, values in columns.items():
         if values.dtype.kind not in "if":
@@ -135,14 +121,18 @@ def lane_function(problem: Problem, vary: Vary, columns: Collection[str]) -> Cal
         )
         _check_only_values_differ(problem, changed)
         is_same = changed.system.params is problem.system.params
-        return Lanes(None if is_same else changed.system.params, tuple(getattr(changed, part) for part in START))
+        return None if is_same else changed.system.params, tuple(getattr(changed, part) for part in START)
 
     return lane
 
 
 def _check_only_values_differ(problem: Problem, changed: Problem) -> None:
     """Refuse a row whose run the program of the problem cannot compute: another system but for parameters, or arrays of other shapes."""
-    same_system = _is_same(problem.system.replace(params=None), changed.system.replace(params=None))
+    leaves, structure = jax.tree.flatten(problem.system.replace(params=None))
+    new_leaves, new_structure = jax.tree.flatten(changed.system.replace(params=None))
+    same_system = structure == new_structure and all(
+        a is b or (is_concrete(b) and np.array_equal(a, b)) for a, b in zip(leaves, new_leaves, strict=True)
+    )
     before, after = ((entry.system.params, [getattr(entry, part) for part in START]) for entry in (problem, changed))
     if not same_system or jax.tree.map(np.shape, before) != jax.tree.map(np.shape, after):
         raise ValueError(
@@ -151,58 +141,36 @@ def _check_only_values_differ(problem: Problem, changed: Problem) -> None:
         )
 
 
-def _is_same(before: System, after: System) -> bool:
-    """Whether two systems have the same functions and the same arrays."""
-    leaves, structure = jax.tree.flatten(before)
-    other_leaves, other_structure = jax.tree.flatten(after)
-    return structure == other_structure and all(
-        a is b or (is_concrete(b) and np.array_equal(a, b)) for a, b in zip(leaves, other_leaves, strict=True)
-    )
-
-
-def _known(problem: Problem) -> dict[str, Callable[[tuple[int, ...]], ColumnPlace]]:
-    """For each name of a column, a function that gives its place from an index."""
-    known: dict[str, Callable] = {}
+def _known(problem: Problem) -> dict[str, ColumnPlace]:
+    """The place of each name of a column, in order: parameters, coordinates and their velocities, parts of the start."""
     paths, _ = jax.tree_util.tree_flatten_with_path(problem.system.params)
-    for leaf, (path, _) in enumerate(paths):
-        name = jax.tree_util.keystr(path, simple=True, separator=".")
-        known[name or "params"] = lambda index, leaf=leaf: ColumnPlace("params", leaf, index)
+    leaf_names = [jax.tree_util.keystr(path, simple=True, separator=".") or "params" for path, _ in paths]
+    known = {name: ColumnPlace(leaf) for leaf, name in enumerate(leaf_names)}
+    parts = {part: ColumnPlace(len(paths) + i) for i, part in enumerate(START)}
     names = (problem.names or Names()).of_coordinates(problem.q_s.size, problem.q_f.size)
     for part, labels in (("s", names.slow_coordinates), ("f", names.fast_coordinates)):
         for i, label in enumerate(labels):
-            known.setdefault(label, lambda _, part=part, i=i: ColumnPlace(f"q_{part}", 0, (i,)))
-            known.setdefault(f"v {label}", lambda _, part=part, i=i: ColumnPlace(f"v_{part}", 0, (i,)))
-    for part in START:
-        known.setdefault(part, lambda index, part=part: ColumnPlace(part, 0, index))
+            known.setdefault(label, parts[f"q_{part}"]._replace(index=(i,)))
+            known.setdefault(f"v {label}", parts[f"v_{part}"]._replace(index=(i,)))
+    for part, place in parts.items():
+        known.setdefault(part, place)
     return known
 
 
-def _place(name: str, problem: Problem, known: Mapping[str, Callable]) -> ColumnPlace:
+def _place(name: str, arrays: list, known: Mapping[str, ColumnPlace]) -> ColumnPlace:
     if name in known:
-        return known[name](())
+        return known[name]
     match = re.fullmatch(r"(.+)\[(\d+(?:,\s*\d+)*)\]", name)
-    if match is None or match[1] not in known:
+    if match is None or match[1] not in known or known[match[1]].index:
         listed = [n for n in known if n not in START and not re.fullmatch(r"(v )?q_[sf]\[\d+\]", n)]
         raise ValueError(
             f"ensemble: the column {name!r} is no parameter, coordinate, step or scheme.{near(name, [*known, *STEPS, *SCHEMES])} There are "
             f"{', '.join([*listed, *START[1:], *STEPS, *SCHEMES])}. One number of an array is {START[1]}[0], for example."
         )
-    place = known[match[1]](tuple(int(i) for i in match[2].split(",")))
-    shape = _target(problem, place).shape
+    place = ColumnPlace(known[match[1]].leaf, tuple(int(i) for i in match[2].split(",")))
+    shape = np.shape(arrays[place.leaf])
     if len(place.index) != len(shape) or any(i >= n for i, n in zip(place.index, shape, strict=True)):
         raise ValueError(
             f"ensemble: the column {name!r} has an index that {match[1]}, of shape {shape}, does not have."
         )
     return place
-
-
-def _target(problem: Problem, place: ColumnPlace) -> np.ndarray:
-    """The array of the problem that the place is in."""
-    if place.part != "params":
-        return np.asarray(getattr(problem, place.part))
-    return np.asarray(jax.tree.leaves(problem.system.params)[place.leaf])
-
-
-def _shown(place: ColumnPlace, number) -> str:
-    target = "a parameter" if place.part == "params" else place.part
-    return f"{target}{list(number) if len(number) else ''}"

@@ -11,7 +11,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -21,11 +21,9 @@ from vmri_jax.mechanics.names import near
 Rows = dict[str, np.ndarray]
 """Some rows of a design: an array for each column, its first axis the rows."""
 
-MOST_SOBOL_POINTS = 2**30
-"""Largest number of rows by a sequence of Sobol: its numbers have 30 bits, after which the sequence ends."""
-MOST_LATIN_POINTS = 2**22
-"""Largest number of rows of a Latin hypercube. Every worker makes the whole table: 32 MiB for each column, more with a larger number."""
-METHODS = ("sobol", "latin-hypercube", "random")
+MOST_POINTS = {"sobol": 2**30, "latin-hypercube": 2**22, "random": np.inf}
+"""Largest number of rows by the method that draws them. The numbers of a sequence of Sobol have 30 bits, after which the sequence ends. Every
+worker makes the whole table of a Latin hypercube: 32 MiB for each column, more with a larger number."""
 ALIASES = {"normal": "norm", "exponential": "expon"}
 """Further names of distributions, and the names that `scipy.stats` has for them."""
 
@@ -197,14 +195,13 @@ class Draws:
     def __post_init__(self):
         whole_number("Draws: count", self.count)
         whole_number("Draws: seed", self.seed, least=0)
-        if self.method not in METHODS:
+        if self.method not in list(MOST_POINTS):
             raise ValueError(
-                f"Draws: method is {self.method!r}.{near(str(self.method), METHODS)} Give one of {', '.join(METHODS)}."
+                f"Draws: method is {self.method!r}.{near(str(self.method), MOST_POINTS)} Give one of {', '.join(MOST_POINTS)}."
             )
-        most = {"sobol": MOST_SOBOL_POINTS, "latin-hypercube": MOST_LATIN_POINTS}.get(self.method, self.count)
-        if self.count > most:
+        if self.count > MOST_POINTS[self.method]:
             raise ValueError(
-                f"Draws: count is {self.count}, more than the {most} of the method {self.method}; take method='random'."
+                f"Draws: count is {self.count}, more than the {MOST_POINTS[self.method]} of the method {self.method}; take method='random'."
             )
         if not self.columns:
             raise ValueError("Draws: there are no columns; give at least one, e.g. {'omega': ('uniform', 10, 50)}.")
@@ -222,11 +219,7 @@ class Draws:
         return {name: draw.quantiles(points[:, i]) for i, (name, draw) in enumerate(self.columns.items())}
 
     def combinations(self, names: Sequence[str]) -> Rows:
-        """No rows. Drawn values are all different, and each would need a program of its own, so that names are refused.
-
-        Raises:
-            ValueError: there are names.
-        """
+        """No rows. Drawn values are all different, and each would need a program of its own, so that names are refused."""
         if names:
             raise ValueError(
                 f"Draws: {', '.join(names)} cannot be drawn: each value needs a program of its own. Give the runs as a Table."
@@ -257,6 +250,28 @@ class Draws:
 
 
 Design = Product | Table | Draws
+
+
+class Chunks(NamedTuple):
+    """The division of the runs of an ensemble.
+
+    lanes: number of runs.
+    size: number of runs of a chunk; the last chunk may have fewer.
+    width: number of runs that are computed side by side.
+    """
+
+    lanes: int
+    size: int
+    width: int
+
+    @property
+    def count(self) -> int:
+        """Number of chunks."""
+        return -(-self.lanes // self.size)
+
+    def ends(self, number: int) -> tuple[int, int]:
+        """Number of the first run of a chunk, and of the first run after it."""
+        return number * self.size, min((number + 1) * self.size, self.lanes)
 
 
 def unique_rows(rows: Rows) -> tuple[Rows, np.ndarray]:

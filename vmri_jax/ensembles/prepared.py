@@ -1,26 +1,23 @@
 """Preparation of an ensemble: checks of all arguments, its chunks, the arrays of its store, and the record that identifies it."""
 
-import warnings
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
 
 from vmri_jax.accuracy.companions import resting
 from vmri_jax.ensembles.columns import Row, numbers_in
-from vmri_jax.ensembles.design import Design, Draws, Product
+from vmri_jax.ensembles.design import Chunks, Design, Draws, Product
 from vmri_jax.ensembles.quantities import Kept, Quantity, label_of, quantity, what_is_kept
-from vmri_jax.ensembles.task import Chunks
 from vmri_jax.ensembles.work import Work, all_groups
 from vmri_jax.mechanics.arrays import whole_number
 from vmri_jax.mechanics.names import Names
 from vmri_jax.running.batch import lanes_at_once
 from vmri_jax.running.simulation import Simulation
-from vmri_jax.running.store.identity import changed_conditions, describe, differences, environment, identity, operations
+from vmri_jax.running.store.identity import describe, environment, identity, operations
 from vmri_jax.running.trajectory import Trajectory
-from vmri_jax.steppers.results import Result
 
 CHUNK_SECONDS = 1.0
 """Target seconds of computation of a chunk. A larger one loses more work at an interrupt; with a smaller one workers wait for files."""
@@ -32,44 +29,15 @@ MOST_CHUNK_BYTES = 2**26
 FEWEST_CHUNKS = 64
 """Target for the smallest number of chunks, so that workers share the runs evenly; batches that are computed side by side are not cut for
 it. A larger one makes chunks so small that writing their files takes most of the time."""
-MICRO_STEP_NANOSECONDS = {"explicit": 1.0, "implicit": 25.0, "constrained": 25.0}
+MICRO_STEP_NANOSECONDS = {"explicit": 1.0, "implicit": 25.0}
 """Rough nanoseconds of a micro step, for each coordinate of each run in a batch, by kind of step. They only choose the size of chunks: with
 larger ones chunks have fewer runs."""
 
 
-class Prepared(NamedTuple):
-    """An ensemble before any run is computed.
-
-    arrays: for each array of the store, by name, its shape for one run, dtype, dimensions and attributes.
-    chunks: the division of the runs.
-    run: the longest run.
-    """
-
-    arrays: dict[str, dict]
-    chunks: Chunks
-    run: Simulation
-
-
-def prepared(work: Work, design: Design, chunk: int | None = None) -> Prepared:
-    """Check all arguments, and choose arrays and chunks, before anything is computed.
-
-    Args:
-        work: of the ensemble.
-        design: its rows.
-        chunk: number of runs of a chunk; None to choose it.
-
-    Raises:
-        ValueError, TypeError: bad arguments.
-    """
-    runs = _checked(work, design)
-    arrays = _arrays(work, runs[0])
-    return Prepared(arrays, _chunks(runs, len(design), arrays, chunk), runs[0])
-
-
-def _checked(work: Work, design: Design) -> list[Simulation]:
-    """One run of each group, the longest first, after a check of all arguments."""
+def prepared(work: Work, design: Design, chunk: int | None = None) -> tuple[dict[str, Kept], Chunks, Simulation]:
+    """The arrays of the store, the division of the runs, and the longest run, after a check of all arguments; nothing is computed."""
     jax.eval_shape(work.lane, _first_row(design))
-    runs = [work.simulation(group) for group in all_groups(work, design)]
+    runs = [work.simulation(group) for group in all_groups(work, design)]  # one of each group
     runs[0].check("ensemble: the start", constraints=False)
     over_nodes = [str(name) for name, quantity in zip(work.save, work.quantities, strict=True) if quantity.over_nodes]
     if over_nodes and work.num_saves == 1:
@@ -77,7 +45,13 @@ def _checked(work: Work, design: Design) -> list[Simulation]:
             f"ensemble: {', '.join(over_nodes)} looks at the saved nodes of a run, and only its end is saved; give num_saves, "
             "for example 50."
         )
-    return sorted(runs, key=_micro_steps, reverse=True)
+    runs.sort(key=_micro_steps, reverse=True)
+    arrays = {
+        "result": Kept(np.empty((), np.int32), (), "status of the run, see flag_meanings"),
+        "failed_at": Kept(np.empty((), np.int32), (), "macro step that failed, -1 if none did"),
+    }
+    arrays |= what_is_kept(work.quantities, runs[0])
+    return arrays, _chunks(runs, len(design), arrays, chunk), runs[0]
 
 
 def _first_row(design: Design) -> Row:
@@ -89,28 +63,7 @@ def _micro_steps(run: Simulation) -> int:
     return run.num_steps * run.scheme.num_micro
 
 
-def _arrays(work: Work, run: Simulation) -> dict[str, dict]:
-    """The arrays of the store by name: shape for one run, dtype, dimensions and attributes."""
-    meanings = " ".join(result.name.lower() for result in Result)
-    values = [int(result) for result in Result]
-    status = {
-        "result": Kept(np.empty((), np.int32), (), "status of the run, see flag_meanings"),
-        "failed_at": Kept(np.empty((), np.int32), (), "macro step that failed, -1 if none did"),
-    }
-    arrays = {}
-    for name, kept in (status | what_is_kept(work.quantities, run)).items():
-        attributes = {"description": kept.description} if kept.description else {}
-        flags = {"flag_values": values, "flag_meanings": meanings} if name == "result" else {}
-        arrays[name] = {
-            "shape": kept.value.shape,
-            "dtype": kept.value.dtype,
-            "dimensions": kept.dimensions,
-            "attributes": attributes | flags,
-        }
-    return arrays
-
-
-def _chunks(runs: list[Simulation], lanes: int, arrays: dict[str, dict], chunk: int | None) -> Chunks:
+def _chunks(runs: list[Simulation], lanes: int, arrays: dict[str, Kept], chunk: int | None) -> Chunks:
     """Chunks of about `CHUNK_SECONDS`, of a power of two times `width` runs; `width` runs are computed side by side."""
     run = runs[0]
     # A chunk has runs of every group: a batch wider than the share of one group would be filled with copies.
@@ -118,10 +71,10 @@ def _chunks(runs: list[Simulation], lanes: int, arrays: dict[str, dict], chunk: 
     if chunk is not None:
         size = min(whole_number("ensemble: chunk", chunk, otherwise=", or None"), lanes)
         return Chunks(lanes, size, min(width, size))
-    kind = "constrained" if run.system.is_constrained else "implicit" if run.plan.has_fallback else "explicit"
+    kind = "implicit" if run.system.is_constrained or run.plan.has_fallback else "explicit"
     size_q = run.state.q_s.size + run.state.q_f.size
     seconds = 1e-9 * MICRO_STEP_NANOSECONDS[kind] * _micro_steps(run) * run.scheme.degree**2 * size_q
-    array_bytes = sum(np.dtype(array["dtype"]).itemsize * int(np.prod(array["shape"])) for array in arrays.values())
+    array_bytes = sum(kept.value.dtype.itemsize * int(np.prod(kept.value.shape)) for kept in arrays.values())
     bytes_of_run = array_bytes + 8 * (2 * size_q + 8) * (run.num_saves + 1)
     most_lanes = min(
         max(CHUNK_SECONDS / seconds, lanes / MOST_CHUNKS), MOST_CHUNK_BYTES / bytes_of_run, lanes / FEWEST_CHUNKS
@@ -192,29 +145,3 @@ def _describe_design(design: Design) -> dict[str, str]:
             f"column {name}", axis.values if axis.values.dtype.kind != "U" else ", ".join(axis.values.ravel())
         )
     return description
-
-
-def check_same(path: Path, attributes: dict, stored: dict, chunk: int | None) -> None:
-    """Refuse to continue the store of another ensemble; warn if versions have changed.
-
-    Args:
-        path: of the store.
-        attributes: of the ensemble that the user wants.
-        stored: attributes of the store.
-        chunk: number of runs of a chunk that the user wants, or None.
-
-    Raises:
-        ValueError: with all differences.
-    """
-    changes = differences(attributes, stored, chunk)
-    if changes:
-        raise ValueError(
-            f"{path} holds another ensemble and cannot go on with this one. Differences: {'; '.join(changes)}. Give the arguments of the "
-            "first call, or another name."
-        )
-    changed = changed_conditions(attributes, stored)
-    if changed:
-        warnings.warn(
-            f"{path} was started under other conditions; the last digits of its runs may differ. Now: {', '.join(changed)}.",
-            stacklevel=3,
-        )

@@ -48,12 +48,9 @@ class Quantity(NamedTuple):
 
 def _end(run: Trajectory) -> dict[str, Kept]:
     names = {"q": "positions", "p": "momenta"}
+    arrays = {name: getattr(run.states, name) for name in ("q_s", "q_f", "p_s", "p_f")}
     return {
-        f"{letter}_{part}": Kept(
-            getattr(run.states, f"{letter}_{part}")[-1], (dimension,), f"{names[letter]} at the end"
-        )
-        for letter in "qp"
-        for part, dimension in (("s", "slow"), ("f", "fast"))
+        name: Kept(array[-1], DIMENSIONS[name][1:], f"{names[name[0]]} at the end") for name, array in arrays.items()
     }
 
 
@@ -87,23 +84,19 @@ def _iterations(run: Trajectory) -> dict[str, Kept]:
 
 def _extremes(run: Trajectory) -> dict[str, Kept]:
     extremes = {}
-    for part, dimension in (("s", "slow"), ("f", "fast")):
-        q = getattr(run.states, f"q_{part}")
-        extremes[f"min_q_{part}"] = Kept(jnp.min(q, axis=0), (dimension,), "smallest positions")
-        extremes[f"max_q_{part}"] = Kept(jnp.max(q, axis=0), (dimension,), "largest positions")
+    for name, dimension in (("q_s", "slow"), ("q_f", "fast")):
+        q = getattr(run.states, name)
+        extremes[f"min_{name}"] = Kept(jnp.min(q, axis=0), (dimension,), "smallest positions")
+        extremes[f"max_{name}"] = Kept(jnp.max(q, axis=0), (dimension,), "largest positions")
     return extremes
 
 
 def _quantiles(run: Trajectory) -> dict[str, Kept]:
-    levels = jnp.array(LEVELS)
-    return {
-        f"quantiles_q_{part}": Kept(
-            jnp.quantile(getattr(run.states, f"q_{part}"), levels, axis=0),
-            ("quantile", dimension),
-            "quantiles of the positions over the saved nodes",
-        )
-        for part, dimension in (("s", "slow"), ("f", "fast"))
-    }
+    words, quantiles = "quantiles of the positions over the saved nodes", {}
+    for name, dimension in (("q_s", "slow"), ("q_f", "fast")):
+        values = jnp.quantile(getattr(run.states, name), jnp.array(LEVELS), axis=0)
+        quantiles[f"quantiles_{name}"] = Kept(values, ("quantile", dimension), words)
+    return quantiles
 
 
 QUANTITIES = {
@@ -161,11 +154,7 @@ def label_of(saved: Saved) -> str:
 
 
 def kept(quantities: Sequence[Quantity], run: Trajectory) -> dict[str, Kept]:
-    """All arrays that the store keeps of a run.
-
-    Raises:
-        ValueError: two quantities with an array of one name.
-    """
+    """All arrays that the store keeps of a run."""
     arrays: dict[str, Kept] = {}
     for item in quantities:
         part = item.function(run)
@@ -177,11 +166,7 @@ def kept(quantities: Sequence[Quantity], run: Trajectory) -> dict[str, Kept]:
 
 
 def what_is_kept(quantities: Sequence[Quantity], run: Simulation) -> dict[str, Kept]:
-    """The arrays that the store keeps of a run, with shapes in place of values; nothing is computed.
-
-    Raises:
-        ValueError: two quantities with an array of one name, or a function of the user that cannot be traced.
-    """
+    """The arrays that the store keeps of a run, with shapes in place of values; nothing is computed."""
     arrays: dict[str, Kept] = {}
 
     def shapes():
@@ -194,15 +179,7 @@ def what_is_kept(quantities: Sequence[Quantity], run: Simulation) -> dict[str, K
 
 
 def drawn_by_default(names: Sequence[str], problem: Problem) -> list[str]:
-    """Arrays that `vmri_jax.plots.plot_ensemble` draws by default: one number per run, or one per saved node.
-
-    Args:
-        names: of quantities, as in `quantity`.
-        problem: of the ensemble, for the numbers of its coordinates; nothing is computed.
-
-    Raises:
-        ValueError: an unknown name.
-    """
+    """Arrays of these quantities that `vmri_jax.plots.plot_ensemble` draws by default: one number per run, or one per saved node."""
     n_s, n_f = problem.q_s.size, problem.q_f.size
     quantities, dimensions = [quantity(name) for name in names], {}
 

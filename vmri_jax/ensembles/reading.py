@@ -15,8 +15,6 @@ from vmri_jax.running.export import FILL, extra
 if TYPE_CHECKING:
     import xarray
 
-LEVEL_NAMES = ["position", "velocity"]
-
 
 def open_ensemble(path: str | os.PathLike) -> "xarray.Dataset":
     """The results of `ensemble`, as an `xarray.Dataset` whose arrays Dask loads when they are used.
@@ -51,7 +49,8 @@ def open_ensemble(path: str | os.PathLike) -> "xarray.Dataset":
         )
     for name, column in columns_record.items():
         data[name].attrs |= {key: column[key] for key in ("units", "description") if key in column}
-    labels = {"slow": attributes["slow"], "fast": attributes["fast"], "level": LEVEL_NAMES, "quantile": list(LEVELS)}
+    labels = {"slow": attributes["slow"], "fast": attributes["fast"], "quantile": list(LEVELS)}
+    labels["level"] = ["position", "velocity"]
     data = data.assign_coords({name: values for name, values in labels.items() if name in data.dims})
     kept = ("system", "lanes", "made_with")
     data.attrs = {"title": f"ensemble of {attributes['lanes']} runs"} | {name: attributes[name] for name in kept}
@@ -86,8 +85,10 @@ def _drawn(attributes: dict[str, Any]):
     """Columns of random rows, as arrays of Dask whose values are drawn when they are used."""
     import dask.array
 
-    design = _design_of(attributes)
-    chunk, lanes = attributes["chunk"], attributes["lanes"]
+    record, chunk, lanes = attributes["design"], attributes["chunk"], attributes["lanes"]
+    distributions = {name: column["distribution"] for name, column in record["columns"].items()}
+    draws = {name: Draw(kind, tuple(arguments)) for name, (kind, *arguments) in distributions.items()}
+    design = Draws(lanes, draws, record["method"], record["seed"])
     sizes = (*[chunk] * (lanes // chunk), *([lanes % chunk] if lanes % chunk else []))
 
     def column(name: str):
@@ -98,16 +99,6 @@ def _drawn(attributes: dict[str, Any]):
         return dask.array.map_blocks(block, dtype=float, chunks=(sizes,), meta=np.zeros(0))
 
     return {name: column(name) for name in design.columns}
-
-
-def _design_of(attributes: dict[str, Any]) -> Draws:
-    """The random design of a store."""
-    design = attributes["design"]
-    columns = {}
-    for name, column in design["columns"].items():
-        kind, *arguments = column["distribution"]
-        columns[name] = Draw(kind, tuple(arguments))
-    return Draws(attributes["lanes"], columns, design["method"], design["seed"])
 
 
 def _table(path: Path, xarray) -> dict[str, Any]:

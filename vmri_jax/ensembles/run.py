@@ -2,27 +2,28 @@
 
 import os
 import time
-from collections.abc import Mapping, Sequence
-from concurrent.futures import BrokenExecutor, CancelledError, Executor
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import BrokenExecutor, CancelledError, Future
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 from vmri_jax.ensembles import store
 from vmri_jax.ensembles.columns import Vary
-from vmri_jax.ensembles.design import Design, Draws, Product, Table
-from vmri_jax.ensembles.prepared import attributes_of, check_same, prepared
+from vmri_jax.ensembles.design import Chunks, Design, Draws, Product, Table
+from vmri_jax.ensembles.prepared import attributes_of, prepared
 from vmri_jax.ensembles.quantities import Saved
-from vmri_jax.ensembles.task import Chunks, Job, run_chunk, run_packed_chunk
 from vmri_jax.ensembles.work import AnyScheme, Work
-from vmri_jax.executors.executor import Here, as_done, executor_of
-from vmri_jax.executors.worker import NotAWorker, call_in_worker, known_versions, packed
+from vmri_jax.executors.executor import Here, as_done, executor_of, submitter
+from vmri_jax.executors.worker import NotAWorker, packed
 from vmri_jax.mechanics.arrays import require_x64, whole_number
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
-from vmri_jax.running.files import clear_partial, is_new
+from vmri_jax.running.files import clear_partial, explained, is_new
 from vmri_jax.running.interrupts import Interrupted, interrupts_noted
 from vmri_jax.running.progress import Progress, ShowsProgress, progress_to
+from vmri_jax.running.store.identity import check_same
 from vmri_jax.running.store.layout import locked
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
@@ -44,7 +45,8 @@ class EnsembleError(RuntimeError):
     def __init__(self, ensemble: "Ensemble"):
         self.ensemble, self.failures = ensemble, ensemble.failures
         first, reason = next(iter(self.failures.items()))
-        lanes = ", ".join(_runs(ensemble.chunks, number) for number in list(self.failures)[:5])
+        ends = map(ensemble.chunks.ends, list(self.failures)[:5])
+        lanes = ", ".join(f"{first} to {last - 1}" for first, last in ends)
         ellipsis = f" and {len(self.failures) - 5} more" if len(self.failures) > 5 else ""
         all_tried = len(ensemble.done) + len(self.failures) == ensemble.chunks.count
         remainder = (
@@ -212,41 +214,35 @@ def ensemble(
         stored = store.read_attributes(path)
         # On another machine the default division may differ; files in the store have the old one.
         chunks = chunks._replace(size=stored["chunk"], width=stored["width"])
-        check_same(path, attributes, stored, chunk)
+        check_same(path, "ensemble", attributes, stored, chunk)
     with ExitStack() as opened:
         tasks = opened.enter_context(executor_of("ensemble", executor, processes))
         if not isinstance(tasks, Here):
-            packed("ensemble", work)
+            packed("ensemble", run_chunk, work)
         if not (resume and path.exists()):
             columns = design.rows(0, len(design)) if isinstance(design, Table) else {}
-            try:
+            with explained(path, "Give another place."):
                 store.create(path, attributes, arrays, columns, chunks.size)
-            except OSError as error:
-                raise _unwritable(path, error, "Give another place.") from error
         opened.enter_context(locked(path))
         clear_partial(path)
         tell = opened.enter_context(progress_to("ensemble", progress))
         interrupted = opened.enter_context(interrupts_noted())
         runs = Ensemble(path, chunks, store.committed(path))
-        job = Job(str(path.resolve()), chunks, work, None if isinstance(design, Table) else design)
-        _compute(runs, job, tasks, tell, interrupted)
+        rows = None if isinstance(design, Table) else design
+        submit = submitter("ensemble", tasks, run_chunk, str(path.resolve()), chunks, work, rows)
+        _compute(runs, submit, tell, interrupted)
     if runs.failures and throw:
         raise EnsembleError(runs) from runs.first_error
     return runs
 
 
-def _compute(runs: Ensemble, job: Job, tasks: Executor, tell: Progress, interrupted) -> None:
+def _compute(runs: Ensemble, submit: Callable[[int], Future], tell: Progress, interrupted) -> None:
     """Compute the missing chunks and record them in `runs`."""
     begin = time.perf_counter()
-    missing = ((number,) for number in range(job.chunks.count) if number not in runs.done)
-    if isinstance(tasks, Here):
-        submit = lambda number: tasks.submit(run_chunk, job, number)  # noqa: E731
-    else:
-        data, versions = packed("ensemble", job), known_versions()
-        submit = lambda number: tasks.submit(*call_in_worker(versions, run_packed_chunk, data, number))  # noqa: E731
-    tell(_progress(runs), _lanes_done(runs), job.chunks.lanes)
+    missing = (number for number in range(runs.chunks.count) if number not in runs.done)
+    tell(_progress(runs), _lanes_done(runs), len(runs))
     try:
-        for (number,), future in as_done(submit, missing, interrupted):
+        for number, future in as_done(submit, missing, interrupted):
             try:
                 runs.done[number] = future.result()
             except Exception as error:
@@ -258,7 +254,7 @@ def _compute(runs: Ensemble, job: Job, tasks: Executor, tell: Progress, interrup
             if not runs.computed and len(runs.failures) >= FAILURES_TO_STOP:
                 return
             runs.seconds = time.perf_counter() - begin
-            tell(_progress(runs), _lanes_done(runs), job.chunks.lanes)
+            tell(_progress(runs), _lanes_done(runs), len(runs))
     except KeyboardInterrupt:
         again = f"go on with resume=True, {runs.path}"
         raise Interrupted(runs, len(runs.done), runs.chunks.count, "chunks", again) from None
@@ -266,20 +262,33 @@ def _compute(runs: Ensemble, job: Job, tasks: Executor, tell: Progress, interrup
         raise _gone(runs) from gone
 
 
-def _why(error: Exception, runs: Ensemble) -> str:
-    """The error of a chunk in words; errors that all chunks would have are raised.
+def run_chunk(path: str, chunks: Chunks, work: Work, design: Design | None, number: int) -> int:
+    """Compute a chunk of runs, write it to the store and commit it; returns how many of its runs failed.
 
-    Raises:
-        OSError: the store cannot be written.
-        RuntimeError: workers are gone, do not have this package, or have other versions.
+    `design` makes the rows; None for a table, whose rows are in the store.
     """
+    first, last = chunks.ends(number)
+    writer = _writer(path, chunks.size, store.made(Path(path)))
+    rows = writer.columns(first, last) if design is None else design.rows(first, last)
+    return writer.write(number, work.compute(rows, last - first, chunks.width))
+
+
+@lru_cache(maxsize=4)
+def _writer(path: str, chunk: int, made: tuple[int, int]) -> store.Writer:
+    """The writer of a store. `made` is part of the cache key: a store that replaced another one gets a new writer."""
+    return store.Writer(Path(path), chunk)
+
+
+def _why(error: Exception, runs: Ensemble) -> str:
+    """The error of a chunk in words; errors that all chunks would have are raised."""
     if (
         isinstance(error, OSError)
         and error.errno is not None
         and not isinstance(error, FileNotFoundError | ConnectionError)
     ):
         kept = f"{len(runs.done)} of {runs.chunks.count} chunks are kept; go on with resume=True when there is room."
-        raise _unwritable(runs.path, error, kept) from error
+        with explained(runs.path, kept):
+            raise error
     if isinstance(error, ModuleNotFoundError) and (error.name or "").partition(".")[0] == "vmri_jax":
         raise RuntimeError(
             "ensemble: a worker does not have vmri_jax. Install it in the environment of the workers, the version of this process."
@@ -296,10 +305,6 @@ def _gone(runs: Ensemble) -> RuntimeError:
         f"ensemble: the workers, or their scheduler, are gone. {len(store.committed(runs.path))} of {runs.chunks.count} chunks are in {runs.path}; "
         "go on with resume=True."
     )
-
-
-def _unwritable(path: Path, error: OSError, kept: str) -> OSError:
-    return OSError(error.errno, f"{path} cannot be written: {error.strerror or error}. {kept}")
 
 
 def _progress(runs: Ensemble) -> str:
@@ -319,11 +324,6 @@ def _lanes_done(runs: Ensemble) -> int:
     count = len(runs.done) * runs.chunks.size
     last = runs.chunks.count - 1
     return count - (runs.chunks.count * runs.chunks.size - len(runs) if last in runs.done else 0)
-
-
-def _runs(chunks: Chunks, number: int) -> str:
-    first, last = chunks.ends(number)
-    return f"{first} to {last - 1}"
 
 
 def _schemes(scheme) -> dict[str, AnyScheme]:

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from vmri_jax.ensembles.design import Rows
+from vmri_jax.ensembles.quantities import Kept
 from vmri_jax.running.files import made_beside, replaced
 from vmri_jax.running.store.layout import (
     CONFIG,
@@ -31,33 +32,33 @@ from vmri_jax.running.store.layout import (
     create_array,
     synchronize_files,
 )
+from vmri_jax.steppers.results import Result
 
 FORMAT = "vmri_jax ensemble store 1"
 COMMITTED = Path("resume", "chunks")
 DESIGN = "design"
 LANE = "lane"
+FLAGS = {
+    "flag_values": [int(result) for result in Result],
+    "flag_meanings": " ".join(result.name.lower() for result in Result),
+}
+"""Attributes of the array "result", by the conventions of CF: the numbers and the names of all statuses."""
 LABELS = "labels"
 """Attribute of a column of labels: the list of labels, whose numbers in the list are the values of the column."""
 
 
-def create(path: Path, attributes: Mapping[str, Any], arrays: Mapping[str, dict], columns: Rows, chunk: int) -> None:
-    """Make a store without runs. When it is complete it replaces a store at this place.
-
-    Args:
-        path: folder of the store.
-        attributes: of the store.
-        arrays: for each array by name the shape for one run, dtype, dimensions and attributes.
-        columns: of a design that is a table.
-        chunk: number of runs of a chunk.
-    """
+def create(path: Path, attributes: Mapping[str, Any], arrays: Mapping[str, Kept], columns: Rows, chunk: int) -> None:
+    """Make a store without runs, with the `columns` of a design that is a table. When it is complete it replaces a store at this place."""
     import zarr
 
     lanes = attributes["lanes"]
     with made_beside(path) as partial:
         group = zarr.create_group(partial, attributes={"format": FORMAT, **attributes})
-        for name, array in arrays.items():
-            dimensions, options = (LANE, *array["dimensions"]), {"attributes": array["attributes"]}
-            create_array(group, name, (lanes, *array["shape"]), array["dtype"], chunk, dimensions, **options)
+        for name, (value, dimensions, description) in arrays.items():
+            words = {"description": description} if description else {}
+            words |= FLAGS if name == "result" else {}
+            shape = (lanes, *value.shape)
+            create_array(group, name, shape, value.dtype, chunk, (LANE, *dimensions), attributes=words)
         for name, values in columns.items():
             _store_column(group.require_group(DESIGN), name, values, chunk)
         count = -(-lanes // chunk)
@@ -139,12 +140,5 @@ def committed(path: Path) -> dict[int, int]:
 
 
 def read_attributes(path: Path) -> dict[str, Any]:
-    """Attributes of a store.
-
-    Raises:
-        FileNotFoundError: the folder does not exist.
-        ValueError: it is not the store of an ensemble.
-    """
-    if not path.exists():
-        raise FileNotFoundError(f"{path} does not exist; give the folder of an ensemble.")
-    return attributes_in(path, FORMAT, "the store of an ensemble")
+    """Attributes of a store, see `attributes_in`."""
+    return attributes_in(path, FORMAT, "an ensemble", "the store of an ensemble")

@@ -1,6 +1,5 @@
 """The work of an ensemble: a small object that pickle can send, with which a worker computes some of the runs."""
 
-import hashlib
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property, lru_cache
@@ -15,6 +14,7 @@ from vmri_jax.catalogue import find_problem, find_scheme
 from vmri_jax.ensembles.columns import SCHEMES, STEPS, Lanes, Row, Vary, by_name, lane_function, numbers_in
 from vmri_jax.ensembles.design import Design, Rows, unique_rows
 from vmri_jax.ensembles.quantities import Quantity, Saved, of_lanes, quantity
+from vmri_jax.mechanics.checks import digest
 from vmri_jax.mechanics.names import near
 from vmri_jax.mechanics.state import Problem
 from vmri_jax.running import arguments
@@ -74,6 +74,20 @@ class Work:
     def __getstate__(self) -> dict[str, Any]:
         return {part.name: getattr(self, part.name) for part in fields(self)}  # without cached properties
 
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Refuse a worker on which a file of the user is missing, or differs from the file where the ensemble was started."""
+        self.__dict__.update(state)
+        for file, digest_at_start in self.sources.items():
+            if not Path(file).is_file():
+                raise FileNotFoundError(
+                    f"{file} does not exist on this worker. Put it where all workers see it, or install it as a package and give "
+                    "my_package.my_module:name."
+                )
+            if digest(Path(file).read_bytes()) != digest_at_start:
+                raise ValueError(
+                    f"{file} differs from the file where the ensemble was started; give all workers the same file."
+                )
+
     def with_sources(self) -> "Work":
         """This work with absolute paths of the user's files, and with digests of them."""
         names = [name for name in (self.system, *self.save) if isinstance(name, str)]
@@ -84,25 +98,8 @@ class Work:
             file, colon, attribute = name.partition(":") if isinstance(name, str) else ("", "", "")
             return f"{resolved[file]}{colon}{attribute}" if file in resolved else name
 
-        sources = {file: _digest(file) for file in resolved.values()}
+        sources = {file: digest(Path(file).read_bytes()) for file in resolved.values()}
         return replace(self, system=located(self.system), save=tuple(map(located, self.save)), sources=sources)
-
-    def check_sources(self) -> None:
-        """Refuse a worker on which a file of the user is missing, or differs from the file where the ensemble was started.
-
-        Raises:
-            FileNotFoundError, ValueError: with the file.
-        """
-        for file, digest in self.sources.items():
-            if not Path(file).is_file():
-                raise FileNotFoundError(
-                    f"{file} does not exist on this worker. Put it where all workers see it, or install it as a package and give "
-                    "my_package.my_module:name."
-                )
-            if _digest(file) != digest:
-                raise ValueError(
-                    f"{file} differs from the file where the ensemble was started; give all workers the same file."
-                )
 
     @cached_property
     def problem(self) -> Problem:
@@ -133,11 +130,7 @@ class Work:
         return [name for name in self.columns if name in (*SCHEMES, *steps)]
 
     def groups(self, rows: Rows, count: int) -> Iterator[Group]:
-        """Divide rows into groups, one for each compiled program.
-
-        Raises:
-            ValueError, TypeError: values from which no run can be made.
-        """
+        """Divide rows into groups, one for each compiled program."""
         different, number = unique_rows({name: rows[name] for name in self.told_apart})
         if not self.told_apart:
             number = np.zeros(count, dtype=int)
@@ -149,11 +142,7 @@ class Work:
             yield Group(lanes, scheme, *self._steps(values | dt, scheme))
 
     def simulation(self, group: Group) -> Simulation:
-        """The first run of a group, after a check of its arguments.
-
-        Raises:
-            ValueError, TypeError: bad arguments.
-        """
+        """The first run of a group, after a check of its arguments."""
         macro_dt, num_steps = float(np.ravel(group.macro_dt)[0]), group.num_steps
         if num_steps % self.num_saves:
             raise ValueError(
@@ -166,13 +155,7 @@ class Work:
         return simulation(self.problem, group.scheme, state, self.solver, steps)
 
     def compute(self, rows: Rows, count: int, width: int) -> dict[str, np.ndarray]:
-        """Kept quantities and status of some runs, arrays by name with a row for each run.
-
-        Args:
-            rows: of the design.
-            count: number of rows.
-            width: number of runs that are computed side by side.
-        """
+        """Kept quantities and status of the runs of `count` rows, `width` of them side by side; arrays by name, a row for each run."""
         arrays: dict[str, np.ndarray] = {}
         for group in self.groups(rows, count):
             part = self._compute(group, {name: values[group.lanes] for name, values in rows.items()}, width)
@@ -187,9 +170,9 @@ class Work:
         filled = np.minimum(np.arange(max(count, width)), count - 1)
         rows = {name: values[filled] for name, values in rows.items()}
         macro_dt = group.macro_dt[filled] if np.ndim(group.macro_dt) else group.macro_dt
-        lanes = self.lanes(numbers_in(rows), len(filled))
+        params, start = self.lanes(numbers_in(rows), len(filled))
         project = self.problem.project if self.project is None else self.project
-        states = consistent_states(self.problem.system, lanes.params, lanes.start, project)
+        states = consistent_states(self.problem.system, params, start, project)
         trajectory = simulate_batch(
             self.problem,
             group.scheme,
@@ -197,7 +180,7 @@ class Work:
             macro_dt=macro_dt,
             num_steps=group.num_steps,
             save_every=group.num_steps // self.num_saves,
-            params=lanes.params,
+            params=params,
             solver=self.solver,
             chunk=width,
             warn=False,
@@ -231,11 +214,7 @@ class Work:
         return made
 
     def _steps(self, values: Mapping[str, Any], scheme) -> tuple[Any, int]:
-        """Macro step, a number or one for each run, and number of macro steps.
-
-        Raises:
-            ValueError: not two of t_end, num_steps and a step; a step that is not positive.
-        """
+        """Macro step, a number or one for each run, and number of macro steps."""
         values_by_name = dict(self.steps)
         twice = sorted(set(values_by_name) & set(values))
         if twice:
@@ -256,10 +235,8 @@ class Work:
         start = float(self.problem.t)
         if names == {"t_end", "num_steps"}:
             return (float(values_by_name["t_end"]) - start) / values_by_name["num_steps"], values_by_name["num_steps"]
-        factor = scheme.num_micro if "micro_dt" in values_by_name else 1
-        macro_dt = factor * np.asarray(
-            values_by_name["micro_dt" if "micro_dt" in values_by_name else "macro_dt"], dtype=float
-        )
+        name, factor = ("micro_dt", scheme.num_micro) if "micro_dt" in values_by_name else ("macro_dt", 1)
+        macro_dt = factor * np.asarray(values_by_name[name], dtype=float)
         if not np.all(macro_dt > 0):
             raise ValueError(f"ensemble: a step is {np.min(macro_dt)}; steps must be positive.")
         macro_dt = float(macro_dt) if macro_dt.ndim == 0 else macro_dt
@@ -290,7 +267,3 @@ def _whole(name: str, value) -> int:
     if float(value) != int(value) or value < 1:
         raise ValueError(f"ensemble: a value of {name} is {value}; it must be a whole number of at least 1.")
     return int(value)
-
-
-def _digest(file: str) -> str:
-    return hashlib.sha256(Path(file).read_bytes()).hexdigest()[:16]

@@ -3,10 +3,11 @@
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from itertools import islice
 from typing import Any
 
-from vmri_jax.executors.worker import call_in_worker, call_packed, known_versions, packed
+from vmri_jax.executors.worker import call_in_worker, packed
 from vmri_jax.mechanics.arrays import whole_number
 from vmri_jax.running.export import extra
 from vmri_jax.running.interrupts import Interrupted, interrupts_noted
@@ -36,17 +37,7 @@ class Here(Executor):
 
 @contextmanager
 def executor_of(caller: str, executor: Any, processes: int | None = None) -> Iterator[Executor]:
-    """The `concurrent.futures.Executor` that computes the tasks of a call.
-
-    Args:
-        caller: name of the calling function, for messages.
-        executor: None for this process, a `concurrent.futures.Executor`, or a `dask.distributed.Client`, which makes one.
-        processes: number of workers to start on this machine, or None.
-
-    Raises:
-        TypeError, ValueError: another executor, or both `executor` and `processes`.
-        ImportError: `processes` without Dask.
-    """
+    """The `concurrent.futures.Executor` that computes the tasks of a call; `executor` and `processes` are those of `ensemble`."""
     if executor is not None and processes is not None:
         raise ValueError(f"{caller}: executor and processes are given; choose one of them.")
     with ExitStack() as resources:
@@ -64,40 +55,40 @@ def executor_of(caller: str, executor: Any, processes: int | None = None) -> Ite
 
 @contextmanager
 def local_workers(count: int) -> Iterator[Any]:
-    """A client of `count` workers on this machine, each a process with one thread.
-
-    Raises:
-        ImportError: Dask is not installed.
-    """
+    """A client of `count` workers on this machine, each a process with one thread."""
     distributed = extra("distributed", "processes=", "ensemble")
     cluster = distributed.LocalCluster(n_workers=count, threads_per_worker=1, processes=True, dashboard_address=":0")
     with cluster, distributed.Client(cluster) as client:
         yield client
 
 
+def submitter(caller: str, tasks: Executor, task: Callable, *shared) -> Callable[..., Future]:
+    """The function of further arguments that has an executor compute ``task(*shared, *further)``, see `packed`."""
+    if isinstance(tasks, Here):
+        return partial(tasks.submit, task, *shared)
+    data = packed(caller, task, *shared)
+    return lambda *further: tasks.submit(*call_in_worker(data, *further))
+
+
 def as_done(
-    submit: Callable[..., Future], arguments: Iterable[tuple], interrupted: Callable[[], bool] = lambda: False
-) -> Iterator[tuple[tuple, Future]]:
-    """Submit a task for each tuple of arguments, at most `MOST_UNDER_WAY` ahead, and yield the arguments with the future as tasks end.
+    submit: Callable[[int], Future], numbers: Iterable[int], interrupted: Callable[[], bool] = lambda: False
+) -> Iterator[tuple[int, Future]]:
+    """Submit tasks by their numbers, at most `MOST_UNDER_WAY` ahead, and yield each number with its future as the tasks end.
 
     Args:
         submit: starts one task. A task of this process has ended when `submit` returns, and is yielded before the next one starts.
-        arguments: a tuple for each task.
-        interrupted: returns whether Ctrl-C was pressed. Python loses a `KeyboardInterrupt` that is raised in the finaliser of a future
-            of Dask; therefore a handler notes Ctrl-C, and this function polls it.
-
-    Raises:
-        KeyboardInterrupt: Ctrl-C was pressed.
+        interrupted: returns whether Ctrl-C was pressed, for a `KeyboardInterrupt`. Python loses one that is raised in the finaliser of a
+            future of Dask; therefore a handler notes Ctrl-C, and this function polls it.
     """
-    waiting: dict[Future, tuple] = {}
-    left = iter(arguments)
+    waiting: dict[Future, int] = {}
+    left = iter(numbers)
     try:
         while True:
             if interrupted():
                 raise KeyboardInterrupt
-            for call in islice(left, MOST_UNDER_WAY - len(waiting)):
-                future = submit(*call)
-                waiting[future] = call
+            for number in islice(left, MOST_UNDER_WAY - len(waiting)):
+                future = submit(number)
+                waiting[future] = number
                 if future.done():
                     break
             if not waiting:
@@ -117,13 +108,11 @@ def mapped(
     executor: Any = None,
     report: Callable[[int, int], None] = lambda done, number: None,
 ) -> list:
-    """``[task(*call) for call in arguments]``, computed by an executor; the first error is raised.
+    """``[task(*call) for call in arguments]``, computed by an executor as in `ensemble`; the first error is raised.
 
     Args:
-        caller: name of the calling function, for messages.
         task: a function that is defined in a module.
         arguments: a tuple for each call, which pickle can send if workers compute.
-        executor: as in `ensemble`.
         report: ``report(done, number)``, the number of calls that are done when call `number` is submitted.
 
     Raises:
@@ -131,23 +120,22 @@ def mapped(
     """
     calls = list(arguments)
     results: list = [None] * len(calls)
+
+    def done() -> int:
+        return sum(result is not None for result in results)
+
     with ExitStack() as opened:
         tasks = opened.enter_context(executor_of(caller, executor))
-        here, versions = isinstance(tasks, Here), known_versions()
         # In this process Ctrl-C stops the task itself, so that nothing has to poll.
-        interrupted = (lambda: False) if here else opened.enter_context(interrupts_noted())
-        numbers = ((i,) for i in range(len(calls)))
+        interrupted = (lambda: False) if isinstance(tasks, Here) else opened.enter_context(interrupts_noted())
 
         def submit(i: int) -> Future:
-            report(sum(part is not None for part in results), i)
-            if here:
-                return tasks.submit(task, *calls[i])
-            return tasks.submit(*call_in_worker(versions, call_packed, packed(caller, (task, calls[i]))))
+            report(done(), i)
+            return submitter(caller, tasks, task, *calls[i])()
 
         try:
-            for (i,), future in as_done(submit, numbers, interrupted):
+            for i, future in as_done(submit, range(len(calls)), interrupted):
                 results[i] = future.result()
         except KeyboardInterrupt:
-            done = sum(result is not None for result in results)
-            raise Interrupted(results, done, len(results), "calls") from None
+            raise Interrupted(results, done(), len(results), "calls") from None
     return results

@@ -8,12 +8,9 @@ import pickle
 import socket
 from collections.abc import Callable
 from functools import lru_cache
-from typing import Any
 
 from vmri_jax.configure import cache_folder, configure, processor
 from vmri_jax.running.store.identity import environment
-
-VERSIONS = ("vmri_jax", "jax", "jaxlib")
 
 
 class NotAWorker(RuntimeError):
@@ -24,21 +21,13 @@ class NotAWorker(RuntimeError):
 def known_versions() -> dict[str, str]:
     """Versions of the packages that the last digits of a run depend on."""
     versions = environment()
-    return {name: versions[name] for name in VERSIONS}
+    return {name: versions[name] for name in ("vmri_jax", "jax", "jaxlib")}
 
 
-def packed(caller: str, value: Any) -> bytes:
-    """A value as bytes that another process can read.
-
-    Args:
-        caller: name of the calling function, for messages.
-        value: its functions have to be importable.
-
-    Raises:
-        ValueError: the value has functions that workers cannot import.
-    """
+def packed(caller: str, task: Callable, *shared) -> bytes:
+    """A function and its first arguments as bytes that another process can read; refuses functions that workers cannot import."""
     try:
-        data = pickle.dumps(value)
+        data = pickle.dumps((task, shared))
         if b"__main__" in data:
             raise pickle.PicklingError("it has functions of the running program")
     except (pickle.PicklingError, AttributeError, TypeError) as error:
@@ -61,26 +50,19 @@ class _Call:
         return self.call
 
 
-def call_in_worker(versions: dict[str, str], task: Callable, packed: bytes, *plain) -> tuple[Callable, bytes]:
+def call_in_worker(data: bytes, *plain) -> tuple[Callable, bytes]:
     """A function and its argument for an executor, ``(pickle.loads, bytes)``, that make the call of `in_worker`.
 
     `pickle.loads` makes the call while it unpickles `_Call`. A worker without this package therefore raises ModuleNotFoundError within the
     task, which is reported; a worker of Dask ends at a task whose function it cannot import.
     """
-    return pickle.loads, pickle.dumps(_Call(in_worker, versions, task, packed, *plain))
+    return pickle.loads, pickle.dumps(_Call(in_worker, known_versions(), data, *plain))
 
 
-def in_worker(versions: dict[str, str], task: Callable, packed: bytes, *plain):
-    """Set up JAX in this process and return ``task(packed, *plain)``.
+def in_worker(versions: dict[str, str], data: bytes, *plain):
+    """Set up JAX in this process and return ``task(*shared, *plain)`` for the task that `packed` has packed.
 
-    Args:
-        versions: versions of packages of the process that started the work.
-        task: unpacks its first argument.
-        packed: bytes for it.
-        plain: further arguments.
-
-    Raises:
-        NotAWorker: this process has other versions, or JAX has started in it with other settings.
+    Refuses a process with other `versions` than the one that started the work, or one where JAX has started with other settings.
     """
     here = known_versions()
     differ = [
@@ -92,21 +74,20 @@ def in_worker(versions: dict[str, str], task: Callable, packed: bytes, *plain):
             "workers the versions of the process that starts them."
         )
     _prepare(os.getpid())
-    return task(packed, *plain)
+    task, shared = _unpacked(data)
+    return task(*shared, *plain)
 
 
-def call_packed(packed: bytes):
-    """``task(*arguments)`` from the pickled ``(task, arguments)``."""
-    task, arguments = pickle.loads(packed)
-    return task(*arguments)
+@lru_cache(maxsize=4)
+def _unpacked(data: bytes) -> tuple[Callable, tuple]:
+    return pickle.loads(data)
 
 
 @lru_cache(maxsize=1)
 def _prepare(process: int) -> None:
-    """Settings of JAX: one thread, 64-bit floats, fast loops, and compiled programs on disk in a folder for this kind of processor.
+    """One thread, 64-bit floats, fast loops, and compiled programs on disk in a folder for this kind of processor.
 
-    Args:
-        process: number of this process; a forked process has another one, and prepares itself again.
+    `process` is the number of this process; a forked process has another one, and prepares itself again.
     """
     os.environ.setdefault("PJRT_NPROC", "1")
     try:

@@ -15,7 +15,7 @@ from vmri_jax.fitting.shooting import Shooting
 from vmri_jax.fitting.unknowns import Unknown, Unknowns
 from vmri_jax.mechanics.arrays import whole_number
 from vmri_jax.mechanics.checks import check_type
-from vmri_jax.mechanics.state import HasProblem, Problem, opened
+from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
 from vmri_jax.running.export import extra
 from vmri_jax.running.progress import Progress, Working
 from vmri_jax.running.simulation import prepare
@@ -117,11 +117,7 @@ def _model(problem, parameters: Mapping) -> Callable[[Mapping], Problem]:
         )
     if not isinstance(problem, Problem) and callable(problem) and not hasattr(problem, "problem"):
         return cast(Callable[[Mapping], Problem], problem)
-    base = opened(problem)
-    if not isinstance(base, Problem):
-        raise TypeError(
-            f"fit: problem is {type(base).__name__}; give a Problem, a scene, or a function from parameters to a Problem."
-        )
+    base = problem_of("fit", cast(Problem, problem))
     params = base.system.params
     known, structure = _by_name(params if isinstance(params, Mapping) else {})
     for name, unknown in parameters.items():
@@ -181,15 +177,12 @@ class _Search:
         scale = np.abs(np.concatenate([self.part_starts, np.asarray(shooting.start(u_start))[None]])).max(axis=0)
         self.scale = np.where(scale > 0, scale, scale.max() or 1.0)
 
-    def residual(self, x, values, weight):
-        """Misses of all values in standard deviations, and weighted gaps between the parts.
+    def residual(self, x, args):
+        """Misses of all values in standard deviations, and weighted gaps between the parts; `args` are the values and the weight of gaps.
 
-        Args:
-            x: (u, z), search variables of the parameters, and starts of the parts after the first one in units of `scale`.
-            values: measured values.
-            weight: of the gaps.
+        x is (u, z), search variables of the parameters, and starts of the parts after the first one in units of `scale`.
         """
-        u, z = x
+        (u, z), (values, weight) = x, args
         predicted, gaps = self.shooting.predict(u, z * self.scale)
         misses = (predicted - values) / self.shooting.sigma
         finite = jnp.isfinite(misses)
@@ -204,19 +197,13 @@ class _Search:
         weights = jnp.asarray(GAP_WEIGHTS if self.shooting.segments > 1 else (1.0,))
 
         def stage(x, weight):
-            solution = optimistix.least_squares(
-                lambda x, args: self.residual(x, *args),
-                solver,
-                x,
-                (values, weight),
-                max_steps=self.max_steps,
-                throw=False,
-            )
+            options = {"max_steps": self.max_steps, "throw": False}
+            solution = optimistix.least_squares(self.residual, solver, x, (values, weight), **options)
             good = solution.result == optimistix.RESULTS.successful
             return solution.value, (solution.stats["num_steps"], good)
 
         (u, z), (iterations, good) = jax.lax.scan(stage, (u, z), weights)
-        misses, gaps = self.residual((u, z), values, 1.0)
+        misses, gaps = self.residual((u, z), (values, 1.0))
         return u, z, misses, jnp.sum(iterations), good[-1], jnp.max(jnp.abs(gaps), initial=0.0)
 
     def jacobian(self, u, z, values):
@@ -224,9 +211,8 @@ class _Search:
 
         def joined(x):
             u, z = jnp.split(x, [self.size])
-            return jnp.concatenate(
-                [jnp.ravel(a) for a in self.residual((u, z.reshape(shape)), values, GAP_WEIGHTS[-1])]
-            )
+            parts = self.residual((u, z.reshape(shape)), (values, GAP_WEIGHTS[-1]))
+            return jnp.concatenate([jnp.ravel(a) for a in parts])
 
         shape = jnp.shape(z)
         # dr/dx = (dr/du) / (dx/du), since the number i of the parameters depends on u_i alone
@@ -256,30 +242,19 @@ class _Search:
         squares = np.sum(ends[2] ** 2, axis=1)  # of the misses
         u, z, misses, iterations, good, gap = (a[np.argmin(squares)] for a in ends)
         tell("the derivatives at the end of the search", 3, NUM_PHASES)
-        by_parameters, by_starts = (np.asarray(a) for a in self.compiled_jacobian(u, z, self.shooting.values))
-        return Fit.of(
-            self.shooting,
-            u,
-            misses,
-            by_parameters=by_parameters,
-            by_starts=by_starts,
-            iterations=int(iterations),
-            success=bool(good),
-            gap=float(gap),
-            squares=squares,
-            again=partial(_again, self, u, z),
-        )
+        jacobians = [np.asarray(a) for a in self.compiled_jacobian(u, z, self.shooting.values)]
+        end = {"iterations": int(iterations), "success": bool(good), "gap": float(gap), "squares": squares}
+        return Fit.of(self.shooting, u, misses, jacobians, **end, again=partial(self.again, u, z))
 
+    def again(self, u, z, values):
+        """Parameters (k, p) and covariances (k, p, p) of fits to other values (k, m); each search starts at the end u, z of the first fit."""
+        unknowns = self.shooting.unknowns
 
-def _again(search: _Search, u, z, values):
-    """Parameters (k, p) and covariances (k, p, p) of fits to other values (k, m); each search starts at the end u, z of the first fit."""
-    unknowns = search.shooting.unknowns
+        @jax.jit
+        def refit(values):
+            u_end, z_end, *_ = self.solve(u, z, values)
+            jacobian = without_starts(*self.jacobian(u_end, z_end, values))
+            covariance = jnp.linalg.pinv(jacobian.T @ jacobian, hermitian=True)
+            return unknowns.vector(unknowns.at(u_end)), covariance
 
-    @jax.jit
-    def refit(values):
-        u_end, found_z, *_ = search.solve(u, z, values)
-        jacobian = without_starts(*search.jacobian(u_end, found_z, values))
-        covariance = jnp.linalg.pinv(jacobian.T @ jacobian, hermitian=True)
-        return unknowns.vector(unknowns.at(u_end)), covariance
-
-    return jax.lax.map(refit, values, batch_size=50)
+        return jax.lax.map(refit, values, batch_size=50)

@@ -62,8 +62,8 @@ class Fit:
     again: Callable = field(repr=False)
 
     @classmethod
-    def of(cls, shooting: Shooting, u, misses, *, by_parameters, by_starts, **search: Any) -> "Fit":
-        """The fit at the end of a search, see `vmri_jax.fitting.fit`; `search` has the other fields by name."""
+    def of(cls, shooting: Shooting, u, misses, jacobians, **search: Any) -> "Fit":
+        """The fit at the end of a search; `jacobians` as of `_covariance`, and the other fields by name."""
         unknowns = shooting.unknowns
         parameters = {name: np.asarray(value) for name, value in unknowns.at(u).items()}
         numbers = np.asarray(unknowns.vector(parameters))
@@ -73,7 +73,7 @@ class Fit:
             # s^2 = sum of squares / (m - p)
             sigma = float(np.sqrt(np.sum(misses**2) / max(freedom, 1)))
             misses = misses / sigma
-        covariance, undetermined = _covariance(by_parameters, by_starts, numbers, unknowns.labels)
+        covariance, undetermined = _covariance(jacobians, numbers, unknowns.labels)
         estimates = parameters, unknowns.labels, sigma**2 * covariance, misses, freedom, sigma, undetermined
         return cls(*estimates, shooting=shooting, **search)
 
@@ -211,8 +211,9 @@ def without_starts(by_parameters, by_starts):
     return by_parameters - q @ (q.T @ by_parameters)
 
 
-def _covariance(by_parameters, by_starts, numbers, labels) -> tuple[np.ndarray, list[str]]:
+def _covariance(jacobians, numbers, labels) -> tuple[np.ndarray, list[str]]:
     """``(J^T J)^-1`` of the parameters, and in words their combinations that the data does not determine."""
+    by_parameters, by_starts = jacobians
     scale = np.where(numbers == 0, 1.0, np.abs(numbers))
     jacobian = np.asarray(without_starts(by_parameters * scale, by_starts))
     _, sizes, directions = np.linalg.svd(jacobian, full_matrices=False)

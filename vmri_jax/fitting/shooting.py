@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from math import gcd
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -89,15 +90,9 @@ class Shooting:
         if self.segments == 1:
             return np.zeros((0, self.start(u).size))
         problem = self.model(self.unknowns.at(u))
-        run = simulate(
-            problem,
-            self.scheme,
-            macro_dt=self.macro_dt,
-            num_steps=self.length * self.segments,
-            save_every=self.length,
-            solver=self.solver,
-        )
-        nodes = State(*(np.asarray(getattr(run, name))[1:-1] for name in ("t", "q_s", "q_f", "p_s", "p_f")))
+        steps = {"macro_dt": self.macro_dt, "num_steps": self.length * self.segments, "save_every": self.length}
+        run = simulate(problem, self.scheme, **steps, solver=self.solver)
+        nodes = jax.tree.map(lambda a: np.asarray(a)[1:-1], run.states)
         return np.asarray(jax.vmap(partial(_phase, problem))(nodes))
 
     def predict(self, u, starts):
@@ -158,18 +153,9 @@ class Shooting:
 
     def _run(self, problem: Problem, state: State):
         """Observed quantities at the saved nodes of a run of one part from a state, and its end (2 n,)."""
-        run = simulate(
-            problem.system,
-            self.scheme,
-            state,
-            macro_dt=self.macro_dt,
-            num_steps=self.length,
-            save_every=self.every,
-            solver=self.solver,
-            throw=False,
-            adjoint="stored",
-        )
-        nodes = run.states
+        steps = {"macro_dt": self.macro_dt, "num_steps": self.length, "save_every": self.every}
+        options: dict[str, Any] = {"solver": self.solver, "throw": False, "adjoint": "stored"}
+        nodes = simulate(problem.system, self.scheme, state, **steps, **options).states
         observed = [jax.vmap(m.observe)(nodes) for m in self.data]
         return observed, _phase(problem, jax.tree.map(lambda a: a[-1], nodes))
 

@@ -7,25 +7,26 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax import diagnostics, textbook
+from vmri_jax.accuracy.companions import positions
 from vmri_jax.diagnostics import step_condition
-from vmri_jax.hard_cases.case import Case, Outcome
+from vmri_jax.diagnostics.linear import phase_vector
+from vmri_jax.hard_cases.case import Case, Outcome, draw_energy
 from vmri_jax.hard_cases.derivatives import derivatives
-from vmri_jax.hard_cases.guards import bad_lane, single_precision
 from vmri_jax.hard_cases.measures import (
     Energy,
+    bad_lane,
     constraints,
     difference,
     drift_meter,
     energy,
     energy_scale,
     long_run,
-    nodes,
     relative_constraints,
     reversal,
     run,
+    single_precision,
     status,
 )
-from vmri_jax.hard_cases.pictures import draw_energy
 from vmri_jax.mechanics.motion import motion
 from vmri_jax.mechanics.projection import legendre
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
@@ -56,6 +57,7 @@ ROUND_OFF = 4 * np.finfo(float).eps
 """Round-off of a position in a step, as a part of the largest position; a larger value hides differences of momenta."""
 ENERGY_CRITERION = "the linear trend is at most half of the largest energy error, or flattens in a longer run, or the error is below 1e-9"
 EXPLICIT_CRITERION = "runs at omega h = 1; at 2.5 every NaN is reported as a failure"
+DERIVATIVE_CRITERION = "gradients and Hessians are those of the functions, to 1e-4"
 LANE_CRITERION = "the bad lane reports its failure, the others equal their single runs to 1e-12"
 
 
@@ -122,7 +124,7 @@ class Resolved:
         for tolerance in (1e-4, 1e-8, 1e-12):
             solver = solvers.Auto(tolerance=tolerance)
             trajectory = run(self.problem, self.scheme, self.macro_dt, steps, save_every=steps, solver=solver)
-            ends[tolerance] = nodes(trajectory)[-1]
+            ends[tolerance] = positions(trajectory)[-1]
         size = np.abs(ends[1e-12]).max()
         loose, middle = (difference(ends[t], ends[1e-12]) / size for t in (1e-4, 1e-8))
         return Outcome(
@@ -177,13 +179,9 @@ class Resolved:
         """
         system, state = self.problem.system, self.problem.state()
         simulated = jax.jit(textbook.simulate, static_argnames="num_steps")
-        (q, p), (q_oracle, p_oracle) = (
-            (np.concatenate([states.q_s, states.q_f], axis=1), np.concatenate([states.p_s, states.p_f], axis=1))
-            for states in (
-                run(self.problem, scheme, macro_dt, steps).states,
-                simulated(system, scheme, state, macro_dt, num_steps=steps),
-            )
-        )
+        oracle = simulated(system, scheme, state, macro_dt, num_steps=steps)
+        runs = run(self.problem, scheme, macro_dt, steps).states, oracle
+        (q, p), (q_oracle, p_oracle) = (np.split(np.asarray(phase_vector(states)), 2, axis=1) for states in runs)
         n_s, still = state.q_s.size, jnp.zeros(q.shape[1])
         mass = jax.jacfwd(lambda v: jnp.concatenate(legendre(system, state.q_s, state.q_f, v[:n_s], v[n_s:])))(still)
         size = float(jnp.abs(mass).max())
@@ -231,13 +229,8 @@ def cases_for(problem: Problem | HasProblem) -> tuple[Case, ...]:
         cases = resolved(problem)
     system = problem.system
     unconstrained = "" if system.is_constrained else "the system has no constraints"
-    one_way = _turns_one_way(problem)
-
-    def precision(full: bool) -> Outcome:
-        return single_precision(problem, cases.macro_dt)
-
-    def differences(full: bool) -> Outcome:
-        return derivatives(problem, cases.scheme, cases.macro_dt)
+    outside, limitless = _outside(system), _has_no_limit(system)
+    one_way = f"{outside}: the way back is another motion" if outside else _turns_one_way(problem)
 
     def lane(full: bool) -> Outcome:
         return bad_lane(problem, cases.scheme, cases.macro_dt, 20, solvers.Auto(), lanes=64 if full else 16)
@@ -247,28 +240,21 @@ def cases_for(problem: Problem | HasProblem) -> tuple[Case, ...]:
     rows = [
         ("advice", step, "no error, no warning", cases.advice),
         ("rank of the constraints", step, "rows independent at the start and on the way", cases.rank, unconstrained),
-        (
-            "constraints for long",
-            step,
-            "position constraint below 1e-10 of its size",
-            cases.constraints,
-            unconstrained,
-        ),
-        ("energy for long", step, ENERGY_CRITERION, cases.energy, _does_work(system)),
+        ("constraints for long", step, "position constraint below 1e-10 of its size", cases.constraints, unconstrained),
+        ("energy for long", step, ENERGY_CRITERION, cases.energy, outside and f"{outside}: no energy is kept"),
         ("loose Newton tolerance", f"{step}, 1e-4 to 1e-12", "error shrinks with the tolerance", cases.tolerance),
         ("tiny steps", f"{step} and smaller", "scaled condition flat", cases.tiny_steps),
         ("reversibility", step, "back at the start to 1e-6", cases.reversal, one_way),
-        (
-            "explicit limit",
-            f"fully_explicit, {single}",
-            EXPLICIT_CRITERION,
-            cases.explicit_limit,
-            _has_no_limit(system),
-        ),
+        ("explicit limit", f"fully_explicit, {single}", EXPLICIT_CRITERION, cases.explicit_limit, limitless),
         ("textbook", f"{step}; fully_explicit, {single}", "steps of vmri_jax.textbook to 1e-10", cases.textbook),
-        ("float32", "64-bit mode off, and float32 data", "refused with the one-line fix", precision),
+        (
+            "float32",
+            "64-bit mode off, and float32 data",
+            "refused with the one-line fix",
+            lambda _: single_precision(problem, cases.macro_dt),
+        ),
         ("one bad lane in a batch", step, LANE_CRITERION, lane),
-        ("derivatives", step, "gradients and Hessians are those of the functions, to 1e-4", differences),
+        ("derivatives", step, DERIVATIVE_CRITERION, lambda _: derivatives(problem, cases.scheme, cases.macro_dt)),
     ]
     pictures = {"energy for long": draw_energy}
     return tuple(
@@ -277,13 +263,11 @@ def cases_for(problem: Problem | HasProblem) -> tuple[Case, ...]:
     )
 
 
-def _does_work(system: System) -> str:
-    """The reason why the system does not conserve its energy; empty for a closed system."""
+def _outside(system: System) -> str:
+    """The reason why work may be done on the system from outside; empty for a closed system."""
     if system.is_rheonomic:
-        return "its constraints move with time and do work: no energy is kept"
-    if system.force is not None:
-        return "it has forces besides its potentials, which may do work: no energy is kept"
-    return ""
+        return "its constraints move with time"
+    return "" if system.force is None else "it has forces besides its potentials, as friction and drives"
 
 
 def _has_no_limit(system: System) -> str:
@@ -298,11 +282,7 @@ def _has_no_limit(system: System) -> str:
 
 
 def _turns_one_way(problem: Problem) -> str:
-    """The reason why reversed momenta do not lead back to the start; empty if they do: potentials, and a kinetic energy even in the velocities."""
-    if problem.system.is_rheonomic:
-        return "its constraints move with time: the way back is another motion"
-    if problem.system.force is not None:
-        return "it has forces besides its potentials, as friction and drives: the way back is another motion"
+    """The reason why reversed momenta do not lead a closed system back to the start; empty if its kinetic energy is even in the velocities."""
     random, system = np.random.default_rng(0), problem.system
     v_s, v_f = (random.uniform(-1, 1, q.shape) for q in (problem.q_s, problem.q_f))
     there, back = (float(system.kinetic(problem.q_s, problem.q_f, v_s * x, v_f * x, system.params)) for x in (1, -1))

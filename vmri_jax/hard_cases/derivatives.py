@@ -125,12 +125,9 @@ def _quotients(f: Callable, z, directions, size: float):
 
 
 def _smallest_difference(derivative, quotients, value_per_size):
-    """Relative difference of a derivative from its quotients, less round-off, for the h with the smallest difference.
+    """Relative difference of a derivative (DIRECTIONS, ...) from its quotients (STEPS, DIRECTIONS, ...) for the h with the smallest one.
 
-    Args:
-        derivative: (DIRECTIONS, ...).
-        quotients: (STEPS, DIRECTIONS, ...).
-        value_per_size: size of the values divided by the size of the positions, which sets the round-off.
+    Less the round-off, which the size of the values divided by the size of the positions sets.
     """
     difference = jnp.abs(quotients - derivative).reshape(len(STEPS), -1).max(axis=1)
     difference = jnp.where(jnp.isfinite(difference), difference, jnp.inf)

@@ -7,6 +7,7 @@ import traceback
 from collections.abc import Callable
 from functools import lru_cache, partial
 from pathlib import Path
+from types import UnionType
 
 import jax
 import jax.numpy as jnp
@@ -54,7 +55,7 @@ def check_flags(**flags) -> None:
             raise TypeError(f"{name} is {value!r}; it must be True or False.")
 
 
-def check_type(name: str, value, kind: type, example: str) -> None:
+def check_type(name: str, value, kind: type | UnionType, example: str) -> None:
     """Refuse objects of another class; `example` in the message names a right object."""
     if not isinstance(value, kind):
         raise TypeError(f"{name} is {type(value).__name__}; give {example}.")

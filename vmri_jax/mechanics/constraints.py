@@ -250,8 +250,6 @@ def check_constraints(
         return rows.gradients[:n_g, :n_s], rows.gradients[:n_g, n_s:], rows.gradients[n_g : n_g + n_gs, :n_s]
 
     slow, fast, alone = gradients(rows)
-    _check_counts(fast, alone)
-    _check_gradients(system, state, rows, weights, in_words)
     allowed = rows.allowed(tolerance)[: n_g + n_gs]
     violated = np.abs(solved) > allowed
     if violated.any():
@@ -264,13 +262,15 @@ def check_constraints(
     _check_implied(rows, n_g + n_gs, place)
 
     size = np.linalg.norm(np.concatenate([slow, fast], axis=1), axis=1)
-    slow_only = np.flatnonzero(np.linalg.norm(fast, axis=1) <= LEAST_FAST_PART * size)
+    slow_only = np.flatnonzero((size > 0) & (np.linalg.norm(fast, axis=1) <= LEAST_FAST_PART * size))
     if slow_only.size:
         raise ValueError(
             f"System: row(s) {in_words(slow_only, 'constraint')} of constraint do not depend on the fast variables q_f. {MICRO_GRID} "
             "Give them as System(slow_constraint=...), a function of (q_s, params), which is held at the macro nodes; or make the "
             "variables that they hold fast."
         )
+    _check_counts(fast, alone)
+    _check_gradients(system, state, rows, weights, in_words)
     if any(dependent for _, dependent in map(rank_of, (alone, fast))):
         # At a singular configuration (a linkage folded flat) rows are dependent there and nowhere else, and runs pass it: only rows that are
         # dependent at a generic configuration nearby are refused.

@@ -119,11 +119,10 @@ def _moduli(run: SavedRun) -> dict[str, dict[str, np.ndarray]]:
                 curves, modulus = panels[unit], np.linalg.norm(reaction, axis=1)
                 curves[constraint] = np.maximum(curves.get(constraint, 0.0), modulus)
     for curves in panels.values():
-        largest = max((np.nanmax(curve, initial=0.0) for curve in curves.values()), default=0.0)
-        for name in [
-            name for name, curve in curves.items() if not np.nanmax(curve, initial=0.0) > LEAST_SHOWN * largest
-        ]:
-            del curves[name]
+        largest = {name: np.nanmax(curve, initial=0.0) for name, curve in curves.items()}
+        for name, size in largest.items():
+            if not size > LEAST_SHOWN * max(largest.values()):
+                del curves[name]
     return {f"reaction {unit}": curves for unit, curves in panels.items() if curves}
 
 
@@ -134,20 +133,16 @@ def position_panels(run: SavedRun) -> list[tuple[np.ndarray, list[str], str, np.
     """
     names, error = run.names, run.error
     slow, fast = (None, None) if error is None else (error.q_s, error.q_f)
-    panels = (
+    parts = (
         (run.states.q_s, names.positions("s"), names.slow_coordinates, r"slow positions $q_s$", slow),
         (run.states.q_f, names.positions("f"), names.fast_coordinates, r"fast positions $q_f$", fast),
     )
-    return [
-        (
-            np.asarray(values)[:, shown],
-            [labels[i] for i in shown],
-            quantity,
-            None if errors is None else np.asarray(errors)[:, shown],
-        )
-        for values, shown, labels, quantity, errors in panels
-        if shown
-    ]
+    panels = []
+    for values, shown, labels, quantity, errors in parts:
+        if shown:
+            errors = None if errors is None else np.asarray(errors)[:, shown]
+            panels.append((np.asarray(values)[:, shown], [labels[i] for i in shown], quantity, errors))
+    return panels
 
 
 def limit_times(axes: Axes, t) -> None:
@@ -212,9 +207,8 @@ def _energy_balance(above: Axes, below: Axes, trajectory: SavedRun, theme: Theme
     curves = {"energy": energy - energy[0], "forces": work.forces, "moving constraints": work.constraints}
     for (name, values), color in zip(curves.items(), theme.curves, strict=False):
         if name == "energy" or np.any(values != 0):
-            above.plot(
-                t, values, color=color, linewidth=_thin(t), label=name if name == "energy" else f"work of {name}"
-            )
+            label = name if name == "energy" else f"work of {name}"
+            above.plot(t, values, color=color, linewidth=_thin(t), label=label)
     above.set_ylabel("energy and work")
     legend_beside(above, size=7.5)
     below.plot(t, work.balance, color=theme.curves[0], linewidth=_thin(t), label=r"$\Delta E$ - work")

@@ -94,17 +94,9 @@ def plot_staircases(
             x, y = [bound.factor * stair.seconds for stair in stairs], positive([stair.error for stair in stairs])
             axes.step(x, y, where="post", color=theme.rod, linestyle=":", linewidth=1.3, label=bound.label, zorder=1.5)
         for run in marked:
-            look = {"marker": "*", "markersize": 15} if run.star else {"marker": "o", "markersize": 13}
-            face = gold if run.star else "none"
-            axes.plot(
-                run.seconds,
-                *positive([run.error]),
-                linestyle="",
-                label=run.label,
-                color=theme.ink,
-                markerfacecolor=face,
-                **look,
-            )
+            look: dict[str, Any] = {"marker": "*", "markersize": 15} if run.star else {"marker": "o", "markersize": 13}
+            look |= {"linestyle": "", "color": theme.ink, "markerfacecolor": gold if run.star else "none"}
+            axes.plot(run.seconds, *positive([run.error]), label=run.label, **look)
         if any(np.isfinite(stair.fast_share) for stairs in kinds.values() for stair in stairs):
             for name, color in (("error of the macro steps", blue), ("error of the micro steps", orange)):
                 axes.plot([], [], "o", color=theme.rod, markerfacecolor=color, markersize=7, label=name)

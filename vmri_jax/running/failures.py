@@ -10,7 +10,9 @@ from vmri_jax.steppers.results import Result, SimulationError
 
 def simulation_error(trajectory: Trajectory, macro_dt, save_every: int, num_micro: int) -> SimulationError:
     """The `SimulationError` of a failed run: the failing step, its status, and the largest motion before it."""
-    from vmri_jax.stability.labels import swapped_at_start  # imported here: vmri_jax.stability imports vmri_jax.running
+    from vmri_jax.stability.vibrations import (
+        swapped_at_start,
+    )  # imported here: vmri_jax.stability imports vmri_jax.running
 
     step = int(trajectory.failed_at)
     interval = step // save_every

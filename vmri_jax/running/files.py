@@ -47,6 +47,15 @@ def made_beside(path: Path) -> Iterator[Path]:
     synchronize(path.parent)
 
 
+@contextmanager
+def explained(path: Path, advice: str) -> Iterator[None]:
+    """Context whose errors of the file system name the path that cannot be written, and end with the advice."""
+    try:
+        yield
+    except OSError as error:
+        raise OSError(error.errno, f"{path} cannot be written: {error.strerror or error}. {advice}") from error
+
+
 def clear_partial(path: Path) -> None:
     """Remove the partial files that an interrupted `replaced` left in a folder."""
     for file in path.rglob("*.partial"):
@@ -102,11 +111,9 @@ def check_writable(path: Path) -> None:
     if path.exists() and not path.is_file():  # a device: written to directly, without a file beside it
         return
     attempt = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
+    with explained(path, "Give another place."):
         attempt.touch()
         attempt.unlink()
-    except OSError as error:
-        raise OSError(error.errno, f"{path} cannot be written: {error.strerror}. Give another place.") from error
 
 
 def make_writable_folder(path: Path) -> None:

@@ -59,11 +59,11 @@ def build(sorting: Sorting, placed: Sequence[Placed]) -> System:
 
 def actuation(sorting: Sorting) -> Actuation | None:
     """The forces of the controls of a scene, None if it has no controls."""
+    bodies, layout = sorting.bodies, sorting.layout
     controls = [part for part in sorting.placed if part.home == "control"]
-    of_effects = [part.effect.terms(part.elements, sorting.bodies, sorting.layout, {}) for part in controls]
-    terms = tuple(term for (term,) in of_effects)
-    names = tuple(part.effect.components(sorting.bodies) for part in controls)
-    return Actuation(terms, _kinematics("control", terms, sorting.layout), names) if controls else None
+    terms = tuple(part.effect.terms(part.elements, bodies, layout, {})[0] for part in controls)
+    names = tuple(part.effect.components(bodies) for part in controls)
+    return Actuation(terms, _kinematics("control", terms, layout), names) if controls else None
 
 
 def _kinematics(home: str, terms: Sequence, layout: Layout) -> Kinematics | None:

@@ -62,10 +62,7 @@ def moving(names: Iterable[str]) -> tuple[str, ...]:
 
 
 class Point(NamedTuple):
-    """A body, or a point in a body, as an effect between points takes it.
-
-    mass: of the whole body; None for a point in a body.
-    """
+    """A body, or a point in a body, as an effect between points takes it; a point in a body has no mass."""
 
     name: str
     position: Any
@@ -114,27 +111,15 @@ class AnyBody(ABC):
         return np.eye(self.size)
 
     def weights(self, offset: Any) -> Any:
-        """(3,) components X along the directors of a point ``phi + sum_i X_i d_i`` that is fixed in the body.
-
-        Args:
-            offset: (3,) m from the centre of mass, in the axes of the body.
-        """
+        """(3,) components X along the directors of a point ``phi + sum_i X_i d_i`` fixed in the body, see `point`."""
         return joined([offset, np.zeros(3 - offset.shape[0])])
 
     @abstractmethod
     def point(self, offset: Any = None) -> Point:
-        """The centre of the body, or a point fixed in it, at the start.
-
-        Args:
-            offset: (3,) m from the centre of mass, in the axes of the body; None for the centre.
-        """
+        """The centre of the body, or the point at `offset` (3,) m from it in the axes of the body, at the start."""
 
     def with_rates(self, rates: np.ndarray) -> "AnyBody":
-        """The same body with other velocities; a body without mass has none.
-
-        Args:
-            rates: (n,) rates of its coordinates at the start.
-        """
+        """The same body with other rates (n,) of its coordinates at the start; a body without mass has none."""
         return self
 
     def _check_names(self) -> None:
@@ -235,11 +220,7 @@ class Body(AnyBody):
         return self.mass + np.zeros(self.size)
 
     def point(self, offset: Any = None) -> Point:
-        """The position of the body at the start.
-
-        Raises:
-            ValueError: an offset, as if the body were rigid.
-        """
+        """The position of the body at the start; an offset, as if the body were rigid, is refused."""
         if offset is not None:
             raise ValueError(f"{self.name} is no rigid body, so that no point is fixed in it; give its name alone.")
         return Point(self.name, self.position, self.mass, self.block)
@@ -314,12 +295,7 @@ def body_of(bodies: Bodies, name: str) -> AnyBody:
 
 
 def end_of(bodies: Bodies, name: str, whole: bool = False) -> Point:
-    """The point that an effect acts on: a point mass, the centre of a rigid body, or a point fixed in a rigid body.
-
-    Args:
-        name: of a body, or an `Attachment`.
-        whole: all coordinates of a rigid body instead of its centre.
-    """
+    """The point that an effect acts on, see `AnyBody.point`; if `whole` all coordinates of a rigid body."""
     body, offset = body_of(bodies, name), getattr(name, "offset", None)
     if whole and body.rigid and offset is None:
         return Point(name, body.coordinates)

@@ -16,9 +16,8 @@ from typing import Any, Literal, TypeVar, dataclass_transform
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
-from vmri_jax.mechanics.arrays import is_concrete, real_array
+from vmri_jax.mechanics.arrays import real_array
 from vmri_jax.mechanics.order import in_order, order_of
 from vmri_jax.scene.body import Bodies, Frame, Point, entry, is_entry
 
@@ -42,12 +41,7 @@ class Names:
     may_be_all: bool = False
 
     def elements(self, argument: Any, bodies: Bodies, about: str) -> Elements:
-        """The elements: names of the bodies of each.
-
-        Args:
-            argument: an element ``("a", "b")``, a list of elements ``[("a", "b"), ("b", "c")]``, or None.
-            about: names of effect and field, for messages.
-        """
+        """The elements of an argument ``("a", "b")``, ``[("a", "b"), ("b", "c")]`` or None; `about` begins messages."""
         if argument is None and self.may_be_all:
             argument = tuple(name for name, body in bodies.items() if not isinstance(body, Frame))
         if is_entry(argument):
@@ -91,13 +85,7 @@ class Parameter:
     may_be_number: bool = False
 
     def array(self, about: str, argument: Any, bodies: Sequence[Point]) -> jax.Array:
-        """The array that the function gets.
-
-        Args:
-            about: names of effect and field, for messages.
-            argument: the numbers of the user.
-            bodies: the first body of every element.
-        """
+        """The array that the function gets; `bodies` are the first of every element, `about` begins messages."""
         value = jnp.asarray(real_array(about, argument))
         count, size = len(bodies), bodies[0].size
         if self.shape == "number" and value.shape not in ((), (count,)):
@@ -120,13 +108,6 @@ class Parameter:
                 f"{about} has shape {value.shape}; its bodies have dimension {size}, give ({size},){for_each}"
             )
         return squeeze(jnp.broadcast_to(value, (count, size)))
-
-    def check_sign(self, about: str, argument: Any) -> None:
-        """Refuse numbers of another sign; `about` begins the message."""
-        if self.sign and is_concrete(argument):
-            value = np.asarray(argument, dtype=float)
-            if not np.all(value > 0 if self.sign == "positive" else value >= 0):
-                raise ValueError(f"{about} is {value}; it must be {self.sign}.")
 
 
 def names(count: int = 1, *, default: Any = MISSING, pairs: bool = False) -> Any:
@@ -160,7 +141,7 @@ def array(*, default: Any = MISSING, sign: Sign = "") -> Any:
 
 
 def of_time() -> Any:
-    """A function of the user, ``f(t, params)``."""
+    """A function of the user, ``f(t, params)``; the function of the effect gets `params` by the name of this field."""
     return field(metadata={"of_time": True})
 
 

@@ -20,21 +20,28 @@ def drawing(sorting: Sorting, effects: Sequence[Effect]) -> dict[str, Any]:
     entries: dict[str, Any] = {kind: [] for kind in ("bodies", "blocks", *EFFECT_LISTS)}
     radii = {body.name: float(body.radius) for body in sorting.bodies.values() if body.radius is not None}
     for body in sorting.bodies.values():
-        part, start, size = sorting.places[body.name]
+        part, start, size = sorting.layout.bodies[body.name]
         if isinstance(body, RigidBody):
             for kind, of_body in body.drawing(part, start).items():
                 entries[kind] += of_body
         elif not isinstance(body, Frame):
             coordinates = [[part, start + i] for i in range(size)]
             entries["blocks" if body.block else "bodies"].append({"name": body.name, "coordinates": coordinates})
-    entries["bodies"] += _points(sorting, effects)
+    points: dict[str, dict[str, Any]] = {}
     for effect in effects:
+        # ends phi + sum_i X_i d_i of links and springs in rigid bodies, as bodies that are not shown themselves
+        for label, (name, components) in effect.drawn_points(sorting.bodies).items():
+            part, start, size = sorting.layout.bodies[name]
+            weights = [1.0, *np.asarray(components).tolist()][: size // 3]
+            forms = [[[w, part, start + 3 * k + i] for k, w in enumerate(weights) if w] for i in range(3)]
+            points[label] = {"name": label, "coordinates": forms, "shown": ""}
         of_effect = effect.drawing(sorting.bodies)
         for kind in EFFECT_LISTS:
             entries[kind] += of_effect.get(kind, [])
         radii |= dict(of_effect.get("radii", []))
         if "up" in of_effect:
             entries["up"] = of_effect["up"]
+    entries["bodies"] += points.values()
     for entry in entries["bodies"]:
         if entry["name"] in radii:
             entry["radius"] = radii[entry["name"]]
@@ -42,18 +49,3 @@ def drawing(sorting: Sorting, effects: Sequence[Effect]) -> dict[str, Any]:
         joints = {name: np.asarray(values).tolist() for name, values in sorting.joints.items()}
         entries["kinematics"] = {"map": asdict(kinematics), "joints": joints}
     return entries
-
-
-def _points(sorting: Sorting, effects: Sequence[Effect]) -> list[dict[str, Any]]:
-    """Ends of links and springs in rigid bodies: entries of bodies that are not shown themselves.
-
-    Each coordinate of a point ``phi + sum_i X_i d_i`` is a list of triples (weight, "s" or "f", number of the coordinate).
-    """
-    points = {}
-    for effect in effects:
-        for label, (name, components) in effect.drawn_points(sorting.bodies).items():
-            part, start, size = sorting.places[name]
-            weights = [1.0, *np.asarray(components).tolist()][: size // 3]
-            forms = [[[w, part, start + 3 * k + i] for k, w in enumerate(weights) if w] for i in range(3)]
-            points[label] = {"name": label, "coordinates": forms, "shown": ""}
-    return list(points.values())

@@ -16,7 +16,7 @@ from vmri_jax.mechanics.functions import check_arguments
 from vmri_jax.mechanics.names import unknown
 from vmri_jax.mechanics.rows import Place, Rows
 from vmri_jax.scene.body import GROUND, Attachment, Bodies, body_of, end_of, label_of, moving
-from vmri_jax.scene.declare import Elements, Parameter, effect_class, lasting, squeeze
+from vmri_jax.scene.declare import Elements, Parameter, effect_class, lasting, real_tree, squeeze
 from vmri_jax.scene.layout import Key, Layout
 from vmri_jax.scene.returned import check_function
 from vmri_jax.scene.terms import EffectTerm, InRigidBodies, OnBodies, OnGround, Role, choose
@@ -111,16 +111,15 @@ class Effect(ABC):
         return super().__new__(cls)
 
     def __post_init__(self):
-        for argument in fields(self):
-            object.__setattr__(self, argument.name, lasting(getattr(self, argument.name)))
         if not self.name:
             object.__setattr__(self, "name", self.default_name or type(self).__name__.lower())
         for argument in fields(self):
+            about, value = f"{self.name}: {argument.name}", lasting(getattr(self, argument.name))
+            object.__setattr__(self, argument.name, value)
             if "of_time" in argument.metadata:
-                about, function = f"{self.name}: {argument.name}", getattr(self, argument.name)
-                if not callable(function):
-                    raise TypeError(f"{about} is {function!r}; give a function of (t, params).")
-                check_arguments(about, function, "t, params")
+                if not callable(value):
+                    raise TypeError(f"{about} is {value!r}; give a function of (t, params).")
+                check_arguments(about, value, "t, params")
         is_number = isinstance(self.rate, int) and not isinstance(self.rate, bool) and self.rate > 0
         if not (is_number and self.kind == "potential") and self.rate not in ("slow", "fast", "auto"):
             number = ", or of a potential a whole number k, for every k-th micro node"
@@ -157,6 +156,9 @@ class Effect(ABC):
         for name, parameter in self.declared.items():
             if getattr(self, name) is not None:
                 params[name] = parameter.array(f"{self.name}: {name}", getattr(self, name), firsts)
+        for argument in fields(self):
+            if "of_time" in argument.metadata:
+                params[argument.name] = real_tree(f"{self.name}: params", vars(self)["params"])
         for role, name in enumerate(self.masses):
             params[name] = squeeze(jnp.stack([self._mass(element[role], bodies) for element in elements]))
         params |= self.points(bodies)
@@ -192,10 +194,7 @@ class Effect(ABC):
     ) -> tuple[EffectTerm, dict[str, Any]]:
         """Element i as a term of the coordinates of its moving bodies, one after the other, and its part of the params of all elements.
 
-        The term takes these coordinates as q_s, and no q_f: whether a body is slow or fast does not matter for a single element.
-
-        Args:
-            freedoms: the freedoms among `freedoms_of` the element that are coordinates of the scene; these follow the bodies in q_s.
+        The term takes these coordinates, followed by `freedoms` that are coordinates of the scene, as q_s, and no q_f.
         """
         places, end = {}, 0
         for name in moving(self.elements(bodies)[i]):
@@ -254,11 +253,10 @@ class Effect(ABC):
                     end = end_of(bodies, name, self.whole)
                 except ValueError as error:
                     raise ValueError(f"{self.name}: {error}") from None
-                block, size = end.block, end.size
-                if self.dimensions and (block or size not in self.dimensions):
-                    general, allowed = "general " if block else "", " or ".join(map(str, self.dimensions))
+                if self.dimensions and (end.block or end.size not in self.dimensions):
+                    general, allowed = "general " if end.block else "", " or ".join(map(str, self.dimensions))
                     raise ValueError(
-                        f"{self.name}: {name} has {size} {general}coordinates; this effect is between points of dimension {allowed}."
+                        f"{self.name}: {name} has {end.size} {general}coordinates; this effect is between points of dimension {allowed}."
                     )
             if self.same_size:
                 self._check_sizes(element, bodies)
@@ -275,36 +273,30 @@ class Effect(ABC):
                 if is_concrete(leaf) and not np.isfinite(leaf).all():
                     raise ValueError(f"{self.name}: {name} is {np.asarray(leaf)}, which is not finite.")
         for name, parameter in self.declared.items():
-            if getattr(self, name) is not None:
-                parameter.check_sign(f"{self.name}: {name}", getattr(self, name))
+            value = getattr(self, name)
+            if parameter.sign and value is not None and is_concrete(value):
+                value = np.asarray(value, dtype=float)
+                fits = value > 0 if parameter.sign == "positive" else value >= 0
+                self.require(fits, name, value, f"it must be {parameter.sign}")
 
     def by_size(self, select: Sequence[int], bodies: Bodies) -> list[list[int]]:
         """Elements, by their numbers, in groups between bodies of the same sizes and kinds: each group is a term."""
         elements, groups = self.elements(bodies), {}
         for i in select:
-            groups.setdefault(tuple(self._kind(name, bodies) for name in elements[i]), []).append(i)
+            ends = [(name, end_of(bodies, name, self.whole).size) for name in elements[i]]
+            kinds = ((name == GROUND, isinstance(name, Attachment), body_of(bodies, name).size, n) for name, n in ends)
+            groups.setdefault(tuple(kinds), []).append(i)
         return list(groups.values())
 
-    def _kind(self, name: str, bodies: Bodies) -> tuple:
-        """The properties of a body that must be equal for all bodies of a role in a term."""
-        body, end = body_of(bodies, name), end_of(bodies, name, self.whole)
-        return name == GROUND, isinstance(name, Attachment), body.size, end.size
-
     def terms(self, select: Sequence[int], bodies: Bodies, layout: Layout, potentials: Mapping[str, Any]):
-        """The terms of some elements, one for each group of bodies of the same sizes.
-
-        Args:
-            potentials: terms of all potentials of the scene by name of the effect.
-        """
-        return tuple(self._term(group, bodies, layout.bodies) for group in self.by_size(select, bodies))
-
-    def _term(self, group: Sequence[int], bodies: Bodies, places: Mapping[str, Place]) -> EffectTerm:
-        """The term of a group of elements between bodies of the same sizes and kinds."""
-        elements = self.elements(bodies)
-        names = zip(POINTS, zip(*(elements[i] for i in group), strict=True), strict=False)
-        roles = tuple(self._role(parameter, role, bodies, places) for parameter, role in names)
-        select = None if len(group) == len(elements) else tuple(group)
-        return EffectTerm(self.name, self.function, roles, select, self.split, self.timed)
+        """The terms of some elements, one for each group `by_size`; `potentials` has all their terms by name."""
+        elements, terms = self.elements(bodies), []
+        for group in self.by_size(select, bodies):
+            names = zip(POINTS, zip(*(elements[i] for i in group), strict=True), strict=False)
+            roles = tuple(self._role(parameter, role, bodies, layout.bodies) for parameter, role in names)
+            numbers = None if len(group) == len(elements) else tuple(group)
+            terms.append(EffectTerm(self.name, self.function, roles, numbers, self.split, self.timed))
+        return tuple(terms)
 
     def _role(self, parameter: str, names: Sequence[str], bodies: Bodies, places: Mapping[str, Place]) -> Role:
         """The map from q_s and q_f to the coordinates of the bodies of a role, all of the same kind, or to points in them, which are a parameter."""
@@ -347,11 +339,7 @@ class Effect(ABC):
         return {DRAWN[self.drawn_as]: between, "anchors": anchors}
 
     def require(self, condition: Any, quantity: str, value: Any, expected: str) -> None:
-        """Raise ValueError unless all entries of a condition are true; a traced condition passes.
-
-        Args:
-            quantity, value, expected: for the message, "{quantity} is {value}; {expected}."
-        """
+        """Raise ValueError, "{quantity} is {value}; {expected}.", unless a condition is true everywhere, or traced."""
         if is_concrete(condition) and not np.all(condition):
             shown = np.asarray(value) if is_concrete(value) else value
             raise ValueError(f"{self.name}: {quantity} is {shown}; {expected}.")

@@ -26,11 +26,9 @@ RESERVED = {
 
 @dataclass(frozen=True)
 class _OfTerms:
-    """A function of a `System` that is made of terms; compared by class, terms and kinematics.
+    """A function of a `System`, made of terms of the coordinates Q of bodies; compared by class, terms and kinematics.
 
-    Args:
-        terms: functions of the coordinates Q of bodies.
-        kinematics: the map from the coordinates q of the scene to Q; None if Q = q.
+    The kinematics are the map from the coordinates q of the scene to Q; None if Q = q.
     """
 
     terms: tuple[Any, ...]
@@ -126,12 +124,7 @@ class TotalForce(_OfTerms):
 
 @dataclass(frozen=True)
 class Actuation(_OfTerms):
-    """Forces of the controls of a scene, ``(q_s, q_f, u, params) -> (F_s, F_f)``, see `vmri_jax.control.minimize`.
-
-    Args:
-        terms: a term for each effect.
-        names: of the controls of each effect.
-    """
+    """Forces of controls, ``(q_s, q_f, u, params) -> (F_s, F_f)``; each effect has a term and names of its controls."""
 
     names: tuple[tuple[str, ...], ...] = ()
 

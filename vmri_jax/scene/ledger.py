@@ -48,10 +48,8 @@ DEFAULT_FREQUENCY = 10.0
 class LedgerRow:
     """A body or effect in the ledger.
 
-    name: of the body or effect.
     kind: "body", or the term that the effect is part of.
-    grid: "macro" or "micro", the grid of its unknowns or evaluations.
-    why: the reason for this grid.
+    grid, why: "macro" or "micro", the grid of its unknowns or evaluations, and the reason for it.
     unknowns, multipliers: how many of each it adds to the equations of a macro step.
     evaluations: number of nodes in a macro step at which its function is evaluated (by implicit schemes in every Newton iteration).
     microseconds: computing time of its first derivatives once at all these nodes, None if not measured.
@@ -113,7 +111,7 @@ def ledger(sorting: Sorting, scheme: Scheme | Composition, macro_dt: float | Non
         raise TypeError(f"Scene.explain: scheme is {scheme!r}; give a Scheme, e.g. fully_implicit(num_micro=10).")
     stage, stages, intervals = _intervals(scheme)
     rows = []
-    sizes = {name: sorting.places[name].size for name in sorting.bodies}
+    sizes = {name: place.size for name, place in sorting.layout.bodies.items()}
     sizes |= {branch.child: len(branch.joint.freedoms) for branch in sorting.branches}
     for name, pace in sorting.paces.items():
         grid = "micro" if pace.value == "fast" else "macro"
@@ -157,29 +155,25 @@ def ledger_of_functions(
         pace, grid = ("fast", "micro") if part == "f" else ("slow", "macro")
         rows.append(LedgerRow(name, "body", grid, f"{pace}: it is in q_{part}", intervals[grid] * size, 0, 0))
 
-    def microseconds(alone: System, count: int) -> float | None:
-        """Computing time of the first derivatives of a function at its nodes in a macro step."""
-        if not measure:
-            return None
-        derivatives = _first_derivatives(alone, state.q_s.size, problem.v_s, problem.v_f)
-        return 1e6 * seconds_each(derivatives, jnp.concatenate([state.q_s, state.q_f])) * count
-
-    homes = [home for home in TERMS if getattr(system, home, None) is not None]
-    if system.has_constant_mass:
-        homes.remove("kinetic")
-    for home in homes:
-        alone = _alone(system, home, state)
-        rule = _rule(stage, home)
-        multipliers = intervals[rule.grid] * sum(alone.num_constraints(state.q_s, state.q_f))
-        count = stages * rule.evaluations(stage.num_micro)
-        why = f"the rule of the scheme for it is on the {rule.grid} grid"
-        name, time = name_of(getattr(system, home)), microseconds(alone, count)
-        rows.append(LedgerRow(name, TERMS[home], rule.grid, why, 0, multipliers, count, time))
+    parts = []
+    for home in TERMS:
+        function = getattr(system, home, None)
+        if function is not None and not (home == "kinetic" and system.has_constant_mass):
+            rule = _rule(stage, home)
+            why = f"the rule of the scheme for it is on the {rule.grid} grid"
+            parts.append((function, TERMS[home], _alone(system, home, state), rule, why))
     for name, function in system.potentials:
         alone, rule = _alone(system, "", state).replace(potentials={name: function}), stage.rule_of(name)
-        count = stages * rule.evaluations(stage.num_micro)
-        why, time = f"the rule of the scheme for it: {rule.in_words()}", microseconds(alone, count)
-        rows.append(LedgerRow(name_of(function), f"potential {label(name)}", rule.grid, why, 0, 0, count, time))
+        parts.append(
+            (function, f"potential {label(name)}", alone, rule, f"the rule of the scheme for it: {rule.in_words()}")
+        )
+    for function, kind, alone, rule, why in parts:
+        multipliers = intervals[rule.grid] * sum(alone.num_constraints(state.q_s, state.q_f))
+        count, microseconds = stages * rule.evaluations(stage.num_micro), None
+        if measure:
+            derivatives = _first_derivatives(alone, state.q_s.size, problem.v_s, problem.v_f)
+            microseconds = 1e6 * seconds_each(derivatives, jnp.concatenate([state.q_s, state.q_f])) * count
+        rows.append(LedgerRow(name_of(function), kind, rule.grid, why, 0, multipliers, count, microseconds))
     return Ledger(tuple(rows), _macro_step(system, scheme, state, macro_dt, DEFAULT_FREQUENCY) if measure else None)
 
 
@@ -195,30 +189,21 @@ def _measure(sorting: Sorting, scheme, macro_dt) -> tuple[float, list[float]]:
     """Microseconds of a macro step, and nanoseconds of an evaluation of the first derivatives of every effect."""
     system = build(sorting, sorting.placed)
     state = initial_state(system, *sorting.start, project=True)
-    step = _macro_step(system, scheme, state, macro_dt, _turning(sorting) or DEFAULT_FREQUENCY)
     q_s, q_f, v_s, v_f = sorting.start
+    largest_q, largest_v = (max(np.abs(x).max(initial=0.0) for x in pair) for pair in ((q_s, q_f), (v_s, v_f)))
+    turning = float(largest_v / max(largest_q, 1e-300))  # rad/s; of a spinning body roughly its angular velocity
+    step = _macro_step(system, scheme, state, macro_dt, turning or DEFAULT_FREQUENCY)
     of_effects = [_first_derivatives(build(sorting, [part]), q_s.size, v_s, v_f) for part in sorting.placed]
     q = jnp.concatenate([q_s, q_f])
     return step, [1e9 * seconds_each(derivatives, q) for derivatives in of_effects]
 
 
 def _macro_step(system: System, scheme, state: State, macro_dt: float | None, frequency: float) -> float:
-    """Microseconds of a macro step.
-
-    Args:
-        macro_dt: s; None for micro steps of 0.1 / w, with the largest frequency w of a vibration.
-        frequency: w of a system without vibrations, rad/s.
-    """
+    """Microseconds of a macro step, by default of micro steps 0.1 / w, w the largest frequency or `frequency`."""
     if macro_dt is None:
         macro_dt = scheme.num_micro * 0.1 / (float(frequencies(system, state).max(initial=0.0)) or frequency)
     seconds = interleaved({"": prepare_steps(system, scheme, state, macro_dt).timed()}, 5)[""]
     return 1e6 * float(np.median(seconds)) / STEPS
-
-
-def _turning(sorting: Sorting) -> float:
-    """``max |v| / max |q|`` at the start, rad/s; for a spinning body roughly its angular velocity."""
-    q_s, q_f, v_s, v_f = (np.abs(x).max(initial=0.0) for x in sorting.start)
-    return float(max(v_s, v_f) / max(q_s, q_f, 1e-300))
 
 
 def _first_derivatives(system: System, n_s: int, v_s, v_f):

@@ -14,7 +14,6 @@ MuJoCo's equalities are soft; here they are constraints, satisfied to round-off.
 """
 
 from collections.abc import Collection, Iterator
-from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -65,14 +64,12 @@ def bodies_and_effects(
         raise TypeError(f"Scene.from_mujoco: model is {type(model).__name__}; give a path, or a mujoco.MjModel.")
     if limits not in ("refuse", "spring"):
         raise ValueError(f"Scene.from_mujoco: limits is {limits!r}; it must be 'refuse' or 'spring'.")
-    compiled = Compiled(mujoco, model, coordinates, _start(mujoco, model, qpos, qvel, key))
-    compiled.refuse([*ignore, "limits"] if limits == "spring" and not isinstance(ignore, str) else ignore)
-    close(compiled, compiled.data)
-    reader = _Reader(compiled, compiled.data)
+    reader = _Reader(mujoco, model, coordinates, _start(mujoco, model, qpos, qvel, key))
+    reader.refuse([*ignore, "limits"] if limits == "spring" and not isinstance(ignore, str) else ignore)
+    close(reader)
     bodies = reader.bodies()
     springs = list(reader.limits("limits" in ignore)) if limits == "spring" else []
-    coupled = couplings(compiled, reader.data)
-    return bodies, [*reader.joints(), *springs, *reader.equalities(), *coupled, *reader.gravity(bodies)]
+    return bodies, [*reader.joints(), *springs, *reader.closing(), *couplings(reader), *reader.weights(bodies)]
 
 
 def _start(mujoco: Any, model: Any, qpos: Any, qvel: Any, key: str | int | None) -> Any:
@@ -83,7 +80,12 @@ def _start(mujoco: Any, model: Any, qpos: Any, qvel: Any, key: str | int | None)
             raise ValueError(
                 "Scene.from_mujoco: key and qpos or qvel are given; both define the start. Give one of them."
             )
-        number = _keyframe(model, key)
+        names = [model.key(i).name for i in range(model.nkey)]
+        if isinstance(key, str) and key not in names:
+            raise ValueError(f"Scene.from_mujoco: {unknown('keyframe', key, names)}")
+        number = names.index(key) if isinstance(key, str) else key
+        if not 0 <= number < model.nkey:
+            raise ValueError(f"Scene.from_mujoco: key is {key}; the model has {model.nkey} keyframes, counted from 0.")
         mujoco.mj_resetDataKeyframe(model, data, number)
         qpos, qvel = model.key_qpos[number], model.key_qvel[number]
     for name, value in (("qpos", qpos), ("qvel", qvel)):
@@ -99,41 +101,25 @@ def _start(mujoco: Any, model: Any, qpos: Any, qvel: Any, key: str | int | None)
     return data
 
 
-def _keyframe(model: Any, key: str | int) -> int:
-    """The number of a keyframe."""
-    names = [model.key(i).name for i in range(model.nkey)]
-    if isinstance(key, str):
-        if key not in names:
-            raise ValueError(f"Scene.from_mujoco: {unknown('keyframe', key, names)}")
-        return names.index(key)
-    if not 0 <= key < model.nkey:
-        raise ValueError(f"Scene.from_mujoco: key is {key}; the model has {model.nkey} keyframes, counted from 0.")
-    return key
-
-
 def lift(q, params):
     """The potential ``-f . x`` of a constant force on a point."""
     return -jnp.sum(params["force"] * q[0])
 
 
-@dataclass(frozen=True)
-class _Reader:
-    """A compiled model, and its `mujoco.MjData` at the start."""
-
-    compiled: Compiled
-    data: Any
+class _Reader(Compiled):
+    """The bodies and effects of a compiled model."""
 
     def bodies(self) -> list[RigidBody | Frame]:
         """A rigid body for each group of bodies that are welded together, after the frames between its joints."""
         bodies: list[RigidBody | Frame] = []
-        for root in self.compiled.roots:
-            bodies += [Frame(self._frame(j), self.data.xanchor[j]) for j in self.compiled.joints_of(root)[:-1]]
+        for root in self.roots:
+            bodies += [Frame(self._frame(j), self.data.xanchor[j]) for j in self.joints_of(root)[:-1]]
             bodies.append(self._body(root))
         return bodies
 
     def _body(self, root: int) -> RigidBody:
         """The rigid body of all bodies that are welded to `root`, at their common centre of mass."""
-        model, name = self.compiled.model, self.compiled.name("body", root)
+        model, mujoco = self.model, self.mujoco
         members = np.flatnonzero(model.body_weldid == root)
         masses, centres = model.body_mass[members], self.data.xipos[members]
         mass = float(masses.sum())
@@ -144,22 +130,18 @@ class _Reader:
             axes, arm = self.data.ximat[b].reshape(3, 3), position - centre
             inertia += axes @ np.diag(model.body_inertia[b]) @ axes.T
             inertia += m * (arm @ arm * np.eye(3) - np.outer(arm, arm))
-        motion, mujoco = (
-            np.zeros(6),
-            self.compiled.mujoco,
-        )  # angular velocity, and velocity of the centre of mass, in space
+        motion = np.zeros(6)  # angular velocity, and velocity of the centre of mass, in space
         mujoco.mj_objectVelocity(model, self.data, mujoco.mjtObj.mjOBJ_BODY, root, motion, 0)
         spin, velocity = motion[:3], motion[3:]
         velocity = velocity + np.cross(spin, centre - self.data.xipos[root])
-        return RigidBody(name, mass, inertia, centre, velocity=velocity, spin=spin)
+        return RigidBody(self.name("body", root), mass, inertia, centre, velocity=velocity, spin=spin)
 
     def joints(self) -> Iterator[Effect]:
         """All joints, each followed by its linear spring, damper and rotor."""
-        compiled, model = self.compiled, self.compiled.model
-        kinds = compiled.mujoco.mjtJoint
+        model, kinds = self.model, self.mujoco.mjtJoint
         for j in range(model.njnt):
             between = self._between(j)
-            name, anchor, axis = compiled.name("joint", j), self.data.xanchor[j].copy(), self.data.xaxis[j].copy()
+            name, anchor, axis = self.name("joint", j), self.data.xanchor[j].copy(), self.data.xaxis[j].copy()
             kind = model.jnt_type[j]
             if kind == kinds.mjJNT_FREE:
                 continue  # a body without a joint is free in a scene
@@ -172,73 +154,68 @@ class _Reader:
                 float(x) for x in (model.jnt_stiffness[j], model.dof_damping[dof], model.dof_armature[dof])
             )
             is_nonlinear = np.any(model.jnt_stiffnesspoly[j]) or model.jnt_springyield[j]
-            if stiffness and not is_nonlinear and not compiled.off("SPRING"):
+            if stiffness and not is_nonlinear and not self.off("SPRING"):
                 relaxed = float(model.qpos_spring[place] - self.data.qpos[place])
                 yield JointSpring(name, stiffness, relaxed, name=f"{name} spring")
-            if damping and not np.any(model.dof_dampingpoly[dof]) and not compiled.off("DAMPER"):
+            if damping and not np.any(model.dof_dampingpoly[dof]) and not self.off("DAMPER"):
                 yield JointDamper(name, damping, name=f"{name} damper")
             if rotor:
                 yield RotorInertia(name, rotor, name=f"{name} rotor")
 
     def _between(self, j: int) -> tuple[str, str]:
         """Names of both bodies or frames of a joint."""
-        compiled, child = self.compiled, int(self.compiled.model.jnt_bodyid[j])
-        joints = compiled.joints_of(child)
-        parent = compiled.group(compiled.model.body_parentid[child])
+        child = int(self.model.jnt_bodyid[j])
+        joints, parent = self.joints_of(child), self.group(self.model.body_parentid[child])
         return (
             parent if j == joints[0] else self._frame(j - 1),
-            compiled.group(child) if j == joints[-1] else self._frame(j),
+            self.group(child) if j == joints[-1] else self._frame(j),
         )
 
     def _frame(self, j: int) -> str:
         """Name of the frame between a joint and the next joint of the same body."""
-        return f"{self.compiled.name('joint', j)} frame"
+        return f"{self.name('joint', j)} frame"
 
     def limits(self, ignored: bool) -> Iterator[JointLimit]:
         """Limits of joints as springs, with MuJoCo's stiffness for the inertia that the joint moves at qpos0.
 
         MuJoCo's solref of a limit is (T, z), its time constant and damping ratio: at the depth d it pulls back with the acceleration
         ``d / (T z)^2``. Negative numbers are (-k, -c), with the acceleration ``k d``. The inertia is ``1 / dof_invweight0``.
-
-        Args:
-            ignored: whether the scene may leave out limits of ball joints and of tendons, which are refused otherwise.
+        Limits of ball joints and of tendons are refused unless they are `ignored`.
         """
-        compiled, model = self.compiled, self.compiled.model
-        if compiled.off(CONSTRAINTS, "LIMIT"):
+        model = self.model
+        if self.off(CONSTRAINTS, "LIMIT"):
             return
-        unfit = [model.joint(int(j)).name or f"joint {j}" for j in np.flatnonzero(model.jnt_limited & compiled.turning)]
+        unfit = [model.joint(int(j)).name or f"joint {j}" for j in np.flatnonzero(model.jnt_limited & self.turning)]
         unfit += [model.tendon(int(i)).name or f"tendon {i}" for i in np.flatnonzero(model.tendon_limited)]
         if unfit and not ignored:
             raise ValueError(
                 f"Scene.from_mujoco: limits='spring' is for limits of hinges and slides, and {', '.join(unfit)} have limits of another "
                 "kind. Leave these out of the motion, ignore=['limits'], or change the model."
             )
-        for j in np.flatnonzero(np.asarray(model.jnt_limited) & ~compiled.turning).tolist():
+        for j in np.flatnonzero(np.asarray(model.jnt_limited) & ~self.turning).tolist():
             time, ratio = model.jnt_solref[j]
             rate = -time if time < 0 else 1 / (time * ratio) ** 2
             stiffness = rate / float(model.dof_invweight0[model.jnt_dofadr[j]])
             lower, upper = model.jnt_range[j] - self.data.qpos[model.jnt_qposadr[j]]
-            name = compiled.name("joint", j)
-            smoothing = SMOOTHING * (upper - lower)
+            name, smoothing = self.name("joint", j), SMOOTHING * (upper - lower)
             yield JointLimit(name, lower, upper, stiffness=stiffness, smoothing=smoothing, name=f"{name} limit")
 
-    def equalities(self) -> Iterator[Joint]:
+    def closing(self) -> Iterator[Joint]:
         """Joints that close loops, from the equalities connect and weld."""
-        for loop in loops(self.compiled, self.data):
+        for loop in loops(self):
             first, second = loop.ends
-            between = self.compiled.group(first.body), self.compiled.group(second.body)
             kind = Fixed if loop.welded else Spherical
-            yield kind(between, first.point, name=self.compiled.name("equality", loop.number))
+            between = self.group(first.body), self.group(second.body)
+            yield kind(between, first.point, name=self.name("equality", loop.number))
 
-    def gravity(self, bodies: list[RigidBody | Frame]) -> Iterator[Effect]:
+    def weights(self, bodies: list[RigidBody | Frame]) -> Iterator[Effect]:
         """Gravity, unless the model switches it off, and the forces ``-c m g`` in centres of mass that compensate a fraction c of it."""
-        compiled, model = self.compiled, self.compiled.model
-        g = compiled.gravity
+        model, g = self.model, self.gravity
         if g.any():
             yield Gravity(g.tolist())
         by_name = {body.name: body for body in bodies}
-        for b in compiled.compensated:
-            body, force = by_name[compiled.group(b)], -model.body_gravcomp[b] * model.body_mass[b] * g
+        for b in self.compensated:
+            body, force = by_name[self.group(b)], -model.body_gravcomp[b] * model.body_mass[b] * g
             point = self.data.xipos[b] - body.position  # at the start the axes of the body are the axes of space
-            name = f"{compiled.name('body', b)} gravity compensation"
+            name = f"{self.name('body', b)} gravity compensation"
             yield Potential(lift, ((body.name, point.tolist()),), {"force": force}, name=name)

@@ -18,7 +18,7 @@ Source: MuJoCo's documentation, "XML reference", equality.
 """
 
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -56,13 +56,7 @@ class End(NamedTuple):
 
 
 class Loop(NamedTuple):
-    """An equality connect or weld.
-
-    Attributes:
-        number: of the equality in the model.
-        welded: whether it is a weld, which holds the frames of both ends together, too.
-        ends: both ends.
-    """
+    """An equality connect, or weld, which holds the frames of both ends together, too; with its number in the model."""
 
     number: int
     welded: bool
@@ -78,38 +72,37 @@ class Loop(NamedTuple):
         return np.concatenate([distance, Rotation.from_matrix(first.frame @ second.frame.T).as_rotvec()])
 
 
-def loops(compiled: Compiled, data: Any) -> list[Loop]:
+def loops(compiled: Compiled) -> list[Loop]:
     """The active equalities connect and weld between bodies that can move against each other."""
     closed = []
     for i in compiled.equalities:
         if compiled.closes(i):
-            ends = _ends(compiled, data, i)
+            ends = _ends(compiled, i)
             if compiled.group(ends[0].body) != compiled.group(ends[1].body):
                 closed.append(Loop(i, compiled.model.eq_type[i] == compiled.mujoco.mjtEq.mjEQ_WELD, ends))
     return closed
 
 
-def close(compiled: Compiled, data: Any) -> None:
+def close(compiled: Compiled) -> None:
     """Move joints so that small gaps close, in place; refuse wide gaps."""
-    model, mujoco, extent = compiled.model, compiled.mujoco, float(compiled.model.stat.extent)
-    _refuse_gaps(compiled, loops(compiled, data), WIDEST_GAP, "is open at the start by")
+    model, mujoco, data = compiled.model, compiled.mujoco, compiled.data
+    _refuse_gaps(compiled, WIDEST_GAP, "is open at the start by")
     for _ in range(ITERATIONS):
-        closing = loops(compiled, data)
-        if not closing or max(_size(loop, extent) for loop in closing) <= ROUND_OFF_GAP:
+        closing = loops(compiled)
+        if max((_size(compiled, loop) for loop in closing), default=0.0) <= ROUND_OFF_GAP:
             return
-        jacobian = np.concatenate([_jacobian(compiled, data, loop) for loop in closing])
+        jacobian = np.concatenate([_jacobian(compiled, loop) for loop in closing])
         gaps = np.concatenate([loop.gap for loop in closing])
         mujoco.mj_integratePos(model, data.qpos, np.linalg.lstsq(jacobian, -gaps, rcond=RANK)[0], 1.0)
         mujoco.mj_forward(model, data)
-    _refuse_gaps(compiled, loops(compiled, data), WIDEST_LEFT, "does not close; its remaining gap is")
+    _refuse_gaps(compiled, WIDEST_LEFT, "does not close; its remaining gap is")
 
 
-def _refuse_gaps(compiled: Compiled, closing: list[Loop], widest: float, phrase: str) -> None:
+def _refuse_gaps(compiled: Compiled, widest: float, phrase: str) -> None:
     """Raise ValueError if a loop has a gap above `widest`; the message says "{name} {phrase} {gap}"."""
-    extent = float(compiled.model.stat.extent)
     gaps = []
-    for loop in closing:
-        if _size(loop, extent) > widest:
+    for loop in loops(compiled):
+        if _size(compiled, loop) > widest:
             distances = np.linalg.norm(loop.gap.reshape(-1, 3), axis=1)
             angle = f" and {distances[1]:.3g} rad" if loop.welded else ""
             gaps.append(f"{compiled.name('equality', loop.number)} {phrase} {distances[0]:.3g} m{angle}")
@@ -117,15 +110,15 @@ def _refuse_gaps(compiled: Compiled, closing: list[Loop], widest: float, phrase:
         raise ValueError(f"Scene.from_mujoco: {'; '.join(gaps)}. {ADVICE}")
 
 
-def _size(loop: Loop, extent: float) -> float:
+def _size(compiled: Compiled, loop: Loop) -> float:
     """The gap of a loop, in extents of the model or rad."""
     distances = np.linalg.norm(loop.gap.reshape(-1, 3), axis=1)
-    return float(np.max(distances / [extent, 1.0][: len(distances)]))
+    return float(np.max(distances / [float(compiled.model.stat.extent), 1.0][: len(distances)]))
 
 
-def _ends(compiled: Compiled, data: Any, i: int) -> tuple[End, End]:
+def _ends(compiled: Compiled, i: int) -> tuple[End, End]:
     """Both ends of an equality, as MuJoCo's engine defines them."""
-    model = compiled.model
+    model, data = compiled.model, compiled.data
     objects = int(model.eq_obj1id[i]), int(model.eq_obj2id[i])
     if model.eq_objtype[i] == compiled.mujoco.mjtObj.mjOBJ_SITE:
         first, second = (
@@ -145,12 +138,12 @@ def _ends(compiled: Compiled, data: Any, i: int) -> tuple[End, End]:
     return End(objects[0], points[0], frames[0] @ rotation), End(objects[1], points[1], frames[1])
 
 
-def _jacobian(compiled: Compiled, data: Any, loop: Loop) -> np.ndarray:
+def _jacobian(compiled: Compiled, loop: Loop) -> np.ndarray:
     """The Jacobian of the gap with respect to MuJoCo's velocities, (3, nv), of a weld (6, nv)."""
-    sides = []
+    model, sides = compiled.model, []
     for end in loop.ends:
-        of_point, of_rotation = np.zeros((3, compiled.model.nv)), np.zeros((3, compiled.model.nv))
-        compiled.mujoco.mj_jac(compiled.model, data, of_point, of_rotation, end.point, end.body)
+        of_point, of_rotation = np.zeros((3, model.nv)), np.zeros((3, model.nv))
+        compiled.mujoco.mj_jac(model, compiled.data, of_point, of_rotation, end.point, end.body)
         sides.append(np.concatenate([of_point, of_rotation]) if loop.welded else of_point)
     return sides[0] - sides[1]
 
@@ -161,7 +154,7 @@ def polynomial(x, params):
     return y - jnp.polyval(params["coefficients"][::-1], z)
 
 
-def couplings(compiled: Compiled, data: Any) -> Iterator[JointCoupling]:
+def couplings(compiled: Compiled) -> Iterator[JointCoupling]:
     """The couplings that the model does not switch off, none of which the start may violate."""
     model = compiled.model
     for i in compiled.equalities:
@@ -174,7 +167,8 @@ def couplings(compiled: Compiled, data: Any) -> Iterator[JointCoupling]:
         coefficients = np.where(np.any(ratios[1]), model.eq_data[i, :5], [model.eq_data[i, 0], 0, 0, 0, 0])
         params = {
             "ratios": ratios,
-            "offsets": ratios @ (data.qpos[places] - model.qpos0[places]),  # a scene counts coordinates from the start
+            "offsets": ratios
+            @ (compiled.data.qpos[places] - model.qpos0[places]),  # a scene counts coordinates from the start
             "coefficients": coefficients,
         }
         name = compiled.name("equality", i)
@@ -185,12 +179,7 @@ def couplings(compiled: Compiled, data: Any) -> Iterator[JointCoupling]:
 
 
 def _ratios(compiled: Compiled, i: int, number: int) -> dict[int, float]:
-    """The ratios of the joints on a side of an equality, by number of the joint; {} for an equality without this side.
-
-    Args:
-        i: number of the equality.
-        number: of the joint or tendon on this side; negative if there is none.
-    """
+    """The ratios of the joints on a side of equality i, by number of the joint; {} if `number` is negative."""
     model = compiled.model
     if number < 0:
         return {}

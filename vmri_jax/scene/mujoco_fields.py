@@ -15,12 +15,10 @@ PASSIVE = "SPRING DAMPER"
 
 @dataclass(frozen=True)
 class Refusal:
-    """A part of a model that no scene expresses.
+    """A part of a model that no scene expresses; `ignore` may name it unless it is not `ignorable`.
 
-    Attributes:
-        without: the motion of the model if `ignore` names this part; for a part that `ignore` may not name, advice.
-        fields: the fields whose entries define the part, each with the flags that switch it off: any entry is enough, of an entry with several flags all of them.
-        ignorable: whether `ignore` may name this part.
+    without: the motion of the model if `ignore` names this part; for a part that it may not name, advice.
+    fields: the fields whose entries define the part, each with the flags that switch it off, see `Compiled.off`.
     """
 
     without: str

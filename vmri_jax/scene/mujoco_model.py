@@ -28,13 +28,10 @@ NAMED = 8
 
 @dataclass(frozen=True)
 class Compiled:
-    """A compiled model.
+    """A compiled model: the package mujoco, and `mujoco.MjModel`.
 
-    Args:
-        mujoco: the package.
-        model: `mujoco.MjModel`.
-        coordinates: of the scene: by "directors" a body can have one joint.
-        data: `mujoco.MjData` at the start, with the controls and activations there; None for the model's own start.
+    coordinates: of the scene: by "directors" a body can have one joint.
+    data: `mujoco.MjData` at the start, with the controls and activations there; None for the model's own start.
     """
 
     mujoco: Any
@@ -66,11 +63,9 @@ class Compiled:
 
     def closes(self, i: int) -> bool:
         """Whether an equality closes a loop: a connect or a weld of bodies or of sites."""
-        model, kinds, objects = self.model, self.mujoco.mjtEq, self.mujoco.mjtObj
-        return model.eq_type[i] in (int(kinds.mjEQ_CONNECT), int(kinds.mjEQ_WELD)) and model.eq_objtype[i] in (
-            int(objects.mjOBJ_BODY),
-            int(objects.mjOBJ_SITE),
-        )
+        kinds, objects = self.mujoco.mjtEq, self.mujoco.mjtObj
+        is_loop = self.model.eq_type[i] in (int(kinds.mjEQ_CONNECT), int(kinds.mjEQ_WELD))
+        return is_loop and self.model.eq_objtype[i] in (int(objects.mjOBJ_BODY), int(objects.mjOBJ_SITE))
 
     def ties(self, i: int) -> bool:
         """Whether an equality couples hinges and slides, or fixed tendons of hinges and slides."""
@@ -183,13 +178,10 @@ class Compiled:
         """Actuators with a force, joints with a force of actuators (a range without zero), and all actuators with armature or damping."""
         model = self.model
         forces, rates, loads = self._actuation()
-        parts = (
-            (forces, model.actuator_outadr, model.actuator_outnum),
-            (rates, model.actuator_actadr, model.actuator_actnum),
-        )
         acting = np.zeros(model.nactuator, dtype=bool)
-        for values, addresses, sizes in parts:
-            acting |= np.array([values[a : a + n].any() for a, n in zip(addresses, sizes, strict=True)], dtype=bool)
+        for values, part in ((forces, "out"), (rates, "act")):
+            spans = zip(getattr(model, f"actuator_{part}adr"), getattr(model, f"actuator_{part}num"), strict=True)
+            acting |= np.array([values[a : a + n].any() for a, n in spans], dtype=bool)
         for name, flags in REFUSED["actuators"].fields.items():
             if name != "nactuator" and not self.off(*flags):
                 acting |= _rows(getattr(model, name))
@@ -199,10 +191,9 @@ class Compiled:
         return self._listed("actuator", np.flatnonzero(acting))
 
     def _actuation(self) -> list[np.ndarray]:
-        """Whether MuJoCo computes forces of actuators (nout,), rates of activations (na,), and forces on velocities (nv,) that are not zero.
+        """Whether forces of actuators (nout,), rates of activations (na,), forces on velocities (nv,) are not all zero.
 
-        It computes them for the controls and activations of the start, there and at states that differ in all coordinates and velocities:
-        an actuator whose force is zero in all of these states exerts none.
+        The states are the start and some that differ in all coordinates; controls and activations do not differ.
         """
         model, mujoco, random = self.model, self.mujoco, np.random.default_rng(0)
         data, acting = mujoco.MjData(model), []
@@ -265,17 +256,14 @@ class Compiled:
     def _soft_equalities(self) -> str:
         """Equalities that are softer than by default, or whose solref has negative numbers, which define a spring."""
         model = self.model
-        soft = [
-            i
-            for i in self.equalities
-            if (self.closes(i) or self.ties(i))
-            and (not 0 < model.eq_solref[i, 0] <= SOFTEST_TIME or model.eq_solimp[i, :2].min() < SOFTEST_IMPEDANCE)
-        ]
-        return self._listed("equality", soft)
+        kept = np.array([i for i in self.equalities if self.closes(i) or self.ties(i)], dtype=int)
+        time, impedance = model.eq_solref[kept, 0], model.eq_solimp[kept, :2].min(axis=1)
+        is_stiff = (time > 0) & (time <= SOFTEST_TIME) & (impedance >= SOFTEST_IMPEDANCE)
+        return self._listed("equality", kept[~is_stiff])
 
     def _sleep(self) -> str:
-        asleep = int(self.model.opt.enableflags) & int(self.mujoco.mjtEnableBit.mjENBL_SLEEP)
-        return "the flag sleep" if asleep else ""
+        is_on = int(self.model.opt.enableflags) & int(self.mujoco.mjtEnableBit.mjENBL_SLEEP)
+        return "the flag sleep" if is_on else ""
 
     def _several_joints(self) -> str:
         """Bodies with several joints, if one of them is a ball joint or the scene has directors alone."""

@@ -43,13 +43,10 @@ class Rates(NamedTuple):
 
 
 class Linearised(NamedTuple):
-    """An element at the start. All derivatives are with respect to the velocities that its bodies can have: of a rigid body the velocity
-    of its centre and its spin.
+    """An element at the start, in the velocities of its bodies: of a rigid body that of its centre and its spin.
 
     columns: indices of these velocities among the velocities of all bodies.
-    force: on the bodies at rest.
-    stiffness, gyroscopic: K and G.
-    mass: d2L/dv2, the part of the element in the mass matrix.
+    force, stiffness, gyroscopic, mass: force on the bodies at rest, K, G, and d2L/dv2, a part of the mass matrix.
     translation, turning: matrices from these velocities to the rates of positions and to the rates of directors.
     """
 
@@ -79,10 +76,7 @@ def measure(bodies: Bodies, effects: Sequence[Effect]) -> dict[str, Rates]:
 def border(rates: Sequence[np.ndarray], slow: float = 0.0, fast: float = np.inf) -> float | None:
     """The border between slow and fast: the middle of the widest gap between rates, rad/s; None if no gap is wide enough.
 
-    Args:
-        rates: of all effects, rad/s.
-        slow: the largest rate of effects that are declared slow; the border is above it.
-        fast: the smallest rate of effects that are declared fast; the border is below it.
+    It is above `slow`, the largest rate that is declared slow, and below `fast`, the smallest one declared fast.
     """
     ordered = np.sort([rate for of_effect in rates for rate in of_effect if rate > 0])
     if not ordered.size:

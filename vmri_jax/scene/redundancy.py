@@ -46,11 +46,9 @@ BEND = "Bend bodies that lie in line or flat at the start by a little, leave oth
 
 
 class Opening(NamedTuple):
-    """Dropped rows that do not vanish where the kept rows do.
+    """Numbers of dropped rows that do not vanish where the kept rows do, and their largest values over their sizes.
 
-    rows: their numbers among all rows.
-    values: their largest values, relative to their sizes.
-    motion: length of the motion, relative to the scales of coordinates; 0 if these rows are violated at the start itself.
+    motion: its length relative to the scales of coordinates; 0 if these rows are violated at the start itself.
     """
 
     rows: list[int]
@@ -97,12 +95,6 @@ def without_redundant(sorting: Sorting) -> Sorting:
     return replace(sorting, placed=tuple(placed))
 
 
-def dropped_rows(sorting: Sorting) -> list[str]:
-    """Names of the dropped rows."""
-    rows = ConstraintRows.of(sorting)
-    return [] if rows is None else [row.name for row in rows.rows if not row.kept]
-
-
 def find_opening(rows: ConstraintRows) -> Opening | None:
     """The dropped rows that do not follow from the kept rows g_k, with their values; None if all follow.
 
@@ -138,15 +130,9 @@ def find_opening(rows: ConstraintRows) -> Opening | None:
 
 
 def _onto_surface(rows: ConstraintRows, kept: list[int], t: float, x: np.ndarray, contraction: float):
-    """The point where the kept rows vanish, by Newton's iteration from x; None if it fails.
+    """The point x where the kept rows vanish, by Newton's iteration, and the values of all rows (k,) over their sizes.
 
-    Args:
-        kept: numbers of the kept rows.
-        x: (n,) distances of coordinates from the start, relative to their scales.
-        contraction: largest ratio of consecutive corrections; beyond it the iteration fails.
-
-    Returns:
-        x there, and the values of all rows (k,), relative to their sizes.
+    x (n,) is relative to the start and to scales. None, if the ratio of consecutive corrections is above `contraction`.
     """
     previous = np.inf
     for _ in range(ITERATIONS):
@@ -166,8 +152,7 @@ def _onto_surface(rows: ConstraintRows, kept: list[int], t: float, x: np.ndarray
 def _cure(sorting: Sorting) -> str:
     """Advice about rows that depend on others: to leave one out, unless this would change the motion."""
     rows = ConstraintRows.of(without_redundant(sorting))
-    opening = None if rows is None else find_opening(rows)
-    if rows is None or opening is None:
+    if rows is None or (opening := find_opening(rows)) is None:
         return f'{_joined_twice(sorting)}leave one of them out, or let the scene choose, redundant="drop"'
     return f"leaving one out would change the motion: {_in_words(rows, opening)}"
 
@@ -188,7 +173,7 @@ def _joined_twice(sorting: Sorting) -> str:
 
 def _in_words(rows: ConstraintRows, opening: Opening) -> str:
     """That dropped rows do not vanish where the others do, and advice."""
-    names = rows.names(opening.rows)
+    names = [rows.rows[i].name for i in opening.rows]
     errors = _listed([f"{name} by {value:.1e}" for name, value in zip(names, opening.values, strict=True)])
     if not opening.motion:
         return (
@@ -225,14 +210,8 @@ def _advice(sorting: Sorting, rows: ConstraintRows, micro: list[int]) -> str:
 
 
 def _refuse(rows: ConstraintRows, numbers: list[int], first: int, advice: Callable[[], str]) -> None:
-    """Raise ValueError if rows are dependent, with the names of the rows that take part in the dependence.
-
-    Args:
-        numbers: of the rows.
-        first: number of the first coordinate that counts: 0, or that of the first fast coordinate.
-        advice: end of the message.
-    """
-    names, jacobian = rows.names(numbers), rows.by_masses[numbers][:, first:]
+    """Raise ValueError with the names of the dependent rows, if there are some in the coordinates from `first` on."""
+    names, jacobian = [rows.rows[i].name for i in numbers], rows.by_masses[numbers][:, first:]
     _, involved = rank_of(jacobian)
     if not involved:
         return

@@ -18,16 +18,9 @@ LIBRARY = "vmri_jax."
 
 
 def check_function(effect: Any, bodies: Bodies, moved: bool) -> None:
-    """Refuse a function of the user that returns a wrong value, and a constraint of the user that the start violates.
+    """Refuse a function of the user with a wrong value, and a constraint that the start violates unless `moved`.
 
     The function gets each group of equal elements, as the terms of the system do.
-
-    Args:
-        moved: as of `Effect.check`.
-
-    Raises:
-        ValueError: an energy that is no scalar, constraint values that are no vector, forces of other numbers or shapes than the roles, or
-            constraint values at the start that are not zero.
     """
     function = effect.function
     while isinstance(function, partial):

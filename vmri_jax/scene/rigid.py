@@ -201,11 +201,7 @@ class RigidBody(AnyBody):
         return replace(self, velocity=rates[:3], spin=np.linalg.lstsq(self._turns(), rates[3:], rcond=None)[0])
 
     def components(self, vector):
-        """(3,) components along the principal axes of a vector in the axes of the body.
-
-        Raises:
-            ValueError: a vector with a component along an axis in which the body has no width, and so no director.
-        """
+        """(3,) components of a vector along the principal axes; refused along an axis without width and director."""
         components = vector @ self.axes
         thin = [i for i in range(3) if i not in self.wide]
         if thin and is_concrete(components):
@@ -222,11 +218,7 @@ class RigidBody(AnyBody):
         return self.shape or box_of(float(self.mass), self.moments)
 
     def covers(self, weights) -> bool:
-        """Whether a point of the body is inside the bounding box of its drawn shape.
-
-        Args:
-            weights: (3,) components of the point along the directors.
-        """
+        """Whether a point with these components along the directors is inside the bounding box of the drawn shape."""
         shape = self._drawn_shape
         if isinstance(shape, Ball):
             return bool(np.linalg.norm(weights) <= shape.radius)
@@ -236,12 +228,7 @@ class RigidBody(AnyBody):
         return bool(np.all(np.abs(weights[: len(self.wide)]) <= COVERED * np.abs(corners).max(axis=0)))
 
     def drawing(self, part: str, start: int) -> dict[str, list]:
-        """Entries of the body in the lists of `Scene.drawing`.
-
-        Args:
-            part: "s" or "f", the part of the coordinates that the body is in.
-            start: number of its first coordinate there.
-        """
+        """Entries in the lists of `Scene.drawing`; the coordinates begin at number `start` of `part`, "s" or "f"."""
         shape = self._drawn_shape
         centre = {"name": self.name, "coordinates": [[part, start + i] for i in range(3)]}
         if isinstance(shape, Ball):

@@ -32,9 +32,8 @@ class Row(NamedTuple):
     """A row of a constraint.
 
     name: of its effect and bodies, with a number if an element has several rows.
-    part: number of its entry in `Sorting.placed`.
+    part: number of its entry in `Sorting.placed`, which has this effect and home.
     number: of the row in this entry, in the order of its terms.
-    effect, home: of this entry.
     kept: False for a row that the scene leaves out.
     """
 
@@ -47,11 +46,7 @@ class Row(NamedTuple):
 
 
 class _Element(NamedTuple):
-    """An element of a constraint as a function of the coordinates of its bodies.
-
-    value, params: of its term, see `Effect.element_term`.
-    columns: numbers of these coordinates, and of the freedoms that are coordinates, in (Q_s, Q_f), taken as one vector.
-    """
+    """An element of a constraint, see `Effect.element_term`, and numbers of its coordinates in (Q_s, Q_f)."""
 
     value: TracedOnce
     params: dict[str, Any]
@@ -62,15 +57,10 @@ class _Element(NamedTuple):
 class ConstraintRows:
     """The k rows of all constraints, in the order of `Sorting.placed`, over the n coordinates, slow ones first.
 
-    Attributes:
-        rows: the k rows.
-        elements: their functions.
-        start: (n,) coordinates at the start.
-        masses: (n,) of the coordinates; 1 for traced masses, since they only weigh the choice of the rows to drop.
-        scales: (n,) change of each coordinate in a large motion: the extent of the scene for positions, 1 for
-            directors of rigid bodies and angles of joints, and for general coordinates their largest value, or 1 if all are zero.
-        num_slow: number of slow coordinates.
-        to_bodies: (Q_s, Q_f) as one vector at q, and its Jacobian dQ/dq.
+    masses: (n,) of the coordinates; 1 for traced masses, since they only weigh the choice of the rows to drop.
+    scales: (n,) change of each coordinate in a large motion: the extent of the scene for positions, 1 for
+        directors of rigid bodies and angles of joints, and for general coordinates their largest value, or 1 if all are zero.
+    to_bodies: (Q_s, Q_f) as one vector at q, and its Jacobian dQ/dq.
     """
 
     rows: tuple[Row, ...]
@@ -142,10 +132,6 @@ class ConstraintRows:
         """Numbers of the kept rows, all or only the rows with a certain home."""
         return [i for i, row in enumerate(self.rows) if row.kept and home in (None, row.home)]
 
-    def names(self, numbers: Sequence[int]) -> list[str]:
-        """Names of some rows."""
-        return [self.rows[i].name for i in numbers]
-
 
 def _label(effect: Effect, element: Sequence[str]) -> str:
     """The label of an element: the name of its effect and the names of its bodies."""
@@ -176,12 +162,9 @@ def _value_and_jacobian(function: TracedOnce, params, q, t):
 
 
 def _scales(sorting: Sorting) -> np.ndarray:
-    """(n,) change of each coordinate in a large motion, see `ConstraintRows`.
-
-    The extent of the scene is the largest distance of a body from the mean of all positions along an axis. If all bodies are at the same
-    place, it is the largest coordinate of this place, or 1 at the origin.
-    """
+    """(n,) change of each coordinate in a large motion, see `ConstraintRows`."""
     points, layout = positions(sorting.bodies), sorting.layout
+    # largest distance from the mean along an axis; of bodies at one place their largest coordinate, or 1 at the origin
     extent = float(np.abs(points - points.mean(axis=0)).max() or np.abs(points).max() or 1.0)
     scales = {place: np.full(1, 1.0 if key[2] in ANGLES else extent) for key, place in layout.freedoms.items()}
     for name, body in sorting.bodies.items():
@@ -196,10 +179,7 @@ def _scales(sorting: Sorting) -> np.ndarray:
 
 
 def names_of(sorting: Sorting) -> Names:
-    """Bodies and constraints by name, in the order of the coordinates and of the rows.
-
-    The rows of an effect with a single element have the name of the effect; with several elements the names of the bodies follow.
-    """
+    """Bodies and constraints by name, in the order of the coordinates and of the rows."""
     sizes: dict[Any, dict[str, int]] = {"s": {}, "f": {}, "constraint": {}, "slow_constraint": {}}
     for name, place in sorting.layout.coordinates.items():
         sizes[place.part][name] = place.size
@@ -209,7 +189,7 @@ def names_of(sorting: Sorting) -> Names:
     blocks, rigid = (
         [name for name, body in sorting.bodies.items() if getattr(body, kind)] for kind in ("block", "rigid")
     )
-    carried = {name: place for name, place in sorting.places.items() if name not in sorting.layout.coordinates}
+    carried = {name: place for name, place in sorting.layout.bodies.items() if name not in sorting.layout.coordinates}
     rows = sizes["constraint"], sizes["slow_constraint"]
     return Names(sizes["s"], sizes["f"], *rows, blocks, rigid, carried, sorting.layout.kinematics)
 

@@ -26,9 +26,9 @@ from vmri_jax.scene.effects.joint_base import joint_named
 from vmri_jax.scene.functions import RESERVED, Actuation
 from vmri_jax.scene.layout import Key
 from vmri_jax.scene.ledger import Ledger, ledger
-from vmri_jax.scene.redundancy import check_constraints, dropped_rows, without_redundant
+from vmri_jax.scene.redundancy import check_constraints, without_redundant
 from vmri_jax.scene.rigid import Rigidity
-from vmri_jax.scene.rows import names_of
+from vmri_jax.scene.rows import ConstraintRows, names_of
 from vmri_jax.scene.sorting import Sorting, sort
 from vmri_jax.scene.trees import Branch, check_frames, grow
 from vmri_jax.scene.turns import along_run, check_reach, check_run
@@ -194,12 +194,13 @@ class Scene:
     @property
     def dropped(self) -> list[str]:
         """Names of the rows of constraints that the scene leaves out because they depend on others."""
-        return dropped_rows(self.sorting)
+        rows = ConstraintRows.of(self.sorting)
+        return [] if rows is None else [row.name for row in rows.rows if not row.kept]
 
     @property
     def places(self) -> dict[str, Place]:
         """Where each body's coordinates are in q_s and q_f; with joint coordinates, in the (Q_s, Q_f) that `Names.kinematics` computes."""
-        return self.sorting.places
+        return self.sorting.layout.bodies
 
     @cached_property
     def names(self) -> Names:
@@ -218,7 +219,7 @@ class Scene:
         Raises:
             ValueError: velocities of bodies that their joints do not allow, unless `project` is set, which takes the nearest allowed ones.
         """
-        start, violation = self.sorting.start, self.sorting.violation
+        start, violation = self.sorting.start_and_violation
         if is_concrete(violation):
             tell_of_velocities("Scene", float(violation), self.project, "the joints")
         return start

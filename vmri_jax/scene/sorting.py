@@ -37,7 +37,6 @@ from scipy.sparse import eye_array
 
 from vmri_jax.mechanics.arrays import is_concrete, library, quickly_compiled
 from vmri_jax.mechanics.kinematics import Kinematics
-from vmri_jax.mechanics.rows import Place
 from vmri_jax.scene.body import GROUND, Bodies
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.joint_constants import joint_constants
@@ -63,10 +62,8 @@ class Reason(NamedTuple):
 
 
 class Placed(NamedTuple):
-    """Some elements of an effect with a common home.
+    """Some elements of an effect, by their indices, with a common home, and the reason for it.
 
-    effect, elements: the effect, and the indices of these elements.
-    home, reason: the argument of `System` that they are part of, and why.
     dropped: indices of the rows of a constraint that the scene leaves out, in the order of its terms.
     sizes: of the dropped rows, see `ConstraintRows.sizes`.
     """
@@ -81,15 +78,11 @@ class Placed(NamedTuple):
 
 @dataclass(frozen=True)
 class Sorting:
-    """Bodies with their paces and places, and the homes of all effects.
+    """Bodies with their paces and places, and the effects, each with its home.
 
-    Attributes:
-        bodies, paces: by name.
-        layout: places of all coordinates.
-        placed: the effects, each with its home.
-        links: of bodies on joints, in the order of the kinematics; None where a chain of joints is shorter than the longest one.
-        joint_starts: values and rates of freedoms of joints at the start, by the keys of `Layout.freedoms`. Other freedoms start at zero,
-            with the rates that follow from the velocities of bodies.
+    links: of bodies on joints, in the order of the kinematics; None where a chain of joints is shorter than the longest one.
+    joint_starts: values and rates of freedoms of joints at the start, by the keys of `Layout.freedoms`. Other freedoms start at zero,
+        with the rates that follow from the velocities of bodies.
     """
 
     bodies: Bodies
@@ -105,16 +98,9 @@ class Sorting:
         return tuple(dict.fromkeys(link.branch for link in self.links if link is not None))
 
     @property
-    def places(self) -> dict[str, Place]:
-        """Places of the coordinates of bodies (centres and directors) in Q_s and Q_f, see `Layout`."""
-        return self.layout.bodies
-
-    @property
     def start(self) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
         """(q_s, q_f, v_s, v_f) at the start."""
-        if self.layout.kinematics is None:
-            return (*self._of_bodies("coordinates"), *self._of_bodies("rates"))
-        return self._on_joints[0]
+        return self.start_and_violation[0]
 
     @property
     def positions(self) -> tuple[jax.Array, jax.Array]:
@@ -138,14 +124,11 @@ class Sorting:
             slow, fast = (changed, fast) if part == "s" else (slow, changed)
         return slow, fast
 
-    @property
-    def violation(self) -> Any:
-        """The part of the velocities of bodies that their joints do not allow, relative to all, in the norm of the kinetic energy."""
-        return self._on_joints[1] if self.layout.kinematics is not None else 0.0
-
     @cached_property
-    def _on_joints(self) -> tuple[tuple, Any]:
-        """`start` and `violation` of a scene in joint coordinates."""
+    def start_and_violation(self) -> tuple[tuple, Any]:
+        """`start`, and the part of the velocities of bodies that their joints do not allow, relative to all, by masses."""
+        if self.layout.kinematics is None:
+            return (*self._of_bodies("coordinates"), *self._of_bodies("rates")), 0.0
         q, n_s = library(self.assembled).concatenate(self.assembled), self.layout.sizes[0]
         rates, masses = (library(parts).concatenate(parts) for parts in map(self._of_bodies, ("rates", "masses")))
         v, violation = _nearest_rates(self.to_bodies(q)[1], rates, masses)
@@ -181,10 +164,7 @@ def _bodies_and_jacobian(kinematics: Kinematics, q, joints):
 
 
 def _nearest_rates(jacobian, rates, masses) -> tuple[Any, Any]:
-    """The velocities v of the scene for which ``J v`` is nearest to the velocities V of the bodies, ``J^T M J v = J^T M V``.
-
-    With v comes the part ``V - J v`` that the joints do not allow, relative to V in the norm of the kinetic energy.
-    """
+    """v with ``J^T M J v = J^T M V``: ``J v`` is nearest to the rates V of bodies; and ``|V - J v| / |V|``, by M."""
     xp = library(jacobian, rates, masses)
     v = xp.linalg.solve(jacobian.T @ (masses[:, None] * jacobian), jacobian.T @ (masses * rates))
     violation, square = rates - jacobian @ v, xp.sum(masses * rates**2)
@@ -231,11 +211,7 @@ def _chain(name: str, branches: Mapping[str, Branch]) -> list[str]:
 
 
 def sort(bodies: Bodies, effects: Sequence[Effect], branches: Sequence[Branch] = ()) -> Sorting:
-    """Paces of all bodies and homes of all effects.
-
-    Raises:
-        ValueError: a decision between slow and fast that depends on traced numbers; joints that leave no freedom.
-    """
+    """Paces of all bodies and homes of all effects; refused if traced numbers decide, or nothing can move."""
     energies = [effect for effect in effects if effect.kind in ("potential", "kinetic")]
     owned = {effect.name: _owners(effect, bodies, branches) for effect in effects}
     measured = _measure(with_weight(bodies, branches), energies, owned)
@@ -260,13 +236,13 @@ def sort(bodies: Bodies, effects: Sequence[Effect], branches: Sequence[Branch] =
             home, reason = _home(effect, i, slow, len(names), measured, limit)
             homes.setdefault(home, {})[i] = reason
         placed += [Placed(effect, tuple(reasons), home, _summary(reasons.values())) for home, reasons in homes.items()]
-    places, links = make_layout(bodies, paces, branches)
-    if not any(places.sizes):
+    layout, links = make_layout(bodies, paces, branches)
+    if not any(layout.sizes):
         joints = dict.fromkeys(branch.joint.name for branch in branches)
         raise ValueError(
             f"Scene: nothing can move: {', '.join(joints)} leave no freedom to any body. Leave one of these joints out."
         )
-    return Sorting(bodies, paces, places, tuple(placed), links)
+    return Sorting(bodies, paces, layout, tuple(placed), links)
 
 
 def _measure(bodies, energies, owned: Mapping[str, Sequence[Owners]]) -> dict[str, Rates]:
@@ -330,12 +306,7 @@ def _stiff(effect: Effect, i: int, measured, limit) -> str:
 
 
 def _home(effect: Effect, i: int, slow: tuple[str, ...], size: int, measured, limit) -> tuple[Home, Reason]:
-    """The home of element i, and why, see the table of this module.
-
-    Args:
-        slow: the slow bodies that the element touches.
-        size: number of all bodies that it touches.
-    """
+    """The home of element i, see the table of this module, and why; it touches `size` bodies, the slow ones `slow`."""
     if effect.kind == "kinetic":
         return "kinetic", Reason("depends on velocities")
     if effect.kind == "force":

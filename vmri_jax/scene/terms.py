@@ -59,12 +59,7 @@ class OnBodies:
 
 @dataclass(frozen=True)
 class InRigidBodies:
-    """A role whose points are fixed in rigid bodies: ``phi + sum_i X_i d_i`` with the components X in params.
-
-    Args:
-        rows: places of the coordinates of the bodies in q_s and q_f.
-        parameter: name of the parameter X.
-    """
+    """A role of points fixed in rigid bodies, ``phi + sum_i X_i d_i`` with X, a `parameter` in params."""
 
     rows: Rows
     parameter: str
@@ -86,12 +81,9 @@ class InRigidBodies:
 
 @dataclass(frozen=True)
 class OnGround:
-    """A role that does not move: points in params, or the ground as a rigid body with the axes of space.
+    """A role that does not move: for `count` elements points of `size` coordinates, a `parameter` in params.
 
-    Args:
-        count: number of elements.
-        size: number of coordinates of a point; 12 for the ground as a whole.
-        parameter: name of the parameter with the points; None for the ground as a whole.
+    Without a parameter it is the ground as a rigid body with the axes of space, and the size is 12.
     """
 
     count: int
@@ -121,15 +113,12 @@ Role = OnBodies | InRigidBodies | OnGround
 
 @dataclass(frozen=True)
 class EffectTerm:
-    """The function of an effect on some of its elements.
+    """The function of an effect, whose name is the key of its parameters, on some of its elements.
 
-    Args:
-        name: of the effect, the key of its parameters in params.
-        function: of the effect.
-        roles: the maps from q_s and q_f to the coordinates of each role.
-        select: indices of the elements; None for all.
-        split: names of the parameters that have an entry for each element.
-        timed: whether the first argument of the function is the time.
+    roles: the maps from q_s and q_f to the coordinates of each role.
+    select: indices of the elements; None for all.
+    split: names of the parameters that have an entry for each element.
+    timed: whether the first argument of the function is the time.
     """
 
     name: str

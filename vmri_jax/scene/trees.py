@@ -104,12 +104,7 @@ class Link(NamedTuple):
 
 
 def grow(bodies: Bodies, effects: Sequence[Effect], everywhere: bool = True) -> tuple[Branch, ...]:
-    """The branches of all trees, parents before children.
-
-    Args:
-        effects: bound, see `Effect.bound`.
-        everywhere: False leaves out branches where directors are faster, see `LONGEST` and `MOST_LOOPS`.
-    """
+    """The branches of all trees, parents first; if not `everywhere`, without those where directors are faster."""
     ranks = _ranks(bodies, effects)
     by_parent = _offers(bodies, effects, ranks)
     branches, tree_of, deepest = [], {}, {}
@@ -189,10 +184,7 @@ def check_frames(bodies: Bodies, branches: Sequence[Branch]) -> None:
 
 
 def with_weight(bodies: Bodies, branches: Sequence[Branch]) -> Bodies:
-    """The bodies, each frame replaced by a rigid body with the mass and the inertia of a body that it carries.
-
-    The frequencies of effects on a frame are estimated with this mass.
-    """
+    """The bodies, with rigid bodies like the ones they carry for frames: frequencies are estimated by this inertia."""
     weighted = dict(bodies)
     for branch in reversed(branches):  # children first: a frame may carry a frame
         frame, child = bodies.get(branch.parent), weighted[branch.child]
@@ -204,10 +196,9 @@ def with_weight(bodies: Bodies, branches: Sequence[Branch]) -> Bodies:
 def make_layout(
     bodies: Bodies, paces: Mapping[str, DecidedPace], branches: Sequence[Branch] = ()
 ) -> tuple[Layout, tuple[Link | None, ...]]:
-    """The places of all coordinates, of slow bodies in q_s and of fast bodies in q_f, in the order of the bodies.
+    """The places of all coordinates in q_s and q_f, and the links of the frames of the kinematics, in their order.
 
-    A body on a joint has the freedoms of this joint as coordinates. With the layout come the links of the frames of its kinematics, in the
-    order of these frames.
+    A body on a joint has the freedoms of this joint as coordinates.
     """
     ends: dict[Part, int] = {"s": 0, "f": 0}
     on_joints = {branch.child: branch for branch in branches}
@@ -229,11 +220,7 @@ def make_layout(
 
 
 def _with_kinematics(bodies: Bodies, branches: Sequence[Branch], places, coordinates, freedoms, sizes):
-    """The layout with the bodies on joints, and the links of their frames.
-
-    Args:
-        places: of the bodies on no joint.
-    """
+    """The layout with the bodies on joints, and the links of their frames; `places` of the bodies on no joint."""
     grids: dict[str, Grid] = {name: place.part for name, place in places.items()}
     grids[GROUND] = "s"
     depths: dict[str, int] = {}
@@ -244,14 +231,13 @@ def _with_kinematics(bodies: Bodies, branches: Sequence[Branch], places, coordin
         depths[branch.child] = depths.get(branch.parent, 0) + 1
     roots = list(dict.fromkeys(branch.parent for branch in branches if branch.parent in places))
     numbers = {GROUND: -1} | {name: i for i, name in enumerate(roots)}
-    carriers = _carriers_of_fast(branches, grids)
+    carriers: set[str] = set()  # the bodies that carry, at any depth, bodies which depend on fast coordinates
+    for branch in reversed(branches):  # children before parents
+        if grids[branch.child] != "s" or branch.child in carriers:
+            carriers.add(branch.parent)
     # branches by grid, and by whether the positions of fast bodies depend on them; in the order of `Kinematics.frames`
-    groups: dict[tuple[Grid, bool], list[Branch]] = {
-        ("s", True): [],
-        ("f", True): [],
-        ("sf", True): [],
-        ("s", False): [],
-    }
+    order: tuple[tuple[Grid, bool], ...] = (("s", True), ("f", True), ("sf", True), ("s", False))
+    groups: dict[tuple[Grid, bool], list[Branch]] = {group: [] for group in order}
     for branch in branches:
         grid = grids[branch.child]
         groups[grid, grid != "s" or branch.child in carriers].append(branch)
@@ -271,23 +257,10 @@ def _with_kinematics(bodies: Bodies, branches: Sequence[Branch], places, coordin
     return Layout(all_places, coordinates, freedoms, kinematics), tuple(links)
 
 
-def _carriers_of_fast(branches: Sequence[Branch], grids: Mapping[str, Grid]) -> set[str]:
-    """The bodies that carry, at any depth, bodies which depend on fast coordinates."""
-    carriers: set[str] = set()
-    for branch in reversed(branches):  # children before parents
-        if grids[branch.child] != "s" or branch.child in carriers:
-            carriers.add(branch.parent)
-    return carriers
-
-
 def _frames(grid: Grid, first: int, branches: Sequence[Branch], bodies: Bodies, freedoms, numbers: Mapping[str, int]):
-    """The frames of bodies that depend on the same part of the coordinates, and their links in the same order.
+    """The frames of bodies on one grid, numbered from `first` on, and their links; paths are padded with None.
 
-    Paths from a root to a leaf are padded with None to the same length.
-
-    Args:
-        first: index of the first of these frames.
-        numbers: indices of the bodies that the branches may hang on.
+    `numbers` are indices of the bodies that the branches may hang on.
     """
     branch_of = {branch.child: branch for branch in branches}
     parents = {branch.parent for branch in branches}

@@ -91,10 +91,9 @@ def _require_reach(effect: OfFreedoms, quantity: str, value: Any, joint: Joint) 
 
 
 def at_start(sorting: Sorting, joint: Joint, pair: int, freedom: str) -> Any:
-    """The angle of a joint without a coordinate at the start, rad.
+    """The angle of a joint without a coordinate at the start, rad; it is zero at the positions in `bodies`.
 
-    It is zero at the positions of the bodies as the user gave them. From there turns are counted along the straight line to the start in
-    joint coordinates.
+    From there turns are counted along the straight line to the start in joint coordinates.
     """
     starts, begin = sorting.joint_starts, np.concatenate(sorting.assembled) if is_concrete(sorting.positions) else None
     if not starts or begin is None:

@@ -12,7 +12,7 @@ from vmri_jax.mechanics.arrays import is_concrete, real_array
 from vmri_jax.mechanics.constraints import RANK
 from vmri_jax.mechanics.projection import legendre
 from vmri_jax.mechanics.system import System
-from vmri_jax.scene.body import AnyBody, Bodies, moving
+from vmri_jax.scene.body import AnyBody, moving
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.effects.freedoms import ANGLES
 from vmri_jax.scene.effects.joint_base import Joint, freedom_of, joint_named
@@ -61,15 +61,16 @@ def with_rates(
     t = jnp.zeros(())
     rows = [np.asarray(jax.jacfwd(constraints, 1)(t, q))]
     values = [-np.asarray(jax.jacfwd(constraints)(t, q))]
-    for joint, freedom, numbers in _rates(effects, sorting.bodies, rates):
+    for joint, freedom, number in _by_freedom("Scene.with_rates", effects, rates):
         pairs = joint.elements(sorting.bodies)
+        numbers = _for_pairs(f"Scene.with_rates: the rate of {joint.name}", number, len(pairs), "one number")
         gradient = jax.jacfwd(
             lambda q, joint=joint, freedom=freedom, pairs=pairs: joint.values(
                 freedom, range(len(pairs)), sorting.bodies, {name: q[columns[name]] for name in moving(chain(*pairs))}
             )
         )
         rows.append(np.asarray(gradient(jnp.asarray(bodies))) @ of_bodies)
-        values.append(numbers)
+        values.append(np.broadcast_to(numbers, (len(pairs),)))
     c, b = np.concatenate(rows), np.concatenate(values)
     root = np.linalg.cholesky(np.asarray(jax.jacfwd(momentum)(jnp.asarray(v))))  # M = R R^T
     # rows of C R^-T and b in units of their lengths: all have the unit of R^T v, whose squared length is twice the kinetic energy
@@ -99,10 +100,6 @@ def _freedom_numbers(sorting: Sorting) -> dict[Key, int]:
 
 def joint_starts(sorting: Sorting, effects: Sequence[Effect], starts: Mapping[str, Any]) -> dict[Key, tuple[Any, Any]]:
     """Values and rates of freedoms by the keys of `Layout.freedoms`, see `Scene.with_joints`."""
-    if not isinstance(starts, Mapping):
-        raise TypeError(
-            f'Scene.with_joints: joints is {starts!r}; give starts by the names of joints, {{"hinge": 0.3}}.'
-        )
     by_key = {}
     for joint, freedom, start in _by_freedom("Scene.with_joints", effects, starts):
         name, count = joint.name, len(joint.elements(sorting.bodies))
@@ -113,10 +110,8 @@ def joint_starts(sorting: Sorting, effects: Sequence[Effect], starts: Mapping[st
             key = name, i, freedom
             if key not in sorting.layout.freedoms:
                 raise ValueError(
-                    f"Scene.with_joints: {joint.label(i, sorting.bodies)} has no coordinate of its own: "
-                    + (
-                        'it closes a loop, where you may set the other joints, or its bodies have directors: then give the scene coordinates="joint".'
-                    )
+                    f"Scene.with_joints: {joint.label(i, sorting.bodies)} has no coordinate of its own: it closes a loop, where you may set "
+                    'the other joints, or its bodies have directors: then give the scene coordinates="joint".'
                 )
             by_key[key] = tuple(number if number.ndim == 0 else number[i] for number in numbers)
     return with_closed_loops(sorting, by_key)
@@ -177,15 +172,7 @@ def _of_joints_alone(sorting: Sorting, rows: ConstraintRows) -> np.ndarray:
 
 
 def _close(rows: ConstraintRows, numbers: np.ndarray, q: np.ndarray, free: Sequence[int]) -> tuple[str, float] | None:
-    """Move coordinates of q, in place, until rows are zero.
-
-    Args:
-        numbers: of the rows.
-        free: numbers of the coordinates that may move.
-
-    Returns:
-        None, or if the iteration fails the name and value of the row that is furthest from zero.
-    """
+    """Move the `free` coordinates of q, in place, until rows are zero; on failure name and value of the largest row."""
     gap = None
     for _ in range(CORRECTIONS):
         values, jacobian = (x[numbers] for x in rows.evaluate(0.0, q))
@@ -201,6 +188,8 @@ def _close(rows: ConstraintRows, numbers: np.ndarray, q: np.ndarray, free: Seque
 
 def _by_freedom(method: str, effects: Sequence[Effect], numbers: Mapping[str, Any]) -> Iterator[tuple[Joint, str, Any]]:
     """(joint, freedom, numbers) from a mapping by names of joints, whose values may be mappings by freedoms; `method` begins messages."""
+    if not isinstance(numbers, Mapping):
+        raise TypeError(f'{method}: got {numbers!r}; give numbers by the names of joints, {{"hinge": 0.3}}.')
     for name, of_joint in numbers.items():
         joint = joint_named(method, name, effects)
         for freedom, of_freedom in of_joint.items() if isinstance(of_joint, Mapping) else [("auto", of_joint)]:
@@ -209,17 +198,6 @@ def _by_freedom(method: str, effects: Sequence[Effect], numbers: Mapping[str, An
             except ValueError as error:
                 raise ValueError(f'{method}: {error} Give a dictionary, {{"turn": ..., "slide": ...}}.') from None
             yield joint, known, of_freedom
-
-
-def _rates(effects: Sequence[Effect], bodies: Bodies, rates: Mapping[str, Any]):
-    """(joint, freedom, rates (n,) of its n pairs of bodies)."""
-    if not isinstance(rates, Mapping):
-        raise TypeError(
-            f'Scene.with_rates: rates is {rates!r}; give rates by the names of joints, {{"bearing": 100.0}}.'
-        )
-    for joint, freedom, numbers in _by_freedom("Scene.with_rates", effects, rates):
-        about, count = f"Scene.with_rates: the rate of {joint.name}", len(joint.elements(bodies))
-        yield joint, freedom, np.broadcast_to(_for_pairs(about, numbers, count, "one number"), (count,))
 
 
 def _for_pairs(about: str, numbers: Any, count: int, form: str):

@@ -199,6 +199,11 @@ def stage_scheme(scheme: Scheme | Composition) -> Scheme:
     return scheme.scheme if isinstance(scheme, Composition) else scheme
 
 
+def stage_lengths(scheme: Scheme | Composition):
+    """(s,) lengths of the stages of a macro step, in macro steps; ``[1]`` of a scheme."""
+    return scheme.coefficients if isinstance(scheme, Composition) else np.ones(1)
+
+
 def _order(coefficients: np.ndarray, order: int, symmetric: bool) -> int:
     """Order of the composition of a generic scheme of this order, by power series in H with matrix coefficients.
 

@@ -4,8 +4,7 @@ from vmri_jax.stability.advice import Advice, Finding, advise
 from vmri_jax.stability.figures import plot_stability
 from vmri_jax.stability.linear import SmallMotions, linear_model, small_motions
 from vmri_jax.stability.map import StabilityMap, Window, stability_map
-from vmri_jax.stability.monodromy import Monodromy, monodromy
-from vmri_jax.stability.multipliers import Multipliers, multipliers
+from vmri_jax.stability.multipliers import Monodromy, Multipliers, monodromy, multipliers
 from vmri_jax.stability.vibrations import Vibration, Vibrations, vibrations
 
 __all__ = [

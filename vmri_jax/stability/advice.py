@@ -9,14 +9,14 @@ import numpy as np
 from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.mechanics.system import label
 from vmri_jax.running.origin import names_of
-from vmri_jax.schemes.composition import Composition, stage_scheme
+from vmri_jax.schemes.composition import Composition, stage_lengths, stage_scheme
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.stability.drive import LEAST_STEPS, drive_period, driven_motion, growth_of_run, in_words, periods_of_run
-from vmri_jax.stability.labels import swapped
 from vmri_jax.stability.linear import SmallMotions, small_motions
 from vmri_jax.stability.map import TOLERANCE, Window, measure
 from vmri_jax.stability.multipliers import multipliers
 from vmri_jax.stability.oscillator import fast_limit, kick_limit, phase, slow_limit
+from vmri_jax.stability.vibrations import swapped
 from vmri_jax.study.table import Column, ResultTable
 
 SCANNED_STEPS = (0.5, 1.25)
@@ -283,7 +283,7 @@ def _cause(motions: SmallMotions, scheme: Scheme | Composition, macro_dt: float)
 def _stability_limit(motions: SmallMotions, scheme: Scheme | Composition, macro_dt: float) -> str:
     """A sentence about a potential for which alone the step is unstable; empty if there is none."""
     stage = stage_scheme(scheme)
-    longest = macro_dt * np.abs(_stage_lengths(scheme)).max()
+    longest = macro_dt * np.abs(stage_lengths(scheme)).max()
     of_stage = " of the longest stage" if isinstance(scheme, Composition) else ""
     micro_dt = longest / stage.num_micro
     cases = [
@@ -378,14 +378,14 @@ def _turn(motions: SmallMotions, scheme: Scheme | Composition, macro_dt: float, 
     if not _is_fast(motions, i):
         return exact
     stage = stage_scheme(scheme)
-    phases = [phase(stage, exact * part / stage.num_micro) for part in _stage_lengths(scheme)]
+    phases = [phase(stage, exact * part / stage.num_micro) for part in np.asarray(stage_lengths(scheme))]
     turn = stage.num_micro * sum(phases)
     return turn if np.isfinite(turn) else exact
 
 
 def _stages(scheme: Scheme | Composition) -> Iterator[Finding]:
     """A note on backward steps of a composition."""
-    parts = _stage_lengths(scheme)
+    parts = np.asarray(stage_lengths(scheme))
     if not (parts > 0).all():
         longest = float(np.abs(parts).max())
         sentence = (
@@ -393,8 +393,3 @@ def _stages(scheme: Scheme | Composition) -> Iterator[Finding]:
             f"backwards: the largest stable macro step of the composition is about that of its scheme divided by {longest:.3g}."
         )
         yield Finding("note", "stages", sentence, longest)
-
-
-def _stage_lengths(scheme: Scheme | Composition) -> np.ndarray:
-    """Lengths of the stages of a macro step, in macro steps."""
-    return np.asarray(scheme.coefficients) if isinstance(scheme, Composition) else np.ones(1)

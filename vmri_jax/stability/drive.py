@@ -21,7 +21,7 @@ from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
 from vmri_jax.schemes.composition import Composition, stage_scheme
 from vmri_jax.schemes.scheme import Scheme
-from vmri_jax.stability.monodromy import monodromy
+from vmri_jax.stability.multipliers import monodromy
 
 SAMPLES = 1024
 """Times at which the drive is compared with itself, one period later or earlier; with fewer of them narrow pulses are missed."""
@@ -74,12 +74,8 @@ def in_words(growth: float) -> str:
 def drive_period(system: System, state: State, scale: float) -> float | None:
     """The smallest period of all terms that depend on time and of their derivatives, with positions and velocities of the state.
 
-    Args:
-        system, state: as of the run.
-        scale: a time, such as the macro step; periods of 1/500 to 2000 times this are seen.
-
-    Returns:
-        The period; None if nothing depends on time, or no period is seen, as for pulses, chirps, and drives with jumps.
+    Periods of 1/500 to 2000 times `scale`, such as the macro step, are seen. None if nothing depends on time, or no period is seen, as for
+    pulses, chirps, and drives with jumps.
     """
     if not driven(system, state) or not 0 < scale < np.inf:
         return None

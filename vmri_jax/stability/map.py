@@ -147,7 +147,8 @@ def stability_map(
         rows = {label: (motions, s) for label, s in schemes.items()}
     else:
         only = _single_scheme(schemes, system, kappa)
-        rows = {float(k): (small_motions(_with_kappa(system, k), state), only) for k in kappa}
+        params = {float(k): {**system.params, "kappa": np.asarray(k, dtype=float)} for k in kappa}
+        rows = {k: (small_motions(system.replace(params=p), state), only) for k, p in params.items()}
     omega = next(iter(rows.values()))[0].omega
     if omega == 0:
         raise ValueError("stability_map: the system has no frequency that could scale omega_H; nothing vibrates there.")
@@ -194,11 +195,7 @@ def find_windows(
     Between neighbouring samples with different labels lies an end of a window, or a whole window. All such brackets are
     divided at the same time, until they are shorter than `resolution`; shorter windows are left out.
 
-    Args:
-        label: function of an array of samples that returns a label for each: None for unstable, else any value to compare.
-        x: (k,) increasing samples to start from.
-        labels: their labels.
-        resolution: length of a bracket at which its division ends.
+    ``label(samples)`` has a label for each sample, None for unstable, else any value to compare; `labels` are the labels of x (k,).
     """
     edges = [x[0]] if labels[0] is None else []
     samples = zip(x, x[1:], labels, labels[1:], strict=False)
@@ -247,7 +244,3 @@ def _single_scheme(schemes: Mapping[Any, Scheme | Composition], system: System, 
         )
     [only] = schemes.values()
     return only
-
-
-def _with_kappa(system: System, kappa) -> System:
-    return system.replace(params={**system.params, "kappa": np.asarray(kappa, dtype=float)})

@@ -30,9 +30,8 @@ def phase(scheme: Scheme, x: float) -> float:
     if not scheme.fast.is_local:
         return np.nan
     path = np.linspace(0.0, x, 2 + int(abs(x) / RESOLUTION))
-    cosine, direction = _turn(
-        scheme.degree, scheme.kinetic.rule, scheme.fast.rule, scheme.fast.gradient_corrected, path
-    )
+    kinetic, fast = scheme.kinetic, scheme.fast
+    cosine, direction = _turn(scheme.degree, kinetic.rule, fast.rule, fast.gradient_corrected, path)
     if abs(cosine[-1]) > 1:
         return np.nan
     # Unwrapped from x = 0: the cosine alone gives the phase only up to sign and multiples of 2 pi.

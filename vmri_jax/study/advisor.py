@@ -227,10 +227,6 @@ def first_verified(
     """The fastest setting whose run from another start, too, keeps the error; warns if none of `MAX_CHECKS` settings does.
 
     A setting that misses the error there waits again, with more steps, among the settings that are slower.
-
-    Args:
-        settings: that keep the error in the search.
-        problem, reference: of the other start.
     """
     waiting, checked = list(settings), []
     for _ in range(MAX_CHECKS):

@@ -6,7 +6,9 @@ The error of a run is the largest difference over all saved nodes and all coordi
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from itertools import product
 from typing import Any
 
 import jax
@@ -17,20 +19,37 @@ from vmri_jax.diagnostics import OrderFit
 from vmri_jax.executors.executor import mapped
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
 from vmri_jax.running.interrupts import Interrupted
-from vmri_jax.running.progress import shows_progress
+from vmri_jax.running.progress import Progress, shows_progress
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.results import Method, Result
 from vmri_jax.steppers.solvers import Newton
-from vmri_jax.study.cases import Case, cases_of
 from vmri_jax.study.program import Program
-from vmri_jax.study.reference_solution import ReferenceSolution
+from vmri_jax.study.reference_solution import ReferenceSolution, reference_solution
 from vmri_jax.study.table import Column, ResultTable
 
 MIN_ERROR_OVER_REFERENCE = 100.0
 """Least ratio of a fitted error to the error of the reference; at this ratio the reference changes the error of the scheme by 1 %; a larger
 ratio fits fewer runs."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """One set of parameters: its label, the problem with it, and the reference solution."""
+
+    label: str
+    problem: Problem
+    reference: ReferenceSolution
+
+    @cached_property
+    def energies(self) -> np.ndarray | None:
+        """(num_saves + 1,) energies of the reference; None where the system keeps its energy: the energy at the start then serves."""
+        if self.problem.system.keeps_energy:
+            return None
+        n_s = self.problem.q_s.size
+        phase = [part for array in (self.reference.q, self.reference.p) for part in np.split(array, [n_s], axis=1)]
+        return np.asarray(jax.jit(jax.vmap(partial(diagnostics.energy, self.problem.system)))(*phase))
 
 
 @dataclass(frozen=True)
@@ -80,18 +99,18 @@ class SchemeSummary:
         finished = [row for row in self.runs if np.isfinite(row.error_q)]
         return min(finished, key=lambda row: row.macro_dt, default=None)
 
-    @property
-    def failures(self) -> str:
-        """How many of the runs failed; empty if none did."""
-        failed = sum(not np.isfinite(row.error_q) for row in self.runs)
-        return f"{failed} of {len(self.runs)}" if failed else ""
-
 
 def _order(fit: OrderFit) -> str:
     """The text of an observed order with its uncertainty."""
     if not np.isfinite(fit.order):
         return "-"
     return f"{fit.order:.2f}" + (f" ± {fit.half_width:.2f}" if np.isfinite(fit.half_width) else "")
+
+
+def _failures(summary: SchemeSummary) -> str:
+    """The number of failed runs; empty if no run failed."""
+    failed = sum(not np.isfinite(row.error_q) for row in summary.runs)
+    return f"{failed} of {len(summary.runs)}" if failed else ""
 
 
 def _of_finest(name: str, form: str = ".1e") -> Callable[[SchemeSummary], str]:
@@ -117,7 +136,7 @@ class ConvergenceStudy(ResultTable):
         Column("error of q", _of_finest("error_q"), right=True),
         Column("error of p", _of_finest("error_p"), right=True),
         Column("energy", _of_finest("energy_error"), right=True),
-        Column("failed", lambda summary: summary.failures, right=True),
+        Column("failed", _failures, right=True),
     )
     rows: tuple[ConvergenceRow, ...]
     references: Mapping[str, ReferenceSolution]
@@ -168,11 +187,12 @@ class ConvergenceStudy(ResultTable):
 
     def shown(self) -> list[SchemeSummary]:
         """Observed orders, and the errors at the smallest step that did not fail."""
-        return [self._summary(scheme, case) for scheme in self.schemes for case in self.cases]
-
-    def _summary(self, scheme: str, case: str) -> SchemeSummary:
-        runs = tuple(row for row in self.rows if (row.scheme, row.case) == (scheme, case))
-        return SchemeSummary(runs, self.fit(scheme, "q", case=case), self.fit(scheme, "p", case=case))
+        summaries = []
+        for scheme, case in product(self.schemes, self.cases):
+            runs = tuple(row for row in self.rows if (row.scheme, row.case) == (scheme, case))
+            fits = (self.fit(scheme, quantity, case=case) for quantity in ("q", "p"))
+            summaries.append(SchemeSummary(runs, *fits))
+        return summaries
 
     def content(self) -> dict[str, Any]:
         """The rows, and the errors of the references."""
@@ -238,7 +258,7 @@ def convergence_study(
         raise ValueError("convergence_study: macro_dt is empty; give the macro steps to run.")
     total = len(schemes) * len(steps) * (1 if params is None else len(params))
     told = lambda message, *_: progress(message, 0, total)  # noqa: E731
-    cases = cases_of(problem, params, reference, t_end, num_saves, told)
+    cases = _cases(problem, params, reference, t_end, num_saves, told)
     labels = [(label, case, num_steps) for label in schemes for case in cases for num_steps in steps]
     stopped = None
     try:
@@ -261,6 +281,37 @@ def convergence_study(
         raise Interrupted(study, len(study.rows), None, "runs") from None
     progress("done", total, total)
     return study
+
+
+def _cases(problem: Problem, params, reference, t_end: float, num_saves: int, progress: Progress) -> list[Case]:
+    """The cases of `convergence_study`; refuses references with other labels or of another shape."""
+    if params is not None and not params:
+        raise ValueError("convergence_study: params is empty; give a set of parameters by label, or leave it out.")
+    problems = (
+        {"": problem}
+        if params is None
+        else {label: replace(problem, system=problem.system.replace(params=p)) for label, p in params.items()}
+    )
+    if reference is None:
+        return [
+            Case(label, problem, reference_solution(problem, t_end, num_saves=num_saves, progress=progress))
+            for label, problem in problems.items()
+        ]
+    by_label = isinstance(reference, Mapping)
+    references: dict[str, Any] = dict(reference if by_label else dict.fromkeys(problems, reference))
+    if set(references) != set(problems) or (len(problems) > 1 and not by_label):
+        raise ValueError(
+            f"convergence_study: params has the labels {list(problems)}, so reference must be a mapping with the same labels."
+        )
+    for label, problem in problems.items():
+        shape = (num_saves + 1, problem.q_s.size + problem.q_f.size)
+        q, p = references[label].q, references[label].p
+        if q.shape != shape or p.shape != shape:
+            raise ValueError(
+                f"convergence_study: reference has q of shape {q.shape} and p of shape {p.shape}; both "
+                f"must be {shape}: num_saves + 1 nodes from the start to t_end, slow coordinates first."
+            )
+    return [Case(label, problem, references[label]) for label, problem in problems.items()]
 
 
 def _run(problem: Problem, scheme, t_end: float, num_saves: int, solver, num_steps: int) -> Trajectory:

@@ -19,9 +19,8 @@ from vmri_jax.running.files import make_writable_folder
 from vmri_jax.running.progress import part, shows_progress
 from vmri_jax.steppers.results import SimulationError
 from vmri_jax.study.advisor import MIN_ERROR_OVER_REFERENCE
-from vmri_jax.study.cost_figures import draw_shares
 from vmri_jax.study.html import embedded, write_page
-from vmri_jax.study.prices import FAST, SLOW, prices, shares
+from vmri_jax.study.prices import FAST, SLOW, draw_shares, prices, shares
 from vmri_jax.study.program import Program
 from vmri_jax.study.reference_solution import ReferenceSolution, reference_solution
 from vmri_jax.study.search import Search, Setting, stopwatch
@@ -43,11 +42,7 @@ REPEATS = 5
 
 @dataclass(frozen=True)
 class Answer:
-    """The cheapest setting for an error.
-
-    error: largest accepted error of the positions in the run.
-    setting: the cheapest setting; None if no setting keeps the error.
-    """
+    """The largest accepted error of the positions, and the cheapest setting for it; None if no setting keeps the error."""
 
     error: float
     setting: Setting | None
@@ -263,13 +258,12 @@ def _confirmed(search: Search, answers: Sequence[Answer]) -> list[Answer]:
     """The answers with the fastest setting whose confirmed error keeps the error; an answer without such a setting stays as it is."""
     settings = {(s.row.scheme, s.num_steps): s for s in search.settings.values()}
     stairs = confirmed([s.row for s in search.settings.values()])
-
-    def confirmed_answer(answer: Answer) -> Answer:
-        keeping = [stair for stair in stairs if stair.error <= answer.error]
-        row = min(keeping, key=lambda stair: stair.seconds).row if keeping else None
-        return answer if row is None else replace(answer, setting=settings[row.scheme, row.num_steps])
-
-    return [confirmed_answer(answer) for answer in answers]
+    best = []
+    for answer in answers:
+        rows = [stair.row for stair in stairs if stair.error <= answer.error]
+        row = min(rows, key=lambda row: row.seconds, default=None)
+        best.append(answer if row is None else replace(answer, setting=settings[row.scheme, row.num_steps]))
+    return best
 
 
 def _fastest_that_keep(answers: Sequence[Answer]) -> list[Answer]:

@@ -8,13 +8,14 @@ settings in turn.
 
 import time
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from operator import attrgetter
 
 import numpy as np
 
 from vmri_jax import diagnostics
 from vmri_jax.accuracy.families import Family
+from vmri_jax.mechanics.state import Problem
 from vmri_jax.running.progress import Progress, silent
 from vmri_jax.steppers.solvers import Newton
 from vmri_jax.study.program import Program
@@ -74,32 +75,24 @@ def stopwatch() -> Callable[[], float]:
     return lambda: min(time.monotonic() - wall_start, time.process_time() - processor_start)
 
 
+@dataclass
 class Search:
     """Runs of one problem, each made once: programs, errors and times by family, num_micro and number of steps.
 
-    Args:
-        problem: system and start.
-        t_end: simulated time.
-        menu: families to choose from.
-        reference: the solution that errors are measured against; runs save as many nodes.
-        solver: how implicit equations are solved.
-        fallback: see `Program`.
+    Runs save as many nodes as the reference solution. Arguments are as of `Program`.
     """
 
-    def __init__(
-        self,
-        problem,
-        t_end: float,
-        menu: Sequence[Family],
-        reference: ReferenceSolution,
-        solver: Newton | None = None,
-        fallback: bool = True,
-    ):
-        self.problem, self.t_end, self.menu, self.reference = problem, t_end, menu, reference
-        self.solver, self.fallback = solver, fallback
-        self.frequency = float(diagnostics.frequencies(problem)[0])
-        self.programs: dict[tuple[str, int], Program] = {}
-        self.settings: dict[tuple[str, int, int], Setting] = {}
+    problem: Problem
+    t_end: float
+    menu: Sequence[Family]
+    reference: ReferenceSolution
+    solver: Newton | None = None
+    fallback: bool = True
+    programs: dict[tuple[str, int], Program] = field(default_factory=dict)
+    settings: dict[tuple[str, int, int], Setting] = field(default_factory=dict)
+
+    def __post_init__(self):
+        self.frequency = float(diagnostics.frequencies(self.problem)[0])
 
     def program(self, family: Family, num_micro: int) -> Program:
         """The compiled scheme; the search keeps the MAX_PROGRAMS that were used last."""
@@ -165,11 +158,7 @@ class Search:
     ) -> list[Setting]:
         """Settings that keep the error, the fastest first; the best ones are timed in turn.
 
-        Args:
-            error: largest accepted ``|q - q_ref|``, in the unit of the positions.
-            progress: told about every scheme.
-            exhaustive: try every num_micro of every family, to check the staged search.
-            budget: seconds after which the search compiles no further scheme, once a setting keeps the error.
+        `budget` are the seconds after which the search compiles no further scheme, once a setting keeps the error.
         """
         reached: dict[tuple[str, int], Setting] = {}
         limit, elapsed = MAX_RUN_SECONDS, stopwatch()

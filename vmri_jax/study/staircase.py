@@ -19,16 +19,11 @@ from vmri_jax.accuracy.companions import ratio
 from vmri_jax.accuracy.families import Family
 from vmri_jax.study.program import joined
 from vmri_jax.study.search import Search
-from vmri_jax.study.work import WorkRow
+from vmri_jax.study.work import WorkRow, pareto_front
 
-SINGLE, MICRO, COMPOSED, INTERVALS = (
-    "single steps of order 2",
-    "micro steps of order 2",
-    "composed to order 4, 6, 8",
-    "intervals of high degree",
-)
+KINDS = "single steps of order 2", "micro steps of order 2", "composed to order 4, 6, 8", "intervals of high degree"
 """Kinds of schemes by their structure."""
-KINDS = (SINGLE, MICRO, COMPOSED, INTERVALS)
+SINGLE, MICRO, COMPOSED, INTERVALS = KINDS
 CONFIRMING_RATIO = 1.3
 """Least ratio of the steps of a confirming run to the steps of the run that it confirms. An error that is small by chance grows again
 within a few percent more steps; a larger ratio leaves fewer runs confirmed."""
@@ -41,10 +36,8 @@ SINGLE_STEP_RUNS = 2
 
 @dataclass(frozen=True)
 class Stair:
-    """A run of a staircase.
+    """A run of a staircase with its confirmed error.
 
-    row: the run.
-    error: its confirmed error.
     fast_share: part of the error that more micro steps remove, between 0 and 1; NaN where it was not measured.
     """
 
@@ -83,19 +76,11 @@ def confirmed(rows: Sequence[WorkRow]) -> list[Stair]:
     return stairs
 
 
-def front(stairs: Sequence[Stair]) -> list[Stair]:
-    """The Pareto front in time and error: the stairs that no other stair beats in both, the fastest first."""
-    best: list[Stair] = []
-    for stair in sorted(stairs, key=lambda s: (s.seconds, s.error)):
-        if not best or stair.error < best[-1].error:
-            best.append(stair)
-    return best
-
-
 def staircases(rows: Sequence[WorkRow]) -> dict[str, list[Stair]]:
     """The staircase of each kind of schemes, empty where no run is confirmed."""
     stairs = confirmed(rows)
-    return {kind: front([stair for stair in stairs if kind_of(stair.row) == kind]) for kind in KINDS}
+    by_kind = {kind: [stair for stair in stairs if kind_of(stair.row) == kind] for kind in KINDS}
+    return {kind: pareto_front(of_kind, "seconds", "error") for kind, of_kind in by_kind.items()}
 
 
 def confirm(search: Search) -> None:
@@ -105,9 +90,8 @@ def confirm(search: Search) -> None:
     schemes = {s.row.scheme: (s.family, s.num_micro) for s in settings}
     finest: dict[str, int] = {}  # by scheme, the most steps of a run on the unconfirmed staircase
     for kind in KINDS:
-        of_kind = [s.row for s in settings if kind_of(s.row) == kind and np.isfinite(s.row.error_q)]
-        for stair in front([Stair(row, row.error_q) for row in of_kind]):
-            finest[stair.row.scheme] = max(stair.row.num_steps, finest.get(stair.row.scheme, 0))
+        for row in pareto_front([s.row for s in settings if kind_of(s.row) == kind], "seconds", "error_q"):
+            finest[row.scheme] = max(row.num_steps, finest.get(row.scheme, 0))
     for scheme, num_steps in finest.items():
         most_steps = max(s.num_steps for s in settings if s.row.scheme == scheme)
         if most_steps < CONFIRMING_RATIO * num_steps:

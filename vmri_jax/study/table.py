@@ -86,7 +86,11 @@ class ResultTable:
 
     def markdown(self) -> str:
         """The table in Markdown."""
-        return markdown_table(self.columns, self.shown())
+        columns, cells = _filled(self.columns, self.shown())
+        body = [[str(cell).replace("|", "\\|").replace("\n", " ") for cell in line] for line in cells]
+        head = [column.name for column in columns]
+        rule = ["---:" if column.right else "---" for column in columns]
+        return "".join(f"| {' | '.join(line)} |\n" for line in (head, rule, *body))
 
     def to_csv(self, path: str | Path) -> None:
         """Write a CSV file."""
@@ -123,15 +127,6 @@ def rich_table(columns: Sequence[Column], rows: Sequence[Any], caption: str = ""
     for line in cells:
         table.add_row(*(escape(cell) if isinstance(cell, str) else cell for cell in line))
     return table
-
-
-def markdown_table(columns: Sequence[Column], rows: Sequence[Any]) -> str:
-    """Rows as a table in Markdown."""
-    columns, cells = _filled(columns, rows)
-    body = [[str(cell).replace("|", "\\|").replace("\n", " ") for cell in line] for line in cells]
-    head = [column.name for column in columns]
-    rule = ["---:" if column.right else "---" for column in columns]
-    return "".join(f"| {' | '.join(line)} |\n" for line in (head, rule, *body))
 
 
 def _filled(columns: Sequence[Column], rows: Sequence[Any]) -> tuple[list[Column], list[list[str | Text]]]:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -118,11 +119,7 @@ class WorkPrecision(ResultTable):
         Args:
             work: "seconds", "slow_evaluations", "fast_evaluations" or "solves".
         """
-        front: list[WorkRow] = []
-        for row in sorted(self.rows, key=lambda r: (getattr(r, work), r.error_q)):
-            if np.isfinite(row.error_q) and (not front or row.error_q < front[-1].error_q):
-                front.append(row)
-        return front
+        return pareto_front(self.rows, work, "error_q")
 
     def shown(self) -> list[WorkRow]:
         """The Pareto front."""
@@ -145,6 +142,15 @@ class WorkPrecision(ResultTable):
     def plot(self, title: str = "", work: str = "seconds"):
         """Error against work, see `vmri_jax.plots.plot_work_precision`."""
         return plots.plot_work_precision(self, title, work)
+
+
+def pareto_front(items: Sequence[Any], work: str, error: str) -> list[Any]:
+    """The items that no other item beats both in the attribute `work` and in the attribute `error`, the cheapest first."""
+    front, finite = [], [item for item in items if np.isfinite(getattr(item, error))]
+    for item in sorted(finite, key=attrgetter(work, error)):
+        if not front or getattr(item, error) < getattr(front[-1], error):
+            front.append(item)
+    return front
 
 
 def work_row(name: str, program: Program, num_steps: int, reference: ReferenceSolution) -> WorkRow:
@@ -244,12 +250,10 @@ def work_precision(
             tasks = [(ladder, repeats) for ladder in ladders]
             report = lambda done, i: progress(ladders[i].label, done, total)  # noqa: E731
             rows = [row for part in mapped("work_precision", _timed, tasks, executor, report) for row in part]
-    except Interrupted as stopped:
-        rows = [row for part in stopped.done if part is not None for row in part]
+    except KeyboardInterrupt as stopped:
+        parts = stopped.done if isinstance(stopped, Interrupted) else [[row for _, row in runs]]
+        rows = [row for part in parts if part is not None for row in part]
         raise Interrupted(WorkPrecision(tuple(rows), t_end, reference), len(rows), None, "runs") from None
-    except KeyboardInterrupt:
-        done = WorkPrecision(tuple(row for _, row in runs), t_end, reference)
-        raise Interrupted(done, len(runs), None, "runs") from None
     progress("done", 1, 1)
     return WorkPrecision(tuple(rows), t_end, reference)
 

@@ -3,7 +3,9 @@
 import dataclasses
 import os
 import platform
+import warnings
 from importlib.metadata import version
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -35,29 +37,38 @@ def environment() -> dict[str, str]:
     return versions | {"machine": f"{platform.system()} {platform.machine()}", "XLA_FLAGS": flags}
 
 
-def differences(attributes: dict, stored: dict, chunk: int | None) -> list[str]:
-    """Sentences about the differences of two identities, and of the sizes of chunks.
+def check_same(
+    path: Path, kind: str, attributes: dict, stored: dict, chunk: int | None, complete: bool = False
+) -> None:
+    """Refuse to go on with the store of another run; warn if its environment was another one, unless it is complete.
 
     Operations are compared only if both were made with the same version of JAX: another version prints them differently.
 
     Args:
+        kind: "run" or "ensemble".
         attributes, stored: of the store that the user wants, and of the store on disk, with "identity", "made_with" and "chunk".
         chunk: size of a chunk that the user wants, or None.
     """
     here, there = attributes["identity"], stored["identity"]
+    now, then = attributes["made_with"], stored["made_with"]
     names = [name for name in {**here, **there} if here.get(name) != there.get(name)]
-    if attributes["made_with"]["jax"] != stored["made_with"]["jax"]:
+    if now["jax"] != then["jax"]:
         names = [name for name in names if not name.startswith("operations of ")]
     changes = [f"{name}: {here.get(name, 'none')} here, {there.get(name, 'none')} in the store" for name in names]
-    return changes + (
-        [] if chunk in (None, stored["chunk"]) else [f"chunk: {chunk} here, {stored['chunk']} in the store"]
-    )
-
-
-def changed_conditions(attributes: dict, stored: dict) -> list[str]:
-    """Texts about the differences of the environments in the attributes of two stores, the present one and the one on disk."""
-    here, there = attributes["made_with"], stored["made_with"]
-    return [f"{name} {value} ({there.get(name)} then)" for name, value in here.items() if value != there.get(name)]
+    if chunk not in (None, stored["chunk"]):
+        changes.append(f"chunk: {chunk} here, {stored['chunk']} in the store")
+    if changes:
+        raise ValueError(
+            f"{path} holds another {kind} and cannot go on with this one. Differences: {'; '.join(changes)}. Give the arguments it was started "
+            "with, or another name."
+        )
+    changed = [f"{name} {value} ({then.get(name)} then)" for name, value in now.items() if value != then.get(name)]
+    if changed and not complete:
+        warnings.warn(
+            f"{path} was started under other conditions; its last digits may differ from those of an uninterrupted {kind}. "
+            f"Now: {', '.join(changed)}.",
+            stacklevel=3,
+        )
 
 
 def describe(name: str, value) -> dict[str, str]:

@@ -62,19 +62,13 @@ class Record(NamedTuple):
     leaves: list[np.ndarray]
 
     @classmethod
-    def of(
-        cls, checkpoint: Checkpoint, saved: int = 0, result: int = int(Result.CONVERGED), failed_at: int = -1
-    ) -> "Record":
+    def of(cls, checkpoint: Checkpoint, saved=0, result=int(Result.CONVERGED), failed_at=-1) -> "Record":
         """The record of a checkpoint."""
         leaves = [np.asarray(leaf) for leaf in jax.tree.leaves((checkpoint.state, checkpoint.memory))]
         return cls(saved, result, failed_at, checkpoint.step, checkpoint.fell_back, leaves)
 
     def checkpoint(self, like: Checkpoint) -> Checkpoint:
-        """The checkpoint, with the tree structure of `like`, any checkpoint of the same run.
-
-        Raises:
-            ValueError: the arrays do not fit the structure.
-        """
+        """The checkpoint, with the tree structure of `like`, any checkpoint of the same run; a ValueError if the arrays do not fit it."""
         expected, structure = jax.tree.flatten((like.state, like.memory))
         if [(leaf.shape, leaf.dtype) for leaf in self.leaves] != [(leaf.shape, leaf.dtype) for leaf in expected]:
             raise ValueError("the checkpoint was made by a version of vmri_jax whose steps remember something else")
@@ -159,27 +153,18 @@ def commit(path: Path, record: Record) -> None:
 
 
 def read_attributes(path: Path) -> dict[str, Any]:
-    """Attributes of a store.
-
-    Raises:
-        FileNotFoundError: the path does not exist.
-        ValueError: the path is no store, or a damaged one.
-    """
-    if not path.exists():
-        raise FileNotFoundError(f"{path} does not exist; give the folder of a stored trajectory.")
+    """Attributes of a store, see `attributes_in`."""
     if path.is_file():
         raise ValueError(
             f"{path} is not a stored trajectory but a file; a run written by Trajectory.save is read by Trajectory.load({str(path)!r})."
         )
-    return attributes_in(path, FORMAT, "a stored trajectory")
+    return attributes_in(path, FORMAT, "a stored trajectory", "a stored trajectory")
 
 
-def attributes_in(path: Path, format_name: str, kind: str) -> dict[str, Any]:
-    """Attributes of a group of Zarr with an attribute "format".
-
-    Args:
-        kind: in the message on another format.
-    """
+def attributes_in(path: Path, format_name: str, contents: str, kind: str) -> dict[str, Any]:
+    """Attributes of a group of Zarr with an attribute "format"; `contents` and `kind` of the folder are for messages."""
+    if not path.exists():
+        raise FileNotFoundError(f"{path} does not exist; give the folder of {contents}.")
     try:
         attributes = json.loads((path / METADATA).read_text())["attributes"]
         if attributes["format"] != format_name:
@@ -190,36 +175,14 @@ def attributes_in(path: Path, format_name: str, kind: str) -> dict[str, Any]:
 
 
 def read_record(path: Path) -> Record:
-    """The checkpoint of a store.
-
-    Raises:
-        ValueError: the checkpoint is missing or damaged.
-    """
+    """The checkpoint of a store; a ValueError if it is missing or damaged."""
     try:
         with np.load(io.BytesIO((path / CHECKPOINT).read_bytes()), allow_pickle=False) as data:
-            saved, result, failed_at, step, fell_back = data["counts"].tolist()
+            *counts, fell_back = data["counts"].tolist()
             leaves = [data[f"leaf_{k}"] for k in range(len(data.files) - 1)]
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
         raise ValueError(f"{path}: the checkpoint is damaged ({error}); the run cannot go on.") from error
-    return Record(saved, result, failed_at, step, bool(fell_back), leaves)
-
-
-def read_rows(path: Path, name: str, rows: slice, chunk: int) -> np.ndarray:
-    """Rows of an array, which must have been committed.
-
-    Raises:
-        ValueError: a file of these rows is missing or damaged.
-    """
-    import zarr
-
-    try:
-        array = zarr.open_array(path / name, mode="r")
-        for k in range(rows.start // chunk, -(-rows.stop // chunk)):
-            if array.size and not chunk_file(path / name, array.ndim, k).is_file():  # zarr would return fill values
-                raise ValueError(f"chunk {k} is missing")
-        return np.asarray(array[rows])
-    except Exception as error:
-        raise ValueError(f"{path}: {name} cannot be read ({error}); the store is damaged.") from error
+    return Record._make((*counts, bool(fell_back), leaves))
 
 
 @contextmanager
@@ -248,9 +211,8 @@ def locked(path: Path) -> Iterator[None]:
 def _packed(record: Record) -> bytes:
     """A record as the bytes of an .npz file, of the same length throughout a run."""
     out = io.BytesIO()
-    counts = np.array([record.saved, record.result, record.failed_at, record.step, record.fell_back], dtype=np.int64)
-    leaves = {f"leaf_{k}": leaf for k, leaf in enumerate(record.leaves)}
-    np.savez(out, counts=counts, **leaves)  # pyright: ignore[reportArgumentType]
+    counts = np.array(record[:-1], dtype=np.int64)
+    np.savez(out, counts=counts, **{f"leaf_{k}": leaf for k, leaf in enumerate(record.leaves)})  # pyright: ignore[reportArgumentType]
     return out.getvalue()
 
 

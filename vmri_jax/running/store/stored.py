@@ -13,7 +13,7 @@ from vmri_jax.mechanics.system import System
 from vmri_jax.running.export import MICRO, Exports
 from vmri_jax.running.largest_motion import largest_motion_in_words
 from vmri_jax.running.origin import Origin
-from vmri_jax.running.store.layout import Record, read_attributes, read_record, read_rows
+from vmri_jax.running.store.layout import Record, chunk_file, read_attributes, read_record
 from vmri_jax.running.summaries import named_coordinates
 from vmri_jax.running.trajectory import NODES, RunInfo, Trajectory, ends_of, from_named_arrays, with_origin
 from vmri_jax.steppers.results import Result, SimulationError
@@ -101,9 +101,6 @@ class StoredTrajectory(Exports):
     def names(self) -> Names:
         return self[:1].names
 
-    def whole(self) -> Trajectory:
-        return self.load()
-
     def load(self) -> Trajectory:
         """All saved nodes.
 
@@ -111,6 +108,8 @@ class StoredTrajectory(Exports):
             ValueError: no chunk is complete yet, or a file is damaged.
         """
         return self[:]
+
+    whole = load
 
     def __len__(self) -> int:
         return self.record.saved + 1 if self.record.saved else 0
@@ -145,11 +144,7 @@ class StoredTrajectory(Exports):
             yield self[first : first + self.chunk + 1]
 
     def raise_failure(self, num_micro: int = 1) -> None:
-        """Raise the `SimulationError` of a failed run, with this store as its trajectory; do nothing after a success.
-
-        Args:
-            num_micro: micro steps of the macro step.
-        """
+        """Raise the `SimulationError` of a failed run, whose macro step has `num_micro` micro steps; do nothing after a success."""
         if self.success:
             return
         interval = self.failed_at // self.save_every
@@ -164,4 +159,16 @@ class StoredTrajectory(Exports):
         )
 
     def _rows(self, name: str, rows: slice) -> np.ndarray:
-        return read_rows(self.path, name, rows, self.chunk)
+        """Committed rows of an array; a ValueError if one of their files is missing or damaged."""
+        import zarr
+
+        try:
+            array = zarr.open_array(self.path / name, mode="r")
+            for k in range(rows.start // self.chunk, -(-rows.stop // self.chunk)):
+                if (
+                    array.size and not chunk_file(self.path / name, array.ndim, k).is_file()
+                ):  # zarr would return fill values
+                    raise ValueError(f"chunk {k} is missing")
+            return np.asarray(array[rows])
+        except Exception as error:
+            raise ValueError(f"{self.path}: {name} cannot be read ({error}); the store is damaged.") from error

@@ -1,26 +1,23 @@
 """`stream`: runs that are written to disk while they are computed, and can be resumed."""
 
 import os
-import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from vmri_jax.mechanics.arrays import whole_number
 from vmri_jax.mechanics.state import Movable, State
 from vmri_jax.running.arguments import Steps
-from vmri_jax.running.files import clear_partial, is_new
+from vmri_jax.running.files import clear_partial, explained, is_new
 from vmri_jax.running.interrupts import Interrupted, interrupts_noted
 from vmri_jax.running.observables import Observables
 from vmri_jax.running.progress import Progress, ShowsProgress, progress_to
 from vmri_jax.running.saved import numbers_per_node
 from vmri_jax.running.simulation import Simulation, simulation
 from vmri_jax.running.store import layout
-from vmri_jax.running.store.identity import changed_conditions, differences, environment, identity
+from vmri_jax.running.store.identity import check_same, environment, identity
 from vmri_jax.running.store.layout import Record
 from vmri_jax.running.store.stored import StoredTrajectory
 from vmri_jax.running.trajectory import join, trajectory_of
@@ -106,12 +103,16 @@ def stream(
     attributes |= {} if run.names is None else {"names": run.names.to_dict()}
     with interrupts_noted() as interrupted, progress_to("stream", progress) as tell:
         if overwrite or not path.exists():
-            with _explained(path, 0):
+            with explained(path, _advice(0)):
                 layout.create(path, attributes, Record.of(run.start()))
         with layout.locked(path):
             stored = StoredTrajectory(path)
-            _check_same_run(stored, attributes, chunk)
-            _lengthen(stored, num_steps)
+            check_same(path, "run", attributes, stored.attributes, chunk, stored.complete)
+            if num_steps < stored.step:
+                raise ValueError(f"stream: num_steps is {num_steps}, but {path} has {stored.step} already; open it.")
+            if num_steps != stored.num_steps:
+                with explained(path, _advice(stored.step)):
+                    layout.change_attributes(path, num_steps=num_steps)
             clear_partial(path)
             for step in _continue(StoredTrajectory(path), run, tell):
                 if interrupted():
@@ -147,7 +148,7 @@ def _continue(stored: StoredTrajectory, run: Simulation, tell: Progress) -> Iter
         times = np.concatenate([[run.state.t], *(part.states.t for part, _ in pieces)])
         has_warned = has_warned or run.warn("stream", table, times, stacklevel=4)
         before = Observables.of(table).so_far()
-        with _explained(path, checkpoint.step - size * run.save_every):
+        with explained(path, _advice(checkpoint.step - size * run.save_every)):
             writer.append(piece, record.saved)
             result = max(record.result, int(piece.result))  # failures have larger codes than successes
             record = Record.of(checkpoint, record.saved + size, result, int(piece.failed_at))
@@ -157,16 +158,11 @@ def _continue(stored: StoredTrajectory, run: Simulation, tell: Progress) -> Iter
             return
 
 
-@contextmanager
-def _explained(path: Path, step: int) -> Iterator[None]:
-    """Context whose errors of the file system name the last macro step on disk and the way to continue."""
-    try:
-        yield
-    except OSError as error:
-        kept = (
-            f"The run is kept up to macro step {step}: resume it when there is room." if step else "Give another place."
-        )
-        raise OSError(error.errno, f"{path} cannot be written: {error.strerror or error}. {kept}") from error
+def _advice(step: int) -> str:
+    """Advice where the file system fails after so many macro steps are on disk."""
+    if step:
+        return f"The run is kept up to macro step {step}: resume it when there is room."
+    return "Give another place."
 
 
 def _check_place(path: Path, resume: bool, overwrite: bool) -> None:
@@ -179,30 +175,6 @@ def _check_place(path: Path, resume: bool, overwrite: bool) -> None:
             f"{path} holds a run of {stored.num_steps} macro steps, {stored.step} of them done. Go on with it (resume), replace "
             "it (overwrite), or give another name."
         )
-
-
-def _check_same_run(stored: StoredTrajectory, attributes: dict[str, Any], chunk: int | None) -> None:
-    different = differences(attributes, stored.attributes, chunk)
-    if different:
-        raise ValueError(
-            f"{stored.path} holds another run and cannot go on with this one. Differences: {'; '.join(different)}. Give the "
-            "arguments it was started with, or another name."
-        )
-    changed = changed_conditions(attributes, stored.attributes)
-    if changed and not stored.complete:
-        warnings.warn(
-            f"{stored.path} was started under other conditions; its last digits may differ from those of an uninterrupted "
-            f"run. Now: {', '.join(changed)}.",
-            stacklevel=3,
-        )
-
-
-def _lengthen(stored: StoredTrajectory, num_steps: int) -> None:
-    if num_steps < stored.step:
-        raise ValueError(f"stream: num_steps is {num_steps}, but {stored.path} has {stored.step} already; open it.")
-    if num_steps != stored.num_steps:
-        with _explained(stored.path, stored.step):
-            layout.change_attributes(stored.path, num_steps=num_steps)
 
 
 def _chunk(run: Simulation) -> int:

@@ -69,10 +69,8 @@ class Controlled(Effect):
             object.__setattr__(self, "name", f"{label_of(entry(self.body))} {self.load}" if named else str(self.load))
         super().__post_init__()
         for argument, allowed in (("load", ("force", "torque")), ("axes", ("space", "body"))):
-            if getattr(self, argument) not in allowed:
-                raise ValueError(
-                    f"{self.name}: {argument} is {getattr(self, argument)!r}; it must be {' or '.join(map(repr, allowed))}."
-                )
+            value = getattr(self, argument)
+            self.require(value in allowed, argument, repr(value), f"it must be {' or '.join(map(repr, allowed))}")
 
     def bound(self, effects):
         """The effect itself, or a `ControlledJoint` if `body` is the name of a joint."""
@@ -146,10 +144,7 @@ class ControlledJoint(InJoint):
     def check_bodies(self, bodies):
         super().check_bodies(bodies)
         count = len(self.elements(bodies))
-        if count > 1:
-            raise ValueError(
-                f"{self.name}: {self.joint.name} joins {count} pairs of bodies; give each pair its own joint."
-            )
+        self.require(count == 1, f"the number of pairs of {self.joint.name}", count, "give each pair its own joint")
 
     def components(self, bodies) -> tuple[str, ...]:
         """Name of the control."""

@@ -90,19 +90,15 @@ class _Coupling(OfFreedoms):
     def check_parameters(self, bodies):
         super().check_parameters(bodies)
         for joint, _ in self.joints:
-            count = len(joint.elements(bodies))
-            self.require(
-                count == 1, f"the number of pairs of {joint.name}", count, "give each pair a joint of its own name"
-            )
+            count, expected = len(joint.elements(bodies)), "give each pair a joint of its own name"
+            self.require(count == 1, f"the number of pairs of {joint.name}", count, expected)
 
     def check_start(self, bodies):
         violation = jnp.abs(self.law(jnp.zeros(len(self.joints)), self.numbers()))
-        self.require(
-            violation < START,
-            "the equation",
-            violation,
-            "it must be zero at the positions in `bodies`, where all freedoms are zero; change it, or let project=True move the joints",
+        expected = (
+            "it must be zero at the positions in `bodies`, where all freedoms are zero; change it, or set project=True"
         )
+        self.require(violation < START, "the equation", violation, expected)
 
 
 @effect_class

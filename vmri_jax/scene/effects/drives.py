@@ -96,9 +96,8 @@ class Drive(Effect):
 
     def check_parameters(self, bodies):
         super().check_parameters(bodies)
-        shape = getattr(
-            shape_of(f"{self.name}: history", self.history, jnp.zeros(()), self.parameters(bodies)), "shape", None
-        )
+        value = shape_of(f"{self.name}: history", self.history, jnp.zeros(()), self.parameters(bodies))
+        shape = getattr(value, "shape", None)
         for (name,) in self.elements(bodies):
             size = end_of(bodies, name).size
             if shape != (size,) and (shape, size) != ((), 1):

@@ -92,16 +92,10 @@ class Joint(Effect):
             if not is_concrete(points):
                 continue
             distance = np.linalg.norm(points[1] - points[0])
-            size = max(np.max(np.abs(points[0])), 1.0)
-            positions = " and ".join(
-                f"{label_of(name)} is at {np.asarray(p)}" for name, p in zip((a, b), points, strict=True)
-            )
-            self.require(
-                distance <= START * size,
-                f"the distance of the points of {a}-{b}",
-                f"{float(distance):.6g}",
-                f"{positions}; they must coincide at the start",
-            )
+            coincide = distance <= START * max(np.max(np.abs(points[0])), 1.0)
+            first, second = (f"{label_of(name)} is at {np.asarray(p)}" for name, p in zip((a, b), points, strict=True))
+            expected = f"{first} and {second}; they must coincide at the start"
+            self.require(coincide, f"the distance of the points of {a}-{b}", f"{float(distance):.6g}", expected)
 
     def drawn_points(self, bodies):
         params = self.parameters(bodies)
@@ -246,11 +240,7 @@ def _triad(axis):
 
 
 def _vectors(argument: str, numbers, count: int):
-    """(count, 3) vectors from a single vector (3,), or from a vector for each pair.
-
-    Args:
-        argument: name of effect and argument, for messages.
-    """
+    """(count, 3) vectors from a single vector (3,), or from a vector for each pair; `argument` begins messages."""
     vectors = real_array(argument, numbers)
     if vectors.shape not in ((3,), (count, 3)):
         for_pairs = f", or one for each pair, ({count}, 3)" if count > 1 else ""

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from vmri_jax.mechanics.rows import Rows
-from vmri_jax.scene.declare import effect_class, number, of_time, positive, real_tree
+from vmri_jax.scene.declare import effect_class, number, of_time, positive
 from vmri_jax.scene.effect import START
 from vmri_jax.scene.effects.contact import penalty
 from vmri_jax.scene.effects.freedoms import ANGLES, COORDINATE, FREEDOMS, Freedom
@@ -28,10 +28,7 @@ def energy_of_rate(law, freedom: str, q, v, params):
 
 
 def force_along(law, freedom: str, t, q, v, params):
-    """``F = f dx/dq`` with ``f = law(t, x, x', params)``.
-
-    For the angle of a hinge f is a torque about its axis: b gets it, and a its opposite.
-    """
+    """``F = f dx/dq`` with ``f = law(t, x, x', params)``: b gets f, a torque about a hinge, and a its opposite."""
 
     def value(q):
         return FREEDOMS[freedom](q, params)
@@ -243,9 +240,6 @@ class JointDrive(InJoint):
     def law(self):
         return Applied(of_history, (self.history,))
 
-    def parameters(self, bodies):
-        return super().parameters(bodies) | {"history": real_tree(f"{self.name}: params", self.params)}
-
 
 @effect_class
 class JointMotion(InJoint):
@@ -275,10 +269,7 @@ class JointMotion(InJoint):
     def law(self):
         return self.path
 
-    def parameters(self, bodies):
-        return super().parameters(bodies) | {"path": real_tree(f"{self.name}: params", self.params)}
-
     def check_parameters(self, bodies):
         super().check_parameters(bodies)
-        start = self.path(jnp.zeros(()), real_tree(f"{self.name}: params", self.params))
+        start = self.path(jnp.zeros(()), self.parameters(bodies)["path"])
         self.require(jnp.abs(jnp.asarray(start)) < START, "path(0)", start, "the joint starts at zero")

@@ -114,9 +114,6 @@ class ToPath(ToPoint):
     def function(self):
         return Applied(along_path, (self.law, self.path))
 
-    def parameters(self, bodies):
-        return super().parameters(bodies) | {"path": real_tree(f"{self.name}: params", self.params)}
-
     def point_at_start(self, params):
         return self.path(jnp.zeros(()), real_tree(f"{self.name}: params", self.params))
 
