@@ -38,11 +38,11 @@ def test_rows_are_scaled_with_other_columns():
 @pytest.mark.parametrize("moves", [False, True])
 def test_refused_rows_have_the_names_that_the_constraint_gives_them(moves):
     def distance(q_s, q_f, params):
-        return {"rope": q_s["a"] - q_f["c"], "rail": q_s["a"] - q_s["b"]}
+        return {"rope": q_s["a"] - q_f["c"][:1], "rail": q_s["a"] - q_s["b"]}
 
     constraint = vm.Rheonomic(lambda t, *arguments: distance(*arguments)) if moves else distance
     system = vm.System(vm.ConstantMass(slow={"a": 1.0, "b": 1.0}, fast={"c": 1.0}), constraint=constraint)
-    problem = vm.Problem(system, q_s={"a": np.zeros(1), "b": np.zeros(1)}, q_f={"c": np.zeros(1)})
+    problem = vm.Problem(system, q_s={"a": np.zeros(1), "b": np.zeros(1)}, q_f={"c": np.zeros(2)})
     with pytest.raises(ValueError, match=r"row\(s\) 1 \(rail\) of constraint do not depend on the fast variables"):
         vm.simulate(problem, vm.fully_implicit(2), macro_dt=0.1, num_steps=2)
 
