@@ -80,7 +80,8 @@ def area_change(ends, dimension: int) -> float:
     """
     pair = np.random.default_rng(0).standard_normal((2, dimension))
     pair /= np.linalg.norm(pair, axis=1, keepdims=True)
-    tangents = slopes(lambda x: np.stack([phase(state) for state in ends(x)]), pair)
+    # steps of 0.03: round-off of the positions, over the step, is three times as small as with steps of 0.01
+    tangents = slopes(lambda x: np.stack([phase(state) for state in ends(x)]), pair, step=0.03)
     (dq_u, dp_u), (dq_v, dp_v) = (np.split(tangents[..., i], 2, axis=1) for i in (0, 1))
     start, end = np.sum(dq_u * dp_v - dp_u * dq_v, axis=1)
     return float(abs(end / start - 1))

@@ -136,18 +136,17 @@ def failures(run, table, save_every: int, step: int = 0):
     wrong = ~(module.isfinite(now.energy) & (now.solved > 0) & (now.implied > 0))
     if module is np and not wrong.any() and np.all(run.failed_at < 0):
         return run, table
-    node = wrong.argmax(axis=-1)
-    last_step = step + module.maximum(node * save_every - 1, 0)
-    breaks = wrong.any(axis=-1) & ((run.failed_at < 0) | (last_step < run.failed_at))
+    node, num_nodes = wrong.argmax(axis=-1), wrong.shape[-1]
+    after_step = module.where(run.failed_at < 0, num_nodes, (run.failed_at - step) // save_every + 1)
+    breaks = wrong.any(axis=-1) & (node < after_step)
     energy, solved = (module.take_along_axis(a, node[..., None], axis=-1)[..., 0] for a in (now.energy, now.solved))
     # If the solved rows are kept, the implied rows are to blame.
     violated = module.where(solved > 0, int(Result.NOT_IMPLIED), int(Result.CONSTRAINT_VIOLATED))
     cause = module.where(module.isfinite(energy), violated, int(Result.NON_FINITE))
-    result, failed_at = module.where(breaks, cause, run.result), module.where(breaks, last_step, run.failed_at)
-    first = module.where(
-        breaks, node, module.where(failed_at < 0, wrong.shape[-1], (failed_at - step) // save_every + 1)
-    )
-    is_lost = np.arange(wrong.shape[-1]) >= first[..., None]
+    result = module.where(breaks, cause, run.result)
+    failed_at = module.where(breaks, step + module.maximum(node * save_every - 1, 0), run.failed_at)
+    first = module.where(breaks, node, after_step)
+    is_lost = np.arange(num_nodes) >= first[..., None]
 
     def masked(array):
         lost = is_lost[..., -array.shape[wrong.ndim - 1] :]  # arrays of micro nodes have no row for the start
