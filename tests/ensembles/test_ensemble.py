@@ -365,7 +365,7 @@ def _files(path: Path) -> dict[str, bytes]:
 
 
 def test_functions_of_runs_are_kept_by_their_names(tmp_path):
-    def reach(run):
+    def reach(run):  # pyright: ignore[reportRedeclaration]
         return jnp.max(run.q_f)
 
     design, out = {"omega": [20.0]}, tmp_path / "runs.zarr"

@@ -2,6 +2,7 @@
 
 from collections import OrderedDict
 from dataclasses import replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -111,7 +112,8 @@ def test_other_params_have_the_order_of_the_first(way):
     problem = at_rest()
 
     def energy(params):
-        return problem.system.replace(params=params).fast_potential(problem.q_f, params)
+        potential: Any = problem.system.replace(params=params).fast_potential
+        return potential(problem.q_f, params)
 
     if way == "grad":
         slopes = jax.grad(energy)(NEW)

@@ -419,8 +419,8 @@ def test_the_functions_of_control_and_of_solvers_are_watched():
     custom = vm.solvers.Custom(by_global)
     f = traced_once(by_global)
     optimal = Transcription(
-        problem().system, problem().state(), SCHEME, vm.solvers.Auto(), 0.1, f, f, f, f, f, (0, 1), 1
-    )  # pyright: ignore[reportArgumentType]
+        problem().system, problem().state(), SCHEME, vm.solvers.Auto(), 0.1, f, f, f, f, f, (np.zeros(1), np.ones(1)), 1
+    )
     for value in (custom, optimal):
         here.STRENGTH = 1.0
         before = jax.tree.structure(value)

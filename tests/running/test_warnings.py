@@ -1,6 +1,7 @@
 """All roads say the same about a run: the grid of roads and of causes, written once."""
 
 import warnings
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -181,10 +182,11 @@ def test_the_steps_have_no_energy_and_one_program_observes_all():
     for scheme, num_steps in ((EXPLICIT, 5), (vm.fully_explicit(2), 7), (EXPLICIT, 40)):
         vm.simulate(moving, scheme, macro_dt=0.1, num_steps=num_steps)
     prepared = vm.prepare(moving, EXPLICIT, macro_dt=0.1, num_steps=5)
-    program = _at_all(observables, prepared._system[0], (), False)
+    program: Any = _at_all(observables, prepared._system[0], (), False)
     assert _at_all.cache_info().misses == program._cache_size() == 1
     arrays, *counts = prepared._arguments(None, None, None, None)
-    steps = jax.jit(lambda arrays: prepared.engine.run(arrays, *counts)).lower(arrays).compile().as_text()
-    whole = prepared.compiled().as_text()
+    engine: Any = prepared.engine
+    steps = str(jax.jit(lambda arrays: engine.run(arrays, *counts)).lower(arrays).compile().as_text())
+    whole = str(prepared.compiled().as_text())
     assert ["sine(" in text for text in (steps, whole)] == [True, True]
     assert [" cosine(" in text for text in (steps, whole)] == [False, True]

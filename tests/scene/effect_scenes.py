@@ -90,6 +90,7 @@ RIGID = sc.Scene(
         sc.RigidBody("free", 3.0, sc.Cylinder(0.3, 1.0), [0.0, 2.0, 0.0], [0.3, 0.0, 0.0], pace="fast"),
     ],
     [sc.Gravity(9.81), sc.Revolute(("hub", "arm"), [0.5, 0.0, 0.0], name="pin")],
+    coordinates="directors",
 )
 PAIR, AT = ("hub", "free"), [0.0, 1.0, 0.0]
 RIGID_EFFECTS = [
@@ -116,7 +117,7 @@ RIGID_EFFECTS = [
 
 def scene_with(effect: sc.Effect, base: sc.Scene = BASE) -> sc.Scene:
     """The base with an effect between its own two."""
-    return sc.Scene(base.bodies, (base.effects[0], effect, base.effects[1]))
+    return sc.Scene(base.bodies, (base.effects[0], effect, base.effects[1]), coordinates=base.coordinates)
 
 
 def weight(q_s, q_f, params):

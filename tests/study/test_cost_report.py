@@ -28,7 +28,9 @@ def test_cost_report(tmp_path):
     assert setting.command("spring") in text.replace("&#34;", '"')
     settings = {answer.error: answer.setting for answer in report.rows}
     for error, family, num_micro, gain in _multirate(report):  # the page's sentences agree with its table
-        assert (family, num_micro) == (settings[error].family.name, settings[error].num_micro)
+        chosen = settings[error]
+        assert chosen is not None
+        assert (family, num_micro) == (chosen.family.name, chosen.num_micro)
         assert gain >= 1
     assert sum(report.shares.values()) == pytest.approx(1)
     assert report.accuracy is not None

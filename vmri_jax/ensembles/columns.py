@@ -134,10 +134,11 @@ def _check_only_values_differ(problem: Problem, changed: Problem) -> None:
         a is b or (is_concrete(b) and np.array_equal(a, b)) for a, b in zip(leaves, new_leaves, strict=True)
     )
     before, after = ((entry.system.params, [getattr(entry, part) for part in START]) for entry in (problem, changed))
-    if not same_system or jax.tree.map(np.shape, before) != jax.tree.map(np.shape, after):
+    same_shapes = jax.tree.map(np.shape, before) == jax.tree.map(np.shape, after)
+    if not (same_system and same_shapes):
         raise ValueError(
             "ensemble: vary(problem, row) may change the values of system.params, positions, velocities and t. It changes "
-            f"{'the structure or shape of one of them' if same_system else 'the system besides its params'}; such runs need an ensemble of their own."
+            f"{'the system besides its params' if same_shapes else 'the structure or shape of one of them'}; such runs need an ensemble of their own."
         )
 
 

@@ -204,7 +204,7 @@ def ensemble(
         num_micro=num_micro,
         solver=solver,
         project=project,
-        save=tuple(save) if isinstance(save, list | tuple) else (save,),
+        save=tuple(save) if isinstance(save, list | tuple) else (save,),  # pyright: ignore[reportArgumentType]
         num_saves=whole_number("ensemble: num_saves", num_saves),
         vary=vary,
     ).with_sources()

@@ -10,7 +10,7 @@ weights w, square roots of the masses, give all coordinates one unit: lengths of
 position, which bounds its round-off, are taken with them. Mass matrices are judged with a diagonal of ones.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -106,7 +106,7 @@ class Rows(NamedTuple):
         return tolerance * self.sizes + ROUNDING * np.finfo(float).eps * self.rounding
 
     @classmethod
-    def of(cls, function, q, weights=1.0) -> "Rows":
+    def of(cls, function, q, weights: Any = 1.0) -> "Rows":
         """The rows (k,) of a function of q (n,)."""
         direction = np.random.default_rng(0).normal(size=q.size) / weights
         gradients, bends = (a / weights for a in jax.jvp(jax.jacrev(function), (q,), (direction,)))
@@ -253,6 +253,7 @@ def check_constraints(
     allowed = rows.allowed(tolerance)[: n_g + n_gs]
     violated = np.abs(solved) > allowed
     if violated.any():
+        _check_gradients(system, state, rows, weights, in_words)  # of a square, which no start fulfils to round-off
         worst = int(np.argmax(np.abs(solved) / np.where(violated, allowed, np.inf)))
         row = in_words([worst], "constraint") if worst < n_g else in_words([worst - n_g], "slow_constraint")
         raise ValueError(

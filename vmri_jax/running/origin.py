@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.mechanics.arrays import is_concrete, options_of_runs
+from vmri_jax.mechanics.arrays import is_concrete, of_one_type, options_of_runs
 from vmri_jax.mechanics.checks import check_system
 from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.rows import Part
@@ -149,7 +149,7 @@ def at_nodes(function, origin: Origin, nodes, *static):
     """
     arrays, structure = jax.tree.flatten(origin.system())  # raises if the system is not known
     with Working("quantities of the run"):
-        values = evaluated(function, structure, arrays, nodes, *static)
+        values = evaluated(function, structure, of_one_type(arrays), nodes, *static)
     return jax.device_put(values) if is_concrete(values) else values
 
 
