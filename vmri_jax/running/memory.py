@@ -3,6 +3,7 @@
 import psutil
 
 from vmri_jax.mechanics.state import State
+from vmri_jax.running.observables import Observables
 from vmri_jax.running.saved import numbers_per_node
 
 BYTES_PER_NUMBER = 8
@@ -25,7 +26,7 @@ def check_memory(caller: str, state: State, num_micro: int, num_saves: int, save
     Raises:
         ValueError: the trajectory is larger than the free memory.
     """
-    numbers = numbers_per_node(state, num_micro if save_micro else 0)
+    numbers = numbers_per_node(state, num_micro if save_micro else 0) + len(Observables._fields)
     needed = BYTES_PER_NUMBER * numbers * (num_saves + 1) * lanes
     if needed < UNCHECKED_BYTES:
         return
