@@ -93,9 +93,9 @@ def test_bad_vectors(fpu, changes, message):
         replace(fpu, **changes).state()
 
 
-@pytest.mark.parametrize("junk", [None, "one", [1.0, "a"], [[1.0], [2.0, 3.0]], {"a": 1}, object(), 1j, 10**400])
+@pytest.mark.parametrize("junk", ["one", [1.0, "a"], [[1.0], [2.0, 3.0]], {"a": 1}, object(), 1j, 10**400])
 def test_what_is_no_number(fpu, junk: Any):
-    for name in ("q_s", "v_f", "t", "tolerance")[2 * (junk is None) :]:  # without positions or velocities: of a problem
+    for name in ("q_s", "v_f", "t", "tolerance"):
         with pytest.raises(TypeError, match=rf"{name} is .*; give (a )?real number"):
             start(fpu, **{name: junk})
     masses: Any = {"a": "heavy"} if junk == {"a": 1} else junk  # masses may be given by name
@@ -418,5 +418,5 @@ def test_results_that_do_not_fit_into_memory(fpu):
     with pytest.raises(ValueError, match=message):
         simulate(fpu.system, fully_implicit(2), fpu.state(), macro_dt=0.1, num_steps=10**11)
     states = jax.tree.map(lambda a: jnp.stack([a, a]), fpu.state())
-    with pytest.raises(ValueError, match="simulate_batch: 100000000001 saved nodes of 2 runs would take 3"):
+    with pytest.raises(ValueError, match="simulate_batch: 100000000001 saved nodes of 2 runs would take 4"):
         simulate_batch(fpu.system, fully_implicit(2), states, macro_dt=0.1, num_steps=10**11)
