@@ -11,6 +11,7 @@ import pytest
 import vmri_jax
 from tests.scene.gallery_scenes import gallery_scene
 from vmri_jax import ConstantMass, simulate, systems
+from vmri_jax.mechanics import arrays
 
 NAMES = ("fermi_pasta_ulam", "triple_spherical_pendulum", "simple_atomic_model")
 FPU, TSP, SAM = NAMES
@@ -26,6 +27,7 @@ MORE = [
 
 def assert_trajectories_are_equal(name, scheme):
     jax.config.update("jax_enable_x64", True)
+    arrays.OLDER_EMITTERS = {}
     scene, problem, scheme = gallery_scene(name), getattr(systems, name)(), getattr(vmri_jax, scheme)(5)
     step = {"macro_dt": 0.01, "num_steps": 200}
     run = simulate(scene.system(), scheme, scene.state(), **step)
@@ -37,7 +39,7 @@ def assert_trajectories_are_equal(name, scheme):
 
 @pytest.mark.parametrize(("name", "scheme"), [*CASES, *(pytest.param(*case, marks=pytest.mark.full) for case in MORE)])
 def test_trajectories_are_equal(name, scheme, monkeypatch):
-    """In a process of its own: to the last bit only as XLA compiles by default, not with the flags of these tests."""
+    """In a process of its own: to the last bit only as XLA compiles by default, not with the flags of these tests and the options of runs."""
     monkeypatch.setenv("XLA_FLAGS", "")
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as process:
         process.submit(assert_trajectories_are_equal, name, scheme).result()
