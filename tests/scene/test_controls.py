@@ -59,12 +59,12 @@ def test_a_force_at_a_point_of_a_body():
 
 def test_a_torque_in_a_joint_has_its_opposite():
     bearing = Revolute(("hub", "wheel"), [1.0, 0.0, 0.0], axis=[1.0, 0.0, 0.0], name="bearing")
-    found = rates_of_momenta(
+    rates = rates_of_momenta(
         Scene([HUB, WHEEL], [bearing, Controlled("bearing", "torque")], project=True, coordinates="directors"), [2.5]
     )
-    np.testing.assert_allclose(found["wheel"][1], [2.5, 0.0, 0.0], atol=1e-13)
-    np.testing.assert_allclose(found["hub"][1], [-2.5, 0.0, 0.0], atol=1e-13)
-    np.testing.assert_allclose(found["hub"][0], 0.0, atol=1e-13)
+    np.testing.assert_allclose(rates["wheel"][1], [2.5, 0.0, 0.0], atol=1e-13)
+    np.testing.assert_allclose(rates["hub"][1], [-2.5, 0.0, 0.0], atol=1e-13)
+    np.testing.assert_allclose(rates["hub"][0], 0.0, atol=1e-13)
 
 
 def test_a_force_in_a_slide():

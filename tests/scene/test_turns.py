@@ -109,8 +109,10 @@ def seen(scene, angles, rate=0.8):
     if scene.actuation is not None:
         numbers += [*(scene.actuation(q, none, jnp.array([2.0]), system.params)[0] @ motions)]
     rows = system.constraints(0.3, q, none)
-    own = [i for name, rows in scene.names.rows.items() if name in ("gear", "coupling", "joint_motion") for i in rows]
-    return np.array([*numbers, *(rows[i] for i in own)], dtype=float)
+    rows_of_angles = [
+        i for name, rows in scene.names.rows.items() if name in ("gear", "coupling", "joint_motion") for i in rows
+    ]
+    return np.array([*numbers, *(rows[i] for i in rows_of_angles)], dtype=float)
 
 
 @pytest.mark.parametrize("name", EFFECTS)

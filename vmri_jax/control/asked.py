@@ -15,7 +15,7 @@ from vmri_jax.mechanics.arrays import real_array, whole_number
 from vmri_jax.mechanics.functions import traced_once
 from vmri_jax.mechanics.order import order_of
 from vmri_jax.mechanics.state import start_of
-from vmri_jax.running.simulation import prepare
+from vmri_jax.running.prepare import prepare
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers import solvers

@@ -17,8 +17,8 @@ from vmri_jax.mechanics.arrays import whole_number
 from vmri_jax.mechanics.checks import check_type
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
 from vmri_jax.running.export import extra
+from vmri_jax.running.prepare import prepare
 from vmri_jax.running.progress import Progress, Working
-from vmri_jax.running.simulation import prepare
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers import solvers

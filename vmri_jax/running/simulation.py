@@ -14,8 +14,8 @@ with the same tolerance and limit of iterations; all pieces after it are compute
 
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import jax
@@ -24,17 +24,15 @@ import numpy as np
 
 from vmri_jax.configure import warn_if_slow
 from vmri_jax.mechanics.arrays import is_concrete, of_one_type
-from vmri_jax.mechanics.checks import check_params, check_system
-from vmri_jax.mechanics.constraints import check_constraints, check_mass
+from vmri_jax.mechanics.checks import check_params
 from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.state import Movable, State, opened, start_of
 from vmri_jax.mechanics.summary import numbers, summary
 from vmri_jax.mechanics.system import System
-from vmri_jax.running.arguments import Steps, check_run, check_vectors, nothing_fast
+from vmri_jax.running.arguments import Checked, Steps, check_once, check_run, check_vectors, nothing_fast
 from vmri_jax.running.engine import Arrays, Engine, Model, PieceStart, engine
 from vmri_jax.running.failures import simulation_error
 from vmri_jax.running.interrupts import Interrupted, interrupts_noted
-from vmri_jax.running.memory import check_memory
 from vmri_jax.running.observables import concerns, failures, observables, with_tolerance
 from vmri_jax.running.origin import Origin, evaluated, names_of
 from vmri_jax.running.progress import ShowsProgress, Working, progress_to
@@ -166,19 +164,18 @@ class Simulation:
             model: the leaves of its model, of which the last ones are the leaves of the system; in a batch with an axis of lanes.
             step: macro steps before its first node.
         """
-        structure, count = self._system
-        table = evaluated(
-            observables, structure, model[len(model) - count :], with_tolerance(run.states, self.solver.tolerance)
-        )
+        table = self._observables(run.states, model)
         return failures(run, table, self.save_every, step)
 
     def at_start(self) -> np.ndarray:
         """(1, 9) the `Observables` of the start."""
+        return self._observables(jax.tree.map(lambda a: np.asarray(a)[None], self.state), self.arrays.model)
+
+    def _observables(self, states: State, model: list) -> Any:
+        """(..., k, 9) the `Observables` at states of the system whose leaves are the last ones of a model."""
         structure, count = self._system
-        start = jax.tree.map(lambda a: np.asarray(a)[None], self.state)
-        return evaluated(
-            observables, structure, self.arrays.model[-count:], with_tolerance(start, self.solver.tolerance)
-        )
+        leaves = model[len(model) - count :]
+        return evaluated(observables, structure, leaves, with_tolerance(states, self.solver.tolerance))
 
     def traced(self, run: Run) -> Trajectory:
         """The trajectory of a run some of whose arrays are tracers: its observables are a part of the trace."""
@@ -293,7 +290,7 @@ class Simulation:
         numbers = tuple(np.asarray(number).tobytes() for number in (*self.arrays.model, *positions))
         key = self._model[1], self.state.q_s.shape, self.state.q_f.shape, numbers
         with Working("checks of the system"):
-            _check_once(_Checked(key, self.system, self.state, state_name, constraints))
+            check_once(Checked(key, self.system, self.state, state_name, constraints))
 
     def start(self, state: State | None = None, step: int = 0, fell_back: bool = False) -> Checkpoint:
         """The checkpoint before the first step; or before step number `step` at another state, with blank memory."""
@@ -365,47 +362,6 @@ class Simulation:
         return with_origin(jax.device_put(whole), self.origin)
 
 
-def prepare(
-    system: Movable,
-    scheme: Scheme | Composition,
-    state: State | None = None,
-    *,
-    macro_dt=None,
-    micro_dt=None,
-    num_steps: int | None = None,
-    t_end: float | None = None,
-    save_every: int = 1,
-    save_micro: bool = False,
-    solver: Newton | None = None,
-) -> "Simulation":
-    """Check and compile a run of `simulate` once, to be called many times.
-
-        run = vm.prepare(system, scheme, state, macro_dt=0.01, num_steps=1000, save_every=10)
-        trajectory = run()
-        other = run(other_state, macro_dt=0.02, params=other_params)
-
-    A call costs some ten microseconds besides its steps, and raises `SimulationError` if a step fails, as `simulate` does. The first call
-    that needs the fallback of `solvers.Auto` compiles it, which takes as long as `prepare`. The run keeps what the functions of the system
-    read from around them (globals, closures, attributes) when it was prepared. Arguments as of `simulate`.
-
-    Returns:
-        The `Simulation`.
-
-    Raises:
-        ValueError, TypeError: bad arguments, as of `simulate`.
-    """
-    run = simulation(system, scheme, state, solver, Steps(macro_dt, micro_dt, num_steps, t_end, save_every, save_micro))
-    if not run.is_concrete:
-        raise ValueError("prepare: arguments are tracers; call it outside of jax.jit, vmap and grad, or take simulate.")
-    run.check()
-    check_memory("prepare", run.state, scheme.num_micro, run.num_saves, save_micro)
-    on_device = ("system", "scheme", "solver", "state", "macro_dt")
-    run = replace(run, **jax.device_put({name: getattr(run, name) for name in on_device}))
-    with Working("prepare: the program of the run"):
-        jax.block_until_ready(run._program(False)(run.arrays, 0, 0))  # no steps: it only compiles
-    return run
-
-
 def simulation(moving: Movable, scheme, state: State | None, solver: Newton | None, steps: Steps) -> Simulation:
     """The `Simulation` with these arguments of `simulate`; bad arguments raise."""
     warn_if_slow()
@@ -429,23 +385,3 @@ def _arrays(state: State) -> tuple:
 def _float(value):
     """Numbers as an array of float64: of JAX if they are traced, else of NumPy, which is made faster."""
     return np.asarray(value, dtype=float) if is_concrete(value) else jnp.asarray(value, dtype=float)
-
-
-@dataclass(frozen=True)
-class _Checked:
-    """A system and a state to be checked, equal to every other one of the same `key`: structure and numbers of the model, time and positions."""
-
-    key: tuple
-    system: System = field(compare=False)
-    state: State = field(compare=False)
-    state_name: str = field(compare=False)
-    constraints: bool
-
-
-@lru_cache(maxsize=256)
-def _check_once(checked: _Checked) -> None:
-    """Check a system at a state. The check takes longer than a short run; the cache skips it for an equal `key`."""
-    check_system(checked.system, checked.state.q_s, checked.state.q_f)
-    check_mass(checked.system, checked.state.q_s, checked.state.q_f)
-    if checked.constraints:
-        check_constraints(checked.system, checked.state, checked.state_name)

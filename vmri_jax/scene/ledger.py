@@ -16,8 +16,9 @@ from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.state import Problem, State, initial_state
 from vmri_jax.mechanics.surroundings import name_of
 from vmri_jax.mechanics.system import System, label
+from vmri_jax.running.prepare import prepare
 from vmri_jax.running.printed import PrintedTable
-from vmri_jax.running.simulation import Simulation, prepare
+from vmri_jax.running.simulation import Simulation
 from vmri_jax.running.timing import interleaved, seconds_each
 from vmri_jax.scene.assembly import build
 from vmri_jax.scene.sorting import Sorting

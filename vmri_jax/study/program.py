@@ -7,7 +7,7 @@ import numpy as np
 
 from vmri_jax.diagnostics.linear import phase_vector
 from vmri_jax.mechanics.state import Problem
-from vmri_jax.running.simulation import prepare
+from vmri_jax.running.prepare import prepare
 from vmri_jax.running.timing import MIN_SECONDS, interleaved
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes.composition import Composition

@@ -1,0 +1,55 @@
+"""`prepare`: a run that is checked and compiled once, to be called many times."""
+
+from dataclasses import replace
+
+import jax
+
+from vmri_jax.mechanics.state import Movable, State
+from vmri_jax.running.arguments import Steps
+from vmri_jax.running.memory import check_memory
+from vmri_jax.running.progress import Working
+from vmri_jax.running.simulation import Simulation, simulation
+from vmri_jax.schemes.composition import Composition
+from vmri_jax.schemes.scheme import Scheme
+from vmri_jax.steppers.solvers import Newton
+
+
+def prepare(
+    system: Movable,
+    scheme: Scheme | Composition,
+    state: State | None = None,
+    *,
+    macro_dt=None,
+    micro_dt=None,
+    num_steps: int | None = None,
+    t_end: float | None = None,
+    save_every: int = 1,
+    save_micro: bool = False,
+    solver: Newton | None = None,
+) -> Simulation:
+    """Check and compile a run of `simulate` once, to be called many times.
+
+        run = vm.prepare(system, scheme, state, macro_dt=0.01, num_steps=1000, save_every=10)
+        trajectory = run()
+        other = run(other_state, macro_dt=0.02, params=other_params)
+
+    A call costs some ten microseconds besides its steps, and raises `SimulationError` if a step fails, as `simulate` does. The first call
+    that needs the fallback of `solvers.Auto` compiles it, which takes as long as `prepare`. The run keeps what the functions of the system
+    read from around them (globals, closures, attributes) when it was prepared. Arguments as of `simulate`.
+
+    Returns:
+        The `Simulation`.
+
+    Raises:
+        ValueError, TypeError: bad arguments, as of `simulate`.
+    """
+    run = simulation(system, scheme, state, solver, Steps(macro_dt, micro_dt, num_steps, t_end, save_every, save_micro))
+    if not run.is_concrete:
+        raise ValueError("prepare: arguments are tracers; call it outside of jax.jit, vmap and grad, or take simulate.")
+    run.check()
+    check_memory("prepare", run.state, scheme.num_micro, run.num_saves, save_micro)
+    on_device = ("system", "scheme", "solver", "state", "macro_dt")
+    run = replace(run, **jax.device_put({name: getattr(run, name) for name in on_device}))
+    with Working("prepare: the program of the run"):
+        jax.block_until_ready(run._program(False)(run.arrays, 0, 0))  # no steps: it only compiles
+    return run
