@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import vmri_jax as vm
 from tests.running.store.conftest import CHUNK, EVERY, STEPS, H, Runs, assert_identical
 from tests.user_systems import two_oscillators
 from vmri_jax import (
@@ -334,3 +335,15 @@ def test_no_files_are_written_from_within_a_transformation(run, out):
 def test_chunks_of_their_own_size(run, out):
     """A short run is one chunk."""
     assert run(out, chunk=None).chunk == STEPS // EVERY
+
+
+def kinetic_energy(q_s, q_f, v_s, v_f, params):
+    return jnp.sum((2 + jnp.sin(q_f)) * v_f**2) / 2
+
+
+def test_a_system_without_numbers(tmp_path):
+    """Neither masses nor params: the program of observables gets no array of the system."""
+    start = vm.Problem(vm.System(kinetic_energy), [], [0.3], [], [1.0])
+    stored = vm.stream(start, vm.fully_implicit(1), macro_dt=0.01, num_steps=4, out=tmp_path / "run.zarr")
+    run = vm.simulate(start, vm.fully_implicit(1), macro_dt=0.01, num_steps=4)
+    assert np.array_equal(stored.load().energy, run.energy)
