@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from vmri_jax import Problem
+from vmri_jax.mechanics.surroundings import innermost
 from vmri_jax.systems.fermi_pasta_ulam import soft_springs
 from vmri_jax.systems.simple_atomic_model import slow_forces
 from vmri_jax.systems.triple_spherical_pendulum import spring
@@ -117,7 +118,7 @@ def _rattle(name: str, problem: Problem, parameters, *arguments) -> CLoop:
 
 
 def _check(name: str, potential, function, *counts: int) -> None:
-    if getattr(potential, "function", None) is not function:
+    if innermost(potential) is not function:
         raise ValueError(f"{name}: the C loop knows only the built-in system of this name, with its own potentials.")
     if min(counts) < 1:
         raise ValueError(f"{name}: numbers of steps are {counts}; they must be at least 1.")

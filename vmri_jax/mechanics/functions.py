@@ -10,7 +10,7 @@ from functools import lru_cache, partial, wraps
 import jax
 
 from vmri_jax.mechanics.order import Order, ordered
-from vmri_jax.mechanics.surroundings import Surroundings, name_of
+from vmri_jax.mechanics.surroundings import Surroundings, innermost, name_of
 
 COPIES_UNTIL_WARNING = 5
 """Number of surroundings of one piece of code, each compiled anew, at which the user is warned. A larger number warns late; a smaller one warns
@@ -119,8 +119,7 @@ def _traced(function: TracedOnce) -> Callable:
 
 def _count(function: Callable) -> None:
     """Count the surroundings in which one piece of code is traced, and warn once about `COPIES_UNTIL_WARNING` of them."""
-    while hasattr(function, "function"):  # of `InOrder` and `vmri_jax.mechanics.by_name.ByName`
-        function = function.function
+    function = innermost(function)
     code = getattr(function, "__code__", None)
     if code is None:
         return

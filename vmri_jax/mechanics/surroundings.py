@@ -199,6 +199,12 @@ def is_of_library(module: str | None) -> bool:
 
 def name_of(function) -> str:
     """The name of a function of a system; the name of its class if the function has none."""
-    while hasattr(function, "function"):  # `TracedOnce`, `Rheonomic`, `KineticFunction`, `ByName`
-        function = function.function
+    function = innermost(function)
     return getattr(function, "__name__", type(function).__name__)
+
+
+def innermost(function) -> Any:
+    """The function as the user wrote it, out of `TracedOnce`, `Rheonomic`, `KineticFunction`, `InOrder` and `ByName`."""
+    while hasattr(function, "function"):
+        function = function.function
+    return function
