@@ -18,7 +18,7 @@ from vmri_jax.accuracy.steps import AccuracyNotReached
 from vmri_jax.mechanics.state import problem_of
 from vmri_jax.running.timing import interleaved
 from vmri_jax.study import Program, families, reference_solution, tune
-from vmri_jax.study.advisor import NothingReached
+from vmri_jax.study.tuning import NothingReached
 
 COLUMNS = (
     "system",
@@ -124,11 +124,11 @@ def _row(case: Case, clock: Callable[[], float]) -> dict:
     reference = reference_solution(problem, case.t_end, num_saves=NODES)
     menu = None if case.menu is None else [f for f in families() if f.name in case.menu]
     begun = clock()
-    best = tune(problem, case.error, case.t_end, menu=menu, num_saves=NODES, reference=reference, verify=False).setting
+    best = tune(problem, case.error, case.t_end, menu=menu, num_saves=NODES, verify=False)
     of_search = clock() - begun
     ours = Program(problem, settings.scheme, case.t_end, NODES)
     theirs = Program(problem, best.scheme, case.t_end, NODES)
-    true = reference.errors(ours(settings.num_steps))[0]
+    true, true_of_search = (reference.errors(run)[0] for run in (ours(settings.num_steps), theirs(best.num_steps)))
     runs = {"ours": ours.timed(settings.num_steps), "theirs": theirs.timed(best.num_steps)}
     samples = interleaved(runs, REPEATS, clock=clock)
     return {
@@ -137,8 +137,8 @@ def _row(case: Case, clock: Callable[[], float]) -> dict:
         "by accuracy": f"{settings.python}, {settings.num_steps} steps",
         "its error": true,
         "ms": 1e3 * float(np.median(samples["ours"])),
-        "by search": f"{best.row.scheme}, {best.num_steps} steps",
-        "error there": best.row.error_q,
+        "by search": f"{best.setting.row.scheme}, {best.num_steps} steps",
+        "error there": true_of_search,
         "ms there": 1e3 * float(np.median(samples["theirs"])),
         "ratio": ratio(samples["ours"], samples["theirs"]).value,
         "seconds": seconds,

@@ -23,10 +23,8 @@ from vmri_jax.study import (
     WorkRow,
     families,
 )
-from vmri_jax.study.cost_report import Answer, _draw_stairs, _fastest_that_keep
-from vmri_jax.study.prices import draw_shares
-from vmri_jax.study.search import Setting
-from vmri_jax.study.staircase import Stair
+from vmri_jax.study.cost_report import Answer
+from vmri_jax.study.tuning import Setting
 
 
 def run(num_nodes=21, n_s=2, n_f=3, constrained=False):
@@ -247,31 +245,16 @@ def test_convergence_without_a_positive_error_is_drawn(errors):
 
 
 @pytest.mark.parametrize("count", [0, 1])
-def test_the_panels_of_a_cost_page_are_drawn_whatever_they_hold(count):
-    """The page is drawn in the course of the search, before there are any answers."""
-    family = families()[0]
-    found = tuple(Setting(family, n, 4, work_row(1e-3)) for n in range(1, count + 1))
-    answers = Answer(1e-2, found[0] if found else None), Answer(1e-4, None)
-    report = CostReport(Path("cost.html"), "", 1.0, answers, WorkPrecision((), 1.0, EXACT), {})
-    assert is_drawn(draw_shares(report.shares, plots.LIGHT))
-    assert is_drawn(_draw_stairs(report, {}, "", plots.DARK))
-
-
-@pytest.mark.parametrize("share", [np.nan, 0.3])
 @pytest.mark.parametrize("error", [0.0, 1e-3])
-def test_staircases_are_drawn(error, share):
-    stairs = [Stair(work_row(error, seconds), error / seconds, share) for seconds in (1e-3, 2e-3)]
-    bound = plots.Bound("bound", "single", 0.5)
-    marked = [plots.Marked("answers", 1e-3, error), plots.Marked("accuracy", 2e-3, error, star=True)]
-    kinds = {"single": stairs, "micro": stairs[:1]}
-    assert is_drawn(plots.plot_staircases(kinds, marked, bound, known_to=1e-3, title="title", theme=plots.DARK))
-
-
-def test_no_answer_of_a_cost_page_is_slower_than_that_for_a_smaller_error():
-    slow, fast, slowest = (Setting(families()[0], 1, 4, work_row(1e-3, seconds)) for seconds in (2.0, 1.0, 3.0))
-    answers = [Answer(1e-2, slow), Answer(1e-4, None), Answer(1e-6, fast), Answer(1e-7, slowest), Answer(1e-8, None)]
-    assert [answer.setting for answer in _fastest_that_keep(answers)] == [fast, fast, fast, slowest, None]
-    assert [answer.error for answer in _fastest_that_keep(answers)] == [1e-2, 1e-4, 1e-6, 1e-7, 1e-8]
+def test_the_figure_of_a_cost_page_is_drawn_whatever_it_holds(count, error):
+    """The page is drawn where a search ends early, with whatever it has."""
+    family, rows = families()[0], (work_row(error),) * count
+    scheme = family.make(2)
+    settings = [Setting(family, vm.Settings(scheme, "", "", row.macro_dt, row.num_steps, 1), row) for row in rows]
+    answers = Answer(1e-2, settings[0] if settings else None), Answer(1e-4, None)
+    bound = tuple((row.seconds / 2, row.error_q) for row in rows)
+    runs = WorkPrecision(rows, 1.0)
+    assert is_drawn(CostReport(Path("cost.html"), "", 1.0, answers, runs, runs, {}, bound).figure("title", plots.DARK))
 
 
 def test_a_single_node_and_a_run_that_failed_at_once_are_drawn():

@@ -11,7 +11,7 @@ import pytest
 import vmri_jax as vm
 from tests.accuracy.test_run_error import double_pendulum
 from tests.small_systems import SYSTEMS, no_constraint
-from vmri_jax.accuracy import steps, trials
+from vmri_jax.accuracy import search, steps
 from vmri_jax.accuracy.families import of_order_2
 from vmri_jax.schemes.composition import stage_scheme
 from vmri_jax.stability import linear_model
@@ -94,12 +94,12 @@ def test_number_of_saved_nodes():
 def test_steps_beside_resonances():
     """A slow kick once in half a turn of the fast oscillator is resonant; a few percent more steps are not."""
     problem, length, family = linear_model(omega=50.0, kappa=25.0), 20.0, of_order_2(vm.explicit_slow)
-    search = steps.Search(lambda scheme: vm.prepare(problem, scheme, macro_dt=length, num_steps=1), length, None)
-    trial = search.trial(family, 40, 2048)
+    trials = steps.search_of(problem, None, None, length)
+    trial = trials.trial(family, 40, 2048)
     resonant = round(length / 0.0625)  # within the window from 0.06223 to 0.06286 of `vmri_jax.stability.advise`
-    beside = steps._beside_resonances(search, trial, resonant)
+    beside = trials.beside_resonances(trial, resonant)
     assert resonant < beside < 1.3 * resonant
-    assert steps._beside_resonances(search, trial, beside) == beside
+    assert trials.beside_resonances(trial, beside) == beside
 
 
 def test_a_later_start_and_a_single_saved_interval():
@@ -133,7 +133,7 @@ def test_a_motion_that_ends_fails_as_without_an_accuracy():
 
 
 def test_more_steps_than_there_may_be_are_not_tried(monkeypatch):
-    monkeypatch.setattr(steps, "MOST_STEPS", 2**12)
+    monkeypatch.setattr(search, "MOST_STEPS", 2**12)
     with pytest.warns(vm.AccuracyNotReached, match="its error is"):
         run = vm.simulate(SYSTEMS["slow_alone"], vm.fully_explicit(1, alpha=0.3), accuracy=1e-9, t_end=1.0)
     assert run.settings.num_steps <= 2**12
@@ -169,8 +169,8 @@ def test_wrong_types(arguments, message):
 
 
 def test_chaotic_motion_misses_the_accuracy(monkeypatch):
-    monkeypatch.setattr(trials, "MOST_TRIAL_SECONDS", 0.0)
-    monkeypatch.setattr(trials, "FEWEST_STEPS", 1024)
+    monkeypatch.setattr(search, "MOST_TRIAL_SECONDS", 0.0)
+    monkeypatch.setattr(search, "FEWEST_STEPS", 1024)
     with pytest.warns(steps.AccuracyNotReached, match="no error is certified"), pytest.warns(match="chaotic"):
         run = vm.simulate(double_pendulum(), vm.galerkin(1, 3), accuracy=1e-3, t_end=40.0)
     assert run.error.largest == np.inf

@@ -23,7 +23,7 @@ from vmri_jax.hard_cases import Outcome
 from vmri_jax.running.interrupts import Interrupted
 from vmri_jax.running.quantities import Work
 from vmri_jax.running.simulation import Simulation
-from vmri_jax.study import ReferenceSolution, WorkPrecision, families, reference_solution
+from vmri_jax.study import WorkPrecision, families, reference_solution
 
 USER_FILE = """
 import jax.numpy as jnp
@@ -324,8 +324,7 @@ def test_about_a_thousand_nodes_are_saved(steps, save_every):
 def short_menu(monkeypatch):
     """The search chooses among few schemes."""
     menu = [family for family in families() if family.name in ("fully explicit", "explicit slow")]
-    for module in ("advisor", "cost_report"):
-        monkeypatch.setattr(importlib.import_module(f"vmri_jax.study.{module}"), "families", lambda: menu)
+    monkeypatch.setattr("vmri_jax.study.tuning.families", lambda: menu)
 
 
 def test_tune_prints_a_command_that_keeps_its_promise(vmri, short_menu, tmp_path):
@@ -343,7 +342,7 @@ def test_tune_prints_a_command_that_keeps_its_promise(vmri, short_menu, tmp_path
 
 
 def test_tune_that_reaches_nothing_keeps_the_runs(vmri, short_menu, tmp_path, monkeypatch):
-    monkeypatch.setattr("vmri_jax.study.search.MAX_STEPS", 16)
+    monkeypatch.setattr("vmri_jax.accuracy.search.MOST_STEPS", 16)
     code, text = vmri("tune", "user.py:my_problem", "--error", "1e-9", "--t-end", "1", "--out", "runs.json")
     assert code == 1
     assert "no setting reached 1e-09" in text
@@ -411,7 +410,7 @@ def test_simulate_composes(vmri):
 COMPUTING = {
     "cli.run": "_run",
     "study": "tune",
-    "study.cost_report": "reference_solution",
+    "study.cost_report": "Tuning",
     "cli.stability": "stability_map",
     "cli.check": "cases_for",
 }
@@ -463,7 +462,7 @@ def test_a_fault_inside_is_no_usage_error(tmp_path, monkeypatch):
     assert (tmp_path / "run.npz").exists()
 
 
-NOTHING = WorkPrecision((), 1.0, ReferenceSolution(np.zeros((2, 1)), np.zeros((2, 1))))
+NOTHING = WorkPrecision((), 1.0)
 
 
 def test_a_page_that_cannot_be_drawn_leaves_its_table(tmp_path, monkeypatch):
@@ -471,13 +470,15 @@ def test_a_page_that_cannot_be_drawn_leaves_its_table(tmp_path, monkeypatch):
     cost_report = importlib.import_module("vmri_jax.study.cost_report")
 
     def failing(problem, name, out, **_):
-        search: Any = SimpleNamespace(problem=problem, rows=lambda: NOTHING, t_end=1.0, not_tried=list)
-        return cost_report._write(search, [cost_report.Answer(1e-2, None)], name, out)
+        tuning: Any = SimpleNamespace(
+            problem=problem, runs=lambda: NOTHING, t_end=1.0, keeping=lambda _: [], settings=list
+        )
+        return cost_report._write(tuning, [1e-2], name, out)
 
     def broken(*_, **__):
         return int("no figure")
 
-    monkeypatch.setattr("vmri_jax.plots.plot_staircases", broken)
+    monkeypatch.setattr("vmri_jax.plots.plot_work_precision", broken)
     monkeypatch.setattr("vmri_jax.study.cost_report", failing)
     result = CliRunner().invoke(cli.app, ["cost", "fpu", "--out", "page"])
     assert result.exit_code == 1

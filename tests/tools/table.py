@@ -8,8 +8,7 @@ number of nodes, so that they share compiled programs.
 import re
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
-from functools import cache, partial
-from importlib import import_module
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -62,13 +61,9 @@ class Cell:
         return reference_of(self.system)
 
     def quick_searches(self) -> None:
-        """Let searches know one family, without micro steps, and let references of order 2 do."""
-        reference = partial(reference_solution, degree=1, num_steps=REFERENCE_STEPS)
-        for name in ("advisor", "cost_report"):
-            module = import_module(f"vmri_jax.study.{name}")
-            self.patch.setattr(module, "families", lambda: MENU)
-            self.patch.setattr(module, "reference_solution", reference)
-        self.patch.setattr("vmri_jax.study.search.NUM_MICRO", (1,))
+        """Let searches know one family, without micro steps."""
+        self.patch.setattr("vmri_jax.study.tuning.families", lambda: MENU)
+        self.patch.setattr("vmri_jax.accuracy.search.micro_steps_help", lambda *_: False)
 
 
 @cache

@@ -1,13 +1,21 @@
 """The schemes that a search may choose from: families of schemes that differ only in num_micro."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 
-from vmri_jax.schemes.composition import Composition, compose, stage_lengths
+from vmri_jax.mechanics.masses import ConstantMass
+from vmri_jax.mechanics.state import State
+from vmri_jax.mechanics.system import System
+from vmri_jax.schemes.composition import Composition, compose, stage_scheme
 from vmri_jax.schemes.scheme import Scheme, explicit_slow, fully_explicit, fully_implicit, galerkin, takahashi_imada
+
+COMPOSED = ((2.5, None), (5.0, "suzuki4"), (8.0, "kahan-li6"), (np.inf, "kahan-li8"))
+"""(most digits, composition): the composition for an accuracy of at most this number of digits. Higher orders need fewer steps for many digits, and
+more steps for few."""
 
 
 @dataclass(frozen=True)
@@ -18,7 +26,7 @@ class Family:
     make: the scheme with a number of micro steps (per stage, in a composition).
     options: options of the scheme on the command line.
     python: Python expression of the scheme, with ``{}`` for num_micro.
-    first: the num_micro that a search tries first.
+    first: the num_micro that a search tries first. One far from the best number makes its trials take longer.
     """
 
     name: str
@@ -40,12 +48,6 @@ class Family:
         """Name with num_micro, for progress and tables."""
         return f"{self.name}, {num_micro} micro"
 
-    def coarsest(self, num_micro: int, frequency: float, t_end: float) -> int:
-        """Fewest macro steps up to `t_end` worth a trial: their micro steps h just resolve the fastest vibration, ``omega h`` = degree."""
-        scheme = self.make(num_micro)
-        longest = float(np.abs(stage_lengths(scheme)).max())
-        return max(1, int(frequency * t_end * longest / (num_micro * scheme.degree)))
-
 
 def families(
     compositions: tuple[str, ...] = ("suzuki4", "kahan-li6", "kahan-li8"), degrees: tuple[int, ...] = (2, 4, 12)
@@ -59,6 +61,20 @@ def families(
     bases = [of_order_2(make) for make in (fully_explicit, explicit_slow, fully_implicit, takahashi_imada)]
     menu = bases + [base.composed(name) for base in bases[:2] for name in compositions]
     return menu + [of_degree(degree) for degree in degrees]
+
+
+def two_families(system: System, degrees_of_freedom: int, digits: float, most_single: int) -> list[Family]:
+    """The usual menu for an accuracy of a number of digits: kicks, and a single interval of high degree.
+
+    Kicks are composed to an order of about the number of digits; with masses that depend on the configuration the midpoint rule takes their place. A
+    single micro interval carries no rule on every k-th micro node, and is left out for more than `most_single` degrees of freedom.
+    """
+    base = of_order_2(fully_explicit if isinstance(system.kinetic, ConstantMass) else fully_implicit)
+    name = next((name for most, name in COMPOSED if digits <= most), None)
+    kicks = base if name is None else base.composed(name)
+    single = replace(of_degree(int(np.clip(np.ceil(digits), 2, 8))), first=1)
+    has_single = unit_of(system, base.make(1)) == 1 and degrees_of_freedom <= most_single
+    return [kicks, single] if has_single else [kicks]
 
 
 def of_order_2(make: Callable[[int], Scheme]) -> Family:
@@ -76,3 +92,36 @@ def of_degree(degree: int) -> Family:
         f'vm.galerkin({{}}, {degree}, "lobatto")',
         1 if degree > 2 else Family.first,  # a single interval of high degree resolves the fast variables
     )
+
+
+def of_scheme(scheme: Scheme | Composition) -> Family:
+    """The family of a scheme of the user, with its rules; the search begins with its num_micro."""
+    return Family("own", scheme.with_num_micro, "", "scheme.with_num_micro({})", stage_scheme(scheme).num_micro)
+
+
+def for_system(menu: Sequence[Family], system: System, has_two_rates: bool) -> list[Family]:
+    """The families with a first num_micro that the rates of the potentials divide: the least one where micro steps save no time."""
+
+    def adapted(family: Family) -> Family:
+        unit = unit_of(system, family.make(family.first))
+        return replace(family, first=unit * -(-family.first // unit) if has_two_rates else unit)
+
+    return [adapted(family) for family in menu]
+
+
+def by_promise(menu: Sequence[Family], digits: float) -> list[Family]:
+    """The menu, sorted: first the families whose order is near the number of digits of the accuracy.
+
+    Lower orders take many steps, and higher orders take long to compile.
+    """
+    return sorted(menu, key=lambda family: abs(np.log(family.make(family.first).order / max(digits, 2.0))))
+
+
+def micro_steps_help(system: System, start: State) -> bool:
+    """Whether micro steps may save time: the system has fast coordinates, and slow coordinates or potentials for the macro grid."""
+    return bool(start.q_f.size and (start.q_s.size or system.slow_potential is not None or system.potentials))
+
+
+def unit_of(system: System, scheme: Scheme | Composition) -> int:
+    """The number whose multiples are allowed as num_micro: the least common multiple of all k of rules on every k-th micro node."""
+    return math.lcm(stage_scheme(scheme).unit, *(name for name, _ in system.potentials if isinstance(name, int)))

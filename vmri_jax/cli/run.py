@@ -23,7 +23,6 @@ from vmri_jax.running.interrupts import Interrupted
 from vmri_jax.running.settings import Settings
 from vmri_jax.running.store import StoredTrajectory, stream
 from vmri_jax.running.trajectory import Trajectory
-from vmri_jax.schemes.composition import stage_scheme
 from vmri_jax.steppers import solvers
 from vmri_jax.steppers.results import Method, SimulationError
 
@@ -185,10 +184,8 @@ def _print_again(chosen: Settings, system: str, method: str) -> None:
     """Print the command for a run with the chosen scheme and steps, unless the user gave the scheme."""
     if not chosen.options:
         return
-    numbers = f"--num-micro {stage_scheme(chosen.scheme).num_micro} --macro-dt {chosen.macro_dt!r}"
-    saved = f"--steps {chosen.num_steps} --save-every {chosen.save_every}"
     method_option = "" if method == "auto" else f" --method {method}"
-    command = f"vmri simulate {shlex.quote(system)} {chosen.options} {numbers} {saved}{method_option}"
+    command = f"{chosen.command(system)}{method_option}"
     console.print(f"The same run again:\n[bold]{escape(command)}[/bold]", soft_wrap=True)
 
 

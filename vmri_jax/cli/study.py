@@ -24,10 +24,9 @@ from vmri_jax.cli.common import (
 from vmri_jax.running.interrupts import Interrupted
 from vmri_jax.running.progress import Progress, progress_shown
 from vmri_jax.steppers.results import SimulationError
-from vmri_jax.study.advisor import NothingReached, check_target
 from vmri_jax.study.cost_report import PERIODS, PageFailed
-from vmri_jax.study.table import ResultTable, rich_table
-from vmri_jax.study.work import duration
+from vmri_jax.study.table import ResultTable
+from vmri_jax.study.tuning import NothingReached, check_target
 
 app = typer.Typer()
 
@@ -56,14 +55,7 @@ def tune(
             _write_runs(failure.runs, out)
             print_failure("Nothing reached the error", f"{failure} The best runs are above.")
             raise typer.Exit(1) from failure
-    console.print("[bold]Errors against time[/bold], the best of all runs\n", choice.runs.table())
-    best = rich_table(choice.columns, choice.shown())
-    console.print(f"\n[bold]For an error of {error:g}[/bold], the choice first\n", best)
-    verification = choice.verification
-    if verification is not None:
-        console.print(
-            f"\nFrom another start the choice has an error of {verification.error_q:.1e} and takes {duration(verification.seconds)}."
-        )
+    console.print("[bold]Errors against time[/bold], the best of all runs\n", choice.runs.table(), "\n", choice.table())
     console.print(f"\n[bold]{escape(choice.setting.command(system))}[/bold]", soft_wrap=True)
     with refusals():
         _write_runs(choice.runs, out)
@@ -102,12 +94,12 @@ def cost(
 
 @contextmanager
 def _search(out: Path | None) -> Iterator[Progress]:
-    """A progress bar for a search, a panel if the reference solution fails; after Ctrl-C the runs, also in `out`."""
+    """A progress bar for a search, a panel if all its runs fail; after Ctrl-C the runs, also in `out`."""
     try:
         with progress_shown() as tell:
             yield tell
     except SimulationError as failure:
-        print_failure("No reference solution", str(failure))
+        print_failure("All runs failed", str(failure))
         raise typer.Exit(1) from failure
     except Interrupted as stopped:
         console.print(stopped.done.table())

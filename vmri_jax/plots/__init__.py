@@ -8,7 +8,6 @@ from vmri_jax.plots.controls import plot_control
 from vmri_jax.plots.ensembles import plot_ensemble
 from vmri_jax.plots.fits import plot_fit
 from vmri_jax.plots.runs import plot_forces, plot_trajectory
-from vmri_jax.plots.staircases import Bound, Marked, plot_staircases
 from vmri_jax.plots.studies import plot_convergence, plot_work_precision
 from vmri_jax.plots.theme import (
     DARK,
@@ -30,8 +29,6 @@ __all__ = [
     "DARK",
     "LIGHT",
     "MARKERS",
-    "Bound",
-    "Marked",
     "NotebookFigure",
     "Theme",
     "curve_look",
@@ -44,7 +41,6 @@ __all__ = [
     "plot_ensemble",
     "plot_fit",
     "plot_forces",
-    "plot_staircases",
     "plot_trajectory",
     "plot_work_precision",
     "positive",

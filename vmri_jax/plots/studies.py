@@ -69,7 +69,15 @@ WORK = {
 """Labels of the axis of work in `plot_work_precision`, by the names of the attributes of the rows."""
 
 
-def plot_work_precision(study: Any, title: str = "", work: str = "seconds", theme: Theme = LIGHT) -> NotebookFigure:
+def plot_work_precision(
+    study: Any,
+    title: str = "",
+    work: str = "seconds",
+    theme: Theme = LIGHT,
+    *,
+    ringed: Sequence[Any] = (),
+    bound: Sequence[tuple[float, float]] = (),
+) -> NotebookFigure:
     """Error of the positions against work, one curve per scheme; the Pareto front is underlaid.
 
     Args:
@@ -77,6 +85,8 @@ def plot_work_precision(study: Any, title: str = "", work: str = "seconds", them
         title: title above the panel.
         work: "seconds", "slow_evaluations", "fast_evaluations" or "solves".
         theme: colours.
+        ringed: rows to mark with rings, as chosen.
+        bound: work and error of points of a lower bound.
 
     Raises:
         ValueError: work is another string.
@@ -93,9 +103,15 @@ def plot_work_precision(study: Any, title: str = "", work: str = "seconds", them
             curve = sorted(study.curve(scheme), key=lambda row: row.num_steps)
             x, y = (positive([getattr(row, name) for row in curve]) for name in (work, "error_q"))
             axes.loglog(x, y, label=scheme, markersize=4, linewidth=1.1, **curve_look(i, theme))
+        if bound:
+            axes.loglog(*zip(*bound, strict=True), color=theme.rod, linestyle=":", label="bound: gradients alone")
+        if ringed:
+            x, y = (positive([getattr(row, name) for row in ringed]) for name in (work, "error_q"))
+            look: dict[str, Any] = {"linestyle": "", "markerfacecolor": "none", "markersize": 13, "color": theme.ink}
+            axes.loglog(x, y, "o", label="chosen", **look)
         axes.set(xlabel=WORK[work], ylabel=r"largest error $|q - q_{\mathrm{ref}}|$")
         axes.set_ylim(top=30 * np.nanmax(errors, initial=0.0) or None)
-        mark_reference(axes, study.reference.error_q, theme)
+        mark_reference(axes, study.known_to, theme)
         log_ticks(axes.xaxis, [getattr(row, work) for scheme in study.schemes for row in study.curve(scheme)])
         if work == "seconds":
             axes.xaxis.set_major_formatter(EngFormatter("s"))

@@ -1,9 +1,10 @@
 """Scheme and steps of a run that were chosen for an accuracy."""
 
+import shlex
 from dataclasses import dataclass, field
 from typing import Any
 
-from vmri_jax.schemes.composition import Composition
+from vmri_jax.schemes.composition import Composition, stage_scheme
 from vmri_jax.schemes.plain_data import from_plain, to_plain
 from vmri_jax.schemes.scheme import Scheme
 
@@ -36,6 +37,12 @@ class Settings:
         """Arguments of `vmri_jax.simulate` by name."""
         steps = {"macro_dt": self.macro_dt, "num_steps": self.num_steps, "save_every": self.save_every}
         return {"scheme": self.scheme, **steps}
+
+    def command(self, system: str) -> str:
+        """The command line that repeats the run of a system; without the scheme's options if the scheme is the user's."""
+        steps = f"--macro-dt {self.macro_dt!r} --steps {self.num_steps} --save-every {self.save_every}"
+        num_micro = stage_scheme(self.scheme).num_micro
+        return f"vmri simulate {shlex.quote(system)} {self.options} --num-micro {num_micro} {steps}"
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data for JSON."""

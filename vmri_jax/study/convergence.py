@@ -196,7 +196,7 @@ class ConvergenceStudy(ResultTable):
 
     def content(self) -> dict[str, Any]:
         """The rows, and the errors of the references."""
-        references = {case: {"error_q": r.error_q, "error_p": r.error_p} for case, r in self.references.items()}
+        references = {case: reference.errors_known() for case, reference in self.references.items()}
         return {"references": references, **super().content()}
 
     def plot(self, title: str = "", orders: Sequence[int] = ()):

@@ -4,9 +4,7 @@ from collections.abc import Callable, Mapping
 
 import jax
 import jax.numpy as jnp
-from matplotlib.figure import Figure
 
-from vmri_jax import plots
 from vmri_jax.mechanics.state import Problem
 from vmri_jax.mechanics.system import label
 from vmri_jax.running.timing import seconds_each
@@ -16,8 +14,6 @@ SLOW, FAST, CONSTRAINTS = "gradient of V", "gradient of W", "constraints"
 """Names of functions whose evaluations take time; `gradient_of` names the gradients of further potentials."""
 REMAINDER = "everything else"
 """Name of the time outside of these functions: moving, solving, and starting the run."""
-MIN_LABELLED_SHARE = 0.06
-"""Parts of a bar below this share of the time have no room for a label."""
 
 
 def functions(problem: Problem) -> dict[str, Callable]:
@@ -50,29 +46,17 @@ def prices(problem: Problem) -> dict[str, float]:
     return {name: seconds_each(function, q) for name, function in functions(problem).items()}
 
 
-def shares(price: dict[str, float], row: WorkRow) -> dict[str, float]:
-    """Parts of the time of a run by function, evaluations times `prices`; with the remainder they sum to 1."""
+def seconds_by_function(price: Mapping[str, float], row: WorkRow) -> dict[str, float]:
+    """Seconds of a run in each function, its evaluations times `prices`."""
     counts = {SLOW: row.slow_evaluations, FAST: row.fast_evaluations}
     counts |= {gradient_of(name): count for name, count in row.evaluations.items()}
     counts[CONSTRAINTS] = row.fast_evaluations or row.slow_evaluations  # about one evaluation for each fast gradient
-    parts = {name: seconds * counts.get(name, 0) / row.seconds for name, seconds in price.items()}
+    return {name: seconds * counts.get(name, 0) for name, seconds in price.items()}
+
+
+def shares(price: Mapping[str, float], row: WorkRow) -> dict[str, float]:
+    """Parts of the time of a run by function; with the remainder they sum to 1."""
+    parts = {name: seconds / row.seconds for name, seconds in seconds_by_function(price, row).items()}
     total = sum(parts.values())  # above 1 where functions cost less in the run than in loops of their own
     parts = {name: part / max(total, 1.0) for name, part in parts.items()}
     return parts | {REMAINDER: max(0.0, 1.0 - total)}
-
-
-def draw_shares(parts: Mapping[str, float], theme: plots.Theme) -> Figure:
-    """One bar for the time of a run, cut into the parts of `shares`, which sum to 1."""
-    with plots.new_figure(7.2, 1.1, "", theme) as figure:
-        axes = figure.subplots()
-        left = 0.0
-        for color, (name, share) in zip(theme.curves, parts.items(), strict=False):
-            last = name == REMAINDER
-            axes.barh([0], [share], left=left, color=theme.faint if last else color)
-            if share > MIN_LABELLED_SHARE:
-                ink = theme.ink if last else theme.paper
-                axes.text(left + share / 2, 0, f"{name}\n{share:.0%}", ha="center", va="center", fontsize=8, color=ink)
-            left += share
-        axes.set(xlim=(0, 1))
-        axes.set_axis_off()
-    return figure

@@ -38,6 +38,10 @@ class ReferenceSolution:
         """Saved nodes, the start not counted."""
         return len(self.q) - 1
 
+    def errors_known(self) -> dict[str, float]:
+        """The errors of q and p by name, for files."""
+        return {"error_q": self.error_q, "error_p": self.error_p}
+
     def errors(self, trajectory: Trajectory) -> tuple[float, float]:
         """Largest error of q and of p over nodes and coordinates; NaN for a run that failed."""
         q, p = joined(trajectory)

@@ -2,18 +2,20 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from operator import attrgetter
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from vmri_jax import diagnostics, plots
 from vmri_jax.executors.executor import mapped
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
-from vmri_jax.mechanics.system import label
+from vmri_jax.mechanics.system import System, label
 from vmri_jax.running.interrupts import Interrupted
 from vmri_jax.running.progress import shows_progress
 from vmri_jax.running.timing import interleaved
+from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes.composition import Composition, stage_scheme
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.results import Method, Result
@@ -38,9 +40,10 @@ class WorkRow:
     """One run: its errors, its time and its evaluations.
 
     scheme: label.
-    error_q, error_p: largest error over the compared nodes, see `ReferenceSolution`.
-    seconds, low, high: median and quartiles of the wall time of the run, without compiling.
-    compile_seconds: time to compile the program that all runs of the scheme share.
+    error_q, error_p: largest error over the compared nodes, see `ReferenceSolution`; in a search `error_q` is the estimated error of the run,
+        see `vmri_jax.accuracy.companions`, and `error_p` is NaN.
+    seconds, low, high: median and quartiles of the wall time of the run, without compiling; in a search `seconds` are those of the steps.
+    compile_seconds: time to compile the program that all runs of the scheme share; NaN in a search.
     slow_evaluations, fast_evaluations: evaluations of the gradients of V and of W in the whole run, counted from the scheme
         and the Newton passes that the run reports, one evaluation per pass.
     solves: systems of equations solved in the whole run.
@@ -56,7 +59,7 @@ class WorkRow:
     num_steps: int
     macro_dt: float
     error_q: float
-    error_p: float
+    error_p: float = np.nan
     seconds: float = np.nan
     low: float = np.nan
     high: float = np.nan
@@ -87,7 +90,10 @@ def duration(seconds: float) -> str:
 
 @dataclass(frozen=True)
 class WorkPrecision(ResultTable):
-    """Rows of one comparison, with the reference solution that errors are measured against; its table is the Pareto front."""
+    """Rows of one comparison; its table is the Pareto front.
+
+    reference: the solution that errors are measured against; None for a search, whose errors are estimated by companion runs.
+    """
 
     columns = (
         Column("scheme", lambda row: row.scheme),
@@ -102,7 +108,12 @@ class WorkPrecision(ResultTable):
     )
     rows: tuple[WorkRow, ...]
     t_end: float
-    reference: ReferenceSolution
+    reference: ReferenceSolution | None = None
+
+    @property
+    def known_to(self) -> float:
+        """Error of the positions of the reference; 0 without one."""
+        return 0.0 if self.reference is None else self.reference.error_q
 
     @property
     def schemes(self) -> list[str]:
@@ -136,8 +147,8 @@ class WorkPrecision(ResultTable):
 
     def content(self) -> dict[str, Any]:
         """Rows, error of the reference, machine and versions."""
-        known = {"error_q": self.reference.error_q, "error_p": self.reference.error_p}
-        return {"t_end": self.t_end, "reference": known, "machine": machine(), **super().content()}
+        known = {} if self.reference is None else {"reference": self.reference.errors_known()}
+        return {"t_end": self.t_end, **known, "machine": machine(), **super().content()}
 
     def plot(self, title: str = "", work: str = "seconds"):
         """Error against work, see `vmri_jax.plots.plot_work_precision`."""
@@ -153,36 +164,47 @@ def pareto_front(items: Sequence[Any], work: str, error: str) -> list[Any]:
     return front
 
 
-def work_row(name: str, program: Program, num_steps: int, reference: ReferenceSolution) -> WorkRow:
-    """Run the program; the row has its errors and evaluations, and NaN for its time."""
-    trajectory, scheme = program(num_steps), program.scheme
-    error_q, error_p = reference.errors(trajectory)
+def work_row(
+    name: str,
+    system: System,
+    scheme: Scheme | Composition,
+    trajectory: Trajectory,
+    macro_dt: float,
+    num_steps: int,
+    **measured,
+) -> WorkRow:
+    """The row of a run, with its evaluations and without a time; `measured` are its errors, and what else is known."""
     cost, passes = scheme.describe(), np.maximum(np.asarray(trajectory.info.iterations), 1)
     method = Method(int(np.max(trajectory.info.method)))
-    solves = 0
-    if method > Method.EXPLICIT:
-        constrained = max(program.problem.system.num_constraints(program.problem.q_s, program.problem.q_f)) > 0
-        solves = num_steps * (cost.constrained_solves if constrained else cost.solves)
+    solves = cost.constrained_solves if system.is_constrained else cost.solves
     evaluations = num_steps * float(passes.mean())
-    stage, further = stage_scheme(scheme), dict(program.problem.system.potentials)
+    stage, further = stage_scheme(scheme), dict(system.potentials)
     return WorkRow(
         scheme=name,
         num_micro=scheme.num_micro,
         order=scheme.order,
         num_steps=num_steps,
-        macro_dt=program.t_end / num_steps,
-        error_q=error_q,
-        error_p=error_p,
-        compile_seconds=program.compile_seconds,
+        macro_dt=macro_dt,
         slow_evaluations=round(evaluations * cost.slow_evaluations),
         fast_evaluations=round(evaluations * cost.fast_evaluations),
-        solves=solves,
+        solves=num_steps * solves if method > Method.EXPLICIT else 0,
         iterations=int(np.max(trajectory.info.iterations)),
         method=method.name,
         result=Result(int(trajectory.result)).name,
         stages=cost.stages,
         degree=cost.degree,
         evaluations={name: round(evaluations * cost.stages * stage.evaluations_of(name)) for name in further},
+        **measured,
+    )
+
+
+def _row(name: str, program: Program, num_steps: int, reference: ReferenceSolution) -> WorkRow:
+    """Run the program; the row has its errors and evaluations, and NaN for its time."""
+    trajectory = program(num_steps)
+    error_q, error_p = reference.errors(trajectory)
+    measured = {"error_q": error_q, "error_p": error_p, "compile_seconds": program.compile_seconds}
+    return work_row(
+        name, program.problem.system, program.scheme, trajectory, program.t_end / num_steps, num_steps, **measured
     )
 
 
@@ -233,22 +255,20 @@ def work_precision(
     if reference is None:
         reference = reference_solution(problem, t_end, num_saves=num_saves, progress=progress)
     frequency = float(diagnostics.frequencies(problem)[0])
-    total = len(schemes) + 1
-    ladders = [
-        _Ladder(problem, label, scheme, t_end, num_saves, solver, num_steps, reference, frequency)
-        for label, scheme in schemes.items()
-    ]
-    runs: list[tuple[Program, WorkRow]] = []
+    climbed = partial(_climbed, problem, t_end, num_saves, solver, num_steps, reference, frequency)
+    total, runs = len(schemes) + 1, list[tuple[Program, WorkRow]]()
     try:
         if executor is None:
-            for i, ladder in enumerate(ladders):
-                for run in _climbed(ladder, lambda n, i=i: progress(f"{ladders[i].label}, {n} steps", i, total)):
+            for i, (label, scheme) in enumerate(schemes.items()):
+                for run in climbed(
+                    label, scheme, lambda n, i=i, label=label: progress(f"{label}, {n} steps", i, total)
+                ):
                     runs.append(run)  # one by one, so that Ctrl-C keeps the runs of an unfinished ladder
             progress("measuring times", len(schemes), total)
             rows = timed_in_turn(runs, repeats)
         else:
-            tasks = [(ladder, repeats) for ladder in ladders]
-            report = lambda done, i: progress(ladders[i].label, done, total)  # noqa: E731
+            tasks = [(climbed, label, scheme, repeats) for label, scheme in schemes.items()]
+            report = lambda done, i: progress(tasks[i][1], done, total)  # noqa: E731
             rows = [row for part in mapped("work_precision", _timed, tasks, executor, report) for row in part]
     except KeyboardInterrupt as stopped:
         parts = stopped.done if isinstance(stopped, Interrupted) else [[row for _, row in runs]]
@@ -258,38 +278,38 @@ def work_precision(
     return WorkPrecision(tuple(rows), t_end, reference)
 
 
-class _Ladder(NamedTuple):
-    """A ladder of runs of one scheme over numbers of macro steps; `num_steps` None doubles them until `_goes_on` ends it."""
+def _climbed(
+    problem: Problem,
+    t_end: float,
+    num_saves: int,
+    solver: Newton | None,
+    num_steps: Sequence[int] | None,
+    reference: ReferenceSolution,
+    frequency: float,
+    name: str,
+    scheme: Scheme | Composition,
+    report: Callable[[int], None] = lambda _: None,
+) -> Iterator[tuple[Program, WorkRow]]:
+    """All runs of a scheme over a ladder of macro steps, each with the time of one call; `report` gets their numbers of steps.
 
-    problem: Problem
-    label: str
-    scheme: Scheme | Composition
-    t_end: float
-    num_saves: int
-    solver: Newton | None
-    num_steps: Sequence[int] | None
-    reference: ReferenceSolution
-    frequency: float
-
-
-def _climbed(ladder: _Ladder, report: Callable[[int], None] = lambda _: None) -> Iterator[tuple[Program, WorkRow]]:
-    """All runs of a ladder, one after the other, each with the time of one call; `report` gets their numbers of steps."""
-    program = Program(ladder.problem, ladder.scheme, ladder.t_end, ladder.num_saves, ladder.solver)
-    per_save = ladder.frequency * ladder.t_end / ladder.scheme.num_micro / ladder.scheme.degree / ladder.num_saves
-    queue, rows = list(ladder.num_steps or [ladder.num_saves * max(1, int(per_save))]), []
+    With `num_steps` None they double until `_goes_on` ends the ladder.
+    """
+    program = Program(problem, scheme, t_end, num_saves, solver)
+    per_save = frequency * t_end / scheme.num_micro / scheme.degree / num_saves
+    queue, rows = list(num_steps or [num_saves * max(1, int(per_save))]), []
     while queue:
         n = queue.pop(0)
         report(n)
-        seconds = program.seconds(n, 1, 0.0)
-        rows.append(work_row(ladder.label, program, n, ladder.reference).timed(seconds))
+        seconds = interleaved({"": program.timed(n)}, 1, 0.0)[""]
+        rows.append(_row(name, program, n, reference).timed(seconds))
         yield program, rows[-1]
-        if ladder.num_steps is None and _goes_on(rows, ladder.reference):
+        if num_steps is None and _goes_on(rows, reference):
             queue = [2 * n]
 
 
-def _timed(ladder: _Ladder, repeats: int) -> list[WorkRow]:
+def _timed(climbed: Callable, name: str, scheme: Scheme | Composition, repeats: int) -> list[WorkRow]:
     """The rows of a ladder, timed in turn."""
-    return timed_in_turn(list(_climbed(ladder)), repeats)
+    return timed_in_turn(list(climbed(name, scheme)), repeats)
 
 
 def timed_in_turn(runs: Sequence[tuple[Program, WorkRow]], repeats: int) -> list[WorkRow]:

@@ -1,0 +1,353 @@
+"""The search for the scheme and the steps of the least time for an accuracy, from the errors and times of trial runs.
+
+A trial is a run over the whole time, and a companion run with half the macro step; both give the error e of the trial,
+see `vmri_jax.accuracy.companions`. A scheme of order p has an error of at most ``eps`` with
+
+    n = n_trial (e / eps)^(1 / p)
+
+macro steps. A macro step of N micro steps takes the time ``a + b N`` and makes an error with the shares ``S H^p`` (slow) and
+``F (H/N)^p`` (fast). The least time for a given error is reached with
+
+    N^(p + 1) = (a / b) (F / S).
+
+Then the times on both grids have the ratio of the error shares, ``a / (b N) = S / (F / N^p)``.
+
+`Search.cheapest` has three stages: a trial of each family of a menu with large steps; the number of micro steps of the families that promise the least
+time; their steps for the accuracy. `vmri_jax.simulate` with an accuracy takes the first of two families, `vmri_jax.tune` compares the best of many.
+"""
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+
+from vmri_jax.accuracy.companions import (
+    FEWEST_DIVIDED,
+    certified_nodes,
+    companion,
+    estimated_errors,
+    extent_of,
+    extrapolated,
+    fewest_steps,
+)
+from vmri_jax.accuracy.families import Family, micro_steps_help, unit_of
+from vmri_jax.accuracy.trials import LEAST_TIME, Trial, seconds_of_steps
+from vmri_jax.mechanics.driving import Events
+from vmri_jax.mechanics.state import State
+from vmri_jax.mechanics.system import System
+from vmri_jax.running.progress import Progress, silent
+from vmri_jax.running.run_error import largest_of
+from vmri_jax.running.settings import Settings
+from vmri_jax.running.simulation import Simulation
+from vmri_jax.schemes.composition import Composition, stage_scheme
+from vmri_jax.schemes.scheme import Scheme
+
+AIMED_PART = 0.5
+"""Part of the accuracy for which steps are chosen. Trials predict errors of finer runs to about a factor of 2: with a larger part more runs
+miss the accuracy and are repeated, with a smaller part all runs take more steps."""
+AIMED_PART_OF_FEWEST = 0.95
+"""The same part where the fewest steps are looked for, which takes runs that miss the accuracy anyway."""
+STEPS_RATIO = 1.1
+"""The fewest steps that keep an accuracy are at most this many times a number that misses it; a ratio nearer 1 takes more runs."""
+MOST_SAVED = 1000
+"""Most saved intervals of a run with an accuracy whose user gives no number; a larger value takes more memory in long runs."""
+FEWEST_STEPS = 16
+"""Macro steps of the first trial of a scheme; a trial without a certified error is repeated with twice the steps. A larger value makes
+searches with large accuracies slower."""
+MOST_STEPS = 2**22
+"""Macro steps of the longest trial. With a larger value searches for an accuracy out of reach take minutes."""
+MOST_GROWTH = 64
+"""Most steps of a run over the steps of the run before. With a larger number a search whose accuracy is out of reach, as with jumps of forces, ends with
+fewer steps than it could take; with a smaller one it repeats runs more often."""
+MOST_REPEATS = 5
+"""Runs that may miss the accuracy before the search gives up; a larger value makes searches for an accuracy out of reach take longer."""
+MOST_TRIAL_SECONDS = 20.0
+"""Seconds of a trial, compiling included, after which the search no longer halves the steps of an uncertified trial. With a larger value
+searches take longer where no error can be certified, as for chaotic motion."""
+LEAST_TRIAL_SECONDS = 0.2
+"""Seconds of an uncertified trial that a family may take in any case; with a smaller value the cost of a call decides which families are given up."""
+MOST_TIME_RATIO = 5.0
+"""A family is given up when its trials, still uncertified, take this many times as long as the best family so far would take for the accuracy, and
+where it promises a run so many times as long. A larger ratio searches longer."""
+NUM_MICRO = (1, 2, 3, 5, 8, 12, 20, 30, 50)
+"""Numbers of micro steps that an exhaustive search tries, in units of the rates of the potentials."""
+MOST_MICRO = 64
+"""Most micro steps chosen; more save little unless an evaluation of the slow force takes a hundred times as long as of the fast force."""
+SAME_COST = 1.3
+"""Ratio of two numbers of micro steps up to which they count as equally fast, so that the second is not compiled. A larger value misses
+savings."""
+LEAST_SHARE = 1e-3
+"""Least slow share of the error, as a part of the fast share: the number of micro steps stays finite where the slow share vanishes. A larger
+value allows fewer micro steps."""
+USUAL_TRIALS = 5
+"""Trial runs of a usual search, the total that a progress bar starts with; with a larger value the bar ends before it is full."""
+MOST_COORDINATES = 60
+"""Most coordinates of a system for which a single interval of high degree is tried, and for which resonances are looked up. The matrices of
+both have a row for each coordinate: with 200 of them they take minutes, and schemes with kicks are faster."""
+RESONANT_GROWTH = 1e-6
+"""Growth of disturbances per macro step above which a step is resonant, see `vmri_jax.stability.advise`; a larger value accepts steps of
+weak resonances."""
+SHORTER_STEPS = (1.0, 0.98, 0.96, 0.93, 0.9, 0.86, 0.82, 0.78)
+"""Macro steps that are tried in this order until one is not resonant, in units of the largest step for the accuracy."""
+
+
+@dataclass
+class Search:
+    """Trial runs of several schemes from the same start over the same time, the `length`.
+
+    make: function of a scheme that returns a `Simulation` of a single macro step.
+    system, start: of all runs.
+    num_saves: saved intervals; None for at most `MOST_SAVED`.
+    drives: events of the system in this time; all runs have steps that see them.
+    fewest: whether to look for the fewest steps that keep an accuracy, within `STEPS_RATIO`; else the first ones that keep it are taken.
+    seen: called with each trial.
+    seconds: measured seconds of a macro step by the key of the trial.
+    """
+
+    make: Callable[[Scheme | Composition], Simulation]
+    system: System
+    start: State
+    length: float
+    num_saves: int | None = None
+    progress: Progress = silent
+    drives: Events = Events()  # noqa: RUF009 (immutable)
+    fewest: bool = False
+    seen: Callable[[Trial], None] = lambda trial: None
+    seconds: dict[tuple[str, int], float] = field(default_factory=dict)
+    num_trials: int = 0
+    _runs: dict[tuple[str, int], Simulation] = field(default_factory=dict)
+    _firsts: dict[tuple[str, int], Trial] = field(default_factory=dict)
+    _chosen: dict[str, Trial] = field(default_factory=dict)
+    _relative_times: dict[str, Callable[[int], float]] = field(default_factory=dict)
+
+    @cached_property
+    def has_two_rates(self) -> bool:
+        """Whether micro steps may save time."""
+        return micro_steps_help(self.system, self.start)
+
+    def cheapest(
+        self, menu: Sequence[Family], accuracy: float, finalists: int = 1, exhaustive: bool = False
+    ) -> list[Trial]:
+        """Trials with steps for the accuracy, of the families that promise the least time; the most promising one first.
+
+        An exhaustive search tries all of `NUM_MICRO` with every family, and every pair of them may be a finalist.
+        """
+        if exhaustive:
+            units = [(family, unit_of(self.system, family.make(family.first))) for family in menu]
+            menu = [replace(family, first=unit * n) for family, unit in units for n in NUM_MICRO]
+            finalists = len(menu)
+        aimed = AIMED_PART * accuracy
+        trials = sorted(self.first_trials(menu, accuracy), key=lambda trial: self.time_for(trial, aimed))
+        most = MOST_TIME_RATIO * self.time_for(trials[0], aimed)
+        promising = [trial for trial in trials[:finalists] if self.time_for(trial, aimed) <= most]
+        chosen = promising if exhaustive else [self._with_best_num_micro(trial, aimed) for trial in promising]
+        return [self.accurate(trial, accuracy) for trial in chosen]
+
+    def first_trials(self, menu: Sequence[Family], accuracy: float) -> list[Trial]:
+        """A trial of each family, which the search makes once.
+
+        First without the fallback: steps that are too large for the motion fail with any method. The fallback is compiled only if no scheme
+        of the menu succeeds without it.
+        """
+        for falls_back in (False, True):
+            limit = np.inf
+            for family in menu:
+                key = family.python, family.first
+                before = self._firsts.get(key)
+                if before is None or (falls_back and not before.run.may_fall_back):
+                    most_seconds = max(limit, LEAST_TRIAL_SECONDS)
+                    self._firsts[key] = self.trial(
+                        *(family, family.first), FEWEST_STEPS, falls_back, None, most_seconds
+                    )
+                if len(menu) > 1:
+                    limit = min(limit, MOST_TIME_RATIO * self.time_for(self._firsts[key], AIMED_PART * accuracy))
+            trials = [self._firsts[family.python, family.first] for family in menu]
+            if any(int(trial.trajectory.failed_at) < 0 for trial in trials):
+                break
+        return trials
+
+    def trial(
+        self,
+        family: Family,
+        num_micro: int,
+        num_steps: int,
+        falls_back: bool = False,
+        accuracy: float | None = None,
+        most_seconds: float = np.inf,
+    ) -> Trial:
+        """The first trial with a certified error, of 1, 2, 4, ... times the macro steps; the last trial if the search runs out of time or steps.
+
+        `falls_back` tells whether the fallback is tried where the first solver fails, see `Simulation`. With an accuracy the errors are also from
+        a third companion where it is needed, see `estimated_errors`.
+        """
+        while True:
+            run = replace(self.run(family, num_micro, num_steps), may_fall_back=falls_back)
+            total = max(USUAL_TRIALS, self.num_trials + 1)
+            self.progress(f"trial of {family.label(num_micro)}, {run.num_steps} macro steps", self.num_trials, total)
+            self.num_trials += 1
+            before = time.perf_counter()
+            trajectory, halved = run.in_pieces(), companion(run, 2)
+            seconds = time.perf_counter() - before
+            trial = Trial(family, num_micro, run, trajectory, halved, np.zeros(0), np.inf)
+            if trial.succeeded and accuracy is not None:
+                errors = estimated_errors(run, trajectory, halved, self.drives, accuracy)
+            else:
+                errors = extrapolated(run.order, trajectory, halved)
+            certified = trial.succeeded and bool(certified_nodes(trajectory, errors)[0].all())
+            trial = replace(trial, errors=errors, error=float(largest_of(errors).max()) if certified else np.inf)
+            self.seen(trial)
+            # The seconds of the first trial include compiling, which later trials do not repeat.
+            is_late = seconds > min(most_seconds, MOST_TRIAL_SECONDS) and run.num_steps > FEWEST_STEPS
+            if certified or is_late or 2 * run.num_steps > MOST_STEPS:
+                return trial
+            num_steps = 2 * run.num_steps
+
+    def accurate(self, trial: Trial, accuracy: float) -> Trial:
+        """A trial of the same scheme with an error of at most the accuracy; the last trial if `MOST_REPEATS` of them miss it."""
+        aimed = accuracy * (AIMED_PART_OF_FEWEST if self.fewest else AIMED_PART)
+        order = 1.0 if self.drives.jump else float(trial.run.order)
+        kept, too_few = None, 0 if trial.error <= accuracy else trial.run.num_steps
+        for _ in range(MOST_REPEATS * (2 if self.fewest else 1)):
+            if not np.isfinite(trial.error):
+                break
+            wanted = max(min(trial.steps_for(aimed, order), MOST_GROWTH * trial.run.num_steps), too_few + 1)
+            if kept is not None:
+                wanted = max(min(wanted, int(kept.run.num_steps / STEPS_RATIO)), too_few + 1)
+            num_steps = self.beside_resonances(trial, wanted)
+            if num_steps > max(MOST_STEPS, fewest_steps(trial.run.scheme, self.drives, self.length)):
+                break
+            if kept is not None and self.run(trial.family, trial.num_micro, num_steps).num_steps >= kept.run.num_steps:
+                break
+            before, falls_back = trial, trial.run.may_fall_back
+            trial = self.trial(trial.family, trial.num_micro, num_steps, falls_back, accuracy)
+            if trial.error <= accuracy:
+                kept = trial
+            else:
+                too_few = trial.run.num_steps
+            if kept is not None and (not self.fewest or kept.run.num_steps <= max(too_few + 1, STEPS_RATIO * too_few)):
+                break
+            order = self._observed_order(before, trial)
+        return kept or trial
+
+    def _observed_order(self, before: Trial, after: Trial) -> float:
+        """The order between two trials, from 1 to the order of the scheme: kinks of a force lower it."""
+        if not (before.error > 0 and 0 < after.error < np.inf) or before.run.num_steps == after.run.num_steps:
+            return 1.0
+        falls, grows = np.log(before.error / after.error), np.log(after.run.num_steps / before.run.num_steps)
+        return float(np.clip(falls / grows, 1.0, after.run.order))
+
+    def rounded(self, num_steps: int) -> tuple[int, int]:
+        """(num_steps, save_every): the number of macro steps, rounded up to a multiple of the saved intervals."""
+        saves = self.num_saves or min(num_steps, MOST_SAVED)
+        save_every = -(-num_steps // saves)
+        if self.num_saves is None:
+            saves = -(-num_steps // save_every)
+            saves = -(-saves // FEWEST_DIVIDED) * FEWEST_DIVIDED if self.drives.names else saves
+        return saves * save_every, save_every
+
+    def run(self, family: Family, num_micro: int, num_steps: int) -> Simulation:
+        """The run with at least `num_steps` macro steps, and with steps that see all events."""
+        key = family.python, num_micro
+        if key not in self._runs:
+            self._runs[key] = self.make(family.make(num_micro))
+        fewest = fewest_steps(self._runs[key].scheme, self.drives, self.length)
+        num_steps, save_every = self.rounded(max(num_steps, fewest))
+        dt = np.asarray(self.length / num_steps)
+        return replace(self._runs[key], macro_dt=dt, num_steps=num_steps, save_every=save_every)
+
+    def extent(self) -> float:
+        """Largest extent of the motion in the first trials; it is 0 before the first one."""
+        return max((extent_of(trial.trajectory) for trial in self._firsts.values()), default=0.0)
+
+    def time_for(self, trial: Trial, error: float) -> float:
+        """Seconds of the steps of a run with this error; infinite if the error of the trial is not certified."""
+        if not np.isfinite(trial.error):
+            return np.inf
+        if trial.key not in self.seconds:
+            self.measure([trial])
+        return trial.steps_for(error) * self.seconds[trial.key]
+
+    def measure(self, trials: Sequence[Trial]) -> None:
+        """Measure the seconds of a macro step of each trial, in turns."""
+        for trial, seconds in zip(trials, seconds_of_steps(*[trial.run for trial in trials]), strict=True):
+            self.seconds[trial.key] = float(seconds)
+
+    def settings(self, trial: Trial) -> Settings:
+        """The arguments of `vmri_jax.simulate` that repeat the run of a trial."""
+        run, relative_time = trial.run, self._relative_times.get(trial.family.python)
+        numbers = float(run.macro_dt), run.num_steps, run.save_every
+        gain = 1.0
+        if relative_time is not None and trial.num_micro > 1:
+            gain = relative_time(1) / relative_time(trial.num_micro)
+        return Settings(run.scheme, trial.family.python.format(trial.num_micro), trial.family.options, *numbers, gain)
+
+    def _with_best_num_micro(self, trial: Trial, error: float) -> Trial:
+        """A trial with the number of micro steps of the least time; `trial` itself if its number is about as fast.
+
+        A single interval of high degree (above 1) stays single: it resolves the fast variables by its degree.
+        """
+        can_choose = self.has_two_rates and stage_scheme(trial.run.scheme).degree == 1
+        if not (can_choose and 0 < trial.error < np.inf):
+            return trial
+        python = trial.family.python
+        if python not in self._chosen:
+            best = self._best_num_micro(trial)
+            if max(best, trial.num_micro) > SAME_COST * min(best, trial.num_micro):
+                num_steps = max(
+                    1, round(trial.run.num_steps * trial.num_micro / best)
+                )  # micro steps of the same length
+                new_trial = self.trial(trial.family, best, num_steps, trial.run.may_fall_back)
+                trial = min((trial, new_trial), key=lambda candidate: self.time_for(candidate, error))
+            self._chosen[python] = trial
+        return self._chosen[python]
+
+    def _best_num_micro(self, trial: Trial) -> int:
+        """The number of micro steps of the least time for an error, ``N^(p + 1) = (a / b) (F / S)``."""
+        num_micro, p = trial.num_micro, trial.run.order
+        finer = self.run(trial.family, 2 * num_micro, trial.run.num_steps)
+        finer_trajectory = finer.in_pieces()
+        if int(finer_trajectory.failed_at) >= 0:
+            return num_micro
+        fast_share = extrapolated(p, trial.trajectory, finer_trajectory)
+        fast, slow = (float(largest_of(share).max()) for share in (fast_share, trial.errors - fast_share))
+        # time(N) = a + b N: b = (time(2 N) - time(N)) / N and a = time(N) - N b
+        seconds, finer_seconds = seconds_of_steps(trial.run, finer)
+        least = LEAST_TIME * seconds
+        micro_seconds = max(finer_seconds - seconds, least) / num_micro
+        macro_seconds = max(seconds - num_micro * micro_seconds, least)
+        slow = max(slow, LEAST_SHARE * fast)
+        fast = num_micro**p * fast
+
+        def relative_time(num_micro: int) -> float:
+            """Time of a run with a given error, ``(a + b N) (S + F / N^p)^(1 / p)``, up to a factor that does not depend on N."""
+            return (macro_seconds + num_micro * micro_seconds) * (slow + fast / num_micro**p) ** (1 / p)
+
+        self._relative_times[trial.family.python] = relative_time
+        best = (macro_seconds / micro_seconds * fast / slow) ** (1 / (p + 1))
+        unit = unit_of(self.system, trial.run.scheme)  # the rates of the rules divide num_micro
+        return unit * int(np.clip(round(best / unit), 1, max(1, MOST_MICRO // unit)))
+
+    @cached_property
+    def _small_motions(self):
+        """The expansion of the system about its start; None for large systems, and for mechanisms whose drives prescribe all coordinates."""
+        # Imported here, since vmri_jax.stability imports matplotlib, which takes half a second.
+        from vmri_jax.stability.linear import small_motions
+
+        if self.start.q_s.size + self.start.q_f.size > MOST_COORDINATES:
+            return None
+        try:
+            return small_motions(self.system, self.start)
+        except ValueError:
+            return None
+
+    def beside_resonances(self, trial: Trial, num_steps: int) -> int:
+        """This number of macro steps, or the next larger number for which small motions about the start do not grow."""
+        if trial.num_micro == 1 or self._small_motions is None:
+            return num_steps
+        from vmri_jax.stability.multipliers import multipliers
+
+        numbers = [self.rounded(int(np.ceil(num_steps / shorter)))[0] for shorter in SHORTER_STEPS]
+        radii = multipliers(self._small_motions, trial.run.scheme, [self.length / n for n in numbers]).radius
+        return next((n for n, radius in zip(numbers, radii, strict=True) if radius <= 1 + RESONANT_GROWTH), num_steps)
