@@ -137,7 +137,7 @@ def _row(case: Case, clock: Callable[[], float]) -> dict:
         "by accuracy": f"{settings.python}, {settings.num_steps} steps",
         "its error": true,
         "ms": 1e3 * float(np.median(samples["ours"])),
-        "by search": f"{best.setting.row.scheme}, {best.num_steps} steps",
+        "by search": f"{best.setting.scheme}, {best.num_steps} steps",
         "error there": true_of_search,
         "ms there": 1e3 * float(np.median(samples["theirs"])),
         "ratio": ratio(samples["ours"], samples["theirs"]).value,

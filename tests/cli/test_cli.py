@@ -470,9 +470,7 @@ def test_a_page_that_cannot_be_drawn_leaves_its_table(tmp_path, monkeypatch):
     cost_report = importlib.import_module("vmri_jax.study.cost_report")
 
     def failing(problem, name, out, **_):
-        tuning: Any = SimpleNamespace(
-            problem=problem, runs=lambda: NOTHING, t_end=1.0, keeping=lambda _: [], settings=list
-        )
+        tuning: Any = SimpleNamespace(problem=problem, runs=lambda: NOTHING, t_end=1.0, keeping=lambda _: [], rows=list)
         return cost_report._write(tuning, [1e-2], name, out)
 
     def broken(*_, **__):

@@ -19,11 +19,11 @@ def test_cost_report(tmp_path):
     printed = " ".join(str(report).split())  # whatever the width of the terminal
     assert "Runs to t = 1, with the largest errors of the positions on the way." in printed
     large, small = report.reached
-    assert small.command("spring") in text.replace("&#34;", '"')
-    assert small.row.error_q <= 1e-5
-    assert large.row.error_q <= 1e-3
-    assert large.row.seconds <= small.row.seconds
-    assert report.growth == pytest.approx(small.row.seconds / large.row.seconds)
+    assert small.settings.command("spring") in text.replace("&#34;", '"')
+    assert small.error_q <= 1e-5
+    assert large.error_q <= 1e-3
+    assert large.seconds <= small.seconds
+    assert report.growth == pytest.approx(small.seconds / large.seconds)
     assert sum(report.shares.values()) == pytest.approx(1)
     assert set(report.curves.schemes) == {family.name for family in SHORT_MENU}
     for scheme in report.curves.schemes:  # a curve falls

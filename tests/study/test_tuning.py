@@ -29,14 +29,14 @@ def best():
 def test_the_setting_keeps_the_error_at_all_nodes(best):
     run = vm.simulate(PROBLEM, **best.setting.settings.arguments)
     truth = reference_solution(PROBLEM, 1.0, num_saves=len(run) - 1)
-    assert truth.errors(run)[0] == pytest.approx(best.setting.row.error_q, rel=0.1)  # 3 % measured
+    assert truth.errors(run)[0] == pytest.approx(best.setting.error_q, rel=0.1)  # 3 % measured
     assert truth.errors(run)[0] <= 1e-5
     assert (best.macro_dt, best.num_steps) == (float(run.t[1]), len(run) - 1)
 
 
 def test_steps_are_as_few_as_possible(best):
     """Of the scheme that is chosen, the fewest steps that keep the error are known within a tenth."""
-    chosen = best.setting.row
+    chosen = best.setting
     rows = [row for row in best.runs.rows if row.scheme == chosen.scheme]
     missed = max(row.num_steps for row in rows if not row.error_q <= 1e-5)
     assert chosen.num_steps <= max(missed + 1, 1.1 * missed)
@@ -50,13 +50,14 @@ def test_from_another_start_it_keeps_the_error(best):
 def test_a_setting_that_misses_from_another_start_is_replaced():
     """A lucky setting, whose error at its start is said to be 0, gets the steps with which it keeps the error from another start."""
     tuning = Tuning(PROBLEM, 1.0, SHORT_MENU[:1])
-    coarse = tuning.run(SHORT_MENU[0], 5, 100, 1e-3)
-    error = coarse.row.error_q / 3
-    lucky = dataclasses.replace(coarse, row=dataclasses.replace(coarse.row, error_q=0.0))
-    setting, check = first_verified(tuning, [lucky], error, another_start(PROBLEM, 1.0))
-    assert setting.row.num_steps > 100
-    assert setting.num_micro == 5
-    assert max(setting.row.error_q, check.error_q) <= error
+    tuning.search.first_trials(tuning.menu, 1e-3)
+    tuning.search.trial(SHORT_MENU[0], 5, 100)
+    (coarse,) = [row for row in tuning.rows() if row.num_steps == 100]
+    error, lucky = coarse.error_q / 3, dataclasses.replace(coarse, error_q=0.0)
+    row, check = first_verified(tuning, [lucky], error, another_start(PROBLEM, 1.0))
+    assert row.num_steps > 100
+    assert row.num_micro == 5
+    assert max(row.error_q, check.error_q) <= error
 
 
 def test_the_front_falls(best):
@@ -70,7 +71,7 @@ def test_it_prints_the_best_few_and_keeps_all(best, tmp_path, monkeypatch):
     head, *rows, last = str(best).splitlines()
     assert head.split()[:2] == ["scheme", "H"]
     assert len(rows) == min(5, 1 + len(best.others))
-    assert rows[0].startswith(best.setting.row.scheme)
+    assert rows[0].startswith(best.setting.scheme)
     assert last.startswith("For an error of 1e-05 take the first: its .scheme, .macro_dt and .num_steps. From another")
     assert repr(best) == str(best)
     best.to_csv(tmp_path / "runs.csv")
@@ -80,7 +81,7 @@ def test_it_prints_the_best_few_and_keeps_all(best, tmp_path, monkeypatch):
 
 
 def test_the_command_names_the_setting(best):
-    command = best.setting.command("my_file.py:spring")
+    command = best.setting.settings.command("my_file.py:spring")
     assert command.startswith("vmri simulate my_file.py:spring --scheme fully-explicit")
     assert f"--steps {best.num_steps}" in command
 

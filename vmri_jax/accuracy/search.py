@@ -16,7 +16,6 @@ Then the times on both grids have the ratio of the error shares, ``a / (b N) = S
 time; their steps for the accuracy. `vmri_jax.simulate` with an accuracy takes the first of two families, `vmri_jax.tune` compares the best of many.
 """
 
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -41,6 +40,7 @@ from vmri_jax.running.progress import Progress, silent
 from vmri_jax.running.run_error import largest_of
 from vmri_jax.running.settings import Settings
 from vmri_jax.running.simulation import Simulation
+from vmri_jax.running.timing import stopwatch
 from vmri_jax.schemes.composition import Composition, stage_scheme
 from vmri_jax.schemes.scheme import Scheme
 
@@ -66,7 +66,7 @@ MOST_REPEATS = 5
 MOST_TRIAL_SECONDS = 20.0
 """Seconds of a trial, compiling included, after which the search no longer halves the steps of an uncertified trial. With a larger value
 searches take longer where no error can be certified, as for chaotic motion."""
-LEAST_TRIAL_SECONDS = 0.2
+LEAST_TRIAL_SECONDS = 0.5
 """Seconds of an uncertified trial that a family may take in any case; with a smaller value the cost of a call decides which families are given up."""
 MOST_TIME_RATIO = 5.0
 """A family is given up when its trials, still uncertified, take this many times as long as the best family so far would take for the accuracy, and
@@ -103,7 +103,7 @@ class Search:
     drives: events of the system in this time; all runs have steps that see them.
     fewest: whether to look for the fewest steps that keep an accuracy, within `STEPS_RATIO`; else the first ones that keep it are taken.
     seen: called with each trial.
-    seconds: measured seconds of a macro step by the key of the trial.
+    seconds: measured seconds of a macro step by the Python expression of the scheme.
     """
 
     make: Callable[[Scheme | Composition], Simulation]
@@ -115,7 +115,7 @@ class Search:
     drives: Events = Events()  # noqa: RUF009 (immutable)
     fewest: bool = False
     seen: Callable[[Trial], None] = lambda trial: None
-    seconds: dict[tuple[str, int], float] = field(default_factory=dict)
+    seconds: dict[str, float] = field(default_factory=dict)
     num_trials: int = 0
     _runs: dict[tuple[str, int], Simulation] = field(default_factory=dict)
     _firsts: dict[tuple[str, int], Trial] = field(default_factory=dict)
@@ -157,10 +157,8 @@ class Search:
                 key = family.python, family.first
                 before = self._firsts.get(key)
                 if before is None or (falls_back and not before.run.may_fall_back):
-                    most_seconds = max(limit, LEAST_TRIAL_SECONDS)
-                    self._firsts[key] = self.trial(
-                        *(family, family.first), FEWEST_STEPS, falls_back, None, most_seconds
-                    )
+                    how = {"falls_back": falls_back, "most_seconds": max(limit, LEAST_TRIAL_SECONDS)}
+                    self._firsts[key] = self.trial(family, family.first, FEWEST_STEPS, **how)
                 if len(menu) > 1:
                     limit = min(limit, MOST_TIME_RATIO * self.time_for(self._firsts[key], AIMED_PART * accuracy))
             trials = [self._firsts[family.python, family.first] for family in menu]
@@ -180,16 +178,17 @@ class Search:
         """The first trial with a certified error, of 1, 2, 4, ... times the macro steps; the last trial if the search runs out of time or steps.
 
         `falls_back` tells whether the fallback is tried where the first solver fails, see `Simulation`. With an accuracy the errors are also from
-        a third companion where it is needed, see `estimated_errors`.
+        a third companion where it is needed, see `estimated_errors`. Repeated trials end after `most_seconds`.
         """
+        most = MOST_TRIAL_SECONDS
         while True:
             run = replace(self.run(family, num_micro, num_steps), may_fall_back=falls_back)
             total = max(USUAL_TRIALS, self.num_trials + 1)
             self.progress(f"trial of {family.label(num_micro)}, {run.num_steps} macro steps", self.num_trials, total)
             self.num_trials += 1
-            before = time.perf_counter()
+            elapsed = stopwatch()
             trajectory, halved = run.in_pieces(), companion(run, 2)
-            seconds = time.perf_counter() - before
+            seconds = elapsed()
             trial = Trial(family, num_micro, run, trajectory, halved, np.zeros(0), np.inf)
             if trial.succeeded and accuracy is not None:
                 errors = estimated_errors(run, trajectory, halved, self.drives, accuracy)
@@ -199,10 +198,10 @@ class Search:
             trial = replace(trial, errors=errors, error=float(largest_of(errors).max()) if certified else np.inf)
             self.seen(trial)
             # The seconds of the first trial include compiling, which later trials do not repeat.
-            is_late = seconds > min(most_seconds, MOST_TRIAL_SECONDS) and run.num_steps > FEWEST_STEPS
+            is_late = seconds > most and run.num_steps > FEWEST_STEPS
             if certified or is_late or 2 * run.num_steps > MOST_STEPS:
                 return trial
-            num_steps = 2 * run.num_steps
+            num_steps, most = 2 * run.num_steps, min(most_seconds, MOST_TRIAL_SECONDS)
 
     def accurate(self, trial: Trial, accuracy: float) -> Trial:
         """A trial of the same scheme with an error of at most the accuracy; the last trial if `MOST_REPEATS` of them miss it."""
@@ -258,21 +257,22 @@ class Search:
         return replace(self._runs[key], macro_dt=dt, num_steps=num_steps, save_every=save_every)
 
     def extent(self) -> float:
-        """Largest extent of the motion in the first trials; it is 0 before the first one."""
-        return max((extent_of(trial.trajectory) for trial in self._firsts.values()), default=0.0)
+        """Largest extent of the motion in the first trials whose errors are certified; NaN if there are none."""
+        certified = [trial for trial in self._firsts.values() if np.isfinite(trial.error)]
+        return max((extent_of(trial.trajectory) for trial in certified), default=np.nan)
 
     def time_for(self, trial: Trial, error: float) -> float:
         """Seconds of the steps of a run with this error; infinite if the error of the trial is not certified."""
         if not np.isfinite(trial.error):
             return np.inf
-        if trial.key not in self.seconds:
+        if trial.python not in self.seconds:
             self.measure([trial])
-        return trial.steps_for(error) * self.seconds[trial.key]
+        return trial.steps_for(error) * self.seconds[trial.python]
 
     def measure(self, trials: Sequence[Trial]) -> None:
         """Measure the seconds of a macro step of each trial, in turns."""
         for trial, seconds in zip(trials, seconds_of_steps(*[trial.run for trial in trials]), strict=True):
-            self.seconds[trial.key] = float(seconds)
+            self.seconds[trial.python] = float(seconds)
 
     def settings(self, trial: Trial) -> Settings:
         """The arguments of `vmri_jax.simulate` that repeat the run of a trial."""
@@ -281,7 +281,7 @@ class Search:
         gain = 1.0
         if relative_time is not None and trial.num_micro > 1:
             gain = relative_time(1) / relative_time(trial.num_micro)
-        return Settings(run.scheme, trial.family.python.format(trial.num_micro), trial.family.options, *numbers, gain)
+        return Settings(run.scheme, trial.python, trial.family.options, *numbers, gain)
 
     def _with_best_num_micro(self, trial: Trial, error: float) -> Trial:
         """A trial with the number of micro steps of the least time; `trial` itself if its number is about as fast.

@@ -104,6 +104,12 @@ def search_of(
 def reached(name: str, search: Search, menu: list[Family], accuracy: float, **how) -> list[Trial]:
     """`Search.cheapest` of an accuracy, which is refused if no position moves as far; `name` begins the message, `how` are further arguments."""
     search.first_trials(menu, accuracy)
+    check_extent(name, search, accuracy)
+    return search.cheapest(menu, accuracy, **how)
+
+
+def check_extent(name: str, search: Search, accuracy: float) -> None:
+    """Refuse an accuracy above the extent of the motion in the first trials."""
     extent = search.extent()
     # Driven systems: positions at few saved nodes may hide the motion, and all trials see the events.
     if accuracy > extent and not search.drives.names:
@@ -111,7 +117,6 @@ def reached(name: str, search: Search, menu: list[Family], accuracy: float, **ho
             f"{name} is {accuracy:g}, and no position moves by more than {extent:.3g} until t = "
             f"{float(search.start.t) + search.length:g}: any run is as accurate. Give a smaller one, in the unit of the positions."
         )
-    return search.cheapest(menu, accuracy, **how)
 
 
 def usual_menu(search: Search, scheme: Scheme | Composition | None, accuracy: float) -> list[Family]:

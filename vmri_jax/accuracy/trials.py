@@ -39,9 +39,9 @@ class Trial:
     error: float
 
     @property
-    def key(self) -> tuple[str, int]:
-        """The scheme: its family and num_micro."""
-        return self.family.python, self.num_micro
+    def python(self) -> str:
+        """The Python expression of the scheme, which identifies it in a search."""
+        return self.family.python.format(self.num_micro)
 
     @property
     def succeeded(self) -> bool:

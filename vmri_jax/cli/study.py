@@ -56,7 +56,8 @@ def tune(
             print_failure("Nothing reached the error", f"{failure} The best runs are above.")
             raise typer.Exit(1) from failure
     console.print("[bold]Errors against time[/bold], the best of all runs\n", choice.runs.table(), "\n", choice.table())
-    console.print(f"\n[bold]{escape(choice.setting.command(system))}[/bold]", soft_wrap=True)
+    command = f"{choice.setting.settings.command(system)} --out run.npz"
+    console.print(f"\n[bold]{escape(command)}[/bold]", soft_wrap=True)
     with refusals():
         _write_runs(choice.runs, out)
 

@@ -55,18 +55,24 @@ def seconds_per_call(run: Callable[[], object], calls: int, clock: Callable[[], 
     return (clock() - start) / calls
 
 
-def least_seconds(runs: Sequence[Callable[[], object]], samples: int) -> list[float]:
-    """Estimated seconds of every run on an idle machine: the least of `samples` samples, taken in turns.
+def stopwatch() -> Callable[[], float]:
+    """Start a clock: a function that returns the seconds since this call.
 
-    On a CPU a sample is the lesser of wall time, which other programs lengthen, and processor time, which the threads of the run itself
-    lengthen.
+    On a CPU they are the lesser of wall time, which other programs lengthen, and processor time, which the threads of the work itself lengthen: a
+    busy machine then has the same time for the work as an idle one.
     """
     clocks = (time.perf_counter, time.process_time) if jax.default_backend() == "cpu" else (time.perf_counter,)
+    before = [clock() for clock in clocks]
+    return lambda: min(clock() - start for clock, start in zip(clocks, before, strict=True))
+
+
+def least_seconds(runs: Sequence[Callable[[], object]], samples: int) -> list[float]:
+    """Estimated seconds of every run on an idle machine: the least of `samples` samples by a `stopwatch`, taken in turns."""
     least = [float("inf")] * len(runs)
     for i in [*range(len(runs))] * samples:
-        before = [clock() for clock in clocks]
+        elapsed = stopwatch()
         jax.block_until_ready(runs[i]())
-        least[i] = min(least[i], *(clock() - start for clock, start in zip(clocks, before, strict=True)))
+        least[i] = min(least[i], elapsed())
     return least
 
 

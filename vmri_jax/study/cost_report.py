@@ -1,22 +1,23 @@
 """A page on the cost of accuracy for a system: the cheapest scheme for each of a few errors, drawn from the runs of one search."""
 
 import math
+from collections import defaultdict
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from vmri_jax import diagnostics, plots
 from vmri_jax.accuracy.families import Family
-from vmri_jax.accuracy.steps import round_off
+from vmri_jax.accuracy.steps import check_extent, round_off
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
 from vmri_jax.running.files import make_writable_folder
 from vmri_jax.running.progress import part, shows_progress
 from vmri_jax.study.html import embedded, write_page
 from vmri_jax.study.prices import CONSTRAINTS, prices, seconds_by_function, shares
 from vmri_jax.study.table import Column, ResultTable, interruptible
-from vmri_jax.study.tuning import Setting, Tuning
+from vmri_jax.study.tuning import Tuning
 from vmri_jax.study.work import WorkPrecision, WorkRow, duration, pareto_front
 
 TEMPLATE = Path(__file__).parent / "cost.html.j2"
@@ -28,10 +29,10 @@ RELATIVE_ERRORS = (1e-2, 1e-4, 1e-6, 1e-8)
 
 @dataclass(frozen=True)
 class Answer:
-    """The largest accepted error of the positions, and the cheapest setting for it; None if no setting keeps the error."""
+    """The largest accepted error of the positions, and the run of the cheapest setting for it; None if no setting keeps the error."""
 
     error: float
-    setting: Setting | None
+    setting: WorkRow | None
 
 
 class PageFailed(RuntimeError):
@@ -44,14 +45,14 @@ class PageFailed(RuntimeError):
         )
 
 
-def _of_setting(form: Callable[[Setting], str]) -> Callable[[Answer], str]:
-    """The text of a column: `form` of the setting, empty if no setting keeps the error."""
+def _of_setting(form: Callable[[WorkRow], str]) -> Callable[[Answer], str]:
+    """The text of a column: `form` of the run, empty if none keeps the error."""
     return lambda answer: "" if answer.setting is None else form(answer.setting)
 
 
-def _gain(setting: Setting) -> str:
+def _gain(row: WorkRow) -> str:
     """The gain of more than one micro step."""
-    return f"{setting.settings.gain:.2g}" if setting.num_micro > 1 else ""
+    return f"{row.settings.gain:.2g}" if row.num_micro > row.stages else ""
 
 
 @dataclass(frozen=True)
@@ -70,10 +71,10 @@ class CostReport(ResultTable):
 
     columns = (
         Column("error", lambda answer: f"{answer.error:.0e}", right=True),
-        Column("scheme", lambda answer: "not reached" if answer.setting is None else answer.setting.row.scheme),
-        Column("macro step", _of_setting(lambda setting: f"{setting.row.macro_dt:.4g}"), right=True),
-        Column("reached", _of_setting(lambda setting: f"{setting.row.error_q:.1e}"), right=True),
-        Column("time", _of_setting(lambda setting: duration(setting.row.seconds)), right=True),
+        Column("scheme", lambda answer: "not reached" if answer.setting is None else answer.setting.scheme),
+        Column("macro step", _of_setting(lambda row: f"{row.macro_dt:.4g}"), right=True),
+        Column("reached", _of_setting(lambda row: f"{row.error_q:.1e}"), right=True),
+        Column("time", _of_setting(lambda row: duration(row.seconds)), right=True),
         Column("gain of micro steps", _of_setting(_gain), right=True),
     )
     path: Path
@@ -91,8 +92,8 @@ class CostReport(ResultTable):
         return f"Runs to t = {self.t_end:g}, with the largest errors of the positions on the way."
 
     @property
-    def reached(self) -> list[Setting]:
-        """The settings of the answers that have one."""
+    def reached(self) -> list[WorkRow]:
+        """The runs of the answers that have one."""
         return [answer.setting for answer in self.rows if answer.setting is not None]
 
     @property
@@ -101,17 +102,17 @@ class CostReport(ResultTable):
         errors = [answer.error for answer in self.rows if answer.setting is not None]
         if len(errors) < 2:
             return math.nan
-        times = self.reached[-1].row.seconds / self.reached[0].row.seconds
+        times = self.reached[-1].seconds / self.reached[0].seconds
         return times ** (math.log(100) / math.log(errors[0] / errors[-1]))
 
     def records(self) -> list[dict[str, Any]]:
         """A dictionary for each answer: the error and the columns of its run."""
-        return [{"error": a.error, **(asdict(a.setting.row) if a.setting else {})} for a in self.rows]
+        runs = [WorkPrecision((a.setting,) if a.setting else (), self.t_end).records() for a in self.rows]
+        return [{"error": answer.error, **(run[0] if run else {})} for answer, run in zip(self.rows, runs, strict=True)]
 
     def figure(self, title: str, theme: plots.Theme) -> plots.NotebookFigure:
         """Error against time: a curve for each family, the answers, and the bound."""
-        rows = [setting.row for setting in self.reached]
-        return plots.plot_work_precision(self.curves, title, theme=theme, ringed=rows, bound=self.bound)
+        return plots.plot_work_precision(self.curves, title, theme=theme, ringed=self.reached, bound=self.bound)
 
 
 def default_t_end(problem: Problem) -> float:
@@ -162,16 +163,19 @@ def cost_report(
     tuning, answered = Tuning(problem, t_end, menu, progress=progress), []
     with interruptible(tuning.runs):  # around the drawing as well, so that Ctrl-C there keeps the runs, too
         errors = sorted(_default_errors(tuning) if errors is None else errors)
+        tuning.extent()
+        check_extent("cost_report: the largest of errors", tuning.search, errors[-1])
         try:
-            for i, error in enumerate(
-                errors
-            ):  # families that are given up for a small error are hopeless for larger ones
+            # The smallest error first: families that are given up for it are hopeless for larger errors.
+            for i, error in enumerate(errors):
                 tuning.search.progress = part(progress, i, len(errors))
                 tuning.look_for("cost_report: error", error)
                 answered.append(error)
-        finally:
+        except BaseException:
             if answered:
-                report = _write(tuning, answered, name, out)
+                _write(tuning, answered, name, out)
+            raise
+        report = _write(tuning, answered, name, out)
     progress("done", 1, 1)
     return report
 
@@ -179,12 +183,12 @@ def cost_report(
 def _default_errors(tuning: Tuning) -> list[float]:
     """RELATIVE_ERRORS of a power of ten near how far the system moves, without errors that round-off hides."""
     moved, least = tuning.extent(), round_off(tuning.problem)[1]
-    motion = 10.0 ** math.floor(math.log10(max(moved, 1e-300)))
+    motion = 10.0 ** math.floor(math.log10(moved)) if moved > 0 else 0.0
     errors = [motion * error for error in RELATIVE_ERRORS if motion * error > least]
     if not errors:
         raise ValueError(
             f"cost_report: until t_end = {tuning.t_end:g} the positions are those of the start up to {moved:.1e}, and errors below {least:.1e} "
-            "cannot be told from round-off: the system is at rest. Give a start that moves, another t_end, or the errors that you accept."
+            "cannot be told from round-off: the system is at rest, or no run until then is certified. Give a start that moves, another t_end, or the errors that you accept."
         )
     return errors
 
@@ -202,7 +206,7 @@ def _write(tuning: Tuning, errors: Sequence[float], name: str, out: Path) -> Cos
         rows=answers,
         runs=runs,
         curves=curves,
-        shares=shares(price, middle.row) if middle is not None else {},
+        shares=shares(price, middle) if middle is not None else {},
         bound=bound_of(price, curves.pareto()),
     )
     runs.to_csv(out / "cost.csv")
@@ -215,10 +219,12 @@ def _write(tuning: Tuning, errors: Sequence[float], name: str, out: Path) -> Cos
 
 def _curves(tuning: Tuning) -> WorkPrecision:
     """The Pareto fronts of the families, each with the name of the family as its scheme."""
-    settings, rows = [s for s in tuning.settings() if math.isfinite(s.row.seconds)], []
-    for family in dict.fromkeys(setting.family.name for setting in settings):
-        own = [setting.row for setting in settings if setting.family.name == family]
-        rows += [replace(row, scheme=family) for row in pareto_front(own, "seconds", "error_q")]
+    by_family, rows = defaultdict(list), []
+    for row in tuning.rows():
+        by_family[tuning.family_of(row).name].append(row)
+    for family, runs in by_family.items():
+        timed = [row for row in runs if math.isfinite(row.seconds)]
+        rows += [replace(row, scheme=family) for row in pareto_front(timed, "seconds", "error_q")]
     return WorkPrecision(tuple(rows), tuning.t_end)
 
 

@@ -6,7 +6,7 @@ an error may be small by chance, as where its leading term changes sign.
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from operator import attrgetter
 from typing import Any
 
@@ -20,7 +20,6 @@ from vmri_jax.mechanics.projection import legendre, project_momentum
 from vmri_jax.mechanics.state import HasProblem, Problem, State, problem_of
 from vmri_jax.running.failures import simulation_error
 from vmri_jax.running.progress import Progress, shows_progress, silent
-from vmri_jax.running.settings import Settings
 from vmri_jax.steppers.solvers import Newton
 from vmri_jax.study.table import ResultTable, interruptible
 from vmri_jax.study.work import WorkPrecision, WorkRow, work_row
@@ -37,34 +36,10 @@ MORE_STEPS = 1.1
 one leads to slower settings."""
 MAX_CHECKS = 8
 """Settings that are checked, the fastest first, until one keeps the error from another start; a larger number searches longer in vain."""
-by_seconds = attrgetter("row.seconds")
-
-
-@dataclass(frozen=True)
-class Setting:
-    """A run of a search: the family of its scheme, its scheme and steps as arguments of `vmri_jax.simulate`, and its row with error and time."""
-
-    family: Family
-    settings: Settings
-    row: WorkRow
-
-    @property
-    def key(self) -> tuple[str, int, int]:
-        """Name of the family, num_micro and number of macro steps."""
-        return self.family.name, self.num_micro, self.row.num_steps
-
-    @property
-    def num_micro(self) -> int:
-        """Micro steps per macro step, or per stage of a composition."""
-        return self.row.num_micro // self.row.stages
-
-    def command(self, system: str) -> str:
-        """The command line that simulates `system` with this setting."""
-        return f"{self.settings.command(system)} --out run.npz"
 
 
 class Tuning:
-    """A search over a menu for the errors of a problem, and a `Setting` for each of its runs; arguments as of `tune`."""
+    """A search over a menu for the errors of a problem, and a row for each of its runs; arguments as of `tune`."""
 
     def __init__(
         self,
@@ -80,53 +55,47 @@ class Tuning:
         self.search.seen = self._add
         whole = families() if menu is None else menu
         self.menu = for_system(whole, self.search.system, self.search.has_two_rates)
-        self._settings: dict[tuple[str, int, int], Setting] = {}
+        self._seen: dict[tuple[str, int], tuple[Family, WorkRow]] = {}
 
-    def _add(self, trial: Trial) -> Setting:
-        """Add the setting of a trial; a failed or uncertified run has an error of NaN."""
+    def _add(self, trial: Trial) -> None:
+        """Add the row of a trial; a failed or uncertified run has an error of NaN."""
         run, error = trial.run, trial.error if np.isfinite(trial.error) else np.nan
         label, numbers = trial.family.label(trial.num_micro), (float(run.macro_dt), run.num_steps)
-        row = work_row(label, run.system, run.scheme, trial.trajectory, *numbers, error_q=error)
-        setting = Setting(trial.family, self.search.settings(trial), row)
-        self._settings[setting.key] = setting
-        return setting
+        measured = {"error_q": error, "settings": self.search.settings(trial)}
+        row = work_row(label, run.system, run.scheme, trial.trajectory, *numbers, **measured)
+        self._seen[trial.python, run.num_steps] = trial.family, row
 
     def extent(self) -> float:
-        """How far the system moves in the first trials, of the first family if there are none yet."""
-        if not self.search.extent():
+        """How far the system moves in the first trials, of the first family if there are none yet; NaN if no error of them is certified."""
+        if not self.search.extent() > 0:
             self.search.first_trials(self.menu[:1], np.inf)
         return self.search.extent()
 
-    def look_for(self, name: str, error: float, exhaustive: bool = False) -> list[Setting]:
-        """Search for an error, and return the settings that keep it, the fastest first; `name` begins messages."""
+    def look_for(self, name: str, error: float, exhaustive: bool = False) -> list[WorkRow]:
+        """Search for an error, and return the runs that keep it, the fastest first; `name` begins messages."""
         menu = by_promise(self.menu, digits_of(self.search, error))
         finals = reached(name, self.search, menu, error, finalists=FINALISTS, exhaustive=exhaustive)
         self.search.measure([trial for trial in finals if np.isfinite(trial.error)])
         return self.keeping(error)
 
-    def run(self, family: Family, num_micro: int, num_steps: int, error: float) -> Setting:
-        """The setting of a run with at least this number of macro steps, more if its error is not certified otherwise."""
-        trial = self.search.trial(family, num_micro, num_steps, True, error)
-        self.search.time_for(trial, error)  # measures the seconds of a step if they are not known
-        return self._timed(self._add(trial))
+    def family_of(self, row: WorkRow) -> Family:
+        """The family of the scheme of a run."""
+        return next(family for family, seen in self._seen.values() if seen.scheme == row.scheme)
 
-    def settings(self) -> list[Setting]:
-        """All runs so far, sorted by family, num_micro and number of steps."""
-        return [self._timed(setting) for _, setting in sorted(self._settings.items(), key=lambda item: item[0])]
+    def rows(self) -> list[WorkRow]:
+        """All runs so far, sorted by scheme and number of steps; seconds are those of the steps, NaN where they were not measured."""
+        rows = sorted((row for _, row in self._seen.values()), key=attrgetter("scheme", "num_steps"))
+        seconds = self.search.seconds
+        return [replace(row, seconds=seconds.get(row.settings.python, np.nan) * row.num_steps) for row in rows]
 
-    def keeping(self, error: float) -> list[Setting]:
-        """The settings that keep an error and whose time is known, the fastest first."""
-        kept = [s for s in self.settings() if s.row.error_q <= error and np.isfinite(s.row.seconds)]
-        return sorted(kept, key=by_seconds)
+    def keeping(self, error: float) -> list[WorkRow]:
+        """The runs that keep an error and whose time is known, the fastest first."""
+        kept = [row for row in self.rows() if row.error_q <= error and np.isfinite(row.seconds)]
+        return sorted(kept, key=attrgetter("seconds"))
 
     def runs(self) -> WorkPrecision:
-        """The rows of all runs so far."""
-        return WorkPrecision(tuple(setting.row for setting in self.settings()), self.t_end)
-
-    def _timed(self, setting: Setting) -> Setting:
-        """The setting with the seconds of its steps, by the seconds of a step of its scheme; NaN if they were not measured."""
-        each = self.search.seconds.get((setting.family.python, setting.num_micro), np.nan)
-        return replace(setting, row=replace(setting.row, seconds=each * setting.row.num_steps))
+        """The table of all runs so far."""
+        return WorkPrecision(tuple(self.rows()), self.t_end)
 
 
 class NothingReached(ValueError):
@@ -151,17 +120,17 @@ class Recommendation(ResultTable):
 
     Its files, `to_csv` and `to_json`, hold all runs of the search.
 
-    scheme, macro_dt, num_steps: arguments for `vmri_jax.simulate`; `setting.settings` has all of them.
+    scheme, macro_dt, num_steps: arguments for `vmri_jax.simulate`; `setting.settings.arguments` are all of them.
     error: the accepted error, in the unit of the positions.
-    setting: the recommended scheme and steps with their error and time.
+    setting: the recommended run, with its error and time.
     others: the runners-up, the fastest first.
-    verification: the same setting from another start; None if it was not checked.
+    verification: the same scheme and steps from another start; None if it was not checked.
     runs: all runs of the search; ``runs.pareto()`` is their Pareto front.
     """
 
     error: float
-    setting: Setting
-    others: tuple[Setting, ...]
+    setting: WorkRow
+    others: tuple[WorkRow, ...]
     verification: Verification | None
     runs: WorkPrecision
     columns = WorkPrecision.columns
@@ -173,7 +142,7 @@ class Recommendation(ResultTable):
 
     def shown(self) -> list[WorkRow]:
         """The best settings, the recommended one first."""
-        return [setting.row for setting in (self.setting, *self.others)[:SETTINGS_PRINTED]]
+        return [self.setting, *self.others][:SETTINGS_PRINTED]
 
     @property
     def caption(self) -> str:
@@ -186,7 +155,8 @@ class Recommendation(ResultTable):
 
     def content(self) -> dict[str, Any]:
         """The content of the JSON file: the runs of the search, the accepted error and the recommended run."""
-        return {**self.runs.content(), "error": self.error, "choice": asdict(self.setting.row)}
+        (choice,) = WorkPrecision((self.setting,), self.runs.t_end).records()
+        return {**self.runs.content(), "error": self.error, "choice": choice}
 
     @property
     def scheme(self):
@@ -196,12 +166,12 @@ class Recommendation(ResultTable):
     @property
     def macro_dt(self) -> float:
         """Macro step H."""
-        return self.setting.row.macro_dt
+        return self.setting.macro_dt
 
     @property
     def num_steps(self) -> int:
         """Macro steps up to t_end."""
-        return self.setting.row.num_steps
+        return self.setting.num_steps
 
 
 def check_target(error: float, t_end: float, problem: Problem) -> None:
@@ -251,34 +221,29 @@ def tune(
     problem = problem_of("tune", problem)
     check_target(error, t_end, problem)
     tuning = Tuning(problem, t_end, menu, num_saves, solver, progress)
-    search = tuning.search
-    search.fewest = True
+    tuning.search.fewest = True
     with interruptible(tuning.runs):
-        settings = tuning.look_for("tune: error", error, exhaustive)
-        if not settings:
+        rows = tuning.look_for("tune: error", error, exhaustive)
+        if not rows:
             raise _nothing(tuning, error)
-        setting, verification = settings[0], None
+        setting, verification = rows[0], None
         if verify:
-            mean_speed = search.extent() / t_end
-            setting, verification = first_verified(tuning, settings, error, another_start(problem, mean_speed))
+            mean_speed = tuning.extent() / t_end
+            setting, verification = first_verified(tuning, rows, error, another_start(problem, mean_speed))
     progress("done", 1, 1)
-    others = tuple(s for s in tuning.keeping(error) if s.key != setting.key)
+    others = tuple(row for row in tuning.keeping(error) if row.settings != setting.settings)
     return Recommendation(error, setting, others, verification, tuning.runs())
 
 
 def _nothing(tuning: Tuning, error: float) -> Exception:
     """The reason why no setting keeps the error: all runs failed, or none is as accurate."""
-    search, settings = tuning.search, tuning.settings()
-    trial = search.first_trials(tuning.menu, error)[0]
-    if all(setting.row.result not in ("CONVERGED", "CONVERGED_AT_ROUNDOFF") for setting in settings):
-        run = trial.run
-        return simulation_error(trial.trajectory, run.macro_dt, run.save_every, run.scheme.num_micro)
-    best = min(settings, key=lambda s: np.nan_to_num(s.row.error_q, nan=np.inf))
-    certified = f"the best error was {best.row.error_q:.1e}, with {best.row.scheme} and {best.row.num_steps} steps"
-    reason = certified if np.isfinite(best.row.error_q) else "no error is certified until t_end"
-    text = (
-        f"tune: no setting reached {error:g} in {len(settings)} runs; {reason}. Give a larger error or a shorter t_end."
-    )
+    rows, trial = tuning.rows(), tuning.search.first_trials(tuning.menu, error)[0]
+    if all(row.result not in ("CONVERGED", "CONVERGED_AT_ROUNDOFF") for row in rows):
+        return simulation_error(trial.trajectory, trial.run.macro_dt, trial.run.save_every, trial.run.scheme.num_micro)
+    best = min(rows, key=lambda row: np.nan_to_num(row.error_q, nan=np.inf))
+    certified = f"the best error was {best.error_q:.1e}, with {best.scheme} and {best.num_steps} steps"
+    reason = certified if np.isfinite(best.error_q) else "no error is certified until t_end"
+    text = f"tune: no setting reached {error:g} in {len(rows)} runs; {reason}. Give a larger error or a shorter t_end."
     return NothingReached(text, tuning.runs())
 
 
@@ -298,34 +263,32 @@ def another_start(problem: Problem, speed: float) -> Problem:
 
 
 def first_verified(
-    tuning: Tuning, settings: Sequence[Setting], error: float, other: Problem
-) -> tuple[Setting, Verification]:
+    tuning: Tuning, rows: Sequence[WorkRow], error: float, other: Problem
+) -> tuple[WorkRow, Verification]:
     """The fastest setting whose run from another start, too, keeps the error; warns if none of `MAX_CHECKS` settings does.
 
     A setting that misses the error there waits again, with more steps, among the settings that are slower.
     """
     search = search_of(other, None, tuning.solver, other.t + tuning.t_end, tuning.search.num_saves)
-    waiting, checked = list(settings), []
+    waiting, checked = list(rows), []
     for i in range(MAX_CHECKS):
-        setting = min(waiting, key=by_seconds)
-        waiting.remove(setting)
-        tuning.search.progress(f"{setting.row.scheme} from another start", i, MAX_CHECKS)
-        num_steps, of_search = setting.row.num_steps, setting.row.error_q
-        trial = search.trial(setting.family, setting.num_micro, num_steps, True, error)
+        row = min(waiting, key=attrgetter("seconds"))
+        waiting.remove(row)
+        tuning.search.progress(f"{row.scheme} from another start", i, MAX_CHECKS)
+        family, num_micro, num_steps = tuning.family_of(row), row.num_micro // row.stages, row.num_steps
+        trial = search.trial(family, num_micro, num_steps, True, error)
         certified = trial.error if trial.run.num_steps == num_steps else np.inf
         # A search in which nothing moves has errors of exactly 0.
-        checked.append((setting, Verification(certified, certified / of_search if of_search else 1.0)))
-        if max(certified, of_search) <= error:
-            break
-        miss = max(certified, of_search) / error
-        more = MORE_STEPS * miss ** (1 / setting.row.order) if np.isfinite(miss) else trial.run.num_steps / num_steps
-        if np.isfinite(more):
-            waiting.append(tuning.run(setting.family, setting.num_micro, int(np.ceil(more * num_steps)), error))
-    else:
-        warnings.warn(
-            f"tune: none of {MAX_CHECKS} settings keeps the error {error:g} from another start; the best of them is recommended.",
-            stacklevel=4,
-        )
-        return min(checked, key=lambda pair: pair[1].error_q)
-    warn_of_events("tune", search, trial, stacklevel=5)
-    return checked[-1]
+        checked.append((row, Verification(certified, certified / row.error_q if row.error_q else 1.0)))
+        if max(certified, row.error_q) <= error:
+            warn_of_events("tune", search, trial, stacklevel=5)
+            return checked[-1]
+        miss = max(certified, row.error_q) / error
+        more = MORE_STEPS * miss ** (1 / row.order) if np.isfinite(miss) else trial.run.num_steps / num_steps
+        again = tuning.search.trial(family, num_micro, int(np.ceil(more * num_steps)), True, error)
+        waiting += [row for row in tuning.rows() if row.settings == tuning.search.settings(again)]
+    warnings.warn(
+        f"tune: none of {MAX_CHECKS} settings keeps the error {error:g} from another start; the best of them is recommended.",
+        stacklevel=4,
+    )
+    return min(checked, key=lambda pair: pair[1].error_q)

@@ -14,6 +14,7 @@ from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
 from vmri_jax.mechanics.system import System, label
 from vmri_jax.running.interrupts import Interrupted
 from vmri_jax.running.progress import shows_progress
+from vmri_jax.running.settings import Settings
 from vmri_jax.running.timing import interleaved
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes.composition import Composition, stage_scheme
@@ -51,6 +52,7 @@ class WorkRow:
     method, result: names of the costliest `Method` and of the `Result`.
     stages, degree: stages of the composition, and degree of the path.
     evaluations: evaluations of the gradients of further potentials, by name.
+    settings: arguments of `vmri_jax.simulate` that repeat a run of a search; None for other runs.
     """
 
     scheme: str
@@ -73,6 +75,7 @@ class WorkRow:
     stages: int = 1
     degree: int = 1
     evaluations: Mapping[str | int, int] = field(default_factory=dict)
+    settings: Settings = None  # pyright: ignore[reportAssignmentType] (as of `Trajectory.settings`)
 
     def timed(self, seconds: Sequence[float]) -> "WorkRow":
         """The row with the median and the quartiles of these samples."""
@@ -140,8 +143,9 @@ class WorkPrecision(ResultTable):
         """The rows as dictionaries, with an entry for the gradients of each further potential."""
         records = []
         for row in self.rows:
-            record = asdict(row)
+            record = asdict(replace(row, settings=None))  # pyright: ignore[reportArgumentType]
             further = record.pop("evaluations")
+            del record["settings"]
             records.append(record | {f"evaluations of {label(name)}": count for name, count in further.items()})
         return records
 
