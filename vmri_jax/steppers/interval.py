@@ -189,23 +189,23 @@ def _curved(system: System, scheme: Scheme, n_s: int, n_f: int) -> Sparsity:
 
     An entry that differs from zero elsewhere alone is missed, which costs passes, not accuracy.
     """
-    touched = np.zeros((n_f, n_f), bool)
+    touched, parts = np.zeros((n_f, n_f), bool), interval_problem(system, scheme)
     for seed in range(PATHS):
         rng = np.random.default_rng(seed)
         numbers = [rng.normal(size=n) for n in (n_s, n_f, n_s, n_f)]
         # random numbers in place of traced ones
-        traced = interval_problem(system, scheme)
-        known = jax.tree.map(lambda a, rng=rng: a if is_concrete(a) else rng.uniform(0.5, 1.5, np.shape(a)), traced)
+        known = jax.tree.map(lambda a, rng=rng: a if is_concrete(a) else rng.uniform(0.5, 1.5, np.shape(a)), parts)
         with jax.ensure_compile_time_eval():
-            touched |= np.asarray(_touched(*known, numbers, rng.normal(size=(scheme.degree, n_f))))
+            touched |= np.asarray(_touched(known, numbers, rng.normal(size=(scheme.degree, n_f))))
     return sparsity(touched | touched.T, scheme.degree)
 
 
 @eqx.filter_jit
-def _touched(system: System, scheme: Scheme, numbers, fast):
+def _touched(parts: tuple[System, Scheme], numbers, fast):
     """(n_f, n_f) whether the rows of each coordinate change with each other one, on the path with these positions and increments."""
-    local = StepEquations(system, scheme, jnp.zeros(()), *numbers, jnp.ones(()))
-    path = local.path_of(jnp.zeros((scheme.degree, numbers[0].size)), fast[None])
+    (system, scheme), (q_s, q_f, p_s, p_f) = parts, numbers
+    local = StepEquations(system, scheme, jnp.zeros(()), q_s, q_f, p_s, p_f, jnp.ones(()))
+    path = local.path_of(jnp.zeros((scheme.degree, q_s.size)), fast[None])
     times_k = jax.linearize(partial(_fast_rows, local, path), fast)[1]
 
     def column(i):
