@@ -100,16 +100,17 @@ def plot_work_precision(
         under = {"color": theme.faint, "linewidth": 7, "solid_capstyle": "round", "zorder": 1}
         axes.loglog(best, errors, label="best of all", **under)
         for i, scheme in enumerate(study.schemes):
-            curve = sorted(study.curve(scheme), key=lambda row: row.num_steps)
+            curve = sorted(study.curve(scheme), key=lambda row: row.num_steps * row.num_micro)
             x, y = (positive([getattr(row, name) for row in curve]) for name in (work, "error_q"))
             axes.loglog(x, y, label=scheme, markersize=4, linewidth=1.1, **curve_look(i, theme))
         if bound:
-            axes.loglog(*zip(*bound, strict=True), color=theme.rod, linestyle=":", label="bound: gradients alone")
+            x, y = (positive(values) for values in zip(*bound, strict=True))
+            axes.loglog(x, y, color=theme.rod, linestyle=":", label="bound: gradients alone")
         if ringed:
             x, y = (positive([getattr(row, name) for row in ringed]) for name in (work, "error_q"))
             look: dict[str, Any] = {"linestyle": "", "markerfacecolor": "none", "markersize": 13, "color": theme.ink}
             axes.loglog(x, y, "o", label="chosen", **look)
-        axes.set(xlabel=WORK[work], ylabel=r"largest error $|q - q_{\mathrm{ref}}|$")
+        axes.set(xlabel=WORK[work], ylabel="largest error of a position")
         axes.set_ylim(top=30 * np.nanmax(errors, initial=0.0) or None)
         mark_reference(axes, study.known_to, theme)
         log_ticks(axes.xaxis, [getattr(row, work) for scheme in study.schemes for row in study.curve(scheme)])
