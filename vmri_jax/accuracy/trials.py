@@ -55,17 +55,15 @@ class Trial:
 
 def seconds_of_steps(*runs: Simulation) -> np.ndarray:
     """Seconds of a macro step of each run, ``(T(2 n) - T(n)) / n``: the difference cancels the fixed cost of a call."""
-    runs = [_of_usual_seconds(run) for run in runs]
-    doubles = [replace(run, num_steps=2 * run.num_steps, save_every=2 * run.save_every) for run in runs]
-    seconds = least_seconds([run.in_pieces for run in (*runs, *doubles)], SAMPLES)
-    single, double = np.reshape(seconds, (2, len(runs)))
-    num_steps = [run.num_steps for run in runs]
+    timed = [_of_usual_seconds(run) for run in runs]
+    doubles = [replace(run, num_steps=2 * run.num_steps, save_every=2 * run.save_every) for run in timed]
+    single, double = np.reshape(least_seconds([run.in_pieces for run in (*timed, *doubles)], SAMPLES), (2, -1))
+    num_steps = [run.num_steps for run in timed]
     return np.maximum(double - single, LEAST_TIME * double) / num_steps  # noise may make the difference negative
 
 
 def _of_usual_seconds(run: Simulation) -> Simulation:
-    """The run in about `TIMED_SECONDS`: with smaller steps, up to `MOST_DIVIDED` for each, where it is shorter; its begin where it is longer."""
-    run.in_pieces()  # compiles the program
+    """The run, which is compiled, in about `TIMED_SECONDS`: with smaller steps, up to `MOST_DIVIDED` for each, where it is shorter; its begin where it is longer."""
     seconds = least_seconds([run.in_pieces], 1)[0]
     saves = int(np.clip(run.num_saves * TIMED_SECONDS / seconds, 1, run.num_saves))
     divided = finer(run, int(np.clip(TIMED_SECONDS / seconds, 1, MOST_DIVIDED)))
