@@ -4,7 +4,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from vmri_jax.accuracy.companions import finer
 from vmri_jax.accuracy.families import Family
 from vmri_jax.running.simulation import Simulation
 from vmri_jax.running.timing import least_seconds
@@ -13,13 +12,14 @@ from vmri_jax.running.trajectory import Trajectory
 LEAST_TIME = 0.02
 """Least seconds a and b N in ``a + b N``, as a part of the seconds of a macro step, and of the steps of a run, as a part of its seconds, since the noise
 of the clock may make them zero. A larger value pulls the number of micro steps towards the present one."""
-SAMPLES = 4
-"""Timed runs of each length, of which the fastest counts. With fewer runs other programs on the machine distort the prices of the steps."""
+FEWEST_SAMPLES = 4
+"""Least samples of the seconds of a run, of which the least counts. With fewer of them other programs on the machine distort the prices of the steps."""
+MOST_SAMPLES = 24
+"""Most samples, for short runs, whose time is mostly that of the call; with fewer of them the noise of the call hides the time of the steps."""
+SAMPLED_SECONDS = 0.1
+"""Seconds of all samples, unless their number ends them; a larger value makes searches longer and prices surer."""
 TIMED_SECONDS = 0.02
-"""Seconds of a run that is timed. A shorter run takes about as long as its call, and says little about its steps; longer runs make searches longer."""
-MOST_DIVIDED = 16
-"""Most steps in place of one where a run is too short to be timed. Smaller steps take fewer iterations of implicit equations, so that a larger value
-makes implicit schemes cheaper than they are."""
+"""Seconds of a run after which its timing ends; with a larger value searches with long runs take longer."""
 
 
 @dataclass(frozen=True)
@@ -55,16 +55,16 @@ class Trial:
 
 def seconds_of_steps(*runs: Simulation) -> np.ndarray:
     """Seconds of a macro step of each run, ``(T(2 n) - T(n)) / n``: the difference cancels the fixed cost of a call."""
-    timed = [_of_usual_seconds(run) for run in runs]
+    timed = [_begin_of(run) for run in runs]
     doubles = [replace(run, num_steps=2 * run.num_steps, save_every=2 * run.save_every) for run in timed]
-    single, double = np.reshape(least_seconds([run.in_pieces for run in (*timed, *doubles)], SAMPLES), (2, -1))
+    calls = [run.in_pieces for run in (*timed, *doubles)]
+    samples = int(np.clip(SAMPLED_SECONDS / (sum(least_seconds(calls, 1)) or np.inf), FEWEST_SAMPLES, MOST_SAMPLES))
+    single, double = np.reshape(least_seconds(calls, samples), (2, -1))
     num_steps = [run.num_steps for run in timed]
     return np.maximum(double - single, LEAST_TIME * double) / num_steps  # noise may make the difference negative
 
 
-def _of_usual_seconds(run: Simulation) -> Simulation:
-    """The run, which is compiled, in about `TIMED_SECONDS`: with smaller steps, up to `MOST_DIVIDED` for each, where it is shorter; its begin where it is longer."""
-    seconds = least_seconds([run.in_pieces], 1)[0]
-    saves = int(np.clip(run.num_saves * TIMED_SECONDS / seconds, 1, run.num_saves))
-    divided = finer(run, int(np.clip(TIMED_SECONDS / seconds, 1, MOST_DIVIDED)))
-    return replace(divided, num_steps=divided.save_every * saves)
+def _begin_of(run: Simulation) -> Simulation:
+    """The run, or its begin where the run takes longer than `TIMED_SECONDS`."""
+    saves = int(np.clip(run.num_saves * TIMED_SECONDS / least_seconds([run.in_pieces], 1)[0], 1, run.num_saves))
+    return replace(run, num_steps=run.save_every * saves)
