@@ -14,8 +14,8 @@ from vmri_jax.schemes.composition import Composition, compose, stage_scheme
 from vmri_jax.schemes.scheme import Scheme, explicit_slow, fully_explicit, fully_implicit, galerkin, takahashi_imada
 
 COMPOSED = ((2.5, None), (5.0, "suzuki4"), (8.0, "kahan-li6"), (np.inf, "kahan-li8"))
-"""(most digits, composition): the composition for an accuracy of at most this number of digits. Higher orders need fewer steps for many digits, and
-more steps for few."""
+"""(most digits, composition): the composition for an accuracy of at most this number of digits. Higher orders need
+fewer steps for many digits, and more steps for few."""
 
 
 @dataclass(frozen=True)
@@ -66,8 +66,9 @@ def families(
 def two_families(system: System, degrees_of_freedom: int, digits: float, most_single: int) -> list[Family]:
     """The usual menu for an accuracy of a number of digits: kicks, and a single interval of high degree.
 
-    Kicks are composed to an order of about the number of digits; with masses that depend on the configuration the midpoint rule takes their place. A
-    single micro interval carries no rule on every k-th micro node, and is left out for more than `most_single` degrees of freedom.
+    Kicks are composed to an order of about the number of digits; with masses that depend on the configuration the
+    midpoint rule takes their place. A single micro interval carries no rule on every k-th micro node, and is left out
+    for more than `most_single` degrees of freedom.
     """
     base = of_order_2(fully_explicit if isinstance(system.kinetic, ConstantMass) else fully_implicit)
     name = next((name for most, name in COMPOSED if digits <= most), None)
@@ -100,7 +101,8 @@ def of_scheme(scheme: Scheme | Composition) -> Family:
 
 
 def for_system(menu: Sequence[Family], system: System, has_two_rates: bool) -> list[Family]:
-    """The families with a first num_micro that the rates of the potentials divide: the least one where micro steps save no time."""
+    """The families with a first num_micro that the rates of the potentials divide: the least one where micro steps save
+    no time."""
 
     def adapted(family: Family) -> Family:
         unit = unit_of(system, family.make(family.first))
@@ -118,10 +120,12 @@ def by_promise(menu: Sequence[Family], digits: float) -> list[Family]:
 
 
 def micro_steps_help(system: System, start: State) -> bool:
-    """Whether micro steps may save time: the system has fast coordinates, and slow coordinates or potentials for the macro grid."""
+    """Whether micro steps may save time: the system has fast coordinates, and slow coordinates or potentials for the
+    macro grid."""
     return bool(start.q_f.size and (start.q_s.size or system.slow_potential is not None or system.potentials))
 
 
 def unit_of(system: System, scheme: Scheme | Composition) -> int:
-    """The number whose multiples are allowed as num_micro: the least common multiple of all k of rules on every k-th micro node."""
+    """The number whose multiples are allowed as num_micro: the least common multiple of all k of rules on every k-th
+    micro node."""
     return math.lcm(stage_scheme(scheme).unit, *(name for name, _ in system.potentials if isinstance(name, int)))

@@ -5,15 +5,16 @@ see `vmri_jax.accuracy.companions`. A scheme of order p has an error of at most 
 
     n = n_trial (e / eps)^(1 / p)
 
-macro steps. A macro step of N micro steps takes the time ``a + b N`` and makes an error with the shares ``S H^p`` (slow) and
-``F (H/N)^p`` (fast). The least time for a given error is reached with
+macro steps. A macro step of N micro steps takes the time ``a + b N`` and makes an error with the shares ``S H^p``
+(slow) and ``F (H/N)^p`` (fast). The least time for a given error is reached with
 
     N^(p + 1) = (a / b) (F / S).
 
 Then the times on both grids have the ratio of the error shares, ``a / (b N) = S / (F / N^p)``.
 
-`Search.cheapest` has three stages: a trial of each family of a menu with large steps; the number of micro steps of the families that promise the least
-time; their steps for the accuracy. `vmri_jax.simulate` with an accuracy takes the first of two families, `vmri_jax.tune` compares the best of many.
+`Search.cheapest` has three stages: a trial of each family of a menu with large steps; the number of micro steps of the
+families that promise the least time; their steps for the accuracy. `vmri_jax.simulate` with an accuracy takes the first
+of two families, `vmri_jax.tune` compares the best of many.
 """
 
 from collections.abc import Callable, Sequence
@@ -45,50 +46,57 @@ from vmri_jax.schemes.composition import Composition, stage_scheme
 from vmri_jax.schemes.scheme import Scheme
 
 AIMED_PART = 0.5
-"""Part of the accuracy for which steps are chosen. Trials predict errors of finer runs to about a factor of 2: with a larger part more runs
-miss the accuracy and are repeated, with a smaller part all runs take more steps."""
+"""Part of the accuracy for which steps are chosen. Trials predict errors of finer runs to about a factor of 2: with a
+larger part more runs miss the accuracy and are repeated, with a smaller part all runs take more steps."""
 AIMED_PART_OF_FEWEST = 0.95
 """The same part where the fewest steps are looked for, which takes runs that miss the accuracy anyway."""
 STEPS_RATIO = 1.1
-"""The fewest steps that keep an accuracy are at most this many times a number that misses it; a ratio nearer 1 takes more runs."""
+"""The fewest steps that keep an accuracy are at most this many times a number that misses it; a ratio nearer 1 takes
+more runs."""
 MOST_SAVED = 1000
-"""Most saved intervals of a run with an accuracy whose user gives no number; a larger value takes more memory in long runs."""
+"""Most saved intervals of a run with an accuracy whose user gives no number; a larger value takes more memory in long
+runs."""
 FEWEST_STEPS = 16
-"""Macro steps of the first trial of a scheme; a trial without a certified error is repeated with twice the steps. A larger value makes
-searches with large accuracies slower."""
+"""Macro steps of the first trial of a scheme; a trial without a certified error is repeated with twice the steps. A
+larger value makes searches with large accuracies slower."""
 MOST_STEPS = 2**22
 """Macro steps of the longest trial. With a larger value searches for an accuracy out of reach take minutes."""
 MOST_GROWTH = 64
-"""Most steps of a run over the steps of the run before. With a larger number a search whose accuracy is out of reach, as with jumps of forces, ends with
-fewer steps than it could take; with a smaller one it repeats runs more often."""
+"""Most steps of a run over the steps of the run before. With a larger number a search whose accuracy is out of reach,
+as with jumps of forces, ends with fewer steps than it could take; with a smaller one it repeats runs more often."""
 MOST_REPEATS = 5
-"""Runs that may miss the accuracy before the search gives up; a larger value makes searches for an accuracy out of reach take longer."""
+"""Runs that may miss the accuracy before the search gives up; a larger value makes searches for an accuracy out of
+reach take longer."""
 MOST_TRIAL_SECONDS = 20.0
-"""Seconds of a trial, compiling included, after which the search no longer halves the steps of an uncertified trial. With a larger value
-searches take longer where no error can be certified, as for chaotic motion."""
+"""Seconds of a trial, compiling included, after which the search no longer halves the steps of an uncertified trial.
+With a larger value searches take longer where no error can be certified, as for chaotic motion."""
 LEAST_TRIAL_SECONDS = 0.5
-"""Seconds of an uncertified trial that a family may take in any case; with a smaller value the cost of a call decides which families are given up."""
+"""Seconds of an uncertified trial that a family may take in any case; with a smaller value the cost of a call decides
+which families are given up."""
 MOST_TIME_RATIO = 5.0
-"""A family is given up when its trials, still uncertified, take this many times as long as the best family so far would take for the accuracy, and
-where it promises a run so many times as long. A larger ratio searches longer."""
+"""A family is given up when its trials, still uncertified, take this many times as long as the best family so far would
+take for the accuracy, and where it promises a run so many times as long. A larger ratio searches longer."""
 NUM_MICRO = (1, 2, 3, 5, 8, 12, 20, 30, 50)
 """Numbers of micro steps that an exhaustive search tries, in units of the rates of the potentials."""
 MOST_MICRO = 64
-"""Most micro steps chosen; more save little unless an evaluation of the slow force takes a hundred times as long as of the fast force."""
+"""Most micro steps chosen; more save little unless an evaluation of the slow force takes a hundred times as long as of
+the fast force."""
 SAME_COST = 1.3
-"""Ratio of two numbers of micro steps up to which they count as equally fast, so that the second is not compiled. A larger value misses
-savings."""
+"""Ratio of two numbers of micro steps up to which they count as equally fast, so that the second is not compiled. A
+larger value misses savings."""
 LEAST_SHARE = 1e-3
-"""Least slow share of the error, as a part of the fast share: the number of micro steps stays finite where the slow share vanishes. A larger
-value allows fewer micro steps."""
+"""Least slow share of the error, as a part of the fast share: the number of micro steps stays finite where the slow
+share vanishes. A larger value allows fewer micro steps."""
 USUAL_TRIALS = 5
-"""Trial runs of a usual search, the total that a progress bar starts with; with a larger value the bar ends before it is full."""
+"""Trial runs of a usual search, the total that a progress bar starts with; with a larger value the bar ends before it
+is full."""
 MOST_COORDINATES = 60
-"""Most coordinates of a system for which a single interval of high degree is tried, and for which resonances are looked up. The matrices of
-both have a row for each coordinate: with 200 of them they take minutes, and schemes with kicks are faster."""
+"""Most coordinates of a system for which a single interval of high degree is tried, and for which resonances are looked
+up. The matrices of both have a row for each coordinate: with 200 of them they take minutes, and schemes with kicks are
+faster."""
 RESONANT_GROWTH = 1e-6
-"""Growth of disturbances per macro step above which a step is resonant, see `vmri_jax.stability.advise`; a larger value accepts steps of
-weak resonances."""
+"""Growth of disturbances per macro step above which a step is resonant, see `vmri_jax.stability.advise`; a larger value
+accepts steps of weak resonances."""
 SHORTER_STEPS = (1.0, 0.98, 0.96, 0.93, 0.9, 0.86, 0.82, 0.78)
 """Macro steps that are tried in this order until one is not resonant, in units of the largest step for the accuracy."""
 
@@ -101,7 +109,8 @@ class Search:
     system, start: of all runs.
     num_saves: saved intervals; None for at most `MOST_SAVED`.
     drives: events of the system in this time; all runs have steps that see them.
-    fewest: whether to look for the fewest steps that keep an accuracy, within `STEPS_RATIO`; else the first ones that keep it are taken.
+    fewest: whether to look for the fewest steps that keep an accuracy, within `STEPS_RATIO`; else the first ones that
+        keep it are taken.
     seen: called with each trial.
     seconds: measured seconds of a macro step by the Python expression of the scheme.
     """
@@ -130,7 +139,8 @@ class Search:
     def cheapest(
         self, menu: Sequence[Family], accuracy: float, finalists: int = 1, exhaustive: bool = False
     ) -> list[Trial]:
-        """Trials with steps for the accuracy, of the families that promise the least time; the most promising one first.
+        """Trials with steps for the accuracy, of the families that promise the least time; the most promising one
+        first.
 
         An exhaustive search tries all of `NUM_MICRO` with every family, and every pair of them may be a finalist.
         """
@@ -148,8 +158,8 @@ class Search:
     def first_trials(self, menu: Sequence[Family], accuracy: float) -> list[Trial]:
         """A trial of each family, which the search makes once.
 
-        First without the fallback: steps that are too large for the motion fail with any method. The fallback is compiled only if no scheme
-        of the menu succeeds without it.
+        First without the fallback: steps that are too large for the motion fail with any method. The fallback is
+        compiled only if no scheme of the menu succeeds without it.
         """
         for falls_back in (False, True):
             limit = np.inf
@@ -175,10 +185,12 @@ class Search:
         accuracy: float | None = None,
         most_seconds: float = np.inf,
     ) -> Trial:
-        """The first trial with a certified error, of 1, 2, 4, ... times the macro steps; the last trial if the search runs out of time or steps.
+        """The first trial with a certified error, of 1, 2, 4, ... times the macro steps; the last trial if the search
+        runs out of time or steps.
 
-        `falls_back` tells whether the fallback is tried where the first solver fails, see `Simulation`. With an accuracy the errors are also from
-        a third companion where it is needed, see `estimated_errors`. Repeated trials end after `most_seconds`.
+        `falls_back` tells whether the fallback is tried where the first solver fails, see `Simulation`. With an
+        accuracy the errors are also from a third companion where it is needed, see `estimated_errors`. Repeated trials
+        end after `most_seconds`.
         """
         most = MOST_TRIAL_SECONDS
         while True:
@@ -204,7 +216,8 @@ class Search:
             num_steps, most = 2 * run.num_steps, min(most_seconds, MOST_TRIAL_SECONDS)
 
     def accurate(self, trial: Trial, accuracy: float) -> Trial:
-        """A trial of the same scheme with an error of at most the accuracy; the last trial if `MOST_REPEATS` of them miss it."""
+        """A trial of the same scheme with an error of at most the accuracy; the last trial if `MOST_REPEATS` of them
+        miss it."""
         aimed = accuracy * (AIMED_PART_OF_FEWEST if self.fewest else AIMED_PART)
         order = 1.0 if self.drives.jump else float(trial.run.order)
         kept, too_few = None, 0 if trial.error <= accuracy else trial.run.num_steps
@@ -321,7 +334,8 @@ class Search:
         fast = num_micro**p * fast
 
         def relative_time(num_micro: int) -> float:
-            """Time of a run with a given error, ``(a + b N) (S + F / N^p)^(1 / p)``, up to a factor that does not depend on N."""
+            """Time of a run with a given error, ``(a + b N) (S + F / N^p)^(1 / p)``, up to a factor that does not
+            depend on N."""
             return (macro_seconds + num_micro * micro_seconds) * (slow + fast / num_micro**p) ** (1 / p)
 
         self._relative_times[trial.family.python] = relative_time
@@ -331,7 +345,8 @@ class Search:
 
     @cached_property
     def _small_motions(self):
-        """The expansion of the system about its start; None for large systems, and for mechanisms whose drives prescribe all coordinates."""
+        """The expansion of the system about its start; None for large systems, and for mechanisms whose drives
+        prescribe all coordinates."""
         # Imported here, since vmri_jax.stability imports matplotlib, which takes half a second.
         from vmri_jax.stability.linear import small_motions
 

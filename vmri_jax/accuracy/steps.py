@@ -1,4 +1,5 @@
-"""The doors of the search for an accuracy: checks of what is asked for, the usual menu, and warnings about what was reached."""
+"""The doors of the search for an accuracy: checks of what is asked for, the usual menu, and warnings about what was
+reached."""
 
 import warnings
 from collections.abc import Callable
@@ -23,9 +24,11 @@ from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.solvers import Newton
 
 MANY_STEPS = 100_000
-"""Macro steps that short events demand, above which a warning tells of them; a smaller value warns of runs that take less than a second."""
+"""Macro steps that short events demand, above which a warning tells of them; a smaller value warns of runs that take
+less than a second."""
 ROUNDOFF = 100 * np.finfo(float).eps
-"""Error below which an accuracy is refused as round-off, as a part of the largest position; a larger value refuses reachable accuracies."""
+"""Error below which an accuracy is refused as round-off, as a part of the largest position; a larger value refuses
+reachable accuracies."""
 
 
 class AccuracyNotReached(UserWarning):
@@ -50,7 +53,8 @@ def with_accuracy(
 
     Raises:
         TypeError: scheme is not a scheme.
-        ValueError: an accuracy below round-off, or above the extent of the motion; arguments that `vmri_jax.simulate` refuses.
+        ValueError: an accuracy below round-off, or above the extent of the motion; arguments that `vmri_jax.simulate`
+            refuses.
     """
     a_scheme = "a Scheme, e.g. fully_implicit(num_micro=10), or None"
     check_type("simulate: scheme", scheme, Scheme | Composition | None, a_scheme)
@@ -69,8 +73,8 @@ def with_accuracy(
         uncertified = "no error is certified over its length"
         reached_error = f"its error is {best.error:.1e}" if np.isfinite(best.error) else uncertified
         warnings.warn(
-            f"simulate: accuracy {accuracy:g} is not reached with {best.run.num_steps} macro steps, {reached_error}; give a shorter t_end, a "
-            "larger accuracy, or another scheme.",
+            f"simulate: accuracy {accuracy:g} is not reached with {best.run.num_steps} macro steps, {reached_error}; "
+            "give a shorter t_end, a larger accuracy, or another scheme.",
             AccuracyNotReached,
             stacklevel=3,
         )
@@ -102,7 +106,8 @@ def search_of(
 
 
 def reached(name: str, search: Search, menu: list[Family], accuracy: float, **how) -> list[Trial]:
-    """`Search.cheapest` of an accuracy, which is refused if no position moves as far; `name` begins the message, `how` are further arguments."""
+    """`Search.cheapest` of an accuracy, which is refused if no position moves as far; `name` begins the message, `how`
+    are further arguments."""
     search.first_trials(menu, accuracy)
     check_extent(name, search, accuracy)
     return search.cheapest(menu, accuracy, **how)
@@ -115,12 +120,14 @@ def check_extent(name: str, search: Search, accuracy: float) -> None:
     if accuracy > extent and not search.drives.names:
         raise ValueError(
             f"{name} is {accuracy:g}, and no position moves by more than {extent:.3g} until t = "
-            f"{float(search.start.t) + search.length:g}: any run is as accurate. Give a smaller one, in the unit of the positions."
+            f"{float(search.start.t) + search.length:g}: any run is as accurate. Give a smaller one, in the unit of the "
+            "positions."
         )
 
 
 def usual_menu(search: Search, scheme: Scheme | Composition | None, accuracy: float) -> list[Family]:
-    """The families for an accuracy: the user's scheme alone; without one, kicks and a single interval of high degree."""
+    """The families for an accuracy: the user's scheme alone; without one, kicks and a single interval of high
+    degree."""
     if scheme is not None:
         return [of_scheme(scheme)]
     size = search.start.q_s.size + search.start.q_f.size
@@ -129,7 +136,8 @@ def usual_menu(search: Search, scheme: Scheme | Composition | None, accuracy: fl
 
 
 def digits_of(search: Search, accuracy: float) -> float:
-    """The digits of an accuracy, relative to the largest position at the start, or to the largest speed times the length; at least one."""
+    """The digits of an accuracy, relative to the largest position at the start, or to the largest speed times the
+    length; at least one."""
     start = search.start
     q, v = (start.q_s, start.q_f), velocity(search.system, start.q_s, start.q_f, start.p_s, start.p_f)
     size, speed = (max(np.abs(np.asarray(a)).max(initial=0.0) for a in pair) for pair in (q, v))
@@ -141,8 +149,9 @@ def warn_of_events(caller: str, search: Search, trial: Trial, stacklevel: int = 
     drives, fewest = search.drives, fewest_steps(trial.run.scheme, search.drives, search.length)
     if fewest > MANY_STEPS:
         warnings.warn(
-            f"{caller}: {' and '.join(drives.names)} of the system changes and changes back within {drives.shortest:.2g}, so that the run takes at "
-            f"least {fewest} macro steps until t = {float(search.start.t) + search.length:g}; a run in parts, with its steps for each part, takes fewer.",
+            f"{caller}: {' and '.join(drives.names)} of the system changes and changes back within "
+            f"{drives.shortest:.2g}, so that the run takes at least {fewest} macro steps until "
+            f"t = {float(search.start.t) + search.length:g}; a run in parts, with its steps for each part, takes fewer.",
             stacklevel=stacklevel,
         )
 
@@ -153,8 +162,8 @@ def check_error(name: str, error: float, start: State | Problem) -> None:
     size, floor = round_off(start)
     if not error > floor:
         raise ValueError(
-            f"{name} is {error:g}; the largest position is {size:.3g}, so that round-off of float64 alone is about {floor:.0e}. "
-            "Give a larger one, in the unit of the positions."
+            f"{name} is {error:g}; the largest position is {size:.3g}, so that round-off of float64 alone is about "
+            f"{floor:.0e}. Give a larger one, in the unit of the positions."
         )
 
 

@@ -58,8 +58,8 @@ def seconds_per_call(run: Callable[[], object], calls: int, clock: Callable[[], 
 def stopwatch() -> Callable[[], float]:
     """Start a clock: a function that returns the seconds since this call.
 
-    On a CPU they are the lesser of wall time, which other programs lengthen, and processor time, which the threads of the work itself lengthen: a
-    busy machine then has the same time for the work as an idle one.
+    On a CPU they are the lesser of wall time, which other programs lengthen, and of processor time, which the threads
+    of the work itself lengthen: a busy machine then has the same time for the work as an idle one.
     """
     clocks = (time.perf_counter, time.process_time) if jax.default_backend() == "cpu" else (time.perf_counter,)
     before = [clock() for clock in clocks]

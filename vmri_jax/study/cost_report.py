@@ -1,4 +1,5 @@
-"""A page on the cost of accuracy for a system: the cheapest scheme for each of a few errors, drawn from the runs of one search."""
+"""A page on the cost of accuracy for a system: the cheapest scheme for each of a few errors, drawn from the runs of one
+search."""
 
 import math
 from collections import defaultdict
@@ -29,14 +30,16 @@ RELATIVE_ERRORS = (1e-2, 1e-4, 1e-6, 1e-8)
 
 @dataclass(frozen=True)
 class Answer:
-    """The largest accepted error of the positions, and the run of the cheapest setting for it; None if no setting keeps the error."""
+    """The largest accepted error of the positions, and the run of the cheapest setting for it; None if no setting keeps
+    the error."""
 
     error: float
     setting: WorkRow | None
 
 
 class PageFailed(RuntimeError):
-    """The search came to its end, but its page could not be drawn or written; its results are in `.report` and in cost.csv."""
+    """The search came to its end, but its page could not be drawn or written; its results are in `.report` and in
+    cost.csv."""
 
     def __init__(self, report: "CostReport"):
         self.report = report
@@ -66,7 +69,8 @@ class CostReport(ResultTable):
     runs: every run of the search.
     curves: the best runs of each family, named by it.
     shares: parts of the time of the middle answer by function, see `vmri_jax.study.prices.shares`.
-    bound: seconds and error of the runs of the Pareto front, if the time of a run were that of its gradients alone; empty with constraints.
+    bound: seconds and error of the runs of the Pareto front, if the time of a run were that of its gradients alone;
+        empty with constraints.
     """
 
     columns = (
@@ -98,7 +102,8 @@ class CostReport(ResultTable):
 
     @property
     def growth(self) -> float:
-        """Factor in time for a hundredth of the error, the geometric mean over the answers; NaN for fewer than two answers."""
+        """Factor in time for a hundredth of the error, the geometric mean over the answers; NaN for fewer than two
+        answers."""
         errors = [answer.error for answer in self.rows if answer.setting is not None]
         if len(errors) < 2:
             return math.nan
@@ -143,12 +148,14 @@ def cost_report(
         name: of the system, for the title and the commands: a built-in one or ``my_file.py:my_problem``.
         out: folder, made if it does not exist.
         t_end: simulated time, by default `default_t_end`.
-        errors: largest accepted errors of a position, as of `tune`; by default `RELATIVE_ERRORS` times how far the system moves.
+        errors: largest accepted errors of a position, as of `tune`; by default `RELATIVE_ERRORS` times how far the
+            system moves.
         menu: families to choose from, by default `families()`.
         progress: True for a bar, or a function (what, done, total) that is told about every run.
 
     Raises:
-        ValueError: errors that are not positive, or above the extent of the motion; no errors are passed, and the system does not move.
+        ValueError: errors that are not positive, or above the extent of the motion; no errors are passed, and the
+            system does not move.
         Interrupted: Ctrl-C; carries the runs of the search.
         PageFailed: the page could not be drawn or written; carries the report.
     """
@@ -187,14 +194,16 @@ def _default_errors(tuning: Tuning) -> list[float]:
     errors = [motion * error for error in RELATIVE_ERRORS if motion * error > least]
     if not errors:
         raise ValueError(
-            f"cost_report: until t_end = {tuning.t_end:g} the positions are those of the start up to {moved:.1e}, and errors below {least:.1e} "
-            "cannot be told from round-off: the system is at rest, or no run until then is certified. Give a start that moves, another t_end, or the errors that you accept."
+            f"cost_report: until t_end = {tuning.t_end:g} the positions are those of the start up to {moved:.1e}, and "
+            f"errors below {least:.1e} cannot be told from round-off: the system is at rest, or no run until then is "
+            "certified. Give a start that moves, another t_end, or the errors that you accept."
         )
     return errors
 
 
 def _write(tuning: Tuning, errors: Sequence[float], name: str, out: Path) -> CostReport:
-    """Write the page of the fastest settings that keep the errors, whichever of them they were found for, and hand back its report."""
+    """Write the page of the fastest settings that keep the errors, whichever of them they were found for, and hand back
+    its report."""
     settings = {error: tuning.keeping(error) for error in sorted(errors, reverse=True)}
     answers = tuple(Answer(error, kept[0] if kept else None) for error, kept in settings.items())
     runs, curves, middle = tuning.runs(), _curves(tuning), answers[len(answers) // 2].setting
@@ -229,9 +238,11 @@ def _curves(tuning: Tuning) -> WorkPrecision:
 
 
 def bound_of(price: dict[str, float], rows: Sequence[WorkRow]) -> tuple[tuple[float, float], ...]:
-    """Seconds and error of runs whose time is that of their gradients alone; empty with constraints, whose solution costs more than `prices` say.
+    """Seconds and error of runs whose time is that of their gradients alone; empty with constraints, whose solution
+    costs more than `prices` say.
 
-    A gradient that is evaluated in a loop of its own may take longer than in the run, so that the time of the run bounds it.
+    A gradient that is evaluated in a loop of its own may take longer than in the run, so that the time of the run
+    bounds it.
     """
     if not price or CONSTRAINTS in price:
         return ()

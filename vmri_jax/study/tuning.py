@@ -1,7 +1,8 @@
-"""Advice: the scheme, num_micro and macro step that reach an accepted error in the least time, from the search for an accuracy over a whole menu.
+"""Advice: the scheme, num_micro and macro step that reach an accepted error in the least time, from the search for an
+accuracy over a whole menu.
 
-Settings are checked by runs from another start, the fastest first, and the first one that keeps the error there too is recommended: at one start
-an error may be small by chance, as where its leading term changes sign.
+Settings are checked by runs from another start, the fastest first, and the first one that keeps the error there too is
+recommended: at one start an error may be small by chance, as where its leading term changes sign.
 """
 
 import warnings
@@ -25,17 +26,19 @@ from vmri_jax.study.table import ResultTable, interruptible
 from vmri_jax.study.work import WorkPrecision, WorkRow, work_row
 
 FINALISTS = 4
-"""Families whose micro steps and steps are searched for, of those that promise the least time. A larger number searches longer."""
+"""Families whose micro steps and steps are searched for, of those that promise the least time. A larger number searches
+longer."""
 SETTINGS_PRINTED = 5
 """Number of settings, the recommended one included, that a recommendation and `vmri tune` print."""
 RELATIVE_VELOCITY_CHANGE = 0.01
-"""Standard deviation of the change of velocities over the largest velocity. The motion is another one with the same time scales; a
-larger change may lead to a motion of another kind, with another error."""
+"""Standard deviation of the change of velocities over the largest velocity. The motion is another one with the same
+time scales; a larger change may lead to a motion of another kind, with another error."""
 MORE_STEPS = 1.1
-"""Steps of a setting that misses the error from another start, over the steps that its miss predicts; a smaller number needs more checks, a larger
-one leads to slower settings."""
+"""Steps of a setting that misses the error from another start, over the steps that its miss predicts; a smaller number
+needs more checks, a larger one leads to slower settings."""
 MAX_CHECKS = 8
-"""Settings that are checked, the fastest first, until one keeps the error from another start; a larger number searches longer in vain."""
+"""Settings that are checked, the fastest first, until one keeps the error from another start; a larger number searches
+longer in vain."""
 
 
 class Tuning:
@@ -66,7 +69,8 @@ class Tuning:
         self._seen[trial.python, run.num_steps] = trial.family, row
 
     def extent(self) -> float:
-        """How far the system moves in the first trials, of the first family if there are none yet; NaN if no error of them is certified."""
+        """How far the system moves in the first trials, of the first family if there are none yet; NaN if no error of
+        them is certified."""
         if not self.search.extent() > 0:
             self.search.first_trials(self.menu[:1], np.inf)
         return self.search.extent()
@@ -83,7 +87,8 @@ class Tuning:
         return next(family for family, seen in self._seen.values() if seen.scheme == row.scheme)
 
     def rows(self) -> list[WorkRow]:
-        """All runs so far, sorted by scheme and number of steps; seconds are those of the steps, NaN where they were not measured."""
+        """All runs so far, sorted by scheme and number of steps; seconds are those of the steps, NaN where they were
+        not measured."""
         rows = sorted((row for _, row in self._seen.values()), key=attrgetter("scheme", "num_steps"))
         seconds = self.search.seconds
         return [replace(row, seconds=seconds.get(row.settings.python, np.nan) * row.num_steps) for row in rows]
@@ -108,7 +113,8 @@ class NothingReached(ValueError):
 
 @dataclass(frozen=True)
 class Verification:
-    """A run from another start: its error, infinite if it is not certified, and the ratio of the error to the error in the search."""
+    """A run from another start: its error, infinite if it is not certified, and the ratio of the error to the error in
+    the search."""
 
     error_q: float
     error_ratio: float
@@ -196,14 +202,16 @@ def tune(
 ) -> Recommendation:
     """Find the scheme, num_micro and macro step that reach an error in the least time on this machine.
 
-    Errors are those of ``simulate(..., error=True)``: estimated by companion runs, the largest over all positions and saved nodes, and certified.
+    Errors are those of ``simulate(..., error=True)``: estimated by companion runs, the largest over all positions and
+    saved nodes, and certified.
 
     Args:
         problem: system and start; a `Problem` or a scene.
         error: largest accepted error of a position, in the unit of the positions, from this start and from another one.
         t_end: simulated time.
         menu: families to choose from, by default `families()`.
-        num_saves: saved intervals, equally spaced, at whose ends errors are compared; None for one per macro step, at most 1000.
+        num_saves: saved intervals, equally spaced, at whose ends errors are compared; None for one per macro step, at
+            most 1000.
         solver: how implicit equations are solved.
         verify: run settings from another start, too, and recommend one that keeps the error there.
         exhaustive: try every num_micro of every family, to check the staged search.
@@ -265,7 +273,8 @@ def another_start(problem: Problem, speed: float) -> Problem:
 def first_verified(
     tuning: Tuning, rows: Sequence[WorkRow], error: float, other: Problem
 ) -> tuple[WorkRow, Verification]:
-    """The fastest setting whose run from another start, too, keeps the error; warns if none of `MAX_CHECKS` settings does.
+    """The fastest setting whose run from another start, too, keeps the error; warns if none of `MAX_CHECKS` settings
+    does.
 
     A setting that misses the error there waits again, with more steps, among the settings that are slower.
     """
@@ -288,7 +297,8 @@ def first_verified(
         again = tuning.search.trial(family, num_micro, int(np.ceil(more * num_steps)), True, error)
         waiting += [row for row in tuning.rows() if row.settings == tuning.search.settings(again)]
     warnings.warn(
-        f"tune: none of {MAX_CHECKS} settings keeps the error {error:g} from another start; the best of them is recommended.",
+        f"tune: none of {MAX_CHECKS} settings keeps the error {error:g} from another start; the best of them is "
+        "recommended.",
         stacklevel=4,
     )
     return min(checked, key=lambda pair: pair[1].error_q)
