@@ -69,7 +69,7 @@ def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
     return growing("batch", name, (_measure(case, size, tell) for case in size.cases), c_loops.missing())
 
 
-def _program(problem: vm.Problem, case: Case, batch: int, solver: vm.solvers.Newton, devices: int) -> Callable:
+def _program(problem: vm.Problem, case: Case, batch: int, solver: vm.Solver, devices: int) -> Callable:
     states = starts(problem, batch)
 
     def run(num_steps: int) -> vm.Trajectory:
@@ -99,9 +99,9 @@ def _measure(case: Case, size: Size, tell: Tell) -> tuple[list[dict], list[Claim
 
 def _all_sizes(case: Case, size: Size, tell: Tell) -> tuple[list[dict], list[Claim]]:
     problem = programs.problem(case.system)
-    newtons = {"default": vm.solvers.Auto()}
+    newtons = {"default": vm.Solver()}
     if case.fixed:
-        newtons["fixed"] = vm.solvers.Auto(fixed_iterations=_fewest_iterations(problem, case))
+        newtons["fixed"] = vm.Solver(fixed_iterations=_fewest_iterations(problem, case))
     runs, work, results = {}, {}, {}
     for option, solver in newtons.items():
         for batch in size.batches:
@@ -174,7 +174,7 @@ def _fewest_iterations(problem: vm.Problem, case: Case) -> int:
     taken = np.asarray(run.info.iterations)
     for iterations in range(max(1, int(taken.mean())), int(taken.max())):
         simulate = programs.program(
-            problem, scheme, vm.solvers.Auto(fixed_iterations=iterations), micro_dt=case.micro_dt
+            problem, scheme, vm.Solver(fixed_iterations=iterations), micro_dt=case.micro_dt
         )
         if not programs.failed(simulate(steps)):
             return iterations

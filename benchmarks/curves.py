@@ -105,7 +105,7 @@ def measure(case: Case, repeats: int, seconds: float, tell: Tell = silent) -> Cu
                 total = unit * max(1, round(case.t_end / case.micro_dt / unit))
         runs["auto", n] = partial(run, total // n), total
         results["auto", n] = run(total // n)
-    dense, whole = vm.solvers.Dense(), problem
+    dense, whole = dense(), problem
     if case.system.startswith("FPU") and case.scheme != "fully implicit":
         whole = unstructured(problem)  # explicit schemes solve for the whole macro step too, as the paper did
     for n in case.dense_num_micro:

@@ -48,9 +48,9 @@ class System:
     @property
     def run(self) -> dict[str, Any]:
         """Arguments of `simulate`; without a second method, which every lane would compute."""
-        method = "nested" if self.problem.system.has_constant_mass else "arrowhead"
+        method = "masses" if self.problem.system.has_constant_mass else "exact"
         steps = {"macro_dt": T_END / self.num_steps, "num_steps": self.num_steps, "save_every": self.num_steps}
-        return {**steps, "solver": vm.solvers.named(method)()}
+        return {**steps, "solver": named(method)}
 
     def end(self, state: vm.State):
         """Positions (n,) at the end."""

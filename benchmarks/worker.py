@@ -107,7 +107,7 @@ def simulator(case: Case):
     """``simulate(num_steps)`` by `vm.simulate`."""
     problem, scheme = case.problem(), case.made_scheme()
     state = problem.state()
-    solver = vm.solvers.named(case.method)()  # pyright: ignore[reportArgumentType]
+    solver = named(case.method)  # pyright: ignore[reportArgumentType]
     return lambda n: vm.simulate(
         problem.system, scheme, state, **last_node(case.macro_dt, n), solver=solver, throw=False
     )

@@ -88,7 +88,7 @@ def few_programs():
 @pytest.fixture(scope="session", autouse=True)
 def default_method(request):
     """`solvers.Auto()` is the solver with the method of the command line: the tests hold for every method."""
-    from vmri_jax.steppers import solvers
+    from vmri_jax.steppers.solver import Solver
 
     method = request.config.getoption("--method")
     if method is None:

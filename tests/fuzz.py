@@ -60,7 +60,7 @@ def verdicts(of: rs.Structure, draws: list[rs.Draw]) -> list[str]:
             "num_steps": of.num_saves * first.save_every,
             "save_every": first.save_every,
             "save_micro": of.save_micro,
-            "solver": vm.solvers.named(of.method)(first.tolerance, first.max_iterations, of.fixed_iterations),  # pyright: ignore
+            "solver": named(of.method, first.tolerance, first.max_iterations, of.fixed_iterations),  # pyright: ignore
         }
         made = rs.scheme(of, first)
         if of.lanes is None:

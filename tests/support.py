@@ -8,7 +8,7 @@ import numpy as np
 
 from vmri_jax import State, initial_state, macro_step, simulate, systems
 from vmri_jax.schemes.composition import stage_scheme
-from vmri_jax.steppers import solvers
+from vmri_jax.steppers.solver import Solver
 
 DATA = Path(__file__).parent / "data"
 PROBLEMS = {
@@ -38,12 +38,12 @@ def step_matrix(system, scheme, macro_dt):
     return jax.jacfwd(step)(jnp.zeros(4))
 
 
-def without_fallback(system, scheme) -> solvers.Newton:
+def without_fallback(system, scheme) -> Solver:
     """The default iteration; where it is the nested iteration, without the exact solve behind it, which takes long to compile."""
     scheme = stage_scheme(scheme)
     potentials = (system.slow_potential, scheme.slow), (system.fast_potential, scheme.fast)
     local = all(f is None or placed.grid == "micro" or placed.only_ends for f, placed in potentials)
-    return solvers.Nested() if system.has_constant_mass and local else solvers.Auto()
+    return Solver("masses") if system.has_constant_mass and local else Solver()
 
 
 STENCIL = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}

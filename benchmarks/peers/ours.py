@@ -22,7 +22,7 @@ LOOSE = (1e-2, 1e-4, 1e-6)
 """Newton tolerances for moderate errors, where there are constraints; equations are also solved to round-off."""
 LOOSE_HIGH = tuple(tolerances(1e-3, 1e-10))
 """The same for high degrees, whose steps are long: tolerances are relative to the motion."""
-MARCH = vm.solvers.Nested()
+MARCH = vm.Solver("masses")
 """As `vm.simulate` starts a run. What it does not solve fails here, and is not solved again in another way."""
 
 

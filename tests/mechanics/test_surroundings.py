@@ -416,10 +416,10 @@ def test_quantities_that_ensembles_keep_say_what_their_functions_say_now():
 
 
 def test_the_functions_of_control_and_of_solvers_are_watched():
-    custom = vm.solvers.Custom(by_global)
+    custom = vm.Solver(stepper=by_global)
     f = traced_once(by_global)
     optimal = Transcription(
-        problem().system, problem().state(), SCHEME, vm.solvers.Auto(), 0.1, f, f, f, f, f, (np.zeros(1), np.ones(1)), 1
+        problem().system, problem().state(), SCHEME, vm.Solver(), 0.1, f, f, f, f, f, (np.zeros(1), np.ones(1)), 1
     )
     for value in (custom, optimal):
         here.STRENGTH = 1.0

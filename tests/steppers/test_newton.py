@@ -19,10 +19,10 @@ from vmri_jax import (
     simulate,
     simulate_batch,
 )
-from vmri_jax.steppers import solvers
+from vmri_jax.steppers.solver import Solver
 from vmri_jax.steppers.marched import PLAIN_PASSES
 
-EXACT = solvers.Arrowhead()
+EXACT = Solver("exact")
 
 
 def step(problem, scheme, macro_dt, solver=EXACT, state=None):
@@ -40,7 +40,7 @@ def test_a_plain_step_converges(fpu):
 
 
 def test_too_few_iterations_stagnate(fpu):
-    _, info, result = step(fpu, fully_implicit(20), 0.05, solvers.Arrowhead(max_iterations=1))
+    _, info, result = step(fpu, fully_implicit(20), 0.05, Solver("exact", max_iterations=1))
     assert result is Result.STAGNATED
     assert not result.success
     assert int(info.iterations) == 1
@@ -56,7 +56,7 @@ def test_nan_is_reported(fpu):
 
 
 def test_a_tolerance_below_roundoff_ends_at_the_floor(fpu):
-    _, info, result = step(fpu, fully_implicit(20), 0.05, solvers.Arrowhead(tolerance=1e-30))
+    _, info, result = step(fpu, fully_implicit(20), 0.05, Solver("exact", tolerance=1e-30))
     assert result is Result.CONVERGED_AT_ROUNDOFF or result is Result.CONVERGED
     assert int(info.iterations) < 10
     assert float(info.residual) < 1e-13
@@ -79,7 +79,7 @@ def test_iterations_of_a_large_macro_step(fpu):
 def test_a_looser_tolerance_needs_fewer_iterations_and_is_as_accurate_as_asked(fpu):
     scheme = fully_implicit(20)
     exact, info, _ = step(fpu, scheme, 0.5)
-    loose, loose_info, result = step(fpu, scheme, 0.5, solvers.Arrowhead(tolerance=1e-4))
+    loose, loose_info, result = step(fpu, scheme, 0.5, Solver("exact", tolerance=1e-4))
     assert result is Result.CONVERGED
     assert int(loose_info.iterations) < int(info.iterations)
     assert 1e-15 < largest_difference(loose.q_s, exact.q_s) < 1e-4
@@ -95,7 +95,7 @@ def test_a_looser_tolerance_needs_fewer_iterations_and_is_as_accurate_as_asked(f
 )
 def test_bad_options_are_refused(arguments, message):
     with pytest.raises(ValueError, match=message):
-        solvers.Auto(**arguments)
+        Solver(**arguments)
 
 
 @pytest.mark.parametrize(
@@ -108,7 +108,7 @@ def test_bad_options_are_refused(arguments, message):
 )
 def test_options_that_are_no_numbers_are_refused(arguments, message):
     with pytest.raises(TypeError, match=message):
-        solvers.Auto(**arguments)
+        Solver(**arguments)
 
 
 def test_a_solver_that_is_not_there():

@@ -25,7 +25,7 @@ simulate_textbook = jax.jit(partial(textbook.simulate, num_steps=STEPS))
 def agrees(structure: rs.Structure, draw: rs.Draw) -> str:
     """The name of the method that solved the steps, if they end where the textbook's end."""
     problem, scheme = rs.problem(structure, draw), rs.scheme(structure, draw)
-    state, solver = problem.state(), vm.solvers.named(structure.method)()  # pyright: ignore
+    state, solver = problem.state(), named(structure.method)  # pyright: ignore
     run = vm.simulate(
         problem.system, scheme, state, macro_dt=draw.macro_dt, num_steps=STEPS, save_every=EVERY, solver=solver
     )

@@ -17,9 +17,9 @@ from vmri_jax.scene import Scene
 STEPS = 2
 
 
-def _newton(cell: Cell) -> vm.solvers.Newton | None:
+def _newton(cell: Cell) -> vm.Solver | None:
     """Without the fallback, whose derivative takes as long to compile again, where there is one."""
-    return vm.solvers.Nested() if cell.problem.system.has_constant_mass else None
+    return vm.Solver("masses") if cell.problem.system.has_constant_mass else None
 
 
 def gradient(cell: Cell) -> None:

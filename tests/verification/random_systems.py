@@ -166,9 +166,9 @@ def structure(random: Random, tame: bool = False) -> Structure:
     degree = random.choice([1, 2, 3, 4] if tame else [1, 2, 3]) if scheme in HIGH_DEGREE else 1
     functions = list(KINETIC)[: (0 if scheme == "takahashi imada" else 2) if tame else None]
     methods = (
-        ["auto", "arrowhead", "null_space", "dense"]
+        ["auto", "exact", "null_space", "dense"]
         if tame
-        else ["auto"] * 4 + ["nested", "arrowhead", "null_space", "dense"]
+        else ["auto"] * 4 + ["masses", "exact", "null_space", "dense"]
     )
     composable = not tame or (degree == 1 and scheme != "mixed")
     return Structure(
