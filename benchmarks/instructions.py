@@ -47,7 +47,7 @@ class Program:
     problem: Callable[[], vm.Problem]
     scheme: vm.Scheme
     most: int
-    method: str = "auto"
+    matrix: str = "auto"
     is_gradient: bool = False
 
     def compiled(self) -> jax.stages.Compiled:
@@ -57,7 +57,7 @@ class Program:
             "macro_dt": macro_dt,
             "num_steps": STEPS,
             "save_every": STEPS,
-            "solver": named(self.method),
+            "solver": vm.Solver(self.matrix),
         }
         if not self.is_gradient:
             return vm.prepare(problem, self.scheme, **options).compiled()

@@ -105,7 +105,7 @@ class CostPanel:
 
     dense, structured: make the problem that each solver gets; dense_num_micro and dense_t_end are those of the first.
     paper_minimum: the num_micro that was cheapest in the paper, None if it does not say.
-    others: further methods of `vmri_jax.Newton`, on the structured problem.
+    others: further matrices of `vmri_jax.Solver`, on the structured problem.
     minimal: makes the problem in coordinates without constraints, by "exact"; None where it has none to lose.
     """
 

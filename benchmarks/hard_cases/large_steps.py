@@ -6,6 +6,7 @@ from functools import partial
 import numpy as np
 
 import vmri_jax as vm
+from benchmarks.gail2014.dense import dense
 from benchmarks.hard_cases.case import hard_case, iterations
 from vmri_jax.accuracy.companions import positions
 from vmri_jax.diagnostics import step_condition
@@ -14,7 +15,7 @@ from vmri_jax.hard_cases.measures import constraints, difference, energy, run, s
 from vmri_jax.running.timing import interleaved
 
 EXACT = vm.Solver("exact")
-"""The march with exact matrices, which a pass may take over from those before it: it has to converge."""
+"""Exact matrices, which a pass may take over from those before it: they have to converge."""
 DENSE = dense()
 """Newton's iteration as textbooks have it, with the matrix of every iterate: its iterations are counted."""
 
@@ -62,9 +63,7 @@ def large_macro_step(full: bool) -> Outcome:
 PENDULUM = vm.fully_implicit(5)
 
 
-def _pendulum_run(
-    problem: vm.Problem, macro_dt: float, num_steps: int, solver: vm.Solver = EXACT
-) -> vm.Trajectory:
+def _pendulum_run(problem: vm.Problem, macro_dt: float, num_steps: int, solver: vm.Solver = EXACT) -> vm.Trajectory:
     """With 20 saved nodes."""
     return run(problem, PENDULUM, macro_dt, num_steps, save_every=num_steps // 20, solver=solver)
 

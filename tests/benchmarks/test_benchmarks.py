@@ -217,7 +217,7 @@ def check_floor(found):
 
 def check_batch(found):
     sizes = [(row["program"], row["batch"]) for row in found["rows"] if row["program"] != "C"]
-    assert sizes == [("default", 2), ("default", 256), ("fixed", 2), ("fixed", 256)]
+    assert sizes == [("default", 2), ("default", 256)]
     assert all(row["result"] == "CONVERGED" for row in found["rows"] if row["program"] != "C")
 
 

@@ -31,7 +31,7 @@ def test_rows(study):
         ("dense", 1),
         ("dense", 3),
     ]
-    assert {(row.method, row.solved_by) for row in study.rows} == {("auto", "LINEAR"), ("dense", "DENSE")}
+    assert {(row.method, row.solved_by) for row in study.rows} == {("auto", "LINEAR"), ("dense", "EXACT")}
     assert [row.num_unknowns for row in study.rows] == [4, 8, 4, 8]
     assert all(row.result == "CONVERGED" for row in study.rows)
     assert [row.iterations >= 1 for row in study.rows] == [False, False, True, True]
@@ -79,7 +79,7 @@ def test_bad_input(bad):
 
 def cost(costs=(9.0, 3.0, 6.0), solver="dense"):
     rows = [
-        CostRow("FPU", solver, n, 3 * n, 10, 1.0, value, 1.0, 2, solver.upper(), "CONVERGED")
+        CostRow("FPU", solver, n, 3 * n, 10, 1.0, value, 1.0, 2, "EXACT", "CONVERGED")
         for n, value in zip((1, 10, 100), costs, strict=True)
     ]
     return CostStudy(tuple(rows))
@@ -115,5 +115,5 @@ def test_cost_leaves_failed_runs_out():
 
 
 def test_costs_of_runs_that_all_failed_are_drawn():
-    row = CostRow("", "dense", 2, 8, 4, np.nan, np.nan, 1.0, 1, "DENSE", "NON_FINITE")
+    row = CostRow("", "dense", 2, 8, 4, np.nan, np.nan, 1.0, 1, "EXACT", "NON_FINITE")
     assert is_drawn(plot_cost({"failed": CostStudy((row,))}))

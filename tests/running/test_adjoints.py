@@ -132,8 +132,8 @@ def test_memory_of_long_gradients():
 
 
 @pytest.mark.full
-def test_where_the_march_fails_the_arrowhead_is_differentiated():
-    """With steps that the nested iteration does not solve."""
+def test_where_masses_fail_exact_matrices_are_differentiated():
+    """With steps that passes with masses do not solve."""
     problem = PROBLEMS["tsp"]()
     found = {}
     for name in ("stored", "checkpoint"):

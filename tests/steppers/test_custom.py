@@ -73,7 +73,7 @@ def test_compositions_batches_and_gradients(fpu):
 
 
 def by_march(system, scheme):
-    return Marched(vm.Solver("exact"), "exact")
+    return Marched(vm.Solver("exact"))
 
 
 def without_projection(system, scheme):
@@ -119,10 +119,10 @@ def nothing(system, scheme):
 
 
 def test_bad_input(fpu):
-    with pytest.raises(TypeError, match=r"Custom: stepper is 3; give a function"):
+    with pytest.raises(TypeError, match=r"Solver: stepper is 3; give a function"):
         vm.Solver(stepper=3)  # pyright: ignore[reportArgumentType]
     with pytest.raises(
-        TypeError, match=r"the stepper of solvers.Custom is NoneType; give a vmri_jax.steppers.stepper.Stepper"
+        TypeError, match=r"the value of Solver.stepper is NoneType; give a vmri_jax.steppers.stepper.Stepper"
     ):
         vm.simulate(fpu, vm.fully_explicit(1), solver=vm.Solver(stepper=nothing), **STEPS)  # pyright: ignore[reportArgumentType]
     with pytest.raises(

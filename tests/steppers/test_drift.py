@@ -62,9 +62,7 @@ def test_errors_are_within_the_tolerance(name, scheme, request):
 def test_a_composition_solves_the_equations_of_its_stages():
     """What a solver without memory finds, although guesses are handed from stage to stage."""
     system, start = tied_system()
-    (drift, _), (exact, _) = (
-        phases(system, named(method), SUZUKI, start) for method in ("masses", "exact")
-    )
+    (drift, _), (exact, _) = (phases(system, Solver(matrix), SUZUKI, start) for matrix in ("masses", "exact"))
     assert largest_difference(drift, exact) / np.abs(exact).max() < 1e-13  # measured 1.4e-14
 
 
@@ -100,23 +98,11 @@ def test_where_it_fails_the_whole_equations_are_asked(tsp):
     fast = dataclasses.replace(start, p_s=40 * start.p_s, p_f=40 * start.p_f)
     step = {"macro_dt": 0.2, "num_steps": 20, "throw": False}
     march, auto = (
-        simulate(tsp.system, fully_explicit(1), fast, solver=named(method), **step)
-        for method in ("masses", "auto")
+        simulate(tsp.system, fully_explicit(1), fast, solver=Solver(matrix), **step) for matrix in ("masses", "auto")
     )
     assert Result(int(march.result)) is Result.NON_FINITE
     assert Result(int(auto.result)) is Result.STAGNATED
     assert int(auto.info.method[0]) == Method.EXACT
-
-
-@pytest.mark.full  # as with every method, see test_fallback
-def test_fixed_iterations(tsp):
-    free, _ = phases(tsp, Solver())
-    fixed, info = phases(tsp, Solver(fixed_iterations=4))
-    assert np.all(np.asarray(info.iterations) == 4)
-    assert largest_difference(free, fixed) < 1e-11
-    few = Solver(fixed_iterations=1)
-    run = simulate(tsp.system, fully_explicit(1), tsp.state(), macro_dt=0.02, num_steps=20, solver=few, throw=False)
-    assert Result(int(run.result)) is Result.STAGNATED
 
 
 def test_derivatives_by_parameters():

@@ -1,4 +1,4 @@
-"""Which solver takes a step: the words of a plan, the fallback of a nested iteration that does not converge, the programs that are compiled."""
+"""Which solver takes a step: the words of a plan, the fallback of passes that do not converge, the programs that are compiled."""
 
 import os
 
@@ -10,7 +10,7 @@ from jax.extend.core import jaxprs_in_params
 
 import vmri_jax as vm
 from tests.support import largest_difference
-from tests.user_systems import cart, double_pendulum, two_oscillators
+from tests.user_systems import double_pendulum, two_oscillators
 from vmri_jax import (
     Method,
     Result,
@@ -18,6 +18,7 @@ from vmri_jax import (
     explicit_slow,
     fully_explicit,
     fully_implicit,
+    galerkin,
     macro,
     micro,
     plan,
@@ -31,19 +32,24 @@ def drag(t, q_s, q_f, v_s, v_f, params):
     return -0.1 * v_s, -0.2 * v_f * jnp.sum(v_f**2)
 
 
-def test_a_plan_says_how_a_step_is_solved(fpu):
+def test_a_plan_says_how_a_step_is_solved(fpu, tsp):
     """Only kicks by V let slow and fast variables go their own ways, a force couples them; a term inside the macro interval, or a
     kinetic energy that is a function, needs the whole equations."""
     rule = micro(quadrature.midpoint)
     inside = Scheme(4, kinetic=rule, slow=macro(quadrature.gauss(2)), fast=rule)
-    forced, whole = fpu.system.replace(force=drag), "march over the micro intervals with exact matrices"
-    assert str(plan(fpu, fully_implicit(4))).startswith("nested iteration")
-    assert "nested iteration" not in str(plan(fpu, explicit_slow(4)))
-    assert "nested iteration" in str(plan(forced, explicit_slow(4), fpu.state()))
+    forced, whole = fpu.system.replace(force=drag), "exact: micro intervals in order with exact matrices"
+    assert str(plan(fpu, fully_implicit(4))).startswith("masses: passes")
+    assert "masses:" not in str(plan(fpu, explicit_slow(4)))
+    assert "masses:" in str(plan(forced, explicit_slow(4), fpu.state()))
     assert str(plan(fpu, inside)).startswith(whole)
     assert str(plan(double_pendulum(), fully_implicit(3))).startswith(whole)
-    with pytest.raises(ValueError, match=r"solvers\.Nested needs a ConstantMass, and potentials"):
+    with pytest.raises(ValueError, match="the matrix 'masses' needs a ConstantMass, and potentials"):
         plan(fpu, inside, solver=Solver("masses"))
+    with pytest.raises(ValueError, match=r"the matrix 'modes' needs .* here num_micro = 4, degree = 1"):
+        plan(fpu, fully_implicit(4), solver=Solver("modes"))
+    assert plan(fpu, fully_implicit(4)).first.matrix == "masses"
+    assert plan(tsp, galerkin(1, 3)).first.matrix == "modes"
+    assert plan(fpu, inside).first.matrix == "auto"
 
 
 def test_explicit_steps_have_no_iterations(fpu):
@@ -96,32 +102,16 @@ def test_the_fallback_stays_out_of_the_loop_in_a_compiled_function(tsp):
 
 
 def test_a_run_that_fails_late_is_made_again_with_exact_matrices(tsp):
-    """At this step the nested iteration solves eight steps, and not the ninth."""
+    """At this step passes with masses solve eight steps, and not the ninth."""
     step = {"macro_dt": 0.2, "num_steps": 20, "throw": False}
     march, run, exact = (
-        simulate(tsp, fully_implicit(10), solver=named(method, max_iterations=40), **step)
-        for method in ("masses", "auto", "exact")
+        simulate(tsp, fully_implicit(10), solver=Solver(matrix, max_iterations=40), **step)
+        for matrix in ("masses", "auto", "exact")
     )
     assert int(march.failed_at) == 8
     assert run.success
     assert np.all(run.info.method == Method.EXACT)
     assert largest_difference(run.q_f, exact.q_f) == 0.0
-
-
-@pytest.mark.parametrize("method", ["masses", pytest.param("exact", marks=pytest.mark.full)])
-def test_fixed_iterations(method):
-    problem = cart()
-
-    def run(count):
-        solver = named(method, fixed_iterations=count)
-        step = {"macro_dt": 0.01, "num_steps": 20, "solver": solver, "throw": False}
-        return simulate(problem.system, fully_explicit(5), problem.state(), **step)
-
-    free, enough = run(None), run(6)
-    assert enough.success
-    assert np.all(np.asarray(enough.info.iterations) == 6)
-    assert largest_difference(enough.q_f, free.q_f) < 1e-14  # measured 1e-16
-    assert Result(int(run(1).result)) is Result.STAGNATED
 
 
 @pytest.mark.skipif(os.environ.get("VMRI_KERNELS") == "plain", reason="the plain kernels are library calls")

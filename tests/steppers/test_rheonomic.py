@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from benchmarks.gail2014.dense import named
 from vmri_jax import (
     ConstantMass,
     Rheonomic,
@@ -113,16 +114,16 @@ def test_order(name, scheme, steps):
 
 
 @pytest.mark.parametrize(
-    ("name", "scheme", "method"),
+    ("name", "scheme", "matrix"),
     [
         ("pivot on a sprung cart", galerkin(2, 2), "masses"),
         pytest.param("pivot on a sprung cart", galerkin(2, 2), "dense", marks=pytest.mark.full),
         pytest.param("cart that is moved", fully_implicit(3), "masses", marks=pytest.mark.full),
     ],
 )
-def test_all_methods_find_the_same(name, scheme, method):
+def test_all_methods_find_the_same(name, scheme, matrix):
     expected = run(SYSTEMS[name], scheme, 10, solver=Solver("exact"))
-    found = run(SYSTEMS[name], scheme, 10, solver=named(method))
+    found = run(SYSTEMS[name], scheme, 10, solver=named(matrix))
     assert np.abs(found.q_f - expected.q_f).max() < 1e-12
     assert np.abs(found.p_s - expected.p_s).max() < 1e-11
 

@@ -9,7 +9,7 @@ from tests.verification import random_systems as rs
 from vmri_jax import Method
 
 STRUCTURES = {
-    "arrowhead": (
+    "exact": (
         Method.EXACT,
         rs.Structure(1, 2, 2, **SPRINGS, force="drag", scheme="gauss", num_micro=3, degree=3, method="exact"),
     ),

@@ -42,7 +42,7 @@ def final_position(case: str, solver: Solver | None = None):
     """
     problem, scheme, macro_dt, parameter, entry = CASES[case]
     params, n_s = problem.system.params, problem.q_s.size
-    solver = solver or without_fallback(problem.system, scheme)
+    solver = solver or without_fallback(problem, scheme)
 
     def replaced(stiffness):
         if parameter is None:

@@ -5,9 +5,9 @@ import json
 import numpy as np
 import pytest
 
+from benchmarks.gail2014.dense import named
 from tests.support import DATA, PROBLEMS, relative_difference
 from vmri_jax import explicit_slow, fully_explicit, fully_implicit, initial_state, simulate
-from vmri_jax.steppers.solver import Solver
 
 CASES = {case["name"]: case for case in json.loads((DATA / "reference" / "manifest.json").read_text())}
 

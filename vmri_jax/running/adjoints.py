@@ -34,9 +34,10 @@ def traced_run(run: Simulation, adjoint: str) -> Trajectory:
     """All steps of a run, some of whose arrays are tracers; `adjoint` as of `simulate`."""
     if adjoint == "auto":
         adjoint = "stored" if run.num_steps <= LONGEST_STORED_RUN else "checkpoint"
-    first, exact = (_differentiable(engine, adjoint, run.save_every) for engine in (run.engine, run.exact_engine))
+    first = _differentiable(run.engine, adjoint, run.save_every)
     if not run.plan.has_fallback:
         return run.traced(first(run.arrays))
+    exact = _differentiable(run.exact_engine, adjoint, run.save_every)
     return run.traced(solved_again(first, exact, _is_unsolved, run.arrays))
 
 
