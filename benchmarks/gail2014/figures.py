@@ -209,6 +209,6 @@ def _cost_checks(panel: CostPanel, study: CostStudy) -> list[Check]:
     num_micro, cost = study.curve(panel.title, "exact")
     settled = int(np.argmin(np.abs(num_micro - SETTLED)))
     ratio = cost[-1] / cost[settled]
-    quantity = f"{panel.title}, arrowhead: cost at {num_micro[-1]} micro steps over that at {num_micro[settled]}"
+    quantity = f"{panel.title}, exact: cost at {num_micro[-1]} micro steps over that at {num_micro[settled]}"
     checks.append(Check(quantity, f"at most {UPTURN:g}", "theory", f"{ratio:.2f}", bool(ratio <= UPTURN)))
     return checks

@@ -37,7 +37,7 @@ def traced_run(run: Simulation, adjoint: str) -> Trajectory:
     first = _differentiable(run.engine, adjoint, run.save_every)
     if not run.plan.has_fallback:
         return run.traced(first(run.arrays))
-    exact = _differentiable(run.exact_engine, adjoint, run.save_every)
+    exact = _differentiable(run.exact.engine, adjoint, run.save_every)
     return run.traced(solved_again(first, exact, _is_unsolved, run.arrays))
 
 

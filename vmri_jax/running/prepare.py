@@ -51,5 +51,5 @@ def prepare(
     on_device = ("system", "scheme", "solver", "state", "macro_dt")
     run = replace(run, **jax.device_put({name: getattr(run, name) for name in on_device}))
     with Working("prepare: the program of the run"):
-        jax.block_until_ready(run._program(False)(run.arrays, 0, 0))  # no steps: it only compiles
+        jax.block_until_ready(run.engine.whole(run.arrays, 0, 0))  # no steps: it only compiles
     return run

@@ -108,10 +108,10 @@ class Simulation:
         origin = self.origin if params is None else replace(self.origin, params=params)
         arrays, save_every, _ = arguments
         with Working("the run", running=STEPPING):
-            run, table = self._whole(False, arguments)
+            run, table = self.whole(*arguments)
         if self.unsolved(run):
             with Working(FALLING_BACK):
-                run, table = self._whole(True, arguments)
+                run, table = self.exact.whole(*arguments)
         trajectory = with_origin(trajectory_of(run, table), origin)
         if throw and int(trajectory.failed_at) >= 0:
             raise simulation_error(trajectory, arrays.macro_dt, save_every, self.scheme.num_micro)
@@ -120,7 +120,7 @@ class Simulation:
 
     def compiled(self) -> jax.stages.Compiled:
         """The compiled program of the run without its fallback, for inspection."""
-        return self._program(False).lower(*self._arguments(None, None, None, None)).compile()
+        return self.engine.whole.lower(*self._arguments(None, None, None, None)).compile()
 
     def timed(self, state=None, *, macro_dt=None, params=None, num_steps=None) -> Callable[[], None]:
         """A function without arguments that computes the run and waits for its result, to be timed.
@@ -129,7 +129,8 @@ class Simulation:
         """
         arrays, *counts = self._arguments(state, macro_dt, params, num_steps)
         arguments = jax.device_put(arrays), *counts
-        program = self._program(bool(self.unsolved(self._whole(False, arguments)[0])))
+        solves = self.exact if self.unsolved(self.whole(*arguments)[0]) else self
+        program = solves.engine.whole
         program(*arguments)
         return lambda: program(*arguments)[1].block_until_ready()  # the arrays of one program are ready together
 
@@ -198,14 +199,10 @@ class Simulation:
         leaves = self.arrays.model  # the parameters come last, see `Arrays`
         return leaves[: len(leaves) - len(expected)] + [np.asarray(leaf) for leaf in new]
 
-    def _whole(self, falls_back: bool, arguments: tuple) -> tuple[Run, Any]:
-        """The run by one program, as of `observed`."""
-        leaves, table = self._program(falls_back)(*arguments)
-        return failures(Run.of(leaves), np.asarray(table), arguments[1])
-
-    def _program(self, falls_back: bool):
-        """The compiled run, see `Engine.whole`."""
-        return self.engine_for(falls_back, self.num_saves).whole
+    def whole(self, arrays: Arrays, save_every: int, saves: int) -> tuple[Run, Any]:
+        """The run by one program, without the fallback, as of `observed`; arguments of `Engine.whole`."""
+        leaves, table = self.engine.whole(arrays, save_every, saves)
+        return failures(Run.of(leaves), np.asarray(table), save_every)
 
     def __repr__(self) -> str:
         micro = f", of {self.scheme.num_micro} micro steps each" if self.scheme.num_micro > 1 else ""
@@ -247,22 +244,17 @@ class Simulation:
 
     @cached_property
     def engine(self) -> Engine:
-        """Its programs with the first matrix."""
-        return self.engine_for(False, self.num_saves)
+        """Its programs, without the fallback."""
+        return engine(self._model[1], self.num_saves, self.save_micro)
 
     @cached_property
-    def exact_engine(self) -> Engine:
-        """Its programs with the fallback."""
-        return self.engine_for(True, self.num_saves)
-
-    def engine_for(self, is_exact: bool, num_saves: int) -> Engine:
-        """Programs with the first matrix or with the fallback, for a number of saved intervals."""
-        structure = self._exact_structure if is_exact else self._model[1]
-        return engine(structure, num_saves, self.save_micro)
+    def exact(self) -> "Simulation":
+        """The fallback: the same run with exact matrices."""
+        return replace(self, solver=self.solver.exact())
 
     @cached_property
     def _model(self) -> tuple[list, Any]:
-        """Leaves and structure of the `Model` with the first matrix."""
+        """Leaves and structure of the `Model`."""
         return jax.tree.flatten(Model(self.solver, self.scheme, self.system))
 
     @cached_property
@@ -270,11 +262,6 @@ class Simulation:
         """Structure of the system, and the number of its leaves."""
         leaves, structure = jax.tree.flatten(self.system)
         return structure, len(leaves)
-
-    @cached_property
-    def _exact_structure(self) -> Any:
-        """Structure of the `Model` with the fallback."""
-        return jax.tree.structure(Model(self.solver.exact(), self.scheme, self.system))
 
     def check(self, state_name: str = "simulate: the positions of the state", constraints: bool = True) -> None:
         """Refuse a system whose functions return wrong types or shapes, and a state that violates the constraints; equal ones are checked once.
@@ -295,8 +282,12 @@ class Simulation:
         memory = self._piece_engine(fell_back).blank_memory(self.arrays._replace(state=start))
         return Checkpoint(step, State(*start), memory, fell_back, is_first=True)
 
-    def _piece_engine(self, is_exact: bool) -> Engine:
-        return self.engine_for(is_exact, room_of_a_piece(self.state, self.scheme.num_micro, self.save_micro))
+    def _piece_engine(self, fell_back: bool) -> Engine:
+        run, room = (
+            self.exact if fell_back else self,
+            room_of_a_piece(self.state, self.scheme.num_micro, self.save_micro),
+        )
+        return engine(run._model[1], room, self.save_micro)
 
     def advance(self, checkpoint: Checkpoint, saves: int) -> tuple[list[tuple[Run, np.ndarray]], Checkpoint]:
         """The next `saves` saved intervals, in pieces as of `observed`; from the first one that is not solved, with the fallback."""

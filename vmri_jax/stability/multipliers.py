@@ -22,7 +22,7 @@ from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.equations import StepEquations, Unknowns
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.stability.linear import SmallMotions
-from vmri_jax.steppers.march import MarchEquations, Passed, Worst, exact_pass
+from vmri_jax.steppers.march import MarchEquations, exact_pass
 from vmri_jax.steppers.results import Method, Result
 from vmri_jax.steppers.solved import Solution, StepSolver
 from vmri_jax.steppers.solver import Solver
@@ -111,16 +111,16 @@ class AtRest(StepSolver):
 
     def solve(self, equations: StepEquations, guess: Unknowns, memory) -> tuple[Solution, tuple]:
         march = MarchEquations(equations)
-        z, x = march.flat(guess)
 
-        def corrected(_, last: Passed) -> Passed:
-            x = last.x + last.dx
-            return exact_pass(march, last.z + last.dz, x, x[-1], from_last=False)[1]
+        def corrected(_, last):
+            z, x, *_ = last
+            _, now = exact_pass(march, z, x, x[-1], from_last=False)
+            return now.z + now.dz, now.x + now.dx, now.end, now.p_s
 
-        start = Passed(z, x, jnp.zeros_like(z), jnp.zeros_like(x), march.start(), equations.p_s, Worst.none())
-        done = jax.lax.fori_loop(0, self.passes, corrected, start)
-        end = done.end.position, done.p_s, done.end.gradients[: march.n_f] / equations.micro_dt
-        return Solution(march.by_name(done.z, done.x), end, StepStatus.direct(Method.EXACT)), memory
+        start = *march.flat(guess), march.start(), equations.p_s
+        z, x, end, p_s = jax.lax.fori_loop(0, self.passes, corrected, start)
+        end = end.position, p_s, end.gradients[: march.n_f] / equations.micro_dt
+        return Solution(march.by_name(z, x), end, StepStatus.direct(Method.EXACT)), memory
 
     def describe(self) -> list[str]:
         return [f"exact: {self.passes} passes at rest"]
