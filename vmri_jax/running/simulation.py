@@ -23,13 +23,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.configure import warn_if_slow
-from vmri_jax.mechanics.arrays import is_concrete, of_one_type
+from vmri_jax.mechanics.arrays import Known, is_concrete, of_one_type
 from vmri_jax.mechanics.checks import check_params
 from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.state import Movable, State, opened, start_of
 from vmri_jax.mechanics.summary import numbers, summary
 from vmri_jax.mechanics.system import System
-from vmri_jax.running.arguments import Checked, Steps, check_once, check_run, check_vectors, nothing_fast
+from vmri_jax.running.arguments import Steps, check_once, check_run, check_vectors, nothing_fast
 from vmri_jax.running.engine import Arrays, Engine, Model, PieceStart, engine
 from vmri_jax.running.failures import simulation_error
 from vmri_jax.running.fallback import FALLING_BACK, unsolved
@@ -270,11 +270,8 @@ class Simulation:
             state_name: the state in messages.
             constraints: whether to check the constraints at the state.
         """
-        positions = (self.state.t, self.state.q_s, self.state.q_f) if constraints else ()
-        numbers = tuple(np.asarray(number).tobytes() for number in (*self.arrays.model, *positions))
-        key = self._model[1], self.state.q_s.shape, self.state.q_f.shape, numbers
         with Working("checks of the system"):
-            check_once(Checked(key, self.system, self.state, state_name, constraints))
+            check_once(Known((self.system, self.state)), state_name, constraints)
 
     def start(self, state: State | None = None, step: int = 0, fell_back: bool = False) -> Checkpoint:
         """The checkpoint before the first step; or before step number `step` at another state, with blank memory."""
