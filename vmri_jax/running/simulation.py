@@ -280,11 +280,8 @@ class Simulation:
         return Checkpoint(step, State(*start), memory, fell_back, is_first=True)
 
     def _piece_engine(self, fell_back: bool) -> Engine:
-        run, room = (
-            self.exact if fell_back else self,
-            room_of_a_piece(self.state, self.scheme.num_micro, self.save_micro),
-        )
-        return engine(run._model[1], room, self.save_micro)
+        room = room_of_a_piece(self.state, self.scheme.num_micro, self.save_micro)
+        return engine((self.exact if fell_back else self)._model[1], room, self.save_micro)
 
     def advance(self, checkpoint: Checkpoint, saves: int) -> tuple[list[tuple[Run, np.ndarray]], Checkpoint]:
         """The next `saves` saved intervals, in pieces as of `observed`; from the first one that is not solved, with the fallback."""
