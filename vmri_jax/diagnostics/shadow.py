@@ -33,6 +33,7 @@ from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.kicked import kicked
 from vmri_jax.steppers.marched import Marched
 from vmri_jax.steppers.results import Result
+from vmri_jax.steppers.solver import Solver
 
 BLOCKS = 20
 """Parts of a run to whose means the drift is fitted; with more parts neighbouring means are correlated, with fewer the standard error of the
