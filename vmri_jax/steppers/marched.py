@@ -82,9 +82,9 @@ class Marched(StepSolver):
     newton: Solver
     sizes: tuple[int, int, int, int, int] | None = None
 
-    def remembers(self, equations: StepEquations, guess: Unknowns) -> MarchMemory:
+    def init(self, equations: StepEquations, velocity) -> MarchMemory:
         march = self._march(equations)
-        z, x = march.flat(guess)
+        z, x = march.flat(equations.guess(*velocity, jnp.zeros(march.n_g), jnp.zeros(march.n_gs)))
         return MarchMemory(PolynomialPredictor.constant(z), x[0], march.no_matrices(), jnp.asarray(jnp.inf))
 
     def solve(self, equations: StepEquations, guess: Unknowns, memory: MarchMemory) -> tuple[Solution, MarchMemory]:

@@ -47,12 +47,6 @@ class StepSolver(ABC):
             equations: of the first step.
             velocity: (v_s, v_f) at the start of the run.
         """
-        n_g, n_gs = equations.system.num_constraints(equations.q_s, equations.q_f)
-        v_s, v_f = velocity
-        return self.remembers(equations, equations.guess(v_s, v_f, jnp.zeros(n_g), jnp.zeros(n_gs)))
-
-    def remembers(self, equations: StepEquations, guess: Unknowns) -> Any:
-        """The memory from a guess alone: of the first step."""
         return ()
 
     def renew(self, equations: StepEquations, memory) -> Any:
