@@ -55,7 +55,7 @@ def simulate(
     under ``jax.vmap`` over state, params and macro_dt, and under ``jax.grad`` and ``jax.jacfwd``, where save_every and the number of saved
     nodes are part of the structure, too. There a failed step does not raise: the status is in the trajectory. Names work inside of the
     transformed function: ``run.position("load")``. Under ``jax.vmap`` the matrix "auto" computes its fallback for every lane: take
-    `simulate_batch`, or ``solver=vm.Solver("masses")``.
+    `simulate_batch`, or ``solver=vm.plan(system, scheme, state).first``.
 
     A run whose system keeps its energy warns with `LostEnergyWarning` if the energy changes by more than half of the largest kinetic energy, and a run
     across a pole of its coordinates with `SingularCoordinatesWarning`; ``run.concerns()`` has these sentences, also after a run in a transformation.
