@@ -84,7 +84,7 @@ class Marched(StepSolver):
 
     def init(self, equations: StepEquations, velocity) -> MarchMemory:
         march = self._march(equations)
-        z, x = march.flat(equations.guess(*velocity, jnp.zeros(march.n_g), jnp.zeros(march.n_gs)))
+        z, x = march.flat(equations.guess(velocity[0], velocity[1], jnp.zeros(march.n_g), jnp.zeros(march.n_gs)))
         return MarchMemory(PolynomialPredictor.constant(z), x[0], march.no_matrices(), jnp.asarray(jnp.inf))
 
     def solve(self, equations: StepEquations, guess: Unknowns, memory: MarchMemory) -> tuple[Solution, MarchMemory]:
