@@ -188,7 +188,7 @@ class Search:
         """The first trial with a certified error, of 1, 2, 4, ... times the macro steps; the last trial if the search
         runs out of time or steps.
 
-        `falls_back` tells whether the fallback is tried where the first solver fails, see `Simulation`. With an
+        `falls_back` tells whether the fallback is tried where the first matrix fails, see `Simulation`. With an
         accuracy the errors are also from a third companion where it is needed, see `estimated_errors`. Repeated trials
         end after `most_seconds`.
         """

@@ -21,7 +21,7 @@ from vmri_jax.running.settings import Settings
 from vmri_jax.running.simulation import Simulation, simulation
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
-from vmri_jax.steppers.solvers import Newton
+from vmri_jax.steppers.solver import Solver
 
 MANY_STEPS = 100_000
 """Macro steps that short events demand, above which a warning tells of them; a smaller value warns of runs that take
@@ -39,7 +39,7 @@ def with_accuracy(
     system: Movable,
     scheme: Scheme | Composition | None,
     state: State | None,
-    solver: Newton | None,
+    solver: Solver | None,
     accuracy: float,
     *,
     t_end: float,
@@ -84,7 +84,7 @@ def with_accuracy(
 def search_of(
     system: Movable,
     state: State | None,
-    solver: Newton | None,
+    solver: Solver | None,
     t_end: float,
     num_saves: int | None = None,
     of: Callable | None = None,

@@ -10,7 +10,7 @@ from vmri_jax.running.prepare import prepare
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
-from vmri_jax.steppers.solvers import Newton
+from vmri_jax.steppers.solver import Solver
 
 
 class Program:
@@ -36,7 +36,7 @@ class Program:
         scheme: Scheme | Composition,
         t_end: float,
         num_saves: int = 1,
-        solver: Newton | None = None,
+        solver: Solver | None = None,
     ):
         self.problem, self.scheme, self.t_end, self.num_saves = problem, scheme, float(t_end), num_saves
         self.state = problem.state()

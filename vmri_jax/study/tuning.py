@@ -21,7 +21,7 @@ from vmri_jax.mechanics.projection import legendre, project_momentum
 from vmri_jax.mechanics.state import HasProblem, Problem, State, problem_of
 from vmri_jax.running.failures import simulation_error
 from vmri_jax.running.progress import Progress, shows_progress, silent
-from vmri_jax.steppers.solvers import Newton
+from vmri_jax.steppers.solver import Solver
 from vmri_jax.study.table import ResultTable, interruptible
 from vmri_jax.study.work import WorkPrecision, WorkRow, work_row
 
@@ -50,7 +50,7 @@ class Tuning:
         t_end: float,
         menu: Sequence[Family] | None = None,
         num_saves: int | None = None,
-        solver: Newton | None = None,
+        solver: Solver | None = None,
         progress: Progress = silent,
     ):
         self.problem, self.t_end, self.solver = problem, t_end, solver
@@ -195,7 +195,7 @@ def tune(
     *,
     menu: Sequence[Family] | None = None,
     num_saves: int | None = None,
-    solver: Newton | None = None,
+    solver: Solver | None = None,
     verify: bool = True,
     exhaustive: bool = False,
     progress: Any = False,
