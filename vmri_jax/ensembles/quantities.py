@@ -12,6 +12,7 @@ from vmri_jax.mechanics.names import near
 from vmri_jax.mechanics.state import Problem, State
 from vmri_jax.running.export import DIMENSIONS
 from vmri_jax.running.simulation import Simulation
+from vmri_jax.running.store.layout import Kept
 from vmri_jax.running.trajectory import RunInfo, Trajectory
 
 LEVELS = (0.05, 0.5, 0.95)
@@ -20,19 +21,6 @@ LEVELS = (0.05, 0.5, 0.95)
 
 Saved = str | Callable[[Trajectory], Any]
 """An entry of the argument ``save`` of `vmri_jax.ensemble`."""
-
-
-class Kept(NamedTuple):
-    """An array of the store, for one run.
-
-    value: the array.
-    dimensions: names of its axes.
-    description: of its meaning.
-    """
-
-    value: Any
-    dimensions: tuple[str, ...] = ()
-    description: str = ""
 
 
 class Quantity(NamedTuple):
