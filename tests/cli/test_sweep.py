@@ -64,7 +64,8 @@ def test_a_sweep_runs_is_drawn_and_gone_on_with(vmri, tmp_path):
 
 
 def test_names_of_columns_say_which_number_they_set(fpu):
-    problem = replace(fpu, system=fpu.system.with_params({"spring": {"masses": np.ones((2, 2)), "k": np.ones(())}}))
+    params = fpu.system.params | {"spring": {"masses": np.ones((2, 2)), "k": np.ones(())}}
+    problem = replace(fpu, system=fpu.system.with_params(params))
     row = {"spring.k": 2.0, "spring.masses[1,0]": 3.0, "v elongations[1]": 4.0, "q_s[2]": 5.0, "t": 6.0}
     changed = pickle.loads(pickle.dumps(by_name(problem, [*row, "num_micro"])))(problem, row)  # pyright: ignore[reportOptionalCall]
     params = changed.system.params["spring"]

@@ -22,7 +22,7 @@ Place = tuple[int, tuple[int, ...]]
 
 @dataclass(frozen=True)
 class ByName:
-    """The function ``(problem, row) -> problem`` that puts the value of each column in its place; pickle can send it to workers."""
+    """A function ``(problem, row) -> problem`` that puts the value of each column in its place, and that pickle can send."""
 
     places: dict[str, Place]
 

@@ -55,13 +55,14 @@ def lane_function(
 
     Raises:
         ValueError: there are columns, and no function that takes them.
-        TypeError, ValueError: when the function of rows is called, `vary` returns no problem, or changes something else than the values
-            of parameters and of the start.
+        TypeError, ValueError: when the function of rows is called, `vary` returns no problem, or changes something else than
+            the values of parameters and of the start.
     """
     if vary is None and columns:
+        name = columns[0]
         raise ValueError(
-            f"ensemble: the column {columns[0]!r} is neither a step nor a scheme.{near(columns[0], (*STEPS, *SCHEMES))} Give vary=, a function "
-            f"(problem, row) -> problem that puts row[{columns[0]!r}] into the problem of a run."
+            f"ensemble: the column {name!r} is neither a step nor a scheme.{near(name, (*STEPS, *SCHEMES))} Give vary=, a "
+            f"function (problem, row) -> problem that puts row[{name!r}] into the problem of a run."
         )
 
     def lane(row: Row) -> Lanes:

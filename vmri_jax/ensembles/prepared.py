@@ -21,7 +21,7 @@ from vmri_jax.running.store.layout import Kept, rows_per_chunk
 from vmri_jax.running.trajectory import Trajectory
 
 MOST_CHUNKS = 20_000
-"""Largest number of chunks of an ensemble, unless a limit of `rows_per_chunk`, or the next one, needs more. A scheduler hands out some hundreds of tasks a second,
+"""Largest number of chunks of an ensemble, unless limits need more. A scheduler hands out some hundreds of tasks a second,
 and every chunk has its files: a larger number costs more time than the runs."""
 FEWEST_CHUNKS = 64
 """Target for the smallest number of chunks, so that workers share the runs evenly; batches that are computed side by side are not cut for

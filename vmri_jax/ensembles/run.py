@@ -53,15 +53,10 @@ class EnsembleError(RuntimeError):
         lanes = ", ".join(f"{first} to {last - 1}" for first, last in ends)
         ellipsis = f" and {len(self.failures) - 5} more" if len(self.failures) > 5 else ""
         reason = f"{type(error).__name__}: {error}".rstrip(".").splitlines()[-1]
-        all_tried = len(ensemble.done) + len(self.failures) == ensemble.chunks.count
-        remainder = (
-            "All others are"
-            if all_tried
-            else f"No chunk of this call succeeded, so that the remaining ones were not tried; {len(ensemble.done)} chunks of earlier calls are"
-        )
+        count = ensemble.chunks.count
         super().__init__(
-            f"{len(self.failures)} of {ensemble.chunks.count} chunks could not be computed: runs {lanes}{ellipsis}. Chunk {number}: "
-            f"{reason}. {remainder} in {ensemble.path}; with resume=True only the missing chunks are tried again."
+            f"{len(self.failures)} of {count} chunks could not be computed: runs {lanes}{ellipsis}. Chunk {number}: {reason}. "
+            f"{len(ensemble.done)} of {count} chunks are in {ensemble.path}; with resume=True only the missing ones are tried."
         )
 
 
@@ -158,14 +153,14 @@ def ensemble(
             Problems whose functions belong to the running program, or to no module, can only be computed in this process.
         scheme: a `Scheme`, the name of one, or a function that makes a scheme from num_micro, such as `vmri_jax.fully_implicit`.
             A mapping from labels to schemes is an axis "scheme" of the design.
-        design: `Product`, `Table` or `Draws` of `vmri_jax.ensembles`; a mapping is a `Product`. The columns "macro_dt", "micro_dt",
-            "num_steps", "num_micro" and "scheme" choose steps and schemes; `vary` takes all others.
+        design: `Product`, `Table` or `Draws` of `vmri_jax.ensembles`; a mapping is a `Product`. The columns "macro_dt",
+            "micro_dt", "num_steps", "num_micro" and "scheme" choose steps and schemes; `vary` takes all others.
         out: folder of the store, a zarr group; conventionally named .zarr. All workers must see it.
         t_end, num_steps, macro_dt, micro_dt: two of: the time at the end, the number of macro steps, a step size (macro_dt or micro_dt).
         num_micro: number of micro steps, for schemes given by name or by a function.
-        vary: a function ``(problem, row) -> problem`` that makes the problem of a run from the values of its row by column, for example
-            ``lambda problem, row: replace(problem, v_s=row["speed"] * problem.v_s)``, with names of columns of your choice. It may change
-            the values of parameters and of the start, and is traced, so that its operations must be operations of JAX.
+        vary: a function ``(problem, row) -> problem`` that makes the problem of a run from the values of its row by column,
+            ``lambda problem, row: replace(problem, v_s=row["speed"] * problem.v_s)``, for example. It may change the values of
+            parameters and of the start, and is traced, so that its operations must be operations of JAX.
         save: quantities that are kept of each run: names from `vmri_jax.ensembles.QUANTITIES`, or functions of a trajectory, themselves or
             as ``my_file.py:function``. A function returns an array, or a dictionary of arrays.
         num_saves: number of saved nodes of a run after the start, equally spaced, from which the quantities are computed.
@@ -220,15 +215,15 @@ def ensemble(
     attributes = attributes_of(work, design, run, chunks)
     if resume and path.exists():
         stored = layout.read_attributes(path, "ensemble")
-        check_same(path, attributes, stored, chunk, len(layout.committed(path)) == chunks.count)
         # On another machine the default division may differ; files in the store have the old one.
         chunks = chunks._replace(size=stored["chunk"], width=stored["width"])
+        check_same(path, attributes, stored, chunk, len(layout.committed(path)) == chunks.count)
     table = design if isinstance(design, Table) else None
     with ExitStack() as opened:
         tasks = opened.enter_context(executor_of("ensemble", executor, processes))
         submit = submitter("ensemble", tasks, ChunkTask(path.resolve(), chunks, work))
-        columns = {} if table is None else table.rows(0, len(table))
-        opened.enter_context(layout.writing(path, attributes, arrays, overwrite, dimension=LANE, columns=columns))
+        columns = None if table is None else table.rows(0, len(table))
+        opened.enter_context(layout.writing(path, attributes, arrays, overwrite, dimension=LANE, table=columns))
         tell = opened.enter_context(progress_to("ensemble", progress))
         interrupted = opened.enter_context(interrupts_noted())
         done = {number: int.from_bytes(layout.note(path, number), "little") for number in layout.committed(path)}
@@ -242,7 +237,7 @@ def ensemble(
 
 @dataclass(frozen=True)
 class ChunkTask:
-    """The computation of a chunk of runs: it writes the results to the store, commits them, and returns how many of the runs failed.
+    """The computation of a chunk: it writes the results to the store, commits them, and returns how many of the runs failed.
 
     path: folder of the store.
     chunks: the division of the runs.
@@ -294,8 +289,8 @@ def _compute(runs: Ensemble, submit: Callable[[int], Future], tell: Progress, in
         raise Interrupted(runs, len(runs.done), runs.chunks.count, "chunks", again) from None
     except (BrokenExecutor, CancelledError) as gone:
         raise RuntimeError(
-            f"ensemble: the workers, or their scheduler, are gone. {len(layout.committed(runs.path))} of {runs.chunks.count} chunks are in "
-            f"{runs.path}; go on with resume=True."
+            f"ensemble: the workers, or their scheduler, are gone. {len(layout.committed(runs.path))} of {runs.chunks.count} "
+            f"chunks are in {runs.path}; go on with resume=True."
         ) from gone
 
 

@@ -57,13 +57,14 @@ def executor_of(caller: str, executor: Any, processes: int | None = None) -> Ite
 
 
 def _check_worker(caller: str, tasks: Executor) -> None:
-    """Refuse workers without this package. One of them is asked by a function of Python's library, since Dask never ends a task whose
-    function its workers cannot import."""
+    """Refuse workers without this package; asked by a function of Python's library, since a worker of Dask that cannot import
+    the function of a task ends, and the task never does."""
     try:
         tasks.submit(version, "vmri_jax").result()
     except PackageNotFoundError as error:
         raise NotAWorker(
-            f"{caller}: a worker does not have vmri_jax. Install it in the environment of the workers, the version of this process."
+            f"{caller}: a worker does not have vmri_jax. Install it in the environment of the workers, the version of this "
+            "process."
         ) from error
 
 

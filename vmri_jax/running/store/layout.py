@@ -1,16 +1,15 @@
-"""Layout of a store on disk, and the order in which its files are written; runs of `stream` and ensembles have the same.
+"""Layout of a store on disk, and the order in which its files are written, for long runs and for ensembles.
 
 A store is a folder, a zarr group of format 3 that any zarr library reads, and `xarray.open_zarr` as a dataset:
 
-    t, q_s, energy, ...  one array for each quantity, with a row for each saved node of a run, or for each run of an ensemble; one file per
-                         chunk of rows
-    resume/chunks        one file for each committed chunk, called by its number: a note, some bytes of the writer; and table.npz, the columns
-                         of a design that is a table
-    attributes           format, kind, numbers of rows and of rows in a chunk, identity, names, versions and machine
+    t, q_s, energy, ...  one array for each quantity, a row for each saved node or each run, one file per chunk of rows
+    resume/chunks/0, ... a note for each committed chunk: some bytes of the writer
+    resume/chunks/table.npz  columns of a design that is a table
+    attributes           format, kind, rows, rows of a chunk, identity, names, versions and machine
 
-The note commits a chunk: it is written as a whole after all other files of the chunk are on disk. Readers leave out chunks without a note,
-and whoever resumes writes them again. Any number of processes can write chunks of a store at once, and be killed at any moment. A new store is
-made beside its place and moved there when it is complete, so that a kill leaves a valid store or none.
+The note commits a chunk: it is written as a whole after all other files of the chunk are on disk. Readers leave out chunks
+without a note, and whoever resumes writes them again. Any number of processes can write chunks at once, and be killed at
+any moment. A new store is made beside its place and moved there when it is complete: a kill leaves a valid store or none.
 
 zarr takes seconds to import: the functions that need it import it themselves.
 """
@@ -44,9 +43,9 @@ FLAGS = {
 }
 """Attributes of an array "result", by the conventions of CF: the numbers and the names of all statuses."""
 CHUNK_SECONDS = 1.0
-"""Target seconds of computation of a chunk. A larger one loses more work at a kill; with a smaller one runs wait for files."""
+"""Target seconds of computation of a chunk. A larger one loses more at a kill; with a smaller one runs wait for files."""
 MOST_CHUNK_BYTES = 2**26
-"""Largest size of a chunk, which is held in memory as a whole, in bytes: 64 MiB. A larger one needs more memory in every worker."""
+"""Largest size of a chunk, which is in memory as a whole, in bytes: 64 MiB. A larger one needs more memory per worker."""
 
 
 class Kept(NamedTuple):
@@ -73,14 +72,15 @@ def rows_per_chunk(rows: int, seconds: float, size: int, most_chunks: int) -> fl
 
 
 def check_place(caller: str, path: Path, kind: str, resume: bool, overwrite: bool) -> None:
-    """Refuse a place where no store of a kind, "run" or "ensemble", can be made, or where one is that shall neither go on nor be replaced."""
+    """Refuse a place where no store of a kind can be made, or where one is that shall neither go on nor be replaced."""
     if is_new(caller, path, resume, overwrite):
         return
     stored = read_attributes(path, kind)
     if not (resume or overwrite):
+        count = -(-stored["rows"] // stored["chunk"])
         raise FileExistsError(
-            f"{path} is a stored {kind}, {len(committed(path))} of {-(-stored['rows'] // stored['chunk'])} chunks done. Go on with it "
-            "(resume=True), replace it (overwrite=True), or give another name."
+            f"{path} is a stored {kind}, {len(committed(path))} of {count} chunks done. Go on with it (resume=True), replace it "
+            "(overwrite=True), or give another name."
         )
 
 
@@ -88,7 +88,7 @@ def check_place(caller: str, path: Path, kind: str, resume: bool, overwrite: boo
 def writing(
     path: Path, attributes: Mapping[str, Any], arrays: Mapping[str, Kept], overwrite: bool, **design
 ) -> Iterator[None]:
-    """Context in which this process alone may write to the store at a path; the store is made if there is none, or one to overwrite.
+    """Context in which this process alone may write to a store, which is made if there is none, or one to overwrite.
 
     Args:
         attributes: of a new store, among them "kind", "rows" and "chunk".
@@ -105,36 +105,31 @@ def writing(
 
 def _create(path: Path, attributes, arrays, dimension: str = "t", table=None) -> None:
     import zarr
+    from zarr.codecs import Crc32cCodec
 
     rows, chunk = attributes["rows"], attributes["chunk"]
     with locked(path) if path.exists() else nullcontext(), made_beside(path) as partial:
         group = zarr.create_group(partial, attributes={"format": FORMAT, **attributes})
         for name, (value, axes, description) in arrays.items():
             words = ({"description": description} if description else {}) | (FLAGS if name == "result" else {})
-            _array(group, name, (rows, *value.shape), value.dtype, chunk, (dimension, *axes), words)
+            group.create_array(
+                name,
+                shape=(rows, *value.shape),
+                chunks=(chunk, *(max(n, 1) for n in value.shape)),
+                dtype=value.dtype,
+                fill_value=FILL.get(value.dtype.kind, 0),
+                compressors=Crc32cCodec(),
+                dimension_names=(dimension, *axes),
+                config=CONFIG,
+                chunk_key_encoding=KEYS,
+                attributes=words,
+            )
         # An empty array, since zarr libraries warn of folders that are neither arrays nor groups.
         group.require_group(NOTES.parent.name).create_array(NOTES.name, shape=(), dtype="uint8")
         if table:
             np.savez(partial / TABLE, **table)
         _consolidate(partial)
         _synchronize([file for file in partial.rglob("*") if file.is_file()])
-
-
-def _array(group, name: str, shape: tuple[int, ...], dtype, chunk: int, dimensions: tuple[str, ...], words: dict):
-    from zarr.codecs import Crc32cCodec
-
-    return group.create_array(
-        name,
-        shape=shape,
-        chunks=(chunk, *(max(n, 1) for n in shape[1:])),
-        dtype=dtype,
-        fill_value=FILL.get(np.dtype(dtype).kind, 0),
-        compressors=Crc32cCodec(),
-        dimension_names=dimensions,
-        config=CONFIG,
-        chunk_key_encoding=KEYS,
-        attributes=words,
-    )
 
 
 class Writer:
@@ -162,9 +157,7 @@ class Writer:
             array = self._arrays[name]
             array[first : last + 1] = value
             files += [chunk_file(self._path / name, array.ndim, number) for number in numbers]
-        _synchronize(
-            files
-        )  # after all writes: while the system writes the first file, it writes most of the others, too
+        _synchronize(files)  # after all writes: while the system writes the first file, it writes most of the others
         for number in numbers:
             commit(self._path, number, note)
 
@@ -209,8 +202,8 @@ def read_attributes(path: Path, kind: str) -> dict[str, Any]:
     if known != FORMAT:
         version = attributes.get("made_with", {}).get("vmri_jax", "of another format")
         raise ValueError(
-            f"{path} has the format {known!r}, and this version of vmri_jax reads {FORMAT!r}; read it with the version that wrote it, "
-            f"vmri_jax {version}, or compute it again."
+            f"{path} has the format {known!r}, and this version of vmri_jax reads {FORMAT!r}; read it with the version that "
+            f"wrote it, vmri_jax {version}, or compute it again."
         )
     if attributes["kind"] != kind:
         raise ValueError(f"{path} is not a stored {kind} but a stored {attributes['kind']}.")
@@ -219,7 +212,7 @@ def read_attributes(path: Path, kind: str) -> dict[str, Any]:
 
 @contextmanager
 def locked(path: Path) -> Iterator[None]:
-    """Context in which no other process writes to this store; the operating system releases the lock even if this process is killed."""
+    """Context in which no other process writes to this store; the system releases the lock even if this process is killed."""
     try:
         import fcntl
     except ImportError:  # Windows has no such locks

@@ -57,7 +57,7 @@ class Record(NamedTuple):
         return out.getvalue()
 
     def checkpoint(self, like: Checkpoint) -> Checkpoint:
-        """The checkpoint, with the structure of `like`, the blank one of the run; a ValueError if the arrays do not fit it."""
+        """The checkpoint, in the structure of `like`, the blank one of the run; a ValueError if the arrays do not fit."""
         if not self.leaves:
             return like
         expected, structure = jax.tree.flatten((like.state, like.memory))

@@ -47,7 +47,8 @@ class StoredTrajectory(Exports):
         self.path = Path(path)
         if self.path.is_file():
             raise ValueError(
-                f"{path} is not a stored run but a file; a run written by Trajectory.save is read by Trajectory.load({str(path)!r})."
+                f"{path} is not a stored run but a file; a run written by Trajectory.save is read by "
+                f"Trajectory.load({str(path)!r})."
             )
         self.attributes: dict[str, Any] = read_attributes(self.path, "run")
         self.num_steps: int = self.attributes["num_steps"]

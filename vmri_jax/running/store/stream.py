@@ -29,7 +29,7 @@ from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.solvers import Newton
 
 CHUNKS_PER_RUN = 100
-"""Most chunks of a run on disk, unless they are limited by their size. With more chunks a kill loses less of the run, and the store has more files."""
+"""Most chunks of a run, unless their size is limited. With more chunks a kill loses less, and the store has more files."""
 MICRO_STEP_SECONDS = 1e-6
 """Rough seconds of a micro step, which only choose the size of chunks: a larger value makes smaller ones."""
 
