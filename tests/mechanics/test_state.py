@@ -12,6 +12,7 @@ from tests.user_systems import arms_kinetic, bent_system, double_pendulum
 from vmri_jax import ConstantMass, Problem, Rheonomic, State, System, fully_implicit, initial_state, simulate
 from vmri_jax.diagnostics import constraint_residual, velocity
 from vmri_jax.mechanics.projection import legendre, project_momentum
+from vmri_jax.systems import triple_spherical_pendulum
 
 
 def test_momenta_are_mass_times_velocity(fpu):
@@ -263,3 +264,13 @@ def test_the_state_of_a_problem(fpu):
     assert not np.any(resting.p_s)
     with pytest.raises(TypeError, match="a System has no start; give q_s and q_f, or a Problem"):
         initial_state(fpu.system)
+
+
+def test_an_equal_start_is_made_once(monkeypatch):
+    """Its checks take longer than a short run; another number makes another start."""
+    problem, equal = triple_spherical_pendulum(), triple_spherical_pendulum()
+    state = problem.state()
+    monkeypatch.setattr("vmri_jax.mechanics.state._consistent", None)
+    assert equal.state() == state
+    with pytest.raises(TypeError, match="not callable"):
+        replace(problem, v_s=2 * np.asarray(problem.v_s)).state()

@@ -1,5 +1,6 @@
-"""Long chains: constraints that share no coordinates leave zeros, and a band takes the same steps as the full matrix."""
+"""Long chains: constraints that share no coordinates leave zeros, as do springs; a band takes the same steps as the full matrix."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ import vmri_jax as vm
 from vmri_jax.kernels.band import Band, Full
 from vmri_jax.mechanics import constraint_pattern
 from vmri_jax.running.engine import engine
+from vmri_jax.steppers import interval
 
 LINKS = 16
 
@@ -55,3 +57,52 @@ def test_a_dense_mass_leaves_no_zeros():
     mass = np.eye(400) + 0.001
     system = problem.system.replace(kinetic=vm.ConstantMass(np.zeros(0), mass))
     assert isinstance(constraint_pattern.all_rows(system, problem.q_s, problem.q_f), Full)
+
+
+def linear_springs(q_f, params):
+    """A ring: each mass is tied to its neighbours, the last one to the first; one pair across the ring by a very weak spring."""
+    return 50.0 * jnp.sum((q_f - jnp.roll(q_f, 1)) ** 2) + 1e-9 * (q_f[0] - q_f[3]) ** 2
+
+
+def springs(q_f, params):
+    return linear_springs(q_f, params) + jnp.sum((q_f - jnp.roll(q_f, 1)) ** 4)
+
+
+def ring(n: int, potential=springs) -> vm.Problem:
+    system = vm.System(vm.ConstantMass([], np.ones(n)), fast_potential=potential)
+    return vm.Problem(system, [], np.zeros(n), [], np.random.default_rng(0).normal(size=n))
+
+
+@pytest.mark.parametrize(("scheme", "steps"), [(vm.fully_implicit(1), 40), (vm.galerkin(2, 2), 10)])
+def test_springs_are_a_band(scheme, steps, monkeypatch):
+    runs = []
+    for few in (36, 35):
+        monkeypatch.setattr(interval, "MOST_ROWS_OF_FULL_MATRIX", few)
+        engine.cache_clear()
+        runs.append(vm.prepare(ring(36), scheme, macro_dt=0.05, num_steps=steps)())
+    full, band = (np.asarray(run.q_f) for run in runs)
+    assert 0 < np.abs(full - band).max() < 1e-12  # other programs differ by round-off
+
+
+def test_linear_equations_of_a_band_are_exact(monkeypatch):
+    """The weak spring counts, too: a matrix without it would be wrong by 1e-11 a step."""
+    monkeypatch.setattr(interval, "MOST_ROWS_OF_FULL_MATRIX", 0)
+    problem = ring(36, linear_springs)
+    run = vm.simulate(problem, vm.fully_implicit(1), macro_dt=0.05, num_steps=200)
+    assert run.info.method.max() == vm.Method.LINEAR
+    matrix = np.asarray(jax.hessian(linear_springs)(problem.q_f, None))
+    left, right = np.eye(36) + 0.05**2 / 4 * matrix, np.eye(36) - 0.05**2 / 4 * matrix
+    q = [problem.q_f, np.asarray(run.q_f[1])]
+    for _ in range(199):  # (1 + h^2 K / 4) (q_2 + q_0) = 2 (1 - h^2 K / 4) q_1, the midpoint rule
+        q.append(np.linalg.solve(left, 2 * right @ q[-1]) - q[-2])
+    assert np.abs(q - np.asarray(run.q_f)).max() < 1e-12
+
+
+def test_memory_of_long_chains():
+    """In proportion to the number of springs: a full matrix of a thousand coordinates alone has 8 MB."""
+    run = vm.prepare(ring(1000), vm.fully_implicit(1), macro_dt=0.01, num_steps=4, save_every=4)
+    memory = run.compiled().memory_analysis()
+    assert memory is not None
+    assert memory.temp_size_in_bytes < 1e6
+    energy = run().energy
+    assert abs(energy[-1] / energy[0] - 1) < 1e-4

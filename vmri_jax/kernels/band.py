@@ -1,6 +1,7 @@
-"""Inverses of ``G M^-1 G^T`` as a full or as a band matrix: for a chain of n bodies a band takes O(n) operations, a full matrix O(n^3).
+"""Inverses of ``G M^-1 G^T``, and of the matrix K of a micro interval, as a full or as a band matrix: for a chain of n bodies a band takes
+O(n) operations, a full matrix O(n^3).
 
-Two rows of G without a common body have a zero entry in the product. The order of Cuthill and McKee brings the other entries close to
+Two rows of G without a common body have a zero entry in the product, and so have two coordinates without a common spring in K. The order of Cuthill and McKee brings the other entries close to
 the diagonal, so that the matrix is block tridiagonal. Columns without a common row are computed together, as one product with the sum of
 their unit vectors, a seed (Curtis, Powell, Reid, J. Inst. Math. Appl. 13, 1974).
 
@@ -44,9 +45,9 @@ class Full:
         """(n, n) unit vectors: products of the matrix with them are its columns."""
         return jnp.eye(self.size)
 
-    def inverse(self, products) -> FullInverse:
-        """The inverse of a matrix, from its products (n, n) with the seeds, one product in each row."""
-        return FullInverse(kernels.inverse(regularized(products)).T)
+    def inverse(self, products, may_depend: bool = True) -> FullInverse:
+        """The inverse of a matrix, from its products (n, n) with the seeds, one product in each row; as of `Band.inverse`."""
+        return FullInverse(kernels.inverse(regularized(products) if may_depend else products).T)
 
     def solve(self, products, g):
         """The x (n,) with ``A x = g``, for the matrix A with these products."""
@@ -116,8 +117,11 @@ class Band:
         seeds[color, np.array(self.order)] = 1.0
         return jnp.asarray(seeds)
 
-    def inverse(self, products) -> BandInverse:
-        """The inverse of a matrix, from its products (3 b, n) with the seeds, one product in each row."""
+    def inverse(self, products, may_depend: bool = True) -> BandInverse:
+        """The inverse of a matrix, from its products (3 b, n) with the seeds, one product in each row.
+
+        The matrix is `regularized` if its rows may depend on each other, as constraints may.
+        """
         b, blocks, places = self.width, self._blocks, self._places
         rows = jnp.pad(products, [(0, 0), (0, 1)])[:, places]
         block = np.arange(blocks)
@@ -125,7 +129,7 @@ class Band:
         entries = jnp.transpose(rows.reshape(3, b, blocks, b), (2, 0, 3, 1))
         lower, diagonal, upper = (entries[block, (block + shift) % 3] for shift in (-1, 0, 1))
         is_free = (places == len(self.order)).reshape(blocks, b)  # places without a row get a unit diagonal
-        diagonal = regularized(diagonal) + is_free[:, :, None] * np.eye(b)
+        diagonal = (regularized(diagonal) if may_depend else diagonal) + is_free[:, :, None] * np.eye(b)
 
         def eliminate(before, row):
             inverse_before, upper_before = before

@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any, Protocol
 
 import equinox as eqx
@@ -12,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from vmri_jax.mechanics import by_name
-from vmri_jax.mechanics.arrays import Number, Numbers, is_concrete, of_one_type, quickly_compiled, require_x64
+from vmri_jax.mechanics.arrays import Known, Number, Numbers, is_concrete, of_one_type, quickly_compiled, require_x64
 from vmri_jax.mechanics.checks import check_arrays, check_flags, check_number, check_params, check_system, check_type
 from vmri_jax.mechanics.constraints import START, check_constraints, check_mass, project_positions
 from vmri_jax.mechanics.functions import with_time
@@ -116,27 +117,46 @@ def initial_state(
     check_number("tolerance", tolerance)
     v_s, v_f = (np.zeros(np.shape(q)) if v is None else v for q, v in ((q_s, v_s), (q_f, v_f)))
     q_s, q_f, v_s, v_f = check_arrays(q_s=q_s, q_f=q_f, v_s=v_s, v_f=v_f)
-    if is_concrete((system, q_s, q_f)) and not system.has_constant_mass:
-        check_system(system, q_s, q_f)
-        check_mass(system, q_s, q_f)
+    arguments = system, t, q_s, q_f, v_s, v_f
+    if not is_concrete(arguments):
+        if is_concrete((system, q_s, q_f)) and not system.has_constant_mass:
+            check_system(system, q_s, q_f)
+            check_mass(system, q_s, q_f)
+        return _start(arguments, project)[0]
+    state, violation = _checked_start(Known(arguments), project, tolerance)
+    at_rest = not (np.any(v_s) or np.any(v_f))
+    tell_of_velocities("initial_state", violation, project, at_rest=at_rest)
+    return state
+
+
+def _start(arguments, project: bool):
+    """`_consistent` of these arguments, with projected positions if `project`."""
+    system, t, q_s, q_f, *velocities = arguments
     if project:
         q_s, q_f = _projected_positions(system, t, q_s, q_f)
-    state, violation = _consistent(system, t, q_s, q_f, v_s, v_f)
-    if is_concrete((system, state)):
-        advice = (
-            "projection did not reach the constraints; start closer to them."
-            if project
-            else "correct the positions, or pass project=True to move them onto the constraints."
+    return _consistent(system, t, q_s, q_f, *velocities)
+
+
+@lru_cache(maxsize=256)
+def _checked_start(known: Known, project: bool, tolerance: float) -> tuple[State, float]:
+    """`_start` after all checks, which take longer than a short run: equal starts are made once."""
+    system, _, q_s, q_f, *_ = known.tree
+    if not system.has_constant_mass:  # before the projection, which divides by the masses
+        check_system(system, q_s, q_f)
+        check_mass(system, q_s, q_f)
+    state, violation = _start(known.tree, project)
+    advice = (
+        "projection did not reach the constraints; start closer to them."
+        if project
+        else "correct the positions, or pass project=True to move them onto the constraints."
+    )
+    check_constraints(system, state, "initial_state: the initial positions", tolerance, advice)
+    if not all(np.isfinite(p).all() for p in (state.p_s, state.p_f)):
+        raise ValueError(
+            "initial_state: the momenta are not finite. The mass matrix d2T/dv2 or the constraint Jacobian is "
+            "singular at the initial positions, or a function returned NaN there."
         )
-        check_constraints(system, state, "initial_state: the initial positions", tolerance, advice)
-        if not all(np.isfinite(p).all() for p in (state.p_s, state.p_f)):
-            raise ValueError(
-                "initial_state: the momenta are not finite. The mass matrix d2T/dv2 or the constraint Jacobian is "
-                "singular at the initial positions, or a function returned NaN there."
-            )
-        at_rest = not (np.any(v_s) or np.any(v_f))
-        tell_of_velocities("initial_state", float(violation), project, at_rest=at_rest)
-    return state
+    return state, float(violation)
 
 
 def tell_of_velocities(

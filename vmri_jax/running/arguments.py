@@ -1,16 +1,15 @@
 """Checks of the arguments of runs; a message names the argument, its value, the value expected, and what to change."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
-from vmri_jax.mechanics.arrays import is_concrete, real_array, require_x64, whole_number
+from vmri_jax.mechanics.arrays import Known, is_concrete, real_array, require_x64, whole_number
 from vmri_jax.mechanics.checks import check_arrays, check_flags, check_number, check_params, check_system
 from vmri_jax.mechanics.constraints import check_constraints, check_mass
 from vmri_jax.mechanics.state import State
-from vmri_jax.mechanics.system import System
 from vmri_jax.schemes.composition import Composition, stage_scheme
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.solvers import Newton
@@ -123,21 +122,11 @@ def check_vectors(state: State) -> None:
         check_arrays(**vectors)
 
 
-@dataclass(frozen=True)
-class Checked:
-    """A system and a state to be checked, equal to every other one of the same `key`: structure and numbers of the model, time and positions."""
-
-    key: tuple
-    system: System = field(compare=False)
-    state: State = field(compare=False)
-    state_name: str = field(compare=False)
-    constraints: bool
-
-
 @lru_cache(maxsize=256)
-def check_once(checked: Checked) -> None:
-    """Check a system at a state. The check takes longer than a short run; the cache skips it for an equal `key`."""
-    check_system(checked.system, checked.state.q_s, checked.state.q_f)
-    check_mass(checked.system, checked.state.q_s, checked.state.q_f)
-    if checked.constraints:
-        check_constraints(checked.system, checked.state, checked.state_name)
+def check_once(known: Known, state_name: str, constraints: bool) -> None:
+    """Check a system, the tree of `known` with a state, at this state. The check takes longer than a short run: equal ones are checked once."""
+    system, state = known.tree
+    check_system(system, state.q_s, state.q_f)
+    check_mass(system, state.q_s, state.q_f)
+    if constraints:
+        check_constraints(system, state, state_name)

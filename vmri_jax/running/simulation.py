@@ -23,13 +23,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.configure import warn_if_slow
-from vmri_jax.mechanics.arrays import is_concrete, of_one_type
+from vmri_jax.mechanics.arrays import Known, is_concrete, of_one_type
 from vmri_jax.mechanics.checks import check_params
 from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.state import Movable, State, opened, start_of
 from vmri_jax.mechanics.summary import numbers, summary
 from vmri_jax.mechanics.system import System
-from vmri_jax.running.arguments import Checked, Steps, check_once, check_run, check_vectors, nothing_fast
+from vmri_jax.running.arguments import Steps, check_once, check_run, check_vectors, nothing_fast
 from vmri_jax.running.engine import Arrays, Engine, Model, PieceStart, engine
 from vmri_jax.running.failures import simulation_error
 from vmri_jax.running.interrupts import Interrupted, interrupts_noted
@@ -208,7 +208,7 @@ class Simulation:
 
     def _program(self, falls_back: bool):
         """The compiled run, see `Engine.whole`."""
-        return self.engine_for(falls_back, self.num_saves).whole
+        return (self.exact_engine if falls_back else self.engine).whole
 
     def __repr__(self) -> str:
         micro = f", of {self.scheme.num_micro} micro steps each" if self.scheme.num_micro > 1 else ""
@@ -286,11 +286,8 @@ class Simulation:
             state_name: the state in messages.
             constraints: whether to check the constraints at the state.
         """
-        positions = (self.state.t, self.state.q_s, self.state.q_f) if constraints else ()
-        numbers = tuple(np.asarray(number).tobytes() for number in (*self.arrays.model, *positions))
-        key = self._model[1], self.state.q_s.shape, self.state.q_f.shape, numbers
         with Working("checks of the system"):
-            check_once(Checked(key, self.system, self.state, state_name, constraints))
+            check_once(Known((self.system, self.state)), state_name, constraints)
 
     def start(self, state: State | None = None, step: int = 0, fell_back: bool = False) -> Checkpoint:
         """The checkpoint before the first step; or before step number `step` at another state, with blank memory."""

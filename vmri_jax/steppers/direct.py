@@ -44,13 +44,18 @@ class Linear(Stepper):
     def advance(self, state: State, memory: Matrix, macro_dt) -> tuple[State, StepInfo, Matrix]:
         equations = StepEquations.of(self.system, self.scheme, state, macro_dt)
         h, zero = macro_dt, jnp.zeros((self.scheme.degree, state.q_f.size))
-        path = equations.path_of(jnp.zeros((self.scheme.degree, 0)), zero[None])
-        d = jax.grad(equations.without_kinetic)(path, path)
+
+        def gradient(increments):
+            path = equations.path_of(jnp.zeros((self.scheme.degree, 0)), increments[None])
+            return jax.grad(equations.without_kinetic)(path, path)
+
         # r(0): h p_f + h D_{F_0} L and h D_{F_j} L, 0 < j < r
+        d, change = jax.linearize(gradient, zero)
         rows = jnp.concatenate([d.fast_start - d.fast[0].sum(0) + h * state.p_f, d.fast[0, :-1]])
         increments = -memory.solve(rows)
 
-        p_f = (d.fast[0, -1] + memory.outgoing(increments)) / h
+        # h p_f + h D_{F_0} L + ... + h D_{F_r} L: the impulses of the potentials over the step
+        p_f = state.p_f + (d.fast_start + change(increments).fast_start)[0] / h
         q_f = state.q_f + increments[-1]
         none = jnp.zeros((1, self.scheme.degree, 0)), jnp.zeros((self.scheme.degree, 0))
         info = StepInfo(*StepStatus.direct(Method.LINEAR), q_f[None], *none)

@@ -10,23 +10,25 @@ k_ij has the nodes c_n and weights w_n of T. The terms with U'' are summed over 
 intervals. U'' and the derivatives of the forces F, both in fast variables, are evaluated on the straight path over the first micro interval of a macro step. A
 `DiagonalMatrix` takes only potentials of q_f alone, and no forces.
 
-For r = 1, without forces and with W at the midpoint, ``K = -(M_f + h^2 W'' / 4)``: negative definite where the mass dominates. The row i = r
-is the derivative of the momentum at the end of the interval.
+For r = 1, without forces and with W at the midpoint, ``K = -(M_f + h^2 W'' / 4)``: negative definite where the mass dominates. The entries of K
+that couple coordinates of a long chain lie in a band, which O(n_f) operations eliminate.
 """
 
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from vmri_jax.kernels import DIAGONAL_MATRICES, inverse, matvec, solve
-from vmri_jax.kernels.band import Full, Sparsity
+from vmri_jax.kernels import DIAGONAL_MATRICES, LARGEST_RENEWED, inverse, solve
+from vmri_jax.kernels.band import Band, BandInverse, Full, FullInverse, Sparsity, sparsity
 from vmri_jax.kernels.saddle import regularized
-from vmri_jax.mechanics.constraint_pattern import fast_rows
+from vmri_jax.mechanics.arrays import is_concrete
+from vmri_jax.mechanics.constraint_pattern import MOST_ROWS_OF_FULL_MATRIX, fast_rows
 from vmri_jax.mechanics.masses import ConstantMass, Diagonal
 from vmri_jax.mechanics.structure import has_constant_hessian, has_diagonal_hessian, is_linear
 from vmri_jax.mechanics.system import System, label
@@ -39,6 +41,8 @@ from vmri_jax.schemes.scheme import Scheme
 SMALL = 16
 """Most fast variables for which an interval of high degree is solved with one full matrix. For more variables, matrices per coordinate, or
 matrices that are kept over many steps, are cheaper."""
+PATHS = 3
+"""Random paths on which the entries of K are looked for; fewer of them miss entries that are zero by chance, or in a part of the positions."""
 
 
 def weighted_sum(weights, increments):
@@ -81,40 +85,26 @@ def _of_fast(term: Term, q_s, q_f):
 
 
 class DiagonalMatrix(NamedTuple):
-    """K as one matrix (r, r) for every fast coordinate.
-
-    inverse: ``K^-1``, of the rows i = 0..r-1.
-    last: the row i = r, which gives the momentum at the end.
-    """
+    """``K^-1`` as one matrix (r, r) for every fast coordinate."""
 
     inverse: Float[Array, "r r n_f"]
-    last: Float[Array, "r n_f"]
 
     def solve(self, rows):
         """The increments ``K^-1 rows`` (r, n_f) for rows (r, n_f)."""
         return jnp.sum(self.inverse * rows[None], axis=1)
 
-    def outgoing(self, increments):
-        """Change (n_f,) of the momentum at the end, times h, with the increments."""
-        return jnp.sum(self.last * increments, axis=0)
 
+class JoinedMatrix(NamedTuple):
+    """``K^-1`` (r n_f, r n_f) for all fast coordinates together, as a full matrix or by a band."""
 
-class FullMatrix(NamedTuple):
-    """K as one matrix for all fast coordinates; fields as in `DiagonalMatrix`."""
-
-    inverse: Float[Array, "r*n_f r*n_f"]
-    last: Float[Array, "n_f r*n_f"]
+    inverse: FullInverse | BandInverse
 
     def solve(self, rows):
         """The increments ``K^-1 rows`` (r, n_f) for rows (r, n_f)."""
-        return matvec(self.inverse, rows.reshape(-1)).reshape(rows.shape)
-
-    def outgoing(self, increments):
-        """Change (n_f,) of the momentum at the end, times h, with the increments."""
-        return matvec(self.last, increments.reshape(-1))
+        return self.inverse.times(rows.reshape(-1)).reshape(rows.shape)
 
 
-Matrix = DiagonalMatrix | FullMatrix
+Matrix = DiagonalMatrix | JoinedMatrix
 
 
 @dataclass(frozen=True)
@@ -126,12 +116,14 @@ class Interval:
         linear in q_f, or there are only V and W, and each function of q_f alone among V and W is a sum over the coordinates. K then leaves
         out forces and potentials that depend on slow variables: this costs passes, not accuracy.
     is_constant: whether K is the same for a whole run.
+    curved: sparsity of K, where it is not diagonal.
     sparsity: of ``G K^-1 G^T``.
     """
 
     is_explicit: bool
     is_diagonal: bool
     is_constant: bool
+    curved: Sparsity
     sparsity: Sparsity
 
     @classmethod
@@ -154,14 +146,19 @@ class Interval:
         )
         full = Full(scheme.degree * system.num_constraints(q_s, q_f)[0])
         sparsity = fast_rows(system, q_s, q_f, scheme.degree) if is_diagonal else full
-        return cls(is_explicit, is_diagonal, is_constant, sparsity)
+        curved = Full(scheme.degree * q_f.size)
+        if not is_diagonal and q_f.size > MOST_ROWS_OF_FULL_MATRIX:
+            curved = _curved(system, scheme, q_s.size, q_f.size)
+        return cls(is_explicit, is_diagonal, is_constant, curved, sparsity)
+
+    @property
+    def is_cheap(self) -> bool:
+        """Whether every macro step computes K anew: it is small, or no larger than a few vectors."""
+        return self.is_diagonal or isinstance(self.curved, Band) or self.curved.size <= LARGEST_RENEWED
 
     def no_matrix(self, equations: StepEquations) -> Matrix:
         """K filled with zeros, for its shapes."""
-        r, n_f = equations.scheme.degree, equations.q_f.shape[0]
-        if self.is_diagonal:
-            return DiagonalMatrix(jnp.zeros((r, r, n_f)), jnp.zeros((r, n_f)))
-        return FullMatrix(jnp.zeros((r * n_f, r * n_f)), jnp.zeros((n_f, r * n_f)))
+        return jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(self.matrix, equations))
 
     def matrix(self, equations: StepEquations) -> Matrix:
         """K on the first micro interval of a macro step, on the straight path from its start."""
@@ -171,31 +168,60 @@ class Interval:
         velocities = constant_mass(system).velocity(equations.p_s, equations.p_f)
         slow, fast = (local.macro_dt * control_nodes(scheme.degree)[1:, None] * v for v in velocities)
         path = local.path_of(slow, fast[None])
-        return _diagonal_matrix(local, path) if self.is_diagonal else _full_matrix(local, path)
+        if self.is_diagonal:
+            return _diagonal_matrix(local, path)
+        times_k = jax.linearize(partial(_fast_rows, local, path), path.fast[0])[1]
+        seeds = self.curved.seeds
+        products = jax.vmap(times_k)(seeds.reshape(len(seeds), *path.fast[0].shape))
+        return JoinedMatrix(self.curved.inverse(products.reshape(seeds.shape), may_depend=False))
 
 
-def _full_matrix(local: StepEquations, path: Path) -> FullMatrix:
-    kinetic = lagrangian(local.system, local.scheme).kinetic
-    _, r, n_f = path.fast.shape
+def _fast_rows(local: StepEquations, path: Path, increments):
+    """``h D_{F_i} L`` (r, n_f), i = 0..r-1, of the action L of an interval without constraints, with forces along the same path."""
+    varied = replace(path, fast=increments[None])
+    d = jax.grad(local.without_kinetic)(varied, varied)
+    d_fast = d.fast[0] + lagrangian(local.system, local.scheme).kinetic.fast_rows(increments)
+    return jnp.concatenate([d.fast_start - d_fast.sum(0), d_fast[:-1]])
 
-    # h D_{F_i} L, i = 0..r, of the action L of the interval without constraints; forces are evaluated along the same path
-    def slots(increments):
-        varied = replace(path, fast=increments[None])
-        d = jax.grad(local.without_kinetic)(varied, varied)
-        d_fast = d.fast[0] + kinetic.fast_rows(increments)
-        return jnp.concatenate([d.fast_start - d_fast.sum(0), d_fast])
 
-    block = jax.jacfwd(slots)(path.fast[0])
-    return FullMatrix(inverse(block[:-1].reshape(r * n_f, r * n_f)), block[-1].reshape(n_f, r * n_f))
+def _curved(system: System, scheme: Scheme, n_s: int, n_f: int) -> Sparsity:
+    """Sparsity of K: the rows that change with each fast coordinate on random paths.
+
+    An entry that differs from zero elsewhere alone is missed, which costs passes, not accuracy.
+    """
+    touched, parts = np.zeros((n_f, n_f), bool), interval_problem(system, scheme)
+    for seed in range(PATHS):
+        rng = np.random.default_rng(seed)
+        numbers = [rng.normal(size=n) for n in (n_s, n_f, n_s, n_f)]
+        # random numbers in place of traced ones
+        known = jax.tree.map(lambda a, rng=rng: a if is_concrete(a) else rng.uniform(0.5, 1.5, np.shape(a)), parts)
+        with jax.ensure_compile_time_eval():
+            touched |= np.asarray(_touched(known, numbers, rng.normal(size=(scheme.degree, n_f))))
+    return sparsity(touched | touched.T, scheme.degree)
+
+
+@eqx.filter_jit
+def _touched(parts: tuple[System, Scheme], numbers, fast):
+    """(n_f, n_f) whether the rows of each coordinate change with each other one, on the path with these positions and increments."""
+    (system, scheme), (q_s, q_f, p_s, p_f) = parts, numbers
+    local = StepEquations(system, scheme, jnp.zeros(()), q_s, q_f, p_s, p_f, jnp.ones(()))
+    path = local.path_of(jnp.zeros((scheme.degree, q_s.size)), fast[None])
+    times_k = jax.linearize(partial(_fast_rows, local, path), fast)[1]
+
+    def column(i):
+        # every change counts, however small: K is the exact matrix of linear equations
+        return jnp.any(times_k(jnp.zeros_like(fast).at[:, i].set(fast[:, i])) != 0, axis=0)
+
+    return jax.lax.map(column, jnp.arange(fast.shape[1]))
 
 
 def _diagonal_matrix(local: StepEquations, path: Path) -> DiagonalMatrix:
     _, r, n_f = path.fast.shape
-    # block_ija = k_ij M_a - h^2 sum_k w_k l_i(c_k) l_j(c_k) W''_aa, i = 0..r, j = 1..r, coordinate a
-    block = jnp.zeros((r + 1, r, n_f))
+    # block_ija = k_ij M_a - h^2 sum_k w_k l_i(c_k) l_j(c_k) W''_aa, i = 0..r-1, j = 1..r, coordinate a
+    block = jnp.zeros((r, r, n_f))
     for term in lagrangian(local.system, local.scheme).terms:
         if isinstance(term, QuadraticKinetic):
-            block += term.fast_form[:, 1:, None] * term.mass.fast
+            block += term.fast_form[:-1, 1:, None] * term.mass.fast
         elif term.inside.groups and term.arguments == ("q_f",):
             q = term.inside.sample(path, ("q_f",))["q_f"]
             gradient = jax.vmap(jax.grad(term.integrand))
@@ -203,10 +229,10 @@ def _diagonal_matrix(local: StepEquations, path: Path) -> DiagonalMatrix:
             curvature = jax.jvp(gradient, (q,), (jnp.ones_like(q),))[1]
             basis = lagrange_basis(r, np.array([group.c for group in term.inside.groups]))
             weights = term.sign * local.macro_dt**2 * term.inside.weights
-            block += jnp.einsum("k,ki,kj,ka->ija", weights, basis, basis[:, 1:], curvature)
+            block += jnp.einsum("k,ki,kj,ka->ija", weights, basis[:, :-1], basis[:, 1:], curvature)
     if r == 1:
-        return DiagonalMatrix(1 / block[:1], block[-1])
-    return DiagonalMatrix(jnp.moveaxis(jax.vmap(inverse, in_axes=-1)(block[:-1]), 0, -1), block[-1])
+        return DiagonalMatrix(1 / block)
+    return DiagonalMatrix(jnp.moveaxis(jax.vmap(inverse, in_axes=-1)(block), 0, -1))
 
 
 def solve_saddle(solve_k, jacobian, push, rows, g):

@@ -23,7 +23,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from vmri_jax.kernels import LARGEST_RENEWED, LINEARISES_FORCES, max_abs
+from vmri_jax.kernels import LINEARISES_FORCES, max_abs
 from vmri_jax.schemes.equations import StepEquations, Unknowns, multiplier_scales
 from vmri_jax.schemes.path import control_nodes
 from vmri_jax.steppers.accept import Accepted, expected
@@ -112,7 +112,7 @@ class Nested(Solver):
         """
         if self.interval.is_constant:
             return memory
-        if self.interval.is_diagonal or len(memory.matrix.inverse) <= LARGEST_RENEWED or self.newton.fixed_iterations:
+        if self.interval.is_cheap or self.newton.fixed_iterations:
             return memory._replace(matrix=self.interval.matrix(equations))
         stale = memory.last_passes > memory.fewest_passes + EXTRA_PASSES
         matrix = jax.lax.cond(stale, lambda: self.interval.matrix(equations), lambda: memory.matrix)
