@@ -7,6 +7,7 @@ t                                       the time of the start
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -58,7 +59,7 @@ def by_name(problem: Problem, columns: Sequence[str]) -> ByName | None:
     return ByName(places) if places else None
 
 
-def _arrays(problem: Problem) -> tuple[list, jax.tree_util.PyTreeDef]:
+def _arrays(problem: Problem) -> tuple[list, Any]:
     """The arrays that columns can change, the parameters and then the parts of the start, and their structure."""
     return jax.tree.flatten((problem.system.params, [getattr(problem, part) for part in START]))
 

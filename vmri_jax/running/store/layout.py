@@ -139,7 +139,8 @@ class Writer:
         import zarr
 
         group = zarr.open_group(path, mode="r+", use_consolidated=False)
-        rows, self._chunk = group.attrs["rows"], group.attrs["chunk"]
+        attributes: Any = group.attrs
+        rows, self._chunk = attributes["rows"], attributes["chunk"]
         self._path = path
         self._arrays = {name: array.with_config(CONFIG) for name, array in group.arrays()}
         changed = [array for array in self._arrays.values() if array.shape[0] != rows]

@@ -45,7 +45,8 @@ class Record(NamedTuple):
         try:
             with np.load(io.BytesIO(layout.note(path, numbers[-1])), allow_pickle=False) as data:
                 *counts, fell_back = data["counts"].tolist()
-                return cls(*counts, bool(fell_back), [data[f"leaf_{k}"] for k in range(len(data.files) - 1)])
+                leaves = [data[f"leaf_{k}"] for k in range(len(data.files) - 1)]
+                return cls._make((*counts, bool(fell_back), leaves))
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
             raise ValueError(f"{path}: the checkpoint is damaged ({error}); the run cannot go on.") from error
 
