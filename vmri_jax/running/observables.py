@@ -5,8 +5,10 @@ and lengths (`evaluated`), in prepared and traced runs as a part of their progra
 its domain, `concerns` says what is wrong with the motion of a run whose steps all succeeded.
 """
 
+from functools import partial
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
@@ -132,12 +134,20 @@ def failures(run, table, save_every: int, step: int = 0):
     Returns:
         The run and its table.
     """
-    module, now = library(table), Observables.of(table)
-    if module is np:  # a prepared run is called many times, and an operation of JAX takes as long as many steps
-        run = run._replace(result=np.asarray(run.result), failed_at=np.asarray(run.failed_at))
-        are_right = np.isfinite(now.energy).all() and now.solved.all() and now.implied.all()
-        if are_right and (run.failed_at < 0).all():
-            return run, table
+    now = Observables.of(table)
+    if library(table) is jnp:  # one program: JAX compiles operations of a gradient outside of jit one by one
+        return _marked_in_a_program(run, table, save_every, step)
+    # a prepared run is called many times, and an operation of JAX takes as long as many steps
+    run = run._replace(result=np.asarray(run.result), failed_at=np.asarray(run.failed_at))
+    are_right = np.isfinite(now.energy).all() and now.solved.all() and now.implied.all()
+    if are_right and (run.failed_at < 0).all():
+        return run, table
+    return _marked(np, run, table, save_every, step)
+
+
+def _marked(module, run, table, save_every, step):
+    """`failures` by NumPy or `jax.numpy`."""
+    now = Observables.of(table)
     wrong = ~(module.isfinite(now.energy) & (now.solved > 0) & (now.implied > 0))
     node, num_nodes = wrong.argmax(axis=-1), wrong.shape[-1]
     after_step = module.where(run.failed_at < 0, num_nodes, (run.failed_at - step) // save_every + 1)
@@ -158,6 +168,9 @@ def failures(run, table, save_every: int, step: int = 0):
     states = State(run.states.t, *map(masked, list(vars(run.states).values())[1:]))
     micro = None if run.micro is None else run.micro._replace(q_f=masked(run.micro.q_f))
     return run._replace(states=states, result=result, failed_at=failed_at, micro=micro), masked(table)
+
+
+_marked_in_a_program = jax.jit(partial(_marked, jnp))
 
 
 def concerns(table: np.ndarray, t, system: System, macro_dt, save_every: int) -> list[LostEnergyWarning]:

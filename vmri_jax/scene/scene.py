@@ -65,7 +65,7 @@ class Scene:
             zero at the positions in `bodies`, and the joint has no constraint rows. Roots of trees other than the ground keep directors;
             joints that close loops and `Spherical` joints keep their rows. "directors": a centre and directors for each body, joints are
             constraints. "auto": joint coordinates, but directors for mechanisms with chains or loops so many that these are faster, see
-            `vmri_jax.scene.trees.LONGEST` and `MOST_LOOPS`; the angle of a joint with a spring, a limit or a gear is a coordinate there, too.
+            `vmri_jax.scene.trees.LONGEST` and `JOINTS_OF_A_LOOP`; the angle of a joint with a spring, a limit or a gear is a coordinate there, too.
         joint_starts: values and rates of joint coordinates at the start; `with_joints` sets them.
 
     Raises:

@@ -28,10 +28,10 @@ LONGEST = 50
 """Most bodies between the root and a leaf of a tree for which coordinates="auto" chooses joint coordinates. The kinetic energy couples all
 joints of a tree, so that the time of a step grows nearly with the third power of this length; by directors it grows in proportion. On a
 hinged chain of 30 bars a step in joint coordinates takes 0.45 of the time by directors, on 100 bars 2.9 times as long."""
-MOST_LOOPS = 10
-"""Most loops of a scene for which coordinates="auto" chooses joint coordinates: each loop ties all its joints together. In a row of six
-four-bars a step in joint coordinates takes 0.13 of the time by directors; it grows with the power 3.3 of the number of loops, by directors in
-proportion, so that they cross near fourteen loops, and compiling takes longer in joint coordinates."""
+JOINTS_OF_A_LOOP = 5
+"""Fewest joints for each loop of a scene for which coordinates="auto" chooses joint coordinates. In denser loops the constraints of the cut joints
+take away most of the coordinates, and each depends on all joints of its loop: in a row of six four-bars, with 3.2 joints for each loop, a step in joint
+coordinates takes 0.13 of the time by directors, and the first result, nearly all of it compiling, 1.5 times as long; of two four-bars 3 times."""
 COUNTED, USED, UNUSED = range(3)
 """Ranks of a pair of bodies in a joint: an effect counts whole turns of its angle, an effect acts in it, none does."""
 
@@ -122,11 +122,12 @@ def grow(bodies: Bodies, effects: Sequence[Effect], everywhere: bool = True) -> 
                 heappush(waiting, (order, depth + 1, names, child, child if name == GROUND else tree, following))
     if everywhere:
         return tuple(branches)
-    num_loops = sum(map(len, by_parent.values())) // 2 - len(branches)
+    num_joints = sum(map(len, by_parent.values())) // 2
+    is_dense = num_joints < JOINTS_OF_A_LOOP * (num_joints - len(branches))
     return tuple(
         branch
         for branch in branches
-        if (num_loops <= MOST_LOOPS and deepest[tree_of[branch.child]] <= LONGEST)
+        if (not is_dense and deepest[tree_of[branch.child]] <= LONGEST)
         or ranks.get((branch.joint.name, branch.element)) == COUNTED
         or any(isinstance(bodies.get(name), Frame) for name in (branch.child, branch.parent))
     )
