@@ -158,9 +158,10 @@ def test_this_process_is_killed(tmp_path, cache, here_slowly):
     program = tmp_path / "program.py"
     arguments = ARGUMENTS | SLOW
     program.write_text(
-        "import numpy as np\nimport vmri_jax as vm\nfrom tests.ensembles import own\n\n"
+        "import numpy as np\nimport vmri_jax as vm\n\n"
         "if __name__ == '__main__':\n"
         "    vm.configure()\n"
+        "    from tests.ensembles import own\n\n"
         "    design = {'omega': np.linspace(20.0, 50.0, 32), 'num_micro': [1, 3]}\n"
         f"    how = {arguments!r}\n"
         f"    vm.ensemble('fpu', 'explicit-slow', design, vary=own.put, **how, out={str(out)!r}, processes=1)\n"

@@ -118,13 +118,13 @@ def initial_state(
     v_s, v_f = (np.zeros(np.shape(q)) if v is None else v for q, v in ((q_s, v_s), (q_f, v_f)))
     q_s, q_f, v_s, v_f = check_arrays(q_s=q_s, q_f=q_f, v_s=v_s, v_f=v_f)
     arguments = system, t, q_s, q_f, v_s, v_f
-    if not is_concrete(arguments):
+    if not is_concrete((arguments, jnp.zeros(()))):  # while JAX stages a program, all new arrays are tracers
         if is_concrete((system, q_s, q_f)) and not system.has_constant_mass:
             check_system(system, q_s, q_f)
             check_mass(system, q_s, q_f)
         return _start(arguments, project)[0]
     state, violation = _checked_start(Known(arguments), project, tolerance)
-    at_rest = not any(np.asarray(v).any() for v in (v_s, v_f))  # of NumPy, since JAX traces while it stages a program
+    at_rest = not (np.any(v_s) or np.any(v_f))
     tell_of_velocities("initial_state", violation, project, at_rest=at_rest)
     return state
 
