@@ -146,7 +146,7 @@ def rod(name, start, end):
     return RigidBody(name, 1.0, shape, (start + end) / 2, [0.0, 0.0, np.arctan2(way[1], way[0])])
 
 
-def crank_rocker(*effects, order: Sequence[int] = range(4), names=HINGES):
+def crank_rocker(*effects, order: Sequence[int] = range(4), names=HINGES, coordinates="auto"):
     """A four-bar linkage whose crank turns all the way round."""
     a, b, d = np.zeros(3), np.array([0.0, CRANK, 0.0]), np.array([2.0, 0.0, 0.0])
     way = d - b
@@ -157,7 +157,7 @@ def crank_rocker(*effects, order: Sequence[int] = range(4), names=HINGES):
     joints = [Revolute(pair, p, Z, name=name) for pair, p, name in zip(pairs, (a, b, c, d), names, strict=True)]
     bodies = [rod("crank", a, b), rod("coupler", b, c), rod("rocker", c, d)]
     listed = [joints[i] for i in order]
-    return Scene(bodies, [*listed, *effects], redundant="drop")
+    return Scene(bodies, [*listed, *effects], redundant="drop", coordinates=coordinates)
 
 
 def cut(scene):
@@ -187,7 +187,7 @@ def test_turns_go_before_other_effects():
 
 def test_a_spring_in_a_loop_counts_its_turns():
     """The angle of the crank at the end is that of DOP853 with one angle."""
-    scene = crank_rocker(JointSpring("hB", 0.2), order=(1, 2, 3, 0)).with_rates({"hA": 12.0})
+    scene = crank_rocker(JointSpring("hB", 0.2), order=(1, 2, 3, 0), coordinates="joint").with_rates({"hA": 12.0})
     run = vm.simulate(scene, ONE, macro_dt=0.002, t_end=3.0)
     assert scene.joint_motion(run, "hA")[-1] == pytest.approx(12.186, abs=1e-3)  # measured 12.18589
     angles = {hinge: scene.joint_motion(run, hinge) for hinge in HINGES}  # one of them without a coordinate
@@ -195,7 +195,7 @@ def test_a_spring_in_a_loop_counts_its_turns():
 
 
 def test_starts_of_loops_count_the_turns_of_all_joints():
-    scene = crank_rocker().with_joints({"hA": 7.0})
+    scene = crank_rocker(coordinates="joint").with_joints({"hA": 7.0})
     (closed,) = cut(scene)
     x = dict(zip(scene.names.slow, np.asarray(scene.start[0]), strict=True))
     x[closed] = at_start(scene.sorting, next(e for e in scene.effects if e.name == closed), 0, "turn")
