@@ -73,7 +73,7 @@ def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
 
 def measured(case: Case, repeats: int, tell: Tell) -> tuple[list[dict], dict[str, Ratio]]:
     """A row for each adjoint and number of steps, and times over that of a run."""
-    problem, scheme, solver = case.problem(), vm.fully_implicit(10), vm.solvers.Nested()
+    problem, scheme, solver = case.problem(), vm.fully_implicit(10), vm.Solver("masses")
     start, params = problem.state(), jax.tree.map(jnp.asarray, problem.system.params)
 
     def gradient(adjoint: str, steps: int):

@@ -29,14 +29,12 @@ class Case:
     """One system under the fully explicit scheme.
 
     target: the most that a trajectory in a batch of HELD may take over C.
-    fixed: whether a fixed number of iterations is also run.
     as_accurate: the problem of `benchmarks.peers.cases` on which a batch of any step and order has to reach C's error.
     """
 
     system: str
     micro_dt: float
     target: float
-    fixed: bool
     as_accurate: str | None = None
 
 
@@ -55,9 +53,9 @@ class Size:
 def sizes(name: str, devices: int = 1) -> Size:
     """ "quick" or "full"."""
     chosen = (
-        Case("FPU l=3", 0.001, 0.6, False),
-        Case("TSP", 0.0002, 0.7, True, "TSP t=1"),
-        Case("SAM", 0.0002, 0.7, True, "SAM t=1"),
+        Case("FPU l=3", 0.001, 0.6),
+        Case("TSP", 0.0002, 0.7, "TSP t=1"),
+        Case("SAM", 0.0002, 0.7, "SAM t=1"),
     )
     if name == "quick":
         return Size(chosen, (1, 32, 256), 5, 0.05, devices)
@@ -69,7 +67,7 @@ def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
     return growing("batch", name, (_measure(case, size, tell) for case in size.cases), c_loops.missing())
 
 
-def _program(problem: vm.Problem, case: Case, batch: int, solver: vm.solvers.Newton, devices: int) -> Callable:
+def _program(problem: vm.Problem, case: Case, batch: int, devices: int) -> Callable:
     states = starts(problem, batch)
 
     def run(num_steps: int) -> vm.Trajectory:
@@ -80,7 +78,6 @@ def _program(problem: vm.Problem, case: Case, batch: int, solver: vm.solvers.New
             micro_dt=case.micro_dt,
             num_steps=num_steps,
             save_every=num_steps,
-            solver=solver,
             devices=devices if batch % devices == 0 else 1,
         )
 
@@ -99,18 +96,14 @@ def _measure(case: Case, size: Size, tell: Tell) -> tuple[list[dict], list[Claim
 
 def _all_sizes(case: Case, size: Size, tell: Tell) -> tuple[list[dict], list[Claim]]:
     problem = programs.problem(case.system)
-    newtons = {"default": vm.solvers.Auto()}
-    if case.fixed:
-        newtons["fixed"] = vm.solvers.Auto(fixed_iterations=_fewest_iterations(problem, case))
     runs, work, results = {}, {}, {}
-    for option, solver in newtons.items():
-        for batch in size.batches:
-            tell(f"{case.system}, batch {batch}, {option}")
-            simulate = _program(problem, case, batch, solver, min(size.devices, batch))
-            steps = _steps(simulate, batch, size)
-            key = f"{option} {batch}"
-            runs[key], work[key] = partial(simulate, steps), batch * steps * NUM_MICRO
-            results[key] = runs[key]()
+    for batch in size.batches:
+        tell(f"{case.system}, batch {batch}")
+        simulate = _program(problem, case, batch, min(size.devices, batch))
+        steps = _steps(simulate, batch, size)
+        key = f"default {batch}"
+        runs[key], work[key] = partial(simulate, steps), batch * steps * NUM_MICRO
+        results[key] = runs[key]()
     if c_loops.compiler() is not None:
         loop = partial(c_loops.c_loop, case.system, problem, NUM_MICRO, case.micro_dt)
         steps = steps_for(lambda n: loop(n)(), size.seconds, 10)
@@ -120,13 +113,13 @@ def _all_sizes(case: Case, size: Size, tell: Tell) -> tuple[list[dict], list[Cla
 
     rows, claims = [], []
     for key, sample in ns.items():
-        option, _, batch = key.partition(" ")
+        program, _, batch = key.partition(" ")
         run = results.get(key)
         to_c = ratio(sample, ns["C"]) if "C" in ns else None
         rows.append(
             {
                 "system": case.system,
-                "program": option,
+                "program": program,
                 "batch": int(batch or 1),
                 "micro_dt": case.micro_dt,
                 **spread(TIME, quartiles(sample)),
@@ -136,7 +129,7 @@ def _all_sizes(case: Case, size: Size, tell: Tell) -> tuple[list[dict], list[Cla
             }
         )
         if to_c and key != "C" and int(batch) == HELD:
-            claims.append(Claim(f"{case.system}, batch of {HELD}, {option}: over C", to_c, at_most=case.target))
+            claims.append(Claim(f"{case.system}, batch of {HELD}: over C", to_c, at_most=case.target))
     return rows, claims
 
 
@@ -165,17 +158,3 @@ def _steps(simulate: Callable, batch: int, size: Size) -> int:
     steps = max(1, size.micro_steps // (batch * NUM_MICRO))
     (seconds,) = interleaved({"": partial(simulate, steps)}, 1, 0.0)[""]
     return steps if seconds > size.seconds / 4 else round(steps * size.seconds / seconds)
-
-
-def _fewest_iterations(problem: vm.Problem, case: Case) -> int:
-    """As many as keep a single run of a thousand steps converged."""
-    scheme, state, steps = vm.fully_explicit(NUM_MICRO), problem.state(), 1000
-    run = vm.simulate(problem.system, scheme, state, micro_dt=case.micro_dt, num_steps=steps)
-    taken = np.asarray(run.info.iterations)
-    for iterations in range(max(1, int(taken.mean())), int(taken.max())):
-        simulate = programs.program(
-            problem, scheme, vm.solvers.Auto(fixed_iterations=iterations), micro_dt=case.micro_dt
-        )
-        if not programs.failed(simulate(steps)):
-            return iterations
-    return max(1, int(taken.max()))

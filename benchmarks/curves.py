@@ -12,6 +12,7 @@ from matplotlib.ticker import FixedLocator, NullFormatter, NullLocator
 
 import vmri_jax as vm
 from benchmarks import programs
+from benchmarks.gail2014.dense import dense
 from benchmarks.gail2014.reference import unstructured
 from benchmarks.measure import Ratio, Tell, interleaved, quartiles, ratio, silent, steps_for
 from benchmarks.report import legend_below, spread
@@ -105,12 +106,12 @@ def measure(case: Case, repeats: int, seconds: float, tell: Tell = silent) -> Cu
                 total = unit * max(1, round(case.t_end / case.micro_dt / unit))
         runs["auto", n] = partial(run, total // n), total
         results["auto", n] = run(total // n)
-    dense, whole = vm.solvers.Dense(), problem
+    whole = problem
     if case.system.startswith("FPU") and case.scheme != "fully implicit":
         whole = unstructured(problem)  # explicit schemes solve for the whole macro step too, as the paper did
     for n in case.dense_num_micro:
         tell(f"{case.label}, num_micro {n}, dense")
-        run = programs.program(whole, programs.SCHEMES[case.scheme](n), dense, micro_dt=case.micro_dt)
+        run = programs.program(whole, programs.SCHEMES[case.scheme](n), dense(), micro_dt=case.micro_dt)
         num_steps = steps_for(run, seconds / 2, 3, 300)
         runs["dense", n] = partial(run, num_steps), num_steps * n
         results["dense", n] = run(num_steps)

@@ -47,10 +47,9 @@ class System:
 
     @property
     def run(self) -> dict[str, Any]:
-        """Arguments of `simulate`; without a second method, which every lane would compute."""
-        method = "nested" if self.problem.system.has_constant_mass else "arrowhead"
+        """Arguments of `simulate`; without the fallback, which every lane would compute."""
         steps = {"macro_dt": T_END / self.num_steps, "num_steps": self.num_steps, "save_every": self.num_steps}
-        return {**steps, "solver": vm.solvers.named(method)()}
+        return {**steps, "solver": vm.plan(self.problem, self.scheme).first}
 
     def end(self, state: vm.State):
         """Positions (n,) at the end."""

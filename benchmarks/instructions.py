@@ -47,7 +47,7 @@ class Program:
     problem: Callable[[], vm.Problem]
     scheme: vm.Scheme
     most: int
-    method: str = "auto"
+    matrix: str = "auto"
     is_gradient: bool = False
 
     def compiled(self) -> jax.stages.Compiled:
@@ -57,7 +57,7 @@ class Program:
             "macro_dt": macro_dt,
             "num_steps": STEPS,
             "save_every": STEPS,
-            "solver": vm.solvers.named(self.method)(),
+            "solver": vm.Solver(self.matrix),
         }
         if not self.is_gradient:
             return vm.prepare(problem, self.scheme, **options).compiled()
@@ -83,12 +83,12 @@ PROGRAMS: dict[str, Program] = {
     "double pendulum in angles, galerkin(1, 3)": Program(double_pendulum, vm.galerkin(1, 3), 3140),
     "FPU, fully_explicit(5)": Program(FPU, vm.fully_explicit(5), 1030),
     "FPU, fully_implicit(5)": Program(FPU, vm.fully_implicit(5), 3130),
-    "FPU, fully_implicit(5), exact matrices": Program(FPU, vm.fully_implicit(5), 3740, "arrowhead"),
+    "FPU, fully_implicit(5), exact matrices": Program(FPU, vm.fully_implicit(5), 3740, "exact"),
     "TSP, fully_explicit(5)": Program(TSP, vm.fully_explicit(5), 4390),
     "TSP, fully_implicit(5)": Program(TSP, vm.fully_implicit(5), 4890),
-    "TSP, fully_implicit(5), exact matrices": Program(TSP, vm.fully_implicit(5), 5270, "arrowhead"),
+    "TSP, fully_implicit(5), exact matrices": Program(TSP, vm.fully_implicit(5), 5270, "exact"),
     "SAM, fully_implicit(5)": Program(SAM, vm.fully_implicit(5), 6470),
-    "SAM, fully_implicit(5), exact matrices": Program(SAM, vm.fully_implicit(5), 7020, "arrowhead"),
+    "SAM, fully_implicit(5), exact matrices": Program(SAM, vm.fully_implicit(5), 7020, "exact"),
     "satellite in joint coordinates, fully_explicit(5)": Program(SATELLITE, vm.fully_explicit(5), 13280),
     "squeezer by directors, fully_implicit(1)": Program(SQUEEZER, vm.fully_implicit(1), 6430),
     "engine by directors, explicit_slow(5)": Program(ENGINE, vm.explicit_slow(5), 13120),

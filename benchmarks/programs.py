@@ -43,7 +43,7 @@ def unknowns(problem: vm.Problem, num_micro: int) -> int:
     return problem.q_s.size + n_gs + num_micro * (problem.q_f.size + n_g)
 
 
-def program(problem: vm.Problem, scheme: vm.Scheme | vm.Composition, solver: vm.solvers.Newton | None = None, **step):
+def program(problem: vm.Problem, scheme: vm.Scheme | vm.Composition, solver: vm.Solver | None = None, **step):
     """``run(num_steps)``, a prepared run with ``macro_dt`` or ``micro_dt`` that saves the last node only, NaN if it fails."""
     prepared = vm.prepare(problem.system, scheme, problem.state(), **step, num_steps=1, solver=solver)
     return lambda num_steps, **other: prepared(num_steps=num_steps, **other, throw=False)

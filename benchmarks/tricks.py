@@ -31,7 +31,7 @@ CASES += [
     Case("single", "FPU l=3", "fully_implicit 10", 0.2),  # slow forces change much within a step
     *(Case("single", system, "fully_explicit 1", 0.0002) for system in ("TSP", "SAM")),  # drifts along constraints
     *(
-        Case("single", *of, method="arrowhead")
+        Case("single", *of, method="exact")
         for of in (("TSP", "fully_implicit 5", 0.002), ("SAM", "fully_implicit 5", 0.01))
     ),
     Case("single", "satellite", "fully_implicit 5", 0.02),  # its kinetic energy is a function

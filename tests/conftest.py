@@ -36,7 +36,7 @@ def pytest_addoption(parser):
         action="store_true",
         help="programs are compiled without LLVM's optimisations, in about a third of the time",
     )
-    parser.addoption("--method", help="method of Newton's iteration wherever a test does not choose one; default auto")
+    parser.addoption("--matrix", help="matrix of solvers wherever a test does not choose one; default auto")
     parser.addoption(
         "--kernels", choices=["plain", "cpu"], help="which small dense algebra; default: the package's own"
     )
@@ -86,16 +86,21 @@ def few_programs():
 
 
 @pytest.fixture(scope="session", autouse=True)
-def default_method(request):
-    """`solvers.Auto()` is the solver with the method of the command line: the tests hold for every method."""
-    from vmri_jax.steppers import solvers
+def default_matrix(request):
+    """`Solver()` has the matrix of the command line: the tests hold for every matrix."""
+    from vmri_jax import Solver
 
-    method = request.config.getoption("--method")
-    if method is None:
+    matrix, made = request.config.getoption("--matrix"), Solver.__init__
+    if matrix is None:
         yield
         return
+
+    def with_matrix(self, *arguments, **settings):
+        chosen = arguments or "matrix" in settings or "stepper" in settings
+        made(self, *arguments, **({} if chosen else {"matrix": matrix}) | settings)
+
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(solvers, "Auto", solvers.named(method))
+        patch.setattr(Solver, "__init__", with_matrix)
         yield
 
 

@@ -24,6 +24,7 @@ from rich.console import Console
 from rich.table import Table
 
 import vmri_jax as vm
+from benchmarks.gail2014.dense import named
 from tests.verification import random_systems as rs
 from vmri_jax.mechanics.checks import is_refusal
 from vmri_jax.mechanics.constraints import CONSTRAINT_TOLERANCE
@@ -60,7 +61,7 @@ def verdicts(of: rs.Structure, draws: list[rs.Draw]) -> list[str]:
             "num_steps": of.num_saves * first.save_every,
             "save_every": first.save_every,
             "save_micro": of.save_micro,
-            "solver": vm.solvers.named(of.method)(first.tolerance, first.max_iterations, of.fixed_iterations),  # pyright: ignore
+            "solver": named(of.method, tolerance=first.tolerance, max_iterations=first.max_iterations),
         }
         made = rs.scheme(of, first)
         if of.lanes is None:

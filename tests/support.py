@@ -6,9 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax import State, initial_state, macro_step, simulate, systems
-from vmri_jax.schemes.composition import stage_scheme
-from vmri_jax.steppers import solvers
+from vmri_jax import Solver, State, initial_state, macro_step, plan, simulate, systems
 
 DATA = Path(__file__).parent / "data"
 PROBLEMS = {
@@ -32,18 +30,15 @@ def step_matrix(system, scheme, macro_dt):
 
     def step(z):
         state = State(jnp.zeros(()), *jnp.split(z, 4))
-        end, _ = macro_step(system, scheme, state, macro_dt, without_fallback(system, scheme))
+        end, _ = macro_step(system, scheme, state, macro_dt, without_fallback(system, scheme, state))
         return jnp.concatenate([end.q_s, end.q_f, end.p_s, end.p_f])
 
     return jax.jacfwd(step)(jnp.zeros(4))
 
 
-def without_fallback(system, scheme) -> solvers.Newton:
-    """The default iteration; where it is the nested iteration, without the exact solve behind it, which takes long to compile."""
-    scheme = stage_scheme(scheme)
-    potentials = (system.slow_potential, scheme.slow), (system.fast_potential, scheme.fast)
-    local = all(f is None or placed.grid == "micro" or placed.only_ends for f, placed in potentials)
-    return solvers.Nested() if system.has_constant_mass and local else solvers.Auto()
+def without_fallback(moving, scheme, state=None) -> Solver:
+    """The default solver without the exact one behind it, which takes long to compile."""
+    return plan(moving, scheme, state).first
 
 
 STENCIL = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}

@@ -18,6 +18,7 @@ Runs
     prepare                             the same run again and again, a Simulation
     stream                              long runs on disk, a StoredTrajectory
     ensemble, open_ensemble             many runs, by workers, into a store
+    Solver                              how implicit equations are solved
 
 Questions
     tune                                the cheapest scheme and steps for an error
@@ -31,7 +32,6 @@ Subpackages and modules
     diagnostics, stability              invariants and defects of a step, maps of stable steps
     study, hard_cases                   convergence, work and precision; cases
     fitting, control, ensembles         measurements, optimal control, designs of many runs
-    solvers                             how implicit equations are solved
     textbook                            the whole method on one page
 
 Inside of a step
@@ -80,9 +80,9 @@ from vmri_jax.schemes.scheme import (
     mollified_impulse,
     takahashi_imada,
 )
-from vmri_jax.steppers import solvers
 from vmri_jax.steppers.plan import Plan, plan
 from vmri_jax.steppers.results import Method, Result, SimulationError
+from vmri_jax.steppers.solver import Solver
 from vmri_jax.steppers.stepper import StepInfo
 
 from vmri_jax import systems  # isort: skip  (last: its modules use the names imported above)
@@ -150,6 +150,7 @@ __all__ = [
     "Simulation",
     "SimulationError",
     "SingularCoordinatesWarning",
+    "Solver",
     "State",
     "StepInfo",
     "StoredTrajectory",
@@ -189,7 +190,6 @@ __all__ = [
     "scene",
     "simulate",
     "simulate_batch",
-    "solvers",
     "stability",
     "stream",
     "study",

@@ -10,13 +10,13 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import FixedLocator, NullLocator
 
+from benchmarks.gail2014.dense import named
 from vmri_jax import plots
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
 from vmri_jax.running.progress import shows_progress
 from vmri_jax.running.timing import interleaved
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes.scheme import Scheme
-from vmri_jax.steppers import solvers
 from vmri_jax.steppers.results import Method, Result
 from vmri_jax.study.program import Program
 from vmri_jax.study.table import Column, ResultTable, interruptible
@@ -27,7 +27,7 @@ class CostRow:
     """One program: its size and its times.
 
     label: of the system or the scheme, as passed to `cost_study`.
-    method: name of the solver, as in ``vm.solvers.named(method)()``.
+    method: name of the solver, see `benchmarks.gail2014.dense.named`.
     num_unknowns: unknowns of one macro step, ``r n_s + r n_gs + num_micro r (n_f + n_g)``, r the degree.
     num_steps: macro steps of the timed run.
     seconds_per_unit: computing time per unit of simulated time; the figures of the reference paper up to a constant.
@@ -53,7 +53,7 @@ class CostRow:
 
 @dataclass(frozen=True)
 class CostStudy(ResultTable):
-    """Rows of one or several cost studies; each row is a run of ``simulate(..., solver=vm.solvers.named(row.method)())``."""
+    """Rows of one or several cost studies; each row is a run of ``simulate(..., solver=named(row.method))``."""
 
     columns = (
         Column("what", lambda row: row.label),
@@ -105,8 +105,7 @@ def cost_study(
 ) -> CostStudy:
     """Time ``scheme(n)`` for every n in `num_micro` with every method of Newton's iteration, over the same simulated time.
 
-    "auto" is the default of `simulate`, and "dense" is the method of the reference paper. A method "dense" here is
-    ``solver=vm.solvers.Dense()`` of `simulate` and ``--method dense`` of ``vmri simulate``.
+    "auto" is the default of `simulate`, and "dense" is the method of the reference paper.
 
     The number of macro steps is rounded if `t_end` is not a multiple of one; times are per unit of simulated time and
     per micro step. A timed call starts one compiled program; choose `t_end` long enough (thousands of micro steps for
@@ -121,7 +120,7 @@ def cost_study(
         num_micro: numbers of micro steps per macro step.
         micro_dt: the constant micro step h.
         t_end: simulated time of every timed run.
-        methods: "auto", "nested", "arrowhead", "null_space", "dense", see `vmri_jax.Newton`.
+        methods: the matrices of `vmri_jax.Solver`, and "dense".
         repeats: timed runs of each program.
         min_seconds: runs shorter than this are called several times and averaged.
         label: name of this scheme or system in the rows.
@@ -148,7 +147,7 @@ def cost_study(
 
     with interruptible(study):
         for method in methods:
-            solver = solvers.named(method)()
+            solver = named(method)
             for n in num_micro:
                 progress(f"{label} {method}, {n} micro steps: compiling".strip(), len(runs), total)
                 num_steps = max(1, round(t_end / (n * micro_dt)))

@@ -105,8 +105,8 @@ class CostPanel:
 
     dense, structured: make the problem that each solver gets; dense_num_micro and dense_t_end are those of the first.
     paper_minimum: the num_micro that was cheapest in the paper, None if it does not say.
-    others: further methods of `vmri_jax.Newton`, on the structured problem.
-    minimal: makes the problem in coordinates without constraints, by "arrowhead"; None where it has none to lose.
+    others: further matrices of `vmri_jax.Solver`, on the structured problem.
+    minimal: makes the problem in coordinates without constraints, by "exact"; None where it has none to lose.
     """
 
     title: str
@@ -125,7 +125,7 @@ class CostPanel:
 
     def measure(self, progress: Progress) -> CostStudy:
         """Time all solvers."""
-        runs = [(method, self.structured, self.num_micro, self.t_end) for method in ("arrowhead", *self.others)]
+        runs = [(method, self.structured, self.num_micro, self.t_end) for method in ("exact", *self.others)]
         if self.dense_num_micro:
             runs.insert(0, ("dense", self.dense, self.dense_num_micro, self.dense_t_end))
         if self.minimal is not None:
@@ -137,7 +137,7 @@ class CostPanel:
                 num_micro,
                 micro_dt=self.micro_dt,
                 t_end=t_end,
-                methods=("arrowhead" if solver == MINIMAL else solver,),
+                methods=("exact" if solver == MINIMAL else solver,),
                 repeats=self.repeats,
                 label=self.title,
                 progress=part(progress, i, len(runs)),
@@ -206,9 +206,9 @@ def _cost_checks(panel: CostPanel, study: CostStudy) -> list[Check]:
             quantity = f"{panel.title}, dense: cheapest number of micro steps"
             agrees = panel.paper_minimum / 2 <= best <= 2 * panel.paper_minimum
             checks.append(Check(quantity, f"{panel.paper_minimum}", "paper", f"{best}", agrees))
-    num_micro, cost = study.curve(panel.title, "arrowhead")
+    num_micro, cost = study.curve(panel.title, "exact")
     settled = int(np.argmin(np.abs(num_micro - SETTLED)))
     ratio = cost[-1] / cost[settled]
-    quantity = f"{panel.title}, arrowhead: cost at {num_micro[-1]} micro steps over that at {num_micro[settled]}"
+    quantity = f"{panel.title}, exact: cost at {num_micro[-1]} micro steps over that at {num_micro[settled]}"
     checks.append(Check(quantity, f"at most {UPTURN:g}", "theory", f"{ratio:.2f}", bool(ratio <= UPTURN)))
     return checks

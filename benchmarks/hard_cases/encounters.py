@@ -49,7 +49,7 @@ def norm_at_zero(full: bool) -> Outcome:
     finite gradients; coincident points fail plainly
     """
     problem = vm.systems.triple_spherical_pendulum(lengths=(10.0, 2.0, 0.01))
-    steps, scheme, solver = 500 if full else 50, vm.fully_explicit(2), vm.solvers.Nested()
+    steps, scheme, solver = 500 if full else 50, vm.fully_explicit(2), vm.Solver("masses")
 
     @jax.jit
     @partial(jax.jacfwd, has_aux=True)

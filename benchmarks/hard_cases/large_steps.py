@@ -6,6 +6,7 @@ from functools import partial
 import numpy as np
 
 import vmri_jax as vm
+from benchmarks.gail2014.dense import dense
 from benchmarks.hard_cases.case import hard_case, iterations
 from vmri_jax.accuracy.companions import positions
 from vmri_jax.diagnostics import step_condition
@@ -13,9 +14,9 @@ from vmri_jax.hard_cases import Outcome
 from vmri_jax.hard_cases.measures import constraints, difference, energy, run, status
 from vmri_jax.running.timing import interleaved
 
-EXACT = vm.solvers.Arrowhead()
-"""The march with exact matrices, which a pass may take over from those before it: it has to converge."""
-DENSE = vm.solvers.Dense()
+EXACT = vm.Solver("exact")
+"""Exact matrices, which a pass may take over from those before it: they have to converge."""
+DENSE = dense()
 """Newton's iteration as textbooks have it, with the matrix of every iterate: its iterations are counted."""
 
 
@@ -62,9 +63,7 @@ def large_macro_step(full: bool) -> Outcome:
 PENDULUM = vm.fully_implicit(5)
 
 
-def _pendulum_run(
-    problem: vm.Problem, macro_dt: float, num_steps: int, solver: vm.solvers.Newton = EXACT
-) -> vm.Trajectory:
+def _pendulum_run(problem: vm.Problem, macro_dt: float, num_steps: int, solver: vm.Solver = EXACT) -> vm.Trajectory:
     """With 20 saved nodes."""
     return run(problem, PENDULUM, macro_dt, num_steps, save_every=num_steps // 20, solver=solver)
 
@@ -151,7 +150,7 @@ def many_micro_steps(full: bool) -> Outcome:
     seconds = interleaved(runs, 40 if full else 20, min_seconds=0.0, clock=time.process_time)
     best = {n: min(seconds[f"{n}"]) / steps[n] for n in micro}
     slope = np.polyfit(np.log(micro), np.log(list(best.values())), 1)[0]
-    apart = difference(end(micro[0], 3), end(micro[0], 3, vm.solvers.Dense()))
+    apart = difference(end(micro[0], 3), end(micro[0], 3, dense()))
     return Outcome(
         f"time over num_micro {micro[0]} to {micro[-1]}: slope {slope:.2f}; from the dense solve at 200: {apart:.0e}",
         abs(slope - 1) <= 0.15 and apart < 1e-11,

@@ -1,6 +1,5 @@
 """vmri_jax itself: every scheme as a prepared run, compiled once for all numbers of steps."""
 
-import dataclasses
 from functools import cache
 
 import numpy as np
@@ -22,8 +21,12 @@ LOOSE = (1e-2, 1e-4, 1e-6)
 """Newton tolerances for moderate errors, where there are constraints; equations are also solved to round-off."""
 LOOSE_HIGH = tuple(tolerances(1e-3, 1e-10))
 """The same for high degrees, whose steps are long: tolerances are relative to the motion."""
-MARCH = vm.solvers.Nested()
-"""As `vm.simulate` starts a run. What it does not solve fails here, and is not solved again in another way."""
+TOLERANCE = vm.Solver().tolerance
+
+
+def first_solver(problem: vm.Problem, scheme: vm.Scheme | vm.Composition, tolerance: float) -> vm.Solver:
+    """As `vm.simulate` starts a run. What it does not solve fails here, and is not solved again in another way."""
+    return vm.plan(problem, scheme, solver=vm.Solver(tolerance=tolerance)).first
 
 
 def schemes(case: Case) -> dict[str, vm.Scheme | vm.Composition]:
@@ -61,7 +64,7 @@ def ladders(case: Case) -> list[Ladder]:
     def ladder(name: str, scheme, tolerance: float) -> Ladder:
         @cache
         def prepared():
-            solver = dataclasses.replace(MARCH, tolerance=tolerance)
+            solver = first_solver(case.problem, scheme, tolerance)
             return programs.program(case.problem, scheme, solver, macro_dt=case.t_end)
 
         def build(num_steps: int):
@@ -83,7 +86,7 @@ def _with_tolerances(case: Case, schemes) -> list[tuple[str, vm.Scheme | vm.Comp
     """Name, scheme and tolerance: to round-off, and the looser ones."""
     found = []
     for name, scheme in schemes.items():
-        found.append((name, scheme, MARCH.tolerance))
+        found.append((name, scheme, TOLERANCE))
         found += [(f"{name}, tolerance {tol:.1e}", scheme, tol) for tol in loose(case, scheme)]
     return found
 
@@ -98,7 +101,7 @@ def batch_ladders(case: Case, states: vm.State, q, v, schemes=None) -> list[Ladd
     del q, v  # known from the states
 
     def ladder(name: str, scheme, tolerance: float) -> Ladder:
-        solver = dataclasses.replace(MARCH, tolerance=tolerance)
+        solver = first_solver(case.problem, scheme, tolerance)
 
         def build(num_steps: int):
             steps = {"macro_dt": case.t_end / num_steps, "num_steps": num_steps, "save_every": num_steps}

@@ -13,7 +13,6 @@ ROOMS = {
     "vmri_jax": "Problems, schemes and runs",
     "vmri_jax.scene": "Scenes: bodies and effects",
     "vmri_jax.schemes.quadrature": "Quadrature rules",
-    "vmri_jax.steppers.solvers": "Solvers",
     "vmri_jax.systems": "Systems of the reference study",
     "vmri_jax.diagnostics": "Diagnostics",
     "vmri_jax.stability": "Stability",

@@ -146,7 +146,7 @@ TINY = {
         floor,
         floor.Size((floor.Pair("FPU l=3", 1e-3, 2, ("fully explicit", "explicit slow"), 2.5, 3.0),), 2, 1e-3),
     ),
-    "batch": (batch, batch.Size((batch.Case("FPU l=3", 1e-3, 0.6, True),), (2, 256), 2, 1e-3, 1, 5120)),
+    "batch": (batch, batch.Size((batch.Case("FPU l=3", 1e-3, 0.6),), (2, 256), 2, 1e-3, 1, 5120)),
     "chains": (chains, chains.Size((2,), (2,), 1, (2,), ())),
     "compile": (compilation, compilation.Size(("FPU l=3",), ("fully explicit",), (10,), 1)),
 }
@@ -217,7 +217,7 @@ def check_floor(found):
 
 def check_batch(found):
     sizes = [(row["program"], row["batch"]) for row in found["rows"] if row["program"] != "C"]
-    assert sizes == [("default", 2), ("default", 256), ("fixed", 2), ("fixed", 256)]
+    assert sizes == [("default", 2), ("default", 256)]
     assert all(row["result"] == "CONVERGED" for row in found["rows"] if row["program"] != "C")
 
 

@@ -31,7 +31,7 @@ def test_rows(study):
         ("dense", 1),
         ("dense", 3),
     ]
-    assert {(row.method, row.solved_by) for row in study.rows} == {("auto", "LINEAR"), ("dense", "DENSE")}
+    assert {(row.method, row.solved_by) for row in study.rows} == {("auto", "LINEAR"), ("dense", "EXACT")}
     assert [row.num_unknowns for row in study.rows] == [4, 8, 4, 8]
     assert all(row.result == "CONVERGED" for row in study.rows)
     assert [row.iterations >= 1 for row in study.rows] == [False, False, True, True]
@@ -64,7 +64,7 @@ def test_csv(study, tmp_path):
 
 def test_a_run_that_fails_has_no_time():
     problem = vm.systems.fermi_pasta_ulam(2, omega=1e9)
-    study = cost_study(problem, vm.fully_explicit, (2,), micro_dt=1.0, t_end=40.0, methods=("arrowhead",), repeats=1)
+    study = cost_study(problem, vm.fully_explicit, (2,), micro_dt=1.0, t_end=40.0, methods=("exact",), repeats=1)
     (row,) = study.rows
     assert row.result == "NON_FINITE"
     assert np.isnan(row.us_per_micro_step)
@@ -79,18 +79,18 @@ def test_bad_input(bad):
 
 def cost(costs=(9.0, 3.0, 6.0), solver="dense"):
     rows = [
-        CostRow("FPU", solver, n, 3 * n, 10, 1.0, value, 1.0, 2, solver.upper(), "CONVERGED")
+        CostRow("FPU", solver, n, 3 * n, 10, 1.0, value, 1.0, 2, "EXACT", "CONVERGED")
         for n, value in zip((1, 10, 100), costs, strict=True)
     ]
     return CostStudy(tuple(rows))
 
 
 def test_cost_circles_the_minimum_and_marks_the_paper():
-    figure = plot_cost({"FPU": cost() + cost((5.0, 4.0, 3.0), "arrowhead")}, {"FPU": 60})
+    figure = plot_cost({"FPU": cost() + cost((5.0, 4.0, 3.0), "exact")}, {"FPU": 60})
     lines = figure.axes[0].lines
     circled = [np.asarray(line.get_xydata()).tolist() for line in lines if line.get_markersize() == 11]
     assert circled == [[[10.0, 3.0]], [[100.0, 3.0]]]
-    assert names_below(figure) == ["dense", "arrowhead", "minimum in the paper"]
+    assert names_below(figure) == ["dense", "exact", "minimum in the paper"]
     assert np.asarray(lines[-1].get_xdata()).tolist() == [60, 60]
 
 
@@ -115,5 +115,5 @@ def test_cost_leaves_failed_runs_out():
 
 
 def test_costs_of_runs_that_all_failed_are_drawn():
-    row = CostRow("", "dense", 2, 8, 4, np.nan, np.nan, 1.0, 1, "DENSE", "NON_FINITE")
+    row = CostRow("", "dense", 2, 8, 4, np.nan, np.nan, 1.0, 1, "EXACT", "NON_FINITE")
     assert is_drawn(plot_cost({"failed": CostStudy((row,))}))

@@ -115,7 +115,7 @@ def test_checks_compare_what_was_measured(made):
     assert [check.quantity for check in cost.checks] == [
         "FPU, dense: cost turns up again",
         "FPU, dense: cheapest number of micro steps",
-        "FPU, arrowhead: cost at 2 micro steps over that at 2",
+        "FPU, exact: cost at 2 micro steps over that at 2",
     ]
 
 

@@ -273,7 +273,7 @@ def test_a_full_disk_is_told(vmri, monkeypatch):
         (["fpu", *RUN[:4], "--alpha", 0.5], "use explicit-slow or mollified-impulse or fully-explicit"),
         (["fpu", *RUN[:4], "--scheme", "galerkin"], "needs the degree"),
         (["fpu", *RUN[:4], "--scheme", "galerkin", "--degree", 2, "--rule", "simpson"], "must be 'gauss', 'lobatto'"),
-        (["fpu", *RUN, "--method", "sparse"], "it must be one of auto, nested, arrowhead, null_space, dense"),
+        (["fpu", *RUN, "--matrix", "sparse"], "it must be one of auto, masses, modes, exact, null_space"),
     ],
 )
 def test_bad_input_is_refused_in_one_panel(vmri, arguments, message):

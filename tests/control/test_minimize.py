@@ -13,7 +13,7 @@ from vmri_jax.control import minimize
 NONE = np.zeros(0)
 POINT = vm.Problem(vm.System(vm.ConstantMass([1.0], NONE)), [0.0], NONE)
 """On a straight line, moved by a force."""
-MARCH = vm.solvers.Nested()
+MARCH = vm.Solver("masses")
 """Without the exact solve behind it, which takes long to compile."""
 STIFFNESS = np.array([4.0, 9.0])
 TIPS = np.array([0.1, 0.05])

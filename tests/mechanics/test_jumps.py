@@ -66,7 +66,7 @@ def test_a_run_with_dry_friction_names_it():
     system = vm.System(vm.ConstantMass([1.0], []), force=dry)
     block = vm.Problem(system, [0.0], [], [0.1], [], names=vm.Names(slow={"block": 1}))
     with pytest.raises(vm.SimulationError, match="STAGNATED") as caught:
-        vm.simulate(block, vm.fully_implicit(1), macro_dt=0.01, num_steps=10, solver=vm.solvers.Nested())
+        vm.simulate(block, vm.fully_implicit(1), macro_dt=0.01, num_steps=10, solver=vm.Solver("masses"))
     first = caught.value.__notes__[0]
     assert (
         "The likely cause: the force on block jumps from -3 to 3 just ahead, where the velocity of block passes"

@@ -327,7 +327,7 @@ def test_a_prepared_run_keeps_what_it_was_made_with():
     run = vm.prepare(problem(), vm.fully_implicit(1), **STEPS)
     here.STRENGTH = 9.0
     first = run().q_s
-    exact, _ = run._whole(True, run._arguments(None, None, None, None))  # the fallback, which is compiled only now
+    exact, _ = run.exact.whole(*run._arguments(None, None, None, None))  # the fallback, which is compiled only now
     np.testing.assert_allclose(exact.states.q_s, first, rtol=1e-14)
     here.STRENGTH = 1.0
     np.testing.assert_array_equal(vm.simulate(problem(), vm.fully_implicit(1), **STEPS).q_s, first)
@@ -416,10 +416,10 @@ def test_quantities_that_ensembles_keep_say_what_their_functions_say_now():
 
 
 def test_the_functions_of_control_and_of_solvers_are_watched():
-    custom = vm.solvers.Custom(by_global)
+    custom = vm.Solver(stepper=by_global)
     f = traced_once(by_global)
     optimal = Transcription(
-        problem().system, problem().state(), SCHEME, vm.solvers.Auto(), 0.1, f, f, f, f, f, (np.zeros(1), np.ones(1)), 1
+        problem().system, problem().state(), SCHEME, vm.Solver(), 0.1, f, f, f, f, f, (np.zeros(1), np.ones(1)), 1
     )
     for value in (custom, optimal):
         here.STRENGTH = 1.0

@@ -62,7 +62,7 @@ def cost_of(problem: vm.Problem, scheme, macro_dt, steps, save_every, solver=Non
 
 def simple_cost(adjoint, steps="solved"):
     """Of a small system without constraints, a function of the momenta at the start alone."""
-    cost, at = cost_of(CHAIN, SIMPLE[steps], 0.05, 6, 6, vm.solvers.Nested(), adjoint=adjoint)
+    cost, at = cost_of(CHAIN, SIMPLE[steps], 0.05, 6, 6, vm.Solver("masses"), adjoint=adjoint)
     return (lambda p_f: cost(at[0], at[1], p_f, at[3])), at[2]
 
 
@@ -76,7 +76,7 @@ def simple_gradient(adjoint, steps="solved"):
 def gradient(case: str, save_every: int, adjoint: str, save_micro: bool = False):
     """All derivatives of a case in a row."""
     make, scheme, macro_dt, steps = CASES[case]
-    solver = vm.solvers.Nested() if case != "composed" else None
+    solver = vm.Solver("masses") if case != "composed" else None
     cost, at = cost_of(make(), scheme, macro_dt, steps, save_every, solver, adjoint=adjoint, save_micro=save_micro)
     derivatives = jax.jit(jax.grad(cost, argnums=(0, 1, 2, 3)))(*at)
     return np.concatenate([np.ravel(a) for a in jax.tree.leaves(derivatives)])
@@ -132,14 +132,14 @@ def test_memory_of_long_gradients():
 
 
 @pytest.mark.full
-def test_where_the_march_fails_the_arrowhead_is_differentiated():
-    """With steps that the nested iteration does not solve."""
+def test_where_masses_fail_exact_matrices_are_differentiated():
+    """With steps that passes with masses do not solve."""
     problem = PROBLEMS["tsp"]()
     found = {}
     for name in ("stored", "checkpoint"):
         cost, at = cost_of(problem, vm.fully_implicit(1), 0.3, 4, 2, adjoint=name)
         found[name] = jax.jit(jax.grad(cost))(*at)
     run = vm.simulate(problem, vm.fully_implicit(1), macro_dt=0.3, num_steps=4)
-    assert max(run.info.method) == vm.Method.ARROWHEAD
+    assert max(run.info.method) == vm.Method.EXACT
     for a, b in zip(*map(jax.tree.leaves, found.values()), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-6)

@@ -176,7 +176,7 @@ def test_too_few_iterations_fail_the_run(fpu):
     with pytest.raises(
         SimulationError, match=r"step 0 .*STAGNATED.* after 1 Newton iterations.*max_iterations"
     ) as caught:
-        run(fpu, fully_implicit(3), solver=vm.solvers.Auto(max_iterations=1))
+        run(fpu, fully_implicit(3), solver=vm.Solver(max_iterations=1))
     assert caught.value.iterations == 1
     assert caught.value.residual > 1e-12
 

@@ -48,7 +48,7 @@ def test_a_run_says_what_it_is_and_what_it_has_kept(run):
         "fast 2 coordinates: tip x, tip y",
         "energy 2 at the start, changed by at most 9.99e-04, 5.0e-04 of it",
         "constraints kept to 1.0e-14 in positions, 2.0e-13 in velocities",
-        "solver NESTED, at most 4 iterations per step, residual at most 1.0e-15",
+        "solver MASSES, at most 4 iterations per step, residual at most 1.0e-15",
     ]
 
 

@@ -42,7 +42,7 @@ def test_what_is_taken_out_was_never_there(base, effect):
 
 def step(system, state, memory):
     """A macro step of `fully_explicit(5)`."""
-    return plan(system, fully_explicit(5), state, fallback=False).step(state, memory, 0.01)
+    return plan(system, fully_explicit(5), state).step(state, memory, 0.01)
 
 
 def look(system, state, memory):
@@ -55,7 +55,7 @@ def look(system, state, memory):
 def test_program_is_that_of_the_system_written_by_hand(function):
     state, programs = BASE.state(), []
     for system in (BASE.system(), base_by_hand()):
-        memory = plan(system, fully_explicit(5), state, fallback=False).init(state, 0.01)
+        memory = plan(system, fully_explicit(5), state).init(state, 0.01)
         programs.append(jax.jit(function).lower(system, state, memory).compile())
     ours, theirs = programs
     assert sum(operations(ours).values()) > 20

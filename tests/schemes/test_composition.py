@@ -80,7 +80,7 @@ def test_equals_its_stages_one_by_one(name, base):
     problem, dt = PROBLEMS[name](), 0.01
     scheme = compose(base, "suzuki4")
     run = vm.simulate(problem.system, scheme, problem.state(), macro_dt=dt, num_steps=3, save_micro=True)
-    state, micro, solver = problem.state(), [], without_fallback(problem.system, base)
+    state, micro, solver = problem.state(), [], without_fallback(problem, base)
     for _ in range(3):
         micro.append([])
         for c in np.asarray(scheme.coefficients):
@@ -110,7 +110,7 @@ def test_keeps_constraints_and_symmetry():
 def test_keeps_the_area(name):
     """With constraints it follows from the symplectic step, and from the stages one by one."""
     problem, scheme = PROBLEMS[name](), compose(fully_explicit(2), "kahan-li6")
-    solver = without_fallback(problem.system, scheme)
+    solver = without_fallback(problem, scheme)
     assert vm.diagnostics.symplectic_defect(problem, scheme, macro_dt=0.01, solver=solver) < 1e-11
 
 

@@ -17,10 +17,9 @@ STEPS = {
     "explicit": ("fermi_pasta_ulam", vm.fully_explicit(4), None),
     "rattle": ("triple_spherical_pendulum", vm.fully_explicit(1), None),
     "split": ("simple_atomic_model", vm.explicit_slow(3), None),
-    "nested iteration": ("triple_spherical_pendulum", vm.fully_implicit(3), vm.solvers.Nested()),
-    "collocation": ("fermi_pasta_ulam", vm.galerkin(1, 3), None),
-    "coupled, dense": ("fermi_pasta_ulam", vm.fully_implicit(2), vm.solvers.Dense()),
-    "coupled, arrowhead": ("fermi_pasta_ulam", vm.fully_implicit(2), vm.solvers.Arrowhead()),
+    "masses": ("triple_spherical_pendulum", vm.fully_implicit(3), vm.Solver("masses")),
+    "modes": ("fermi_pasta_ulam", vm.galerkin(1, 3), None),
+    "exact": ("fermi_pasta_ulam", vm.fully_implicit(2), vm.Solver("exact")),
     "composition": ("fermi_pasta_ulam", vm.compose(vm.fully_explicit(2), "suzuki4"), None),
 }
 

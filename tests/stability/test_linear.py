@@ -19,7 +19,7 @@ from vmri_jax import (
 )
 from vmri_jax.mechanics.arrays import QUICK
 from vmri_jax.stability import linear_model, multipliers, small_motions
-from vmri_jax.steppers import solvers
+from vmri_jax.steppers.solver import Solver
 
 
 def step_matrix(system, scheme, state, macro_dt, motions):
@@ -29,7 +29,7 @@ def step_matrix(system, scheme, state, macro_dt, motions):
 
     def step(coordinates):
         start = State(state.t, *jnp.split(z + motions.embed @ coordinates, (n_s, n, n + n_s)))
-        end = macro_step(system, scheme, start, macro_dt, solvers.Arrowhead())[0]
+        end = macro_step(system, scheme, start, macro_dt, Solver("exact"))[0]
         return motions.read @ jnp.concatenate([end.q_s, end.q_f, end.p_s, end.p_f])
 
     return np.asarray(jax.jit(jax.jacfwd(step), compiler_options=QUICK)(jnp.zeros(motions.embed.shape[1])))

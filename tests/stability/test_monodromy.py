@@ -7,9 +7,9 @@ import pytest
 from tests.stability.systems import double_pendulum
 from vmri_jax import fully_explicit, initial_state
 from vmri_jax.stability import linear_model, monodromy, multipliers, small_motions, stability_map
-from vmri_jax.steppers import solvers
+from vmri_jax.steppers.solver import Solver
 
-MARCH = solvers.Nested()
+MARCH = Solver("masses")
 
 
 def test_powers_of_a_linear_step():

@@ -23,7 +23,7 @@ from vmri_jax import (
     simulate,
 )
 from vmri_jax.schemes.path import control_nodes
-from vmri_jax.steppers import solvers
+from vmri_jax.steppers.solver import Solver
 from vmri_jax.steppers.time_modes import TimeModes, times_i
 
 
@@ -112,7 +112,7 @@ def test_potentials_are_taken_at_the_nodes_of_their_rule_alone(scheme):
     system = System(mass, fast_potential=lambda q_f, params: 1e-3 * jnp.sum(jnp.sqrt(q_f)))
     none, one, h = jnp.zeros(0), jnp.ones(2), 0.1
     state = State(jnp.zeros(()), none, one, none, -1.05 / h * one)
-    end, info = compiled_step(system, scheme, state, h, solvers.Nested())
+    end, info = compiled_step(system, scheme, state, h, Solver("modes"))
     assert np.all(np.asarray(end.q_f) < 0)
     assert Result(int(info.result)).success or scheme.fast.rule.nodes[-1] == 1.0  # there is no momentum there
 
@@ -138,12 +138,12 @@ def test_few_passes_and_errors_within_the_tolerance(name, scheme, macro_dt, pass
     """Few passes: the matrix is that of the equations at the start."""
     system, state = start_of(name, request)
     n = state.q_s.size + state.q_f.size
-    expected, info = phases(system, scheme, state, solvers.Nested(), macro_dt)
-    assert int(info.method.max()) == Method.COLLOCATION
+    expected, info = phases(system, scheme, state, Solver("modes"), macro_dt)
+    assert int(info.method.max()) == Method.MODES
     assert info.iterations.mean() < passes, info.iterations.mean()
     motion = np.abs(np.diff(expected[:, :n], axis=0)).max()
     for tolerance in (1e-3, 1e-9):
-        loose, _ = phases(system, scheme, state, solvers.Nested(tolerance), macro_dt)
+        loose, _ = phases(system, scheme, state, Solver("modes", tolerance), macro_dt)
         assert largest_difference(loose[:, :n], expected[:, :n]) < tolerance * motion
 
 
@@ -154,7 +154,7 @@ def test_few_passes_and_errors_within_the_tolerance(name, scheme, macro_dt, pass
 )
 def test_it_solves_the_equations_of_the_step(make, scheme, macro_dt):
     system, state = make()
-    runs = [phases(system, scheme, state, solvers.named(method)(), macro_dt)[0] for method in ("nested", "arrowhead")]
+    runs = [phases(system, scheme, state, Solver(matrix), macro_dt)[0] for matrix in ("modes", "exact")]
     assert largest_difference(*runs) / np.abs(runs[1]).max() < 1e-12  # measured 1e-14
 
 
@@ -171,23 +171,10 @@ def test_where_it_fails_the_whole_equations_are_asked(tsp):
     fast = dataclasses.replace(start, p_s=40 * start.p_s, p_f=40 * start.p_f)
     step = {"macro_dt": 0.2, "num_steps": 10, "throw": False}
     march, auto = (
-        simulate(tsp.system, galerkin(1, 3), fast, solver=solvers.named(method)(), **step)
-        for method in ("nested", "auto")
+        simulate(tsp.system, galerkin(1, 3), fast, solver=Solver(matrix), **step) for matrix in ("modes", "auto")
     )
     assert int(march.failed_at) == 0
-    assert int(auto.info.method[0]) == Method.ARROWHEAD
-
-
-@pytest.mark.full  # as with every method, see test_fallback
-def test_fixed_iterations(tsp):
-    system, state = tsp.system, tsp.state()
-    free, _ = phases(system, galerkin(1, 3), state)
-    fixed, info = phases(system, galerkin(1, 3), state, solvers.Auto(fixed_iterations=8))
-    assert np.all(np.asarray(info.iterations) == 8)
-    assert largest_difference(free, fixed) < 1e-11
-    few = solvers.Auto(fixed_iterations=1)
-    run = simulate(system, galerkin(1, 3), state, macro_dt=0.02, num_steps=10, solver=few, throw=False)
-    assert Result(int(run.result)) is Result.STAGNATED
+    assert int(auto.info.method[0]) == Method.EXACT
 
 
 @pytest.mark.full

@@ -39,7 +39,7 @@ def rotation(system, scheme):
     return Kicked(lagrangian(system.replace(fast_potential=None), scheme).kicks, Rotation(system))
 
 
-EXACT = vm.solvers.Custom(rotation)
+EXACT = vm.Solver(stepper=rotation)
 
 
 def test_micro_steps_converge_to_it(fpu):
@@ -73,12 +73,12 @@ def test_compositions_batches_and_gradients(fpu):
 
 
 def by_march(system, scheme):
-    return Marched(vm.solvers.Arrowhead(), "arrowhead")
+    return Marched(vm.Solver("exact"))
 
 
 def without_projection(system, scheme):
     """A whole step that ends with the momenta of the discrete Legendre transform."""
-    whole = vm.plan(system, scheme, double_pendulum().state(), vm.solvers.Arrowhead()).stepper
+    whole = vm.plan(system, scheme, double_pendulum().state(), vm.Solver("exact")).stepper
     return WithoutProjection(whole.inner)  # pyright: ignore[reportAttributeAccessIssue]
 
 
@@ -100,16 +100,16 @@ class WithoutProjection(Stepper):
 def test_a_solver_gets_the_kicks_and_the_projection(scheme):
     """A user's solver solves the equations between the kicks; momenta end on the hidden constraints."""
     pendulum = double_pendulum()
-    ours = vm.simulate(pendulum, scheme, solver=vm.solvers.Custom(by_march), **STEPS)
-    theirs = vm.simulate(pendulum, scheme, solver=vm.solvers.Arrowhead(), **STEPS)
+    ours = vm.simulate(pendulum, scheme, solver=vm.Solver(stepper=by_march), **STEPS)
+    theirs = vm.simulate(pendulum, scheme, solver=vm.Solver("exact"), **STEPS)
     np.testing.assert_allclose(ours.states.p_f, theirs.states.p_f, rtol=1e-13)
     assert ours.constraint_residual.max() < 1e-12
 
 
 def test_momenta_of_a_whole_step_are_projected():
     pendulum, scheme = double_pendulum(), vm.fully_implicit(2)
-    ours = vm.simulate(pendulum, scheme, solver=vm.solvers.Custom(without_projection), **STEPS)
-    theirs = vm.simulate(pendulum, scheme, solver=vm.solvers.Arrowhead(), **STEPS)
+    ours = vm.simulate(pendulum, scheme, solver=vm.Solver(stepper=without_projection), **STEPS)
+    theirs = vm.simulate(pendulum, scheme, solver=vm.Solver("exact"), **STEPS)
     assert ours.constraint_residual.max() < 1e-12
     np.testing.assert_allclose(ours.states.p_f, theirs.states.p_f, atol=1e-12)
 
@@ -119,12 +119,12 @@ def nothing(system, scheme):
 
 
 def test_bad_input(fpu):
-    with pytest.raises(TypeError, match=r"Custom: stepper is 3; give a function"):
-        vm.solvers.Custom(3)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(TypeError, match=r"Solver: stepper is 3; give a function"):
+        vm.Solver(stepper=3)  # pyright: ignore[reportArgumentType]
     with pytest.raises(
-        TypeError, match=r"the stepper of solvers.Custom is NoneType; give a vmri_jax.steppers.stepper.Stepper"
+        TypeError, match=r"the value of Solver.stepper is NoneType; give a vmri_jax.steppers.stepper.Stepper"
     ):
-        vm.simulate(fpu, vm.fully_explicit(1), solver=vm.solvers.Custom(nothing), **STEPS)  # pyright: ignore[reportArgumentType]
+        vm.simulate(fpu, vm.fully_explicit(1), solver=vm.Solver(stepper=nothing), **STEPS)  # pyright: ignore[reportArgumentType]
     with pytest.raises(
         ValueError,
         match=r"advance of .* returns StepInfo.q_f_micro of shape \(1, 3\); it must be \(2, 3\) for num_micro = 2",
@@ -144,8 +144,8 @@ def test_a_subclass_of_kicked_keeps_its_methods_with_constraints():
     def counted(system, scheme):
         return Counted((), without_projection(system, scheme))
 
-    ours = vm.simulate(pendulum, scheme, solver=vm.solvers.Custom(counted), **STEPS)
-    theirs = vm.simulate(pendulum, scheme, solver=vm.solvers.Arrowhead(), **STEPS)
+    ours = vm.simulate(pendulum, scheme, solver=vm.Solver(stepper=counted), **STEPS)
+    theirs = vm.simulate(pendulum, scheme, solver=vm.Solver("exact"), **STEPS)
     assert calls
     assert ours.constraint_residual.max() < 1e-12
     np.testing.assert_allclose(ours.states.p_f, theirs.states.p_f, atol=1e-12)
@@ -188,7 +188,7 @@ def verlet(system, scheme):
 def test_stages_of_a_composition_start_with_their_own_memory(fpu):
     """Memory that depends on the state, and a wrong time: compositions of the stepper equal compositions of the library's scheme."""
     for scheme in (vm.fully_explicit(1), vm.compose(vm.fully_explicit(1), "suzuki4")):
-        ours = vm.simulate(fpu, scheme, solver=vm.solvers.Custom(verlet), **STEPS)
+        ours = vm.simulate(fpu, scheme, solver=vm.Solver(stepper=verlet), **STEPS)
         theirs = vm.simulate(fpu, scheme, **STEPS)
         np.testing.assert_allclose(ours.states.q_f, theirs.states.q_f, atol=1e-14)
         np.testing.assert_allclose(ours.states.t, theirs.states.t, atol=1e-15)

@@ -16,7 +16,7 @@ from vmri_jax.diagnostics.linear import newton_matrix
 from vmri_jax.steppers.march import inverse_with_multipliers
 from vmri_jax.steppers.newton.null_space import inverse_without_multipliers, motions
 
-NULL_SPACE = vm.solvers.NullSpace()
+NULL_SPACE = vm.Solver("null_space")
 REFERENCE = "triple_spherical_pendulum", pytest.param("simple_atomic_model", marks=pytest.mark.full)
 
 
@@ -57,7 +57,7 @@ def test_trajectories_are_those_of_the_method_with_multipliers(make, step, steps
     arguments = {"macro_dt": step, "num_steps": steps, "save_every": 20}
     runs = [
         vm.simulate(problem, vm.fully_implicit(num_micro=5), solver=solver, **arguments)
-        for solver in (NULL_SPACE, vm.solvers.Arrowhead())
+        for solver in (NULL_SPACE, vm.Solver("exact"))
     ]
     assert runs[0].info.method[0] == vm.Method.NULL_SPACE
     assert float(runs[0].constraint_residual.max()) < 1e-12

@@ -21,7 +21,7 @@ from vmri_jax import (
 
 
 def step(problem, scheme, macro_dt):
-    return compiled_step(problem.system, scheme, problem.state(), macro_dt, without_fallback(problem.system, scheme))
+    return compiled_step(problem.system, scheme, problem.state(), macro_dt, without_fallback(problem, scheme))
 
 
 def only_slow(q_s, q_f, params):
@@ -36,7 +36,8 @@ def test_split_and_coupled_routes_agree():
     )
     separate = problem.system.replace(slow_potential=only_slow)
     together = problem.system.replace(slow_potential=lambda q_s, q_f, params: only_slow(q_s, q_f, params) + 0 * q_f[0])
-    a, b = (compiled_step(s, scheme, problem.state(), 0.1, without_fallback(s, scheme)) for s in (separate, together))
+    state = problem.state()
+    a, b = (compiled_step(s, scheme, state, 0.1, without_fallback(s, scheme, state)) for s in (separate, together))
     assert largest_difference(a[1].q_f_micro, b[1].q_f_micro) < 1e-14
     for name in ("q_s", "q_f", "p_s", "p_f"):
         assert largest_difference(getattr(a[0], name), getattr(b[0], name)) < 1e-13

@@ -8,6 +8,7 @@ import jax
 import numpy as np
 
 import vmri_jax as vm
+from benchmarks.gail2014.dense import named
 from tests.verification import random_systems as rs
 from vmri_jax import textbook
 
@@ -25,7 +26,7 @@ simulate_textbook = jax.jit(partial(textbook.simulate, num_steps=STEPS))
 def agrees(structure: rs.Structure, draw: rs.Draw) -> str:
     """The name of the method that solved the steps, if they end where the textbook's end."""
     problem, scheme = rs.problem(structure, draw), rs.scheme(structure, draw)
-    state, solver = problem.state(), vm.solvers.named(structure.method)()  # pyright: ignore
+    state, solver = problem.state(), named(structure.method)
     run = vm.simulate(
         problem.system, scheme, state, macro_dt=draw.macro_dt, num_steps=STEPS, save_every=EVERY, solver=solver
     )

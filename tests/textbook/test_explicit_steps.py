@@ -16,13 +16,13 @@ STRUCTURES = {
         rs.Structure(2, 1, 2, "matrix", "harmonic", "harmonic", scheme="explicit slow", num_micro=3),
     ),
     "slow and fast apart": (
-        Method.NESTED,
+        Method.MASSES,
         rs.Structure(
             2, 1, 2, **SPRINGS, constraint="anchored", slow_constraint="sphere", scheme="explicit slow", num_micro=3
         ),
     ),
     "composition": (
-        Method.NESTED,
+        Method.MASSES,
         rs.Structure(
             2,
             1,

@@ -9,12 +9,12 @@ from tests.verification import random_systems as rs
 from vmri_jax import Method
 
 STRUCTURES = {
-    "arrowhead": (
-        Method.ARROWHEAD,
-        rs.Structure(1, 2, 2, **SPRINGS, force="drag", scheme="gauss", num_micro=3, degree=3, method="arrowhead"),
+    "exact": (
+        Method.EXACT,
+        rs.Structure(1, 2, 2, **SPRINGS, force="drag", scheme="gauss", num_micro=3, degree=3, method="exact"),
     ),
     "kinetic function and all else": (
-        Method.ARROWHEAD,
+        Method.EXACT,
         rs.Structure(
             2, 1, 1, "bent", **SPRINGS, constraint="rod", moving=True, slow_constraint="norm", force="drag", num_micro=2
         ),
@@ -36,7 +36,7 @@ STRUCTURES = {
         ),
     ),
     "own rules": (
-        Method.DENSE,
+        Method.EXACT,
         rs.Structure(
             1, 1, 2, "coupled", **SPRINGS, force="drive", scheme="mixed", num_micro=2, degree=2, method="dense"
         ),

@@ -17,9 +17,9 @@ from vmri_jax.scene import Scene
 STEPS = 2
 
 
-def _newton(cell: Cell) -> vm.solvers.Newton | None:
+def _first(cell: Cell) -> vm.Solver:
     """Without the fallback, whose derivative takes as long to compile again, where there is one."""
-    return vm.solvers.Nested() if cell.problem.system.has_constant_mass else None
+    return vm.plan(cell.problem, SCHEME).first
 
 
 def gradient(cell: Cell) -> None:
@@ -27,7 +27,7 @@ def gradient(cell: Cell) -> None:
 
     def distance(part):
         start = vm.State(state.t, state.q_s, state.q_f, part * state.p_s, part * state.p_f)
-        run = vm.simulate(problem.system, SCHEME, start, macro_dt=MACRO_DT, num_steps=STEPS, solver=_newton(cell))
+        run = vm.simulate(problem.system, SCHEME, start, macro_dt=MACRO_DT, num_steps=STEPS, solver=_first(cell))
         return jnp.sum(run.q_s[-1] ** 2) + jnp.sum(run.q_f[-1] ** 2)
 
     assert np.isfinite(jax.grad(distance)(1.0))
@@ -69,7 +69,7 @@ STEPPING = {"scheme": SCHEME, "macro_dt": MACRO_DT, "num_steps": STEPS}
 
 
 def minimize(cell: Cell) -> None:
-    best = control.minimize(cell.problem, effort, actuate=push, num_controls=1, solver=_newton(cell), **STEPPING)
+    best = control.minimize(cell.problem, effort, actuate=push, num_controls=1, solver=_first(cell), **STEPPING)
     assert best.success
     assert str(best)
     plots.save(plots.plot_control(best), cell.folder / "controls.png")

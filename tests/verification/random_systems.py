@@ -128,7 +128,6 @@ class Structure:
     degree: int = 1
     composition: str | None = None
     method: str = "auto"
-    fixed_iterations: int | None = None
     num_saves: int = 3
     save_micro: bool = False
     lanes: int | None = None
@@ -166,9 +165,7 @@ def structure(random: Random, tame: bool = False) -> Structure:
     degree = random.choice([1, 2, 3, 4] if tame else [1, 2, 3]) if scheme in HIGH_DEGREE else 1
     functions = list(KINETIC)[: (0 if scheme == "takahashi imada" else 2) if tame else None]
     methods = (
-        ["auto", "arrowhead", "null_space", "dense"]
-        if tame
-        else ["auto"] * 4 + ["nested", "arrowhead", "null_space", "dense"]
+        ["auto", "exact", "null_space", "dense"] if tame else ["auto"] * 4 + ["masses", "exact", "null_space", "dense"]
     )
     composable = not tame or (degree == 1 and scheme != "mixed")
     return Structure(
@@ -187,7 +184,6 @@ def structure(random: Random, tame: bool = False) -> Structure:
         degree=degree,
         composition=random.choice(["yoshida4", "suzuki4"]) if composable and random.random() < 0.1 else None,
         method=random.choice(methods),
-        fixed_iterations=random.choice([1, 3, 6]) if not tame and random.random() < 0.1 else None,
         num_saves=random.choice([1, 3]),
         save_micro=random.random() < 0.3,
         lanes=4 if not tame and random.random() < 0.1 else None,

@@ -91,7 +91,7 @@ compiled_defect = jax.jit(symplectic_defect)
 
 
 def defect(problem, scheme, macro_dt):
-    solver = without_fallback(problem.system, scheme)
+    solver = without_fallback(problem, scheme)
     return compiled_defect(problem.system, scheme, problem.state(), macro_dt=macro_dt, solver=solver)
 
 

@@ -31,13 +31,13 @@ STRUCTURES = {
         constraint="chain",
         scheme="fully explicit",
         num_micro=3,
-        method="nested",
+        method="masses",
     ),
     "a constraint that crosses itself": rs.Structure(
-        dimension=2, fast_potential="finitely extensible", constraint="product", num_micro=2, method="arrowhead"
+        dimension=2, fast_potential="finitely extensible", constraint="product", num_micro=2, method="exact"
     ),
     "a force that is NaN for half of all velocities": rs.Structure(
-        slow_potential="logarithm", fast_potential="double well", force="root", method="arrowhead"
+        slow_potential="logarithm", fast_potential="double well", force="root", method="exact"
     ),
 }
 

@@ -11,7 +11,7 @@ import pytest
 from tests.support import PROBLEMS, without_fallback
 from tests.user_systems import cart
 from vmri_jax import State, fully_explicit, fully_implicit, galerkin, initial_state, simulate, systems
-from vmri_jax.steppers import solvers
+from vmri_jax.steppers.solver import Solver
 
 CHAIN = systems.fermi_pasta_ulam(1)
 CASES = {  # problem, scheme, macro_dt, name and entry of the parameter
@@ -34,7 +34,7 @@ def central_difference(function, x, step):
     return float((4 * d[1] - d[0]) / 3)
 
 
-def final_position(case: str, solver: solvers.Newton | None = None):
+def final_position(case: str, solver: Solver | None = None):
     """The sum of cosines of the fast positions after 10 steps as a function of ``(stiffness, v, q_f, macro_dt)``.
 
     The start has the velocities v, projected onto the constraints, and the fast positions q_f; by the march alone where no
@@ -42,7 +42,7 @@ def final_position(case: str, solver: solvers.Newton | None = None):
     """
     problem, scheme, macro_dt, parameter, entry = CASES[case]
     params, n_s = problem.system.params, problem.q_s.size
-    solver = solver or without_fallback(problem.system, scheme)
+    solver = solver or without_fallback(problem, scheme)
 
     def replaced(stiffness):
         if parameter is None:
@@ -64,7 +64,7 @@ def final_position(case: str, solver: solvers.Newton | None = None):
 @cache
 def gradient_program(case: str):
     """Value and gradient with respect to all arguments in one compiled program, and the arguments of the case."""
-    function, at = final_position(case, solvers.Auto() if case == FALLS_BACK else None)
+    function, at = final_position(case, Solver() if case == FALLS_BACK else None)
     return jax.jit(jax.value_and_grad(function, argnums=(0, 1, 2, 3))), at
 
 
@@ -109,7 +109,7 @@ def test_both_methods_agree():
     """The derivative through all unknowns at once is that through the march."""
     case = "cart, fully implicit"
     program, at = gradient_program(case)
-    function, _ = final_position(case, solvers.Arrowhead())
+    function, _ = final_position(case, Solver("exact"))
     by_stiffness = jax.jit(jax.grad(function))(*at)
     assert float(by_stiffness) == pytest.approx(float(program(*at)[1][0]), rel=1e-9)
 

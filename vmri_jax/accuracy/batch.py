@@ -19,7 +19,7 @@ from vmri_jax.running.trajectory import Trajectory, trajectory_of, with_origin
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.results import Result
-from vmri_jax.steppers.solvers import Newton
+from vmri_jax.steppers.solver import Solver
 
 
 class FailedLanesWarning(UserWarning):
@@ -38,7 +38,7 @@ def simulate_batch(
     save_every: int = 1,
     save_micro: bool = False,
     params=None,
-    solver: Newton | None = None,
+    solver: Solver | None = None,
     chunk: int | None = None,
     devices: int = 1,
     warn: bool = True,
@@ -52,8 +52,8 @@ def simulate_batch(
     Whatever has no axis of lanes holds for all lanes. Lanes are computed side by side (`jax.vmap`), in chunks that fit into the cache. Unlike
     `simulate`, a failed step never raises: its
     lane is NaN after the step and has its status in ``.result`` and ``.failed_at``; other lanes do not change. A
-    `FailedLanesWarning` says how many lanes failed. Lanes that the first solver of `Auto` does not solve are run again with `Arrowhead`,
-    whose program is compiled at the first such lane.
+    `FailedLanesWarning` says how many lanes failed. Lanes that the first matrix of "auto" does not solve are run again with exact
+    matrices, whose program is compiled at the first such lane.
 
     Args:
         system: a `Problem` or a scene; or a `System`, with states.

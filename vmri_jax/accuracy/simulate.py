@@ -19,7 +19,7 @@ from vmri_jax.running.simulation import simulation
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
-from vmri_jax.steppers.solvers import Newton
+from vmri_jax.steppers.solver import Solver
 
 
 def simulate(
@@ -33,7 +33,7 @@ def simulate(
     t_end: float | None = None,
     save_every: int = 1,
     save_micro: bool = False,
-    solver: Newton | None = None,
+    solver: Solver | None = None,
     throw: bool = True,
     progress: ShowsProgress = False,
     adjoint: str = "auto",
@@ -54,8 +54,8 @@ def simulate(
     numbers of steps and of saved nodes vary without another compilation; num_micro and save_micro are part of the structure. It works
     under ``jax.vmap`` over state, params and macro_dt, and under ``jax.grad`` and ``jax.jacfwd``, where save_every and the number of saved
     nodes are part of the structure, too. There a failed step does not raise: the status is in the trajectory. Names work inside of the
-    transformed function: ``run.position("load")``. Under ``jax.vmap`` the solver `solvers.Auto` computes its fallback for every lane: take
-    `simulate_batch`, or ``solver=vm.solvers.Nested()``.
+    transformed function: ``run.position("load")``. Under ``jax.vmap`` the matrix "auto" computes its fallback for every lane: take
+    `simulate_batch`, or ``solver=vm.plan(system, scheme, state).first``.
 
     A run whose system keeps its energy warns with `LostEnergyWarning` if the energy changes by more than half of the largest kinetic energy, and a run
     across a pole of its coordinates with `SingularCoordinatesWarning`; ``run.concerns()`` has these sentences, also after a run in a transformation.
@@ -68,7 +68,7 @@ def simulate(
         num_steps, t_end: number of macro steps, a multiple of `save_every`, or the time of the end; exactly one of them.
         save_every: macro steps from one saved node to the next.
         save_micro: also keep the fast positions at the micro nodes of the macro step that ends at each saved node.
-        solver: for implicit equations, one of `vmri_jax.solvers`; None for `solvers.Auto`.
+        solver: for implicit equations; None for ``Solver()``.
         throw: raise `SimulationError` (which carries the partial trajectory) if a step fails; else return the trajectory,
             NaN after the failure.
         progress: True for a bar, or a function of (what, done, total), with an accuracy called before every trial run. With False a run

@@ -35,7 +35,7 @@ from vmri_jax.running.settings import Settings
 from vmri_jax.running.simulation import Simulation, simulation
 from vmri_jax.schemes.composition import Composition, stage_scheme
 from vmri_jax.schemes.scheme import Scheme, fully_explicit, fully_implicit
-from vmri_jax.steppers.solvers import Newton
+from vmri_jax.steppers.solver import Solver
 
 FIRST_MICRO = 5
 """Micro steps of the first trials; the search then chooses another number. One far from the best number makes the trials take longer."""
@@ -71,7 +71,7 @@ def with_accuracy(
     system: Movable,
     scheme: Scheme | Composition | None,
     state: State | None,
-    solver: Newton | None,
+    solver: Solver | None,
     accuracy: float,
     *,
     t_end: float,

@@ -24,8 +24,8 @@ from vmri_jax.running.settings import Settings
 from vmri_jax.running.store import StoredTrajectory, stream
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes.composition import stage_scheme
-from vmri_jax.steppers import solvers
 from vmri_jax.steppers.results import Method, SimulationError
+from vmri_jax.steppers.solver import Solver
 
 DEFAULT_SCHEME = "fully-implicit"
 """The scheme of a run without --scheme and --accuracy."""
@@ -78,7 +78,7 @@ def simulate(
             "--save-micro", help="Keep the fast motion within macro steps too, by default of every macro step."
         ),
     ] = False,
-    method: Annotated[str, typer.Option(help="auto, nested, arrowhead, null-space or dense.")] = "auto",
+    matrix: Annotated[str, typer.Option(help="auto, masses, modes, exact or null-space.")] = "auto",
     out: Annotated[
         Path | None, typer.Option(help="Write the trajectory here: .npz at the end, or .zarr during the run.")
     ] = None,
@@ -111,7 +111,7 @@ def simulate(
             "num_steps": steps,
             "save_every": save_every,
             "save_micro": save_micro,
-            "solver": solvers.named(method.replace("-", "_"))(),  # pyright: ignore[reportArgumentType]
+            "solver": Solver(matrix.replace("-", "_")),
             "progress": True,
         }
         if streamed:
@@ -156,7 +156,7 @@ def simulate(
                     }
                 )
                 if steps is None:
-                    _print_again(trajectory.settings, system, method)
+                    _print_again(trajectory.settings, system, matrix)
             else:
                 code = _print_stop(stopped, saved, streamed)
     if stopped is not None:
@@ -181,14 +181,14 @@ def _check_steps(steps: int | None, accuracy: float | None, t_end: float | None,
         raise ValueError(f"{option} compares runs that are in memory; give --out with a file that ends in .npz.")
 
 
-def _print_again(chosen: Settings, system: str, method: str) -> None:
+def _print_again(chosen: Settings, system: str, matrix: str) -> None:
     """Print the command for a run with the chosen scheme and steps, unless the user gave the scheme."""
     if not chosen.options:
         return
     numbers = f"--num-micro {stage_scheme(chosen.scheme).num_micro} --macro-dt {chosen.macro_dt!r}"
     saved = f"--steps {chosen.num_steps} --save-every {chosen.save_every}"
-    method_option = "" if method == "auto" else f" --method {method}"
-    command = f"vmri simulate {shlex.quote(system)} {chosen.options} {numbers} {saved}{method_option}"
+    matrix_option = "" if matrix == "auto" else f" --matrix {matrix}"
+    command = f"vmri simulate {shlex.quote(system)} {chosen.options} {numbers} {saved}{matrix_option}"
     console.print(f"The same run again:\n[bold]{escape(command)}[/bold]", soft_wrap=True)
 
 

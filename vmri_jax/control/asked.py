@@ -18,9 +18,8 @@ from vmri_jax.mechanics.state import start_of
 from vmri_jax.running.prepare import prepare
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
-from vmri_jax.steppers import solvers
 from vmri_jax.steppers.plan import plan
-from vmri_jax.steppers.solvers import Newton
+from vmri_jax.steppers.solver import Solver
 
 
 def actuation_of(problem, actuate, num_controls) -> tuple[Callable, tuple[str, ...]]:
@@ -57,7 +56,7 @@ def transcribed(
     macro_dt: float,
     num_steps: int,
     grid: Literal["macro", "micro"],
-    solver: Newton | None,
+    solver: Solver | None,
 ) -> Transcription:
     """The optimal control problem on the grid of the scheme, from the arguments of `minimize`, which are checked."""
     whole_number("minimize: num_steps", num_steps)
@@ -71,8 +70,7 @@ def transcribed(
         )
     prepare(problem, scheme, macro_dt=macro_dt, num_steps=1, solver=solver)  # makes the checks of a run
     # A fallback is a branch of the compiled step. `jax.vmap` over all steps would compute both of its sides for every step.
-    if solver is None and plan(system, scheme, state).has_fallback:
-        solver = solvers.Nested()
+    solver = solver or plan(system, scheme, state).first
     u = np.zeros(num_controls)
     actuate = traced_once(actuate, order_of(params))
     forces = jax.eval_shape(lambda: actuate(state.q_s, state.q_f, u, params))
@@ -93,7 +91,7 @@ def transcribed(
         system.replace(params=params),
         state,
         scheme,
-        solver or solvers.Auto(),
+        solver,
         np.asarray(float(macro_dt)),
         traced_once(actuate),
         traced_once(cost),

@@ -24,7 +24,7 @@ from vmri_jax.running.trajectory import Run, RunInfo, Trajectory, trajectory_of,
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.results import Result
-from vmri_jax.steppers.solvers import Newton
+from vmri_jax.steppers.solver import Solver
 from vmri_jax.steppers.stepper import StepStatus
 
 
@@ -45,7 +45,7 @@ def minimize(
     grid: Literal["macro", "micro"] = "macro",
     tolerance: float = 1e-8,
     max_iterations: int = 50,
-    solver: Newton | None = None,
+    solver: Solver | None = None,
     progress: ShowsProgress = False,
 ) -> Optimum:
     """Minimise ``sum_k H (C(z_k, u_k) + C(z_{k+1}, u_k)) / 2 + final_cost(z_N)`` subject to the steps of the scheme and ``goal = 0``.

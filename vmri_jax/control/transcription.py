@@ -28,7 +28,7 @@ from vmri_jax.running.macro_step import macro_step
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.results import Result
-from vmri_jax.steppers.solvers import Newton
+from vmri_jax.steppers.solver import Solver
 
 CONTROL = "vmri_jax.control"
 """Entry of ``system.params`` with the controls: u, the time when the first one starts, and the duration of each."""
@@ -56,7 +56,7 @@ class Transcription(eqx.Module):
     system: System
     start: State
     scheme: Scheme | Composition
-    solver: Newton
+    solver: Solver
     macro_dt: Float[Numbers, ""]
     actuate: TracedOnce
     cost: TracedOnce

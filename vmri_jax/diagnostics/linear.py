@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 
 from vmri_jax.mechanics.arrays import quickly_compiled
 from vmri_jax.mechanics.invariants import all_constraints, potential_energy, velocity
@@ -12,9 +13,8 @@ from vmri_jax.running.macro_step import macro_step
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.equations import StepEquations
 from vmri_jax.schemes.scheme import Scheme
-from vmri_jax.steppers.newton import dense
 from vmri_jax.steppers.results import Result
-from vmri_jax.steppers.solvers import Newton
+from vmri_jax.steppers.solver import Solver
 
 
 def phase_vector(state: State):
@@ -89,7 +89,7 @@ def frequencies_of(stiffness: np.ndarray) -> np.ndarray:
 
 
 def symplectic_defect(
-    system: Movable, scheme: Scheme | Composition, state: State | None = None, *, macro_dt, solver: Newton | None = None
+    system: Movable, scheme: Scheme | Composition, state: State | None = None, *, macro_dt, solver: Solver | None = None
 ):
     """Largest entry of ``M^T J M - J`` for the derivative M of one macro step, on the constraint manifold.
 
@@ -163,5 +163,5 @@ def newton_matrix(system: System, scheme: Scheme, state: State, macro_dt):
     equations = StepEquations(system, scheme, state.t, state.q_s, state.q_f, state.p_s, state.p_f, macro_dt)
     v_s, v_f = velocity(system, state.q_s, state.q_f, state.p_s, state.p_f)
     n_g, n_gs = system.num_constraints(state.q_s, state.q_f)
-    x = equations.guess(v_s, v_f, jnp.zeros(n_g), jnp.zeros(n_gs))
-    return dense.matrix(equations, x)
+    x, unravel = ravel_pytree(equations.guess(v_s, v_f, jnp.zeros(n_g), jnp.zeros(n_gs)))
+    return jax.jacfwd(lambda x: ravel_pytree(equations.residual(unravel(x)))[0])(x)

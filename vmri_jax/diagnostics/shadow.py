@@ -30,10 +30,10 @@ from vmri_jax.schemes.composition import Composition, stage_lengths, stage_schem
 from vmri_jax.schemes.discrete_lagrangian import lagrangian
 from vmri_jax.schemes.equations import StepEquations
 from vmri_jax.schemes.scheme import Scheme
-from vmri_jax.steppers import solvers
 from vmri_jax.steppers.kicked import kicked
 from vmri_jax.steppers.marched import Marched
 from vmri_jax.steppers.results import Result
+from vmri_jax.steppers.solver import Solver
 
 BLOCKS = 20
 """Parts of a run to whose means the drift is fitted; with more parts neighbouring means are correlated, with fewer the standard error of the
@@ -176,8 +176,8 @@ def _stage(system: System, scheme: Scheme, state: State, macro_dt):
     n_g, n_gs = system.num_constraints(state.q_s, state.q_f)
     v_s, v_f = velocity(system, start.q_s, start.q_f, start.p_s, start.p_f)
     guess = equations.guess(v_s, v_f, jnp.zeros(n_g), jnp.zeros(n_gs))
-    solver = Marched(solvers.Auto(), "arrowhead")
-    solution, _ = solver.solve(equations, guess, solver.remembers(equations, guess))
+    solver = Marched(Solver())
+    solution, _ = solver.solve(equations, guess, solver.init(equations, (v_s, v_f)))
     q_s, (q_f, p_s, p_f) = state.q_s + solution.x.slow[-1], solution.end
     end = with_kicks(State(state.t + macro_dt, q_s, q_f, p_s, p_f), end=1.0)
     return end, terms(equations.path(solution.x)), solution.status.result

@@ -29,7 +29,7 @@ from vmri_jax.running.store import layout
 from vmri_jax.running.store.identity import check_same
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
-from vmri_jax.steppers.solvers import Newton
+from vmri_jax.steppers.solver import Solver
 
 FAILURES_TO_STOP = 10
 """Number of failed chunks, before any chunk succeeds, at which the ensemble stops. A larger one spends more time on an error that all chunks
@@ -124,7 +124,7 @@ def ensemble(
     vary: Vary | None = None,
     save: Saved | Sequence[Saved] = "end",
     num_saves: int = 1,
-    solver: Newton | None = None,
+    solver: Solver | None = None,
     project: bool | None = None,
     chunk: int | None = None,
     executor: Any = None,

@@ -33,7 +33,7 @@ from vmri_jax.running.simulation import Simulation, simulation
 from vmri_jax.running.trajectory import STATUS, Trajectory
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
-from vmri_jax.steppers.solvers import Newton
+from vmri_jax.steppers.solver import Solver
 
 AnyScheme = str | Scheme | Composition | Callable[[int], Scheme | Composition]
 """A scheme, the name of one, or a function from the number of micro steps to a scheme."""
@@ -73,7 +73,7 @@ class Work:
     columns: tuple[str, ...]
     steps: Mapping[str, Any]
     num_micro: int | None = None
-    solver: Newton | None = None
+    solver: Solver | None = None
     project: bool | None = None
     save: tuple[Saved, ...] = ("end",)
     num_saves: int = 1

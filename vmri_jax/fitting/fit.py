@@ -21,8 +21,7 @@ from vmri_jax.running.prepare import prepare
 from vmri_jax.running.progress import Progress, Working
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
-from vmri_jax.steppers import solvers
-from vmri_jax.steppers.solvers import Newton
+from vmri_jax.steppers.solver import Solver
 
 START = ("q_s", "q_f", "v_s", "v_f")
 """Unknowns of these names are the start of the problem."""
@@ -51,7 +50,7 @@ def fit(
     starts: int = 1,
     spread: float = 0.3,
     max_steps: int = 100,
-    solver: Newton | None = None,
+    solver: Solver | None = None,
     seed: int = 0,
 ) -> Fit:
     """Find the parameters for which the motion comes closest to what was measured.
@@ -100,9 +99,7 @@ def fit(
         run = prepare(first, scheme, macro_dt=macro_dt, num_steps=max(int(s.max()) for s in steps), solver=solver)
         run()
         # A fallback is a branch of the compiled step; `jax.vmap` over searches and derivatives would compute both of its sides.
-        if solver is None and run.plan.has_fallback:
-            solver = solvers.Nested()
-        shooting = Shooting(model, unknowns, data, steps, scheme, solver or solvers.Auto(), float(macro_dt), segments)
+        shooting = Shooting(model, unknowns, data, steps, scheme, solver or run.plan.first, float(macro_dt), segments)
         search = _Search(shooting, max_steps)
         u = np.zeros((starts, unknowns.size))
         u[1:] = spread * np.random.default_rng(seed).standard_normal((starts - 1, unknowns.size))

@@ -24,7 +24,7 @@ from vmri_jax.mechanics.invariants import velocity
 from vmri_jax.mechanics.state import Problem, State, initial_state
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
-from vmri_jax.steppers.solvers import Newton
+from vmri_jax.steppers.solver import Solver
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +44,7 @@ class Shooting:
     data: Sequence[Measured]
     steps: Sequence[np.ndarray]
     scheme: Scheme | Composition
-    solver: Newton
+    solver: Solver
     macro_dt: float
     segments: int
 

@@ -37,7 +37,7 @@ from vmri_jax.schemes.scheme import Scheme, fully_explicit, fully_implicit
 from vmri_jax.stability import advise
 from vmri_jax.stability.drive import drive_period
 from vmri_jax.stability.linear import small_motions
-from vmri_jax.steppers import solvers
+from vmri_jax.steppers.solver import Solver
 
 NUM_MICRO = 5
 """Micro steps per macro step of the cases."""
@@ -122,7 +122,7 @@ class Resolved:
     def tolerance(self, full: bool) -> Outcome:
         steps, ends = 1_000 if full else 100, {}
         for tolerance in (1e-4, 1e-8, 1e-12):
-            solver = solvers.Auto(tolerance=tolerance)
+            solver = Solver(tolerance=tolerance)
             trajectory = run(self.problem, self.scheme, self.macro_dt, steps, save_every=steps, solver=solver)
             ends[tolerance] = positions(trajectory)[-1]
         size = np.abs(ends[1e-12]).max()
@@ -233,7 +233,7 @@ def cases_for(problem: Problem | HasProblem) -> tuple[Case, ...]:
     one_way = f"{outside}: the way back is another motion" if outside else _turns_one_way(problem)
 
     def lane(full: bool) -> Outcome:
-        return bad_lane(problem, cases.scheme, cases.macro_dt, 20, solvers.Auto(), lanes=64 if full else 16)
+        return bad_lane(problem, cases.scheme, cases.macro_dt, 20, Solver(), lanes=64 if full else 16)
 
     step = f"fully_implicit, num_micro {NUM_MICRO}, H = {cases.macro_dt:.3g}"
     single = f"num_micro 1, omega = {cases.omega:.3g}"

@@ -21,7 +21,7 @@ from vmri_jax.running.observables import LostEnergyWarning
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes.scheme import fully_implicit
 from vmri_jax.steppers.results import Result
-from vmri_jax.steppers.solvers import Newton
+from vmri_jax.steppers.solver import Solver
 
 SAVED_NODES = 10_000
 """Approximate number of saved nodes of a long run; a larger value takes more memory."""
@@ -152,7 +152,7 @@ def _refusal(call) -> str:
 
 
 def bad_lane(
-    problem: Problem, scheme, macro_dt, num_steps: int, solver: Newton, *, lanes: int = 256, compared: int = 4
+    problem: Problem, scheme, macro_dt, num_steps: int, solver: Solver, *, lanes: int = 256, compared: int = 4
 ) -> Outcome:
     """A batch whose lanes start at the nodes of a run, one of them with overflowing momenta, compared with single runs of some lanes."""
     bad = lanes // 3

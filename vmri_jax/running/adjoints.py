@@ -7,16 +7,12 @@ the steps from the last to the first and needs the state at which each step star
   derivatives; third derivatives are NaN where equations are solved by iteration;
 * *checkpoint*: the run keeps the starts of some steps and computes the steps between them again, see `Recursive`; works in reverse mode,
   once.
-
-Names with `exact` belong to the fallback, see `vmri_jax.running.simulation`.
 """
 
 from collections.abc import Callable
-from functools import partial
-
-import jax
 
 from vmri_jax.running.engine import Arrays, Engine
+from vmri_jax.running.fallback import solved_again, unsolved
 from vmri_jax.running.simulation import Simulation
 from vmri_jax.running.trajectory import Run, Trajectory
 
@@ -38,28 +34,18 @@ def traced_run(run: Simulation, adjoint: str) -> Trajectory:
     """All steps of a run, some of whose arrays are tracers; `adjoint` as of `simulate`."""
     if adjoint == "auto":
         adjoint = "stored" if run.num_steps <= LONGEST_STORED_RUN else "checkpoint"
-    if run.plan.has_fallback:
-        return run.traced(_with_fallback(run.engine, run.exact_engine, adjoint, run.save_every, run.arrays))
-    return run.traced(_differentiable(run.engine, adjoint, run.save_every)(run.arrays))
+    first = _differentiable(run.engine, adjoint, run.save_every)
+    if not run.plan.has_fallback:
+        return run.traced(first(run.arrays))
+    exact = _differentiable(run.exact.engine, adjoint, run.save_every)
+    return run.traced(solved_again(first, exact, _is_unsolved, run.arrays))
+
+
+def _is_unsolved(run: Run):
+    return unsolved(run.result, run.info.method.max())
 
 
 def _differentiable(engine: Engine, adjoint: str, save_every: int) -> Callable[[Arrays], Run]:
     """The run as a function of its arrays, with this adjoint."""
     program = engine.stored if adjoint == "stored" else engine.checkpointed
     return lambda arrays: program(arrays, save_every)
-
-
-@partial(jax.custom_jvp, nondiff_argnums=(0, 1, 2, 3))
-def _with_fallback(first: Engine, exact: Engine, adjoint: str, save_every: int, arrays: Arrays) -> Run:
-    """The run with the first solver of its plan, or with the fallback if the first solver fails."""
-    run = first.stored(arrays, save_every)
-    return jax.lax.cond(run.failed_at < 0, lambda: run, lambda: exact.stored(arrays, save_every))
-
-
-@_with_fallback.defjvp
-def _by_exact_matrices(first, exact, adjoint, save_every, primals, tangents):
-    """Value and derivative of the run with the fallback: to differentiate with both solvers would compile two programs.
-
-    Values of the two solvers differ by the tolerance of the solver.
-    """
-    return jax.jvp(_differentiable(exact, adjoint, save_every), primals, tangents)

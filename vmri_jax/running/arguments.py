@@ -12,7 +12,7 @@ from vmri_jax.mechanics.constraints import check_constraints, check_mass
 from vmri_jax.mechanics.state import State
 from vmri_jax.schemes.composition import Composition, stage_scheme
 from vmri_jax.schemes.scheme import Scheme
-from vmri_jax.steppers.solvers import Newton
+from vmri_jax.steppers.solver import Solver
 
 WHOLE_NUMBER_TOLERANCE = 1e-9
 """Relative distance from a whole number up to which ``(t_end - t) / macro_dt`` counts as one. The end of a run misses t_end by at most this
@@ -39,8 +39,8 @@ def check_run(system, scheme, state, solver, steps: Steps):
             f"simulate: scheme is {type(scheme).__name__}; give a Scheme, e.g. fully_implicit(num_micro=10)."
         )
     check_params(system.params)
-    if not isinstance(solver, Newton | None):
-        raise TypeError(f"simulate: solver is {solver!r}; give one of vmri_jax.solvers, e.g. vm.solvers.Dense().")
+    if not isinstance(solver, Solver | None):
+        raise TypeError(f"simulate: solver is {solver!r}; give a Solver, e.g. vm.Solver(tolerance=1e-10).")
     check_flags(save_micro=steps.save_micro)
     dt, num_steps, t_end = check_step_size(scheme, steps.macro_dt, steps.micro_dt), steps.num_steps, steps.t_end
     check_number("simulate: the t of state", state.t)

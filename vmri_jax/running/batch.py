@@ -21,14 +21,14 @@ from vmri_jax.mechanics.state import Movable, State, initial_state, opened, star
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.arguments import Steps
 from vmri_jax.running.engine import Arrays, Engine
+from vmri_jax.running.fallback import FALLING_BACK
 from vmri_jax.running.memory import check_memory
 from vmri_jax.running.origin import Origin, is_repeated
 from vmri_jax.running.progress import Working
-from vmri_jax.running.simulation import FALLING_BACK, STEPPING, Simulation, simulation
+from vmri_jax.running.simulation import STEPPING, Simulation, simulation
 from vmri_jax.running.trajectory import Run
 from vmri_jax.schemes.composition import Composition, stage_scheme
 from vmri_jax.schemes.scheme import Scheme
-from vmri_jax.steppers.results import Result
 
 NUMBERS_PER_CHUNK = 4096
 """Positions at all nodes of a macro step, summed over the lanes of a chunk: 32 kB of float64, the first-level cache of a core. Chunks with
@@ -56,17 +56,17 @@ class Batch:
     devices: int
 
     def __call__(self) -> tuple[Run, np.ndarray]:
-        """The runs and their observables, see `Simulation.observed`; lanes that the first solver does not solve are computed again by the fallback."""
+        """The runs and their observables, see `Simulation.observed`; lanes that are not solved are computed again by the fallback."""
         run, lanes = self.run, len(self.arrays.macro_dt)
         with Working(f"simulate_batch, {lanes} lanes", running=STEPPING):
-            done, table = self._in_chunks(run.engine)
-        failed = np.flatnonzero((done.failed_at >= 0) & (done.result != Result.NOT_IMPLIED))
-        if failed.size and run.plan.has_fallback:
+            done, table = self._in_chunks()
+        failed = np.flatnonzero(run.unsolved(done))
+        if failed.size:
             # Failed lanes are padded to a power of two with copies of the last one, so that few programs serve all numbers of failures.
             padded_size = 2 ** int(failed.size - 1).bit_length()
             padded = failed[np.minimum(np.arange(padded_size), failed.size - 1)]
             with Working(f"simulate_batch, {failed.size} of {lanes} lanes: {FALLING_BACK}"):
-                again = replace(self, arrays=_taken(self.arrays, padded))._in_chunks(run.exact_engine)
+                again = replace(self, run=run.exact, arrays=_taken(self.arrays, padded))._in_chunks()
             for old, new in zip(jax.tree.leaves((done, table)), jax.tree.leaves(again), strict=True):
                 old[failed] = new[: failed.size]
         return done, table
@@ -91,12 +91,12 @@ class Batch:
         macro_dt = all_alike if is_repeated(macro_dt) else macro_dt * (run.macro_dt / macro_dt[0])
         return replace(self, run=run, arrays=self.arrays._replace(macro_dt=macro_dt))
 
-    def _in_chunks(self, engine: Engine) -> tuple[Run, np.ndarray]:
+    def _in_chunks(self) -> tuple[Run, np.ndarray]:
         """All lanes, `width` at a time; the last chunk is padded with copies of its last lane, so that one program computes all chunks."""
         lanes = len(self.arrays.macro_dt)
         width = min(self.width, -(-lanes // self.devices) * self.devices)
         differs = tuple(not is_repeated(a) for a in jax.tree.leaves(self.arrays))
-        program = _side_by_side(engine, jax.tree.structure(self.arrays), differs, self.devices)
+        program = _side_by_side(self.run.engine, jax.tree.structure(self.arrays), differs, self.devices)
         pieces = []
         for start in range(0, lanes, width):
             part = _taken(self.arrays, np.minimum(np.arange(start, start + width), lanes - 1))

@@ -25,13 +25,13 @@ from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.plan import Plan, plan
 from vmri_jax.steppers.results import Result
-from vmri_jax.steppers.solvers import Newton
+from vmri_jax.steppers.solver import Solver
 
 
 class Model(NamedTuple):
     """Solver, scheme and system: everything but state and macro step that the motion depends on."""
 
-    solver: Newton
+    solver: Solver
     scheme: Scheme | Composition
     system: System
 
@@ -189,12 +189,9 @@ class Engine:
         return jax.tree.unflatten(self.structure, leaves)
 
     def stepper(self, leaves: list, state: State, reverse_only: bool = False) -> Plan:
-        """The `Plan` that takes the steps of the model with these leaves.
-
-        It has no fallback inside: `Simulation` computes a run or piece that fails again, with `Simulation.exact_engine`.
-        """
+        """The `Plan` that takes the steps of the model with these leaves."""
         solver, scheme, system = self.model(leaves)
-        return plan(system, scheme, state, solver, fallback=False, reverse_only=reverse_only)
+        return plan(system, scheme, state, solver, reverse_only=reverse_only)
 
     def _by_while_loop(self, stepper: Plan, cursor: "_Cursor", saved: Saved, times: "_Times", saves) -> "_Loop":
         """``saves * save_every`` macro steps, or fewer if one fails.

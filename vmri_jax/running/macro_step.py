@@ -8,17 +8,17 @@ from vmri_jax.mechanics.checks import check_type
 from vmri_jax.mechanics.constraints import are_kept
 from vmri_jax.mechanics.state import A_SYSTEM, State
 from vmri_jax.mechanics.system import System
+from vmri_jax.running.fallback import solved_again, unsolved
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
-from vmri_jax.steppers import solvers
 from vmri_jax.steppers.plan import plan
 from vmri_jax.steppers.results import Result
-from vmri_jax.steppers.solvers import Newton
+from vmri_jax.steppers.solver import Solver
 from vmri_jax.steppers.stepper import StepInfo
 
 
 def macro_step(
-    system: System, scheme: Scheme | Composition, state: State, macro_dt, solver: Newton | None = None
+    system: System, scheme: Scheme | Composition, state: State, macro_dt, solver: Solver | None = None
 ) -> tuple[State, StepInfo]:
     """One macro step, ``(state, info) = macro_step(system, scheme, state, macro_dt)``; a pure function.
 
@@ -31,7 +31,7 @@ def macro_step(
         scheme: a scheme or composition.
         state: a consistent state, from `initial_state` or a former step.
         macro_dt: length H of the macro step, positive.
-        solver: for implicit equations; None for `solvers.Auto`.
+        solver: for implicit equations; None for ``Solver()``. What "auto" does not solve is solved again with exact matrices.
 
     Returns:
         The state at the end of the step, and the status, method, iterations and micro nodes of the step.
@@ -41,11 +41,24 @@ def macro_step(
     """
     check_type("macro_step: system", system, System, A_SYSTEM)
     check_type("macro_step: state", state, State, "a State, e.g. problem.state()")
-    return _macro_step(system, scheme, state, macro_dt, solver or solvers.Auto())
+    return _macro_step((system, scheme, state, macro_dt, solver or Solver()))
 
 
 @jax.jit
-def _macro_step(system, scheme, state, macro_dt, solver):
+def _macro_step(arguments):
+    system, scheme, state, _, solver = arguments
+    if not plan(system, scheme, state, solver).has_fallback:
+        return _step(arguments)
+    return solved_again(_step, _exact_step, lambda end: unsolved(end[1].result, end[1].method), arguments)
+
+
+def _exact_step(arguments):
+    *others, solver = arguments
+    return _step((*others, solver.exact()))
+
+
+def _step(arguments):
+    system, scheme, state, macro_dt, solver = arguments
     planned = plan(system, scheme, state, solver)
     state, info, memory = planned.step(state, planned.init(state, macro_dt), macro_dt)
     if system.is_constrained:  # rows that contradict each other leave increments that converge

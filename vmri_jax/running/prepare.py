@@ -11,7 +11,7 @@ from vmri_jax.running.progress import Working
 from vmri_jax.running.simulation import Simulation, simulation
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
-from vmri_jax.steppers.solvers import Newton
+from vmri_jax.steppers.solver import Solver
 
 
 def prepare(
@@ -25,7 +25,7 @@ def prepare(
     t_end: float | None = None,
     save_every: int = 1,
     save_micro: bool = False,
-    solver: Newton | None = None,
+    solver: Solver | None = None,
 ) -> Simulation:
     """Check and compile a run of `simulate` once, to be called many times.
 
@@ -34,7 +34,7 @@ def prepare(
         other = run(other_state, macro_dt=0.02, params=other_params)
 
     A call costs some ten microseconds besides its steps, and raises `SimulationError` if a step fails, as `simulate` does. The first call
-    that needs the fallback of `solvers.Auto` compiles it, which takes as long as `prepare`. The run keeps what the functions of the system
+    that needs the fallback compiles it, which takes as long as `prepare`. The run keeps what the functions of the system
     read from around them (globals, closures, attributes) when it was prepared. Arguments as of `simulate`.
 
     Returns:
@@ -51,5 +51,5 @@ def prepare(
     on_device = ("system", "scheme", "solver", "state", "macro_dt")
     run = replace(run, **jax.device_put({name: getattr(run, name) for name in on_device}))
     with Working("prepare: the program of the run"):
-        jax.block_until_ready(run._program(False)(run.arrays, 0, 0))  # no steps: it only compiles
+        jax.block_until_ready(run.engine.whole(run.arrays, 0, 0))  # no steps: it only compiles
     return run

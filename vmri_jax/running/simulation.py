@@ -8,8 +8,8 @@
 
 All of them return a `Run`, states and statuses; `Simulation.observed` makes its `Trajectory`, with energy, constraints and failures of the nodes.
 
-*The fallback*: with `solvers.Auto` a piece whose first solver fails is computed again by `solvers.Arrowhead`, whose Newton matrices are exact,
-with the same tolerance and limit of iterations; all pieces after it are computed by `Arrowhead` alone. Names with `exact` belong to the fallback.
+With the matrix "auto" a piece that is not solved is computed again with exact matrices (`vmri_jax.running.fallback`), with the same tolerance and
+limit of iterations; so are all pieces after it.
 """
 
 import warnings
@@ -32,6 +32,7 @@ from vmri_jax.mechanics.system import System
 from vmri_jax.running.arguments import Steps, check_once, check_run, check_vectors, nothing_fast
 from vmri_jax.running.engine import Arrays, Engine, Model, PieceStart, engine
 from vmri_jax.running.failures import simulation_error
+from vmri_jax.running.fallback import FALLING_BACK, unsolved
 from vmri_jax.running.interrupts import Interrupted, interrupts_noted
 from vmri_jax.running.observables import concerns, failures, observables, with_tolerance
 from vmri_jax.running.origin import Origin, evaluated, names_of
@@ -40,17 +41,13 @@ from vmri_jax.running.saved import room_of_a_piece
 from vmri_jax.running.trajectory import Run, Trajectory, join, trajectory_of, with_origin
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
-from vmri_jax.steppers import solvers
 from vmri_jax.steppers.plan import Plan, plan, with_rules_for
-from vmri_jax.steppers.results import Method, Result
-from vmri_jax.steppers.solvers import Newton
+from vmri_jax.steppers.solver import Solver
 
 PARTS_OF_A_BAR = 50
 """Parts of a run with a progress bar. More parts move the bar more smoothly, and each costs a call of some 30 microseconds."""
 STEPPING = "stepping"
 """The work of a run that is compiled, for lines about runs that take more than two seconds."""
-FALLING_BACK = "a step was not solved: computing its part of the run again with exact matrices (solvers.Arrowhead), as accurate but slower"
-"""Line about a fallback that takes more than two seconds."""
 
 
 class Checkpoint(NamedTuple):
@@ -59,7 +56,7 @@ class Checkpoint(NamedTuple):
     step: macro steps done.
     state: state at the node reached.
     memory: memory of the stepper, such as the start of Newton's next iteration.
-    fell_back: whether the fallback has replaced the first solver.
+    fell_back: whether the fallback has replaced the first matrix.
     is_first: whether the stepper has no memory of earlier steps, so that `memory` is blank.
     """
 
@@ -74,19 +71,19 @@ class Checkpoint(NamedTuple):
 class Simulation:
     """A run with checked arguments, ready to be computed.
 
-    The first solver of its plan computes the run. If it fails in a run or a piece, the fallback computes the run or piece again; the program
+    The matrix of its plan computes the run. If it fails in a run or a piece, the fallback computes the run or piece again; the program
     of the fallback is compiled only then.
 
     Attributes:
         system, scheme, solver, state, num_steps, save_every, save_micro: as of `simulate`.
         macro_dt: macro step H, an array of shape ().
         names: names of bodies and constraints; None if there are none.
-        may_fall_back: whether the fallback is tried where the first solver fails; else the run fails.
+        may_fall_back: whether the fallback is tried where the first matrix fails; else the run fails.
     """
 
     system: System
     scheme: Scheme | Composition
-    solver: Newton
+    solver: Solver
     state: State
     macro_dt: Any
     num_steps: int
@@ -111,10 +108,10 @@ class Simulation:
         origin = self.origin if params is None else replace(self.origin, params=params)
         arrays, save_every, _ = arguments
         with Working("the run", running=STEPPING):
-            run, table = self._whole(False, arguments)
-        if self._fallback_helps(run):
+            run, table = self.whole(*arguments)
+        if self.unsolved(run):
             with Working(FALLING_BACK):
-                run, table = self._whole(True, arguments)
+                run, table = self.exact.whole(*arguments)
         trajectory = with_origin(trajectory_of(run, table), origin)
         if throw and int(trajectory.failed_at) >= 0:
             raise simulation_error(trajectory, arrays.macro_dt, save_every, self.scheme.num_micro)
@@ -122,17 +119,18 @@ class Simulation:
         return trajectory
 
     def compiled(self) -> jax.stages.Compiled:
-        """The compiled program of the run with its first solver, for inspection."""
-        return self._program(False).lower(*self._arguments(None, None, None, None)).compile()
+        """The compiled program of the run without its fallback, for inspection."""
+        return self.engine.whole.lower(*self._arguments(None, None, None, None)).compile()
 
     def timed(self, state=None, *, macro_dt=None, params=None, num_steps=None) -> Callable[[], None]:
         """A function without arguments that computes the run and waits for its result, to be timed.
 
-        It runs the program that succeeds, of the first solver or of the fallback. Arguments as of a call.
+        It runs the program that succeeds, with the first matrix or of the fallback. Arguments as of a call.
         """
         arrays, *counts = self._arguments(state, macro_dt, params, num_steps)
         arguments = jax.device_put(arrays), *counts
-        program = self._program(self._fallback_helps(self._whole(False, arguments)[0]))
+        solves = self.exact if self.unsolved(self.whole(*arguments)[0]) else self
+        program = solves.engine.whole
         program(*arguments)
         return lambda: program(*arguments)[1].block_until_ready()  # the arrays of one program are ready together
 
@@ -201,14 +199,10 @@ class Simulation:
         leaves = self.arrays.model  # the parameters come last, see `Arrays`
         return leaves[: len(leaves) - len(expected)] + [np.asarray(leaf) for leaf in new]
 
-    def _whole(self, falls_back: bool, arguments: tuple) -> tuple[Run, Any]:
-        """The run by one program, as of `observed`."""
-        leaves, table = self._program(falls_back)(*arguments)
-        return failures(Run.of(leaves), np.asarray(table), arguments[1])
-
-    def _program(self, falls_back: bool):
-        """The compiled run, see `Engine.whole`."""
-        return (self.exact_engine if falls_back else self.engine).whole
+    def whole(self, arrays: Arrays, save_every: int, saves: int) -> tuple[Run, Any]:
+        """The run by one program, without the fallback, as of `observed`; arguments of `Engine.whole`."""
+        leaves, table = self.engine.whole(arrays, save_every, saves)
+        return failures(Run.of(leaves), np.asarray(table), save_every)
 
     def __repr__(self) -> str:
         micro = f", of {self.scheme.num_micro} micro steps each" if self.scheme.num_micro > 1 else ""
@@ -235,7 +229,7 @@ class Simulation:
 
     @cached_property
     def plan(self) -> Plan:
-        """The `Plan` with its fallback, which ``print`` shows in words; programs are made of plans without one, see `Engine.stepper`."""
+        """The `Plan`, which ``print`` shows in words."""
         return plan(self.system, self.scheme, self.state, self.solver)
 
     @cached_property
@@ -250,22 +244,17 @@ class Simulation:
 
     @cached_property
     def engine(self) -> Engine:
-        """Its programs with the first solver of the plan."""
-        return self.engine_for(False, self.num_saves)
+        """Its programs, without the fallback."""
+        return engine(self._model[1], self.num_saves, self.save_micro)
 
     @cached_property
-    def exact_engine(self) -> Engine:
-        """Its programs with the fallback."""
-        return self.engine_for(True, self.num_saves)
-
-    def engine_for(self, is_exact: bool, num_saves: int) -> Engine:
-        """Programs with the first solver or with the fallback, for a number of saved intervals."""
-        structure = self._exact_structure if is_exact else self._model[1]
-        return engine(structure, num_saves, self.save_micro)
+    def exact(self) -> "Simulation":
+        """The fallback: the same run with exact matrices."""
+        return replace(self, solver=self.solver.exact())
 
     @cached_property
     def _model(self) -> tuple[list, Any]:
-        """Leaves and structure of the `Model` with the first solver."""
+        """Leaves and structure of the `Model`."""
         return jax.tree.flatten(Model(self.solver, self.scheme, self.system))
 
     @cached_property
@@ -273,11 +262,6 @@ class Simulation:
         """Structure of the system, and the number of its leaves."""
         leaves, structure = jax.tree.flatten(self.system)
         return structure, len(leaves)
-
-    @cached_property
-    def _exact_structure(self) -> Any:
-        """Structure of the `Model` with the fallback."""
-        return jax.tree.structure(Model(self.solver.exact(), self.scheme, self.system))
 
     def check(self, state_name: str = "simulate: the positions of the state", constraints: bool = True) -> None:
         """Refuse a system whose functions return wrong types or shapes, and a state that violates the constraints; equal ones are checked once.
@@ -295,16 +279,17 @@ class Simulation:
         memory = self._piece_engine(fell_back).blank_memory(self.arrays._replace(state=start))
         return Checkpoint(step, State(*start), memory, fell_back, is_first=True)
 
-    def _piece_engine(self, is_exact: bool) -> Engine:
-        return self.engine_for(is_exact, room_of_a_piece(self.state, self.scheme.num_micro, self.save_micro))
+    def _piece_engine(self, fell_back: bool) -> Engine:
+        room = room_of_a_piece(self.state, self.scheme.num_micro, self.save_micro)
+        return engine((self.exact if fell_back else self)._model[1], room, self.save_micro)
 
     def advance(self, checkpoint: Checkpoint, saves: int) -> tuple[list[tuple[Run, np.ndarray]], Checkpoint]:
-        """The next `saves` saved intervals, in pieces as of `observed`; from the first one that the first solver does not solve, with the fallback."""
+        """The next `saves` saved intervals, in pieces as of `observed`; from the first one that is not solved, with the fallback."""
         pieces, room = [], self._piece_engine(checkpoint.fell_back).num_saves
         for done in range(0, saves, room):
             size = min(room, saves - done)
             piece, after = self._advance(checkpoint, size)
-            if not checkpoint.fell_back and self._fallback_helps(piece[0]):
+            if not checkpoint.fell_back and self.unsolved(piece[0]):
                 with Working(FALLING_BACK):
                     again = self.start(checkpoint.state, checkpoint.step, fell_back=True)
                     piece, after = self._advance(again, size)
@@ -323,14 +308,12 @@ class Simulation:
             state = replace(state, t=np.asarray(np.nan))
         return piece, Checkpoint(step + saves * self.save_every, state, memory, fell_back)
 
-    def _fallback_helps(self, piece: Run) -> bool:
-        """Whether a step failed that the fallback may solve.
-
-        It cannot help explicit and linear equations, the methods up to `Method.LINEAR`, nor a step that was solved but violates implied
-        constraints, `Result.NOT_IMPLIED`.
-        """
-        failed = self.may_fall_back and int(piece.failed_at) >= 0 and int(piece.result) != Result.NOT_IMPLIED
-        return failed and int(np.max(piece.info.method)) > Method.LINEAR and self.plan.has_fallback
+    def unsolved(self, run: Run) -> np.ndarray:
+        """Whether the fallback may solve a run or a piece, or (lanes,) the runs of a batch."""
+        is_alive = np.asarray(run.failed_at) < 0
+        if is_alive.all() or not (self.may_fall_back and self.plan.has_fallback):
+            return np.zeros(is_alive.shape, dtype=bool)
+        return unsolved(np.asarray(run.result), np.max(run.info.method, axis=-1))
 
     def in_pieces(self, progress: ShowsProgress = False, caller: str = "") -> Trajectory:
         """The whole run; with a progress bar Ctrl-C raises `Interrupted` with the trajectory computed so far.
@@ -359,7 +342,7 @@ class Simulation:
         return with_origin(jax.device_put(whole), self.origin)
 
 
-def simulation(moving: Movable, scheme, state: State | None, solver: Newton | None, steps: Steps) -> Simulation:
+def simulation(moving: Movable, scheme, state: State | None, solver: Solver | None, steps: Steps) -> Simulation:
     """The `Simulation` with these arguments of `simulate`; bad arguments raise."""
     warn_if_slow()
     problem = opened(moving)
@@ -370,7 +353,7 @@ def simulation(moving: Movable, scheme, state: State | None, solver: Newton | No
     advice = nothing_fast(scheme, state.q_f.size) if moving is not problem else ""
     if advice:
         warnings.warn(f"simulate: {advice}", stacklevel=3)
-    chosen_solver, scheme, system = of_one_type((solver or solvers.Auto(), scheme, system))
+    chosen_solver, scheme, system = of_one_type((solver or Solver(), scheme, system))
     state, macro_dt, names = State(*_arrays(state)), _float(macro_dt), names_of(problem)
     return Simulation(system, scheme, chosen_solver, state, macro_dt, num_steps, save_every, steps.save_micro, names)
 

@@ -19,11 +19,14 @@ from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.macro_step import macro_step
 from vmri_jax.schemes.composition import Composition
+from vmri_jax.schemes.equations import StepEquations, Unknowns
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.stability.linear import SmallMotions
-from vmri_jax.steppers import solvers
-from vmri_jax.steppers.results import Result
-from vmri_jax.steppers.solvers import Newton
+from vmri_jax.steppers.march import MarchEquations, exact_pass
+from vmri_jax.steppers.results import Method, Result
+from vmri_jax.steppers.solved import Solution, StepSolver
+from vmri_jax.steppers.solver import Solver
+from vmri_jax.steppers.stepper import StepStatus
 
 LANES = 64
 """Step sizes that a compiled call computes side by side for up to 18 degrees of freedom; larger systems get fewer, at least 4, to limit memory. With
@@ -100,10 +103,38 @@ def multipliers(motions: SmallMotions, scheme: Scheme | Composition, macro_dt) -
     return Multipliers(values, vectors.astype(complex), growing)
 
 
+@dataclass(frozen=True)
+class AtRest(StepSolver):
+    """Some exact passes, without a test of corrections, which at rest have no motion to be compared with."""
+
+    passes: int
+
+    def solve(self, equations: StepEquations, guess: Unknowns, memory) -> tuple[Solution, tuple]:
+        march = MarchEquations(equations)
+
+        def corrected(_, last):
+            z, x, *_ = last
+            _, now = exact_pass(march, z, x, x[-1], from_last=False)
+            return now.z + now.dz, now.x + now.dx, now.end, now.p_s
+
+        start = *march.flat(guess), march.start(), equations.p_s
+        z, x, end, p_s = jax.lax.fori_loop(0, self.passes, corrected, start)
+        end = end.position, p_s, end.gradients[: march.n_f] / equations.micro_dt
+        return Solution(march.by_name(z, x), end, StepStatus.direct(Method.EXACT)), memory
+
+    def describe(self) -> list[str]:
+        return [f"exact: {self.passes} passes at rest"]
+
+
+def at_rest(system: System, scheme: Scheme) -> AtRest:
+    """Solves the equations of a step at rest."""
+    return AtRest(CONSTRAINED_ITERATIONS if system.is_constrained else 1)
+
+
 @partial(jax.jit, compiler_options=QUICK)
 def _step_matrices(system: System, scheme, rest: State, embed, read, macro_dt):
     """(k, 2 d, 2 d) derivatives of the macro step at rest, for k lengths of the step."""
-    solver = solvers.Arrowhead(fixed_iterations=CONSTRAINED_ITERATIONS if system.is_constrained else 1)
+    solver = Solver(stepper=at_rest)
 
     def step(coordinates, macro_dt):
         state = State(rest.t, *jnp.split(embed @ coordinates, phase_splits(rest)))
@@ -154,7 +185,7 @@ def monodromy(
     *,
     macro_dt,
     num_steps: int,
-    solver: Newton | None = None,
+    solver: Solver | None = None,
 ) -> Monodromy:
     """Product of the step's derivatives along a trajectory, ``M = DPhi(z_(N-1)) ... DPhi(z_0)``.
 

@@ -1,4 +1,4 @@
-"""When the corrections of a step are small enough: the test of all solvers, and the meaning of `Newton.tolerance`.
+"""When the corrections of a step are small enough: the test of all solvers, and the meaning of `Solver.tolerance`.
 
 A solver may omit the next correction c of the slow (or of the fast) increments if
 
@@ -85,7 +85,7 @@ def largest(numbers, weights=None):
 class Accepted(NamedTuple):
     """Accepted corrections of the increments: a part relative to the motion over the step, and a part for round-off of the positions.
 
-    tolerance: `Newton.tolerance` over `SAFETY`.
+    tolerance: `Solver.tolerance` over `SAFETY`.
     slow, fast: accepted round-off. First entry: of these variables, used in the first `ITERATIONS_BEFORE_TIED_ROUNDOFF` iterations. Second
         entry, used later: with the round-off of the variables that constraints tie to them.
     roundoff: `ROUNDOFF` units of round-off of all positions, ``4 eps max |q|``, for `at_floor`.

@@ -35,8 +35,8 @@ from vmri_jax.schemes.path import control_nodes, lagrange_basis
 from vmri_jax.steppers.accept import Accepted, expected
 from vmri_jax.steppers.interval import constant_mass
 from vmri_jax.steppers.results import RUNNING, Method
-from vmri_jax.steppers.solved import Solution, Solver, status_of
-from vmri_jax.steppers.solvers import Newton
+from vmri_jax.steppers.solved import Solution, StepSolver, status_of
+from vmri_jax.steppers.solver import Solver, iterated
 from vmri_jax.steppers.time_modes import TimeModes, product, times_i
 
 
@@ -269,10 +269,10 @@ def only_if(wanted, function, x):
 
 
 @dataclass(frozen=True)
-class Collocation(Solver):
+class Collocation(StepSolver):
     """Newton steps until the next one would change no increment (`Accepted`); its correction is extrapolated from the last two."""
 
-    newton: Newton
+    newton: Solver
 
     def solve(self, equations: StepEquations, guess: Unknowns, memory: tuple) -> tuple[Solution, tuple]:
         newton = self.newton
@@ -298,14 +298,15 @@ class Collocation(Solver):
 
         def step(iterate: Evaluated) -> Evaluated:
             """Forces of the last iterate, then a correction unless it has converged: one place for the forces compiles them once."""
-            last, fixed = iterate.last, newton.fixed_iterations
+            last = iterate.last
             forces = joined.forces(last.x, last.mu)
-            goes_on = last.result == RUNNING if fixed is None else last.iterations < fixed
-            return Evaluated(only_if(goes_on, lambda last: corrected(last, forces), last), forces, last.result)
+            return Evaluated(
+                only_if(last.result == RUNNING, lambda last: corrected(last, forces), last), forces, last.result
+            )
 
         running, none = jnp.asarray(RUNNING), Forces(jnp.zeros_like(x), jnp.zeros_like(joined.q), jnp.zeros_like(mu))
         start = Increments(x, mu, (jnp.zeros(()),) * 2, jnp.asarray(0), running)
-        last, forces, _ = newton.iterate(step, Evaluated(start, none, running), -1)  # forces once more than corrections
+        last, forces, _ = iterated(step, Evaluated(start, none, running))
 
         p, rows = joined.momentum(last.x, forces), joined.residual(last.x, forces)
         x, mu = last.x.T, last.mu.T
@@ -314,7 +315,7 @@ class Collocation(Solver):
         status = status_of(
             equations,
             last.result,
-            Method.COLLOCATION,
+            Method.MODES,
             last.iterations,
             rows=max_abs(rows),
             end=end,
@@ -322,4 +323,4 @@ class Collocation(Solver):
         return Solution(unknowns, end, status), memory
 
     def describe(self) -> list[str]:
-        return ["one interval of high degree: all variables at once, in modes of time"]
+        return ["modes: all variables of the interval at once, in modes of time"]

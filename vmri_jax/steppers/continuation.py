@@ -5,7 +5,7 @@ guess fails, the solver solves the equations of a shorter step, then of longer a
 before (Deuflhard, *Newton Methods for Nonlinear Problems*, 2011, chapter 5). The stride doubles after a success
 and halves after a part that ends early, by a singular matrix or a NaN; a part that uses up all iterations ends the continuation. Plain iteration and continuation are one loop, compiled once; a step that converges at once takes one turn.
 
-The first attempt is the whole step from the prediction of the steps before (of the march; `Coupled` starts it from straight motion), the
+The first attempt is the whole step from the prediction of the steps before, the
 second the whole step from straight motion, all further attempts are parts of the step.
 """
 

@@ -1,20 +1,20 @@
-"""Whole steps from a user's stepper or solver: kicks around a solver, a projection where a stepper has none, and checks of shapes."""
+"""Whole steps from a user's stepper: a projection where it has none, and checks of shapes."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import jax
 import numpy as np
 
 from vmri_jax.mechanics.checks import check_type
-from vmri_jax.mechanics.constraint_pattern import all_rows
 from vmri_jax.mechanics.projection import project_momentum
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
 from vmri_jax.schemes.discrete_lagrangian import lagrangian
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.kicked import Kicked, KickedState
-from vmri_jax.steppers.solved import Solved, Solver
+from vmri_jax.steppers.solved import Solved
 from vmri_jax.steppers.stepper import Stepper
 
 
@@ -29,38 +29,29 @@ class Projecting(Kicked):
         return State(state.t, state.q_s, state.q_f, p_s, p_f), memory
 
 
-def whole_step(
-    made: Stepper | Solver, system: System, scheme: Scheme, state: State, average: Callable | None, reverse_only: bool
-) -> Kicked:
-    """The stepper of a run, made of a user's stepper or solver.
+def whole_step(made: Any, system: System, scheme: Scheme, average: Callable | None) -> Kicked:
+    """The stepper of a run, made of a user's stepper.
 
-    A `Solver` or a `Solved` stepper solves the equations between the kicks, so that the kicks of the scheme are added before and after; any
-    other stepper takes the whole step. With constraints every step ends with a projection of the momenta onto the hidden constraints.
+    A `Solved` stepper solves the equations between the kicks, so that the kicks of the scheme are added before and after; any other stepper
+    takes the whole step. With constraints every step ends with a projection of the momenta onto the hidden constraints.
 
     Args:
-        made: value of the function of `Custom`.
+        made: value of ``Solver.stepper``.
         system: of the run.
         scheme: of a stage.
-        state: only its shapes matter.
         average: of mollified kicks, see `Kicked`.
-        reverse_only: see `Solved`.
 
     Raises:
-        TypeError: `made` is neither a stepper nor a solver.
-        ValueError: shapes of the end state or of the record that do not fit the system and the scheme.
+        TypeError: `made` is no stepper.
     """
-    if isinstance(made, Solver):
-        made = Solved(system, scheme, made, all_rows(system, state.q_s, state.q_f), reverse_only)
-    check_type("plan: the stepper of solvers.Custom", made, Stepper, "a vmri_jax.steppers.stepper.Stepper")
+    check_type("plan: the value of Solver.stepper", made, Stepper, "a vmri_jax.steppers.stepper.Stepper")
     if isinstance(made, Solved):
         made = Kicked(lagrangian(system, scheme).kicks, made, average)
     if type(made) is not Kicked:  # a subclass may have an `advance` of its own
         made = Kicked((), made)
     if system.is_constrained and not _projects(made.inner):
         made = Projecting(made.kicks, made.inner, made.average, system=system)
-    made = replace(made, projects=system.is_constrained)
-    _check_shapes(made, system, scheme, state)
-    return made
+    return replace(made, projects=system.is_constrained)
 
 
 def _projects(stepper: Stepper) -> bool:
@@ -70,8 +61,8 @@ def _projects(stepper: Stepper) -> bool:
     return type(stepper).project is not Stepper.project
 
 
-def _check_shapes(stepper: Stepper, system: System, scheme: Scheme, state: State) -> None:
-    """Refuse a stepper whose end state or record has wrong shapes."""
+def check_shapes(stepper: Stepper, system: System, scheme: Scheme, state: State) -> None:
+    """Refuse a stepper of a user whose end state or record has wrong shapes."""
     (n_g, n_gs), n_f, r = system.num_constraints(state.q_s, state.q_f), state.q_f.size, scheme.degree
 
     def step(state: State):
@@ -87,6 +78,6 @@ def _check_shapes(stepper: Stepper, system: System, scheme: Scheme, state: State
         returned = np.shape(getattr(owner, name))
         if returned != shape:
             raise ValueError(
-                f"plan: advance of the stepper of solvers.Custom returns {type(owner).__name__}.{name} of shape {returned}; it must be {shape} for num_micro = {micro}, "
+                f"plan: advance of the stepper of Solver.stepper returns {type(owner).__name__}.{name} of shape {returned}; it must be {shape} for num_micro = {micro}, "
                 f"degree = {r}, {n_g} constraints and {n_gs} slow ones."
             )

@@ -1,8 +1,7 @@
 """The march as a solver: passes until the corrections are small enough, see `vmri_jax.steppers.march`."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -24,17 +23,12 @@ from vmri_jax.steppers.march import (
 from vmri_jax.steppers.newton import null_space
 from vmri_jax.steppers.predictors import PolynomialPredictor
 from vmri_jax.steppers.results import RUNNING, Method, Result
-from vmri_jax.steppers.solved import Solution, Solver, ended, status_of
-from vmri_jax.steppers.solvers import Newton
+from vmri_jax.steppers.solved import Solution, StepSolver, status_of
+from vmri_jax.steppers.solver import Solver, iterated
 
 PLAIN_PASSES = 30
 """Most passes of an attempt at the whole step, before parts of the step are tried. Newton's method needs at most 15 exact passes from a good
 guess, and about half of the passes are exact. A larger number makes failing runs slower; a smaller one tries parts without need."""
-INVERSES: dict[str, Callable] = {
-    "arrowhead": inverse_with_multipliers,
-    "null_space": null_space.inverse_without_multipliers,
-}
-"""Functions that invert the matrices of micro intervals and of the slow equations, by the name of the linear solver."""
 
 
 class MarchMemory(NamedTuple):
@@ -78,20 +72,19 @@ class Progress(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Marched(Solver):
+class Marched(StepSolver):
     """Passes until the next one would change neither the slow nor the fast increments.
 
-    linear_solver: "arrowhead", elimination with multipliers, or "null_space", without them.
+    newton: settings; its matrix "null_space" eliminates without multipliers, any other one with them.
     sizes: (n_s, n_gs, n_f, n_g) and the degree r, for `describe` of the null space method.
     """
 
-    newton: Newton
-    linear_solver: str
+    newton: Solver
     sizes: tuple[int, int, int, int, int] | None = None
 
-    def remembers(self, equations: StepEquations, guess: Unknowns) -> MarchMemory:
+    def init(self, equations: StepEquations, velocity) -> MarchMemory:
         march = self._march(equations)
-        z, x = march.flat(guess)
+        z, x = march.flat(equations.guess(velocity[0], velocity[1], jnp.zeros(march.n_g), jnp.zeros(march.n_gs)))
         return MarchMemory(PolynomialPredictor.constant(z), x[0], march.no_matrices(), jnp.asarray(jnp.inf))
 
     def solve(self, equations: StepEquations, guess: Unknowns, memory: MarchMemory) -> tuple[Solution, MarchMemory]:
@@ -109,9 +102,6 @@ class Marched(Solver):
             passes=jnp.asarray(0),
             result=jnp.asarray(RUNNING),
         )
-        if self.newton.fixed_iterations is not None:
-            done = self._iterate(march, guess, start, memory, None)
-            return self._solution(march, done, ended(done.result), done.passes), self._learned(march, memory, done)
 
         def part(equations, guess, limit, is_first):
             done = self._iterate(self._march(equations), guess, start, memory, limit, is_first)
@@ -121,16 +111,20 @@ class Marched(Solver):
         done = parts.solution
         return self._solution(march, done, parts.result, parts.iterations), self._learned(march, memory, done)
 
+    @property
+    def _has_multipliers(self) -> bool:
+        return self.newton.matrix != "null_space"
+
     def _march(self, equations: StepEquations) -> MarchEquations:
-        return MarchEquations(equations, INVERSES[self.linear_solver], Weights.of(equations))
+        inverted = inverse_with_multipliers if self._has_multipliers else null_space.inverse_without_multipliers
+        return MarchEquations(equations, inverted, Weights.of(equations))
 
     def _iterate(
-        self, march: MarchEquations, guess: Unknowns, start: Progress, memory: MarchMemory, limit, is_first: Any = True
+        self, march: MarchEquations, guess: Unknowns, start: Progress, memory: MarchMemory, limit, is_first
     ) -> Progress:
         """At most `limit` passes. The first attempt starts from the predicted slow unknowns, later attempts from the guess."""
         accepted = Accepted.of(march.equations, self.newton, march.weights)
         accepted = accepted.with_constraints(march.equations, march.weights)
-        fixed = self.newton.fixed_iterations
         z, x = march.flat(guess)
         z = jnp.where(is_first, memory.slow.next(march.num_slow), z)
         progress = start._replace(
@@ -147,9 +141,8 @@ class Marched(Solver):
             ratio = accepted.ratio((slow, still_moves), motions, passes)
             at_floor = accepted.at_floor(size, before.size)
             result = jnp.where(ratio <= 1, Result.CONVERGED, jnp.where(at_floor, Result.CONVERGED_AT_ROUNDOFF, RUNNING))
-            if limit is not None:
-                failed = jnp.where(size > before.size, Result.DIVERGED, Result.STAGNATED)
-                result = jnp.where((passes >= limit) & (result == RUNNING), failed, result)
+            failed = jnp.where(size > before.size, Result.DIVERGED, Result.STAGNATED)
+            result = jnp.where((passes >= limit) & (result == RUNNING), failed, result)
             # a correction that grows in the first attempt: the prediction was poor, and the next attempt starts from straight motion
             lost = is_first & (size > before.size)
             result = jnp.where(lost & (result == RUNNING), Result.DIVERGED, result)
@@ -183,7 +176,7 @@ class Marched(Solver):
             last = jax.lax.while_loop(lambda p: (p.result == RUNNING) & (p.rate <= CONTRACTION), further, last)
             return jax.lax.while_loop(lambda p: (p.result == RUNNING) & ~(p.rate <= CONTRACTION), exact, last)
 
-        return self.newton.iterate(passes if fixed is None else exact, progress)
+        return iterated(passes, progress)
 
     def _solution(self, march: MarchEquations, done: Progress, result, passes) -> Solution:
         equations, passed = march.equations, done.passed
@@ -192,7 +185,8 @@ class Marched(Solver):
         # The residual after the last correction is not evaluated. Estimate: it has shrunk like the fast corrections,
         # |R| = |R before the correction| min(1, expected correction / last correction).
         shrinks = done.still_moves / jnp.maximum(passed.worst.moved, jnp.finfo(float).tiny)
-        rows, method = passed.worst.rows * jnp.minimum(shrinks, 1.0), Method[self.linear_solver.upper()]
+        rows = passed.worst.rows * jnp.minimum(shrinks, 1.0)
+        method = Method.EXACT if self._has_multipliers else Method.NULL_SPACE
         status = status_of(equations, result, method, passes, rows=rows, end=end, weights=march.weights)
         return Solution(x, end, with_dependent_constraints(equations, status))
 
@@ -201,8 +195,10 @@ class Marched(Solver):
         return MarchMemory(memory.slow.add(passed.z, march.num_slow), passed.x[-1], done.matrices, done.rate)
 
     def describe(self) -> list[str]:
-        head = f"march over the micro intervals with exact matrices, {self.linear_solver.replace('_', ' ')}"
-        if self.linear_solver != "null_space" or self.sizes is None:
+        if self._has_multipliers:
+            return ["exact: micro intervals in order with exact matrices"]
+        head = "null_space: micro intervals in order with exact matrices, without multipliers"
+        if self.sizes is None:
             return [head]
         *counts, r = self.sizes
         parts = zip(("slow variables", "each micro interval"), counts[::2], counts[1::2], strict=True)

@@ -32,8 +32,8 @@ from vmri_jax.steppers.micro_intervals import FastUnknowns, MicroSweep, SweepTot
 from vmri_jax.steppers.predictors import PolynomialPredictor
 from vmri_jax.steppers.results import Method
 from vmri_jax.steppers.slow_equations import ConstraintInertia, SlowEquations
-from vmri_jax.steppers.solved import Solution, Solver, status_of
-from vmri_jax.steppers.solvers import Newton
+from vmri_jax.steppers.solved import Solution, StepSolver, status_of
+from vmri_jax.steppers.solver import Solver, iterated
 
 EXTRA_PASSES = 1
 """Passes above the fewest with a matrix K that the solver tolerates; it renews K after a step with more. A larger number lets steps with an old K
@@ -86,14 +86,14 @@ class Pass(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Nested(Solver):
+class Nested(StepSolver):
     """Passes until the next one would change neither the slow nor the fast increments (`Accepted`).
 
     The next slow correction follows from the residual of the slow equations, the next fast one is extrapolated from the last two, as in
     stiff solvers (Hairer, Wanner, *Solving Ordinary Differential Equations II*, IV.8).
     """
 
-    newton: Newton
+    newton: Solver
     interval: Interval
 
     def init(self, equations: StepEquations, velocity) -> NestedState:
@@ -108,11 +108,11 @@ class Nested(Solver):
     def renew(self, equations: StepEquations, memory: NestedState) -> NestedState:
         """The memory with a new matrix K, unless K is constant.
 
-        A large K is kept while it costs at most `EXTRA_PASSES` passes. With a fixed number of passes K is always new: old matrices converge slower.
+        A large K is kept while it costs at most `EXTRA_PASSES` passes.
         """
         if self.interval.is_constant:
             return memory
-        if self.interval.is_cheap or self.newton.fixed_iterations:
+        if self.interval.is_cheap:
             return memory._replace(matrix=self.interval.matrix(equations))
         stale = memory.last_passes > memory.fewest_passes + EXTRA_PASSES
         matrix = jax.lax.cond(stale, lambda: self.interval.matrix(equations), lambda: memory.matrix)
@@ -125,12 +125,12 @@ class Nested(Solver):
         scale, _ = multiplier_scales(scheme, equations.macro_dt)
         sweep = MicroSweep(equations, self.interval.is_explicit, memory.matrix, scale, self.interval.sparsity)
         passes = _Passes(equations, memory, sweep, newton)
-        done = newton.iterate(passes.next, passes.first(), done=1)
+        done = iterated(passes.next, passes.first())
 
         x = Unknowns(done.slow, done.slow_multiplier, done.fast.increments, done.fast.multiplier)
         per_h = 1 / equations.micro_dt
         end = done.totals.q_f, equations.p_s + per_h * done.impulse, per_h * done.totals.p_f
-        status = status_of(equations, done.result, Method.NESTED, done.passes, rows=done.rows, end=end)
+        status = status_of(equations, done.result, Method.MASSES, done.passes, rows=done.rows, end=end)
 
         learned = NestedState(
             memory.matrix,
@@ -148,7 +148,7 @@ class Nested(Solver):
     def describe(self) -> list[str]:
         inside = "the multipliers alone" if self.interval.is_explicit else "fast increments and multipliers"
         return [
-            "nested iteration: the slow path outside, micro intervals in order inside",
+            "masses: passes over the slow path, with the micro intervals in order inside",
             f"  each interval solves for {inside}, with a matrix {self._matrix_in_words()}",
         ]
 
@@ -160,7 +160,7 @@ class Nested(Solver):
 class _Passes:
     """The iteration over passes of one macro step."""
 
-    def __init__(self, equations: StepEquations, memory: NestedState, sweep: MicroSweep, newton: Newton):
+    def __init__(self, equations: StepEquations, memory: NestedState, sweep: MicroSweep, newton: Solver):
         self.equations, self.memory, self.sweep, self.newton = equations, memory, sweep, newton
         self.slow_equations = SlowEquations.of(equations)
         self.accepted = Accepted.of(equations, newton)

@@ -9,9 +9,9 @@ The plan chooses the cheapest stepper that the rules and the system allow, from 
   node kick between groups of k fast steps (*repeated*);
 * *free flight*: only kinetic energy of constant masses is left;
 * *linear*: only fast variables with linear equations are left;
-* else a solver: for the multipliers of a drift (*Rattle*), for one interval of high degree (*collocation*), for the micro intervals in
-  order with cheap matrices (*nested*) or with exact ones (*march*). The march is also the *fallback* of the other three. The dense
-  matrix of all unknowns at once (*coupled*) is a reference for studies.
+* else an iteration, by the matrix of `Solver`: masses and constraints, for the multipliers of a drift alone (*Rattle*) or for the micro
+  intervals in order (*nested*); modes of time, for one interval of high degree (*collocation*); or exact (*march*), which is also the
+  *fallback* of the other three.
 """
 
 from collections.abc import Callable
@@ -32,11 +32,9 @@ from vmri_jax.schemes.composition import Composition, stage_scheme
 from vmri_jax.schemes.discrete_lagrangian import PlacedPotential, Term, lagrangian, placed_potentials
 from vmri_jax.schemes.quadrature import macro
 from vmri_jax.schemes.scheme import Scheme
-from vmri_jax.steppers import solvers
 from vmri_jax.steppers.collocation import Collocation
 from vmri_jax.steppers.composed import Composed
-from vmri_jax.steppers.coupled import Coupled
-from vmri_jax.steppers.custom import whole_step
+from vmri_jax.steppers.custom import check_shapes, whole_step
 from vmri_jax.steppers.decoupled import Decoupled
 from vmri_jax.steppers.direct import FreeFlight, Linear
 from vmri_jax.steppers.interval import SMALL, Interval, implicit_terms
@@ -44,8 +42,8 @@ from vmri_jax.steppers.kicked import Kicked, Repeated, average_over_fast_motion
 from vmri_jax.steppers.marched import Marched
 from vmri_jax.steppers.nested import Nested
 from vmri_jax.steppers.rattle import Rattle
-from vmri_jax.steppers.solved import Fallback, Solved, Solver
-from vmri_jax.steppers.solvers import Newton
+from vmri_jax.steppers.solved import Solved, StepSolver
+from vmri_jax.steppers.solver import Solver
 from vmri_jax.steppers.stepper import StepInfo, Stepper, indented
 from vmri_jax.steppers.subsystems import fast_part, frozen_slow, slow_part
 
@@ -56,15 +54,9 @@ spans; the keys k increase, start with 1, and each is a multiple of the one befo
 
 @dataclass(frozen=True)
 class _Choice:
-    """Settings of the solvers.
+    """Settings of all parts of a step: the solver of the user, and whether steps are differentiated in reverse mode only, once."""
 
-    newton: as the user chose.
-    falls_back: whether the march with exact matrices solves the steps that the first solver does not solve.
-    reverse_only: whether steps are differentiated in reverse mode only, once.
-    """
-
-    newton: Newton
-    falls_back: bool
+    solver: Solver
     reverse_only: bool
 
 
@@ -83,7 +75,7 @@ class Plan:
 
     system: System
     scheme: Scheme | Composition
-    solver: Newton
+    solver: Solver
     stepper: Stepper
     defers_projection: bool
 
@@ -101,8 +93,15 @@ class Plan:
 
     @property
     def has_fallback(self) -> bool:
-        """Whether some solver inside has a fallback."""
-        return any(isinstance(solver, Fallback) for solver in _solvers(self.stepper))
+        """Whether the steps are taken by another matrix than the exact one, which "auto" has chosen: a run with `Solver.exact` may solve what fails."""
+        chosen = self.solver.matrix == "auto" and self.solver.stepper is None
+        return chosen and any(not isinstance(solver, Marched) for solver in _solvers(self.stepper))
+
+    @property
+    def first(self) -> Solver:
+        """The solver with the matrix that "auto" has chosen by its name, without a fallback."""
+        modes = any(isinstance(solver, Collocation) for solver in _solvers(self.stepper))
+        return replace(self.solver, matrix="modes" if modes else "masses") if self.has_fallback else self.solver
 
     def describe(self) -> str:
         """The scheme applied to the system in words: rules of the terms that the system has, order, symmetry, and the steppers."""
@@ -116,19 +115,19 @@ class Plan:
             slow = macro(stage_scheme(self.scheme).kinetic.rule).in_words()
             rules = {"T": rules.pop("T"), "T_s": slow} | rules
         scheme = replace(scheme, rules=rules)
-        return "\n".join([str(scheme), "a step:", *indented(self.stepper.describe())])
+        return "\n".join([str(scheme), "a step:", *indented(str(self).splitlines())])
 
     def __str__(self) -> str:
-        return str(self.stepper)
+        again = ["what that does not solve: exact, micro intervals in order with exact matrices"]
+        return "\n".join(self.stepper.describe() + again * self.has_fallback)
 
 
 def plan(
     system: Movable,
     scheme: Scheme | Composition,
     state: State | None = None,
-    solver: Newton | None = None,
+    solver: Solver | None = None,
     *,
-    fallback: bool = True,
     reverse_only: bool = False,
 ) -> Plan:
     """The plan of macro steps of a system under a scheme; ``print`` shows it in words.
@@ -137,28 +136,27 @@ def plan(
         system: a `Problem` or a scene, or a `System` with a state.
         scheme: a `Scheme` or a `Composition`.
         state: any state of the system; only the shapes of its arrays matter.
-        solver: one of `vmri_jax.solvers`, by default `Auto`.
-        fallback: whether the march with exact matrices solves the steps that the first solver does not solve, in the same program.
+        solver: for implicit equations, by default ``Solver()``. The plan of the matrix "auto" has the first matrix that the structure allows; runs
+            solve again what it does not solve (`vmri_jax.running.fallback`).
         reverse_only: whether steps are differentiated in reverse mode only, once, in half the time.
 
     Raises:
-        ValueError: `solvers.Nested` for a system or scheme that does not allow it; a scheme that the system does not allow.
+        ValueError: a matrix that the system or the scheme does not allow; a scheme that the system does not allow.
     """
     system, state = start_of("plan", system, state)
-    newton = solver or solvers.Auto()
-    falls_back = fallback and newton.method == "auto" and newton.fixed_iterations is None
-    choice, defers = _Choice(newton, falls_back, reverse_only), False
-    if isinstance(newton, solvers.Custom):
-        stage = stage_scheme(scheme)
-        average = _average(system, stage, replace(choice, newton=solvers.Auto(), falls_back=False))
-        stepper: Stepper = whole_step(newton.stepper.called(system, stage), system, stage, state, average, reverse_only)
-    else:
-        kicked = _whole_step(system, stage_scheme(scheme), choice, state.q_s, state.q_f)
+    solver, stage, defers = solver or Solver(), stage_scheme(scheme), False
+    own = None if solver.stepper is None else solver.stepper.called(system, stage)
+    if solver.stepper is None or isinstance(own, StepSolver):
+        kicked = _whole_step(system, stage, _Choice(solver, reverse_only), state.q_s, state.q_f)
         defers = _defers_projection(kicked)
-        stepper = replace(kicked, projects=not defers and system.is_constrained)
+        stepper: Stepper = replace(kicked, projects=not defers and system.is_constrained)
+    else:
+        stepper = whole_step(own, system, stage, _average(system, stage, _Choice(Solver(), reverse_only)))
+    if solver.stepper is not None:
+        check_shapes(stepper, system, stage, state)
     if isinstance(scheme, Composition):
         stepper = Composed(scheme.coefficients, stepper)
-    return Plan(system, scheme, newton, stepper, defers)
+    return Plan(system, scheme, solver, stepper, defers)
 
 
 def _defers_projection(stepper: Stepper) -> bool:
@@ -168,11 +166,10 @@ def _defers_projection(stepper: Stepper) -> bool:
     not the motion. So only momenta that are saved need it.
     """
     solvers = _solvers(stepper, constrained=True)
-    solvers = [solver.first if isinstance(solver, Fallback) else solver for solver in solvers]
     return DEFERS_PROJECTION and bool(solvers) and all(isinstance(solver, Rattle) for solver in solvers)
 
 
-def _solvers(stepper: Stepper, constrained: bool = False) -> list[Solver]:
+def _solvers(stepper: Stepper, constrained: bool = False) -> list[StepSolver]:
     """The solvers of a tree of steppers, all of them or only those of constrained systems."""
     if isinstance(stepper, Solved):
         return [stepper.solver] if stepper.system.is_constrained or not constrained else []
@@ -195,42 +192,53 @@ def _whole_step(system: System, scheme: Scheme, choice: _Choice, q_s, q_f) -> Ki
 
 
 def _between_kicks(system: System, scheme: Scheme, choice: _Choice, q_s, q_f) -> Stepper:
-    newton = choice.newton
-    can_be_nested = _can_be_nested(system, scheme)
-    rows = all_rows(system, q_s, q_f)
-    if newton.method == "nested" and not can_be_nested:
-        raise ValueError(
-            "solvers.Nested needs a ConstantMass, and potentials and forces on the micro grid or as kicks at the macro nodes or at every "
-            "k-th micro node; a term of this scheme has other nodes inside the macro interval. Take solvers.Auto() or solvers.Arrowhead()."
-        )
+    solver = choice.solver
+    can_be_nested, rows = _can_be_nested(system, scheme), all_rows(system, q_s, q_f)
+    _check_matrix(solver.matrix, system, scheme, can_be_nested)
     if _is_drift(system, scheme) and not system.is_constrained:
         return FreeFlight(system)
-    if not can_be_nested or newton.method not in ("auto", "nested"):
+    if solver.stepper is not None:
+        own = solver.stepper.called(system, scheme)
+        return Solved(system, scheme, own, rows, choice.reverse_only)
+    if not can_be_nested or solver.matrix in ("exact", "null_space"):
         n_g, n_gs = system.num_constraints(q_s, q_f)
-        sizes = q_s.size, n_gs, q_f.size, n_g, scheme.degree
-        linear_solver = "null_space" if newton.method == "null_space" else "arrowhead"
-        solver = Coupled(newton) if newton.method == "dense" else Marched(newton, linear_solver, sizes)
-        return Solved(system, scheme, solver, rows, choice.reverse_only)
+        marched = Marched(solver, (q_s.size, n_gs, q_f.size, n_g, scheme.degree))
+        return Solved(system, scheme, marched, rows, choice.reverse_only)
     interval = Interval.of(system, scheme, q_s, q_f)
     if _is_linear(system, scheme, interval, q_s):
         return Linear(system, scheme, interval)
-    solver = _first_choice(system, scheme, newton, interval, rows, q_f.size or q_s.size)
-    if choice.falls_back:
-        solver = Fallback(solver, Marched(newton, "arrowhead"))
-    return Solved(system, scheme, solver, rows, choice.reverse_only)
+    approximate = _approximate(system, scheme, solver, interval, rows, q_f.size or q_s.size)
+    return Solved(system, scheme, approximate, rows, choice.reverse_only)
 
 
-def _first_choice(
-    system: System, scheme: Scheme, newton: Newton, interval: Interval, rows: Sparsity, size: int
-) -> Solver:
-    """The first solver of `Auto`, and the solver of `Nested`, for constant masses; `size` is the number of variables of an interval."""
-    if DRIFTS and _is_drift(system, scheme):
-        return Rattle(newton, rows)
-    single = COLLOCATES and scheme.num_micro == 1 and scheme.degree > 1
+def _approximate(
+    system: System, scheme: Scheme, solver: Solver, interval: Interval, rows: Sparsity, size: int
+) -> StepSolver:
+    """The matrix "masses" or "modes", or the first one of "auto", for constant masses; `size` is the number of variables of an interval."""
     small = size <= SMALL  # Nested keeps a larger matrix over many steps, Collocation does not
-    if single and small and system.force is None and not interval.is_diagonal:
-        return Collocation(newton)
-    return Nested(newton, interval)
+    chosen = COLLOCATES and small and not interval.is_diagonal and _has_modes(system, scheme)
+    if solver.matrix == "modes" or (solver.matrix == "auto" and chosen):
+        return Collocation(solver)
+    return Rattle(solver, rows) if DRIFTS and _is_drift(system, scheme) else Nested(solver, interval)
+
+
+def _check_matrix(matrix: str, system: System, scheme: Scheme, can_be_nested: bool) -> None:
+    """Refuse a matrix that the structure of the system and the scheme does not allow."""
+    if matrix in ("masses", "modes") and not can_be_nested:
+        raise ValueError(
+            f"Solver: the matrix {matrix!r} needs a ConstantMass, and potentials and forces on the micro grid or as kicks at the macro nodes or "
+            "at every k-th micro node; a term of this scheme has other nodes inside the macro interval. Take the matrix 'auto' or 'exact'."
+        )
+    if matrix == "modes" and not _has_modes(system, scheme):
+        raise ValueError(
+            f"Solver: the matrix 'modes' needs a scheme with num_micro = 1 and a degree above 1, such as galerkin(1, 3), and a System without "
+            f"force; here num_micro = {scheme.num_micro}, degree = {scheme.degree}. Take the matrix 'auto' or 'exact'."
+        )
+
+
+def _has_modes(system: System, scheme: Scheme) -> bool:
+    """Whether the equations of one interval decouple in modes of time."""
+    return scheme.num_micro == 1 and scheme.degree > 1 and system.force is None
 
 
 def _can_be_nested(system: System, scheme: Scheme) -> bool:

@@ -23,8 +23,8 @@ from vmri_jax.schemes.equations import StepEquations, Unknowns, multiplier_scale
 from vmri_jax.steppers.accept import Accepted
 from vmri_jax.steppers.interval import constant_mass, weighted_sum
 from vmri_jax.steppers.results import Method
-from vmri_jax.steppers.solved import Solution, Solver, status_of
-from vmri_jax.steppers.solvers import Newton
+from vmri_jax.steppers.solved import Solution, StepSolver, status_of
+from vmri_jax.steppers.solver import Solver, iterated
 
 LEAST_SCALE = 0.1
 """Smallest scale s of a multiplier, in units of h^2, that is used for predictions. If a forward and a backward step of a composition nearly cancel,
@@ -57,13 +57,13 @@ class Correction(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Rattle(Solver):
+class Rattle(StepSolver):
     """Corrects the multipliers until the next correction would change no increment (`Accepted`).
 
     sparsity: of ``G M^-1 G^T`` with all constraints.
     """
 
-    newton: Newton
+    newton: Solver
     sparsity: Sparsity
 
     def init(self, equations: StepEquations, velocity) -> RattleState:
@@ -113,14 +113,14 @@ class Rattle(Solver):
 
         # nearly all steps need one correction: outside of the loop it is cheaper
         first = corrected(judged(x, mu, g, 0))
-        done = newton.iterate(corrected, first, done=1)
+        done = iterated(corrected, first)
 
         impulse = force(done.mu) / h  # p+ = p - G_0^T mu / h
         end = equations.q_f + done.x[n_s:], equations.p_s - impulse[:n_s], equations.p_f - impulse[n_s:]
         status = status_of(
             equations,
             done.result,
-            Method.RATTLE,
+            Method.MASSES,
             done.iterations,
             rows=max_abs(force(done.dmu)),
             end=end,
@@ -146,4 +146,4 @@ class Rattle(Solver):
         return memory._replace(last_dt=jnp.zeros_like(memory.last_dt))
 
     def describe(self) -> list[str]:
-        return ["drift along the constraints (RATTLE): Newton's iteration on the multipliers"]
+        return ["masses: drift along the constraints (RATTLE), Newton's iteration on the multipliers"]

@@ -38,7 +38,7 @@ _MESSAGES = {
     Result.STAGNATED: (
         "the iteration of the step used up its iterations without converging. Likely "
         "causes: the step is too large for the motion or for the fast forces, or the constraints are nearly dependent. Try a smaller "
-        "macro_dt or a larger num_micro, or raise max_iterations (or fixed_iterations) of the solver."
+        "macro_dt or a larger num_micro, or raise max_iterations of the solver."
     ),
     Result.DIVERGED: (
         "Newton's iteration moved away from a solution, and following the solution of shorter steps ended before the whole "
@@ -66,7 +66,7 @@ _MESSAGES = {
     ),
     Result.CONSTRAINT_VIOLATED: (
         "the increments converged, but the constraints are not kept. Likely causes: rows that contradict each other, or a "
-        "stepper of your own (solvers.Custom) that does not hold them."
+        "stepper of your own that does not hold them."
     ),
     Result.NOT_IMPLIED: (
         'the constraints that are solved for are kept, but rows that were left out as redundant (redundant="drop" of a scene, '
@@ -96,21 +96,17 @@ RUNNING = -1
 
 
 class Method(IntEnum):
-    """The solver that took a step; of several solvers in a step, the one with the largest number, mostly the most expensive one.
+    """How a step was solved; of several ways in a step, the one with the largest number, mostly the most expensive one.
 
-    EXPLICIT: nothing to solve. LINEAR: linear equations, solved directly. RATTLE: the multipliers of a drift along the
-    constraints. NESTED: passes over the micro intervals, each interval with a small matrix of its own.
-    COLLOCATION: one interval of high degree, in modes of time. ARROWHEAD, NULL_SPACE: the march with exact matrices, with and without
-    multipliers. DENSE: Newton's iteration on all unknowns of the macro step.
+    EXPLICIT: nothing to solve. LINEAR: linear equations, solved directly. MASSES, MODES, EXACT, NULL_SPACE: the matrix of the iteration, see
+    `vmri_jax.steppers.solver`.
     """
 
     EXPLICIT = 0
     LINEAR = 1
-    RATTLE = 2
-    NESTED = 3
-    COLLOCATION = 4
-    ARROWHEAD = 5
-    DENSE = 6
+    MASSES = 3  # files keep the numbers: 2 and 6 were other methods
+    MODES = 4
+    EXACT = 5
     NULL_SPACE = 7
 
 

@@ -2,7 +2,6 @@
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -20,8 +19,7 @@ from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.accept import NO_WEIGHTS, Weights
 from vmri_jax.steppers.interval import constant_mass
 from vmri_jax.steppers.newton.implicit import differentiable, differentiable_reverse_only
-from vmri_jax.steppers.results import RUNNING, Result
-from vmri_jax.steppers.stepper import StepInfo, Stepper, StepStatus, indented
+from vmri_jax.steppers.stepper import StepInfo, Stepper, StepStatus
 
 ROOT = "root"
 """Name of the solution and the status of a step for `jax.checkpoint`: a policy that saves this name lets derivatives reuse the solution."""
@@ -36,7 +34,7 @@ class Solution(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Solver(ABC):
+class StepSolver(ABC):
     """Solves the equations of a step.
 
     First ``memory = init(equations, velocity)``, then ``solution, memory = solve(equations, guess, memory)`` for every step.
@@ -49,12 +47,6 @@ class Solver(ABC):
             equations: of the first step.
             velocity: (v_s, v_f) at the start of the run.
         """
-        n_g, n_gs = equations.system.num_constraints(equations.q_s, equations.q_f)
-        v_s, v_f = velocity
-        return self.remembers(equations, equations.guess(v_s, v_f, jnp.zeros(n_g), jnp.zeros(n_gs)))
-
-    def remembers(self, equations: StepEquations, guess: Unknowns) -> Any:
-        """The memory from a guess alone: of the first step, and of every step that `Fallback` hands to its exact solver."""
         return ()
 
     def renew(self, equations: StepEquations, memory) -> Any:
@@ -112,7 +104,7 @@ class Solved(Stepper):
 
     system: System
     scheme: Scheme
-    solver: Solver
+    solver: StepSolver
     sparsity: Sparsity
     reverse_only: bool = False
 
@@ -164,40 +156,6 @@ class Solved(Stepper):
         return self.solver.describe()
 
 
-@dataclass(frozen=True)
-class Fallback(Solver):
-    """The solver `first`, and the solver `exact` for steps where `first` does not converge."""
-
-    first: Solver
-    exact: Solver
-
-    def init(self, equations: StepEquations, velocity) -> Any:
-        return self.first.init(equations, velocity)
-
-    def renew(self, equations: StepEquations, memory) -> Any:
-        return self.first.renew(equations, memory)
-
-    def solve(self, equations: StepEquations, guess: Unknowns, memory) -> tuple[Solution, Any]:
-        solution, learned = self.first.solve(equations, guess, memory)
-        converged = solution.status.result <= Result.CONVERGED_AT_ROUNDOFF
-        # a failed step leaves the memory as it was
-        memory = jax.tree.map(partial(jnp.where, converged), learned, memory)
-        return jax.lax.cond(
-            converged,
-            lambda: solution,
-            lambda: self.exact.solve(equations, guess, self.exact.remembers(equations, guess))[0],
-        ), memory
-
-    def continued(self, memory, last) -> Any:
-        return self.first.continued(memory, last)
-
-    def projected(self, memory) -> Any:
-        return self.first.projected(memory)
-
-    def describe(self) -> list[str]:
-        return [*self.first.describe(), "where that does not converge:", *indented(self.exact.describe())]
-
-
 def status_of(
     equations: StepEquations, result, method, iterations, *, rows, end, weights: Weights = NO_WEIGHTS
 ) -> StepStatus:
@@ -215,8 +173,3 @@ def status_of(
     momentum = equations.micro_dt * jnp.max(jnp.stack(momenta))
     residual = jnp.where(momentum > 0, rows / jnp.where(momentum > 0, momentum, 1.0), 0.0)
     return StepStatus(result, jnp.asarray(int(method)), iterations, residual)
-
-
-def ended(result):
-    """The final `Result` of an iteration with a fixed number of turns: STAGNATED if it is still RUNNING."""
-    return jnp.where(result == RUNNING, Result.STAGNATED, result)

@@ -18,10 +18,10 @@ class StepInfo(eqx.Module):
     """The record of a macro step.
 
     result: status code, see `Result`.
-    method: code of the solver, see `Method`; with "auto" ARROWHEAD says that the cheaper solvers are not possible, or did not converge.
+    method: see `Method`; with the matrix "auto" EXACT says that cheaper matrices are not possible, or did not converge.
     iterations: most Newton iterations or passes of a solve in the step; 0 for explicit steps.
-    residual: ``max |R| / max |p|`` with the residual R of the momentum equations; 0 for linear equations. `Nested` and the march estimate R
-        after their last correction, RATTLE takes the next impulse of the constraints, all others evaluate it.
+    residual: ``max |R| / max |p|`` with the residual R of the momentum equations; 0 for linear equations. The matrices "masses" and "exact" estimate R
+        after their last correction, a drift takes the next impulse of the constraints, "modes" evaluates it.
     q_f_micro: fast positions at the micro nodes, the start excluded.
     multiplier, slow_multiplier: Lagrange multipliers at the control nodes, with r the degree of the scheme. A composition of s
         stages joins those of its stages: ``(s num_micro, r, n_g)`` and ``(s r, n_gs)``.
@@ -88,7 +88,7 @@ class Stepper(ABC):
         return state, replace(info, result=jnp.where(has_result, info.result, Result.NON_FINITE)), memory
 
     def project(self, state: State, memory) -> tuple[State, Any]:
-        """The state with momenta on the hidden constraints ``G v + dg/dt = 0``; by default unchanged, and `Custom` then adds a projection."""
+        """The state with momenta on the hidden constraints ``G v + dg/dt = 0``; by default unchanged; a run then adds a projection."""
         return state, memory
 
     def continued(self, memory, last, state: State, macro_dt) -> Any:

@@ -18,7 +18,7 @@ from vmri_jax.mechanics.projection import legendre, project_momentum
 from vmri_jax.mechanics.state import HasProblem, Problem, State, problem_of
 from vmri_jax.running.progress import shows_progress
 from vmri_jax.steppers.results import SimulationError
-from vmri_jax.steppers.solvers import Newton
+from vmri_jax.steppers.solver import Solver
 from vmri_jax.study.program import Program
 from vmri_jax.study.reference_solution import ReferenceSolution, reference_solution
 from vmri_jax.study.search import TIMED_RUNS, Search, Setting, by_seconds
@@ -133,7 +133,7 @@ def tune(
     menu: Sequence[Family] | None = None,
     num_saves: int = 10,
     reference: ReferenceSolution | None = None,
-    solver: Newton | None = None,
+    solver: Solver | None = None,
     verify: bool = True,
     exhaustive: bool = False,
     progress: Any = False,

@@ -24,7 +24,7 @@ from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.results import Method, Result
-from vmri_jax.steppers.solvers import Newton
+from vmri_jax.steppers.solver import Solver
 from vmri_jax.study.program import Program
 from vmri_jax.study.reference_solution import ReferenceSolution, reference_solution
 from vmri_jax.study.table import Column, ResultTable
@@ -221,7 +221,7 @@ def convergence_study(
     params: Mapping[str, Any] | None = None,
     momentum_maps: Sequence[Callable] = (),
     reference: ReferenceSolution | Mapping[str, ReferenceSolution] | None = None,
-    solver: Newton | None = None,
+    solver: Solver | None = None,
     executor: Any = None,
     progress: Any = False,
 ) -> ConvergenceStudy:

@@ -12,7 +12,7 @@ from vmri_jax.running.timing import MIN_SECONDS, interleaved
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
-from vmri_jax.steppers.solvers import Newton
+from vmri_jax.steppers.solver import Solver
 
 
 class Program:
@@ -39,7 +39,7 @@ class Program:
         scheme: Scheme | Composition,
         t_end: float,
         num_saves: int = 1,
-        solver: Newton | None = None,
+        solver: Solver | None = None,
         fallback: bool = True,
     ):
         self.problem, self.scheme, self.t_end, self.num_saves = problem, scheme, float(t_end), num_saves

@@ -17,7 +17,7 @@ from vmri_jax import diagnostics
 from vmri_jax.accuracy.families import Family
 from vmri_jax.mechanics.state import Problem
 from vmri_jax.running.progress import Progress, silent
-from vmri_jax.steppers.solvers import Newton
+from vmri_jax.steppers.solver import Solver
 from vmri_jax.study.program import Program
 from vmri_jax.study.reference_solution import ReferenceSolution
 from vmri_jax.study.work import WorkPrecision, WorkRow, timed_in_turn, work_row
@@ -86,7 +86,7 @@ class Search:
     t_end: float
     menu: Sequence[Family]
     reference: ReferenceSolution
-    solver: Newton | None = None
+    solver: Solver | None = None
     fallback: bool = True
     programs: dict[tuple[str, int], Program] = field(default_factory=dict)
     settings: dict[tuple[str, int, int], Setting] = field(default_factory=dict)

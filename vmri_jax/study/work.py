@@ -17,7 +17,7 @@ from vmri_jax.running.timing import interleaved
 from vmri_jax.schemes.composition import Composition, stage_scheme
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.results import Method, Result
-from vmri_jax.steppers.solvers import Newton
+from vmri_jax.steppers.solver import Solver
 from vmri_jax.study.machine import machine
 from vmri_jax.study.program import Program
 from vmri_jax.study.reference_solution import ReferenceSolution, reference_solution
@@ -195,7 +195,7 @@ def work_precision(
     num_steps: Sequence[int] | None = None,
     num_saves: int = 1,
     reference: ReferenceSolution | None = None,
-    solver: Newton | None = None,
+    solver: Solver | None = None,
     repeats: int = 5,
     executor: Any = None,
     progress: Any = False,
@@ -266,7 +266,7 @@ class _Ladder(NamedTuple):
     scheme: Scheme | Composition
     t_end: float
     num_saves: int
-    solver: Newton | None
+    solver: Solver | None
     num_steps: Sequence[int] | None
     reference: ReferenceSolution
     frequency: float

@@ -28,7 +28,7 @@ from vmri_jax import (
 from vmri_jax.running.simulation import Simulation
 from vmri_jax.running.store import layout
 from vmri_jax.running.trajectory import join
-from vmri_jax.steppers import solvers
+from vmri_jax.steppers.solver import Solver
 
 PER_CHUNK = CHUNK * EVERY
 IN_FIRST = PER_CHUNK - EVERY
@@ -136,9 +136,9 @@ def test_a_complete_run_is_returned_at_once(run, uninterrupted, monkeypatch):
 def test_a_run_that_has_fallen_back_goes_on_so(tmp_path, monkeypatch):
     """At this step the march does not converge, see test_march."""
     changes = {"scheme": fully_implicit(20), "macro_dt": 40.0, "num_steps": 12, "save_every": 1}
-    run = partial(Runs(two_oscillators(kappa=25.0)), solver=solvers.Auto(max_iterations=6), **changes)
+    run = partial(Runs(two_oscillators(kappa=25.0)), solver=Solver(max_iterations=6), **changes)
     whole, out = run(tmp_path / "whole.zarr").load(), tmp_path / "run.zarr"
-    assert np.all(np.asarray(whole.info.method) == Method.ARROWHEAD)
+    assert np.all(np.asarray(whole.info.method) == Method.EXACT)
     assert dies_after(monkeypatch, 1, run, out).record.fell_back
     assert_identical(run(out, resume=True).load(), whole)
 
@@ -236,7 +236,7 @@ def same_name(power):
     [
         ({"macro_dt": 0.03}, r"macro_dt: 0.03 here, 0.02 in the store"),
         ({"scheme": fully_explicit(3)}, r"scheme.slow.grid: macro here, micro in the store"),
-        ({"solver": solvers.Auto(tolerance=1e-10)}, r"solver.tolerance: 1e-10 here, 1e-12 in the store"),
+        ({"solver": Solver(tolerance=1e-10)}, r"solver.tolerance: 1e-10 here, 1e-12 in the store"),
         ({"save_micro": False}, r"save_micro: False here, True in the store"),
         ({"chunk": 5}, r"chunk: 5 here, 4 in the store"),
     ],

@@ -26,7 +26,7 @@ from vmri_jax.running.store.stored import StoredTrajectory
 from vmri_jax.running.trajectory import NODES, RunInfo, join, trajectory_of
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
-from vmri_jax.steppers.solvers import Newton
+from vmri_jax.steppers.solver import Solver
 
 CHUNKS_PER_RUN = 100
 """Most chunks of a run, unless their size is limited. With more chunks a kill loses less, and the store has more files."""
@@ -46,7 +46,7 @@ def stream(
     t_end: float | None = None,
     save_every: int = 1,
     save_micro: bool = False,
-    solver: Newton | None = None,
+    solver: Solver | None = None,
     chunk: int | None = None,
     resume: bool = False,
     overwrite: bool = False,
