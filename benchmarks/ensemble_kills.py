@@ -16,11 +16,12 @@ from typing import Any
 import numpy as np
 
 import vmri_jax as vm
+from benchmarks.ensembles import moved
 from benchmarks.measure import Tell, silent
 from benchmarks.report import Report
 from vmri_jax.ensembles import Draws, Ensemble
-from vmri_jax.ensembles.store import committed
 from vmri_jax.executors.executor import local_workers
+from vmri_jax.running.store.layout import committed
 
 COLUMNS = ("ensemble", "kills", "chunks before a resume", "calls", "identical")
 LANES, CHUNK = 30_000, 500
@@ -62,9 +63,9 @@ def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
 
 def ensemble(out: Path, **how) -> Ensemble:
     """The one that is disturbed."""
-    design = Draws(LANES, {"omega": ("uniform", 20.0, 80.0), "v_s[0]": ("normal", 0.0, 0.1)}, seed=1)
+    design = Draws(LANES, {"omega": ("uniform", 20.0, 80.0), "v_s": ("normal", 0.0, 0.1)}, seed=1)
     return vm.ensemble(
-        "fpu", "fully-implicit", design, num_micro=5, t_end=2.0, macro_dt=0.02, out=out, chunk=CHUNK, **how
+        "fpu", "fully-implicit", design, vary=moved, num_micro=5, t_end=2.0, macro_dt=0.02, out=out, chunk=CHUNK, **how
     )
 
 

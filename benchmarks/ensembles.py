@@ -5,13 +5,14 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import psutil
 
@@ -21,9 +22,9 @@ from benchmarks.report import Claim, Part, Report
 from vmri_jax import plots
 from vmri_jax.ensembles import Axis, Draws, Ensemble, Product
 from vmri_jax.ensembles.prepared import prepared
-from vmri_jax.ensembles.store import committed
 from vmri_jax.ensembles.work import Work
 from vmri_jax.executors.executor import as_done, executor_of, local_workers, submitter
+from vmri_jax.running.store.layout import committed
 
 PARTS = ("speed", "paper", "million", "study")
 COLUMNS = {
@@ -32,7 +33,8 @@ COLUMNS = {
     "million": ("lanes", "chunks", "seconds", "lanes a second", "MB on disk", "RSS MB at a third", "RSS MB at the end"),
     "study": ("scheme", "num_micro", "lanes", "failed", "accurate"),
 }
-START = {"omega": ("uniform", 20.0, 80.0), "v_s[0]": ("normal", 0.0, 0.1), "v_f[0]": ("normal", 0.0, 0.1)}
+START = {"omega": ("uniform", 20.0, 80.0), "v_s": ("normal", 0.0, 0.1), "v_f": ("normal", 0.0, 0.1)}
+"""Frequency of the stiff springs, and velocities of the first slow and of the first fast coordinate."""
 RUN: dict[str, Any] = {"t_end": 1.0, "macro_dt": 0.01}
 SCHEME = vm.fully_implicit(10)
 SLEEPERS = 16
@@ -58,6 +60,13 @@ class Size:
     steps: int
 
 
+def moved(problem: vm.Problem, row) -> vm.Problem:
+    """The chain with the frequency of a row, and the velocities that the row has."""
+    system = problem.system.with_params({"omega": row["omega"]})
+    firsts = {name: jnp.asarray(getattr(problem, name)).at[0].set(row[name]) for name in ("v_s", "v_f") if name in row}
+    return replace(problem, system=system, **firsts)
+
+
 def sizes(name: str) -> Size:
     """ "quick" or "full"."""
     return Size(8, 3, 100_000, 60, 8) if name == "quick" else Size(16, 5, 1_000_000, 340, 24)
@@ -76,7 +85,7 @@ def part(name: str) -> Part:
 
 def _sweep(out: Path, lanes: int, **how) -> Ensemble:
     shutil.rmtree(out, ignore_errors=True)
-    return vm.ensemble("fpu", SCHEME, Draws(lanes, START), **RUN, out=out, **how)
+    return vm.ensemble("fpu", SCHEME, Draws(lanes, START), vary=moved, **RUN, out=out, **how)
 
 
 # --- lanes per second ------------------------------------------------------------------------------------------------
@@ -123,7 +132,7 @@ def _batch(first: int, last: int):
     """Runs of the ensemble as `simulate_batch` takes them."""
     problem, rows = vm.systems.fermi_pasta_ulam(), Draws(last, START).rows(first, last)
     v_s, v_f = (np.repeat(np.asarray(v)[None], last - first, axis=0) for v in (problem.v_s, problem.v_f))
-    v_s[:, 0], v_f[:, 0] = rows["v_s[0]"], rows["v_f[0]"]
+    v_s[:, 0], v_f[:, 0] = rows["v_s"], rows["v_f"]
     make = jax.vmap(lambda a, b: vm.initial_state(problem.system, problem.q_s, problem.q_f, a, b))
     return make(v_s, v_f), {"omega": rows["omega"]}
 
@@ -136,7 +145,7 @@ def paper(size: Size, name: str, folder: Path, tell: Tell) -> Report:
     runs = _sweep(folder / "runs.zarr", 2**15, chunk=4096)
     files = [file for file in runs.path.rglob("*") if file.is_file()]
     per_lane = sum(file.stat().st_size for file in files) / len(runs)
-    per_chunk = sum("/c." in str(file) for file in files) / runs.chunks.count
+    per_chunk = sum("/c." in str(file) or file.name.isdecimal() for file in files) / runs.chunks.count
     listing = _listing(runs.path)
     with local_workers(1) as client:
         tell("compiling in a worker")
@@ -194,7 +203,7 @@ def _listing(path: Path) -> float:
 
 def _picked(lanes: int) -> int:
     """The chunk that the library takes for so many runs."""
-    work = Work("fpu", {"scheme": SCHEME}, tuple(START), RUN)
+    work = Work("fpu", {"scheme": SCHEME}, tuple(START), RUN, vary=moved)
     _, chunks, _ = prepared(work, Draws(lanes, START))
     return chunks.size
 
@@ -215,7 +224,8 @@ def million(size: Size, name: str, folder: Path, tell: Tell) -> Report:
     tell(f"{size.million:,} runs")
     out = folder / "million.zarr"
     with _memory() as seen:
-        runs = vm.ensemble("fpu", "fully-explicit", Draws(size.million, START), num_micro=10, **RUN, out=out)
+        design = Draws(size.million, START)
+        runs = vm.ensemble("fpu", "fully-explicit", design, vary=moved, num_micro=10, **RUN, out=out)
     after = psutil.Process().memory_info().rss / 1e6
     data = runs.open()
     mean = float(data.q_s.mean())
@@ -287,9 +297,8 @@ def study(size: Size, name: str, folder: Path, tell: Tell) -> Report:
     axes = {"num_micro": [1, 2, 5, 10, 20], "num_steps": numbers, "omega": omega}
     axes = Product({"scheme": list(schemes), **axes})
     save = "benchmarks.ensembles:relative_energy_error"
-    runs = vm.ensemble(
-        "fpu", schemes, axes, t_end=40.0, save=save, num_saves=40, out=folder / "study.zarr", processes=2
-    )
+    how = {"t_end": 40.0, "save": save, "num_saves": 40, "processes": 2}
+    runs = vm.ensemble("fpu", schemes, axes, vary=moved, **how, out=folder / "study.zarr")
     data = runs.open().load()
     error = data.relative_energy_error.where(data.result <= 1)
     rows = [

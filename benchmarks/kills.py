@@ -13,7 +13,7 @@ import numpy as np
 import vmri_jax as vm
 from benchmarks.measure import Tell, silent
 from benchmarks.report import Report
-from vmri_jax.running.store.layout import CHECKPOINT
+from vmri_jax.running.store.layout import committed
 from vmri_jax.running.trajectory import STATUS, named_arrays
 
 COLUMNS = ("kill", "after, s", "chunks", "new", "moment", "identical")
@@ -114,9 +114,8 @@ def _child(out: str, cache: str) -> None:
 
 
 def _chunks(path: Path) -> int:
-    """Completed chunks."""
-    nodes = len(vm.StoredTrajectory(path)) if path.exists() else 0
-    return max(0, nodes - 1) // PER_CHUNK
+    """Committed chunks."""
+    return len(committed(path)) if path.exists() else 0
 
 
 def _moment(path: Path, chunks: int) -> str:
@@ -130,12 +129,7 @@ def _moment(path: Path, chunks: int) -> str:
 def _wait_for_chunk(child, path: Path, known: int) -> None:
     """Until there are more chunks, or the run has ended."""
     deadline = time.monotonic() + PATIENCE
-    file, seen = path / CHECKPOINT, None
-    while child.is_alive() and time.monotonic() < deadline:
-        if file.exists() and (now := file.stat().st_mtime_ns) != seen:
-            seen = now
-            if _chunks(path) > known:
-                return
+    while child.is_alive() and time.monotonic() < deadline and _chunks(path) <= known:
         time.sleep(0.002)
 
 

@@ -122,7 +122,7 @@ def test_a_saved_run_keeps_the_names_of_its_problem(vmri, tmp_path, out):
     )
     code, text = vmri("simulate", "named.py:my_problem", *RUN, "--out", out)
     assert code == 0, text
-    run = vm.Trajectory.load(out) if out.endswith(".npz") else vm.StoredTrajectory.open(out)[:]
+    run = vm.Trajectory.load(out) if out.endswith(".npz") else vm.StoredTrajectory(out)[:]
     assert run.position("bell").shape == (5, 1)
     assert run.names.slow_coordinates == ["trolley"]
 
@@ -188,7 +188,7 @@ def test_simulate_streams_and_resumes(vmri, tmp_path):
     assert "saved run.zarr" in text
     code, text = vmri(*STREAM)
     assert code == 2
-    assert "run.zarr holds a run of 4 macro steps, 4 of them done" in text
+    assert "run.zarr is a stored run, 2 of 2 chunks done" in text
     code, text = vmri(*STREAM, "--resume", "--plot", "run.png")
     assert code == 0
     assert "per micro step" not in text
@@ -250,7 +250,7 @@ def test_a_full_disk_is_told(vmri, monkeypatch):
             ["fpu", *RUN, "--out", "run.npz", "--resume"],
             "--resume is for a run that is written while it goes; give --out",
         ),
-        (["fpu", *RUN, "--out", "folder.zarr", "--resume"], "folder.zarr is not a stored trajectory"),
+        (["fpu", *RUN, "--out", "folder.zarr", "--resume"], "folder.zarr is not a stored run"),
         (["fpu", *RUN, "--out", "nowhere/run.zarr"], "the folder nowhere does not exist; make it first"),
         (["fpuu", *RUN], "there is no system 'fpuu'. Did you mean fpu? There are fpu, tsp, sam."),
         (["fpu", *RUN[:4], "--scheme", "fully_explict"], "Did you mean fully-explicit? There are fully-implicit"),

@@ -1,8 +1,10 @@
 """`vmri sweep`: files, stores, what is said."""
 
+import pickle
 import re
 import sys
 import tomllib
+from dataclasses import replace
 from importlib.resources import files
 
 import numpy as np
@@ -11,6 +13,7 @@ from typer.testing import CliRunner
 
 import vmri_jax as vm
 from vmri_jax import cli
+from vmri_jax.cli.columns import by_name
 from vmri_jax.cli.sweep import read_sweep
 from vmri_jax.ensembles.quantities import drawn_by_default
 
@@ -55,9 +58,21 @@ def test_a_sweep_runs_is_drawn_and_gone_on_with(vmri, tmp_path):
     assert vm.open_ensemble("runs.zarr").omega.values.tolist() == [20.0, 50.0]
     code, text = vmri("sweep")
     assert code == 2
-    assert "holds an ensemble of 2 runs, 1 of 1 chunks done" in text
+    assert "is a stored ensemble, 1 of 1 chunks done" in text
     assert "computed now 0" in vmri("sweep", "--resume")[1]
     assert "computed now 2" in vmri("sweep", "--overwrite")[1]
+
+
+def test_names_of_columns_say_which_number_they_set(fpu):
+    params = fpu.system.params | {"spring": {"masses": np.ones((2, 2)), "k": np.ones(())}}
+    problem = replace(fpu, system=fpu.system.with_params(params))
+    row = {"spring.k": 2.0, "spring.masses[1,0]": 3.0, "v elongations[1]": 4.0, "q_s[2]": 5.0, "t": 6.0}
+    changed = pickle.loads(pickle.dumps(by_name(problem, [*row, "num_micro"])))(problem, row)  # pyright: ignore[reportOptionalCall]
+    params = changed.system.params["spring"]
+    assert params["k"] == 2.0
+    assert np.array_equal(params["masses"], [[1.0, 1.0], [3.0, 1.0]])
+    assert (changed.v_f[0], changed.v_f[1], changed.q_s[2], changed.t) == (fpu.v_f[0], 4.0, 5.0, 6.0)
+    assert by_name(problem, ["num_micro"]) is None
 
 
 def test_what_cannot_be_drawn_is_refused_before_it_runs(vmri, tmp_path):
@@ -143,7 +158,9 @@ def test_axes_and_files_are_seen_from_the_folder(tmp_path):
         (('system = "fpu"\n', ""), "system is missing"),
         (("omega = [20.0, 50.0]", "omega = { from = 1 }"), "the axis omega: give values, or from, to and count"),
         (("omega = [20.0, 50.0]", "omega = { form = 1 }"), "no entry 'form'. Did you mean from?"),
-        (("omega", "omga"), "the column 'omga' is no parameter, coordinate, step or scheme. Did you mean omega?"),
+        (("omega", "omga"), "the column 'omga' sets no number of the problem. Did you mean omega?"),
+        (("omega", '"q_s[7]"'), "the column 'q_s[7]' sets no number of the problem"),
+        (("[axes]", '[axes]\n"q_s[0]" = 1\n"centres[0]" = 2'), "'q_s[0]' and 'centres[0]' set the same number"),
         (("[axes]", "[draws]"), "no entry 'omega'"),
         (("[axes]", "[draws]\ncount = 3\n[axes]"), "give either [axes] or [draws]"),
         (("macro_dt", "macro_dt ="), "is no TOML"),

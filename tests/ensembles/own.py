@@ -31,6 +31,20 @@ hung = vm.Problem(
 """Positions as dictionaries."""
 
 
+def put(problem, row):
+    """Parameters by name, whole vectors of the start, and numbers in them, "v_s[0]"."""
+    params, start = dict(problem.system.params), {}
+    for name, value in row.items():
+        part, _, index = name.rstrip("]").partition("[")
+        if name in params:
+            params[name] = value
+        elif index:
+            start[part] = jnp.asarray(start.get(part, getattr(problem, part))).at[int(index)].set(value)
+        else:
+            start[part] = value
+    return replace(problem, system=problem.system.with_params(params), **start)
+
+
 def faster(problem, row):
     """All velocities of a chain times a number, and springs of another frequency."""
     system = problem.system.replace(params={"omega": row["frequency"]})

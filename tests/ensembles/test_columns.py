@@ -20,11 +20,6 @@ def test_a_function_of_rows_makes_the_problems(tmp_path):
     problem = chain(20.0)
     run = vm.simulate(replace(problem, v_s=0.5 * problem.v_s), vm.explicit_slow(3), macro_dt=0.02, num_steps=10)
     assert np.allclose(data.q_f[0], run.q_f[-1], rtol=0, atol=1e-14)
-    by_name = few(tmp_path / "named.zarr", system=chain(50.0), design={"omega": [20.0]}).open()
-    whole = few(
-        tmp_path / "one.zarr", system=chain(50.0), design={"speed": [1.0], "frequency": [20.0]}, vary=own.faster
-    )
-    assert np.array_equal(whole.open().q_f.values.ravel(), by_name.q_f.values.ravel())
 
 
 def test_a_function_of_rows_with_dictionaries(tmp_path):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import vmri_jax as vm
+from tests.ensembles.own import put
 from vmri_jax import plots
 from vmri_jax.ensembles import Axis, Draws
 
@@ -17,17 +18,16 @@ def grid(tmp_path_factory):
     """Three axes; some runs fail."""
     axes = {"num_micro": [1, 3], "omega": Axis([20.0, 50.0, 1e9], "rad/s"), "v_s[0]": [0.0, 0.1, 0.2, 0.3]}
     out = tmp_path_factory.mktemp("grid") / "runs.zarr"
-    save = ("nodes", "extremes", "energy_error")
-    return vm.ensemble("fpu", "fully-explicit", axes, t_end=1.0, macro_dt=0.05, save=save, num_saves=5, out=out).open()
+    how = {"vary": put, "t_end": 1.0, "macro_dt": 0.05, "save": ("nodes", "extremes", "energy_error"), "num_saves": 5}
+    return vm.ensemble("fpu", "fully-explicit", axes, **how, out=out).open()
 
 
 @pytest.fixture(scope="module")
 def cloud(tmp_path_factory):
     design = Draws(50, {"omega": ("uniform", 20, 60), "v_s[0]": ("normal", 0, 0.1)})
     out = tmp_path_factory.mktemp("cloud") / "runs.zarr"
-    return vm.ensemble(
-        "fpu", "explicit-slow", design, num_micro=2, t_end=1.0, macro_dt=0.05, save="energy_error", num_saves=5, out=out
-    ).open()
+    how = {"vary": put, "t_end": 1.0, "macro_dt": 0.05, "save": "energy_error", "num_saves": 5}
+    return vm.ensemble("fpu", "explicit-slow", design, num_micro=2, **how, out=out).open()
 
 
 def test_the_status_is_drawn_only_if_it_is_asked_for(grid):

@@ -29,6 +29,7 @@ pytestmark = pytest.mark.filterwarnings("default")  # of Dask, about ports and s
 
 DESIGN = {"omega": np.linspace(20.0, 50.0, 32), "num_micro": [1, 3]}
 ARGUMENTS = {"t_end": 0.2, "macro_dt": 0.02, "save": ("end", f"{OWN}:reach"), "num_saves": 5, "chunk": 16}
+ROOT = Path(__file__).parents[2]
 """Four chunks."""
 
 
@@ -37,7 +38,10 @@ SLOW = {"save": ("end", f"{OWN}:sleeps"), "chunk": 8}
 
 
 def sweep(out: Path, **changes):
-    return vm.ensemble(**{"system": "fpu", "scheme": "explicit-slow", "design": DESIGN, **ARGUMENTS} | changes, out=out)
+    return vm.ensemble(
+        **{"system": "fpu", "scheme": "explicit-slow", "design": DESIGN, "vary": own.put, **ARGUMENTS} | changes,
+        out=out,
+    )
 
 
 def contents(path: Path) -> dict[str, bytes]:
@@ -157,17 +161,19 @@ def test_this_process_is_killed(tmp_path, cache, here_slowly):
         "import numpy as np\nimport vmri_jax as vm\n\n"
         "if __name__ == '__main__':\n"
         "    vm.configure()\n"
+        "    from tests.ensembles import own\n\n"
         "    design = {'omega': np.linspace(20.0, 50.0, 32), 'num_micro': [1, 3]}\n"
-        f"    vm.ensemble('fpu', 'explicit-slow', design, **{arguments!r}, out={str(out)!r}, processes=1)\n"
+        f"    how = {arguments!r}\n"
+        f"    vm.ensemble('fpu', 'explicit-slow', design, vary=own.put, **how, out={str(out)!r}, processes=1)\n"
     )
-    process = subprocess.Popen([sys.executable, str(program)])
-    wait_for(lambda: len(list(out.glob("resume/chunks/c.*"))) > 1)
+    process = subprocess.Popen([sys.executable, str(program)], env=os.environ | {"PYTHONPATH": str(ROOT)})
+    wait_for(lambda: len(list(out.glob("resume/chunks/[0-9]*"))) > 1)
     children = psutil.Process(process.pid).children(recursive=True)
     process.kill()
     process.wait()
     _, alive = psutil.wait_procs(children, timeout=20)
     assert not alive
-    assert 1 < len(list(out.glob("resume/chunks/c.*"))) < 8
+    assert 1 < len(list(out.glob("resume/chunks/[0-9]*"))) < 8
     assert sweep(out, **SLOW, resume=True).complete
     assert contents(out) == here_slowly
 
@@ -185,10 +191,25 @@ def test_a_scheduler_that_goes_away(tmp_path, cache):
     assert sweep(out, **SLOW, resume=True).complete
 
 
+HIDE = """
+import importlib.metadata
+import sys
+
+
+def version(name):
+    raise importlib.metadata.PackageNotFoundError(name)
+
+
+importlib.metadata.version = version
+sys.modules["vmri_jax"] = None
+"""
+"""A worker without the package."""
+
+
 def test_workers_without_the_package(tmp_path, cache):
     hide = tmp_path / "hide.py"
-    hide.write_text("import sys\n\nsys.modules['vmri_jax'] = None\n")
-    missing = pytest.raises(RuntimeError, match="a worker does not have vmri_jax")
+    hide.write_text(HIDE)
+    missing = pytest.raises(NotAWorker, match="a worker does not have vmri_jax")
     with (
         scheduler_and_worker(tmp_path, "--preload", str(hide)) as address,
         distributed.Client(address) as client,
@@ -247,7 +268,7 @@ def at_first_chunk(out: Path, act):
     """Meanwhile, do something when the first chunk of an ensemble is done."""
 
     def wait():
-        wait_for(lambda: any(out.glob("resume/chunks/c.*")))
+        wait_for(lambda: any(out.glob("resume/chunks/[0-9]*")))
         act()
 
     thread = threading.Thread(target=wait, daemon=True)

@@ -1,6 +1,7 @@
 """All roads say the same about a run: the grid of roads and of causes, written once."""
 
 import warnings
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -103,7 +104,8 @@ def by_lanes_with_parameters(moving, scheme, steps, out):
 
 def by_ensemble(moving, scheme, steps, out):
     design = {"k": float(moving.system.params["k"]) * np.array([0.999, 1.0])}
-    vm.ensemble(moving, scheme, design, out=out, num_saves=steps["num_steps"], **steps)
+    vary = lambda problem, row: replace(problem, system=problem.system.with_params({"k": row["k"]}))  # noqa: E731
+    vm.ensemble(moving, scheme, design, vary=vary, out=out, num_saves=steps["num_steps"], **steps)
     return int(vm.open_ensemble(out)["result"].values.ravel()[1])
 
 

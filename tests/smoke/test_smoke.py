@@ -86,8 +86,8 @@ def test_a_store(tmp_path):
 
 
 def test_an_ensemble(tmp_path):
-    design = {"omega": [20.0, 50.0], "num_micro": [1, 3]}
-    runs = vm.ensemble("fpu", "explicit-slow", design, t_end=0.2, macro_dt=0.02, chunk=2, out=tmp_path / "runs.zarr")
+    design = {"num_steps": [10, 20], "num_micro": [1, 3]}
+    runs = vm.ensemble("fpu", "explicit-slow", design, t_end=0.2, chunk=2, out=tmp_path / "runs.zarr")
     assert runs.complete
     assert (runs.failed_runs, runs.computed, runs.chunks.count) == (0, 4, 2)
 

@@ -106,7 +106,7 @@ def _seen_from(shown: Motion, view: str | None) -> Motion:
 def _load(run: Path) -> tuple[Trajectory, str | dict]:
     """A saved run, every k-th node of a long store, and the drawing stored with the run, empty if it has none."""
     if run.suffix.lower() == ".zarr":
-        stored = StoredTrajectory.open(run)
+        stored = StoredTrajectory(run)
         return stored[:: -(-len(stored) // MOST_STORE_NODES)], stored.attributes.get("drawing", "")
     trajectory = Trajectory.load(run)
     with np.load(run, allow_pickle=False) as arrays:

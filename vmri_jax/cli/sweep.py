@@ -15,6 +15,7 @@ from rich.markup import escape
 
 from vmri_jax import plots
 from vmri_jax.catalogue import find_problem
+from vmri_jax.cli.columns import by_name
 from vmri_jax.cli.common import (
     PICTURES,
     check_target_file,
@@ -28,6 +29,7 @@ from vmri_jax.ensembles import Axis, Draw, Draws, Ensemble, EnsembleError, Produ
 from vmri_jax.ensembles.quantities import drawn_by_default
 from vmri_jax.executors.executor import local_workers
 from vmri_jax.mechanics.names import unknown
+from vmri_jax.mechanics.state import Problem
 from vmri_jax.running.export import extra
 from vmri_jax.running.interrupts import Interrupted
 
@@ -66,7 +68,9 @@ def sweep(
         if workers is not None and scheduler is not None:
             raise ValueError("--workers and --scheduler are given; choose one of them.")
         arguments = read_sweep(file)
-        drawn = "" if plot is None else _drawn(arguments)
+        problem = find_problem(arguments["system"])
+        arguments["vary"] = by_name(problem, list(arguments["design"].described()))
+        drawn = "" if plot is None else _drawn(arguments["save"], problem)
         with _client(workers, scheduler) as client:
             try:
                 runs = ensemble(**arguments, executor=client, resume=resume, overwrite=overwrite, progress=True)
@@ -86,13 +90,14 @@ def sweep(
             print_written(f"Figure of {drawn}", plot)
 
 
-def _drawn(arguments: Mapping[str, Any]) -> str:
+def _drawn(save: list[str], problem: Problem) -> str:
     """The array that --plot draws, chosen before anything runs."""
-    drawn = drawn_by_default(arguments["save"], find_problem(arguments["system"]))
+    drawn = drawn_by_default(save, problem)
     if not drawn:
         raise ValueError(
-            f"--plot draws one number per run or per saved node, and save = {json.dumps(arguments['save'])} keeps neither. Add one to the file, e.g. save = "
-            f"{json.dumps([*arguments['save'], 'energy_error'])}, or a function of your own that returns one, my_file.py:function."
+            f"--plot draws one number per run or per saved node, and save = {json.dumps(save)} keeps neither. Add one to the "
+            f"file, e.g. save = {json.dumps([*save, 'energy_error'])}, or a function of your own that returns one, "
+            "my_file.py:function."
         )
     return drawn[-1]
 

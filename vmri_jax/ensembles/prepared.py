@@ -9,23 +9,20 @@ import numpy as np
 
 from vmri_jax.accuracy.companions import resting
 from vmri_jax.ensembles.columns import Row, numbers_in
-from vmri_jax.ensembles.design import Chunks, Design, Draws, Product
-from vmri_jax.ensembles.quantities import Kept, Quantity, label_of, quantity, what_is_kept
+from vmri_jax.ensembles.design import Axis, Chunks, Design, Draws, Product
+from vmri_jax.ensembles.quantities import Quantity, label_of, quantity, what_is_kept
 from vmri_jax.ensembles.work import Work, all_groups
 from vmri_jax.mechanics.arrays import whole_number
 from vmri_jax.mechanics.names import Names
 from vmri_jax.running.batch import lanes_at_once
 from vmri_jax.running.simulation import Simulation
 from vmri_jax.running.store.identity import describe, environment, identity, operations
+from vmri_jax.running.store.layout import Kept, rows_per_chunk
 from vmri_jax.running.trajectory import Trajectory
 
-CHUNK_SECONDS = 1.0
-"""Target seconds of computation of a chunk. A larger one loses more work at an interrupt; with a smaller one workers wait for files."""
 MOST_CHUNKS = 20_000
-"""Largest number of chunks of an ensemble, unless the next two limits need more. A scheduler hands out some hundreds of tasks a second,
+"""Largest number of chunks of an ensemble, unless limits need more. A scheduler hands out some hundreds of tasks a second,
 and every chunk has its files: a larger number costs more time than the runs."""
-MOST_CHUNK_BYTES = 2**26
-"""Largest size of the saved nodes and results of a chunk, in bytes: 64 MiB. A larger one needs more memory in every worker."""
 FEWEST_CHUNKS = 64
 """Target for the smallest number of chunks, so that workers share the runs evenly; batches that are computed side by side are not cut for
 it. A larger one makes chunks so small that writing their files takes most of the time."""
@@ -76,9 +73,7 @@ def _chunks(runs: list[Simulation], lanes: int, arrays: dict[str, Kept], chunk: 
     seconds = 1e-9 * MICRO_STEP_NANOSECONDS[kind] * _micro_steps(run) * run.scheme.degree**2 * size_q
     array_bytes = sum(kept.value.dtype.itemsize * int(np.prod(kept.value.shape)) for kept in arrays.values())
     bytes_of_run = array_bytes + 8 * (2 * size_q + 8) * (run.num_saves + 1)
-    most_lanes = min(
-        max(CHUNK_SECONDS / seconds, lanes / MOST_CHUNKS), MOST_CHUNK_BYTES / bytes_of_run, lanes / FEWEST_CHUNKS
-    )
+    most_lanes = min(rows_per_chunk(lanes, seconds, bytes_of_run, MOST_CHUNKS), lanes / FEWEST_CHUNKS)
     size = width * 2 ** max(0, int(np.log2(max(most_lanes / width, 1.0))))
     return Chunks(lanes, min(size, lanes), width)
 
@@ -90,7 +85,8 @@ def attributes_of(work: Work, design: Design, run: Simulation, chunks: Chunks) -
     if isinstance(design, Draws):
         design_record |= {"method": design.method, "seed": design.seed}
     return {
-        "lanes": chunks.lanes,
+        "kind": "ensemble",
+        "rows": chunks.lanes,
         "chunk": chunks.size,
         "width": chunks.width,
         "design": design_record,
@@ -132,16 +128,11 @@ def _arrays_of(quantity: Quantity) -> Callable[[Trajectory], dict[str, Any]]:
 
 def _describe_design(design: Design) -> dict[str, str]:
     """The design in words and digests, by column."""
-    description = {"design": type(design).__name__}
+    texts = {"design": type(design).__name__}
     if isinstance(design, Draws):
-        return (
-            description
-            | {"method": design.method, "seed": str(design.seed)}
-            | {f"column {name}": f"{draw.name} {draw.arguments}" for name, draw in design.columns.items()}
+        texts |= {"method": design.method, "seed": str(design.seed)}
+    for name, column in (design.axes if isinstance(design, Product) else design.columns).items():
+        texts |= describe(
+            f"column {name}", column.values if isinstance(column, Axis) else (column.name, *column.arguments)
         )
-    columns = design.axes if isinstance(design, Product) else design.columns
-    for name, axis in columns.items():
-        description |= describe(
-            f"column {name}", axis.values if axis.values.dtype.kind != "U" else ", ".join(axis.values.ravel())
-        )
-    return description
+    return texts

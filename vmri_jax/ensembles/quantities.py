@@ -6,13 +6,17 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from vmri_jax.accuracy.companions import resting
 from vmri_jax.catalogue import imported
 from vmri_jax.mechanics.functions import TracedOnce
 from vmri_jax.mechanics.names import near
-from vmri_jax.mechanics.state import Problem, State
+from vmri_jax.mechanics.state import Problem
+from vmri_jax.running.arguments import Steps
 from vmri_jax.running.export import DIMENSIONS
-from vmri_jax.running.simulation import Simulation
-from vmri_jax.running.trajectory import RunInfo, Trajectory
+from vmri_jax.running.simulation import Simulation, simulation
+from vmri_jax.running.store.layout import Kept
+from vmri_jax.running.trajectory import Trajectory
+from vmri_jax.schemes.scheme import fully_implicit
 
 LEVELS = (0.05, 0.5, 0.95)
 """Probabilities of the quantiles over the saved nodes: the median, and an interval with 90 % of them."""
@@ -20,19 +24,6 @@ LEVELS = (0.05, 0.5, 0.95)
 
 Saved = str | Callable[[Trajectory], Any]
 """An entry of the argument ``save`` of `vmri_jax.ensemble`."""
-
-
-class Kept(NamedTuple):
-    """An array of the store, for one run.
-
-    value: the array.
-    dimensions: names of its axes.
-    description: of its meaning.
-    """
-
-    value: Any
-    dimensions: tuple[str, ...] = ()
-    description: str = ""
 
 
 class Quantity(NamedTuple):
@@ -169,30 +160,19 @@ def what_is_kept(quantities: Sequence[Quantity], run: Simulation) -> dict[str, K
     """The arrays that the store keeps of a run, with shapes in place of values; nothing is computed."""
     arrays: dict[str, Kept] = {}
 
-    def shapes():
-        trajectory = run.traced(run.engine.run(run.arrays, run.save_every))
+    def shapes(trajectory: Trajectory):
         arrays.update(kept(quantities, trajectory))
         return {name: array.value for name, array in arrays.items()}
 
-    values = jax.eval_shape(shapes)
+    values = jax.eval_shape(shapes, resting(run))
     return {name: array._replace(value=values[name]) for name, array in arrays.items()}
 
 
 def drawn_by_default(names: Sequence[str], problem: Problem) -> list[str]:
-    """Arrays of these quantities that `vmri_jax.plots.plot_ensemble` draws by default: one number per run, or one per saved node."""
-    n_s, n_f = problem.q_s.size, problem.q_f.size
-    quantities, dimensions = [quantity(name) for name in names], {}
-
-    def shapes() -> None:
-        t, q_s, q_f = jnp.zeros(2), jnp.zeros((2, n_s)), jnp.zeros((2, n_f))
-        info = RunInfo(jnp.zeros(1, dtype=int), jnp.zeros(1, dtype=int), jnp.zeros(1))
-        status = jnp.zeros((), dtype=int)
-        nodes = State(t, q_s, q_f, q_s, q_f)
-        run = Trajectory(nodes, t, jnp.zeros((2, 2)), info, status, status).of(problem)
-        dimensions.update({name: array.dimensions for name, array in kept(quantities, run).items()})
-
-    jax.eval_shape(shapes)
-    return [name for name, axes in dimensions.items() if axes in ((), ("node",)) and name != "node_t"]
+    """Arrays of these quantities that `vmri_jax.plots.plot_ensemble` draws: one number per run, or one per saved node."""
+    run = simulation(problem, fully_implicit(1), None, None, Steps(1.0, num_steps=1))
+    arrays = what_is_kept(list(map(quantity, names)), run)
+    return [name for name, kept in arrays.items() if kept.dimensions in ((), ("node",)) and name != "node_t"]
 
 
 def of_lanes(quantities: Sequence[Quantity]) -> Callable[[Trajectory], dict[str, Any]]:

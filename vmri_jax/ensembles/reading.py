@@ -6,14 +6,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vmri_jax.ensembles import store
 from vmri_jax.ensembles.design import Draw, Draws
 from vmri_jax.ensembles.quantities import LEVELS
-from vmri_jax.ensembles.store import LANE
 from vmri_jax.running.export import FILL, extra
+from vmri_jax.running.store import layout
 
 if TYPE_CHECKING:
     import xarray
+
+LANE = "lane"
 
 
 def open_ensemble(path: str | os.PathLike) -> "xarray.Dataset":
@@ -36,14 +37,14 @@ def open_ensemble(path: str | os.PathLike) -> "xarray.Dataset":
     xarray = extra("xarray", "open_ensemble", "ensemble")
     extra("dask.array", "open_ensemble", "ensemble")
     path = Path(path)
-    attributes = store.read_attributes(path)
+    attributes = layout.read_attributes(path, "ensemble")
     data = xarray.open_zarr(path, chunks={}, consolidated=True, mask_and_scale=False)
     data = _without_missing(data, path, attributes, xarray)
     columns_record = attributes["design"]["columns"]
     if attributes["design"]["kind"] == "Product":
         data = _on_axes(data, columns_record, xarray)
     else:
-        columns = _drawn(attributes) if attributes["design"]["kind"] == "Draws" else _table(path, xarray)
+        columns = _drawn(attributes) if attributes["design"]["kind"] == "Draws" else _table(path)
         data = data.assign_coords(
             {name: ((LANE, *(f"{name}_{i}" for i in range(array.ndim - 1))), array) for name, array in columns.items()}
         )
@@ -52,16 +53,16 @@ def open_ensemble(path: str | os.PathLike) -> "xarray.Dataset":
     labels = {"slow": attributes["slow"], "fast": attributes["fast"], "quantile": list(LEVELS)}
     labels["level"] = ["position", "velocity"]
     data = data.assign_coords({name: values for name, values in labels.items() if name in data.dims})
-    kept = ("system", "lanes", "made_with")
-    data.attrs = {"title": f"ensemble of {attributes['lanes']} runs"} | {name: attributes[name] for name in kept}
+    data.attrs = {"title": f"ensemble of {attributes['rows']} runs"}
+    data.attrs |= {name: attributes[name] for name in ("system", "made_with")}
     return data
 
 
 def _without_missing(data, path: Path, attributes: dict[str, Any], xarray):
     """The data with rows of uncommitted chunks set to missing: a killed worker may have written some of their arrays."""
-    lanes, chunk = attributes["lanes"], attributes["chunk"]
+    lanes, chunk = attributes["rows"], attributes["chunk"]
     is_committed = np.zeros(-(-lanes // chunk), dtype=bool)
-    is_committed[list(store.committed(path))] = True
+    is_committed[layout.committed(path)] = True
     if is_committed.all():
         return data
     in_store = xarray.DataArray(np.repeat(is_committed, chunk)[:lanes], dims=LANE)
@@ -85,7 +86,7 @@ def _drawn(attributes: dict[str, Any]):
     """Columns of random rows, as arrays of Dask whose values are drawn when they are used."""
     import dask.array
 
-    record, chunk, lanes = attributes["design"], attributes["chunk"], attributes["lanes"]
+    record, chunk, lanes = attributes["design"], attributes["chunk"], attributes["rows"]
     distributions = {name: column["distribution"] for name, column in record["columns"].items()}
     draws = {name: Draw(kind, tuple(arguments)) for name, (kind, *arguments) in distributions.items()}
     design = Draws(lanes, draws, record["method"], record["seed"])
@@ -101,10 +102,7 @@ def _drawn(attributes: dict[str, Any]):
     return {name: column(name) for name in design.columns}
 
 
-def _table(path: Path, xarray) -> dict[str, Any]:
+def _table(path: Path) -> dict[str, np.ndarray]:
     """Columns of a design that is a table."""
-    columns = xarray.open_zarr(path, group=store.DESIGN, chunks={}, consolidated=False, mask_and_scale=False)
-    return {
-        name: store.labelled(array.values, array.attrs) if store.LABELS in array.attrs else array.data
-        for name, array in columns.items()
-    }
+    with np.load(path / layout.TABLE, allow_pickle=False) as columns:
+        return dict(columns)

@@ -6,25 +6,27 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, CancelledError, Future
 from contextlib import ExitStack
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from vmri_jax.ensembles import store
+import numpy as np
+
 from vmri_jax.ensembles.columns import Vary
-from vmri_jax.ensembles.design import Chunks, Design, Draws, Product, Table
+from vmri_jax.ensembles.design import Chunks, Design, Draws, Product, Rows, Table
 from vmri_jax.ensembles.prepared import attributes_of, prepared
 from vmri_jax.ensembles.quantities import Saved
+from vmri_jax.ensembles.reading import LANE, open_ensemble
 from vmri_jax.ensembles.work import AnyScheme, Work
-from vmri_jax.executors.executor import Here, as_done, executor_of, submitter
-from vmri_jax.executors.worker import NotAWorker, packed
+from vmri_jax.executors.executor import as_done, executor_of, submitter
+from vmri_jax.executors.worker import NotAWorker
 from vmri_jax.mechanics.arrays import require_x64, whole_number
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
-from vmri_jax.running.files import clear_partial, explained, is_new
+from vmri_jax.running.files import explained
 from vmri_jax.running.interrupts import Interrupted, interrupts_noted
 from vmri_jax.running.progress import Progress, ShowsProgress, progress_to
+from vmri_jax.running.store import layout
 from vmri_jax.running.store.identity import check_same
-from vmri_jax.running.store.layout import locked
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.solver import Solver
@@ -32,6 +34,8 @@ from vmri_jax.steppers.solver import Solver
 FAILURES_TO_STOP = 10
 """Number of failed chunks, before any chunk succeeds, at which the ensemble stops. A larger one spends more time on an error that all chunks
 have."""
+NOTE_BYTES = 4
+"""Bytes of the note of a chunk, the number of its runs that failed; fewer could not hold it."""
 
 
 class EnsembleError(RuntimeError):
@@ -44,20 +48,15 @@ class EnsembleError(RuntimeError):
 
     def __init__(self, ensemble: "Ensemble"):
         self.ensemble, self.failures = ensemble, ensemble.failures
-        first, reason = next(iter(self.failures.items()))
+        number, error = next(iter(self.failures.items()))
         ends = map(ensemble.chunks.ends, list(self.failures)[:5])
         lanes = ", ".join(f"{first} to {last - 1}" for first, last in ends)
         ellipsis = f" and {len(self.failures) - 5} more" if len(self.failures) > 5 else ""
-        all_tried = len(ensemble.done) + len(self.failures) == ensemble.chunks.count
-        remainder = (
-            "All others are"
-            if all_tried
-            else f"No chunk of this call succeeded, so that the remaining ones were not tried; {len(ensemble.done)} chunks of earlier calls are"
-        )
+        reason = f"{type(error).__name__}: {error}".rstrip(".").splitlines()[-1]
+        count = ensemble.chunks.count
         super().__init__(
-            f"{len(self.failures)} of {ensemble.chunks.count} chunks could not be computed: runs {lanes}{ellipsis}. Chunk {first}: "
-            f"{reason.splitlines()[-1]} "
-            f"{remainder} in {ensemble.path}; with resume=True only the missing chunks are tried again."
+            f"{len(self.failures)} of {count} chunks could not be computed: runs {lanes}{ellipsis}. Chunk {number}: {reason}. "
+            f"{len(ensemble.done)} of {count} chunks are in {ensemble.path}; with resume=True only the missing ones are tried."
         )
 
 
@@ -71,16 +70,14 @@ class Ensemble:
     failures: error of each chunk that could not be computed.
     seconds: wall time of this call.
     computed: number of runs that this call computed.
-    first_error: of the first chunk that could not be computed in this call.
     """
 
     path: Path
     chunks: Chunks
     done: dict[int, int]
-    failures: dict[int, str] = field(default_factory=dict)
+    failures: dict[int, Exception] = field(default_factory=dict)
     seconds: float = 0.0
     computed: int = 0
-    first_error: Exception | None = field(default=None, repr=False)
 
     def __len__(self) -> int:
         """Number of runs."""
@@ -90,6 +87,13 @@ class Ensemble:
     def complete(self) -> bool:
         """Whether all chunks are in the store."""
         return len(self.done) == self.chunks.count
+
+    @property
+    def runs_done(self) -> int:
+        """Number of runs in the store."""
+        last = self.chunks.count - 1
+        absent_from_last = self.chunks.count * self.chunks.size - len(self)
+        return len(self.done) * self.chunks.size - (absent_from_last if last in self.done else 0)
 
     @property
     def failed_runs(self) -> int:
@@ -103,8 +107,6 @@ class Ensemble:
 
     def open(self):
         """The results, see `vmri_jax.open_ensemble`."""
-        from vmri_jax.ensembles.reading import open_ensemble  # xarray takes a second
-
         return open_ensemble(self.path)
 
 
@@ -134,8 +136,11 @@ def ensemble(
 ) -> Ensemble:
     """Simulate a system once for each row of a design, and keep the quantities `save` of each run in a store on disk.
 
-        runs = vm.ensemble("fpu", "explicit-slow", {"omega": np.linspace(10, 100, 91), "num_micro": [1, 5, 10]},
-                           t_end=1.0, macro_dt=0.01, out="runs.zarr", processes=4)
+        def stiffer(problem, row):
+            return replace(problem, system=problem.system.with_params({"omega": row["omega"]}))
+
+        axes = {"omega": np.linspace(10, 100, 91), "num_micro": [1, 5, 10]}
+        runs = vm.ensemble("fpu", "explicit-slow", axes, vary=stiffer, t_end=1.0, macro_dt=0.01, out="runs.zarr")
         data = vm.open_ensemble("runs.zarr")
 
     Runs are computed chunk by chunk. A chunk is committed when all its files are on disk: whatever ends early (a worker, this
@@ -148,16 +153,14 @@ def ensemble(
             Problems whose functions belong to the running program, or to no module, can only be computed in this process.
         scheme: a `Scheme`, the name of one, or a function that makes a scheme from num_micro, such as `vmri_jax.fully_implicit`.
             A mapping from labels to schemes is an axis "scheme" of the design.
-        design: `Product`, `Table` or `Draws` of `vmri_jax.ensembles`; a mapping is a `Product`. Columns are parameters of the
-            system ("omega", "spring.stiffness", "masses[2]"), parts of the start ("q_s[0]", "v hub x", "q_f"), steps
-            ("macro_dt", "micro_dt", "num_steps") and schemes ("num_micro", "scheme"). A parameter changes
-            the system alone; the positions and velocities at the start stay.
+        design: `Product`, `Table` or `Draws` of `vmri_jax.ensembles`; a mapping is a `Product`. The columns "macro_dt",
+            "micro_dt", "num_steps", "num_micro" and "scheme" choose steps and schemes; `vary` takes all others.
         out: folder of the store, a zarr group; conventionally named .zarr. All workers must see it.
         t_end, num_steps, macro_dt, micro_dt: two of: the time at the end, the number of macro steps, a step size (macro_dt or micro_dt).
         num_micro: number of micro steps, for schemes given by name or by a function.
-        vary: a function ``(problem, row) -> problem`` that makes the problem of a run from the values of its row by column, for example
-            ``lambda problem, row: replace(problem, v_s=row["speed"] * problem.v_s)``. Columns, besides steps and schemes, then have names
-            of your choice. It may change the values of parameters and of the start, and is traced, so that its operations must be operations of JAX.
+        vary: a function ``(problem, row) -> problem`` that makes the problem of a run from the values of its row by column,
+            ``lambda problem, row: replace(problem, v_s=row["speed"] * problem.v_s)``, for example. It may change the values of
+            parameters and of the start, and is traced, so that its operations must be operations of JAX.
         save: quantities that are kept of each run: names from `vmri_jax.ensembles.QUANTITIES`, or functions of a trajectory, themselves or
             as ``my_file.py:function``. A function returns an array, or a dictionary of arrays.
         num_saves: number of saved nodes of a run after the start, equally spaced, from which the quantities are computed.
@@ -185,7 +188,7 @@ def ensemble(
     """
     require_x64()
     path = Path(out)
-    _check_place(path, resume, overwrite)
+    layout.check_place("ensemble", path, "ensemble", resume, overwrite)
     if not isinstance(system, str):
         system = problem_of("ensemble", system)
     schemes, design = _schemes(scheme), _design(design)
@@ -211,119 +214,105 @@ def ensemble(
     arrays, chunks, run = prepared(work, design, chunk)
     attributes = attributes_of(work, design, run, chunks)
     if resume and path.exists():
-        stored = store.read_attributes(path)
+        stored = layout.read_attributes(path, "ensemble")
         # On another machine the default division may differ; files in the store have the old one.
         chunks = chunks._replace(size=stored["chunk"], width=stored["width"])
-        check_same(path, "ensemble", attributes, stored, chunk)
+        check_same(path, attributes, stored, chunk, len(layout.committed(path)) == chunks.count)
+    table = design if isinstance(design, Table) else None
     with ExitStack() as opened:
         tasks = opened.enter_context(executor_of("ensemble", executor, processes))
-        if not isinstance(tasks, Here):
-            packed("ensemble", run_chunk, work)
-        if not (resume and path.exists()):
-            columns = design.rows(0, len(design)) if isinstance(design, Table) else {}
-            with explained(path, "Give another place."):
-                store.create(path, attributes, arrays, columns, chunks.size)
-        opened.enter_context(locked(path))
-        clear_partial(path)
+        submit = submitter("ensemble", tasks, ChunkTask(path.resolve(), chunks, work))
+        columns = None if table is None else table.rows(0, len(table))
+        opened.enter_context(layout.writing(path, attributes, arrays, overwrite, dimension=LANE, table=columns))
         tell = opened.enter_context(progress_to("ensemble", progress))
         interrupted = opened.enter_context(interrupts_noted())
-        runs = Ensemble(path, chunks, store.committed(path))
-        rows = None if isinstance(design, Table) else design
-        submit = submitter("ensemble", tasks, run_chunk, str(path.resolve()), chunks, work, rows)
-        _compute(runs, submit, tell, interrupted)
+        done = {number: int.from_bytes(layout.note(path, number), "little") for number in layout.committed(path)}
+        runs = Ensemble(path, chunks, done)
+        rows = (lambda _: design) if table is None else lambda number: table.rows(*chunks.ends(number))
+        _compute(runs, lambda number: submit(number, rows(number)), tell, interrupted)
     if runs.failures and throw:
-        raise EnsembleError(runs) from runs.first_error
+        raise EnsembleError(runs) from next(iter(runs.failures.values()))
     return runs
+
+
+@dataclass(frozen=True)
+class ChunkTask:
+    """The computation of a chunk: it writes the results to the store, commits them, and returns how many of the runs failed.
+
+    path: folder of the store.
+    chunks: the division of the runs.
+    work: the arguments that the runs share.
+    """
+
+    path: Path
+    chunks: Chunks
+    work: Work
+
+    @cached_property
+    def writer(self) -> layout.Writer:
+        """The writer of the store, which a worker opens once."""
+        return layout.Writer(self.path)
+
+    def __call__(self, number: int, rows: Rows | Design) -> int:
+        """`rows` are the rows of the chunk, or the design that makes them."""
+        first, last = self.chunks.ends(number)
+        rows = rows if isinstance(rows, dict) else rows.rows(first, last)
+        values = self.work.compute(rows, last - first, self.chunks.width)
+        failed = int(np.count_nonzero(values["failed_at"] >= 0))
+        self.writer.write(first, values, failed.to_bytes(NOTE_BYTES, "little"))
+        return failed
 
 
 def _compute(runs: Ensemble, submit: Callable[[int], Future], tell: Progress, interrupted) -> None:
     """Compute the missing chunks and record them in `runs`."""
     begin = time.perf_counter()
     missing = (number for number in range(runs.chunks.count) if number not in runs.done)
-    tell(_progress(runs), _lanes_done(runs), len(runs))
+    tell(_progress(runs), runs.runs_done, len(runs))
     try:
         for number, future in as_done(submit, missing, interrupted):
             try:
                 runs.done[number] = future.result()
+            except (BrokenExecutor, CancelledError, NotAWorker):
+                raise
             except Exception as error:
-                runs.failures[number] = _why(error, runs)
-                runs.first_error = runs.first_error or error
+                _raise_if_full(error, runs)
+                runs.failures[number] = error
             else:
                 first, last = runs.chunks.ends(number)
                 runs.computed += last - first
             if not runs.computed and len(runs.failures) >= FAILURES_TO_STOP:
                 return
             runs.seconds = time.perf_counter() - begin
-            tell(_progress(runs), _lanes_done(runs), len(runs))
+            tell(_progress(runs), runs.runs_done, len(runs))
     except KeyboardInterrupt:
         again = f"go on with resume=True, {runs.path}"
         raise Interrupted(runs, len(runs.done), runs.chunks.count, "chunks", again) from None
-    except CancelledError as gone:
-        raise _gone(runs) from gone
+    except (BrokenExecutor, CancelledError) as gone:
+        raise RuntimeError(
+            f"ensemble: the workers, or their scheduler, are gone. {len(layout.committed(runs.path))} of {runs.chunks.count} "
+            f"chunks are in {runs.path}; go on with resume=True."
+        ) from gone
 
 
-def run_chunk(path: str, chunks: Chunks, work: Work, design: Design | None, number: int) -> int:
-    """Compute a chunk of runs, write it to the store and commit it; returns how many of its runs failed.
-
-    `design` makes the rows; None for a table, whose rows are in the store.
-    """
-    first, last = chunks.ends(number)
-    writer = _writer(path, chunks.size, store.made(Path(path)))
-    rows = writer.columns(first, last) if design is None else design.rows(first, last)
-    return writer.write(number, work.compute(rows, last - first, chunks.width))
-
-
-@lru_cache(maxsize=4)
-def _writer(path: str, chunk: int, made: tuple[int, int]) -> store.Writer:
-    """The writer of a store. `made` is part of the cache key: a store that replaced another one gets a new writer."""
-    return store.Writer(Path(path), chunk)
-
-
-def _why(error: Exception, runs: Ensemble) -> str:
-    """The error of a chunk in words; errors that all chunks would have are raised."""
-    if (
-        isinstance(error, OSError)
-        and error.errno is not None
-        and not isinstance(error, FileNotFoundError | ConnectionError)
-    ):
+def _raise_if_full(error: Exception, runs: Ensemble) -> None:
+    """Raise the error of a file system that takes no more files: all chunks would have it."""
+    of_files = isinstance(error, OSError) and error.errno is not None
+    if of_files and not isinstance(error, FileNotFoundError | ConnectionError):
         kept = f"{len(runs.done)} of {runs.chunks.count} chunks are kept; go on with resume=True when there is room."
         with explained(runs.path, kept):
             raise error
-    if isinstance(error, ModuleNotFoundError) and (error.name or "").partition(".")[0] == "vmri_jax":
-        raise RuntimeError(
-            "ensemble: a worker does not have vmri_jax. Install it in the environment of the workers, the version of this process."
-        ) from error
-    if isinstance(error, NotAWorker):
-        raise error
-    if isinstance(error, BrokenExecutor | CancelledError):
-        raise _gone(runs) from error
-    return f"{type(error).__name__}: {error}".rstrip(".") + "."
-
-
-def _gone(runs: Ensemble) -> RuntimeError:
-    return RuntimeError(
-        f"ensemble: the workers, or their scheduler, are gone. {len(store.committed(runs.path))} of {runs.chunks.count} chunks are in {runs.path}; "
-        "go on with resume=True."
-    )
 
 
 def _progress(runs: Ensemble) -> str:
-    parts = [f"{_lanes_done(runs):,} of {len(runs):,} runs"]
+    parts = [f"{runs.runs_done:,} of {len(runs):,} runs"]
     if runs.computed:
-        left = (len(runs) - _lanes_done(runs)) / runs.runs_per_second
+        left = (len(runs) - runs.runs_done) / runs.runs_per_second
         parts += [f"{runs.runs_per_second:,.0f} a second", f"{left:,.0f} s left"]
     if runs.failed_runs:
         parts.append(f"{runs.failed_runs:,} failed")
     if runs.failures:
         parts.append(f"{len(runs.failures)} chunks not computed")
     return ", ".join(parts)
-
-
-def _lanes_done(runs: Ensemble) -> int:
-    """Number of runs in the committed chunks; the last chunk may have fewer runs than the others."""
-    count = len(runs.done) * runs.chunks.size
-    last = runs.chunks.count - 1
-    return count - (runs.chunks.count * runs.chunks.size - len(runs) if last in runs.done else 0)
 
 
 def _schemes(scheme) -> dict[str, AnyScheme]:
@@ -349,16 +338,3 @@ def _design(design) -> Design:
             "{'omega': [10, 50]}."
         )
     return design
-
-
-def _check_place(path: Path, resume: bool, overwrite: bool) -> None:
-    """Refuse a folder that does not exist, a file that is in the way, and a store without `resume` or `overwrite`."""
-    if is_new("ensemble", path, resume, overwrite):
-        return
-    stored = store.read_attributes(path)  # raises if this is no store
-    if not (resume or overwrite):
-        done, count = len(store.committed(path)), -(-stored["lanes"] // stored["chunk"])
-        raise FileExistsError(
-            f"{path} holds an ensemble of {stored['lanes']} runs, {done} of {count} chunks done. Go on with it (resume=True), replace it "
-            "(overwrite=True), or give another name."
-        )

@@ -11,7 +11,16 @@ import numpy as np
 
 from vmri_jax.accuracy.batch import simulate_batch
 from vmri_jax.catalogue import find_problem, find_scheme
-from vmri_jax.ensembles.columns import SCHEMES, STEPS, Lanes, Row, Vary, by_name, lane_function, numbers_in
+from vmri_jax.ensembles.columns import (
+    SCHEMES,
+    STEPS,
+    Lanes,
+    Row,
+    Vary,
+    columns_of_problems,
+    lane_function,
+    numbers_in,
+)
 from vmri_jax.ensembles.design import Design, Rows, unique_rows
 from vmri_jax.ensembles.quantities import Quantity, Saved, of_lanes, quantity
 from vmri_jax.mechanics.checks import digest
@@ -55,7 +64,7 @@ class Work:
     num_micro, solver, project: as in `ensemble`.
     save: names of the quantities that are kept, or functions.
     num_saves: number of saved nodes after the start.
-    vary: makes the problem of a run from the problem and a row; None where the names of columns say which numbers they set.
+    vary: makes the problem of a run from the problem and a row; None where all columns are steps and schemes.
     sources: digests of the user's files, by path.
     """
 
@@ -109,8 +118,7 @@ class Work:
     @cached_property
     def lane(self) -> Callable[[Row], Lanes]:
         """The function from the numbers of a row to the parameters and the start of its run."""
-        names = [name for name in self.columns if name not in (*STEPS, *SCHEMES)]
-        return lane_function(self.problem, self.vary or by_name(self.problem, names), names)
+        return lane_function(self.problem, self.vary, columns_of_problems(self.columns), "t_end" in self.steps)
 
     @cached_property
     def lanes(self) -> Callable[[Rows, int], Lanes]:
@@ -225,10 +233,6 @@ class Work:
             raise ValueError(
                 f"ensemble: of the steps {', '.join(sorted(names)) or 'nothing'} is given; give two of: t_end, num_steps, "
                 "a step size (macro_dt or micro_dt), as arguments or columns."
-            )
-        if "t" in self.columns and "t_end" in names:
-            raise ValueError(
-                "ensemble: t is a column, so that t_end does not fix the number of steps; give num_steps and a step."
             )
         if "num_steps" in values_by_name:
             values_by_name["num_steps"] = _whole("num_steps", values_by_name["num_steps"])

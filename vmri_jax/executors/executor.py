@@ -4,10 +4,11 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from contextlib import ExitStack, contextmanager
 from functools import partial
+from importlib.metadata import PackageNotFoundError, version
 from itertools import islice
 from typing import Any
 
-from vmri_jax.executors.worker import call_in_worker, packed
+from vmri_jax.executors.worker import NotAWorker, in_worker, known_versions, packed
 from vmri_jax.mechanics.arrays import whole_number
 from vmri_jax.running.export import extra
 from vmri_jax.running.interrupts import Interrupted, interrupts_noted
@@ -50,7 +51,21 @@ def executor_of(caller: str, executor: Any, processes: int | None = None) -> Ite
                 f"{caller}: executor is {type(executor).__name__}; give a dask.distributed.Client or a concurrent.futures.Executor, "
                 "or the number of processes on this machine."
             )
+        if executor is not None:
+            _check_worker(caller, executor)
         yield Here() if executor is None else executor
+
+
+def _check_worker(caller: str, tasks: Executor) -> None:
+    """Refuse workers without this package; asked by a function of Python's library, since a worker of Dask that cannot import
+    the function of a task ends, and the task never does."""
+    try:
+        tasks.submit(version, "vmri_jax").result()
+    except PackageNotFoundError as error:
+        raise NotAWorker(
+            f"{caller}: a worker does not have vmri_jax. Install it in the environment of the workers, the version of this "
+            "process."
+        ) from error
 
 
 @contextmanager
@@ -66,8 +81,7 @@ def submitter(caller: str, tasks: Executor, task: Callable, *shared) -> Callable
     """The function of further arguments that has an executor compute ``task(*shared, *further)``, see `packed`."""
     if isinstance(tasks, Here):
         return partial(tasks.submit, task, *shared)
-    data = packed(caller, task, *shared)
-    return lambda *further: tasks.submit(*call_in_worker(data, *further))
+    return partial(tasks.submit, in_worker, known_versions(), packed(caller, task, *shared))
 
 
 def as_done(

@@ -8,9 +8,12 @@ import pickle
 import socket
 from collections.abc import Callable
 from functools import lru_cache
+from importlib.metadata import version
 
 from vmri_jax.configure import cache_folder, configure, processor
-from vmri_jax.running.store.identity import environment
+
+PACKAGES = ("vmri_jax", "jax", "jaxlib")
+"""Packages on whose versions the last digits of a run depend."""
 
 
 class NotAWorker(RuntimeError):
@@ -19,9 +22,8 @@ class NotAWorker(RuntimeError):
 
 @lru_cache
 def known_versions() -> dict[str, str]:
-    """Versions of the packages that the last digits of a run depend on."""
-    versions = environment()
-    return {name: versions[name] for name in ("vmri_jax", "jax", "jaxlib")}
+    """Versions of `PACKAGES` in this process."""
+    return {name: version(name) for name in PACKAGES}
 
 
 def packed(caller: str, task: Callable, *shared) -> bytes:
@@ -40,34 +42,13 @@ def packed(caller: str, task: Callable, *shared) -> bytes:
     return data
 
 
-class _Call:
-    """A call whose pickle makes the call when it is loaded: `pickle.loads` returns the result."""
-
-    def __init__(self, function: Callable, *arguments):
-        self.call = function, arguments
-
-    def __reduce__(self):
-        return self.call
-
-
-def call_in_worker(data: bytes, *plain) -> tuple[Callable, bytes]:
-    """A function and its argument for an executor, ``(pickle.loads, bytes)``, that make the call of `in_worker`.
-
-    `pickle.loads` makes the call while it unpickles `_Call`. A worker without this package therefore raises ModuleNotFoundError within the
-    task, which is reported; a worker of Dask ends at a task whose function it cannot import.
-    """
-    return pickle.loads, pickle.dumps(_Call(in_worker, known_versions(), data, *plain))
-
-
 def in_worker(versions: dict[str, str], data: bytes, *plain):
     """Set up JAX in this process and return ``task(*shared, *plain)`` for the task that `packed` has packed.
 
     Refuses a process with other `versions` than the one that started the work, or one where JAX has started with other settings.
     """
     here = known_versions()
-    differ = [
-        f"{name} {here[name]} instead of {version}" for name, version in versions.items() if here[name] != version
-    ]
+    differ = [f"{name} {here[name]} instead of {versions[name]}" for name in versions if here[name] != versions[name]]
     if differ:
         raise NotAWorker(
             f"the worker on {socket.gethostname()} has {', '.join(differ)}. Results would differ in their last digits: give all "

@@ -118,7 +118,7 @@ def initial_state(
     v_s, v_f = (np.zeros(np.shape(q)) if v is None else v for q, v in ((q_s, v_s), (q_f, v_f)))
     q_s, q_f, v_s, v_f = check_arrays(q_s=q_s, q_f=q_f, v_s=v_s, v_f=v_f)
     arguments = system, t, q_s, q_f, v_s, v_f
-    if not is_concrete(arguments):
+    if not is_concrete((arguments, jnp.zeros(()))):  # while JAX stages a program, all new arrays are tracers
         if is_concrete((system, q_s, q_f)) and not system.has_constant_mass:
             check_system(system, q_s, q_f)
             check_mass(system, q_s, q_f)

@@ -8,31 +8,40 @@ from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.steppers.results import Result, SimulationError
 
 
-def simulation_error(trajectory: Trajectory, macro_dt, save_every: int, num_micro: int) -> SimulationError:
-    """The `SimulationError` of a failed run: the failing step, its status, and the largest motion before it."""
+def simulation_error(
+    trajectory: Trajectory, macro_dt, save_every: int, num_micro: int, first: int = 0, whole=None
+) -> SimulationError:
+    """The `SimulationError` of a failed run: the failing step, its status, and the largest motion before it.
+
+    Args:
+        trajectory: the run, or a part of it with the node before the failure.
+        macro_dt, save_every, num_micro: of the run.
+        first: number of the macro step that starts at the first node of `trajectory`.
+        whole: the run, where `trajectory` is a part of it.
+    """
     from vmri_jax.stability.vibrations import (
         swapped_at_start,
     )  # imported here: vmri_jax.stability imports vmri_jax.running
 
-    step = int(trajectory.failed_at)
+    failed_at = int(trajectory.failed_at)
+    step = failed_at - first
     interval = step // save_every
     error = SimulationError(
         Result(int(trajectory.result)),
-        step,
+        failed_at,
         float(trajectory.t[0] + step * macro_dt),
         int(trajectory.info.iterations[interval]),
         float(trajectory.info.residual[interval]),
-        trajectory,
+        trajectory if whole is None else whole,
         moved=largest_motion_in_words(trajectory, step, save_every, float(macro_dt), num_micro),
     )
-    return error.advised(float(macro_dt), swapped_at_start(trajectory), _jump(trajectory, macro_dt, save_every))
+    return error.advised(float(macro_dt), swapped_at_start(trajectory), _jump(trajectory, step, macro_dt, save_every))
 
 
-def _jump(trajectory: Trajectory, macro_dt, save_every: int) -> str:
+def _jump(trajectory: Trajectory, step: int, macro_dt, save_every: int) -> str:
     """A sentence about a force that jumps in the failing step or in the next one; empty where no force jumps."""
     if not trajectory.origin.knows_system or np.ndim(trajectory.t) != 1:
         return ""
-    system, interval = trajectory.origin.system(), int(trajectory.failed_at) // save_every
-    last = trajectory[interval]
-    steps = int(trajectory.failed_at) - interval * save_every + 2
-    return in_words(jump_ahead(system, last, steps * float(macro_dt)), trajectory.names)
+    system, interval = trajectory.origin.system(), step // save_every
+    steps = step - interval * save_every + 2
+    return in_words(jump_ahead(system, trajectory[interval], steps * float(macro_dt)), trajectory.names)

@@ -73,7 +73,7 @@ def test_a_store_that_has_just_begun(run, tmp_path, monkeypatch):
         raise SystemExit
 
     with monkeypatch.context() as patch:
-        patch.setattr(layout.Writer, "append", dies)
+        patch.setattr(layout.Writer, "write", dies)
         with pytest.raises(SystemExit):
             run(tmp_path / "run.zarr")
     begun = StoredTrajectory(tmp_path / "run.zarr")
@@ -90,7 +90,7 @@ def test_any_zarr_library_reads_it(uninterrupted):
         warnings.simplefilter("error")
         group = zarr.open_group(uninterrupted.path, mode="r")
         members = dict(group.members(max_depth=None))
-    assert {"t", "q_s", "q_f_micro", "resume/checkpoint"} <= set(members)
+    assert {"t", "q_s", "q_f_micro", "resume/chunks"} <= set(members)
     assert np.array_equal(np.asarray(group["q_f"]), uninterrupted.load().q_f)
     assert group.attrs["num_steps"] == STEPS
     assert len(list((uninterrupted.path / "q_f").glob("c.*"))) == -(-(STEPS // 2 + 1) // CHUNK)
@@ -115,18 +115,18 @@ def test_no_file_is_left_over(uninterrupted):
 
 
 def test_missing_store(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"nowhere.zarr does not exist; give the folder of a stored trajectory"):
-        StoredTrajectory.open(tmp_path / "nowhere.zarr")
+    with pytest.raises(FileNotFoundError, match=r"nowhere.zarr does not exist; give the folder of a stored run"):
+        StoredTrajectory(tmp_path / "nowhere.zarr")
 
 
 def test_folder_of_something_else(tmp_path):
-    with pytest.raises(ValueError, match=r"is not a stored trajectory"):
+    with pytest.raises(ValueError, match=r"is not a stored run"):
         StoredTrajectory(tmp_path)
 
 
 @pytest.mark.parametrize("part", [0.0, 0.5, 0.99])
 def test_truncated_checkpoint(copy, part):
-    file = copy / layout.CHECKPOINT
+    file = copy / layout.NOTES / str(layout.committed(copy)[-1])
     whole = file.read_bytes()
     file.write_bytes(whole[: int(part * len(whole))])
     with pytest.raises(ValueError, match=r"copy.zarr: the checkpoint is damaged"):
@@ -149,5 +149,17 @@ def test_damaged_and_missing_chunks(copy, uninterrupted):
 
 def test_truncated_attributes(copy):
     (copy / "zarr.json").write_text((copy / "zarr.json").read_text()[:100])
-    with pytest.raises(ValueError, match=r"copy.zarr is not a stored trajectory"):
+    with pytest.raises(ValueError, match=r"copy.zarr is not a stored run"):
+        StoredTrajectory(copy)
+
+
+def test_a_store_of_an_older_version_names_the_version_that_reads_it(copy):
+    layout.change_attributes(copy, format="vmri_jax trajectory store 2", made_with={"vmri_jax": "0.1.0"})
+    with pytest.raises(ValueError, match=r"format 'vmri_jax trajectory store 2'.* read it with .* vmri_jax 0\.1\.0"):
+        StoredTrajectory(copy)
+
+
+def test_another_kind_of_store(copy):
+    layout.change_attributes(copy, kind="ensemble")
+    with pytest.raises(ValueError, match=r"is not a stored run but a stored ensemble"):
         StoredTrajectory(copy)

@@ -79,13 +79,13 @@ def test_what_is_streamed_is_what_simulate_returns(run, uninterrupted):
 
 
 @pytest.mark.parametrize(
-    ("where", "name"), [(Simulation, "advance"), (layout.Writer, "append"), (layout, "commit"), (layout, "replaced")]
+    ("where", "name"), [(Simulation, "advance"), (layout.Writer, "write"), (layout, "commit"), (layout, "replaced")]
 )
 @pytest.mark.parametrize("chunks", [1, 2])
 def test_a_run_that_died_goes_on_to_the_last_bit(run, uninterrupted, out, monkeypatch, where, name, chunks):
-    """While it computed, wrote a chunk, or was about to commit one (the store itself is committed first)."""
+    """While it computed, wrote a chunk, or was about to commit one."""
     with monkeypatch.context() as patch:
-        stop_after(patch, chunks + (where is layout), where, name, SystemExit())
+        stop_after(patch, chunks, where, name, SystemExit())
         with pytest.raises(SystemExit):
             run(out)
     died = StoredTrajectory(out)
@@ -99,7 +99,7 @@ def test_a_run_that_died_goes_on_to_the_last_bit(run, uninterrupted, out, monkey
 
 def test_death_before_there_is_a_store(run, uninterrupted, out, monkeypatch):
     with monkeypatch.context() as patch:
-        stop_after(patch, 0, layout, "commit", SystemExit())
+        stop_after(patch, 0, layout, "_consolidate", SystemExit())
         with pytest.raises(SystemExit):
             run(out)
     assert list(out.parent.iterdir()) == []
@@ -165,7 +165,7 @@ def test_ctrl_c_finishes_the_chunk(run, uninterrupted, out, monkeypatch):
 def test_a_full_disk_keeps_what_was_written(run, uninterrupted, out, monkeypatch):
     with monkeypatch.context() as patch:
         full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        stop_after(patch, 1, layout.Writer, "append", full)
+        stop_after(patch, 1, layout.Writer, "write", full)
         with pytest.raises(
             OSError, match=r"No space left on device. The run is kept up to macro step 6: resume it"
         ) as caught:
@@ -177,7 +177,7 @@ def test_a_full_disk_keeps_what_was_written(run, uninterrupted, out, monkeypatch
 
 def test_a_folder_that_cannot_be_written(run, out, monkeypatch):
     denied = PermissionError(errno.EACCES, os.strerror(errno.EACCES))
-    stop_after(monkeypatch, 0, layout, "commit", denied)
+    stop_after(monkeypatch, 0, layout, "_consolidate", denied)
     with pytest.raises(PermissionError, match=r"run.zarr cannot be written: Permission denied"):
         run(out)
     assert list(out.parent.iterdir()) == []
@@ -272,7 +272,7 @@ def test_another_version_is_told(run, out, monkeypatch):
 
 def test_a_checkpoint_of_another_version(run, out, monkeypatch):
     died = dies_after(monkeypatch, 1, run, out)
-    layout.commit(out, died.record._replace(leaves=died.record.leaves[:-1]))
+    layout.commit(out, 0, died.record._replace(leaves=died.record.leaves[:-1]).packed())
     with pytest.raises(ValueError, match=r"can be read, but its run cannot go on: .* remember something else"):
         run(out, resume=True)
     assert_identical(StoredTrajectory(out).load(), died.load())
@@ -280,9 +280,7 @@ def test_a_checkpoint_of_another_version(run, out, monkeypatch):
 
 def test_nothing_is_overwritten_unless_asked(run, uninterrupted, out):
     run(out, num_steps=PER_CHUNK)
-    with pytest.raises(
-        FileExistsError, match=r"holds a run of 8 macro steps, 8 of them done. Go on with it \(resume\)"
-    ):
+    with pytest.raises(FileExistsError, match=r"is a stored run, 2 of 2 chunks done\. Go on with it \(resume=True\)"):
         run(out)
     with pytest.raises(ValueError, match=r"both resume and overwrite"):
         run(out, resume=True, overwrite=True)
@@ -297,7 +295,7 @@ def test_foreign_things_are_left_alone(run, tmp_path, asked):
     folder.mkdir()
     (folder / "zarr.json").write_text('{"zarr_format": 3, "node_type": "group", "attributes": {}}')
     for path in (tmp_path / "file.zarr", folder):
-        with pytest.raises(ValueError, match=rf"{path.name} is not a stored trajectory"):
+        with pytest.raises(ValueError, match=rf"{path.name} is not a stored run"):
             run(path, **asked)
     assert (tmp_path / "file.zarr").read_text() == "mine"
     assert [path.name for path in folder.iterdir()] == ["zarr.json"]

@@ -37,19 +37,16 @@ def environment() -> dict[str, str]:
     return versions | {"machine": f"{platform.system()} {platform.machine()}", "XLA_FLAGS": flags}
 
 
-def check_same(
-    path: Path, kind: str, attributes: dict, stored: dict, chunk: int | None, complete: bool = False
-) -> None:
+def check_same(path: Path, attributes: dict, stored: dict, chunk: int | None, complete: bool) -> None:
     """Refuse to go on with the store of another run; warn if its environment was another one, unless it is complete.
 
     Operations are compared only if both were made with the same version of JAX: another version prints them differently.
 
     Args:
-        kind: "run" or "ensemble".
         attributes, stored: of the store that the user wants, and of the store on disk, with "identity", "made_with" and "chunk".
         chunk: size of a chunk that the user wants, or None.
     """
-    here, there = attributes["identity"], stored["identity"]
+    kind, here, there = stored["kind"], attributes["identity"], stored["identity"]
     now, then = attributes["made_with"], stored["made_with"]
     names = [name for name in {**here, **there} if here.get(name) != there.get(name)]
     if now["jax"] != then["jax"]:

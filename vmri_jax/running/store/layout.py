@@ -1,92 +1,182 @@
-"""Layout of a store on disk, and the order in which its files are written.
+"""Layout of a store on disk, and the order in which its files are written, for long runs and for ensembles.
 
 A store is a folder, a zarr group of format 3 that any zarr library reads, and `xarray.open_zarr` as a dataset:
 
-    t, q_s, q_f, ...   one array per field of `Trajectory`, a row per saved node, the start first, one file per chunk of rows
-    resume/checkpoint  one file of bytes, an .npz: number of saved intervals, status, and the `Checkpoint` of the run
-    attributes         format, identity of the run, chunk, names, versions and machine
+    t, q_s, energy, ...  one array for each quantity, a row for each saved node or each run, one file per chunk of rows
+    resume/chunks/0, ... a note for each committed chunk: some bytes of the writer
+    resume/chunks/table.npz  columns of a design that is a table
+    attributes           format, kind, rows, rows of a chunk, identity, names, versions and machine
 
-Row k of the solver's arrays has its work from node k - 1 to node k, so that their first row is empty.
-
-The checkpoint commits a chunk: it is replaced as a whole after the files of the chunk are on disk. Rows beyond the checkpoint do not count;
-a resumed run writes them again. A new store is made beside its place and moved there when it is complete, so that a kill at any moment
-leaves a valid store or none.
+The note commits a chunk: it is written as a whole after all other files of the chunk are on disk. Readers leave out chunks
+without a note, and whoever resumes writes them again. Any number of processes can write chunks at once, and be killed at
+any moment. A new store is made beside its place and moved there when it is complete: a kill leaves a valid store or none.
 
 zarr takes seconds to import: the functions that need it import it themselves.
 """
 
-import io
 import json
 import os
 import warnings
-import zipfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.running.export import DIMENSIONS, FILL, rows_of
-from vmri_jax.running.files import made_beside, replaced, synchronize
-from vmri_jax.running.simulation import Checkpoint
-from vmri_jax.running.trajectory import Trajectory
+from vmri_jax.running.export import FILL
+from vmri_jax.running.files import clear_partial, explained, is_new, made_beside, replaced, synchronize
 from vmri_jax.steppers.results import Result
 
-FORMAT = "vmri_jax trajectory store 2"
+FORMAT = "vmri_jax store 3"
 METADATA = "zarr.json"
-CHECKPOINT = Path("resume", "checkpoint", "c", "0")
-"""File of the checkpoint within a store; in a separate group, which datasets leave out."""
+NOTES = Path("resume", "chunks")
+"""Folder of the notes within a store; in a group of its own, which datasets leave out."""
+TABLE = NOTES / "table.npz"
 CONFIG: Any = {"write_empty_chunks": True}
 """Configuration of the arrays: every chunk gets a file, even if all its values are the fill value, so that a missing file is an error."""
 KEYS: Any = {"name": "default", "separator": "."}
 """Names of the files of an array: c.0.0, c.1.0, ..."""
+FLAGS = {
+    "flag_values": [int(result) for result in Result],
+    "flag_meanings": " ".join(result.name.lower() for result in Result),
+}
+"""Attributes of an array "result", by the conventions of CF: the numbers and the names of all statuses."""
+CHUNK_SECONDS = 1.0
+"""Target seconds of computation of a chunk. A larger one loses more at a kill; with a smaller one runs wait for files."""
+MOST_CHUNK_BYTES = 2**26
+"""Largest size of a chunk, which is in memory as a whole, in bytes: 64 MiB. A larger one needs more memory per worker."""
 
 
-class Record(NamedTuple):
-    """Contents of a checkpoint file.
+class Kept(NamedTuple):
+    """An array of a store, in one row.
 
-    saved: number of committed saved intervals.
-    result, failed_at: status of these intervals, as in `Trajectory`.
-    step, fell_back: as in `Checkpoint`.
-    leaves: state and memory of the `Checkpoint` as a list of arrays.
+    value: an array, or its shape and type.
+    dimensions: names of its axes.
+    description: of its meaning.
     """
 
-    saved: int
-    result: int
-    failed_at: int
-    step: int
-    fell_back: bool
-    leaves: list[np.ndarray]
-
-    @classmethod
-    def of(cls, checkpoint: Checkpoint, saved=0, result=int(Result.CONVERGED), failed_at=-1) -> "Record":
-        """The record of a checkpoint."""
-        leaves = [np.asarray(leaf) for leaf in jax.tree.leaves((checkpoint.state, checkpoint.memory))]
-        return cls(saved, result, failed_at, checkpoint.step, checkpoint.fell_back, leaves)
-
-    def checkpoint(self, like: Checkpoint) -> Checkpoint:
-        """The checkpoint, with the tree structure of `like`, any checkpoint of the same run; a ValueError if the arrays do not fit it."""
-        expected, structure = jax.tree.flatten((like.state, like.memory))
-        if [(leaf.shape, leaf.dtype) for leaf in self.leaves] != [(leaf.shape, leaf.dtype) for leaf in expected]:
-            raise ValueError("the checkpoint was made by a version of vmri_jax whose steps remember something else")
-        state, memory = jax.tree.unflatten(structure, map(jnp.asarray, self.leaves))
-        return Checkpoint(self.step, state, memory, self.fell_back, is_first=self.step == 0)
+    value: Any
+    dimensions: tuple[str, ...] = ()
+    description: str = ""
 
 
-def create(path: Path, attributes: dict[str, Any], record: Record) -> None:
-    """Make a store without rows; it replaces an existing store when it is complete."""
+def rows_per_chunk(rows: int, seconds: float, size: int, most_chunks: int) -> float:
+    """Rows of a chunk that takes about `CHUNK_SECONDS`, longer where there would be more than `most_chunks`.
+
+    Args:
+        rows: of the store.
+        seconds, size: time to compute a row, and its bytes.
+    """
+    return min(max(CHUNK_SECONDS / seconds, rows / most_chunks), MOST_CHUNK_BYTES / size)
+
+
+def check_place(caller: str, path: Path, kind: str, resume: bool, overwrite: bool) -> None:
+    """Refuse a place where no store of a kind can be made, or where one is that shall neither go on nor be replaced."""
+    if is_new(caller, path, resume, overwrite):
+        return
+    stored = read_attributes(path, kind)
+    if not (resume or overwrite):
+        count = -(-stored["rows"] // stored["chunk"])
+        raise FileExistsError(
+            f"{path} is a stored {kind}, {len(committed(path))} of {count} chunks done. Go on with it (resume=True), replace it "
+            "(overwrite=True), or give another name."
+        )
+
+
+@contextmanager
+def writing(
+    path: Path, attributes: Mapping[str, Any], arrays: Mapping[str, Kept], overwrite: bool, **design
+) -> Iterator[None]:
+    """Context in which this process alone may write to a store, which is made if there is none, or one to overwrite.
+
+    Args:
+        attributes: of a new store, among them "kind", "rows" and "chunk".
+        arrays: by name, the first axis of each, the rows, left out.
+        design: name of the `dimension` of the rows, and `table`, columns by name.
+    """
+    if overwrite or not path.exists():
+        with explained(path, "Give another place."):
+            _create(path, attributes, arrays, **design)
+    with locked(path):
+        clear_partial(path)
+        yield
+
+
+def _create(path: Path, attributes, arrays, dimension: str = "t", table=None) -> None:
     import zarr
+    from zarr.codecs import Crc32cCodec
 
+    rows, chunk = attributes["rows"], attributes["chunk"]
     with locked(path) if path.exists() else nullcontext(), made_beside(path) as partial:
         group = zarr.create_group(partial, attributes={"format": FORMAT, **attributes})
-        size = len(_packed(record))
-        resume = group.create_group("resume")
-        resume.create_array("checkpoint", shape=(size,), dtype="uint8", chunks=(size,), compressors=None)
-        commit(partial, record)
-        synchronize_files(_files(partial))
+        for name, (value, axes, description) in arrays.items():
+            words = ({"description": description} if description else {}) | (FLAGS if name == "result" else {})
+            group.create_array(
+                name,
+                shape=(rows, *value.shape),
+                chunks=(chunk, *(max(n, 1) for n in value.shape)),
+                dtype=value.dtype,
+                fill_value=FILL.get(value.dtype.kind, 0),
+                compressors=Crc32cCodec(),
+                dimension_names=(dimension, *axes),
+                config=CONFIG,
+                chunk_key_encoding=KEYS,
+                attributes=words,
+            )
+        # An empty array, since zarr libraries warn of folders that are neither arrays nor groups.
+        group.require_group(NOTES.parent.name).create_array(NOTES.name, shape=(), dtype="uint8")
+        if table:
+            np.savez(partial / TABLE, **table)
+        _consolidate(partial)
+        _synchronize([file for file in partial.rglob("*") if file.is_file()])
+
+
+class Writer:
+    """Writes chunks of a store; arrays of a run that became longer or shorter get their rows first."""
+
+    def __init__(self, path: Path):
+        import zarr
+
+        group = zarr.open_group(path, mode="r+", use_consolidated=False)
+        attributes: Any = group.attrs
+        rows, self._chunk = attributes["rows"], attributes["chunk"]
+        self._path = path
+        self._arrays = {name: array.with_config(CONFIG) for name, array in group.arrays()}
+        changed = [array for array in self._arrays.values() if array.shape[0] != rows]
+        for array in changed:
+            array.resize((rows, *array.shape[1:]))
+        if changed:
+            _consolidate(path)
+            _synchronize(list(path.rglob(METADATA)))
+
+    def write(self, first: int, values: Mapping[str, np.ndarray], note: bytes) -> None:
+        """Write rows from number `first` on, and commit their chunks with a note."""
+        last = first + len(next(iter(values.values()))) - 1
+        numbers, files = range(first // self._chunk, last // self._chunk + 1), []
+        for name, value in values.items():
+            array = self._arrays[name]
+            array[first : last + 1] = value
+            files += [chunk_file(self._path / name, array.ndim, number) for number in numbers]
+        _synchronize(files)  # after all writes: while the system writes the first file, it writes most of the others
+        for number in numbers:
+            commit(self._path, number, note)
+
+
+def commit(path: Path, number: int, note: bytes) -> None:
+    """Write the note of a chunk, whose rows count from now on."""
+    with replaced(path / NOTES / str(number)) as file:
+        file.write(note)
+
+
+def committed(path: Path) -> list[int]:
+    """Numbers of the committed chunks, in ascending order."""
+    return sorted(int(name) for name in os.listdir(path / NOTES) if name.isdecimal())
+
+
+def note(path: Path, number: int) -> bytes:
+    """The note of a committed chunk."""
+    return (path / NOTES / str(number)).read_bytes()
 
 
 def change_attributes(path: Path, **changes) -> None:
@@ -97,97 +187,33 @@ def change_attributes(path: Path, **changes) -> None:
         file.write(json.dumps(metadata, indent=2).encode())
 
 
-class Writer:
-    """Appends the pieces of a run to a store of `rows` rows, the start and one for each saved interval."""
+def read_attributes(path: Path, kind: str) -> dict[str, Any]:
+    """Attributes of the store of a kind, "run" or "ensemble".
 
-    def __init__(self, path: Path, rows: int, chunk: int):
-        self._path, self._rows, self._chunk = path, rows, chunk
-        self._arrays: dict[str, Any] = {}
-
-    def append(self, piece: Trajectory, saved: int) -> None:
-        """Write a piece after the `saved` intervals in the store; every piece but the last fills whole chunks; it counts after `commit`."""
-        values = rows_of(piece)
-        files = []
-        if saved == 0:
-            files = self._make(values)
-        elif not self._arrays:
-            files = self._open(values)
-        first, last = (saved + 1 if saved else 0), saved + len(piece) - 1
-        for name, value in values.items():
-            self._arrays[name][first : last + 1] = value[1 if saved else 0 :]
-            chunks = range(first // self._chunk, last // self._chunk + 1)
-            files += [chunk_file(self._path / name, value.ndim, k) for k in chunks]
-        # At the end: while the system writes the first file, it writes most of the others, too.
-        synchronize_files(files)
-
-    def _make(self, values: dict[str, np.ndarray]) -> list[Path]:
-        """Make all arrays; returns all files of the store."""
-        import zarr
-
-        group = zarr.open_group(self._path, mode="r+")
-        for name, value in values.items():
-            shape = (self._rows, *value.shape[1:])
-            self._arrays[name] = create_array(group, name, shape, value.dtype, self._chunk, DIMENSIONS[name])
-        consolidate(self._path)
-        return _files(self._path)
-
-    def _open(self, values: dict[str, np.ndarray]) -> list[Path]:
-        """Open all arrays, and give them more rows if the run became longer; returns their metadata files."""
-        import zarr
-
-        for name, value in values.items():
-            array = zarr.open_array(self._path / name, mode="r+").with_config(CONFIG)
-            if array.shape[0] != self._rows:
-                array.resize((self._rows, *value.shape[1:]))
-            self._arrays[name] = array
-        consolidate(self._path)
-        return [self._path / METADATA, *(self._path / name / METADATA for name in values)]
-
-
-def commit(path: Path, record: Record) -> None:
-    """Replace the checkpoint: the rows of this record count from now on."""
-    file = path / CHECKPOINT
-    file.parent.mkdir(exist_ok=True)
-    with replaced(file) as out:
-        out.write(_packed(record))
-
-
-def read_attributes(path: Path) -> dict[str, Any]:
-    """Attributes of a store, see `attributes_in`."""
-    if path.is_file():
-        raise ValueError(
-            f"{path} is not a stored trajectory but a file; a run written by Trajectory.save is read by Trajectory.load({str(path)!r})."
-        )
-    return attributes_in(path, FORMAT, "a stored trajectory", "a stored trajectory")
-
-
-def attributes_in(path: Path, format_name: str, contents: str, kind: str) -> dict[str, Any]:
-    """Attributes of a group of Zarr with an attribute "format"; `contents` and `kind` of the folder are for messages."""
+    Raises:
+        FileNotFoundError, ValueError: there is no such store at the path, or one of another format.
+    """
     if not path.exists():
-        raise FileNotFoundError(f"{path} does not exist; give the folder of {contents}.")
+        raise FileNotFoundError(f"{path} does not exist; give the folder of a stored {kind}.")
     try:
         attributes = json.loads((path / METADATA).read_text())["attributes"]
-        if attributes["format"] != format_name:
-            raise ValueError(f"its format is {attributes['format']!r}, the format of this version {format_name!r}")
+        known = attributes["format"]
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise ValueError(f"{path} is not {kind} ({type(error).__name__}: {error}).") from error
+        raise ValueError(f"{path} is not a stored {kind} ({type(error).__name__}: {error}).") from error
+    if known != FORMAT:
+        version = attributes.get("made_with", {}).get("vmri_jax", "of another format")
+        raise ValueError(
+            f"{path} has the format {known!r}, and this version of vmri_jax reads {FORMAT!r}; read it with the version that "
+            f"wrote it, vmri_jax {version}, or compute it again."
+        )
+    if attributes["kind"] != kind:
+        raise ValueError(f"{path} is not a stored {kind} but a stored {attributes['kind']}.")
     return attributes
-
-
-def read_record(path: Path) -> Record:
-    """The checkpoint of a store; a ValueError if it is missing or damaged."""
-    try:
-        with np.load(io.BytesIO((path / CHECKPOINT).read_bytes()), allow_pickle=False) as data:
-            *counts, fell_back = data["counts"].tolist()
-            leaves = [data[f"leaf_{k}"] for k in range(len(data.files) - 1)]
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-        raise ValueError(f"{path}: the checkpoint is damaged ({error}); the run cannot go on.") from error
-    return Record._make((*counts, bool(fell_back), leaves))
 
 
 @contextmanager
 def locked(path: Path) -> Iterator[None]:
-    """Context in which no other process writes to this store; the operating system releases the lock even if this process is killed."""
+    """Context in which no other process writes to this store; the system releases the lock even if this process is killed."""
     try:
         import fcntl
     except ImportError:  # Windows has no such locks
@@ -195,47 +221,24 @@ def locked(path: Path) -> Iterator[None]:
         return
     descriptor = os.open(path, os.O_RDONLY)
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError as error:
-        os.close(descriptor)
-        text = f"{path} is being written by another process; wait for it or stop it."
-        raise BlockingIOError(error.errno, text) from error
-    except OSError:  # a file system without locks
-        pass
-    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            text = f"{path} is being written by another process; wait for it or stop it."
+            raise BlockingIOError(error.errno, text) from error
+        except OSError:  # a file system without locks
+            pass
         yield
     finally:
         os.close(descriptor)
 
 
-def _packed(record: Record) -> bytes:
-    """A record as the bytes of an .npz file, of the same length throughout a run."""
-    out = io.BytesIO()
-    counts = np.array(record[:-1], dtype=np.int64)
-    np.savez(out, counts=counts, **{f"leaf_{k}": leaf for k, leaf in enumerate(record.leaves)})  # pyright: ignore[reportArgumentType]
-    return out.getvalue()
+def chunk_file(array: Path, dimensions: int, number: int) -> Path:
+    """The file of a chunk of an array."""
+    return array / ".".join(["c", str(number)] + ["0"] * (dimensions - 1))
 
 
-def create_array(group, name: str, shape: tuple[int, ...], dtype, chunk: int, dimensions: Sequence[str], **options):
-    """An array of a group, one file per `chunk` rows; `options` of `zarr.Group.create_array` come on top."""
-    from zarr.codecs import Crc32cCodec
-
-    return group.create_array(
-        name,
-        shape=shape,
-        chunks=(chunk, *(max(n, 1) for n in shape[1:])),
-        dtype=dtype,
-        fill_value=FILL.get(np.dtype(dtype).kind, 0),
-        compressors=Crc32cCodec(),
-        dimension_names=dimensions,
-        config=CONFIG,
-        chunk_key_encoding=KEYS,
-        overwrite=True,
-        **options,
-    )
-
-
-def consolidate(path: Path) -> None:
+def _consolidate(path: Path) -> None:
     """Copy the metadata of all arrays into the metadata of the group, where `xarray` looks for it first."""
     import zarr
 
@@ -244,16 +247,7 @@ def consolidate(path: Path) -> None:
         zarr.consolidate_metadata(path)
 
 
-def chunk_file(array: Path, dimensions: int, k: int) -> Path:
-    """The file of chunk number k of an array."""
-    return array / ".".join(["c", str(k)] + ["0"] * (dimensions - 1))
-
-
-def _files(path: Path) -> list[Path]:
-    return [file for file in path.rglob("*") if file.is_file()]
-
-
-def synchronize_files(files: list[Path]) -> None:
+def _synchronize(files: list[Path]) -> None:
     """Wait until these files and the lists of files of their folders are on disk."""
     for file in files:
         if file.exists():  # arrays without coordinates have no files

@@ -11,12 +11,12 @@ from vmri_jax.mechanics.state import HasProblem, Problem, State
 from vmri_jax.mechanics.summary import summary
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.export import MICRO, Exports
-from vmri_jax.running.largest_motion import largest_motion_in_words
 from vmri_jax.running.origin import Origin
-from vmri_jax.running.store.layout import Record, chunk_file, read_attributes, read_record
+from vmri_jax.running.store.layout import chunk_file, read_attributes
+from vmri_jax.running.store.record import Record
 from vmri_jax.running.summaries import named_coordinates
 from vmri_jax.running.trajectory import NODES, RunInfo, Trajectory, ends_of, from_named_arrays, with_origin
-from vmri_jax.steppers.results import Result, SimulationError
+from vmri_jax.steppers.results import Result
 
 
 class StoredTrajectory(Exports):
@@ -45,18 +45,18 @@ class StoredTrajectory(Exports):
 
     def __init__(self, path):
         self.path = Path(path)
-        self.attributes: dict[str, Any] = read_attributes(self.path)
+        if self.path.is_file():
+            raise ValueError(
+                f"{path} is not a stored run but a file; a run written by Trajectory.save is read by "
+                f"Trajectory.load({str(path)!r})."
+            )
+        self.attributes: dict[str, Any] = read_attributes(self.path, "run")
         self.num_steps: int = self.attributes["num_steps"]
         self.save_every: int = self.attributes["save_every"]
         self.chunk: int = self.attributes["chunk"]
-        self.record: Record = read_record(self.path)
+        self.record = Record.last_of(self.path)
         self.step, self.result, self.failed_at = self.record.step, Result(self.record.result), self.record.failed_at
         self._origin = Origin.from_file(self.attributes.get("names"))
-
-    @classmethod
-    def open(cls, path) -> "StoredTrajectory":
-        """The store at `path`."""
-        return cls(path)
 
     def __repr__(self) -> str:
         state = "complete" if self.complete else "not complete" if self.success else f"failed: {self.result.name}"
@@ -142,21 +142,6 @@ class StoredTrajectory(Exports):
         """The trajectory in pieces of a chunk each; a piece starts with the last node of the previous piece."""
         for first in range(0, len(self) - 1, self.chunk):
             yield self[first : first + self.chunk + 1]
-
-    def raise_failure(self, num_micro: int = 1) -> None:
-        """Raise the `SimulationError` of a failed run, whose macro step has `num_micro` micro steps; do nothing after a success."""
-        if self.success:
-            return
-        interval = self.failed_at // self.save_every
-        before = self[interval : interval + 2]
-        within = self.failed_at - interval * self.save_every
-        time = float(before.t[0] + (before.t[1] - before.t[0]) * within / self.save_every)
-        iterations, residual = int(before.info.iterations[0]), float(before.info.residual[0])
-        macro_dt = float(before.t[1] - before.t[0]) / self.save_every
-        motion = largest_motion_in_words(before, 0, 1, macro_dt, num_micro)
-        raise SimulationError(self.result, self.failed_at, time, iterations, residual, self, moved=motion).advised(
-            macro_dt
-        )
 
     def _rows(self, name: str, rows: slice) -> np.ndarray:
         """Committed rows of an array; a ValueError if one of their files is missing or damaged."""

@@ -10,7 +10,9 @@ import numpy as np
 from vmri_jax.mechanics.arrays import whole_number
 from vmri_jax.mechanics.state import Movable, State
 from vmri_jax.running.arguments import Steps
-from vmri_jax.running.files import clear_partial, explained, is_new
+from vmri_jax.running.export import DIMENSIONS, MICRO, rows_of
+from vmri_jax.running.failures import simulation_error
+from vmri_jax.running.files import explained
 from vmri_jax.running.interrupts import Interrupted, interrupts_noted
 from vmri_jax.running.observables import Observables
 from vmri_jax.running.progress import Progress, ShowsProgress, progress_to
@@ -18,20 +20,18 @@ from vmri_jax.running.saved import numbers_per_node
 from vmri_jax.running.simulation import Simulation, simulation
 from vmri_jax.running.store import layout
 from vmri_jax.running.store.identity import check_same, environment, identity
-from vmri_jax.running.store.layout import Record
+from vmri_jax.running.store.layout import Kept
+from vmri_jax.running.store.record import Record
 from vmri_jax.running.store.stored import StoredTrajectory
-from vmri_jax.running.trajectory import join, trajectory_of
+from vmri_jax.running.trajectory import NODES, RunInfo, join, trajectory_of
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.solver import Solver
 
 CHUNKS_PER_RUN = 100
-"""Chunks of a long run on disk. With more chunks a kill loses less of the run, and the store has more files."""
-LEAST_MICRO_STEPS = 1_000_000
-"""Fewest micro steps of a chunk, about a second of computing: shorter chunks would spend their time on files, longer ones lose more after a
-kill."""
-MOST_BYTES = 2**26
-"""Most bytes of a chunk, which is held in memory as a whole; a larger value takes more memory."""
+"""Most chunks of a run, unless their size is limited. With more chunks a kill loses less, and the store has more files."""
+MICRO_STEP_SECONDS = 1e-6
+"""Rough seconds of a micro step, which only choose the size of chunks: a larger value makes smaller ones."""
 
 
 def stream(
@@ -84,15 +84,16 @@ def stream(
         Interrupted: Ctrl-C; the current chunk is finished first (a second Ctrl-C does not wait for it).
     """
     path = Path(out)
-    _check_place(path, resume, overwrite)
+    layout.check_place("stream", path, "run", resume, overwrite)
     steps = Steps(macro_dt, micro_dt, num_steps, t_end, save_every, save_micro)
     run = simulation(system, scheme, state, solver, steps)
     num_steps = run.num_steps
     if not run.is_concrete:
         raise ValueError("stream: arguments are tracers; it writes files, call it outside of jax.jit, vmap and grad.")
     run.check("stream: the positions of the state")
-    attributes = {
-        "num_steps": num_steps,
+    length = {"rows": run.num_saves + 1, "num_steps": num_steps}
+    attributes = length | {
+        "kind": "run",
         "save_every": save_every,
         "save_micro": save_micro,
         "chunk": _chunk(run) if chunk is None else whole_number("stream: chunk", chunk, otherwise=", or None"),
@@ -101,26 +102,27 @@ def stream(
     }
     attributes |= {} if drawing is None else {"drawing": drawing}
     attributes |= {} if run.names is None else {"names": run.names.to_dict()}
-    with interrupts_noted() as interrupted, progress_to("stream", progress) as tell:
-        if overwrite or not path.exists():
-            with explained(path, _advice(0)):
-                layout.create(path, attributes, Record.of(run.start()))
-        with layout.locked(path):
-            stored = StoredTrajectory(path)
-            check_same(path, "run", attributes, stored.attributes, chunk, stored.complete)
-            if num_steps < stored.step:
-                raise ValueError(f"stream: num_steps is {num_steps}, but {path} has {stored.step} already; open it.")
-            if num_steps != stored.num_steps:
-                with explained(path, _advice(stored.step)):
-                    layout.change_attributes(path, num_steps=num_steps)
-            clear_partial(path)
-            for step in _continue(StoredTrajectory(path), run, tell):
-                if interrupted():
-                    raise Interrupted(StoredTrajectory(path), step, num_steps, "macro steps")
+    with (
+        interrupts_noted() as interrupted,
+        progress_to("stream", progress) as tell,
+        layout.writing(path, attributes, _arrays(run), overwrite),
+    ):
+        stored = StoredTrajectory(path)
+        check_same(path, attributes, stored.attributes, chunk, stored.complete)
+        if num_steps < stored.step:
+            raise ValueError(f"stream: num_steps is {num_steps}, but {path} has {stored.step} already; open it.")
+        if num_steps != stored.num_steps:
+            with explained(path, _advice(stored.step)):
+                layout.change_attributes(path, **length)
+        for step in _continue(StoredTrajectory(path), run, tell):
+            if interrupted():
+                raise Interrupted(StoredTrajectory(path), step, num_steps, "macro steps")
     stored = StoredTrajectory(path)
     stored = stored.with_origin(run.origin) if len(stored) else stored
-    if throw:
-        stored.raise_failure(scheme.num_micro)
+    if throw and not stored.success:
+        interval = stored.failed_at // save_every
+        part, first = stored[interval : interval + 2], interval * save_every
+        raise simulation_error(part, run.macro_dt, save_every, scheme.num_micro, first, stored)
     return stored
 
 
@@ -134,7 +136,8 @@ def _continue(stored: StoredTrajectory, run: Simulation, tell: Progress) -> Iter
         checkpoint = record.checkpoint(like=run.start(fell_back=record.fell_back))
     except ValueError as error:
         raise ValueError(f"{path} can be read, but its run cannot go on: {error}.") from error
-    writer = layout.Writer(path, rows + 1, chunk)
+    with explained(path, _advice(record.step)):
+        writer = layout.Writer(path)
     # The start and the largest values so far, as a node before each chunk: energies are compared with the start of the run.
     before, has_warned = run.at_start(), False
     # Every write but the last ends at a multiple of `chunk` rows, so that no file is written twice.
@@ -148,11 +151,12 @@ def _continue(stored: StoredTrajectory, run: Simulation, tell: Progress) -> Iter
         times = np.concatenate([[run.state.t], *(part.states.t for part, _ in pieces)])
         has_warned = has_warned or run.warn("stream", table, times, stacklevel=4)
         before = Observables.of(table).so_far()
-        with explained(path, _advice(checkpoint.step - size * run.save_every)):
-            writer.append(piece, record.saved)
+        first = record.saved + 1 if record.saved else 0  # the first chunk has the start
+        values = {name: value[1 if record.saved else 0 :] for name, value in rows_of(piece).items()}
+        with explained(path, _advice(record.step)):
             result = max(record.result, int(piece.result))  # failures have larger codes than successes
             record = Record.of(checkpoint, record.saved + size, result, int(piece.failed_at))
-            layout.commit(path, record)
+            writer.write(first, values, record.packed())
         yield checkpoint.step
         if record.failed_at >= 0:
             return
@@ -165,21 +169,20 @@ def _advice(step: int) -> str:
     return "Give another place."
 
 
-def _check_place(path: Path, resume: bool, overwrite: bool) -> None:
-    """Refuse an existing file or store, unless it is to be resumed or replaced, and a folder that does not exist."""
-    if is_new("stream", path, resume, overwrite):
-        return
-    stored = StoredTrajectory(path)  # raises if the path is no store
-    if not (resume or overwrite):
-        raise FileExistsError(
-            f"{path} holds a run of {stored.num_steps} macro steps, {stored.step} of them done. Go on with it (resume), replace "
-            "it (overwrite), or give another name."
-        )
+def _arrays(run: Simulation) -> dict[str, Kept]:
+    """The arrays of the store of a run."""
+    sizes = {"slow": run.state.q_s.size, "fast": run.state.q_f.size, "level": 2, "micro": run.scheme.num_micro}
+    arrays = {}
+    for name in (*NODES, *RunInfo._fields, *(MICRO if run.save_micro else ())):
+        axes = DIMENSIONS[name][1:]
+        kind = np.int64 if name in ("method", "iterations") else np.float64
+        arrays[name] = Kept(np.empty([sizes[axis] for axis in axes], kind), axes)
+    return arrays
 
 
 def _chunk(run: Simulation) -> int:
     """Saved intervals per chunk where the user gives none."""
     num_micro = run.scheme.num_micro
-    numbers = numbers_per_node(run.state, num_micro if run.save_micro else 0)  # 8 bytes each
-    wanted = max(run.num_saves // CHUNKS_PER_RUN, LEAST_MICRO_STEPS // (num_micro * run.save_every))
-    return max(1, min(wanted, run.num_saves, MOST_BYTES // (8 * numbers)))
+    size = 8 * numbers_per_node(run.state, num_micro if run.save_micro else 0)
+    seconds = MICRO_STEP_SECONDS * num_micro * run.save_every
+    return max(1, min(int(layout.rows_per_chunk(run.num_saves, seconds, size, CHUNKS_PER_RUN)), run.num_saves))
