@@ -37,13 +37,13 @@ class NotConfiguredWarning(UserWarning):
     """Runs are right but slow: the program did not call ``vm.configure()`` before JAX started."""
 
 
-def configure(*, fast_loops: bool = True, devices: int | None = None, cache: str | Path | bool | None = True) -> None:
-    """Set up JAX for this toolkit: 64-bit floats, and loops that are compiled into one kernel.
+def configure(*, devices: int | None = None, cache: str | Path | bool | None = True) -> None:
+    """Set up JAX for this toolkit: 64-bit floats, and loops that are compiled into one kernel, unless ``XLA_FLAGS`` has options of this kind.
+
+    The loops of steppers have many small operations, and a call of a kernel costs more than such an operation: without this option a macro step
+    of a small system takes 2 to 5 times as long. Programs also run in the thread that calls them, which saves some ten microseconds per call.
 
     Args:
-        fast_loops: compile each loop into one kernel. The loops of steppers have many small operations, and a call of a kernel
-            costs more than such an operation: without this option a macro step of a small system takes 2 to 5 times as long.
-            Programs also run in the thread that calls them, which saves some ten microseconds per call.
         devices: number of CPU devices, for `simulate_batch(..., devices=...)`; one device uses one core.
         cache: folder in which JAX keeps compiled programs between processes; True for `cache_folder()`, unless JAX has a folder
             already; False or None leave the setting of JAX. The folder grows with every new program; it may be deleted at any time.
@@ -51,7 +51,7 @@ def configure(*, fast_loops: bool = True, devices: int | None = None, cache: str
     Raises:
         RuntimeError: JAX has already started without these settings.
     """
-    if fast_loops and not loops_are_fast():
+    if not loops_are_fast():
         if _has_started():
             raise RuntimeError(ALREADY_STARTED)
         flags = os.environ.get("XLA_FLAGS", "")
@@ -62,8 +62,7 @@ def configure(*, fast_loops: bool = True, devices: int | None = None, cache: str
             raise RuntimeError(ALREADY_STARTED)
         jax.config.update("jax_num_cpu_devices", devices)
     jax.config.update("jax_enable_x64", True)
-    if fast_loops:
-        jax.config.update("jax_cpu_enable_async_dispatch", False)
+    jax.config.update("jax_cpu_enable_async_dispatch", False)
     if cache is True:
         known = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
         cache = None if known else cache_folder()

@@ -146,7 +146,7 @@ def rod(name, start, end):
     return RigidBody(name, 1.0, shape, (start + end) / 2, [0.0, 0.0, np.arctan2(way[1], way[0])])
 
 
-def crank_rocker(*effects, order: Sequence[int] = range(4), names=HINGES, coordinates="auto"):
+def crank_rocker(*effects, order: Sequence[int] = range(4), names=HINGES, coordinates: Any = "auto"):
     """A four-bar linkage whose crank turns all the way round."""
     a, b, d = np.zeros(3), np.array([0.0, CRANK, 0.0]), np.array([2.0, 0.0, 0.0])
     way = d - b

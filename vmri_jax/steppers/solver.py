@@ -31,10 +31,6 @@ from vmri_jax.steppers.results import RUNNING, Result
 MATRICES = ("auto", "masses", "modes", "exact", "null_space")
 
 
-def _optional(stepper):
-    return None if stepper is None else traced_once(stepper)
-
-
 class Solver(eqx.Module):
     """How the implicit equations of a step are solved, see `vmri_jax.steppers.solver`.
 
@@ -61,7 +57,7 @@ class Solver(eqx.Module):
     matrix: str = eqx.field(static=True, default="auto")
     tolerance: float = 1e-12
     max_iterations: int = 100
-    stepper: TracedOnce | None = eqx.field(default=None, converter=_optional, kw_only=True)
+    stepper: TracedOnce | None = eqx.field(default=None, converter=lambda f: f and traced_once(f), kw_only=True)
 
     def __check_init__(self):
         if self.matrix not in MATRICES:
@@ -71,7 +67,7 @@ class Solver(eqx.Module):
                 raise ValueError(f"Solver: {name} is {value}; it must be positive.")
         if self.stepper is None:
             return
-        if not callable(self.stepper.function):
+        if not callable(getattr(self.stepper, "function", None)):
             raise TypeError(
                 f"Solver: stepper is {self.stepper!r}; give a function of (system, scheme) that makes a Stepper."
             )
