@@ -328,9 +328,7 @@ def test_general_coordinates_are_numbered():
 
 def test_kinds_of_runs_on_disk_that_are_mixed_up(swing, tmp_path):
     swing.save(tmp_path / "run.npz")
-    with pytest.raises(
-        ValueError, match=r"run.npz is not a stored run but a file; .* is read by Trajectory.load"
-    ):
+    with pytest.raises(ValueError, match=r"run.npz is not a stored run but a file; .* is read by Trajectory.load"):
         vm.StoredTrajectory(tmp_path / "run.npz")
     (tmp_path / "run.zarr").mkdir()
     with pytest.raises(ValueError, match=r"run.zarr is a folder; .* opened by StoredTrajectory"):

@@ -125,3 +125,19 @@ def test_a_motion_that_differs_from_period_to_period_is_not_called_unstable():
 def test_hard_cases_resolve_the_drive():
     """A soft spring of frequency 0.1, and a drive of frequency 2."""
     assert resolved(mathieu(0.01, 0.0, 1.0).problem).omega == pytest.approx(2.0, rel=1e-9)
+
+
+def shaken_pivot(t, q_s, q_f, v_s, v_f, params):
+    """A pendulum of 0.5 m at the angle q_f from straight up, on a pivot that moves by ``0.05 cos(omega t)``."""
+    omega = params["omega"]
+    return q_s, (9.81 - 0.05 * omega**2 * jnp.cos(omega * t)) / 0.5 * jnp.sin(q_f)
+
+
+@pytest.mark.parametrize(("omega", "growth"), [(61.0, 0.115), (62.4, 0.0506), (66.0, 0.0)])
+def test_steps_that_do_not_divide_the_period(omega, growth):
+    """Near the border of stability, 62.6 rad/s, the product of steps over nearly three periods would have other multipliers."""
+    system = vm.System(vm.ConstantMass([], [1.0]), force=shaken_pivot, params={"omega": omega})
+    advice = vm.advise(vm.Problem(system, [], [0.0]), vm.fully_explicit(10), macro_dt=0.01)
+    assert [finding.kind for finding in advice.findings] == ["motion"]
+    period = 2 * np.pi / omega
+    assert np.expm1(advice.findings[0].number * period) == pytest.approx(growth, rel=0.01, abs=1e-4)  # by DOP853

@@ -108,7 +108,8 @@ class Advice(ResultTable):
             return f"macro_dt = {self.macro_dt:.6g} is {state} {self.about}."
         driven = any(finding.kind == "drive" for finding in self.findings)
         state = "unstable" if self.growth else "too long for the drive" if driven else "close to an instability"
-        nearest = f"the nearest safe step is {self.safe_macro_dt:.6g}"
+        wanted = "step that follows the motion" if driven and not self.growth else "safe step"
+        nearest = f"the nearest {wanted} is {self.safe_macro_dt:.6g}"
         nearest = "no safe step was found, take another scheme" if np.isnan(self.safe_macro_dt) else nearest
         return f"macro_dt = {self.macro_dt:.6g} is {state}{f' {self.about}' if self.growth else ''}; {nearest}."
 

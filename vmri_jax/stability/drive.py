@@ -131,14 +131,15 @@ def periods_of_run(macro_dt: float, period: float) -> int:
 
 def growth_of_run(system: System, scheme, state: State, macro_dt: float, period: float, periods: int) -> tuple:
     """Growth of disturbances of a run per period, over a number of periods, 0 if they do not grow, infinite if a step fails; and the last state."""
+    # the nearest step of which a whole number takes these periods: the product of steps over another time is no monodromy matrix
     steps = max(1, round(periods * period / macro_dt))
     try:
-        product = monodromy(system, scheme, state, macro_dt=macro_dt, num_steps=steps)
+        product = monodromy(system, scheme, state, macro_dt=periods * period / steps, num_steps=steps)
     except RuntimeError:
         return np.inf, state
     if not np.isfinite(product.matrix).all():
         return np.inf, state
-    growth = float(np.abs(product.multipliers).max(initial=0.0) ** (period / (steps * macro_dt)) - 1)
+    growth = float(np.abs(product.multipliers).max(initial=0.0) ** (1 / periods) - 1)
     return growth if growth > LEAST_GROWTH else 0.0, product.end
 
 
