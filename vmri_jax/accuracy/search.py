@@ -75,7 +75,7 @@ LEAST_TRIAL_SECONDS = 0.5
 which families are given up."""
 MOST_TIME_RATIO = 5.0
 """A family is given up when its trials, still uncertified, take this many times as long as the best family so far would
-take for the accuracy, and where it promises a run so many times as long. A larger ratio searches longer."""
+take for the accuracy, and where its run promises to take this many times as long. A larger ratio searches longer."""
 NUM_MICRO = (1, 2, 3, 5, 8, 12, 20, 30, 50)
 """Numbers of micro steps that an exhaustive search tries, in units of the rates of the potentials."""
 MOST_MICRO = 64

@@ -1,5 +1,5 @@
-"""The doors of the search for an accuracy: checks of what is asked for, the usual menu, and warnings about what was
-reached."""
+"""The doors of the search for an accuracy: checks of arguments, the usual menu, and warnings about runs that miss the
+accuracy."""
 
 import warnings
 from collections.abc import Callable

@@ -17,7 +17,7 @@ FEWEST_SAMPLES = 4
 """Least samples of the seconds of a run, of which the least counts. With fewer of them other programs on the machine
 distort the prices of the steps."""
 MOST_SAMPLES = 24
-"""Most samples, for short runs, whose time is mostly that of the call; with fewer of them the noise of the call hides
+"""Most samples, for short runs, whose time is mostly the time of the call; with fewer of them the noise of the call hides
 the time of the steps."""
 SAMPLED_SECONDS = 0.1
 """Seconds of all samples, unless their number ends them; a larger value makes searches longer and prices surer."""

@@ -124,7 +124,7 @@ def check_vectors(state: State) -> None:
 
 @lru_cache(maxsize=256)
 def check_once(known: Known, state_name: str, constraints: bool) -> None:
-    """Check a system, the tree of `known` with a state, at this state. The check takes longer than a short run: equal ones are checked once."""
+    """Check a system, the tree of `known` with a state, at its time and positions. The check takes longer than a short run: equal ones are checked once."""
     system, state = known.tree
     check_system(system, state.q_s, state.q_f)
     check_mass(system, state.q_s, state.q_f)

@@ -271,7 +271,7 @@ class Simulation:
             constraints: whether to check the constraints at the state.
         """
         with Working("checks of the system"):
-            check_once(Known((self.system, self.state)), state_name, constraints)
+            check_once(Known((self.system, replace(self.state, p_s=None, p_f=None))), state_name, constraints)
 
     def start(self, state: State | None = None, step: int = 0, fell_back: bool = False) -> Checkpoint:
         """The checkpoint before the first step; or before step number `step` at another state, with blank memory."""

@@ -145,13 +145,13 @@ def plan(
     """
     system, state = start_of("plan", system, state)
     solver, stage, defers = solver or Solver(), stage_scheme(scheme), False
-    own = None if solver.stepper is None else solver.stepper.called(system, stage)
-    if solver.stepper is None or isinstance(own, StepSolver):
+    custom = None if solver.stepper is None else solver.stepper.called(system, stage)
+    if solver.stepper is None or isinstance(custom, StepSolver):
         kicked = _whole_step(system, stage, _Choice(solver, reverse_only), state.q_s, state.q_f)
         defers = _defers_projection(kicked)
         stepper: Stepper = replace(kicked, projects=not defers and system.is_constrained)
     else:
-        stepper = whole_step(own, system, stage, _average(system, stage, _Choice(Solver(), reverse_only)))
+        stepper = whole_step(custom, system, stage, _average(system, stage, _Choice(Solver(), reverse_only)))
     if solver.stepper is not None:
         check_shapes(stepper, system, stage, state)
     if isinstance(scheme, Composition):
@@ -198,8 +198,8 @@ def _between_kicks(system: System, scheme: Scheme, choice: _Choice, q_s, q_f) ->
     if _is_drift(system, scheme) and not system.is_constrained:
         return FreeFlight(system)
     if solver.stepper is not None:
-        own = solver.stepper.called(system, scheme)
-        return Solved(system, scheme, own, rows, choice.reverse_only)
+        custom = solver.stepper.called(system, scheme)
+        return Solved(system, scheme, custom, rows, choice.reverse_only)
     if not can_be_nested or solver.matrix in ("exact", "null_space"):
         n_g, n_gs = system.num_constraints(q_s, q_f)
         marched = Marched(solver, (q_s.size, n_gs, q_f.size, n_g, scheme.degree))
