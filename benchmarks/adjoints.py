@@ -85,9 +85,8 @@ def measured(case: Case, repeats: int, tell: Tell) -> tuple[list[dict], dict[str
                 state,
                 macro_dt=case.macro_dt,
                 num_steps=steps,
-                save_every=steps // 10,
+                save=vm.Save(steps // 10, adjoint=adjoint),
                 solver=solver,
-                adjoint=adjoint,
             )
             return jnp.sum(end.q_s[-1] ** 2) + jnp.sum(end.q_f[-1] ** 2)
 
@@ -96,7 +95,7 @@ def measured(case: Case, repeats: int, tell: Tell) -> tuple[list[dict], dict[str
         return program, time.perf_counter() - began
 
     forward = vm.prepare(
-        problem, scheme, macro_dt=case.macro_dt, num_steps=SHORT, save_every=SHORT // 10, solver=solver
+        problem, scheme, macro_dt=case.macro_dt, num_steps=SHORT, save=SHORT // 10, solver=solver
     ).timed()
     calls, rows, expected = {"run": forward}, [], None
     for adjoint in ADJOINTS:

@@ -75,9 +75,9 @@ def _program(problem: vm.Problem, case: Case, batch: int, devices: int) -> Calla
             problem.system,
             vm.fully_explicit(NUM_MICRO),
             states,
-            micro_dt=case.micro_dt,
+            macro_dt=NUM_MICRO * case.micro_dt,
             num_steps=num_steps,
-            save_every=num_steps,
+            save=num_steps,
             devices=devices if batch % devices == 0 else 1,
         )
 

@@ -99,7 +99,7 @@ def speed(size: Size, name: str, folder: Path, tell: Tell) -> Report:
     problem = vm.systems.fermi_pasta_ulam()
 
     def alone(states, params):
-        return vm.simulate_batch(problem, SCHEME, states, params=params, macro_dt=0.01, num_steps=100, save_every=100)
+        return vm.simulate_batch(problem, SCHEME, states, params=params, macro_dt=0.01, num_steps=100, save=100)
 
     alone(*batches[0])
     with local_workers(1) as one, local_workers(2) as two:

@@ -125,7 +125,7 @@ def _of_estimate(case: Case) -> dict:
 
     def simulated(scheme, parts: int = 1, **more) -> vm.Trajectory:
         step = {"macro_dt": case.t_end / case.num_steps / parts, "num_steps": case.num_steps * parts}
-        return vm.simulate(problem, scheme, **step, save_every=case.num_steps * parts // NODES, **more)
+        return vm.simulate(problem, scheme, **step, save=case.num_steps * parts // NODES, **more)
 
     run = simulated(scheme, error=True)
     reference = reference_solution(problem, case.t_end, num_saves=NODES)
@@ -150,7 +150,7 @@ def _of_accuracy(case: Case) -> dict:
     """A run of an accuracy with its true error, and the seconds of the first call."""
     problem = case.problem()
     start = time.perf_counter()
-    run = vm.simulate(problem, accuracy=case.accuracy, t_end=case.t_end, num_saves=NODES)
+    run = vm.simulate(problem, accuracy=case.accuracy, t_end=case.t_end, save=vm.Save(number=NODES))
     seconds = time.perf_counter() - start
     true = reference_solution(problem, case.t_end, num_saves=NODES).errors(run)[0]
     chosen = {"scheme": run.settings.python, "steps": run.settings.num_steps, "order": run.settings.scheme.order}

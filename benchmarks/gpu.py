@@ -48,7 +48,7 @@ class System:
     @property
     def run(self) -> dict[str, Any]:
         """Arguments of `simulate`; without the fallback, which every lane would compute."""
-        steps = {"macro_dt": T_END / self.num_steps, "num_steps": self.num_steps, "save_every": self.num_steps}
+        steps = {"macro_dt": T_END / self.num_steps, "num_steps": self.num_steps, "save": self.num_steps}
         return {**steps, "solver": vm.plan(self.problem, self.scheme).first}
 
     def end(self, state: vm.State):

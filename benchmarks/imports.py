@@ -145,7 +145,7 @@ def compare(file: Path) -> dict[str, Any]:
     row |= {"bodies": len(theirs), "acceleration": apart / size}
     begin = time.process_time()
     scheme, steps = vm.compose(vm.fully_implicit(1), "suzuki4"), round(T_END / STEP)
-    run = vm.simulate(scene, scheme, macro_dt=STEP, num_steps=steps, save_every=steps)
+    run = vm.simulate(scene, scheme, macro_dt=STEP, num_steps=steps, save=steps)
     row["first run"] = time.process_time() - begin
     centres = their_centres(model, qpos, qvel)
     row["error"] = max(float(np.abs(run.position(name)[-1, :3] - centre).max()) for name, centre in centres.items())

@@ -56,7 +56,7 @@ class Program:
         options = {
             "macro_dt": macro_dt,
             "num_steps": STEPS,
-            "save_every": STEPS,
+            "save": STEPS,
             "solver": vm.Solver(self.matrix),
         }
         if not self.is_gradient:

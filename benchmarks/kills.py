@@ -109,7 +109,7 @@ def _child(out: str, cache: str) -> None:
     vm.configure(cache=cache)
     problem = vm.systems.fermi_pasta_ulam()
     scheme, steps = vm.fully_implicit(3), CHUNKS * PER_CHUNK * 2
-    arguments = {"macro_dt": 0.01, "num_steps": steps, "save_every": 2, "save_micro": True, "chunk": PER_CHUNK}
+    arguments = {"macro_dt": 0.01, "num_steps": steps, "save": vm.Save(2, micro=True), "chunk": PER_CHUNK}
     vm.stream(problem.system, scheme, problem.state(), out=out, resume=True, **arguments)
 
 

@@ -119,7 +119,7 @@ def _row(case: Case, clock: Callable[[], float]) -> dict:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UncertifiedWarning)
         warnings.simplefilter("ignore", AccuracyNotReached)
-        settings = vm.simulate(problem, accuracy=case.error, t_end=case.t_end, num_saves=NODES).settings
+        settings = vm.simulate(problem, accuracy=case.error, t_end=case.t_end, save=vm.Save(number=NODES)).settings
     seconds = clock() - begun
     reference = reference_solution(problem, case.t_end, num_saves=NODES)
     menu = None if case.menu is None else [f for f in families() if f.name in case.menu]

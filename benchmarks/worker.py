@@ -100,7 +100,8 @@ class Timed:
 
 def last_node(macro_dt: float, num_steps: int) -> dict:
     """Arguments of a run that saves its last node only."""
-    return {"macro_dt": macro_dt, "num_steps": num_steps, "save_every": num_steps}
+    save = "save" if hasattr(vm, "Save") else "save_every"  # of a checkout from before December 2026
+    return {"macro_dt": macro_dt, "num_steps": num_steps, save: num_steps}
 
 
 def solver_of(matrix: str):
@@ -116,9 +117,14 @@ def simulator(case: Case):
     problem, scheme = case.problem(), case.made_scheme()
     state = problem.state()
     solver = solver_of(case.method)
-    return lambda n: vm.simulate(
-        problem.system, scheme, state, **last_node(case.macro_dt, n), solver=solver, throw=False
-    )
+
+    def simulate(num_steps: int) -> vm.Trajectory:
+        try:
+            return vm.simulate(problem.system, scheme, state, **last_node(case.macro_dt, num_steps), solver=solver)
+        except vm.SimulationError as failure:
+            return failure.trajectory
+
+    return simulate
 
 
 class Single(Timed):

@@ -25,6 +25,7 @@ from rich.table import Table
 
 import vmri_jax as vm
 from benchmarks.gail2014.dense import named
+from tests.support import until_failure
 from tests.verification import random_systems as rs
 from vmri_jax.mechanics.checks import is_refusal
 from vmri_jax.mechanics.constraints import CONSTRAINT_TOLERANCE
@@ -59,14 +60,13 @@ def verdicts(of: rs.Structure, draws: list[rs.Draw]) -> list[str]:
         first, problems = draws[0], [rs.problem(of, at) for at in draws]
         how = {
             "num_steps": of.num_saves * first.save_every,
-            "save_every": first.save_every,
-            "save_micro": of.save_micro,
+            "save": vm.Save(first.save_every, micro=of.save_micro),
             "solver": named(of.method, tolerance=first.tolerance, max_iterations=first.max_iterations),
         }
         made = rs.scheme(of, first)
         if of.lanes is None:
             start = _start(problems[0], first.project or None)
-            found = [vm.simulate(problems[0].system, made, start, macro_dt=first.macro_dt, throw=False, **how)]
+            found = [until_failure(problems[0].system, made, start, macro_dt=first.macro_dt, **how)]
         else:
             found = _batch(problems, made, draws, how)
     except Exception as error:

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax import Solver, State, initial_state, macro_step, plan, simulate, systems
+from vmri_jax import SimulationError, Solver, State, Trajectory, initial_state, macro_step, plan, simulate, systems
 
 DATA = Path(__file__).parent / "data"
 PROBLEMS = {
@@ -34,6 +34,14 @@ def step_matrix(system, scheme, macro_dt):
         return jnp.concatenate([end.q_s, end.q_f, end.p_s, end.p_f])
 
     return jax.jacfwd(step)(jnp.zeros(4))
+
+
+def until_failure(*arguments, **options) -> Trajectory:
+    """`simulate` of a run that may fail: its trajectory, NaN from the failure on."""
+    try:
+        return simulate(*arguments, **options)
+    except SimulationError as failure:
+        return failure.trajectory
 
 
 def without_fallback(moving, scheme, state=None) -> Solver:
@@ -130,9 +138,7 @@ def convergence(problem, scheme, truth: dict, steps, num_saves: int = NUM_SAVES,
     nodes = slice(-1, None) if only_end else slice(None)
     errors = []
     for n in steps:
-        run = simulate(
-            problem.system, scheme, problem.state(), macro_dt=length / n, num_steps=n, save_every=n // num_saves
-        )
+        run = simulate(problem.system, scheme, problem.state(), macro_dt=length / n, num_steps=n, save=n // num_saves)
         q, p = np.concatenate([run.q_s, run.q_f], axis=1), np.concatenate([run.p_s, run.p_f], axis=1)
         errors.append((np.abs(q - q_true)[nodes].max(), np.abs(p - p_true)[nodes].max()))
     return length / np.asarray(steps), *np.transpose(errors)

@@ -14,6 +14,7 @@ import pytest
 from vmri_jax import (
     ConstantMass,
     Rheonomic,
+    Save,
     Scheme,
     SimulationError,
     State,
@@ -121,10 +122,10 @@ def test_bad_start_times(fpu, changes, message):
 def test_flags_are_true_or_false(fpu):
     with pytest.raises(TypeError, match="project is 'no'; it must be True or False"):
         start(fpu, project="no")
-    for name in ("save_micro", "throw", "progress"):
+    for name in ("micro", "progress"):
         flag: Any = {name: 1}
         with pytest.raises(TypeError, match=f"{name} is 1; it must be True or False"):
-            simulate(fpu.system, fully_implicit(2), fpu.state(), macro_dt=0.1, num_steps=1, **flag)
+            Save(**flag)
 
 
 def test_parameters_that_are_no_numbers(fpu):
@@ -349,16 +350,16 @@ def test_bad_schemes(changes, error, message):
 @pytest.mark.parametrize(
     ("changes", "error", "message"),
     [
-        ({}, ValueError, "got neither of macro_dt and micro_dt; give exactly one"),
-        ({"macro_dt": 0.1, "micro_dt": 0.01}, ValueError, "got both of macro_dt and micro_dt; give exactly one"),
+        ({}, ValueError, "macro_dt is missing; give the macro step H"),
         ({"macro_dt": 0.0}, ValueError, "macro_dt is 0.0; it must be a positive number"),
-        ({"micro_dt": -0.1}, ValueError, "micro_dt is -0.1; it must be a positive number"),
+        ({"macro_dt": -0.1}, ValueError, "macro_dt is -0.1; it must be a positive number"),
         ({"macro_dt": float("nan")}, ValueError, "macro_dt is nan; it must be a positive number"),
         ({"macro_dt": 0.1, "num_steps": 0}, ValueError, "num_steps is 0; it must be an integer of at least 1"),
         ({"macro_dt": 0.1, "num_steps": -4}, ValueError, "num_steps is -4"),
         ({"macro_dt": 0.1, "num_steps": 10.0}, ValueError, "num_steps is 10.0; it must be an integer"),
-        ({"macro_dt": 0.1, "save_every": 0}, ValueError, "save_every is 0; it must be an integer of at least 1"),
-        ({"macro_dt": 0.1, "save_every": 3}, ValueError, "num_steps = 10 is not a multiple of save_every = 3"),
+        ({"macro_dt": 0.1, "save": 0}, ValueError, "save is 0; it must be an integer of at least 1, or a Save"),
+        ({"macro_dt": 0.1, "save": 3}, ValueError, "num_steps = 10 is not a multiple of save = 3"),
+        ({"macro_dt": 0.1, "save": Save(number=3)}, ValueError, "not a multiple of the 3 saved intervals"),
         ({"macro_dt": 0.1, "scheme": "fully_implicit"}, TypeError, "scheme is str; give a Scheme"),
         ({"macro_dt": 0.1, "state": None}, TypeError, r"a System has no start; give a State, e.g. from initial_state"),
     ],

@@ -18,6 +18,7 @@ Runs
     prepare                             the same run again and again, a Simulation
     stream                              long runs on disk, a StoredTrajectory
     ensemble, open_ensemble             many runs, by workers, into a store
+    Save                                the nodes that are kept, the states for derivatives, a bar
     Solver                              how implicit equations are solved
 
 Questions
@@ -58,6 +59,7 @@ from vmri_jax.mechanics.functions import CompiledAgainWarning
 from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.state import Problem, State, initial_state
 from vmri_jax.mechanics.system import ConstantMass, Rheonomic, System
+from vmri_jax.running.arguments import Save
 from vmri_jax.running.interrupts import Interrupted
 from vmri_jax.running.macro_step import macro_step
 from vmri_jax.running.observables import LostEnergyWarning, SingularCoordinatesWarning
@@ -145,6 +147,7 @@ __all__ = [
     "Result",
     "Rheonomic",
     "RunError",
+    "Save",
     "Scheme",
     "Settings",
     "Simulation",

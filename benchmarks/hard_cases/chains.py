@@ -65,8 +65,8 @@ def stiff_springs_in_a_chain(full: bool) -> Outcome:
     params = problem.system.params
     weight = params["gravity"] * (params["load"] + 50 * params["mass"])
     at_rest = float(weight / params["stiffness"] / params["length"])
-    implicit = run(problem, vm.fully_implicit(20), 0.02, steps, save_every=steps // 50)
-    explicit = run(problem, vm.fully_explicit(20), 0.001, 100_000, save_every=100)
+    implicit = run(problem, vm.fully_implicit(20), 0.02, steps, save=steps // 50)
+    explicit = run(problem, vm.fully_explicit(20), 0.001, 100_000, save=100)
     strain = {name: _strain(trajectory) / at_rest for name, trajectory in (("2", implicit), ("0.1", explicit))}
     half = len(strain["0.1"]) // 2
     growth = strain["0.1"][half:].max() / strain["0.1"][:half].max()

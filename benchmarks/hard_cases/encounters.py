@@ -25,7 +25,7 @@ def penalty_contact(full: bool) -> Outcome:
     steps = int((bounces + 0.5) * period / macro_dt) // 20 * 20
     heights, jumps, lost = [], [], []
     for scheme in (vm.fully_explicit(20), vm.fully_implicit(20)):
-        trajectory = run(problem, scheme, macro_dt, steps, save_every=2)  # a contact takes 4.5 steps
+        trajectory = run(problem, scheme, macro_dt, steps, save=2)  # a contact takes 4.5 steps
         z, e = np.asarray(trajectory.q_f)[:, 0], np.asarray(trajectory.energy) / float(trajectory.energy[0])
         flying = z > 1e-3  # contact sinks in by 4e-4
         flights = np.split(np.arange(len(z)), np.flatnonzero(np.diff(flying.astype(int))) + 1)
@@ -55,7 +55,7 @@ def norm_at_zero(full: bool) -> Outcome:
     @partial(jax.jacfwd, has_aux=True)
     def reached(stiffness, state):
         system = problem.system.replace(params=problem.system.params | {"stiffness": stiffness})
-        run = vm.simulate(system, scheme, state, macro_dt=1e-3, num_steps=steps, save_every=steps, solver=solver)
+        run = vm.simulate(system, scheme, state, macro_dt=1e-3, num_steps=steps, save=steps, solver=solver)
         return run.q_f[-1], run
 
     values, said = {}, []

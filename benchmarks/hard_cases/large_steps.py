@@ -28,7 +28,7 @@ def explicit_limit(full: bool) -> Outcome:
     """
     problem, num_micro, steps = vm.systems.fermi_pasta_ulam(), 2, 20_000 if full else 5_000
     scheme = vm.fully_explicit(num_micro)  # with more micro steps omega h = 1.9 meets an impulse resonance
-    below, at, beyond = (run(problem, scheme, num_micro * wh / 50.0, steps, save_every=20) for wh in (1.9, 2.0, 2.1))
+    below, at, beyond = (run(problem, scheme, num_micro * wh / 50.0, steps, save=20) for wh in (1.9, 2.0, 2.1))
     e = np.abs(np.asarray(below.energy - below.energy[0]))
     first, second = e[: len(e) // 2].max(), e[len(e) // 2 :].max()
     clean = beyond.result == vm.Result.NON_FINITE and not np.isfinite(beyond.energy[-1])
@@ -65,7 +65,7 @@ PENDULUM = vm.fully_implicit(5)
 
 def _pendulum_run(problem: vm.Problem, macro_dt: float, num_steps: int, solver: vm.Solver = EXACT) -> vm.Trajectory:
     """With 20 saved nodes."""
-    return run(problem, PENDULUM, macro_dt, num_steps, save_every=num_steps // 20, solver=solver)
+    return run(problem, PENDULUM, macro_dt, num_steps, save=num_steps // 20, solver=solver)
 
 
 @hard_case(7, "large constrained step")
@@ -143,7 +143,7 @@ def many_micro_steps(full: bool) -> Outcome:
 
     def end(num_micro, steps, solver=None):  # one saved node: one program for each num_micro
         scheme = vm.fully_implicit(num_micro)
-        return positions(run(problem, scheme, macro_dt, steps, save_every=steps, solver=solver))[-1]
+        return positions(run(problem, scheme, macro_dt, steps, save=steps, solver=solver))[-1]
 
     steps = {n: (20 if full else 5) * micro[-1] // n for n in micro}  # as many micro steps for each
     runs = {f"{n}": partial(end, n, steps[n]) for n in micro}

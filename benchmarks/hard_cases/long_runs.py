@@ -145,12 +145,12 @@ def chaotic_pendulum(full: bool) -> Outcome:
     problem = vm.Problem(problem.system, jnp.asarray(q[0]), jnp.asarray(q[1:].reshape(-1)), jnp.zeros(3), jnp.zeros(6))
     scheme, t_end = vm.fully_implicit(5), 100.0 if full else 10.0
     macro_dt = 0.005
-    trajectory = run(problem, scheme, macro_dt, round(t_end / macro_dt), save_every=10)
+    trajectory = run(problem, scheme, macro_dt, round(t_end / macro_dt), save=10)
     scale = 2 * abs(float(trajectory.energy[0]))  # from upright to hanging
     position, change = constraints(trajectory)[0], energy(trajectory, 1, scale)
     steps, ends = 0.02 / 2.0 ** np.arange(5 if full else 4), []
     for h in steps:
-        ends.append(positions(run(problem, scheme, h, round(1 / h), save_every=round(1 / h)))[-1])
+        ends.append(positions(run(problem, scheme, h, round(1 / h), save=round(1 / h)))[-1])
     order = vm.diagnostics.observed_order(steps[:-2], [difference(a, ends[-1]) for a in ends[:-2]])
     return Outcome(
         f"t = {t_end:g}: {status(trajectory)}, |g| {position:.1e}, energy error {change.band:.1e} of the fall; order {order:.2f} "

@@ -22,7 +22,7 @@ def three_time_scales(full: bool) -> Outcome:
     """
     problem, omega = three_scales(), np.array([50.0, 70.0, 5000.0])
     coarse = run(problem, vm.fully_implicit(5), 0.1, 500)  # omega_3 h = 100
-    fine = run(problem, vm.fully_explicit(100), 0.01, 5000, save_every=10)  # omega_3 h = 0.5
+    fine = run(problem, vm.fully_explicit(100), 0.01, 5000, save=10)  # omega_3 h = 0.5
     actions = [np.asarray(vm.diagnostics.oscillatory_energies(omega, r.q_f, r.p_f)) for r in (coarse, fine)]
     at_end = np.abs(actions[0][-1] - actions[1][-1])
     third = actions[0][:, 2].max()
@@ -50,7 +50,7 @@ def no_coupling(full: bool) -> Outcome:
     problem = replace(problem, system=problem.system.replace(slow_potential=slow_alone))
     steps, values = 10_000 if full else 1_000, {}
     for make in (vm.explicit_slow, vm.fully_explicit):
-        runs = [run(problem, make(n), 0.03, steps, save_every=steps) for n in (1, 10)]
+        runs = [run(problem, make(n), 0.03, steps, save=steps) for n in (1, 10)]
         values[make.__name__] = max(difference(runs[1].q_s, runs[0].q_s), difference(runs[1].p_s, runs[0].p_s))
     words = ", ".join(f"{name} {value:.0e}" for name, value in values.items())
     return Outcome(f"num_micro 10 against 1, {steps} steps: {words}", max(values.values()) < 1e-13, values)

@@ -108,7 +108,7 @@ def batch_case(name: str, lanes: int) -> tuple[Case, tuple]:
     """A case with `lanes` starts, and these: ``(states, q, v)``; the reference is a Gauss scheme of order 4."""
     case = cases.case(name)
     states = starts(case.problem, lanes)
-    steps = {"macro_dt": case.t_end / FINE_STEPS, "num_steps": FINE_STEPS, "save_every": FINE_STEPS}
+    steps = {"macro_dt": case.t_end / FINE_STEPS, "num_steps": FINE_STEPS, "save": FINE_STEPS}
     end = vm.simulate_batch(case.problem.system, vm.galerkin(1, 2, "gauss"), states, **steps)
     q = np.concatenate([states.q_s, states.q_f], axis=1)
     v = np.concatenate([states.p_s, states.p_f], axis=1) / case.masses

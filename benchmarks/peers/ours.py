@@ -104,7 +104,7 @@ def batch_ladders(case: Case, states: vm.State, q, v, schemes=None) -> list[Ladd
         solver = first_solver(case.problem, scheme, tolerance)
 
         def build(num_steps: int):
-            steps = {"macro_dt": case.t_end / num_steps, "num_steps": num_steps, "save_every": num_steps}
+            steps = {"macro_dt": case.t_end / num_steps, "num_steps": num_steps, "save": num_steps}
 
             def run():
                 return last_positions(vm.simulate_batch(case.problem.system, scheme, states, **steps, solver=solver))

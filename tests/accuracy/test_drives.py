@@ -110,7 +110,7 @@ def test_steps_over_a_pulse_are_not_certified():
     assert (
         2.0 <= float(run.error.certified_until) <= 3.2
     )  # the third companion has a node in common with the run every 2.0
-    smaller = vm.simulate(problem, vm.fully_explicit(1), macro_dt=0.0005, t_end=LENGTH, save_every=200, error=True)
+    smaller = vm.simulate(problem, vm.fully_explicit(1), macro_dt=0.0005, t_end=LENGTH, save=200, error=True)
     true = np.abs(smaller.q_s[:, 0] - motion(np.asarray(smaller.t), problem.system.params)).max()
     assert smaller.error.largest == pytest.approx(true, rel=0.1)  # 0.2 % measured
 
@@ -138,7 +138,7 @@ def test_a_car_at_rest_crosses_a_bump(num_saves):
     """The car is at rest at first, so that long steps have no error; at twenty saved nodes it has hardly moved."""
     system = vm.System(vm.ConstantMass(slow={}, fast={"z": 300.0, "u": 40.0}), springs, force=road)
     car = vm.Problem(system, q_s={}, q_f={"z": 0.0, "u": 0.0})
-    run = vm.simulate(car, vm.fully_explicit(1), accuracy=1e-4, t_end=5.0, num_saves=num_saves)
+    run = vm.simulate(car, vm.fully_explicit(1), accuracy=1e-4, t_end=5.0, save=vm.Save(number=num_saves))
     assert 1e-6 < run.error.largest <= 1e-4
     assert float(run.q_f["z"][-1]) == pytest.approx(-3.9413e-3, abs=2e-5)
 

@@ -51,7 +51,7 @@ QUICK = ("kicks", "order 1", "composition", "slow alone", "constraint, order 8",
 )
 def test_estimate_over_true_error(case):
     name, scheme, num_steps = CASES[case]
-    steps = {"macro_dt": LENGTH / num_steps, "num_steps": num_steps, "save_every": num_steps // NODES}
+    steps = {"macro_dt": LENGTH / num_steps, "num_steps": num_steps, "save": num_steps // NODES}
     run = vm.simulate(SYSTEMS[name], scheme, **steps, error=True)
     true = reference_solution(SYSTEMS[name], LENGTH, num_saves=NODES).errors(run)[0]
     assert true > 1e-6  # an error of the scheme, not of the reference
@@ -63,7 +63,7 @@ def test_shares_are_the_limits_of_each_grid():
     problem, num_micro, num_steps = SYSTEMS["no_constraint"], 8, 20
 
     def run(scheme, parts=1, **more):
-        steps = {"macro_dt": 0.1 / parts, "num_steps": num_steps * parts, "save_every": 2 * parts}
+        steps = {"macro_dt": 0.1 / parts, "num_steps": num_steps * parts, "save": 2 * parts}
         return vm.simulate(problem, scheme, **steps, **more)
 
     whole = run(vm.fully_explicit(num_micro), error=True)
@@ -74,11 +74,11 @@ def test_shares_are_the_limits_of_each_grid():
 
 def test_error_of_a_function():
     problem = SYSTEMS["no_constraint"]
-    steps = {"macro_dt": 0.05, "num_steps": 20, "error": True}
-    each = vm.simulate(problem, vm.fully_explicit(4), **steps, of=lambda run: run.q_f[:, 1])
+    steps = {"macro_dt": 0.05, "num_steps": 20}
+    each = vm.simulate(problem, vm.fully_explicit(4), **steps, error=lambda run: run.q_f[:, 1])
     np.testing.assert_array_equal(each.error.of, each.error.q_f[:, 1])
     assert each[::5].error.of.shape == (5,)
-    end = vm.simulate(problem, vm.fully_explicit(4), **steps, of=lambda run: jnp.sum(run.q_s[-1]))
+    end = vm.simulate(problem, vm.fully_explicit(4), **steps, error=lambda run: jnp.sum(run.q_s[-1]))
     assert end.error.of == pytest.approx(end.error.q_s[-1].sum())
     assert end[::5].error.of == end.error.of
 
@@ -86,10 +86,8 @@ def test_error_of_a_function():
 @pytest.mark.parametrize(
     ("arguments", "kind", "message"),
     [
-        ({"of": lambda run: "far", "error": True}, TypeError, "returned 'far'"),
-        ({"of": lambda run: run.q_f}, ValueError, "give error=True"),
-        ({"of": 3.0, "error": True}, TypeError, "give a function of a run"),
-        ({"error": 1e-3}, TypeError, "must be True or False"),
+        ({"error": lambda run: "far"}, TypeError, "returned 'far'"),
+        ({"error": 1e-3}, TypeError, "error is 0.001; it must be True or False, or a function of a run"),
     ],
 )
 def test_refused(arguments, kind, message):
@@ -142,7 +140,7 @@ def last(run):
 
 def test_chaotic_motion_is_not_certified():
     with pytest.warns(UncertifiedWarning, match=r"the motion is chaotic.*The energy has changed by at most"):
-        run = vm.simulate(double_pendulum(), vm.galerkin(1, 3), macro_dt=0.05, t_end=30.0, error=True, of=last)
+        run = vm.simulate(double_pendulum(), vm.galerkin(1, 3), macro_dt=0.05, t_end=30.0, error=last)
     until = float(run.error.certified_until)
     assert 2.0 < until < 30.0
     np.testing.assert_array_equal(np.isnan(run.error.positions), np.asarray(run.t) > until)

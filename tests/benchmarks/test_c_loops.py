@@ -16,9 +16,8 @@ needs_compiler = pytest.mark.skipif(c_loops.compiler() is None, reason="no C com
 def difference(loop, problem, num_micro, micro_dt, num_steps):
     """Largest relative difference of (q_s, q_f, p_s, p_f) at the end from those of `simulate`."""
     scheme = vm.fully_explicit(num_micro)
-    run = vm.simulate(
-        problem.system, scheme, problem.state(), micro_dt=micro_dt, num_steps=num_steps, save_every=num_steps
-    )
+    steps = {"macro_dt": num_micro * micro_dt, "num_steps": num_steps, "save": num_steps}
+    run = vm.simulate(problem.system, scheme, problem.state(), **steps)
     ends = (run.q_s[-1], run.q_f[-1], run.p_s[-1], run.p_f[-1])
     return max(relative_difference(a, np.asarray(b)) for a, b in zip(loop(), ends, strict=True))
 

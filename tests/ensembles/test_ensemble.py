@@ -47,7 +47,7 @@ def test_runs_are_those_of_simulate(tmp_path):
         at = {"scheme": scheme, "num_micro": 4, "num_steps": 16, "omega": 50.0, "v_s[0]": 0.3}
         one = data.sel(at).load()
         problem = replace(chain(50.0, 1), v_s=np.array([0.3]))
-        run = vm.simulate(problem, make(4), macro_dt=0.2 / 16, num_steps=16, save_every=4)
+        run = vm.simulate(problem, make(4), macro_dt=0.2 / 16, num_steps=16, save=4)
         for name in ("q_s", "q_f", "p_s", "p_f"):
             assert np.allclose(one[name], getattr(run, name)[-1], rtol=0, atol=1e-13)  # 2e-15
             assert np.allclose(one[f"node_{name}"], getattr(run, name), rtol=0, atol=1e-13)
@@ -72,7 +72,7 @@ def test_positions_as_dictionaries(tmp_path, system, function):
     runs = few(tmp_path / "runs.zarr", system=system, design=design, save=save, num_saves=5)
     one = runs.open().sel(k=50.0).load()
     stiff = replace(own.hung, system=own.hung.system.replace(params={"k": np.asarray(50.0)}))
-    run = vm.simulate(stiff, vm.explicit_slow(3), macro_dt=0.02, num_steps=10, save_every=2)
+    run = vm.simulate(stiff, vm.explicit_slow(3), macro_dt=0.02, num_steps=10, save=2)
     assert np.allclose(one.q_f, run.states.q_f[-1], rtol=0, atol=1e-13)
     assert np.allclose(one.max_q_f, run.states.q_f.max(axis=0), rtol=0, atol=1e-13)
     assert np.allclose(one["load"], run.q_f["load"][-1], rtol=0, atol=1e-13)
@@ -87,7 +87,7 @@ def test_steps_of_their_own_in_a_table_in_any_order(tmp_path):
     for i in range(5):
         steps = columns["num_steps"][i]
         problem = chain(columns["omega"][i])
-        run = vm.simulate(problem, vm.explicit_slow(3), macro_dt=0.2 / steps, num_steps=steps, save_every=steps)
+        run = vm.simulate(problem, vm.explicit_slow(3), macro_dt=0.2 / steps, num_steps=steps, save=steps)
         assert np.allclose(data.q_f[i], run.q_f[-1], rtol=0, atol=1e-13)
 
 
@@ -96,7 +96,7 @@ def test_steps_of_each_lane(tmp_path):
     data = few(tmp_path / "lanes.zarr", design=design, macro_dt=None, t_end=None, num_steps=10).open()
     problem = vm.systems.fermi_pasta_ulam()
     problem = replace(problem, q_f=design.columns["q_f"].values[2])
-    run = vm.simulate(problem, vm.explicit_slow(3), macro_dt=0.013, num_steps=10, save_every=10)
+    run = vm.simulate(problem, vm.explicit_slow(3), macro_dt=0.013, num_steps=10, save=10)
     assert np.allclose(data.p_s[2], run.p_s[-1], rtol=0, atol=1e-13)
 
 
@@ -118,7 +118,7 @@ def test_own_quantities_systems_and_units(tmp_path):
     data = runs.open()
     assert data.omega.attrs == {"units": "rad/s", "description": "frequency of the stiff springs"}
     assert data.reach.attrs["description"] == "Largest elongation of the first stiff spring."
-    run = vm.simulate(chain(30.0, 2), vm.explicit_slow(3), macro_dt=0.02, num_steps=10, save_every=2)
+    run = vm.simulate(chain(30.0, 2), vm.explicit_slow(3), macro_dt=0.02, num_steps=10, save=2)
     assert data.reach.sel(omega=30.0) == pytest.approx(float(np.abs(run.q_f[:, 0]).max()), abs=1e-14)
     again = few(tmp_path / "module.zarr", system="tests.ensembles.own:slow_chain", design={"omega": [30.0]}, save="end")
     assert np.allclose(again.open().q_f[0], data.q_f[1], rtol=0, atol=1e-13)

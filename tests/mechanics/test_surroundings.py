@@ -357,8 +357,8 @@ def test_functions_that_are_not_pure_are_refused(kind):
 
 
 def test_a_function_of_a_run_that_is_not_pure_is_refused():
-    with pytest.raises(ValueError, match="of returns other numbers for the same run"):
-        vm.simulate(problem(), SCHEME, **STEPS, error=True, of=lambda run: run.q_s[-1] + rng.normal())
+    with pytest.raises(ValueError, match="error returns other numbers for the same run"):
+        vm.simulate(problem(), SCHEME, **STEPS, error=lambda run: run.q_s[-1] + rng.normal())
 
 
 class Controller:

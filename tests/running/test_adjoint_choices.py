@@ -7,7 +7,6 @@ import pytest
 
 import vmri_jax as vm
 from tests.running.test_adjoints import simple_cost, simple_gradient
-from tests.user_systems import cart
 from vmri_jax.running import adjoints
 
 
@@ -47,4 +46,4 @@ def test_what_auto_chooses(monkeypatch):
 @pytest.mark.parametrize("name", ["reversible", "forward"])
 def test_adjoints_that_do_not_exist(name):
     with pytest.raises(ValueError, match=f"adjoint is '{name}'; it must be one of 'auto', 'stored', 'checkpoint'"):
-        vm.simulate(cart(), vm.fully_explicit(2), macro_dt=0.1, num_steps=1, adjoint=name)
+        vm.Save(adjoint=name)

@@ -37,7 +37,7 @@ CASES = {  # problem, scheme, macro_dt, steps
 }
 
 
-def cost_of(problem: vm.Problem, scheme, macro_dt, steps, save_every, solver=None, **options):
+def cost_of(problem: vm.Problem, scheme, macro_dt, steps, save: vm.Save, solver=None):
     """A function of everything a run depends on and tells, ``cost(params, p_s, p_f, macro_dt)``, and where to take it."""
     state, system = problem.state(), problem.system
 
@@ -49,11 +49,10 @@ def cost_of(problem: vm.Problem, scheme, macro_dt, steps, save_every, solver=Non
             start,
             macro_dt=macro_dt,
             num_steps=steps,
-            save_every=save_every,
+            save=save,
             solver=solver,
-            **options,
         )
-        inside = jnp.sum(jnp.sin(run.q_f_micro)) + jnp.sum(run.t_micro) if options.get("save_micro") else 0.0
+        inside = jnp.sum(jnp.sin(run.q_f_micro)) + jnp.sum(run.t_micro) if save.micro else 0.0
         ends = jnp.sum(jnp.cos(run.q_f[1:])) + jnp.sum(run.q_s[-1] ** 2) + jnp.sum(run.p_s[1] ** 2) + jnp.sum(run.t)
         return ends + jnp.mean(run.energy) + inside
 
@@ -62,7 +61,7 @@ def cost_of(problem: vm.Problem, scheme, macro_dt, steps, save_every, solver=Non
 
 def simple_cost(adjoint, steps="solved"):
     """Of a small system without constraints, a function of the momenta at the start alone."""
-    cost, at = cost_of(CHAIN, SIMPLE[steps], 0.05, 6, 6, vm.Solver("masses"), adjoint=adjoint)
+    cost, at = cost_of(CHAIN, SIMPLE[steps], 0.05, 6, vm.Save(6, adjoint=adjoint), vm.Solver("masses"))
     return (lambda p_f: cost(at[0], at[1], p_f, at[3])), at[2]
 
 
@@ -73,11 +72,11 @@ def simple_gradient(adjoint, steps="solved"):
 
 
 @cache
-def gradient(case: str, save_every: int, adjoint: str, save_micro: bool = False):
+def gradient(case: str, every: int, adjoint: str, micro: bool = False):
     """All derivatives of a case in a row."""
     make, scheme, macro_dt, steps = CASES[case]
     solver = vm.Solver("masses") if case != "composed" else None
-    cost, at = cost_of(make(), scheme, macro_dt, steps, save_every, solver, adjoint=adjoint, save_micro=save_micro)
+    cost, at = cost_of(make(), scheme, macro_dt, steps, vm.Save(every, micro=micro, adjoint=adjoint), solver)
     derivatives = jax.jit(jax.grad(cost, argnums=(0, 1, 2, 3)))(*at)
     return np.concatenate([np.ravel(a) for a in jax.tree.leaves(derivatives)])
 
@@ -90,7 +89,7 @@ def assert_agree(derivatives, expected, tolerance=1e-10):
 @pytest.mark.parametrize("case", [pytest.param(c, marks=pytest.mark.full if c in LONG else ()) for c in CASES])
 def test_the_adjoints_agree(case):
     """Derivatives of macro nodes and of micro nodes."""
-    assert_agree(gradient(case, 4, "checkpoint", save_micro=True), gradient(case, 4, "stored", save_micro=True))
+    assert_agree(gradient(case, 4, "checkpoint", micro=True), gradient(case, 4, "stored", micro=True))
 
 
 @pytest.fixture
@@ -103,10 +102,10 @@ def three_parts_a_level(monkeypatch):
 
 
 @pytest.mark.usefixtures("three_parts_a_level")
-@pytest.mark.parametrize("save_every", [1, 5])
-def test_levels_of_checkpoints(save_every):
+@pytest.mark.parametrize("every", [1, 5])
+def test_levels_of_checkpoints(every):
     """Four levels of saved nodes; two of saved nodes and two of the steps between."""
-    assert_agree(gradient("kicks", save_every, "checkpoint"), gradient("kicks", save_every, "stored"), 1e-11)
+    assert_agree(gradient("kicks", every, "checkpoint"), gradient("kicks", every, "stored"), 1e-11)
 
 
 @pytest.mark.full
@@ -117,9 +116,9 @@ def test_levels_of_checkpoints_of_steps_that_are_solved():
     assert_agree(jax.jit(jax.grad(cost))(p_f), simple_gradient("stored")(p_f), 1e-11)
 
 
-def memory(adjoint: str, steps: int, save_every: int) -> float:
+def memory(adjoint: str, steps: int, every: int) -> float:
     """Bytes that the program of a gradient needs besides what goes in and out."""
-    cost, at = cost_of(CHAIN, vm.fully_explicit(2), 0.02, steps, save_every, adjoint=adjoint)
+    cost, at = cost_of(CHAIN, vm.fully_explicit(2), 0.02, steps, vm.Save(every, adjoint=adjoint))
     analysis = jax.jit(jax.grad(cost)).lower(*at).compile().memory_analysis()
     assert analysis is not None
     return analysis.temp_size_in_bytes
@@ -137,7 +136,7 @@ def test_where_masses_fail_exact_matrices_are_differentiated():
     problem = PROBLEMS["tsp"]()
     found = {}
     for name in ("stored", "checkpoint"):
-        cost, at = cost_of(problem, vm.fully_implicit(1), 0.3, 4, 2, adjoint=name)
+        cost, at = cost_of(problem, vm.fully_implicit(1), 0.3, 4, vm.Save(2, adjoint=name))
         found[name] = jax.jit(jax.grad(cost))(*at)
     run = vm.simulate(problem, vm.fully_implicit(1), macro_dt=0.3, num_steps=4)
     assert max(run.info.method) == vm.Method.EXACT

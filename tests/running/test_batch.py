@@ -34,7 +34,7 @@ def spread(problem, lanes: int) -> State:
 
 
 SYSTEMS = PROBLEMS | {"chain": partial(vm.systems.fermi_pasta_ulam, 1), "pendulum": swinging, "cart": cart}
-RUN: dict[str, Any] = {"num_steps": 20, "save_every": 5}
+RUN: dict[str, Any] = {"num_steps": 20, "save": 5}
 WAYS = {  # system, scheme, macro_dt, largest difference of a lane from its single run
     "kicks": ("chain", fully_explicit(3), 0.05, 1e-13),  # measured 3e-15
     "linear fast equations": ("chain", explicit_slow(3), 0.05, 1e-13),

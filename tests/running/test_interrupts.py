@@ -8,7 +8,7 @@ import threading
 import numpy as np
 import pytest
 
-from vmri_jax import Interrupted, fully_explicit, simulate
+from vmri_jax import Interrupted, Save, fully_explicit, simulate
 from vmri_jax.running.interrupts import interrupts_noted
 from vmri_jax.running.simulation import Simulation
 
@@ -67,7 +67,7 @@ def test_a_run_hands_back_what_was_computed(fpu, monkeypatch):
     expected = simulate(fpu.system, fully_explicit(2), fpu.state(), **arguments)
     monkeypatch.setattr(Simulation, "advance", advance)
     with pytest.raises(Interrupted, match=r"interrupted after 6 of 100 macro steps") as caught:
-        simulate(fpu.system, fully_explicit(2), fpu.state(), progress=True, **arguments)
+        simulate(fpu.system, fully_explicit(2), fpu.state(), save=Save(progress=True), **arguments)
     found = caught.value.done
     assert found.success
     assert np.array_equal(found.q_f, expected.q_f[:7])

@@ -12,7 +12,7 @@ import pytest
 
 import vmri_jax as vm
 from tests.running.test_batch import RUN, SYSTEMS, WAYS, lane_of, spread
-from tests.support import largest_difference
+from tests.support import largest_difference, until_failure
 from tests.user_systems import two_oscillators
 from vmri_jax import (
     Method,
@@ -84,7 +84,7 @@ def test_vmap_of_simulate_equals_the_loop(name, scheme, macro_dt, solver):
     def go(v_s, v_f, macro_dt, params):
         system = problem.system.replace(params=params)
         state = initial_state(system, problem.q_s, problem.q_f, v_s, v_f, project=True)
-        return simulate(system, scheme, state, macro_dt=macro_dt, solver=solver, throw=False, **RUN)
+        return until_failure(system, scheme, state, macro_dt=macro_dt, solver=solver, **RUN)
 
     batch = jax.jit(jax.vmap(go))(v_s, v_f, steps, params)
     assert batch.q_f.shape == (LANES, 5, problem.q_f.size)
@@ -115,7 +115,7 @@ def test_lanes_that_the_march_does_not_solve_are_solved_exactly():
 def test_chunks_of_a_batch_do_not_change_it(fpu):
     """Eighteen chunks of two lanes, the last of them half full."""
     states = spread(fpu, 35)
-    run = {"macro_dt": 0.02, "num_steps": 12, "save_every": 4}
+    run = {"macro_dt": 0.02, "num_steps": 12, "save": 4}
     whole = simulate_batch(fpu.system, fully_explicit(3), states, **run)
     in_chunks = simulate_batch(fpu.system, fully_explicit(3), states, chunk=2, **run)
     assert in_chunks.q_f.shape == whole.q_f.shape == (35, 4, 3)
@@ -135,7 +135,7 @@ def test_one_compilation_for_all_chunks_and_step_sizes(fpu):
     system = fpu.system.replace(fast_potential=counted)
     simulate_batch(system, fully_explicit(4), spread(fpu, 7), macro_dt=0.02, num_steps=10, chunk=2)
     before = calls
-    simulate_batch(system, fully_explicit(4), spread(fpu, 5), macro_dt=0.01, num_steps=20, save_every=2, chunk=2)
+    simulate_batch(system, fully_explicit(4), spread(fpu, 5), macro_dt=0.01, num_steps=20, save=2, chunk=2)
     assert calls == before
 
 

@@ -84,7 +84,7 @@ def assert_derivative(program, step=1e-5, tolerance=1e-8):
 
 
 def last_position(system, start, scheme, adjoint="auto"):
-    run = vm.simulate(system, scheme, start, adjoint=adjoint, **STEPS)
+    run = vm.simulate(system, scheme, start, save=vm.Save(adjoint=adjoint), **STEPS)
     return jnp.concatenate([run.q_s[-1], run.q_f[-1]])[0]
 
 
@@ -118,7 +118,7 @@ def test_derivatives_outside_of_jit():
 
 def test_prepared_runs_and_batches():
     problem, scheme = vm.Problem(on_a_rod(9.81 * ONE, ONE), [], [0.6, -0.8]), vm.fully_explicit(1)
-    prepared = vm.prepare(problem, scheme, save_micro=True, **STEPS)()
+    prepared = vm.prepare(problem, scheme, save=vm.Save(micro=True), **STEPS)()
     starts = jax.tree.map(lambda a: jnp.stack([a, a]), problem.state())
     batch = vm.simulate_batch(problem.system, scheme, starts, **STEPS)
     np.testing.assert_allclose(batch.q_f[1], prepared.q_f, atol=1e-14)

@@ -11,6 +11,7 @@ from tests.support import largest_difference
 from vmri_jax import (
     Method,
     Result,
+    Save,
     SimulationError,
     State,
     explicit_slow,
@@ -23,7 +24,7 @@ from vmri_jax.running import progress
 from vmri_jax.steppers.solver import Solver
 
 CALLS = Counter()
-STEPS = {"macro_dt": 0.03, "num_steps": 8, "save_every": 2}
+STEPS = {"macro_dt": 0.03, "num_steps": 8, "save": 2}
 
 
 def watched(q_f, params):
@@ -36,8 +37,8 @@ def moved(state: State) -> State:
 
 
 def test_it_runs_what_simulate_runs(fpu):
-    run = prepare(fpu.system, explicit_slow(3), fpu.state(), **STEPS, save_micro=True)
-    expected = simulate(fpu.system, explicit_slow(3), fpu.state(), **STEPS, save_micro=True)
+    run = prepare(fpu.system, explicit_slow(3), fpu.state(), **STEPS | {"save": Save(2, micro=True)})
+    expected = simulate(fpu.system, explicit_slow(3), fpu.state(), **STEPS | {"save": Save(2, micro=True)})
     for name in ("t", "q_s", "q_f", "p_s", "p_f", "energy", "t_micro", "q_f_micro"):
         assert np.array_equal(getattr(run(), name), getattr(expected, name)), name
 
@@ -50,7 +51,7 @@ def test_numbers_change_without_compiling_again(fpu):
     changed = run(moved(fpu.state()), macro_dt=0.01, params=params, num_steps=20)
     assert Counter() == CALLS
     expected = simulate(
-        system.replace(params=params), fully_implicit(3), moved(fpu.state()), macro_dt=0.01, num_steps=20, save_every=5
+        system.replace(params=params), fully_implicit(3), moved(fpu.state()), macro_dt=0.01, num_steps=20, save=5
     )
     assert Counter() == CALLS  # the same program
     assert largest_difference(changed.q_f, expected.q_f) == 0
@@ -61,7 +62,7 @@ def test_numbers_change_without_compiling_again(fpu):
 def test_the_fallback_takes_over_and_says_so(tsp, capsys, monkeypatch):
     monkeypatch.setattr(progress, "SECONDS_BETWEEN_LINES", 0.0)
     solver = Solver(max_iterations=40)
-    run = prepare(tsp, fully_implicit(10), macro_dt=0.2, num_steps=20, save_every=5, solver=solver)
+    run = prepare(tsp, fully_implicit(10), macro_dt=0.2, num_steps=20, save=5, solver=solver)
     trajectory = run()
     assert trajectory.success
     line = "a step was not solved: computing its part of the run again with exact matrices"

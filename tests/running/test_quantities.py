@@ -13,6 +13,7 @@ import pandas
 import pytest
 
 import vmri_jax as vm
+from tests.support import until_failure
 from tests.user_systems import GRAVITY, LENGTH, MASS, drag, hanging_weight, own_rod, swinging_rod
 from vmri_jax.plots.runs import _moduli
 from vmri_jax.scene import Anchor, Body, Gravity, LinearDamping, RigidLink, Scene, Spring
@@ -28,7 +29,7 @@ def pendulum(**changes) -> vm.Problem:
 @pytest.fixture(scope="module")
 def swing():
     scheme = vm.fully_implicit(10)
-    return vm.simulate(pendulum(), scheme, macro_dt=0.05, num_steps=40, save_micro=True)
+    return vm.simulate(pendulum(), scheme, macro_dt=0.05, num_steps=40, save=vm.Save(micro=True))
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +45,7 @@ def hanging():
 
 @pytest.fixture(scope="module")
 def hanging_run(hanging):
-    return vm.simulate(hanging, vm.fully_implicit(40), macro_dt=0.02, num_steps=50, save_micro=True)
+    return vm.simulate(hanging, vm.fully_implicit(40), macro_dt=0.02, num_steps=50, save=vm.Save(micro=True))
 
 
 def test_velocities_are_those_of_the_momenta(swing):
@@ -70,15 +71,15 @@ def test_the_tension_of_a_pendulum(swing, micro):
 def test_micro_nodes_must_be_there():
     for num_micro in (2, 10):
         scheme = vm.fully_implicit(num_micro)
-        few = vm.simulate(pendulum(), scheme, macro_dt=0.05, num_steps=8, save_every=2, save_micro=True)
-        with pytest.raises(ValueError, match=r"some macro steps only; simulate with save_every=1"):
+        few = vm.simulate(pendulum(), scheme, macro_dt=0.05, num_steps=8, save=vm.Save(2, micro=True))
+        with pytest.raises(ValueError, match="some macro steps only; simulate with save"):
             few.multipliers(micro=True)
     jumping = vm.compose(vm.fully_implicit(2), "suzuki4")
-    back = vm.simulate(pendulum(), jumping, macro_dt=0.05, num_steps=4, save_micro=True)
+    back = vm.simulate(pendulum(), jumping, macro_dt=0.05, num_steps=4, save=vm.Save(micro=True))
     with pytest.raises(ValueError, match=r"the stages of its composition go back in time"):
         back.multipliers(micro=True)
     none = vm.simulate(pendulum(), vm.fully_implicit(2), macro_dt=0.05, num_steps=4)
-    with pytest.raises(ValueError, match=r"kept none; simulate with save_micro=True"):
+    with pytest.raises(ValueError, match="kept none; simulate with save"):
         none.reaction_forces("rod", micro=True)
 
 
@@ -290,7 +291,12 @@ def test_a_run_as_parquet(swing, tmp_path):
 
 def test_a_streamed_run_is_the_same(swing, tmp_path):
     stored = vm.stream(
-        pendulum(), vm.fully_implicit(10), out=tmp_path / "run.zarr", macro_dt=0.05, num_steps=40, save_micro=True
+        pendulum(),
+        vm.fully_implicit(10),
+        out=tmp_path / "run.zarr",
+        macro_dt=0.05,
+        num_steps=40,
+        save=vm.Save(micro=True),
     )
     assert np.array_equal(stored.multipliers()["rod"], swing.multipliers()["rod"])
     read = vm.StoredTrajectory(tmp_path / "run.zarr")
@@ -304,7 +310,7 @@ def test_parts_of_a_run_that_failed():
     scheme = vm.fully_explicit(1, 0.5)
     system = vm.System(vm.ConstantMass([], [1.0]), fast_potential=lambda q_f, params: 50.0 * q_f[0] ** 4)
     problem = vm.Problem(system, [], [1.0], [], [0.0])
-    run = vm.simulate(problem, scheme, macro_dt=1.0, num_steps=20, throw=False)
+    run = until_failure(problem, scheme, macro_dt=1.0, num_steps=20)
     assert not run.success
     last = int(np.flatnonzero(np.isfinite(run.energy))[-1])
     assert run[: last + 1].success

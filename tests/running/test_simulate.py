@@ -1,5 +1,6 @@
 """simulate: times, saving, resuming, failures, compilation."""
 
+import inspect
 from collections import Counter
 
 import jax
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 
 import vmri_jax as vm
-from tests.support import largest_difference
+from tests.support import largest_difference, until_failure
 from vmri_jax import (
     ConstantMass,
     Problem,
@@ -32,13 +33,13 @@ H = 0.03
 
 
 def run(problem, scheme=SCHEME, **changes):
-    arguments = {"state": problem.state(), "macro_dt": H, "num_steps": 20, "save_every": 2} | changes
+    arguments = {"state": problem.state(), "macro_dt": H, "num_steps": 20, "save": 2} | changes
     return simulate(problem.system, scheme, **arguments)
 
 
 @pytest.fixture(scope="module")
 def every_step(fpu):
-    return run(fpu, save_every=1, save_micro=True)
+    return run(fpu, save=vm.Save(micro=True))
 
 
 def assert_equal(a, b, tolerance=0.0):
@@ -49,7 +50,7 @@ def assert_equal(a, b, tolerance=0.0):
 def test_times_are_computed_from_the_step_number(fpu):
     start = fpu.state()
     state = State(jnp.asarray(0.1), start.q_s, start.q_f, start.p_s, start.p_f)
-    trajectory = run(fpu, state=state, num_steps=2000, save_every=100)
+    trajectory = run(fpu, state=state, num_steps=2000, save=100)
     exact = 0.1 + 100 * np.arange(21) * H
     accumulated = 0.1 + np.concatenate([[0.0], np.cumsum(np.full(2000, H))])[::100]
     assert np.abs(accumulated - exact).max() > 1e-13
@@ -82,15 +83,22 @@ def test_micro_nodes(every_step):
 
 
 def test_save_every_keeps_a_part_of_the_same_run(fpu, every_step):
-    sparse = run(fpu, save_every=4, save_micro=True)
+    sparse = run(fpu, save=vm.Save(4, micro=True))
     for name in ("t", "q_s", "q_f", "p_s", "p_f", "energy"):
         assert largest_difference(getattr(sparse, name), getattr(every_step, name)[::4]) < 1e-14
     assert np.allclose(sparse.q_f_micro, every_step.q_f_micro[3::4], rtol=0, atol=1e-14)
     assert np.array_equal(sparse.info.iterations, np.max(np.reshape(every_step.info.iterations, (5, 4)), axis=1))
 
 
-def test_micro_dt_is_macro_dt_over_num_micro(fpu, every_step):
-    assert_equal(run(fpu, save_every=1, save_micro=True, macro_dt=None, micro_dt=H / 3), every_step, 1e-13)
+def test_simulate_has_at_most_ten_arguments():
+    assert len(inspect.signature(simulate).parameters) <= 10
+
+
+def test_saved_intervals_by_number(fpu):
+    by_number = run(fpu, save=vm.Save(number=10))
+    jax.tree.map(np.testing.assert_array_equal, run(fpu), by_number)
+    with pytest.raises(ValueError, match="got every = 2 and number = 10; give one"):
+        vm.Save(2, number=10)
 
 
 def test_a_run_is_a_chain_of_macro_steps(fpu, every_step):
@@ -104,9 +112,9 @@ def test_a_run_is_a_chain_of_macro_steps(fpu, every_step):
 
 
 def test_progress_changes_nothing(fpu, every_step, capsys):
-    assert_equal(run(fpu, save_every=1, save_micro=True, progress=True), every_step, 1e-14)
-    with_progress = run(fpu, save_every=1, save_micro=True, progress=True, num_steps=60)
-    without = run(fpu, save_every=1, save_micro=True, num_steps=60)  # two saved nodes per part
+    assert_equal(run(fpu, save=vm.Save(micro=True, progress=True)), every_step, 1e-14)
+    with_progress = run(fpu, save=vm.Save(micro=True, progress=True), num_steps=60)
+    without = run(fpu, save=vm.Save(micro=True), num_steps=60)  # two saved nodes per part
     assert_equal(with_progress, without, 1e-13)
     assert np.array_equal(with_progress.info.iterations, without.info.iterations)
     assert np.array_equal(with_progress.t_micro, without.t_micro)
@@ -123,7 +131,7 @@ def test_a_run_is_resumed_from_its_final_state(fpu, scheme):
 
 
 def test_jit_of_simulate_is_simulate(fpu):
-    inside = jax.jit(lambda state, dt: simulate(fpu.system, SCHEME, state, macro_dt=dt, num_steps=20, save_every=2))
+    inside = jax.jit(lambda state, dt: simulate(fpu.system, SCHEME, state, macro_dt=dt, num_steps=20, save=2))
     assert_equal(inside(fpu.state(), H), run(fpu), 1e-13)
 
 
@@ -141,7 +149,7 @@ def hits_the_wall(fpu):
 
 def test_failure_is_raised_with_all_there_is_to_know(hits_the_wall):
     with pytest.raises(SimulationError, match=r"macro step \d+ at t = .* failed \(NON_FINITE\)") as caught:
-        run(hits_the_wall, fully_explicit(3), save_every=1, save_micro=True)
+        run(hits_the_wall, fully_explicit(3), save=vm.Save(micro=True))
     error = caught.value
     trajectory, k = error.trajectory, error.step
     assert error.result is Result.NON_FINITE
@@ -158,16 +166,22 @@ def test_failure_is_raised_with_all_there_is_to_know(hits_the_wall):
     assert np.isnan(trajectory.q_f_micro[k:]).all()
     assert np.isfinite(trajectory.t).all()
     assert str(k) in str(error)
-    assert "throw=False" in str(error)
+    assert ".trajectory has the run up to there" in str(error)
 
 
-def test_failure_is_returned_on_request(hits_the_wall):
-    trajectory = run(hits_the_wall, fully_explicit(3), save_every=1, save_micro=True, throw=False)
+def failed(problem, **changes) -> vm.Trajectory:
+    with pytest.raises(SimulationError) as caught:
+        run(problem, fully_explicit(3), **changes)
+    return caught.value.trajectory
+
+
+def test_a_failure_has_its_trajectory(hits_the_wall):
+    trajectory = failed(hits_the_wall, save=vm.Save(micro=True))
     assert not trajectory.success
     assert Result(int(trajectory.result)) is Result.NON_FINITE
-    sparse = run(hits_the_wall, fully_explicit(3), save_every=4, throw=False)
+    sparse = failed(hits_the_wall, save=4)
     assert int(sparse.failed_at) == int(trajectory.failed_at)
-    parts = run(hits_the_wall, fully_explicit(3), save_every=1, save_micro=True, throw=False, progress=True)
+    parts = failed(hits_the_wall, save=vm.Save(micro=True, progress=True))
     assert int(parts.failed_at) == int(trajectory.failed_at)
     assert np.array_equal(parts.q_f, trajectory.q_f, equal_nan=True)
 
@@ -183,10 +197,10 @@ def test_too_few_iterations_fail_the_run(fpu):
 
 def test_an_unstable_explicit_step_fails_cleanly(fpu):
     """omega h = 2.1 is beyond the limit 2: it grows until it overflows."""
-    trajectory = run(fpu, fully_explicit(3), macro_dt=3 * 2.1 / 50, num_steps=3000, save_every=300, throw=False)
+    trajectory = failed(fpu, macro_dt=3 * 2.1 / 50, num_steps=3000, save=300)
     assert Result(int(trajectory.result)) is Result.NON_FINITE
     assert np.isnan(trajectory.q_f[-1]).all()
-    stable = run(fpu, fully_explicit(3), macro_dt=3 * 1.9 / 50, num_steps=3000, save_every=300, throw=False)
+    stable = run(fpu, fully_explicit(3), macro_dt=3 * 1.9 / 50, num_steps=3000, save=300)
     assert stable.success
 
 
@@ -210,7 +224,7 @@ def test_sweeps_trace_the_users_functions_once(fpu, make):
         params = {"kappa": jnp.asarray(kappa), "omega": jnp.asarray(50.0)}
         system = fpu.system.replace(slow_potential=watched_slow, fast_potential=watched_fast, params=params)
         return simulate(
-            system, make(2, alpha), fpu.state(), macro_dt=macro_dt, num_steps=4 * save_every, save_every=save_every
+            system, make(2, alpha), fpu.state(), macro_dt=macro_dt, num_steps=4 * save_every, save=save_every
         )
 
     first = swept()
@@ -306,13 +320,13 @@ def test_lengths_of_runs_share_a_program(fpu, request):
 
 def test_pieces_of_a_run_make_the_whole(fpu, monkeypatch):
     """Short pieces: the same nodes, to the last bit, micro nodes too; and after a failure in one of them NaN to the end."""
-    whole = simulate(fpu, fully_implicit(2), macro_dt=0.05, num_steps=36, save_every=2, save_micro=True)
+    whole = simulate(fpu, fully_implicit(2), macro_dt=0.05, num_steps=36, save=vm.Save(2, micro=True))
     monkeypatch.setattr("vmri_jax.running.saved.NUMBERS_PER_PIECE", 100)
-    pieces = simulate(fpu, fully_implicit(2), macro_dt=0.05, num_steps=36, save_every=2, save_micro=True)
+    pieces = simulate(fpu, fully_implicit(2), macro_dt=0.05, num_steps=36, save=vm.Save(2, micro=True))
     jax.tree.map(np.testing.assert_array_equal, whole, pieces)
 
     steep = fpu.system.replace(fast_potential=lambda q_f, params: jnp.log(1.2 - q_f[0]) - 1e2 * q_f[0])
-    failed = simulate(steep, fully_explicit(1), fpu.state(), macro_dt=0.01, num_steps=60, throw=False)
+    failed = until_failure(steep, fully_explicit(1), fpu.state(), macro_dt=0.01, num_steps=60)
     assert 5 < failed.failed_at < 55
     known = np.isfinite(np.asarray(failed.energy))
     assert known[: int(failed.failed_at)].all()
@@ -330,7 +344,7 @@ def test_systems_of_the_same_functions_and_other_sizes(monkeypatch):
     for n_s, n_f in ((1, 2), (2, 1), (2, 2), (1, 2)):
         system = vm.System(vm.ConstantMass([1.0] * n_s, [1.0] * n_f), springs, None)
         problem = vm.Problem(system, q_s=[0.1] * n_s, q_f=[0.2] * n_f)
-        run = simulate(problem, fully_implicit(2), macro_dt=0.01, num_steps=4, save_micro=True)
+        run = simulate(problem, fully_implicit(2), macro_dt=0.01, num_steps=4, save=vm.Save(micro=True))
         assert (run.q_s.shape, run.q_f.shape, run.q_f_micro.shape) == ((5, n_s), (5, n_f), (4, 2, n_f))
         np.testing.assert_allclose(run.q_s[-1], 0.1, atol=1e-3)
         np.testing.assert_allclose(run.q_f[-1], 0.2, atol=1e-3)

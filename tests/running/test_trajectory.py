@@ -6,7 +6,7 @@ import equinox as eqx
 import numpy as np
 import pytest
 
-from vmri_jax import Result, State, Trajectory, explicit_slow, simulate
+from vmri_jax import Result, Save, State, Trajectory, explicit_slow, simulate
 from vmri_jax.running.trajectory import join
 
 FIELDS = ("t", "q_s", "q_f", "p_s", "p_f", "energy", "constraint_residual")
@@ -14,9 +14,7 @@ FIELDS = ("t", "q_s", "q_f", "p_s", "p_f", "energy", "constraint_residual")
 
 @pytest.fixture(scope="module")
 def trajectory(tsp):
-    return simulate(
-        tsp.system, explicit_slow(3), tsp.state(), macro_dt=0.02, num_steps=12, save_every=3, save_micro=True
-    )
+    return simulate(tsp.system, explicit_slow(3), tsp.state(), macro_dt=0.02, num_steps=12, save=Save(3, micro=True))
 
 
 def test_save_and_load_keep_everything(trajectory, tmp_path):
@@ -59,7 +57,7 @@ def test_files_hold_no_pickles(trajectory, tmp_path):
 def test_a_loaded_run_is_resumed(tsp, trajectory, tmp_path):
     trajectory.save(tmp_path / "run.npz")
     state = Trajectory.load(tmp_path / "run.npz").final_state
-    resumed = simulate(tsp.system, explicit_slow(3), state, macro_dt=0.02, num_steps=12, save_every=3, save_micro=True)
+    resumed = simulate(tsp.system, explicit_slow(3), state, macro_dt=0.02, num_steps=12, save=Save(3, micro=True))
     assert float(resumed.t[0]) == pytest.approx(0.24)
     assert np.array_equal(resumed.q_f[0], trajectory.q_f[-1])
     assert float(resumed.constraint_residual.max()) < 1e-12

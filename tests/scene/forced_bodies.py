@@ -80,7 +80,7 @@ EXACT = {"damped": damped, "driven": driven, "pulled": driven, "falling": fallin
 
 
 def run(scheme, steps):
-    step = {"macro_dt": T_END / steps, "num_steps": steps, "save_every": steps // SAVES}
+    step = {"macro_dt": T_END / steps, "num_steps": steps, "save": steps // SAVES}
     return simulate(SCENE.system(), scheme, SCENE.state(), **step)
 
 

@@ -133,9 +133,7 @@ def test_a_run_with_frames_has_the_order_of_its_scheme():
     )
     scene = scene.with_joints({"pan": (0.0, 1.0), "wrist": 0.2})
     ends = [
-        vm.simulate(scene, vm.fully_implicit(5), macro_dt=0.02 / n, num_steps=20 * n, save_every=20 * n).position(
-            "hand"
-        )[-1]
+        vm.simulate(scene, vm.fully_implicit(5), macro_dt=0.02 / n, num_steps=20 * n, save=20 * n).position("hand")[-1]
         for n in (1, 2, 4)
     ]
     assert np.linalg.norm(ends[0] - ends[1]) / np.linalg.norm(ends[1] - ends[2]) == pytest.approx(4.0, rel=0.1)

@@ -121,7 +121,7 @@ def test_a_floating_root_keeps_all_momenta(run):
 def test_the_motion_is_that_by_directors_to_the_order_of_the_scheme(run):
     errors = []
     for refined in (1, 2):
-        steps = {"macro_dt": 0.05 / refined, "num_steps": 20 * refined, "save_every": 20 * refined}
+        steps = {"macro_dt": 0.05 / refined, "num_steps": 20 * refined, "save": 20 * refined}
         one, other = (vm.simulate(satellite(kind), vm.fully_implicit(10), **steps) for kind in ("joint", "directors"))
         errors.append(max(float(np.abs(one.position(b)[-1] - other.position(b)[-1]).max()) for b in ("hub", "panel")))
     assert errors[0] < 1e-2

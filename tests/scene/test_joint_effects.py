@@ -56,7 +56,7 @@ def test_a_hinged_bar_is_the_compound_pendulum(pace):
     )
     errors = []
     for steps in (50, 100):
-        run = vm.simulate(scene, ONE, macro_dt=2.0 / steps, num_steps=steps, save_every=steps // 50)
+        run = vm.simulate(scene, ONE, macro_dt=2.0 / steps, num_steps=steps, save=steps // 50)
         errors.append(abs(0.5 + angles(scene, run)[-1] - exact.y[0, -1]))
     assert errors[1] < 7e-4  # measured 6.1e-4
     assert errors[0] / errors[1] == pytest.approx(4, rel=0.05)

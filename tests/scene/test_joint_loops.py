@@ -34,7 +34,7 @@ def test_a_joint_between_a_slow_and_a_fast_body():
     bands = []
     for steps in (20, 40):
         run = vm.simulate(
-            scene, vm.fully_implicit(num_micro=10), macro_dt=1.0 / steps, num_steps=steps, save_every=steps // 20
+            scene, vm.fully_implicit(num_micro=10), macro_dt=1.0 / steps, num_steps=steps, save=steps // 20
         )
         assert np.abs(run.constraint_residual).max() < 1e-12
         bands.append(np.ptp(run.energy) / run.energy[0])

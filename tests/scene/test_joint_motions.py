@@ -29,7 +29,7 @@ def arm(length: Any = 1.0, mass: Any = 0.7, stiffness: Any = 3.0, rate: Any = "s
 
 def end(scheme, steps: int, scene=None):
     """Both angles after 0.4 s."""
-    run = vm.simulate(scene or arm(), scheme, macro_dt=0.4 / steps, num_steps=steps, save_every=steps)
+    run = vm.simulate(scene or arm(), scheme, macro_dt=0.4 / steps, num_steps=steps, save=steps)
     return np.concatenate([run.position("shoulder")[-1], run.position("elbow")[-1]])
 
 
@@ -51,7 +51,7 @@ def test_micro_steps_have_the_order_of_their_scheme():
 
 def test_energy_of_a_long_run_does_not_drift():
     """1e5 steps of 0.02 s, chaotic: the error of the energy stays in the band of the first steps."""
-    run = vm.simulate(arm(), vm.fully_implicit(1), macro_dt=0.02, num_steps=100_000, save_every=10)
+    run = vm.simulate(arm(), vm.fully_implicit(1), macro_dt=0.02, num_steps=100_000, save=10)
     error = np.asarray(run.energy - run.energy[0])
     pieces = np.abs(error[1:]).reshape(10, -1).max(axis=1)
     assert pieces[-1] < 1.5 * pieces[0], pieces
@@ -65,7 +65,7 @@ def test_gradients_through_length_mass_and_stiffness():
     @jax.jit
     def reach(numbers):
         scene = arm(*numbers)
-        run = vm.simulate(scene.system(), scheme, scene.state(), macro_dt=0.02, num_steps=20, save_every=20)
+        run = vm.simulate(scene.system(), scheme, scene.state(), macro_dt=0.02, num_steps=20, save=20)
         return run.q_s[-1, 0] + 2 * run.q_s[-1, 1]
 
     numbers = jnp.array([1.0, 0.7, 3.0])

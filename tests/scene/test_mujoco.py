@@ -211,7 +211,7 @@ def test_an_arm_from_a_urdf_moves_as_in_mujoco(tmp_path):
     scene = Scene.from_mujoco(path, qpos=qpos, qvel=qvel, ignore=["limits"])
     assert sum(x.size for x in scene.start[:2]) == 6
     scheme = vm.compose(vm.fully_implicit(1), "suzuki4")
-    run = vm.simulate(scene, scheme, macro_dt=0.005, num_steps=100, save_every=100)
+    run = vm.simulate(scene, scheme, macro_dt=0.005, num_steps=100, save=100)
     end = motion(model, qpos, qvel, 0.5)
     for i in range(6):
         np.testing.assert_allclose(qpos[i] + scene.joint_motion(run, f"axis{i}")[-1], end.qpos[i], atol=1e-6)

@@ -47,7 +47,7 @@ def test_cyclotron_motion(scheme, steps):
     scene = Scene([Body("ion", mass, [radius, 0.0], [0.0, -speed], pace="slow")], [MagneticField(field, charge)])
     errors = []
     for n in steps:
-        step = {"macro_dt": 4.0 / n, "num_steps": n, "save_every": n // 20}
+        step = {"macro_dt": 4.0 / n, "num_steps": n, "save": n // 20}
         trajectory = simulate(scene.system(), scheme, scene.state(), **step)
         t = np.asarray(trajectory.t)
         exact = radius * np.stack([np.cos(w * t), -np.sin(w * t)], axis=1)

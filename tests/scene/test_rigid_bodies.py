@@ -52,7 +52,7 @@ def test_a_free_body_turns_as_jacobi_says_with_order_2_degree(degree):
     errors = []
     for steps in (20, 40):
         scheme = vm.galerkin(num_micro=1, degree=degree)
-        run = vm.simulate(scene, scheme, macro_dt=4.0 / steps, num_steps=steps, save_every=steps // 20)
+        run = vm.simulate(scene, scheme, macro_dt=4.0 / steps, num_steps=steps, save=steps // 20)
         errors.append(np.abs(spins(run) - free_motion(np.asarray(run.t))).max())
     assert np.log2(errors[0] / errors[1]) == pytest.approx(2 * degree, abs=0.1)
     assert errors[1] < (6e-3, 2e-6, 3e-10)[degree - 1]
@@ -83,7 +83,7 @@ def test_a_steady_top_precesses_without_nutation_to_second_order():
     scene = Scene([top], [Gravity(), Spherical(("ground", "top"), [0.0, 0.0, 0.0])])
     nutation, late = [], []
     for steps in (100, 200):
-        run = vm.simulate(scene, ONE, macro_dt=2.0 / steps, num_steps=steps, save_every=steps // 100)
+        run = vm.simulate(scene, ONE, macro_dt=2.0 / steps, num_steps=steps, save=steps // 100)
         axes = rotation(run.position("top"))[..., 2]
         nutation.append(np.ptp(axes[:, 2]))
         late.append(abs(np.arctan2(axes[-1, 1], axes[-1, 0]) - 2.0 * precession))

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import vmri_jax as vm
+from tests.support import until_failure
 from vmri_jax.scene import (
     Box,
     Controlled,
@@ -223,7 +224,7 @@ def test_springs_and_limits_beyond_half_a_turn():
     """A spring of 2 N m/rad at 8 rad/s turns by 8 / sqrt(2) = 5.657 rad, a limit at 4.15 rad turns back at about 4.2 rad."""
     effects = sprung(2.0)
     scene = wheels(*effects, spin=(8.0, 2.0))
-    run = vm.simulate(scene, ONE, macro_dt=0.01, num_steps=500, save_every=5)
+    run = vm.simulate(scene, ONE, macro_dt=0.01, num_steps=500, save=5)
     largest = [np.abs(scene.joint_motion(run, name)).max() for name in ("hinge", "other")]
     assert largest == pytest.approx([5.657, 4.2], abs=0.04)
     with pytest.raises(ValueError, match=r"joint_springs: the largest angle of the run is 5\.6.*directors"):
@@ -236,14 +237,14 @@ def test_springs_and_limits_beyond_half_a_turn():
 
 def test_a_run_by_directors_ends_before_half_a_turn():
     scene = wheels(JointSpring("hinge", 2.0), coordinates="directors", spin=(8.0, 0.0))
-    run = vm.simulate(scene, ONE, macro_dt=0.01, num_steps=100, throw=False)
+    run = until_failure(scene, ONE, macro_dt=0.01, num_steps=100)
     assert Result(int(run.result)) == Result.NON_FINITE
     assert 'coordinates="joint"' in str(run.result)
     reached = run.position("wheel")[int(run.failed_at), 3:5]
     assert np.arctan2(*reached[::-1]) == pytest.approx(REACH, abs=0.1)
 
 
-SPINNING = {"macro_dt": 0.001, "num_steps": 1000, "save_every": 10}
+SPINNING = {"macro_dt": 0.001, "num_steps": 1000, "save": 10}
 """A second, in nodes 0.01 s apart."""
 
 
@@ -262,7 +263,7 @@ def test_turns_of_directors_are_counted_from_node_to_node():
     run = vm.simulate(scene, ONE, **SPINNING)
     # the scheme is ahead by 0.17 rad, as it turns by 0.1 rad in a step
     assert scene.joint_motion(run, "hinge")[-1] == pytest.approx(100.0, abs=0.2)
-    with pytest.raises(ValueError, match=r"hinge may turn by half a turn or more .* nodes 0 and 1.*save_every"):
+    with pytest.raises(ValueError, match=r"hinge may turn by half a turn or more .* nodes 0 and 1.*save="):
         scene.joint_motion(run[::5], "hinge")
 
 

@@ -79,7 +79,7 @@ def test_observed_order_where_only_v_is_explicit(composition):
 def test_equals_its_stages_one_by_one(name, base):
     problem, dt = PROBLEMS[name](), 0.01
     scheme = compose(base, "suzuki4")
-    run = vm.simulate(problem.system, scheme, problem.state(), macro_dt=dt, num_steps=3, save_micro=True)
+    run = vm.simulate(problem.system, scheme, problem.state(), macro_dt=dt, num_steps=3, save=vm.Save(micro=True))
     state, micro, solver = problem.state(), [], without_fallback(problem, base)
     for _ in range(3):
         micro.append([])

@@ -172,7 +172,7 @@ def test_explicit_chain_evaluates_v_once_and_w_num_micro_times_per_macro_step(fp
             fpu.state(),
             macro_dt=0.01,
             num_steps=num_steps,
-            save_every=num_steps,
+            save=num_steps,
         )
         run.q_s.block_until_ready()
         jax.effects_barrier()

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import vmri_jax as vm
+from tests.support import until_failure
 
 NONE = np.zeros(0)
 PERIODS = 1000
@@ -30,7 +31,7 @@ class Driven:
     def largest(self) -> float:
         """Largest position in a run of `PERIODS` periods over that in its first ten periods; infinite if the run fails."""
         steps = round(PERIODS * self.steps)
-        run = vm.simulate(self.problem, self.scheme, macro_dt=self.macro_dt, num_steps=steps, throw=False)
+        run = until_failure(self.problem, self.scheme, macro_dt=self.macro_dt, num_steps=steps)
         away = np.abs(np.concatenate([run.states.q_s - run.states.q_s[0], run.states.q_f - run.states.q_f[0]], axis=1))
         away = away[:, :2]  # the third coordinate of the top turns
         return float(away.max() / away[: round(10 * self.steps)].max()) if run.success else np.inf

@@ -45,7 +45,7 @@ def test_combination_resonance_of_the_fully_implicit_scheme():
 
     problem = linear_model()
     run = simulate(
-        problem.system, fully_implicit(57), problem.state(), macro_dt=CASE_3 / 50, num_steps=16000, save_every=4000
+        problem.system, fully_implicit(57), problem.state(), macro_dt=CASE_3 / 50, num_steps=16000, save=4000
     )
     amplitude = np.sqrt(run.energy)
     assert np.log(amplitude[-1] / amplitude[-2]) / 4000 == pytest.approx(growth[1], rel=0.01)

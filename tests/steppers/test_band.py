@@ -100,7 +100,7 @@ def test_linear_equations_of_a_band_are_exact(monkeypatch):
 
 def test_memory_of_long_chains():
     """In proportion to the number of springs: a full matrix of a thousand coordinates alone has 8 MB."""
-    run = vm.prepare(ring(1000), vm.fully_implicit(1), macro_dt=0.01, num_steps=4, save_every=4)
+    run = vm.prepare(ring(1000), vm.fully_implicit(1), macro_dt=0.01, num_steps=4, save=4)
     memory = run.compiled().memory_analysis()
     assert memory is not None
     assert memory.temp_size_in_bytes < 1e6

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tests.support import compiled_step, largest_difference, phase
+from tests.support import compiled_step, largest_difference, phase, until_failure
 from tests.user_systems import FULL_MASS, lifted, sphere
 from vmri_jax import (
     ConstantMass,
@@ -169,9 +169,9 @@ def test_few_iterations_at_high_degree(name, bound, request):
 def test_where_it_fails_the_whole_equations_are_asked(tsp):
     start = tsp.state()
     fast = dataclasses.replace(start, p_s=40 * start.p_s, p_f=40 * start.p_f)
-    step = {"macro_dt": 0.2, "num_steps": 10, "throw": False}
+    step = {"macro_dt": 0.2, "num_steps": 10}
     march, auto = (
-        simulate(tsp.system, galerkin(1, 3), fast, solver=Solver(matrix), **step) for matrix in ("modes", "auto")
+        until_failure(tsp.system, galerkin(1, 3), fast, solver=Solver(matrix), **step) for matrix in ("modes", "auto")
     )
     assert int(march.failed_at) == 0
     assert int(auto.info.method[0]) == Method.EXACT

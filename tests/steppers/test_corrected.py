@@ -60,12 +60,12 @@ def test_in_coordinates_that_move_along_it_is_of_order_four(fpu):
 
     params, t_end, errors = fpu.system.params, 0.5, []
     q, v = jnp.concatenate([fpu.q_s, fpu.q_f]), jnp.concatenate([fpu.v_s, fpu.v_f])
-    fine = vm.simulate(fpu.system, vm.galerkin(1, 4), fpu.state(), macro_dt=t_end / 200, num_steps=200, save_every=200)
+    fine = vm.simulate(fpu.system, vm.galerkin(1, 4), fpu.state(), macro_dt=t_end / 200, num_steps=200, save=200)
     for steps in (80, 160):
         h = t_end / steps
         x, w = q + h**2 / 12 * force(q), v - h**2 / 12 * jax.jvp(force, (q,), (v,))[1]
         start = vm.initial_state(fpu.system, x[:3], x[3:], w[:3], w[3:])
-        run = vm.simulate(fpu.system, vm.takahashi_imada(1), start, macro_dt=h, num_steps=steps, save_every=steps)
+        run = vm.simulate(fpu.system, vm.takahashi_imada(1), start, macro_dt=h, num_steps=steps, save=steps)
         x = jnp.concatenate([run.q_s[-1], run.q_f[-1]])
         x = x - h**2 / 12 * force(x)
         errors.append(largest_difference(x, jnp.concatenate([fine.q_s[-1], fine.q_f[-1]])))
@@ -74,10 +74,10 @@ def test_in_coordinates_that_move_along_it_is_of_order_four(fpu):
 
 def test_composed_it_is_of_order_four(fpu):
     state, fine = fpu.state(), vm.galerkin(1, 4)
-    exact = vm.simulate(fpu.system, fine, state, macro_dt=0.5 / 200, num_steps=200, save_every=200)
+    exact = vm.simulate(fpu.system, fine, state, macro_dt=0.5 / 200, num_steps=200, save=200)
     scheme, errors = vm.compose(vm.takahashi_imada(2), "suzuki4"), []
     for steps in (40, 80):
-        run = vm.simulate(fpu.system, scheme, state, macro_dt=0.5 / steps, num_steps=steps, save_every=steps)
+        run = vm.simulate(fpu.system, scheme, state, macro_dt=0.5 / steps, num_steps=steps, save=steps)
         errors.append(largest_difference(run.q_s[-1], exact.q_s[-1]))
     assert np.log2(errors[0] / errors[1]) == pytest.approx(4, abs=0.3)
 
@@ -102,12 +102,10 @@ def test_with_constraints_every_method_makes_the_same_step():
 
 def test_with_constraints_vibrations_keep_their_phase(tsp):
     """Errors after 16 periods of the spring: several times smaller with as many steps."""
-    fine = vm.simulate(
-        tsp.system, vm.galerkin(1, 8, "lobatto"), tsp.state(), macro_dt=0.02, num_steps=50, save_every=50
-    )
+    fine = vm.simulate(tsp.system, vm.galerkin(1, 8, "lobatto"), tsp.state(), macro_dt=0.02, num_steps=50, save=50)
 
     def error(scheme):
-        run = vm.simulate(tsp.system, scheme, tsp.state(), macro_dt=1 / 200, num_steps=200, save_every=200)
+        run = vm.simulate(tsp.system, scheme, tsp.state(), macro_dt=1 / 200, num_steps=200, save=200)
         return largest_difference(run.q_f[-1], fine.q_f[-1])
 
     assert error(vm.takahashi_imada(1)) < 0.1 * error(vm.fully_explicit(1))

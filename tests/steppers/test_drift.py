@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tests.support import largest_difference, phase
+from tests.support import largest_difference, phase, until_failure
 from tests.user_systems import cart, tied_system
 from vmri_jax import (
     Method,
@@ -75,7 +75,7 @@ def test_momenta_are_projected_where_they_are_saved(name, scheme, request):
     system, start = started(name, request)
 
     def run(save_every):
-        return simulate(system, scheme, start, macro_dt=DT, num_steps=20 * save_every, save_every=save_every)
+        return simulate(system, scheme, start, macro_dt=DT, num_steps=20 * save_every, save=save_every)
 
     often, rarely = run(1), run(5)
     for field in ("q_s", "q_f", "p_s", "p_f"):
@@ -96,9 +96,10 @@ def test_where_it_fails_the_whole_equations_are_asked(tsp):
     """A step so long that the rods cannot follow."""
     start = tsp.state()
     fast = dataclasses.replace(start, p_s=40 * start.p_s, p_f=40 * start.p_f)
-    step = {"macro_dt": 0.2, "num_steps": 20, "throw": False}
+    step = {"macro_dt": 0.2, "num_steps": 20}
     march, auto = (
-        simulate(tsp.system, fully_explicit(1), fast, solver=Solver(matrix), **step) for matrix in ("masses", "auto")
+        until_failure(tsp.system, fully_explicit(1), fast, solver=Solver(matrix), **step)
+        for matrix in ("masses", "auto")
     )
     assert Result(int(march.result)) is Result.NON_FINITE
     assert Result(int(auto.result)) is Result.STAGNATED

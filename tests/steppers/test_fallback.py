@@ -9,7 +9,7 @@ import pytest
 from jax.extend.core import jaxprs_in_params
 
 import vmri_jax as vm
-from tests.support import largest_difference
+from tests.support import largest_difference, until_failure
 from tests.user_systems import double_pendulum, two_oscillators
 from vmri_jax import (
     Method,
@@ -63,8 +63,8 @@ def test_auto_falls_back_where_the_march_does_not_converge():
     problem, solver = two_oscillators(kappa=25.0), Solver(max_iterations=6)
 
     def go(state, solver):
-        step = {"macro_dt": 40.0, "num_steps": 3, "solver": solver, "throw": False}
-        return simulate(problem.system, fully_implicit(20), state, **step)
+        step = {"macro_dt": 40.0, "num_steps": 3, "solver": solver}
+        return until_failure(problem.system, fully_implicit(20), state, **step)
 
     state = problem.state()
     march, run, exact = (go(state, n) for n in (Solver("masses", max_iterations=6), solver, Solver("exact")))
@@ -103,9 +103,9 @@ def test_the_fallback_stays_out_of_the_loop_in_a_compiled_function(tsp):
 
 def test_a_run_that_fails_late_is_made_again_with_exact_matrices(tsp):
     """At this step passes with masses solve seven or eight steps, as round-off has it, and not the next one."""
-    step = {"macro_dt": 0.2, "num_steps": 20, "throw": False}
+    step = {"macro_dt": 0.2, "num_steps": 20}
     march, run, exact = (
-        simulate(tsp, fully_implicit(10), solver=Solver(matrix, max_iterations=40), **step)
+        until_failure(tsp, fully_implicit(10), solver=Solver(matrix, max_iterations=40), **step)
         for matrix in ("masses", "auto", "exact")
     )
     assert 2 <= int(march.failed_at) < 20

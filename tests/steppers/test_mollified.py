@@ -65,7 +65,7 @@ def hardened():
 
     def end(scheme, macro_dt, num_steps, state=None):
         start = state or problem.state()
-        run = simulate(system, scheme, start, macro_dt=macro_dt, num_steps=num_steps, save_every=num_steps)
+        run = simulate(system, scheme, start, macro_dt=macro_dt, num_steps=num_steps, save=num_steps)
         return run.final_state
 
     return end

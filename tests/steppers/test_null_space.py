@@ -54,7 +54,7 @@ LONG = pytest.mark.full  # the motion is chaotic: over longer times both part, a
 )
 def test_trajectories_are_those_of_the_method_with_multipliers(make, step, steps):
     problem = make()
-    arguments = {"macro_dt": step, "num_steps": steps, "save_every": 20}
+    arguments = {"macro_dt": step, "num_steps": steps, "save": 20}
     runs = [
         vm.simulate(problem, vm.fully_implicit(num_micro=5), solver=solver, **arguments)
         for solver in (NULL_SPACE, vm.Solver("exact"))

@@ -107,7 +107,7 @@ CASES = [
 
 @pytest.mark.parametrize(("name", "scheme", "steps"), CASES)
 def test_order(name, scheme, steps):
-    runs = [run(SYSTEMS[name], scheme, n, save_every=n // 10) for n in steps]
+    runs = [run(SYSTEMS[name], scheme, n, save=n // 10) for n in steps]
     errors = [np.abs(trajectory.q_f[-1] - bob(T_END)).max() for trajectory in runs]
     assert observed_order(1 / np.array(steps), errors) == pytest.approx(scheme.order, abs=0.2), errors
     assert max(trajectory.constraint_residual.max() for trajectory in runs) < 1e-13  # positions and velocities

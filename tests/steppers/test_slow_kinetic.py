@@ -48,7 +48,7 @@ SCHEMES = {"fully implicit": (fully_implicit(4), (40, 80, 160), 2), "gauss 2": (
 
 def end_of(problem, scheme, num_steps):
     """The node at time 1."""
-    run = simulate(problem, scheme, macro_dt=1 / num_steps, num_steps=num_steps, save_every=num_steps)
+    run = simulate(problem, scheme, macro_dt=1 / num_steps, num_steps=num_steps, save=num_steps)
     return [np.asarray(getattr(run, name)[-1]) for name in NAMES]
 
 
@@ -78,7 +78,7 @@ def test_symplectic():
     def ends(x):
         at = moved.q_s, moved.q_f, moved.v_s, moved.v_f
         start = initial_state(moved.system, *(a + dx for a, dx in zip(at, np.split(x, 4), strict=True)))
-        run = simulate(moved.system, SCHEMES["fully implicit"][0], start, macro_dt=0.02, num_steps=20, save_every=20)
+        run = simulate(moved.system, SCHEMES["fully implicit"][0], start, macro_dt=0.02, num_steps=20, save=20)
         return start, node(run, 1)
 
     assert area_change(ends, 4) < 1e-11

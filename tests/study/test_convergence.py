@@ -58,7 +58,7 @@ def test_orders(study, scheme, order, quantity):
 
 def test_errors_are_the_largest_over_nodes_and_coordinates(study, reference):
     trajectory = vm.simulate(
-        PROBLEM.system, vm.fully_explicit(4), PROBLEM.state(), macro_dt=0.01, num_steps=100, save_every=20
+        PROBLEM.system, vm.fully_explicit(4), PROBLEM.state(), macro_dt=0.01, num_steps=100, save=20
     )
     q = np.concatenate([trajectory.q_s, trajectory.q_f], axis=1)
     (row,) = [row for row in study.rows if row.scheme == "second order" and row.macro_dt == 0.01]
@@ -191,7 +191,7 @@ def test_the_energy_of_a_driven_system_has_an_error_too():
         problem, {"implicit": vm.fully_implicit(2)}, (0.02, 0.01), 1.0, num_saves=5, reference=reference
     )
     coarse, fine = (row.energy_error for row in study.rows)
-    run = vm.simulate(problem, vm.fully_implicit(2), macro_dt=0.01, num_steps=100, save_every=20)
+    run = vm.simulate(problem, vm.fully_implicit(2), macro_dt=0.01, num_steps=100, save=20)
     assert abs(run.energy - run.energy[0]).max() > 3.0  # measured 6.3
     assert coarse / fine == pytest.approx(4, rel=0.05)  # measured 4.04
     assert fine < 2e-3  # measured 3.8e-4

@@ -36,9 +36,7 @@ def test_a_program_is_compiled_once_for_all_numbers_of_steps():
     assert len(traced) == before
     with pytest.raises(ValueError, match="multiple of 2"):
         program(5)
-    direct = vm.simulate(
-        problem.system, vm.fully_explicit(3), problem.state(), macro_dt=0.1, num_steps=10, save_every=5
-    )
+    direct = vm.simulate(problem.system, vm.fully_explicit(3), problem.state(), macro_dt=0.1, num_steps=10, save=5)
     np.testing.assert_allclose(program(10).q_f, direct.q_f, rtol=1e-12)
 
 

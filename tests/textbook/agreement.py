@@ -27,9 +27,7 @@ def agrees(structure: rs.Structure, draw: rs.Draw) -> str:
     """The name of the method that solved the steps, if they end where the textbook's end."""
     problem, scheme = rs.problem(structure, draw), rs.scheme(structure, draw)
     state, solver = problem.state(), named(structure.method)
-    run = vm.simulate(
-        problem.system, scheme, state, macro_dt=draw.macro_dt, num_steps=STEPS, save_every=EVERY, solver=solver
-    )
+    run = vm.simulate(problem.system, scheme, state, macro_dt=draw.macro_dt, num_steps=STEPS, save=EVERY, solver=solver)
     expected = simulate_textbook(problem.system, scheme, state, draw.macro_dt)
     for names in (("q_s", "q_f"), ("p_s", "p_f")):
         ours = np.concatenate([np.asarray(getattr(run, name)) for name in names], axis=1)

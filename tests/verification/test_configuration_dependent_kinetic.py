@@ -30,7 +30,7 @@ def run_of(problem, name, num_steps, macro_dt=None, state=None):
     """To time 1 if no step is given. All runs have 20 saved intervals, so that tests share compiled runs."""
     state, macro_dt = state or problem.state(), macro_dt or 1 / num_steps
     every = num_steps // 20
-    return simulate(problem.system, SCHEMES[name][0], state, macro_dt=macro_dt, num_steps=num_steps, save_every=every)
+    return simulate(problem.system, SCHEMES[name][0], state, macro_dt=macro_dt, num_steps=num_steps, save=every)
 
 
 @pytest.fixture(scope="module")

@@ -154,7 +154,7 @@ def long_run(system, scheme, state):
     """10 000 steps and 100 saved intervals, in two runs of `NUM_SAVES`."""
     pieces = []
     for _ in range(2):
-        pieces.append(simulate(system, scheme, state, macro_dt=0.01, num_steps=100 * NUM_SAVES, save_every=100))
+        pieces.append(simulate(system, scheme, state, macro_dt=0.01, num_steps=100 * NUM_SAVES, save=100))
         state = pieces[-1].final_state
     return join(pieces)
 

@@ -68,7 +68,7 @@ def test_order_with_a_force(force, scheme, steps):
         problem = Problem(problem.system, q_s, q_f, v_s, v_f, t=0.5)
     errors = []
     for n in steps:
-        run = simulate(problem.system, scheme, problem.state(), macro_dt=2 / n, num_steps=n, save_every=n // 20)
+        run = simulate(problem.system, scheme, problem.state(), macro_dt=2 / n, num_steps=n, save=n // 20)
         q_s, v_s, q_f, v_f = exact(np.asarray(run.t) - (0.5 if force == "damping" else 0.0))
         pairs = ((run.q_s, q_s), (run.p_s, v_s), (run.q_f, q_f), (run.p_f, v_f))
         errors.append([np.abs(np.asarray(a)[:, 0] - b).max() for a, b in pairs])

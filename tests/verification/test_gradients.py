@@ -53,7 +53,7 @@ def final_position(case: str, solver: Solver | None = None):
         system = problem.system.replace(params=replaced(stiffness))
         state = initial_state(problem.system, problem.q_s, problem.q_f, v[:n_s], v[n_s:])
         state = State(state.t, state.q_s, q_f, state.p_s, state.p_f)
-        run = simulate(system, scheme, state, macro_dt=macro_dt, num_steps=10, save_every=5, solver=solver)
+        run = simulate(system, scheme, state, macro_dt=macro_dt, num_steps=10, save=5, solver=solver)
         return jnp.sum(jnp.cos(run.q_f[-1] * jnp.arange(1, run.q_f.shape[1] + 1)))
 
     stiffness = params if parameter is None else params[parameter]

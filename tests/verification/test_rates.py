@@ -94,7 +94,7 @@ def _force(potential, params):
 
 
 def test_equals_respa():
-    run = vm.simulate(CHAIN, SCHEME, START, macro_dt=H, num_steps=100, save_every=100)
+    run = vm.simulate(CHAIN, SCHEME, START, macro_dt=H, num_steps=100, save=100)
     q, p = respa(CHAIN, np.asarray(START.q_f), np.asarray(START.p_f), 100)
     assert np.abs(run.q_f[-1] - q).max() < 1e-12  # measured 4e-14
     assert np.abs(run.p_f[-1] - p).max() < 3e-12  # measured 3e-13
@@ -104,7 +104,7 @@ def test_equals_respa():
 def test_equals_respa_with_constraints():
     system = CHAIN.replace(constraint=rigid)
     start = vm.initial_state(system, NONE, POINTS, NONE, VELOCITY, project=True)
-    run = vm.simulate(system, SCHEME, start, macro_dt=H, num_steps=100, save_every=100)
+    run = vm.simulate(system, SCHEME, start, macro_dt=H, num_steps=100, save=100)
     q, p = respa(system, np.asarray(start.q_f), np.asarray(start.p_f), 100, lambda q: rigid(NONE, q, PARAMS))
     assert np.abs(run.q_f[-1] - q).max() < 1e-10  # measured 8e-12
     assert np.abs(run.p_f[-1] - p).max() < 1e-10  # measured 1e-11
@@ -130,9 +130,7 @@ def test_evaluations():
     counts = []
     for num_steps in (3, 13):
         EVALUATIONS.clear()
-        vm.simulate(
-            system, SCHEME, START, macro_dt=H, num_steps=num_steps, save_every=num_steps
-        ).q_f.block_until_ready()
+        vm.simulate(system, SCHEME, START, macro_dt=H, num_steps=num_steps, save=num_steps).q_f.block_until_ready()
         jax.effects_barrier()
         counts.append(EVALUATIONS.copy())
     per_step = {name: (counts[1][name] - counts[0][name]) / 10 for name in LEVELS}
@@ -147,7 +145,7 @@ def test_evaluations():
 def test_order(scheme, order, steps):
     """Of positions and momenta together; measured 2.00 and 4.10."""
     assert scheme.order == order
-    runs = [vm.simulate(CHAIN, scheme, START, macro_dt=0.8 / n, num_steps=n, save_every=n) for n in (*steps, 512)]
+    runs = [vm.simulate(CHAIN, scheme, START, macro_dt=0.8 / n, num_steps=n, save=n) for n in (*steps, 512)]
     ends = np.array([np.concatenate([run.q_f[-1], run.p_f[-1]]) for run in runs])
     errors = np.linalg.norm(ends[:-1] - ends[-1], axis=1)
     assert abs(-np.polyfit(np.log(steps), np.log(errors), 1)[0] - order) < 0.2
@@ -172,7 +170,7 @@ def test_batch_and_gradient():
 
     def end(stiffness):
         system = CHAIN.replace(params={**PARAMS, "bends": stiffness})
-        return vm.simulate(system, SCHEME, START, macro_dt=H, num_steps=10, save_every=10, throw=False).q_f[-1]
+        return vm.simulate(system, SCHEME, START, macro_dt=H, num_steps=10, save=10).q_f[-1]
 
     stiffness = jnp.array([30.0, 40.0])
     together, apart = jax.vmap(end)(stiffness), jnp.stack([end(k) for k in stiffness])

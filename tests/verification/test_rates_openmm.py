@@ -74,7 +74,7 @@ def test_equals_openmm(constrained, bound):
     ours = vm.System(vm.ConstantMass([], masses), potentials=levels, constraint=rigid if constrained else None)
     start = vm.initial_state(ours, [], POINTS.ravel(), [], VELOCITY.ravel(), project=constrained)
     scheme = vm.fully_explicit(32).with_potentials(**rules)
-    run = vm.simulate(ours, scheme, start, macro_dt=H, num_steps=NUM_STEPS, save_every=NUM_STEPS)
+    run = vm.simulate(ours, scheme, start, macro_dt=H, num_steps=NUM_STEPS, save=NUM_STEPS)
 
     integrator = mts.MTSIntegrator(H, [(0, 1), (1, 4), (2, 32)])
     integrator.setConstraintTolerance(1e-14)

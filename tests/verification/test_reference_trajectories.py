@@ -7,7 +7,7 @@ import pytest
 
 from benchmarks.gail2014.dense import named
 from tests.support import DATA, PROBLEMS, relative_difference
-from vmri_jax import explicit_slow, fully_explicit, fully_implicit, initial_state, simulate
+from vmri_jax import Save, explicit_slow, fully_explicit, fully_implicit, initial_state, simulate
 
 CASES = {case["name"]: case for case in json.loads((DATA / "reference" / "manifest.json").read_text())}
 
@@ -49,7 +49,7 @@ def test_trajectory_equals_the_reference(name, method):
         state,
         macro_dt=case["macro_step"],
         num_steps=case["steps"],
-        save_micro=True,
+        save=Save(micro=True),
         solver=named(method),
     )
     differences = {k: relative_difference(getattr(run, k), expected[k]) for k in ("q_s", "q_f", "p_s", "p_f")}

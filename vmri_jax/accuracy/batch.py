@@ -11,7 +11,7 @@ from vmri_jax.accuracy.companions import UncertifiedWarning, estimated_errors, e
 from vmri_jax.mechanics.checks import check_flags
 from vmri_jax.mechanics.driving import Events, driven, events
 from vmri_jax.mechanics.state import Movable, State
-from vmri_jax.running.arguments import Steps
+from vmri_jax.running.arguments import Save, Steps
 from vmri_jax.running.batch import Batch, batch
 from vmri_jax.running.progress import Working
 from vmri_jax.running.run_error import RunError
@@ -32,11 +32,9 @@ def simulate_batch(
     states: State | None = None,
     *,
     macro_dt=None,
-    micro_dt=None,
     num_steps: int | None = None,
     t_end: float | None = None,
-    save_every: int = 1,
-    save_micro: bool = False,
+    save: int | Save = 1,
     params=None,
     solver: Solver | None = None,
     chunk: int | None = None,
@@ -60,8 +58,8 @@ def simulate_batch(
         scheme: a scheme or composition.
         states: a `State` whose arrays have an axis of lanes, e.g. ``jax.vmap(make)(q_s, ...)`` or
             ``jax.tree.map(lambda *a: jnp.stack(a), *list_of_states)``; None for positions and velocities of the problem in all lanes.
-        macro_dt, micro_dt: step size, a number or one per lane; exactly one of them.
-        num_steps, t_end, save_every, save_micro, solver: as in `simulate`; t_end with one step size and one time of the start for all.
+        macro_dt: macro step H, a number or one per lane.
+        num_steps, t_end, save, solver: as in `simulate`; t_end with one step size and one time of the start for all.
         params: some or all of ``system.params``, by name: ``{"springs": {"stiffness": k}}``, or "springs.stiffness". An array of the shape of the
             parameter holds for all lanes; one with an axis of lanes in front of this shape has a value for each lane.
         chunk: lanes that are computed side by side; chosen from the size of the problem if None.
@@ -74,7 +72,7 @@ def simulate_batch(
         ValueError, TypeError: bad arguments, before anything is computed.
     """
     check_flags(warn=warn, error=error)
-    steps = Steps(macro_dt, micro_dt, num_steps, t_end, save_every, save_micro)
+    steps = Steps(macro_dt, num_steps, t_end, save)
     with Working("simulate_batch: the starts"):
         lanes = batch(system, scheme, states, steps, params, solver, chunk, devices)
     done, table = lanes()

@@ -30,6 +30,7 @@ import numpy as np
 
 from vmri_jax.mechanics.arrays import of_one_type
 from vmri_jax.mechanics.driving import Events, events
+from vmri_jax.running.arguments import Save
 from vmri_jax.running.observables import SingularCoordinatesWarning
 from vmri_jax.running.run_error import RunError, largest_of
 from vmri_jax.running.simulation import Simulation
@@ -224,20 +225,18 @@ def extent_of(trajectory: Trajectory) -> float:
     return float(np.ptp(positions(trajectory), axis=0).max(initial=0.0))
 
 
-def check_function_of_run(of: Callable | None, error: bool, run: Simulation) -> None:
-    """Refuse a function `of` that returns no numbers; it is called with a run that rests at the start."""
+def check_function_of_run(of: Callable | None, run: Simulation) -> None:
+    """Refuse a function whose error is to be estimated and that returns no numbers; it is called with a run that rests at the start."""
     if of is None:
         return
-    if not error:
-        raise ValueError("simulate: of is the function whose error is estimated; give error=True with it.")
-    if not callable(of):
-        raise TypeError(f"simulate: of is {of!r}; give a function of a run, such as lambda run: run.q_f[:, 0].")
     value = of(resting(run))
     if np.asarray(value).dtype.kind not in "fiu":
-        raise TypeError(f"simulate: of returned {value!r} for a run; it must return a number or an array of numbers.")
+        raise TypeError(
+            f"simulate: the function error returned {value!r} for a run; it must return a number or an array of numbers."
+        )
     if not np.array_equal(value, of(resting(run)), equal_nan=True):
         raise ValueError(
-            "simulate: of returns other numbers for the same run; it must be pure, or differences of runs say nothing."
+            "simulate: the function error returns other numbers for the same run; it must be pure, or differences of runs say nothing."
         )
 
 
@@ -267,7 +266,7 @@ def finer(run: Simulation, parts: int, whole: int = 1) -> Simulation:
         macro_dt=run.macro_dt / (parts / whole),
         num_steps=run.num_steps // whole * parts,
         save_every=max(run.save_every // whole, 1) * parts,
-        save_micro=False,
+        save=Save(),
     )
 
 

@@ -98,7 +98,7 @@ def search_of(
         run = simulation(system, scheme, state, solver, Steps(length, num_steps=1))
         run.check()
         check_memory("simulate", run.state, scheme.num_micro, num_saves or MOST_SAVED, False)
-        check_function_of_run(of, True, run)
+        check_function_of_run(of, run)
         return run
 
     drives = events(opened_system, start, t_end)

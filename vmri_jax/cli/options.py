@@ -5,8 +5,7 @@ from typing import Annotated
 import typer
 
 System = Annotated[str, typer.Argument(help="fpu, tsp, sam, my_file.py:my_problem, or my_file.py alone.")]
-MacroStep = Annotated[float | None, typer.Option(help="Macro step H; or give --micro-dt.")]
-MicroStep = Annotated[float | None, typer.Option(help="Micro step h = H / num_micro.")]
+MacroStep = Annotated[float | None, typer.Option(help="Macro step H, of num_micro micro steps.")]
 Scheme = Annotated[str, typer.Option(help="See [bold]vmri schemes[/bold].")]
 NumMicro = Annotated[int, typer.Option(help="Micro steps per macro step.")]
 Alpha = Annotated[

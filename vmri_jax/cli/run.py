@@ -18,7 +18,7 @@ from vmri_jax.accuracy.simulate import simulate as run_at_once
 from vmri_jax.catalogue import find_problem, find_scheme
 from vmri_jax.cli import options
 from vmri_jax.cli.common import PICTURES, RUN, check_target_file, console, print_failure, print_named, refusals
-from vmri_jax.running.arguments import nothing_fast
+from vmri_jax.running.arguments import Save, nothing_fast
 from vmri_jax.running.interrupts import Interrupted
 from vmri_jax.running.settings import Settings
 from vmri_jax.running.store import StoredTrajectory, stream
@@ -41,14 +41,13 @@ app = typer.Typer()
     epilog="Examples:\n\n"
     "vmri simulate fpu --macro-dt 0.1 --steps 2000 --out run.npz --plot run.png\n\n"
     "vmri simulate fpu --macro-dt 0.1 --steps 10000000 --out run.zarr\n\n"
-    "vmri simulate tsp --scheme fully-explicit --alpha 0.5 --num-micro 5 --micro-dt 0.002 --steps 1000\n\n"
+    "vmri simulate tsp --scheme fully-explicit --alpha 0.5 --num-micro 5 --macro-dt 0.01 --steps 1000\n\n"
     "vmri simulate my_file.py:my_problem --scheme galerkin --degree 2 --macro-dt 0.05 --steps 400",
 )
 def simulate(
     system: options.System,
     steps: Annotated[int | None, typer.Option(help="Number of macro steps; not with --accuracy.")] = None,
     macro_dt: options.MacroStep = None,
-    micro_dt: options.MicroStep = None,
     scheme: Annotated[
         str | None,
         typer.Option(
@@ -100,18 +99,13 @@ def simulate(
             without = " and ".join(name for name, value in of_scheme.items() if value is not None)
             raise ValueError(f"got {without} without --scheme, which --accuracy chooses then; give --scheme with it.")
         before = StoredTrajectory(out) if out is not None and resume and out.exists() else None
-        if save_every is None and (save_micro or steps is None):
-            save_every = 1
-        elif save_every is None and steps is not None:
+        if save_every is None and steps is not None and not save_micro:
             save_every = default_save_every(steps) if before is None else before.save_every
         arguments = {
             "macro_dt": macro_dt,
-            "micro_dt": micro_dt,
             "num_steps": steps,
-            "save_every": save_every,
-            "save_micro": save_micro,
+            "save": Save(save_every, micro=save_micro, progress=True),
             "solver": Solver(matrix.replace("-", "_")),
-            "progress": True,
         }
         if streamed:
             arguments |= {"out": out, "resume": resume, "overwrite": overwrite, "drawing": problem.drawing}
@@ -160,7 +154,7 @@ def simulate(
                 code = _print_stop(stopped, saved, streamed)
     if stopped is not None:
         if code == 1:
-            given = {"--macro-dt": macro_dt, "--micro-dt": micro_dt, "--scheme": scheme, "--num-micro": num_micro}
+            given = {"--macro-dt": macro_dt, "--scheme": scheme, "--num-micro": num_micro}
             words = [word for name, x in (given | of_scheme).items() if x is not None for word in (name, str(x))]
             command = escape(shlex.join(["vmri", "advise", system, *words]))
             text = "Whether this step is stable, which one near it is, and whether slow and fast are swapped"

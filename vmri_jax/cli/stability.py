@@ -36,7 +36,6 @@ app = typer.Typer()
 def advise(
     system: options.System,
     macro_dt: options.MacroStep = None,
-    micro_dt: options.MicroStep = None,
     scheme: options.Scheme = "fully-implicit",
     num_micro: options.NumMicro = 10,
     alpha: options.Alpha = None,
@@ -51,11 +50,10 @@ def advise(
     with refusals():
         problem = find_problem(system)
         chosen = find_scheme(scheme, num_micro, compose, alpha=alpha, degree=degree, rule=rule)
-        if (macro_dt is None) == (micro_dt is None):
-            raise ValueError("give exactly one of --macro-dt and --micro-dt.")
-        step = macro_dt if micro_dt is None else chosen.num_micro * micro_dt
+        if macro_dt is None:
+            raise ValueError("--macro-dt is missing; give the macro step that is to be judged.")
         with status("judging this step and the steps around it"):
-            advice = advise_on(problem, chosen, macro_dt=step)  # pyright: ignore[reportArgumentType]
+            advice = advise_on(problem, chosen, macro_dt=macro_dt)
     console.print(advice.table() if advice.findings else escape(advice.verdict))
     if not advice.ok:
         raise typer.Exit(1)

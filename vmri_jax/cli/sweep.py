@@ -34,7 +34,7 @@ from vmri_jax.running.export import extra
 from vmri_jax.running.interrupts import Interrupted
 
 EXAMPLE = Path("sweep.toml")
-SETTINGS = ("t_end", "num_steps", "macro_dt", "micro_dt", "num_micro", "save", "num_saves", "project", "chunk")
+SETTINGS = ("t_end", "num_steps", "macro_dt", "num_micro", "save", "num_saves", "project", "chunk")
 """Entries whose names and values are arguments of `ensemble`."""
 ENTRIES = ("system", "scheme", "out", *SETTINGS, "axes", "draws")
 AXIS = ("from", "to", "count", "log", "values", "unit", "description")

@@ -1,6 +1,6 @@
 """Columns of a design: a function ``(problem, row) -> problem`` makes the problem of a run from the values of its row.
 
-Columns with these names choose steps and schemes instead: macro_dt, micro_dt, num_steps, num_micro, scheme.
+Columns with these names choose steps and schemes instead: macro_dt, num_steps, num_micro, scheme.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -14,7 +14,7 @@ from vmri_jax.mechanics.checks import check_type, is_concrete
 from vmri_jax.mechanics.names import near
 from vmri_jax.mechanics.state import Problem
 
-STEPS = ("macro_dt", "micro_dt", "num_steps")
+STEPS = ("macro_dt", "num_steps")
 SCHEMES = ("scheme", "num_micro")
 START = ("t", "q_s", "q_f", "v_s", "v_f")
 

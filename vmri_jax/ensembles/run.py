@@ -119,7 +119,6 @@ def ensemble(
     t_end: float | None = None,
     num_steps: int | None = None,
     macro_dt: float | None = None,
-    micro_dt: float | None = None,
     num_micro: int | None = None,
     vary: Vary | None = None,
     save: Saved | Sequence[Saved] = "end",
@@ -154,9 +153,9 @@ def ensemble(
         scheme: a `Scheme`, the name of one, or a function that makes a scheme from num_micro, such as `vmri_jax.fully_implicit`.
             A mapping from labels to schemes is an axis "scheme" of the design.
         design: `Product`, `Table` or `Draws` of `vmri_jax.ensembles`; a mapping is a `Product`. The columns "macro_dt",
-            "micro_dt", "num_steps", "num_micro" and "scheme" choose steps and schemes; `vary` takes all others.
+            "num_steps", "num_micro" and "scheme" choose steps and schemes; `vary` takes all others.
         out: folder of the store, a zarr group; conventionally named .zarr. All workers must see it.
-        t_end, num_steps, macro_dt, micro_dt: two of: the time at the end, the number of macro steps, a step size (macro_dt or micro_dt).
+        t_end, num_steps, macro_dt: two of: the time at the end, the number of macro steps, the macro step H.
         num_micro: number of micro steps, for schemes given by name or by a function.
         vary: a function ``(problem, row) -> problem`` that makes the problem of a run from the values of its row by column,
             ``lambda problem, row: replace(problem, v_s=row["speed"] * problem.v_s)``, for example. It may change the values of
@@ -198,7 +197,7 @@ def ensemble(
                 "ensemble: there are several schemes, but the design has no column 'scheme' that chooses one for each run."
             )
         design = Product({"scheme": list(schemes), **design.axes})
-    steps = {"t_end": t_end, "num_steps": num_steps, "macro_dt": macro_dt, "micro_dt": micro_dt}
+    steps = {"t_end": t_end, "num_steps": num_steps, "macro_dt": macro_dt}
     work = Work(
         system=system,
         schemes=schemes,

@@ -27,7 +27,7 @@ from vmri_jax.mechanics.checks import digest
 from vmri_jax.mechanics.names import near
 from vmri_jax.mechanics.state import Problem
 from vmri_jax.running import arguments
-from vmri_jax.running.arguments import steps_until
+from vmri_jax.running.arguments import Save, steps_until
 from vmri_jax.running.batch import consistent_states
 from vmri_jax.running.simulation import Simulation, simulation
 from vmri_jax.running.trajectory import STATUS, Trajectory
@@ -60,7 +60,7 @@ class Work:
     system: name of a system, or a problem that can be pickled.
     schemes: by label.
     columns: names of the columns of the design.
-    steps: arguments of `ensemble` about steps by name: t_end, num_steps, macro_dt, micro_dt, as far as they are not columns.
+    steps: arguments of `ensemble` about steps by name: t_end, num_steps, macro_dt, as far as they are not columns.
     num_micro, solver, project: as in `ensemble`.
     save: names of the quantities that are kept, or functions.
     num_saves: number of saved nodes after the start.
@@ -145,9 +145,9 @@ class Work:
         for i in range(number.max() + 1):
             lanes = np.flatnonzero(number == i)
             values = {name: values[i] for name, values in different.items()}
-            dt = {name: rows[name][lanes] for name in ("macro_dt", "micro_dt") if name in rows and name not in values}
+            dt = {name: rows[name][lanes] for name in ("macro_dt",) if name in rows and name not in values}
             scheme = self._scheme(values)
-            yield Group(lanes, scheme, *self._steps(values | dt, scheme))
+            yield Group(lanes, scheme, *self._steps(values | dt))
 
     def simulation(self, group: Group) -> Simulation:
         """The first run of a group, after a check of its arguments."""
@@ -158,8 +158,7 @@ class Work:
                 "would not be the end."
             )
         state = self.problem.state(self.project)
-        every = num_steps // self.num_saves
-        steps = arguments.Steps(macro_dt, num_steps=num_steps, save_every=every)
+        steps = arguments.Steps(macro_dt, num_steps, save=Save(number=self.num_saves))
         return simulation(self.problem, group.scheme, state, self.solver, steps)
 
     def compute(self, rows: Rows, count: int, width: int) -> dict[str, np.ndarray]:
@@ -187,7 +186,7 @@ class Work:
             states,
             macro_dt=macro_dt,
             num_steps=group.num_steps,
-            save_every=group.num_steps // self.num_saves,
+            save=Save(number=self.num_saves),
             params=params,
             solver=self.solver,
             chunk=width,
@@ -221,7 +220,7 @@ class Work:
             raise TypeError(f"ensemble: the scheme {label!r} makes {type(made).__name__}; it must make a Scheme.")
         return made
 
-    def _steps(self, values: Mapping[str, Any], scheme) -> tuple[Any, int]:
+    def _steps(self, values: Mapping[str, Any]) -> tuple[Any, int]:
         """Macro step, a number or one for each run, and number of macro steps."""
         values_by_name = dict(self.steps)
         twice = sorted(set(values_by_name) & set(values))
@@ -229,18 +228,17 @@ class Work:
             raise ValueError(f"ensemble: {', '.join(twice)} is a column and an argument; leave one of them out.")
         values_by_name |= {name: values[name] for name in STEPS if name in values}
         names = set(values_by_name)
-        if len(names) != 2 or names == {"macro_dt", "micro_dt"}:
+        if len(names) != 2:
             raise ValueError(
-                f"ensemble: of the steps {', '.join(sorted(names)) or 'nothing'} is given; give two of: t_end, num_steps, "
-                "a step size (macro_dt or micro_dt), as arguments or columns."
+                f"ensemble: of the steps {', '.join(sorted(names)) or 'nothing'} is given; give two of t_end, "
+                "num_steps and macro_dt, as arguments or columns."
             )
         if "num_steps" in values_by_name:
             values_by_name["num_steps"] = _whole("num_steps", values_by_name["num_steps"])
         start = float(self.problem.t)
         if names == {"t_end", "num_steps"}:
             return (float(values_by_name["t_end"]) - start) / values_by_name["num_steps"], values_by_name["num_steps"]
-        name, factor = ("micro_dt", scheme.num_micro) if "micro_dt" in values_by_name else ("macro_dt", 1)
-        macro_dt = factor * np.asarray(values_by_name[name], dtype=float)
+        macro_dt = np.asarray(values_by_name["macro_dt"], dtype=float)
         if not np.all(macro_dt > 0):
             raise ValueError(f"ensemble: a step is {np.min(macro_dt)}; steps must be positive.")
         macro_dt = float(macro_dt) if macro_dt.ndim == 0 else macro_dt
@@ -250,7 +248,7 @@ class Work:
 def all_groups(work: Work, design: Design) -> Iterator[Group]:
     """All groups that the rows of a design can form, each with a single row."""
     rows = design.combinations(work.told_apart)
-    step_columns = [name for name in ("macro_dt", "micro_dt") if name in work.columns and name not in rows]
+    step_columns = [name for name in ("macro_dt",) if name in work.columns and name not in rows]
     first = design.rows(0, 1) if step_columns else {}
     count = max((len(values) for values in rows.values()), default=1)
     yield from work.groups(rows | {name: np.repeat(first[name], count) for name in step_columns}, count)

@@ -11,7 +11,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from math import gcd
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -22,6 +21,7 @@ from vmri_jax.fitting.measured import Measured
 from vmri_jax.fitting.unknowns import Unknowns
 from vmri_jax.mechanics.invariants import velocity
 from vmri_jax.mechanics.state import Problem, State, initial_state
+from vmri_jax.running.arguments import Save
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.solver import Solver
@@ -90,7 +90,7 @@ class Shooting:
         if self.segments == 1:
             return np.zeros((0, self.start(u).size))
         problem = self.model(self.unknowns.at(u))
-        steps = {"macro_dt": self.macro_dt, "num_steps": self.length * self.segments, "save_every": self.length}
+        steps = {"macro_dt": self.macro_dt, "num_steps": self.length * self.segments, "save": self.length}
         run = simulate(problem, self.scheme, **steps, solver=self.solver)
         nodes = jax.tree.map(lambda a: np.asarray(a)[1:-1], run.states)
         return np.asarray(jax.vmap(partial(_phase, problem))(nodes))
@@ -153,9 +153,8 @@ class Shooting:
 
     def _run(self, problem: Problem, state: State):
         """Observed quantities at the saved nodes of a run of one part from a state, and its end (2 n,)."""
-        steps = {"macro_dt": self.macro_dt, "num_steps": self.length, "save_every": self.every}
-        options: dict[str, Any] = {"solver": self.solver, "throw": False, "adjoint": "stored"}
-        nodes = simulate(problem.system, self.scheme, state, **steps, **options).states
+        steps = {"macro_dt": self.macro_dt, "num_steps": self.length, "save": Save(self.every, adjoint="stored")}
+        nodes = simulate(problem.system, self.scheme, state, **steps, solver=self.solver).states
         observed = [jax.vmap(m.observe)(nodes) for m in self.data]
         return observed, _phase(problem, jax.tree.map(lambda a: a[-1], nodes))
 

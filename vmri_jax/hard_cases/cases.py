@@ -72,7 +72,7 @@ class Resolved:
 
     def rank(self, full: bool) -> Outcome:
         state, system = self.problem.state(), self.problem.system
-        trajectory = run(self.problem, self.scheme, self.macro_dt, 10_000 if full else 1_000, save_every=10)
+        trajectory = run(self.problem, self.scheme, self.macro_dt, 10_000 if full else 1_000, save=10)
         jacobian = jax.jit(jax.vmap(jax.jacrev(system.constraints, argnums=(1, 2))))
         jacobians = jacobian(trajectory.t, trajectory.states.q_s, trajectory.states.q_f)
         rows = np.concatenate([np.asarray(a) for a in jacobians], axis=2)
@@ -123,7 +123,7 @@ class Resolved:
         steps, ends = 1_000 if full else 100, {}
         for tolerance in (1e-4, 1e-8, 1e-12):
             solver = Solver(tolerance=tolerance)
-            trajectory = run(self.problem, self.scheme, self.macro_dt, steps, save_every=steps, solver=solver)
+            trajectory = run(self.problem, self.scheme, self.macro_dt, steps, save=steps, solver=solver)
             ends[tolerance] = positions(trajectory)[-1]
         size = np.abs(ends[1e-12]).max()
         loose, middle = (difference(ends[t], ends[1e-12]) / size for t in (1e-4, 1e-8))
@@ -151,9 +151,7 @@ class Resolved:
 
     def explicit_limit(self, full: bool) -> Outcome:
         steps = 10_000 if full else 1_000
-        below, beyond = (
-            run(self.problem, fully_explicit(1), wh / self.omega, steps, save_every=10) for wh in (1.0, 2.5)
-        )
+        below, beyond = (run(self.problem, fully_explicit(1), wh / self.omega, steps, save=10) for wh in (1.0, 2.5))
         bounded = energy(below, steps, energy_scale(self.problem, below)).band
         finite = all(bool(jnp.isfinite(r.energy).all()) == bool(r.success) for r in (below, beyond))
         return Outcome(

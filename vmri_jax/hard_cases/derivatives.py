@@ -62,7 +62,7 @@ def _terms(problem: Problem, scheme: Scheme, macro_dt: float) -> Iterator[tuple[
     The points are the start and nodes of a short run up to a failure.
     """
     system, n_s = problem.system, problem.q_s.size
-    along = run(problem, scheme, macro_dt, 20, save_every=5)
+    along = run(problem, scheme, macro_dt, 20, save=5)
     speeds = jax.jit(jax.vmap(lambda *z: jnp.concatenate(velocity(system, *z))))
     velocities = np.asarray(speeds(along.q_s, along.q_f, along.p_s, along.p_f))
     points = np.concatenate([along.q_s, along.q_f, velocities], axis=1)

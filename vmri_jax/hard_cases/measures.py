@@ -20,7 +20,7 @@ from vmri_jax.mechanics.state import Problem, State, initial_state
 from vmri_jax.running.observables import LostEnergyWarning
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes.scheme import fully_implicit
-from vmri_jax.steppers.results import Result
+from vmri_jax.steppers.results import Result, SimulationError
 from vmri_jax.steppers.solver import Solver
 
 SAVED_NODES = 10_000
@@ -34,12 +34,15 @@ def run(problem: Problem, scheme, macro_dt, num_steps: int, state: State | None 
     start = problem.state() if state is None else state
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", LostEnergyWarning)  # the cases measure it
-        return simulate(problem.system, scheme, start, macro_dt=macro_dt, num_steps=num_steps, throw=False, **options)
+        try:
+            return simulate(problem.system, scheme, start, macro_dt=macro_dt, num_steps=num_steps, **options)
+        except SimulationError as failure:
+            return failure.trajectory
 
 
 def long_run(problem: Problem, scheme, macro_dt, num_steps: int, **options) -> Trajectory:
     """`run` that saves about `SAVED_NODES` nodes."""
-    return run(problem, scheme, macro_dt, num_steps, save_every=max(1, num_steps // SAVED_NODES), **options)
+    return run(problem, scheme, macro_dt, num_steps, save=max(1, num_steps // SAVED_NODES), **options)
 
 
 def status(trajectory: Trajectory) -> str:
@@ -116,12 +119,12 @@ def difference(a, b) -> float:
 
 def reversal(problem: Problem, scheme, macro_dt, num_steps: int) -> float:
     """Distance from the start after `num_steps` steps forward and, with reversed momenta, `num_steps` steps back."""
-    there = run(problem, scheme, macro_dt, num_steps, save_every=num_steps)
+    there = run(problem, scheme, macro_dt, num_steps, save=num_steps)
     if not there.success:
         return np.inf
     end = there.final_state
     turned = State(0.0, end.q_s, end.q_f, -end.p_s, -end.p_f)
-    back = run(problem, scheme, macro_dt, num_steps, turned, save_every=num_steps)
+    back = run(problem, scheme, macro_dt, num_steps, turned, save=num_steps)
     return difference(positions(back)[-1], positions(there)[0])
 
 
@@ -159,7 +162,7 @@ def bad_lane(
     along = run(problem, scheme, macro_dt, lanes - 1, solver=solver)  # its nodes are consistent with all constraints
     p_s, p_f = (jnp.asarray(p).at[bad].set(OVERFLOWING_MOMENTUM) for p in (along.p_s, along.p_f))
     states = State(along.t, along.q_s, along.q_f, p_s, p_f)
-    options = {"macro_dt": macro_dt, "num_steps": num_steps, "save_every": num_steps, "solver": solver}
+    options = {"macro_dt": macro_dt, "num_steps": num_steps, "save": num_steps, "solver": solver}
     batch = simulate_batch(problem.system, scheme, states, **options, warn=False)
     failed = np.flatnonzero(np.asarray(batch.failed_at) >= 0)
     apart = 0.0

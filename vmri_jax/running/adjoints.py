@@ -16,22 +16,13 @@ from vmri_jax.running.fallback import solved_again, unsolved
 from vmri_jax.running.simulation import Simulation
 from vmri_jax.running.trajectory import Run, Trajectory
 
-ADJOINTS = ("auto", "stored", "checkpoint")
 LONGEST_STORED_RUN = 10_000
 """Macro steps of the longest run for which "auto" stores the start of every step; a larger value takes more memory."""
 
 
-def check_adjoint(adjoint: str) -> None:
-    """Refuse an unknown adjoint."""
-    if adjoint not in ADJOINTS:
-        raise ValueError(
-            f"simulate: adjoint is {adjoint!r}; it must be one of {', '.join(map(repr, ADJOINTS))}. For derivatives with respect to "
-            "few numbers without stored steps take jax.jacfwd with adjoint='stored'."
-        )
-
-
-def traced_run(run: Simulation, adjoint: str) -> Trajectory:
-    """All steps of a run, some of whose arrays are tracers; `adjoint` as of `simulate`."""
+def traced_run(run: Simulation) -> Trajectory:
+    """All steps of a run, some of whose arrays are tracers."""
+    adjoint = run.save.adjoint
     if adjoint == "auto":
         adjoint = "stored" if run.num_steps <= LONGEST_STORED_RUN else "checkpoint"
     first = _differentiable(run.engine, adjoint, run.save_every)

@@ -10,6 +10,7 @@ from vmri_jax.mechanics.arrays import Known, is_concrete, real_array, require_x6
 from vmri_jax.mechanics.checks import check_arrays, check_flags, check_number, check_params, check_system
 from vmri_jax.mechanics.constraints import check_constraints, check_mass
 from vmri_jax.mechanics.state import State
+from vmri_jax.running.progress import ShowsProgress, check_progress
 from vmri_jax.schemes.composition import Composition, stage_scheme
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.solver import Solver
@@ -19,20 +20,84 @@ WHOLE_NUMBER_TOLERANCE = 1e-9
 part of its length; a larger value lets runs end visibly beside t_end."""
 
 
+ADJOINTS = ("auto", "stored", "checkpoint")
+
+
+@dataclass(frozen=True)
+class Save:
+    """The nodes and states of a run that are kept while it is computed; ``save=10`` of `vmri_jax.simulate` is short for ``save=vm.Save(10)``.
+
+        vm.simulate(problem, scheme, macro_dt=0.01, t_end=10.0, save=vm.Save(every=10, micro=True))
+
+    Args:
+        every: macro steps from one saved node to the next; 1 where neither `every` nor `number` is given.
+        number: in place of `every`, the number of saved intervals, equally spaced, of which there is one node more.
+        micro: also keep the fast positions at the micro nodes of the macro step that ends at each saved node.
+        adjoint: states that a run keeps for derivatives, see `vmri_jax.running.adjoints`: "stored" for all modes, "checkpoint" for reverse
+            mode in little memory; "auto" chooses by length. Outside of transformations of JAX it changes nothing.
+        progress: True for a bar of the nodes saved so far, or a function of (what, done, total); Ctrl-C then raises `Interrupted` with
+            these nodes. With False a run that takes more than two seconds prints lines on the error stream.
+
+    Raises:
+        ValueError: both `every` and `number`, a number below 1, an unknown adjoint.
+        TypeError: a flag that is neither True nor False.
+    """
+
+    every: int | None = None
+    number: int | None = None
+    micro: bool = False
+    adjoint: str = "auto"
+    progress: ShowsProgress = False
+
+    def __post_init__(self):
+        for name in ("every", "number"):
+            if getattr(self, name) is not None:
+                whole_number(f"Save: {name}", getattr(self, name), otherwise=", or None")
+        if self.every is not None and self.number is not None:
+            raise ValueError(f"Save: got every = {self.every} and number = {self.number}; give one of them.")
+        check_flags(micro=self.micro)
+        check_progress("Save", self.progress)
+        if self.adjoint not in ADJOINTS:
+            raise ValueError(
+                f"Save: adjoint is {self.adjoint!r}; it must be one of {', '.join(map(repr, ADJOINTS))}. For derivatives with "
+                "respect to few numbers without stored steps take jax.jacfwd with adjoint='stored'."
+            )
+
+    @classmethod
+    def of(cls, save: "int | Save") -> "Save":
+        """The argument `save` of a run."""
+        return save if isinstance(save, Save) else cls(whole_number("simulate: save", save, otherwise=", or a Save"))
+
+    def without_bar(self, name: str) -> None:
+        """Refuse a bar of a run of the function of this name, which is one program without parts."""
+        if self.progress is not False:
+            raise ValueError(
+                f"{name}: a run that is one program has no progress; leave it out, or call simulate or stream."
+            )
+
+    def macro_steps(self, num_steps: int) -> int:
+        """Macro steps from one saved node to the next in a run of `num_steps`; refuses a run whose end is not saved."""
+        every = self.every or 1
+        if num_steps % (self.number or every):
+            counts = f"the {self.number} saved intervals" if self.number else f"save = {every}"
+            raise ValueError(
+                f"simulate: num_steps = {num_steps} is not a multiple of {counts}; the last saved node would not be the end."
+            )
+        return num_steps // self.number if self.number else every
+
+
 @dataclass(frozen=True)
 class Steps:
-    """The arguments of `vmri_jax.simulate` for step size and length: one of macro_dt and micro_dt, one of num_steps and t_end, as the user gave them."""
+    """The arguments of `vmri_jax.simulate` for step size, length and saved nodes, as the user gave them; exactly one of num_steps and t_end."""
 
     macro_dt: Any = None
-    micro_dt: Any = None
     num_steps: int | None = None
     t_end: float | None = None
-    save_every: int = 1
-    save_micro: bool = False
+    save: int | Save = 1
 
 
-def check_run(system, scheme, state, solver, steps: Steps):
-    """Refuse bad arguments of `simulate`; returns macro_dt, num_steps and save_every."""
+def check_run(system, scheme, state, solver, steps: Steps) -> tuple[int, int]:
+    """Refuse bad arguments of `simulate`; returns the number of macro steps, and how many of them lie between two saved nodes."""
     require_x64()
     if not isinstance(scheme, Scheme | Composition):
         raise TypeError(
@@ -41,18 +106,17 @@ def check_run(system, scheme, state, solver, steps: Steps):
     check_params(system.params)
     if not isinstance(solver, Solver | None):
         raise TypeError(f"simulate: solver is {solver!r}; give a Solver, e.g. vm.Solver(tolerance=1e-10).")
-    check_flags(save_micro=steps.save_micro)
-    dt, num_steps, t_end = check_step_size(scheme, steps.macro_dt, steps.micro_dt), steps.num_steps, steps.t_end
+    dt, num_steps, t_end = steps.macro_dt, steps.num_steps, steps.t_end
+    check_step_size(dt)
     check_number("simulate: the t of state", state.t)
     if (num_steps is None) == (t_end is None):
         got = "neither" if num_steps is None else "both"
         raise ValueError(f"simulate: got {got} of num_steps and t_end; give exactly one of them.")
-    if num_steps is None:
-        num_steps = steps_until(t_end, state.t, dt)
-    counts = check_counts(num_steps, steps.save_every)
+    num_steps = steps_until(t_end, state.t, dt) if num_steps is None else whole_number("simulate: num_steps", num_steps)
+    every = Save.of(steps.save).macro_steps(num_steps)
     if is_concrete(vars(state)):
         check_vectors(state)
-    return dt, *counts
+    return num_steps, every
 
 
 def nothing_fast(scheme: Scheme | Composition, num_fast: int) -> str:
@@ -89,27 +153,12 @@ def steps_until(t_end, t, macro_dt) -> int:
     return whole
 
 
-def check_step_size(scheme: Scheme | Composition, macro_dt, micro_dt):
-    """Refuse two step sizes, none, or one that is not positive; returns macro_dt."""
-    if (macro_dt is None) == (micro_dt is None):
-        got = "neither" if macro_dt is None else "both"
-        raise ValueError(f"simulate: got {got} of macro_dt and micro_dt; give exactly one of them.")
-    name, dt = ("macro_dt", macro_dt) if micro_dt is None else ("micro_dt", micro_dt)
-    if is_concrete(real_array(f"simulate: {name}", dt, 0)) and not (np.isfinite(dt) and dt > 0):
-        raise ValueError(f"simulate: {name} is {dt}; it must be a positive number.")
-    return dt if micro_dt is None else scheme.num_micro * micro_dt
-
-
-def check_counts(num_steps, save_every) -> tuple[int, int]:
-    """Refuse counts that are no whole numbers, or a last step that is not saved; returns (num_steps, save_every) as Python integers."""
-    num_steps = whole_number("simulate: num_steps", num_steps)
-    save_every = whole_number("simulate: save_every", save_every)
-    if num_steps % save_every:
-        raise ValueError(
-            f"simulate: num_steps = {num_steps} is not a multiple of save_every = {save_every}; the last saved node would "
-            "not be the end."
-        )
-    return num_steps, save_every
+def check_step_size(macro_dt) -> None:
+    """Refuse a missing step size, or one that is not positive."""
+    if macro_dt is None:
+        raise ValueError("simulate: macro_dt is missing; give the macro step H, num_micro times the micro step.")
+    if is_concrete(real_array("simulate: macro_dt", macro_dt, 0)) and not (np.isfinite(macro_dt) and macro_dt > 0):
+        raise ValueError(f"simulate: macro_dt is {macro_dt}; it must be a positive number.")
 
 
 def check_vectors(state: State) -> None:

@@ -19,7 +19,7 @@ from vmri_jax.mechanics.checks import check_params
 from vmri_jax.mechanics.names import unknown
 from vmri_jax.mechanics.state import Movable, State, initial_state, opened, start_of
 from vmri_jax.mechanics.system import System
-from vmri_jax.running.arguments import Steps
+from vmri_jax.running.arguments import Steps, check_step_size
 from vmri_jax.running.engine import Arrays, Engine
 from vmri_jax.running.fallback import FALLING_BACK
 from vmri_jax.running.memory import check_memory
@@ -117,19 +117,19 @@ def batch(
     devices: int,
 ) -> Batch:
     """The `Batch` with these arguments of `simulate_batch`; bad arguments raise."""
-    if not is_concrete((states, steps.macro_dt, steps.micro_dt, params)):
+    if not is_concrete((states, steps.macro_dt, params)):
         raise ValueError(
             "simulate_batch: arguments are tracers; call it outside of jax.jit, vmap and grad, or take jax.vmap of simulate."
         )
     _check_devices(devices, chunk)
     problem: Any = opened(moving)
     system, start = start_of("simulate_batch", problem, states)
-    dt = {name: getattr(steps, name) for name in ("macro_dt", "micro_dt") if getattr(steps, name) is not None}
-    params, start, dt = _with_lanes(system.params, params, start, dt)
-    for name, sizes in dt.items():
-        if not (np.all(np.isfinite(sizes)) and np.all(sizes > 0)):
-            raise ValueError(f"simulate_batch: every {name} must be a positive number, got {sizes}.")
-    if steps.t_end is not None and any(np.ptp(array) > 0 for array in (start.t, *dt.values())):
+    if steps.macro_dt is None:
+        check_step_size(None)
+    params, start, macro_dt = _with_lanes(system.params, params, start, steps.macro_dt)
+    if not (np.all(np.isfinite(macro_dt)) and np.all(macro_dt > 0)):
+        raise ValueError(f"simulate_batch: every macro_dt must be a positive number, got {macro_dt}.")
+    if steps.t_end is not None and any(np.ptp(array) > 0 for array in (start.t, macro_dt)):
         raise ValueError(
             "simulate_batch: t_end with steps or start times that differ; give num_steps, the same for all lanes."
         )
@@ -140,13 +140,11 @@ def batch(
         fixed = tuple(getattr(problem, name) for name in ("t", "q_s", "q_f", "v_s", "v_f"))
         start = consistent_states(system, of_lanes, fixed, problem.project, starts_differ=False)
     state = tuple(map(np.asarray, vars(start).values()))
-    first, steps = State(*(a[0] for a in state)), replace(steps, **{name: sizes[0] for name, sizes in dt.items()})
+    first, steps = State(*(a[0] for a in state)), replace(steps, macro_dt=macro_dt[0])
     run, lanes = simulation(problem, scheme, first, solver, steps), len(state[0])
+    run.save.without_bar("simulate_batch")
     run.check("simulate_batch: the positions of the first state", constraints=not differs)
-    check_memory("simulate_batch", run.state, scheme.num_micro, run.num_saves, steps.save_micro, lanes)
-    ((name, sizes),) = dt.items()
-    factor = scheme.num_micro if name == "micro_dt" else 1
-    macro_dt = shared(run.macro_dt, lanes) if is_repeated(sizes) else factor * sizes
+    check_memory("simulate_batch", run.state, scheme.num_micro, run.num_saves, run.save_micro, lanes)
     model = run.arrays.model  # the parameters come last, see `Arrays`
     model = [shared(leaf, lanes) for leaf in model[: len(model) - len(params)]] + params
     return Batch(
@@ -206,8 +204,8 @@ def _named(values, known: Collection[str], path: tuple[str, ...] = ()) -> Iterat
         yield from _named(entry, known, (*path, jax.tree_util.keystr((key,), simple=True)))
 
 
-def _with_lanes(all_params, params, start: State, dt: dict[str, Any]) -> tuple[list, State, dict[str, Any]]:
-    """Parameters, starts and step sizes of all lanes, with the lanes as their first axis.
+def _with_lanes(all_params, params, start: State, macro_dt) -> tuple[list, State, np.ndarray]:
+    """Parameters, starts and macro steps of all lanes, with the lanes as their first axis.
 
     Args:
         all_params: of the system.
@@ -223,7 +221,7 @@ def _with_lanes(all_params, params, start: State, dt: dict[str, Any]) -> tuple[l
     arrays |= {
         f"states.{name}": (value, np.shape(value)[-1:] if name != "t" else ()) for name, value in vars(start).items()
     }
-    arrays |= {name: (real_array(f"simulate_batch: {name}", sizes), ()) for name, sizes in dt.items()}
+    arrays["macro_dt"] = real_array("simulate_batch: macro_dt", macro_dt), ()
     lengths = {}
     for name, (value, shape) in arrays.items():
         if np.ndim(value) > len(shape) and np.shape(value)[1:] == shape:
@@ -246,7 +244,7 @@ def _with_lanes(all_params, params, start: State, dt: dict[str, Any]) -> tuple[l
     if all(map(is_repeated, whole.values())):  # the user gave such views, and `jax.vmap` wants an axis
         whole["states.t"] = np.array(whole["states.t"])
     starts = (whole[f"states.{name}"] for name in vars(start))
-    return [whole[f"params[{name!r}]"] for name in values], State(*starts), {name: whole[name] for name in dt}
+    return [whole[f"params[{name!r}]"] for name in values], State(*starts), whole["macro_dt"]
 
 
 def _check_devices(devices, chunk) -> None:

@@ -34,6 +34,6 @@ def check_memory(caller: str, state: State, num_micro: int, num_saves: int, save
     if needed > free:
         raise ValueError(
             f"{caller}: {num_saves + 1} saved nodes{f' of {lanes} runs' if lanes > 1 else ''} would take {needed / 1e9:.3g} GB, and "
-            f"{free / 1e9:.3g} GB of memory are free. Save fewer of them (save_every=...), or write them to disk as they come "
+            f"{free / 1e9:.3g} GB of memory are free. Save fewer of them (save=...), or write them to disk as they come "
             "(vmri_jax.stream)."
         )

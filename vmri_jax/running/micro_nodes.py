@@ -33,7 +33,7 @@ def why_not(t, t_micro) -> str:
     if np.ndim(t) != 1:
         return "it is a batch; take one lane of it"
     if t_micro is None:
-        return "it kept none; simulate with save_micro=True and save_every=1"
+        return "it kept none; simulate with save=vm.Save(micro=True)"
     t, t_micro = np.asarray(t, dtype=float), np.asarray(t_micro, dtype=float)
     if len(t) < 2:
         return "it has a single node"
@@ -43,7 +43,7 @@ def why_not(t, t_micro) -> str:
     # the first micro node than after it, there are further macro steps.
     before, after = t_micro[:, 0] - t[:-1], t[1:] - t_micro[:, 0]
     if t_micro.shape[1] > 1 and np.any(before > after * (1 + ROUND_OFF)):
-        return "it kept the micro nodes of some macro steps only; simulate with save_every=1"
+        return "it kept the micro nodes of some macro steps only; simulate with save=vm.Save(every=1, micro=True)"
     return ""
 
 

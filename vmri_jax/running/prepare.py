@@ -5,7 +5,7 @@ from dataclasses import replace
 import jax
 
 from vmri_jax.mechanics.state import Movable, State
-from vmri_jax.running.arguments import Steps
+from vmri_jax.running.arguments import Save, Steps
 from vmri_jax.running.memory import check_memory
 from vmri_jax.running.progress import Working
 from vmri_jax.running.simulation import Simulation, simulation
@@ -20,22 +20,21 @@ def prepare(
     state: State | None = None,
     *,
     macro_dt=None,
-    micro_dt=None,
     num_steps: int | None = None,
     t_end: float | None = None,
-    save_every: int = 1,
-    save_micro: bool = False,
+    save: int | Save = 1,
     solver: Solver | None = None,
 ) -> Simulation:
     """Check and compile a run of `simulate` once, to be called many times.
 
-        run = vm.prepare(system, scheme, state, macro_dt=0.01, num_steps=1000, save_every=10)
+        run = vm.prepare(system, scheme, state, macro_dt=0.01, num_steps=1000, save=10)
         trajectory = run()
         other = run(other_state, macro_dt=0.02, params=other_params)
 
     A call costs some ten microseconds besides its steps, and raises `SimulationError` if a step fails, as `simulate` does. The first call
     that needs the fallback compiles it, which takes as long as `prepare`. The run keeps what the functions of the system
-    read from around them (globals, closures, attributes) when it was prepared. Arguments as of `simulate`.
+    read from around them (globals, closures, attributes) when it was prepared. Arguments as of `simulate`; the run is one program, so that
+    it has no bar.
 
     Returns:
         The `Simulation`.
@@ -43,11 +42,12 @@ def prepare(
     Raises:
         ValueError, TypeError: bad arguments, as of `simulate`.
     """
-    run = simulation(system, scheme, state, solver, Steps(macro_dt, micro_dt, num_steps, t_end, save_every, save_micro))
+    run = simulation(system, scheme, state, solver, Steps(macro_dt, num_steps, t_end, save))
     if not run.is_concrete:
         raise ValueError("prepare: arguments are tracers; call it outside of jax.jit, vmap and grad, or take simulate.")
     run.check()
-    check_memory("prepare", run.state, scheme.num_micro, run.num_saves, save_micro)
+    run.save.without_bar("prepare")
+    check_memory("prepare", run.state, scheme.num_micro, run.num_saves, run.save_micro)
     on_device = ("system", "scheme", "solver", "state", "macro_dt")
     run = replace(run, **jax.device_put({name: getattr(run, name) for name in on_device}))
     with Working("prepare: the program of the run"):

@@ -158,13 +158,18 @@ def progress_to(name: str, progress: ShowsProgress) -> AbstractContextManager[Pr
     Raises:
         TypeError: neither True nor False nor a function.
     """
-    if isinstance(progress, bool):
-        return progress_shown() if progress else Working(name)
-    if not callable(progress):
+    check_progress(name, progress)
+    if callable(progress):
+        return nullcontext(progress)
+    return progress_shown() if progress else Working(name)
+
+
+def check_progress(name: str, progress: ShowsProgress) -> None:
+    """Refuse an argument `progress` of the function of this name that is neither True nor False nor a function."""
+    if not (isinstance(progress, bool) or callable(progress)):
         raise TypeError(
             f"{name}: progress is {progress!r}; it must be True or False, or a function of (what, done, total)."
         )
-    return nullcontext(progress)
 
 
 def shows_progress(function: Callable[P, R]) -> Callable[P, R]:

@@ -154,7 +154,7 @@ class Quantities(ABC):
 
         Args:
             micro: values at the micro nodes ``t_micro`` instead, (k - 1, num_micro, rows), with velocities from a spline through
-                the micro nodes; for runs with save_micro=True and save_every=1.
+                the micro nodes; for runs with ``save=vm.Save(micro=True)``.
 
         Raises:
             ValueError: the run does not know its system, or did not keep the micro nodes.

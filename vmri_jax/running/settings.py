@@ -35,7 +35,7 @@ class Settings:
     @property
     def arguments(self) -> dict[str, Any]:
         """Arguments of `vmri_jax.simulate` by name."""
-        steps = {"macro_dt": self.macro_dt, "num_steps": self.num_steps, "save_every": self.save_every}
+        steps = {"macro_dt": self.macro_dt, "num_steps": self.num_steps, "save": self.save_every}
         return {"scheme": self.scheme, **steps}
 
     def command(self, system: str) -> str:
@@ -58,4 +58,4 @@ class Settings:
         return cls(**{**data, "scheme": from_plain(data["scheme"])})
 
     def __str__(self) -> str:
-        return f"{self.python}, macro_dt={self.macro_dt!r}, num_steps={self.num_steps}, save_every={self.save_every}"
+        return f"{self.python}, macro_dt={self.macro_dt!r}, num_steps={self.num_steps}, save={self.save_every}"

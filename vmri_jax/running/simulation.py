@@ -29,14 +29,14 @@ from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.state import Movable, State, opened, start_of
 from vmri_jax.mechanics.summary import numbers, summary
 from vmri_jax.mechanics.system import System
-from vmri_jax.running.arguments import Steps, check_once, check_run, check_vectors, nothing_fast
+from vmri_jax.running.arguments import Save, Steps, check_once, check_run, check_vectors, nothing_fast
 from vmri_jax.running.engine import Arrays, Engine, Model, PieceStart, engine
 from vmri_jax.running.failures import simulation_error
 from vmri_jax.running.fallback import FALLING_BACK, unsolved
 from vmri_jax.running.interrupts import Interrupted, interrupts_noted
 from vmri_jax.running.observables import concerns, failures, observables, with_tolerance
 from vmri_jax.running.origin import Origin, evaluated, names_of
-from vmri_jax.running.progress import ShowsProgress, Working, progress_to
+from vmri_jax.running.progress import Working, progress_to
 from vmri_jax.running.saved import room_of_a_piece
 from vmri_jax.running.trajectory import Run, Trajectory, join, trajectory_of, with_origin
 from vmri_jax.schemes.composition import Composition
@@ -75,8 +75,9 @@ class Simulation:
     of the fallback is compiled only then.
 
     Attributes:
-        system, scheme, solver, state, num_steps, save_every, save_micro: as of `simulate`.
+        system, scheme, solver, state, num_steps, save: as of `simulate`.
         macro_dt: macro step H, an array of shape ().
+        save_every: macro steps from one saved node to the next.
         names: names of bodies and constraints; None if there are none.
         may_fall_back: whether the fallback is tried where the first matrix fails; else the run fails.
     """
@@ -88,7 +89,7 @@ class Simulation:
     macro_dt: Any
     num_steps: int
     save_every: int
-    save_micro: bool
+    save: Save
     names: Names | None
     may_fall_back: bool = True
 
@@ -223,6 +224,11 @@ class Simulation:
         return self.num_steps // self.save_every
 
     @property
+    def save_micro(self) -> bool:
+        """Whether micro nodes are saved."""
+        return self.save.micro
+
+    @property
     def is_concrete(self) -> bool:
         """Whether all arrays are concrete numbers, not tracers of a transformation."""
         return is_concrete(self.arrays)
@@ -315,16 +321,16 @@ class Simulation:
             return np.zeros(is_alive.shape, dtype=bool)
         return unsolved(np.asarray(run.result), np.max(run.info.method, axis=-1))
 
-    def in_pieces(self, progress: ShowsProgress = False, caller: str = "") -> Trajectory:
+    def in_pieces(self, caller: str = "") -> Trajectory:
         """The whole run; with a progress bar Ctrl-C raises `Interrupted` with the trajectory computed so far.
 
         With the name of a `caller` it warns about the motion, see `warn`.
         """
-        if progress is False:
+        if self.save.progress is False:
             with Working("the run", running=STEPPING):
                 return self._joined(self.advance(self.start(), self.num_saves)[0], caller)
         size, checkpoint, pieces = -(-self.num_saves // PARTS_OF_A_BAR), self.start(), []
-        with interrupts_noted() as interrupted, progress_to("simulate", progress) as tell:
+        with interrupts_noted() as interrupted, progress_to("simulate", self.save.progress) as tell:
             for done in range(0, self.num_saves, size):
                 tell("simulating", done, self.num_saves)
                 new_pieces, checkpoint = self.advance(checkpoint, min(size, self.num_saves - done))
@@ -348,14 +354,15 @@ def simulation(moving: Movable, scheme, state: State | None, solver: Solver | No
     problem = opened(moving)
     with Working("the start of the run"):
         system, state = start_of("simulate", problem, state)
-    macro_dt, num_steps, save_every = check_run(system, scheme, state, solver, steps)
+    num_steps, save_every = check_run(system, scheme, state, solver, steps)
     # Scenes only: `opened` returns problems as they are.
     advice = nothing_fast(scheme, state.q_f.size) if moving is not problem else ""
     if advice:
         warnings.warn(f"simulate: {advice}", stacklevel=3)
     chosen_solver, scheme, system = of_one_type((solver or Solver(), scheme, system))
-    state, macro_dt, names = State(*_arrays(state)), _float(macro_dt), names_of(problem)
-    return Simulation(system, scheme, chosen_solver, state, macro_dt, num_steps, save_every, steps.save_micro, names)
+    state, macro_dt, names = State(*_arrays(state)), _float(steps.macro_dt), names_of(problem)
+    save = Save.of(steps.save)
+    return Simulation(system, scheme, chosen_solver, state, macro_dt, num_steps, save_every, save, names)
 
 
 def _arrays(state: State) -> tuple:

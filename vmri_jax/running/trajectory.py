@@ -106,7 +106,7 @@ class Trajectory(Exports):
         info: work of the solver since the previous node.
         result: status of the run, the number of a `Result`, which prints as a sentence; after a failure the status of the failed step.
         failed_at: number of the macro step that failed; -1 if no step failed.
-        micro: the micro nodes of the macro step that ends at each saved node; None without save_micro=True.
+        micro: the micro nodes of the macro step that ends at each saved node; None without ``Save(micro=True)``.
         error: estimated error of the positions, a `RunError`; None without error=True or an accuracy.
         origin: system, parameters and names.
     """
@@ -154,12 +154,12 @@ class Trajectory(Exports):
 
     @property
     def t_micro(self) -> Any:
-        """(k - 1, num_micro) times of the micro nodes; None without save_micro=True."""
+        """(k - 1, num_micro) times of the micro nodes; None without ``Save(micro=True)``."""
         return None if self.micro is None else self.micro.t
 
     @property
     def q_f_micro(self) -> Any:
-        """(k - 1, num_micro, n_f) fast positions at the micro nodes, or by name; None without save_micro=True."""
+        """(k - 1, num_micro, n_f) fast positions at the micro nodes, or by name; None without ``Save(micro=True)``."""
         return None if self.micro is None else self.origin.shaped("f", self.micro.q_f)
 
     @property

@@ -229,7 +229,7 @@ def _first_derivatives(system: System, n_s: int, v_s, v_f):
 
 def prepare_steps(system: System, scheme: Scheme | Composition, state, macro_dt, num_steps: int = STEPS) -> Simulation:
     """A simulation, see `vmri_jax.prepare`, that saves the end alone; `operations` and `temporary_bytes` take its ``.compiled()``."""
-    return prepare(system, scheme, state, macro_dt=macro_dt, num_steps=num_steps, save_every=num_steps)
+    return prepare(system, scheme, state, macro_dt=macro_dt, num_steps=num_steps, save=num_steps)
 
 
 NO_OPERATION = {"parameter", "constant", "tuple", "get-tuple-element", "bitcast"}

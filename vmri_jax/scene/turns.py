@@ -43,7 +43,7 @@ def along_run(sorting: Sorting, joint: Joint, run: Any, of: str, pair: int) -> n
         raise ValueError(
             f"Scene.joint_motion: {joint.label(pair, sorting.bodies)} may turn by half a turn or more between the saved nodes {node} and "
             f"{node + 1}, and its angle comes from directors, which know no whole turns. Save nodes less than "
-            f'{np.pi / 2 / np.nanmax(fastest):.2g} s apart, save_every=..., or give the scene coordinates="joint".'
+            f'{np.pi / 2 / np.nanmax(fastest):.2g} s apart, save=..., or give the scene coordinates="joint".'
         )
     turns = np.round((at_start(sorting, joint, pair, freedom) - angle[..., :1]) / (2 * np.pi))
     return counted + 2 * np.pi * turns

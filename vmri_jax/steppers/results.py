@@ -131,8 +131,7 @@ class SimulationError(RuntimeError):
         explanation = f"{result.message} {moved}".strip()
         super().__init__(
             f"macro step {step} at t = {time:.6g} failed ({result.name}) after {iterations} Newton iterations with residual "
-            f"{residual:.2e}: {explanation} The trajectory up to there is in this exception's .trajectory; "
-            "throw=False returns it instead of raising."
+            f"{residual:.2e}: {explanation} This exception's .trajectory has the run up to there."
         )
 
     def advised(self, macro_dt: float, labels: str = "", jump: str = "") -> "SimulationError":

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from vmri_jax import StoredTrajectory, Trajectory, fully_implicit, stream
+from vmri_jax import Save, StoredTrajectory, Trajectory, fully_implicit, stream
 from vmri_jax.running.trajectory import named_arrays
 
 H, CHUNK, EVERY, STEPS = 0.02, 4, 2, 24
@@ -22,8 +22,7 @@ class Runs:
             "state": self.problem.state(),
             "macro_dt": H,
             "num_steps": STEPS,
-            "save_every": EVERY,
-            "save_micro": True,
+            "save": Save(EVERY, micro=True),
             "chunk": CHUNK,
         }
         return stream(out=out, **(arguments | changes))

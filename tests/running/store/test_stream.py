@@ -12,6 +12,7 @@ import pytest
 
 import vmri_jax as vm
 from tests.running.store.conftest import CHUNK, EVERY, STEPS, H, Runs, assert_identical
+from tests.support import until_failure
 from tests.user_systems import two_oscillators
 from vmri_jax import (
     ConstantMass,
@@ -69,8 +70,7 @@ def test_what_is_streamed_is_what_simulate_returns(run, uninterrupted):
         run.problem.state(),
         macro_dt=H,
         num_steps=STEPS,
-        save_every=EVERY,
-        save_micro=True,
+        save=vm.Save(EVERY, micro=True),
     )
     assert_identical(uninterrupted.load(), expected)
     assert uninterrupted.complete
@@ -109,7 +109,7 @@ def test_death_before_there_is_a_store(run, uninterrupted, out, monkeypatch):
 def test_the_state_alone_would_not_do(run, uninterrupted):
     """Newton starts from what it learned: without that the run differs in its last digits."""
     begun = uninterrupted[: CHUNK + 1]
-    arguments = {"macro_dt": H, "num_steps": STEPS - PER_CHUNK, "save_every": EVERY, "save_micro": True}
+    arguments = {"macro_dt": H, "num_steps": STEPS - PER_CHUNK, "save": vm.Save(EVERY, micro=True)}
     rest = simulate(run.problem.system, run.scheme, begun.final_state, **arguments)
     whole = join([begun, rest])
     assert not np.array_equal(whole.q_f, uninterrupted.load().q_f)
@@ -135,7 +135,7 @@ def test_a_complete_run_is_returned_at_once(run, uninterrupted, monkeypatch):
 
 def test_a_run_that_has_fallen_back_goes_on_so(tmp_path, monkeypatch):
     """At this step the march does not converge, see test_march."""
-    changes = {"scheme": fully_implicit(20), "macro_dt": 40.0, "num_steps": 12, "save_every": 1}
+    changes = {"scheme": fully_implicit(20), "macro_dt": 40.0, "num_steps": 12, "save": 1}
     run = partial(Runs(two_oscillators(kappa=25.0)), solver=Solver(max_iterations=6), **changes)
     whole, out = run(tmp_path / "whole.zarr").load(), tmp_path / "run.zarr"
     assert np.all(np.asarray(whole.info.method) == Method.EXACT)
@@ -159,7 +159,7 @@ def test_ctrl_c_finishes_the_chunk(run, uninterrupted, out, monkeypatch):
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
     assert isinstance(caught.value, KeyboardInterrupt)
     assert_identical(caught.value.done.load(), uninterrupted[: 2 * CHUNK])
-    assert_identical(run(out, resume=True, progress=True).load(), uninterrupted.load())
+    assert_identical(run(out, resume=True, save=vm.Save(EVERY, micro=True, progress=True)).load(), uninterrupted.load())
 
 
 def test_a_full_disk_keeps_what_was_written(run, uninterrupted, out, monkeypatch):
@@ -194,8 +194,8 @@ def test_a_failure_is_kept_with_its_status(run, out):
     changes = {"system": system, "scheme": fully_explicit(3), "num_steps": 48, "chunk": CHUNK}
     with pytest.raises(SimulationError, match=r"NON_FINITE.* after 0 Newton iterations") as caught:
         run(out, **changes)
-    arguments = {"macro_dt": H, "num_steps": 48, "save_every": EVERY, "save_micro": True, "throw": False}
-    expected = simulate(system, fully_explicit(3), run.problem.state(), **arguments)
+    arguments = {"macro_dt": H, "num_steps": 48, "save": vm.Save(EVERY, micro=True)}
+    expected = until_failure(system, fully_explicit(3), run.problem.state(), **arguments)
     failed = caught.value.trajectory
     assert isinstance(failed, StoredTrajectory)
     assert failed.failed_at == caught.value.step == int(expected.failed_at) >= PER_CHUNK
@@ -210,9 +210,9 @@ def test_a_failure_is_kept_with_its_status(run, out):
         assert np.array_equal(array, getattr(expected, name)[: len(array)], equal_nan=True)
     assert int(on_disk.failed_at) == failed.failed_at
     assert failed[:2].success
-    with pytest.raises(SimulationError, match="NON_FINITE"):
+    with pytest.raises(SimulationError, match="NON_FINITE") as caught:
         run(out, resume=True, **changes)
-    assert run(out, resume=True, throw=False, **changes).failed_at == failed.failed_at
+    assert caught.value.trajectory.failed_at == failed.failed_at
 
 
 # --- refusals --------------------------------------------------------------------------------------------------------
@@ -237,7 +237,7 @@ def same_name(power):
         ({"macro_dt": 0.03}, r"macro_dt: 0.03 here, 0.02 in the store"),
         ({"scheme": fully_explicit(3)}, r"scheme.slow.grid: macro here, micro in the store"),
         ({"solver": Solver(tolerance=1e-10)}, r"solver.tolerance: 1e-10 here, 1e-12 in the store"),
-        ({"save_micro": False}, r"save_micro: False here, True in the store"),
+        ({"save": EVERY}, r"save_micro: False here, True in the store"),
         ({"chunk": 5}, r"chunk: 5 here, 4 in the store"),
     ],
 )
@@ -315,7 +315,7 @@ def test_two_processes_do_not_write_at_once(run, uninterrupted):
         ({"chunk": 0}, r"chunk is 0; it must be an integer of at least 1"),
         ({"chunk": 2.5}, r"chunk is 2.5"),
         ({"system": System(ConstantMass(np.ones(3), np.ones(3)), of_two)}, r"slow_potential returns shape \(2,\)"),
-        ({"num_steps": 23}, r"not a multiple of save_every"),
+        ({"num_steps": 23}, r"not a multiple of save = "),
         ({"out": "nowhere/run.zarr"}, r"out is nowhere/run.zarr, but the folder nowhere does not exist; make it first"),
     ],
 )

@@ -9,13 +9,13 @@ import numpy as np
 
 from vmri_jax.mechanics.arrays import whole_number
 from vmri_jax.mechanics.state import Movable, State
-from vmri_jax.running.arguments import Steps
+from vmri_jax.running.arguments import Save, Steps
 from vmri_jax.running.export import DIMENSIONS, MICRO, rows_of
 from vmri_jax.running.failures import simulation_error
 from vmri_jax.running.files import explained
 from vmri_jax.running.interrupts import Interrupted, interrupts_noted
 from vmri_jax.running.observables import Observables
-from vmri_jax.running.progress import Progress, ShowsProgress, progress_to
+from vmri_jax.running.progress import Progress, progress_to
 from vmri_jax.running.saved import numbers_per_node
 from vmri_jax.running.simulation import Simulation, simulation
 from vmri_jax.running.store import layout
@@ -41,17 +41,13 @@ def stream(
     *,
     out: str | os.PathLike,
     macro_dt=None,
-    micro_dt=None,
     num_steps: int | None = None,
     t_end: float | None = None,
-    save_every: int = 1,
-    save_micro: bool = False,
+    save: int | Save = 1,
     solver: Solver | None = None,
     chunk: int | None = None,
     resume: bool = False,
     overwrite: bool = False,
-    throw: bool = True,
-    progress: ShowsProgress = False,
     drawing: dict | None = None,
 ) -> StoredTrajectory:
     """`simulate` that writes the trajectory to disk chunk by chunk; `resume` continues a run whose process was killed.
@@ -62,30 +58,28 @@ def stream(
     start; a resumed run whose functions do other operations is refused.
 
     Args:
-        system, scheme, state, macro_dt, micro_dt, t_end, save_every, save_micro, solver: as in `simulate`.
+        system, scheme, state, macro_dt, t_end, save, solver: as in `simulate`.
         out: folder of the store, a zarr group; conventionally named .zarr.
         num_steps: macro steps. A larger number than before makes a resumed run longer.
         chunk: saved intervals that are computed and written together, kept by the store; None for a hundredth of the run,
             within limits.
         resume: continue the run in `out`, which must be this run; start it if `out` does not exist. A complete run is returned at once.
         overwrite: replace a store in `out`.
-        throw: raise `SimulationError` if a step fails; else return the store. Either way all computed chunks are on disk.
-        progress: True for a bar, or a function of (what, done, total).
         drawing: plain data of a `vmri_jax.animation.Drawing`, kept in the store (see `Trajectory.save`).
 
     Returns:
-        The `StoredTrajectory`. After a failure it ends with the chunk of the failure, NaN from the failing step on.
+        The `StoredTrajectory`.
 
     Raises:
         ValueError, TypeError: bad arguments, or a store of another run, before anything is computed.
         FileExistsError: `out` exists, and neither `resume` nor `overwrite` is set.
         OSError: `out` cannot be written; after a full disk the earlier chunks are kept.
-        SimulationError: a step failed; the store is its trajectory.
+        SimulationError: a step failed; its trajectory is the store, whose last chunk is NaN from the failing step on.
         Interrupted: Ctrl-C; the current chunk is finished first (a second Ctrl-C does not wait for it).
     """
     path = Path(out)
     layout.check_place("stream", path, "run", resume, overwrite)
-    steps = Steps(macro_dt, micro_dt, num_steps, t_end, save_every, save_micro)
+    steps = Steps(macro_dt, num_steps, t_end, save)
     run = simulation(system, scheme, state, solver, steps)
     num_steps = run.num_steps
     if not run.is_concrete:
@@ -94,8 +88,8 @@ def stream(
     length = {"rows": run.num_saves + 1, "num_steps": num_steps}
     attributes = length | {
         "kind": "run",
-        "save_every": save_every,
-        "save_micro": save_micro,
+        "save_every": run.save_every,
+        "save_micro": run.save_micro,
         "chunk": _chunk(run) if chunk is None else whole_number("stream: chunk", chunk, otherwise=", or None"),
         "identity": identity(run, run.state),
         "made_with": environment(),
@@ -104,7 +98,7 @@ def stream(
     attributes |= {} if run.names is None else {"names": run.names.to_dict()}
     with (
         interrupts_noted() as interrupted,
-        progress_to("stream", progress) as tell,
+        progress_to("stream", run.save.progress) as tell,
         layout.writing(path, attributes, _arrays(run), overwrite),
     ):
         stored = StoredTrajectory(path)
@@ -119,10 +113,10 @@ def stream(
                 raise Interrupted(StoredTrajectory(path), step, num_steps, "macro steps")
     stored = StoredTrajectory(path)
     stored = stored.with_origin(run.origin) if len(stored) else stored
-    if throw and not stored.success:
-        interval = stored.failed_at // save_every
-        part, first = stored[interval : interval + 2], interval * save_every
-        raise simulation_error(part, run.macro_dt, save_every, scheme.num_micro, first, stored)
+    if not stored.success:
+        interval = stored.failed_at // run.save_every
+        part, first = stored[interval : interval + 2], interval * run.save_every
+        raise simulation_error(part, run.macro_dt, run.save_every, scheme.num_micro, first, stored)
     return stored
 
 
