@@ -7,6 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax import SimulationError, Solver, State, Trajectory, initial_state, macro_step, plan, simulate, systems
+from vmri_jax.running.origin import UNKNOWN
+from vmri_jax.running.trajectory import join, with_origin
 
 DATA = Path(__file__).parent / "data"
 PROBLEMS = {
@@ -42,6 +44,12 @@ def until_failure(*arguments, **options) -> Trajectory:
         return simulate(*arguments, **options)
     except SimulationError as failure:
         return failure.trajectory
+
+
+def joined(runs) -> Trajectory:
+    """One run of runs each of which goes on from the one before."""
+    bare = [(with_origin(run, UNKNOWN), np.asarray(run.energy)) for run in runs]
+    return with_origin(join(bare)[0], runs[0].origin)
 
 
 def without_fallback(moving, scheme, state=None) -> Solver:

@@ -262,7 +262,8 @@ def test_params_nested_partial_and_shared():
     assert (np.asarray(batch.failed_at) == -1).all()
     assert largest_difference(batch.q_f[0], batch.q_f[2]) == 0
     assert largest_difference(batch.q_f[0], batch.q_f[1]) > 1e-4
-    assert batch.origin.params["gravity"].shape == (3, 2)
+    lanes: Any = batch.origin.simulated
+    assert lanes.params["gravity"].shape == (3, 2)
     with_dots = simulate_batch(
         rod(),
         fully_implicit(2),

@@ -37,8 +37,9 @@ def moved(state: State) -> State:
 
 
 def test_it_runs_what_simulate_runs(fpu):
-    run = prepare(fpu.system, explicit_slow(3), fpu.state(), **STEPS | {"save": Save(2, micro=True)})
-    expected = simulate(fpu.system, explicit_slow(3), fpu.state(), **STEPS | {"save": Save(2, micro=True)})
+    steps: Any = STEPS | {"save": Save(2, micro=True)}
+    run = prepare(fpu.system, explicit_slow(3), fpu.state(), **steps)
+    expected = simulate(fpu.system, explicit_slow(3), fpu.state(), **steps)
     for name in ("t", "q_s", "q_f", "p_s", "p_f", "energy", "t_micro", "q_f_micro"):
         assert np.array_equal(getattr(run(), name), getattr(expected, name)), name
 

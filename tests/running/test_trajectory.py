@@ -6,8 +6,8 @@ import equinox as eqx
 import numpy as np
 import pytest
 
+from tests.support import joined
 from vmri_jax import Result, Save, State, Trajectory, explicit_slow, simulate
-from vmri_jax.running.trajectory import join
 
 FIELDS = ("t", "q_s", "q_f", "p_s", "p_f", "energy", "constraint_residual")
 
@@ -129,4 +129,4 @@ def test_the_status_of_all_pieces(trajectory, at):
     pieces = [trajectory, trajectory]
     roundoff = np.asarray(int(Result.CONVERGED_AT_ROUNDOFF))
     pieces[at] = eqx.tree_at(lambda piece: piece.result, trajectory, roundoff)
-    assert int(join(pieces).result) == Result.CONVERGED_AT_ROUNDOFF
+    assert int(joined(pieces).result) == Result.CONVERGED_AT_ROUNDOFF

@@ -186,9 +186,8 @@ def test_the_steps_have_no_energy_and_one_program_observes_all():
     prepared = vm.prepare(moving, EXPLICIT, macro_dt=0.1, num_steps=5)
     program: Any = _at_all(observables, prepared._system[0], (), False)
     assert _at_all.cache_info().misses == program._cache_size() == 1
-    arrays, *counts = prepared._arguments(None, None, None, None)
     engine: Any = prepared.engine
-    steps = str(jax.jit(lambda arrays: engine.run(arrays, *counts)).lower(arrays).compile().as_text())
+    steps = str(jax.jit(lambda leaves: engine.run(leaves, 1, 5)).lower(prepared.leaves).compile().as_text())
     whole = str(prepared.compiled().as_text())
     assert ["sine(" in text for text in (steps, whole)] == [True, True]
     assert [" cosine(" in text for text in (steps, whole)] == [False, True]

@@ -174,7 +174,6 @@ def test_explicit_chain_evaluates_v_once_and_w_num_micro_times_per_macro_step(fp
             num_steps=num_steps,
             save=num_steps,
         )
-        run.q_s.block_until_ready()
         jax.effects_barrier()
         counts.append(EVALUATIONS.copy())
     assert counts[1]["V"] - counts[0]["V"] == 15

@@ -8,11 +8,10 @@ energy to round-off.
 import numpy as np
 import pytest
 
-from tests.support import NAMES, area_change, largest_difference, node
+from tests.support import NAMES, area_change, joined, largest_difference, node
 from tests.user_systems import arms_kinetic, arms_weight, double_pendulum
 from vmri_jax import explicit_slow, fully_implicit, galerkin, initial_state, simulate
 from vmri_jax.diagnostics import observed_order
-from vmri_jax.running.trajectory import join
 
 SCHEMES = {
     "fully implicit": (fully_implicit(5), (80, 160, 320), 2),
@@ -54,7 +53,7 @@ def test_energy_band_without_drift(problem, name):
     pieces = [run_of(problem, name, 2000, 0.02)]
     for _ in range(4):
         pieces.append(run_of(problem, name, 2000, 0.02, pieces[-1].final_state))
-    run = join(pieces)
+    run = joined(pieces)
     energy = np.asarray(run.energy) / abs(float(run.energy[0]))
     drift = np.polyfit(np.linspace(0, 1, energy.size), energy, 1)[0]
     assert np.ptp(energy) < {"fully implicit": 1e-3, "gauss 2": 1e-7}[name]  # measured 2.0e-4, 1.9e-8

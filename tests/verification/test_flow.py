@@ -16,6 +16,7 @@ from tests.support import (
     NUM_SAVES,
     PROBLEMS,
     area_change,
+    joined,
     largest_difference,
     node,
     states_near,
@@ -39,7 +40,6 @@ from vmri_jax import (
     systems,
 )
 from vmri_jax.diagnostics import momentum_map, rotation_about, symplectic_defect, translation_along
-from vmri_jax.running.trajectory import join
 
 MACRO_DT = {"fpu": 0.05, "tsp": 0.02, "sam": 0.02}
 
@@ -156,7 +156,7 @@ def long_run(system, scheme, state):
     for _ in range(2):
         pieces.append(simulate(system, scheme, state, macro_dt=0.01, num_steps=100 * NUM_SAVES, save=100))
         state = pieces[-1].final_state
-    return join(pieces)
+    return joined(pieces)
 
 
 @cache

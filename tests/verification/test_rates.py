@@ -130,7 +130,7 @@ def test_evaluations():
     counts = []
     for num_steps in (3, 13):
         EVALUATIONS.clear()
-        vm.simulate(system, SCHEME, START, macro_dt=H, num_steps=num_steps, save=num_steps).q_f.block_until_ready()
+        vm.simulate(system, SCHEME, START, macro_dt=H, num_steps=num_steps, save=num_steps)
         jax.effects_barrier()
         counts.append(EVALUATIONS.copy())
     per_step = {name: (counts[1][name] - counts[0][name]) / 10 for name in LEVELS}

@@ -1,7 +1,6 @@
 """`simulate_batch`: runs side by side, with an estimate of their errors on request."""
 
 import warnings
-from dataclasses import replace
 from functools import cache
 
 import jax
@@ -15,7 +14,7 @@ from vmri_jax.running.arguments import Save, Steps
 from vmri_jax.running.batch import Batch, batch
 from vmri_jax.running.progress import Working
 from vmri_jax.running.run_error import RunError
-from vmri_jax.running.trajectory import Trajectory, trajectory_of, with_origin
+from vmri_jax.running.trajectory import Trajectory, with_observables, with_origin
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.results import Result
@@ -75,11 +74,11 @@ def simulate_batch(
     steps = Steps(macro_dt, num_steps, t_end, save)
     with Working("simulate_batch: the starts"):
         lanes = batch(system, scheme, states, steps, params, solver, chunk, devices)
-    done, table = lanes()
-    plain = trajectory_of(done, table)
+    plain, table = lanes()
+    plain = with_observables(plain, table)
     errors = _errors(lanes, plain) if error else None
-    trajectory = replace(with_origin(jax.device_put(plain), lanes.origin), error=errors)
-    lanes.run.warn("simulate_batch", table, done.states.t, lanes.arrays.macro_dt)
+    trajectory = with_origin(plain, lanes.origin, error=errors)
+    lanes.run.warn("simulate_batch", table, plain.states.t, lanes.leaves[0])
     for kind, message in ((FailedLanesWarning, _failures(trajectory)), (UncertifiedWarning, _uncertified(trajectory))):
         if warn and message:
             warnings.warn(f"simulate_batch: {message}", kind, stacklevel=2)
@@ -91,7 +90,7 @@ def _errors(lanes: Batch, plain: Trajectory) -> RunError:
 
     @cache
     def companions(parts: int, whole: int = 1) -> Trajectory:
-        return trajectory_of(*lanes.with_steps(finer(lanes.run, parts, whole))())
+        return with_observables(*lanes.with_steps(finer(lanes.run, parts, whole))())
 
     def error(i: int) -> RunError:
         run, coarse, halved = lanes.lane(i), plain.lane(i), companions(2).lane(i)

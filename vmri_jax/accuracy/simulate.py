@@ -12,8 +12,8 @@ from vmri_jax.mechanics.state import Movable, State
 from vmri_jax.running.adjoints import traced_run
 from vmri_jax.running.arguments import Save, Steps
 from vmri_jax.running.failures import simulation_error
-from vmri_jax.running.memory import check_memory
 from vmri_jax.running.progress import progress_to
+from vmri_jax.running.saved import check_memory
 from vmri_jax.running.simulation import simulation
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes.composition import Composition
@@ -104,7 +104,7 @@ def simulate(
         check_system(run.system, run.state.q_s, run.state.q_f)
         return traced_run(run)
     run.check()
-    check_memory("simulate", run.state, scheme.num_micro, run.num_saves, run.save_micro)
+    check_memory("simulate", run)
     check_function_of_run(of, run)
     trajectory = run.in_pieces("simulate")
     if int(trajectory.failed_at) >= 0:

@@ -15,8 +15,8 @@ from vmri_jax.mechanics.driving import events
 from vmri_jax.mechanics.invariants import velocity
 from vmri_jax.mechanics.state import Movable, Problem, State, start_of
 from vmri_jax.running.arguments import Steps
-from vmri_jax.running.memory import check_memory
 from vmri_jax.running.progress import Progress, silent
+from vmri_jax.running.saved import check_memory
 from vmri_jax.running.settings import Settings
 from vmri_jax.running.simulation import Simulation, simulation
 from vmri_jax.schemes.composition import Composition
@@ -97,7 +97,7 @@ def search_of(
     def make(scheme: Scheme | Composition) -> Simulation:
         run = simulation(system, scheme, state, solver, Steps(length, num_steps=1))
         run.check()
-        check_memory("simulate", run.state, scheme.num_micro, num_saves or MOST_SAVED, False)
+        check_memory("simulate", run, num_saves=num_saves or MOST_SAVED)
         check_function_of_run(of, run)
         return run
 

@@ -20,7 +20,7 @@ from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
 from vmri_jax.running.observables import observables, with_tolerance
 from vmri_jax.running.origin import Origin, names_of
 from vmri_jax.running.progress import ShowsProgress, progress_to
-from vmri_jax.running.trajectory import Run, RunInfo, Trajectory, trajectory_of, with_origin
+from vmri_jax.running.trajectory import RunInfo, Trajectory, with_observables
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.results import Result
@@ -127,7 +127,7 @@ def minimize(
     driven = setup.driven(u, setup.start.t)
     origin = replace(Origin.of(driven), names=names_of(opened_problem))
     # The last nodes may have gaps; the trajectory is the motion that the controls make.
-    trajectory = with_origin(_trajectory(setup, *rolled(setup, u)), origin)
+    trajectory = _trajectory(setup, *rolled(setup, u), origin)
     controls, times = np.asarray(u), setup.times(num_steps)
     if grid == "macro":
         controls, times = controls[:, 0], times[:, 0]
@@ -149,16 +149,13 @@ def minimize(
     )
 
 
-def _trajectory(setup: Transcription, z, status: StepStatus) -> Trajectory:
+def _trajectory(setup: Transcription, z, status: StepStatus, origin: Origin) -> Trajectory:
     """The run with nodes z (N, n) after the start."""
     count = len(z)
     nodes = jax.vmap(setup.state)(jnp.concatenate([setup.z_start[None], z]), jnp.arange(count + 1))
     table = jax.jit(jax.vmap(partial(observables, setup.system)))(with_tolerance(nodes, 0.0))
     failed = np.flatnonzero(np.asarray(status.result) > Result.CONVERGED_AT_ROUNDOFF)
-    run = Run(
-        nodes,
-        info=RunInfo(status.method, status.iterations, status.residual),
-        result=status.result[failed[0]] if failed.size else jnp.max(status.result),
-        failed_at=np.asarray(failed[0] if failed.size else -1),
-    )
-    return trajectory_of(run, table)
+    info = RunInfo(status.method, status.iterations, status.residual)
+    result = status.result[failed[0]] if failed.size else jnp.max(status.result)
+    run = Trajectory(nodes, None, None, info, result, np.asarray(failed[0] if failed.size else -1))
+    return with_observables(run, table, origin)

@@ -11,10 +11,10 @@ the steps from the last to the first and needs the state at which each step star
 
 from collections.abc import Callable
 
-from vmri_jax.running.engine import Arrays, Engine
+from vmri_jax.running.engine import Engine
 from vmri_jax.running.fallback import solved_again, unsolved
 from vmri_jax.running.simulation import Simulation
-from vmri_jax.running.trajectory import Run, Trajectory
+from vmri_jax.running.trajectory import Trajectory
 
 LONGEST_STORED_RUN = 10_000
 """Macro steps of the longest run for which "auto" stores the start of every step; a larger value takes more memory."""
@@ -27,16 +27,16 @@ def traced_run(run: Simulation) -> Trajectory:
         adjoint = "stored" if run.num_steps <= LONGEST_STORED_RUN else "checkpoint"
     first = _differentiable(run.engine, adjoint, run.save_every)
     if not run.plan.has_fallback:
-        return run.traced(first(run.arrays))
+        return run.traced(first(run.leaves))
     exact = _differentiable(run.exact.engine, adjoint, run.save_every)
-    return run.traced(solved_again(first, exact, _is_unsolved, run.arrays))
+    return run.traced(solved_again(first, exact, _is_unsolved, run.leaves))
 
 
-def _is_unsolved(run: Run):
+def _is_unsolved(run: Trajectory):
     return unsolved(run.result, run.info.method.max())
 
 
-def _differentiable(engine: Engine, adjoint: str, save_every: int) -> Callable[[Arrays], Run]:
-    """The run as a function of its arrays, with this adjoint."""
+def _differentiable(engine: Engine, adjoint: str, save_every: int) -> Callable[[list], Trajectory]:
+    """The run as a function of the leaves of its motion, with this adjoint."""
     program = engine.stored if adjoint == "stored" else engine.checkpointed
-    return lambda arrays: program(arrays, save_every)
+    return lambda leaves: program(leaves, save_every)

@@ -20,13 +20,13 @@ from vmri_jax.mechanics.names import unknown
 from vmri_jax.mechanics.state import Movable, State, initial_state, opened, start_of
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.arguments import Steps, check_step_size
-from vmri_jax.running.engine import Arrays, Engine
+from vmri_jax.running.engine import NUM_STATE, Engine
 from vmri_jax.running.fallback import FALLING_BACK
-from vmri_jax.running.memory import check_memory
 from vmri_jax.running.origin import Origin, is_repeated
 from vmri_jax.running.progress import Working
+from vmri_jax.running.saved import check_memory
 from vmri_jax.running.simulation import STEPPING, Simulation, simulation
-from vmri_jax.running.trajectory import Run
+from vmri_jax.running.trajectory import Piece
 from vmri_jax.schemes.composition import Composition, stage_scheme
 from vmri_jax.schemes.scheme import Scheme
 
@@ -45,65 +45,62 @@ class Batch:
 
     Attributes:
         run: the run of the first lane.
-        arrays: (lanes, ...) the numbers of all lanes.
+        leaves: (lanes, ...) the leaves of the motions of all lanes.
         width: lanes that are computed side by side.
         devices: CPU devices that share the lanes.
     """
 
     run: Simulation
-    arrays: Arrays
+    leaves: list
     width: int
     devices: int
 
-    def __call__(self) -> tuple[Run, np.ndarray]:
+    def __call__(self) -> Piece:
         """The runs and their observables, see `Simulation.observed`; lanes that are not solved are computed again by the fallback."""
-        run, lanes = self.run, len(self.arrays.macro_dt)
+        run, lanes = self.run, len(self.leaves[0])
         with Working(f"simulate_batch, {lanes} lanes", running=STEPPING):
-            done, table = self._in_chunks()
-        failed = np.flatnonzero(run.unsolved(done))
+            done = self._in_chunks()
+        failed = np.flatnonzero(run.unsolved(done[0]))
         if failed.size:
             # Failed lanes are padded to a power of two with copies of the last one, so that few programs serve all numbers of failures.
             padded_size = 2 ** int(failed.size - 1).bit_length()
             padded = failed[np.minimum(np.arange(padded_size), failed.size - 1)]
             with Working(f"simulate_batch, {failed.size} of {lanes} lanes: {FALLING_BACK}"):
-                again = replace(self, run=run.exact, arrays=_taken(self.arrays, padded))._in_chunks()
-            for old, new in zip(jax.tree.leaves((done, table)), jax.tree.leaves(again), strict=True):
+                again = replace(self, run=run.exact, leaves=_taken(self.leaves, padded))._in_chunks()
+            for old, new in zip(jax.tree.leaves(done), jax.tree.leaves(again), strict=True):
                 old[failed] = new[: failed.size]
-        return done, table
+        return done
 
     @property
     def origin(self) -> Origin:
         """The origin of its trajectories."""
-        structure = jax.tree.structure(self.run.system.params)
-        params = self.arrays.model[len(self.arrays.model) - structure.num_leaves :]
-        return self.run.origin.repeated((len(self.arrays.macro_dt),), jax.tree.unflatten(structure, params))
+        structure, count = self.run._system
+        return Origin(self.run.names, jax.tree.unflatten(structure, self.leaves[len(self.leaves) - count :]))
 
     def lane(self, i: int) -> Simulation:
         """The run of a lane."""
-        model, state, macro_dt = jax.tree.map(lambda a: a[i], self.arrays)
-        system = self.run.engine.model(model).system
-        return replace(self.run, system=system, state=State(*state), macro_dt=macro_dt)
+        return replace(self.run, **self.run.engine.motion([a[i] for a in self.leaves])._asdict())
 
     def with_steps(self, run: Simulation) -> "Batch":
         """The batch with the steps of another run of its first lane, in the same ratio for all lanes."""
-        macro_dt = self.arrays.macro_dt
+        macro_dt, *others = self.leaves
         all_alike = shared(run.macro_dt, len(macro_dt))
         macro_dt = all_alike if is_repeated(macro_dt) else macro_dt * (run.macro_dt / macro_dt[0])
-        return replace(self, run=run, arrays=self.arrays._replace(macro_dt=macro_dt))
+        return replace(self, run=run, leaves=[macro_dt, *others])
 
-    def _in_chunks(self) -> tuple[Run, np.ndarray]:
+    def _in_chunks(self) -> Piece:
         """All lanes, `width` at a time; the last chunk is padded with copies of its last lane, so that one program computes all chunks."""
-        lanes = len(self.arrays.macro_dt)
+        lanes = len(self.leaves[0])
         width = min(self.width, -(-lanes // self.devices) * self.devices)
-        differs = tuple(not is_repeated(a) for a in jax.tree.leaves(self.arrays))
-        program = _side_by_side(self.run.engine, jax.tree.structure(self.arrays), differs, self.devices)
+        program = _side_by_side(self.run.engine, tuple(not is_repeated(a) for a in self.leaves), self.devices)
         pieces = []
         for start in range(0, lanes, width):
-            part = _taken(self.arrays, np.minimum(np.arange(start, start + width), lanes - 1))
-            part = jax.tree.map(lambda a: a[0] if is_repeated(a) else a, part)
+            part = _taken(self.leaves, np.minimum(np.arange(start, start + width), lanes - 1))
+            part = [a[0] if is_repeated(a) else a for a in part]
             pieces.append(program(part, self.run.save_every))
-        whole = [np.concatenate(parts)[:lanes] for parts in zip(*pieces, strict=True)]
-        return self.run.observed(Run.of(whole), self.arrays.model)
+        saved, result, failed_at = jax.tree.map(lambda *parts: np.concatenate(parts)[:lanes], *pieces)
+        run = self.run.unpacked(saved, self.leaves, result, failed_at, self.run.save_every)
+        return self.run.observed(run, self.leaves)
 
 
 def batch(
@@ -144,17 +141,16 @@ def batch(
     run, lanes = simulation(problem, scheme, first, solver, steps), len(state[0])
     run.save.without_bar("simulate_batch")
     run.check("simulate_batch: the positions of the first state", constraints=not differs)
-    check_memory("simulate_batch", run.state, scheme.num_micro, run.num_saves, run.save_micro, lanes)
-    model = run.arrays.model  # the parameters come last, see `Arrays`
+    check_memory("simulate_batch", run, lanes)
+    model = run.leaves[NUM_STATE:]  # the parameters come last, see `Motion`
     model = [shared(leaf, lanes) for leaf in model[: len(model) - len(params)]] + params
-    return Batch(
-        run, Arrays(model, state, macro_dt), (lanes_at_once(run) if chunk is None else chunk) * devices, devices
-    )
+    width = (lanes_at_once(run) if chunk is None else chunk) * devices
+    return Batch(run, [macro_dt, *state, *model], width, devices)
 
 
-def _taken(arrays: Arrays, index: np.ndarray) -> Arrays:
+def _taken(leaves: list, index: np.ndarray) -> list:
     """The lanes with these numbers."""
-    return jax.tree.map(lambda a: shared(a[0], len(index)) if is_repeated(a) else a[index], arrays)
+    return [shared(a[0], len(index)) if is_repeated(a) else a[index] for a in leaves]
 
 
 def shared(value, lanes: int) -> np.ndarray:
@@ -265,17 +261,12 @@ def lanes_at_once(run: Simulation) -> int:
 
 
 @lru_cache(maxsize=32)
-def _side_by_side(engine: Engine, structure, differs: tuple[bool, ...], devices: int):
-    """``program(arrays, save_every)``: a run of `engine` for each lane; `differs` says which of the arrays have an axis of lanes."""
-
-    def lane(arrays: Arrays, save_every):
-        return jax.tree.leaves(engine.run(arrays, save_every))
-
-    program = jax.vmap(lane, (jax.tree.unflatten(structure, [0 if differ else None for differ in differs]), None))
+def _side_by_side(engine: Engine, differs: tuple[bool, ...], devices: int):
+    """``program(leaves, save_every)``: `Engine.run` for each lane; `differs` says which of the leaves have an axis of lanes."""
+    program = jax.vmap(engine.run, ([0 if differ else None for differ in differs], None))
     if devices > 1:
         mesh = jax.sharding.Mesh(np.array(jax.devices()[:devices]), ("lanes",))
         spread = PartitionSpec("lanes")
-        specs = jax.tree.unflatten(structure, [spread if differ else PartitionSpec() for differ in differs])
-        in_specs = specs, PartitionSpec()
+        in_specs = [spread if differ else PartitionSpec() for differ in differs], PartitionSpec()
         program = jax.shard_map(program, mesh=mesh, in_specs=in_specs, out_specs=spread, check_vma=False)
     return jax.jit(program, compiler_options=options_of_runs())

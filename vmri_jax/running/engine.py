@@ -4,7 +4,6 @@ Names: `save_every` macro steps lie between two saved nodes; `num_saves` saved i
 the first `saves` of them.
 """
 
-from collections import defaultdict
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
 from typing import Any, NamedTuple
@@ -20,7 +19,7 @@ from vmri_jax.mechanics.system import System
 from vmri_jax.running.loops import MOST_STORED_STEPS, PLAIN, Loops, Recursive, Stored
 from vmri_jax.running.observables import observables, with_tolerance
 from vmri_jax.running.saved import Saved
-from vmri_jax.running.trajectory import MicroNodes, Run, RunInfo
+from vmri_jax.running.trajectory import MicroNodes, RunInfo, Trajectory
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.plan import Plan, plan
@@ -28,56 +27,52 @@ from vmri_jax.steppers.results import Result
 from vmri_jax.steppers.solver import Solver
 
 
-class Model(NamedTuple):
-    """Solver, scheme and system: everything but state and macro step that the motion depends on."""
+class Motion(NamedTuple):
+    """The numbers and functions that a motion follows from; the programs of an `Engine` get it as a list of leaves.
 
+    A system is flattened once: to flatten it at every call would take longer than a short run. Two places in the list are fixed: first
+    macro_dt and the five arrays of the state; last the leaves of the parameters, since `params` is the last of the fields of a `System` that have leaves.
+    """
+
+    macro_dt: Any
+    state: State
     solver: Solver
     scheme: Scheme | Composition
     system: System
 
-
-class Arrays(NamedTuple):
-    """The numbers that a run is computed from, flattened once: to flatten a system at every call would take longer than a short run.
-
-    model: leaves of a `Model`. `system` is its last field, and `params` is the last of the fields of a `System` that have leaves, so that the
-        leaves of the parameters come last.
-    state: the five arrays of the state at the start.
-    macro_dt: macro step H.
-    """
-
-    model: list
-    state: tuple
-    macro_dt: Any
-
-    def start(self) -> State:
-        """The state at the start."""
-        return State(*self.state)
+    def stepper(self, reverse_only: bool = False) -> Plan:
+        """The `Plan` that takes the steps."""
+        return plan(self.system, self.scheme, self.state, self.solver, reverse_only=reverse_only)
 
 
-class PieceStart(NamedTuple):
-    """The place in a run where a piece begins.
+NUM_STATE = 6
+"""Leaves of macro_dt and of the state in a list of leaves."""
 
-    memory: memory of the stepper after the previous piece.
-    is_first: whether the stepper has no memory of earlier steps; then the memory of a first step replaces `memory`.
-    t_start: time of the start of the whole run.
-    step: macro steps done before the piece.
-    """
 
+class Cursor(NamedTuple):
+    """Progress of a run: state and memory before macro step `step`, the worst `result` so far, the failed step or -1."""
+
+    state: State
     memory: Any
-    is_first: Any
-    t_start: Any
-    step: Any
+    step: Int[Numbers, ""]
+    result: Int[Numbers, ""]
+    failed_at: Int[Numbers, ""]
+
+    @classmethod
+    def at_start(cls, state: State, memory) -> "Cursor":
+        """The cursor of a run that begins."""
+        return cls(state, memory, np.asarray(0), np.asarray(int(Result.CONVERGED)), np.asarray(-1))
 
 
 @dataclass(frozen=True)
 class Engine:
-    """Compiled runs of all systems and schemes of one structure, as functions of `Arrays` and of numbers of steps.
+    """Compiled runs of all systems and schemes of one structure, as functions of the leaves of a `Motion` and of numbers of steps.
 
     Two kinds of loops: `whole` and `piece` use `jax.lax.while_loop`, which is fast, and the numbers of steps are traced arguments; `stored`
     and `checkpointed` use `jax.lax.scan`, which reverse mode can differentiate, but the numbers of steps are static.
 
     Attributes:
-        structure: structure of the pytree `Model`.
+        structure: structure of the pytree `Motion`.
         num_saves: saved intervals that fit into the arrays of a run.
         save_micro: whether micro nodes are saved.
     """
@@ -88,155 +83,147 @@ class Engine:
 
     @cached_property
     def whole(self):
-        """``whole(arrays, save_every, saves)``: a run from its first step, as the arrays of its `Run`, and its `Observables` (k, 9).
+        """``whole(leaves, save_every, saves)``: the nodes of `run`, in each row its `Observables` beside, and (2,) result and failed step.
 
         Only the first `saves` of the saved intervals are computed. A call of a prepared run is short: observables of a program of their own would add
-        a third to it.
+        a third to it, and each array that it returns some 20 microseconds.
         """
 
-        def whole(arrays: Arrays, *counts):
-            run = self.run(arrays, *counts)
-            nodes = with_tolerance(run.states, self.model(arrays.model).solver.tolerance)
-            return jax.tree.leaves(run), jax.vmap(partial(observables, self.model(arrays.model).system))(nodes)
+        def whole(leaves: list, save_every, saves):
+            motion, (saved, *status) = self.motion(leaves), self.run(leaves, save_every, saves)
+            steps = jnp.arange(self.num_saves + 1) * save_every
+            states = saved.states(motion.state, motion.state.t + steps * motion.macro_dt)
+            nodes = with_tolerance(states, motion.solver.tolerance)
+            table = jax.vmap(partial(observables, motion.system))(nodes)
+            return Saved(jnp.concatenate([saved.rows, table], axis=1), saved.micros), jnp.stack(status)
 
         return jax.jit(whole, compiler_options=options_of_runs())
 
     @cached_property
     def stored(self):
-        """``stored(arrays, save_every)``: `run` with `save_every` static, to be differentiated in any mode."""
-
-        def stored(arrays: Arrays, save_every):
-            return self.run(arrays, save_every, loops=Stored())
-
-        return jax.jit(stored, static_argnums=1)
+        """``stored(leaves, save_every)``: a run with `save_every` static, to be differentiated in any mode."""
+        return jax.jit(partial(self._by_scan, loops=Stored()), static_argnums=1)
 
     @cached_property
     def checkpointed(self):
         """`stored` with derivatives in reverse mode only, whose memory grows like the logarithm of the number of steps."""
 
-        def checkpointed(arrays: Arrays, save_every):
+        def checkpointed(leaves: list, save_every):
             loops = Stored() if self.num_saves * save_every <= MOST_STORED_STEPS else Recursive(save_every)
-            return self.run(arrays, save_every, loops=loops, reverse_only=True)
+            return self._by_scan(leaves, save_every, loops, reverse_only=True)
 
         return jax.jit(checkpointed, static_argnums=1)
 
     @cached_property
     def piece(self):
-        """``piece(saved, arrays, begin, save_every, saves)``: the next `saves` saved intervals of a run, as a `_Loop`.
+        """``piece(saved, leaves, cursor, is_first, save_every, saves)``: the next `saves` saved intervals of a run, and its cursor.
 
-        The nodes are written into the arrays `saved`, which are donated: the caller must not use them again.
+        If the piece `is_first`, the memory of a first step replaces the memory of the cursor. The nodes are written into the arrays `saved`, which are
+        donated: the caller must not use them again.
         """
 
-        def piece(saved: Saved, arrays: Arrays, begin: PieceStart, save_every, saves):
-            start, macro_dt = arrays.start(), arrays.macro_dt
-            stepper = self.stepper(arrays.model, start)
-            memory = jax.tree.map(partial(jnp.where, begin.is_first), stepper.init(start, macro_dt), begin.memory)
-            times = _Times(begin.t_start, macro_dt, save_every)
-            return self._by_while_loop(stepper, _Cursor.before(start, memory, begin.step), saved, times, saves)
+        def piece(saved: Saved, leaves: list, cursor: Cursor, is_first, save_every, saves):
+            motion = self.motion(leaves)
+            stepper = motion.stepper()
+            first = stepper.init(cursor.state, motion.macro_dt)
+            cursor = cursor._replace(memory=jax.tree.map(partial(jnp.where, is_first), first, cursor.memory))
+            return self._by_while_loop(stepper, motion, cursor, saved, save_every, saves)
 
         return jax.jit(piece, donate_argnums=0, compiler_options=options_of_runs())
 
     def next_piece(
-        self, arrays: Arrays, begin: PieceStart, save_every: int, saves: int, is_alive: bool = True
-    ) -> tuple[Run, State, Any]:
-        """`piece` as a `Run` in arrays of NumPy, and the state and memory at its end; without steps, NaN, unless the run is alive."""
-        scheme = self.model(arrays.model).scheme
-        free = self._free[tuple(a.shape for a in arrays.state)]
+        self, leaves: list, cursor: Cursor, is_first: bool, save_every: int, saves: int
+    ) -> tuple[Saved, Cursor]:
+        """`piece` with its nodes in arrays of NumPy; nodes after a failure have old data."""
+        free = self._room(leaves)[1]
         try:
             room = free.pop()
         except IndexError:  # the first piece, or all arrays are in use by other threads
-            room = self._empty(arrays.start(), scheme.num_micro)
-        loop = self.piece(room, arrays, begin, save_every, saves if is_alive else -1)
-        saved = loop.saved.first(saves, int(loop.number))
-        free.append(loop.saved)
-        macro_dt = np.asarray(arrays.macro_dt)
-        times = np.asarray(begin.t_start) + (begin.step + np.arange(saves + 1) * save_every) * macro_dt
-        run = self._run(scheme, loop._replace(saved=saved), times, macro_dt)
-        return run, loop.cursor.state, loop.cursor.memory
+            room = self._empty(self.motion(leaves))
+        saved, cursor = self.piece(room, leaves, cursor, is_first, save_every, saves)
+        nodes = saved.first(saves)
+        free.append(saved)
+        return nodes, cursor
+
+    def blank_memory(self, leaves: list):
+        """Zeros in the shapes of the memory of the stepper, for a first piece."""
+        return self._room(leaves)[0]
+
+    def _room(self, leaves: list) -> tuple[Any, list[Saved]]:
+        """Blank memory, and arrays for saved nodes that no piece uses at present, for a motion of these shapes."""
+        shapes = tuple((a.shape, a.dtype) for a in leaves)
+        if shapes not in self._rooms:
+            blank = jax.eval_shape(self._first_memory, [jax.ShapeDtypeStruct(*shape) for shape in shapes])
+            self._rooms[shapes] = jax.device_put(jax.tree.map(lambda a: np.zeros(a.shape, a.dtype), blank)), []
+        return self._rooms[shapes]
 
     @cached_property
-    def _free(self) -> defaultdict[tuple, list[Saved]]:
-        """Arrays for saved nodes that no piece uses at present, by the shapes of states."""
-        return defaultdict(list)
+    def _rooms(self) -> dict[tuple, tuple[Any, list[Saved]]]:
+        return {}
 
-    def blank_memory(self, arrays: Arrays):
-        """Zeros in the shapes of the memory of the stepper, for a `PieceStart` that is the first."""
-        return _blank_memory(self, tuple((a.shape, a.dtype) for a in (*arrays.model, *arrays.state)))
+    def _first_memory(self, leaves: list):
+        motion = self.motion(leaves)
+        return motion.stepper().init(motion.state, motion.macro_dt)
 
-    def run(
-        self, arrays: Arrays, save_every, saves=None, loops: Loops | None = None, reverse_only: bool = False
-    ) -> Run:
-        """A run from its first step, not jitted; of all saved intervals, or of the first `saves` of them.
+    def run(self, leaves: list, save_every, saves=None) -> tuple[Saved, Any, Any]:
+        """The nodes of a run from its first step, its result, and the failed step, not jitted; of all saved intervals, or of the first `saves` of them."""
+        motion = self.motion(leaves)
+        stepper = motion.stepper()
+        cursor = Cursor.at_start(motion.state, stepper.init(motion.state, motion.macro_dt))
+        saved, cursor = self._by_while_loop(stepper, motion, cursor, self._empty(motion), save_every, saves)
+        return saved, cursor.result, cursor.failed_at
 
-        Args:
-            loops: loops that reverse mode can differentiate; None for the while-loop.
-            reverse_only: as of `plan`.
-        """
-        start, macro_dt = arrays.start(), arrays.macro_dt
-        stepper, times = self.stepper(arrays.model, start, reverse_only), _Times(start.t, macro_dt, save_every)
-        cursor = _Cursor.before(start, stepper.init(start, macro_dt), 0)
-        if loops is not None:
-            return self._by_scan(stepper, cursor, times, loops)
-        empty = self._empty(start, stepper.scheme.num_micro)
-        loop = self._by_while_loop(stepper, cursor, empty, times, saves)
-        if saves is not None:  # else all nodes are written
-            loop = loop._replace(saved=loop.saved.ended(saves, loop.number))
-        nodes = start.t + jnp.arange(self.num_saves + 1) * save_every * macro_dt
-        return self._run(stepper.scheme, loop, nodes, macro_dt)
-
-    def model(self, leaves: list) -> Model:
-        """The `Model` with these leaves."""
+    def motion(self, leaves: list) -> Motion:
+        """The `Motion` with these leaves."""
         return jax.tree.unflatten(self.structure, leaves)
 
-    def stepper(self, leaves: list, state: State, reverse_only: bool = False) -> Plan:
-        """The `Plan` that takes the steps of the model with these leaves."""
-        solver, scheme, system = self.model(leaves)
-        return plan(system, scheme, state, solver, reverse_only=reverse_only)
-
-    def _by_while_loop(self, stepper: Plan, cursor: "_Cursor", saved: Saved, times: "_Times", saves) -> "_Loop":
+    def _by_while_loop(
+        self, stepper: Plan, motion: Motion, cursor: Cursor, saved: Saved, save_every, saves
+    ) -> tuple[Saved, Cursor]:
         """``saves * save_every`` macro steps, or fewer if one fails.
 
         With `saves` None all `num_saves` intervals, failed or not: the end of the loop then depends on no lane of a batch, and `jax.vmap` need
         not select between old and new values in every lane.
         """
-        interval = self._interval(stepper, cursor.state, times, PLAIN)
+        interval = self._interval(stepper, motion, PLAIN)
 
-        def goes_on(loop: _Loop):
-            if saves is None:
-                return loop.number <= self.num_saves
-            return (loop.number <= saves) & (loop.cursor.failed_at < 0)
+        def goes_on(loop):
+            number, cursor, _ = loop
+            return number <= self.num_saves if saves is None else (number <= saves) & (cursor.failed_at < 0)
 
-        def save(loop: _Loop) -> _Loop:
+        def save(loop):
             number, cursor, saved = loop
             is_later = number > 0  # turn 0 saves the start, so that the code for nodes is compiled once
-            moved, info, micro = interval(cursor, jnp.where(is_later, times.save_every, 0))
+            moved, info, micro = interval(cursor, jnp.where(is_later, save_every, 0))
             cursor = jax.tree.map(lambda a, b: a if a is b else jnp.where(is_later, a, b), moved, cursor)
-            return _Loop(number + 1, cursor, saved.write(number, cursor.state, info, micro))
+            return number + 1, cursor, saved.write(number, cursor.state, info, micro)
 
-        return jax.lax.while_loop(goes_on, save, _Loop(jnp.asarray(0), cursor, saved))
+        _, cursor, saved = jax.lax.while_loop(goes_on, save, (jnp.asarray(0), jax.tree.map(jnp.asarray, cursor), saved))
+        return saved, cursor
 
-    def _by_scan(self, stepper: Plan, cursor: "_Cursor", times: "_Times", loops: Loops) -> Run:
+    def _by_scan(self, leaves: list, save_every: int, loops: Loops, reverse_only: bool = False) -> Trajectory:
         """A whole run from its first step, by loops that reverse mode can differentiate."""
-        interval = self._interval(stepper, cursor.state, times, loops)
+        motion = self.motion(leaves)
+        stepper = motion.stepper(reverse_only)
+        interval = self._interval(stepper, motion, loops)
 
-        def save(cursor: _Cursor, _):
-            cursor, info, micro = interval(cursor, times.save_every)
+        def save(cursor: Cursor, _):
+            cursor, info, micro = interval(cursor, save_every)
             return cursor, (cursor.state, info, micro)
 
-        first = cursor.state
-        cursor, (states, info, micros) = loops.scan(save, cursor, self.num_saves)
-        states = jax.tree.map(lambda a, b: jnp.concatenate([jnp.asarray(a)[None], b]), first, states)
-        before_end = _before_end(stepper.scheme, times.macro_dt)
-        micro = None if micros is None else MicroNodes(states.t[1:, None] - before_end, micros)
-        return Run(states, info, cursor.result, cursor.failed_at, micro)
+        cursor = Cursor.at_start(motion.state, stepper.init(motion.state, motion.macro_dt))
+        cursor, (states, info, micros) = loops.scan(save, jax.tree.map(jnp.asarray, cursor), self.num_saves)
+        states = jax.tree.map(lambda a, b: jnp.concatenate([jnp.asarray(a)[None], b]), motion.state, states)
+        micro = None if micros is None else MicroNodes.of(states.t, motion.scheme, motion.macro_dt, micros)
+        return Trajectory(states, None, None, info, cursor.result, cursor.failed_at, micro)
 
-    def _interval(self, stepper: Plan, state: State, times: "_Times", loops: Loops):
+    def _interval(self, stepper: Plan, motion: Motion, loops: Loops):
         """``cursor, info, micro = interval(cursor, count)``: the `count` macro steps between two saved nodes."""
         no_info = RunInfo(np.asarray(0), np.asarray(0), np.zeros(()))
-        no_micro = jnp.zeros((stepper.scheme.num_micro, state.q_f.shape[0])) if self.save_micro else None
-        take_step = _step_of(stepper, times, self.save_micro)
+        no_micro = jnp.zeros((stepper.scheme.num_micro, motion.state.q_f.shape[0])) if self.save_micro else None
+        take_step = _step_of(stepper, motion, self.save_micro)
 
-        def interval(cursor: _Cursor, count):
+        def interval(cursor: Cursor, count):
             cursor, info, micro = loops.repeat(count, take_step, (cursor, no_info, no_micro))
             if stepper.defers_projection:  # between saved nodes a projection would not change the motion
                 state, memory = stepper.project(cursor.state, cursor.memory)
@@ -245,13 +232,8 @@ class Engine:
 
         return interval
 
-    def _empty(self, state: State, num_micro: int) -> Saved:
-        return Saved.none(state, self.num_saves, num_micro if self.save_micro else None)
-
-    def _run(self, scheme, loop: "_Loop", times, macro_dt) -> Run:
-        status = {"result": loop.cursor.result, "failed_at": loop.cursor.failed_at}
-        before_end = _before_end(scheme, macro_dt) if self.save_micro else None
-        return loop.saved.run(loop.cursor.state.q_s.shape[0], times, status, before_end)
+    def _empty(self, motion: Motion) -> Saved:
+        return Saved.none(motion.state, self.num_saves, motion.scheme.num_micro if self.save_micro else None)
 
 
 engine = lru_cache(maxsize=32)(Engine)
@@ -259,62 +241,9 @@ engine = lru_cache(maxsize=32)(Engine)
 least recently, which compiles again when it is needed: each program takes memory maps, of which a process has a limited number."""
 
 
-def _before_end(scheme, macro_dt):
-    """(num_micro,) times from the micro nodes of a macro step to its end, ``H (1 - c_i)``."""
-    return macro_dt * (1 - scheme.micro_times)
-
-
-@lru_cache(maxsize=256)
-def _blank_memory(engine: Engine, shapes: tuple):
-    """Zeros in the shapes of the memory of a stepper.
-
-    Args:
-        engine: makes the stepper.
-        shapes: (shape, dtype) of the leaves of the model and, last, of the five arrays of the state.
-    """
-
-    def memory(*arrays):
-        start = State(*arrays[-5:])
-        return engine.stepper(list(arrays[:-5]), start).init(start, 1.0)
-
-    blank = jax.eval_shape(memory, *(jax.ShapeDtypeStruct(*shape) for shape in shapes))
-    return jax.device_put(jax.tree.map(lambda a: np.zeros(a.shape, a.dtype), blank))
-
-
-class _Times(NamedTuple):
-    """Time of the start of a run, macro step H, and macro steps from one saved node to the next."""
-
-    t_start: Any
-    macro_dt: Any
-    save_every: Any
-
-
-class _Cursor(NamedTuple):
-    """Progress of a run: state and memory before macro step `step`, the worst `result` so far, the failed step or -1."""
-
-    state: State
-    memory: Any
-    step: Int[Numbers, ""]
-    result: Int[Numbers, ""]
-    failed_at: Int[Numbers, ""]
-
-    @classmethod
-    def before(cls, state: State, memory, step) -> "_Cursor":
-        """The cursor before macro step `step`, without failures so far."""
-        return cls(state, memory, jnp.asarray(step), np.asarray(int(Result.CONVERGED)), np.asarray(-1))
-
-
-class _Loop(NamedTuple):
-    """Carry of the while-loop: number of the next node to be saved, cursor of the run, and the nodes saved so far."""
-
-    number: Int[Numbers, ""]
-    cursor: _Cursor
-    saved: Saved
-
-
-def _step_of(stepper: Plan, times: _Times, save_micro: bool):
+def _step_of(stepper: Plan, motion: Motion, save_micro: bool):
     """A macro step as the body of a loop."""
-    t_start, macro_dt, _ = times
+    t_start, macro_dt = motion.state.t, motion.macro_dt
 
     def step(_, carry):
         cursor, worst, _ = carry
@@ -330,6 +259,6 @@ def _step_of(stepper: Plan, times: _Times, save_micro: bool):
         result = jnp.where(alive, jnp.maximum(cursor.result, info.result), cursor.result)
         failed_at = jnp.where(alive & ~ok, cursor.step, cursor.failed_at)
         micro = jnp.where(ok, info.q_f_micro, jnp.nan) if save_micro else None
-        return _Cursor(state, memory, cursor.step + 1, result, failed_at), worst, micro
+        return Cursor(state, memory, cursor.step + 1, result, failed_at), worst, micro
 
     return step

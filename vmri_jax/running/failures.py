@@ -1,11 +1,97 @@
-"""The exception of a failed run, with its probable cause."""
+"""The exception of a failed run, with its probable cause: the body that moves most in the step, a force that jumps, swapped rates."""
+
+from typing import NamedTuple
 
 import numpy as np
 
+from vmri_jax.mechanics.invariants import velocity
 from vmri_jax.mechanics.jumps import in_words, jump_ahead
-from vmri_jax.running.largest_motion import largest_motion_in_words
+from vmri_jax.mechanics.names import AXES, Names
+from vmri_jax.mechanics.state import State
+from vmri_jax.mechanics.system import System
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.steppers.results import Result, SimulationError
+
+LARGE_TURN = 0.5
+"""Radians that a rigid body may turn in a step. Beyond one radian the constraint forces at the start of a step, which hold the directors,
+cannot make them unit vectors again at its end; with a larger value a step near that limit is no longer blamed."""
+LARGE_MOVE = 0.25
+"""Distance that a point or a coordinate may move in a step, as a part of the extent of all positions; with a larger value a step that throws
+a point through other points is no longer blamed."""
+RUN_AWAY = 20.0
+"""Multiple of `LARGE_TURN` or `LARGE_MOVE` above which a motion is the result of an instability, not its cause; with a larger value the advice
+computes steps from positions that have already exploded."""
+
+
+class Motion(NamedTuple):
+    """How far a body, or a coordinate without a body, moves in a step.
+
+    name: of the body or coordinate.
+    micro: whether it is fast, so that the motion in a micro step counts.
+    amount: radians for a turn; for a move the distance as a part of the extent of all positions.
+    turns: whether this is the turn of a rigid body; else it is a move.
+    """
+
+    name: str
+    micro: bool
+    amount: float
+    turns: bool
+
+    @property
+    def size(self) -> float:
+        """The amount divided by the limit, `LARGE_TURN` or `LARGE_MOVE`."""
+        return self.amount / (LARGE_TURN if self.turns else LARGE_MOVE)
+
+    def sentence(self, macro_dt: float) -> str:
+        """The motion in words, with advice on the step.
+
+        Args:
+            macro_dt: macro step H in which the motion happens.
+        """
+        step = "micro step" if self.micro else "macro step"
+        moves = f"turns {self.amount:.2g} rad" if self.turns else f"moves {self.amount:.1%} of the extent of the system"
+        if self.size < 1:
+            return f"By the velocities before the failed step, {self.name} {moves} in a {step}, which is little; its forces may be too large for the step."
+        if self.size > RUN_AWAY:
+            return (
+                f"{self.name} ran away before the failure: the run was unstable, its steps too large for a vibration. Look at the "
+                "energy of earlier nodes."
+            )
+        else_fast = ", or more micro steps" if self.micro else ", or make it fast, so that micro steps follow it"
+        return (
+            f"{self.name} {moves} in a {step}, which is too much for one step: take macro_dt below "
+            f"{macro_dt / self.size:.2g}{else_fast}."
+        )
+
+
+def largest_motion(system: System, state: State, names: Names | None, macro_dt: float, num_micro: int) -> Motion | None:
+    """The motion of largest `Motion.size` in the macro step H from a state; None where there are no coordinates or no finite numbers.
+
+    A rigid body turns by ``h |omega|`` with ``2 |omega|^2 = sum_i |dd_i/dt|^2`` over its three directors d_i.
+    """
+    q, h = {"s": np.asarray(state.q_s), "f": np.asarray(state.q_f)}, {"s": macro_dt, "f": macro_dt / num_micro}
+    v_s, v_f = velocity(system, state.q_s, state.q_f, state.p_s, state.p_f)
+    moves = {"s": h["s"] * np.asarray(v_s), "f": h["f"] * np.asarray(v_f)}
+    known = (names or Names()).of_coordinates(q["s"].size, q["f"].size)
+    labels = {"s": known.slow_coordinates, "f": known.fast_coordinates}
+    positions = np.concatenate([q[part][known.positions(part)] for part in ("s", "f")])
+    extent = float(np.ptp(positions)) if positions.size > 1 else 0.0
+    motions = []
+    for name, place in known.bodies.items():
+        move, micro = moves[place.part][place.start : place.start + place.size], place.part == "f"
+        if name in known.rigid:
+            # The centre of mass comes first, then the directors: h^2 |dd_i/dt|^2 of each.
+            squares = np.sum(move[len(AXES) :].reshape(-1, len(AXES)) ** 2, axis=1)
+            has_all_directors = len(squares) == len(AXES)  # a body of fewer directors turns by its fastest director
+            turn = np.sqrt(squares.sum() / 2 if has_all_directors else squares.max(initial=0.0))
+            motions.append(Motion(name, micro, float(turn), True))
+            move = move[: len(AXES)]
+        if name in known.numbered:  # coordinates without bodies: name the one that moves most
+            fastest = int(np.abs(move).argmax())
+            name, move = labels[place.part][place.start + fastest], move[fastest]
+        if extent > 0:
+            motions.append(Motion(name, micro, float(np.linalg.norm(move) / extent), False))
+    return max((motion for motion in motions if np.isfinite(motion.amount)), key=lambda m: m.size, default=None)
 
 
 def simulation_error(
@@ -19,13 +105,17 @@ def simulation_error(
         first: number of the macro step that starts at the first node of `trajectory`.
         whole: the run, where `trajectory` is a part of it.
     """
-    from vmri_jax.stability.vibrations import (
-        swapped_at_start,
-    )  # imported here: vmri_jax.stability imports vmri_jax.running
+    # imported here: vmri_jax.stability imports vmri_jax.running
+    from vmri_jax.stability.vibrations import swapped_at_start
 
-    failed_at = int(trajectory.failed_at)
+    failed_at, dt = int(trajectory.failed_at), float(macro_dt)
     step = failed_at - first
-    interval = step // save_every
+    interval, moved, jump = step // save_every, None, ""
+    if trajectory.origin.knows_system:
+        system, before, names = trajectory.origin.system(), trajectory[interval], trajectory.names
+        moved = largest_motion(system, before, names, dt, num_micro)
+        if np.ndim(trajectory.t) == 1:  # a force that jumps in the failing step or in the next one
+            jump = in_words(jump_ahead(system, before, (step - interval * save_every + 2) * dt), names)
     error = SimulationError(
         Result(int(trajectory.result)),
         failed_at,
@@ -33,15 +123,6 @@ def simulation_error(
         int(trajectory.info.iterations[interval]),
         float(trajectory.info.residual[interval]),
         trajectory if whole is None else whole,
-        moved=largest_motion_in_words(trajectory, step, save_every, float(macro_dt), num_micro),
+        moved="" if moved is None else moved.sentence(dt),
     )
-    return error.advised(float(macro_dt), swapped_at_start(trajectory), _jump(trajectory, step, macro_dt, save_every))
-
-
-def _jump(trajectory: Trajectory, step: int, macro_dt, save_every: int) -> str:
-    """A sentence about a force that jumps in the failing step or in the next one; empty where no force jumps."""
-    if not trajectory.origin.knows_system or np.ndim(trajectory.t) != 1:
-        return ""
-    system, interval = trajectory.origin.system(), step // save_every
-    steps = step - interval * save_every + 2
-    return in_words(jump_ahead(system, trajectory[interval], steps * float(macro_dt)), trajectory.names)
+    return error.advised(dt, swapped_at_start(trajectory), jump)

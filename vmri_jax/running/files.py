@@ -75,26 +75,6 @@ def check_place(path: Path) -> None:
         raise IsADirectoryError(f"{path} is a folder; give the name of a file.")
 
 
-def is_new(caller: str, path: Path, resume: bool, overwrite: bool) -> bool:
-    """Whether nothing is at the path of a store yet.
-
-    Args:
-        caller: begins the messages.
-
-    Raises:
-        ValueError: both `resume` and `overwrite`.
-        FileNotFoundError, OSError: no store can be written there.
-    """
-    if resume and overwrite:
-        raise ValueError(f"{caller}: both resume and overwrite are true; choose one of them.")
-    if not path.resolve().parent.is_dir():
-        raise FileNotFoundError(f"{caller}: out is {path}, but the folder {path.parent} does not exist; make it first.")
-    if path.exists():
-        return False
-    check_writable(path)
-    return True
-
-
 def check_writable(path: Path) -> None:
     """Refuse a path where no file can be written, before long work: a file is made beside `path` and removed again.
 

@@ -5,6 +5,7 @@ and lengths (`evaluated`), in prepared and traced runs as a part of their progra
 its domain, `concerns` says what is wrong with the motion of a run whose steps all succeeded.
 """
 
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -92,6 +93,10 @@ class Observables(NamedTuple):
         return np.array([[self.energy[0], *(column.max() for column in self[1:-1]), self.volume[-1]]])
 
 
+KEPT = slice(3, 5)
+"""Columns `solved` and `implied` of a table of `Observables`."""
+
+
 def observables(system: System, node: tuple[State, Any]):
     """The `Observables` of a state, as an array (9,).
 
@@ -126,7 +131,7 @@ def failures(run, table, save_every: int, step: int = 0):
     a stepper of the user leaves the constraints. The last step before the first such node counts as the failed one.
 
     Args:
-        run: a `Run`.
+        run: a `Trajectory`, of whose nodes after a failed step anything may be there.
         table: its `Observables` (..., k, 9).
         save_every: macro steps from one saved node to the next.
         step: macro steps before the first node.
@@ -134,13 +139,10 @@ def failures(run, table, save_every: int, step: int = 0):
     Returns:
         The run and its table.
     """
-    now = Observables.of(table)
     if library(table) is jnp:  # one program: JAX compiles operations of a gradient outside of jit one by one
         return _marked_in_a_program(run, table, save_every, step)
     # a prepared run is called many times, and an operation of JAX takes as long as many steps
-    run = run._replace(result=np.asarray(run.result), failed_at=np.asarray(run.failed_at))
-    are_right = np.isfinite(now.energy).all() and now.solved.all() and now.implied.all()
-    if are_right and (run.failed_at < 0).all():
+    if (run.failed_at < 0).all() and np.isfinite(table[..., 0]).all() and table[..., KEPT].all():
         return run, table
     return _marked(np, run, table, save_every, step)
 
@@ -158,16 +160,17 @@ def _marked(module, run, table, save_every, step):
     cause = module.where(module.isfinite(energy), violated, int(Result.NON_FINITE))
     result = module.where(breaks, cause, run.result)
     failed_at = module.where(breaks, step + module.maximum(node * save_every - 1, 0), run.failed_at)
-    first = module.where(breaks, node, after_step)
-    is_lost = np.arange(num_nodes) >= first[..., None]
+    is_lost = np.arange(num_nodes) >= module.where(breaks, node, after_step)[..., None]
+    is_unreached = np.arange(num_nodes) > module.where(breaks, num_nodes, after_step)[..., None]
 
-    def masked(array):
-        lost = is_lost[..., -array.shape[wrong.ndim - 1] :]  # arrays of micro nodes have no row for the start
-        return module.where(lost.reshape(*lost.shape, *(1,) * (array.ndim - lost.ndim)), module.nan, array)
+    def masked(array, lost=is_lost, instead=np.nan):
+        lost = lost[..., -array.shape[wrong.ndim - 1] :]  # arrays of intervals have no row for the start
+        return module.where(lost.reshape(*lost.shape, *(1,) * (array.ndim - lost.ndim)), instead, array)
 
     states = State(run.states.t, *map(masked, list(vars(run.states).values())[1:]))
+    info = jax.tree.map(partial(masked, lost=is_unreached, instead=0), run.info)
     micro = None if run.micro is None else run.micro._replace(q_f=masked(run.micro.q_f))
-    return run._replace(states=states, result=result, failed_at=failed_at, micro=micro), masked(table)
+    return replace(run, states=states, info=info, result=result, failed_at=failed_at, micro=micro), masked(table)
 
 
 _marked_in_a_program = jax.jit(partial(_marked, jnp))
@@ -190,9 +193,8 @@ def concerns(table: np.ndarray, t, system: System, macro_dt, save_every: int) ->
         macro_dt: macro step H, or one for each lane.
         save_every: macro steps from one saved node to the next.
     """
-    nodes = Observables.of(table)
-    change = np.ptp(nodes.energy, axis=-1)
-    if not np.any(change > min(CHANGE_AT_POLE, REPORTED_CHANGE) * nodes.kinetic.max(axis=-1)):
+    energy, kinetic = table[..., 0], table[..., Observables._fields.index("kinetic")]
+    if not np.any(np.ptp(energy, axis=-1) > min(CHANGE_AT_POLE, REPORTED_CHANGE) * kinetic.max(axis=-1)):
         return []  # the usual case, within microseconds
     keeps, may_be_singular = system.keeps_energy, not system.has_constant_mass
     if not keeps and not (may_be_singular and save_every == 1):

@@ -1,5 +1,6 @@
 """The origin of a run, its system and names; and the evaluation of functions of system and state at all nodes of a run."""
 
+import math
 import pickle
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
@@ -9,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.mechanics.arrays import is_concrete, of_one_type, options_of_runs
+from vmri_jax.mechanics.arrays import is_concrete, library, of_one_type, options_of_runs
 from vmri_jax.mechanics.checks import check_system
 from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.rows import Part
@@ -29,21 +30,19 @@ NUMBERS_PER_CALL = 4096
 into more calls of some 20 microseconds each."""
 
 
-@partial(jax.tree_util.register_dataclass, data_fields=["bare", "params"], meta_fields=["names", "settings"])
+@partial(jax.tree_util.register_dataclass, data_fields=["simulated"], meta_fields=["names", "settings"])
 @dataclass(frozen=True, eq=False)
 class Origin:
     """The origin of a run, as far as it is known; a pytree, whose arrays have the lanes of a batch of runs as their first axes.
 
     Attributes:
         names: names of bodies and constraints; None if there are none.
-        bare: the system without its parameters; None for a run that was read from a file.
-        params: the parameters of the run, like ``system.params``.
+        simulated: the system with the parameters of the run; None for a run that was read from a file.
         settings: scheme and steps of a run with an accuracy, for which they were chosen; else None.
     """
 
     names: Names | None = None
-    bare: System | None = None
-    params: Any = None
+    simulated: System | None = None
     settings: Settings | None = None
 
     @classmethod
@@ -54,7 +53,7 @@ class Origin:
         system = system.system if isinstance(system, Problem) else system
         if not isinstance(system, System):
             raise TypeError(f"of: got {type(moving).__name__}; give the vmri_jax.System, Problem or Scene of the run.")
-        return cls(names, system.with_params(None), system.params)
+        return cls(names, system)
 
     @classmethod
     def from_file(cls, names: dict | None, settings: dict | None = None) -> "Origin":
@@ -62,25 +61,18 @@ class Origin:
         known_names = None if names is None else Names.from_dict(names)
         return cls(known_names, settings=None if settings is None else Settings.from_dict(settings))
 
-    def repeated(self, lanes: tuple[int, ...], params: Any = None) -> "Origin":
-        """The origin of a batch of runs: a view of every array with the axes of lanes, without copies.
+    def with_params(self, params) -> "Origin":
+        """The origin of a run with other parameters."""
+        return self if self.simulated is None else replace(self, simulated=self.simulated.with_params(params))
 
-        Args:
-            lanes: shape of the batch.
-            params: parameters with the axes of lanes, where lanes differ in them; None where all lanes share them.
-        """
-        if not lanes:
-            return self
-
-        def of_all(tree):
-            return jax.tree.map(lambda leaf: np.broadcast_to(leaf, (*lanes, *np.shape(leaf))), tree)
-
-        return replace(self, bare=of_all(self.bare), params=of_all(self.params) if params is None else params)
+    def repeated(self, lanes: tuple[int, ...]) -> "Origin":
+        """The origin of a batch of runs: a view of every array with the axes of lanes, without copies."""
+        return jax.tree.map(lambda leaf: np.broadcast_to(leaf, (*lanes, *np.shape(leaf))), self) if lanes else self
 
     @property
     def knows_system(self) -> bool:
         """Whether the system is known."""
-        return self.bare is not None
+        return self.simulated is not None
 
     def system(self, axes: int = 0) -> System:
         """The system with the parameters of the run; of a batch with the parameters of its first lane.
@@ -91,15 +83,12 @@ class Origin:
         Raises:
             ValueError: the run does not know its system.
         """
-        if self.bare is None:
+        if self.simulated is None:
             raise ValueError(
                 "this run does not know its system, since it was read from a file, or pickled with functions that Python cannot "
                 "pickle. Give it: run.of(problem), with the Problem, Scene or System that was simulated."
             )
-        bare, params = (
-            jax.tree.map(lambda leaf: leaf[(0,) * axes], (self.bare, self.params)) if axes else (self.bare, self.params)
-        )
-        return bare.with_params(params)
+        return jax.tree.map(lambda leaf: leaf[(0,) * axes], self.simulated) if axes else self.simulated
 
     def shaped(self, part: Part, vectors) -> Any:
         """Vectors (..., n) in the form in which the user gave the start: vectors, or a dictionary of arrays by name."""
@@ -120,9 +109,9 @@ class Origin:
         """All fields for pickle; without the system if Python cannot pickle one of its functions, such as a lambda."""
         state = dict(vars(self))
         try:
-            pickle.dumps(self.bare)
+            pickle.dumps(self.simulated)
         except (pickle.PicklingError, AttributeError, TypeError):
-            state |= {"bare": None, "params": None}
+            state["simulated"] = None
         return state
 
 
@@ -149,8 +138,7 @@ def at_nodes(function, origin: Origin, nodes, *static):
     """
     arrays, structure = jax.tree.flatten(origin.system())  # raises if the system is not known
     with Working("quantities of the run"):
-        values = evaluated(function, structure, of_one_type(arrays), nodes, *static)
-    return jax.device_put(values) if is_concrete(values) else values
+        return evaluated(function, structure, of_one_type(arrays), nodes, *static)
 
 
 def evaluated(function, structure, arrays: list, nodes, *static):
@@ -159,24 +147,32 @@ def evaluated(function, structure, arrays: list, nodes, *static):
     A call of the program gets a room of nodes, of which it evaluates the first blocks; long runs take several calls.
     """
     shape = np.shape(jax.tree.leaves(nodes)[0])
-    axes, count = len(shape), int(np.prod(shape))
+    axes, count = len(shape), math.prod(shape)
     # Arrays that all lanes share go in once: for each node they would be copied.
     is_shared = [axes == 1 or is_repeated(array, axes - 1) for array in arrays]
     shared = [array[(0,) * (axes - 1)] if once else None for array, once in zip(arrays, is_shared, strict=True)]
     of_lanes = _in_a_row([None if once else array for array, once in zip(arrays, is_shared, strict=True)], axes - 1)
-    of_nodes, node = _in_a_row(nodes, axes), np.arange(count)
-    if not is_concrete((arrays, nodes, jnp.zeros(()))):  # while JAX stages a program, all new arrays are tracers
-        values = _at_all(function, structure, static, True)(shared, _rows(of_lanes, node // shape[-1]), of_nodes)
+    of_nodes = _in_a_row(nodes, axes)
+    if not is_concrete((arrays, nodes)):
+        of_nodes_lanes = _rows(of_lanes, np.arange(count) // shape[-1])
+        values = _at_all(function, structure, static, True)(shared, of_nodes_lanes, of_nodes)
         return jax.tree.map(lambda a: a.reshape(*shape, *a.shape[1:]), values)
-    numbers = sum(int(np.prod(leaf.shape[1:])) for leaf in jax.tree.leaves((of_lanes, of_nodes)))
+    numbers = sum(math.prod(leaf.shape[1:]) for leaf in jax.tree.leaves((of_lanes, of_nodes)))
     room = max(NUMBERS_PER_CALL // numbers // NODES_AT_ONCE, 1) * NODES_AT_ONCE
     program, pieces = _at_all(function, structure, static, False), []
     for first in range(0, count, room):
         node, size = np.minimum(np.arange(first, first + room), count - 1), min(room, count - first)
         parts = _rows(of_lanes, node // shape[-1]), _rows(of_nodes, node)  # the last node fills up the room
         values = program(shared, *parts, -(-size // NODES_AT_ONCE))
-        pieces.append(jax.tree.map(lambda a, size=size: np.asarray(a)[:size], values))
-    return jax.tree.map(lambda *a: np.concatenate(a).reshape(*shape, *a[0].shape[1:]), *pieces)
+        as_array = (
+            np.asarray if is_concrete(values) else jnp.asarray
+        )  # tracers, where JAX is tracing a function around this one
+        pieces.append(jax.tree.map(lambda a, size=size, as_array=as_array: as_array(a)[:size], values))
+
+    def joined(*parts):
+        return library(parts).concatenate(parts).reshape(*shape, *parts[0].shape[1:])
+
+    return jax.tree.map(joined, *pieces)
 
 
 def is_repeated(array, axes: int = 1) -> bool:

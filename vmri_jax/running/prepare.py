@@ -6,8 +6,8 @@ import jax
 
 from vmri_jax.mechanics.state import Movable, State
 from vmri_jax.running.arguments import Save, Steps
-from vmri_jax.running.memory import check_memory
 from vmri_jax.running.progress import Working
+from vmri_jax.running.saved import check_memory
 from vmri_jax.running.simulation import Simulation, simulation
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
@@ -47,9 +47,9 @@ def prepare(
         raise ValueError("prepare: arguments are tracers; call it outside of jax.jit, vmap and grad, or take simulate.")
     run.check()
     run.save.without_bar("prepare")
-    check_memory("prepare", run.state, scheme.num_micro, run.num_saves, run.save_micro)
+    check_memory("prepare", run)
     on_device = ("system", "scheme", "solver", "state", "macro_dt")
     run = replace(run, **jax.device_put({name: getattr(run, name) for name in on_device}))
     with Working("prepare: the program of the run"):
-        jax.block_until_ready(run.engine.whole(run.arrays, 0, 0))  # no steps: it only compiles
+        jax.block_until_ready(run.engine.whole(run.leaves, 0, 0))  # no steps: it only compiles
     return run

@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, overload
 
 import equinox as eqx
 import jax
@@ -75,6 +75,36 @@ class Quantities(ABC):
     def origin(self) -> Origin:
         """System, parameters and names of the run, as far as they are known."""
 
+    @abstractmethod
+    def __len__(self) -> int:
+        """Number of saved nodes."""
+
+    @abstractmethod
+    def _node(self, number: int) -> State: ...
+
+    @abstractmethod
+    def _part(self, first: int, last: int, stride: int) -> SavedRun: ...
+
+    @overload
+    def __getitem__(self, nodes: int) -> State: ...
+    @overload
+    def __getitem__(self, nodes: slice) -> SavedRun: ...
+    def __getitem__(self, nodes):
+        kind, count = type(self).__name__, len(self)
+        if isinstance(nodes, int | np.integer):
+            return self._node(range(count)[nodes])  # raises IndexError beyond the ends
+        if not isinstance(nodes, slice):
+            raise TypeError(f"{kind}: the index is {nodes!r}; give the number of a node, or a slice as in run[:100].")
+        first, stop, stride = nodes.indices(count)
+        if stride < 1 or first >= stop:
+            raise ValueError(f"{kind}: no nodes {first}:{stop}:{stride}; it has {count}, and they are taken forwards.")
+        return self._part(first, first + (stop - 1 - first) // stride * stride, stride)
+
+    @property
+    def final_state(self) -> State:
+        """`State` at the last saved node (of every run, in a batch)."""
+        return self[-1]
+
     @property
     def names(self) -> Names:
         """Names of bodies, coordinates and constraints, plain ones where none are known."""
@@ -89,7 +119,7 @@ class Quantities(ABC):
     def keeps_energy(self) -> bool | None:
         """Whether the energy of the system is constant; None if the system is not known."""
         origin = self.origin
-        return origin.bare.keeps_energy if origin.bare is not None else None
+        return origin.simulated.keeps_energy if origin.simulated is not None else None
 
     @property
     def v_s(self) -> Any:

@@ -6,7 +6,7 @@
 | ``run.in_pieces()``, ``run.advance(...)`` | `Engine.piece`, one program for runs of all lengths | `simulate`, `stream` |
 | `vmri_jax.running.adjoints` | `Engine.stored`, `Engine.checkpointed`, with derivatives | `simulate` under transformations |
 
-All of them return a `Run`, states and statuses; `Simulation.observed` makes its `Trajectory`, with energy, constraints and failures of the nodes.
+All of them return states and statuses; `Simulation.observed` adds energy, constraints and failures of the nodes.
 
 With the matrix "auto" a piece that is not solved is computed again with exact matrices (`vmri_jax.running.fallback`), with the same tolerance and
 limit of iterations; so are all pieces after it.
@@ -15,7 +15,7 @@ limit of iterations; so are all pieces after it.
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any, NamedTuple
 
 import jax
@@ -30,15 +30,15 @@ from vmri_jax.mechanics.state import Movable, State, opened, start_of
 from vmri_jax.mechanics.summary import numbers, summary
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.arguments import Save, Steps, check_once, check_run, check_vectors, nothing_fast
-from vmri_jax.running.engine import Arrays, Engine, Model, PieceStart, engine
+from vmri_jax.running.engine import NUM_STATE, Cursor, Engine, Motion, engine
 from vmri_jax.running.failures import simulation_error
 from vmri_jax.running.fallback import FALLING_BACK, unsolved
 from vmri_jax.running.interrupts import Interrupted, interrupts_noted
-from vmri_jax.running.observables import concerns, failures, observables, with_tolerance
+from vmri_jax.running.observables import Observables, concerns, failures, observables, with_tolerance
 from vmri_jax.running.origin import Origin, evaluated, names_of
 from vmri_jax.running.progress import Working, progress_to
-from vmri_jax.running.saved import room_of_a_piece
-from vmri_jax.running.trajectory import Run, Trajectory, join, trajectory_of, with_origin
+from vmri_jax.running.saved import Saved, room_of_a_piece
+from vmri_jax.running.trajectory import Piece, Trajectory, join, with_observables
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.plan import Plan, plan, with_rules_for
@@ -53,18 +53,14 @@ STEPPING = "stepping"
 class Checkpoint(NamedTuple):
     """A run between two steps: everything that its next steps depend on, to the last bit.
 
-    step: macro steps done.
-    state: state at the node reached.
-    memory: memory of the stepper, such as the start of Newton's next iteration.
+    cursor: state, memory of the stepper such as the start of Newton's next iteration, steps done, and status so far.
+    is_first: whether the stepper has no memory of earlier steps, so that the memory of the cursor is blank.
     fell_back: whether the fallback has replaced the first matrix.
-    is_first: whether the stepper has no memory of earlier steps, so that `memory` is blank.
     """
 
-    step: int
-    state: State
-    memory: Any
-    fell_back: bool = False
+    cursor: Cursor
     is_first: bool = False
+    fell_back: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,80 +101,104 @@ class Simulation:
             ValueError: arrays whose shapes differ from the shapes of the run.
             SimulationError: a step failed.
         """
-        arguments = self._arguments(state, macro_dt, params, num_steps)
-        origin = self.origin if params is None else replace(self.origin, params=params)
-        arrays, save_every, _ = arguments
+        leaves, save_every = self._arguments(state, macro_dt, params, num_steps)
+        origin = self.origin if params is None else self.origin.with_params(params)
         with Working("the run", running=STEPPING):
-            run, table = self.whole(*arguments)
+            run, table = self.whole(leaves, save_every)
         if self.unsolved(run):
             with Working(FALLING_BACK):
-                run, table = self.exact.whole(*arguments)
-        trajectory = with_origin(trajectory_of(run, table), origin)
+                run, table = self.exact.whole(leaves, save_every)
+        trajectory = with_observables(run, table, origin)
         if throw and int(trajectory.failed_at) >= 0:
-            raise simulation_error(trajectory, arrays.macro_dt, save_every, self.scheme.num_micro)
-        self.warn("run", table, run.states.t, arrays.macro_dt, save_every)
+            raise simulation_error(trajectory, leaves[0], save_every, self.scheme.num_micro)
+        self.warn("run", table, run.states.t, leaves[0], save_every)
         return trajectory
 
     def compiled(self) -> jax.stages.Compiled:
         """The compiled program of the run without its fallback, for inspection."""
-        return self.engine.whole.lower(*self._arguments(None, None, None, None)).compile()
+        return self.engine.whole.lower(*self._arguments(None, None, None, None), self.num_saves).compile()
 
     def timed(self, state=None, *, macro_dt=None, params=None, num_steps=None) -> Callable[[], None]:
         """A function without arguments that computes the run and waits for its result, to be timed.
 
         It runs the program that succeeds, with the first matrix or of the fallback. Arguments as of a call.
         """
-        arrays, *counts = self._arguments(state, macro_dt, params, num_steps)
-        arguments = jax.device_put(arrays), *counts
-        solves = self.exact if self.unsolved(self.whole(*arguments)[0]) else self
-        program = solves.engine.whole
+        leaves, save_every = self._arguments(state, macro_dt, params, num_steps)
+        solves = self.exact if self.unsolved(self.whole(leaves, save_every)[0]) else self
+        program, arguments = solves.engine.whole, (jax.device_put(leaves), save_every, self.num_saves)
         program(*arguments)
         return lambda: program(*arguments)[1].block_until_ready()  # the arrays of one program are ready together
 
-    def _arguments(self, state, macro_dt, params, num_steps) -> tuple[Arrays, int, int]:
-        """The arguments of the programs of the engine."""
-        leaves, start, save_every = self.arrays.model, self.arrays.state, self.save_every
+    def _arguments(self, state, macro_dt, params, num_steps) -> tuple[list, int]:
+        """The leaves of the motion, and the macro steps from one saved node to the next."""
+        dt, *start = self.leaves[:NUM_STATE]
+        model, save_every = self.leaves[NUM_STATE:], self.save_every
         if state is not None:
             check_vectors(state)
-            start = _arrays(state)
-            if [a.shape for a in start] != [a.shape for a in self.arrays.state]:
+            shapes, start = [a.shape for a in start], _arrays(state)
+            if [a.shape for a in start] != shapes:
                 raise ValueError(
-                    f"the arrays of state have shapes {[a.shape for a in start]}; the run was prepared for "
-                    f"{[a.shape for a in self.arrays.state]}."
+                    f"the arrays of state have shapes {[a.shape for a in start]}; the run was prepared for {shapes}."
                 )
         if params is not None:
-            leaves = self._leaves_with(params)
+            model = self._with_params(model, params)
         if num_steps is not None:
             if num_steps < 1 or num_steps % self.num_saves:
                 raise ValueError(f"num_steps is {num_steps}; it must be a positive multiple of {self.num_saves}.")
             save_every = num_steps // self.num_saves
-        macro_dt = self.macro_dt if macro_dt is None else np.asarray(macro_dt, dtype=float)
-        return Arrays(leaves, start, macro_dt), save_every, self.num_saves
+        return [dt if macro_dt is None else np.asarray(macro_dt, dtype=float), *start, *model], save_every
 
-    def observed(self, run: Run, model: list, step: int = 0) -> tuple[Run, Any]:
-        """A run and its `Observables` (..., k, 9), both NaN from a failure on; failures that the nodes show are in its status.
+    def _with_params(self, model: list, params) -> list:
+        """The leaves of the model with other parameters."""
+        check_params(params)
+        expected, expected_structure = jax.tree.flatten(self.system.params)
+        new, structure = jax.tree.flatten(params)
+        if structure != expected_structure or list(map(np.shape, new)) != list(map(np.shape, expected)):
+            raise ValueError(f"params is {params!r}; give the pytree of system.params with other numbers in it.")
+        return model[: len(model) - len(expected)] + [np.asarray(leaf) for leaf in new]
+
+    def whole(self, leaves: list, save_every: int) -> Piece:
+        """The run by one program, without the fallback; arguments of `Engine.whole`."""
+        saved, status = self.engine.whole(leaves, save_every, self.num_saves)
+        saved, status = Saved(*(None if a is None else np.asarray(a) for a in saved)), np.asarray(status)
+        run = self.unpacked(saved, leaves, status[..., 0], status[..., 1], save_every)
+        return failures(run, saved.rows[:, -len(Observables._fields) :], save_every)
+
+    def unpacked(self, saved: Saved, leaves: list, result, failed_at, save_every: int, step: int = 0) -> Trajectory:
+        """Nodes in arrays of NumPy as a trajectory without observables, or a batch of them.
+
+        Args:
+            saved, result, failed_at: of an engine.
+            leaves: of the motion; in a batch with an axis of lanes.
+            step: macro steps before the first node.
+        """
+        macro_dt, t_start = map(np.asarray, leaves[:2])
+        steps = step + np.arange(saved.rows.shape[-2]) * save_every
+        t = t_start[..., None] + steps * macro_dt[..., None]
+        return saved.run(self.state, t, result, failed_at, self.scheme, macro_dt)
+
+    def observed(self, run: Trajectory, leaves: list, step: int = 0) -> Piece:
+        """A run, or a batch, and its `Observables` (..., k, 9), both NaN from a failure on; failures that the nodes show are in its status.
 
         Args:
             run: of the engine.
-            model: the leaves of its model, of which the last ones are the leaves of the system; in a batch with an axis of lanes.
+            leaves: of the motion, of which the last ones are the leaves of the system; in a batch with an axis of lanes.
             step: macro steps before its first node.
         """
-        table = self._observables(run.states, model)
-        return failures(run, table, self.save_every, step)
+        return failures(run, self._observables(run.states, leaves), self.save_every, step)
 
     def at_start(self) -> np.ndarray:
         """(1, 9) the `Observables` of the start."""
-        return self._observables(jax.tree.map(lambda a: np.asarray(a)[None], self.state), self.arrays.model)
+        return self._observables(jax.tree.map(lambda a: a[None], self.state), self.leaves)
 
-    def _observables(self, states: State, model: list) -> Any:
-        """(..., k, 9) the `Observables` at states of the system whose leaves are the last ones of a model."""
+    def _observables(self, states: State, leaves: list) -> Any:
         structure, count = self._system
-        leaves = model[len(model) - count :]
-        return evaluated(observables, structure, leaves, with_tolerance(states, self.solver.tolerance))
+        nodes = with_tolerance(states, self.solver.tolerance)
+        return evaluated(observables, structure, leaves[len(leaves) - count :], nodes)
 
-    def traced(self, run: Run) -> Trajectory:
+    def traced(self, run: Trajectory) -> Trajectory:
         """The trajectory of a run some of whose arrays are tracers: its observables are a part of the trace."""
-        return with_origin(trajectory_of(*self.observed(run, self.arrays.model)), self.origin)
+        return with_observables(*self.observed(run, self.leaves), self.origin)
 
     def warn(self, caller: str, table, t, macro_dt=None, save_every: int | None = None, stacklevel: int = 3) -> bool:
         """Give the warnings about the motion of a run, or of a batch, see `concerns`, with its arguments; returns whether there are any."""
@@ -187,23 +207,6 @@ class Simulation:
         for concern in all_concerns:
             warnings.warn(type(concern)(f"{caller}: {concern}"), stacklevel=stacklevel)
         return bool(all_concerns)
-
-    def _leaves_with(self, params) -> list:
-        """The leaves of the model with other parameters."""
-        expected, expected_structure = jax.tree.flatten(self.system.params)
-        new, structure = jax.tree.flatten(params)
-        # The full check takes longer than a short run; plain float64 leaves need none.
-        if not all(isinstance(leaf, float) or getattr(leaf, "dtype", None) == np.float64 for leaf in new):
-            check_params(params)
-        if structure != expected_structure or list(map(np.shape, new)) != list(map(np.shape, expected)):
-            raise ValueError(f"params is {params!r}; give the pytree of system.params with other numbers in it.")
-        leaves = self.arrays.model  # the parameters come last, see `Arrays`
-        return leaves[: len(leaves) - len(expected)] + [np.asarray(leaf) for leaf in new]
-
-    def whole(self, arrays: Arrays, save_every: int, saves: int) -> tuple[Run, Any]:
-        """The run by one program, without the fallback, as of `observed`; arguments of `Engine.whole`."""
-        leaves, table = self.engine.whole(arrays, save_every, saves)
-        return failures(Run.of(leaves), np.asarray(table), save_every)
 
     def __repr__(self) -> str:
         micro = f", of {self.scheme.num_micro} micro steps each" if self.scheme.num_micro > 1 else ""
@@ -231,7 +234,7 @@ class Simulation:
     @property
     def is_concrete(self) -> bool:
         """Whether all arrays are concrete numbers, not tracers of a transformation."""
-        return is_concrete(self.arrays)
+        return is_concrete(self.leaves)
 
     @cached_property
     def plan(self) -> Plan:
@@ -241,17 +244,17 @@ class Simulation:
     @cached_property
     def origin(self) -> Origin:
         """The origin of its trajectories."""
-        return replace(Origin.of(self.system), names=self.names)
+        return Origin(self.names, self.system)
 
-    @cached_property
-    def arrays(self) -> Arrays:
-        """The arguments of its programs."""
-        return Arrays(self._model[0], tuple(vars(self.state).values()), self.macro_dt)
+    @property
+    def leaves(self) -> list:
+        """The leaves of its `Motion`, the arguments of its programs."""
+        return self._motion[0]
 
     @cached_property
     def engine(self) -> Engine:
         """Its programs, without the fallback."""
-        return engine(self._model[1], self.num_saves, self.save_micro)
+        return engine(self._motion[1], self.num_saves, self.save_micro)
 
     @cached_property
     def exact(self) -> "Simulation":
@@ -259,15 +262,15 @@ class Simulation:
         return replace(self, solver=self.solver.exact())
 
     @cached_property
-    def _model(self) -> tuple[list, Any]:
-        """Leaves and structure of the `Model`."""
-        return jax.tree.flatten(Model(self.solver, self.scheme, self.system))
+    def _motion(self) -> tuple[list, Any]:
+        """Leaves and structure of the `Motion`."""
+        return jax.tree.flatten(Motion(self.macro_dt, self.state, self.solver, self.scheme, self.system))
 
     @cached_property
     def _system(self) -> tuple[Any, int]:
         """Structure of the system, and the number of its leaves."""
-        leaves, structure = jax.tree.flatten(self.system)
-        return structure, len(leaves)
+        structure = self._motion[1].children()[Motion._fields.index("system")]
+        return structure, structure.num_leaves
 
     def check(self, state_name: str = "simulate: the positions of the state", constraints: bool = True) -> None:
         """Refuse a system whose functions return wrong types or shapes, and a state that violates the constraints; equal ones are checked once.
@@ -279,42 +282,50 @@ class Simulation:
         with Working("checks of the system"):
             check_once(Known((self.system, replace(self.state, p_s=None, p_f=None))), state_name, constraints)
 
-    def start(self, state: State | None = None, step: int = 0, fell_back: bool = False) -> Checkpoint:
-        """The checkpoint before the first step; or before step number `step` at another state, with blank memory."""
-        start = self.arrays.state if state is None else _arrays(state)
-        memory = self._piece_engine(fell_back).blank_memory(self.arrays._replace(state=start))
-        return Checkpoint(step, State(*start), memory, fell_back, is_first=True)
+    def start(self, fell_back: bool = False) -> Checkpoint:
+        """The checkpoint before the first step."""
+        return self._blank(Cursor.at_start(self.state, None), fell_back)
+
+    def _blank(self, cursor: Cursor, fell_back: bool) -> Checkpoint:
+        """A checkpoint whose stepper has no memory of earlier steps."""
+        memory = self._piece_engine(fell_back).blank_memory(self.leaves)
+        return Checkpoint(cursor._replace(memory=memory), is_first=True, fell_back=fell_back)
 
     def _piece_engine(self, fell_back: bool) -> Engine:
-        room = room_of_a_piece(self.state, self.scheme.num_micro, self.save_micro)
-        return engine((self.exact if fell_back else self)._model[1], room, self.save_micro)
+        return (self.exact if fell_back else self)._pieces
 
-    def advance(self, checkpoint: Checkpoint, saves: int) -> tuple[list[tuple[Run, np.ndarray]], Checkpoint]:
-        """The next `saves` saved intervals, in pieces as of `observed`; from the first one that is not solved, with the fallback."""
+    @cached_property
+    def _pieces(self) -> Engine:
+        """Its programs for pieces, without the fallback."""
+        room = room_of_a_piece(self.state, self.scheme.num_micro, self.save_micro)
+        return engine(self._motion[1], room, self.save_micro)
+
+    def advance(self, checkpoint: Checkpoint, saves: int) -> tuple[Piece, Checkpoint]:
+        """The next `saves` saved intervals, as of `observed`; from the first piece that is not solved, with the fallback.
+
+        After a failure nothing is computed, and all further nodes are NaN.
+        """
         pieces, room = [], self._piece_engine(checkpoint.fell_back).num_saves
         for done in range(0, saves, room):
             size = min(room, saves - done)
             piece, after = self._advance(checkpoint, size)
-            if not checkpoint.fell_back and self.unsolved(piece[0]):
+            if not checkpoint.fell_back and int(checkpoint.cursor.failed_at) < 0 and self.unsolved(piece[0]):
                 with Working(FALLING_BACK):
-                    again = self.start(checkpoint.state, checkpoint.step, fell_back=True)
-                    piece, after = self._advance(again, size)
+                    piece, after = self._advance(self._blank(checkpoint.cursor, fell_back=True), size)
             pieces.append(piece)
             checkpoint = after
-        return pieces, checkpoint
+        return join(pieces), checkpoint
 
-    def _advance(self, checkpoint: Checkpoint, saves: int) -> tuple[tuple[Run, np.ndarray], Checkpoint]:
-        step, state, memory, fell_back, is_first = checkpoint
-        is_alive = not np.isnan(state.t)  # after a failure nothing is computed, and the trajectory keeps its length
-        arrays = self.arrays._replace(state=tuple(vars(state).values()))
-        begin = PieceStart(memory, is_first, self.arrays.state[0], step)
-        run, state, memory = self._piece_engine(fell_back).next_piece(arrays, begin, self.save_every, saves, is_alive)
-        piece = self.observed(run, arrays.model, step)
-        if not is_alive or int(piece[0].failed_at) >= 0:
-            state = replace(state, t=np.asarray(np.nan))
-        return piece, Checkpoint(step + saves * self.save_every, state, memory, fell_back)
+    def _advance(self, checkpoint: Checkpoint, saves: int) -> tuple[Piece, Checkpoint]:
+        cursor, is_first, fell_back = checkpoint
+        step, leaves = int(cursor.step), self.leaves
+        saved, cursor = self._piece_engine(fell_back).next_piece(leaves, cursor, is_first, self.save_every, saves)
+        result, failed_at = np.asarray(cursor.result), np.asarray(cursor.failed_at)
+        run, table = self.observed(self.unpacked(saved, leaves, result, failed_at, self.save_every, step), leaves, step)
+        after = cursor._replace(step=step + saves * self.save_every, result=run.result, failed_at=run.failed_at)
+        return (run, table), Checkpoint(after, fell_back=fell_back)
 
-    def unsolved(self, run: Run) -> np.ndarray:
+    def unsolved(self, run: Trajectory) -> np.ndarray:
         """Whether the fallback may solve a run or a piece, or (lanes,) the runs of a batch."""
         is_alive = np.asarray(run.failed_at) < 0
         if is_alive.all() or not (self.may_fall_back and self.plan.has_fallback):
@@ -328,24 +339,23 @@ class Simulation:
         """
         if self.save.progress is False:
             with Working("the run", running=STEPPING):
-                return self._joined(self.advance(self.start(), self.num_saves)[0], caller)
+                return self._finished(self.advance(self.start(), self.num_saves)[0], caller)
         size, checkpoint, pieces = -(-self.num_saves // PARTS_OF_A_BAR), self.start(), []
         with interrupts_noted() as interrupted, progress_to("simulate", self.save.progress) as tell:
             for done in range(0, self.num_saves, size):
                 tell("simulating", done, self.num_saves)
-                new_pieces, checkpoint = self.advance(checkpoint, min(size, self.num_saves - done))
-                pieces += new_pieces
+                piece, checkpoint = self.advance(checkpoint, min(size, self.num_saves - done))
+                pieces.append(piece)
                 if interrupted():
-                    raise Interrupted(self._joined(pieces), checkpoint.step, self.num_steps, "macro steps")
-        return self._joined(pieces, caller)
+                    steps = int(checkpoint.cursor.step)
+                    raise Interrupted(self._finished(join(pieces)), steps, self.num_steps, "macro steps")
+        return self._finished(join(pieces), caller)
 
-    def _joined(self, pieces: list[tuple[Run, np.ndarray]], caller: str = "") -> Trajectory:
-        """One trajectory with arrays of JAX; `device_put`, since `jax.numpy.asarray` would compile a program for every length."""
-        whole = join([trajectory_of(*piece) for piece in pieces])
+    def _finished(self, piece: Piece, caller: str = "") -> Trajectory:
+        run, table = piece
         if caller:
-            tables = [table[1 if i else 0 :] for i, (_, table) in enumerate(pieces)]
-            self.warn(caller, np.concatenate(tables) if len(tables) > 1 else tables[0], whole.t, stacklevel=5)
-        return with_origin(jax.device_put(whole), self.origin)
+            self.warn(caller, table, run.states.t, stacklevel=5)
+        return with_observables(run, table, self.origin)
 
 
 def simulation(moving: Movable, scheme, state: State | None, solver: Solver | None, steps: Steps) -> Simulation:
@@ -359,10 +369,15 @@ def simulation(moving: Movable, scheme, state: State | None, solver: Solver | No
     advice = nothing_fast(scheme, state.q_f.size) if moving is not problem else ""
     if advice:
         warnings.warn(f"simulate: {advice}", stacklevel=3)
-    chosen_solver, scheme, system = of_one_type((solver or Solver(), scheme, system))
+    chosen_solver, scheme, system = of_one_type((solver or _usual_solver(), scheme, system))
     state, macro_dt, names = State(*_arrays(state)), _float(steps.macro_dt), names_of(problem)
     save = Save.of(steps.save)
     return Simulation(system, scheme, chosen_solver, state, macro_dt, num_steps, save_every, save, names)
+
+
+@cache
+def _usual_solver() -> Solver:
+    return Solver()
 
 
 def _arrays(state: State) -> tuple:

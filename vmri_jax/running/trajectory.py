@@ -3,7 +3,7 @@
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path as FilePath
-from typing import Any, NamedTuple, overload
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -16,11 +16,12 @@ from vmri_jax.mechanics.summary import has_values, summary
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.export import MICRO, Exports
 from vmri_jax.running.files import replaced
-from vmri_jax.running.observables import Observables
 from vmri_jax.running.origin import UNKNOWN, Origin
 from vmri_jax.running.run_error import RunError
 from vmri_jax.running.settings import Settings
 from vmri_jax.running.summaries import summary_of
+from vmri_jax.schemes.composition import Composition
+from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.results import Method, Result, Status
 
 FORMAT = "vmri_jax trajectory 2"
@@ -70,21 +71,10 @@ class MicroNodes(NamedTuple):
     t: Float[Numbers, "k-1 num_micro"]
     q_f: Float[Numbers, "k-1 num_micro n_f"]
 
-
-class Run(NamedTuple):
-    """The arrays that the programs of runs return, fields as of `Trajectory`: a run before anything is computed of its states."""
-
-    states: State
-    info: RunInfo
-    result: Int[Numbers, ""]
-    failed_at: Int[Numbers, ""]
-    micro: MicroNodes | None = None
-
     @classmethod
-    def of(cls, arrays: list) -> "Run":
-        """The run with these leaves, with or without micro nodes."""
-        states, info, (result, failed_at, *micro) = State(*arrays[:5]), RunInfo(*arrays[5:8]), arrays[8:]
-        return cls(states, info, result, failed_at, MicroNodes(*micro) if micro else None)
+    def of(cls, t, scheme: Scheme | Composition, macro_dt, q_f) -> "MicroNodes":
+        """The micro nodes of the macro steps that end at the times t[1:]; micro node i lies ``H (1 - c_i)`` before the end."""
+        return cls(t[..., 1:, None] - macro_dt[..., None, None] * (1 - scheme.micro_times), q_f)
 
 
 @jax.tree_util.register_dataclass
@@ -191,25 +181,16 @@ class Trajectory(Exports):
     def __len__(self) -> int:
         return np.shape(self.t)[-1]
 
-    @overload
-    def __getitem__(self, nodes: int) -> State: ...
-    @overload
-    def __getitem__(self, nodes: slice) -> "Trajectory": ...
-    def __getitem__(self, nodes):
-        if isinstance(nodes, int | np.integer):
-            node = range(len(self))[nodes]  # raises IndexError beyond the ends
-            lanes = (slice(None),) * (np.ndim(self.t) - 1)
-            return jax.tree.map(lambda a: a[*lanes, node], self.states)
-        if not isinstance(nodes, slice):
-            raise TypeError(
-                f"Trajectory: the index is {nodes!r}; give the number of a node, or a slice as in run[:100]."
-            )
+    def _node(self, number: int) -> State:
+        lanes = (slice(None),) * (np.ndim(self.t) - 1)
+        return jax.tree.map(lambda a: a[*lanes, number], self.states)
+
+    def _part(self, first: int, last: int, stride: int) -> "Trajectory":
         if not is_concrete(self.energy):
             raise TypeError("Trajectory: the run is traced by JAX; take slices of its arrays, run.q_s[a:b].")
-        first, last, stride = ends_of("Trajectory", nodes, len(self))
         part = from_named_arrays(part_of(named_arrays(self), first, last, stride))
         error: Any = None if self.error is None else self.error.part(slice(first, last + 1, stride))
-        return with_origin(replace(part, error=error), self.origin)
+        return with_origin(part, self.origin, error=error)
 
     def lane(self, i: int) -> "Trajectory":
         """One run of a batch.
@@ -228,11 +209,6 @@ class Trajectory(Exports):
     def success(self):
         """Whether no step failed (of every run, in a batch)."""
         return self.result <= Result.CONVERGED_AT_ROUNDOFF
-
-    @property
-    def final_state(self):
-        """`State` at the last saved node (of every run, in a batch)."""
-        return self[-1]
 
     def save(self, path, drawing: dict | None = None) -> None:
         """Write all arrays to a .npz file (no pickled objects); an existing file is replaced after all bytes are on disk.
@@ -302,35 +278,17 @@ class Trajectory(Exports):
         return with_origin(from_named_arrays(arrays), origin)
 
 
-def with_origin(trajectory: Trajectory, origin: Origin) -> Trajectory:
-    """A trajectory of the engine with its origin, and with a status that prints as a sentence."""
+def with_origin(trajectory: Trajectory, origin: Origin, **arrays) -> Trajectory:
+    """A trajectory of the engine with its origin, and with a status that prints as a sentence; `arrays` replace other fields."""
     result = trajectory.result
     if isinstance(result, STATUS_ARRAYS) and result.ndim == 0 and is_concrete(result):
         result = Status(result)
-    return replace(trajectory, result=result, origin=origin)
+    return replace(trajectory, result=result, origin=origin, **arrays)
 
 
-def trajectory_of(run: Run, table) -> Trajectory:
-    """The trajectory of a run with its `Observables` (..., k, 9)."""
-    now = Observables.of(table)
-    return Trajectory(run.states, now.energy, table[..., 1:3], run.info, run.result, run.failed_at, run.micro)
-
-
-def ends_of(run: str, nodes: slice, count: int) -> tuple[int, int, int]:
-    """First node, last node and stride of a slice.
-
-    Args:
-        run: the class of the run, for messages.
-        nodes: the slice.
-        count: nodes of the run.
-
-    Raises:
-        ValueError: the slice is empty, or goes backwards.
-    """
-    first, stop, stride = nodes.indices(count)
-    if stride < 1 or first >= stop:
-        raise ValueError(f"{run}: no nodes {first}:{stop}:{stride}; it has {count}, and they are taken forwards.")
-    return first, first + (stop - 1 - first) // stride * stride, stride
+def with_observables(run: Trajectory, table, origin: Origin = UNKNOWN) -> Trajectory:
+    """A run with energy and constraints from its `Observables` (..., k, 9), and with its origin."""
+    return with_origin(run, origin, energy=table[..., 0], constraint_residual=table[..., 1:3])
 
 
 def part_of(arrays: dict, first: int, last: int, stride: int) -> dict:
@@ -359,22 +317,25 @@ def part_of(arrays: dict, first: int, last: int, stride: int) -> dict:
     return parts
 
 
-def join(pieces: list[Trajectory]) -> Trajectory:
-    """One trajectory of consecutive pieces, each of which starts with the last node of the previous piece; with arrays of NumPy."""
+Piece = tuple[Trajectory, Any]
+"""A run or a piece of it in arrays of NumPy, without an origin, and the table of its `Observables` (k, 9)."""
+
+
+def join(pieces: list[Piece]) -> Piece:
+    """One piece of consecutive ones, each of which starts with the last node of the previous piece, and has the worst status."""
     if len(pieces) == 1:
         return pieces[0]
-    flat = [named_arrays(piece) for piece in pieces]
-    failed = [f for f in flat if int(f["failed_at"]) >= 0]
-    status = failed[0] if failed else max(flat, key=lambda f: int(f["result"]))
+    intervals = len(pieces[0][0]) - 1
 
-    def joined(name: str):
-        first = flat[0][name]
-        if first is None or name in STATUS:
-            return status[name]
-        skip = 1 if name in NODES else 0  # the first node repeats the last one of the previous piece
-        return np.concatenate([first, *(f[name][skip:] for f in flat[1:])])
+    def joined(first, *others):
+        if not np.ndim(first):
+            return np.max([first, *others])  # failures have larger codes than successes, and later steps larger numbers
+        repeated = (
+            len(first) - intervals
+        )  # 1 where there is a row for each node, of which the first repeats the last one before
+        return np.concatenate([first, *(other[repeated:] for other in others)])
 
-    return from_named_arrays({name: joined(name) for name in flat[0]})
+    return jax.tree.map(joined, *pieces)
 
 
 def named_arrays(trajectory: Trajectory) -> dict:

@@ -9,9 +9,9 @@ import pytest
 import xarray
 
 from tests.running.store.conftest import CHUNK, STEPS, assert_identical
+from tests.support import joined
 from vmri_jax import State, StoredTrajectory
 from vmri_jax.running.store import layout
-from vmri_jax.running.trajectory import join
 
 
 @pytest.fixture
@@ -28,7 +28,7 @@ def test_parts_are_those_of_the_whole(uninterrupted):
     for name in ("t_micro", "q_f_micro"):
         assert np.array_equal(getattr(part, name), getattr(whole, name)[3:8])
     assert np.array_equal(part.info.iterations, whole.info.iterations[3:8])
-    assert_identical(join(list(uninterrupted.chunks())), whole)
+    assert_identical(joined(list(uninterrupted.chunks())), whole)
     assert_identical(uninterrupted[:], whole)
     assert uninterrupted[12:].q_f.shape[0] == 1
     assert isinstance(uninterrupted.final_state, State)

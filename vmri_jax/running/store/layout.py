@@ -25,7 +25,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from vmri_jax.running.export import FILL
-from vmri_jax.running.files import clear_partial, explained, is_new, made_beside, replaced, synchronize
+from vmri_jax.running.files import check_writable, clear_partial, explained, made_beside, replaced, synchronize
 from vmri_jax.steppers.results import Result
 
 FORMAT = "vmri_jax store 3"
@@ -73,7 +73,12 @@ def rows_per_chunk(rows: int, seconds: float, size: int, most_chunks: int) -> fl
 
 def check_place(caller: str, path: Path, kind: str, resume: bool, overwrite: bool) -> None:
     """Refuse a place where no store of a kind can be made, or where one is that shall neither go on nor be replaced."""
-    if is_new(caller, path, resume, overwrite):
+    if resume and overwrite:
+        raise ValueError(f"{caller}: both resume and overwrite are true; choose one of them.")
+    if not path.resolve().parent.is_dir():
+        raise FileNotFoundError(f"{caller}: out is {path}, but the folder {path.parent} does not exist; make it first.")
+    if not path.exists():
+        check_writable(path)
         return
     stored = read_attributes(path, kind)
     if not (resume or overwrite):

@@ -19,7 +19,7 @@ class Record(NamedTuple):
 
     saved: number of committed saved intervals.
     result, failed_at: status of these intervals, as in `Trajectory`.
-    step, fell_back: as in `Checkpoint`.
+    step, fell_back: as in `Cursor` and `Checkpoint`.
     leaves: state and memory of the `Checkpoint` as a list of arrays.
     """
 
@@ -31,10 +31,12 @@ class Record(NamedTuple):
     leaves: list[np.ndarray] = []  # noqa: RUF012 (never changed)
 
     @classmethod
-    def of(cls, checkpoint: Checkpoint, saved: int, result: int, failed_at: int) -> "Record":
+    def of(cls, checkpoint: Checkpoint, saved: int) -> "Record":
         """The record of a checkpoint."""
-        leaves = [np.asarray(leaf) for leaf in jax.tree.leaves((checkpoint.state, checkpoint.memory))]
-        return cls(saved, result, failed_at, checkpoint.step, checkpoint.fell_back, leaves)
+        state, memory, *counts = checkpoint.cursor
+        step, result, failed_at = map(int, counts)
+        leaves = [np.asarray(leaf) for leaf in jax.tree.leaves((state, memory))]
+        return cls(saved, result, failed_at, step, checkpoint.fell_back, leaves)
 
     @classmethod
     def last_of(cls, path: Path) -> "Record":
@@ -61,8 +63,10 @@ class Record(NamedTuple):
         """The checkpoint, in the structure of `like`, the blank one of the run; a ValueError if the arrays do not fit."""
         if not self.leaves:
             return like
-        expected, structure = jax.tree.flatten((like.state, like.memory))
+        cursor = like.cursor
+        expected, structure = jax.tree.flatten((cursor.state, cursor.memory))
         if [(leaf.shape, leaf.dtype) for leaf in self.leaves] != [(leaf.shape, leaf.dtype) for leaf in expected]:
             raise ValueError("the checkpoint was made by a version of vmri_jax whose steps remember something else")
         state, memory = jax.tree.unflatten(structure, map(jnp.asarray, self.leaves))
-        return Checkpoint(self.step, state, memory, self.fell_back)
+        status = map(np.asarray, (self.step, self.result, self.failed_at))
+        return Checkpoint(type(cursor)(state, memory, *status), fell_back=self.fell_back)

@@ -2,7 +2,7 @@
 
 from copy import copy
 from pathlib import Path
-from typing import Any, overload
+from typing import Any
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from vmri_jax.running.origin import Origin
 from vmri_jax.running.store.layout import chunk_file, read_attributes
 from vmri_jax.running.store.record import Record
 from vmri_jax.running.summaries import named_coordinates
-from vmri_jax.running.trajectory import NODES, RunInfo, Trajectory, ends_of, from_named_arrays, with_origin
+from vmri_jax.running.trajectory import NODES, RunInfo, Trajectory, from_named_arrays, with_origin
 from vmri_jax.steppers.results import Result
 
 
@@ -93,11 +93,6 @@ class StoredTrajectory(Exports):
         return self.success and self.step == self.num_steps
 
     @property
-    def final_state(self) -> State:
-        """`State` at the last saved node."""
-        return self[-1]
-
-    @property
     def names(self) -> Names:
         return self[:1].names
 
@@ -114,19 +109,10 @@ class StoredTrajectory(Exports):
     def __len__(self) -> int:
         return self.record.saved + 1 if self.record.saved else 0
 
-    @overload
-    def __getitem__(self, nodes: int) -> State: ...
-    @overload
-    def __getitem__(self, nodes: slice) -> Trajectory: ...
-    def __getitem__(self, nodes):
-        if isinstance(nodes, int | np.integer):
-            node = range(len(self))[nodes]  # raises IndexError beyond the ends
-            return self[node : node + 1][0]
-        if not isinstance(nodes, slice):
-            raise TypeError(
-                f"StoredTrajectory: the index is {nodes!r}; give the number of a node, or a slice as in stored[:100]."
-            )
-        first, last, stride = ends_of(f"StoredTrajectory {self.path}", nodes, len(self))
+    def _node(self, number: int) -> State:
+        return self[number : number + 1][0]
+
+    def _part(self, first: int, last: int, stride: int) -> Trajectory:
         arrays = {name: self._rows(name, slice(first, last + 1, stride)) for name in NODES}
         for name in RunInfo._fields:  # the maximum over the intervals between two nodes
             rows = self._rows(name, slice(first + 1, last + 1))

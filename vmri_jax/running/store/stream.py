@@ -23,7 +23,7 @@ from vmri_jax.running.store.identity import check_same, environment, identity
 from vmri_jax.running.store.layout import Kept
 from vmri_jax.running.store.record import Record
 from vmri_jax.running.store.stored import StoredTrajectory
-from vmri_jax.running.trajectory import NODES, RunInfo, join, trajectory_of
+from vmri_jax.running.trajectory import NODES, RunInfo, with_observables
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.solver import Solver
@@ -127,7 +127,7 @@ def _continue(stored: StoredTrajectory, run: Simulation, tell: Progress) -> Iter
     if record.saved == rows or not stored.success:
         return
     try:
-        checkpoint = record.checkpoint(like=run.start(fell_back=record.fell_back))
+        checkpoint = record.checkpoint(like=run.start(record.fell_back))
     except ValueError as error:
         raise ValueError(f"{path} can be read, but its run cannot go on: {error}.") from error
     with explained(path, _advice(record.step)):
@@ -139,19 +139,16 @@ def _continue(stored: StoredTrajectory, run: Simulation, tell: Progress) -> Iter
     sizes = [end - begin for begin, end in pairwise([record.saved + 1, *ends])]
     for size in sizes:
         tell("simulating", record.saved, rows)
-        pieces, checkpoint = run.advance(checkpoint, size)
-        piece = join([trajectory_of(*part) for part in pieces])
-        table = np.concatenate([before, *(table for _, table in pieces)])
-        times = np.concatenate([[run.state.t], *(part.states.t for part, _ in pieces)])
-        has_warned = has_warned or run.warn("stream", table, times, stacklevel=4)
+        piece, checkpoint = run.advance(checkpoint, size)
+        table, t = np.concatenate([before, piece[1]]), np.append(run.state.t, piece[0].states.t)
+        has_warned = has_warned or run.warn("stream", table, t, stacklevel=4)
         before = Observables.of(table).so_far()
         first = record.saved + 1 if record.saved else 0  # the first chunk has the start
-        values = {name: value[1 if record.saved else 0 :] for name, value in rows_of(piece).items()}
+        values = {name: value[1 if record.saved else 0 :] for name, value in rows_of(with_observables(*piece)).items()}
         with explained(path, _advice(record.step)):
-            result = max(record.result, int(piece.result))  # failures have larger codes than successes
-            record = Record.of(checkpoint, record.saved + size, result, int(piece.failed_at))
+            record = Record.of(checkpoint, record.saved + size)
             writer.write(first, values, record.packed())
-        yield checkpoint.step
+        yield record.step
         if record.failed_at >= 0:
             return
 
