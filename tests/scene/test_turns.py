@@ -101,7 +101,7 @@ def seen(scene, angles, rate=0.8):
     """What the effects of a scene do to the angles: forces of potentials, forces, controls, energy of rotors, rows of couplings."""
     q, motions = turned(scene, angles)
     v, none, system = motions @ np.array([rate, 0.0]), jnp.zeros(0), scene.system()
-    numbers = [system.kinetic(q, none, v, none, system.params) if not system.has_constant_mass else v @ v / 4]
+    numbers = [system.kinetic_energy(q, none, v, none) if not system.has_constant_mass else v @ v / 4]
     if system.slow_potential is not None:
         numbers += [*(jax.grad(system.slow_potential)(q, none, system.params) @ motions)]
     if system.force is not None:

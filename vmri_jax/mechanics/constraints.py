@@ -209,7 +209,7 @@ def check_mass(system: System, q_s, q_f) -> None:
 @quickly_compiled
 def _mass_matrix(system, q_s, q_f, v_s, v_f):
     n_s = v_s.size
-    return jax.hessian(lambda v: system.kinetic(q_s, q_f, v[:n_s], v[n_s:], system.params))(jnp.append(v_s, v_f))
+    return jax.hessian(lambda v: system.kinetic_energy(q_s, q_f, v[:n_s], v[n_s:]))(jnp.append(v_s, v_f))
 
 
 def check_constraints(
