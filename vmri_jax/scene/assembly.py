@@ -3,14 +3,16 @@
 from collections.abc import Sequence
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.mechanics.kinematics import JOINTS, MASS, Kinematics
 from vmri_jax.mechanics.system import ConstantMass, Rheonomic, System
 from vmri_jax.scene.functions import FUNCTIONS, IMPLIED, Actuation
 from vmri_jax.scene.layout import Layout, join
-from vmri_jax.scene.sorting import Placed, Sorting
-from vmri_jax.scene.terms import SomeRows
+from vmri_jax.scene.sorting import HOMES, Placed, Sorting
+from vmri_jax.scene.terms import SomeRows, joined
 
 
 def build(sorting: Sorting, placed: Sequence[Placed]) -> System:
@@ -20,12 +22,14 @@ def build(sorting: Sorting, placed: Sequence[Placed]) -> System:
     terms: dict[Any, list] = {}
     # potentials first: a damping force may need the terms of the potentials
     for part in sorted(placed, key=lambda part: part.effect.kind != "potential"):
-        name, of_effect = part.effect.name, part.effect.terms(part.elements, bodies, layout, potentials)
+        name, of_effect = part.effect.name, part.effect.terms(part.elements, layout, potentials)
         if part.effect.kind == "potential":
             potentials[name] = (*potentials.get(name, ()), *of_effect)
         terms.setdefault(part.home, []).extend([SomeRows(of_effect, part.dropped)] if part.dropped else of_effect)
         if part.dropped:
             terms.setdefault("implied", []).append(SomeRows(of_effect, part.dropped, alone=True))
+    # the values of constraints keep the order in which `names_of` has them
+    terms = {home: [*joined(of_home, in_order=home in HOMES)] for home, of_home in terms.items()}
     # with joint coordinates the masses depend on positions, so that T is a function even without kinetic effects
     if layout.kinematics is not None:
         terms.setdefault("kinetic", [])
@@ -45,7 +49,7 @@ def build(sorting: Sorting, placed: Sequence[Placed]) -> System:
     for home in ("constraint", "slow_constraint", "implied"):
         if any(term.timed for term in terms.get(home, ())):
             functions[home] = Rheonomic(functions[home])
-    params: dict[str, Any] = {part.effect.name: part.effect.parameters(bodies) for part in placed}
+    params: dict[str, Any] = {part.effect.name: jax.tree.map(jnp.asarray, part.effect.parameters) for part in placed}
     slow, fast = (join(bodies, layout, part, "masses") for part in ("s", "f"))
     if "kinetic" in functions:
         params[MASS] = {"slow": slow, "fast": fast}
@@ -59,10 +63,10 @@ def build(sorting: Sorting, placed: Sequence[Placed]) -> System:
 
 def actuation(sorting: Sorting) -> Actuation | None:
     """The forces of the controls of a scene, None if it has no controls."""
-    bodies, layout = sorting.bodies, sorting.layout
+    layout = sorting.layout
     controls = [part for part in sorting.placed if part.home == "control"]
-    terms = tuple(part.effect.terms(part.elements, bodies, layout, {})[0] for part in controls)
-    names = tuple(part.effect.components(bodies) for part in controls)
+    terms = tuple(part.effect.terms(part.elements, layout, {})[0] for part in controls)
+    names = tuple(part.effect.components() for part in controls)
     return Actuation(terms, _kinematics("control", terms, layout), names) if controls else None
 
 

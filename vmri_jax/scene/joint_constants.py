@@ -58,7 +58,7 @@ def _ends(bodies: Bodies, links: Sequence[Link]) -> dict[str, Any]:
     """The points X and triads F of all links: "point_a", "frame_a" in the frame that a link hangs on, "point_b", "frame_b" in its own."""
     carried = {link.branch.child for link in links}
     joints = {link.branch.joint.name: link.branch.joint for link in links}
-    points = {name: joint.joining_points(bodies) for name, joint in joints.items()}
+    points = {name: joint.joining_points for name, joint in joints.items()}
     triads: dict[str, Any] = {name: joint.frame(len(points[name])) for name, joint in joints.items()}
     ends: dict[str, list] = {}
     for link in links:

@@ -16,8 +16,8 @@ from scipy.linalg import qr
 from vmri_jax.mechanics.constraints import RANK, rank_of
 from vmri_jax.scene.effects.joint_base import Joint
 from vmri_jax.scene.rigid import Rigidity
-from vmri_jax.scene.rows import HOMES, ConstraintRows
-from vmri_jax.scene.sorting import Sorting
+from vmri_jax.scene.rows import ConstraintRows
+from vmri_jax.scene.sorting import HOMES, Sorting
 
 NAMED = 8
 """Most rows that a message names; with more it is hard to read."""
@@ -163,8 +163,8 @@ def _joined_twice(sorting: Sorting) -> str:
     joints |= {part.effect.name: part.effect for part in sorting.placed if isinstance(part.effect, Joint)}
     labels: dict[frozenset[str], list[str]] = {}
     for joint in joints.values():
-        for i, pair in enumerate(joint.elements(sorting.bodies)):
-            labels.setdefault(frozenset(pair), []).append(joint.label(i, sorting.bodies))
+        for i, pair in enumerate(joint.elements):
+            labels.setdefault(frozenset(pair), []).append(joint.label(i))
     twice = [
         f"{' and '.join(sorted(pair))} by {' and '.join(names)}" for pair, names in labels.items() if len(names) > 1
     ]

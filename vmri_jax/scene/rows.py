@@ -13,15 +13,13 @@ import numpy as np
 from vmri_jax.mechanics.arrays import is_concrete, quickly_compiled
 from vmri_jax.mechanics.functions import TracedOnce
 from vmri_jax.mechanics.names import Names
-from vmri_jax.scene.body import LARGEST_POINT, Bodies, label_of, moving
+from vmri_jax.scene.body import LARGEST_POINT, label_of, moving
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.effects.freedoms import ANGLES
 from vmri_jax.scene.layout import Key, join
 from vmri_jax.scene.rates import positions
-from vmri_jax.scene.sorting import Home, Placed, Sorting
+from vmri_jax.scene.sorting import HOMES, Home, Placed, Sorting
 
-HOMES: tuple[Home, ...] = ("slow_constraint", "constraint")
-"""The arguments of `System` that hold constraints, in the order of the grids macro, micro."""
 CANCELLED = 1e-14
 """An entry of the Jacobian dg/dq is the product of the row dg/dQ and the column dQ/dq. If it is below this fraction of the product of
 their lengths it is round-off and set to zero, as for the rows that hold a planar loop in its plane. A larger value removes rows with
@@ -76,8 +74,9 @@ class ConstraintRows:
         """The rows of all constraints of a scene; None if it has none, or if their numbers are traced."""
         bodies, layout, to_bodies = sorting.bodies, sorting.layout, sorting.to_bodies
         constraints = [(i, part) for i, part in enumerate(sorting.placed) if part.home in HOMES]
-        params = {i: part.effect.parameters(bodies) for i, part in constraints}
-        if not constraints or not is_concrete((sorting.positions, sorting.joints, params)):
+        if not constraints or not is_concrete(
+            (sorting.positions, sorting.joints, [part.effect.parameters for _, part in constraints])
+        ):
             return None
         start, columns = np.concatenate(sorting.positions), layout.columns
         q_bodies, jacobian = to_bodies(start)
@@ -88,7 +87,7 @@ class ConstraintRows:
         rows, elements = [], []
         for i, part in constraints:
             number = 0
-            for names, element in _elements(part, bodies, columns, params[i]):
+            for names, element in _elements(part, columns):
                 elements.append(element)
                 size = _value_and_jacobian(element.value, element.params, q_bodies[element.columns], 0.0)[0].size
                 for j in range(size):
@@ -138,15 +137,14 @@ def _label(effect: Effect, element: Sequence[str]) -> str:
     return f"{effect.name} {'-'.join(map(label_of, element))}"
 
 
-def _elements(part: Placed, bodies: Bodies, columns: dict[str | Key, np.ndarray], params: dict[str, Any]):
+def _elements(part: Placed, columns: dict[str | Key, np.ndarray]):
     """Labels and elements of an effect, in the order of its terms."""
     effect = part.effect
-    elements = effect.elements(bodies)
-    for i in chain(*effect.by_size(part.elements, bodies)):
+    for i in chain(*effect.by_size(part.elements)):
         freedoms = [key for key in effect.freedoms_of(i) if key in columns]
-        of_element = np.concatenate([columns[name] for name in (*moving(elements[i]), *freedoms)])
-        term, element_params = effect.element_term(i, bodies, params, freedoms)
-        yield _label(effect, elements[i]), _Element(TracedOnce(term.value), element_params, of_element)
+        of_element = np.concatenate([columns[name] for name in (*moving(effect.elements[i]), *freedoms)])
+        term, element_params = effect.element_term(i, freedoms)
+        yield _label(effect, effect.elements[i]), _Element(TracedOnce(term.value), element_params, of_element)
 
 
 @quickly_compiled
@@ -185,7 +183,7 @@ def names_of(sorting: Sorting) -> Names:
         sizes[place.part][name] = place.size
     for part in sorting.placed:
         if part.home in HOMES:
-            sizes[part.home] |= _kept_rows(sorting, part)
+            sizes[part.home] |= _kept_rows(part)
     blocks, rigid = (
         [name for name, body in sorting.bodies.items() if getattr(body, kind)] for kind in ("block", "rigid")
     )
@@ -194,16 +192,14 @@ def names_of(sorting: Sorting) -> Names:
     return Names(sizes["s"], sizes["f"], *rows, blocks, rigid, carried, sorting.layout.kinematics)
 
 
-def _kept_rows(sorting: Sorting, part: Placed) -> dict[str, int]:
+def _kept_rows(part: Placed) -> dict[str, int]:
     """Number of kept rows of each element of an effect by its label, in the order of the terms of the effect."""
-    bodies, effect = sorting.bodies, part.effect
-    elements, params = effect.elements(bodies), effect.parameters(bodies)
+    effect, rows, first = part.effect, {}, 0
     t = (jnp.zeros(()),) if effect.timed else ()
-    rows, first = {}, 0
-    for i in chain(*effect.by_size(part.elements, bodies)):
-        size = jax.eval_shape(effect.function, *t, *effect.element_arguments(i, bodies, params)).size
+    for i in chain(*effect.by_size(part.elements)):
+        size = jax.eval_shape(effect.function, *t, effect.positions((i,)), effect.params_of((i,))).size
         kept = sum(row not in part.dropped for row in range(first, first + size))
         if kept:
-            rows[effect.name if len(elements) == 1 else _label(effect, elements[i])] = kept
+            rows[effect.name if len(effect.elements) == 1 else _label(effect, effect.elements[i])] = kept
         first += size
     return rows

@@ -7,6 +7,7 @@ from functools import cached_property
 from typing import Any, Literal
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.mechanics.arrays import is_concrete
@@ -18,6 +19,7 @@ from vmri_jax.mechanics.summary import listed, summary
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.scene.assembly import actuation, build
+from vmri_jax.scene.binding import bound
 from vmri_jax.scene.body import AnyBody, Frame
 from vmri_jax.scene.drawing import drawing
 from vmri_jax.scene.effect import Effect
@@ -119,7 +121,7 @@ class Scene:
                     f"Scene: an effect is called {name!r}, where the params keep {content}; give it another name."
                 )
         for effect in self.everything:
-            effect.check(self.by_name, self.project)
+            effect.check(self.project)
         check_frames(self.by_name, self.branches)
         check_constraints(self.sorting)
         check_reach(self.sorting)
@@ -170,20 +172,23 @@ class Scene:
         return {body.name: body for body in self.bodies}
 
     @cached_property
+    def bound(self) -> tuple[Effect, ...]:
+        """The effects of the user on the bodies of this scene: their elements, parameters and values at the start, each computed once."""
+        return bound(self.effects, self.by_name)
+
+    @cached_property
     def branches(self) -> tuple[Branch, ...]:
         """The bodies that are functions of the freedoms of joints, each with its joint and the body that it hangs on."""
         if self.coordinates == "directors":
             return ()
-        bound = [effect.bound(self.effects) for effect in self.effects]
-        return grow(self.by_name, bound, everywhere=self.coordinates == "joint")
+        return grow(self.by_name, self.bound, everywhere=self.coordinates == "joint")
 
     @cached_property
     def everything(self) -> tuple[Effect, ...]:
-        """All effects: `Rigidity` of the bodies that have directors, then the effects of the user, with joints instead of names of joints."""
+        """All effects: `Rigidity` of the bodies that have directors, then the effects of the user, all bound to the bodies."""
         carried = {branch.child for branch in self.branches}
         rigid = [body.name for body in self.bodies if body.rigid and body.name not in carried]
-        effects = tuple(effect.bound(self.effects) for effect in self.effects)
-        return (Rigidity(rigid), *effects) if rigid else effects
+        return (Rigidity(rigid).bound(self.by_name), *self.bound) if rigid else self.bound
 
     @cached_property
     def sorting(self) -> Sorting:
@@ -210,7 +215,7 @@ class Scene:
     @property
     def params(self) -> dict[str, Any]:
         """Parameters by the name of the effect."""
-        return {effect.name: effect.parameters(self.by_name) for effect in self.everything}
+        return {effect.name: jax.tree.map(jnp.asarray, effect.parameters) for effect in self.everything}
 
     @property
     def start(self) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
@@ -263,7 +268,7 @@ class Scene:
             ValueError: no such joint or freedom; a joint without a coordinate that may turn by half a turn or more between two nodes.
             IndexError: no such pair.
         """
-        return along_run(self.sorting, joint_named("Scene.joint_motion", joint, self.effects), run, of, pair)
+        return along_run(self.sorting, joint_named("Scene.joint_motion", joint, self.bound), run, of, pair)
 
     def by_directors(self, run: Trajectory) -> Trajectory:
         """The same run with bodies described by their centres and directors, where joints have rows, multipliers and reaction forces.
@@ -354,7 +359,7 @@ class Scene:
             TypeError: no mapping, or numbers of the scene that jax.jit, grad or vmap traces.
             ValueError: no joint of this name, a joint without this freedom, rates that contradict each other or the constraints.
         """
-        bodies, starts = with_rates(self.sorting, self.effects, self.system(), rates)
+        bodies, starts = with_rates(self.sorting, self.bound, self.system(), rates)
         return replace(self, bodies=bodies, joint_starts=starts)
 
     def with_joints(self, joints: Mapping[str, Any]) -> "Scene":
@@ -375,7 +380,7 @@ class Scene:
             ValueError: no joint of this name; a joint without this freedom, or without joint coordinates; numbers that are not finite; a
                 loop that does not close with these values, or whose last joint, without a coordinate, would turn too far for its effects.
         """
-        return replace(self, joint_starts={**self.joint_starts, **joint_starts(self.sorting, self.effects, joints)})
+        return replace(self, joint_starts={**self.joint_starts, **joint_starts(self.sorting, self.bound, joints)})
 
     def explain(self, scheme: Scheme | Composition, *, macro_dt: float | None = None, measure: bool = True) -> Ledger:
         """The grid, unknowns, evaluations and computing time that every body and effect adds to a macro step of a scheme.

@@ -3,16 +3,17 @@
 All classes here are compared by value: scenes of the same structure give equal functions, which JAX compiles only once.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
 from functools import reduce
-from itertools import pairwise
+from itertools import chain, groupby, pairwise
 from operator import add
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
+from vmri_jax.mechanics.arrays import library
 from vmri_jax.mechanics.rows import Rows
 from vmri_jax.scene.body import GROUND_COORDINATES
 
@@ -41,10 +42,24 @@ def place(q, weights):
 
 
 @dataclass(frozen=True)
-class OnBodies:
-    """A role whose bodies are points, blocks, whole rigid bodies or their centres: it takes their coordinates."""
+class _OfRows:
+    """A role on bodies that move."""
 
     rows: Rows
+
+    @property
+    def kind(self) -> tuple:
+        """Equal for roles that can be one role."""
+        return replace(self, rows=None), self.rows.size, self.rows.stride
+
+    def with_all(self, roles: Sequence["_OfRows"]) -> "_OfRows":
+        """One role of the bodies of roles of this kind."""
+        return replace(self, rows=Rows.of([*chain(*(role.rows.places for role in roles))], self.rows.size))
+
+
+@dataclass(frozen=True)
+class OnBodies(_OfRows):
+    """A role whose bodies are points, blocks, whole rigid bodies or their centres: it takes their coordinates."""
 
     def positions(self, q_s, q_f, params):
         """(d,) or (n, d) coordinates."""
@@ -58,10 +73,9 @@ class OnBodies:
 
 
 @dataclass(frozen=True)
-class InRigidBodies:
+class InRigidBodies(_OfRows):
     """A role of points fixed in rigid bodies, ``phi + sum_i X_i d_i`` with X, a `parameter` in params."""
 
-    rows: Rows
     parameter: str
 
     def positions(self, q_s, q_f, params):
@@ -90,6 +104,15 @@ class OnGround:
     size: int
     parameter: str | None = None
 
+    @property
+    def kind(self) -> tuple:
+        """Equal for roles that can be one role."""
+        return OnGround, self.size, self.parameter
+
+    def with_all(self, roles: Sequence["OnGround"]) -> "OnGround":
+        """One role of the elements of roles of this kind."""
+        return replace(self, count=sum(role.count for role in roles))
+
     def positions(self, q_s, q_f, params):
         """(d,) or (n, d) points."""
         if self.parameter is not None:
@@ -111,26 +134,50 @@ class OnGround:
 Role = OnBodies | InRigidBodies | OnGround
 
 
-@dataclass(frozen=True)
-class EffectTerm:
-    """The function of an effect, whose name is the key of its parameters, on some of its elements.
+class Source(NamedTuple):
+    """Some elements of an effect, whose name is the key of its parameters.
 
-    roles: the maps from q_s and q_f to the coordinates of each role.
-    select: indices of the elements; None for all.
-    split: names of the parameters that have an entry for each element.
-    timed: whether the first argument of the function is the time.
+    count: number of these elements.
+    select: their indices; None for all.
     """
 
     name: str
+    count: int
+    select: tuple[int, ...] | None = None
+
+
+@dataclass(frozen=True)
+class EffectTerm:
+    """The function of one or more effects of a kind on some of their elements.
+
+    sources: the elements.
+    roles: the maps from q_s and q_f to the coordinates of each role.
+    split: names of the parameters that have an entry for each element.
+    timed: whether the first argument of the function is the time.
+    is_joined: whether the terms of several effects with this function are one term, see `joined`.
+    """
+
+    sources: tuple[Source, ...]
     function: Callable
     roles: tuple[Role, ...]
-    select: tuple[int, ...] | None = None
     split: tuple[str, ...] = ()
     timed: bool = False
+    is_joined: bool = False
 
     def params_of(self, params):
-        """The params of the function: the parameters of the effect, for the selected elements."""
-        return params[self.name] if self.select is None else choose(params[self.name], self.select, self.split)
+        """The params of the function: the parameters of the effects for their elements, one after the other."""
+        of_each = [
+            params[name] if select is None else choose(params[name], select, self.split)
+            for name, _, select in self.sources
+        ]
+        if len(of_each) == 1:
+            return of_each[0]
+        return {
+            name: jnp.concatenate(
+                [_rows(numbers[name], source.count) for numbers, source in zip(of_each, self.sources, strict=True)]
+            )
+            for name in self.split
+        }
 
     def value(self, q_s, q_f, params, t=None):
         """Energy or constraint values."""
@@ -219,8 +266,37 @@ class TangentDamping(_OfSeveral):
 
 
 def choose(params, select: Sequence[int], split: Sequence[str]):
-    """The parameters of some elements; parameters in `split` may have an entry for each element."""
-    return params | {name: pick(params[name], select) for name in split if name in params and jnp.ndim(params[name])}
+    """The parameters of some elements; each parameter in `split` has an entry for each element, or one number for all."""
+    return params | {name: pick(params[name], select) for name in split if jnp.ndim(params[name])} if split else params
+
+
+def _rows(numbers, count: int):
+    """A parameter of `count` elements with an axis for them, which a single element and a number for all elements lack."""
+    numbers = jnp.asarray(numbers)
+    return numbers[None] if count == 1 else jnp.broadcast_to(numbers, (count,)) if numbers.ndim == 0 else numbers
+
+
+def joined(terms: Iterable[Any], in_order: bool = False) -> tuple[Any, ...]:
+    """The terms, with one term in place of several of one kind; if `in_order`, of neighbours alone, so that the elements keep their order."""
+    numbers: dict[Any, int] = {}
+    keyed = [(numbers.setdefault(_kind(term), len(numbers)), term) for term in terms]
+    groups = groupby(keyed if in_order else sorted(keyed, key=lambda pair: pair[0]), key=lambda pair: pair[0])
+    return tuple(_as_one([term for _, term in group]) for _, group in groups)
+
+
+def _kind(term) -> Any:
+    """Equal for terms of several effects that can be one term."""
+    if not getattr(term, "is_joined", False):
+        return id(term)
+    return term.function, tuple(role.kind for role in term.roles), term.split, term.timed
+
+
+def _as_one(terms: Sequence[Any]) -> Any:
+    """A term of all elements of terms of one kind."""
+    if len(terms) == 1:
+        return terms[0]
+    roles = (roles[0].with_all(roles) for roles in zip(*(term.roles for term in terms), strict=True))
+    return replace(terms[0], sources=tuple(chain(*(term.sources for term in terms))), roles=tuple(roles))
 
 
 def pick(values, select: Sequence[int]):
@@ -229,7 +305,7 @@ def pick(values, select: Sequence[int]):
         return values[select[0]]
     if list(select) == list(range(select[0], select[0] + len(select))):
         return values[select[0] : select[0] + len(select)]
-    return jnp.stack([values[i] for i in select])
+    return library(values).stack([values[i] for i in select])
 
 
 def total(values: Sequence):

@@ -62,11 +62,11 @@ def with_rates(
     rows = [np.asarray(jax.jacfwd(constraints, 1)(t, q))]
     values = [-np.asarray(jax.jacfwd(constraints)(t, q))]
     for joint, freedom, number in _by_freedom("Scene.with_rates", effects, rates):
-        pairs = joint.elements(sorting.bodies)
+        pairs = joint.elements
         numbers = _for_pairs(f"Scene.with_rates: the rate of {joint.name}", number, len(pairs), "one number")
         gradient = jax.jacfwd(
             lambda q, joint=joint, freedom=freedom, pairs=pairs: joint.values(
-                freedom, range(len(pairs)), sorting.bodies, {name: q[columns[name]] for name in moving(chain(*pairs))}
+                freedom, range(len(pairs)), {name: q[columns[name]] for name in moving(chain(*pairs))}
             )
         )
         rows.append(np.asarray(gradient(jnp.asarray(bodies))) @ of_bodies)
@@ -102,7 +102,7 @@ def joint_starts(sorting: Sorting, effects: Sequence[Effect], starts: Mapping[st
     """Values and rates of freedoms by the keys of `Layout.freedoms`, see `Scene.with_joints`."""
     by_key = {}
     for joint, freedom, start in _by_freedom("Scene.with_joints", effects, starts):
-        name, count = joint.name, len(joint.elements(sorting.bodies))
+        name, count = joint.name, len(joint.elements)
         value, rate = start if isinstance(start, tuple) else (start, 0.0)
         about = f"Scene.with_joints: the start of {name}"
         numbers = [_for_pairs(about, number, count, "one number, or a pair (value, rate)") for number in (value, rate)]
@@ -110,7 +110,7 @@ def joint_starts(sorting: Sorting, effects: Sequence[Effect], starts: Mapping[st
             key = name, i, freedom
             if key not in sorting.layout.freedoms:
                 raise ValueError(
-                    f"Scene.with_joints: {joint.label(i, sorting.bodies)} has no coordinate of its own: it closes a loop, where you may set "
+                    f"Scene.with_joints: {joint.label(i)} has no coordinate of its own: it closes a loop, where you may set "
                     'the other joints, or its bodies have directors: then give the scene coordinates="joint".'
                 )
             by_key[key] = tuple(number if number.ndim == 0 else number[i] for number in numbers)

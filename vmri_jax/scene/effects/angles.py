@@ -56,9 +56,9 @@ class Angle(_AmongPoints):
     def function(q, params):
         return elastic_energy(params["stiffness"], angle_between(q) - params["angle"])
 
-    def check_parameters(self, bodies):
-        super().check_parameters(bodies)
-        angle = self.parameters(bodies)["angle"]
+    def check_parameters(self):
+        super().check_parameters()
+        angle = self.parameters["angle"]
         expected = "it must lie between 0 and pi, where the energy is smooth; for pi take Bending"
         self.require((angle > 1e-3) & (angle < np.pi - 1e-3), "angle", angle, expected)
 
@@ -122,13 +122,13 @@ class Torsion(_AmongPoints):
         phi = jnp.arctan2(sine, jnp.sum(left * right, axis=-1))
         return jnp.sum(params["stiffness"] * (1 - jnp.cos(params["multiplicity"] * (phi - params["angle"]))))
 
-    def check_parameters(self, bodies):
-        super().check_parameters(bodies)
-        multiplicity = self.parameters(bodies)["multiplicity"]
+    def check_parameters(self):
+        super().check_parameters()
+        multiplicity = self.parameters["multiplicity"]
         self.require(multiplicity == jnp.round(multiplicity), "multiplicity", multiplicity, "it must be an integer")
         expected = "they must not start on a line, where there is no dihedral angle"
-        for element in self.elements(bodies):
+        for element in self.elements:
             for corner in (element[:3], element[1:]):
-                a, b, c = (end_of(bodies, name).position for name in corner)
+                a, b, c = (end_of(self.by_name, name).position for name in corner)
                 area, size = jnp.linalg.norm(jnp.cross(b - a, c - b)), jnp.linalg.norm(b - a) * jnp.linalg.norm(c - b)
                 self.require(area > 1e-9 * size, f"the area between {', '.join(corner)}", area, expected)

@@ -142,9 +142,9 @@ class Screw(AboutAxis):
     moves = (Move("screw", N),)
     freedoms = ("turn",)
 
-    def check_parameters(self, bodies):
-        super().check_parameters(bodies)
-        pitch = self.parameters(bodies)["pitch"]
+    def check_parameters(self):
+        super().check_parameters()
+        pitch = self.parameters["pitch"]
         self.require(pitch != 0, "pitch", pitch, "it must not be zero; take Revolute if b does not move along the axis")
 
     def pitch_of(self, i):

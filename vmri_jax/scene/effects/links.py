@@ -104,9 +104,9 @@ class Guide(ToPath):
     def law(line, params):
         return line
 
-    def check_start(self, bodies):
-        super().check_start(bodies)
-        distance = self.at_start(bodies, self.parameters(bodies))
-        size = jnp.max(jnp.abs(jnp.stack([end_of(bodies, name).position for (name,) in self.elements(bodies)])))
+    def check_start(self):
+        super().check_start()
+        distance = self.at_start(self.parameters)
+        size = jnp.max(jnp.abs(jnp.stack([end_of(self.by_name, name).position for (name,) in self.elements])))
         quantity = "the distance of the body from its point at t = 0"
         self.require(distance <= START * jnp.maximum(size, 1.0), quantity, distance, "it must start there")

@@ -59,9 +59,9 @@ class ToPoint(Effect):
         (q,) = q
         return jnp.linalg.norm(q - self.point_at_start(params), axis=-1)
 
-    def require_apart(self, bodies):
+    def require_apart(self):
         """Refuse bodies that start at the point."""
-        distance = self.at_start(bodies, self.parameters(bodies))
+        distance = self.at_start(self.parameters)
         expected = f"bodies must not start there; {self.advice}"
         self.require(distance > 0, "the distance of a body from its point", distance, expected)
 
@@ -85,11 +85,11 @@ class ToFixedPoint(ToPoint):
                 "point that moves take MovingPivot (a rigid link), Guide (the point itself) or MovingAnchor (a spring)."
             )
 
-    def drawing(self, bodies):
-        points = np.atleast_2d(self.parameters(bodies)["point"])
+    def drawing(self):
+        points = np.atleast_2d(self.parameters["point"])
         anchors = []
-        for (name,), point in zip(self.elements(bodies), points.tolist(), strict=True):
-            if not end_of(bodies, name).block:
+        for (name,), point in zip(self.elements, points.tolist(), strict=True):
+            if not end_of(self.by_name, name).block:
                 anchors.append({"body": label_of(name), "point": point, "kind": self.drawn_as})
         return {"anchors": anchors}
 
@@ -117,11 +117,11 @@ class ToPath(ToPoint):
     def point_at_start(self, params):
         return self.path(jnp.zeros(()), real_tree(f"{self.name}: params", self.params))
 
-    def check_bodies(self, bodies):
-        super().check_bodies(bodies)
+    def check_bodies(self):
+        super().check_bodies()
         shape = jax.eval_shape(lambda: jnp.asarray(self.point_at_start({}))).shape
-        for (name,) in self.elements(bodies):
-            size = end_of(bodies, name).size
+        for (name,) in self.elements:
+            size = end_of(self.by_name, name).size
             if shape != (size,):
                 raise ValueError(
                     f"{self.name}: path returns shape {shape}; {name} has dimension {size}, return ({size},)."
