@@ -3,12 +3,11 @@
 from collections.abc import Sequence
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.mechanics.kinematics import JOINTS, MASS, Kinematics
 from vmri_jax.mechanics.system import ConstantMass, Rheonomic, System
+from vmri_jax.scene.declare import arrays
 from vmri_jax.scene.functions import FUNCTIONS, IMPLIED, Actuation
 from vmri_jax.scene.layout import Layout, join
 from vmri_jax.scene.sorting import HOMES, Placed, Sorting
@@ -18,13 +17,9 @@ from vmri_jax.scene.terms import SomeRows, joined
 def build(sorting: Sorting, placed: Sequence[Placed]) -> System:
     """The system of the bodies and of some or all effects; a function without effects is None."""
     bodies, layout = sorting.bodies, sorting.layout
-    potentials: dict[str, tuple] = {}
     terms: dict[Any, list] = {}
-    # potentials first: a damping force may need the terms of the potentials
-    for part in sorted(placed, key=lambda part: part.effect.kind != "potential"):
-        name, of_effect = part.effect.name, part.effect.terms(part.elements, layout, potentials)
-        if part.effect.kind == "potential":
-            potentials[name] = (*potentials.get(name, ()), *of_effect)
+    for part in placed:
+        of_effect = part.effect.terms(part.elements, layout)
         terms.setdefault(part.home, []).extend([SomeRows(of_effect, part.dropped)] if part.dropped else of_effect)
         if part.dropped:
             terms.setdefault("implied", []).append(SomeRows(of_effect, part.dropped, alone=True))
@@ -49,7 +44,7 @@ def build(sorting: Sorting, placed: Sequence[Placed]) -> System:
     for home in ("constraint", "slow_constraint", "implied"):
         if any(term.timed for term in terms.get(home, ())):
             functions[home] = Rheonomic(functions[home])
-    params: dict[str, Any] = {part.effect.name: jax.tree.map(jnp.asarray, part.effect.parameters) for part in placed}
+    params: dict[str, Any] = {part.effect.name: arrays(part.effect.parameters) for part in placed}
     slow, fast = (join(bodies, layout, part, "masses") for part in ("s", "f"))
     if "kinetic" in functions:
         params[MASS] = {"slow": slow, "fast": fast}
@@ -65,7 +60,7 @@ def actuation(sorting: Sorting) -> Actuation | None:
     """The forces of the controls of a scene, None if it has no controls."""
     layout = sorting.layout
     controls = [part for part in sorting.placed if part.home == "control"]
-    terms = tuple(part.effect.terms(part.elements, layout, {})[0] for part in controls)
+    terms = tuple(part.effect.terms(part.elements, layout)[0] for part in controls)
     names = tuple(part.effect.components() for part in controls)
     return Actuation(terms, _kinematics("control", terms, layout), names) if controls else None
 

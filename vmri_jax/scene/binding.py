@@ -6,12 +6,14 @@ from dataclasses import fields, replace
 from functools import cached_property
 from typing import Any, ClassVar, Self
 
+import numpy as np
+
 from vmri_jax.mechanics.arrays import library
 from vmri_jax.mechanics.rows import Place, Rows
 from vmri_jax.scene.body import GROUND, Attachment, Bodies, Point, body_of, end_of, moving
 from vmri_jax.scene.declare import Elements, Parameter, real_tree, stacked
 from vmri_jax.scene.layout import Key, Layout
-from vmri_jax.scene.terms import EffectTerm, InRigidBodies, OnBodies, OnGround, Role, Source, choose
+from vmri_jax.scene.terms import EffectTerm, Role, Source, choose
 
 MOST_ROLES = 32
 """Most bodies of an element: the two bodies of each of sixteen joints that one equation couples. More are refused."""
@@ -46,12 +48,6 @@ class Bindable(ABC):
     def declared(self) -> dict[str, Parameter]:
         """The declared parameters by name."""
         return {f.name: f.metadata["parameter"] for f in fields(self) if "parameter" in f.metadata}
-
-    @property
-    def split(self) -> tuple[str, ...]:
-        """Names of parameters that have an entry for each element, or a single number for all."""
-        declared = [name for name, parameter in self.declared.items() if parameter.shape in ("number", "vector")]
-        return (*declared, *self.masses, *self.derived, *POINTS)
 
     def bound(self, bodies: Bodies) -> Self:
         """A copy that knows the bodies of its scene; the effect itself if it knows these bodies already."""
@@ -89,17 +85,11 @@ class Bindable(ABC):
         """The points at the start that every element acts on, one for each role."""
         return tuple(tuple(end_of(self.by_name, name, self.whole) for name in element) for element in self.elements)
 
-    @property
-    def candidates(self) -> Mapping[str, Any]:
-        """The bodies that None stands for in a field with names of bodies."""
-        return self.by_name
-
     def _elements(self) -> Elements:
         """See `elements`."""
         names = next(f for f in fields(self) if "names" in f.metadata)
-        return names.metadata["names"].elements(
-            getattr(self, names.name), self.candidates, f"{self.name}: {names.name}"
-        )
+        argument, about = getattr(self, names.name), f"{self.name}: {names.name}"
+        return names.metadata["names"].elements(argument, self.by_name, about)
 
     def _parameters(self) -> dict[str, Any]:
         """See `parameters`."""
@@ -123,34 +113,25 @@ class Bindable(ABC):
         """For each role with points fixed in rigid bodies, the components X of these points along the directors; zeros for whole bodies."""
         points = {}
         for parameter, role in zip(POINTS, zip(*self.elements, strict=True), strict=False):
-            if any(isinstance(name, Attachment) for name in role):
-                points[parameter] = stacked(
-                    [
-                        body_of(self.by_name, name).weights(name.offset)
-                        if isinstance(name, Attachment)
-                        else np.zeros(3)
-                        for name in role
-                    ]
-                )
+            offsets = [getattr(name, "offset", None) for name in role]
+            if any(offset is not None for offset in offsets):
+                bodies = [body_of(self.by_name, name) for name in role]
+                ends = zip(bodies, offsets, strict=True)
+                points[parameter] = stacked([np.zeros(3) if x is None else body.weights(x) for body, x in ends])
         return points
 
     def at_start(self, params: Mapping[str, Any]):
         """The measured value of every element at the start, (n,), or () of a single element."""
-        values = {
-            i: value for group in self.by_size() for i, value in zip(group, self._measured(group, params), strict=True)
-        }
+        values: dict[int, Any] = {}
+        for group in self.by_size():
+            of_group = self.rest(self.positions(group), self.params_of(group, params))
+            values |= zip(group, library(of_group).atleast_1d(of_group), strict=True)
         return stacked([values[i] for i in sorted(values)])
-
-    def _measured(self, group: Sequence[int], params: Mapping[str, Any]):
-        """(n,) the measured values of elements of the same size."""
-        value = self.rest(self.positions(group), self.params_of(group, params))
-        return library(value).atleast_1d(value)
 
     def positions(self, group: Sequence[int]) -> tuple[Any, ...]:
         """The argument q of the function for elements of the same size at the start."""
-        return tuple(
-            stacked([end.position for end in role]) for role in zip(*(self.ends[i] for i in group), strict=True)
-        )
+        roles = zip(*(self.ends[i] for i in group), strict=True)
+        return tuple(stacked([end.position for end in role]) for role in roles)
 
     def params_of(self, group: Sequence[int], params: Mapping[str, Any] | None = None) -> dict[str, Any]:
         """The argument params of the function for some elements, from the `params` of all elements."""
@@ -158,8 +139,10 @@ class Bindable(ABC):
         return params if len(self.elements) == len(group) else choose(params, group, self.split_of(params))
 
     def split_of(self, params: Any) -> tuple[str, ...]:
-        """The names in `split` of some params, which a user may also give as a tree that is no dictionary."""
-        return tuple(name for name in self.split if name in params) if isinstance(params, dict) else ()
+        """Names in params that have an entry for each element, or a single number for all; none in a tree of a user that is no dictionary."""
+        declared = [name for name, parameter in self.declared.items() if parameter.shape in ("number", "vector")]
+        names = (*declared, *self.masses, *self.derived, *POINTS) if isinstance(params, dict) else ()
+        return tuple(name for name in names if name in params)
 
     def element_term(self, i: int, freedoms: Sequence[Key] = ()) -> tuple[EffectTerm, dict[str, Any]]:
         """Element i as a term of the coordinates of its moving bodies, one after the other, and its part of the params of all elements.
@@ -171,7 +154,7 @@ class Bindable(ABC):
             places[name] = Place("s", end, self.by_name[name].size)
             end += self.by_name[name].size
         of_freedoms = {key: Place("s", end + k, 1) for k, key in enumerate(freedoms)}
-        (term,) = self.terms((i,), Layout(places, {}, of_freedoms), {})
+        (term,) = self.terms((i,), Layout(places, {}, of_freedoms))
         # without the name and number of the element, equal terms share a compiled program
         return replace(term, sources=(Source(ALONE, 1),)), {ALONE: self.params_of((i,))}
 
@@ -190,8 +173,8 @@ class Bindable(ABC):
             groups.setdefault(kinds, []).append(i)
         return list(groups.values())
 
-    def terms(self, select: Sequence[int], layout: Layout, potentials: Mapping[str, Any]) -> tuple:
-        """The terms of some elements, one for each group `by_size`; `potentials` has all their terms by name."""
+    def terms(self, select: Sequence[int], layout: Layout) -> tuple:
+        """The terms of some elements, one for each group `by_size`."""
         terms = []
         for group in self.by_size(select):
             roles = zip(POINTS, zip(*(self.elements[i] for i in group), strict=True), strict=False)
@@ -207,11 +190,10 @@ class Bindable(ABC):
 
     def _role(self, parameter: str, names: Sequence[str], places: Mapping[str, Place]) -> Role:
         """The map from q_s and q_f to the coordinates of the bodies of a role, all of the same kind, or to points in them, which are a parameter."""
-        size, attached = end_of(self.by_name, names[0], self.whole).size, isinstance(names[0], Attachment)
-        if names[0] == GROUND:
-            return OnGround(len(names), size, parameter if attached else None)
-        of_bodies = [places[name] for name in names]
-        return InRigidBodies(Rows.of(of_bodies), parameter) if attached else OnBodies(Rows.of(of_bodies, size))
+        size = end_of(self.by_name, names[0], self.whole).size
+        point = parameter if isinstance(names[0], Attachment) else ""
+        rows = None if names[0] == GROUND else Rows.of([places[name] for name in names], None if point else size)
+        return Role(rows, len(names), size, point)
 
 
 def bound(effects: Sequence[Any], bodies: Bodies) -> tuple[Any, ...]:

@@ -168,6 +168,11 @@ def lasting(value):
     return value
 
 
+def arrays(tree: Any) -> Any:
+    """The numbers of a pytree as arrays of JAX, in the order of writing."""
+    return in_order(jax.device_put(tree), order_of(tree))
+
+
 def real_tree(about: str, tree):
     """A pytree of real numbers as a pytree of arrays, in the order of writing; the error for another leaf begins with `about` and its place."""
 

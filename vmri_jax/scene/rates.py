@@ -131,8 +131,8 @@ def _linearise(effect: Effect, bodies: Bodies, columns: Mapping[str, np.ndarray]
     linearised = []
     for i, element in enumerate(map(moving, effect.elements)):
         term, element_params = effect.element_term(i)
-        q = jnp.concatenate([bodies[name].coordinates for name in element])
-        v = jnp.concatenate([bodies[name].rates for name in element])
+        q = np.concatenate([bodies[name].coordinates for name in element])
+        v = np.concatenate([bodies[name].rates for name in element])
         is_kinetic = effect.kind == "kinetic"
         function = TracedOnce(term.kinetic if is_kinetic else term.value)
         force, *matrices = map(np.asarray, _derivatives(function, is_kinetic, q, v, element_params))

@@ -11,6 +11,7 @@ from jax.flatten_util import ravel_pytree
 from vmri_jax.mechanics.arrays import is_concrete
 from vmri_jax.mechanics.checks import describe, shape_of
 from vmri_jax.mechanics.constraints import START, Rows
+from vmri_jax.scene.declare import arrays
 
 LIBRARY = "vmri_jax."
 """Beginning of the names of modules whose functions are not checked: the tests of the package do that."""
@@ -27,10 +28,10 @@ def check_function(effect: Any, moved: bool) -> None:
     if effect.kind == "control" or getattr(function, "__module__", "").startswith(LIBRARY):
         return
     for group in effect.by_size():
-        q = tuple(map(jnp.asarray, effect.positions(group)))
-        t, v = (jnp.zeros(()),), tuple(map(jnp.zeros_like, q))
+        q = jax.device_put(effect.positions(group))
+        t, v = jax.device_put(((np.zeros(()),), tuple(np.zeros(x.shape) for x in q)))
         before = {"force": (*t, q, v), "kinetic": (q, v)}.get(effect.kind, (*t, q) if effect.timed else (q,))
-        arguments = *before, jax.tree.map(jnp.asarray, effect.params_of(group))
+        arguments = *before, arrays(effect.params_of(group))
         value = shape_of(f"{effect.name}: function", effect.function, *arguments)
         _check_value(effect, value, [x.shape for x in q], len(group))
         if effect.kind == "constraint" and not moved and is_concrete(arguments):

@@ -7,7 +7,6 @@ from functools import cached_property
 from typing import Any, Literal
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.mechanics.arrays import is_concrete
@@ -21,6 +20,7 @@ from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.scene.assembly import actuation, build
 from vmri_jax.scene.binding import bound
 from vmri_jax.scene.body import AnyBody, Frame
+from vmri_jax.scene.declare import arrays
 from vmri_jax.scene.drawing import drawing
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.effects.freedoms import Freedom
@@ -30,7 +30,7 @@ from vmri_jax.scene.layout import Key
 from vmri_jax.scene.ledger import Ledger, ledger
 from vmri_jax.scene.redundancy import check_constraints, without_redundant
 from vmri_jax.scene.rigid import Rigidity
-from vmri_jax.scene.rows import ConstraintRows, names_of
+from vmri_jax.scene.rows import names_of, rows_of
 from vmri_jax.scene.sorting import Sorting, sort
 from vmri_jax.scene.trees import Branch, check_frames, grow
 from vmri_jax.scene.turns import along_run, check_reach, check_run
@@ -199,8 +199,7 @@ class Scene:
     @property
     def dropped(self) -> list[str]:
         """Names of the rows of constraints that the scene leaves out because they depend on others."""
-        rows = ConstraintRows.of(self.sorting)
-        return [] if rows is None else [row.name for row in rows.rows if not row.kept]
+        return [row.name for row in rows_of(self.sorting) if not row.kept]
 
     @property
     def places(self) -> dict[str, Place]:
@@ -215,7 +214,7 @@ class Scene:
     @property
     def params(self) -> dict[str, Any]:
         """Parameters by the name of the effect."""
-        return {effect.name: jax.tree.map(jnp.asarray, effect.parameters) for effect in self.everything}
+        return {effect.name: arrays(effect.parameters) for effect in self.everything}
 
     @property
     def start(self) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from vmri_jax.mechanics.arrays import library
 from vmri_jax.mechanics.rows import Rows
@@ -42,96 +43,58 @@ def place(q, weights):
 
 
 @dataclass(frozen=True)
-class _OfRows:
-    """A role on bodies that move."""
+class Role:
+    """The map from q_s and q_f to the coordinates of the bodies, or to points in them, that elements have in one role: linear but on the ground.
 
-    rows: Rows
-
-    @property
-    def kind(self) -> tuple:
-        """Equal for roles that can be one role."""
-        return replace(self, rows=None), self.rows.size, self.rows.stride
-
-    def with_all(self, roles: Sequence["_OfRows"]) -> "_OfRows":
-        """One role of the bodies of roles of this kind."""
-        return replace(self, rows=Rows.of([*chain(*(role.rows.places for role in roles))], self.rows.size))
-
-
-@dataclass(frozen=True)
-class OnBodies(_OfRows):
-    """A role whose bodies are points, blocks, whole rigid bodies or their centres: it takes their coordinates."""
-
-    def positions(self, q_s, q_f, params):
-        """(d,) or (n, d) coordinates."""
-        return self.rows.take(q_s, q_f)
-
-    velocities = positions
-
-    def put(self, force, params, n_s: int, n_f: int):
-        """Forces on all slow and on all fast coordinates."""
-        return self.rows.put(force, n_s, n_f)
-
-
-@dataclass(frozen=True)
-class InRigidBodies(_OfRows):
-    """A role of points fixed in rigid bodies, ``phi + sum_i X_i d_i`` with X, a `parameter` in params."""
-
-    parameter: str
-
-    def positions(self, q_s, q_f, params):
-        """(3,) or (n, 3) points."""
-        return place(self.rows.take(q_s, q_f), params[self.parameter])
-
-    velocities = positions  # the map is linear
-
-    def put(self, force, params, n_s: int, n_f: int):
-        """Forces on all slow and on all fast coordinates."""
-        # the transpose of the map of positions: F on the centre, X_i F on the director d_i
-        components = params[self.parameter][..., : self.rows.stride // 3 - 1, None]
-        force = jnp.broadcast_to(force, (*jnp.broadcast_shapes(force.shape[:-1], components.shape[:-2]), 3))
-        triples = jnp.concatenate([force[..., None, :], components * force[..., None, :]], axis=-2)
-        return self.rows.put(triples.reshape(*triples.shape[:-2], -1), n_s, n_f)
-
-
-@dataclass(frozen=True)
-class OnGround:
-    """A role that does not move: for `count` elements points of `size` coordinates, a `parameter` in params.
-
-    Without a parameter it is the ground as a rigid body with the axes of space, and the size is 12.
+    rows: coordinates of the bodies, all of one kind; None for the ground.
+    count, size: number of elements, and of coordinates that the function takes of each.
+    point: name of the parameter with the components X of points ``phi + sum_i X_i d_i`` fixed in rigid bodies or, on the ground, of
+        points in space; "" for bodies themselves. The ground itself is a rigid body with the axes of space.
     """
 
+    rows: Rows | None
     count: int
     size: int
-    parameter: str | None = None
+    point: str = ""
 
     @property
     def kind(self) -> tuple:
         """Equal for roles that can be one role."""
-        return OnGround, self.size, self.parameter
+        return self.rows and self.rows.stride, self.size, self.point
 
-    def with_all(self, roles: Sequence["OnGround"]) -> "OnGround":
-        """One role of the elements of roles of this kind."""
-        return replace(self, count=sum(role.count for role in roles))
+    @classmethod
+    def joined(cls, roles: Sequence["Role"]) -> "Role":
+        """One role of the elements of roles of one kind, one after the other."""
+        places = [*chain(*(role.rows.places for role in roles if role.rows))]
+        rows = Rows.of(places, roles[0].rows.size) if roles[0].rows else None
+        return replace(roles[0], rows=rows, count=sum(role.count for role in roles))
 
     def positions(self, q_s, q_f, params):
-        """(d,) or (n, d) points."""
-        if self.parameter is not None:
-            return params[self.parameter][..., : self.size]
-        return self._shaped(jnp.asarray(GROUND_COORDINATES))
+        """(d,) or (n, d) coordinates or points."""
+        if self.rows is None:
+            return params[self.point][..., : self.size] if self.point else self._shaped(GROUND_COORDINATES)
+        q = self.rows.take(q_s, q_f)
+        return place(q, params[self.point]) if self.point else q
 
     def velocities(self, v_s, v_f, params):
-        """Zero."""
-        return self._shaped(jnp.zeros(self.size))
+        """(d,) or (n, d) velocities."""
+        return self._shaped(np.zeros(self.size)) if self.rows is None else self.positions(v_s, v_f, params)
 
     def put(self, force, params, n_s: int, n_f: int):
-        """Zero: no coordinate of the scene feels a force on the ground."""
-        return jnp.zeros(n_s), jnp.zeros(n_f)
+        """Forces on all slow and on all fast coordinates; no coordinate feels a force on the ground."""
+        if self.rows is None:
+            return jnp.zeros(n_s), jnp.zeros(n_f)
+        if self.point:
+            # the transpose of the map of positions: F on the centre, X_i F on the director d_i
+            components = params[self.point][..., : self.rows.stride // 3 - 1, None]
+            force = jnp.broadcast_to(force, (*jnp.broadcast_shapes(force.shape[:-1], components.shape[:-2]), 3))
+            triples = jnp.concatenate([force[..., None, :], components * force[..., None, :]], axis=-2)
+            force = triples.reshape(*triples.shape[:-2], -1)
+        return self.rows.put(force, n_s, n_f)
 
     def _shaped(self, vector):
+        vector = jnp.asarray(vector)
         return vector if self.count == 1 else jnp.broadcast_to(vector, (self.count, self.size))
-
-
-Role = OnBodies | InRigidBodies | OnGround
 
 
 class Source(NamedTuple):
@@ -203,7 +166,7 @@ class EffectTerm:
 
     def within(self, sizes: tuple[int, int]) -> bool:
         """Whether the term depends only on the coordinates of the scene, the first n_s of Q_s and the first n_f of Q_f."""
-        return all(isinstance(role, OnGround) or role.rows.within(sizes) for role in self.roles)
+        return all(role.rows is None or role.rows.within(sizes) for role in self.roles)
 
     def _put(self, forces, params, n_s: int, n_f: int):
         return totals([role.put(force, params, n_s, n_f) for role, force in zip(self.roles, forces, strict=True)])
@@ -295,7 +258,7 @@ def _as_one(terms: Sequence[Any]) -> Any:
     """A term of all elements of terms of one kind."""
     if len(terms) == 1:
         return terms[0]
-    roles = (roles[0].with_all(roles) for roles in zip(*(term.roles for term in terms), strict=True))
+    roles = (Role.joined(roles) for roles in zip(*(term.roles for term in terms), strict=True))
     return replace(terms[0], sources=tuple(chain(*(term.sources for term in terms))), roles=tuple(roles))
 
 

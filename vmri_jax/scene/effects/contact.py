@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.mechanics.arrays import real_array
+from vmri_jax.mechanics.arrays import library, real_array
 from vmri_jax.scene.body import end_of
 from vmri_jax.scene.declare import array, common, effect_class, names, number, positive
 from vmri_jax.scene.effect import Effect
@@ -73,11 +73,11 @@ class PlaneContact(_Contact):
     def _parameters(self):
         params = super()._parameters()
         normal = params["normal"]
-        return params | {"normal": normal / jnp.linalg.norm(normal)}
+        return params | {"normal": normal / library(normal).linalg.norm(normal)}
 
     def check_parameters(self):
-        normal = jnp.asarray(real_array(f"{self.name}: normal", self.normal))
-        self.require(jnp.any(normal != 0), "normal", self.normal, "it must not be zero")
+        normal = real_array(f"{self.name}: normal", self.normal)
+        self.require((normal != 0).any(), "normal", self.normal, "it must not be zero")
         super().check_parameters()
 
     def drawing(self):
@@ -115,10 +115,12 @@ class SphereContact(_Contact):
 
     def check_parameters(self):
         super().check_parameters()
+        center = self.parameters["center"]
         for (name,) in self.elements:
             position = end_of(self.by_name, name).position
-            differs = jnp.any(position != jnp.asarray(self.center))
-            self.require(differs, f"the start of {name}", position, "it must not be the center of the sphere")
+            self.require(
+                (position != center).any(), f"the start of {name}", position, "it must not be the center of the sphere"
+            )
 
     def drawing(self):
         params = self.parameters

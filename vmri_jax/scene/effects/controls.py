@@ -6,7 +6,9 @@ from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
+from vmri_jax.mechanics.arrays import real_array
 from vmri_jax.mechanics.names import AXES
 from vmri_jax.scene.body import Attachment, body_of, entry, is_entry, label_of
 from vmri_jax.scene.declare import effect_class, names, vector
@@ -97,8 +99,7 @@ class Controlled(Effect):
         if self.along is not None:
             params["along"] = self.declared["along"].array(f"{self.name}: along", self.along, [body.point()])
         if body.rigid:
-            offset = jnp.asarray(name.offset) if isinstance(name, Attachment) else jnp.zeros(3)
-            params["point"] = jnp.asarray(body.weights(offset))
+            params["point"] = body.weights(name.offset if isinstance(name, Attachment) else np.zeros(3))
         return params
 
     def check_bodies(self):
@@ -106,7 +107,9 @@ class Controlled(Effect):
         name = entry(self.body)
         body = body_of(self.by_name, name)
         if self.along is not None:
-            self.require(jnp.any(jnp.asarray(self.along) != 0), "along", self.along, "it must have a direction")
+            self.require(
+                real_array(f"{self.name}: along", self.along).any(), "along", self.along, "it must have a direction"
+            )
         directors = body.size // 3 - 1 if body.rigid else 0
         if isinstance(name, Attachment) and not body.rigid:
             raise ValueError(

@@ -7,6 +7,7 @@ from itertools import islice
 from typing import Any, ClassVar
 
 import jax.numpy as jnp
+import numpy as np
 
 from vmri_jax.mechanics.arrays import real_array
 from vmri_jax.mechanics.checks import describe, shape_of
@@ -17,7 +18,7 @@ from vmri_jax.scene.declare import effect_class, real_tree
 from vmri_jax.scene.effect import START
 from vmri_jax.scene.effects.freedoms import COORDINATE, FREEDOMS
 from vmri_jax.scene.effects.joint_base import OfFreedoms, freedom_of, joint_named
-from vmri_jax.scene.terms import Applied, OnBodies
+from vmri_jax.scene.terms import Applied, Role
 
 
 def equation(law, freedoms: tuple[str, ...], q, params):
@@ -74,13 +75,13 @@ class _Coupling(OfFreedoms):
     def _parameters(self):
         return {"law": self.numbers(), "joints": tuple(joint.parameters for joint, _ in self.joints)}
 
-    def terms(self, select, layout, potentials):
+    def terms(self, select, layout):
         roles, freedoms = [], []
         for (joint, freedom), key in zip(self.joints, self.freedoms_of(0), strict=True):
             is_coordinate = key in layout.freedoms
             freedoms.append(COORDINATE if is_coordinate else self.by_directors(freedom))
             if is_coordinate:
-                roles.append(OnBodies(Rows.of([layout.freedoms[key]])))
+                roles.append(Role(Rows.of([layout.freedoms[key]]), 1, 1))
             else:
                 roles += [self._role("", (name,), layout.bodies) for name in joint.elements[0]]
         return (self._term(Applied(equation, (self.law, tuple(freedoms))), roles, (0,)),)
@@ -95,7 +96,7 @@ class _Coupling(OfFreedoms):
             self.require(count == 1, f"the number of pairs of {joint.name}", count, expected)
 
     def check_start(self):
-        violation = jnp.abs(self.law(jnp.zeros(len(self.joints)), self.numbers()))
+        violation = abs(self.law(np.zeros(len(self.joints)), self.numbers()))
         expected = (
             "it must be zero at the positions in `bodies`, where all freedoms are zero; change it, or set project=True"
         )
@@ -148,7 +149,7 @@ class JointCoupling(_Coupling):
 
 def weighted_sum(x, params):
     """``sum_i r_i x_i``."""
-    return jnp.sum(params["ratios"] * x)
+    return (params["ratios"] * x).sum()
 
 
 @effect_class
@@ -171,10 +172,10 @@ class Gear(_Coupling):
     law = staticmethod(weighted_sum)
 
     def numbers(self):
-        return {"ratios": jnp.asarray(real_array(f"{self.name}: ratios", self.ratios))}
+        return {"ratios": real_array(f"{self.name}: ratios", self.ratios)}
 
     def check_parameters(self):
         ratios = self.numbers()["ratios"]
-        self.require(jnp.shape(ratios) == (len(self.joints),), "ratios", self.ratios, "give one for each of the joints")
+        self.require(np.shape(ratios) == (len(self.joints),), "ratios", self.ratios, "give one for each of the joints")
         self.require(ratios != 0, "ratios", self.ratios, "none of them may be zero")
         super().check_parameters()

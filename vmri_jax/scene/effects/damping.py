@@ -127,13 +127,13 @@ class RayleighDamping(Effect):
         return () if self.mass is None else ("mass_of",)
 
     def resolved(self, effects):
-        """The effect with the names of its potentials in a tuple."""
-        potentials = [effect.name for effect in effects if effect.kind == "potential"]
+        """The effect with its potentials in a tuple instead of their names."""
+        potentials = {effect.name: effect for effect in effects if effect.kind == "potential"}
         names = potentials if self.of is None else [self.of] if isinstance(self.of, str) else self.of
         for name in names:
             if name not in potentials:
                 raise ValueError(f"{self.name}: {unknown('potential', name, potentials)}")
-        return replace(self, of=tuple(names))
+        return replace(self, of=tuple(potentials[name] for name in names))
 
     def _elements(self):
         return tuple((name,) for name in self.by_name)
@@ -143,7 +143,7 @@ class RayleighDamping(Effect):
             raise ValueError(f"{self.name}: mass and stiffness are both None; give at least one of them.")
         super().check_parameters()
 
-    def terms(self, select, layout, potentials):
-        terms = () if self.mass is None else super().terms(select, layout, potentials)
-        damped = tuple(term for name in potentials if name in self.of for term in potentials[name])
+    def terms(self, select, layout):
+        terms = () if self.mass is None else super().terms(select, layout)
+        damped = [term for potential in self.of for term in potential.terms(range(len(potential.elements)), layout)]
         return terms if self.stiffness is None or not damped else (*terms, TangentDamping(joined(damped), self.name))

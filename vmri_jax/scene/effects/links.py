@@ -4,7 +4,7 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from vmri_jax.scene.body import end_of
+from vmri_jax.mechanics.arrays import library
 from vmri_jax.scene.declare import effect_class, positive
 from vmri_jax.scene.effect import START, Effect
 from vmri_jax.scene.effects.points import BetweenPoints, ToFixedPoint, ToPath
@@ -107,6 +107,7 @@ class Guide(ToPath):
     def check_start(self):
         super().check_start()
         distance = self.at_start(self.parameters)
-        size = jnp.max(jnp.abs(jnp.stack([end_of(self.by_name, name).position for (name,) in self.elements])))
+        (positions,) = self.positions(range(len(self.elements)))
+        size = abs(positions).max()
         quantity = "the distance of the body from its point at t = 0"
-        self.require(distance <= START * jnp.maximum(size, 1.0), quantity, distance, "it must start there")
+        self.require(distance <= START * library(size).maximum(size, 1.0), quantity, distance, "it must start there")

@@ -66,7 +66,7 @@ class _Nonbonded(Effect):
                     f"{self.name}: {pair!r} is in exclude; give pairs of names, as from within_bonds(bonds, 3)."
                 )
             for name in pair:
-                if name not in self.candidates:
+                if name not in self.by_name:
                     raise ValueError(f"{self.name}: exclude: {unknown('body', name, sorted(known))}")
             left_out.add(frozenset(pair))
         kept = tuple(pair for pair in pairs if frozenset(pair) not in left_out)
@@ -118,9 +118,10 @@ class Coulomb(_Nonbonded):
     default_name = "coulomb"
     derived = ("charge_a", "charge_b")
 
-    @property
-    def candidates(self):
-        return self.charges if self.between is None else self.by_name
+    def __post_init__(self):
+        super().__post_init__()
+        if self.between is None and isinstance(self.charges, Mapping):
+            object.__setattr__(self, "between", tuple(self.charges))
 
     @staticmethod
     def function(q, params):

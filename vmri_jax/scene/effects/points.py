@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from vmri_jax.mechanics.arrays import library
 from vmri_jax.scene.body import end_of, label_of
 from vmri_jax.scene.declare import effect_class, names, of_time, real_tree, vector
 from vmri_jax.scene.effect import Effect
@@ -20,7 +21,7 @@ from vmri_jax.scene.terms import Applied
 def distance(q, params=None):
     """``|q_b - q_a|``, (...) m."""
     a, b = q
-    return jnp.linalg.norm(b - a, axis=-1)
+    return library(q).linalg.norm(b - a, axis=-1)
 
 
 @effect_class
@@ -56,8 +57,8 @@ class ToPoint(Effect):
 
     def rest(self, q, params):
         """Distance of a body from the point at the start."""
-        (q,) = q
-        return jnp.linalg.norm(q - self.point_at_start(params), axis=-1)
+        line = q[0] - self.point_at_start(params)
+        return library(line).linalg.norm(line, axis=-1)
 
     def require_apart(self):
         """Refuse bodies that start at the point."""
@@ -115,7 +116,7 @@ class ToPath(ToPoint):
         return Applied(along_path, (self.law, self.path))
 
     def point_at_start(self, params):
-        return self.path(jnp.zeros(()), real_tree(f"{self.name}: params", self.params))
+        return self.path(np.zeros(()), real_tree(f"{self.name}: params", self.params))
 
     def check_bodies(self):
         super().check_bodies()
