@@ -241,8 +241,7 @@ class Scene:
         """The `Problem`: the system with positions and velocities at the start, and with the drawing unless jax.jit, grad or vmap traces numbers of the scene."""
         if self._problems:
             return self._problems[0]
-        is_drawn = is_concrete((self.params, [body.radius for body in self.bodies]))
-        drawn = self.drawing() if is_drawn else None
+        drawn = self.drawing() if is_concrete((self.params, [body.radius for body in self.bodies])) else None
         problem = Problem(self.system(), *self.start, drawing=drawn, project=self.project, names=self.names)
         if is_concrete((problem.system, self.start)):  # traced arrays must not outlive their trace
             self._problems.append(problem)
@@ -291,13 +290,9 @@ class Scene:
         effects = [replace(effect, rate="auto") for effect in self.effects]
         twin = replace(self, bodies=bodies, effects=effects, coordinates="directors", joint_starts={})
         check_run(self.sorting, run, twin.sorting)
-        arrays: dict[str, Any] = {}
-        for letter, of_body in (("q", run.position), ("p", run.momentum)):
-            for part in ("s", "f"):
-                places = {name: place for name, place in twin.places.items() if place.part == part}
-                pieces = [of_body(name) for name in sorted(places, key=lambda name: places[name].start)]
-                arrays[f"{letter}_{part}"] = np.concatenate(pieces, axis=-1) if pieces else run.states.q_s[..., :0]
-        return run.with_arrays(**arrays, t_micro=None, q_f_micro=None).of(twin)
+        q_s, p_s = (np.concatenate([of(name) for name in twin.places], axis=-1) for of in (run.position, run.momentum))
+        none = q_s[..., :0]
+        return run.with_arrays(q_s=q_s, q_f=none, p_s=p_s, p_f=none, t_micro=None, q_f_micro=None).of(twin)
 
     def without(self, *names: str) -> "Scene":
         """The scene without these effects.
