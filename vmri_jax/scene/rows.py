@@ -1,7 +1,7 @@
 """The rows of a scene's constraints: names, also of coordinates, values and Jacobian at any positions."""
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import chain
@@ -53,10 +53,10 @@ class Row(NamedTuple):
     kept: bool
 
 
-def rows_of(sorting: Sorting) -> list[Row]:
-    """The rows of all constraints, in the order of `Sorting.placed` and of the terms of each effect."""
+def rows_of(placed: Sequence[Placed]) -> list[Row]:
+    """The rows of constraints, in the order of `Sorting.placed` and of the terms of each effect."""
     rows = []
-    for i, part in enumerate(sorting.placed):
+    for i, part in enumerate(placed):
         effect, number = part.effect, 0
         for group in effect.by_size(part.elements) if part.home in HOMES else ():
             # all elements of a group have as many rows
@@ -114,7 +114,7 @@ class ConstraintRows:
         masses = np.concatenate(of_bodies) @ (jacobian * jacobian) if is_known else np.ones_like(start)
         elements = [element for part in constraints for element in _elements(part, columns)]
         return cls(
-            tuple(rows_of(sorting)), tuple(elements), start, masses, _scales(sorting), layout.sizes[0], to_bodies
+            tuple(rows_of(sorting.placed)), tuple(elements), start, masses, _scales(sorting), layout.sizes[0], to_bodies
         )
 
     def evaluate(self, t: float, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -149,7 +149,7 @@ class ConstraintRows:
             scaled = jacobian[np.ix_(numbers, free)] * self.scales[free] / self.sizes[numbers, None]
             correction = np.linalg.lstsq(scaled, values[numbers], rcond=RANK)[0]
             size = np.linalg.norm(correction)
-            if not size <= contraction * previous:
+            if not size / contraction <= previous:
                 break
             q, previous = q.copy(), size
             q[free] -= self.scales[free] * correction
@@ -221,7 +221,7 @@ def names_of(sorting: Sorting) -> Names:
     for name, place in sorting.layout.coordinates.items():
         sizes[place.part][name] = place.size
     for home in HOMES:
-        sizes[home] = dict(Counter(row.label for row in rows_of(sorting) if row.kept and row.home == home))
+        sizes[home] = dict(Counter(row.label for row in rows_of(sorting.placed) if row.kept and row.home == home))
     blocks, rigid = (
         [name for name, body in sorting.bodies.items() if getattr(body, kind)] for kind in ("block", "rigid")
     )

@@ -6,7 +6,7 @@ All classes here are compared by value: scenes of the same structure give equal 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
-from itertools import chain, groupby, pairwise
+from itertools import chain, groupby
 from operator import add
 from typing import Any, NamedTuple
 
@@ -179,41 +179,10 @@ class EffectTerm:
 
 
 @dataclass(frozen=True)
-class _OfSeveral:
-    """A term that is made of terms."""
-
-    terms: tuple[EffectTerm, ...]
-
-    @property
-    def timed(self) -> bool:
-        """Whether a term depends on time."""
-        return any(term.timed for term in self.terms)
-
-    def within(self, sizes: tuple[int, int]) -> bool:
-        """Whether all terms depend only on the coordinates of the scene, see `EffectTerm.within`."""
-        return all(term.within(sizes) for term in self.terms)
-
-
-@dataclass(frozen=True)
-class SomeRows(_OfSeveral):
-    """The values of some terms of a constraint one after the other, without the rows `dropped`, or these rows `alone`."""
-
-    dropped: tuple[int, ...]
-    alone: bool = False
-
-    def value(self, q_s, q_f, params, t=None):
-        """The values of the rows, by static slices."""
-        values = concatenated([term.value(q_s, q_f, params, t) for term in self.terms])
-        if self.alone:
-            return concatenated([values[k : k + 1] for k in self.dropped])
-        ends = [-1, *self.dropped, values.shape[0]]
-        return concatenated([values[low + 1 : high] for low, high in pairwise(ends)])
-
-
-@dataclass(frozen=True)
-class TangentDamping(_OfSeveral):
+class TangentDamping:
     """``F = -beta K v`` with the Hessian K of the energy of some terms; beta is the parameter "stiffness"."""
 
+    terms: tuple[EffectTerm, ...]
     name: str
 
     def forces(self, t, q_s, q_f, v_s, v_f, params):
@@ -226,6 +195,10 @@ class TangentDamping(_OfSeveral):
         # K v as the derivative of the gradient along v, without the matrix K
         products = jax.jvp(jax.grad(energy), ((q_s, q_f),), ((v_s, v_f),))[1]
         return tuple(-params[self.name]["stiffness"] * product for product in products)
+
+    def within(self, sizes: tuple[int, int]) -> bool:
+        """See `EffectTerm.within`."""
+        return all(term.within(sizes) for term in self.terms)
 
 
 def choose(params, select: Sequence[int], split: Sequence[str]):
