@@ -41,7 +41,8 @@ def well(q, params):
 def one_by_one() -> Scene:
     """A hanging chain in which every effect has several of its kind: of one element, of several, on the ground, in bodies, and with elements on both grids."""
     hinges = [
-        Revolute(pair, at, SIDE, name=f"hinge {i}") for i, (pair, at) in enumerate(zip(PAIRS, POINTS, strict=True))
+        Revolute(pair, point, SIDE, name=f"hinge {i}")
+        for i, (pair, point) in enumerate(zip(PAIRS, POINTS, strict=True))
     ]
     tips = [(f"bar {i}", [0.0, 0.1 * i, 0.2]) for i in range(N)]
     balls = [Body(f"ball {i}", 1.0 + i, [2.0, i, 1.0], pace="slow") for i in range(3)]
@@ -100,10 +101,13 @@ def equations(scene: Scene) -> int:
 
 def test_six_hinges_cost_what_six_elements_of_one_hinge_cost(monkeypatch):
     bars = [RigidBody(f"bar {i}", 1.0, Box((0.1, 0.2, 1.0)), [0, 0, -0.5 - i], pace="slow") for i in range(6)]
-    pairs, at = [("ground", "bar 0"), *pairwise(bar.name for bar in bars)], [[0.0, 0.0, -float(i)] for i in range(6)]
-    hinges = [Revolute(pair, x, SIDE, name=f"hinge {i}") for i, (pair, x) in enumerate(zip(pairs, at, strict=True))]
+    pairs, points = (
+        [("ground", "bar 0"), *pairwise(bar.name for bar in bars)],
+        [[0.0, 0.0, -float(i)] for i in range(6)],
+    )
+    hinges = [Revolute(pair, x, SIDE, name=f"hinge {i}") for i, (pair, x) in enumerate(zip(pairs, points, strict=True))]
     scene = Scene(bars, hinges, coordinates="directors")
-    alone = equations(Scene(bars, [Revolute(pairs, at, SIDE)], coordinates="directors"))
+    alone = equations(Scene(bars, [Revolute(pairs, points, SIDE)], coordinates="directors"))
     assert equations(scene) < 1.1 * alone  # measured: 0.996
     assert [*scene.names.slow_constraint] == [*(f"rigid {bar.name}" for bar in bars), *(hinge.name for hinge in hinges)]
     monkeypatch.setattr(assembly, "joined", lambda terms, in_order=False: tuple(terms))

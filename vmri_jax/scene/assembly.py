@@ -24,7 +24,7 @@ def build(sorting: Sorting, placed: Sequence[Placed]) -> System:
         for home in (part.home, "implied") if part.dropped else (part.home,):
             terms.setdefault(home, []).extend(part.effect.terms(part.elements, layout))
     # the values of constraints keep the order of `rows_of`
-    in_order = *HOMES, "implied"
+    in_order: tuple[Any, ...] = (*HOMES, "implied")
     terms = {home: [*joined(of_home, home in in_order)] for home, of_home in terms.items()}
     taken = _taken(placed) if "implied" in terms else {}
     # with joint coordinates the masses depend on positions, so that T is a function even without kinetic effects
@@ -58,10 +58,10 @@ def build(sorting: Sorting, placed: Sequence[Placed]) -> System:
     return System(kinetic, **functions, params=params)
 
 
-def _taken(placed: Sequence[Placed]) -> dict[str, Entries]:
+def _taken(placed: Sequence[Placed]) -> dict[Any, Entries]:
     """The rows that each function of constraints takes of its terms."""
     rows = rows_of(placed)
-    taken = {home: Entries.of([row.kept for row in rows if row.home == home]) for home in HOMES}
+    taken: dict[Any, Entries] = {home: Entries.of([row.kept for row in rows if row.home == home]) for home in HOMES}
     return taken | {"implied": Entries.of([not row.kept for row in rows if placed[row.part].dropped])}
 
 

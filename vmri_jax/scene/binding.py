@@ -2,16 +2,16 @@
 
 from abc import ABC
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import field, fields, replace
 from functools import cached_property
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 
 from vmri_jax.mechanics.arrays import library
 from vmri_jax.mechanics.rows import Place, Rows
-from vmri_jax.scene.body import GROUND, Attachment, Bodies, Point, body_of, end_of, moving
-from vmri_jax.scene.declare import Elements, Parameter, real_tree, stacked
+from vmri_jax.scene.body import GROUND, Attachment, Bodies, Point, body_of, end_of, label_of, moving
+from vmri_jax.scene.declare import Elements, Parameter, effect_class, real_tree, stacked
 from vmri_jax.scene.layout import Key, Layout
 from vmri_jax.scene.terms import EffectTerm, Role, Source, choose
 
@@ -23,6 +23,7 @@ ALONE = "alone"
 """Name of the term of a single element, the same for all effects, so that equal functions share a compiled program."""
 
 
+@effect_class
 class Bindable(ABC):
     """An effect with the bodies of its scene; see `vmri_jax.scene.effect.Effect` for the attributes of its class.
 
@@ -42,7 +43,8 @@ class Bindable(ABC):
     """Whether the function gets all coordinates of a rigid body instead of the coordinates of its centre."""
     of_many: ClassVar[bool] = True
     """Whether the function takes any number of elements; effects of one kind with such a function are one term of the system."""
-    name: str
+    name: str = field(default="", kw_only=True)
+    rate: Literal["slow", "fast", "auto"] | int = field(default="auto", kw_only=True)
 
     @property
     def declared(self) -> dict[str, Parameter]:
@@ -108,6 +110,19 @@ class Bindable(ABC):
                 params[name] = self.at_start(params)
         return params
 
+    def _mass(self, name: str):
+        """The mass () of a body, refused if it has none or several."""
+        mass = end_of(self.by_name, name).mass
+        if mass is None:
+            raise ValueError(
+                f"{self.name}: {label_of(name)} has no mass; this effect needs the mass of a whole body. Name a body with mass, without a point."
+            )
+        if mass.ndim:
+            raise ValueError(
+                f"{self.name}: {name} has a mass for each coordinate; this effect needs one mass for each body. Leave this body out, or give it one mass."
+            )
+        return mass
+
     @cached_property
     def points(self) -> dict[str, Any]:
         """For each role with points fixed in rigid bodies, the components X of these points along the directors; zeros for whole bodies."""
@@ -133,7 +148,7 @@ class Bindable(ABC):
         roles = zip(*(self.ends[i] for i in group), strict=True)
         return tuple(stacked([end.position for end in role]) for role in roles)
 
-    def params_of(self, group: Sequence[int], params: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    def params_of(self, group: Sequence[int], params: Any = None) -> Any:
         """The argument params of the function for some elements, from the `params` of all elements."""
         params = self.parameters if params is None else params
         return params if len(self.elements) == len(group) else choose(params, group, self.split_of(params))

@@ -1,7 +1,7 @@
 """Effects: each adds a function of positions, velocities and time of some bodies to the Lagrangian, the constraints or the forces."""
 
 from collections.abc import Sequence
-from dataclasses import Field, field, fields
+from dataclasses import Field, fields
 from inspect import getattr_static, isfunction
 from itertools import chain, pairwise
 from typing import Any, ClassVar, Literal, get_args
@@ -65,9 +65,6 @@ class Effect(Bindable):
     """Whether neighbouring bodies of an element, or a body and the fixed point it is tied to, must start at different places."""
     drawn_as: ClassVar[Literal["link", "spring"] | None] = None
     """The symbol that is drawn between neighbouring bodies of an element."""
-
-    name: str = field(default="", kw_only=True)
-    rate: Literal["slow", "fast", "auto"] | int = field(default="auto", kw_only=True)
 
     def __new__(cls, *args, **kwargs):
         """A new effect, of a class that is complete.
@@ -213,19 +210,6 @@ class Effect(Bindable):
                 differs = library(from_a, to_b).any(to_b.position != from_a.position)
                 expected = "they must not start at the same point; move one of them"
                 self.require(differs, f"the distance of {a} and {b}", 0.0, expected)
-
-    def _mass(self, name: str):
-        """The mass () of a body, refused if it has none or several."""
-        mass = end_of(self.by_name, name).mass
-        if mass is None:
-            raise ValueError(
-                f"{self.name}: {label_of(name)} has no mass; this effect needs the mass of a whole body. Name a body with mass, without a point."
-            )
-        if mass.ndim:
-            raise ValueError(
-                f"{self.name}: {name} has a mass for each coordinate; this effect needs one mass for each body. Leave this body out, or give it one mass."
-            )
-        return mass
 
     def _check_sizes(self, names: Sequence[str]) -> None:
         sizes = {name: end_of(self.by_name, name, self.whole).size for name in names}
