@@ -71,7 +71,8 @@ class Joint(Effect):
             values.append(FREEDOMS[freedom](tuple(map(jnp.asarray, ends)), self.params_of((i,))))
         return jnp.stack(values)
 
-    def frame(self, count: int) -> list | None:
+    @cached_property
+    def triads(self) -> Any:
         """(n, 3, 3) axes (m, m', n) of the joint in space, for all pairs, where the freedoms are zero; None if the joint has no axis."""
         return None
 
@@ -138,10 +139,9 @@ class Joint(Effect):
 
     def _frames(self) -> dict[str, list]:
         """Points and triads of every pair as components along the directors of each body: "point_a", "frame_a", "point_b", "frame_b"."""
-        elements, points = self.elements, self.joining_points
-        triads = self.frame(len(elements))
+        points, triads = self.joining_points, self.triads
         components: dict[str, list] = {}
-        for i, element in enumerate(elements):
+        for i, element in enumerate(self.elements):
             for role, name, point in zip("ab", element, points[i], strict=True):
                 body = body_of(self.by_name, name)
                 if not body.rigid and triads is not None:
@@ -176,12 +176,13 @@ class AboutAxis(Joint):
     def function(cls, q, params):
         return jnp.concatenate([cls.lengths(q, params), aligned(q, params, *cls.products)], axis=-1)
 
-    def frame(self, count: int):
-        return [_triad(axis) for axis in self._directions("axis", count)]
+    @cached_property
+    def triads(self):
+        return [_triad(axis) for axis in self._directions("axis")]
 
-    def _directions(self, name: str, count: int):
+    def _directions(self, name: str):
         """(n, 3) the vectors of the field `name` for all pairs, scaled to length one."""
-        vectors = _vectors(f"{self.name}: {name}", getattr(self, name), count)
+        vectors = _vectors(f"{self.name}: {name}", getattr(self, name), len(self.elements))
         lengths = library(vectors).linalg.norm(vectors, axis=-1, keepdims=True)
         self.require(lengths > 0, name, getattr(self, name), "it must not be zero")
         return vectors / lengths
