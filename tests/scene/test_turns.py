@@ -26,6 +26,7 @@ from vmri_jax.scene import (
     Scene,
     trees,
 )
+from vmri_jax.scene.binding import bound
 from vmri_jax.scene.effects.freedoms import REACH
 from vmri_jax.scene.effects.joint_base import OfFreedoms
 from vmri_jax.scene.turns import at_start
@@ -170,9 +171,9 @@ def test_a_joint_with_an_effect_is_not_cut_in_any_order(name):
     scene, make = crank_rocker(), EFFECTS[name][0]
     cuts = set()
     for hinge in HINGES:
-        bound = make(hinge).bound(scene.effects)
-        for order in permutations(scene.effects):
-            branches = trees.grow(scene.by_name, [*order, bound])
+        *joints, acting = bound([*scene.effects, make(hinge)], scene.by_name)
+        for order in permutations(joints):
+            branches = trees.grow(scene.by_name, [*order, acting])
             cuts.add((hinge, *(h for h in HINGES if h not in {branch.joint.name for branch in branches})))
     assert len(cuts) == 4  # one for each hinge, whatever the order
     assert all(hinge != closed for hinge, closed in cuts)
@@ -198,7 +199,7 @@ def test_starts_of_loops_count_the_turns_of_all_joints():
     scene = crank_rocker(coordinates="joint").with_joints({"hA": 7.0})
     (closed,) = cut(scene)
     x = dict(zip(scene.names.slow, np.asarray(scene.start[0]), strict=True))
-    x[closed] = at_start(scene.sorting, next(e for e in scene.effects if e.name == closed), 0, "turn")
+    x[closed] = at_start(scene.sorting, next(e for e in scene.bound if e.name == closed), 0, "turn")
     assert x["hA"] == 7.0
     assert x["hA"] + x["hB"] + x["hC"] == pytest.approx(x["hD"], abs=1e-9)
     assert max(abs(x["hB"]), abs(x["hC"])) > 5.0
