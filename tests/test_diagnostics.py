@@ -53,7 +53,7 @@ def test_energy_parts(tsp):
 def test_energy_of_a_kinetic_function():
     problem = double_pendulum()
     state = problem.state()
-    expected = problem.system.kinetic(problem.q_s, problem.q_f, problem.v_s, problem.v_f, problem.system.params)
+    expected = problem.system.kinetic_energy(problem.q_s, problem.q_f, problem.v_s, problem.v_f)
     expected += problem.system.slow_potential(problem.q_s, problem.q_f, problem.system.params)
     assert float(energy(problem.system, state.q_s, state.q_f, state.p_s, state.p_f)) == pytest.approx(float(expected))
 

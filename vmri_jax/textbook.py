@@ -121,10 +121,8 @@ def discrete_lagrangian(system: System, scheme: Scheme, slow, fast, macro_dt):
 
     slow_potential, fast_potential = potentials(system, scheme, macro_dt)
     T, T_s = system.kinetic, system.slow_kinetic
-    if T_s is not None:  # T_s(q_s, v_s) has a rule on the macro grid; T.function is the kinetic energy without it
-        T = T.function
     kinetic = action(scheme.kinetic, lambda q_s, q_f, v_s, v_f: T(q_s, q_f, v_s, v_f, system.params))
-    if T_s is not None:
+    if T_s is not None:  # has a rule on the macro grid
         kinetic += action(macro(scheme.kinetic.rule), lambda q_s, q_f, v_s, v_f: T_s(q_s, v_s, system.params))
     L_d = kinetic - action(scheme.slow, lambda q_s, q_f, v_s, v_f: slow_potential(q_s, q_f))
     L_d -= action(scheme.fast, lambda q_s, q_f, v_s, v_f: fast_potential(q_s, q_f))
@@ -220,7 +218,7 @@ def project(system: System, state: State, v_s, v_f):
     # unknowns v and mu:  dT/dv(q, v) + G^T mu = p,    G v + dg/dt = 0
     def residual(x):
         v_s, v_f, mu = x
-        p_s, p_f = jax.grad(system.kinetic, argnums=(2, 3))(q_s, q_f, v_s, v_f, system.params)
+        p_s, p_f = jax.grad(system.kinetic_energy, argnums=(2, 3))(q_s, q_f, v_s, v_f)
         force_s, force_f = pull(mu)
         rates = system.constraint_rates(t, q_s, q_f, v_s, v_f)
         return p_s + force_s - state.p_s, p_f + force_f - state.p_f, rates

@@ -46,7 +46,7 @@ def potential(case: Case, q):
 def kinetic(case: Case, v):
     """T at the positions of the start; masses are constant."""
     system, splits = case.problem.system, [case.problem.q_s.size]
-    return system.kinetic(*jnp.split(case.q, splits), *jnp.split(v, splits), system.params)
+    return system.kinetic_energy(*jnp.split(case.q, splits), *jnp.split(v, splits))
 
 
 def energy(case: Case) -> float:

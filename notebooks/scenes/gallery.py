@@ -81,7 +81,7 @@ def momentum_maps(system: vm.System, run: vm.Trajectory, size: int, shifted: tup
     """
 
     def functions(q, v):
-        lagrangian = system.kinetic(*q, *v, system.params)
+        lagrangian = system.kinetic_energy(*q, *v)
         for potential, where in ((system.slow_potential, q), (system.fast_potential, q[1:])):
             lagrangian -= 0.0 if potential is None else potential(*where, system.params)
         return jnp.append(system.constraints(0.0, *q), lagrangian)

@@ -80,7 +80,7 @@ def test_one_vector_is_no_force_on_several_elements():
     class Uniform(Drive):
         function = staticmethod(uniform)  # pyright: ignore[reportAssignmentType]
 
-        def check_parameters(self, bodies):
+        def check_parameters(self):
             """None: `Drive` would check its history."""
 
     bodies = [Body("a", 1.0, [0.0, 0.0]), Body("b", 1.0, [1.0, 0.0])]

@@ -44,7 +44,7 @@ def test_joints_in_a_row_are_one_joint_of_several_freedoms():
         (Planar(("ground", "plate"), [0, 0, 0], axis=axis, name="joint"), [Prismatic, Prismatic, Revolute]),
     ]
     for whole, kinds in cases:
-        axes = whole.frame(1)[0][[move.axis for move in whole.moves]]
+        axes = whole.bound({PLATE.name: PLATE}).triads[0][[move.axis for move in whole.moves]]
         frames = [Frame(f"frame {i}", [0.1 * i, 0.2, 0.3]) for i in range(len(kinds) - 1)]
         names = ["ground", *(frame.name for frame in frames), "plate"]
         row = [

@@ -77,5 +77,5 @@ def test_kinetic_energy_and_bodies_are_those_of_all(carried_by):
     assert kinematics is not None
     rates = kinematics.velocities(q_s, q_f, v_s, v_f, scene.sorting.joints)
     expected = sum(jnp.sum(masses[part] * rate**2) / 2 for part, rate in zip(("slow", "fast"), rates, strict=True))
-    assert float(system.kinetic(q_s, q_f, v_s, v_f, system.params)) == pytest.approx(float(expected), rel=1e-14)
+    assert float(system.kinetic_energy(q_s, q_f, v_s, v_f)) == pytest.approx(float(expected), rel=1e-14)
     assert scene.places["wheel 0"].part == "s"

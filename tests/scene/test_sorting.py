@@ -32,7 +32,7 @@ def paces(scene) -> dict:
 
 def frequency(scene, name) -> np.ndarray:
     """Of the elements of an effect."""
-    effects = [effect for effect in scene.effects if effect.kind in ("potential", "kinetic")]
+    effects = [effect for effect in scene.bound if effect.kind in ("potential", "kinetic")]
     return measure(scene.by_name, effects)[name].frequency
 
 
@@ -72,7 +72,7 @@ def test_angular_accelerations_count_without_the_size_of_the_scene(far):
         return -6.0 * q[0][4]  # the x axis leans towards y, at the rate of the turn about z
 
     scene = Scene([wheel, Body("stone", 1.0, [far, 0.0, 0.0])], [Potential(turn, "wheel"), Gravity()])
-    effects = [effect for effect in scene.effects if effect.kind == "potential"]
+    effects = [effect for effect in scene.bound if effect.kind == "potential"]
     rates = measure(scene.by_name, effects)
     assert rates["turn"].rate == pytest.approx(np.sqrt(30.0))
     assert rates["gravity"].rate.max() == pytest.approx(np.sqrt(9.81 / far))

@@ -27,6 +27,7 @@ from vmri_jax.scene import (
     Scene,
     trees,
 )
+from vmri_jax.scene.binding import bound
 from vmri_jax.scene.effects.freedoms import REACH
 from vmri_jax.scene.effects.joint_base import OfFreedoms
 from vmri_jax.scene.turns import at_start
@@ -102,7 +103,7 @@ def seen(scene, angles, rate=0.8):
     """What the effects of a scene do to the angles: forces of potentials, forces, controls, energy of rotors, rows of couplings."""
     q, motions = turned(scene, angles)
     v, none, system = motions @ np.array([rate, 0.0]), jnp.zeros(0), scene.system()
-    numbers = [system.kinetic(q, none, v, none, system.params) if not system.has_constant_mass else v @ v / 4]
+    numbers = [system.kinetic_energy(q, none, v, none) if not system.has_constant_mass else v @ v / 4]
     if system.slow_potential is not None:
         numbers += [*(jax.grad(system.slow_potential)(q, none, system.params) @ motions)]
     if system.force is not None:
@@ -171,9 +172,9 @@ def test_a_joint_with_an_effect_is_not_cut_in_any_order(name):
     scene, make = crank_rocker(), EFFECTS[name][0]
     cuts = set()
     for hinge in HINGES:
-        bound = make(hinge).bound(scene.effects)
-        for order in permutations(scene.effects):
-            branches = trees.grow(scene.by_name, [*order, bound])
+        *joints, acting = bound([*scene.effects, make(hinge)], scene.by_name)
+        for order in permutations(joints):
+            branches = trees.grow(scene.by_name, [*order, acting])
             cuts.add((hinge, *(h for h in HINGES if h not in {branch.joint.name for branch in branches})))
     assert len(cuts) == 4  # one for each hinge, whatever the order
     assert all(hinge != closed for hinge, closed in cuts)
@@ -199,7 +200,7 @@ def test_starts_of_loops_count_the_turns_of_all_joints():
     scene = crank_rocker(coordinates="joint").with_joints({"hA": 7.0})
     (closed,) = cut(scene)
     x = dict(zip(scene.names.slow, np.asarray(scene.start[0]), strict=True))
-    x[closed] = at_start(scene.sorting, next(e for e in scene.effects if e.name == closed), 0, "turn")
+    x[closed] = at_start(scene.sorting, next(e for e in scene.bound if e.name == closed), 0, "turn")
     assert x["hA"] == 7.0
     assert x["hA"] + x["hB"] + x["hC"] == pytest.approx(x["hD"], abs=1e-9)
     assert max(abs(x["hB"]), abs(x["hC"])) > 5.0

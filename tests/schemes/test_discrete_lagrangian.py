@@ -96,7 +96,7 @@ def galerkin_action(system, s, f, degree, rule):
             theta = (m + c) / N
             q_s, v_s = lagrange_basis(degree, theta) @ s, lagrange_derivative(degree, theta) @ s / H
             q_f, v_f = lagrange_basis(degree, c) @ points, lagrange_derivative(degree, c) @ points * N / H
-            integrand = system.kinetic(q_s, q_f, v_s, v_f, system.params)
+            integrand = system.kinetic_energy(q_s, q_f, v_s, v_f)
             integrand -= system.slow_potential(q_s, q_f, system.params) + system.fast_potential(q_f, system.params)
             value += H / N * w * integrand
     return value

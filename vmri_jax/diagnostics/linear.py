@@ -75,7 +75,7 @@ def frequencies(system: Movable, state: State | None = None):
     def potential(q):
         return potential_energy(system, q[:n_s], q[n_s:])
 
-    mass = jax.hessian(lambda v: system.kinetic(q[:n_s], q[n_s:], v[:n_s], v[n_s:], system.params))(v)
+    mass = jax.hessian(lambda v: system.kinetic_energy(q[:n_s], q[n_s:], v[:n_s], v[n_s:]))(v)
     basis = np.asarray(_null_space(jax.jacfwd(lambda q: system.constraints(state.t, q[:n_s], q[n_s:]))(q)))
     # With M = L L^T, the squares omega^2 are the eigenvalues of the symmetric matrix L^-1 K L^-T.
     cholesky = np.linalg.cholesky(basis @ np.asarray(mass) @ basis.T)

@@ -283,7 +283,7 @@ def _turns_one_way(problem: Problem) -> str:
     """The reason why reversed momenta do not lead a closed system back to the start; empty if its kinetic energy is even in the velocities."""
     random, system = np.random.default_rng(0), problem.system
     v_s, v_f = (random.uniform(-1, 1, q.shape) for q in (problem.q_s, problem.q_f))
-    there, back = (float(system.kinetic(problem.q_s, problem.q_f, v_s * x, v_f * x, system.params)) for x in (1, -1))
+    there, back = (float(system.kinetic_energy(problem.q_s, problem.q_f, v_s * x, v_f * x)) for x in (1, -1))
     if abs(there - back) <= 1e-12 * (abs(there) + abs(back)):
         return ""
     return (

@@ -78,7 +78,7 @@ def _terms(problem: Problem, scheme: Scheme, macro_dt: float) -> Iterator[tuple[
         yield f"potential {name!r}", values, points[:, :n]
     if not system.has_constant_mass:
         parts = (n_s, n, n + n_s)
-        yield "kinetic", lambda z: system.kinetic(*jnp.split(z, parts), params)[None], points
+        yield "kinetic", lambda z: system.kinetic_energy(*jnp.split(z, parts))[None], points
     if system.is_constrained:
         yield "the constraints", lambda q: system.constraints(t, q[:n_s], q[n_s:]), points[:, :n]
 

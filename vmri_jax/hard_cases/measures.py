@@ -83,7 +83,7 @@ def energy(trajectory: Trajectory, num_steps: int, scale: float = 1.0) -> Energy
 
 def energy_scale(problem: Problem, trajectory: Trajectory) -> float:
     """Size of the energies of a run: the larger of ``|E_0|`` and the largest kinetic energy, at least 1e-300."""
-    still = problem.system.replace(slow_potential=None, fast_potential=None, potentials=None)
+    still = problem.system.only(lambda term: term.kind != "potential")
     kinetic = jax.vmap(partial(diagnostics.energy, still))
     _, *phase = vars(trajectory.states).values()
     return max(float(np.nanmax(kinetic(*phase))), float(abs(trajectory.energy[0])), 1e-300)

@@ -15,10 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.mechanics.arrays import library, real_array
-from vmri_jax.mechanics.functions import Rheonomic, TracedOnce, traced_once
+from vmri_jax.mechanics.functions import TracedOnce, traced_once
 from vmri_jax.mechanics.masses import ConstantMass
 from vmri_jax.mechanics.order import InOrder, Order, in_order
-from vmri_jax.mechanics.system import ARGUMENTS, KineticFunction, System
+from vmri_jax.mechanics.system import System
+from vmri_jax.mechanics.terms import Term
 
 SLOW, FAST = ("q_s", "v_s"), ("q_f", "v_f")
 """Names of the arguments that are slow, and fast, positions or velocities."""
@@ -178,24 +179,13 @@ def flat_system(system: System, slow: Layout | None, fast: Layout | None) -> Sys
         ValueError: masses of bodies that are not in the layouts.
     """
 
-    def wrapped(name: str, function):
-        if isinstance(function, Rheonomic):
-            return Rheonomic(_wrapped(function.function, ("t", *ARGUMENTS[name].split(", ")), slow, fast))
-        return None if function is None else _wrapped(function, tuple(ARGUMENTS[name].split(", ")), slow, fast)
+    def flat(term: Term):
+        masses = term.function
+        if isinstance(masses, ConstantMass):
+            return ConstantMass(_flat_mass("slow", masses.slow, slow), _flat_mass("fast", masses.fast, fast))
+        return _wrapped(term.function, (*term.arguments, "params"), slow, fast)
 
-    kinetic, slow_kinetic = system.kinetic, None
-    if isinstance(kinetic, ConstantMass):
-        kinetic = ConstantMass(_flat_mass("slow", kinetic.slow, slow), _flat_mass("fast", kinetic.fast, fast))
-    elif isinstance(kinetic, KineticFunction):
-        slow_kinetic, kinetic = wrapped("slow_kinetic", kinetic.slow), wrapped("kinetic", kinetic.function)
-    names = "slow_potential", "fast_potential", "constraint", "slow_constraint", "force", "implied"
-    return System(
-        kinetic,
-        **{name: wrapped(name, getattr(system, name)) for name in names},
-        params=system.params,
-        slow_kinetic=slow_kinetic,
-        potentials=tuple((name, wrapped("potentials", function)) for name, function in system.potentials),
-    )
+    return system.mapped(flat)
 
 
 def _repeats(shape: tuple[int, ...], whole: tuple[int, ...]) -> bool:

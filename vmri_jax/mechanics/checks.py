@@ -15,11 +15,11 @@ import numpy as np
 
 from vmri_jax.mechanics.arrays import check_precision, is_concrete, real_array
 from vmri_jax.mechanics.arrays import require_x64 as require_x64
-from vmri_jax.mechanics.functions import TracedOnce, traced_once, with_time
+from vmri_jax.mechanics.functions import TracedOnce, traced_once
 from vmri_jax.mechanics.masses import ConstantMass
 from vmri_jax.mechanics.order import order_of, ordered
 from vmri_jax.mechanics.surroundings import name_of
-from vmri_jax.mechanics.system import KineticFunction, System
+from vmri_jax.mechanics.system import System
 
 
 def check_arrays(**arrays):
@@ -87,41 +87,28 @@ def check_system(system: System, q_s, q_f) -> None:
         for name, mass, n in (("slow", system.kinetic.slow_mass, n_s), ("fast", system.kinetic.fast_mass, n_f)):
             if mass.size != n:
                 raise ValueError(f"ConstantMass: {name} is for {mass.size} coordinates, the state has {n} {name} ones.")
-    scalars = {
-        "kinetic": (system.kinetic, (q_s, q_f, q_s, q_f)),
-        "slow_kinetic": (system.slow_kinetic, (q_s, q_s)),
-        "slow_potential": (system.slow_potential, (q_s, q_f)),
-        "fast_potential": (system.fast_potential, (q_f,)),
-        **{f"potentials[{name!r}]": (function, (q_s, q_f)) for name, function in system.potentials},
-    }
-    for name, (function, args) in scalars.items():
-        if function is not None:
-            shape = shape_of(f"System: {name}", function, *args, system.params)
-            if getattr(shape, "shape", None) != ():
-                raise ValueError(f"System: {name} returns {describe(shape)}; it must return a scalar, shape ().")
-            _check_float64(name, shape)
+    values = {"t": jnp.zeros(()), "q_s": q_s, "q_f": q_f, "v_s": q_s, "v_f": q_f}
+    for term in system.terms:
+        name = f"System: {term.place}"
+        shape = shape_of(name, term.function, *term.of_arguments(values), system.params)
+        if term.kind in ("kinetic", "potential") and getattr(shape, "shape", None) != ():
+            raise ValueError(f"{name} returns {describe(shape)}; it must return a scalar, shape ().")
+        if term.kind in ("constraint", "implied") and len(getattr(shape, "shape", ())) != 1:
+            raise ValueError(
+                f"{name} returns {describe(shape)}; it must return a vector, shape (n_g,), or rows by name."
+            )
+        is_pair = isinstance(shape, tuple) and [getattr(s, "shape", None) for s in shape] == [(n_s,), (n_f,)]
+        if term.kind == "force" and not is_pair:
+            raise ValueError(
+                f"{name} returns {describe(shape)}; it must return (F_s, F_f) of shapes ({n_s},) and ({n_f},)."
+            )
+        for part in shape if isinstance(shape, tuple) else (shape,):
+            _check_float64(term.place, part)
     if system.implied is not None and not system.is_constrained:
         raise ValueError(
             "System: implied is given, but neither constraint nor slow_constraint: its rows are watched, not solved for, and must "
             "follow from rows that are. Give it as constraint."
         )
-    for name, args in (("constraint", (q_s, q_f)), ("slow_constraint", (q_s,)), ("implied", (q_s, q_f))):
-        function, args = with_time(getattr(system, name), jnp.zeros(()), *args, system.params)
-        if function is not None:
-            shape = shape_of(f"System: {name}", function, *args)
-            if len(getattr(shape, "shape", ())) != 1:
-                raise ValueError(
-                    f"System: {name} returns {describe(shape)}; it must return a vector, shape (n_g,), or rows by name."
-                )
-            _check_float64(name, shape)
-    if system.force is not None:
-        shape = shape_of("System: force", system.force, jnp.zeros(()), q_s, q_f, q_s, q_f, system.params)
-        if not isinstance(shape, tuple) or [getattr(s, "shape", None) for s in shape] != [(n_s,), (n_f,)]:
-            raise ValueError(
-                f"System: force returns {describe(shape)}; it must return (F_s, F_f) of shapes ({n_s},) and ({n_f},)."
-            )
-        for part in shape:
-            _check_float64("force", part)
 
 
 def shape_of(name: str, function, *args):
@@ -136,7 +123,7 @@ def shape_of(name: str, function, *args):
         ValueError: the function cannot be traced, differentiated, or evaluated.
     """
 
-    if not isinstance(function, TracedOnce | KineticFunction | ConstantMass):  # these have the order of their system
+    if not isinstance(function, TracedOnce | ConstantMass):  # these have the order of their system
         function = ordered(function, order_of(args[-1]))
 
     def differentiated_twice(*args):
@@ -167,7 +154,6 @@ def shape_of(name: str, function, *args):
             f"{_line_of(error)}: {type(error).__name__}: {error}"
         ) from error
     if not isinstance(function, ConstantMass):
-        function = function.function if isinstance(function, KineticFunction) else function
         leaves, structure = jax.tree.flatten(args)
         fault = _fault(
             traced_once(function), structure, tuple((np.shape(leaf), jnp.result_type(leaf)) for leaf in leaves)

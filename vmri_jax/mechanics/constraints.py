@@ -10,6 +10,7 @@ weights w, square roots of the masses, give all coordinates one unit: lengths of
 position, which bounds its round-off, are taken with them. Mass matrices are judged with a diagonal of ones.
 """
 
+from contextlib import nullcontext
 from typing import Any, NamedTuple
 
 import jax
@@ -18,7 +19,7 @@ import numpy as np
 from jaxtyping import Float
 
 from vmri_jax.kernels.saddle import least_norm
-from vmri_jax.mechanics.arrays import Numbers, quickly_compiled
+from vmri_jax.mechanics.arrays import Numbers, is_concrete, quickly_compiled
 from vmri_jax.mechanics.by_name import constraint_sizes
 from vmri_jax.mechanics.functions import Rheonomic
 from vmri_jax.mechanics.masses import correlation
@@ -183,7 +184,9 @@ def check_mass(system: System, q_s, q_f) -> None:
     """
     if system.has_constant_mass:
         return
-    with jax.ensure_compile_time_eval():  # velocities may be traced, positions are not
+    # velocities may be traced, positions are not; outside of traces each operation would be a program of its own
+    is_staged = not is_concrete(jnp.zeros(()))
+    with jax.ensure_compile_time_eval() if is_staged else nullcontext():
         random = np.random.default_rng(0)
         velocities = (SPEED * random.normal(size=np.size(q)) for q in (q_s, q_f))
         mass = np.asarray(_mass_matrix(system, q_s, q_f, *velocities))
@@ -209,7 +212,7 @@ def check_mass(system: System, q_s, q_f) -> None:
 @quickly_compiled
 def _mass_matrix(system, q_s, q_f, v_s, v_f):
     n_s = v_s.size
-    return jax.hessian(lambda v: system.kinetic(q_s, q_f, v[:n_s], v[n_s:], system.params))(jnp.append(v_s, v_f))
+    return jax.hessian(lambda v: system.kinetic_energy(q_s, q_f, v[:n_s], v[n_s:]))(jnp.append(v_s, v_f))
 
 
 def check_constraints(

@@ -12,9 +12,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.mechanics.functions import Rheonomic
 from vmri_jax.mechanics.structure import depends_on
 from vmri_jax.mechanics.system import System
+from vmri_jax.mechanics.terms import Term
 
 SAMPLES = 2**20
 """Samples in time of an entry. With fewer samples short pulses are overlooked, with more of them the search for events takes longer."""
@@ -63,15 +63,10 @@ def driven(system: System, state) -> tuple[str, ...]:
     Args:
         state: a `State`, or any object with arrays q_s (n_s,) and q_f (n_f,).
     """
-    q_s, q_f = state.q_s, state.q_f
-    terms = {}
-    if system.force is not None:
-        terms["force"] = partial(system.forces, q_s=q_s, q_f=q_f, v_s=jnp.zeros_like(q_s), v_f=jnp.zeros_like(q_f))
-    if isinstance(system.constraint, Rheonomic):
-        terms["constraint"] = partial(system.g, q_s=q_s, q_f=q_f)
-    if isinstance(system.slow_constraint, Rheonomic):
-        terms["slow_constraint"] = partial(system.g_slow, q_s=q_s)
-    return tuple(name for name, value in terms.items() if depends_on(value, jnp.zeros(()))[0])
+    values = {"q_s": state.q_s, "q_f": state.q_f, "v_s": jnp.zeros_like(state.q_s), "v_f": jnp.zeros_like(state.q_f)}
+    moving = [term for term in system.terms if "t" in term.arguments and term.kind != "implied"]
+    depends = (depends_on(partial(_at_time, term, system.params, values), jnp.zeros(()))[0] for term in moving)
+    return tuple(term.field for term, on_time in zip(moving, depends, strict=True) if on_time)
 
 
 def events(system: System, state, t_end: float) -> Events:
@@ -146,18 +141,22 @@ def _jumps(values, t: np.ndarray, f: np.ndarray) -> bool:
     return bool(change >= LEAST_JUMP)
 
 
+def _at_time(term: Term, params, values: dict, t):
+    """The value of a term at a time."""
+    return term(params, t=t, **values)
+
+
 @partial(jax.jit, static_argnames="names")
 def _sampled(system: System, names: tuple[str, ...], configuration, times):
     """(k, m) entries of the terms `names` at the times (k,): forces, and values and rates of moving constraints."""
-    q_s, q_f, *_ = configuration
+    values = dict(zip(("q_s", "q_f", "v_s", "v_f"), configuration, strict=True))
 
     def entries(t):
-        parts = list(system.forces(t, *configuration)) if "force" in names else []
-        for name, g in (
-            ("constraint", lambda t: system.g(t, q_s, q_f)),
-            ("slow_constraint", lambda t: system.g_slow(t, q_s)),
-        ):
-            parts += jax.jvp(g, (t,), (jnp.ones_like(t),)) if name in names else ()
+        parts = []
+        for term in system.terms:
+            if term.field in names:
+                value = partial(_at_time, term, system.params, values)
+                parts += value(t) if term.kind == "force" else jax.jvp(value, (t,), (jnp.ones_like(t),))
         return jnp.concatenate(parts)
 
     return jax.vmap(entries)(times)

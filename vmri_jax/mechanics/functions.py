@@ -197,8 +197,3 @@ class Rheonomic:
     def __post_init__(self):
         if not callable(self.function):
             raise TypeError(f"Rheonomic: function is {self.function!r}; give a function of (t, q_s, q_f, params).")
-
-
-def with_time(function, t, *arguments):
-    """A constraint as a plain function and its arguments, with the time as the first one if the constraint is `Rheonomic`."""
-    return (function.function, (t, *arguments)) if isinstance(function, Rheonomic) else (function, arguments)

@@ -19,7 +19,7 @@ def energy_parts(system: System, q_s, q_f, p_s, p_f, velocities=None) -> dict:
     Velocities (v_s, v_f) of the momenta that are known already are not computed again.
     """
     v_s, v_f = velocities or velocity(system, q_s, q_f, p_s, p_f)
-    kinetic = jnp.sum(p_s * v_s) + jnp.sum(p_f * v_f) - system.kinetic(q_s, q_f, v_s, v_f, system.params)
+    kinetic = jnp.sum(p_s * v_s) + jnp.sum(p_f * v_f) - system.kinetic_energy(q_s, q_f, v_s, v_f)
     return {"kinetic": kinetic, **system.all_potentials(q_s, q_f)}
 
 
@@ -31,7 +31,7 @@ def potential_energy(system: System, q_s, q_f):
 def lagrangian(system: System, n_s: int, q, v):
     """``T - V - W - sum_i V_i`` at positions and velocities (n_s + n_f,)."""
     q_s, q_f = q[:n_s], q[n_s:]
-    return system.kinetic(q_s, q_f, v[:n_s], v[n_s:], system.params) - potential_energy(system, q_s, q_f)
+    return system.kinetic_energy(q_s, q_f, v[:n_s], v[n_s:]) - potential_energy(system, q_s, q_f)
 
 
 def energy(system: System, q_s, q_f, p_s, p_f):
@@ -87,7 +87,7 @@ def velocity(system: System, q_s, q_f, p_s, p_f):
         q_s, q_f: (n_s,) and (n_f,) positions, for masses that depend on them.
         p_s, p_f: (n_s,) and (n_f,) momenta.
     """
-    free = system.replace(constraint=None, slow_constraint=None, implied=None)
+    free = system.only(lambda term: term.kind not in ("constraint", "implied"))
     return project_momentum(free, State(jnp.zeros(()), q_s, q_f, p_s, p_f))[2:]
 
 
@@ -98,7 +98,7 @@ def velocity_and_masses(system: System, q_s, q_f, p_s, p_f):
     n_s, p = q_s.size, jnp.concatenate([p_s, p_f])
 
     def kinetic(v):
-        return system.kinetic(q_s, q_f, v[:n_s], v[n_s:], system.params)
+        return system.kinetic_energy(q_s, q_f, v[:n_s], v[n_s:])
 
     is_quadratic = has_constant_hessian(kinetic, p)
     v = jnp.zeros_like(p) if is_quadratic else jnp.concatenate(velocity(system, q_s, q_f, p_s, p_f))

@@ -26,7 +26,7 @@ def legendre(system: System, q_s, q_f, v_s, v_f):
     """Continuous Legendre transform ``p = dT/dv``: (p_s, p_f)."""
     if system.has_constant_mass:
         return system.kinetic.momentum(v_s, v_f)
-    return jax.grad(system.kinetic, argnums=(2, 3))(q_s, q_f, v_s, v_f, system.params)
+    return jax.grad(system.kinetic_energy, argnums=(2, 3))(q_s, q_f, v_s, v_f)
 
 
 def mass_diagonal(system: System, q_s, q_f):
@@ -39,7 +39,7 @@ def mass_diagonal(system: System, q_s, q_f):
     def second(direction):
         def kinetic(step):
             v = step * direction
-            return system.kinetic(q_s, q_f, v[:n_s], v[n_s:], system.params)
+            return system.kinetic_energy(q_s, q_f, v[:n_s], v[n_s:])
 
         return jax.jvp(lambda step: jax.jvp(kinetic, (step,), (1.0,))[1], (0.0,), (1.0,))[1]
 
@@ -110,7 +110,7 @@ def _velocity_and_impulse(system: System, q_s, q_f, constraints, p, guess):
     """The v that minimises ``T(v) - p . v`` over ``G v + dg/dt = 0``, and ``G^T mu``, with `constraints` (G, dg/dt); NaN without convergence."""
 
     def kinetic(system, q_s, q_f, v):
-        return system.kinetic(q_s, q_f, v[: q_s.size], v[q_s.size :], system.params)
+        return system.kinetic_energy(q_s, q_f, v[: q_s.size], v[q_s.size :])
 
     # Newton direction d:  [T'', G^T; G, 0] (d, mu) = (p - T'(v), -(G v + rates))
     def direction(data, v):

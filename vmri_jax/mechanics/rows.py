@@ -98,6 +98,15 @@ class Rows:
                 runs.append(Run(part, start, 1, False))
         return cls(size or stride, stride, tuple(runs), len(places) == 1)
 
+    @property
+    def places(self) -> list[Place]:
+        """Places of the bodies, in the order of the rows."""
+        return [
+            Place(part, start + (0 if same else i * self.stride), self.stride)
+            for part, start, count, same in self.runs
+            for i in range(count)
+        ]
+
     def within(self, sizes: tuple[int, int]) -> bool:
         """Whether all rows are among the first (n_s, n_f) coordinates."""
         most = {"s": sizes[0], "f": sizes[1]}

@@ -16,7 +16,6 @@ from vmri_jax.mechanics import by_name
 from vmri_jax.mechanics.arrays import Known, Number, Numbers, is_concrete, of_one_type, quickly_compiled, require_x64
 from vmri_jax.mechanics.checks import check_arrays, check_flags, check_number, check_params, check_system, check_type
 from vmri_jax.mechanics.constraints import START, check_constraints, check_mass, project_positions
-from vmri_jax.mechanics.functions import with_time
 from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.projection import legendre, project_momentum
 from vmri_jax.mechanics.summary import coordinates, has_values, listed, numbers, summary
@@ -266,12 +265,12 @@ class Problem:
 
     def _names_of(self, layouts: "Layouts") -> Names:
         """The names of the problem, with the names of bodies and rows in the dictionaries."""
-        names, system, t = self.names or Names(), self.system, jnp.zeros(())
-        arguments = {"constraint": (self.q_s, self.q_f), "slow_constraint": (self.q_s,)}
-        sizes = {}
-        for name, configuration in arguments.items():
-            function, all_arguments = with_time(getattr(system, name), t, *configuration, system.params)
-            sizes[name] = by_name.constraint_sizes(function, *all_arguments) or getattr(names, name)
+        names, system = self.names or Names(), self.system
+        values = {"t": jnp.zeros(()), "q_s": self.q_s, "q_f": self.q_f}
+        sizes = {"constraint": names.constraint, "slow_constraint": names.slow_constraint}
+        for term in system.of_kind("constraint"):
+            of_rows = by_name.constraint_sizes(term.function, *term.of_arguments(values), system.params)
+            sizes[term.field] = of_rows or sizes[term.field]
         for name, layout in zip(("slow", "fast"), layouts, strict=True):
             sizes[name] = getattr(names, name) if layout is None else layout.sizes
         return replace(names, **sizes, layouts=layouts)
@@ -284,7 +283,7 @@ class Problem:
             {
                 "slow": coordinates(names.slow_coordinates),
                 "fast": coordinates(names.fast_coordinates),
-                **self.system.terms(),
+                **self.system.in_words(),
                 "rows of constraints": listed(constraints),
                 "start": f"t = {numbers(self.t)}",
                 **{name: numbers(getattr(self, name)) for name in ("q_s", "q_f", "v_s", "v_f")},

@@ -1,6 +1,7 @@
 """The physics of a system: plain JAX functions of slow and fast variables, written by the user."""
 
 import dataclasses
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -15,27 +16,17 @@ from vmri_jax.mechanics.functions import (
     TracedOnce,
     check_arguments,
     traced_once,
-    with_time,
 )
 from vmri_jax.mechanics.masses import ConstantMass
 from vmri_jax.mechanics.order import Order, order_of
 from vmri_jax.mechanics.summary import numbers, parameters, summary
 from vmri_jax.mechanics.surroundings import name_of
+from vmri_jax.mechanics.terms import KINDS, Term, label
 
-ARGUMENTS = {
-    "kinetic": "q_s, q_f, v_s, v_f, params",
-    "slow_kinetic": "q_s, v_s, params",
-    "slow_potential": "q_s, q_f, params",
-    "fast_potential": "q_f, params",
-    "constraint": "q_s, q_f, params",
-    "slow_constraint": "q_s, params",
-    "force": "t, q_s, q_f, v_s, v_f, params",
-    "implied": "q_s, q_f, params",
-    "potentials": "q_s, q_f, params",
-}
-"""Arguments of the functions of a system; a `Rheonomic` constraint gets t before them."""
-RESERVED = ("kinetic", "T", "T_s", "V", "W", "F", "g", "g_s", "path", "order", "solves")
-"""Names that potentials in `System.potentials` must not have: names of other terms, and of rows in the description of a scheme."""
+RESERVED = ("kinetic", "path", "order", "solves", *(kind.symbol for kind in KINDS.values() if kind.symbol))
+"""Names that potentials in `System.potentials` must not have: symbols of other terms, and names of rows in the description of a scheme."""
+RATE_OF: dict[str | int, str] = {"V": "slow", "W": "fast"}
+"""The rates of V and W: a potential of this name in `System.potentials` has the same rule."""
 FAST_ALONE = (
     "It sees fast variables alone: whatever a stiff spring joins is fast, also a heavy body, and stands in q_f. Or give the function as "
     "potentials={{'fast': W}}, which may join slow and fast variables on the micro grid."
@@ -58,22 +49,6 @@ jax.tree_util.register_pytree_node(
 )
 
 
-class KineticFunction(eqx.Module):
-    """Kinetic energy given by functions, ``T(q_s, q_f, v_s, v_f, params) + T_s(q_s, v_s, params)``.
-
-    Args:
-        function: T.
-        slow: T_s, the part that depends on slow variables alone; None without such a part.
-    """
-
-    function: TracedOnce
-    slow: TracedOnce | None = None
-
-    def __call__(self, q_s, q_f, v_s, v_f, params):
-        energy = self.function(q_s, q_f, v_s, v_f, params)
-        return energy if self.slow is None else energy + self.slow(q_s, v_s, params)
-
-
 class System(eqx.Module):
     """Mechanical system with Lagrangian ``L = T - V - W - sum_i V_i``, constraints ``g = 0`` and forces ``F``.
 
@@ -93,7 +68,7 @@ class System(eqx.Module):
             `Rheonomic` function. Steps do not solve for them, and they have no multipliers. A run checks them at its saved nodes: they
             count in `constraint_residual`, and if one of them is not zero the run ends as `NOT_IMPLIED`.
         slow_kinetic: ``T_s(q_s, v_s, params) -> ()``, the part of the kinetic energy that depends on slow variables alone, besides the
-            function `kinetic`. Schemes evaluate it on the macro grid, see `vmri_jax.schemes.discrete_lagrangian`. It is stored in `kinetic`.
+            function `kinetic`. Schemes evaluate it on the macro grid, see `vmri_jax.schemes.discrete_lagrangian`.
         potentials: further potentials ``V_i(q_s, q_f, params) -> ()`` by name, each with a rate of its own: a scheme has a rule for each
             name, see `vmri_jax.Scheme.with_potentials`. The names "slow" and "fast" have the rules of V and of W unless the scheme says
             otherwise, so that ``{"fast": V_1}`` is a potential on the micro grid that may join slow and fast variables. The name k, a
@@ -113,6 +88,7 @@ class System(eqx.Module):
     force: TracedOnce | None = None
     params: Any = None
     implied: TracedOnce | Rheonomic | None = None
+    slow_kinetic: TracedOnce | None = None
     potentials: Potentials = Potentials()
 
     def __init__(
@@ -136,51 +112,64 @@ class System(eqx.Module):
             "slow_constraint": slow_constraint,
             "force": force,
             "implied": implied,
+            "slow_kinetic": slow_kinetic,
         }
         order = order_of(params)
         for name, function in functions.items():
             setattr(self, name, _checked(name, function, order))
-        if not isinstance(kinetic, ConstantMass | KineticFunction):
-            if not callable(kinetic):
-                raise TypeError(
-                    f"System: kinetic is {kinetic!r}; give ConstantMass(slow, fast) or a function "
-                    "kinetic(q_s, q_f, v_s, v_f, params)."
-                )
-            _check_function("kinetic", kinetic)
-            slow: Any = _checked("slow_kinetic", slow_kinetic, order)
-            kinetic = KineticFunction(traced_once(kinetic, order), slow)
-        elif slow_kinetic is not None:
+        if isinstance(kinetic, ConstantMass) and slow_kinetic is not None:
             raise ValueError(
                 "System: slow_kinetic is given besides a ConstantMass, which has the masses of all slow variables; give the whole kinetic "
                 "energy as ConstantMass, or kinetic as a function."
             )
-        self.kinetic = kinetic
+        if not callable(kinetic):
+            raise TypeError(
+                f"System: kinetic is {kinetic!r}; give ConstantMass(slow, fast) or a function "
+                "kinetic(q_s, q_f, v_s, v_f, params)."
+            )
+        self.kinetic = kinetic if isinstance(kinetic, ConstantMass) else _checked("kinetic", kinetic, order)
         self.params = params
         self.potentials = _named_potentials(potentials or (), order)
 
     def __repr__(self) -> str:
-        return summary("System", self.terms())
+        return summary("System", self.in_words())
 
-    def terms(self) -> dict[str, str]:
-        """The terms in words by name, for summaries; empty for absent terms."""
-        kinetic = self.kinetic
-        if isinstance(kinetic, ConstantMass):
-            mass = f"masses, slow {numbers(kinetic.slow)}; fast {numbers(kinetic.fast)}"
-        else:
-            mass = f"function {name_of(kinetic)}" + (f" + {name_of(kinetic.slow)}" if kinetic.slow else "")
-        functions = {
-            "slow potential V": self.slow_potential,
-            "fast potential W": self.fast_potential,
-            "constraint g": self.constraint,
-            "slow constraint g_s": self.slow_constraint,
-            **{f"potential {label(name)}": function for name, function in self.potentials},
-            "force F": self.force,
-        }
-        terms = {name: "" if f is None else f"function {name_of(f)}" for name, f in functions.items()}
-        for name, function in functions.items():
-            if isinstance(function, Rheonomic):
-                terms[name] += ", which depends on time"
-        return {"kinetic energy T": mass, **terms, "params": parameters(self.params)}
+    @property
+    def terms(self) -> tuple[Term, ...]:
+        """The terms that the system has, see `vmri_jax.mechanics.terms`."""
+        terms = []
+        for field in KINDS:
+            functions = self.potentials if field == "potentials" else [("", getattr(self, field))]
+            terms += [Term.of(field, function, name) for name, function in functions if function is not None]
+        return tuple(terms)
+
+    def of_kind(self, kind: str) -> tuple[Term, ...]:
+        """The terms of a kind, of `vmri_jax.mechanics.terms`."""
+        return tuple(term for term in self.terms if term.kind == kind)
+
+    def only(self, keep: Callable[[Term], bool]) -> "System":
+        """The same kinetic energy, and those of the other terms for which `keep` is true."""
+        return self.mapped(lambda term: term.function if term.kind == "kinetic" or keep(term) else None)
+
+    def mapped(self, changed: Callable[[Term], Any]) -> "System":
+        """The system whose functions are those that `changed` returns for its terms, each in place of its function; None for no function."""
+        fields: dict[str, Any] = {"potentials": {}}
+        for term, function in [(term, changed(term)) for term in self.terms]:
+            if function is not None and term.field == "potentials":
+                fields["potentials"][term.name] = function
+            elif function is not None:
+                fields[term.field] = term.in_system(function)
+        return System(**fields, params=self.params)
+
+    def in_words(self) -> dict[str, str]:
+        """The terms and the params in words, for summaries."""
+        words = {}
+        for term in self.terms:
+            mass, moves = term.function, ", which depends on time" if term.moves else ""
+            is_function = not isinstance(mass, ConstantMass)
+            masses = "" if is_function else f"masses, slow {numbers(mass.slow)}; fast {numbers(mass.fast)}"
+            words[f"{KINDS[term.field].in_words} {term.label}"] = masses or f"function {name_of(term.function)}{moves}"
+        return {**words, "params": parameters(self.params)}
 
     def replace(self, **changes) -> "System":
         """The same system with some fields changed, e.g. ``system.replace(params=new)``."""
@@ -195,36 +184,37 @@ class System(eqx.Module):
 
     def all_potentials(self, q_s, q_f) -> dict:
         """Values of V ("slow"), of W ("fast") and of `potentials` by name; zero without V or W. A potential named "slow" or "fast" is added."""
-        zero = jnp.zeros(())
-        values: dict[str | int, Any] = {
-            "slow": zero if self.slow_potential is None else self.slow_potential(q_s, q_f, self.params),
-            "fast": zero if self.fast_potential is None else self.fast_potential(q_f, self.params),
-        }
-        for name, function in self.potentials:
-            values[name] = values.get(name, 0.0) + function(q_s, q_f, self.params)
+        values: dict[str | int, Any] = {"slow": jnp.zeros(()), "fast": jnp.zeros(())}
+        for term in self.of_kind("potential"):
+            name = RATE_OF.get(term.name, term.name)
+            values[name] = values.get(name, 0.0) + term(self.params, q_s=q_s, q_f=q_f)
         return values
+
+    def kinetic_energy(self, q_s, q_f, v_s, v_f):
+        """``T + T_s``."""
+        energy = self.kinetic(q_s, q_f, v_s, v_f, self.params)
+        return energy if self.slow_kinetic is None else energy + self.slow_kinetic(q_s, v_s, self.params)
 
     def g(self, t, q_s, q_f):
         """Values of `constraint`, shape (n_g,); n_g = 0 without a constraint."""
-        return _constrain(self.constraint, t, q_s, q_f, self.params)
+        return self._rows("constraint", t=t, q_s=q_s, q_f=q_f)
 
     def g_slow(self, t, q_s):
         """Values of `slow_constraint`, shape (n_gs,); n_gs = 0 without a slow constraint."""
-        return _constrain(self.slow_constraint, t, q_s, self.params)
+        return self._rows("slow_constraint", t=t, q_s=q_s)
 
     def g_implied(self, t, q_s, q_f):
         """Values of `implied`, shape (n_i,); n_i = 0 without implied rows."""
-        return _constrain(self.implied, t, q_s, q_f, self.params)
+        return self._rows("implied", t=t, q_s=q_s, q_f=q_f)
+
+    def _rows(self, field: str, **values):
+        function = getattr(self, field)
+        return jnp.zeros(0) if function is None else Term.of(field, function)(self.params, **values)
 
     @property
     def has_constant_mass(self) -> bool:
         """Whether the kinetic energy is a `ConstantMass`."""
         return isinstance(self.kinetic, ConstantMass)
-
-    @property
-    def slow_kinetic(self) -> TracedOnce | None:
-        """The part T_s of the kinetic energy, None without such a part."""
-        return None if isinstance(self.kinetic, ConstantMass) else self.kinetic.slow
 
     @property
     def is_constrained(self) -> bool:
@@ -277,7 +267,7 @@ def _checked(name: str, function, order: Order | None):
     """The function as `TracedOnce` or `Rheonomic`, after checks; None for None. `order` is of the params."""
     if function is None:
         return None
-    if isinstance(function, Rheonomic) and name in ("constraint", "slow_constraint", "implied"):
+    if isinstance(function, Rheonomic) and KINDS[name].kind in ("constraint", "implied"):
         _check_function(name, function.function, "t, ")
         return Rheonomic(traced_once(function.function, order))
     if isinstance(function, ConstantMass):
@@ -286,11 +276,6 @@ def _checked(name: str, function, order: Order | None):
         raise TypeError(f"System: {name} is {function!r}; it must be a function or None.")
     _check_function(name, function)
     return traced_once(function, order)
-
-
-def label(name: str | int) -> str:
-    """The name of a potential of `System.potentials` in texts; V_k for the name k."""
-    return f"V_{name}" if isinstance(name, int) else name
 
 
 def _named_potentials(potentials, order: Order | None) -> "Potentials":
@@ -320,15 +305,8 @@ def _named_potentials(potentials, order: Order | None) -> "Potentials":
     return Potentials((name, traced_once(function, order)) for name, function in named.items())
 
 
-def _constrain(function, t, *arguments):
-    if function is None:
-        return jnp.zeros(0)
-    function, arguments = with_time(function, t, *arguments)
-    return function(*arguments)
-
-
 def _check_function(name: str, function, before: str = "") -> None:
-    """Refuse a function without a hash, or whose arguments are not `before` and then `ARGUMENTS` of its name."""
+    """Refuse a function without a hash, or whose arguments are not `before` and then those of its `Kind`."""
     try:
         hash(function)
     except TypeError:
@@ -336,8 +314,8 @@ def _check_function(name: str, function, before: str = "") -> None:
             f"System: {name} is {function!r}, which has no hash: programs are compiled once per function. Give a plain "
             "function, with what varies in params."
         ) from None
-    holonomic = name in ("constraint", "slow_constraint", "implied")
+    holonomic = KINDS[name].kind in ("constraint", "implied")
     instead = "" if name == "force" else NO_VELOCITY if holonomic else NO_TIME
     if name == "fast_potential" and "q_s" in getattr(getattr(function, "__code__", None), "co_varnames", ()):
         instead = FAST_ALONE
-    check_arguments(f"System: {name}", function, before + ARGUMENTS[name], instead.format(**_INSTEAD))
+    check_arguments(f"System: {name}", function, before + KINDS[name].call, instead.format(**_INSTEAD))

@@ -109,7 +109,7 @@ def observables(system: System, node: tuple[State, Any]):
     parts = list(energy_parts(system, *phase, velocities).values())
     position, rate = constraint_residual(system, state, velocities)
     if masses is None:
-        rounding, volume = system.kinetic(state.q_s, state.q_f, state.q_s, state.q_f, system.params), 0.0
+        rounding, volume = system.kinetic_energy(state.q_s, state.q_f, state.q_s, state.q_f), 0.0
     else:
         q = jnp.concatenate([state.q_s, state.q_f])
         rounding, volume = q @ masses @ q / 2, 2 * jnp.sum(jnp.log(jnp.diagonal(jnp.linalg.cholesky(masses))))

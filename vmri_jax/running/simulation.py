@@ -214,7 +214,7 @@ class Simulation:
             "macro steps": f"{self.num_steps} of {numbers(self.macro_dt)}{micro}",
             "saved nodes": f"{self.num_saves + 1}, one every {self.save_every} macro steps",
         }
-        return summary("Simulation, prepared: run() makes a Trajectory", lines | self.system.terms())
+        return summary("Simulation, prepared: run() makes a Trajectory", lines | self.system.in_words())
 
     @property
     def order(self) -> int:

@@ -6,33 +6,34 @@ from typing import Any
 import numpy as np
 
 from vmri_jax.mechanics.kinematics import JOINTS, MASS, Kinematics
+from vmri_jax.mechanics.rows import Entries
 from vmri_jax.mechanics.system import ConstantMass, Rheonomic, System
+from vmri_jax.scene.declare import arrays
 from vmri_jax.scene.functions import FUNCTIONS, IMPLIED, Actuation
 from vmri_jax.scene.layout import Layout, join
-from vmri_jax.scene.sorting import Placed, Sorting
-from vmri_jax.scene.terms import SomeRows
+from vmri_jax.scene.rows import rows_of
+from vmri_jax.scene.sorting import HOMES, Placed, Sorting
+from vmri_jax.scene.terms import joined
 
 
 def build(sorting: Sorting, placed: Sequence[Placed]) -> System:
     """The system of the bodies and of some or all effects; a function without effects is None."""
     bodies, layout = sorting.bodies, sorting.layout
-    potentials: dict[str, tuple] = {}
     terms: dict[Any, list] = {}
-    # potentials first: a damping force may need the terms of the potentials
-    for part in sorted(placed, key=lambda part: part.effect.kind != "potential"):
-        name, of_effect = part.effect.name, part.effect.terms(part.elements, bodies, layout, potentials)
-        if part.effect.kind == "potential":
-            potentials[name] = (*potentials.get(name, ()), *of_effect)
-        terms.setdefault(part.home, []).extend([SomeRows(of_effect, part.dropped)] if part.dropped else of_effect)
-        if part.dropped:
-            terms.setdefault("implied", []).append(SomeRows(of_effect, part.dropped, alone=True))
+    for part in placed:
+        for home in (part.home, "implied") if part.dropped else (part.home,):
+            terms.setdefault(home, []).extend(part.effect.terms(part.elements, layout))
+    # the values of constraints keep the order of `rows_of`
+    in_order: tuple[Any, ...] = (*HOMES, "implied")
+    terms = {home: [*joined(of_home, home in in_order)] for home, of_home in terms.items()}
+    taken = _taken(placed) if "implied" in terms else {}
     # with joint coordinates the masses depend on positions, so that T is a function even without kinetic effects
     if layout.kinematics is not None:
         terms.setdefault("kinetic", [])
     if "kinetic" in terms and layout.sizes[0]:
         terms["slow_kinetic"] = []
     functions: dict[str, Any] = {
-        home: FUNCTIONS[home](tuple(terms[home]), _kinematics(home, terms[home], layout))
+        home: FUNCTIONS[home](tuple(terms[home]), _kinematics(home, terms[home], layout), taken.get(home))
         for home in FUNCTIONS
         if terms.get(home) or ("kinetic" in home and home in terms)
     }
@@ -42,10 +43,10 @@ def build(sorting: Sorting, placed: Sequence[Placed]) -> System:
             rate: FUNCTIONS["slow_potential"](tuple(terms[rate]), _kinematics("potentials", terms[rate], layout))
             for rate in rates
         }
-    for home in ("constraint", "slow_constraint", "implied"):
+    for home in in_order:
         if any(term.timed for term in terms.get(home, ())):
             functions[home] = Rheonomic(functions[home])
-    params: dict[str, Any] = {part.effect.name: part.effect.parameters(bodies) for part in placed}
+    params: dict[str, Any] = {part.effect.name: arrays(part.effect.parameters) for part in placed}
     slow, fast = (join(bodies, layout, part, "masses") for part in ("s", "f"))
     if "kinetic" in functions:
         params[MASS] = {"slow": slow, "fast": fast}
@@ -57,13 +58,20 @@ def build(sorting: Sorting, placed: Sequence[Placed]) -> System:
     return System(kinetic, **functions, params=params)
 
 
+def _taken(placed: Sequence[Placed]) -> dict[Any, Entries]:
+    """The rows that each function of constraints takes of its terms."""
+    rows = rows_of(placed)
+    taken: dict[Any, Entries] = {home: Entries.of([row.kept for row in rows if row.home == home]) for home in HOMES}
+    return taken | {"implied": Entries.of([not row.kept for row in rows if placed[row.part].dropped])}
+
+
 def actuation(sorting: Sorting) -> Actuation | None:
     """The forces of the controls of a scene, None if it has no controls."""
-    bodies, layout = sorting.bodies, sorting.layout
+    layout = sorting.layout
     controls = [part for part in sorting.placed if part.home == "control"]
-    terms = tuple(part.effect.terms(part.elements, bodies, layout, {})[0] for part in controls)
-    names = tuple(part.effect.components(bodies) for part in controls)
-    return Actuation(terms, _kinematics("control", terms, layout), names) if controls else None
+    terms = tuple(part.effect.terms(part.elements, layout)[0] for part in controls)
+    names = tuple(part.effect.components() for part in controls)
+    return Actuation(terms, _kinematics("control", terms, layout), names=names) if controls else None
 
 
 def _kinematics(home: str, terms: Sequence, layout: Layout) -> Kinematics | None:

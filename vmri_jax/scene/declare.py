@@ -15,9 +15,9 @@ from itertools import combinations
 from typing import Any, Literal, TypeVar, dataclass_transform
 
 import jax
-import jax.numpy as jnp
+import numpy as np
 
-from vmri_jax.mechanics.arrays import real_array
+from vmri_jax.mechanics.arrays import is_concrete, library, real_array
 from vmri_jax.mechanics.order import in_order, order_of
 from vmri_jax.scene.body import Bodies, Frame, Point, entry, is_entry
 
@@ -84,9 +84,10 @@ class Parameter:
     measured: bool = False
     may_be_number: bool = False
 
-    def array(self, about: str, argument: Any, bodies: Sequence[Point]) -> jax.Array:
+    def array(self, about: str, argument: Any, bodies: Sequence[Point]) -> Any:
         """The array that the function gets; `bodies` are the first of every element, `about` begins messages."""
-        value = jnp.asarray(real_array(about, argument))
+        value = real_array(about, argument)
+        value = np.asarray(value) if is_concrete(value) else value
         count, size = len(bodies), bodies[0].size
         if self.shape == "number" and value.shape not in ((), (count,)):
             raise ValueError(
@@ -94,7 +95,7 @@ class Parameter:
             )
         if self.shape in ("number", "array") or (self.may_be_number and value.ndim == 0):
             return value
-        value = jnp.atleast_1d(value)
+        value = library(value).atleast_1d(value)
         if self.shape == "common":
             for body in bodies:
                 if value.shape != (body.size,):
@@ -107,7 +108,7 @@ class Parameter:
             raise ValueError(
                 f"{about} has shape {value.shape}; its bodies have dimension {size}, give ({size},){for_each}"
             )
-        return squeeze(jnp.broadcast_to(value, (count, size)))
+        return value.reshape(size) if count == 1 else library(value).broadcast_to(value, (count, size))
 
 
 def names(count: int = 1, *, default: Any = MISSING, pairs: bool = False) -> Any:
@@ -155,9 +156,9 @@ def effect_class(cls: type[Class]) -> type[Class]:
     return dataclass(frozen=True, eq=False)(cls)
 
 
-def squeeze(values):
-    """The values (n, ...) of n elements; for n = 1 without this axis."""
-    return values[0] if len(values) == 1 else values
+def stacked(values: Sequence[Any]):
+    """The values (n, ...) of n elements in one array; for n = 1 without this axis. Of NumPy unless a value is traced."""
+    return library(values).asarray(values[0]) if len(values) == 1 else library(values).stack(values)
 
 
 def lasting(value):
@@ -167,10 +168,16 @@ def lasting(value):
     return value
 
 
+def arrays(tree: Any) -> Any:
+    """The numbers of a pytree as arrays of JAX, in the order of writing."""
+    return in_order(jax.device_put(tree), order_of(tree))
+
+
 def real_tree(about: str, tree):
     """A pytree of real numbers as a pytree of arrays, in the order of writing; the error for another leaf begins with `about` and its place."""
 
     def convert(path, leaf):
-        return jnp.asarray(real_array(about + jax.tree_util.keystr(path), leaf))
+        array = real_array(about + jax.tree_util.keystr(path), leaf)
+        return np.asarray(array) if is_concrete(array) else array
 
     return in_order(jax.tree_util.tree_map_with_path(convert, tree), order_of(tree))

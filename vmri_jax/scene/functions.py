@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.mechanics.kinematics import JOINTS, MASS, Kinematics
+from vmri_jax.mechanics.rows import Entries
 from vmri_jax.scene.terms import concatenated, total, totals
 
 IMPLIED = "implied"
@@ -28,11 +29,18 @@ RESERVED = {
 class _OfTerms:
     """A function of a `System`, made of terms of the coordinates Q of bodies; compared by class, terms and kinematics.
 
-    The kinematics are the map from the coordinates q of the scene to Q; None if Q = q.
+    The kinematics are the map from the coordinates q of the scene to Q; None if Q = q. Of the rows of a constraint `rows` are taken; None for all.
     """
 
     terms: tuple[Any, ...]
     kinematics: Kinematics | None = None
+    rows: Entries | None = None
+
+    def values(self, q_s, q_f, params, *t):
+        """The values of the rows of constraints, one term after the other."""
+        bodies = self.bodies(q_s, q_f, params)
+        values = concatenated([term.value(*bodies, params, *t) for term in self.terms])
+        return values if self.rows is None else self.rows.take(values)
 
     def bodies(self, q_s, q_f, params) -> tuple[Any, Any]:
         """(Q_s, Q_f) of q_s and q_f; one of these may be None if the terms do not depend on it, and zeros take its place."""
@@ -75,8 +83,7 @@ class MicroConstraint(_OfTerms):
 
     def __call__(self, *arguments):
         *t, q_s, q_f, params = arguments
-        bodies = self.bodies(q_s, q_f, params)
-        return concatenated([term.value(*bodies, params, *t) for term in self.terms])
+        return self.values(q_s, q_f, params, *t)
 
 
 class MacroConstraint(_OfTerms):
@@ -84,8 +91,7 @@ class MacroConstraint(_OfTerms):
 
     def __call__(self, *arguments):
         *t, q_s, params = arguments
-        bodies = self.bodies(q_s, None, params)
-        return concatenated([term.value(*bodies, params, *t) for term in self.terms])
+        return self.values(q_s, None, params, *t)
 
 
 class ImpliedRows(MicroConstraint):

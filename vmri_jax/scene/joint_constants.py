@@ -57,13 +57,10 @@ def joint_constants(bodies: Bodies, links: Sequence[Link | None]) -> dict[str, A
 def _ends(bodies: Bodies, links: Sequence[Link]) -> dict[str, Any]:
     """The points X and triads F of all links: "point_a", "frame_a" in the frame that a link hangs on, "point_b", "frame_b" in its own."""
     carried = {link.branch.child for link in links}
-    joints = {link.branch.joint.name: link.branch.joint for link in links}
-    points = {name: joint.joining_points(bodies) for name, joint in joints.items()}
-    triads: dict[str, Any] = {name: joint.frame(len(points[name])) for name, joint in joints.items()}
     ends: dict[str, list] = {}
     for link in links:
         branch = link.branch
-        point, triad = points[branch.joint.name][branch.element], triads[branch.joint.name][branch.element]
+        point, triad = (of_pairs[branch.element] for of_pairs in (branch.joint.joining_points, branch.joint.triads))
         of_parent, of_child = (0, 1) if branch.forward else (1, 0)
         for role, name, number, is_body in (
             ("a", branch.parent, of_parent, link.step == 0),

@@ -15,7 +15,8 @@ from vmri_jax.mechanics.masses import ConstantMass
 from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.state import Problem, State, initial_state
 from vmri_jax.mechanics.surroundings import name_of
-from vmri_jax.mechanics.system import System, label
+from vmri_jax.mechanics.system import System
+from vmri_jax.mechanics.terms import label
 from vmri_jax.running.prepare import prepare
 from vmri_jax.running.printed import PrintedTable
 from vmri_jax.running.simulation import Simulation
@@ -214,7 +215,7 @@ def _first_derivatives(system: System, n_s: int, v_s, v_f):
         potentials = invariants.potential_energy(system, q[:n_s], q[n_s:])
         if system.has_constant_mass:
             return -potentials
-        return system.kinetic(q[:n_s], q[n_s:], v_s, v_f, system.params) - potentials
+        return system.kinetic_energy(q[:n_s], q[n_s:], v_s, v_f) - potentials
 
     def derivatives(q):
         total = jax.grad(lagrangian)(q)

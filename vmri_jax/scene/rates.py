@@ -60,7 +60,7 @@ class Linearised(NamedTuple):
 
 
 def measure(bodies: Bodies, effects: Sequence[Effect]) -> dict[str, Rates]:
-    """Rates of potentials and kinetic effects by name."""
+    """Rates of potentials and kinetic effects by name; the inertia is the one of `bodies`, where frames have some."""
     sizes = [body.motions.shape[1] for body in bodies.values()]
     columns = dict(zip(bodies, np.split(np.arange(sum(sizes)), np.cumsum(sizes)[:-1]), strict=True))
     # M = A^T diag(m) A with the motions A of each body, plus d2L/dv2 of kinetic effects
@@ -70,7 +70,7 @@ def measure(bodies: Bodies, effects: Sequence[Effect]) -> dict[str, Rates]:
         mass[np.ix_(element.columns, element.columns)] += element.mass
     points = positions(bodies)
     size = max(float(np.ptp(points, axis=0).max(initial=0.0)), float(np.abs(points).max()))
-    return {effect.name: _rates(effect, bodies, elements[effect.name], mass, size or 1.0) for effect in effects}
+    return {effect.name: _rates(effect, elements[effect.name], mass, size or 1.0) for effect in effects}
 
 
 def border(rates: Sequence[np.ndarray], slow: float = 0.0, fast: float = np.inf) -> float | None:
@@ -88,12 +88,12 @@ def border(rates: Sequence[np.ndarray], slow: float = 0.0, fast: float = np.inf)
     return float(middle) if widest >= SEPARATION or (declared and widest > 1) else None
 
 
-def _rates(effect: Effect, bodies, elements: Sequence[Linearised], mass: np.ndarray, size: float) -> Rates:
+def _rates(effect: Effect, elements: Sequence[Linearised], mass: np.ndarray, size: float) -> Rates:
     """Frequencies and rates of the elements of an effect, with the mass matrix of all bodies and the size L of the scene."""
-    declared = effect.curvature(bodies)
+    declared = effect.curvature()
     curvatures = np.broadcast_to(-np.inf if declared is None else declared, len(elements))
     frequency, rate = np.zeros(len(elements)), np.zeros(len(elements))
-    for i, (names, element) in enumerate(zip(effect.elements(bodies), elements, strict=True)):
+    for i, (names, element) in enumerate(zip(effect.elements, elements, strict=True)):
         element_mass = mass[np.ix_(element.columns, element.columns)]
         if not np.linalg.eigvalsh(element_mass).min() > 0:
             raise ValueError(
@@ -114,7 +114,7 @@ def _rates(effect: Effect, bodies, elements: Sequence[Linearised], mass: np.ndar
         rate[i] = max(frequency[i], np.sqrt(a / size), np.sqrt(alpha))
     # elements between the same bodies are terms of a series, as of a torsion: they get the rate of the fastest
     same_bodies: dict[frozenset, list[int]] = {}
-    for i, names in enumerate(effect.elements(bodies)):
+    for i, names in enumerate(effect.elements):
         same_bodies.setdefault(frozenset(names), []).append(i)
     for numbers in same_bodies.values():
         frequency[numbers], rate[numbers] = frequency[numbers].max(), rate[numbers].max()
@@ -128,11 +128,11 @@ def _scaled(root: np.ndarray, matrix: np.ndarray) -> np.ndarray:
 
 def _linearise(effect: Effect, bodies: Bodies, columns: Mapping[str, np.ndarray]) -> list[Linearised]:
     """The elements of an effect at the start; `columns` of each body, see `Linearised`."""
-    params, linearised = effect.parameters(bodies), []
-    for i, element in enumerate(map(moving, effect.elements(bodies))):
-        term, element_params = effect.element_term(i, bodies, params)
-        q = jnp.concatenate([bodies[name].coordinates for name in element])
-        v = jnp.concatenate([bodies[name].rates for name in element])
+    linearised = []
+    for i, element in enumerate(map(moving, effect.elements)):
+        term, element_params = effect.element_term(i)
+        q = np.concatenate([bodies[name].coordinates for name in element])
+        v = np.concatenate([bodies[name].rates for name in element])
         is_kinetic = effect.kind == "kinetic"
         function = TracedOnce(term.kinetic if is_kinetic else term.value)
         force, *matrices = map(np.asarray, _derivatives(function, is_kinetic, q, v, element_params))
@@ -141,7 +141,7 @@ def _linearise(effect: Effect, bodies: Bodies, columns: Mapping[str, np.ndarray]
         force, (stiffness, gyroscopic, mass) = motions.T @ force, [motions.T @ matrix @ motions for matrix in matrices]
         if not all(np.isfinite(part).all() for part in (force, stiffness, gyroscopic, mass)):
             raise ValueError(
-                f"{effect.name}: its energy between {', '.join(map(label_of, effect.elements(bodies)[i]))} has no finite derivatives at the "
+                f"{effect.name}: its energy between {', '.join(map(label_of, effect.elements[i]))} has no finite derivatives at the "
                 "start; move these bodies, or smooth the energy."
             )
         # the first three coordinates of a rigid body are its centre, all others directors

@@ -16,8 +16,8 @@ from scipy.linalg import qr
 from vmri_jax.mechanics.constraints import RANK, rank_of
 from vmri_jax.scene.effects.joint_base import Joint
 from vmri_jax.scene.rigid import Rigidity
-from vmri_jax.scene.rows import HOMES, ConstraintRows
-from vmri_jax.scene.sorting import Sorting
+from vmri_jax.scene.rows import ConstraintRows
+from vmri_jax.scene.sorting import HOMES, Sorting
 
 NAMED = 8
 """Most rows that a message names; with more it is hard to read."""
@@ -33,11 +33,6 @@ SHORTENING = 4.0
 """Factor by which a motion is shortened after corrections that shrink too slowly; a larger factor may skip usable lengths."""
 NUM_LENGTHS = 10
 """Most lengths of a motion that are tried. The last of ten suits a molecule of a millionth of the extent of the scene."""
-ITERATIONS = 12
-"""Most corrections of Newton's iteration; from nearby six reach round-off. More only delay the verdict that it fails."""
-REACHED = 1e-12
-"""Newton's iteration ends when the kept rows, relative to their sizes, are below this value, which is near round-off. With a larger value
-the dropped rows carry the remaining error."""
 FOLLOWS = RANK
 """Largest value of a dropped row, relative to its size, that counts as zero: the accuracy to which the choice of dropped rows finds them
 dependent. A larger value accepts rows that change the motion."""
@@ -98,8 +93,8 @@ def without_redundant(sorting: Sorting) -> Sorting:
 def find_opening(rows: ConstraintRows) -> Opening | None:
     """The dropped rows that do not follow from the kept rows g_k, with their values; None if all follow.
 
-    In coordinates x over their scales, motions z along the surface solve ``dg_k(x_0) z = 0``. Newton's iteration leads from
-    ``x_0 + s z`` back onto ``g_k = 0``, where the dropped rows are evaluated.
+    In coordinates over their scales, motions z along the surface solve ``dg_k(q_0) z = 0``. Newton's iteration leads from
+    ``q_0 + s z`` back onto ``g_k = 0``, where the dropped rows are evaluated.
     """
     kept, dropped = rows.numbers(), [i for i, row in enumerate(rows.rows) if not row.kept]
     if not dropped:
@@ -107,10 +102,10 @@ def find_opening(rows: ConstraintRows) -> Opening | None:
     unit = (rows.jacobian * rows.scales / rows.sizes[:, None])[kept]
     basis, triangle = np.linalg.qr(unit.T)
     step = NEARBY * float(np.linalg.svd(triangle, compute_uv=False).min(initial=1.0))
-    start = _onto_surface(rows, kept, 0.0, np.zeros(rows.start.size), np.inf)
-    if start is None:
+    everywhere = np.arange(rows.start.size)
+    q, values, is_reached = rows.onto(kept, rows.start, everywhere)
+    if not is_reached:
         return None  # positions far off the constraints: the initial state refuses them with a message of its own
-    x, values = start
     worst, length = np.abs(values[dropped]), 0.0
     if worst.max() <= FOLLOWS:
         random, timed = np.random.default_rng(0), any(row.effect.timed for row in rows.rows)
@@ -118,35 +113,16 @@ def find_opening(rows: ConstraintRows) -> Opening | None:
             time, motion = random.normal() * timed, random.normal(size=rows.start.size)
             motion -= basis @ (basis.T @ motion)
             for _ in range(NUM_LENGTHS):
-                end = _onto_surface(rows, kept, step * time, x + step * motion, CONTRACTION)
-                if end is not None:
-                    worst, length = np.maximum(worst, np.abs(end[1][dropped])), max(length, step)
+                start = q + rows.scales * step * motion
+                _, values, is_reached = rows.onto(kept, start, everywhere, step * time, CONTRACTION)
+                if is_reached:
+                    worst, length = np.maximum(worst, np.abs(values[dropped])), max(length, step)
                     break
                 step /= SHORTENING
     opened = np.flatnonzero(worst > FOLLOWS)
     if not opened.size:
         return None
     return Opening([dropped[i] for i in opened], worst[opened].tolist(), length)
-
-
-def _onto_surface(rows: ConstraintRows, kept: list[int], t: float, x: np.ndarray, contraction: float):
-    """The point x where the kept rows vanish, by Newton's iteration, and the values of all rows (k,) over their sizes.
-
-    x (n,) is relative to the start and to scales. None, if the ratio of consecutive corrections is above `contraction`.
-    """
-    previous = np.inf
-    for _ in range(ITERATIONS):
-        values, jacobian = rows.evaluate(t, rows.start + rows.scales * x)
-        values = values / rows.sizes
-        if np.abs(values[kept]).max(initial=0.0) <= REACHED:
-            return x, values
-        scaled = jacobian[kept] * rows.scales / rows.sizes[kept, None]
-        correction = np.linalg.lstsq(scaled, values[kept], rcond=None)[0]
-        size = np.linalg.norm(correction)
-        if not size <= contraction * previous:
-            return None
-        x, previous = x - correction, size
-    return None
 
 
 def _cure(sorting: Sorting) -> str:
@@ -163,8 +139,8 @@ def _joined_twice(sorting: Sorting) -> str:
     joints |= {part.effect.name: part.effect for part in sorting.placed if isinstance(part.effect, Joint)}
     labels: dict[frozenset[str], list[str]] = {}
     for joint in joints.values():
-        for i, pair in enumerate(joint.elements(sorting.bodies)):
-            labels.setdefault(frozenset(pair), []).append(joint.label(i, sorting.bodies))
+        for i, pair in enumerate(joint.elements):
+            labels.setdefault(frozenset(pair), []).append(joint.label(i))
     twice = [
         f"{' and '.join(sorted(pair))} by {' and '.join(names)}" for pair, names in labels.items() if len(names) > 1
     ]

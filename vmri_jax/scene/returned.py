@@ -3,6 +3,7 @@
 from functools import partial
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
@@ -10,14 +11,13 @@ from jax.flatten_util import ravel_pytree
 from vmri_jax.mechanics.arrays import is_concrete
 from vmri_jax.mechanics.checks import describe, shape_of
 from vmri_jax.mechanics.constraints import START, Rows
-from vmri_jax.scene.body import Bodies, end_of
-from vmri_jax.scene.terms import choose
+from vmri_jax.scene.declare import arrays
 
 LIBRARY = "vmri_jax."
 """Beginning of the names of modules whose functions are not checked: the tests of the package do that."""
 
 
-def check_function(effect: Any, bodies: Bodies, moved: bool) -> None:
+def check_function(effect: Any, moved: bool) -> None:
     """Refuse a function of the user with a wrong value, and a constraint that the start violates unless `moved`.
 
     The function gets each group of equal elements, as the terms of the system do.
@@ -27,8 +27,11 @@ def check_function(effect: Any, bodies: Bodies, moved: bool) -> None:
         function = function.func
     if effect.kind == "control" or getattr(function, "__module__", "").startswith(LIBRARY):
         return
-    for group in effect.by_size(range(len(effect.elements(bodies))), bodies):
-        q, arguments = _arguments(effect, bodies, group)
+    for group in effect.by_size():
+        q = jax.device_put(effect.positions(group))
+        t, v = jax.device_put(((np.zeros(()),), tuple(np.zeros(x.shape) for x in q)))
+        before = {"force": (*t, q, v), "kinetic": (q, v)}.get(effect.kind, (*t, q) if effect.timed else (q,))
+        arguments = *before, arrays(effect.params_of(group))
         value = shape_of(f"{effect.name}: function", effect.function, *arguments)
         _check_value(effect, value, [x.shape for x in q], len(group))
         if effect.kind == "constraint" and not moved and is_concrete(arguments):
@@ -45,19 +48,6 @@ def _rows(constraint, *arguments) -> Rows:
     *before, q, params = arguments
     flat, by_role = ravel_pytree(q)
     return Rows.of(lambda flat: jnp.ravel(constraint(*before, by_role(flat), params)), flat)
-
-
-def _arguments(effect: Any, bodies: Bodies, group: list[int]) -> tuple[tuple, tuple]:
-    """The positions of some elements at the start, and all arguments of the function for them; velocities are zero."""
-    elements, params = effect.elements(bodies), effect.parameters(bodies)
-    if len(elements) > 1:
-        params = choose(params, group, effect.split)
-    roles = zip(*(elements[i] for i in group), strict=True)
-    q = tuple(jnp.stack([end_of(bodies, name, effect.whole).position for name in role]) for role in roles)
-    q = q if len(group) > 1 else tuple(x[0] for x in q)
-    t, v = (jnp.zeros(()),), tuple(map(jnp.zeros_like, q))
-    before = {"force": (*t, q, v), "kinetic": (q, v)}.get(effect.kind, (*t, q) if effect.timed else (q,))
-    return q, (*before, params)
 
 
 def _check_value(effect: Any, value: Any, sizes: list[tuple[int, ...]], count: int) -> None:

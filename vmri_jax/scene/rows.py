@@ -1,5 +1,6 @@
 """The rows of a scene's constraints: names, also of coordinates, values and Jacobian at any positions."""
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -11,38 +12,63 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.mechanics.arrays import is_concrete, quickly_compiled
+from vmri_jax.mechanics.constraints import RANK
 from vmri_jax.mechanics.functions import TracedOnce
 from vmri_jax.mechanics.names import Names
-from vmri_jax.scene.body import LARGEST_POINT, Bodies, label_of, moving
+from vmri_jax.scene.body import LARGEST_POINT, label_of, moving
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.effects.freedoms import ANGLES
 from vmri_jax.scene.layout import Key, join
 from vmri_jax.scene.rates import positions
-from vmri_jax.scene.sorting import Home, Placed, Sorting
+from vmri_jax.scene.sorting import HOMES, Home, Placed, Sorting
 
-HOMES: tuple[Home, ...] = ("slow_constraint", "constraint")
-"""The arguments of `System` that hold constraints, in the order of the grids macro, micro."""
 CANCELLED = 1e-14
 """An entry of the Jacobian dg/dq is the product of the row dg/dQ and the column dQ/dq. If it is below this fraction of the product of
 their lengths it is round-off and set to zero, as for the rows that hold a planar loop in its plane. A larger value removes rows with
 short levers; with a smaller value round-off counts as an independent row."""
 
+REACHED = 1e-12
+"""Newton's iteration ends when rows, relative to their sizes, are below this value, which is near round-off. With a larger value loops have a
+visible gap, which the initial state refuses, and dropped rows carry the remaining error."""
+CORRECTIONS = 20
+"""Most corrections of Newton's iteration; from nearby six reach round-off. More only delay the message that it fails."""
+
 
 class Row(NamedTuple):
     """A row of a constraint.
 
-    name: of its effect and bodies, with a number if an element has several rows.
+    label: of its element: the name of the effect and, if it has several elements, names of the bodies.
+    name: of the effect and the bodies, with a number if an element has several rows.
     part: number of its entry in `Sorting.placed`, which has this effect and home.
     number: of the row in this entry, in the order of its terms.
     kept: False for a row that the scene leaves out.
     """
 
+    label: str
     name: str
     part: int
     number: int
     effect: Effect
     home: Home
     kept: bool
+
+
+def rows_of(placed: Sequence[Placed]) -> list[Row]:
+    """The rows of constraints, in the order of `Sorting.placed` and of the terms of each effect."""
+    rows = []
+    for i, part in enumerate(placed):
+        effect, number = part.effect, 0
+        for group in effect.by_size(part.elements) if part.home in HOMES else ():
+            # all elements of a group have as many rows
+            t, one = (np.zeros(()),) if effect.timed else (), group[:1]
+            size = jax.eval_shape(effect.function, *t, effect.positions(one), effect.params_of(one)).size
+            for element in group:
+                named = f"{effect.name} {'-'.join(map(label_of, effect.elements[element]))}"
+                label = effect.name if len(effect.elements) == 1 else named
+                for name in [named] if size == 1 else [f"{named} [{j}]" for j in range(size)]:
+                    rows.append(Row(label, name, i, number, effect, part.home, number not in part.dropped))
+                    number += 1
+    return rows
 
 
 class _Element(NamedTuple):
@@ -75,28 +101,21 @@ class ConstraintRows:
     def of(cls, sorting: Sorting) -> "ConstraintRows | None":
         """The rows of all constraints of a scene; None if it has none, or if their numbers are traced."""
         bodies, layout, to_bodies = sorting.bodies, sorting.layout, sorting.to_bodies
-        constraints = [(i, part) for i, part in enumerate(sorting.placed) if part.home in HOMES]
-        params = {i: part.effect.parameters(bodies) for i, part in constraints}
-        if not constraints or not is_concrete((sorting.positions, sorting.joints, params)):
+        constraints = [part for part in sorting.placed if part.home in HOMES]
+        if not constraints or not is_concrete(
+            (sorting.positions, sorting.joints, [part.effect.parameters for part in constraints])
+        ):
             return None
         start, columns = np.concatenate(sorting.positions), layout.columns
-        q_bodies, jacobian = to_bodies(start)
+        _, jacobian = to_bodies(start)
         # the diagonal of J^T M J with J = dQ/dq
         of_bodies = join(bodies, layout, "s", "masses"), join(bodies, layout, "f", "masses")
         is_known = is_concrete(of_bodies)
         masses = np.concatenate(of_bodies) @ (jacobian * jacobian) if is_known else np.ones_like(start)
-        rows, elements = [], []
-        for i, part in constraints:
-            number = 0
-            for names, element in _elements(part, bodies, columns, params[i]):
-                elements.append(element)
-                size = _value_and_jacobian(element.value, element.params, q_bodies[element.columns], 0.0)[0].size
-                for j in range(size):
-                    name = names if size == 1 else f"{names} [{j}]"
-                    rows.append(Row(name, i, number, part.effect, part.home, number not in part.dropped))
-                    number += 1
-        scales = _scales(sorting)
-        return cls(tuple(rows), tuple(elements), start, masses, scales, layout.sizes[0], to_bodies)
+        elements = [element for part in constraints for element in _elements(part, columns)]
+        return cls(
+            tuple(rows_of(sorting.placed)), tuple(elements), start, masses, _scales(sorting), layout.sizes[0], to_bodies
+        )
 
     def evaluate(self, t: float, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Values g (k,) and Jacobian dg/dq (k, n) at a time and at positions (n,)."""
@@ -111,6 +130,30 @@ class ConstraintRows:
         jacobian = by_bodies @ by_coordinates
         lengths = np.linalg.norm(by_bodies, axis=1)[:, None] * np.sqrt((by_coordinates * by_coordinates).sum(axis=0))
         return values, np.where(np.abs(jacobian) > CANCELLED * lengths, jacobian, 0.0)
+
+    def onto(self, numbers: Any, q: np.ndarray, free: Any, t: float = 0.0, contraction: float = np.inf):
+        """The nearest positions where rows vanish, by Newton's iteration in the `free` coordinates, the values of all rows (k,) over their
+        sizes, and whether these positions are reached.
+
+        Args:
+            numbers: of the rows.
+            q: (n,) where the iteration starts.
+            contraction: largest ratio of consecutive corrections, relative to scales.
+        """
+        previous, values = np.inf, np.empty(0)
+        for _ in range(CORRECTIONS):
+            values, jacobian = self.evaluate(t, q)
+            values = values / self.sizes
+            if np.abs(values[numbers]).max(initial=0.0) <= REACHED:
+                return q, values, True
+            scaled = jacobian[np.ix_(numbers, free)] * self.scales[free] / self.sizes[numbers, None]
+            correction = np.linalg.lstsq(scaled, values[numbers], rcond=RANK)[0]
+            size = np.linalg.norm(correction)
+            if not size / contraction <= previous:
+                break
+            q, previous = q.copy(), size
+            q[free] -= self.scales[free] * correction
+        return q, values, False
 
     @cached_property
     def jacobian(self) -> np.ndarray:
@@ -133,20 +176,14 @@ class ConstraintRows:
         return [i for i, row in enumerate(self.rows) if row.kept and home in (None, row.home)]
 
 
-def _label(effect: Effect, element: Sequence[str]) -> str:
-    """The label of an element: the name of its effect and the names of its bodies."""
-    return f"{effect.name} {'-'.join(map(label_of, element))}"
-
-
-def _elements(part: Placed, bodies: Bodies, columns: dict[str | Key, np.ndarray], params: dict[str, Any]):
-    """Labels and elements of an effect, in the order of its terms."""
+def _elements(part: Placed, columns: dict[str | Key, np.ndarray]):
+    """The elements of an effect, in the order of its terms."""
     effect = part.effect
-    elements = effect.elements(bodies)
-    for i in chain(*effect.by_size(part.elements, bodies)):
+    for i in chain(*effect.by_size(part.elements)):
         freedoms = [key for key in effect.freedoms_of(i) if key in columns]
-        of_element = np.concatenate([columns[name] for name in (*moving(elements[i]), *freedoms)])
-        term, element_params = effect.element_term(i, bodies, params, freedoms)
-        yield _label(effect, elements[i]), _Element(TracedOnce(term.value), element_params, of_element)
+        of_element = np.concatenate([columns[name] for name in (*moving(effect.elements[i]), *freedoms)])
+        term, params = effect.element_term(i, freedoms)
+        yield _Element(TracedOnce(term.value), params, of_element)
 
 
 @quickly_compiled
@@ -180,30 +217,14 @@ def _scales(sorting: Sorting) -> np.ndarray:
 
 def names_of(sorting: Sorting) -> Names:
     """Bodies and constraints by name, in the order of the coordinates and of the rows."""
-    sizes: dict[Any, dict[str, int]] = {"s": {}, "f": {}, "constraint": {}, "slow_constraint": {}}
+    sizes: dict[Any, dict[str, int]] = {"s": {}, "f": {}}
     for name, place in sorting.layout.coordinates.items():
         sizes[place.part][name] = place.size
-    for part in sorting.placed:
-        if part.home in HOMES:
-            sizes[part.home] |= _kept_rows(sorting, part)
+    for home in HOMES:
+        sizes[home] = dict(Counter(row.label for row in rows_of(sorting.placed) if row.kept and row.home == home))
     blocks, rigid = (
         [name for name, body in sorting.bodies.items() if getattr(body, kind)] for kind in ("block", "rigid")
     )
     carried = {name: place for name, place in sorting.layout.bodies.items() if name not in sorting.layout.coordinates}
     rows = sizes["constraint"], sizes["slow_constraint"]
     return Names(sizes["s"], sizes["f"], *rows, blocks, rigid, carried, sorting.layout.kinematics)
-
-
-def _kept_rows(sorting: Sorting, part: Placed) -> dict[str, int]:
-    """Number of kept rows of each element of an effect by its label, in the order of the terms of the effect."""
-    bodies, effect = sorting.bodies, part.effect
-    elements, params = effect.elements(bodies), effect.parameters(bodies)
-    t = (jnp.zeros(()),) if effect.timed else ()
-    rows, first = {}, 0
-    for i in chain(*effect.by_size(part.elements, bodies)):
-        size = jax.eval_shape(effect.function, *t, *effect.element_arguments(i, bodies, params)).size
-        kept = sum(row not in part.dropped for row in range(first, first + size))
-        if kept:
-            rows[effect.name if len(elements) == 1 else _label(effect, elements[i])] = kept
-        first += size
-    return rows

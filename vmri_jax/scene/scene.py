@@ -18,7 +18,9 @@ from vmri_jax.mechanics.summary import listed, summary
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.scene.assembly import actuation, build
+from vmri_jax.scene.binding import bound
 from vmri_jax.scene.body import AnyBody, Frame
+from vmri_jax.scene.declare import arrays
 from vmri_jax.scene.drawing import drawing
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.effects.freedoms import Freedom
@@ -28,7 +30,7 @@ from vmri_jax.scene.layout import Key
 from vmri_jax.scene.ledger import Ledger, ledger
 from vmri_jax.scene.redundancy import check_constraints, without_redundant
 from vmri_jax.scene.rigid import Rigidity
-from vmri_jax.scene.rows import ConstraintRows, names_of
+from vmri_jax.scene.rows import names_of, rows_of
 from vmri_jax.scene.sorting import Sorting, sort
 from vmri_jax.scene.trees import Branch, check_frames, grow
 from vmri_jax.scene.turns import along_run, check_reach, check_run
@@ -119,7 +121,7 @@ class Scene:
                     f"Scene: an effect is called {name!r}, where the params keep {content}; give it another name."
                 )
         for effect in self.everything:
-            effect.check(self.by_name, self.project)
+            effect.check(self.project)
         check_frames(self.by_name, self.branches)
         check_constraints(self.sorting)
         check_reach(self.sorting)
@@ -170,20 +172,23 @@ class Scene:
         return {body.name: body for body in self.bodies}
 
     @cached_property
+    def bound(self) -> tuple[Effect, ...]:
+        """The effects of the user on the bodies of this scene: their elements, parameters and values at the start, each computed once."""
+        return bound(self.effects, self.by_name)
+
+    @cached_property
     def branches(self) -> tuple[Branch, ...]:
         """The bodies that are functions of the freedoms of joints, each with its joint and the body that it hangs on."""
         if self.coordinates == "directors":
             return ()
-        bound = [effect.bound(self.effects) for effect in self.effects]
-        return grow(self.by_name, bound, everywhere=self.coordinates == "joint")
+        return grow(self.by_name, self.bound, everywhere=self.coordinates == "joint")
 
     @cached_property
     def everything(self) -> tuple[Effect, ...]:
-        """All effects: `Rigidity` of the bodies that have directors, then the effects of the user, with joints instead of names of joints."""
+        """All effects: `Rigidity` of the bodies that have directors, then the effects of the user, all bound to the bodies."""
         carried = {branch.child for branch in self.branches}
         rigid = [body.name for body in self.bodies if body.rigid and body.name not in carried]
-        effects = tuple(effect.bound(self.effects) for effect in self.effects)
-        return (Rigidity(rigid), *effects) if rigid else effects
+        return (Rigidity(rigid).bound(self.by_name), *self.bound) if rigid else self.bound
 
     @cached_property
     def sorting(self) -> Sorting:
@@ -194,8 +199,7 @@ class Scene:
     @property
     def dropped(self) -> list[str]:
         """Names of the rows of constraints that the scene leaves out because they depend on others."""
-        rows = ConstraintRows.of(self.sorting)
-        return [] if rows is None else [row.name for row in rows.rows if not row.kept]
+        return [row.name for row in rows_of(self.sorting.placed) if not row.kept]
 
     @property
     def places(self) -> dict[str, Place]:
@@ -210,7 +214,7 @@ class Scene:
     @property
     def params(self) -> dict[str, Any]:
         """Parameters by the name of the effect."""
-        return {effect.name: effect.parameters(self.by_name) for effect in self.everything}
+        return {effect.name: arrays(effect.parameters) for effect in self.everything}
 
     @property
     def start(self) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
@@ -237,8 +241,7 @@ class Scene:
         """The `Problem`: the system with positions and velocities at the start, and with the drawing unless jax.jit, grad or vmap traces numbers of the scene."""
         if self._problems:
             return self._problems[0]
-        is_drawn = is_concrete((self.params, [body.radius for body in self.bodies]))
-        drawn = self.drawing() if is_drawn else None
+        drawn = self.drawing() if is_concrete((self.params, [body.radius for body in self.bodies])) else None
         problem = Problem(self.system(), *self.start, drawing=drawn, project=self.project, names=self.names)
         if is_concrete((problem.system, self.start)):  # traced arrays must not outlive their trace
             self._problems.append(problem)
@@ -263,7 +266,7 @@ class Scene:
             ValueError: no such joint or freedom; a joint without a coordinate that may turn by half a turn or more between two nodes.
             IndexError: no such pair.
         """
-        return along_run(self.sorting, joint_named("Scene.joint_motion", joint, self.effects), run, of, pair)
+        return along_run(self.sorting, joint_named("Scene.joint_motion", joint, self.bound), run, of, pair)
 
     def by_directors(self, run: Trajectory) -> Trajectory:
         """The same run with bodies described by their centres and directors, where joints have rows, multipliers and reaction forces.
@@ -287,13 +290,9 @@ class Scene:
         effects = [replace(effect, rate="auto") for effect in self.effects]
         twin = replace(self, bodies=bodies, effects=effects, coordinates="directors", joint_starts={})
         check_run(self.sorting, run, twin.sorting)
-        arrays: dict[str, Any] = {}
-        for letter, of_body in (("q", run.position), ("p", run.momentum)):
-            for part in ("s", "f"):
-                places = {name: place for name, place in twin.places.items() if place.part == part}
-                pieces = [of_body(name) for name in sorted(places, key=lambda name: places[name].start)]
-                arrays[f"{letter}_{part}"] = np.concatenate(pieces, axis=-1) if pieces else run.states.q_s[..., :0]
-        return run.with_arrays(**arrays, t_micro=None, q_f_micro=None).of(twin)
+        q_s, p_s = (np.concatenate([of(name) for name in twin.places], axis=-1) for of in (run.position, run.momentum))
+        none = q_s[..., :0]
+        return run.with_arrays(q_s=q_s, q_f=none, p_s=p_s, p_f=none, t_micro=None, q_f_micro=None).of(twin)
 
     def without(self, *names: str) -> "Scene":
         """The scene without these effects.
@@ -354,7 +353,7 @@ class Scene:
             TypeError: no mapping, or numbers of the scene that jax.jit, grad or vmap traces.
             ValueError: no joint of this name, a joint without this freedom, rates that contradict each other or the constraints.
         """
-        bodies, starts = with_rates(self.sorting, self.effects, self.system(), rates)
+        bodies, starts = with_rates(self.sorting, self.bound, self.system(), rates)
         return replace(self, bodies=bodies, joint_starts=starts)
 
     def with_joints(self, joints: Mapping[str, Any]) -> "Scene":
@@ -375,7 +374,7 @@ class Scene:
             ValueError: no joint of this name; a joint without this freedom, or without joint coordinates; numbers that are not finite; a
                 loop that does not close with these values, or whose last joint, without a coordinate, would turn too far for its effects.
         """
-        return replace(self, joint_starts={**self.joint_starts, **joint_starts(self.sorting, self.effects, joints)})
+        return replace(self, joint_starts={**self.joint_starts, **joint_starts(self.sorting, self.bound, joints)})
 
     def explain(self, scheme: Scheme | Composition, *, macro_dt: float | None = None, measure: bool = True) -> Ledger:
         """The grid, unknowns, evaluations and computing time that every body and effect adds to a macro step of a scheme.

@@ -53,6 +53,9 @@ Home = (
 )
 """The argument of `System` that an element is part of; "fast" or a whole number is the key of a potential in `System.potentials`."""
 
+HOMES: tuple[Home, ...] = ("slow_constraint", "constraint")
+"""The arguments of `System` that hold constraints, in the order of the grids macro, micro."""
+
 
 class Reason(NamedTuple):
     """Why an element has its home. A text about bodies has two braces ``{}``, for their names and for "is" or "are"."""
@@ -176,7 +179,7 @@ Owners = tuple[tuple[str, ...], tuple[str, ...]]
 against each other, not together."""
 
 
-def _owners(effect: Effect, bodies: Bodies, branches: Sequence[Branch]) -> list[Owners]:
+def _owners(effect: Effect, branches: Sequence[Branch]) -> list[Owners]:
     """The bodies whose coordinates each element of an effect depends on.
 
     Every body of an element depends on a chain of bodies, from itself to the root of its tree. All bodies are the union of these chains; the
@@ -185,7 +188,7 @@ def _owners(effect: Effect, bodies: Bodies, branches: Sequence[Branch]) -> list[
     on_joints = {branch.child: branch for branch in branches}
     carried = {(branch.joint.name, branch.element): branch.child for branch in branches}
     owners = []
-    for i, names in enumerate(effect.elements(bodies)):
+    for i, names in enumerate(effect.elements):
         pairs = [key[:2] for key in effect.freedoms_of(i)]
         if pairs and all(pair in carried for pair in pairs):
             chains = [[carried[pair]] for pair in pairs]
@@ -213,7 +216,7 @@ def _chain(name: str, branches: Mapping[str, Branch]) -> list[str]:
 def sort(bodies: Bodies, effects: Sequence[Effect], branches: Sequence[Branch] = ()) -> Sorting:
     """Paces of all bodies and homes of all effects; refused if traced numbers decide, or nothing can move."""
     energies = [effect for effect in effects if effect.kind in ("potential", "kinetic")]
-    owned = {effect.name: _owners(effect, bodies, branches) for effect in effects}
+    owned = {effect.name: _owners(effect, branches) for effect in effects}
     measured = _measure(with_weight(bodies, branches), energies, owned)
     declared = {
         rate: [measured[effect.name].rate for effect in energies if effect.rate == rate and effect.name in measured]
@@ -256,7 +259,7 @@ def _measure(bodies, energies, owned: Mapping[str, Sequence[Owners]]) -> dict[st
         return {}
     kinetic = any(effect.kind == "kinetic" for effect in energies)
     numbers = [(body.masses, body.coordinates, body.rates if kinetic else None) for body in bodies.values()]
-    if not is_concrete((numbers, [effect.parameters(bodies) for effect in energies])):
+    if not is_concrete((numbers, [effect.parameters for effect in energies])):
         raise ValueError(
             f"Scene: whether {', '.join(undecided or bodies)} is slow or fast depends on numbers that jax.jit, grad or vmap traces, so that "
             "their values are unknown. Give every body a pace and every potential between fast bodies a rate, or build the system outside of "

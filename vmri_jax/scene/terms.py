@@ -3,16 +3,18 @@
 All classes here are compared by value: scenes of the same structure give equal functions, which JAX compiles only once.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
 from functools import reduce
-from itertools import pairwise
+from itertools import chain, groupby
 from operator import add
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
+from vmri_jax.mechanics.arrays import library
 from vmri_jax.mechanics.rows import Rows
 from vmri_jax.scene.body import GROUND_COORDINATES
 
@@ -41,96 +43,104 @@ def place(q, weights):
 
 
 @dataclass(frozen=True)
-class OnBodies:
-    """A role whose bodies are points, blocks, whole rigid bodies or their centres: it takes their coordinates."""
+class Role:
+    """The map from q_s and q_f to the coordinates of the bodies, or to points in them, that elements have in one role: linear but on the ground.
 
-    rows: Rows
-
-    def positions(self, q_s, q_f, params):
-        """(d,) or (n, d) coordinates."""
-        return self.rows.take(q_s, q_f)
-
-    velocities = positions
-
-    def put(self, force, params, n_s: int, n_f: int):
-        """Forces on all slow and on all fast coordinates."""
-        return self.rows.put(force, n_s, n_f)
-
-
-@dataclass(frozen=True)
-class InRigidBodies:
-    """A role of points fixed in rigid bodies, ``phi + sum_i X_i d_i`` with X, a `parameter` in params."""
-
-    rows: Rows
-    parameter: str
-
-    def positions(self, q_s, q_f, params):
-        """(3,) or (n, 3) points."""
-        return place(self.rows.take(q_s, q_f), params[self.parameter])
-
-    velocities = positions  # the map is linear
-
-    def put(self, force, params, n_s: int, n_f: int):
-        """Forces on all slow and on all fast coordinates."""
-        # the transpose of the map of positions: F on the centre, X_i F on the director d_i
-        components = params[self.parameter][..., : self.rows.stride // 3 - 1, None]
-        force = jnp.broadcast_to(force, (*jnp.broadcast_shapes(force.shape[:-1], components.shape[:-2]), 3))
-        triples = jnp.concatenate([force[..., None, :], components * force[..., None, :]], axis=-2)
-        return self.rows.put(triples.reshape(*triples.shape[:-2], -1), n_s, n_f)
-
-
-@dataclass(frozen=True)
-class OnGround:
-    """A role that does not move: for `count` elements points of `size` coordinates, a `parameter` in params.
-
-    Without a parameter it is the ground as a rigid body with the axes of space, and the size is 12.
+    rows: coordinates of the bodies, all of one kind; None for the ground.
+    count, size: number of elements, and of coordinates that the function takes of each.
+    point: name of the parameter with the components X of points ``phi + sum_i X_i d_i`` fixed in rigid bodies or, on the ground, of
+        points in space; "" for bodies themselves. The ground itself is a rigid body with the axes of space.
     """
 
+    rows: Rows | None
     count: int
     size: int
-    parameter: str | None = None
+    point: str = ""
+
+    @property
+    def kind(self) -> tuple:
+        """Equal for roles that can be one role."""
+        return self.rows and self.rows.stride, self.size, self.point
+
+    @classmethod
+    def joined(cls, roles: Sequence["Role"]) -> "Role":
+        """One role of the elements of roles of one kind, one after the other."""
+        places = [*chain(*(role.rows.places for role in roles if role.rows))]
+        rows = Rows.of(places, roles[0].rows.size) if roles[0].rows else None
+        return replace(roles[0], rows=rows, count=sum(role.count for role in roles))
 
     def positions(self, q_s, q_f, params):
-        """(d,) or (n, d) points."""
-        if self.parameter is not None:
-            return params[self.parameter][..., : self.size]
-        return self._shaped(jnp.asarray(GROUND_COORDINATES))
+        """(d,) or (n, d) coordinates or points."""
+        if self.rows is None:
+            return params[self.point][..., : self.size] if self.point else self._shaped(GROUND_COORDINATES)
+        q = self.rows.take(q_s, q_f)
+        return place(q, params[self.point]) if self.point else q
 
     def velocities(self, v_s, v_f, params):
-        """Zero."""
-        return self._shaped(jnp.zeros(self.size))
+        """(d,) or (n, d) velocities."""
+        return self._shaped(np.zeros(self.size)) if self.rows is None else self.positions(v_s, v_f, params)
 
     def put(self, force, params, n_s: int, n_f: int):
-        """Zero: no coordinate of the scene feels a force on the ground."""
-        return jnp.zeros(n_s), jnp.zeros(n_f)
+        """Forces on all slow and on all fast coordinates; no coordinate feels a force on the ground."""
+        if self.rows is None:
+            return jnp.zeros(n_s), jnp.zeros(n_f)
+        if self.point:
+            # the transpose of the map of positions: F on the centre, X_i F on the director d_i
+            components = params[self.point][..., : self.rows.stride // 3 - 1, None]
+            force = jnp.broadcast_to(force, (*jnp.broadcast_shapes(force.shape[:-1], components.shape[:-2]), 3))
+            triples = jnp.concatenate([force[..., None, :], components * force[..., None, :]], axis=-2)
+            force = triples.reshape(*triples.shape[:-2], -1)
+        return self.rows.put(force, n_s, n_f)
 
     def _shaped(self, vector):
+        vector = jnp.asarray(vector)
         return vector if self.count == 1 else jnp.broadcast_to(vector, (self.count, self.size))
 
 
-Role = OnBodies | InRigidBodies | OnGround
+class Source(NamedTuple):
+    """Some elements of an effect, whose name is the key of its parameters.
+
+    count: number of these elements.
+    select: their indices; None for all.
+    """
+
+    name: str
+    count: int
+    select: tuple[int, ...] | None = None
 
 
 @dataclass(frozen=True)
 class EffectTerm:
-    """The function of an effect, whose name is the key of its parameters, on some of its elements.
+    """The function of one or more effects of a kind on some of their elements.
 
+    sources: the elements.
     roles: the maps from q_s and q_f to the coordinates of each role.
-    select: indices of the elements; None for all.
     split: names of the parameters that have an entry for each element.
     timed: whether the first argument of the function is the time.
+    is_joined: whether the terms of several effects with this function are one term, see `joined`.
     """
 
-    name: str
+    sources: tuple[Source, ...]
     function: Callable
     roles: tuple[Role, ...]
-    select: tuple[int, ...] | None = None
     split: tuple[str, ...] = ()
     timed: bool = False
+    is_joined: bool = False
 
     def params_of(self, params):
-        """The params of the function: the parameters of the effect, for the selected elements."""
-        return params[self.name] if self.select is None else choose(params[self.name], self.select, self.split)
+        """The params of the function: the parameters of the effects for their elements, one after the other."""
+        of_each = [
+            params[name] if select is None else choose(params[name], select, self.split)
+            for name, _, select in self.sources
+        ]
+        if len(of_each) == 1:
+            return of_each[0]
+        return {
+            name: jnp.concatenate(
+                [_rows(numbers[name], source.count) for numbers, source in zip(of_each, self.sources, strict=True)]
+            )
+            for name in self.split
+        }
 
     def value(self, q_s, q_f, params, t=None):
         """Energy or constraint values."""
@@ -156,7 +166,7 @@ class EffectTerm:
 
     def within(self, sizes: tuple[int, int]) -> bool:
         """Whether the term depends only on the coordinates of the scene, the first n_s of Q_s and the first n_f of Q_f."""
-        return all(isinstance(role, OnGround) or role.rows.within(sizes) for role in self.roles)
+        return all(role.rows is None or role.rows.within(sizes) for role in self.roles)
 
     def _put(self, forces, params, n_s: int, n_f: int):
         return totals([role.put(force, params, n_s, n_f) for role, force in zip(self.roles, forces, strict=True)])
@@ -169,41 +179,10 @@ class EffectTerm:
 
 
 @dataclass(frozen=True)
-class _OfSeveral:
-    """A term that is made of terms."""
-
-    terms: tuple[EffectTerm, ...]
-
-    @property
-    def timed(self) -> bool:
-        """Whether a term depends on time."""
-        return any(term.timed for term in self.terms)
-
-    def within(self, sizes: tuple[int, int]) -> bool:
-        """Whether all terms depend only on the coordinates of the scene, see `EffectTerm.within`."""
-        return all(term.within(sizes) for term in self.terms)
-
-
-@dataclass(frozen=True)
-class SomeRows(_OfSeveral):
-    """The values of some terms of a constraint one after the other, without the rows `dropped`, or these rows `alone`."""
-
-    dropped: tuple[int, ...]
-    alone: bool = False
-
-    def value(self, q_s, q_f, params, t=None):
-        """The values of the rows, by static slices."""
-        values = concatenated([term.value(q_s, q_f, params, t) for term in self.terms])
-        if self.alone:
-            return concatenated([values[k : k + 1] for k in self.dropped])
-        ends = [-1, *self.dropped, values.shape[0]]
-        return concatenated([values[low + 1 : high] for low, high in pairwise(ends)])
-
-
-@dataclass(frozen=True)
-class TangentDamping(_OfSeveral):
+class TangentDamping:
     """``F = -beta K v`` with the Hessian K of the energy of some terms; beta is the parameter "stiffness"."""
 
+    terms: tuple[EffectTerm, ...]
     name: str
 
     def forces(self, t, q_s, q_f, v_s, v_f, params):
@@ -217,10 +196,43 @@ class TangentDamping(_OfSeveral):
         products = jax.jvp(jax.grad(energy), ((q_s, q_f),), ((v_s, v_f),))[1]
         return tuple(-params[self.name]["stiffness"] * product for product in products)
 
+    def within(self, sizes: tuple[int, int]) -> bool:
+        """See `EffectTerm.within`."""
+        return all(term.within(sizes) for term in self.terms)
+
 
 def choose(params, select: Sequence[int], split: Sequence[str]):
-    """The parameters of some elements; parameters in `split` may have an entry for each element."""
-    return params | {name: pick(params[name], select) for name in split if name in params and jnp.ndim(params[name])}
+    """The parameters of some elements; each parameter in `split` has an entry for each element, or one number for all."""
+    return params | {name: pick(params[name], select) for name in split if jnp.ndim(params[name])} if split else params
+
+
+def _rows(numbers, count: int):
+    """A parameter of `count` elements with an axis for them, which a single element and a number for all elements lack."""
+    numbers = jnp.asarray(numbers)
+    return numbers[None] if count == 1 else jnp.broadcast_to(numbers, (count,)) if numbers.ndim == 0 else numbers
+
+
+def joined(terms: Iterable[Any], in_order: bool = False) -> tuple[Any, ...]:
+    """The terms, with one term in place of several of one kind; if `in_order`, of neighbours alone, so that the elements keep their order."""
+    numbers: dict[Any, int] = {}
+    keyed = [(numbers.setdefault(_kind(term), len(numbers)), term) for term in terms]
+    groups = groupby(keyed if in_order else sorted(keyed, key=lambda pair: pair[0]), key=lambda pair: pair[0])
+    return tuple(_as_one([term for _, term in group]) for _, group in groups)
+
+
+def _kind(term) -> Any:
+    """Equal for terms of several effects that can be one term."""
+    if not getattr(term, "is_joined", False):
+        return id(term)
+    return term.function, tuple(role.kind for role in term.roles), term.split, term.timed
+
+
+def _as_one(terms: Sequence[Any]) -> Any:
+    """A term of all elements of terms of one kind."""
+    if len(terms) == 1:
+        return terms[0]
+    roles = (Role.joined(roles) for roles in zip(*(term.roles for term in terms), strict=True))
+    return replace(terms[0], sources=tuple(chain(*(term.sources for term in terms))), roles=tuple(roles))
 
 
 def pick(values, select: Sequence[int]):
@@ -229,7 +241,7 @@ def pick(values, select: Sequence[int]):
         return values[select[0]]
     if list(select) == list(range(select[0], select[0] + len(select))):
         return values[select[0] : select[0] + len(select)]
-    return jnp.stack([values[i] for i in select])
+    return library(values).stack([values[i] for i in select])
 
 
 def total(values: Sequence):

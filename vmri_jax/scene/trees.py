@@ -14,6 +14,8 @@ from heapq import heappop, heappush
 from itertools import count
 from typing import Any, Literal, NamedTuple
 
+import numpy as np
+
 from vmri_jax.mechanics.arrays import is_concrete
 from vmri_jax.mechanics.kinematics import Frames, Grid, Kinematics, Move
 from vmri_jax.mechanics.rows import Part, Place, Rows
@@ -59,9 +61,9 @@ class Branch(NamedTuple):
         """The freedoms of the joint as keys of `Layout.freedoms`."""
         return [(self.joint.name, self.element, freedom) for freedom in self.joint.freedoms]
 
-    def labels(self, bodies: Bodies) -> list[str]:
+    def labels(self) -> list[str]:
         """Names of the coordinates of the joint."""
-        name = self.joint.label(self.element, bodies)
+        name = self.joint.label(self.element)
         freedoms = self.joint.freedoms
         return [name] if len(freedoms) == 1 else [f"{name} {freedom}" for freedom in freedoms]
 
@@ -105,7 +107,7 @@ class Link(NamedTuple):
 
 def grow(bodies: Bodies, effects: Sequence[Effect], everywhere: bool = True) -> tuple[Branch, ...]:
     """The branches of all trees, parents first; if not `everywhere`, without those where directors are faster."""
-    ranks = _ranks(bodies, effects)
+    ranks = _ranks(effects)
     by_parent = _offers(bodies, effects, ranks)
     branches, tree_of, deepest = [], {}, {}
     for root in sorted(by_parent, key=lambda name: (*_root_rank(name, bodies), name)):
@@ -137,7 +139,7 @@ def _offers(bodies: Bodies, effects: Sequence[Effect], ranks: Mapping) -> dict[s
     """For each body all branches that may hang on it, as (sort key, best first; sort key among equals; branch)."""
     by_parent, number = defaultdict(list), count()
     for joint in (effect for effect in effects if isinstance(effect, Joint) and effect.carries):
-        for i, (a, b) in enumerate(joint.elements(bodies)):
+        for i, (a, b) in enumerate(joint.elements):
             if a != b and all(name == GROUND or (name in bodies and bodies[name].rigid) for name in (a, b)):
                 order = ranks.get((joint.name, i), UNUSED), len(joint.moves)
                 names = joint.name, *sorted((a, b)), next(number)
@@ -146,11 +148,11 @@ def _offers(bodies: Bodies, effects: Sequence[Effect], ranks: Mapping) -> dict[s
     return by_parent
 
 
-def _ranks(bodies: Bodies, effects: Sequence[Effect]) -> dict[tuple[str, int], int]:
+def _ranks(effects: Sequence[Effect]) -> dict[tuple[str, int], int]:
     """`COUNTED` or `USED` for each (joint, number of its pair) in which an effect acts."""
     ranks: dict[tuple[str, int], int] = {}
     for effect in (effect for effect in effects if isinstance(effect, OfFreedoms)):
-        for i in range(len(effect.elements(bodies))):
+        for i in range(len(effect.elements)):
             for joint, pair, freedom in effect.freedoms_of(i):
                 rank = COUNTED if effect.counts_turns and freedom in ANGLES else USED
                 ranks[joint, pair] = min(rank, ranks.get((joint, pair), rank))
@@ -190,7 +192,9 @@ def with_weight(bodies: Bodies, branches: Sequence[Branch]) -> Bodies:
     for branch in reversed(branches):  # children first: a frame may carry a frame
         frame, child = bodies.get(branch.parent), weighted[branch.child]
         if isinstance(frame, Frame) and isinstance(child, RigidBody):
-            weighted[frame.name] = RigidBody(frame.name, child.mass, child.moments, frame.position, pace=frame.pace)
+            # a frame has three directors, also if it carries a rod or a plate
+            moments = child.moments if len(child.wide) == 3 else np.full(3, child.moments.mean())
+            weighted[frame.name] = RigidBody(frame.name, child.mass, moments, frame.position, pace=frame.pace)
     return weighted
 
 
@@ -211,7 +215,7 @@ def make_layout(
             coordinates[name] = places[name] = Place(part, ends[part], body.size)
             ends[part] += body.size
             continue
-        for freedom, label in zip(branch.joint.freedoms, branch.labels(bodies), strict=True):
+        for freedom, label in zip(branch.joint.freedoms, branch.labels(), strict=True):
             place = Place(part, ends[part], 1)
             coordinates[label] = freedoms[branch.joint.name, branch.element, freedom] = place
             ends[part] += 1

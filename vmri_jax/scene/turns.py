@@ -20,7 +20,7 @@ from vmri_jax.scene.velocities import steps_of
 
 def along_run(sorting: Sorting, joint: Joint, run: Any, of: str, pair: int) -> np.ndarray:
     """The freedom of a joint along a run, (k,) rad or m, whole turns included; see `Scene.joint_motion`."""
-    freedom, elements = freedom_of(joint, of), joint.elements(sorting.bodies)
+    freedom, elements = freedom_of(joint, of), joint.elements
     pair = range(len(elements))[pair]  # raises IndexError
     place = sorting.layout.freedoms.get((joint.name, pair, freedom))
     label = next((name for name, other in sorting.layout.coordinates.items() if other == place), "")
@@ -28,7 +28,7 @@ def along_run(sorting: Sorting, joint: Joint, run: Any, of: str, pair: int) -> n
         return np.asarray(run.position(label))[..., 0]
 
     def value(coordinates):
-        return joint.values(freedom, [pair], sorting.bodies, coordinates)[0]
+        return joint.values(freedom, [pair], coordinates)[0]
 
     q = {name: run.position(name) for name in moving(elements[pair])}
     if freedom not in ANGLES:
@@ -41,7 +41,7 @@ def along_run(sorting: Sorting, joint: Joint, run: Any, of: str, pair: int) -> n
     if unknown.size:
         node = unknown[0, -1]
         raise ValueError(
-            f"Scene.joint_motion: {joint.label(pair, sorting.bodies)} may turn by half a turn or more between the saved nodes {node} and "
+            f"Scene.joint_motion: {joint.label(pair)} may turn by half a turn or more between the saved nodes {node} and "
             f"{node + 1}, and its angle comes from directors, which know no whole turns. Save nodes less than "
             f'{np.pi / 2 / np.nanmax(fastest):.2g} s apart, save=..., or give the scene coordinates="joint".'
         )
@@ -51,12 +51,9 @@ def along_run(sorting: Sorting, joint: Joint, run: Any, of: str, pair: int) -> n
 
 def check_reach(sorting: Sorting) -> None:
     """Refuse limits, neutral angles and starts that effects which count turns cannot take from directors."""
-    params: dict[str, dict[str, Any]] = {}
     for effect, i, joint, pair, freedom in _from_directors(sorting):
-        if effect.name not in params:
-            params[effect.name] = effect.parameters(sorting.bodies)
         for mark in effect.marks:
-            value = params[effect.name][mark]
+            value = effect.parameters[mark]
             _require_reach(effect, mark, value[i] if np.ndim(value) else value, joint)
         _require_reach(effect, "the start", at_start(sorting, joint, pair, freedom), joint)
 
@@ -99,9 +96,9 @@ def at_start(sorting: Sorting, joint: Joint, pair: int, freedom: str) -> Any:
     if not starts or begin is None:
         return 0.0
     way = np.concatenate(sorting.positions) - begin
-    names, columns, angles = moving(joint.elements(sorting.bodies)[pair]), sorting.layout.columns, []
+    names, columns, angles = moving(joint.elements[pair]), sorting.layout.columns, []
     for fraction in np.linspace(0.0, 1.0, 1 + steps_of(starts, (value for value, _ in starts.values()))):
         bodies = sorting.to_bodies(begin + fraction * way)[0]
         coordinates = {name: bodies[columns[name]] for name in names}
-        angles.append(joint.values(freedom, [pair], sorting.bodies, coordinates)[0])
+        angles.append(joint.values(freedom, [pair], coordinates)[0])
     return float(np.unwrap(angles)[-1])

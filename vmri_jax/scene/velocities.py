@@ -27,11 +27,6 @@ STEPS = 20
 other configuration; more take longer."""
 LONGEST_STEP = 0.35
 """Longest of these steps of an angle, rad: other joints of the loop count their turns from step to step. A longer step may lose a turn."""
-CLOSED = 1e-12
-"""A loop is closed when the values of its rows, relative to their sizes, are below this value, which is near round-off. A larger value
-leaves a visible gap, which the initial state refuses."""
-CORRECTIONS = 20
-"""Most corrections of Newton's iteration in a step; a loop that can close needs four. More only delay the message that it cannot."""
 
 
 def with_rates(
@@ -62,11 +57,11 @@ def with_rates(
     rows = [np.asarray(jax.jacfwd(constraints, 1)(t, q))]
     values = [-np.asarray(jax.jacfwd(constraints)(t, q))]
     for joint, freedom, number in _by_freedom("Scene.with_rates", effects, rates):
-        pairs = joint.elements(sorting.bodies)
+        pairs = joint.elements
         numbers = _for_pairs(f"Scene.with_rates: the rate of {joint.name}", number, len(pairs), "one number")
         gradient = jax.jacfwd(
             lambda q, joint=joint, freedom=freedom, pairs=pairs: joint.values(
-                freedom, range(len(pairs)), sorting.bodies, {name: q[columns[name]] for name in moving(chain(*pairs))}
+                freedom, range(len(pairs)), {name: q[columns[name]] for name in moving(chain(*pairs))}
             )
         )
         rows.append(np.asarray(gradient(jnp.asarray(bodies))) @ of_bodies)
@@ -102,7 +97,7 @@ def joint_starts(sorting: Sorting, effects: Sequence[Effect], starts: Mapping[st
     """Values and rates of freedoms by the keys of `Layout.freedoms`, see `Scene.with_joints`."""
     by_key = {}
     for joint, freedom, start in _by_freedom("Scene.with_joints", effects, starts):
-        name, count = joint.name, len(joint.elements(sorting.bodies))
+        name, count = joint.name, len(joint.elements)
         value, rate = start if isinstance(start, tuple) else (start, 0.0)
         about = f"Scene.with_joints: the start of {name}"
         numbers = [_for_pairs(about, number, count, "one number, or a pair (value, rate)") for number in (value, rate)]
@@ -110,7 +105,7 @@ def joint_starts(sorting: Sorting, effects: Sequence[Effect], starts: Mapping[st
             key = name, i, freedom
             if key not in sorting.layout.freedoms:
                 raise ValueError(
-                    f"Scene.with_joints: {joint.label(i, sorting.bodies)} has no coordinate of its own: it closes a loop, where you may set "
+                    f"Scene.with_joints: {joint.label(i)} has no coordinate of its own: it closes a loop, where you may set "
                     'the other joints, or its bodies have directors: then give the scene coordinates="joint".'
                 )
             by_key[key] = tuple(number if number.ndim == 0 else number[i] for number in numbers)
@@ -132,16 +127,17 @@ def with_closed_loops(sorting: Sorting, starts: dict[Key, tuple[Any, Any]]) -> d
     q, v = (np.concatenate(parts) for parts in (sorting.start[:2], sorting.start[2:]))
     numbers = _of_joints_alone(sorting, rows)
     begin, end = q[held], np.array([float(value) for value, _ in starts.values()])
-    reached, gap = begin, None
+    reached, values, is_closed = begin, np.empty(0), True
     for fraction in np.linspace(0.0, 1.0, steps_of(starts, end - begin) + 1)[1:]:
         moved = q.copy()
         moved[held] = begin + fraction * (end - begin)
-        gap = _close(rows, numbers, moved, free)
+        moved, values, is_closed = rows.onto(numbers, moved, free)
         # a loop with several named joints may be open on the way and close again at the end: go on from the last closed position
-        if gap is None:
+        if is_closed:
             q, reached = moved, moved[held]
-    if gap is not None:
-        row, size = gap
+    if not is_closed:
+        worst = numbers[np.argmax(np.abs(values[numbers]))]
+        row, size = rows.rows[worst].name, abs(values[worst]) * rows.sizes[worst]
         named = " and ".join(f"{joint} at {value:.4g}" for (joint, *_), value in zip(starts, reached, strict=True))
         raise ValueError(
             f"Scene.with_joints: no configuration of the other joints keeps {row}, which stays open by {size:.3g}. It is kept up to "
@@ -169,21 +165,6 @@ def _of_joints_alone(sorting: Sorting, rows: ConstraintRows) -> np.ndarray:
             by_motions = rows.jacobian[:, first : first + place.size] @ sorting.bodies[name].motions
             changes |= np.linalg.norm(by_motions, axis=1) > RANK * np.linalg.norm(rows.jacobian, axis=1)
     return np.flatnonzero(~changes)
-
-
-def _close(rows: ConstraintRows, numbers: np.ndarray, q: np.ndarray, free: Sequence[int]) -> tuple[str, float] | None:
-    """Move the `free` coordinates of q, in place, until rows are zero; on failure name and value of the largest row."""
-    gap = None
-    for _ in range(CORRECTIONS):
-        values, jacobian = (x[numbers] for x in rows.evaluate(0.0, q))
-        sizes = np.abs(values / rows.sizes[numbers])
-        if sizes.max(initial=0.0) <= CLOSED:
-            return None
-        worst = int(np.argmax(sizes))
-        gap = rows.rows[numbers[worst]].name, float(abs(values[worst]))
-        scaled, scales = jacobian[:, free] / rows.sizes[numbers, None], rows.scales[free]
-        q[free] -= scales * np.linalg.lstsq(scaled * scales, values / rows.sizes[numbers], rcond=RANK)[0]
-    return gap
 
 
 def _by_freedom(method: str, effects: Sequence[Effect], numbers: Mapping[str, Any]) -> Iterator[tuple[Joint, str, Any]]:

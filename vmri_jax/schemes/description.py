@@ -9,8 +9,8 @@ import numpy as np
 
 from vmri_jax.mechanics.summary import has_values
 
-TERMS = ("T", "V", "W", "F", "g", "g_s")
-"""Terms with a rule: the kinetic energy, the slow and the fast potential, forces, constraints."""
+RULES = {"T": "kinetic", "V": "slow", "W": "fast", "F": "force", "g": "constraint", "g_s": "slow_constraint"}
+"""The arguments of `Scheme` for the rules of terms: of the kinetic energy, the slow and the fast potential, forces, constraints."""
 
 
 @dataclass(frozen=True)
@@ -18,7 +18,7 @@ class Description:
     """Properties of a scheme and the cost of a macro step. Evaluations of implicit schemes are per iteration.
 
     order, symmetric: order of convergence; whether the scheme is time-reversible.
-    rules: rules in words, by the term: one of `TERMS`, or the name of a potential.
+    rules: rules in words, by the term: one of `RULES`, or the name of a potential.
     stages, num_micro, degree: steps of the scheme per macro step, micro steps per macro step, degree of the path.
     slow_evaluations, fast_evaluations: number of gradients of V and of W, and of products of their Hessians with a vector, which cost about
         as much; a node that two macro steps share counts once.

@@ -24,7 +24,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.kernels import matmul
-from vmri_jax.mechanics.system import ConstantMass, System, label
+from vmri_jax.mechanics.system import ConstantMass, System
+from vmri_jax.mechanics.terms import Term
 from vmri_jax.schemes.path import (
     Nodes,
     Path,
@@ -38,7 +39,7 @@ from vmri_jax.schemes.scheme import Scheme
 
 
 @dataclass(frozen=True)
-class Term:
+class TermOnNodes:
     """An integrand on its nodes: ``path -> H^(1 + power) sum_i w_i integrand(path at theta_i)``.
 
     integrand, arguments: function of the path, and the names of its arguments, e.g. ``("q_s", "q_f")``.
@@ -146,7 +147,7 @@ class QuadraticKinetic:
 class Sum:
     """A sum of terms, itself a function of the path."""
 
-    terms: tuple[Any, ...]  # of Term and QuadraticKinetic
+    terms: tuple[Any, ...]  # of TermOnNodes and QuadraticKinetic
 
     def __call__(self, path: Path):
         return sum((term(path) for term in self.terms), jnp.zeros(()))
@@ -166,60 +167,42 @@ class Sum:
         return Sum(tuple(term for term in self.terms if not isinstance(term, QuadraticKinetic)))
 
     @property
-    def kicks(self) -> tuple[Term, ...]:
+    def kicks(self) -> tuple[TermOnNodes, ...]:
         """The terms that have nodes at the ends of the macro interval."""
         return tuple(term for term in self.terms if term.start is not None or term.end is not None)
 
 
-class PlacedPotential(NamedTuple):
-    """A potential of a system with its rule.
+class Placed(NamedTuple):
+    """A term of a system with the rule that a scheme gives it."""
 
-    name: "V", "W", or the name of a further potential.
-    function, arguments: function of some positions and of params, and the names of the positions.
-    placed: its rule.
-    """
-
-    name: str
-    function: Callable
-    arguments: tuple[str, ...]
-    placed: PlacedRule
-
-    def value(self, q_s, q_f, params):
-        """The potential at positions, of which the function gets those in `arguments`."""
-        return self.function(*({"q_s": q_s, "q_f": q_f}[name] for name in self.arguments), params)
+    term: Term
+    rule: PlacedRule
 
 
-def placed_potentials(system: System, scheme: Scheme) -> tuple[PlacedPotential, ...]:
+def placed_potentials(system: System, scheme: Scheme) -> tuple[Placed, ...]:
     """All potentials of a system with the rules that a scheme gives them.
 
     Raises:
         ValueError: a potential without a rule.
     """
-    both = ("q_s", "q_f")
-    known = ("V", system.slow_potential, both, scheme.slow), ("W", system.fast_potential, ("q_f",), scheme.fast)
-    further = ((label(name), function, both, scheme.rule_of(name)) for name, function in system.potentials)
-    return tuple(
-        PlacedPotential(name, function, arguments, placed)
-        for name, function, arguments, placed in (*known, *further)
-        if function is not None
-    )
+    return tuple(Placed(term, scheme.rule_of(term.name)) for term in system.of_kind("potential"))
 
 
 def lagrangian(system: System, scheme: Scheme) -> Sum:
     """``T - V - W - sum_i V_i`` of a system, each term on the nodes the scheme gives it."""
     potentials = [
-        _on_position_nodes(function, arguments, placed, scheme, system, name, sign=-1.0)
-        for name, function, arguments, placed in placed_potentials(system, scheme)
+        _on_position_nodes(term.function, term.arguments, rule, scheme, system, term.label, sign=-1.0)
+        for term, rule in placed_potentials(system, scheme)
     ]
     return Sum((*_kinetic(system, scheme), *potentials, *_corrections(system, scheme)))
 
 
-def _corrections(system: System, scheme: Scheme) -> list[Term]:
+def _corrections(system: System, scheme: Scheme) -> list[TermOnNodes]:
     """The corrections by squared gradients of `vmri_jax.schemes.quadrature.gradient_corrected`.
 
         h^2/24 grad W . M^-1 grad W        H^2/24 grad V . M^-1 grad V + h^2/12 grad V . M^-1 grad W
 
-    as terms of the Lagrangian, with the factor H^2 in `Term.power` and h = H / num_micro.
+    as terms of the Lagrangian, with the factor H^2 in `TermOnNodes.power` and h = H / num_micro.
     """
     if not scheme.slow.gradient_corrected and not scheme.fast.gradient_corrected:
         return []
@@ -252,18 +235,18 @@ def _kinetic(system, scheme) -> list:
     nodes = velocity_nodes(scheme.kinetic, scheme.num_micro, scheme.degree)
     if isinstance(system.kinetic, ConstantMass):
         return [QuadraticKinetic(system.kinetic, nodes)]
-    both, slow = system.kinetic.function, system.slow_kinetic
-    terms = [Term(lambda *z: both(*z, system.params), ("q_s", "q_f", "v_s", "v_f"), nodes)]
+    both, slow = system.kinetic, system.slow_kinetic
+    terms = [TermOnNodes(lambda *z: both(*z, system.params), ("q_s", "q_f", "v_s", "v_f"), nodes)]
     if slow is not None:
         nodes = slow_velocity_nodes(scheme.kinetic, scheme.num_micro, scheme.degree)
-        terms.append(Term(lambda *z: slow(*z, system.params), ("q_s", "v_s"), nodes, grid="macro"))
+        terms.append(TermOnNodes(lambda *z: slow(*z, system.params), ("q_s", "v_s"), nodes, grid="macro"))
     return terms
 
 
-def _on_position_nodes(function, arguments, placed, scheme, system, name: str, **fields) -> Term:
+def _on_position_nodes(function, arguments, placed, scheme, system, name: str, **fields) -> TermOnNodes:
     start, inside, end = position_nodes(placed, scheme.num_micro, scheme.degree)
     fields |= {"grid": placed.grid, "every": placed.every, "mollified": placed.mollified, "name": name}
-    return Term(lambda *q: function(*q, system.params), arguments, inside, start, end, **fields)
+    return TermOnNodes(lambda *q: function(*q, system.params), arguments, inside, start, end, **fields)
 
 
 def discrete_lagrangian(system: System, scheme: Scheme) -> Callable:

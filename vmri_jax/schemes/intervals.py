@@ -31,7 +31,7 @@ from jaxtyping import Array, Float
 from vmri_jax.kernels import matmul
 from vmri_jax.mechanics.rows import Entries
 from vmri_jax.mechanics.structure import entries_seen
-from vmri_jax.schemes.discrete_lagrangian import QuadraticKinetic, Term, lagrangian
+from vmri_jax.schemes.discrete_lagrangian import QuadraticKinetic, TermOnNodes, lagrangian
 from vmri_jax.schemes.equations import StepEquations, slow_basis_at_control_nodes
 from vmri_jax.schemes.path import NodeGroup, Nodes, Path, control_nodes, lagrange_basis, lagrange_derivative
 
@@ -175,7 +175,7 @@ class Intervals:
         self.equations = equations
         terms = lagrangian(equations.system, equations.scheme).terms
         self._kinetic = next((term for term in terms if isinstance(term, QuadraticKinetic)), None)
-        inner = [term for term in terms if isinstance(term, Term) and term.inside.groups]
+        inner = [term for term in terms if isinstance(term, TermOnNodes) and term.inside.groups]
         of_slow = [all(name.endswith("_s") for name in term.arguments) for term in inner]
         self._slow_terms = [term for term, alone in zip(inner, of_slow, strict=True) if alone]
         of_fast = (term for term, alone in zip(inner, of_slow, strict=True) if not alone)
@@ -243,7 +243,7 @@ class Intervals:
             total -= jnp.sum(mu * self._constraints(path, m, slice(0, -1)))
         return total
 
-    def _of_term(self, term: Term, nodes: IntervalNodes, m, path: IntervalPath):
+    def _of_term(self, term: TermOnNodes, nodes: IntervalNodes, m, path: IntervalPath):
         equations = self.equations
         values = jax.vmap(term.integrand)(*nodes.sample(path, equations, self.seen, m, term.arguments))
         return term.sign * term.times_step(equations.macro_dt) * jnp.sum(of_interval(nodes.weights, m) * values)

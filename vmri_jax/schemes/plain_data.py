@@ -5,11 +5,10 @@ from typing import Any
 import numpy as np
 
 from vmri_jax.schemes.composition import Composition
+from vmri_jax.schemes.description import RULES
 from vmri_jax.schemes.quadrature import PlacedRule, Rule
 from vmri_jax.schemes.scheme import Scheme
 
-RULES = ("kinetic", "slow", "fast", "constraint", "slow_constraint", "force")
-"""Placed rules of every scheme."""
 PLACEMENT = ("grid", "mollified", "gradient_corrected", "every")
 """Fields of a placed rule besides the rule."""
 
@@ -18,7 +17,7 @@ def to_plain(scheme: Scheme | Composition) -> dict[str, Any]:
     """A scheme with concrete weights as plain data; numbers of float64 stay the same through JSON."""
     if isinstance(scheme, Composition):
         return {"scheme": to_plain(scheme.scheme), "coefficients": np.asarray(scheme.coefficients).tolist()}
-    rules = {name: _plain_rule(getattr(scheme, name)) for name in RULES}
+    rules = {name: _plain_rule(getattr(scheme, name)) for name in RULES.values()}
     # pairs, since a potential may have a whole number as its name, which keys of JSON cannot be
     potentials = [[name, _plain_rule(placed)] for name, placed in scheme.potentials.items()]
     return {"num_micro": scheme.num_micro, "degree": scheme.degree, **rules, "potentials": potentials}
@@ -35,7 +34,7 @@ def from_plain(data: dict[str, Any]) -> Scheme | Composition:
         if isinstance(scheme, Composition):
             raise ValueError("from_plain: the stages of a composition must be steps of a scheme, not of a composition.")
         return Composition(scheme, np.asarray(data["coefficients"]))
-    rules = {name: _placed_rule(data[name]) for name in RULES}
+    rules = {name: _placed_rule(data[name]) for name in RULES.values()}
     potentials = {name: _placed_rule(placed) for name, placed in data["potentials"]}
     return Scheme(data["num_micro"], data["degree"], **rules, potentials=potentials)
 

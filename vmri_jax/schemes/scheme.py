@@ -25,8 +25,9 @@ import equinox as eqx
 import numpy as np
 
 from vmri_jax.mechanics.arrays import is_concrete
-from vmri_jax.mechanics.system import label
-from vmri_jax.schemes.description import TERMS, Description, printed
+from vmri_jax.mechanics.system import RATE_OF
+from vmri_jax.mechanics.terms import label
+from vmri_jax.schemes.description import RULES, Description, printed
 from vmri_jax.schemes.path import control_nodes, lagrange_derivative
 from vmri_jax.schemes.quadrature import (
     NODE_TOLERANCE,
@@ -85,7 +86,7 @@ class Scheme(eqx.Module):
         self.force = self.kinetic if self.force is None else self.force
         self.constraint = micro(at_control_nodes) if self.constraint is None else self.constraint
         self.slow_constraint = macro(at_control_nodes) if self.slow_constraint is None else self.slow_constraint
-        for name in ("kinetic", "slow", "fast", "force", "constraint", "slow_constraint"):
+        for name in RULES.values():
             _check_placed(name, getattr(self, name))
             if getattr(self, name).every > 1 and name not in ("slow", "fast"):
                 raise ValueError(
@@ -139,14 +140,21 @@ class Scheme(eqx.Module):
         A rule that spans several micro intervals counts as order 2 at most. Potentials and forces of slow variables alone have the full order
         of their rule; a scheme does not know the variables of potentials and forces.
         """
-        placed = self.kinetic, self.slow, self.fast, self.force, *self.potentials.values()
-        return min(2 * self.degree, *(placed.order(self.num_micro) for placed in placed))
+        return min(2 * self.degree, *(placed.order(self.num_micro) for placed in self._of_energies_and_forces))
 
     @property
     def is_symmetric(self) -> bool:
         """Whether a step forward and a step back with -H lead back to the start; needs concrete weights."""
-        placed = self.kinetic, self.slow, self.fast, self.force, *self.potentials.values()
-        return all(placed.rule.is_symmetric for placed in placed)
+        return all(placed.rule.is_symmetric for placed in self._of_energies_and_forces)
+
+    @property
+    def _of_energies_and_forces(self) -> list[PlacedRule]:
+        return [placed for name, placed in self.rules.items() if name not in ("g", "g_s")]
+
+    @property
+    def rules(self) -> dict[str | int, PlacedRule]:
+        """The placed rules by the symbols of `vmri_jax.mechanics.terms` and the names of further potentials."""
+        return {symbol: getattr(self, name) for symbol, name in RULES.items()} | self.potentials
 
     @property
     def micro_times(self) -> np.ndarray:
@@ -183,17 +191,19 @@ class Scheme(eqx.Module):
         return replace(self, potentials=self.potentials | rules)
 
     def rule_of(self, name: str | int) -> PlacedRule:
-        """The rule of a potential in `System.potentials`. The names "slow" and "fast" get the rules of V and W, without filter and correction.
+        """The rule of a term, by its symbol or the name of a potential in `System.potentials`.
+
+        The names "slow" and "fast" get the rules of V and W, without filter and correction.
 
         Raises:
             ValueError: a name without a rule; a whole number that does not divide num_micro.
         """
-        if name in self.potentials:
-            return self.potentials[name]
+        if name in self.rules:
+            return self.rules[name]
         if isinstance(name, int):
             return _on_grid(f"the potential {name}", micro(trapezoidal, every=name), self.num_micro)
-        if name in ("slow", "fast"):
-            placed = self.slow if name == "slow" else self.fast
+        if name in RATE_OF.values():
+            placed = getattr(self, name)
             return PlacedRule(placed.rule, placed.grid, every=placed.every)
         raise ValueError(
             f"Scheme: there is no rule for the potential {name!r} of the system; the scheme has rules for {list(self.potentials) or 'V and W only'}. "
@@ -227,9 +237,7 @@ class Scheme(eqx.Module):
         )
         fast *= 1 + self.slow.mollified  # a second time along the motion of the average
         fast += self.slow.gradient_corrected and self.fast.gradient_corrected  # grad V . M^-1 grad W
-        placed = self.kinetic, self.slow, self.fast, self.force, self.constraint, self.slow_constraint
-        rules = {name: rule.in_words() for name, rule in zip(TERMS, placed, strict=True)}
-        rules |= {label(name): rule.in_words() for name, rule in self.potentials.items()}
+        rules = {label(name): rule.in_words() for name, rule in self.rules.items()}
         evaluations = {label(name): rule.evaluations(self.num_micro) for name, rule in self.potentials.items()}
         costs = slow, fast, free, 1, evaluations
         return Description(self.order, self.is_symmetric, rules, 1, self.num_micro, self.degree, *costs)

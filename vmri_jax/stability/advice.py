@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from vmri_jax.mechanics.state import Movable, State, start_of
-from vmri_jax.mechanics.system import label
+from vmri_jax.mechanics.terms import label
 from vmri_jax.running.origin import names_of
 from vmri_jax.schemes.composition import Composition, stage_lengths, stage_scheme
 from vmri_jax.schemes.scheme import Scheme

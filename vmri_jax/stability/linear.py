@@ -299,7 +299,7 @@ def _expansion(system: System, state: State) -> dict:
 
     def kinetic(z):
         q, v = jnp.split(z, 2)
-        return system.kinetic(q[:n_s], q[n_s:], v[:n_s], v[n_s:], system.params)
+        return system.kinetic_energy(q[:n_s], q[n_s:], v[:n_s], v[n_s:])
 
     def constraints(q):
         return system.constraints(state.t, q[:n_s], q[n_s:])

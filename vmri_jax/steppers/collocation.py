@@ -29,7 +29,7 @@ from jaxtyping import Array, Float, Int
 from vmri_jax.kernels import inverse, matmul, max_abs
 from vmri_jax.kernels.saddle import regularized
 from vmri_jax.mechanics.structure import curved_directions
-from vmri_jax.schemes.discrete_lagrangian import Term, lagrangian
+from vmri_jax.schemes.discrete_lagrangian import TermOnNodes, lagrangian
 from vmri_jax.schemes.equations import StepEquations, Unknowns
 from vmri_jax.schemes.path import control_nodes, lagrange_basis
 from vmri_jax.steppers.accept import Accepted, expected
@@ -83,7 +83,7 @@ class JoinedEquations:
         parts = zip(self.inverse_masses, (x[: self.n_s], x[self.n_s :]), strict=True)
         return jnp.concatenate([inverse.times(part.T).T for inverse, part in parts])
 
-    def by_name(self, term: Term, q) -> tuple:
+    def by_name(self, term: TermOnNodes, q) -> tuple:
         """The arguments of a term, out of joined variables (n, ...)."""
         parts = {"q_s": q[: self.n_s], "q_f": q[self.n_s :]}
         return tuple(parts[name] for name in term.arguments)

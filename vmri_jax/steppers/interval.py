@@ -31,8 +31,8 @@ from vmri_jax.mechanics.arrays import is_concrete
 from vmri_jax.mechanics.constraint_pattern import MOST_ROWS_OF_FULL_MATRIX, fast_rows
 from vmri_jax.mechanics.masses import ConstantMass, Diagonal
 from vmri_jax.mechanics.structure import has_constant_hessian, has_diagonal_hessian, is_linear
-from vmri_jax.mechanics.system import System, label
-from vmri_jax.schemes.discrete_lagrangian import QuadraticKinetic, Term, lagrangian
+from vmri_jax.mechanics.system import System
+from vmri_jax.schemes.discrete_lagrangian import QuadraticKinetic, TermOnNodes, lagrangian, placed_potentials
 from vmri_jax.schemes.equations import StepEquations
 from vmri_jax.schemes.path import Path, control_nodes, lagrange_basis
 from vmri_jax.schemes.quadrature import micro, midpoint
@@ -58,28 +58,22 @@ def constant_mass(system: System) -> ConstantMass:
 
 def interval_problem(system: System, scheme: Scheme) -> tuple[System, Scheme]:
     """System and scheme of one micro interval, without the slow constraint and without terms that only some intervals have."""
-    changes: dict[str, Any] = {"slow_constraint": None}
-    rules: dict[str, Any] = {"slow": scheme.slow, "fast": scheme.fast, "force": scheme.force}
-    for name, placed in rules.items():
-        if not placed.is_local:
-            rules[name] = micro(midpoint)
-            changes |= {} if name == "force" else {f"{name}_potential": None}
-    if system.potentials:
-        local = [(label(name), function, scheme.rule_of(name)) for name, function in system.potentials]
-        local = [potential for potential in local if potential[2].is_local]
-        changes["potentials"] = {name: function for name, function, _ in local}
-        rules["potentials"] = {name: placed for name, _, placed in local}
-    local = Scheme(1, scheme.degree, kinetic=scheme.kinetic, constraint=scheme.constraint, **rules)
-    return system.replace(**changes), local
+    local = {term: rule for term, rule in placed_potentials(system, scheme) if rule.is_local}
+    parts = system.only(lambda term: term in local if term.kind == "potential" else term.field != "slow_constraint")
+    # the rule of a term that is left out does not matter
+    rules = {name: getattr(scheme, name) for name in ("slow", "fast", "force")}
+    rules: dict[str, Any] = {name: rule if rule.is_local else micro(midpoint) for name, rule in rules.items()}
+    rules["potentials"] = {term.name: rule for term, rule in local.items() if term.field == "potentials"}
+    return parts, Scheme(1, scheme.degree, kinetic=scheme.kinetic, constraint=scheme.constraint, **rules)
 
 
-def implicit_terms(system: System, scheme: Scheme) -> list[Term]:
+def implicit_terms(system: System, scheme: Scheme) -> list[TermOnNodes]:
     """The potentials with nodes inside a micro interval, whose gradients depend on the fast unknowns."""
     terms = lagrangian(*interval_problem(system, scheme)).terms
-    return [term for term in terms if isinstance(term, Term) and term.inside.groups]
+    return [term for term in terms if isinstance(term, TermOnNodes) and term.inside.groups]
 
 
-def _of_fast(term: Term, q_s, q_f):
+def _of_fast(term: TermOnNodes, q_s, q_f):
     """The integrand of a term as a function of q_f."""
     return term.integrand(*({"q_s": q_s, "q_f": q_f}[name] for name in term.arguments))
 

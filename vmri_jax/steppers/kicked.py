@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from vmri_jax.mechanics.arrays import Numbers, is_concrete
 from vmri_jax.mechanics.state import State
-from vmri_jax.schemes.discrete_lagrangian import Term
+from vmri_jax.schemes.discrete_lagrangian import TermOnNodes
 from vmri_jax.steppers.results import Result
 from vmri_jax.steppers.stepper import StepInfo, Stepper, StepStatus, indented
 
@@ -30,7 +30,7 @@ class KickedState(NamedTuple):
 class Kicked(Stepper):
     """Kicks before and after an inner step, ``p <- p - H w dV/dq`` with the weight w of the rule at that end of the interval.
 
-    Corrections have the factor H^3 instead of H, see `Term.times_step`.
+    Corrections have the factor H^3 instead of H, see `TermOnNodes.times_step`.
 
     kicks: the terms with nodes at the ends of the interval; may be empty.
     inner: the stepper between the kicks.
@@ -38,7 +38,7 @@ class Kicked(Stepper):
     projects: whether every step ends with a projection of the momenta onto the hidden constraints.
     """
 
-    kicks: tuple[Term, ...]
+    kicks: tuple[TermOnNodes, ...]
     inner: Stepper
     average: Callable | None = None
     projects: bool = False
@@ -106,7 +106,7 @@ class Kicked(Stepper):
     def _gradients(self, state: State, macro_dt):
         q_s, q_f = state.q_s, state.q_f
 
-        def gradient(term: Term):
+        def gradient(term: TermOnNodes):
             if self.average is None or not term.mollified:
                 return term.gradient(q_s, q_f)
             # mollified: gradient of V(q_s, a(q_s, q_f)), dV/dq_s + (da/dq_s)^T dV/da and (da/dq_f)^T dV/da
@@ -167,7 +167,9 @@ def _all_steps(before, last):
     return jnp.concatenate([before, last])
 
 
-def kicked(state: State, kicks: tuple[Term, ...], gradients, macro_dt, start: float = 0.0, end: float = 0.0) -> State:
+def kicked(
+    state: State, kicks: tuple[TermOnNodes, ...], gradients, macro_dt, start: float = 0.0, end: float = 0.0
+) -> State:
     """The state after kicks with these gradients: `start` times the weight at the start of an interval plus `end` times that at its end."""
     p_s, p_f = state.p_s, state.p_f
     for term, (d_s, d_f) in zip(kicks, gradients, strict=True):

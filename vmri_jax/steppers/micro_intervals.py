@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 from vmri_jax.kernels import max_abs
 from vmri_jax.kernels.band import BandInverse, FullInverse, Sparsity
 from vmri_jax.mechanics.arrays import Numbers
-from vmri_jax.schemes.discrete_lagrangian import Term, lagrangian
+from vmri_jax.schemes.discrete_lagrangian import TermOnNodes, lagrangian
 from vmri_jax.schemes.equations import StepEquations, slow_basis_at_control_nodes
 from vmri_jax.schemes.path import control_nodes
 from vmri_jax.steppers.interval import Matrix, constant_mass, interval_problem, weighted_sum
@@ -136,7 +136,7 @@ class MicroSweep(NamedTuple):
         return unknowns, totals
 
 
-def kick_weight(term: Term, h):
+def kick_weight(term: TermOnNodes, h):
     """Weight of a kick at a node where one interval ends and the next one starts, times the power of h of the term."""
     return term.times_step(h) * sum(w for w in (term.start, term.end) if w is not None)
 

@@ -27,9 +27,9 @@ from vmri_jax.kernels.band import Sparsity
 from vmri_jax.mechanics.constraint_pattern import all_rows
 from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.mechanics.structure import depends_on
-from vmri_jax.mechanics.system import System, label
+from vmri_jax.mechanics.system import System
 from vmri_jax.schemes.composition import Composition, stage_scheme
-from vmri_jax.schemes.discrete_lagrangian import PlacedPotential, Term, lagrangian, placed_potentials
+from vmri_jax.schemes.discrete_lagrangian import Placed, TermOnNodes, lagrangian, placed_potentials
 from vmri_jax.schemes.quadrature import macro
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.collocation import Collocation
@@ -47,7 +47,7 @@ from vmri_jax.steppers.solver import Solver
 from vmri_jax.steppers.stepper import StepInfo, Stepper, indented
 from vmri_jax.steppers.subsystems import fast_part, frozen_slow, slow_part
 
-Parts = tuple[list[PlacedPotential], dict[int, list[PlacedPotential]]]
+Parts = tuple[list[Placed], dict[int, list[Placed]]]
 """Potentials of the slow variables, on the macro grid, and of the fast variables, by the number k of micro intervals that a copy of their rule
 spans; the keys k increase, start with 1, and each is a multiple of the one before."""
 
@@ -106,11 +106,9 @@ class Plan:
     def describe(self) -> str:
         """The scheme applied to the system in words: rules of the terms that the system has, order, symmetry, and the steppers."""
         system = self.system
-        has = {"T": system.kinetic, "V": system.slow_potential, "W": system.fast_potential, "F": system.force}
-        has |= {"g": system.constraint, "g_s": system.slow_constraint}
-        has |= {label(name): function for name, function in system.potentials}
+        has = {term.label for term in system.terms}
         scheme = with_rules_for(system, self.scheme).describe()
-        rules = {name: rule for name, rule in scheme.rules.items() if has.get(name) is not None}
+        rules = {name: rule for name, rule in scheme.rules.items() if name in has}
         if system.slow_kinetic is not None:
             slow = macro(stage_scheme(self.scheme).kinetic.rule).in_words()
             rules = {"T": rules.pop("T"), "T_s": slow} | rules
@@ -243,7 +241,7 @@ def _has_modes(system: System, scheme: Scheme) -> bool:
 
 def _can_be_nested(system: System, scheme: Scheme) -> bool:
     """Whether masses are constant, and every term has its nodes inside single micro intervals or at nodes where they meet."""
-    local = all(placed.is_local or placed.only_ends for *_, placed in placed_potentials(system, scheme))
+    local = all(rule.is_local or rule.only_ends for _, rule in placed_potentials(system, scheme))
     force = system.force is None or scheme.force.grid == "micro"
     return system.has_constant_mass and local and force
 
@@ -255,7 +253,7 @@ def _is_drift(system: System, scheme: Scheme) -> bool:
         scheme.num_micro == scheme.degree == 1
         and system.has_constant_mass
         and system.force is None
-        and not any(term.inside.groups for term in terms if isinstance(term, Term))
+        and not any(term.inside.groups for term in terms if isinstance(term, TermOnNodes))
     )
 
 
@@ -281,22 +279,25 @@ def _apart(system: System, scheme: Scheme, q_s, q_f) -> Parts | None:
         return None  # fast variables on one interval: nothing to take apart, as in the parts of a decoupled system
     slow, fast = [], {1: []}
     for potential in placed_potentials(system, scheme):
-        placed = potential.placed
-        if placed.only_kicks:
+        term, rule = potential
+        if rule.only_kicks:
             continue
-        value = partial(potential.value, params=system.params)
-        if placed.grid == "macro":
-            if potential.name == "W" or depends_on(partial(value, q_s), q_f)[0]:
+
+        def value(q_s, q_f, term=term):
+            return term(system.params, q_s=q_s, q_f=q_f)
+
+        if rule.grid == "macro":
+            if term.name == "W" or depends_on(partial(value, q_s), q_f)[0]:
                 return None
             slow.append(potential)
-        elif potential.name == "V" and placed.every == 1:
+        elif term.name == "V" and rule.every == 1:
             return None
         else:
-            may_see_slow = "q_s" in potential.arguments and q_s.size > 0
+            may_see_slow = "q_s" in term.arguments and q_s.size > 0
             sees_slow = may_see_slow and depends_on(partial(value, q_f=q_f), q_s)[0]
-            if sees_slow or (placed.every > 1 and not placed.only_ends):
+            if sees_slow or (rule.every > 1 and not rule.only_ends):
                 return None
-            fast.setdefault(placed.every, []).append(potential)
+            fast.setdefault(rule.every, []).append(potential)
     fast = dict(sorted(fast.items()))
     is_chain = all(longer % shorter == 0 for shorter, longer in pairwise(fast))
     coupled = not is_chain or depends_on(lambda q: system.g(jnp.zeros(()), q, q_f), q_s)[0]
@@ -305,10 +306,8 @@ def _apart(system: System, scheme: Scheme, q_s, q_f) -> Parts | None:
 
 def _decoupled(system: System, scheme: Scheme, choice: _Choice, q_s, q_f, potentials: Parts) -> Decoupled:
     (of_slow, of_fast), none = potentials, jnp.zeros(0)
-    slow, slow_scheme = slow_part(system, scheme, *_named(of_slow, "V"), num_fast=q_f.size)
-    parts = {
-        every: fast_part(system, scheme, *_named(further, "W"), num_slow=q_s.size) for every, further in of_fast.items()
-    }
+    slow, slow_scheme = slow_part(system, of_slow, num_fast=q_f.size)
+    parts = {every: fast_part(system, further, num_slow=q_s.size) for every, further in of_fast.items()}
     fast, length = _whole_step(*parts.pop(1), choice, none, q_f), 1
     for every, part in parts.items():
         fast = Kicked(lagrangian(*part).kicks, Repeated(fast, every // length))
@@ -316,17 +315,12 @@ def _decoupled(system: System, scheme: Scheme, choice: _Choice, q_s, q_f, potent
     return Decoupled(_whole_step(slow, slow_scheme, choice, none, q_s), fast, scheme.num_micro // length)
 
 
-def _named(potentials: list[PlacedPotential], name: str) -> tuple[Callable | None, list[PlacedPotential]]:
-    """The function of the potential of this name, None without it, and all other potentials."""
-    function = next((potential.function for potential in potentials if potential.name == name), None)
-    return function, [potential for potential in potentials if potential.name != name]
-
-
 def with_rules_for(system: System, scheme: Scheme | Composition) -> Scheme | Composition:
     """The scheme with an explicit rule for each of `System.potentials`, also for those whose name implies the rule."""
     if isinstance(scheme, Composition):
         return replace(scheme, scheme=with_rules_for(system, scheme.scheme))
-    return replace(scheme, potentials={label(name): scheme.rule_of(name) for name, _ in system.potentials})
+    further = (term for term in system.terms if term.field == "potentials")
+    return replace(scheme, potentials={term.label: scheme.rule_of(term.name) for term in further})
 
 
 def _average(system: System, scheme: Scheme, choice: _Choice) -> Callable | None:

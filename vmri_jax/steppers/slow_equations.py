@@ -31,11 +31,11 @@ from jaxtyping import Array, Float
 
 from vmri_jax.kernels import inverse, matmul, max_abs, solve
 from vmri_jax.kernels.band import BandInverse, FullInverse
-from vmri_jax.schemes.discrete_lagrangian import QuadraticKinetic, lagrangian
+from vmri_jax.schemes.discrete_lagrangian import QuadraticKinetic, lagrangian, placed_potentials
 from vmri_jax.schemes.equations import StepEquations, Unknowns, slow_basis_at_control_nodes
 from vmri_jax.schemes.path import control_nodes, lagrange_basis, lagrange_derivative
 from vmri_jax.schemes.quadrature import gauss
-from vmri_jax.steppers.interval import constant_mass, interval_problem, solve_saddle
+from vmri_jax.steppers.interval import constant_mass, solve_saddle
 
 NODES = 4
 """Gauss nodes per macro step at which the slow forces are linearised. A larger number makes the solve dearer; with a smaller one, steps in which
@@ -133,7 +133,9 @@ class SlowEquations(NamedTuple):
             x: unknowns, which give the path.
         """
         equations, H, r, n = self.equations, self.equations.macro_dt, len(x.slow), len(x.fast)
-        system, _ = interval_problem(equations.system, equations.scheme)
+        system = equations.system
+        placed = (part for part in placed_potentials(system, equations.scheme) if "q_s" in part.term.arguments)
+        potentials = [part.term for part in placed if not part.rule.only_kicks]
         rule = gauss(min(n, NODES))
         c, basis, slopes = np.array(rule.nodes), lagrange_basis(r, rule.nodes), lagrange_derivative(r, rule.nodes)
         weights = equations.micro_dt * H * (np.array(rule.weights)[:, None] * basis[:, :-1]).T
@@ -145,14 +147,11 @@ class SlowEquations(NamedTuple):
         def sample(increments):
             return matmul(basis[:, 1:], increments), matmul(slopes[:, 1:], increments) / H
 
-        further = [f for name, f in equations.system.potentials if not equations.scheme.rule_of(name).only_kicks]
-
         def forces(q_s, v_s):
             total = jax.vmap(system.forces)(equations.t + c * H, q_s, q_f, v_s, v_f)[0]
-            if system.slow_potential is not None:
-                total -= jax.vmap(jax.grad(system.slow_potential), (0, 0, None))(q_s, q_f, system.params)
-            for potential in further:
-                total -= jax.vmap(jax.grad(potential), (0, 0, None))(q_s, q_f, system.params)
+            for term in potentials:
+                gradient = jax.grad(lambda q_s, q_f, term=term: term(system.params, q_s=q_s, q_f=q_f))
+                total -= jax.vmap(gradient)(q_s, q_f)
             return total
 
         q_s, v_s = sample(x.slow)

@@ -5,109 +5,99 @@ Each part moves on a single interval; slow variables are stored as q_f.
 The functions of the parts are dataclasses. They compare by value, so that JAX traces equal ones once.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import jax.numpy as jnp
 
-from vmri_jax.mechanics.functions import Rheonomic, with_time
+from vmri_jax.mechanics.functions import Rheonomic
 from vmri_jax.mechanics.masses import ConstantMass
 from vmri_jax.mechanics.system import System
-from vmri_jax.schemes.discrete_lagrangian import PlacedPotential
-from vmri_jax.schemes.quadrature import PlacedRule, micro, midpoint
+from vmri_jax.mechanics.terms import Term
+from vmri_jax.schemes.discrete_lagrangian import Placed
+from vmri_jax.schemes.quadrature import micro, midpoint
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.interval import constant_mass
 
 
 @dataclass(frozen=True)
 class OfPart:
-    """A function of a system that depends on one part alone, as a function of the fast variables of that part.
+    """A term that depends on one part alone, as a function of the fast variables of that part, with the time first if it is a constraint.
 
-    whole: a potential, or a constraint.
-    num_slow, num_fast: numbers of slow and of fast variables that `whole` gets as zeros besides the variables of the part; None for no argument.
+    part, other: names of the positions of the part and of all others.
+    num_other: number of the others, which the term gets as zeros.
     """
 
-    whole: Callable | Rheonomic
-    num_slow: int | None = None
-    num_fast: int | None = None
+    term: Term
+    part: str
+    other: str
+    num_other: int
 
     def __call__(self, *arguments):
-        q, params = arguments[-2:]
-        slow, fast = ([] if number is None else [jnp.zeros(number)] for number in (self.num_slow, self.num_fast))
-        # the first argument of a constraint is the time
-        function, arguments = with_time(self.whole, arguments[0], *slow, q, *fast, params)
-        return function(*arguments)
+        *_, q, params = arguments
+        return self.term(params, **{"t": arguments[0], self.part: q, self.other: jnp.zeros(self.num_other)})
 
 
-def slow_part(
-    system: System, scheme: Scheme, potential: Callable | None, further: Sequence[PlacedPotential], num_fast: int
-) -> tuple[System, Scheme]:
+def slow_part(system: System, potentials: Sequence[Placed], num_fast: int) -> tuple[System, Scheme]:
     """The system of the slow variables, and the scheme of their step over the macro interval.
 
     Args:
-        system, scheme: of the whole system.
-        potential: V; None if it only kicks.
-        further: further potentials of slow variables alone, with nodes inside the macro interval.
+        system: the whole one.
+        potentials: of slow variables alone, with nodes inside the macro interval.
         num_fast: number of fast variables of the whole system.
     """
-    alone = System(
-        ConstantMass(jnp.zeros(0), constant_mass(system).slow),
-        fast_potential=None if potential is None else OfPart(potential, num_fast=num_fast),
-        constraint=None if system.slow_constraint is None else Rheonomic(OfPart(system.slow_constraint)),
-        params=system.params,
-        potentials={item.name: OfPart(item.function, num_fast=num_fast) for item in further},
-    )
-    return alone, _single(PlacedRule(scheme.slow.rule, scheme.slow.grid), further)
+    return _part(system, ("q_s", "q_f", num_fast), constant_mass(system).slow, "slow_constraint", potentials)
 
 
-def fast_part(
-    system: System, scheme: Scheme, potential: Callable | None, further: Sequence[PlacedPotential], num_slow: int
-) -> tuple[System, Scheme]:
+def fast_part(system: System, potentials: Sequence[Placed], num_slow: int) -> tuple[System, Scheme]:
     """The system of the fast variables, and the scheme of a step of k micro intervals.
 
     Args:
-        system, scheme: of the whole system.
-        potential: W; None if its rule does not span k micro intervals.
-        further: further potentials of fast variables alone whose rules span k micro intervals.
+        system: the whole one.
+        potentials: of fast variables alone whose rules span k micro intervals.
         num_slow: number of slow variables of the whole system.
     """
+    return _part(system, ("q_f", "q_s", num_slow), constant_mass(system).fast, "constraint", potentials)
+
+
+def _part(
+    system: System, positions: tuple[str, str, int], mass, constraint: str, potentials: Sequence[Placed]
+) -> tuple[System, Scheme]:
+    """A part with its masses and the constraint of this field, and its scheme; W, or else V, is its fast potential."""
+    main = next((part for name in ("W", "V") for part in potentials if part.term.name == name), None)
+    # beside W a potential must not be called V
+    further = {"V alone" if part.term.name == "V" else part.term.label: part for part in potentials if part is not main}
+    rows = (Rheonomic(OfPart(term, *positions)) for term in system.terms if term.field == constraint)
     alone = System(
-        ConstantMass(jnp.zeros(0), constant_mass(system).fast),
-        fast_potential=potential,
-        constraint=None if system.constraint is None else Rheonomic(OfPart(system.constraint, num_slow)),
+        ConstantMass(jnp.zeros(0), mass),
+        fast_potential=None if main is None else OfPart(main.term, *positions),
+        constraint=next(rows, None),
         params=system.params,
-        potentials={item.name: OfPart(item.function, num_slow) for item in further},
+        potentials={name: OfPart(part.term, *positions) for name, part in further.items()},
     )
-    return alone, _single(replace(scheme.fast, every=1), further)
+    drift = micro(midpoint)
+    fast = drift if main is None else replace(main.rule, grid="micro", every=1)
+    rules = {name: micro(part.rule.rule) for name, part in further.items()}
+    return alone, Scheme(1, kinetic=drift, slow=drift, fast=fast, potentials=rules)
 
 
 @dataclass(frozen=True)
 class AtRest:
     """W, or g with the slow variables at rest, as a function with the parameters ``(params, q_s)``."""
 
-    whole: Callable
-    sees_slow: bool
+    term: Term
 
     def __call__(self, *arguments):
         q, (params, q_s) = arguments[-2:]
-        slow = [q_s] if self.sees_slow else []
-        return self.whole(*slow, q, params)
+        return self.term(params, q_s=q_s, q_f=q)
 
 
 def frozen_slow(system: System, scheme: Scheme, q_s) -> tuple[System, Scheme]:
     """The system of the fast variables under W and g with the slow variables at rest in q_s, and the scheme of one micro interval."""
-    alone = System(
-        ConstantMass(jnp.zeros(0), constant_mass(system).fast),
-        fast_potential=None if system.fast_potential is None else AtRest(system.fast_potential, sees_slow=False),
-        constraint=None if system.constraint is None else AtRest(system.constraint, sees_slow=True),  # pyright: ignore[reportArgumentType]
-        params=(system.params, q_s),
-    )
+    functions: dict[str, Any] = {
+        term.field: AtRest(term) for term in system.terms if term.field in ("fast_potential", "constraint")
+    }
+    alone = System(ConstantMass(jnp.zeros(0), constant_mass(system).fast), **functions, params=(system.params, q_s))
     rule = micro(scheme.kinetic.rule)
     return alone, Scheme(1, scheme.degree, kinetic=rule, slow=rule, fast=scheme.fast)
-
-
-def _single(fast: PlacedRule, further: Sequence[PlacedPotential]) -> Scheme:
-    """A scheme of fast variables alone on one interval."""
-    drift = micro(midpoint)
-    potentials = {item.name: micro(item.placed.rule) for item in further}
-    return Scheme(1, kinetic=drift, slow=drift, fast=fast, potentials=potentials)

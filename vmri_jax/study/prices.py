@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from vmri_jax.mechanics.state import Problem
-from vmri_jax.mechanics.system import label
+from vmri_jax.mechanics.terms import label
 from vmri_jax.running.timing import seconds_each
 from vmri_jax.study.work import WorkRow
 

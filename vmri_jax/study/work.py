@@ -11,7 +11,8 @@ import numpy as np
 from vmri_jax import diagnostics, plots
 from vmri_jax.executors.executor import mapped
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
-from vmri_jax.mechanics.system import System, label
+from vmri_jax.mechanics.system import System
+from vmri_jax.mechanics.terms import label
 from vmri_jax.running.interrupts import Interrupted
 from vmri_jax.running.progress import shows_progress
 from vmri_jax.running.settings import Settings

@@ -11,9 +11,10 @@ import jax
 import numpy as np
 
 from vmri_jax.mechanics.checks import digest, operations
-from vmri_jax.mechanics.functions import TracedOnce, with_time
+from vmri_jax.mechanics.functions import TracedOnce
+from vmri_jax.mechanics.masses import ConstantMass
 from vmri_jax.mechanics.state import State
-from vmri_jax.mechanics.system import KineticFunction, Potentials, System
+from vmri_jax.mechanics.system import Potentials, System
 from vmri_jax.running.simulation import Simulation
 
 MOST_NUMBERS_PRINTED = 8
@@ -96,17 +97,6 @@ def _text(leaf) -> str:
 
 def _operations(system: System, start: State) -> dict[str, str]:
     """Digests of the operations of the user's functions: a function with a changed body and the same name makes another run."""
-    q_s, q_f, params = start.q_s, start.q_f, system.params
-    functions = {
-        "slow_potential": (system.slow_potential, (q_s, q_f, params)),
-        "fast_potential": (system.fast_potential, (q_f, params)),
-        "constraint": with_time(system.constraint, start.t, q_s, q_f, params),
-        "slow_constraint": with_time(system.slow_constraint, start.t, q_s, params),
-        "implied": with_time(system.implied, start.t, q_s, q_f, params),
-        "force": (system.force, (start.t, q_s, q_f, q_s, q_f, params)),
-        **{f"potential {name}": (function, (q_s, q_f, params)) for name, function in system.potentials},
-    }
-    if isinstance(system.kinetic, KineticFunction):
-        functions["kinetic"] = system.kinetic.function, (q_s, q_f, q_s, q_f, params)
-        functions["slow_kinetic"] = system.slow_kinetic, (q_s, q_s, params)
-    return {name: operations(function, *args) for name, (function, args) in functions.items() if function is not None}
+    values = {"t": start.t, "q_s": start.q_s, "q_f": start.q_f, "v_s": start.q_s, "v_f": start.q_f}
+    terms = (term for term in system.terms if not isinstance(term.function, ConstantMass))
+    return {term.place: operations(term.function, *term.of_arguments(values), system.params) for term in terms}

@@ -5,6 +5,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from vmri_jax.mechanics.arrays import library
 from vmri_jax.scene.body import end_of
 from vmri_jax.scene.declare import effect_class, names, number, positive
 from vmri_jax.scene.effect import Effect
@@ -23,12 +24,12 @@ def cosine(q):
     """Cosine of the angle at b between a and c."""
     a, b, c = q
     u, w = a - b, c - b
-    return jnp.sum(u * w, axis=-1) / jnp.sqrt(jnp.sum(u**2, axis=-1) * jnp.sum(w**2, axis=-1))
+    return (u * w).sum(axis=-1) / library(q).sqrt((u**2).sum(axis=-1) * (w**2).sum(axis=-1))
 
 
 def angle_between(q, params=None):
     """Angle at b between a and c, rad."""
-    return jnp.arccos(cosine(q))
+    return library(q).arccos(cosine(q))
 
 
 @effect_class
@@ -56,9 +57,9 @@ class Angle(_AmongPoints):
     def function(q, params):
         return elastic_energy(params["stiffness"], angle_between(q) - params["angle"])
 
-    def check_parameters(self, bodies):
-        super().check_parameters(bodies)
-        angle = self.parameters(bodies)["angle"]
+    def check_parameters(self):
+        super().check_parameters()
+        angle = self.parameters["angle"]
         expected = "it must lie between 0 and pi, where the energy is smooth; for pi take Bending"
         self.require((angle > 1e-3) & (angle < np.pi - 1e-3), "angle", angle, expected)
 
@@ -122,13 +123,19 @@ class Torsion(_AmongPoints):
         phi = jnp.arctan2(sine, jnp.sum(left * right, axis=-1))
         return jnp.sum(params["stiffness"] * (1 - jnp.cos(params["multiplicity"] * (phi - params["angle"]))))
 
-    def check_parameters(self, bodies):
-        super().check_parameters(bodies)
-        multiplicity = self.parameters(bodies)["multiplicity"]
-        self.require(multiplicity == jnp.round(multiplicity), "multiplicity", multiplicity, "it must be an integer")
+    def check_parameters(self):
+        super().check_parameters()
+        multiplicity = self.parameters["multiplicity"]
+        self.require(
+            multiplicity == library(multiplicity).round(multiplicity),
+            "multiplicity",
+            multiplicity,
+            "it must be an integer",
+        )
         expected = "they must not start on a line, where there is no dihedral angle"
-        for element in self.elements(bodies):
+        for element in self.elements:
             for corner in (element[:3], element[1:]):
-                a, b, c = (end_of(bodies, name).position for name in corner)
-                area, size = jnp.linalg.norm(jnp.cross(b - a, c - b)), jnp.linalg.norm(b - a) * jnp.linalg.norm(c - b)
+                a, b, c = (end_of(self.by_name, name).position for name in corner)
+                xp = library(a, b, c)
+                area, size = xp.linalg.norm(xp.cross(b - a, c - b)), xp.linalg.norm(b - a) * xp.linalg.norm(c - b)
                 self.require(area > 1e-9 * size, f"the area between {', '.join(corner)}", area, expected)

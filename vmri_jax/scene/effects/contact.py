@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.mechanics.arrays import real_array
+from vmri_jax.mechanics.arrays import library, real_array
 from vmri_jax.scene.body import end_of
 from vmri_jax.scene.declare import array, common, effect_class, names, number, positive
 from vmri_jax.scene.effect import Effect
@@ -32,11 +32,11 @@ class _Contact(Effect):
     kind = "potential"
     dimensions = (1, 2, 3)
 
-    def curvature(self, bodies):
+    def curvature(self):
         return self.stiffness
 
-    def drawing(self, bodies):
-        elements = self.elements(bodies)
+    def drawing(self):
+        elements = self.elements
         radii = np.broadcast_to(np.asarray(self.radius, dtype=float), len(elements)).tolist()
         return {"radii": [[name, r] for (name,), r in zip(elements, radii, strict=True) if r > 0]}
 
@@ -70,20 +70,20 @@ class PlaneContact(_Contact):
         (q,) = q
         return penalty(jnp.sum(params["normal"] * (q - params["point"]), axis=-1) - params["radius"], params)
 
-    def parameters(self, bodies):
-        params = super().parameters(bodies)
+    def _parameters(self):
+        params = super()._parameters()
         normal = params["normal"]
-        return params | {"normal": normal / jnp.linalg.norm(normal)}
+        return params | {"normal": normal / library(normal).linalg.norm(normal)}
 
-    def check_parameters(self, bodies):
-        normal = jnp.asarray(real_array(f"{self.name}: normal", self.normal))
-        self.require(jnp.any(normal != 0), "normal", self.normal, "it must not be zero")
-        super().check_parameters(bodies)
+    def check_parameters(self):
+        normal = real_array(f"{self.name}: normal", self.normal)
+        self.require((normal != 0).any(), "normal", self.normal, "it must not be zero")
+        super().check_parameters()
 
-    def drawing(self, bodies):
-        params = self.parameters(bodies)
+    def drawing(self):
+        params = self.parameters
         plane = {name: params[name].tolist() for name in ("point", "normal")}
-        return super().drawing(bodies) | {"planes": [plane]}
+        return super().drawing() | {"planes": [plane]}
 
 
 @effect_class
@@ -113,14 +113,16 @@ class SphereContact(_Contact):
         distance = jnp.linalg.norm(q - params["center"], axis=-1)
         return penalty(distance - params["sphere_radius"] - params["radius"], params)
 
-    def check_parameters(self, bodies):
-        super().check_parameters(bodies)
-        for (name,) in self.elements(bodies):
-            position = end_of(bodies, name).position
-            differs = jnp.any(position != jnp.asarray(self.center))
-            self.require(differs, f"the start of {name}", position, "it must not be the center of the sphere")
+    def check_parameters(self):
+        super().check_parameters()
+        center = self.parameters["center"]
+        for (name,) in self.elements:
+            position = end_of(self.by_name, name).position
+            self.require(
+                (position != center).any(), f"the start of {name}", position, "it must not be the center of the sphere"
+            )
 
-    def drawing(self, bodies):
-        params = self.parameters(bodies)
+    def drawing(self):
+        params = self.parameters
         sphere = {"center": params["center"].tolist(), "radius": float(params["sphere_radius"])}
-        return super().drawing(bodies) | {"spheres": [sphere]}
+        return super().drawing() | {"spheres": [sphere]}

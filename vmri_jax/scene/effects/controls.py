@@ -6,7 +6,9 @@ from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
+from vmri_jax.mechanics.arrays import real_array
 from vmri_jax.mechanics.names import AXES
 from vmri_jax.scene.body import Attachment, body_of, entry, is_entry, label_of
 from vmri_jax.scene.declare import effect_class, names, vector
@@ -72,7 +74,7 @@ class Controlled(Effect):
             value = getattr(self, argument)
             self.require(value in allowed, argument, repr(value), f"it must be {' or '.join(map(repr, allowed))}")
 
-    def bound(self, effects):
+    def resolved(self, effects):
         """The effect itself, or a `ControlledJoint` if `body` is the name of a joint."""
         joints = {effect.name: effect for effect in effects if isinstance(effect, Joint)}
         if not isinstance(self.body, str) or self.body not in joints:
@@ -86,27 +88,28 @@ class Controlled(Effect):
     def function(self) -> Callable:
         return Applied(load_on, (self.load, self.axes))
 
-    def elements(self, bodies):
+    def _elements(self):
         if not is_entry(self.body):
             raise ValueError(f"{self.name}: body is {self.body!r}; give one body or joint, and a Controlled for each.")
         return ((str(entry(self.body)),),)
 
-    def parameters(self, bodies):
+    def _parameters(self):
         name, params = entry(self.body), {}
-        body = body_of(bodies, name)
+        body = body_of(self.by_name, name)
         if self.along is not None:
             params["along"] = self.declared["along"].array(f"{self.name}: along", self.along, [body.point()])
         if body.rigid:
-            offset = jnp.asarray(name.offset) if isinstance(name, Attachment) else jnp.zeros(3)
-            params["point"] = jnp.asarray(body.weights(offset))
+            params["point"] = body.weights(name.offset if isinstance(name, Attachment) else np.zeros(3))
         return params
 
-    def check_bodies(self, bodies):
-        super().check_bodies(bodies)
+    def check_bodies(self):
+        super().check_bodies()
         name = entry(self.body)
-        body = body_of(bodies, name)
+        body = body_of(self.by_name, name)
         if self.along is not None:
-            self.require(jnp.any(jnp.asarray(self.along) != 0), "along", self.along, "it must have a direction")
+            self.require(
+                real_array(f"{self.name}: along", self.along).any(), "along", self.along, "it must have a direction"
+            )
         directors = body.size // 3 - 1 if body.rigid else 0
         if isinstance(name, Attachment) and not body.rigid:
             raise ValueError(
@@ -117,9 +120,9 @@ class Controlled(Effect):
             directors_of_body = f"{directors} of three directors" if body.rigid else "no directors"
             raise ValueError(f"{self.name}: {name} has {directors_of_body}; {load} needs a rigid body with three.")
 
-    def components(self, bodies) -> tuple[str, ...]:
+    def components(self) -> tuple[str, ...]:
         """Names of the controls."""
-        body = body_of(bodies, entry(self.body))
+        body = body_of(self.by_name, entry(self.body))
         size = body.size if not body.rigid else 3
         if self.along is not None:
             return (self.name,)
@@ -141,11 +144,11 @@ class ControlledJoint(InJoint):
     counts_turns = False
     along = staticmethod(control_along)
 
-    def check_bodies(self, bodies):
-        super().check_bodies(bodies)
-        count = len(self.elements(bodies))
+    def check_bodies(self):
+        super().check_bodies()
+        count = len(self.elements)
         self.require(count == 1, f"the number of pairs of {self.joint.name}", count, "give each pair its own joint")
 
-    def components(self, bodies) -> tuple[str, ...]:
+    def components(self) -> tuple[str, ...]:
         """Name of the control."""
         return (self.name,)

@@ -7,16 +7,18 @@ from itertools import islice
 from typing import Any, ClassVar
 
 import jax.numpy as jnp
+import numpy as np
 
 from vmri_jax.mechanics.arrays import real_array
 from vmri_jax.mechanics.checks import describe, shape_of
 from vmri_jax.mechanics.functions import NO_VELOCITY, check_arguments
 from vmri_jax.mechanics.rows import Rows
+from vmri_jax.scene.binding import MOST_ROLES
 from vmri_jax.scene.declare import effect_class, real_tree
-from vmri_jax.scene.effect import MOST_ROLES, START
+from vmri_jax.scene.effect import START
 from vmri_jax.scene.effects.freedoms import COORDINATE, FREEDOMS
 from vmri_jax.scene.effects.joint_base import OfFreedoms, freedom_of, joint_named
-from vmri_jax.scene.terms import Applied, EffectTerm, OnBodies
+from vmri_jax.scene.terms import Applied, Role
 
 
 def equation(law, freedoms: tuple[str, ...], q, params):
@@ -51,7 +53,7 @@ class _Coupling(OfFreedoms):
             )
         object.__setattr__(self, "joints", joints)
 
-    def bound(self, effects):
+    def resolved(self, effects):
         """A copy with pairs (joint, freedom) in `joints` instead of names."""
         pairs = []
         for item in self.joints:
@@ -60,8 +62,8 @@ class _Coupling(OfFreedoms):
             pairs.append((joint, freedom_of(joint, freedom, f"{self.name}: ")))
         return replace(self, joints=tuple(pairs))
 
-    def elements(self, bodies):
-        return (tuple(name for joint, _ in self.joints for name in joint.elements(bodies)[0]),)
+    def _elements(self):
+        return (tuple(name for joint, _ in self.joints for name in joint.elements[0]),)
 
     def freedoms_of(self, i):
         return tuple((joint.name, 0, freedom) for joint, freedom in self.joints)
@@ -70,31 +72,31 @@ class _Coupling(OfFreedoms):
     def function(self):
         return Applied(equation, (self.law, tuple(self.by_directors(freedom) for _, freedom in self.joints)))
 
-    def parameters(self, bodies):
-        return {"law": self.numbers(), "joints": tuple(joint.parameters(bodies) for joint, _ in self.joints)}
+    def _parameters(self):
+        return {"law": self.numbers(), "joints": tuple(joint.parameters for joint, _ in self.joints)}
 
-    def terms(self, select, bodies, layout, potentials):
+    def terms(self, select, layout):
         roles, freedoms = [], []
         for (joint, freedom), key in zip(self.joints, self.freedoms_of(0), strict=True):
             is_coordinate = key in layout.freedoms
             freedoms.append(COORDINATE if is_coordinate else self.by_directors(freedom))
             if is_coordinate:
-                roles.append(OnBodies(Rows.of([layout.freedoms[key]])))
+                roles.append(Role(Rows.of([layout.freedoms[key]]), 1, 1))
             else:
-                roles += [self._role("", (name,), bodies, layout.bodies) for name in joint.elements(bodies)[0]]
-        return (EffectTerm(self.name, Applied(equation, (self.law, tuple(freedoms))), tuple(roles)),)
+                roles += [self._role("", (name,), layout.bodies) for name in joint.elements[0]]
+        return (self._term(Applied(equation, (self.law, tuple(freedoms))), roles, (0,)),)
 
-    def check_bodies(self, bodies):
+    def check_bodies(self):
         """Nothing: the joints check their bodies themselves."""
 
-    def check_parameters(self, bodies):
-        super().check_parameters(bodies)
+    def check_parameters(self):
+        super().check_parameters()
         for joint, _ in self.joints:
-            count, expected = len(joint.elements(bodies)), "give each pair a joint of its own name"
+            count, expected = len(joint.elements), "give each pair a joint of its own name"
             self.require(count == 1, f"the number of pairs of {joint.name}", count, expected)
 
-    def check_start(self, bodies):
-        violation = jnp.abs(self.law(jnp.zeros(len(self.joints)), self.numbers()))
+    def check_start(self):
+        violation = abs(self.law(np.zeros(len(self.joints)), self.numbers()))
         expected = (
             "it must be zero at the positions in `bodies`, where all freedoms are zero; change it, or set project=True"
         )
@@ -136,18 +138,18 @@ class JointCoupling(_Coupling):
     def numbers(self):
         return real_tree(f"{self.name}: params", self.params)
 
-    def check_parameters(self, bodies):
+    def check_parameters(self):
         value: Any = shape_of(f"{self.name}: law", self.law, jnp.zeros(len(self.joints)), self.numbers())
         if getattr(value, "ndim", 2) > 1:
             raise ValueError(
                 f"{self.name}: law returns {describe(value)}; it must return one value () or several (k,)."
             )
-        super().check_parameters(bodies)
+        super().check_parameters()
 
 
 def weighted_sum(x, params):
     """``sum_i r_i x_i``."""
-    return jnp.sum(params["ratios"] * x)
+    return (params["ratios"] * x).sum()
 
 
 @effect_class
@@ -170,10 +172,10 @@ class Gear(_Coupling):
     law = staticmethod(weighted_sum)
 
     def numbers(self):
-        return {"ratios": jnp.asarray(real_array(f"{self.name}: ratios", self.ratios))}
+        return {"ratios": real_array(f"{self.name}: ratios", self.ratios)}
 
-    def check_parameters(self, bodies):
+    def check_parameters(self):
         ratios = self.numbers()["ratios"]
-        self.require(jnp.shape(ratios) == (len(self.joints),), "ratios", self.ratios, "give one for each of the joints")
+        self.require(np.shape(ratios) == (len(self.joints),), "ratios", self.ratios, "give one for each of the joints")
         self.require(ratios != 0, "ratios", self.ratios, "none of them may be zero")
-        super().check_parameters(bodies)
+        super().check_parameters()

@@ -49,6 +49,7 @@ class CustomEffect(Effect):
 
     same_size = False
     whole = True
+    of_many = False
 
     def __post_init__(self):
         if not callable(self.function):
@@ -62,7 +63,7 @@ class CustomEffect(Effect):
         if self.drawn_as not in (None, *DRAWN):
             raise ValueError(f"{self.name}: drawn_as is {self.drawn_as!r}; it must be 'link', 'spring' or None.")
 
-    def elements(self, bodies):
+    def _elements(self):
         names = (self.bodies,) if is_entry(self.bodies) else tuple(self.bodies)
         if not names or not all(map(is_entry, names)):
             kind = type(self).__name__
@@ -72,23 +73,23 @@ class CustomEffect(Effect):
             )
         return (tuple(map(entry, names)),)
 
-    def parameters(self, bodies):
-        params, points = real_tree(f"{self.name}: params", self.params), self.points(bodies)
+    def _parameters(self):
+        params, points = real_tree(f"{self.name}: params", self.params), self.points
         if points and not isinstance(params, dict):
             raise TypeError(
                 f"{self.name}: params is {self.params!r}; with points in rigid bodies it must be a dictionary."
             )
         return params | points if points else params
 
-    def check_bodies(self, bodies):
-        super().check_bodies(bodies)
+    def check_bodies(self):
+        super().check_bodies()
         if self.drawn_as is None:
             return
-        (element,) = self.elements(bodies)
+        (element,) = self.elements
         alone = f"it is drawn between bodies, and {element[0]} is alone; leave it out"
         self.require(len(element) > 1, "drawn_as", repr(self.drawn_as), alone)
         for name in element:
-            end = end_of(bodies, name)
+            end = end_of(self.by_name, name)
             sized = f"it is drawn between points, and {name} has {end.size} coordinates; leave it out"
             self.require(not end.block, "drawn_as", repr(self.drawn_as), sized)
 

@@ -9,7 +9,7 @@ from vmri_jax.mechanics.names import unknown
 from vmri_jax.scene.declare import array, effect_class, names, positive
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.effects.points import BetweenPoints
-from vmri_jax.scene.terms import TangentDamping
+from vmri_jax.scene.terms import TangentDamping, joined
 
 
 def norm(v):
@@ -126,24 +126,24 @@ class RayleighDamping(Effect):
     def masses(self):
         return () if self.mass is None else ("mass_of",)
 
-    def bound(self, effects):
-        """The effect with the names of its potentials in a tuple."""
-        potentials = [effect.name for effect in effects if effect.kind == "potential"]
+    def resolved(self, effects):
+        """The effect with its potentials in a tuple instead of their names."""
+        potentials = {effect.name: effect for effect in effects if effect.kind == "potential"}
         names = potentials if self.of is None else [self.of] if isinstance(self.of, str) else self.of
         for name in names:
             if name not in potentials:
                 raise ValueError(f"{self.name}: {unknown('potential', name, potentials)}")
-        return replace(self, of=tuple(names))
+        return replace(self, of=tuple(potentials[name] for name in names))
 
-    def elements(self, bodies):
-        return tuple((name,) for name in bodies)
+    def _elements(self):
+        return tuple((name,) for name in self.by_name)
 
-    def check_parameters(self, bodies):
+    def check_parameters(self):
         if self.mass is None and self.stiffness is None:
             raise ValueError(f"{self.name}: mass and stiffness are both None; give at least one of them.")
-        super().check_parameters(bodies)
+        super().check_parameters()
 
-    def terms(self, select, bodies, layout, potentials):
-        terms = () if self.mass is None else super().terms(select, bodies, layout, potentials)
-        damped = tuple(term for name in potentials if name in self.of for term in potentials[name])
-        return terms if self.stiffness is None or not damped else (*terms, TangentDamping(damped, self.name))
+    def terms(self, select, layout):
+        terms = () if self.mass is None else super().terms(select, layout)
+        damped = [term for potential in self.of for term in potential.terms(range(len(potential.elements)), layout)]
+        return terms if self.stiffness is None or not damped else (*terms, TangentDamping(joined(damped), self.name))

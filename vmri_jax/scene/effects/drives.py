@@ -91,15 +91,15 @@ class Drive(Effect):
     def function(self):
         return Applied(same_on_all, (self.history,))
 
-    def parameters(self, bodies):
+    def _parameters(self):
         return real_tree(f"{self.name}: params", self.params)
 
-    def check_parameters(self, bodies):
-        super().check_parameters(bodies)
-        value = shape_of(f"{self.name}: history", self.history, jnp.zeros(()), self.parameters(bodies))
+    def check_parameters(self):
+        super().check_parameters()
+        value = shape_of(f"{self.name}: history", self.history, jnp.zeros(()), self.parameters)
         shape = getattr(value, "shape", None)
-        for (name,) in self.elements(bodies):
-            size = end_of(bodies, name).size
+        for (name,) in self.elements:
+            size = end_of(self.by_name, name).size
             if shape != (size,) and (shape, size) != ((), 1):
                 raise ValueError(
                     f"{self.name}: history returns shape {shape}; {name} has dimension {size}, return ({size},)."

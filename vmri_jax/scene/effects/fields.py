@@ -36,7 +36,7 @@ class Gravity(Effect):
             return g * jnp.sum(params["mass"] * q[..., -1])
         return -jnp.sum(params["mass"] * jnp.sum(g * q, axis=-1))
 
-    def drawing(self, bodies):
+    def drawing(self):
         up = -np.asarray(self.acceleration, dtype=float)
         return {"up": up.tolist()} if up.ndim and up.any() else {}
 
@@ -73,11 +73,11 @@ class MagneticField(Effect):
             swept = jnp.sum(v * jnp.cross(jnp.broadcast_to(field, q.shape), q), axis=-1)
         return jnp.sum(params["charge"] / 2 * swept)
 
-    def check_parameters(self, bodies):
-        super().check_parameters(bodies)
-        shape = self.parameters(bodies)["field"].shape
-        for (name,) in self.elements(bodies):
-            size = end_of(bodies, name).size
+    def check_parameters(self):
+        super().check_parameters()
+        shape = self.parameters["field"].shape
+        for (name,) in self.elements:
+            size = end_of(self.by_name, name).size
             needed = () if size == 2 else (3,)
             if shape != needed:
                 raise ValueError(

@@ -5,6 +5,7 @@ For the letters see `vmri_jax.scene.effects.joints`.
 
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping
+from functools import cached_property
 from typing import Any, ClassVar
 
 import jax.numpy as jnp
@@ -13,8 +14,8 @@ import numpy as np
 from vmri_jax.mechanics.arrays import is_concrete, library, real_array
 from vmri_jax.mechanics.kinematics import Move
 from vmri_jax.mechanics.names import unknown
-from vmri_jax.scene.body import GROUND, GROUND_COORDINATES, Attachment, Bodies, body_of, label_of
-from vmri_jax.scene.declare import effect_class, names, squeeze
+from vmri_jax.scene.body import GROUND, GROUND_COORDINATES, Attachment, body_of, label_of
+from vmri_jax.scene.declare import effect_class, names, stacked
 from vmri_jax.scene.effect import START, Effect
 from vmri_jax.scene.effects.freedoms import FREEDOMS, IN_REACH, PARALLEL, Freedom, aligned, gap
 from vmri_jax.scene.layout import Key
@@ -48,47 +49,46 @@ class Joint(Effect):
     freedoms: ClassVar[tuple[Freedom, ...]] = ()
     """Names of the freedoms, in the order of `moves`."""
 
-    def elements(self, bodies):
-        return tuple(tuple(map(str, element)) for element in super().elements(bodies))
+    def _elements(self):
+        return tuple(tuple(map(str, element)) for element in super()._elements())
 
-    def parameters(self, bodies):
-        frames = {name: squeeze(library(values).stack(values)) for name, values in self._frames(bodies).items()}
-        return super().parameters(bodies) | frames
+    def _parameters(self):
+        return super()._parameters() | {name: stacked(values) for name, values in self._frames().items()}
 
-    def label(self, i: int, bodies: Bodies) -> str:
+    def label(self, i: int) -> str:
         """The name of the joint, followed by the names of both bodies of the i-th pair if the joint has several pairs."""
-        elements = self.elements(bodies)
-        return self.name if len(elements) == 1 else f"{self.name} {'-'.join(elements[i])}"
+        return self.name if len(self.elements) == 1 else f"{self.name} {'-'.join(self.elements[i])}"
 
     def pitch_of(self, i: int):
         """How far b moves along the axis per turn of the i-th pair, m; zero unless the joint is a screw."""
         return np.zeros(())
 
-    def values(self, freedom: str, pairs: Iterable[int], bodies: Bodies, coordinates: Mapping[str, Any]):
+    def values(self, freedom: str, pairs: Iterable[int], coordinates: Mapping[str, Any]):
         """A freedom of some pairs, (pairs, ...) rad or m, by the coordinates (..., n) of bodies by name; an angle is between -pi and pi."""
-        params, elements, values = self.parameters(bodies), self.elements(bodies), []
+        values = []
         for i in pairs:
-            ends = (GROUND_COORDINATES if name == GROUND else coordinates[name] for name in elements[i])
-            values.append(FREEDOMS[freedom](tuple(map(jnp.asarray, ends)), self._element_params(i, bodies, params)))
+            ends = (GROUND_COORDINATES if name == GROUND else coordinates[name] for name in self.elements[i])
+            values.append(FREEDOMS[freedom](tuple(map(jnp.asarray, ends)), self.params_of((i,))))
         return jnp.stack(values)
 
-    def frame(self, count: int) -> list | None:
+    @cached_property
+    def triads(self) -> Any:
         """(n, 3, 3) axes (m, m', n) of the joint in space, for all pairs, where the freedoms are zero; None if the joint has no axis."""
         return None
 
-    def check_bodies(self, bodies):
-        super().check_bodies(bodies)
-        for element in self.elements(bodies):
+    def check_bodies(self):
+        super().check_bodies()
+        for element in self.elements:
             for name in element:
-                body = body_of(bodies, name)
+                body = body_of(self.by_name, name)
                 if not body.rigid and (body.block or body.size != 3):
                     raise ValueError(
                         f"{self.name}: {name} has {body.size} coordinates; joints are between rigid bodies and points in space."
                     )
 
-    def check_parameters(self, bodies):
-        super().check_parameters(bodies)
-        for (a, b), points in zip(super().elements(bodies), self.joining_points(bodies), strict=True):
+    def check_parameters(self):
+        super().check_parameters()
+        for (a, b), points in zip(super()._elements(), self.joining_points, strict=True):
             if not is_concrete(points):
                 continue
             distance = np.linalg.norm(points[1] - points[0])
@@ -97,23 +97,24 @@ class Joint(Effect):
             expected = f"{first} and {second}; they must coincide at the start"
             self.require(coincide, f"the distance of the points of {a}-{b}", f"{float(distance):.6g}", expected)
 
-    def drawn_points(self, bodies):
-        params = self.parameters(bodies)
+    def drawn_points(self):
+        params = self.parameters
         points = {role: np.atleast_2d(params[f"point_{role}"]) for role in "ab"}
         return {
             f"{self.name} {'-'.join(element)} in {name}": (name, points[role][i])
-            for i, element in enumerate(self.elements(bodies))
+            for i, element in enumerate(self.elements)
             for role, name in zip("ab", element, strict=True)
             # a line to a point outside the drawn shape of a body is drawn from the centre
-            if isinstance(body := body_of(bodies, name), RigidBody) and not body.covers(points[role][i])
+            if isinstance(body := body_of(self.by_name, name), RigidBody) and not body.covers(points[role][i])
         }
 
-    def drawing(self, bodies):
-        return {"links": [[name, end] for end, (name, _) in self.drawn_points(bodies).items()]}
+    def drawing(self):
+        return {"links": [[name, end] for end, (name, _) in self.drawn_points().items()]}
 
-    def joining_points(self, bodies):
+    @cached_property
+    def joining_points(self):
         """For each pair the point of the joint in space as a has it and as b has it, at the start: [((3,), (3,)), ...]."""
-        pairs = super().elements(bodies)  # as the user wrote them: `Attachment` where a name came with a point
+        pairs = super()._elements()  # as the user wrote them: `Attachment` where a name came with a point
         if self.at is not None:
             if any(isinstance(name, Attachment) for pair in pairs for name in pair):
                 raise ValueError(
@@ -124,9 +125,9 @@ class Joint(Effect):
         for pair in pairs:
             # a point mass is joined at its position; a rigid body that came without a point, at the point of the other body
             points = [
-                body_of(bodies, name).point(getattr(name, "offset", None)).position
+                body_of(self.by_name, name).point(getattr(name, "offset", None)).position
                 for name in pair
-                if isinstance(name, Attachment) or (name != GROUND and not bodies[name].rigid)
+                if isinstance(name, Attachment) or (name != GROUND and not self.by_name[name].rigid)
             ]
             if not points:
                 raise ValueError(
@@ -136,14 +137,13 @@ class Joint(Effect):
             joining.append((points[0], points[-1]))
         return joining
 
-    def _frames(self, bodies) -> dict[str, list]:
+    def _frames(self) -> dict[str, list]:
         """Points and triads of every pair as components along the directors of each body: "point_a", "frame_a", "point_b", "frame_b"."""
-        elements, points = self.elements(bodies), self.joining_points(bodies)
-        triads = self.frame(len(elements))
+        points, triads = self.joining_points, self.triads
         components: dict[str, list] = {}
-        for i, element in enumerate(elements):
+        for i, element in enumerate(self.elements):
             for role, name, point in zip("ab", element, points[i], strict=True):
-                body = body_of(bodies, name)
+                body = body_of(self.by_name, name)
                 if not body.rigid and triads is not None:
                     raise ValueError(
                         f"{self.name}: {name} is a point, which has no axes; a point can be joined by Spherical alone."
@@ -176,12 +176,13 @@ class AboutAxis(Joint):
     def function(cls, q, params):
         return jnp.concatenate([cls.lengths(q, params), aligned(q, params, *cls.products)], axis=-1)
 
-    def frame(self, count: int):
-        return [_triad(axis) for axis in self._directions("axis", count)]
+    @cached_property
+    def triads(self):
+        return [_triad(axis) for axis in self._directions("axis")]
 
-    def _directions(self, name: str, count: int):
+    def _directions(self, name: str):
         """(n, 3) the vectors of the field `name` for all pairs, scaled to length one."""
-        vectors = _vectors(f"{self.name}: {name}", getattr(self, name), count)
+        vectors = _vectors(f"{self.name}: {name}", getattr(self, name), len(self.elements))
         lengths = library(vectors).linalg.norm(vectors, axis=-1, keepdims=True)
         self.require(lengths > 0, name, getattr(self, name), "it must not be zero")
         return vectors / lengths

@@ -6,7 +6,9 @@ from typing import Any, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
+from vmri_jax.mechanics.arrays import library
 from vmri_jax.mechanics.rows import Rows
 from vmri_jax.scene.declare import effect_class, number, of_time, positive
 from vmri_jax.scene.effect import START
@@ -14,7 +16,7 @@ from vmri_jax.scene.effects.contact import penalty
 from vmri_jax.scene.effects.freedoms import ANGLES, COORDINATE, FREEDOMS, Freedom
 from vmri_jax.scene.effects.joint_base import Joint, OfFreedoms, freedom_of, joint_named
 from vmri_jax.scene.effects.springs import elastic_energy
-from vmri_jax.scene.terms import Applied, EffectTerm, OnBodies
+from vmri_jax.scene.terms import Applied, Role
 
 
 def energy_of(law, freedom: str, q, params):
@@ -68,7 +70,7 @@ class InJoint(OfFreedoms):
     along: ClassVar[Any]
     """The function ``(law, freedom, ...)`` that makes of the law a function of coordinates; the freedom x by its name in `FREEDOMS`."""
 
-    def bound(self, effects):
+    def resolved(self, effects):
         """A copy with the joint itself instead of its name."""
         return replace(self, joint=joint_named(self.name, self.joint, effects))
 
@@ -81,28 +83,26 @@ class InJoint(OfFreedoms):
     def function(self):
         return Applied(self.along, (self.law, self.by_directors(self.freedom)))
 
-    def elements(self, bodies):
-        return self.joint.elements(bodies)
+    def _elements(self):
+        return self.joint.elements
 
     def freedoms_of(self, i):
         return ((self.joint.name, i, self.freedom),)
 
-    def terms(self, select, bodies, layout, potentials):
+    def terms(self, select, layout):
         # pairs that carry a body have x as a coordinate; those that close loops have x as a function of the coordinates of both bodies
         keys = {i: self.freedoms_of(i)[0] for i in select}
         carrying = [i for i in select if keys[i] in layout.freedoms]
-        terms = super().terms([i for i in select if i not in carrying], bodies, layout, potentials)
+        terms = super().terms([i for i in select if i not in carrying], layout)
         if not carrying:
             return terms
-        numbers = None if len(carrying) == len(self.elements(bodies)) else tuple(carrying)
-        roles = (OnBodies(Rows.of([layout.freedoms[keys[i]] for i in carrying])),)
-        function = Applied(self.along, (self.law, COORDINATE))
-        return (*terms, EffectTerm(self.name, function, roles, numbers, self.split, self.timed))
+        role = Role(Rows.of([layout.freedoms[keys[i]] for i in carrying]), len(carrying), 1)
+        return (*terms, self._term(Applied(self.along, (self.law, COORDINATE)), [role], carrying))
 
-    def parameters(self, bodies):
-        return super().parameters(bodies) | self.joint.parameters(bodies)
+    def _parameters(self):
+        return super()._parameters() | self.joint.parameters
 
-    def check_bodies(self, bodies):
+    def check_bodies(self):
         """Refuse a joint without this freedom; the joint checks its bodies itself."""
         _ = self.freedom
 
@@ -161,12 +161,12 @@ class JointLimit(InJoint):
     def law(x, params):
         return penalty(x - params["lower"], params) + penalty(params["upper"] - x, params)
 
-    def curvature(self, bodies):
+    def curvature(self):
         return None if self.freedom in ANGLES else self.stiffness
 
-    def check_parameters(self, bodies):
-        super().check_parameters(bodies)
-        params = self.parameters(bodies)
+    def check_parameters(self):
+        super().check_parameters()
+        params = self.parameters
         self.require(params["lower"] < params["upper"], "lower", params["lower"], "it must be below upper")
 
 
@@ -269,7 +269,7 @@ class JointMotion(InJoint):
     def law(self):
         return self.path
 
-    def check_parameters(self, bodies):
-        super().check_parameters(bodies)
-        start = self.path(jnp.zeros(()), self.parameters(bodies)["path"])
-        self.require(jnp.abs(jnp.asarray(start)) < START, "path(0)", start, "the joint starts at zero")
+    def check_parameters(self):
+        super().check_parameters()
+        start = self.path(np.zeros(()), self.parameters["path"])
+        self.require(abs(library(start).asarray(start)) < START, "path(0)", start, "the joint starts at zero")

@@ -20,11 +20,12 @@ then only scaled: it still vanishes for the right directions of the axes.
 Source: P. Betsch, S. Leyendecker, Int. J. Numer. Meth. Engng 67 (2006).
 """
 
+from functools import cached_property
 from typing import Any
 
 import jax.numpy as jnp
 
-from vmri_jax.mechanics.arrays import library, real_array
+from vmri_jax.mechanics.arrays import library
 from vmri_jax.mechanics.kinematics import Move
 from vmri_jax.scene.declare import effect_class, number
 from vmri_jax.scene.effect import START
@@ -88,8 +89,9 @@ class Universal(AboutAxis):
     freedoms = ("turn", "tilt")
     products = ((N, M),)
 
-    def frame(self, count: int):
-        first, second = self._directions("axis", count), self._directions("second", count)
+    @cached_property
+    def triads(self):
+        first, second = self._directions("axis"), self._directions("second")
         product, xp = (first * second).sum(axis=-1), library(first, second)
         self.require(abs(product) < START, "axis . second", product, "the axes must be perpendicular")
         return [xp.stack([m, xp.cross(n, m), n]) for n, m in zip(first, second, strict=True)]
@@ -142,13 +144,13 @@ class Screw(AboutAxis):
     moves = (Move("screw", N),)
     freedoms = ("turn",)
 
-    def check_parameters(self, bodies):
-        super().check_parameters(bodies)
-        pitch = self.parameters(bodies)["pitch"]
+    def check_parameters(self):
+        super().check_parameters()
+        pitch = self.parameters["pitch"]
         self.require(pitch != 0, "pitch", pitch, "it must not be zero; take Revolute if b does not move along the axis")
 
     def pitch_of(self, i):
-        pitch = real_array(f"{self.name}: pitch", self.pitch)
+        pitch = self.parameters["pitch"]
         return pitch[i] if pitch.ndim else pitch
 
     @staticmethod

@@ -4,7 +4,7 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from vmri_jax.scene.body import end_of
+from vmri_jax.mechanics.arrays import library
 from vmri_jax.scene.declare import effect_class, positive
 from vmri_jax.scene.effect import START, Effect
 from vmri_jax.scene.effects.points import BetweenPoints, ToFixedPoint, ToPath
@@ -104,9 +104,10 @@ class Guide(ToPath):
     def law(line, params):
         return line
 
-    def check_start(self, bodies):
-        super().check_start(bodies)
-        distance = self.at_start(bodies, self.parameters(bodies))
-        size = jnp.max(jnp.abs(jnp.stack([end_of(bodies, name).position for (name,) in self.elements(bodies)])))
+    def check_start(self):
+        super().check_start()
+        distance = self.at_start(self.parameters)
+        (positions,) = self.positions(range(len(self.elements)))
+        size = abs(positions).max()
         quantity = "the distance of the body from its point at t = 0"
-        self.require(distance <= START * jnp.maximum(size, 1.0), quantity, distance, "it must start there")
+        self.require(distance <= START * library(size).maximum(size, 1.0), quantity, distance, "it must start there")

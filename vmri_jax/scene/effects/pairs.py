@@ -10,7 +10,7 @@ import numpy as np
 from vmri_jax.mechanics.arrays import is_concrete
 from vmri_jax.mechanics.checks import check_type
 from vmri_jax.mechanics.names import unknown
-from vmri_jax.scene.declare import array, effect_class, names, number, positive, real_tree, squeeze
+from vmri_jax.scene.declare import array, effect_class, names, number, positive, real_tree, stacked
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.effects.points import distance
 
@@ -57,8 +57,8 @@ class _Nonbonded(Effect):
     dimensions = (1, 2, 3)
     apart = True
 
-    def elements(self, bodies):
-        pairs = super().elements(bodies)
+    def _elements(self):
+        pairs = super()._elements()
         known, left_out = {name for pair in pairs for name in pair}, set()
         for pair in self.exclude:
             if isinstance(pair, str) or len(pair) != 2:
@@ -66,7 +66,7 @@ class _Nonbonded(Effect):
                     f"{self.name}: {pair!r} is in exclude; give pairs of names, as from within_bonds(bonds, 3)."
                 )
             for name in pair:
-                if name not in bodies:
+                if name not in self.by_name:
                     raise ValueError(f"{self.name}: exclude: {unknown('body', name, sorted(known))}")
             left_out.add(frozenset(pair))
         kept = tuple(pair for pair in pairs if frozenset(pair) not in left_out)
@@ -118,25 +118,30 @@ class Coulomb(_Nonbonded):
     default_name = "coulomb"
     derived = ("charge_a", "charge_b")
 
+    def __post_init__(self):
+        super().__post_init__()
+        if self.between is None and isinstance(self.charges, Mapping):
+            object.__setattr__(self, "between", tuple(self.charges))
+
     @staticmethod
     def function(q, params):
         return params["constant"] * jnp.sum(params["charge_a"] * params["charge_b"] / distance(q))
 
-    def elements(self, bodies):
+    def _elements(self):
         check_type(
             f"{self.name}: charges", self.charges, Mapping, "a dictionary of charges by name of the body, {'a': 1e-6}"
         )
-        pairs = super().elements(self.charges if self.between is None else bodies)
+        pairs = super()._elements()
         for name in (name for pair in pairs for name in pair):
             if name not in self.charges:
                 raise ValueError(f"{self.name}: {name} has no charge; there are charges of {', '.join(self.charges)}.")
         return pairs
 
-    def parameters(self, bodies):
+    def _parameters(self):
         charges = real_tree(f"{self.name}: charges", self.charges)
-        roles = zip(self.derived, zip(*self.elements(bodies), strict=True), strict=True)
-        of_roles = {name: squeeze(jnp.stack([charges[body] for body in role])) for name, role in roles}
-        return super().parameters(bodies) | of_roles
+        roles = zip(self.derived, zip(*self.elements, strict=True), strict=True)
+        of_roles = {name: stacked([charges[body] for body in role]) for name, role in roles}
+        return super()._parameters() | of_roles
 
 
 @effect_class

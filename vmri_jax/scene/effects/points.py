@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from vmri_jax.mechanics.arrays import library
 from vmri_jax.scene.body import end_of, label_of
 from vmri_jax.scene.declare import effect_class, names, of_time, real_tree, vector
 from vmri_jax.scene.effect import Effect
@@ -20,7 +21,7 @@ from vmri_jax.scene.terms import Applied
 def distance(q, params=None):
     """``|q_b - q_a|``, (...) m."""
     a, b = q
-    return jnp.linalg.norm(b - a, axis=-1)
+    return library(q).linalg.norm(b - a, axis=-1)
 
 
 @effect_class
@@ -56,12 +57,12 @@ class ToPoint(Effect):
 
     def rest(self, q, params):
         """Distance of a body from the point at the start."""
-        (q,) = q
-        return jnp.linalg.norm(q - self.point_at_start(params), axis=-1)
+        line = q[0] - self.point_at_start(params)
+        return library(line).linalg.norm(line, axis=-1)
 
-    def require_apart(self, bodies):
+    def require_apart(self):
         """Refuse bodies that start at the point."""
-        distance = self.at_start(bodies, self.parameters(bodies))
+        distance = self.at_start(self.parameters)
         expected = f"bodies must not start there; {self.advice}"
         self.require(distance > 0, "the distance of a body from its point", distance, expected)
 
@@ -85,11 +86,11 @@ class ToFixedPoint(ToPoint):
                 "point that moves take MovingPivot (a rigid link), Guide (the point itself) or MovingAnchor (a spring)."
             )
 
-    def drawing(self, bodies):
-        points = np.atleast_2d(self.parameters(bodies)["point"])
+    def drawing(self):
+        points = np.atleast_2d(self.parameters["point"])
         anchors = []
-        for (name,), point in zip(self.elements(bodies), points.tolist(), strict=True):
-            if not end_of(bodies, name).block:
+        for (name,), point in zip(self.elements, points.tolist(), strict=True):
+            if not end_of(self.by_name, name).block:
                 anchors.append({"body": label_of(name), "point": point, "kind": self.drawn_as})
         return {"anchors": anchors}
 
@@ -115,13 +116,13 @@ class ToPath(ToPoint):
         return Applied(along_path, (self.law, self.path))
 
     def point_at_start(self, params):
-        return self.path(jnp.zeros(()), real_tree(f"{self.name}: params", self.params))
+        return self.path(np.zeros(()), real_tree(f"{self.name}: params", self.params))
 
-    def check_bodies(self, bodies):
-        super().check_bodies(bodies)
+    def check_bodies(self):
+        super().check_bodies()
         shape = jax.eval_shape(lambda: jnp.asarray(self.point_at_start({}))).shape
-        for (name,) in self.elements(bodies):
-            size = end_of(bodies, name).size
+        for (name,) in self.elements:
+            size = end_of(self.by_name, name).size
             if shape != (size,):
                 raise ValueError(
                     f"{self.name}: path returns shape {shape}; {name} has dimension {size}, return ({size},)."

@@ -67,9 +67,9 @@ class NonlinearSpring(BetweenPoints):
             energy = (energy + params["coefficients"][j - 1] / (j + 1)) * e
         return jnp.sum(energy * e)
 
-    def check_parameters(self, bodies):
-        super().check_parameters(bodies)
-        coefficients = self.parameters(bodies)["coefficients"]
+    def check_parameters(self):
+        super().check_parameters()
+        coefficients = self.parameters["coefficients"]
         is_vector = coefficients.ndim == 1 and coefficients.size > 0
         self.require(is_vector, "coefficients", repr(self.coefficients), "give (k_1, k_2, ...), at least one number")
 

@@ -1,0 +1,113 @@
+"""Terms: a system is its coordinates and a list of terms, each a function with a kind.
+
+| symbol | argument of `System` | kind | function |
+|---|---|---|---|
+| T | kinetic | kinetic | ``T(q_s, q_f, v_s, v_f, params) -> ()``, or a `ConstantMass` |
+| T_s | slow_kinetic | kinetic | ``T_s(q_s, v_s, params) -> ()`` |
+| V | slow_potential | potential | ``V(q_s, q_f, params) -> ()`` |
+| W | fast_potential | potential | ``W(q_f, params) -> ()`` |
+| a name, or k | potentials | potential | ``V_i(q_s, q_f, params) -> ()`` |
+| g | constraint | constraint | ``g(q_s, q_f, params) -> (n_g,)`` |
+| g_s | slow_constraint | constraint | ``g_s(q_s, params) -> (n_gs,)`` |
+| F | force | force | ``F(t, q_s, q_f, v_s, v_f, params) -> (F_s, F_f)`` |
+| g_i | implied | implied | ``g_i(q_s, q_f, params) -> (n_i,)`` |
+
+A constraint or implied row that is `Rheonomic` gets t before the other arguments.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from vmri_jax.mechanics.functions import Rheonomic
+
+POSITIONS, VELOCITIES = ("q_s", "q_f"), ("v_s", "v_f")
+
+
+class Kind(NamedTuple):
+    """What `System` expects of one of its functions.
+
+    symbol: of the term; empty for further potentials, whose symbols are their names.
+    kind: "kinetic", "potential", "constraint", "force" or "implied".
+    arguments: names of the arguments, without time and params.
+    in_words: for summaries, before the symbol or name.
+    """
+
+    symbol: str
+    kind: str
+    arguments: tuple[str, ...]
+    in_words: str
+
+    @property
+    def call(self) -> str:
+        """The arguments of a call, ``q_s, q_f, params``."""
+        return ", ".join((*self.arguments, "params"))
+
+
+KINDS: dict[str, Kind] = {
+    "kinetic": Kind("T", "kinetic", (*POSITIONS, *VELOCITIES), "kinetic energy"),
+    "slow_kinetic": Kind("T_s", "kinetic", ("q_s", "v_s"), "kinetic energy"),
+    "slow_potential": Kind("V", "potential", POSITIONS, "slow potential"),
+    "fast_potential": Kind("W", "potential", ("q_f",), "fast potential"),
+    "constraint": Kind("g", "constraint", POSITIONS, "constraint"),
+    "slow_constraint": Kind("g_s", "constraint", ("q_s",), "slow constraint"),
+    "potentials": Kind("", "potential", POSITIONS, "potential"),
+    "force": Kind("F", "force", ("t", *POSITIONS, *VELOCITIES), "force"),
+    "implied": Kind("g_i", "implied", POSITIONS, "implied rows"),
+}
+"""The functions of a system, by the argument of `System`, in the order of summaries."""
+
+
+class Term(NamedTuple):
+    """A function of a system.
+
+    field: the argument of `System` that has it.
+    name: its symbol, or the name of a further potential: a text, or a whole number k.
+    kind: as of `Kind`.
+    arguments: names of its arguments, without params: some of t, q_s, q_f, v_s, v_f.
+    """
+
+    field: str
+    name: str | int
+    kind: str
+    arguments: tuple[str, ...]
+    function: Callable
+
+    @classmethod
+    def of(cls, field: str, function: Callable | Rheonomic, name: str | int = "") -> "Term":
+        """The term of a function of `System`; `name` is of a further potential."""
+        kind = KINDS[field]
+        if isinstance(function, Rheonomic):
+            return cls(field, kind.symbol, kind.kind, ("t", *kind.arguments), function.function)
+        return cls(field, kind.symbol or name, kind.kind, kind.arguments, function)
+
+    def __call__(self, params, **values):
+        """The value of the function, with its arguments by name among `values`."""
+        return self.function(*self.of_arguments(values), params)
+
+    def of_arguments(self, values) -> list:
+        """Its arguments, in order, out of a mapping by name."""
+        return [values[name] for name in self.arguments]
+
+    @property
+    def label(self) -> str:
+        """Its name in texts: V_k for the potential k."""
+        return label(self.name)
+
+    @property
+    def place(self) -> str:
+        """Its place in messages, ``slow_potential`` or ``potentials['bends']``."""
+        return f"potentials[{self.name!r}]" if self.field == "potentials" else self.field
+
+    @property
+    def moves(self) -> bool:
+        """Whether its rows depend on time, so that `System` takes its function as `Rheonomic`."""
+        return "t" in self.arguments and self.kind != "force"
+
+    def in_system(self, function: Callable) -> Any:
+        """Another function with the same arguments, as an argument of `System`."""
+        return Rheonomic(function) if self.moves else function
+
+
+def label(name: str | int) -> str:
+    """The name of a potential in texts; V_k for the name k."""
+    return f"V_{name}" if isinstance(name, int) else name

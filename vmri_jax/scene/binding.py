@@ -1,0 +1,217 @@
+"""Binding of effects to the bodies of a scene: elements, parameters, values at the start, and terms are computed once."""
+
+from abc import ABC
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import field, fields, replace
+from functools import cached_property
+from typing import Any, ClassVar, Literal, Self
+
+import numpy as np
+
+from vmri_jax.mechanics.arrays import library
+from vmri_jax.mechanics.rows import Place, Rows
+from vmri_jax.scene.body import GROUND, Attachment, Bodies, Point, body_of, end_of, label_of, moving
+from vmri_jax.scene.declare import Elements, Parameter, effect_class, real_tree, stacked
+from vmri_jax.scene.layout import Key, Layout
+from vmri_jax.scene.terms import EffectTerm, Role, Source, choose
+
+MOST_ROLES = 32
+"""Most bodies of an element: the two bodies of each of sixteen joints that one equation couples. More are refused."""
+POINTS = tuple(f"at_{role}" for role in range(MOST_ROLES))
+"""Names of the parameters that hold points fixed in rigid bodies, one for each role."""
+ALONE = "alone"
+"""Name of the term of a single element, the same for all effects, so that equal functions share a compiled program."""
+
+
+@effect_class
+class Bindable(ABC):
+    """An effect with the bodies of its scene; see `vmri_jax.scene.effect.Effect` for the attributes of its class.
+
+    What depends on bodies is known of bound effects alone, see `bound`.
+    """
+
+    function: ClassVar[Any]
+    rest: ClassVar[Any] = None
+    """``rest(q, params) -> (n,)``: the values of a `measured` parameter of n elements at the start; () of a single element."""
+    timed: ClassVar[bool] = False
+    """Whether a constraint depends on time."""
+    masses: ClassVar[tuple[str, ...]] = ()
+    """Names of parameters that hold the masses of the bodies, one for each role."""
+    derived: ClassVar[tuple[str, ...]] = ()
+    """Names of parameters that are computed from fields and bodies, and have an entry for each element."""
+    whole: ClassVar[bool] = False
+    """Whether the function gets all coordinates of a rigid body instead of the coordinates of its centre."""
+    of_many: ClassVar[bool] = True
+    """Whether the function takes any number of elements; effects of one kind with such a function are one term of the system."""
+    name: str = field(default="", kw_only=True)
+    rate: Literal["slow", "fast", "auto"] | int = field(default="auto", kw_only=True)
+
+    @property
+    def declared(self) -> dict[str, Parameter]:
+        """The declared parameters by name."""
+        return {f.name: f.metadata["parameter"] for f in fields(self) if "parameter" in f.metadata}
+
+    def bound(self, bodies: Bodies) -> Self:
+        """A copy that knows the bodies of its scene; the effect itself if it knows these bodies already."""
+        if vars(self).get("_by_name") is bodies:
+            return self
+        copied = replace(self)
+        vars(copied)["_by_name"] = bodies
+        return copied
+
+    def resolved(self, effects: Sequence[Any]) -> Any:
+        """A copy in which names of other effects, such as joints, are replaced by these effects, which are bound.
+
+        Raises:
+            ValueError: a name that no such effect has.
+        """
+        return self
+
+    @property
+    def by_name(self) -> Bodies:
+        """All bodies of the scene by name."""
+        return vars(self)["_by_name"]
+
+    @cached_property
+    def elements(self) -> Elements:
+        """Names of the bodies of every element."""
+        return self._elements()
+
+    @cached_property
+    def parameters(self) -> dict[str, Any]:
+        """The params of the function: arrays by name; of NumPy unless an entry is traced."""
+        return self._parameters()
+
+    @cached_property
+    def ends(self) -> tuple[tuple[Point, ...], ...]:
+        """The points at the start that every element acts on, one for each role."""
+        return tuple(tuple(end_of(self.by_name, name, self.whole) for name in element) for element in self.elements)
+
+    def _elements(self) -> Elements:
+        """See `elements`."""
+        names = next(f for f in fields(self) if "names" in f.metadata)
+        argument, about = getattr(self, names.name), f"{self.name}: {names.name}"
+        return names.metadata["names"].elements(argument, self.by_name, about)
+
+    def _parameters(self) -> dict[str, Any]:
+        """See `parameters`."""
+        params, firsts = {}, [ends[0] for ends in self.ends]
+        for name, parameter in self.declared.items():
+            if getattr(self, name) is not None:
+                params[name] = parameter.array(f"{self.name}: {name}", getattr(self, name), firsts)
+        for argument in fields(self):
+            if "of_time" in argument.metadata:
+                params[argument.name] = real_tree(f"{self.name}: params", vars(self)["params"])
+        for role, name in enumerate(self.masses):
+            params[name] = stacked([self._mass(element[role]) for element in self.elements])
+        params |= self.points
+        for name, parameter in self.declared.items():
+            if parameter.measured and name not in params:
+                params[name] = self.at_start(params)
+        return params
+
+    def _mass(self, name: str):
+        """The mass () of a body, refused if it has none or several."""
+        mass = end_of(self.by_name, name).mass
+        if mass is None:
+            raise ValueError(
+                f"{self.name}: {label_of(name)} has no mass; this effect needs the mass of a whole body. Name a body with mass, without a point."
+            )
+        if mass.ndim:
+            raise ValueError(
+                f"{self.name}: {name} has a mass for each coordinate; this effect needs one mass for each body. Leave this body out, or give it one mass."
+            )
+        return mass
+
+    @cached_property
+    def points(self) -> dict[str, Any]:
+        """For each role with points fixed in rigid bodies, the components X of these points along the directors; zeros for whole bodies."""
+        points = {}
+        for parameter, role in zip(POINTS, zip(*self.elements, strict=True), strict=False):
+            offsets = [getattr(name, "offset", None) for name in role]
+            if any(offset is not None for offset in offsets):
+                bodies = [body_of(self.by_name, name) for name in role]
+                ends = zip(bodies, offsets, strict=True)
+                points[parameter] = stacked([np.zeros(3) if x is None else body.weights(x) for body, x in ends])
+        return points
+
+    def at_start(self, params: Mapping[str, Any]):
+        """The measured value of every element at the start, (n,), or () of a single element."""
+        values: dict[int, Any] = {}
+        for group in self.by_size():
+            of_group = self.rest(self.positions(group), self.params_of(group, params))
+            values |= zip(group, library(of_group).atleast_1d(of_group), strict=True)
+        return stacked([values[i] for i in sorted(values)])
+
+    def positions(self, group: Sequence[int]) -> tuple[Any, ...]:
+        """The argument q of the function for elements of the same size at the start."""
+        roles = zip(*(self.ends[i] for i in group), strict=True)
+        return tuple(stacked([end.position for end in role]) for role in roles)
+
+    def params_of(self, group: Sequence[int], params: Any = None) -> Any:
+        """The argument params of the function for some elements, from the `params` of all elements."""
+        params = self.parameters if params is None else params
+        return params if len(self.elements) == len(group) else choose(params, group, self.split_of(params))
+
+    def split_of(self, params: Any) -> tuple[str, ...]:
+        """Names in params that have an entry for each element, or a single number for all; none in a tree of a user that is no dictionary."""
+        declared = [name for name, parameter in self.declared.items() if parameter.shape in ("number", "vector")]
+        names = (*declared, *self.masses, *self.derived, *POINTS) if isinstance(params, dict) else ()
+        return tuple(name for name in names if name in params)
+
+    def element_term(self, i: int, freedoms: Sequence[Key] = ()) -> tuple[EffectTerm, dict[str, Any]]:
+        """Element i as a term of the coordinates of its moving bodies, one after the other, and its part of the params of all elements.
+
+        The term takes these coordinates, followed by `freedoms` that are coordinates of the scene, as q_s, and no q_f.
+        """
+        places, end = {}, 0
+        for name in moving(self.elements[i]):
+            places[name] = Place("s", end, self.by_name[name].size)
+            end += self.by_name[name].size
+        of_freedoms = {key: Place("s", end + k, 1) for k, key in enumerate(freedoms)}
+        (term,) = self.terms((i,), Layout(places, {}, of_freedoms))
+        # without the name and number of the element, equal terms share a compiled program
+        return replace(term, sources=(Source(ALONE, 1),)), {ALONE: self.params_of((i,))}
+
+    def freedoms_of(self, i: int) -> tuple[Key, ...]:
+        """The freedoms of joints that element i is a function of; () if it depends on other coordinates."""
+        return ()
+
+    def by_size(self, select: Sequence[int] | None = None) -> list[list[int]]:
+        """Some or all elements, by their numbers, in groups between bodies of the same sizes and kinds: each group is a term."""
+        groups: dict[tuple, list[int]] = {}
+        for i in range(len(self.elements)) if select is None else select:
+            kinds = tuple(
+                (name == GROUND, isinstance(name, Attachment), body_of(self.by_name, name).size, end.size)
+                for name, end in zip(self.elements[i], self.ends[i], strict=True)
+            )
+            groups.setdefault(kinds, []).append(i)
+        return list(groups.values())
+
+    def terms(self, select: Sequence[int], layout: Layout) -> tuple:
+        """The terms of some elements, one for each group `by_size`."""
+        terms = []
+        for group in self.by_size(select):
+            roles = zip(POINTS, zip(*(self.elements[i] for i in group), strict=True), strict=False)
+            terms.append(self._term(self.function, [self._role(*role, layout.bodies) for role in roles], group))
+        return tuple(terms)
+
+    def _term(self, function: Any, roles: Iterable[Role], group: Sequence[int]) -> EffectTerm:
+        """A function of some elements as a term."""
+        select = None if len(group) == len(self.elements) else tuple(group)
+        split, sources = self.split_of(self.parameters), (Source(self.name, len(group), select),)
+        is_joined = self.of_many and len(split) == len(self.parameters)  # no parameter is common to all elements
+        return EffectTerm(sources, function, tuple(roles), split, self.timed, is_joined)
+
+    def _role(self, parameter: str, names: Sequence[str], places: Mapping[str, Place]) -> Role:
+        """The map from q_s and q_f to the coordinates of the bodies of a role, all of the same kind, or to points in them, which are a parameter."""
+        size = end_of(self.by_name, names[0], self.whole).size
+        point = parameter if isinstance(names[0], Attachment) else ""
+        rows = None if names[0] == GROUND else Rows.of([places[name] for name in names], None if point else size)
+        return Role(rows, len(names), size, point)
+
+
+def bound(effects: Sequence[Any], bodies: Bodies) -> tuple[Any, ...]:
+    """The effects on the bodies of a scene, with bound effects in place of their names."""
+    on_bodies = [effect.bound(bodies) for effect in effects]
+    return tuple(effect.resolved(on_bodies).bound(bodies) for effect in on_bodies)
