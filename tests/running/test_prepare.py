@@ -1,6 +1,7 @@
 """Prepared runs: the same as `simulate`, compiled once for other starts, steps, parameters and numbers of steps."""
 
 from collections import Counter
+from typing import Any
 
 import jax
 import jax.numpy as jnp

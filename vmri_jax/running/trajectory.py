@@ -186,11 +186,25 @@ class Trajectory(Exports):
         return jax.tree.map(lambda a: a[*lanes, number], self.states)
 
     def _part(self, first: int, last: int, stride: int) -> "Trajectory":
+        """The nodes first, first + stride, ..., last; the work of the solver between two of them is the maximum, and a failure after the last is left out."""
         if not is_concrete(self.energy):
             raise TypeError("Trajectory: the run is traced by JAX; take slices of its arrays, run.q_s[a:b].")
-        part = from_named_arrays(part_of(named_arrays(self), first, last, stride))
-        error: Any = None if self.error is None else self.error.part(slice(first, last + 1, stride))
-        return with_origin(part, self.origin, error=error)
+        lanes, starts = (slice(None),) * (np.ndim(self.t) - 1), range(0, last - first, stride)
+        nodes, ends = slice(first, last + 1, stride), slice(first + stride - 1, last, stride)
+
+        def largest(value):
+            between = np.asarray(value)[*lanes, first:last]
+            return np.maximum.reduceat(between, starts, axis=len(lanes)) if starts else between
+
+        at_nodes = (self.states, self.energy, self.constraint_residual)
+        states, energy, residual = jax.tree.map(lambda a: np.asarray(a)[*lanes, nodes], at_nodes)
+        fails_later = (np.asarray(self.failed_at) >= 0) & ~np.isnan(energy).any(axis=-1)
+        result = np.where(fails_later, int(Result.CONVERGED), self.result)
+        failed_at = np.where(fails_later, -1, self.failed_at)
+        micro = jax.tree.map(lambda a: np.asarray(a)[*lanes, ends], self.micro)
+        error: Any = None if self.error is None else self.error.part(nodes)
+        info = jax.tree.map(largest, self.info)
+        return with_origin(Trajectory(states, energy, residual, info, result, failed_at, micro, error), self.origin)
 
     def lane(self, i: int) -> "Trajectory":
         """One run of a batch.
@@ -289,32 +303,6 @@ def with_origin(trajectory: Trajectory, origin: Origin, **arrays) -> Trajectory:
 def with_observables(run: Trajectory, table, origin: Origin = UNKNOWN) -> Trajectory:
     """A run with energy and constraints from its `Observables` (..., k, 9), and with its origin."""
     return with_origin(run, origin, energy=table[..., 0], constraint_residual=table[..., 1:3])
-
-
-def part_of(arrays: dict, first: int, last: int, stride: int) -> dict:
-    """The arrays of the nodes first, first + stride, ..., last of a trajectory.
-
-    Between two of these nodes the work of the solver is the maximum over the intervals; a failure after the last node is left out.
-    """
-    lanes = (slice(None),) * (np.ndim(arrays["t"]) - 1)
-
-    def part(name: str, value):
-        value = np.asarray(value)
-        if name in NODES:
-            return value[*lanes, first : last + 1 : stride]
-        if name in MICRO:
-            return value[*lanes, first + stride - 1 : last : stride]
-        between = value[*lanes, first:last]
-        starts = range(0, last - first, stride)
-        return np.maximum.reduceat(between, starts, axis=len(lanes)) if starts else between
-
-    without_rows = (*STATUS, *ERROR)
-    parts: dict = {name: None if a is None else part(name, a) for name, a in arrays.items() if name not in without_rows}
-    failed = np.isnan(parts["energy"]).any(axis=-1)
-    ends_before_failure = (np.asarray(arrays["failed_at"]) >= 0) & ~failed
-    parts["failed_at"] = np.where(ends_before_failure, -1, arrays["failed_at"])
-    parts["result"] = np.where(ends_before_failure, int(Result.CONVERGED), arrays["result"])
-    return parts
 
 
 Piece = tuple[Trajectory, Any]
