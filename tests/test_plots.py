@@ -15,12 +15,11 @@ from vmri_jax.mechanics.names import Names
 from vmri_jax.running.origin import Origin
 from vmri_jax.running.trajectory import RunInfo, with_origin
 from vmri_jax.study import (
-    ConvergenceRow,
     ConvergenceStudy,
     CostReport,
     ReferenceSolution,
+    Row,
     WorkPrecision,
-    WorkRow,
 )
 from vmri_jax.study.cost_report import Answer
 
@@ -49,9 +48,7 @@ def run(num_nodes=21, n_s=2, n_f=3, constrained=False):
 def study(orders=(1, 2)):
     """A convergence study of exact orders."""
     rows = [
-        ConvergenceRow(
-            f"order {order}", "", 5, 1, dt, dt**order, 10 * dt**order, 0.0, 0.0, 0.0, 0.0, 0.0, 2, "MARCH", "CONVERGED"
-        )
+        Row(f"order {order}", 5, order, round(1 / dt), dt, dt**order, 10 * dt**order)
         for order in orders
         for dt in (0.1, 0.01, 0.001)
     ]
@@ -214,11 +211,9 @@ def test_global_settings_stay_as_they_were():
 EXACT = ReferenceSolution(np.zeros((2, 2)), np.zeros((2, 2)))
 
 
-def work_row(error: float, seconds: float = 1e-3) -> WorkRow:
+def work_row(error: float, seconds: float = 1e-3) -> Row:
     """A run with this error and time."""
-    return WorkRow(
-        "impulse", 2, 2, 4, 0.1, error, error, seconds, seconds, seconds, 1.0, 0, 0, 0, 1, "EXPLICIT", "CONVERGED"
-    )
+    return Row("impulse", 2, 2, 4, 0.1, error, error, seconds=seconds, low=seconds, high=seconds)
 
 
 @pytest.mark.parametrize(
@@ -232,13 +227,8 @@ def test_runs_without_a_positive_error_or_work_are_drawn(errors, work):
 
 @pytest.mark.parametrize("errors", [(0.0, 0.0), (np.nan, np.nan)], ids=["zero", "failed"])
 def test_convergence_without_a_positive_error_is_drawn(errors):
-    numbers = dict.fromkeys(
-        ("energy_error", "energy_drift", "energy_band", "momentum_error", "constraint_residual"), 0.0
-    )
-    rows = tuple(
-        ConvergenceRow("impulse", "", 2, 1, step, error, error, iterations=1, method="EXPLICIT", result="", **numbers)
-        for step, error in zip((0.1, 0.05), errors, strict=True)
-    )
+    steps = zip((1, 2), errors, strict=True)
+    rows = tuple(Row("impulse", 2, 2, n, 0.1 / n, error, error) for n, error in steps)
     assert is_drawn(ConvergenceStudy(rows, {"": EXACT}).plot("errors", [2]))
 
 

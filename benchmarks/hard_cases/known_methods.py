@@ -11,7 +11,7 @@ from vmri_jax.hard_cases.measures import difference, run
 from vmri_jax.mechanics.invariants import potential_energy
 from vmri_jax.mechanics.state import Problem
 from vmri_jax.schemes.scheme import Scheme
-from vmri_jax.study.program import joined
+from vmri_jax.study.reference_solution import joined
 
 ROUND_OFF = 4 * np.finfo(float).eps
 """Round-off of a position in a step, as a part of the largest position; a larger value hides differences of momenta."""

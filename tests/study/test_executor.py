@@ -24,7 +24,7 @@ def client():
 def test_convergence_study(client):
     schemes = {"implicit": vm.fully_implicit(2), "explicit": vm.explicit_slow(2)}
     study = partial(convergence_study, two_oscillators(), schemes, [0.02, 0.01], 0.2, num_saves=2)
-    assert study().rows == study(executor=client).rows
+    assert study().to_pandas().equals(study(executor=client).to_pandas())
 
 
 def test_stability_map(client):

@@ -11,13 +11,12 @@ from tests.small_systems import one_coordinate
 from vmri_jax.accuracy.families import of_order_2
 from vmri_jax.study import (
     ConvergenceStudy,
-    Program,
     ReferenceSolution,
     convergence_study,
     cost_report,
     work_precision,
 )
-from vmri_jax.study.program import joined
+from vmri_jax.study.reference_solution import joined
 
 SCHEME, T_END = vm.fully_explicit(1), 0.08
 
@@ -34,7 +33,9 @@ def ctrl_c(words: str):
 
 @pytest.fixture(scope="module")
 def reference() -> ReferenceSolution:
-    return ReferenceSolution(*joined(Program(one_coordinate(), SCHEME, T_END)(256)))
+    return ReferenceSolution(
+        *joined(vm.simulate(one_coordinate(), SCHEME, macro_dt=T_END / 256, num_steps=256, save_every=256))
+    )
 
 
 def test_convergence_studies_keep_their_rows(reference):

@@ -8,12 +8,12 @@ import pytest
 
 import vmri_jax as vm
 from tests.small_systems import no_constraint
-from vmri_jax.study import ReferenceSolution, WorkPrecision, WorkRow, work_precision
+from vmri_jax.study import ReferenceSolution, Row, WorkPrecision, work_precision
 from vmri_jax.study.cost_report import bound_of
 from vmri_jax.study.prices import CONSTRAINTS, FAST, REMAINDER, SLOW, prices, shares
 
 EXACT = ReferenceSolution(np.zeros((2, 1)), np.zeros((2, 1)))
-ROW = WorkRow("kicks", 5, 2, 4, 0.1, 1e-3, seconds=2.0, slow_evaluations=4, fast_evaluations=20)
+ROW = Row("kicks", 5, 2, 4, 0.1, 1e-3, seconds=2.0, slow_evaluations=4, fast_evaluations=20)
 
 
 def test_bound_is_the_time_of_the_gradients():
@@ -39,7 +39,7 @@ def test_tables_list_further_potentials(tmp_path):
     assert one.evaluations == {"bends": passes * 10 * 4, 4: passes * 10 * 2}
     assert five.stages == 5
     assert "bends" in str(study)
-    assert "V_4" in study.markdown()
+    assert "V_4" in str(study)
     study.to_csv(tmp_path / "runs.csv")
     assert "evaluations of bends" in (tmp_path / "runs.csv").read_text()
     price = prices(problem)
@@ -52,4 +52,4 @@ def test_tables_list_further_potentials(tmp_path):
 
 def test_tables_without_further_potentials_have_no_column_for_them():
     study = WorkPrecision((ROW,), 1.0, EXACT)
-    assert "further gradients" not in study.markdown()
+    assert "further gradients" not in str(study)

@@ -1,14 +1,10 @@
-"""Work and precision against a reference, and the programs of studies."""
+"""Work and precision against a reference."""
 
-import dataclasses
-
-import jax.numpy as jnp
-import numpy as np
 import pytest
 
 import vmri_jax as vm
 from tests.study.test_convergence import PROBLEM
-from vmri_jax.study import Program, reference_solution, work_precision
+from vmri_jax.study import reference_solution, work_precision
 
 
 @pytest.fixture(scope="module")
@@ -21,27 +17,6 @@ def test_a_reference_refines_itself_until_it_agrees(reference):
     assert reference.num_saves == 1
 
 
-def test_a_program_is_compiled_once_for_all_numbers_of_steps():
-    traced = []
-
-    def spring(q_f, params):
-        traced.append(1)
-        return jnp.sum(q_f**2)
-
-    problem = dataclasses.replace(PROBLEM, system=PROBLEM.system.replace(fast_potential=spring))
-    program = Program(problem, vm.fully_explicit(3), 1.0, num_saves=2)
-    program(10)
-    before = len(traced)
-    program(20)
-    assert len(traced) == before
-    with pytest.raises(ValueError, match="multiple of 2"):
-        program(5)
-    direct = vm.simulate(
-        problem.system, vm.fully_explicit(3), problem.state(), macro_dt=0.1, num_steps=10, save_every=5
-    )
-    np.testing.assert_allclose(program(10).q_f, direct.q_f, rtol=1e-12)
-
-
 def test_work_precision_counts_and_times(reference, tmp_path):
     schemes = {"impulse": vm.fully_explicit(4), "midpoint": vm.fully_implicit(4)}
     study = work_precision(PROBLEM, schemes, 1.0, num_steps=(50, 100), reference=reference, repeats=2)
@@ -52,7 +27,6 @@ def test_work_precision_counts_and_times(reference, tmp_path):
     assert all(0 < row.low <= row.seconds <= row.high for row in study.rows)
     assert impulse[0].error_q / impulse[1].error_q == pytest.approx(4, rel=0.2)
     study.to_csv(tmp_path / "study.csv")
-    study.to_json(tmp_path / "study.json")
     assert len((tmp_path / "study.csv").read_text().splitlines()) == 5
     labels = {work: study.plot(work=work).axes[0].get_xlabel() for work in ("seconds", "solves")}
     assert labels == {"seconds": "computing time of the run", "solves": "systems of equations solved"}

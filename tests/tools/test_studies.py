@@ -19,7 +19,6 @@ def convergence_study(cell: Cell) -> None:
     assert str(rows)
     plots.save(rows.plot("orders", [2]), cell.folder / "orders.png")
     rows.to_csv(cell.folder / "orders.csv")
-    rows.to_json(cell.folder / "orders.json")
     rows.to_xarray()
 
 

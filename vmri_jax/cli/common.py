@@ -8,12 +8,11 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 from rich.panel import Panel
-from rich.table import Table
 from rich.text import Text
 
 from vmri_jax.mechanics.checks import is_refusal
 from vmri_jax.running.files import check_writable, make_writable_folder
-from vmri_jax.running.printed import OutputConsole
+from vmri_jax.running.printed import OutputConsole, PrintedTable
 
 console = OutputConsole()
 
@@ -81,16 +80,11 @@ def print_written(title: str, path: Path | None) -> None:
 
 def print_named(texts: dict[str, str]) -> None:
     """Print a line for each name and its text; empty texts are left out."""
-    table = plain_table("", "", show_header=False)
+    table = PrintedTable("", "", show_header=False)
     for name, text in texts.items():
         if text:
             table.add_row(f"[dim]{name}[/dim]", escape(text))
     console.print(table)
-
-
-def plain_table(*columns: str, show_header: bool = True) -> Table:
-    """A table without lines."""
-    return Table(*columns, box=None, pad_edge=False, show_header=show_header)
 
 
 def check_target_file(option: str, path: Path | None, endings: tuple[str, ...]) -> None:

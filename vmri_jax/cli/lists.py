@@ -4,7 +4,8 @@ import numpy as np
 import typer
 
 from vmri_jax.catalogue import SCHEMES, SYSTEMS
-from vmri_jax.cli.common import MANY, console, plain_table
+from vmri_jax.cli.common import MANY, console
+from vmri_jax.running.printed import PrintedTable
 from vmri_jax.schemes.composition import COMPOSITIONS
 
 app = typer.Typer()
@@ -13,7 +14,7 @@ app = typer.Typer()
 @app.command(rich_help_panel=MANY)
 def systems() -> None:
     """List the built-in systems."""
-    table = plain_table("name", "system", "slow", "fast", "constraints", "parameters")
+    table = PrintedTable("name", "system", "slow", "fast", "constraints", "parameters")
     for name, entry in SYSTEMS.items():
         problem = entry.factory()
         n_g, n_gs = problem.system.num_constraints(problem.q_s, problem.q_f)
@@ -33,7 +34,7 @@ def systems() -> None:
 @app.command(rich_help_panel=MANY)
 def schemes() -> None:
     """List the built-in schemes."""
-    table = plain_table("name", "order", "options", "scheme")
+    table = PrintedTable("name", "order", "options", "scheme")
     for name, entry in SCHEMES.items():
         options = " ".join(f"--{option}" for option in entry.options)
         table.add_row(f"[bold]{name}[/bold]", entry.order, options, entry.title)
@@ -41,7 +42,7 @@ def schemes() -> None:
     console.print(
         "\nOf higher order, [bold]--compose[/bold] NAME: several steps of a scheme of order 2, some backwards.\n"
     )
-    table = plain_table("name", "order", "stages", "source")
+    table = PrintedTable("name", "order", "stages", "source")
     for name, entry in COMPOSITIONS.items():
         table.add_row(f"[bold]{name}[/bold]", f"{entry.order}", f"{len(entry.coefficients)}", entry.source)
     console.print(table)

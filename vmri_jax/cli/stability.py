@@ -15,11 +15,11 @@ from vmri_jax.cli.common import (
     RIGHT,
     check_target_file,
     console,
-    plain_table,
     print_written,
     refusals,
     status,
 )
+from vmri_jax.running.printed import PrintedTable
 from vmri_jax.stability import advise as advise_on
 from vmri_jax.stability import linear_model, plot_stability, stability_map
 from vmri_jax.stability.map import windows_text
@@ -96,7 +96,7 @@ def stability(
             maps = {name: stability_map(problem, schemes, grid) for name, schemes in chosen.items()}
         if out is not None:
             plots.save(plot_stability(maps, system or "one slow and one stiff spring"), out)
-    table = plain_table("scheme", "num_micro", "unstable where omega H / pi is in")
+    table = PrintedTable("scheme", "num_micro", "unstable where omega H / pi is in")
     table.caption = next(iter(maps.values())).note or None
     for name, stability_of_scheme in maps.items():
         for n, windows in stability_of_scheme.shown():

@@ -40,11 +40,11 @@ def tune(
     error: Annotated[float, typer.Option(help="Largest accepted error of a position in the run, in its unit.")],
     t_end: Annotated[float, typer.Option(help="Simulated time.")],
     exhaustive: Annotated[bool, typer.Option("--exhaustive", help="Search without shortcuts.")] = False,
-    out: Annotated[Path | None, typer.Option(help="Write all runs of the search here, .csv or .json.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Write all runs of the search here, .csv.")] = None,
 ) -> None:
     """Find the scheme, num_micro and macro step that reach an error in the least time on this machine."""
     with refusals():
-        check_target_file("--out", out, (".csv", ".json"))
+        check_target_file("--out", out, (".csv",))
         problem = find_problem(system)
         check_target(error, t_end, problem)
         try:
@@ -111,4 +111,4 @@ def _search(out: Path | None) -> Iterator[Progress]:
 
 def _write_runs(runs: ResultTable, out: Path | None) -> None:
     if out is not None:
-        runs.to_csv(out) if out.suffix.lower() == ".csv" else runs.to_json(out)
+        runs.to_csv(out)

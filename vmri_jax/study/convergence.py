@@ -19,15 +19,15 @@ from vmri_jax.diagnostics import OrderFit
 from vmri_jax.executors.executor import mapped
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
 from vmri_jax.running.interrupts import Interrupted
+from vmri_jax.running.prepare import prepare
 from vmri_jax.running.progress import Progress, shows_progress
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
-from vmri_jax.steppers.results import Method, Result
 from vmri_jax.steppers.solver import Solver
-from vmri_jax.study.program import Program
 from vmri_jax.study.reference_solution import ReferenceSolution, reference_solution
-from vmri_jax.study.table import Column, ResultTable
+from vmri_jax.study.row import Row, RunTable, row_of
+from vmri_jax.study.table import Column
 
 MIN_ERROR_OVER_REFERENCE = 100.0
 """Least ratio of a fitted error to the error of the reference; at this ratio the reference changes the error of the scheme by 1 %; a larger
@@ -51,53 +51,26 @@ class Case:
         phase = [part for array in (self.reference.q, self.reference.p) for part in np.split(array, [n_s], axis=1)]
         return np.asarray(jax.jit(jax.vmap(partial(diagnostics.energy, self.problem.system)))(*phase))
 
-
-@dataclass(frozen=True)
-class ConvergenceRow:
-    """One run: its errors, its invariants and its iterations.
-
-    case: label of the parameters, "" if there is one set only.
-    error_q, error_p: largest error of positions and of momenta over nodes and coordinates.
-    energy_error: largest error of the energy: its change since the start where the system keeps its energy; its difference from the
-        energy of the reference where forces or moving constraints do work.
-    energy_drift: change, over the run, of the straight line fitted to the error of the energy.
-    energy_band: largest distance of the error of the energy from this line.
-    momentum_error: largest change of a momentum map since the start.
-    constraint_residual: largest constraint value, of positions or velocities.
-    iterations: most Newton iterations of a step.
-    method, result: names of the costliest `Method` and of the `Result`.
-    """
-
-    scheme: str
-    case: str
-    num_micro: int
-    degree: int
-    macro_dt: float
-    error_q: float
-    error_p: float
-    energy_error: float
-    energy_drift: float
-    energy_band: float
-    momentum_error: float
-    constraint_residual: float
-    iterations: int
-    method: str
-    result: str
+    def row(self, name: str, scheme, num_steps: int, t_end: float, maps: Sequence[Callable], run: Trajectory) -> Row:
+        """The row of a run of a scheme to `t_end`."""
+        error_q, error_p = self.reference.errors(run)
+        counts = t_end / num_steps, num_steps
+        measured = {"error_q": error_q, "error_p": error_p, "case": self.label}
+        return row_of(name, self.problem.system, scheme, run, *counts, self.energies, maps, **measured)
 
 
 @dataclass(frozen=True)
 class SchemeSummary:
     """One scheme with one set of parameters: its runs and observed orders of positions and momenta."""
 
-    runs: tuple[ConvergenceRow, ...]
+    runs: tuple[Row, ...]
     fit_q: OrderFit
     fit_p: OrderFit
 
     @property
-    def finest(self) -> ConvergenceRow | None:
+    def finest(self) -> Row | None:
         """The run with the smallest step that did not fail."""
-        finished = [row for row in self.runs if np.isfinite(row.error_q)]
-        return min(finished, key=lambda row: row.macro_dt, default=None)
+        return min((row for row in self.runs if not row.failed), key=lambda row: row.macro_dt, default=None)
 
 
 def _order(fit: OrderFit) -> str:
@@ -109,7 +82,7 @@ def _order(fit: OrderFit) -> str:
 
 def _failures(summary: SchemeSummary) -> str:
     """The number of failed runs; empty if no run failed."""
-    failed = sum(not np.isfinite(row.error_q) for row in summary.runs)
+    failed = sum(row.failed for row in summary.runs)
     return f"{failed} of {len(summary.runs)}" if failed else ""
 
 
@@ -119,10 +92,10 @@ def _of_finest(name: str, form: str = ".1e") -> Callable[[SchemeSummary], str]:
 
 
 @dataclass(frozen=True)
-class ConvergenceStudy(ResultTable):
+class ConvergenceStudy(RunTable):
     """Rows of a convergence study, sorted by scheme, then by case, then by macro step in the order of the call.
 
-    The column "energy" of its table is the error of the energy, see `ConvergenceRow`, at the smallest step.
+    The column "energy" of its table is the error of the energy, see `Row`, at the smallest step.
 
     references: reference solutions by case.
     """
@@ -138,13 +111,8 @@ class ConvergenceStudy(ResultTable):
         Column("energy", _of_finest("energy_error"), right=True),
         Column("failed", _failures, right=True),
     )
-    rows: tuple[ConvergenceRow, ...]
+    rows: tuple[Row, ...]
     references: Mapping[str, ReferenceSolution]
-
-    @property
-    def schemes(self) -> list[str]:
-        """Labels of the schemes."""
-        return list(dict.fromkeys(row.scheme for row in self.rows))
 
     @property
     def cases(self) -> list[str]:
@@ -193,11 +161,6 @@ class ConvergenceStudy(ResultTable):
             fits = (self.fit(scheme, quantity, case=case) for quantity in ("q", "p"))
             summaries.append(SchemeSummary(runs, *fits))
         return summaries
-
-    def content(self) -> dict[str, Any]:
-        """The rows, and the errors of the references."""
-        references = {case: reference.errors_known() for case, reference in self.references.items()}
-        return {"references": references, **super().content()}
 
     def plot(self, title: str = "", orders: Sequence[int] = ()):
         """Errors against the macro step, with guides of the slopes `orders`, see `vmri_jax.plots.plot_convergence`."""
@@ -272,7 +235,7 @@ def convergence_study(
     except Interrupted as interrupted:
         runs, stopped = interrupted.done, interrupted
     rows = [
-        _row(label, schemes[label], t_end / num_steps, case, momentum_maps, run)
+        case.row(label, schemes[label], num_steps, t_end, momentum_maps, run)
         for (label, case, num_steps), run in zip(labels, runs, strict=True)
         if run is not None
     ]
@@ -315,7 +278,8 @@ def _cases(problem: Problem, params, reference, t_end: float, num_saves: int, pr
 
 
 def _run(problem: Problem, scheme, t_end: float, num_saves: int, solver, num_steps: int) -> Trajectory:
-    return Program(problem, scheme, t_end, num_saves, solver)(num_steps)
+    steps = {"macro_dt": t_end / num_steps, "num_steps": num_steps, "save_every": num_steps // num_saves}
+    return prepare(problem, scheme, **steps, solver=solver)(throw=False)
 
 
 def _num_steps(t_end: float, macro_dt: float, num_saves: int) -> int:
@@ -328,45 +292,3 @@ def _num_steps(t_end: float, macro_dt: float, num_saves: int) -> int:
             "saves the same times."
         )
     return num_steps
-
-
-def _row(
-    label: str,
-    scheme: Scheme | Composition,
-    macro_dt: float,
-    case: Case,
-    momentum_maps: Sequence[Callable],
-    trajectory: Trajectory,
-) -> ConvergenceRow:
-    """The row of one run."""
-    error_q, error_p = case.reference.errors(trajectory)
-    energy = np.asarray(trajectory.energy)
-    energy_error = energy - (energy[0] if case.energies is None else case.energies)
-    drift, band = _drift_and_band(np.asarray(trajectory.t), energy_error)
-    _, *phase = vars(trajectory.states).values()
-    maps = [np.asarray(jax.vmap(lambda *z, xi=xi: diagnostics.momentum_map(xi, *z))(*phase)) for xi in momentum_maps]
-    return ConvergenceRow(
-        scheme=label,
-        case=case.label,
-        num_micro=scheme.num_micro,
-        degree=scheme.degree,
-        macro_dt=macro_dt,
-        error_q=error_q,
-        error_p=error_p,
-        energy_error=float(np.abs(energy_error).max()),
-        energy_drift=drift,
-        energy_band=band,
-        momentum_error=float(max((np.abs(m - m[0]).max() for m in maps), default=0.0)),
-        constraint_residual=float(np.max(trajectory.constraint_residual)),
-        iterations=int(np.max(trajectory.info.iterations)),
-        method=Method(int(np.max(trajectory.info.method))).name,
-        result=Result(int(trajectory.result)).name,
-    )
-
-
-def _drift_and_band(t: np.ndarray, energy_error: np.ndarray) -> tuple[float, float]:
-    """Change over the run of the straight line fitted to the error of the energy, and the largest distance from the line."""
-    if not np.isfinite(energy_error).all():
-        return float("nan"), float("nan")
-    line = np.polynomial.Polynomial.fit(t, energy_error, 1)(t)
-    return float(line[-1] - line[0]), float(np.abs(energy_error - line).max())

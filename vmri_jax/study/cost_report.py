@@ -17,9 +17,10 @@ from vmri_jax.running.files import make_writable_folder
 from vmri_jax.running.progress import part, shows_progress
 from vmri_jax.study.html import embedded, write_page
 from vmri_jax.study.prices import CONSTRAINTS, prices, seconds_by_function, shares
+from vmri_jax.study.row import Row, record
 from vmri_jax.study.table import Column, ResultTable, interruptible
 from vmri_jax.study.tuning import Tuning
-from vmri_jax.study.work import WorkPrecision, WorkRow, duration, pareto_front
+from vmri_jax.study.work import WorkPrecision, duration, pareto_front
 
 TEMPLATE = Path(__file__).parent / "cost.html.j2"
 PERIODS = 30
@@ -34,7 +35,7 @@ class Answer:
     the error."""
 
     error: float
-    setting: WorkRow | None
+    setting: Row | None
 
 
 class PageFailed(RuntimeError):
@@ -48,12 +49,12 @@ class PageFailed(RuntimeError):
         )
 
 
-def _of_setting(form: Callable[[WorkRow], str]) -> Callable[[Answer], str]:
+def _of_setting(form: Callable[[Row], str]) -> Callable[[Answer], str]:
     """The text of a column: `form` of the run, empty if none keeps the error."""
     return lambda answer: "" if answer.setting is None else form(answer.setting)
 
 
-def _gain(row: WorkRow) -> str:
+def _gain(row: Row) -> str:
     """The gain of more than one micro step."""
     return f"{row.settings.gain:.2g}" if row.num_micro > row.stages else ""
 
@@ -96,7 +97,7 @@ class CostReport(ResultTable):
         return f"Runs to t = {self.t_end:g}, with the largest errors of the positions on the way."
 
     @property
-    def reached(self) -> list[WorkRow]:
+    def reached(self) -> list[Row]:
         """The runs of the answers that have one."""
         return [answer.setting for answer in self.rows if answer.setting is not None]
 
@@ -112,8 +113,7 @@ class CostReport(ResultTable):
 
     def records(self) -> list[dict[str, Any]]:
         """A dictionary for each answer: the error and the columns of its run."""
-        runs = [WorkPrecision((a.setting,) if a.setting else (), self.t_end).records() for a in self.rows]
-        return [{"error": answer.error, **(run[0] if run else {})} for answer, run in zip(self.rows, runs, strict=True)]
+        return [{"error": a.error, **(record(a.setting) if a.setting else {})} for a in self.rows]
 
     def figure(self, title: str, theme: plots.Theme) -> plots.NotebookFigure:
         """Error against time: a curve for each family, the answers, and the bound."""
@@ -237,7 +237,7 @@ def _curves(tuning: Tuning) -> WorkPrecision:
     return WorkPrecision(tuple(rows), tuning.t_end)
 
 
-def bound_of(price: dict[str, float], rows: Sequence[WorkRow]) -> tuple[tuple[float, float], ...]:
+def bound_of(price: dict[str, float], rows: Sequence[Row]) -> tuple[tuple[float, float], ...]:
     """Seconds and error of runs whose time is that of their gradients alone; empty with constraints, whose solution
     costs more than `prices` say.
 

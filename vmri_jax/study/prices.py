@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from vmri_jax.mechanics.state import Problem
 from vmri_jax.mechanics.system import label
 from vmri_jax.running.timing import seconds_each
-from vmri_jax.study.work import WorkRow
+from vmri_jax.study.row import Row
 
 SLOW, FAST, CONSTRAINTS = "gradient of V", "gradient of W", "constraints"
 """Names of functions whose evaluations take time; `gradient_of` names the gradients of further potentials."""
@@ -46,7 +46,7 @@ def prices(problem: Problem) -> dict[str, float]:
     return {name: seconds_each(function, q) for name, function in functions(problem).items()}
 
 
-def seconds_by_function(price: Mapping[str, float], row: WorkRow) -> dict[str, float]:
+def seconds_by_function(price: Mapping[str, float], row: Row) -> dict[str, float]:
     """Seconds of a run in each function, its evaluations times `prices`."""
     counts = {SLOW: row.slow_evaluations, FAST: row.fast_evaluations}
     counts |= {gradient_of(name): count for name, count in row.evaluations.items()}
@@ -54,7 +54,7 @@ def seconds_by_function(price: Mapping[str, float], row: WorkRow) -> dict[str, f
     return {name: seconds * counts.get(name, 0) for name, seconds in price.items()}
 
 
-def shares(price: Mapping[str, float], row: WorkRow) -> dict[str, float]:
+def shares(price: Mapping[str, float], row: Row) -> dict[str, float]:
     """Parts of the time of a run by function; with the remainder they sum to 1."""
     parts = {name: seconds / row.seconds for name, seconds in seconds_by_function(price, row).items()}
     total = sum(parts.values())  # above 1 where functions cost less in the run than in loops of their own
