@@ -1,4 +1,4 @@
-"""Cases 1 to 4 and 26: resonances of the macro step, and slow and fast variables exchanged."""
+"""Cases 1 to 4 and 24: resonances of the macro step, and slow and fast variables exchanged."""
 
 from dataclasses import replace
 
@@ -110,7 +110,7 @@ def nonlinear_resonance(full: bool) -> Outcome:
     return Outcome(f"relative energy drift (median of {STARTS} starts) at {'; at '.join(said)}", fine, values)
 
 
-@hard_case(26, "swapped labels")
+@hard_case(24, "swapped labels")
 def swapped_labels(full: bool) -> Outcome:
     """FPU chain with slow and fast variables exchanged
 

@@ -507,4 +507,4 @@ def test_ctrl_c_leaves_the_cases_that_were_done(vmri, tmp_path, monkeypatch):
     assert code == 130
     assert "1 of 1 criteria met" in text
     assert "After 1 of 2 cases" in text
-    assert (tmp_path / "cases" / "cases.md").exists()
+    assert (tmp_path / "cases" / "cases.csv").exists()

@@ -1,6 +1,5 @@
 """Stability maps against measured windows, and against runs."""
 
-
 import numpy as np
 import pytest
 

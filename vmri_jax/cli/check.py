@@ -15,7 +15,7 @@ from vmri_jax.running.progress import progress_shown
 
 Numbers = Annotated[list[int] | None, typer.Option("--case", help="Number of a case; may be repeated.")]
 Full = Annotated[bool, typer.Option("--full", help="Full forms: runs of up to a million steps, minutes.")]
-Out = Annotated[Path | None, typer.Option(help="Folder for tables (md, csv, json) and pictures.")]
+Out = Annotated[Path | None, typer.Option(help="Folder for a table, cases.csv, and pictures.")]
 
 
 def check(system: options.System, case: Numbers = None, full: Full = False, out: Out = None) -> None:
@@ -38,11 +38,10 @@ def run_and_show(cases: Sequence[Case], numbers: Sequence[int], full: bool, out:
         except Interrupted as interrupted:
             report, stopped = interrupted.done, interrupted
     console.print(report.table())
-    judged = [row for row in report.rows if row.outcome.passed is not None]
-    missed = [str(row.case.number) for row in judged if row.missed]
+    judged, missed = [row for row in report.rows if row.passed is not None], report.missed
     console.print(f"{len(judged) - len(missed)} of {len(judged)} criteria met")
     if missed:
-        console.print(f"missed: {', '.join(missed)}")
+        console.print(f"missed: {', '.join(str(row.case.number) for row in missed)}")
     if out is not None:
         with refusals():
             for path in report.write(out):
