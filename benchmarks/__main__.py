@@ -45,7 +45,7 @@ Out = Annotated[Path, typer.Option(help="Folder for the JSON files and the figur
 OUT = Path("out/benchmarks")
 
 app.command()(gail2014)
-app.command()(hard)
+app.command()(refusals()(hard))
 
 
 COMPILES = ("chains",)

@@ -29,16 +29,10 @@ class BadInput(typer.BadParameter):
 
 FAULT = "This is no error of your command, but of the program. Please report it, with the command and the lines below."
 
-RUN = "Run and see:  vmri simulate fpu --macro-dt 0.05 --steps 400 --out run.npz"
-RIGHT = "Is it right:  vmri check my_system.py:problem"
-COSTS = "What it costs:  vmri tune fpu --error 1e-4 --t-end 2"
-MANY = "Many runs, and what there is:  vmri sweep --example"
-"""Titles of the four groups of commands in the help of `vmri`, each with an example."""
-
 
 @contextmanager
 def refusals() -> Iterator[None]:
-    """Show refusals of the library as panels, and any other error of their classes as a fault of the program."""
+    """Within this context refusals of the library are shown as panels, and other errors of their classes as faults of the program."""
     try:
         yield
     except (ValueError, TypeError, ImportError) as error:

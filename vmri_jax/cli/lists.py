@@ -1,17 +1,13 @@
 """`vmri systems` and `vmri schemes`: lists of the built-in systems and schemes."""
 
 import numpy as np
-import typer
 
 from vmri_jax.catalogue import SCHEMES, SYSTEMS
-from vmri_jax.cli.common import MANY, console
+from vmri_jax.cli.common import console
 from vmri_jax.running.printed import PrintedTable
 from vmri_jax.schemes.composition import COMPOSITIONS
 
-app = typer.Typer()
 
-
-@app.command(rich_help_panel=MANY)
 def systems() -> None:
     """List the built-in systems."""
     table = PrintedTable("name", "system", "slow", "fast", "constraints", "parameters")
@@ -31,7 +27,6 @@ def systems() -> None:
     console.print("\nYour own: [bold]vmri simulate my_file.py:my_problem[/bold], a vmri_jax.Problem in that file.")
 
 
-@app.command(rich_help_panel=MANY)
 def schemes() -> None:
     """List the built-in schemes."""
     table = PrintedTable("name", "order", "options", "scheme")
