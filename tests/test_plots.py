@@ -11,8 +11,11 @@ import pytest
 
 import vmri_jax as vm
 from vmri_jax import plots
+from vmri_jax.accuracy.companions import resting
 from vmri_jax.mechanics.names import Names
+from vmri_jax.running.arguments import Steps
 from vmri_jax.running.origin import Origin
+from vmri_jax.running.simulation import simulation
 from vmri_jax.running.trajectory import RunInfo, with_origin
 from vmri_jax.study import (
     ConvergenceStudy,
@@ -256,3 +259,30 @@ def is_drawn(figure) -> bool:
     file = BytesIO()
     figure.savefig(file, format="svg")
     return file.tell() > 1000
+
+
+# --- scenes in joint coordinates ---------------------------------------------------------------------------------------
+@pytest.fixture(scope="module")
+def sliding_door():
+    """A cart on a rail with a door on a hinge, at rest at its start; nothing is computed."""
+    cart = vm.scene.RigidBody("cart", 2.0, vm.scene.Box((1.0, 1.0, 1.0)), [0.0, 0.0, 0.0])
+    door = vm.scene.RigidBody("door", 1.0, vm.scene.Box((1.0, 0.1, 1.0)), [1.0, 0.0, 0.0])
+    rail = vm.scene.Prismatic(("ground", "cart"), at=[0.0, 0.0, 0.0], axis=[1.0, 0.0, 0.0], name="rail")
+    hinge = vm.scene.Revolute(("cart", "door"), at=[0.5, 0.0, 0.0], axis=[0.0, 0.0, 1.0], name="hinge")
+    scene = vm.scene.Scene([cart, door], [rail, hinge])
+    return resting(simulation(scene, vm.fully_implicit(1), None, None, Steps(0.1, num_steps=4)))
+
+
+def test_angles_and_lengths_have_panels_of_their_own(sliding_door):
+    curves = {a.get_ylabel(): [line.get_label() for line in a.lines] for a in sliding_door.plot().axes}
+    angles, lengths = ([curves[name] for name in curves if unit in name] for unit in ("rad", "positions"))
+    assert angles == [["hinge"]]
+    assert lengths == [["rail"]]
+
+
+def test_forces_have_units_and_name_the_joints_without_curves(sliding_door, monkeypatch):
+    forces = {"stop": {"hinge": np.ones((5, 1)), "rail": np.ones((5, 1))}}
+    monkeypatch.setattr(vm.Trajectory, "reaction_forces", lambda run: forces)
+    figure = sliding_door.plot_forces()
+    assert [axes.get_ylabel() for axes in figure.axes] == ["reaction force\nN", "reaction torque\nN m"]
+    assert "by_directors" in figure.get_supxlabel()
