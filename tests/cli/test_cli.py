@@ -447,7 +447,7 @@ def test_a_fault_inside_is_no_usage_error(tmp_path, monkeypatch):
     assert isinstance(result.exception, ValueError)
     assert "Usage" not in result.output
     assert "A fault inside" in result.output
-    assert "energy change" in result.output
+    assert "changed by at most" in result.output
     assert (tmp_path / "run.npz").exists()
 
 
