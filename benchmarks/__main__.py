@@ -150,7 +150,7 @@ def mechanisms_command(
     way: Annotated[list[str] | None, typer.Option(help="Ways that begin so, e.g. joint; may be repeated.")] = None,
 ) -> None:
     prepare(core, cache=False)
-    _measure("mechanisms", mechanisms, full, out, markdown=True, only=only or (), way=way or ())
+    _measure("mechanisms", mechanisms, full, out, only=only or (), way=way or ())
 
 
 @app.command("imports", help=imports.__doc__)
@@ -190,7 +190,7 @@ def tricks_command(
     out: Out = OUT,
 ) -> None:
     prepare(core)
-    _measure("tricks", tricks, full, out, markdown=True, only=only or ())
+    _measure("tricks", tricks, full, out, only=only or ())
 
 
 @app.command("ensembles", help=ensembles.__doc__)
@@ -238,7 +238,7 @@ def all_command(full: Full = False, core: Core = None, out: Out = OUT) -> None:
         _measure(name, module, full, out)
 
 
-def _measure(title: str, module, full: bool, out: Path, markdown: bool = False, **options) -> None:
+def _measure(title: str, module, full: bool, out: Path, **options) -> None:
     """Measure, print and write: after each case what is known by then, so that nothing is lost."""
     name, report, path = "full" if full else "quick", None, None
     size = module.sizes(name, **options)
@@ -246,8 +246,6 @@ def _measure(title: str, module, full: bool, out: Path, markdown: bool = False, 
         with progress(title) as tell:
             for report in module.run(size, name, tell):
                 path = report.write(out)
-                if markdown:
-                    path.with_suffix(".md").write_text(report.markdown(module.COLUMNS), encoding="utf-8")
     finally:
         if report is not None:
             report.show(module.COLUMNS)

@@ -243,7 +243,7 @@ def test_the_figure_of_a_cost_page_is_drawn_whatever_it_holds(count, error):
     answers = Answer(1e-2, rows[0] if rows else None), Answer(1e-4, None)
     bound = tuple((row.seconds / 2, row.error_q) for row in rows)
     runs = WorkPrecision(rows, 1.0)
-    assert is_drawn(CostReport(Path("cost.html"), "", 1.0, answers, runs, runs, {}, bound).figure("title", plots.DARK))
+    assert is_drawn(CostReport(Path("cost.html"), "", 1.0, answers, runs, runs, bound).figure("title", plots.DARK))
 
 
 def test_a_single_node_and_a_run_that_failed_at_once_are_drawn():

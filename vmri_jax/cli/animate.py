@@ -61,7 +61,7 @@ def animate(
     out = run.with_suffix(".html") if out is None else out
     check_target_file("--out", out, (".html", *PICTURES, ".gif", ".pvd"))
     shown = _seen_from(_motion(run, system, drawing).between(start, end), view)
-    name = title or (SYSTEMS[system].title if system in SYSTEMS else run.stem)
+    name = title or (system if system in SYSTEMS else run.stem)
     _write(shown, out, name, frames, seconds, plots.DARK if dark else plots.LIGHT)
     if shown.ending:
         console.print(f"[yellow]{escape(shown.ending)}[/yellow]")

@@ -69,7 +69,7 @@ def cost(
     ] = None,
     out: Annotated[Path, typer.Option(help="Folder for the page.")] = Path("out/cost"),
 ) -> None:
-    """Write a page about the cost of accuracy: time over error, the best scheme for each error, where the time goes.
+    """Write a page about the cost of accuracy: time over error, and the best scheme for each error.
 
     Examples:
 
