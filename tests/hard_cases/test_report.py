@@ -89,6 +89,7 @@ def test_a_case_that_does_not_apply_says_why_and_is_not_missed():
     assert report.rows[0].measured == "it is driven"
 
 
+@pytest.mark.compiles
 def test_vmri_check_judges_a_system_of_ones_own(tmp_path):
     file = tmp_path / "mine.py"
     file.write_text("from tests.user_systems import two_oscillators as mine\n")
