@@ -224,7 +224,7 @@ def work_row(error: float, seconds: float = 1e-3) -> Row:
 )
 @pytest.mark.parametrize("work", ["seconds", "solves"])
 def test_runs_without_a_positive_error_or_work_are_drawn(errors, work):
-    study = WorkPrecision(tuple(map(work_row, errors)), 1.0, EXACT)
+    study = WorkPrecision(tuple(map(work_row, errors)), EXACT)
     assert is_drawn(study.plot(work=work))
 
 
@@ -242,7 +242,7 @@ def test_the_figure_of_a_cost_page_is_drawn_whatever_it_holds(count, error):
     rows = (work_row(error),) * count
     answers = Answer(1e-2, rows[0] if rows else None), Answer(1e-4, None)
     bound = tuple((row.seconds / 2, row.error_q) for row in rows)
-    runs = WorkPrecision(rows, 1.0)
+    runs = WorkPrecision(rows)
     assert is_drawn(CostReport(Path("cost.html"), "", 1.0, answers, runs, runs, bound).figure("title", plots.DARK))
 
 

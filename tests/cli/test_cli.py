@@ -451,7 +451,7 @@ def test_a_fault_inside_is_no_usage_error(tmp_path, monkeypatch):
     assert (tmp_path / "run.npz").exists()
 
 
-NOTHING = WorkPrecision((), 1.0)
+NOTHING = WorkPrecision(())
 
 
 def test_a_page_that_cannot_be_drawn_leaves_its_table(tmp_path, monkeypatch):

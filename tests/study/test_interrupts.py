@@ -3,7 +3,6 @@
 from dataclasses import replace
 from importlib import import_module
 
-import numpy as np
 import pytest
 
 import vmri_jax as vm
@@ -14,7 +13,6 @@ from vmri_jax.study import (
     ReferenceSolution,
     convergence_study,
     cost_report,
-    work_precision,
 )
 from vmri_jax.study.reference_solution import joined
 
@@ -38,33 +36,21 @@ def reference() -> ReferenceSolution:
     )
 
 
-def test_convergence_studies_keep_their_rows(reference):
+@pytest.mark.parametrize(("words", "rows"), [("H = 0.01", 2), ("measuring times", 3)])
+def test_convergence_studies_keep_their_rows(reference, words, rows):
     steps = [0.04, 0.02, 0.01]
-    with pytest.raises(vm.Interrupted, match="interrupted after 2 runs") as caught:
+    with pytest.raises(vm.Interrupted, match=f"interrupted after {rows} runs") as caught:
         convergence_study(
             *(one_coordinate(), {"explicit": SCHEME}, steps, T_END),
             num_saves=1,
             reference=reference,
-            progress=ctrl_c("H = 0.01"),
+            repeats=1,
+            progress=ctrl_c(words),
         )
     study = caught.value.done
     assert isinstance(study, ConvergenceStudy)
-    assert [row.macro_dt for row in study.rows] == steps[:2]
+    assert [row.macro_dt for row in study.rows] == steps[:rows]
     assert study.order("explicit") == pytest.approx(2.0, abs=0.05)
-
-
-@pytest.mark.parametrize(("words", "rows"), [("4 steps", 1), ("measuring times", 3)])
-def test_work_and_precision_keeps_its_rows(reference, words, rows):
-    with pytest.raises(vm.Interrupted) as caught:
-        work_precision(
-            *(one_coordinate(), {"explicit": SCHEME}, T_END),
-            num_steps=[2, 4, 8],
-            reference=reference,
-            progress=ctrl_c(words),
-        )
-    kept = caught.value.done.rows
-    assert [row.num_steps for row in kept] == [2, 4, 8][:rows]
-    assert all(row.seconds > 0 and np.isfinite(row.error_q) for row in kept)
 
 
 def test_cost_reports_keep_their_runs_while_the_page_is_drawn(monkeypatch, tmp_path):

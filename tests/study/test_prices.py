@@ -8,7 +8,7 @@ import pytest
 
 import vmri_jax as vm
 from tests.small_systems import no_constraint
-from vmri_jax.study import ReferenceSolution, Row, WorkPrecision, work_precision
+from vmri_jax.study import ReferenceSolution, Row, WorkPrecision, convergence_study
 from vmri_jax.study.cost_report import bound_of
 from vmri_jax.study.prices import FAST, SLOW, prices, seconds_of_gradients
 
@@ -31,7 +31,7 @@ def test_tables_list_further_potentials(tmp_path):
     kicks = vm.quadrature.trapezoidal
     stage = vm.fully_explicit(8).with_potentials(bends=vm.micro(kicks, every=2))
     schemes = {"kicks": stage, "composed": vm.compose(stage, "suzuki4")}
-    study = work_precision(problem, schemes, 1.0, num_steps=(10,), reference=EXACT, repeats=1)
+    study = convergence_study(problem, schemes, [0.1], 1.0, num_saves=1, reference=EXACT).work()
     one, five = study.rows
     passes = one.fast_evaluations / (10 * 8)
     assert one.evaluations == {"bends": passes * 10 * 4, 4: passes * 10 * 2}
@@ -46,5 +46,5 @@ def test_tables_list_further_potentials(tmp_path):
 
 
 def test_tables_without_further_potentials_have_no_column_for_them():
-    study = WorkPrecision((ROW,), 1.0, EXACT)
+    study = WorkPrecision((ROW,), EXACT)
     assert "further gradients" not in str(study)

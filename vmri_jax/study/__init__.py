@@ -7,7 +7,7 @@ from vmri_jax.study.reference_solution import ReferenceSolution, reference_solut
 from vmri_jax.study.row import Row
 from vmri_jax.study.table import Column, ResultTable
 from vmri_jax.study.tuning import Recommendation, tune
-from vmri_jax.study.work import WorkPrecision, work_precision
+from vmri_jax.study.work import WorkPrecision
 
 __all__ = [
     "Column",
@@ -24,5 +24,4 @@ __all__ = [
     "families",
     "reference_solution",
     "tune",
-    "work_precision",
 ]

@@ -21,13 +21,16 @@ from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
 from vmri_jax.running.interrupts import Interrupted
 from vmri_jax.running.prepare import prepare
 from vmri_jax.running.progress import Progress, shows_progress
+from vmri_jax.running.simulation import Simulation
+from vmri_jax.running.timing import interleaved
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.solver import Solver
 from vmri_jax.study.reference_solution import ReferenceSolution, reference_solution
 from vmri_jax.study.row import Row, RunTable, row_of
-from vmri_jax.study.table import Column
+from vmri_jax.study.table import Column, interruptible
+from vmri_jax.study.work import WorkPrecision
 
 MIN_ERROR_OVER_REFERENCE = 100.0
 """Least ratio of a fitted error to the error of the reference; at this ratio the reference changes the error of the scheme by 1 %; a larger
@@ -51,12 +54,12 @@ class Case:
         phase = [part for array in (self.reference.q, self.reference.p) for part in np.split(array, [n_s], axis=1)]
         return np.asarray(jax.jit(jax.vmap(partial(diagnostics.energy, self.problem.system)))(*phase))
 
-    def row(self, name: str, scheme, num_steps: int, t_end: float, maps: Sequence[Callable], run: Trajectory) -> Row:
-        """The row of a run of a scheme to `t_end`."""
+    def row(self, name: str, scheme, num_steps: int, t_end: float, maps: Sequence[Callable], run, seconds) -> Row:
+        """The row of a run of a scheme to `t_end`, with samples of its seconds."""
         error_q, error_p = self.reference.errors(run)
         counts = t_end / num_steps, num_steps
         measured = {"error_q": error_q, "error_p": error_p, "case": self.label}
-        return row_of(name, self.problem.system, scheme, run, *counts, self.energies, maps, **measured)
+        return row_of(name, self.problem.system, scheme, run, *counts, self.energies, maps, **measured).timed(seconds)
 
 
 @dataclass(frozen=True)
@@ -162,6 +165,11 @@ class ConvergenceStudy(RunTable):
             summaries.append(SchemeSummary(runs, *fits))
         return summaries
 
+    def work(self, case: str | None = None) -> WorkPrecision:
+        """The runs of a case, the first one by default, by their errors and their work; times where the study has them."""
+        case = self.cases[0] if case is None else case
+        return WorkPrecision(tuple(row for row in self.rows if row.case == case), self.references[case])
+
     def plot(self, title: str = "", orders: Sequence[int] = ()):
         """Errors against the macro step, with guides of the slopes `orders`, see `vmri_jax.plots.plot_convergence`."""
         return plots.plot_convergence(self, orders, title)
@@ -185,6 +193,7 @@ def convergence_study(
     momentum_maps: Sequence[Callable] = (),
     reference: ReferenceSolution | Mapping[str, ReferenceSolution] | None = None,
     solver: Solver | None = None,
+    repeats: int = 0,
     executor: Any = None,
     progress: Any = False,
 ) -> ConvergenceStudy:
@@ -204,7 +213,10 @@ def convergence_study(
         reference: the solution that errors are measured against, by label of the parameters if there are several; by default
             `reference_solution`.
         solver: how implicit equations are solved.
-        executor: where runs are computed, as of `vmri_jax.ensemble`; None for this process.
+        repeats: timed samples of every run; 0 for no times. In this process the runs take turns on the clock, so that a slow
+            moment of the machine hits all of them; a row has the median.
+        executor: where runs are computed and timed, as of `vmri_jax.ensemble`; None for this process. A worker that measures
+            times needs a core of its own.
         progress: True for a bar, or a function (what, done, total) that is told about every run before it starts.
 
     Raises:
@@ -223,25 +235,30 @@ def convergence_study(
     told = lambda message, *_: progress(message, 0, total)  # noqa: E731
     cases = _cases(problem, params, reference, t_end, num_saves, told)
     labels = [(label, case, num_steps) for label in schemes for case in cases for num_steps in steps]
+    arguments = lambda label, case, num_steps: (case.problem, schemes[label], t_end, num_saves, solver, num_steps)  # noqa: E731
     stopped = None
     try:
         runs = mapped(
             "convergence_study",
             _run,
-            [(case.problem, schemes[label], t_end, num_saves, solver, num_steps) for label, case, num_steps in labels],
+            [(*arguments(*run), 0 if executor is None else repeats) for run in labels],
             executor,
             lambda done, i: progress(f"{labels[i][0]}, H = {t_end / labels[i][2]:g}", done, total),
         )
     except Interrupted as interrupted:
         runs, stopped = interrupted.done, interrupted
-    rows = [
-        case.row(label, schemes[label], num_steps, t_end, momentum_maps, run)
-        for (label, case, num_steps), run in zip(labels, runs, strict=True)
-        if run is not None
-    ]
+    done = [(labels[i], run) for i, run in enumerate(runs) if run is not None]
+    rows = [case.row(label, schemes[label], n, t_end, momentum_maps, *run) for (label, case, n), run in done]
     study = ConvergenceStudy(tuple(rows), {case.label: case.reference for case in cases})
     if stopped is not None:
         raise Interrupted(study, len(study.rows), None, "runs") from None
+    if repeats and executor is None:
+        progress("measuring times", total, total)
+        with interruptible(lambda: study):
+            calls = {str(i): _prepared(*arguments(*labels[i])).timed() for i, row in enumerate(rows) if not row.failed}
+            samples = interleaved(calls, repeats)
+        rows = [row.timed(samples.get(str(i), ())) for i, row in enumerate(rows)]
+        study = replace(study, rows=tuple(rows))
     progress("done", total, total)
     return study
 
@@ -277,9 +294,18 @@ def _cases(problem: Problem, params, reference, t_end: float, num_saves: int, pr
     return [Case(label, problem, references[label]) for label, problem in problems.items()]
 
 
-def _run(problem: Problem, scheme, t_end: float, num_saves: int, solver, num_steps: int) -> Trajectory:
+def _prepared(problem: Problem, scheme, t_end: float, num_saves: int, solver, num_steps: int) -> Simulation:
     steps = {"macro_dt": t_end / num_steps, "num_steps": num_steps, "save_every": num_steps // num_saves}
-    return prepare(problem, scheme, **steps, solver=solver)(throw=False)
+    return prepare(problem, scheme, **steps, solver=solver)
+
+
+def _run(*arguments) -> tuple[Trajectory, list[float]]:
+    """A run with arguments of `_prepared`, and samples of its seconds, as many as the last argument says."""
+    *arguments, repeats = arguments
+    run = _prepared(*arguments)
+    trajectory = run(throw=False)
+    is_timed = repeats and trajectory.success
+    return trajectory, interleaved({"": run.timed()}, repeats)[""] if is_timed else []
 
 
 def _num_steps(t_end: float, macro_dt: float, num_saves: int) -> int:

@@ -224,7 +224,7 @@ def _curves(tuning: Tuning) -> WorkPrecision:
     for family, runs in by_family.items():
         timed = [row for row in runs if math.isfinite(row.seconds)]
         rows += [replace(row, scheme=family) for row in pareto_front(timed, "seconds", "error_q")]
-    return WorkPrecision(tuple(rows), tuning.t_end)
+    return WorkPrecision(tuple(rows))
 
 
 def bound_of(price: dict[str, float], rows: Sequence[Row]) -> tuple[tuple[float, float], ...]:

@@ -33,7 +33,6 @@ class Row:
     constraint_residual: largest constraint value, of positions or velocities.
     seconds, low, high: median and quartiles of the wall time of the run, without compiling; in a search `seconds` are those
         of the steps.
-    compile_seconds: time to compile the program that all runs of the scheme share.
     slow_evaluations, fast_evaluations: evaluations of the gradients of V and of W in the whole run, counted from the scheme
         and the Newton passes that the run reports, one evaluation per pass.
     evaluations: evaluations of the gradients of further potentials, by name.
@@ -60,7 +59,6 @@ class Row:
     seconds: float = np.nan
     low: float = np.nan
     high: float = np.nan
-    compile_seconds: float = np.nan
     slow_evaluations: int = 0
     fast_evaluations: int = 0
     evaluations: Mapping[str | int, int] = field(default_factory=dict)
@@ -78,7 +76,9 @@ class Row:
         return not np.isfinite(self.error_q)
 
     def timed(self, seconds: Sequence[float]) -> "Row":
-        """The row with the median and the quartiles of these samples."""
+        """The row with the median and the quartiles of these samples, as it is without any."""
+        if not len(seconds):
+            return self
         low, middle, high = (float(x) for x in np.quantile(seconds, (0.25, 0.5, 0.75)))
         return replace(self, seconds=middle, low=low, high=high)
 

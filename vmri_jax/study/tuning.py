@@ -101,7 +101,7 @@ class Tuning:
 
     def runs(self) -> WorkPrecision:
         """The table of all runs so far."""
-        return WorkPrecision(tuple(self.rows()), self.t_end)
+        return WorkPrecision(tuple(self.rows()))
 
 
 class NothingReached(ValueError):

@@ -1,38 +1,17 @@
 """Work and precision: errors of runs against their time and their evaluations, and the Pareto front of all runs."""
 
-import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from operator import attrgetter
 from typing import Any
 
 import numpy as np
 
-from vmri_jax import diagnostics, plots
-from vmri_jax.executors.executor import mapped
-from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
+from vmri_jax import plots
 from vmri_jax.mechanics.system import label
-from vmri_jax.running.interrupts import Interrupted
-from vmri_jax.running.prepare import prepare
-from vmri_jax.running.progress import shows_progress
-from vmri_jax.running.simulation import Simulation
-from vmri_jax.running.timing import interleaved
-from vmri_jax.schemes.composition import Composition
-from vmri_jax.schemes.scheme import Scheme
-from vmri_jax.steppers.solver import Solver
-from vmri_jax.study.reference_solution import ReferenceSolution, reference_solution
-from vmri_jax.study.row import Row, RunTable, row_of
+from vmri_jax.study.reference_solution import ReferenceSolution
+from vmri_jax.study.row import Row, RunTable
 from vmri_jax.study.table import Column
-
-FINEST_ERROR = 1e-10
-"""Error of positions, relative to the largest one, below which a ladder of steps ends; a smaller value adds finer runs, which round-off may spoil."""
-SLOWEST = 2.0
-"""Seconds of a run after which a ladder of steps ends; a larger value adds slower runs."""
-RESOLVED_ERROR = 1e-6
-"""Error of positions, relative to the largest one, below which a ladder ends when errors stop falling; a larger value may end it at steps that resolve nothing yet."""
-LEAST_GAIN = 1.5
-"""Ratio of the least error so far to the next error below which errors have stopped falling; a larger ratio ends ladders earlier."""
 
 
 def duration(seconds: float) -> str:
@@ -45,7 +24,7 @@ def duration(seconds: float) -> str:
 
 @dataclass(frozen=True)
 class WorkPrecision(RunTable):
-    """Rows of one comparison; its table is the Pareto front.
+    """Runs by their errors and their work; its table is the Pareto front.
 
     reference: the solution that errors are measured against; None for a search, whose errors are estimated by companion runs.
     """
@@ -62,7 +41,6 @@ class WorkPrecision(RunTable):
         Column("solves", lambda row: f"{row.solves:,}", right=True),
     )
     rows: tuple[Row, ...]
-    t_end: float
     reference: ReferenceSolution | None = None
 
     @property
@@ -98,131 +76,3 @@ def pareto_front(items: Sequence[Any], work: str, error: str) -> list[Any]:
         if not front or getattr(item, error) < getattr(front[-1], error):
             front.append(item)
     return front
-
-
-@shows_progress
-def work_precision(
-    problem: Problem | HasProblem,
-    schemes: Mapping[str, Scheme | Composition],
-    t_end: float,
-    *,
-    num_steps: Sequence[int] | None = None,
-    num_saves: int = 1,
-    reference: ReferenceSolution | None = None,
-    solver: Solver | None = None,
-    repeats: int = 5,
-    executor: Any = None,
-    progress: Any = False,
-) -> WorkPrecision:
-    """Error against wall time and evaluations for every scheme over a ladder of macro steps.
-
-    Every scheme is compiled once. All runs are made once for their errors; then they take turns on the clock, so that a
-    slow moment of the machine hits all of them; a row has the median. A run that fails is a row of NaN.
-
-    Args:
-        problem: system and start; a `Problem` or a scene.
-        schemes: schemes by label.
-        t_end: simulated time.
-        num_steps: numbers of macro steps, multiples of `num_saves`; by default the first has micro steps of
-            ``degree / omega`` with the fastest angular frequency omega, and the number doubles until the error no longer falls
-            or is below 1e-10, or a run takes two seconds.
-        num_saves: nodes compared, equally spaced.
-        reference: the solution that errors are measured against; by default `reference_solution`.
-        solver: how implicit equations are solved.
-        repeats: timed samples of every run.
-        executor: where runs are computed and timed, a task for each scheme, as of `vmri_jax.ensemble`; None for this
-            process. Workers measure the times on their machines, and only runs of one scheme take turns: each worker
-            needs a core of its own for its times to count.
-        progress: True for a bar, or a function (what, done, total) that is told about every run.
-
-    Raises:
-        ValueError: no scheme, or numbers of steps that are no multiples of num_saves.
-        Interrupted: Ctrl-C; carries the runs that were done; a run whose turn had not come has the time of one call.
-    """
-    problem = problem_of("work_precision", problem)
-    if not schemes:
-        raise ValueError("work_precision: schemes is empty; give at least one, e.g. {'impulse': fully_explicit(10)}.")
-    if num_steps is not None and (not len(num_steps) or any(n < 1 or n % num_saves for n in num_steps)):
-        raise ValueError(f"work_precision: num_steps is {list(num_steps)}; give multiples of num_saves = {num_saves}.")
-    if reference is None:
-        reference = reference_solution(problem, t_end, num_saves=num_saves, progress=progress)
-    frequency = float(diagnostics.frequencies(problem)[0])
-    climbed = partial(_climbed, problem, t_end, num_saves, solver, num_steps, reference, frequency)
-    total, runs = len(schemes) + 1, list[tuple[Simulation, Row]]()
-    try:
-        if executor is None:
-            for i, (label, scheme) in enumerate(schemes.items()):
-                for run in climbed(
-                    label, scheme, lambda n, i=i, label=label: progress(f"{label}, {n} steps", i, total)
-                ):
-                    runs.append(run)  # one by one, so that Ctrl-C keeps the runs of an unfinished ladder
-            progress("measuring times", len(schemes), total)
-            rows = timed_in_turn(runs, repeats)
-        else:
-            tasks = [(climbed, label, scheme, repeats) for label, scheme in schemes.items()]
-            report = lambda done, i: progress(tasks[i][1], done, total)  # noqa: E731
-            rows = [row for part in mapped("work_precision", _timed, tasks, executor, report) for row in part]
-    except KeyboardInterrupt as stopped:
-        parts = stopped.done if isinstance(stopped, Interrupted) else [[row for _, row in runs]]
-        rows = [row for part in parts if part is not None for row in part]
-        raise Interrupted(WorkPrecision(tuple(rows), t_end, reference), len(rows), None, "runs") from None
-    progress("done", 1, 1)
-    return WorkPrecision(tuple(rows), t_end, reference)
-
-
-def _climbed(
-    problem: Problem,
-    t_end: float,
-    num_saves: int,
-    solver: Solver | None,
-    num_steps: Sequence[int] | None,
-    reference: ReferenceSolution,
-    frequency: float,
-    name: str,
-    scheme: Scheme | Composition,
-    report: Callable[[int], None] = lambda _: None,
-) -> Iterator[tuple[Simulation, Row]]:
-    """All runs of a scheme over a ladder of macro steps, each with the time of one call; `report` gets their numbers of steps.
-
-    With `num_steps` None they double until `_goes_on` ends the ladder.
-    """
-    start = time.perf_counter()
-    run = prepare(problem, scheme, macro_dt=t_end / num_saves, num_steps=num_saves, solver=solver)
-    compile_seconds = time.perf_counter() - start
-    per_save = frequency * t_end / scheme.num_micro / scheme.degree / num_saves
-    queue, rows = list(num_steps or [num_saves * max(1, int(per_save))]), []
-    while queue:
-        n = queue.pop(0)
-        report(n)
-        steps = {"macro_dt": t_end / n, "num_steps": n}
-        seconds = interleaved({"": run.timed(**steps)}, 1, 0.0)[""]
-        trajectory = run(**steps, throw=False)
-        error_q, error_p = reference.errors(trajectory)
-        measured = {"error_q": error_q, "error_p": error_p, "compile_seconds": compile_seconds}
-        rows.append(row_of(name, problem.system, scheme, trajectory, **steps, **measured).timed(seconds))
-        yield run, rows[-1]
-        if num_steps is None and _goes_on(rows, reference):
-            queue = [2 * n]
-
-
-def _timed(climbed: Callable, name: str, scheme: Scheme | Composition, repeats: int) -> list[Row]:
-    """The rows of a ladder, timed in turn."""
-    return timed_in_turn(list(climbed(name, scheme)), repeats)
-
-
-def timed_in_turn(runs: Sequence[tuple[Simulation, Row]], repeats: int) -> list[Row]:
-    """The rows with the medians of `repeats` runs that took turns; a row of a failed run stays as it is."""
-    steps = [{"macro_dt": row.macro_dt, "num_steps": row.num_steps} for _, row in runs]
-    calls = {str(i): run.timed(**steps[i]) for i, (run, row) in enumerate(runs) if not row.failed}
-    samples = interleaved(calls, repeats)
-    return [row.timed(samples[str(i)]) if str(i) in samples else row for i, (_, row) in enumerate(runs)]
-
-
-def _goes_on(rows: Sequence[Row], reference: ReferenceSolution) -> bool:
-    """Whether twice the steps of the last run may give a smaller error in acceptable time."""
-    last, errors = rows[-1], [row.error_q for row in rows[:-1] if not row.failed]
-    least = min(errors, default=np.inf)
-    size = np.abs(reference.q).max()
-    stopped_falling = least < RESOLVED_ERROR * size and not last.error_q < least / LEAST_GAIN  # true for NaN, too
-    reached = last.error_q < max(FINEST_ERROR * size, reference.error_q)
-    return not (reached or last.seconds > SLOWEST or stopped_falling)
