@@ -1,4 +1,4 @@
-"""`python -m benchmarks hard`: the 24 hard cases of this project."""
+"""`python -m benchmarks hard`: the 22 hard cases of this project."""
 
 from benchmarks.measure import prepare
 from vmri_jax.cli.check import Full, Numbers, Out, run_and_show

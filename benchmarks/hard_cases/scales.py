@@ -1,4 +1,4 @@
-"""Case 23: three time scales."""
+"""Three time scales."""
 
 import numpy as np
 
@@ -10,7 +10,7 @@ from vmri_jax.hard_cases import Outcome
 from vmri_jax.hard_cases.measures import run, status
 
 
-@hard_case(23, "three scales", draw_oscillatory_energies)
+@hard_case("three scales", draw_oscillatory_energies)
 def three_time_scales(full: bool) -> Outcome:
     """FPU chain with omega = 50, 70, 5000, fully_implicit, h = 0.02, t = 50
 

@@ -124,9 +124,9 @@ def single_precision(problem: Problem, macro_dt: float = 0.01) -> Outcome:
     """Whether a run with the 64-bit mode off, and a start with positions in float32, are refused with the line that mends them."""
     state = problem.state()
     with jax.enable_x64(False):
-        off = _refusal(lambda: simulate(problem.system, fully_implicit(2), state, macro_dt=macro_dt, num_steps=1))
+        off = refusal(lambda: simulate(problem.system, fully_implicit(2), state, macro_dt=macro_dt, num_steps=1))
     q_s, q_f = (np.asarray(q, np.float32) for q in (problem.q_s, problem.q_f))
-    data = _refusal(lambda: initial_state(problem.system, q_s, q_f, problem.v_s, problem.v_f))
+    data = refusal(lambda: initial_state(problem.system, q_s, q_f, problem.v_s, problem.v_f))
     fix = 'jax.config.update("jax_enable_x64", True)' in off
     cast = "float32" in data and "astype(float)" in data
     return Outcome(
@@ -137,7 +137,7 @@ def single_precision(problem: Problem, macro_dt: float = 0.01) -> Outcome:
     )
 
 
-def _refusal(call) -> str:
+def refusal(call) -> str:
     """The message of the ValueError that a call raises; empty if it raises none."""
     try:
         call()
