@@ -253,8 +253,8 @@ def convergence_study(
     if stopped is not None:
         raise Interrupted(study, len(study.rows), None, "runs") from None
     if repeats and executor is None:
-        progress("measuring times", total, total)
         with interruptible(lambda: study):
+            progress("measuring times", total, total)
             calls = {str(i): _prepared(*arguments(*labels[i])).timed() for i, row in enumerate(rows) if not row.failed}
             samples = interleaved(calls, repeats)
         rows = [row.timed(samples.get(str(i), ())) for i, row in enumerate(rows)]
