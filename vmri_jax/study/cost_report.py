@@ -222,8 +222,7 @@ def _curves(tuning: Tuning) -> WorkPrecision:
     for row in tuning.rows():
         by_family[tuning.family_of(row).name].append(row)
     for family, runs in by_family.items():
-        timed = [row for row in runs if math.isfinite(row.seconds)]
-        rows += [replace(row, scheme=family) for row in pareto_front(timed, "seconds", "error_q")]
+        rows += [replace(row, scheme=family) for row in pareto_front(runs, "seconds", "error_q")]
     return WorkPrecision(tuple(rows))
 
 

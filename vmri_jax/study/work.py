@@ -15,7 +15,9 @@ from vmri_jax.study.table import Column
 
 
 def duration(seconds: float) -> str:
-    """A time with its unit: 12 µs, 3.4 ms, 1.2 s."""
+    """A time with its unit: 12 µs, 3.4 ms, 1.2 s; empty for NaN."""
+    if np.isnan(seconds):
+        return ""
     for unit, size in (("s", 1.0), ("ms", 1e-3), ("µs", 1e-6)):
         if seconds >= size:
             return f"{seconds / size:.3g} {unit}"
@@ -61,8 +63,8 @@ class WorkPrecision(RunTable):
         return pareto_front(self.rows, work, "error_q")
 
     def shown(self) -> list[Row]:
-        """The Pareto front."""
-        return self.pareto()
+        """The Pareto front, by numbers of steps where no run has a time."""
+        return self.pareto() or self.pareto("num_steps")
 
     def plot(self, title: str = "", work: str = "seconds"):
         """Error against work, see `vmri_jax.plots.plot_work_precision`."""
@@ -71,7 +73,7 @@ class WorkPrecision(RunTable):
 
 def pareto_front(items: Sequence[Any], work: str, error: str) -> list[Any]:
     """The items that no other item beats both in the attribute `work` and in the attribute `error`, the cheapest first."""
-    front, finite = [], [item for item in items if np.isfinite(getattr(item, error))]
+    front, finite = [], [item for item in items if np.isfinite([getattr(item, error), getattr(item, work)]).all()]
     for item in sorted(finite, key=attrgetter(work, error)):
         if not front or getattr(item, error) < getattr(front[-1], error):
             front.append(item)
