@@ -12,7 +12,7 @@ from vmri_jax.study import ReferenceSolution, Row, WorkPrecision, convergence_st
 from vmri_jax.study.cost_report import bound_of
 from vmri_jax.study.prices import FAST, SLOW, prices, seconds_of_gradients
 
-EXACT = ReferenceSolution(np.zeros((2, 1)), np.zeros((2, 1)))
+EXACT = ReferenceSolution(np.zeros((2, 4)), np.zeros((2, 4)))
 ROW = Row("kicks", 5, 2, 4, 0.1, 1e-3, seconds=2.0, slow_evaluations=4, fast_evaluations=20)
 
 
