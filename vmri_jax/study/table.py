@@ -102,5 +102,6 @@ def rich_table(columns: Sequence[Column], rows: Sequence[Any], caption: str = ""
     for i in kept:
         table.add_column(columns[i].name, justify="right" if columns[i].right else "left")
     for line in cells:
-        table.add_row(*(escape(line[i]) if isinstance(line[i], str) else line[i] for i in kept))
+        shown = [line[i] for i in kept]
+        table.add_row(*(escape(cell) if isinstance(cell, str) else cell for cell in shown))
     return table
