@@ -12,13 +12,16 @@ AS_USERS := tests/benchmarks tests/pages
 # Timed, or printed on a page: compiled as users compile.
 TOOLS := tests/tools tests/ensembles/test_workers.py
 
-.PHONY: reproduce test test-tools smoke notebooks docs bench lint lock clean
+.PHONY: reproduce test test-quick test-tools smoke notebooks docs bench lint lock clean
 
 reproduce: .venv/installed  ## the quick reference study: figures, tables and out/report.html
 	$(BIN)/python -m benchmarks gail2014 --quick --out out
 
 test: .venv/installed  ## the library; the same instructions, compiled without LLVM's optimisations: most of the time is compiling
 	$(PYTEST) --unoptimised $(addprefix --ignore=,tests/smoke $(TOOLS) $(AS_USERS)) $(OPTIONS)
+
+test-quick: .venv/installed  ## below a minute: refusals and structure, which compile nothing; tests/quick.py holds the list
+	$(BIN)/python -m pytest --quick --unoptimised tests $(OPTIONS)
 
 test-tools: .venv/installed  ## benchmarks, notebooks, programs and commands of the pages, every tool on every small system, ensembles on workers
 	$(PYTEST) $(AS_USERS) $(OPTIONS)

@@ -1,5 +1,7 @@
 """Measurements of time and memory: each prints tables, writes JSON with machine and versions, and draws figures."""
 
+from collections.abc import Sequence
+from inspect import Parameter, Signature, signature
 from pathlib import Path
 from typing import Annotated
 
@@ -36,6 +38,7 @@ from benchmarks.gail2014.command import gail2014
 from benchmarks.hard_cases.command import hard
 from benchmarks.measure import prepare
 from benchmarks.report import console, progress
+from vmri_jax.cli.common import refusals
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help=__doc__, pretty_exceptions_show_locals=False)
 
@@ -45,63 +48,68 @@ Out = Annotated[Path, typer.Option(help="Folder for the JSON files and the figur
 OUT = Path("out/benchmarks")
 
 app.command()(gail2014)
-app.command()(hard)
+app.command()(refusals()(hard))
 
 
-COMPILES = ("chains",)
-"""Commands that report seconds of compilation: programs in the cache would be no measure of them."""
+COMPILES = ("chains", "mechanisms", "kills")
+"""Commands that report seconds of compilation, or start processes: programs in the cache would be no measure of them."""
+MANY_CORES = ("gpu", "kills", "ensemble-kills")
+"""Commands that keep to no core."""
+
+HELP = {
+    "only": "Cases of these names, or whose names begin so; may be repeated.",
+    "shared": "Count processor time: other processes use the core too.",
+    "peers": "Integrators, e.g. heyoka; may be repeated. Ours always runs.",
+    "way": "Ways that begin so, e.g. joint; may be repeated.",
+    "python": "Python of the other checkout; by default that in its .venv, else this one.",
+}
+"""Texts of options that are arguments of `sizes`."""
 
 
-def _plain_command(name: str, module) -> None:
-    """A command without options of its own; its help is the docstring of the benchmark."""
+def _register(name: str, module) -> None:
+    """A command with the arguments of the function `sizes` of its module as options; its help is the docstring of the module."""
 
-    @app.command(name, help=module.__doc__)
-    def command(full: Full = False, core: Core = None, out: Out = OUT) -> None:
-        prepare(core, cache=name not in COMPILES)
-        _measure(name, module, full, out)
+    def command(full: Full = False, core: Core = None, out: Out = OUT, **options) -> None:
+        prepare(-1 if core is None and name in MANY_CORES else core, cache=name not in COMPILES)
+        _measure(name, module, full, out, **options)
+
+    _, *own = signature(module.sizes).parameters.values()
+    for i, option in enumerate(own):
+        kind = list[str] if option.annotation == Sequence[str] else option.annotation
+        if option.name in HELP:
+            own[i] = option.replace(annotation=Annotated[kind, typer.Option(help=HELP[option.name])])
+    *common, _ = signature(command).parameters.values()
+    parameters = [p.replace(kind=Parameter.KEYWORD_ONLY) for p in (*own, *common)]
+    command.__signature__ = Signature(parameters)  # pyright: ignore[reportFunctionMemberAccess]
+    command.__annotations__ = {p.name: p.annotation for p in parameters}
+    app.command(name, help=module.__doc__)(command)
 
 
 for _name, _module in {
     "adjoints": adjoints,
+    "against": against,
     "cost": cost,
+    "dear": dear,
+    "ensemble-kills": ensemble_kills,
     "floor": floor,
     "chains": chains,
     "compile": compilation,
     "control": control,
     "errors": errors,
+    "gpu": gpu,
+    "imports": imports,
+    "kills": kills,
+    "mechanisms": mechanisms,
     "models": random_models,
     "orders": orders,
+    "peers": peers,
     "programs": instructions,
     "savings": savings,
     "scenes": scenes,
+    "tricks": tricks,
+    "tuned": tuned,
 }.items():
-    _plain_command(_name, _module)
-
-
-@app.command("dear", help=dear.__doc__)
-def dear_command(
-    shared: Annotated[bool, typer.Option(help="Count processor time: other processes use the core too.")] = False,
-    only: Annotated[
-        list[str] | None, typer.Option(help="Systems that begin so, e.g. network; may be repeated.")
-    ] = None,
-    full: Full = False,
-    core: Core = None,
-    out: Out = OUT,
-) -> None:
-    prepare(core)
-    _measure("dear", dear, full, out, only=only or (), shared=shared)
-
-
-@app.command("tuned", help=tuned.__doc__)
-def tuned_command(
-    shared: Annotated[bool, typer.Option(help="Count processor time: other processes use the core too.")] = False,
-    only: Annotated[list[str] | None, typer.Option(help="Systems, e.g. 'FPU l=3'; may be repeated.")] = None,
-    full: Full = False,
-    core: Core = None,
-    out: Out = OUT,
-) -> None:
-    prepare(core)
-    _measure("tuned", tuned, full, out, only=only or (), shared=shared)
+    _register(_name, _module)
 
 
 @app.command("batch", help=batch.__doc__)
@@ -113,84 +121,6 @@ def batch_command(
 ) -> None:
     prepare(core if devices == 1 else -1, devices=devices)
     _measure("batch", batch, full, out, devices=devices)
-
-
-@app.command("gpu", help=gpu.__doc__)
-def gpu_command(full: Full = False, out: Out = OUT) -> None:
-    prepare()
-    _measure("gpu", gpu, full, out)
-
-
-@app.command("peers")
-def peers_command(
-    full: Full = False,
-    core: Core = None,
-    out: Out = OUT,
-    only: Annotated[
-        list[str] | None, typer.Option(help="Cases, e.g. 'TSP t=1', or all of a system, e.g. TSP; may be repeated.")
-    ] = None,
-    peer: Annotated[
-        list[str] | None, typer.Option(help="Integrators, e.g. heyoka; may be repeated. Ours always runs.")
-    ] = None,
-) -> None:
-    """Time to reach an error, against other integrators; the extra `peers` installs them."""
-    prepare(core)
-    _measure("peers", peers, full, out, only=only or (), peers=peer or ())
-
-
-@app.command("mechanisms", help=mechanisms.__doc__)
-def mechanisms_command(
-    full: Full = False,
-    core: Core = None,
-    out: Out = OUT,
-    only: Annotated[
-        list[str] | None,
-        typer.Option(help="Mechanisms, e.g. 'chain 3', or all of a kind, e.g. chain; may be repeated."),
-    ] = None,
-    way: Annotated[list[str] | None, typer.Option(help="Ways that begin so, e.g. joint; may be repeated.")] = None,
-) -> None:
-    prepare(core, cache=False)
-    _measure("mechanisms", mechanisms, full, out, markdown=True, only=only or (), way=way or ())
-
-
-@app.command("imports", help=imports.__doc__)
-def imports_command(
-    full: Full = False,
-    core: Core = None,
-    out: Out = OUT,
-    only: Annotated[
-        list[str] | None, typer.Option(help="Files whose names begin so, e.g. humanoid; may be repeated.")
-    ] = None,
-) -> None:
-    prepare(core)
-    _measure("imports", imports, full, out, only=only or ())
-
-
-@app.command("against", help=against.__doc__)
-def against_command(
-    before: Annotated[Path, typer.Argument(help="Another checkout of this repository, to compare this one with.")],
-    python: Annotated[
-        Path | None, typer.Option(help="Its Python; by default that in its .venv, else this one.")
-    ] = None,
-    only: Annotated[list[str] | None, typer.Option(help=f"Of {', '.join(against.GROUPS)}; may be repeated.")] = None,
-    shared: Annotated[bool, typer.Option(help="Count processor time: other processes use the core too.")] = False,
-    full: Full = False,
-    core: Core = None,
-    out: Out = OUT,
-) -> None:
-    prepare(core)
-    _measure("against", against, full, out, before=before, python=python, only=only or (), shared=shared)
-
-
-@app.command("tricks", help=tricks.__doc__)
-def tricks_command(
-    only: Annotated[list[str] | None, typer.Option(help="Functions of the kernels; may be repeated.")] = None,
-    full: Full = False,
-    core: Core = None,
-    out: Out = OUT,
-) -> None:
-    prepare(core)
-    _measure("tricks", tricks, full, out, markdown=True, only=only or ())
 
 
 @app.command("ensembles", help=ensembles.__doc__)
@@ -214,22 +144,6 @@ def baseline_command(
     console.print(f"written to {baseline.FILE}")
 
 
-@app.command("kills", help=kills.__doc__)
-def kills_command(count: Annotated[int, typer.Option(min=1, help="Kills.")] = 100, out: Out = OUT) -> None:
-    prepare(cache=False)
-    _measure("kills", kills, False, out, count=count)
-
-
-@app.command("ensemble-kills", help=ensemble_kills.__doc__)
-def ensemble_kills_command(
-    workers: Annotated[int, typer.Option(min=0, help="Workers to kill.")] = 50,
-    mains: Annotated[int, typer.Option(min=0, help="Whole processes to kill.")] = 20,
-    out: Out = OUT,
-) -> None:
-    prepare()
-    _measure("ensemble kills", ensemble_kills, False, out, workers=workers, mains=mains)
-
-
 @app.command("all")
 def all_command(full: Full = False, core: Core = None, out: Out = OUT) -> None:
     """Floor, batch, compile and cost, one after the other."""
@@ -238,7 +152,7 @@ def all_command(full: Full = False, core: Core = None, out: Out = OUT) -> None:
         _measure(name, module, full, out)
 
 
-def _measure(title: str, module, full: bool, out: Path, markdown: bool = False, **options) -> None:
+def _measure(title: str, module, full: bool, out: Path, **options) -> None:
     """Measure, print and write: after each case what is known by then, so that nothing is lost."""
     name, report, path = "full" if full else "quick", None, None
     size = module.sizes(name, **options)
@@ -246,8 +160,6 @@ def _measure(title: str, module, full: bool, out: Path, markdown: bool = False, 
         with progress(title) as tell:
             for report in module.run(size, name, tell):
                 path = report.write(out)
-                if markdown:
-                    path.with_suffix(".md").write_text(report.markdown(module.COLUMNS), encoding="utf-8")
     finally:
         if report is not None:
             report.show(module.COLUMNS)

@@ -15,8 +15,9 @@ from benchmarks import programs
 from benchmarks.gail2014.dense import dense
 from benchmarks.gail2014.reference import unstructured
 from benchmarks.measure import Ratio, Tell, interleaved, quartiles, ratio, silent, steps_for
-from benchmarks.report import legend_below, spread
+from benchmarks.report import spread
 from vmri_jax import plots
+from vmri_jax.plots import legend_below
 
 TIME = "µs/micro step"
 FROM = 10

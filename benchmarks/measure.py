@@ -1,9 +1,11 @@
 """Before anything is measured: the process keeps to one core, and JAX is told how to compile. Ratios of times with their spread."""
 
 import os
+import platform
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from importlib.metadata import version
 from typing import Generic, TypeVar
 
 import jax
@@ -11,7 +13,7 @@ import numpy as np
 
 from vmri_jax.configure import cache_folder, configure
 from vmri_jax.running.timing import Tell, interleaved, seconds_per_call, silent
-from vmri_jax.study.machine import machine
+from vmri_jax.study.html import processor
 
 __all__ = [
     "Ratio",
@@ -102,6 +104,22 @@ def quartiles(samples: Sequence[float], scale: float = 1.0) -> Ratio:
     """Median and quartiles of samples, times `scale`."""
     low, middle, high = (scale * float(x) for x in np.quantile(samples, (0.25, 0.5, 0.75)))
     return Ratio(middle, low, high)
+
+
+def machine() -> dict:
+    """Versions, processor, cores of this process and compiler flags, for every file of results."""
+    cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None
+    return {
+        "processor": processor(),
+        "cores": cores,
+        "system": platform.platform(),
+        "python": platform.python_version(),
+        "jax": jax.__version__,
+        "jaxlib": version("jaxlib"),
+        "numpy": np.__version__,
+        "vmri_jax": version("vmri_jax"),
+        "xla_flags": os.environ.get("XLA_FLAGS", ""),
+    }
 
 
 def pin(core: int | None) -> int | None:

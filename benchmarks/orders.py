@@ -11,7 +11,7 @@ from benchmarks import programs
 from benchmarks.measure import Tell, silent
 from benchmarks.report import Report
 from vmri_jax.diagnostics import fit_order
-from vmri_jax.study import Program, ReferenceSolution
+from vmri_jax.study import ReferenceSolution
 
 COLUMNS = ("system", "scheme", "num_micro", "order", "of q", "+-", "of p", "+- ", "points", "finest error", "holds")
 DEGREES, COMPOSITIONS = (1, 2, 3, 4), ("suzuki4", "kahan-li6", "kahan-li8")
@@ -72,7 +72,7 @@ def truth(system: str) -> ReferenceSolution:
 def measure(case: Case) -> dict:
     """Errors over ever smaller macro steps, and the slopes through the last of them."""
     problem, reference = programs.problem(case.system), truth(case.system)
-    program, order = Program(problem, case.scheme, 1.0, NODES), case.scheme.order
+    run, order = vm.prepare(problem, case.scheme, macro_dt=1.0 / NODES, num_steps=NODES), case.scheme.order
     sizes = np.array([np.abs(reference.q).max(), np.abs(reference.p).max()])
     constrained = sum(problem.system.num_constraints(problem.q_s, problem.q_f)) > 0
     floors = FLOOR * np.array([1, OF_MULTIPLIERS if constrained else 1])
@@ -80,7 +80,7 @@ def measure(case: Case) -> dict:
     n = NODES * max(1, round(100 / case.scheme.num_micro / case.scheme.degree / NODES))
     while n < MOST_STEPS and not (errors and np.all(errors[-1] < floors)):
         steps.append(n)
-        errors.append(np.array(reference.errors(program(n))) / sizes)
+        errors.append(np.array(reference.errors(run(macro_dt=1.0 / n, num_steps=n, throw=False))) / sizes)
         n = max(n + NODES, NODES * round(n * RATIO / NODES))
     row = {"system": case.system, "scheme": case.label, "num_micro": case.num_micro, "order": order}
     fits = []

@@ -12,11 +12,10 @@ from typing import Any
 
 from matplotlib.figure import Figure
 from rich.markup import escape
-from rich.table import Table
 
 from benchmarks.measure import Ratio, Tell, machine
 from vmri_jax import plots
-from vmri_jax.running.printed import OutputConsole
+from vmri_jax.running.printed import OutputConsole, PrintedTable
 from vmri_jax.running.progress import SECONDS_BETWEEN_LINES
 
 console = OutputConsole()
@@ -76,18 +75,11 @@ class Report:
             plots.save(figure, out / f"{name}.png")
         return path
 
-    def markdown(self, columns: Sequence[str]) -> str:
-        """Rows (these columns of them), claims and notes as Markdown."""
-        lines = [f"## {self.name}, {self.size}"]
-        for head, *body in self._tables(columns):
-            lines += ["", *(f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *body))]
-        return "\n".join([*lines, "", *(f"- {note}" for note in self.notes), ""])
-
     def show(self, columns: Sequence[str]) -> None:
         """Print the rows (these columns of them), the claims and the notes."""
         console.print(f"{self.name}, {self.size}", style="bold")
         for head, *body in self._tables(columns):
-            table = Table(*head, box=None, pad_edge=False)
+            table = PrintedTable(*head)
             for row in body:
                 table.add_row(*map(escape, row))
             console.print(table, "")
@@ -124,16 +116,6 @@ def growing(name: str, size: str, parts: Iterable[tuple[list[dict], list[Claim]]
         rows += more_rows
         claims += more_claims
         yield Report(name, size, rows, claims, list(notes))
-
-
-def legend_below(figure: Figure, names: Sequence[str] = ()) -> None:
-    """Every curve once, under the panels, in the order of these names."""
-    curves: dict = {}
-    for axes in figure.axes:
-        handles, labels = axes.get_legend_handles_labels()
-        curves |= dict(zip(labels, handles, strict=True))
-    shown = [name for name in names or curves if name in curves]
-    figure.legend([curves[name] for name in shown], shown, loc="outside lower center", ncols=min(len(shown), 5))
 
 
 @contextmanager

@@ -12,7 +12,7 @@ from benchmarks.report import Claim, Report
 from benchmarks.scenes import gallery_scene
 from vmri_jax import plots
 from vmri_jax.running.timing import interleaved
-from vmri_jax.study.program import Program, joined
+from vmri_jax.study.reference_solution import joined
 
 COLUMNS = ("scene", "num_micro", "H", "error", "ms", "saving")
 SURGE = 4.0
@@ -101,15 +101,17 @@ def measured(case: Case, repeats: int, tell: Tell) -> dict[int, tuple[np.ndarray
     """Errors of the positions at the end and milliseconds, by num_micro."""
     problem = case.problem()
     tell(f"{case.name}, fine steps")
-    exact, _ = joined(Program(problem, vm.explicit_slow(1), case.t_end)(case.fine))
+    length = {"macro_dt": case.t_end / case.fine, "num_steps": case.fine, "save": case.fine}
+    exact, _ = joined(vm.simulate(problem, vm.explicit_slow(1), **length))
     errors, calls = {}, {}
     for num_micro, steps in case.steps.items():
-        program = Program(problem, vm.explicit_slow(num_micro), case.t_end)
+        run = vm.prepare(problem, vm.explicit_slow(num_micro), macro_dt=case.t_end, num_steps=1)
         for n in steps:
             tell(f"{case.name}, num_micro = {num_micro}, {n} steps")
-            q, _ = joined(program(n))
+            length = {"macro_dt": case.t_end / n, "num_steps": n}
+            q, _ = joined(run(**length, throw=False))
             errors[num_micro, n] = float(np.abs(q[-1] - exact[-1]).max())
-            calls[f"{num_micro} {n}"] = program.timed(n)
+            calls[f"{num_micro} {n}"] = run.timed(**length)
     seconds = interleaved(calls, repeats)
     return {
         num_micro: (

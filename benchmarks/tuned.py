@@ -17,7 +17,7 @@ from vmri_jax.accuracy.companions import UncertifiedWarning
 from vmri_jax.accuracy.steps import AccuracyNotReached
 from vmri_jax.mechanics.state import problem_of
 from vmri_jax.running.timing import interleaved
-from vmri_jax.study import Program, families, reference_solution, tune
+from vmri_jax.study import families, reference_solution, tune
 from vmri_jax.study.tuning import NothingReached
 
 COLUMNS = (
@@ -126,11 +126,13 @@ def _row(case: Case, clock: Callable[[], float]) -> dict:
     begun = clock()
     best = tune(problem, case.error, case.t_end, menu=menu, num_saves=NODES, verify=False)
     of_search = clock() - begun
-    ours = Program(problem, settings.scheme, case.t_end, NODES)
-    theirs = Program(problem, best.scheme, case.t_end, NODES)
-    true, true_of_search = (reference.errors(run)[0] for run in (ours(settings.num_steps), theirs(best.num_steps)))
-    runs = {"ours": ours.timed(settings.num_steps), "theirs": theirs.timed(best.num_steps)}
-    samples = interleaved(runs, REPEATS, clock=clock)
+    runs = [
+        vm.prepare(problem, it.scheme, macro_dt=it.macro_dt, num_steps=it.num_steps, save=it.num_steps // NODES)
+        for it in (settings, best)
+    ]
+    true, true_of_search = (reference.errors(run(throw=False))[0] for run in runs)
+    timed = (run.timed() for run in runs)
+    samples = interleaved(dict(zip(("ours", "theirs"), timed, strict=True)), REPEATS, clock=clock)
     return {
         "system": case.system,
         "error": case.error,

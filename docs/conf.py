@@ -11,7 +11,7 @@ import vmri_jax  # noqa: E402
 
 vmri_jax.configure()
 
-from extensions import docstrings, gallery, public  # noqa: E402
+from extensions import docstrings, effects, gallery, public  # noqa: E402
 
 project, author, copyright = "vmri_jax", "the vmri_jax developers", "the vmri_jax developers"
 version = release = vmri_jax.__version__
@@ -72,4 +72,5 @@ def setup(app):
         text = path.read_text(encoding="utf-8").replace("(scenes/README.md)", "(../gallery/index.rst)")
         (HERE / "tutorials" / path.name).write_text(text, encoding="utf-8")
     public.write(HERE / "reference")
+    effects.write(HERE / "reference")
     app.connect("autodoc-process-docstring", docstrings.as_rest, priority=1)  # before napoleon

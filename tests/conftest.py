@@ -31,6 +31,7 @@ def pytest_addoption(parser):
         action="store_true",
         help="fail if a test or a file takes more processor time than tests/durations.py allows",
     )
+    parser.addoption("--quick", action="store_true", help="refusals and structure, tests that compile nothing")
     parser.addoption(
         "--unoptimised",
         action="store_true",
@@ -61,6 +62,10 @@ def pytest_configure(config):
     configure(cache=cache_folder())
     trace_quickly()
     config.pluginmanager.register(Durations(config.getoption("--budget")), "durations")
+    if config.getoption("--quick"):
+        from tests.quick import Quick  # imports JAX, which is configured by now
+
+        config.pluginmanager.register(Quick(), "quick")
     # Tests make functions of one piece of code again for each case, runs that lose their energy, and starts with random velocities.
     config.addinivalue_line("filterwarnings", "ignore::vmri_jax.CompiledAgainWarning")
     config.addinivalue_line("filterwarnings", "ignore::vmri_jax.LostEnergyWarning")

@@ -374,6 +374,7 @@ def nan_potential(q_f, params):
     return jnp.sum(jnp.sqrt(-1.0 - q_f**2))
 
 
+@pytest.mark.compiles
 def test_nan_from_a_user_function(fpu):
     system = fpu.system.replace(fast_potential=nan_potential)
     with pytest.raises(SimulationError, match=r"a NaN or infinity appeared.*outside its domain") as caught:

@@ -11,16 +11,18 @@ import pytest
 
 import vmri_jax as vm
 from vmri_jax import plots
+from vmri_jax.accuracy.companions import resting
 from vmri_jax.mechanics.names import Names
+from vmri_jax.running.arguments import Steps
 from vmri_jax.running.origin import Origin
+from vmri_jax.running.simulation import simulation
 from vmri_jax.running.trajectory import RunInfo, with_origin
 from vmri_jax.study import (
-    ConvergenceRow,
     ConvergenceStudy,
     CostReport,
     ReferenceSolution,
+    Row,
     WorkPrecision,
-    WorkRow,
 )
 from vmri_jax.study.cost_report import Answer
 
@@ -49,9 +51,7 @@ def run(num_nodes=21, n_s=2, n_f=3, constrained=False):
 def study(orders=(1, 2)):
     """A convergence study of exact orders."""
     rows = [
-        ConvergenceRow(
-            f"order {order}", "", 5, 1, dt, dt**order, 10 * dt**order, 0.0, 0.0, 0.0, 0.0, 0.0, 2, "MARCH", "CONVERGED"
-        )
+        Row(f"order {order}", 5, order, round(1 / dt), dt, dt**order, 10 * dt**order)
         for order in orders
         for dt in (0.1, 0.01, 0.001)
     ]
@@ -214,11 +214,9 @@ def test_global_settings_stay_as_they_were():
 EXACT = ReferenceSolution(np.zeros((2, 2)), np.zeros((2, 2)))
 
 
-def work_row(error: float, seconds: float = 1e-3) -> WorkRow:
+def work_row(error: float, seconds: float = 1e-3) -> Row:
     """A run with this error and time."""
-    return WorkRow(
-        "impulse", 2, 2, 4, 0.1, error, error, seconds, seconds, seconds, 1.0, 0, 0, 0, 1, "EXPLICIT", "CONVERGED"
-    )
+    return Row("impulse", 2, 2, 4, 0.1, error, error, seconds=seconds, low=seconds, high=seconds)
 
 
 @pytest.mark.parametrize(
@@ -226,19 +224,14 @@ def work_row(error: float, seconds: float = 1e-3) -> WorkRow:
 )
 @pytest.mark.parametrize("work", ["seconds", "solves"])
 def test_runs_without_a_positive_error_or_work_are_drawn(errors, work):
-    study = WorkPrecision(tuple(map(work_row, errors)), 1.0, EXACT)
+    study = WorkPrecision(tuple(map(work_row, errors)), EXACT)
     assert is_drawn(study.plot(work=work))
 
 
 @pytest.mark.parametrize("errors", [(0.0, 0.0), (np.nan, np.nan)], ids=["zero", "failed"])
 def test_convergence_without_a_positive_error_is_drawn(errors):
-    numbers = dict.fromkeys(
-        ("energy_error", "energy_drift", "energy_band", "momentum_error", "constraint_residual"), 0.0
-    )
-    rows = tuple(
-        ConvergenceRow("impulse", "", 2, 1, step, error, error, iterations=1, method="EXPLICIT", result="", **numbers)
-        for step, error in zip((0.1, 0.05), errors, strict=True)
-    )
+    steps = zip((1, 2), errors, strict=True)
+    rows = tuple(Row("impulse", 2, 2, n, 0.1 / n, error, error) for n, error in steps)
     assert is_drawn(ConvergenceStudy(rows, {"": EXACT}).plot("errors", [2]))
 
 
@@ -249,8 +242,8 @@ def test_the_figure_of_a_cost_page_is_drawn_whatever_it_holds(count, error):
     rows = (work_row(error),) * count
     answers = Answer(1e-2, rows[0] if rows else None), Answer(1e-4, None)
     bound = tuple((row.seconds / 2, row.error_q) for row in rows)
-    runs = WorkPrecision(rows, 1.0)
-    assert is_drawn(CostReport(Path("cost.html"), "", 1.0, answers, runs, runs, {}, bound).figure("title", plots.DARK))
+    runs = WorkPrecision(rows)
+    assert is_drawn(CostReport(Path("cost.html"), "", 1.0, answers, runs, runs, bound).figure("title", plots.DARK))
 
 
 def test_a_single_node_and_a_run_that_failed_at_once_are_drawn():
@@ -266,3 +259,30 @@ def is_drawn(figure) -> bool:
     file = BytesIO()
     figure.savefig(file, format="svg")
     return file.tell() > 1000
+
+
+# --- scenes in joint coordinates ---------------------------------------------------------------------------------------
+@pytest.fixture(scope="module")
+def sliding_door():
+    """A cart on a rail with a door on a hinge, at rest at its start; nothing is computed."""
+    cart = vm.scene.RigidBody("cart", 2.0, vm.scene.Box((1.0, 1.0, 1.0)), [0.0, 0.0, 0.0])
+    door = vm.scene.RigidBody("door", 1.0, vm.scene.Box((1.0, 0.1, 1.0)), [1.0, 0.0, 0.0])
+    rail = vm.scene.Prismatic(("ground", "cart"), at=[0.0, 0.0, 0.0], axis=[1.0, 0.0, 0.0], name="rail")
+    hinge = vm.scene.Revolute(("cart", "door"), at=[0.5, 0.0, 0.0], axis=[0.0, 0.0, 1.0], name="hinge")
+    scene = vm.scene.Scene([cart, door], [rail, hinge])
+    return resting(simulation(scene, vm.fully_implicit(1), None, None, Steps(0.1, num_steps=4)))
+
+
+def test_angles_and_lengths_have_panels_of_their_own(sliding_door):
+    curves = {a.get_ylabel(): [line.get_label() for line in a.lines] for a in sliding_door.plot().axes}
+    angles, lengths = ([curves[name] for name in curves if unit in name] for unit in ("rad", "positions"))
+    assert angles == [["hinge"]]
+    assert lengths == [["rail"]]
+
+
+def test_forces_have_units_and_name_the_joints_without_curves(sliding_door, monkeypatch):
+    forces = {"stop": {"hinge": np.ones((5, 1)), "rail": np.ones((5, 1))}}
+    monkeypatch.setattr(vm.Trajectory, "reaction_forces", lambda run: forces)
+    figure = sliding_door.plot_forces()
+    assert [axes.get_ylabel() for axes in figure.axes] == ["reaction force\nN", "reaction torque\nN m"]
+    assert "by_directors" in figure.get_supxlabel()

@@ -6,7 +6,6 @@ import inspect
 import sys
 import traceback
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 from vmri_jax import systems
@@ -25,72 +24,26 @@ from vmri_jax.schemes.scheme import (
     takahashi_imada,
 )
 
-
-@dataclass(frozen=True)
-class NamedSystem:
-    """A built-in system: its factory, its title, and descriptions of its slow and fast variables."""
-
-    factory: Callable[..., Problem]
-    title: str
-    slow: str
-    fast: str
-
-
-@dataclass(frozen=True)
-class NamedScheme:
-    """A built-in scheme: its factory, its order, and a title that says where potentials are evaluated."""
-
-    factory: Callable[..., Scheme]
-    order: str
-    title: str
-
-    @property
-    def options(self) -> list[str]:
-        """Names of the arguments of the factory besides num_micro."""
-        return [name for name in inspect.signature(self.factory).parameters if name != "num_micro"]
-
-
 SYSTEMS = {
-    "fpu": NamedSystem(
-        systems.fermi_pasta_ulam,
-        "Fermi-Pasta-Ulam chain",
-        "centres of the stiff springs",
-        "elongations of the stiff springs",
-    ),
-    "tsp": NamedSystem(
-        systems.triple_spherical_pendulum,
-        "triple spherical pendulum",
-        "the heavy bob, on a rod",
-        "two light bobs, on a rod and a stiff spring",
-    ),
-    "sam": NamedSystem(
-        systems.simple_atomic_model,
-        "simple atomic model",
-        "two heavy atoms",
-        "four light atoms with rigid bonds and stiff springs",
-    ),
+    "fpu": systems.fermi_pasta_ulam,
+    "tsp": systems.triple_spherical_pendulum,
+    "sam": systems.simple_atomic_model,
 }
+"""The built-in systems."""
 
 DEFAULT_NAMES = ("scene", "problem")
 """Names that are taken, in this order, from a file with several problems if the user names only the file."""
 
-ORDER_OF_KICKS = "2 at alpha = 1/2, else 1"
-SCHEMES = {
-    "fully-implicit": NamedScheme(fully_implicit, "2", "V and W at the micro midpoints"),
-    "explicit-slow": NamedScheme(explicit_slow, ORDER_OF_KICKS, "V as kicks at the macro nodes, W at micro midpoints"),
-    "mollified-impulse": NamedScheme(
-        mollified_impulse, ORDER_OF_KICKS, "explicit-slow with V at averaged fast positions: no impulse resonance"
-    ),
-    "fully-explicit": NamedScheme(
-        fully_explicit, ORDER_OF_KICKS, "V as kicks at the macro nodes, W at the micro nodes"
-    ),
-    "takahashi-imada": NamedScheme(
-        takahashi_imada,
-        "2; frequencies to order 4",
-        "fully-explicit with corrected kicks: a Hessian product beside each gradient",
-    ),
-    "galerkin": NamedScheme(galerkin, "2 x degree", "one rule (gauss or lobatto) on every term, any degree"),
+SCHEMES: dict[str, Callable[..., Scheme]] = {
+    scheme.__name__.replace("_", "-"): scheme
+    for scheme in (fully_implicit, explicit_slow, mollified_impulse, fully_explicit, takahashi_imada, galerkin)
 }
+"""The built-in schemes."""
+
+
+def options_of(scheme: Callable[..., Scheme]) -> list[str]:
+    """Names of the arguments of a scheme besides num_micro."""
+    return [name for name in inspect.signature(scheme).parameters if name != "num_micro"]
 
 
 MODELS = (".xml", ".mjcf", ".urdf")
@@ -122,7 +75,7 @@ def find_scene_or_problem(name: str) -> Scene | Problem:
         ValueError: as in `find_problem`.
     """
     if name in SYSTEMS:
-        return SYSTEMS[name].factory()
+        return SYSTEMS[name]()
     file_name, colon, attribute = name.partition(":")
     if Path(name).suffix.lower() in MODELS:
         try:
@@ -178,12 +131,12 @@ def find_scheme(name: str, num_micro: int, compose: str | None = None, **options
         raise ValueError(unknown("scheme", name, SCHEMES))
     arguments = {key: value for key, value in options.items() if value is not None}
     for key in arguments:
-        if key not in scheme.options:
-            takers = [label for label, entry in SCHEMES.items() if key in entry.options]
+        if key not in options_of(scheme):
+            takers = [label for label, other in SCHEMES.items() if key in options_of(other)]
             raise ValueError(f"the scheme {name} has no {key}; leave --{key} out or use {' or '.join(takers)}.")
-    if scheme.factory is galerkin and "degree" not in arguments:
+    if scheme is galerkin and "degree" not in arguments:
         raise ValueError("the scheme galerkin needs the degree of its path; give e.g. --degree 2.")
-    made = scheme.factory(num_micro, **arguments)
+    made = scheme(num_micro, **arguments)
     return made if compose is None else composition.compose(made, compose)
 
 

@@ -19,8 +19,9 @@ from benchmarks.measure import Ratio, Size, Tell, silent
 from benchmarks.report import Claim, Report
 from benchmarks.savings import ratio_at
 from vmri_jax import plots
+from vmri_jax.running.simulation import Simulation
 from vmri_jax.running.timing import interleaved, seconds_each
-from vmri_jax.study.program import Program, joined
+from vmri_jax.study.reference_solution import joined
 
 COLUMNS = ("system", "scheme", "H", "error", "ms", "gain", "bound")
 TARGET = 1e-5
@@ -203,7 +204,8 @@ def measured(
 ) -> dict[str, Curve]:
     """Numbers of macro steps, errors of the positions at the end and milliseconds, by scheme."""
     tell(f"{case.title}, fine steps")
-    exact, _ = joined(Program(problem, vm.compose(vm.fully_explicit(10), "kahan-li8"), case.t_end)(case.fine))
+    length = {"macro_dt": case.t_end / case.fine, "num_steps": case.fine, "save_every": case.fine}
+    exact, _ = joined(vm.simulate(problem, vm.compose(vm.fully_explicit(10), "kahan-li8"), **length))
     runs: dict[str, Callable[[], object]] = {}
     errors: dict[str, dict[int, float]] = {}
     samples: dict[str, list[float]] = {}
@@ -227,7 +229,7 @@ def measured(
 
     for scheme, (of_scheme, integrator) in schemes(case, problem).items():
         first = max(1, case.first // 16) if isinstance(integrator, vm.Composition) else case.first
-        climb(scheme, _rungs(Program(of_scheme, integrator, case.t_end), first))
+        climb(scheme, _rungs(vm.prepare(of_scheme, integrator, macro_dt=case.t_end, num_steps=1), first))
     fastest = max(case.num_micro)
     for peer in peers:
         name = f"{peer}, N = {fastest}" if peer in FIXED_STEPS else peer
@@ -262,11 +264,12 @@ def schemes(case: Case, problem: vm.Problem) -> dict[str, tuple[vm.Problem, Any]
     return found
 
 
-def _rungs(program: Program, first: int) -> Rungs:
-    """Numbers of macro steps, the positions at the end, and a run for the clock."""
+def _rungs(run: Simulation, first: int) -> Rungs:
+    """Numbers of macro steps over the length of a run of one step, the positions at the end, and a run for the clock."""
     n = first
     while True:
-        yield n, lambda n=n: joined(program(n))[0][-1], program.timed(n)
+        length = {"macro_dt": run.macro_dt / n, "num_steps": n}
+        yield n, lambda length=length: joined(run(**length, throw=False))[0][-1], run.timed(**length)
         n = round(n * RATIO)
 
 

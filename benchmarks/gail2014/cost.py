@@ -13,12 +13,13 @@ from matplotlib.ticker import FixedLocator, NullLocator
 from benchmarks.gail2014.dense import named
 from vmri_jax import plots
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
+from vmri_jax.running.prepare import prepare
 from vmri_jax.running.progress import shows_progress
+from vmri_jax.running.simulation import Simulation
 from vmri_jax.running.timing import interleaved
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.results import Method, Result
-from vmri_jax.study.program import Program
 from vmri_jax.study.table import Column, ResultTable, interruptible
 
 
@@ -139,7 +140,7 @@ def cost_study(
             f"micro_dt = {micro_dt}, t_end = {t_end}; give at least one of each, and positive times."
         )
     total = len(num_micro) * len(methods) + 1
-    runs: list[tuple[str, Program, int, Trajectory]] = []
+    runs: list[tuple[str, Simulation, float, Trajectory]] = []
     seconds: dict[str, list[float]] = {}
 
     def study() -> CostStudy:
@@ -151,30 +152,38 @@ def cost_study(
             for n in num_micro:
                 progress(f"{label} {method}, {n} micro steps: compiling".strip(), len(runs), total)
                 num_steps = max(1, round(t_end / (n * micro_dt)))
-                program = Program(problem, scheme(n), num_steps * n * micro_dt, solver=solver)
-                runs.append((method, program, num_steps, program(num_steps)))
+                start = time.perf_counter()
+                length = {"macro_dt": n * micro_dt, "num_steps": num_steps, "save_every": num_steps}
+                program = prepare(problem, scheme(n), **length, solver=solver)
+                first_call_seconds = time.perf_counter() - start
+                runs.append((method, program, first_call_seconds, program(throw=False)))
         progress(f"{label} measuring times".strip(), total - 1, total)
-        calls = {str(i): program.timed(n) for i, (_, program, n, run) in enumerate(runs) if run.success}
+        calls = {str(i): program.timed() for i, (_, program, _, run) in enumerate(runs) if run.success}
         seconds = interleaved(calls, repeats, min_seconds, clock=clock)
     progress("done", total, total)
     return study()
 
 
 def _row(
-    label: str, method: str, program: Program, num_steps: int, trajectory: Trajectory, seconds: Sequence[float]
+    label: str,
+    method: str,
+    program: Simulation,
+    first_call_seconds: float,
+    trajectory: Trajectory,
+    seconds: Sequence[float],
 ) -> CostRow:
     """The row of a run with the median of its samples of seconds."""
     scheme, state, median = program.scheme, program.state, float(np.median(seconds))
-    n_g, n_gs = program.problem.system.num_constraints(state.q_s, state.q_f)
+    n_g, n_gs = program.system.num_constraints(state.q_s, state.q_f)
     return CostRow(
         label=label,
         method=method,
         num_micro=scheme.num_micro,
         num_unknowns=scheme.degree * (state.q_s.size + n_gs + scheme.num_micro * (state.q_f.size + n_g)),
-        num_steps=num_steps,
-        seconds_per_unit=median / program.t_end,
-        us_per_micro_step=1e6 * median / (num_steps * scheme.num_micro),
-        first_call_seconds=program.compile_seconds,
+        num_steps=program.num_steps,
+        seconds_per_unit=median / (program.num_steps * float(program.macro_dt)),
+        us_per_micro_step=1e6 * median / (program.num_steps * scheme.num_micro),
+        first_call_seconds=first_call_seconds,
         iterations=int(np.max(trajectory.info.iterations)),
         solved_by=Method(int(np.max(trajectory.info.method))).name,
         result=Result(int(trajectory.result)).name,

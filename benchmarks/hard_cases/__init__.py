@@ -1,12 +1,14 @@
-"""The 28 hard cases: where multirate variational integrators break, and what counts as a pass."""
+"""Hard cases of this project beside those of `vmri check`: where multirate variational integrators break, and what counts as a pass."""
 
-from benchmarks.hard_cases import chains, constraints, encounters, guards, large_steps, long_runs, resonance, scales
+from dataclasses import replace
+
+from benchmarks.hard_cases import chains, constraints, encounters, large_steps, long_runs, resonance, scales
 from vmri_jax.hard_cases import Case
 
-MODULES = (chains, constraints, encounters, guards, large_steps, long_runs, resonance, scales)
+MODULES = (resonance, large_steps, constraints, chains, long_runs, encounters, scales)
 
 
 def catalogue() -> tuple[Case, ...]:
-    """All cases, by number."""
-    found = [value for module in MODULES for value in vars(module).values() if isinstance(value, Case)]
-    return tuple(sorted(found, key=lambda case: case.number))
+    """All cases, numbered in the order of their modules."""
+    cases = [value for module in MODULES for value in vars(module).values() if isinstance(value, Case)]
+    return tuple(replace(case, number=number) for number, case in enumerate(cases, start=1))

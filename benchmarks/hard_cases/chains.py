@@ -1,4 +1,4 @@
-"""Cases 11 and 12: linkages through singular configurations, a chain that hardly stretches."""
+"""Linkages through singular configurations, a chain that hardly stretches."""
 
 import numpy as np
 
@@ -10,7 +10,7 @@ from vmri_jax.hard_cases import Outcome
 from vmri_jax.hard_cases.measures import constraints, energy, run, status
 
 
-@hard_case(11, "singular configuration", draw_singular)
+@hard_case("singular configuration", draw_singular)
 def singular_configuration(full: bool) -> Outcome:
     """four-bar linkage through its collinear position, straight 20-link chain
 
@@ -55,7 +55,7 @@ def _meets_zero(scheme, macro_steps: int = 8) -> float:
     return b
 
 
-@hard_case(12, "near-inextensible chain")
+@hard_case("near-inextensible chain")
 def stiff_springs_in_a_chain(full: bool) -> Outcome:
     """50 masses, k = 1e6, num_micro 20: fully_implicit, H = 0.02; fully_explicit, H = 0.001, 1e5 steps
 

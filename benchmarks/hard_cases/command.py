@@ -1,11 +1,11 @@
-"""`python -m benchmarks hard`: the 28 hard cases that are ours."""
+"""`python -m benchmarks hard`: the 22 hard cases of this project."""
 
 from benchmarks.measure import prepare
 from vmri_jax.cli.check import Full, Numbers, Out, run_and_show
 
 
 def hard(case: Numbers = None, full: Full = False, out: Out = None) -> None:
-    """Hard cases: resonances, large and tiny steps, constraints under stress, contact, long runs, bad input.
+    """Hard cases: resonances, large and tiny steps, constraints under stress, contact, long runs.
 
     Ends with code 1 if a criterion is not met.
     """

@@ -1,4 +1,4 @@
-"""Cases 19, 21 and 22: stiff contact, points that nearly coincide, a close encounter."""
+"""Stiff contact, points that nearly coincide, a close encounter."""
 
 from functools import partial
 
@@ -14,7 +14,7 @@ from vmri_jax.hard_cases.measures import energy, long_run, run, status
 from vmri_jax.running.timing import interleaved
 
 
-@hard_case(19, "stiff penalty contact")
+@hard_case("stiff penalty contact")
 def penalty_contact(full: bool) -> Outcome:
     """ball on a floor of k = 1e8, 100 bounces, num_micro 20, H = 1e-4
 
@@ -42,7 +42,7 @@ def penalty_contact(full: bool) -> Outcome:
     )
 
 
-@hard_case(21, "norm at zero")
+@hard_case("norm at zero")
 def norm_at_zero(full: bool) -> Outcome:
     """triple pendulum with l_3 = 0.01, points 1e-2 to 1e-8 apart, and coincident
 
@@ -77,7 +77,7 @@ def norm_at_zero(full: bool) -> Outcome:
     )
 
 
-@hard_case(22, "close encounter")
+@hard_case("close encounter")
 def close_encounter(full: bool) -> Outcome:
     """two bodies, e = 0.9, centre of mass in a trap
 

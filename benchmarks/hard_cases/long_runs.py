@@ -1,4 +1,4 @@
-"""Cases 16 to 18 and 20: constraints and energy over long runs, a loose tolerance, chaos."""
+"""Constraints and energy over long runs, a loose tolerance, chaos."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -47,7 +47,7 @@ def smooth_shift(trajectory: vm.Trajectory, num_steps: int, scale: float) -> flo
     return float(weights @ (e[-half:] - e[:half]) / weights.sum() / (num_steps - num_steps / 2) * 1e5)
 
 
-@hard_case(16, "constraints for long", draw_energy)
+@hard_case("constraints for long", draw_energy)
 def constraints_for_long(full: bool) -> Outcome:
     """triple pendulum, fully_implicit, num_micro 5, H = 0.01, 1e6 steps
 
@@ -79,7 +79,7 @@ def constraints_for_long(full: bool) -> Outcome:
     )
 
 
-@hard_case(17, "energy for long", draw_energy)
+@hard_case("energy for long", draw_energy)
 def energy_for_long(full: bool) -> Outcome:
     """FPU chain, fully_implicit, num_micro 10, H = 0.03, 1e6 steps
 
@@ -108,9 +108,9 @@ def energy_for_long(full: bool) -> Outcome:
     )
 
 
-@hard_case(18, "loose Newton tolerance", draw_energy)
+@hard_case("loose Newton tolerance", draw_energy)
 def loose_tolerance(full: bool) -> Outcome:
-    """case 17 with tolerance 1e-4, 1e-8, and 1e-12, the default
+    """the energy for long with tolerance 1e-4, 1e-8, and 1e-12, the default
 
     drift shrinks with the tolerance, the default shows none
     """
@@ -132,7 +132,7 @@ def loose_tolerance(full: bool) -> Outcome:
     )
 
 
-@hard_case(20, "chaotic pendulum")
+@hard_case("chaotic pendulum")
 def chaotic_pendulum(full: bool) -> Outcome:
     """triple pendulum, upright but for 1e-3, t = 100
 

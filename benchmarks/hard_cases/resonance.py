@@ -1,4 +1,4 @@
-"""Cases 1 to 4 and 26: resonances of the macro step, and slow and fast variables exchanged."""
+"""Resonances of the macro step, and slow and fast variables exchanged."""
 
 from dataclasses import replace
 
@@ -23,7 +23,7 @@ def advised(advice) -> str:
     return "let pass" if advice.ok else "advised against"
 
 
-@hard_case(1, "impulse resonance", draw_windows)
+@hard_case("impulse resonance", draw_windows)
 def impulse_resonance(full: bool) -> Outcome:
     """linear model, kappa = 25, omega = 50, explicit_slow, omega H to 4 pi
 
@@ -46,7 +46,7 @@ def impulse_resonance(full: bool) -> Outcome:
     )
 
 
-@hard_case(2, "FPU at omega H = pi")
+@hard_case("FPU at omega H = pi")
 def chain_at_half_period(full: bool) -> Outcome:
     """FPU chain, H = 0.0628, num_micro 30, t = 200
 
@@ -66,7 +66,7 @@ def chain_at_half_period(full: bool) -> Outcome:
     )
 
 
-@hard_case(3, "implicit combination resonance")
+@hard_case("implicit combination resonance")
 def combination_resonance(full: bool) -> Outcome:
     """linear model, kappa = 25, fully_implicit, omega h = 0.1, num_micro 57
 
@@ -88,7 +88,7 @@ def combination_resonance(full: bool) -> Outcome:
     )
 
 
-@hard_case(4, "nonlinear resonance T/3, T/4")
+@hard_case("nonlinear resonance T/3, T/4")
 def nonlinear_resonance(full: bool) -> Outcome:
     """FPU chain with cubic coupling, explicit_slow, omega H = 2 pi / 3 and pi / 2, 1e5 steps
 
@@ -110,7 +110,7 @@ def nonlinear_resonance(full: bool) -> Outcome:
     return Outcome(f"relative energy drift (median of {STARTS} starts) at {'; at '.join(said)}", fine, values)
 
 
-@hard_case(26, "swapped labels")
+@hard_case("swapped labels")
 def swapped_labels(full: bool) -> Outcome:
     """FPU chain with slow and fast variables exchanged
 

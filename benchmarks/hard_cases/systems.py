@@ -61,25 +61,18 @@ def four_bars(q_s, q_f, params):
     return (square - jnp.stack([params["crank"], params["base"], params["crank"]]) ** 2) / 2
 
 
-def four_bars_and_one_again(q_s, q_f, params):
-    """`four_bars` with the coupler given twice."""
-    rows = four_bars(q_s, q_f, params)
-    return jnp.concatenate([rows, rows[1:2]])
-
-
-def four_bar(angle: float, kappa: float = 0.0, redundant: bool = False) -> vm.Problem:
+def four_bar(angle: float, kappa: float = 0.0) -> vm.Problem:
     """Parallelogram linkage (fast), with a heavy slide (slow) on a spring; singular at angle 0.
 
     Args:
         angle: of the crank at the start; it turns with speed 1.
         kappa: stiffness of the spring; without it the linkage turns uniformly.
-        redundant: give one of the three constraints twice.
     """
     base = 2.0
     system = vm.System(
         vm.ConstantMass([50.0], [1.0] * 4),
         slow_potential=pull_on_crank,
-        constraint=four_bars_and_one_again if redundant else four_bars,
+        constraint=four_bars,
         params=arrays(crank=1.0, base=base, kappa=kappa),
     )
     tip = np.array([np.cos(angle), np.sin(angle)])

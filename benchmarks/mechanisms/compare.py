@@ -13,8 +13,9 @@ from benchmarks.mechanisms.plane import Mechanism
 from benchmarks.mechanisms.ways import ways
 from benchmarks.peers.cases import NotRepresentable
 from benchmarks.peers.scan import Point, candidates, front, scan
-from benchmarks.report import Report, legend_below
+from benchmarks.report import Report
 from vmri_jax import plots
+from vmri_jax.plots import legend_below
 
 LEVELS = (1e-3, 1e-5)
 """Largest errors of the centres of bars at the end, over the size of the mechanism."""
@@ -161,5 +162,5 @@ def draw(found: dict[str, dict[str, list[Point]]]):
                     [p.seconds for p in shown], [p.settled for p in shown], label=way, markersize=4, **look, **strong
                 )
             axes.set(title=title, xlabel="processor time, s", ylabel="error / size")
-        legend_below(figure, names)
+        legend_below(figure)
     return figure

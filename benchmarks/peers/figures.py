@@ -9,8 +9,8 @@ from matplotlib.ticker import LogFormatterSciNotation, LogLocator, NullFormatter
 
 from benchmarks.peers.cases import LEVELS
 from benchmarks.peers.scan import Point, front
-from benchmarks.report import legend_below
 from vmri_jax import plots
+from vmri_jax.plots import legend_below
 
 FAMILIES = {"FPU": "Fermi-Pasta-Ulam chain", "TSP": "Triple spherical pendulum", "SAM": "Simple atomic model"}
 COLORS = (
@@ -44,7 +44,7 @@ def draw(found: Mapping[str, Sequence[Point]], peers: Sequence[str], title: str)
             _panel(axes, points, peers)
             axes.set(title=name, xlabel="time, s", ylim=(max(SHOWN[0], lowest / 3), SHOWN[1]))
         panels[0].set(ylabel=r"error $\max\,|q - q_{\mathrm{ref}}|$ at the end")
-        legend_below(figure, peers)
+        legend_below(figure)
     return figure
 
 

@@ -120,6 +120,7 @@ def test_missing_coordinates_are_zero():
 
 
 @pytest.mark.parametrize(("name", "macro_dt"), [("tsp_fully_implicit_p1", 0.01), ("sam_fully_implicit_a05_p4", 0.008)])
+@pytest.mark.compiles
 def test_links_of_built_in_drawings_keep_their_length_along_a_run(name, macro_dt):
     run = reference_run(name, macro_dt)
     drawing = Drawing.from_dict(built_in(name[:3], run.q_s.shape[1]))
@@ -137,6 +138,7 @@ def test_links_of_built_in_drawings_keep_their_length_along_a_run(name, macro_dt
     assert np.ptp(points, axis=0).max() > 0.01
 
 
+@pytest.mark.compiles
 def test_the_drawn_chain_stretches_as_its_potentials_say(fpu, monkeypatch):
     monkeypatch.setattr(defaults_module, "MAGNIFICATION", 1.0)
     run = reference_run("fpu3_fully_implicit_p1", 0.05)

@@ -13,7 +13,7 @@ import vmri_jax as vm
 from benchmarks import c_loops, dear
 from benchmarks.dear import compare, peers, spacecraft, systems
 from vmri_jax.mechanics.invariants import potential_energy
-from vmri_jax.study.program import Program, joined
+from vmri_jax.study.reference_solution import joined
 
 
 def test_two_molecules(monkeypatch):
@@ -113,7 +113,7 @@ def test_peers_have_the_same_motion(peer):
     if peer not in ready:
         assert any(note.startswith(f"{peer} is not installed") for note in missing)
         pytest.skip(f"{peer} is not installed")
-    exact = joined(Program(problem, vm.galerkin(1, 4, "gauss"), t_end)(200))[0][-1]
+    exact = joined(vm.simulate(problem, vm.galerkin(1, 4, "gauss"), macro_dt=t_end / 200, num_steps=200))[0][-1]
     errors = []
     for _, run in peers.PEERS[peer](problem, t_end, num_micro):
         errors.append(float(np.abs(run() - exact).max()))
@@ -128,8 +128,7 @@ def test_the_c_loop_computes_kicks(count, num_micro):
     problem = systems.molecules(count)
     micro_dt, num_steps = 1e-3, 50
     loop = c_loops.molecules(problem, systems.BOND, systems.STIFFNESS, num_micro, micro_dt, num_steps)
-    program = Program(problem, vm.fully_explicit(num_micro), num_steps * num_micro * micro_dt)
-    q, p = joined(program(num_steps))
+    q, p = joined(vm.simulate(problem, vm.fully_explicit(num_micro), micro_dt=micro_dt, num_steps=num_steps))
     (_, q_f, _, p_f), _ = loop.run()
     np.testing.assert_allclose(q_f, q[-1], rtol=0, atol=2e-11)
     np.testing.assert_allclose(p_f, p[-1], rtol=0, atol=5e-9)

@@ -1,4 +1,4 @@
-"""Quick forms of the 28 hard cases: every criterion is met, and what a prototype measured is measured again."""
+"""Quick forms of the hard cases of this project: every criterion is met, and what a prototype measured is measured again."""
 
 import pytest
 from typer.testing import CliRunner
@@ -10,26 +10,22 @@ CASES = catalogue()
 
 # (case, value): what an independent prototype measured; the quick forms come within 20 %
 MEASURED = {
-    (1, "first_unstable_2"): 1.248,
-    (1, "first_unstable_5"): 1.025,
-    (3, "growth"): 8.4e-4,
-    (6, "iterations"): 6,
-    (7, "iterations"): 4,
-    (13, "iterations_1e+06"): 3,
-    (17, "band"): 4.4e-4,
+    ("impulse resonance", "first_unstable_2"): 1.248,
+    ("impulse resonance", "first_unstable_5"): 1.025,
+    ("implicit combination resonance", "growth"): 8.4e-4,
+    ("large macro step", "iterations"): 6,
+    ("large constrained step", "iterations"): 4,
+    ("mass ratios 1e4 to 1e8", "iterations_1e+06"): 3,
+    ("energy for long", "band"): 4.4e-4,
 }
-
-
-def test_there_are_28_in_order():
-    assert [case.number for case in CASES] == list(range(1, 29))
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: f"{case.number}-{case.title.replace(' ', '-')}")
 def test_criterion_is_met(case):
     outcome = case.run(False)
     assert outcome.passed, outcome.measured
-    for (number, name), value in MEASURED.items():
-        if number == case.number:
+    for (title, name), value in MEASURED.items():
+        if title == case.title:
             assert outcome.values[name] == pytest.approx(value, rel=0.2)
 
 
@@ -48,7 +44,7 @@ def test_the_command_refuses_an_unknown_case():
 
 @pytest.mark.usefixtures("prepared")
 def test_the_command_runs_a_case_and_writes_files(tmp_path):
-    result = CliRunner().invoke(app, ["hard", "--case", "27", "--out", str(tmp_path / "out")])
+    result = CliRunner().invoke(app, ["hard", "--case", "10", "--out", str(tmp_path / "out")])
     assert result.exit_code == 0, result.output
     assert "1 of 1 criteria met" in result.output
-    assert (tmp_path / "out" / "cases.md").read_text().count("\n") == 3
+    assert len((tmp_path / "out" / "cases.csv").read_text().splitlines()) == 2

@@ -6,14 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import typer
 from PIL import Image
 from typer.testing import CliRunner
 
 import vmri_jax as vm
 from tests.animation.support import PENDULUM, reference_run, swinging
 from vmri_jax.cli import app
-from vmri_jax.cli.animate import animate
 from vmri_jax.running.store import stream
 from vmri_jax.running.store.layout import change_attributes
 
@@ -29,11 +27,9 @@ def vmri(tmp_path, monkeypatch):
     (tmp_path / "text.npz").write_text("no run")
     (tmp_path / "wrong.json").write_text(json.dumps(PENDULUM | {"links": [["bob", "tipp"]]}))
     (tmp_path / "broken.json").write_text("{")
-    app = typer.Typer()
-    app.command()(animate)
 
     def run(*arguments):
-        result = CliRunner().invoke(app, [str(argument) for argument in arguments])
+        result = CliRunner().invoke(app, ["animate", *map(str, arguments)])
         assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
         return result.exit_code, re.sub(r"[\s│╭╮╰╯─]+", " ", result.output)
 

@@ -54,6 +54,7 @@ def test_other_threads_may_run_too():
     assert seen == [False]
 
 
+@pytest.mark.compiles
 def test_a_run_hands_back_what_was_computed(fpu, monkeypatch):
     real, calls = Simulation.advance, []
 

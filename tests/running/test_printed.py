@@ -19,14 +19,14 @@ def table():
 def test_wide_tables_keep_their_lines_where_the_output_is_no_terminal(table, monkeypatch):
     monkeypatch.delenv("COLUMNS", raising=False)
     for text in (str(table), printed(table)):
-        assert [line.count(WORDS) for line in text.splitlines()] == [0, 0, 0, 4, 0, 2]
+        assert [line.count(WORDS) for line in text.splitlines()] == [0, 4, 2]
 
 
 def test_columns_of_the_environment_are_obeyed(table, monkeypatch):
     monkeypatch.setenv("COLUMNS", "90")
     lines = str(table).splitlines()
     assert max(map(len, lines)) <= 90
-    assert len(lines) > 6
+    assert len(lines) > 3
 
 
 def test_a_terminal_has_its_own_width(table, monkeypatch):

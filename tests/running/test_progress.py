@@ -53,6 +53,7 @@ def test_a_bar_says_it_alone(quick, capsys):
     assert capsys.readouterr().err == ""
 
 
+@pytest.mark.compiles
 def test_lines_tell_tracing_and_compiling_from_stepping(quick, capsys):
     def slowly_traced(x):
         time.sleep(0.3)
@@ -69,6 +70,7 @@ def test_lines_tell_tracing_and_compiling_from_stepping(quick, capsys):
     assert list(dict.fromkeys(lines)) == ["tracing)", "compiling)", "stepping)"]
 
 
+@pytest.mark.compiles
 def test_a_compiled_program_has_no_stages():
     program, stages = jax.jit(lambda x: x + 1), []
     program(np.zeros(3))

@@ -68,6 +68,7 @@ def test_a_batch_counts_its_runs(run):
     assert "energy changed by at most 9.99e-04 in a run" in lines
 
 
+@pytest.mark.compiles
 def test_the_status_of_a_run_prints_as_a_sentence_and_is_a_number(run):
     assert (str(run.result), f"{run.result}", repr(run.result)) == ("CONVERGED", "CONVERGED", repr(Result.CONVERGED))
     assert str(Status(3)).startswith("DIVERGED: Newton's iteration moved away")
@@ -79,6 +80,7 @@ def test_the_status_of_a_run_prints_as_a_sentence_and_is_a_number(run):
     assert jnp.stack([run.result, run.result]).tolist() == [0, 0]
 
 
+@pytest.mark.compiles
 def test_nothing_fails_to_print_without_numbers(run, fpu):
     def seen(*things):
         said.extend(map(repr, things))

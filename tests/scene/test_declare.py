@@ -38,6 +38,7 @@ class TorsionSpring(Effect):
 POINTERS = [Body("a", 1.0, [1.0, 0.0], [0.0, 0.3], pace="slow"), Body("b", 1.0, [0.0, 2.0], pace="slow")]
 
 
+@pytest.mark.compiles
 def test_one_class_is_enough():
     scene = Scene(POINTERS, [TorsionSpring(["a", "b"], [1.0, 4.0])])
     assert np.allclose(scene.params["torsion_springs"]["angle"], [0.0, np.pi / 2])

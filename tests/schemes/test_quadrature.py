@@ -131,6 +131,7 @@ def test_merged_nodes_are_evaluated_once():
     assert value == pytest.approx(quadrature.trapezoidal.repeat(3)(lambda x: x**2) + 1 / 3)
 
 
+@pytest.mark.compiles
 def test_alpha_may_be_traced():
     value = jax.jit(lambda alpha: affine(alpha)(jnp.exp))
     assert value(0.25) == pytest.approx(0.25 + 0.75 * np.e)

@@ -23,8 +23,6 @@ def test_cost_report(tmp_path):
     assert small.error_q <= 1e-5
     assert large.error_q <= 1e-3
     assert large.seconds <= small.seconds
-    assert report.growth == pytest.approx(small.seconds / large.seconds)
-    assert sum(report.shares.values()) == pytest.approx(1)
     assert set(report.curves.schemes) == {family.name for family in SHORT_MENU}
     for scheme in report.curves.schemes:  # a curve falls
         assert all(a.error_q > b.error_q for a, b in pairwise(report.curves.curve(scheme)))

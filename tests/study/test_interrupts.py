@@ -3,7 +3,6 @@
 from dataclasses import replace
 from importlib import import_module
 
-import numpy as np
 import pytest
 
 import vmri_jax as vm
@@ -11,13 +10,11 @@ from tests.small_systems import one_coordinate
 from vmri_jax.accuracy.families import of_order_2
 from vmri_jax.study import (
     ConvergenceStudy,
-    Program,
     ReferenceSolution,
     convergence_study,
     cost_report,
-    work_precision,
 )
-from vmri_jax.study.program import joined
+from vmri_jax.study.reference_solution import joined
 
 SCHEME, T_END = vm.fully_explicit(1), 0.08
 
@@ -34,36 +31,26 @@ def ctrl_c(words: str):
 
 @pytest.fixture(scope="module")
 def reference() -> ReferenceSolution:
-    return ReferenceSolution(*joined(Program(one_coordinate(), SCHEME, T_END)(256)))
+    return ReferenceSolution(
+        *joined(vm.simulate(one_coordinate(), SCHEME, macro_dt=T_END / 256, num_steps=256, save=256))
+    )
 
 
-def test_convergence_studies_keep_their_rows(reference):
+@pytest.mark.parametrize(("words", "rows"), [("H = 0.01", 2), ("measuring times", 3)])
+def test_convergence_studies_keep_their_rows(reference, words, rows):
     steps = [0.04, 0.02, 0.01]
-    with pytest.raises(vm.Interrupted, match="interrupted after 2 runs") as caught:
+    with pytest.raises(vm.Interrupted, match=f"interrupted after {rows} runs") as caught:
         convergence_study(
             *(one_coordinate(), {"explicit": SCHEME}, steps, T_END),
             num_saves=1,
             reference=reference,
-            progress=ctrl_c("H = 0.01"),
+            repeats=1,
+            progress=ctrl_c(words),
         )
     study = caught.value.done
     assert isinstance(study, ConvergenceStudy)
-    assert [row.macro_dt for row in study.rows] == steps[:2]
+    assert [row.macro_dt for row in study.rows] == steps[:rows]
     assert study.order("explicit") == pytest.approx(2.0, abs=0.05)
-
-
-@pytest.mark.parametrize(("words", "rows"), [("4 steps", 1), ("measuring times", 3)])
-def test_work_and_precision_keeps_its_rows(reference, words, rows):
-    with pytest.raises(vm.Interrupted) as caught:
-        work_precision(
-            *(one_coordinate(), {"explicit": SCHEME}, T_END),
-            num_steps=[2, 4, 8],
-            reference=reference,
-            progress=ctrl_c(words),
-        )
-    kept = caught.value.done.rows
-    assert [row.num_steps for row in kept] == [2, 4, 8][:rows]
-    assert all(row.seconds > 0 and np.isfinite(row.error_q) for row in kept)
 
 
 def test_cost_reports_keep_their_runs_while_the_page_is_drawn(monkeypatch, tmp_path):

@@ -17,7 +17,7 @@ def two_cases(cell: Cell) -> None:
 def all_cases(cell: Cell) -> None:
     report = run_cases(cases_for(cell.moving))
     assert report.passed, str(report)
-    assert (cell.folder / "cases.md") in report.write(cell.folder)
+    assert (cell.folder / "cases.csv") in report.write(cell.folder)
 
 
 TOOLS = {"two_cases": two_cases, "all_cases": all_cases}

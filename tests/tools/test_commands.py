@@ -33,7 +33,7 @@ def named(cell: Cell) -> str:
 
 def simulate(cell: Cell) -> None:
     out, plot = cell.folder / "run.npz", cell.folder / "run.png"
-    assert "Newton iterations" in vmri(
+    assert "iterations per step" in vmri(
         *("simulate", named(cell), *SCHEME, "--macro-dt", MACRO_DT, "--steps", STEPS, "--out", out, "--plot", plot)
     )
     assert out.exists()

@@ -19,21 +19,20 @@ def convergence_study(cell: Cell) -> None:
     assert str(rows)
     plots.save(rows.plot("orders", [2]), cell.folder / "orders.png")
     rows.to_csv(cell.folder / "orders.csv")
-    rows.to_json(cell.folder / "orders.json")
     rows.to_xarray()
 
 
-def work_precision(cell: Cell) -> None:
-    rows = study.work_precision(
-        cell.moving, {"explicit": SCHEME}, T_END, num_steps=[8, 16], reference=cell.reference, repeats=1
-    )
+def work_and_precision(cell: Cell) -> None:
+    rows = study.convergence_study(
+        cell.moving, {"explicit": SCHEME}, [MACRO_DT], T_END, num_saves=1, reference=cell.reference, repeats=1
+    ).work()
     assert all(np.isfinite(row.error_q) for row in rows.rows)
     assert str(rows)
     for work in ("seconds", "solves", "fast_evaluations"):
         plots.save(rows.plot(work=work), cell.folder / "work.png")
 
 
-TOOLS = {tool.__name__: tool for tool in (reference_solution, convergence_study, work_precision)}
+TOOLS = {tool.__name__: tool for tool in (reference_solution, convergence_study, work_and_precision)}
 REFUSED = {}
 
 

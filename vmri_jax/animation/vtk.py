@@ -7,6 +7,7 @@ import numpy as np
 
 from vmri_jax.animation.drawing import Drawing
 from vmri_jax.animation.motion import Motion
+from vmri_jax.running.export import extra
 from vmri_jax.running.files import check_place
 
 KINDS = ("body", "link", "spring", "solid")
@@ -28,10 +29,7 @@ def write_vtk(motion: Motion, path: str | Path) -> None:
         ImportError: without the package meshio.
         OSError: files cannot be written.
     """
-    try:
-        import meshio
-    except ImportError:
-        raise ImportError("VTK files need the package meshio; install it with: pip install 'vmri_jax[vtk]'") from None
+    meshio = extra("meshio", "write_vtk", "vtk")
     path = Path(path)
     check_place(path)
     folder = path.with_suffix("")

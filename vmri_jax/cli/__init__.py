@@ -8,13 +8,25 @@ import os
 import jax
 import typer
 
-from vmri_jax.cli import lists, run, scenes, stability, study
 from vmri_jax.cli.animate import animate
 from vmri_jax.cli.check import check
-from vmri_jax.cli.common import MANY, RIGHT, RUN
+from vmri_jax.cli.common import refusals
+from vmri_jax.cli.lists import schemes, systems
 from vmri_jax.cli.new import new
+from vmri_jax.cli.run import simulate
+from vmri_jax.cli.scenes import explain
+from vmri_jax.cli.stability import advise, stability
+from vmri_jax.cli.study import cost, tune
 from vmri_jax.cli.sweep import sweep
 from vmri_jax.configure import configure
+
+COMMANDS = {
+    "Run and see:  vmri simulate fpu --macro-dt 0.05 --steps 400 --out run.npz": (new, simulate, animate),
+    "Is it right:  vmri check my_system.py:problem": (advise, stability, explain, check),
+    "What it costs:  vmri tune fpu --error 1e-4 --t-end 2": (tune, cost),
+    "Many runs, and what there is:  vmri sweep --example": (systems, schemes, sweep),
+}
+"""The commands by the title of their group in the help of `vmri`, which has an example."""
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -22,12 +34,9 @@ app = typer.Typer(
     pretty_exceptions_show_locals=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-app.command(rich_help_panel=RUN)(new)
-for part in (run, stability, scenes, study, lists):
-    app.add_typer(part.app)
-app.command(rich_help_panel=RUN)(animate)
-app.command(rich_help_panel=RIGHT)(check)
-app.command(rich_help_panel=MANY)(sweep)
+for title, commands in COMMANDS.items():
+    for command in commands:
+        app.command(rich_help_panel=title)(refusals()(command))  # a command shows refusals wherever they come from
 
 
 def main() -> None:

@@ -19,7 +19,7 @@ from vmri_jax.animation.html import write_html
 from vmri_jax.animation.motion import Motion, motion
 from vmri_jax.animation.vtk import write_vtk
 from vmri_jax.catalogue import SYSTEMS, find_problem
-from vmri_jax.cli.common import PICTURES, check_target_file, console, refusals
+from vmri_jax.cli.common import PICTURES, check_target_file, console
 from vmri_jax.running.progress import progress_shown
 from vmri_jax.running.store import StoredTrajectory
 from vmri_jax.running.trajectory import Trajectory
@@ -58,12 +58,11 @@ def animate(
 
     The drawing is the one stored with the run, else the drawing of --system; without a drawing every coordinate is a bar.
     """
-    with refusals():
-        out = run.with_suffix(".html") if out is None else out
-        check_target_file("--out", out, (".html", *PICTURES, ".gif", ".pvd"))
-        shown = _seen_from(_motion(run, system, drawing).between(start, end), view)
-        name = title or (SYSTEMS[system].title if system in SYSTEMS else run.stem)
-        _write(shown, out, name, frames, seconds, plots.DARK if dark else plots.LIGHT)
+    out = run.with_suffix(".html") if out is None else out
+    check_target_file("--out", out, (".html", *PICTURES, ".gif", ".pvd"))
+    shown = _seen_from(_motion(run, system, drawing).between(start, end), view)
+    name = title or (system if system in SYSTEMS else run.stem)
+    _write(shown, out, name, frames, seconds, plots.DARK if dark else plots.LIGHT)
     if shown.ending:
         console.print(f"[yellow]{escape(shown.ending)}[/yellow]")
     console.print(f"[bold]{escape(str(out))}[/bold]  {out.stat().st_size / 1e6:.2g} MB", soft_wrap=True)

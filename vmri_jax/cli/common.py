@@ -8,12 +8,11 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 from rich.panel import Panel
-from rich.table import Table
 from rich.text import Text
 
 from vmri_jax.mechanics.checks import is_refusal
 from vmri_jax.running.files import check_writable, make_writable_folder
-from vmri_jax.running.printed import OutputConsole
+from vmri_jax.running.printed import OutputConsole, PrintedTable
 
 console = OutputConsole()
 
@@ -30,16 +29,10 @@ class BadInput(typer.BadParameter):
 
 FAULT = "This is no error of your command, but of the program. Please report it, with the command and the lines below."
 
-RUN = "Run and see:  vmri simulate fpu --macro-dt 0.05 --steps 400 --out run.npz"
-RIGHT = "Is it right:  vmri check my_system.py:problem"
-COSTS = "What it costs:  vmri tune fpu --error 1e-4 --t-end 2"
-MANY = "Many runs, and what there is:  vmri sweep --example"
-"""Titles of the four groups of commands in the help of `vmri`, each with an example."""
-
 
 @contextmanager
 def refusals() -> Iterator[None]:
-    """Show refusals of the library as panels, and any other error of their classes as a fault of the program."""
+    """Within this context refusals of the library are shown as panels, and other errors of their classes as faults of the program."""
     try:
         yield
     except (ValueError, TypeError, ImportError) as error:
@@ -81,16 +74,11 @@ def print_written(title: str, path: Path | None) -> None:
 
 def print_named(texts: dict[str, str]) -> None:
     """Print a line for each name and its text; empty texts are left out."""
-    table = plain_table("", "", show_header=False)
+    table = PrintedTable("", "", show_header=False)
     for name, text in texts.items():
         if text:
             table.add_row(f"[dim]{name}[/dim]", escape(text))
     console.print(table)
-
-
-def plain_table(*columns: str, show_header: bool = True) -> Table:
-    """A table without lines."""
-    return Table(*columns, box=None, pad_edge=False, show_header=show_header)
 
 
 def check_target_file(option: str, path: Path | None, endings: tuple[str, ...]) -> None:

@@ -17,33 +17,24 @@ from vmri_jax import plots
 from vmri_jax.accuracy.simulate import simulate as run_at_once
 from vmri_jax.catalogue import find_problem, find_scheme
 from vmri_jax.cli import options
-from vmri_jax.cli.common import PICTURES, RUN, check_target_file, console, print_failure, print_named, refusals
+from vmri_jax.cli.common import PICTURES, check_target_file, console, print_failure, print_named
 from vmri_jax.running.arguments import Save, nothing_fast
 from vmri_jax.running.interrupts import Interrupted
 from vmri_jax.running.settings import Settings
 from vmri_jax.running.store import StoredTrajectory, stream
+from vmri_jax.running.summaries import summary_of
 from vmri_jax.running.trajectory import Trajectory
-from vmri_jax.steppers.results import Method, SimulationError
+from vmri_jax.steppers.results import SimulationError
 from vmri_jax.steppers.solver import Solver
 
 DEFAULT_SCHEME = "fully-implicit"
 """The scheme of a run without --scheme and --accuracy."""
 DEFAULT_SAVED_NODES = 1000
 """Approximate number of saved nodes of a run without --save-every; more make larger files, and figures do not show them."""
-MOST_DRAWN_NODES = 10_000
-"""Largest number of nodes of a run in a figure; more are not seen, and take longer to read and to draw."""
-
-app = typer.Typer()
+MOST_READ_NODES = 10_000
+"""Largest number of nodes of a run in its summary and figure; more are not seen, and take longer to read and to draw."""
 
 
-@app.command(
-    rich_help_panel=RUN,
-    epilog="Examples:\n\n"
-    "vmri simulate fpu --macro-dt 0.1 --steps 2000 --out run.npz --plot run.png\n\n"
-    "vmri simulate fpu --macro-dt 0.1 --steps 10000000 --out run.zarr\n\n"
-    "vmri simulate tsp --scheme fully-explicit --alpha 0.5 --num-micro 5 --macro-dt 0.01 --steps 1000\n\n"
-    "vmri simulate my_file.py:my_problem --scheme galerkin --degree 2 --macro-dt 0.05 --steps 400",
-)
 def simulate(
     system: options.System,
     steps: Annotated[int | None, typer.Option(help="Number of macro steps; not with --accuracy.")] = None,
@@ -84,74 +75,73 @@ def simulate(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the run in --out, a .zarr.")] = False,
     plot: Annotated[Path | None, typer.Option(help="Draw the run here: .png, .svg or .pdf.")] = None,
 ) -> None:
-    """Simulate a system, and report steps, energy, constraints and time."""
-    with refusals():
-        streamed = _check_out(out, resume, overwrite)
-        check_target_file("--plot", plot, PICTURES)
-        problem = find_problem(system)
-        _check_steps(steps, accuracy, t_end, streamed, error)
-        of_scheme = {"--compose": compose, "--alpha": alpha, "--degree": degree, "--rule": rule}
-        chosen = None
-        if scheme is not None or accuracy is None:
-            scheme = scheme or DEFAULT_SCHEME
-            chosen = find_scheme(scheme, num_micro, compose, alpha=alpha, degree=degree, rule=rule)
-        elif any(value is not None for value in of_scheme.values()):
-            without = " and ".join(name for name, value in of_scheme.items() if value is not None)
-            raise ValueError(f"got {without} without --scheme, which --accuracy chooses then; give --scheme with it.")
-        before = StoredTrajectory(out) if out is not None and resume and out.exists() else None
-        if save_every is None and steps is not None and not save_micro:
-            save_every = default_save_every(steps) if before is None else before.save_every
-        arguments = {
-            "macro_dt": macro_dt,
-            "num_steps": steps,
-            "save": Save(save_every, micro=save_micro, progress=True),
-            "solver": Solver(matrix.replace("-", "_")),
-        }
-        if streamed:
-            arguments |= {"out": out, "resume": resume, "overwrite": overwrite, "drawing": problem.drawing}
+    """Simulate a system, and report steps, energy, constraints and time.
+
+    Examples:
+
+    vmri simulate fpu --macro-dt 0.1 --steps 2000 --out run.npz --plot run.png
+
+    vmri simulate fpu --macro-dt 0.1 --steps 10000000 --out run.zarr
+
+    vmri simulate tsp --scheme fully-explicit --alpha 0.5 --num-micro 5 --macro-dt 0.01 --steps 1000
+
+    vmri simulate my_file.py:my_problem --scheme galerkin --degree 2 --macro-dt 0.05 --steps 400
+    """
+    streamed = _check_out(out, resume, overwrite)
+    check_target_file("--plot", plot, PICTURES)
+    problem = find_problem(system)
+    _check_steps(steps, accuracy, t_end, streamed, error)
+    of_scheme = {"--compose": compose, "--alpha": alpha, "--degree": degree, "--rule": rule}
+    chosen = None
+    if scheme is not None or accuracy is None:
+        scheme = scheme or DEFAULT_SCHEME
+        chosen = find_scheme(scheme, num_micro, compose, alpha=alpha, degree=degree, rule=rule)
+    elif any(value is not None for value in of_scheme.values()):
+        without = " and ".join(name for name, value in of_scheme.items() if value is not None)
+        raise ValueError(f"got {without} without --scheme, which --accuracy chooses then; give --scheme with it.")
+    before = StoredTrajectory(out) if out is not None and resume and out.exists() else None
+    if save_every is None and steps is not None and not save_micro:
+        save_every = default_save_every(steps) if before is None else before.save_every
+    arguments = {
+        "macro_dt": macro_dt,
+        "num_steps": steps,
+        "save": Save(save_every, micro=save_micro, progress=True),
+        "solver": Solver(matrix.replace("-", "_")),
+    }
+    if streamed:
+        arguments |= {"out": out, "resume": resume, "overwrite": overwrite, "drawing": problem.drawing}
+    else:
+        arguments |= {"accuracy": accuracy, "t_end": t_end, "error": error}
+    compiling = _compile_clock()
+    start = time.perf_counter()
+    trajectory, stopped = _run(stream if streamed else run_at_once, problem, chosen, arguments)
+    seconds, compiled = time.perf_counter() - start, sum(compiling)
+    saved, nodes = [str(out)] if streamed else [], trajectory[:: -(-len(trajectory) // MOST_READ_NODES)]
+    try:  # the report is printed even if a file cannot be written
+        if out is not None and isinstance(trajectory, Trajectory):
+            trajectory.save(out, problem.drawing)
+            saved.append(str(out))
+        if plot is not None:
+            title = f"{system}, accuracy {accuracy:g}" if accuracy else f"{system}, {scheme}, {num_micro} micro steps"
+            plots.save(plots.plot_trajectory(nodes, title), plot)
+            saved.append(str(plot))
+    finally:
+        if stopped is None:
+            title, lines = summary_of(nodes)
+            lines["nodes"] = title.partition(": ")[2]
+            if steps is not None and chosen is not None:  # else the time includes trial runs
+                lines["macro steps"] = f"{steps}, of {chosen.num_micro} micro steps each"
+                done = (steps - (0 if before is None else before.step)) * chosen.num_micro
+                lines["per micro step"] = f"{1e6 * max(seconds - compiled, 0.0) / done:.3g} µs" if done else ""
+            lines |= {} if trajectory.keeps_energy else _energy_balance(trajectory)
+            lines["wall time"] = f"{seconds:.2f} s, of which {compiled:.2f} s compiling"
+            lines["saved"] = ", ".join(saved) or "nothing; give --out run.npz or --plot run.png"
+            lines[""] = "" if chosen is None else nothing_fast(chosen, problem.q_f.size)
+            print_named(lines)
+            if steps is None:
+                _print_again(trajectory.settings, system, matrix)
         else:
-            arguments |= {"accuracy": accuracy, "t_end": t_end, "error": error}
-        compiling = _compile_clock()
-        start = time.perf_counter()
-        trajectory, stopped = _run(stream if streamed else run_at_once, problem, chosen, arguments)
-        seconds, compiled = time.perf_counter() - start, sum(compiling)
-        saved = [str(out)] if streamed else []
-        try:  # the report is printed even if a file cannot be written
-            if out is not None and isinstance(trajectory, Trajectory):
-                trajectory.save(out, problem.drawing)
-                saved.append(str(out))
-            if plot is not None:
-                nodes = trajectory[:: -(-len(trajectory) // MOST_DRAWN_NODES)]
-                title = (
-                    f"{system}, accuracy {accuracy:g}" if accuracy else f"{system}, {scheme}, {num_micro} micro steps"
-                )
-                plots.save(plots.plot_trajectory(nodes, title), plot)
-                saved.append(str(plot))
-        finally:
-            if stopped is None:
-                if steps is not None and chosen is not None:
-                    done = (steps - (0 if before is None else before.step)) * chosen.num_micro
-                    lines = {"macro steps": f"{steps}, of {chosen.num_micro} micro steps each"}
-                else:  # the time includes trial runs, so that there is no time per micro step
-                    done, settings = 0, trajectory.settings
-                    lines = {
-                        "chosen": f"{settings.python}, macro_dt {settings.macro_dt:.6g}, {settings.num_steps} steps"
-                    }
-                print_named(
-                    {
-                        **lines,
-                        "": "" if chosen is None else nothing_fast(chosen, problem.q_f.size),
-                        "wall time": f"{seconds:.2f} s, of which {compiled:.2f} s compiling",
-                        "per micro step": f"{1e6 * max(seconds - compiled, 0.0) / done:.3g} µs" if done else "",
-                        **_summary(trajectory, problem.system.is_constrained),
-                        "saved": ", ".join(saved)
-                        or "nothing" + ("" if out or plot else "; give --out run.npz or --plot run.png"),
-                    }
-                )
-                if steps is None:
-                    _print_again(trajectory.settings, system, matrix)
-            else:
-                code = _print_stop(stopped, saved, streamed)
+            code = _print_stop(stopped, saved, streamed)
     if stopped is not None:
         if code == 1:
             given = {"--macro-dt": macro_dt, "--scheme": scheme, "--num-micro": num_micro}
@@ -233,48 +223,17 @@ def _compile_clock() -> list[float]:
     return seconds
 
 
-def _summary(trajectory: Trajectory | StoredTrajectory, constrained: bool) -> dict[str, str]:
-    """Times, iterations, energy, error and residuals of a run, in words; a stored run is read piece by piece."""
-    pieces = [trajectory] if isinstance(trajectory, Trajectory) else trajectory.chunks()
-    times, energies, largest = (np.array(column) for column in zip(*map(_extremes, pieces), strict=True))
-    position, velocity, method, iterations = largest.max(axis=0)
-    error = trajectory.error if isinstance(trajectory, Trajectory) else None
-    start = energies[0, 0]
-    change = np.abs(energies - start).max()
-    of_start = f"{change / abs(start):.2e} of the energy at the start" if abs(start) > 1e-12 else f"{change:.2e}"
-    energy = {"energy change": f"at most {of_start}"}
-    return {
-        "simulated time": f"{times[0, 0]:g} to {times[-1, 1]:g}",
-        "Newton iterations": f"at most {int(iterations)} per step, {Method(int(method)).name.lower()}",
-        **(energy if trajectory.keeps_energy else _energy_balance(trajectory)),
-        "error": "" if error is None else error.in_words(),
-        "constraint residual": f"{position:.2e} in positions, {velocity:.2e} in velocities" if constrained else "",
-    }
-
-
 def _energy_balance(trajectory: Trajectory | StoredTrajectory) -> dict[str, str]:
-    """Energy, work of forces and of moving constraints, and the remainder of their balance, in words."""
+    """Work of forces and of moving constraints, and the remainder of their balance, in words; a stored run is read piece by piece."""
     pieces = [trajectory] if isinstance(trajectory, Trajectory) else trajectory.chunks()
     works = [piece.work() for piece in pieces]
     forces, constraints, left = (sum(part[-1] for part in parts) for parts in zip(*(w[:3] for w in works), strict=True))
     uncertainty = sum(work.uncertainty for work in works)
-    work = {"forces": forces, "moving constraints": constraints}
-    work_texts = {f"work of {name}": f"{value:.6g}" for name, value in work.items() if value != 0}
-    start, end = (float(trajectory[nodes].energy[0]) for nodes in (slice(0, 1), slice(-1, None)))
-    energy = {"energy": f"{start:.6g} at the start, {end:.6g} at the end"}
-    resolved = f"; the saved nodes resolve the work to {uncertainty:.1e}"
-    return energy | work_texts | {"energy balance": f"{left:.1e} left at the end{resolved}"}
-
-
-def _extremes(piece: Trajectory) -> tuple:
-    """First and last time; energy at the start, lowest, highest; largest residuals, largest code of a method, most iterations."""
-    energy, info = np.asarray(piece.energy), piece.info
-    residuals = np.asarray(piece.constraint_residual).max(axis=0)
-    return (
-        (piece.t[0], piece.t[-1]),
-        (energy[0], energy.min(), energy.max()),
-        (*residuals, np.max(info.method), np.max(info.iterations)),
-    )
+    work = {"work of forces": forces, "work of moving constraints": constraints}
+    words = {name: f"{value:.6g}" for name, value in work.items() if value != 0}
+    return words | {
+        "energy balance": f"{left:.1e} left at the end; the saved nodes resolve the work to {uncertainty:.1e}"
+    }
 
 
 def default_save_every(steps: int) -> int:

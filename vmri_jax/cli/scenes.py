@@ -7,18 +7,13 @@ from rich.markup import escape
 
 from vmri_jax.catalogue import find_scene_or_problem, find_scheme
 from vmri_jax.cli import options
-from vmri_jax.cli.common import RIGHT, console, refusals, status
+from vmri_jax.cli.common import console, status
 from vmri_jax.mechanics.state import Problem
 from vmri_jax.running.arguments import nothing_fast
 from vmri_jax.scene.ledger import ledger_of_functions
 from vmri_jax.stability.vibrations import vibrations
 
-app = typer.Typer()
 
-
-@app.command(
-    rich_help_panel=RIGHT, epilog="Example:\n\nvmri explain my_file.py:my_scene --scheme explicit-slow --num-micro 20"
-)
 def explain(
     system: options.System,
     scheme: options.Scheme = "fully-implicit",
@@ -36,16 +31,19 @@ def explain(
 
     The cost: unknowns, evaluations, and the time of one evaluation of the first derivatives at all nodes. Frequencies are of
     small vibrations about the start.
+
+    Example:
+
+    vmri explain my_file.py:my_scene --scheme explicit-slow --num-micro 20
     """
-    with refusals():
-        chosen = find_scheme(scheme, num_micro, compose, alpha=alpha, degree=degree, rule=rule)
-        moving = find_scene_or_problem(system)
-        with status("compiling and timing a macro step, and frequencies" if measure else "frequencies"):
-            if isinstance(moving, Problem):
-                ledger = ledger_of_functions(moving, chosen, macro_dt, measure)
-            else:
-                ledger = moving.explain(chosen, macro_dt=macro_dt, measure=measure)
-            small = vibrations(moving)
+    chosen = find_scheme(scheme, num_micro, compose, alpha=alpha, degree=degree, rule=rule)
+    moving = find_scene_or_problem(system)
+    with status("compiling and timing a macro step, and frequencies" if measure else "frequencies"):
+        if isinstance(moving, Problem):
+            ledger = ledger_of_functions(moving, chosen, macro_dt, measure)
+        else:
+            ledger = moving.explain(chosen, macro_dt=macro_dt, measure=measure)
+        small = vibrations(moving)
     console.print(ledger.table())
     console.print()
     console.print(ledger.reasons())

@@ -12,27 +12,17 @@ from vmri_jax.catalogue import find_problem, find_scheme
 from vmri_jax.cli import options
 from vmri_jax.cli.common import (
     PICTURES,
-    RIGHT,
     check_target_file,
     console,
-    plain_table,
     print_written,
-    refusals,
     status,
 )
+from vmri_jax.running.printed import PrintedTable
 from vmri_jax.stability import advise as advise_on
 from vmri_jax.stability import linear_model, plot_stability, stability_map
 from vmri_jax.stability.map import windows_text
 
-app = typer.Typer()
 
-
-@app.command(
-    rich_help_panel=RIGHT,
-    epilog="Examples:\n\n"
-    "vmri advise fpu --scheme explicit-slow --num-micro 30 --macro-dt 0.0628\n\n"
-    "vmri advise my_file.py:my_problem --macro-dt 0.02",
-)
 def advise(
     system: options.System,
     macro_dt: options.MacroStep = None,
@@ -46,24 +36,24 @@ def advise(
     """Judge a step before a long run: resonances, limits, labels, and the nearest safe step.
 
     Exit code 1 where the step is unstable at the start of the run, or close to it.
+
+    Examples:
+
+    vmri advise fpu --scheme explicit-slow --num-micro 30 --macro-dt 0.0628
+
+    vmri advise my_file.py:my_problem --macro-dt 0.02
     """
-    with refusals():
-        problem = find_problem(system)
-        chosen = find_scheme(scheme, num_micro, compose, alpha=alpha, degree=degree, rule=rule)
-        if macro_dt is None:
-            raise ValueError("--macro-dt is missing; give the macro step that is to be judged.")
-        with status("judging this step and the steps around it"):
-            advice = advise_on(problem, chosen, macro_dt=macro_dt)
+    problem = find_problem(system)
+    chosen = find_scheme(scheme, num_micro, compose, alpha=alpha, degree=degree, rule=rule)
+    if macro_dt is None:
+        raise ValueError("--macro-dt is missing; give the macro step that is to be judged.")
+    with status("judging this step and the steps around it"):
+        advice = advise_on(problem, chosen, macro_dt=macro_dt)
     console.print(advice.table() if advice.findings else escape(advice.verdict))
     if not advice.ok:
         raise typer.Exit(1)
 
 
-@app.command(
-    rich_help_panel=RIGHT,
-    epilog="Examples:\n\nvmri stability --scheme explicit-slow --num-micro 2 --num-micro 5 --num-micro 10 --out map.png\n\n"
-    "vmri stability tsp --scheme fully-explicit --scheme mollified-impulse",
-)
 def stability(
     system: Annotated[
         str | None, typer.Argument(help="A system at its start. [dim]one slow and one stiff spring, kappa = 25[/dim]")
@@ -81,20 +71,26 @@ def stability(
     until: Annotated[float, typer.Option(help="Largest omega H, in units of pi.", min=0.1)] = 4.0,
     out: Annotated[Path | None, typer.Option(help="Draw the map here: .png, .svg or .pdf.")] = None,
 ) -> None:
-    """Find the stable macro steps of a scheme, in units of the fastest vibration."""
-    with refusals():
-        check_target_file("--out", out, PICTURES)
-        problem = linear_model() if system is None else find_problem(system)
-        numbers, grid = num_micro or [2, 5, 10, 20], np.linspace(0.02, until, max(2, round(50 * until))) * np.pi
-        chosen = {
-            name: {n: find_scheme(name, n, compose, alpha=alpha, degree=degree, rule=rule) for n in numbers}
-            for name in scheme or ["explicit-slow"]
-        }
-        with status("multipliers of the steps"):
-            maps = {name: stability_map(problem, schemes, grid) for name, schemes in chosen.items()}
-        if out is not None:
-            plots.save(plot_stability(maps, system or "one slow and one stiff spring"), out)
-    table = plain_table("scheme", "num_micro", "unstable where omega H / pi is in")
+    """Find the stable macro steps of a scheme, in units of the fastest vibration.
+
+    Examples:
+
+    vmri stability --scheme explicit-slow --num-micro 2 --num-micro 5 --num-micro 10 --out map.png
+
+    vmri stability tsp --scheme fully-explicit --scheme mollified-impulse
+    """
+    check_target_file("--out", out, PICTURES)
+    problem = linear_model() if system is None else find_problem(system)
+    numbers, grid = num_micro or [2, 5, 10, 20], np.linspace(0.02, until, max(2, round(50 * until))) * np.pi
+    chosen = {
+        name: {n: find_scheme(name, n, compose, alpha=alpha, degree=degree, rule=rule) for n in numbers}
+        for name in scheme or ["explicit-slow"]
+    }
+    with status("multipliers of the steps"):
+        maps = {name: stability_map(problem, schemes, grid) for name, schemes in chosen.items()}
+    if out is not None:
+        plots.save(plot_stability(maps, system or "one slow and one stiff spring"), out)
+    table = PrintedTable("scheme", "num_micro", "unstable where omega H / pi is in")
     table.caption = next(iter(maps.values())).note or None
     for name, stability_of_scheme in maps.items():
         for n, windows in stability_of_scheme.shown():

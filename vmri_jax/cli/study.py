@@ -13,13 +13,11 @@ from vmri_jax import study
 from vmri_jax.catalogue import find_problem
 from vmri_jax.cli import options
 from vmri_jax.cli.common import (
-    COSTS,
     check_target_file,
     check_target_folder,
     console,
     print_failure,
     print_written,
-    refusals,
 )
 from vmri_jax.running.interrupts import Interrupted
 from vmri_jax.running.progress import Progress, progress_shown
@@ -28,44 +26,39 @@ from vmri_jax.study.cost_report import PERIODS, PageFailed
 from vmri_jax.study.table import ResultTable
 from vmri_jax.study.tuning import NothingReached, check_target
 
-app = typer.Typer()
 
-
-@app.command(
-    rich_help_panel=COSTS,
-    epilog="Examples:\n\nvmri tune fpu --error 1e-4 --t-end 10\n\nvmri tune my_file.py:my_problem --error 1e-3 --t-end 2",
-)
 def tune(
     system: options.System,
     error: Annotated[float, typer.Option(help="Largest accepted error of a position in the run, in its unit.")],
     t_end: Annotated[float, typer.Option(help="Simulated time.")],
     exhaustive: Annotated[bool, typer.Option("--exhaustive", help="Search without shortcuts.")] = False,
-    out: Annotated[Path | None, typer.Option(help="Write all runs of the search here, .csv or .json.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Write all runs of the search here, .csv.")] = None,
 ) -> None:
-    """Find the scheme, num_micro and macro step that reach an error in the least time on this machine."""
-    with refusals():
-        check_target_file("--out", out, (".csv", ".json"))
-        problem = find_problem(system)
-        check_target(error, t_end, problem)
-        try:
-            with _search(out) as tell:
-                choice = study.tune(problem, error, t_end, exhaustive=exhaustive, progress=tell)
-        except NothingReached as failure:
-            console.print(failure.runs.table())
-            _write_runs(failure.runs, out)
-            print_failure("Nothing reached the error", f"{failure} The best runs are above.")
-            raise typer.Exit(1) from failure
+    """Find the scheme, num_micro and macro step that reach an error in the least time on this machine.
+
+    Examples:
+
+    vmri tune fpu --error 1e-4 --t-end 10
+
+    vmri tune my_file.py:my_problem --error 1e-3 --t-end 2
+    """
+    check_target_file("--out", out, (".csv",))
+    problem = find_problem(system)
+    check_target(error, t_end, problem)
+    try:
+        with _search(out) as tell:
+            choice = study.tune(problem, error, t_end, exhaustive=exhaustive, progress=tell)
+    except NothingReached as failure:
+        console.print(failure.runs.table())
+        _write_runs(failure.runs, out)
+        print_failure("Nothing reached the error", f"{failure} The best runs are above.")
+        raise typer.Exit(1) from failure
     console.print("[bold]Errors against time[/bold], the best of all runs\n", choice.runs.table(), "\n", choice.table())
     command = f"{choice.setting.settings.command(system)} --out run.npz"
     console.print(f"\n[bold]{escape(command)}[/bold]", soft_wrap=True)
-    with refusals():
-        _write_runs(choice.runs, out)
+    _write_runs(choice.runs, out)
 
 
-@app.command(
-    rich_help_panel=COSTS,
-    epilog="Examples:\n\nvmri cost tsp --out out/tsp\n\nvmri cost my_file.py:my_problem --t-end 5",
-)
 def cost(
     system: options.System,
     t_end: Annotated[
@@ -76,19 +69,25 @@ def cost(
     ] = None,
     out: Annotated[Path, typer.Option(help="Folder for the page.")] = Path("out/cost"),
 ) -> None:
-    """Write a page about the cost of accuracy: time over error, the best scheme for each error, where the time goes."""
-    with refusals():
-        problem = find_problem(system)
-        for target in error or [np.finfo(float).max]:
-            check_target(target, 1.0 if t_end is None else t_end, problem)
-        check_target_folder("--out", out)
-        try:
-            with _search(None) as tell:
-                report = study.cost_report(problem, system, out, t_end=t_end, errors=error, progress=tell)
-        except PageFailed as failure:
-            console.print(failure.report.table())
-            print_written("\nRuns", out / "cost.csv")
-            raise failure.__cause__ or failure from None
+    """Write a page about the cost of accuracy: time over error, and the best scheme for each error.
+
+    Examples:
+
+    vmri cost tsp --out out/tsp
+
+    vmri cost my_file.py:my_problem --t-end 5
+    """
+    problem = find_problem(system)
+    for target in error or [np.finfo(float).max]:
+        check_target(target, 1.0 if t_end is None else t_end, problem)
+    check_target_folder("--out", out)
+    try:
+        with _search(None) as tell:
+            report = study.cost_report(problem, system, out, t_end=t_end, errors=error, progress=tell)
+    except PageFailed as failure:
+        console.print(failure.report.table())
+        print_written("\nRuns", out / "cost.csv")
+        raise failure.__cause__ or failure from None
     console.print(report.table())
     print_written("\nPage", report.path)
 
@@ -111,4 +110,4 @@ def _search(out: Path | None) -> Iterator[Progress]:
 
 def _write_runs(runs: ResultTable, out: Path | None) -> None:
     if out is not None:
-        runs.to_csv(out) if out.suffix.lower() == ".csv" else runs.to_json(out)
+        runs.to_csv(out)

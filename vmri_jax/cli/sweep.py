@@ -23,7 +23,6 @@ from vmri_jax.cli.common import (
     print_failure,
     print_named,
     print_written,
-    refusals,
 )
 from vmri_jax.ensembles import Axis, Draw, Draws, Ensemble, EnsembleError, Product, ensemble
 from vmri_jax.ensembles.quantities import drawn_by_default
@@ -57,37 +56,36 @@ def sweep(
 
     Finished runs stay if a worker or this program dies; --resume computes the others.
     """
-    with refusals():
-        if example:
-            _write_example(file)
-            return
-        check_target_file("--plot", plot, PICTURES)
-        if plot is not None:
-            for package in ("xarray", "dask.array"):  # refuse a missing package now: the figure comes after all runs
-                extra(package, "--plot", "ensemble")
-        if workers is not None and scheduler is not None:
-            raise ValueError("--workers and --scheduler are given; choose one of them.")
-        arguments = read_sweep(file)
-        problem = find_problem(arguments["system"])
-        arguments["vary"] = by_name(problem, list(arguments["design"].described()))
-        drawn = "" if plot is None else _drawn(arguments["save"], problem)
-        with _client(workers, scheduler) as client:
-            try:
-                runs = ensemble(**arguments, executor=client, resume=resume, overwrite=overwrite, progress=True)
-            except EnsembleError as error:
-                _print_summary(error.ensemble)
-                print_failure("Not all chunks could be computed", str(error))
-                raise typer.Exit(1) from error
-            except Interrupted as stopped:
-                print_failure("Interrupted", str(stopped).replace("resume=True", "--resume"))
-                raise typer.Exit(130) from stopped
-            except RuntimeError as error:
-                print_failure("Stopped", str(error).replace("resume=True", "--resume"))
-                raise typer.Exit(1) from error
-        _print_summary(runs)
-        if plot is not None:
-            plots.save(plots.plot_ensemble(runs.open(), drawn, title=file.stem), plot)
-            print_written(f"Figure of {drawn}", plot)
+    if example:
+        _write_example(file)
+        return
+    check_target_file("--plot", plot, PICTURES)
+    if plot is not None:
+        for package in ("xarray", "dask.array"):  # refuse a missing package now: the figure comes after all runs
+            extra(package, "--plot", "ensemble")
+    if workers is not None and scheduler is not None:
+        raise ValueError("--workers and --scheduler are given; choose one of them.")
+    arguments = read_sweep(file)
+    problem = find_problem(arguments["system"])
+    arguments["vary"] = by_name(problem, list(arguments["design"].described()))
+    drawn = "" if plot is None else _drawn(arguments["save"], problem)
+    with _client(workers, scheduler) as client:
+        try:
+            runs = ensemble(**arguments, executor=client, resume=resume, overwrite=overwrite, progress=True)
+        except EnsembleError as error:
+            _print_summary(error.ensemble)
+            print_failure("Not all chunks could be computed", str(error))
+            raise typer.Exit(1) from error
+        except Interrupted as stopped:
+            print_failure("Interrupted", str(stopped).replace("resume=True", "--resume"))
+            raise typer.Exit(130) from stopped
+        except RuntimeError as error:
+            print_failure("Stopped", str(error).replace("resume=True", "--resume"))
+            raise typer.Exit(1) from error
+    _print_summary(runs)
+    if plot is not None:
+        plots.save(plots.plot_ensemble(runs.open(), drawn, title=file.stem), plot)
+        print_written(f"Figure of {drawn}", plot)
 
 
 def _drawn(save: list[str], problem: Problem) -> str:

@@ -175,12 +175,15 @@ def drawn_by_default(names: Sequence[str], problem: Problem) -> list[str]:
     return [name for name, kept in arrays.items() if kept.dimensions in ((), ("node",)) and name != "node_t"]
 
 
-def of_lanes(quantities: Sequence[Quantity]) -> Callable[[Trajectory], dict[str, Any]]:
-    """A compiled function from the trajectory of a batch to the arrays that the store keeps, a row for each run."""
+def of_lanes(quantities: Sequence[Quantity], run: Trajectory) -> dict[str, Any]:
+    """The arrays that the store keeps of a batch, a row for each run, by a program that JAX keeps for these quantities."""
+    return _of_lanes([TracedOnce(item.function) for item in quantities], run)
 
+
+@jax.jit
+def _of_lanes(functions: list[TracedOnce], run: Trajectory) -> dict[str, Any]:
     def of_lane(run: Trajectory):
+        quantities = [Quantity(function.function, False) for function in functions]
         return {name: array.value for name, array in kept(quantities, run).items()}
 
-    program = jax.jit(lambda functions, run: jax.vmap(of_lane)(run))  # the functions tell JAX when to trace anew
-    functions = [TracedOnce(item.function) for item in quantities]
-    return lambda run: program(functions, run)
+    return jax.vmap(of_lane)(run)

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
-from functools import cached_property, lru_cache
+from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -30,7 +30,7 @@ from vmri_jax.running import arguments
 from vmri_jax.running.arguments import Save, steps_until
 from vmri_jax.running.batch import consistent_states
 from vmri_jax.running.simulation import Simulation, simulation
-from vmri_jax.running.trajectory import STATUS, Trajectory
+from vmri_jax.running.trajectory import STATUS
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.solver import Solver
@@ -192,9 +192,8 @@ class Work:
             chunk=width,
             warn=False,
         )
-        kept_of = _kept_of(self.save, tuple(self.sources.items()))
-        kept = {name: np.asarray(getattr(trajectory, name))[:count] for name in STATUS}
-        return kept | {name: np.asarray(value)[:count] for name, value in kept_of(trajectory).items()}
+        kept = {name: np.asarray(getattr(trajectory, name)) for name in STATUS} | of_lanes(self.quantities, trajectory)
+        return {name: np.asarray(value)[:count] for name, value in kept.items()}
 
     def _scheme(self, values: Mapping[str, Any]) -> Scheme | Composition:
         label = str(values.get("scheme", next(iter(self.schemes))))
@@ -252,17 +251,6 @@ def all_groups(work: Work, design: Design) -> Iterator[Group]:
     first = design.rows(0, 1) if step_columns else {}
     count = max((len(values) for values in rows.values()), default=1)
     yield from work.groups(rows | {name: np.repeat(first[name], count) for name in step_columns}, count)
-
-
-@lru_cache(maxsize=8)
-def _kept_of(save: tuple[Saved, ...], sources: tuple) -> Callable[[Trajectory], dict[str, Any]]:
-    """The compiled function that computes the kept quantities, cached for the ensembles of a process.
-
-    Args:
-        save: names of quantities, or functions.
-        sources: digests of the user's files, so that a changed file is read again.
-    """
-    return of_lanes(list(map(quantity, save)))
 
 
 def _whole(name: str, value) -> int:

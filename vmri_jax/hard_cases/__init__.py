@@ -2,6 +2,6 @@
 
 from vmri_jax.hard_cases.case import Case, Outcome
 from vmri_jax.hard_cases.cases import cases_for
-from vmri_jax.hard_cases.report import Report, Row, check, run_cases
+from vmri_jax.hard_cases.report import Report, check, run_cases
 
-__all__ = ["Case", "Outcome", "Report", "Row", "cases_for", "check", "run_cases"]
+__all__ = ["Case", "Outcome", "Report", "cases_for", "check", "run_cases"]

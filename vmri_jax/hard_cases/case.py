@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -24,17 +24,26 @@ class Outcome:
         passed: whether the criterion is met; None if the case does not apply.
         values: the measured values by name.
         details: arrays for the picture of the case.
+        case, seconds: the case and the time that it took, which `run_cases` notes.
     """
 
+    VERDICTS: ClassVar = {True: "pass", False: "fail", None: "does not apply"}
     measured: str
     passed: bool | np.bool | None
     values: Mapping[str, Any] = field(default_factory=dict)
     details: Mapping[str, Any] = field(default_factory=dict)
+    case: "Case" = None  # pyright: ignore[reportAssignmentType] (every row of a report has one)
+    seconds: float = 0.0
 
     def __post_init__(self):
         object.__setattr__(self, "passed", None if self.passed is None else bool(self.passed))
         object.__setattr__(self, "values", {name: float(value) for name, value in self.values.items()})
         object.__setattr__(self, "details", {name: np.asarray(value) for name, value in self.details.items()})
+
+    @property
+    def verdict(self) -> str:
+        """Whether the criterion is met, or the case does not apply."""
+        return self.VERDICTS[self.passed]
 
 
 @dataclass(frozen=True)

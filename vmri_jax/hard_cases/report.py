@@ -2,11 +2,10 @@
 
 import time
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from rich.table import Table
 from rich.text import Text
 
 from vmri_jax import plots
@@ -14,99 +13,68 @@ from vmri_jax.hard_cases.case import Case, Outcome
 from vmri_jax.hard_cases.cases import cases_for
 from vmri_jax.mechanics.state import HasProblem, Problem
 from vmri_jax.running.interrupts import Interrupted
+from vmri_jax.running.printed import PrintedTable
 from vmri_jax.running.progress import ShowsProgress, progress_to
 from vmri_jax.study.table import Column, ResultTable, rich_table
 
-VERDICTS = {True: ("pass", "green"), False: ("fail", "red"), None: ("does not apply", "dim")}
-
-
-@dataclass(frozen=True)
-class Row:
-    """A case that was run, with its outcome and its seconds."""
-
-    case: Case
-    outcome: Outcome
-    seconds: float
-
-    @property
-    def verdict(self) -> str:
-        """Whether the criterion is met, or the case does not apply."""
-        return VERDICTS[self.outcome.passed][0]
-
-    @property
-    def missed(self) -> bool:
-        """Whether the criterion is not met."""
-        return self.outcome.passed is False
-
-
-NUMBER = Column("#", lambda row: str(row.case.number))
-TITLE = Column("case", lambda row: row.case.title)
-SETUP = Column("set-up", lambda row: row.case.setup)
-CRITERION = Column("criterion", lambda row: row.case.criterion)
-MEASURED = Column("measured", lambda row: row.outcome.measured)
-VERDICT = Column("", lambda row: Text(*VERDICTS[row.outcome.passed]))
-SECONDS = Column("s", lambda row: f"{row.seconds:.1f}", right=True)
+COLORS = {True: "green", False: "red", None: "dim"}
+"""Colour of the verdict, by `Outcome.passed`."""
 
 
 @dataclass(frozen=True)
 class Report(ResultTable):
-    """Cases that were run, in order."""
+    """Outcomes of cases, in order."""
 
-    columns = (NUMBER, TITLE, SETUP, CRITERION, MEASURED, VERDICT)
-    rows: tuple[Row, ...]
-    full: bool
+    columns = (
+        Column("#", lambda row: str(row.case.number)),
+        Column("case", lambda row: row.case.title),
+        Column("criterion", lambda row: row.case.criterion),
+        Column("measured", lambda row: row.measured),
+        Column("", lambda row: Text(row.verdict, COLORS[row.passed])),
+        Column("s", lambda row: f"{row.seconds:.1f}", right=True),
+    )
+    rows: tuple[Outcome, ...]
+
+    @property
+    def missed(self) -> list[Outcome]:
+        """The outcomes that do not meet their criterion."""
+        return [row for row in self.rows if row.passed is False]
 
     @property
     def passed(self) -> bool:
         """Whether every criterion is met."""
-        return not any(row.missed for row in self.rows)
+        return not self.missed
 
     def records(self) -> list[dict[str, Any]]:
-        """All fields of every row but the arrays for its picture."""
+        """Case, verdict and measured values of every row."""
         return [
             {
                 **{name: getattr(row.case, name) for name in ("number", "title", "setup", "criterion")},
-                "measured": row.outcome.measured,
-                "passed": row.outcome.passed,
-                "values": dict(row.outcome.values),
-                "seconds": row.seconds,
+                **{name: getattr(row, name) for name in ("measured", "verdict", "seconds")},
+                **row.values,
             }
             for row in self.rows
         ]
 
-    def lines(self) -> list[dict[str, Any]]:
-        """One line per value of a case."""
-        return [
-            {"number": row.case.number, "case": row.case.title, "verdict": row.verdict, "value": name, "size": size}
-            for row in self.rows
-            for name, size in row.outcome.values.items()
-        ]
-
-    def content(self) -> dict[str, Any]:
-        """The rows, and whether these are the full forms."""
-        return {"full": self.full, **super().content()}
-
-    def table(self) -> Table:
-        """One line per case, for the terminal."""
-        return rich_table((NUMBER, TITLE, CRITERION, MEASURED, VERDICT, SECONDS), self.rows, ruled=True)
+    def table(self) -> PrintedTable:
+        """The rows, with lines between them, for the terminal."""
+        return rich_table(self.columns, self.rows, ruled=True)
 
     def pictures(self, theme: plots.Theme = plots.LIGHT) -> dict:
         """Figures by the title of the case, for all cases with a picture."""
-        drawn = [(row.case.title, row.case.draw, row.outcome.details) for row in self.rows]
+        drawn = [(row.case.title, row.case.draw, row.details) for row in self.rows]
         return {title: draw(details, theme) for title, draw, details in drawn if draw is not None and details}
 
     def write(self, folder: str | Path) -> list[Path]:
-        """Write cases.md, cases.csv, cases.json and the pictures into a folder, made if it does not exist; returns their paths."""
+        """Write cases.csv and the pictures into a folder, made if it does not exist; returns their paths."""
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / "cases.md").write_text(self.markdown(), encoding="utf-8")
-        self.to_csv(folder / "cases.csv")
-        self.to_json(folder / "cases.json")
-        names = ["cases.md", "cases.csv", "cases.json"]
+        paths = [folder / "cases.csv"]
+        self.to_csv(paths[0])
         for title, figure in self.pictures().items():
-            names.append(f"{title.lower().replace(' ', '_')}.png")
-            plots.save(figure, folder / names[-1])
-        return [folder / name for name in names]
+            paths.append(folder / f"{title.lower().replace(' ', '_')}.png")
+            plots.save(figure, paths[-1])
+        return paths
 
 
 def check(
@@ -119,7 +87,7 @@ def check(
         numbers, full, progress: as of `run_cases`.
 
     Returns:
-        The `Report`, a row for each case; ``print(report.markdown())``.
+        The `Report`, an outcome for each case.
 
     Raises:
         ValueError, Interrupted: as of `run_cases`.
@@ -155,10 +123,10 @@ def run_cases(
             try:
                 outcome = _outcome(case, full)
             except KeyboardInterrupt:
-                raise Interrupted(Report(tuple(rows), full), len(rows), len(chosen), "cases") from None
-            rows.append(Row(case, outcome, time.perf_counter() - start))
+                raise Interrupted(Report(tuple(rows)), len(rows), len(chosen), "cases") from None
+            rows.append(replace(outcome, case=case, seconds=time.perf_counter() - start))
         tell("done", len(chosen), len(chosen))
-    return Report(tuple(rows), full)
+    return Report(tuple(rows))
 
 
 def _outcome(case: Case, full: bool) -> Outcome:

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from functools import lru_cache, partial
 from pathlib import Path
 from types import UnionType
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -111,7 +112,7 @@ def check_system(system: System, q_s, q_f) -> None:
         )
 
 
-def shape_of(name: str, function, *args):
+def shape_of(name: str, function: Any, *args):
     """Shape and type of the value of a user function, by tracing; two derivatives in forward mode, by all arguments but params, must exist.
 
     Args:

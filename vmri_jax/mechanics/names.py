@@ -29,6 +29,7 @@ class Names:
         rigid: bodies whose coordinates are a centre and directors: "name x", "name y", "name z", "name d1 x" and so on.
         carried: places in Q_s and Q_f of the bodies that are functions of the coordinates, by name.
         kinematics: the map from q_s, q_f to Q_s, Q_f, see `vmri_jax.mechanics.kinematics`; None without such bodies.
+        angles: coordinates of `slow` and `fast` that are angles, rad.
         layouts: of q_s and of q_f if the user gave dictionaries of arrays, None for vectors; a run returns its positions in the same form.
 
     Raises:
@@ -45,6 +46,7 @@ class Names:
     carried: Mapping[str, Place] = field(default_factory=dict)
     kinematics: Kinematics | None = None
     layouts: tuple[Layout | None, Layout | None] = (None, None)
+    angles: Sequence[str] = ()
 
     def __hash__(self) -> int:
         return hash((*map(tuple, (self.slow, self.fast, self.constraint, self.slow_constraint)), self.layouts))

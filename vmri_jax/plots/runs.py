@@ -25,12 +25,13 @@ LEAST_SPAN = 1e-13
 def plot_trajectory(trajectory: SavedRun, title: str = "", theme: Theme = LIGHT) -> NotebookFigure:
     """Slow and fast positions, energy and, where there are constraints, their residual, against time.
 
-    Rigid bodies are drawn by their centres of mass. Curves have the units of the system.
+    Rigid bodies are drawn by their centres of mass. Curves have the units of the system; angles of joints have a panel of their own.
 
     A run with an estimated error has bands of this error about its positions, and a panel of the largest error and its shares.
 
     If the system keeps its energy, the figure shows the error of the energy; if forces or moving constraints do work, it shows the change
-    of the energy, the work, and their difference.
+    of the energy, the work, and their difference. Of a scheme with kicks, which act at the
+    macro nodes, this balance has terms of H^2, a drift among them, unless the run saves its micro nodes.
 
     Args:
         trajectory: a run; nodes after a failure are NaN, which matplotlib leaves out.
@@ -78,7 +79,8 @@ def plot_forces(trajectory: SavedRun, title: str = "", theme: Theme = LIGHT) -> 
     """Moduli of the reaction forces of all constraints against time, a curve for each constraint by name.
 
     There is a panel for each unit: forces on points and on centres of rigid bodies; torques about these centres, ``sum_i d_i x F_i`` of the
-    forces on directors; forces on generalised coordinates, such as N m for an angle. The modulus is the largest over the bodies of the
+    forces on directors, and on angles of joints; forces on generalised coordinates. The axes have the units of a system in m, kg and s. Joints
+    that carry bodies have no multiplier, and a line below the panels says so. The modulus is the largest over the bodies of the
     constraint; the two bodies of a link have the same. Forces themselves are those of ``run.reaction_forces()``.
 
     Args:
@@ -100,15 +102,24 @@ def plot_forces(trajectory: SavedRun, title: str = "", theme: Theme = LIGHT) -> 
         axes[-1].set(xlabel="time $t$")
         limit_times(axes[-1], t)
         figure.align_ylabels()
+        if trajectory.names.carried:
+            figure.supxlabel(WITHOUT_CURVES, fontsize=7.5, x=0.01, ha="left")
     return figure
+
+
+WITHOUT_CURVES = "Joints that carry bodies have no curves here: scene.by_directors(run).plot_forces() draws all joints."
+"""Line below the forces of a scene in joint coordinates."""
+UNITS = {"force": "N", "torque": "N m", "generalised force": "N, or N m for an angle"}
+"""Units of reactions in a system in m, kg and s."""
 
 
 def _moduli(run: SavedRun) -> dict[str, dict[str, np.ndarray]]:
     """For each unit, the largest modulus (k,) of the reaction on a body of each constraint by name; reactions that are round-off are left out."""
-    names, panels = run.names, {"force": {}, "torque": {}, "generalised force": {}}
+    names, panels = run.names, {unit: {} for unit in UNITS}
     for constraint, by_body in run.reaction_forces().items():
         for body, force in by_body.items():
-            reactions = {"generalised force" if body in names.numbered else "force": force}
+            kind = "torque" if body in names.angles else "generalised force" if body in names.numbered else "force"
+            reactions = {kind: force}
             if body in names.rigid:
                 # (k, directors, 3): the first three entries are of the centre
                 pulls, directors = (
@@ -123,25 +134,25 @@ def _moduli(run: SavedRun) -> dict[str, dict[str, np.ndarray]]:
         for name, size in largest.items():
             if not size > LEAST_SHOWN * max(largest.values()):
                 del curves[name]
-    return {f"reaction {unit}": curves for unit, curves in panels.items() if curves}
+    return {f"reaction {unit}\n{UNITS[unit]}": curves for unit, curves in panels.items() if curves}
 
 
 def position_panels(run: SavedRun) -> list[tuple[np.ndarray, list[str], str, np.ndarray | None]]:
-    """For slow and fast positions of a run, if there are any: values (k, n), names, label of the axis, and errors (k, n) or None.
+    """For slow and fast positions and angles of a run, if there are any: values (k, n), names, label of the axis, and errors (k, n) or None.
 
     Directors of rigid bodies are left out.
     """
-    names, error = run.names, run.error
-    slow, fast = (None, None) if error is None else (error.q_s, error.q_f)
-    parts = (
-        (run.states.q_s, names.positions("s"), names.slow_coordinates, r"slow positions $q_s$", slow),
-        (run.states.q_f, names.positions("f"), names.fast_coordinates, r"fast positions $q_f$", fast),
-    )
-    panels = []
-    for values, shown, labels, quantity, errors in parts:
-        if shown:
-            errors = None if errors is None else np.asarray(errors)[:, shown]
-            panels.append((np.asarray(values)[:, shown], [labels[i] for i in shown], quantity, errors))
+    names, error, panels = run.names, run.error, []
+    for part, pace, labels in (("s", "slow", names.slow_coordinates), ("f", "fast", names.fast_coordinates)):
+        values = np.asarray(getattr(run.states, f"q_{part}"))
+        turning = {place.start for name, place in names.bodies.items() if name in names.angles and place.part == part}
+        kinds: dict[str, list[int]] = {}
+        for i in names.positions(part):
+            quantity = f"angles $q_{part}$, rad" if i in turning else f"positions $q_{part}$"
+            kinds.setdefault(f"{pace} {quantity}", []).append(i)
+        for quantity, shown in kinds.items():
+            errors = None if error is None else np.asarray(getattr(error, f"q_{part}"))[:, shown]
+            panels.append((values[:, shown], [labels[i] for i in shown], quantity, errors))
     return panels
 
 
@@ -214,6 +225,10 @@ def _energy_balance(above: Axes, below: Axes, trajectory: SavedRun, theme: Theme
     below.plot(t, work.balance, color=theme.curves[0], linewidth=_thin(t), label=r"$\Delta E$ - work")
     below.axhspan(-work.uncertainty, work.uncertainty, color=theme.faint, label="not resolved\nby the nodes")
     below.set_ylabel("energy balance")
+    if trajectory.micro is None:
+        below.set_title(
+            "schemes with kicks: terms of $H^2$, a drift among them, without Save(micro=True)", fontsize=7.5
+        )
     legend_beside(below, size=7.5)
     _not_below_roundoff(below.yaxis, energy)
 

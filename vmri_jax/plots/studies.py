@@ -81,7 +81,7 @@ def plot_work_precision(
     """Error of the positions against work, one curve per scheme; the Pareto front is underlaid.
 
     Args:
-        study: result of `vmri_jax.study.work_precision`, or the runs of a recommendation.
+        study: `vmri_jax.study.WorkPrecision`: ``study.work()`` of a convergence study, or the runs of a recommendation.
         title: title above the panel.
         work: "seconds", "slow_evaluations", "fast_evaluations" or "solves".
         theme: colours.

@@ -1,11 +1,15 @@
 """Printed tables, and the console that prints them."""
 
 import os
+from typing import Any
 
+from rich.box import Box
 from rich.console import Console, ConsoleDimensions, ConsoleOptions, RenderResult
 from rich.table import Table
 from rich.text import Text
 
+SENTENCE_COLUMNS = 120
+"""Characters in a line of a table with lines between its rows, whose cells are sentences. Longer lines are hard to read."""
 PIPE_COLUMNS = 1000
 """Characters in a line of a pipe or a file. It is wider than any table, so that no cell is broken into lines; a larger value changes nothing."""
 
@@ -27,8 +31,13 @@ class OutputConsole(Console):
 class PrintedTable(Table):
     """A table of rich that the built-in `print` shows, too; its caption takes the width of the console, not of the table."""
 
+    def __init__(self, *headers: str, box: Box | None = None, pad_edge: bool = False, **look: Any):
+        super().__init__(*headers, box=box, pad_edge=pad_edge, **look)
+
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         caption, self.caption = self.caption, None
+        if self.show_lines:
+            options = options.update(max_width=min(options.max_width, SENTENCE_COLUMNS))
         try:
             yield from super().__rich_console__(console, options)
         finally:

@@ -81,7 +81,7 @@ class Ledger:
 
     def table(self) -> PrintedTable:
         """Unknowns, evaluations and time of every body and effect; the reasons for their grids are in `reasons`."""
-        table = PrintedTable("name", "part of", "grid", box=None, pad_edge=False)
+        table = PrintedTable("name", "part of", "grid")
         for column in ("unknowns", "evaluations", *(["time"] if self.microseconds is not None else [])):
             table.add_column(column, justify="right")
         for row in self.rows:
@@ -101,7 +101,7 @@ class Ledger:
 
     def reasons(self) -> PrintedTable:
         """For every body the reason why it is slow or fast, for every effect the reason for its grid."""
-        table = PrintedTable("name", "why", box=None, pad_edge=False)
+        table = PrintedTable("name", "why")
         for row in self.rows:
             table.add_row(f"[bold]{row.name}[/bold]", row.why)
         return table

@@ -226,5 +226,7 @@ def names_of(sorting: Sorting) -> Names:
         [name for name, body in sorting.bodies.items() if getattr(body, kind)] for kind in ("block", "rigid")
     )
     carried = {name: place for name, place in sorting.layout.bodies.items() if name not in sorting.layout.coordinates}
+    turning = {place for key, place in sorting.layout.freedoms.items() if key[2] in ANGLES}
+    angles = [name for name, place in sorting.layout.coordinates.items() if place in turning]
     rows = sizes["constraint"], sizes["slow_constraint"]
-    return Names(sizes["s"], sizes["f"], *rows, blocks, rigid, carried, sorting.layout.kinematics)
+    return Names(sizes["s"], sizes["f"], *rows, blocks, rigid, carried, sorting.layout.kinematics, angles=angles)

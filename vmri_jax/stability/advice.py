@@ -115,12 +115,6 @@ class Advice(ResultTable):
 
     rows = property(lambda self: self.findings, doc="The findings.")
 
-    def content(self) -> dict[str, Any]:
-        """Findings, windows and frequencies."""
-        fields = {name: value for name, value in vars(self).items() if name != "findings"}
-        windows = [window._asdict() for window in self.windows]
-        return {"verdict": self.verdict, **fields, "windows": windows, **super().content()}
-
     caption = verdict
 
     def __str__(self) -> str:

@@ -1,7 +1,7 @@
 """Stability maps: the stable macro steps of a scheme, over ``omega H`` and over schemes or coupling strengths."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -97,10 +97,6 @@ class StabilityMap(ResultTable):
             for label, radius in zip(self.rows, self.radius, strict=True)
             for x, dt, value in zip(self.omega_H, self.macro_dt, radius, strict=True)
         ]
-
-    def content(self) -> dict[str, Any]:
-        """All fields, for `to_json`."""
-        return asdict(self)
 
 
 def stability_map(

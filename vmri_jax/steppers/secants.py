@@ -39,7 +39,7 @@ class Secants(NamedTuple):
             d += jnp.sum(step * d[: step.size]) * change
         return d
 
-    def after(self, s, d, is_wanted) -> "tuple[Secants, Float[Array, m]]":
+    def after(self, s, d, is_wanted) -> tuple["Secants", Array]:
         """The corrections after one more step s and the update d by the cheap matrix that follows it, and this update with them.
 
         Args:

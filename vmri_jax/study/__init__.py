@@ -1,30 +1,27 @@
 """Studies of schemes: convergence, work and precision, advice, computing time."""
 
 from vmri_jax.accuracy.families import Family, families
-from vmri_jax.study.convergence import ConvergenceRow, ConvergenceStudy, convergence_study
+from vmri_jax.study.convergence import ConvergenceStudy, convergence_study
 from vmri_jax.study.cost_report import CostReport, cost_report
-from vmri_jax.study.program import Program
 from vmri_jax.study.reference_solution import ReferenceSolution, reference_solution
+from vmri_jax.study.row import Row
 from vmri_jax.study.table import Column, ResultTable
 from vmri_jax.study.tuning import Recommendation, tune
-from vmri_jax.study.work import WorkPrecision, WorkRow, work_precision
+from vmri_jax.study.work import WorkPrecision
 
 __all__ = [
     "Column",
-    "ConvergenceRow",
     "ConvergenceStudy",
     "CostReport",
     "Family",
-    "Program",
     "Recommendation",
     "ReferenceSolution",
     "ResultTable",
+    "Row",
     "WorkPrecision",
-    "WorkRow",
     "convergence_study",
     "cost_report",
     "families",
     "reference_solution",
     "tune",
-    "work_precision",
 ]

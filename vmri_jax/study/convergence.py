@@ -19,15 +19,18 @@ from vmri_jax.diagnostics import OrderFit
 from vmri_jax.executors.executor import mapped
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
 from vmri_jax.running.interrupts import Interrupted
+from vmri_jax.running.prepare import prepare
 from vmri_jax.running.progress import Progress, shows_progress
+from vmri_jax.running.simulation import Simulation
+from vmri_jax.running.timing import interleaved
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
-from vmri_jax.steppers.results import Method, Result
 from vmri_jax.steppers.solver import Solver
-from vmri_jax.study.program import Program
 from vmri_jax.study.reference_solution import ReferenceSolution, reference_solution
-from vmri_jax.study.table import Column, ResultTable
+from vmri_jax.study.row import Row, RunTable, row_of
+from vmri_jax.study.table import Column, interruptible
+from vmri_jax.study.work import WorkPrecision
 
 MIN_ERROR_OVER_REFERENCE = 100.0
 """Least ratio of a fitted error to the error of the reference; at this ratio the reference changes the error of the scheme by 1 %; a larger
@@ -51,53 +54,26 @@ class Case:
         phase = [part for array in (self.reference.q, self.reference.p) for part in np.split(array, [n_s], axis=1)]
         return np.asarray(jax.jit(jax.vmap(partial(diagnostics.energy, self.problem.system)))(*phase))
 
-
-@dataclass(frozen=True)
-class ConvergenceRow:
-    """One run: its errors, its invariants and its iterations.
-
-    case: label of the parameters, "" if there is one set only.
-    error_q, error_p: largest error of positions and of momenta over nodes and coordinates.
-    energy_error: largest error of the energy: its change since the start where the system keeps its energy; its difference from the
-        energy of the reference where forces or moving constraints do work.
-    energy_drift: change, over the run, of the straight line fitted to the error of the energy.
-    energy_band: largest distance of the error of the energy from this line.
-    momentum_error: largest change of a momentum map since the start.
-    constraint_residual: largest constraint value, of positions or velocities.
-    iterations: most Newton iterations of a step.
-    method, result: names of the costliest `Method` and of the `Result`.
-    """
-
-    scheme: str
-    case: str
-    num_micro: int
-    degree: int
-    macro_dt: float
-    error_q: float
-    error_p: float
-    energy_error: float
-    energy_drift: float
-    energy_band: float
-    momentum_error: float
-    constraint_residual: float
-    iterations: int
-    method: str
-    result: str
+    def row(self, name: str, scheme, num_steps: int, t_end: float, maps: Sequence[Callable], run, seconds) -> Row:
+        """The row of a run of a scheme to `t_end`, with samples of its seconds."""
+        error_q, error_p = self.reference.errors(run)
+        counts = t_end / num_steps, num_steps
+        measured = {"error_q": error_q, "error_p": error_p, "case": self.label}
+        return row_of(name, self.problem.system, scheme, run, *counts, self.energies, maps, **measured).timed(seconds)
 
 
 @dataclass(frozen=True)
 class SchemeSummary:
     """One scheme with one set of parameters: its runs and observed orders of positions and momenta."""
 
-    runs: tuple[ConvergenceRow, ...]
+    runs: tuple[Row, ...]
     fit_q: OrderFit
     fit_p: OrderFit
 
     @property
-    def finest(self) -> ConvergenceRow | None:
+    def finest(self) -> Row | None:
         """The run with the smallest step that did not fail."""
-        finished = [row for row in self.runs if np.isfinite(row.error_q)]
-        return min(finished, key=lambda row: row.macro_dt, default=None)
+        return min((row for row in self.runs if not row.failed), key=lambda row: row.macro_dt, default=None)
 
 
 def _order(fit: OrderFit) -> str:
@@ -109,7 +85,7 @@ def _order(fit: OrderFit) -> str:
 
 def _failures(summary: SchemeSummary) -> str:
     """The number of failed runs; empty if no run failed."""
-    failed = sum(not np.isfinite(row.error_q) for row in summary.runs)
+    failed = sum(row.failed for row in summary.runs)
     return f"{failed} of {len(summary.runs)}" if failed else ""
 
 
@@ -119,10 +95,10 @@ def _of_finest(name: str, form: str = ".1e") -> Callable[[SchemeSummary], str]:
 
 
 @dataclass(frozen=True)
-class ConvergenceStudy(ResultTable):
+class ConvergenceStudy(RunTable):
     """Rows of a convergence study, sorted by scheme, then by case, then by macro step in the order of the call.
 
-    The column "energy" of its table is the error of the energy, see `ConvergenceRow`, at the smallest step.
+    The column "energy" of its table is the error of the energy, see `Row`, at the smallest step.
 
     references: reference solutions by case.
     """
@@ -138,13 +114,8 @@ class ConvergenceStudy(ResultTable):
         Column("energy", _of_finest("energy_error"), right=True),
         Column("failed", _failures, right=True),
     )
-    rows: tuple[ConvergenceRow, ...]
+    rows: tuple[Row, ...]
     references: Mapping[str, ReferenceSolution]
-
-    @property
-    def schemes(self) -> list[str]:
-        """Labels of the schemes."""
-        return list(dict.fromkeys(row.scheme for row in self.rows))
 
     @property
     def cases(self) -> list[str]:
@@ -194,10 +165,10 @@ class ConvergenceStudy(ResultTable):
             summaries.append(SchemeSummary(runs, *fits))
         return summaries
 
-    def content(self) -> dict[str, Any]:
-        """The rows, and the errors of the references."""
-        references = {case: reference.errors_known() for case, reference in self.references.items()}
-        return {"references": references, **super().content()}
+    def work(self, case: str | None = None) -> WorkPrecision:
+        """The runs of a case, the first one by default, by their errors and their work; times where the study has them."""
+        case = self.cases[0] if case is None else case
+        return WorkPrecision(tuple(row for row in self.rows if row.case == case), self.references[case])
 
     def plot(self, title: str = "", orders: Sequence[int] = ()):
         """Errors against the macro step, with guides of the slopes `orders`, see `vmri_jax.plots.plot_convergence`."""
@@ -222,6 +193,7 @@ def convergence_study(
     momentum_maps: Sequence[Callable] = (),
     reference: ReferenceSolution | Mapping[str, ReferenceSolution] | None = None,
     solver: Solver | None = None,
+    repeats: int = 0,
     executor: Any = None,
     progress: Any = False,
 ) -> ConvergenceStudy:
@@ -241,7 +213,10 @@ def convergence_study(
         reference: the solution that errors are measured against, by label of the parameters if there are several; by default
             `reference_solution`.
         solver: how implicit equations are solved.
-        executor: where runs are computed, as of `vmri_jax.ensemble`; None for this process.
+        repeats: timed samples of every run; 0 for no times. In this process the runs take turns on the clock, so that a slow
+            moment of the machine hits all of them; a row has the median.
+        executor: where runs are computed and timed, as of `vmri_jax.ensemble`; None for this process. A worker that measures
+            times needs a core of its own.
         progress: True for a bar, or a function (what, done, total) that is told about every run before it starts.
 
     Raises:
@@ -260,25 +235,30 @@ def convergence_study(
     told = lambda message, *_: progress(message, 0, total)  # noqa: E731
     cases = _cases(problem, params, reference, t_end, num_saves, told)
     labels = [(label, case, num_steps) for label in schemes for case in cases for num_steps in steps]
+    arguments = lambda label, case, num_steps: (case.problem, schemes[label], t_end, num_saves, solver, num_steps)  # noqa: E731
     stopped = None
     try:
         runs = mapped(
             "convergence_study",
             _run,
-            [(case.problem, schemes[label], t_end, num_saves, solver, num_steps) for label, case, num_steps in labels],
+            [(*arguments(*run), 0 if executor is None else repeats) for run in labels],
             executor,
             lambda done, i: progress(f"{labels[i][0]}, H = {t_end / labels[i][2]:g}", done, total),
         )
     except Interrupted as interrupted:
         runs, stopped = interrupted.done, interrupted
-    rows = [
-        _row(label, schemes[label], t_end / num_steps, case, momentum_maps, run)
-        for (label, case, num_steps), run in zip(labels, runs, strict=True)
-        if run is not None
-    ]
+    done = [(labels[i], run) for i, run in enumerate(runs) if run is not None]
+    rows = [case.row(label, schemes[label], n, t_end, momentum_maps, *run) for (label, case, n), run in done]
     study = ConvergenceStudy(tuple(rows), {case.label: case.reference for case in cases})
     if stopped is not None:
         raise Interrupted(study, len(study.rows), None, "runs") from None
+    if repeats and executor is None:
+        with interruptible(lambda: study):
+            progress("measuring times", total, total)
+            calls = {str(i): _prepared(*arguments(*labels[i])).timed() for i, row in enumerate(rows) if not row.failed}
+            samples = interleaved(calls, repeats)
+        rows = [row.timed(samples.get(str(i), ())) for i, row in enumerate(rows)]
+        study = replace(study, rows=tuple(rows))
     progress("done", total, total)
     return study
 
@@ -314,8 +294,18 @@ def _cases(problem: Problem, params, reference, t_end: float, num_saves: int, pr
     return [Case(label, problem, references[label]) for label, problem in problems.items()]
 
 
-def _run(problem: Problem, scheme, t_end: float, num_saves: int, solver, num_steps: int) -> Trajectory:
-    return Program(problem, scheme, t_end, num_saves, solver)(num_steps)
+def _prepared(problem: Problem, scheme, t_end: float, num_saves: int, solver, num_steps: int) -> Simulation:
+    steps = {"macro_dt": t_end / num_steps, "num_steps": num_steps, "save": num_steps // num_saves}
+    return prepare(problem, scheme, **steps, solver=solver)
+
+
+def _run(*arguments) -> tuple[Trajectory, list[float]]:
+    """A run with arguments of `_prepared`, and samples of its seconds, as many as the last argument says."""
+    *arguments, repeats = arguments
+    run = _prepared(*arguments)
+    trajectory = run(throw=False)
+    is_timed = repeats and trajectory.success
+    return trajectory, interleaved({"": run.timed()}, repeats)[""] if is_timed else []
 
 
 def _num_steps(t_end: float, macro_dt: float, num_saves: int) -> int:
@@ -328,45 +318,3 @@ def _num_steps(t_end: float, macro_dt: float, num_saves: int) -> int:
             "saves the same times."
         )
     return num_steps
-
-
-def _row(
-    label: str,
-    scheme: Scheme | Composition,
-    macro_dt: float,
-    case: Case,
-    momentum_maps: Sequence[Callable],
-    trajectory: Trajectory,
-) -> ConvergenceRow:
-    """The row of one run."""
-    error_q, error_p = case.reference.errors(trajectory)
-    energy = np.asarray(trajectory.energy)
-    energy_error = energy - (energy[0] if case.energies is None else case.energies)
-    drift, band = _drift_and_band(np.asarray(trajectory.t), energy_error)
-    _, *phase = vars(trajectory.states).values()
-    maps = [np.asarray(jax.vmap(lambda *z, xi=xi: diagnostics.momentum_map(xi, *z))(*phase)) for xi in momentum_maps]
-    return ConvergenceRow(
-        scheme=label,
-        case=case.label,
-        num_micro=scheme.num_micro,
-        degree=scheme.degree,
-        macro_dt=macro_dt,
-        error_q=error_q,
-        error_p=error_p,
-        energy_error=float(np.abs(energy_error).max()),
-        energy_drift=drift,
-        energy_band=band,
-        momentum_error=float(max((np.abs(m - m[0]).max() for m in maps), default=0.0)),
-        constraint_residual=float(np.max(trajectory.constraint_residual)),
-        iterations=int(np.max(trajectory.info.iterations)),
-        method=Method(int(np.max(trajectory.info.method))).name,
-        result=Result(int(trajectory.result)).name,
-    )
-
-
-def _drift_and_band(t: np.ndarray, energy_error: np.ndarray) -> tuple[float, float]:
-    """Change over the run of the straight line fitted to the error of the energy, and the largest distance from the line."""
-    if not np.isfinite(energy_error).all():
-        return float("nan"), float("nan")
-    line = np.polynomial.Polynomial.fit(t, energy_error, 1)(t)
-    return float(line[-1] - line[0]), float(np.abs(energy_error - line).max())

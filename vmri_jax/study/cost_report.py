@@ -16,10 +16,11 @@ from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
 from vmri_jax.running.files import make_writable_folder
 from vmri_jax.running.progress import part, shows_progress
 from vmri_jax.study.html import embedded, write_page
-from vmri_jax.study.prices import CONSTRAINTS, prices, seconds_by_function, shares
+from vmri_jax.study.prices import prices, seconds_of_gradients
+from vmri_jax.study.row import Row, record
 from vmri_jax.study.table import Column, ResultTable, interruptible
 from vmri_jax.study.tuning import Tuning
-from vmri_jax.study.work import WorkPrecision, WorkRow, duration, pareto_front
+from vmri_jax.study.work import WorkPrecision, duration, pareto_front
 
 TEMPLATE = Path(__file__).parent / "cost.html.j2"
 PERIODS = 30
@@ -34,7 +35,7 @@ class Answer:
     the error."""
 
     error: float
-    setting: WorkRow | None
+    setting: Row | None
 
 
 class PageFailed(RuntimeError):
@@ -48,12 +49,12 @@ class PageFailed(RuntimeError):
         )
 
 
-def _of_setting(form: Callable[[WorkRow], str]) -> Callable[[Answer], str]:
+def _of_setting(form: Callable[[Row], str]) -> Callable[[Answer], str]:
     """The text of a column: `form` of the run, empty if none keeps the error."""
     return lambda answer: "" if answer.setting is None else form(answer.setting)
 
 
-def _gain(row: WorkRow) -> str:
+def _gain(row: Row) -> str:
     """The gain of more than one micro step."""
     return f"{row.settings.gain:.2g}" if row.num_micro > row.stages else ""
 
@@ -68,7 +69,6 @@ class CostReport(ResultTable):
     rows: the answers by error, the largest first.
     runs: every run of the search.
     curves: the best runs of each family, named by it.
-    shares: parts of the time of the middle answer by function, see `vmri_jax.study.prices.shares`.
     bound: seconds and error of the runs of the Pareto front, if the time of a run were that of its gradients alone;
         empty with constraints.
     """
@@ -87,7 +87,6 @@ class CostReport(ResultTable):
     rows: tuple[Answer, ...]
     runs: WorkPrecision
     curves: WorkPrecision
-    shares: dict[str, float]
     bound: tuple[tuple[float, float], ...] = ()
 
     @property
@@ -96,24 +95,13 @@ class CostReport(ResultTable):
         return f"Runs to t = {self.t_end:g}, with the largest errors of the positions on the way."
 
     @property
-    def reached(self) -> list[WorkRow]:
+    def reached(self) -> list[Row]:
         """The runs of the answers that have one."""
         return [answer.setting for answer in self.rows if answer.setting is not None]
 
-    @property
-    def growth(self) -> float:
-        """Factor in time for a hundredth of the error, the geometric mean over the answers; NaN for fewer than two
-        answers."""
-        errors = [answer.error for answer in self.rows if answer.setting is not None]
-        if len(errors) < 2:
-            return math.nan
-        times = self.reached[-1].seconds / self.reached[0].seconds
-        return times ** (math.log(100) / math.log(errors[0] / errors[-1]))
-
     def records(self) -> list[dict[str, Any]]:
         """A dictionary for each answer: the error and the columns of its run."""
-        runs = [WorkPrecision((a.setting,) if a.setting else (), self.t_end).records() for a in self.rows]
-        return [{"error": answer.error, **(run[0] if run else {})} for answer, run in zip(self.rows, runs, strict=True)]
+        return [{"error": a.error, **(record(a.setting) if a.setting else {})} for a in self.rows]
 
     def figure(self, title: str, theme: plots.Theme) -> plots.NotebookFigure:
         """Error against time: a curve for each family, the answers, and the bound."""
@@ -204,10 +192,13 @@ def _default_errors(tuning: Tuning) -> list[float]:
 def _write(tuning: Tuning, errors: Sequence[float], name: str, out: Path) -> CostReport:
     """Write the page of the fastest settings that keep the errors, whichever of them they were found for, and hand back
     its report."""
-    settings = {error: tuning.keeping(error) for error in sorted(errors, reverse=True)}
-    answers = tuple(Answer(error, kept[0] if kept else None) for error, kept in settings.items())
-    runs, curves, middle = tuning.runs(), _curves(tuning), answers[len(answers) // 2].setting
-    price = prices(tuning.problem) if middle is not None else {}
+    errors = sorted(errors, reverse=True)
+    kept = [next(iter(tuning.keeping(error)), None) for error in errors]
+    answers = tuple(map(Answer, errors, kept))
+    runs, curves = tuning.runs(), _curves(tuning)
+    # Constraints cost more than their evaluations: the runs have no bound.
+    has_bound = any(kept) and not tuning.problem.system.is_constrained
+    bound = bound_of(prices(tuning.problem), curves.pareto()) if has_bound else ()
     report = CostReport(
         path=out / "cost.html",
         name=name,
@@ -215,8 +206,7 @@ def _write(tuning: Tuning, errors: Sequence[float], name: str, out: Path) -> Cos
         rows=answers,
         runs=runs,
         curves=curves,
-        shares=shares(price, middle) if middle is not None else {},
-        bound=bound_of(price, curves.pareto()),
+        bound=bound,
     )
     runs.to_csv(out / "cost.csv")
     try:
@@ -232,21 +222,17 @@ def _curves(tuning: Tuning) -> WorkPrecision:
     for row in tuning.rows():
         by_family[tuning.family_of(row).name].append(row)
     for family, runs in by_family.items():
-        timed = [row for row in runs if math.isfinite(row.seconds)]
-        rows += [replace(row, scheme=family) for row in pareto_front(timed, "seconds", "error_q")]
-    return WorkPrecision(tuple(rows), tuning.t_end)
+        rows += [replace(row, scheme=family) for row in pareto_front(runs, "seconds", "error_q")]
+    return WorkPrecision(tuple(rows))
 
 
-def bound_of(price: dict[str, float], rows: Sequence[WorkRow]) -> tuple[tuple[float, float], ...]:
-    """Seconds and error of runs whose time is that of their gradients alone; empty with constraints, whose solution
-    costs more than `prices` say.
+def bound_of(price: dict[str, float], rows: Sequence[Row]) -> tuple[tuple[float, float], ...]:
+    """Seconds and error of runs whose time is that of their gradients alone.
 
     A gradient that is evaluated in a loop of its own may take longer than in the run, so that the time of the run
     bounds it.
     """
-    if not price or CONSTRAINTS in price:
-        return ()
-    return tuple((min(sum(seconds_by_function(price, row).values()), row.seconds), row.error_q) for row in rows)
+    return tuple((min(seconds_of_gradients(price, row), row.seconds), row.error_q) for row in rows)
 
 
 def _draw(report: CostReport, problem: Problem) -> None:

@@ -14,7 +14,6 @@ import jinja2
 from matplotlib.figure import Figure
 
 from vmri_jax import plots
-from vmri_jax.study.machine import processor
 
 STYLE_FOLDER = Path(__file__).parent
 
@@ -32,6 +31,13 @@ def write_page(path: Path, template: Path, **values) -> None:
         **values,
     )
     path.write_text(text, encoding="utf-8")
+
+
+def processor() -> str:
+    """Name of the processor."""
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text().splitlines() if info.exists() else []
+    return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), platform.machine())
 
 
 def embedded(draw: Callable[[plots.Theme], Figure]) -> tuple[str, str]:

@@ -6,13 +6,14 @@ from typing import Any
 import numpy as np
 
 from vmri_jax.accuracy.companions import fewest_steps
+from vmri_jax.diagnostics.linear import phase_vector
 from vmri_jax.mechanics.driving import events
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
 from vmri_jax.running.failures import simulation_error
+from vmri_jax.running.prepare import prepare
 from vmri_jax.running.progress import shows_progress
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes.scheme import galerkin
-from vmri_jax.study.program import Program, joined
 
 ROUNDOFF = 1e-13
 """Difference of two runs, relative to the largest coordinate, that counts as round-off; a larger value ends with coarser steps."""
@@ -38,14 +39,16 @@ class ReferenceSolution:
         """Saved nodes, the start not counted."""
         return len(self.q) - 1
 
-    def errors_known(self) -> dict[str, float]:
-        """The errors of q and p by name, for files."""
-        return {"error_q": self.error_q, "error_p": self.error_p}
-
     def errors(self, trajectory: Trajectory) -> tuple[float, float]:
         """Largest error of q and of p over nodes and coordinates; NaN for a run that failed."""
         q, p = joined(trajectory)
         return float(np.abs(q - self.q).max()), float(np.abs(p - self.p).max())
+
+
+def joined(trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray]:
+    """q and p, each (num_saves + 1, n_s + n_f), at the saved nodes, slow coordinates first."""
+    q, p = np.split(np.asarray(phase_vector(trajectory.states)), 2, axis=-1)
+    return q, p
 
 
 @shows_progress
@@ -79,15 +82,15 @@ def reference_solution(
         SimulationError: runs failed with every number of steps; carries the last run.
     """
     problem = problem_of("reference_solution", problem)
-    program = Program(problem, galerkin(1, degree, "gauss"), t_end, num_saves)
+    run = prepare(problem, galerkin(1, degree, "gauss"), macro_dt=t_end / num_saves, num_steps=num_saves)
     fixed = num_steps is not None
-    drives = events(problem.system, program.state, float(program.state.t) + t_end)
-    fewest = max(32, fewest_steps(program.scheme, drives, t_end))  # steps that see the events of forces
+    drives = events(problem.system, run.state, float(run.state.t) + t_end)
+    fewest = max(32, fewest_steps(run.scheme, drives, t_end))  # steps that see the events of forces
     n = num_steps if fixed else num_saves * -(-fewest // num_saves)
     coarse, best, last_error = None, None, np.inf
     while True:
         progress(f"reference solution, {n} steps", 0, 1)
-        trajectory = program(n)
+        trajectory = run(macro_dt=t_end / n, num_steps=n, throw=False)
         fine = joined(trajectory) if bool(trajectory.success) else None
         if coarse is not None and fine is not None:
             error_q, error_p = (float(np.abs(a - b).max()) for a, b in zip(coarse, fine, strict=True))

@@ -1,17 +1,14 @@
 """Result tables: the base class of results with rows, of studies, stability maps and checks."""
 
 import csv
-import json
-import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
-import numpy as np
+from rich.box import HEAVY_HEAD
 from rich.markup import escape
-from rich.table import Table
 from rich.text import Text
 
 from vmri_jax.running.export import extra
@@ -29,7 +26,7 @@ class Column:
 
 
 class ResultTable:
-    """Rows that can be shown, and written as CSV, JSON and Markdown.
+    """Rows that can be printed, written to a CSV file, and handed to pandas.
 
     A subclass is a frozen dataclass with a field `rows`, whose items are dataclasses, and with the `columns` of the printed
     table; a column that is empty in all rows is left out. Files hold every field of every row.
@@ -44,30 +41,22 @@ class ResultTable:
         return ""
 
     def shown(self) -> Sequence[Any]:
-        """The items that `table` and `markdown` print, one per line: the rows, unless a subclass chooses among them."""
+        """The items that `table` prints, one per line: the rows, unless a subclass chooses among them."""
         return self.rows
 
     def records(self) -> list[dict[str, Any]]:
         """The rows as dictionaries of plain values."""
         return [asdict(row) for row in self.rows]
 
-    def lines(self) -> list[dict[str, Any]]:
-        """The lines of the CSV file: the records, unless a subclass writes several lines per row."""
-        return self.records()
-
     def to_pandas(self):
-        """The lines of the CSV file as a `pandas.DataFrame`; needs the extra ``vmri_jax[xarray]``, which brings pandas."""
-        return extra("pandas", "to_pandas").DataFrame(self.lines())
+        """The records as a `pandas.DataFrame`; needs the extra ``vmri_jax[xarray]``, which brings pandas."""
+        return extra("pandas", "to_pandas").DataFrame(self.records())
 
-    def content(self) -> dict[str, Any]:
-        """The content of the JSON file: the rows; a subclass adds its further fields."""
-        return {"rows": self.records()}
-
-    def table(self) -> Table:
+    def table(self) -> PrintedTable:
         """A table for the terminal and for notebooks."""
         return rich_table(self.columns, self.shown(), self.caption)
 
-    def __rich__(self) -> Table:
+    def __rich__(self) -> PrintedTable:
         return self.table()
 
     def __init_subclass__(cls, **options):
@@ -84,26 +73,14 @@ class ResultTable:
         """The representation in notebooks: the table."""
         return self.table()._repr_mimebundle_(include, exclude, **kwargs)
 
-    def markdown(self) -> str:
-        """The table in Markdown."""
-        columns, cells = _filled(self.columns, self.shown())
-        body = [[str(cell).replace("|", "\\|").replace("\n", " ") for cell in line] for line in cells]
-        head = [column.name for column in columns]
-        rule = ["---:" if column.right else "---" for column in columns]
-        return "".join(f"| {' | '.join(line)} |\n" for line in (head, rule, *body))
-
     def to_csv(self, path: str | Path) -> None:
-        """Write a CSV file."""
-        lines = self.lines()
-        names = list(dict.fromkeys(name for line in lines for name in line))
+        """Write the records to a CSV file."""
+        records = self.records()
+        names = list(dict.fromkeys(name for record in records for name in record))
         with open(path, "w", newline="") as file:
             writer = csv.DictWriter(file, names)
             writer.writeheader()
-            writer.writerows(lines)
-
-    def to_json(self, path: str | Path) -> None:
-        """Write a JSON file. NaN becomes null, infinite numbers become "inf" and "-inf"."""
-        Path(path).write_text(json.dumps(_plain(self.content()), indent=1))
+            writer.writerows(records)
 
 
 @contextmanager
@@ -116,34 +93,15 @@ def interruptible(rows: Callable[[], ResultTable]) -> Iterator[None]:
         raise Interrupted(done, len(done.rows), None, "runs") from None
 
 
-def rich_table(columns: Sequence[Column], rows: Sequence[Any], caption: str = "", ruled: bool = False) -> Table:
-    """Rows as a `rich.table.Table`, with lines between the rows if `ruled`."""
-    columns, cells = _filled(columns, rows)
-    table = PrintedTable(header_style="bold", caption=caption or None, show_lines=ruled)
-    if not ruled:
-        table.box, table.pad_edge = None, False
-    for column in columns:
-        table.add_column(column.name, justify="right" if column.right else "left")
-    for line in cells:
-        table.add_row(*(escape(cell) if isinstance(cell, str) else cell for cell in line))
-    return table
-
-
-def _filled(columns: Sequence[Column], rows: Sequence[Any]) -> tuple[list[Column], list[list[str | Text]]]:
-    """The columns that are not empty in all rows, and the cells of each row."""
+def rich_table(columns: Sequence[Column], rows: Sequence[Any], caption: str = "", ruled: bool = False) -> PrintedTable:
+    """The columns that are not empty in all rows, with lines between the rows if `ruled`."""
     cells = [[column.text(row) for column in columns] for row in rows]
     kept = [i for i in range(len(columns)) if not cells or any(str(line[i]) for line in cells)]
-    return [columns[i] for i in kept], [[line[i] for i in kept] for line in cells]
-
-
-def _plain(value: Any) -> Any:
-    """The value in types that JSON knows: NaN becomes None, infinite numbers become strings, arrays become lists."""
-    if isinstance(value, np.ndarray):
-        return _plain(value.tolist())
-    if isinstance(value, Mapping):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None if math.isnan(value) else str(value)
-    return value
+    look = {"show_lines": True, "box": HEAVY_HEAD, "pad_edge": True} if ruled else {}
+    table = PrintedTable(header_style="bold", caption=caption or None, **look)
+    for i in kept:
+        table.add_column(columns[i].name, justify="right" if columns[i].right else "left")
+    for line in cells:
+        shown = [line[i] for i in kept]
+        table.add_row(*(escape(cell) if isinstance(cell, str) else cell for cell in shown))
+    return table

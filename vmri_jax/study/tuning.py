@@ -22,8 +22,9 @@ from vmri_jax.mechanics.state import HasProblem, Problem, State, problem_of
 from vmri_jax.running.failures import simulation_error
 from vmri_jax.running.progress import Progress, shows_progress, silent
 from vmri_jax.steppers.solver import Solver
-from vmri_jax.study.table import ResultTable, interruptible
-from vmri_jax.study.work import WorkPrecision, WorkRow, work_row
+from vmri_jax.study.row import Row, RunTable, row_of
+from vmri_jax.study.table import interruptible
+from vmri_jax.study.work import WorkPrecision
 
 FINALISTS = 4
 """Families whose micro steps and steps are searched for, of those that promise the least time. A larger number searches
@@ -58,14 +59,14 @@ class Tuning:
         self.search.seen = self._add
         whole = families() if menu is None else menu
         self.menu = for_system(whole, self.search.system, self.search.has_two_rates)
-        self._seen: dict[tuple[str, int], tuple[Family, WorkRow]] = {}
+        self._seen: dict[tuple[str, int], tuple[Family, Row]] = {}
 
     def _add(self, trial: Trial) -> None:
         """Add the row of a trial; a failed or uncertified run has an error of NaN."""
         run, error = trial.run, trial.error if np.isfinite(trial.error) else np.nan
         label, numbers = trial.family.label(trial.num_micro), (float(run.macro_dt), run.num_steps)
         measured = {"error_q": error, "settings": self.search.settings(trial)}
-        row = work_row(label, run.system, run.scheme, trial.trajectory, *numbers, **measured)
+        row = row_of(label, run.system, run.scheme, trial.trajectory, *numbers, **measured)
         self._seen[trial.python, run.num_steps] = trial.family, row
 
     def extent(self) -> float:
@@ -75,32 +76,32 @@ class Tuning:
             self.search.first_trials(self.menu[:1], np.inf)
         return self.search.extent()
 
-    def look_for(self, name: str, error: float, exhaustive: bool = False) -> list[WorkRow]:
+    def look_for(self, name: str, error: float, exhaustive: bool = False) -> list[Row]:
         """Search for an error, and return the runs that keep it, the fastest first; `name` begins messages."""
         menu = by_promise(self.menu, digits_of(self.search, error))
         finals = reached(name, self.search, menu, error, finalists=FINALISTS, exhaustive=exhaustive)
         self.search.measure([trial for trial in finals if np.isfinite(trial.error)])
         return self.keeping(error)
 
-    def family_of(self, row: WorkRow) -> Family:
+    def family_of(self, row: Row) -> Family:
         """The family of the scheme of a run."""
         return next(family for family, seen in self._seen.values() if seen.scheme == row.scheme)
 
-    def rows(self) -> list[WorkRow]:
+    def rows(self) -> list[Row]:
         """All runs so far, sorted by scheme and number of steps; seconds are those of the steps, NaN where they were
         not measured."""
         rows = sorted((row for _, row in self._seen.values()), key=attrgetter("scheme", "num_steps"))
         seconds = self.search.seconds
         return [replace(row, seconds=seconds.get(row.settings.python, np.nan) * row.num_steps) for row in rows]
 
-    def keeping(self, error: float) -> list[WorkRow]:
+    def keeping(self, error: float) -> list[Row]:
         """The runs that keep an error and whose time is known, the fastest first."""
         kept = [row for row in self.rows() if row.error_q <= error and np.isfinite(row.seconds)]
         return sorted(kept, key=attrgetter("seconds"))
 
     def runs(self) -> WorkPrecision:
         """The table of all runs so far."""
-        return WorkPrecision(tuple(self.rows()), self.t_end)
+        return WorkPrecision(tuple(self.rows()))
 
 
 class NothingReached(ValueError):
@@ -121,10 +122,10 @@ class Verification:
 
 
 @dataclass(frozen=True)
-class Recommendation(ResultTable):
+class Recommendation(RunTable):
     """The cheapest setting for an error, and the search that led to it; prints as a table of the best few settings.
 
-    Its files, `to_csv` and `to_json`, hold all runs of the search.
+    `to_csv` and `to_pandas` have all runs of the search.
 
     scheme, macro_dt, num_steps: arguments for `vmri_jax.simulate`; `setting.settings.arguments` are all of them.
     error: the accepted error, in the unit of the positions.
@@ -135,18 +136,18 @@ class Recommendation(ResultTable):
     """
 
     error: float
-    setting: WorkRow
-    others: tuple[WorkRow, ...]
+    setting: Row
+    others: tuple[Row, ...]
     verification: Verification | None
     runs: WorkPrecision
     columns = WorkPrecision.columns
 
     @property
-    def rows(self) -> tuple[WorkRow, ...]:
+    def rows(self) -> tuple[Row, ...]:
         """All runs of the search."""
         return self.runs.rows
 
-    def shown(self) -> list[WorkRow]:
+    def shown(self) -> list[Row]:
         """The best settings, the recommended one first."""
         return [self.setting, *self.others][:SETTINGS_PRINTED]
 
@@ -158,11 +159,6 @@ class Recommendation(ResultTable):
             f"For an error of {self.error:g} take the first: its .scheme, .macro_dt and .num_steps.{again} "
             f"All {len(self.rows)} runs are in .runs and .to_csv(path)."
         )
-
-    def content(self) -> dict[str, Any]:
-        """The content of the JSON file: the runs of the search, the accepted error and the recommended run."""
-        (choice,) = WorkPrecision((self.setting,), self.runs.t_end).records()
-        return {**self.runs.content(), "error": self.error, "choice": choice}
 
     @property
     def scheme(self):
@@ -270,9 +266,7 @@ def another_start(problem: Problem, speed: float) -> Problem:
     return replace(problem, q_s=state.q_s, q_f=state.q_f, v_s=v_s, v_f=v_f, project=False)
 
 
-def first_verified(
-    tuning: Tuning, rows: Sequence[WorkRow], error: float, other: Problem
-) -> tuple[WorkRow, Verification]:
+def first_verified(tuning: Tuning, rows: Sequence[Row], error: float, other: Problem) -> tuple[Row, Verification]:
     """The fastest setting whose run from another start, too, keeps the error; warns if none of `MAX_CHECKS` settings
     does.
 

@@ -15,7 +15,7 @@ from vmri_jax.steppers.march import MarchEquations, factor, solve
 
 ONLY_FIRST_DERIVATIVES = (
     "the adjoint of this run has first derivatives in reverse mode only. For second derivatives and forward mode take "
-    "vmri_jax.simulate(..., adjoint='stored')."
+    "vmri_jax.simulate(..., save=vm.Save(adjoint='stored'))."
 )
 
 

@@ -1,0 +1,167 @@
+"""The row of a run in a study: its errors, invariants, evaluations and time."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
+
+import jax
+import numpy as np
+
+from vmri_jax import diagnostics
+from vmri_jax.mechanics.system import System
+from vmri_jax.mechanics.terms import label
+from vmri_jax.running.settings import Settings
+from vmri_jax.running.trajectory import Trajectory
+from vmri_jax.schemes.composition import Composition, stage_scheme
+from vmri_jax.schemes.scheme import Scheme
+from vmri_jax.steppers.results import Method, Result
+from vmri_jax.study.table import ResultTable
+
+
+@dataclass(frozen=True)
+class Row:
+    """One run of a study; NaN, or None, where a study does not measure.
+
+    scheme: label.
+    error_q, error_p: largest error over the compared nodes, see `ReferenceSolution`; in a search `error_q` is the estimated
+        error of the run, see `vmri_jax.accuracy.companions`.
+    case: label of the parameters, "" if there is one set only.
+    energy_error: largest error of the energy: its change since the start where the system keeps its energy; its difference
+        from the energy of the reference where forces or moving constraints do work.
+    energy_drift: change, over the run, of the straight line fitted to the error of the energy.
+    energy_band: largest distance of the error of the energy from this line.
+    momentum_error: largest change of a momentum map since the start.
+    constraint_residual: largest constraint value, of positions or velocities.
+    seconds, low, high: median and quartiles of the wall time of the run, without compiling; in a search `seconds` are those
+        of the steps.
+    slow_evaluations, fast_evaluations: evaluations of the gradients of V and of W in the whole run, counted from the scheme
+        and the Newton passes that the run reports, one evaluation per pass.
+    evaluations: evaluations of the gradients of further potentials, by name.
+    solves: systems of equations solved in the whole run.
+    iterations: most Newton iterations of a step.
+    method, result: names of the costliest `Method` and of the `Result`.
+    stages, degree: stages of the composition, and degree of the path.
+    settings: arguments of `vmri_jax.simulate` that repeat a run of a search.
+    """
+
+    scheme: str
+    num_micro: int
+    order: int
+    num_steps: int
+    macro_dt: float
+    error_q: float
+    error_p: float = np.nan
+    case: str = ""
+    energy_error: float = np.nan
+    energy_drift: float = np.nan
+    energy_band: float = np.nan
+    momentum_error: float = np.nan
+    constraint_residual: float = np.nan
+    seconds: float = np.nan
+    low: float = np.nan
+    high: float = np.nan
+    slow_evaluations: int = 0
+    fast_evaluations: int = 0
+    evaluations: Mapping[str | int, int] = field(default_factory=dict)
+    solves: int = 0
+    iterations: int = 0
+    method: str = ""
+    result: str = ""
+    stages: int = 1
+    degree: int = 1
+    settings: Settings = None  # pyright: ignore[reportAssignmentType] (as of `Trajectory.settings`)
+
+    @property
+    def failed(self) -> bool:
+        """Whether a step failed, or the error is not known."""
+        return not np.isfinite(self.error_q)
+
+    def timed(self, seconds: Sequence[float]) -> "Row":
+        """The row with the median and the quartiles of these samples, as it is without any."""
+        if not len(seconds):
+            return self
+        low, middle, high = (float(x) for x in np.quantile(seconds, (0.25, 0.5, 0.75)))
+        return replace(self, seconds=middle, low=low, high=high)
+
+
+class RunTable(ResultTable):
+    """A table of runs of several schemes."""
+
+    rows: tuple[Row, ...]
+
+    @property
+    def schemes(self) -> list[str]:
+        """Labels of the schemes."""
+        return list(dict.fromkeys(row.scheme for row in self.rows))
+
+    def records(self) -> list[dict[str, Any]]:
+        """The rows as dictionaries, with an entry for the gradients of each further potential."""
+        return list(map(record, self.rows))
+
+
+def record(row: Row) -> dict[str, Any]:
+    """A row as a dictionary of plain values."""
+    plain = asdict(replace(row, settings=None))  # pyright: ignore[reportArgumentType]
+    further = plain.pop("evaluations")
+    del plain["settings"]
+    return plain | {f"evaluations of {label(name)}": count for name, count in further.items()}
+
+
+def row_of(
+    name: str,
+    system: System,
+    scheme: Scheme | Composition,
+    run: Trajectory,
+    macro_dt: float,
+    num_steps: int,
+    energies: np.ndarray | None = None,
+    momentum_maps: Sequence[Callable] = (),
+    **measured,
+) -> Row:
+    """The row of a run, with its invariants and evaluations, and without a time.
+
+    Args:
+        energies: right energies at the saved nodes; None for the energy at the start.
+        momentum_maps: infinitesimal generators of symmetries.
+        measured: errors of the run, and further fields that are known.
+    """
+    cost, passes = scheme.describe(), np.maximum(np.asarray(run.info.iterations), 1)
+    method = Method(int(np.max(run.info.method)))
+    solves = cost.constrained_solves if system.is_constrained else cost.solves
+    evaluations = num_steps * float(passes.mean())
+    stage, further = stage_scheme(scheme), dict(system.potentials)
+    energy = np.asarray(run.energy)
+    energy_error = energy - (energy[0] if energies is None else energies)
+    drift, band = _drift_and_band(np.asarray(run.t), energy_error)
+    _, *phase = vars(run.states).values()
+    maps = [np.asarray(jax.vmap(lambda *z, xi=xi: diagnostics.momentum_map(xi, *z))(*phase)) for xi in momentum_maps]
+    return Row(
+        scheme=name,
+        num_micro=scheme.num_micro,
+        order=scheme.order,
+        num_steps=num_steps,
+        macro_dt=macro_dt,
+        energy_error=float(np.abs(energy_error).max()),
+        energy_drift=drift,
+        energy_band=band,
+        momentum_error=float(max((np.abs(m - m[0]).max() for m in maps), default=np.nan)),
+        constraint_residual=float(np.max(run.constraint_residual)),
+        slow_evaluations=round(evaluations * cost.slow_evaluations),
+        fast_evaluations=round(evaluations * cost.fast_evaluations),
+        evaluations={name: round(evaluations * cost.stages * stage.evaluations_of(name)) for name in further},
+        solves=num_steps * solves if method > Method.EXPLICIT else 0,
+        iterations=int(np.max(run.info.iterations)),
+        method=method.name,
+        result=Result(int(run.result)).name,
+        stages=cost.stages,
+        degree=cost.degree,
+        **measured,
+    )
+
+
+def _drift_and_band(t: np.ndarray, energy_error: np.ndarray) -> tuple[float, float]:
+    """Change over the run of the straight line fitted to the error of the energy, and the largest distance from the line."""
+    if not np.isfinite(energy_error).all():
+        return float("nan"), float("nan")
+    line = np.polynomial.Polynomial.fit(t, energy_error, 1)(t)
+    return float(line[-1] - line[0]), float(np.abs(energy_error - line).max())
