@@ -98,7 +98,7 @@ def measure(case: Case, repeats: int, seconds: float, tell: Tell = silent) -> Cu
     runs, results, total = {}, {}, 0
     for n in case.num_micro:
         tell(f"{case.label}, num_micro {n}")
-        run = programs.program(problem, programs.SCHEMES[case.scheme](n), case.micro_dt)
+        run = programs.program(problem, programs.SCHEMES[case.scheme](n), n * case.micro_dt)
         if not total:  # of micro steps, one that all num_micro divide
             unit = math.lcm(*case.num_micro)
             if case.t_end is None:
@@ -112,7 +112,7 @@ def measure(case: Case, repeats: int, seconds: float, tell: Tell = silent) -> Cu
         whole = unstructured(problem)  # explicit schemes solve for the whole macro step too, as the paper did
     for n in case.dense_num_micro:
         tell(f"{case.label}, num_micro {n}, dense")
-        run = programs.program(whole, programs.SCHEMES[case.scheme](n), case.micro_dt, dense())
+        run = programs.program(whole, programs.SCHEMES[case.scheme](n), n * case.micro_dt, dense())
         num_steps = steps_for(run, seconds / 2, 3, 300)
         runs["dense", n] = partial(run, num_steps), num_steps * n
         results["dense", n] = run(num_steps)

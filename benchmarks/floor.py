@@ -68,7 +68,8 @@ def _measure(pair: Pair, size: Size, tell: Tell) -> tuple[list[dict], list[Claim
     runs, steps, results = {}, {}, {}
     for scheme in pair.schemes:
         tell(f"{pair.label}, {scheme}")
-        simulate = programs.program(problem, programs.SCHEMES[scheme](pair.num_micro), pair.micro_dt)
+        made = programs.SCHEMES[scheme](pair.num_micro)
+        simulate = programs.program(problem, made, pair.num_micro * pair.micro_dt)
         steps[scheme] = steps_for(simulate, size.seconds, 10)
         runs[scheme] = partial(simulate, steps[scheme])
         results[scheme] = vm.Result(int(np.asarray(runs[scheme]().result))).name

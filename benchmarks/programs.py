@@ -43,10 +43,10 @@ def unknowns(problem: vm.Problem, num_micro: int) -> int:
     return problem.q_s.size + n_gs + num_micro * (problem.q_f.size + n_g)
 
 
-def program(problem: vm.Problem, scheme: vm.Scheme | vm.Composition, micro_dt, solver: vm.Solver | None = None):
+def program(problem: vm.Problem, scheme: vm.Scheme | vm.Composition, macro_dt, solver: vm.Solver | None = None):
     """``run(num_steps)``, a prepared run that saves the last node only, NaN if it fails."""
-    steps = {"macro_dt": scheme.num_micro * micro_dt, "num_steps": 1}
-    prepared = vm.prepare(problem.system, scheme, problem.state(), **steps, solver=solver)
+    start = problem.state()
+    prepared = vm.prepare(problem.system, scheme, start, macro_dt=macro_dt, num_steps=1, solver=solver)
     return lambda num_steps, **other: prepared(num_steps=num_steps, **other, throw=False)
 
 

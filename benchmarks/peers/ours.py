@@ -65,7 +65,7 @@ def ladders(case: Case) -> list[Ladder]:
         @cache
         def prepared():
             solver = first_solver(case.problem, scheme, tolerance)
-            return programs.program(case.problem, scheme, solver, macro_dt=case.t_end)
+            return programs.program(case.problem, scheme, case.t_end, solver)
 
         def build(num_steps: int):
             simulate, macro_dt = prepared(), case.t_end / num_steps

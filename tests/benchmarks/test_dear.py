@@ -128,7 +128,9 @@ def test_the_c_loop_computes_kicks(count, num_micro):
     problem = systems.molecules(count)
     micro_dt, num_steps = 1e-3, 50
     loop = c_loops.molecules(problem, systems.BOND, systems.STIFFNESS, num_micro, micro_dt, num_steps)
-    q, p = joined(vm.simulate(problem, vm.fully_explicit(num_micro), micro_dt=micro_dt, num_steps=num_steps))
+    q, p = joined(
+        vm.simulate(problem, vm.fully_explicit(num_micro), macro_dt=num_micro * micro_dt, num_steps=num_steps)
+    )
     (_, q_f, _, p_f), _ = loop.run()
     np.testing.assert_allclose(q_f, q[-1], rtol=0, atol=2e-11)
     np.testing.assert_allclose(p_f, p[-1], rtol=0, atol=5e-9)
