@@ -19,12 +19,11 @@ from jaxtyping import Float
 
 from vmri_jax.control.bounded import Limits
 from vmri_jax.control.riccati import Final, Stages
-from vmri_jax.diagnostics.linear import phase_splits, phase_vector
+from vmri_jax.diagnostics.linear import phase_step, phase_vector, state_of, with_slopes
 from vmri_jax.mechanics.arrays import Numbers
 from vmri_jax.mechanics.functions import TracedOnce
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
-from vmri_jax.running.macro_step import macro_step
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.results import Result
@@ -84,7 +83,7 @@ class Transcription(eqx.Module):
 
     def state(self, z, k) -> State:
         """The state at node k."""
-        return State(self.start.t + k * self.macro_dt, *jnp.split(z, phase_splits(self.start)))
+        return state_of(z, self.start.t + k * self.macro_dt, self.start)
 
     @property
     def z_start(self) -> jax.Array:
@@ -97,9 +96,9 @@ class Transcription(eqx.Module):
 
     def step(self, z, u, k):
         """The end of the step from node k at z (n,) with controls u (parts, m), and the `StepStatus` of the step."""
-        state = self.state(z, k)
-        end, info = macro_step(self.driven(u, state.t), self.scheme, state, self.macro_dt, self.solver)
-        return phase_vector(end), info.status
+        t = self.start.t + k * self.macro_dt
+        driven, fixed = self.driven(u, t), {"macro_dt": self.macro_dt, "solver": self.solver}
+        return phase_step(driven, self.scheme, self.start, t, z, **fixed)
 
     def steps(self, z, u, follow):
         """Ends (N, n) of all steps, NaN where a step fails, and their `StepStatus`.
@@ -152,25 +151,23 @@ class Transcription(eqx.Module):
 
         def stage(z, v, z_next, k):
             def end(x):
-                reached, _ = self.step(x[:n], x[n:].reshape(u.shape[1:]), k)
-                return reached, reached
+                return self.step(x[:n], x[n:].reshape(u.shape[1:]), k)
 
             def cost(y):
                 x, z_next = y[: n + v.size], y[n + v.size :]
                 return self.stage_cost(x[:n], x[n:].reshape(u.shape[1:]), z_next, k)
 
             x = jnp.concatenate([z, v])
-            slopes, reached = jax.jacfwd(end, has_aux=True)(x)
+            reached, _, slopes = with_slopes(end, x, jnp.eye(x.size))
             y = jnp.concatenate([x, z_next])
             gradient, hessian = jax.grad(cost)(y), convex(jax.hessian(cost)(y))
             # The cost depends on y = (z, u, z_next). To first order  dy = along (dz, du) + shift,  since the step gives
-            # dz_next = slopes (dz, du) + c;  this turns gradient and hessian by y into those by (z, u).
-            along = jnp.concatenate([jnp.eye(x.size), slopes])
+            # dz_next = slopes^T (dz, du) + c;  this turns gradient and hessian by y into those by (z, u).
+            along = jnp.concatenate([jnp.eye(x.size), slopes], axis=1)
             c = reached - z_next
             shift = jnp.concatenate([jnp.zeros(x.size), c])
-            return Stages(
-                along.T @ hessian @ along, along.T @ (gradient + hessian @ shift), slopes[:, :n], slopes[:, n:], c
-            )
+            A, B = slopes[:n].T, slopes[n:].T
+            return Stages(along @ hessian @ along.T, along @ (gradient + hessian @ shift), A, B, c)
 
         stages = jax.vmap(stage)(self.before(z), flat, z, jnp.arange(count))
 

@@ -7,11 +7,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from vmri_jax.executors.executor import mapped
+from vmri_jax.mechanics.linearisation import Linearisation, linearise
 from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.mechanics.system import System
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
-from vmri_jax.stability.linear import SmallMotions, small_motions
 from vmri_jax.stability.multipliers import multipliers
 from vmri_jax.study.table import Column, ResultTable
 
@@ -52,7 +52,7 @@ class StabilityMap(ResultTable):
         infinite where the step failed.
     unstable: the windows of omega_H of each row in which radius > 1 + tolerance; they may be far narrower than the grid.
     tolerance: growth per step that counts as instability.
-    note: why the map does not tell whether the motion is stable, see `SmallMotions.frozen`; empty at an equilibrium.
+    note: why the map does not tell whether the motion is stable, see `Linearisation.frozen`; empty at an equilibrium.
     """
 
     columns = (
@@ -116,7 +116,7 @@ def stability_map(
     """Stability of macro steps of length H, from the multipliers of the step of small motions about a state.
 
     At an equilibrium these are the eigenvalues of the derivative of `macro_step`; elsewhere the eigenvalues for the frozen problem
-    (see `small_motions`). Multipliers of opposite Krein signature that have passed each other between two grid points reveal a window there,
+    (see `linearise`). Multipliers of opposite Krein signature that have passed each other between two grid points reveal a window there,
     whose ends are refined by bisection.
 
     Args:
@@ -143,12 +143,12 @@ def stability_map(
             f"stability_map: scheme is {scheme!r}; give a Scheme or Composition, e.g. explicit_slow(10), or a dict of them."
         )
     if kappa is None:
-        motions = small_motions(system, state)
-        rows = {label: (motions, s) for label, s in schemes.items()}
+        linear = linearise(system, state)
+        rows = {label: (linear, s) for label, s in schemes.items()}
     else:
         only = _single_scheme(schemes, system, kappa)
         params = {float(k): {**system.params, "kappa": np.asarray(k, dtype=float)} for k in kappa}
-        rows = {k: (small_motions(system.replace(params=p), state), only) for k, p in params.items()}
+        rows = {k: (linearise(system.replace(params=p), state), only) for k, p in params.items()}
     omega = next(iter(rows.values()))[0].omega
     if omega == 0:
         raise ValueError("stability_map: the system has no frequency that could scale omega_H; nothing vibrates there.")
@@ -166,7 +166,7 @@ def stability_map(
 
 
 def measure(
-    motions: SmallMotions,
+    linear: Linearisation,
     scheme: Scheme | Composition,
     macro_dt,
     tolerance: float = TOLERANCE,
@@ -175,15 +175,15 @@ def measure(
     """Spectral radius (n,) at n increasing macro steps, and the unstable windows between the first and the last of them."""
 
     def label(macro_dt):
-        return multipliers(motions, scheme, macro_dt).krein_signatures(tolerance)
+        return multipliers(linear, scheme, macro_dt).krein_signatures(tolerance)
 
-    spectra = multipliers(motions, scheme, macro_dt)
+    spectra = multipliers(linear, scheme, macro_dt)
     signatures = spectra.krein_signatures(tolerance)
     edges = find_windows(label, macro_dt, signatures, resolution * (macro_dt[-1] - macro_dt[0]))
     if not edges:
         return spectra.radius, []
     inside = np.array([a + (b - a) * POINTS_IN_WINDOW for a, b in edges])
-    peaks = multipliers(motions, scheme, inside.reshape(-1)).radius.reshape(inside.shape).max(axis=1) - 1
+    peaks = multipliers(linear, scheme, inside.reshape(-1)).radius.reshape(inside.shape).max(axis=1) - 1
     return spectra.radius, [Window(*ends, float(peak)) for ends, peak in zip(edges, peaks, strict=True)]
 
 

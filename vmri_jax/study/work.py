@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from vmri_jax import diagnostics, plots
+from vmri_jax import plots
 from vmri_jax.executors.executor import mapped
+from vmri_jax.mechanics.linearisation import linearise
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
 from vmri_jax.mechanics.system import System, label
 from vmri_jax.running.interrupts import Interrupted
@@ -258,7 +259,7 @@ def work_precision(
         raise ValueError(f"work_precision: num_steps is {list(num_steps)}; give multiples of num_saves = {num_saves}.")
     if reference is None:
         reference = reference_solution(problem, t_end, num_saves=num_saves, progress=progress)
-    frequency = float(diagnostics.frequencies(problem)[0])
+    frequency = float(linearise(problem).frequencies.max(initial=0.0))
     climbed = partial(_climbed, problem, t_end, num_saves, solver, num_steps, reference, frequency)
     total, runs = len(schemes) + 1, list[tuple[Program, WorkRow]]()
     try:
