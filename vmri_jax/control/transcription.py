@@ -100,6 +100,7 @@ class Transcription(eqx.Module):
         driven, fixed = self.driven(u, t), {"macro_dt": self.macro_dt, "solver": self.solver}
         return phase_step(driven, self.scheme, self.start, t, z, **fixed)
 
+    @eqx.filter_jit
     def steps(self, z, u, follow):
         """Ends (N, n) of all steps, NaN where a step fails, and their `StepStatus`.
 
@@ -134,6 +135,7 @@ class Transcription(eqx.Module):
 
         return jax.vmap(stage)(z, u, jnp.arange(len(u)))
 
+    @eqx.filter_jit
     def limited(self, z, u) -> Limits:
         """The inequalities, linearised at nodes z and controls u."""
 
@@ -144,6 +146,7 @@ class Transcription(eqx.Module):
         lower, upper = (jnp.tile(bound, self.parts) - u.reshape(len(u), -1) for bound in self.bounds)
         return Limits(C, D.reshape(*D.shape[:2], u[0].size), self.over(z, u), lower, upper)
 
+    @eqx.filter_jit
     def linearised(self, z, u) -> tuple[Stages, Final]:
         """The linear-quadratic problem at nodes z (N, n) and controls u (N, parts, m)."""
         count, n = len(u), z.shape[1]

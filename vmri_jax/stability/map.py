@@ -1,7 +1,8 @@
-"""Stability maps: the stable macro steps of a scheme, over ``omega H`` and over schemes or coupling strengths."""
+"""Stability maps: the stable macro steps of a scheme, over ``omega H`` and over schemes or systems."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -9,7 +10,6 @@ import numpy as np
 from vmri_jax.executors.executor import mapped
 from vmri_jax.mechanics.linearisation import Linearisation, linearise
 from vmri_jax.mechanics.state import Movable, State, start_of
-from vmri_jax.mechanics.system import System
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.stability.multipliers import multipliers
@@ -44,7 +44,7 @@ def windows_text(windows: Sequence[Window]) -> str:
 class StabilityMap(ResultTable):
     """Largest multipliers of a macro step over a grid, and the windows of instability.
 
-    axis: "scheme" or "kappa", the meaning of the rows.
+    axis: "scheme" or "system", the meaning of the rows.
     rows: (m,) labels of the rows.
     omega: frequency that scales the grid, the largest frequency of the fast potential alone.
     omega_H: (n,) grid, macro step times omega.
@@ -104,12 +104,11 @@ class StabilityMap(ResultTable):
 
 
 def stability_map(
-    system: Movable,
+    system: Movable | Mapping[Any, Movable],
     scheme: Scheme | Composition | Mapping[Any, Scheme | Composition],
     omega_H: Sequence[float] | np.ndarray,
     *,
     state: State | None = None,
-    kappa: Sequence[float] | None = None,
     tolerance: float = TOLERANCE,
     executor: Any = None,
 ) -> StabilityMap:
@@ -120,48 +119,46 @@ def stability_map(
     whose ends are refined by bisection.
 
     Args:
-        system: `linear_model()`, any other problem or scene, or a system with a state. The unit of the grid is its omega: the
-            largest frequency of the fast potential alone, or the largest rate of all motions if this potential has no frequency.
+        system: `linear_model()`, any other problem or scene, a system with a state, or several by label for a single scheme, e.g.
+            ``{k: linear_model(kappa=k) for k in (5.0, 25.0)}``. The unit of the grid is omega of the first: the largest frequency of its
+            fast potential alone, or the largest rate of all motions if this potential has no frequency.
         scheme: a scheme or composition, or several by label, e.g. ``{n: explicit_slow(n) for n in (2, 3, 5)}``; each
             num_micro and structure is compiled once.
         omega_H: (n,) increasing positive values of omega times the macro step. A spacing of 0.1 or less finds narrow
             windows; with a larger one a multiplier may pass several multipliers between two points, which hides windows.
-        kappa: values of ``params["kappa"]`` of the system, one row each, for a single scheme.
         state: point of expansion of the small motions; None for the start of the problem.
         tolerance: growth per macro step above which a step is unstable.
         executor: executor that computes the rows, as of `vmri_jax.ensemble`; None for this process.
 
     Raises:
         TypeError: a system or scheme of the wrong kind.
-        ValueError: a grid that is not increasing and positive; kappa for several schemes, or for a system without it.
+        ValueError: a grid that is not increasing and positive; several systems with several schemes.
     """
-    system, state = start_of("stability_map", system, state)
     grid = _grid(omega_H)
+    systems = system if isinstance(system, Mapping) else {"": system}
     schemes = scheme if isinstance(scheme, Mapping) else {"": scheme}
     if not schemes or not all(isinstance(s, Scheme | Composition) for s in schemes.values()):
         raise TypeError(
             f"stability_map: scheme is {scheme!r}; give a Scheme or Composition, e.g. explicit_slow(10), or a dict of them."
         )
-    if kappa is None:
-        linear = linearise(system, state)
-        rows = {label: (linear, s) for label, s in schemes.items()}
-    else:
-        only = _single_scheme(schemes, system, kappa)
-        params = {float(k): {**system.params, "kappa": np.asarray(k, dtype=float)} for k in kappa}
-        rows = {k: (linearise(system.replace(params=p), state), only) for k, p in params.items()}
-    omega = next(iter(rows.values()))[0].omega
+    if min(len(systems), len(schemes)) != 1:
+        raise ValueError(f"stability_map: {len(systems)} systems and {len(schemes)} schemes; give one of either.")
+    axis, labels = ("system", systems) if isinstance(system, Mapping) and len(schemes) == 1 else ("scheme", schemes)
+    linear = [linearise(*start_of("stability_map", movable, state)) for movable in systems.values()]
+    rows = dict(zip(labels, product(linear, schemes.values()), strict=True))
+    omega = linear[0].omega
     if omega == 0:
         raise ValueError("stability_map: the system has no frequency that could scale omega_H; nothing vibrates there.")
     measured = mapped("stability_map", measure, [(*row, grid / omega, tolerance) for row in rows.values()], executor)
     return StabilityMap(
-        axis="scheme" if kappa is None else "kappa",
+        axis=axis,
         rows=tuple(rows),
         omega=omega,
         omega_H=grid,
         radius=np.array([radius for radius, _ in measured]),
         unstable=tuple(tuple(Window(omega * a, omega * b, g) for a, b, g in windows) for _, windows in measured),
         tolerance=tolerance,
-        note=next(iter(rows.values()))[0].frozen,
+        note=linear[0].frozen,
     )
 
 
@@ -232,15 +229,3 @@ def _grid(omega_H) -> np.ndarray:
             "increasing, e.g. numpy.linspace(0.05, 12, 240)."
         )
     return grid
-
-
-def _single_scheme(schemes: Mapping[Any, Scheme | Composition], system: System, kappa) -> Scheme | Composition:
-    if not len(kappa):
-        raise ValueError("stability_map: kappa is empty; give at least one value.")
-    if len(schemes) > 1 or not isinstance(system.params, Mapping) or "kappa" not in system.params:
-        raise ValueError(
-            "stability_map: kappa goes with a single scheme and a system whose params are a dict with an entry 'kappa'; "
-            f"got {len(schemes)} scheme(s) and params {system.params!r}. Make one map per scheme."
-        )
-    [only] = schemes.values()
-    return only
