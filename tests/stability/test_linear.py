@@ -92,7 +92,6 @@ def test_frequencies_of_the_linear_model():
     assert np.sort(np.abs(motions.rates))[::-2] == pytest.approx(exact)
     assert motions.frequencies_of("fast") == pytest.approx([50.0, 0.0])
     assert motions.frequencies_of("slow") == pytest.approx([np.sqrt(50.0), 0.0])
-    assert motions.omega == pytest.approx(50.0)
 
 
 def test_multipliers_of_the_impulse_method():

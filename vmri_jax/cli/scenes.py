@@ -48,15 +48,12 @@ def explain(
                 ledger = moving.explain(chosen, macro_dt=macro_dt, measure=measure)
             small = linearise(moving)
             growth = growth_over_period(moving, small)
+            vibrations = str(small) if growth is None else f"{small}\n{growth}"
     console.print(ledger.table())
     console.print()
     console.print(ledger.reasons())
-    console.print(
-        "\n[bold]Small vibrations[/bold] about the start, estimates where it is not at rest\n",
-        escape(str(small)),
-        growth or "",
-        sep="\n",
-    )
+    console.print("\n[bold]Small vibrations[/bold] about the start, estimates where it is not at rest\n")
+    console.print(escape(vibrations))
     useless = nothing_fast(chosen, sum(row.kind == "body" and row.grid != "macro" for row in ledger.rows))
     if useless:
         console.print(f"\n[yellow]{escape(useless)}[/yellow]")

@@ -88,9 +88,10 @@ def minimize(
         raise ValueError(f"minimize: tolerance is {tolerance}; it must be positive.")
     actuate, labels = actuation_of(problem, actuate, num_controls)
     opened_problem = problem_of("minimize", problem)
-    aims: dict[str, Any] = {"cost": cost, "final_cost": final_cost, "goal": goal, "limits": limits, "bounds": bounds}
-    steps: dict[str, Any] = {"scheme": scheme, "macro_dt": macro_dt, "num_steps": num_steps, "grid": grid}
-    setup = transcribed(opened_problem, actuate, len(labels), **aims, **steps, solver=solver)
+    aims = {"cost": cost, "final_cost": final_cost, "goal": goal, "limits": limits}
+    aims = {name: function for name, function in aims.items() if function is not None}
+    steps = scheme, macro_dt, num_steps, grid, solver
+    setup = transcribed(opened_problem, actuate, len(labels), aims, bounds, *steps)
     point = started(setup, start, num_steps, len(labels), grid)
     rho, history, nu = 1.0, [], np.zeros(0)
     with progress_to("minimize", progress) as tell:
@@ -117,8 +118,7 @@ def minimize(
     success = all(last[name] <= tolerance for name in ("update", "gap", "miss", "over"))
     driven = replace(opened_problem, system=setup.driven(point.u, setup.start.t))
     # The last nodes may have gaps; the trajectory is the motion that the controls make.
-    steps = {"macro_dt": macro_dt, "num_steps": num_steps, "solver": setup.solver}
-    trajectory = simulate(driven, scheme, **steps, throw=False)
+    trajectory = simulate(driven, scheme, macro_dt=macro_dt, num_steps=num_steps, solver=setup.solver, throw=False)
     controls, times = np.asarray(point.u), setup.times(num_steps)
     if grid == "macro":
         controls, times = controls[:, 0], times[:, 0]

@@ -47,9 +47,9 @@ class Transcription(eqx.Module):
         cost: cost per time, ``cost(state, u) -> ()``.
         final_cost: cost of the last state, ``final_cost(state) -> ()``.
         goal: equations for the last state, ``goal(state) -> (e,)``.
-        limits: ``limits(state, u) -> (c,)``, not above zero at the end of every macro interval, for each of its controls; None for none.
         bounds: least and largest controls, (m,) each.
         parts: number of controls that follow each other in a macro interval: 1, or num_micro.
+        limits: ``limits(state, u) -> (c,)``, not above zero at the end of every macro interval, for each of its controls; None for none.
     """
 
     system: System
@@ -61,9 +61,9 @@ class Transcription(eqx.Module):
     cost: TracedOnce
     final_cost: TracedOnce
     goal: TracedOnce
-    limits: TracedOnce | None
     bounds: tuple[np.ndarray, np.ndarray]
     parts: int = eqx.field(static=True)
+    limits: TracedOnce | None = None
 
     @property
     def bounded(self) -> bool:

@@ -19,6 +19,7 @@ import numpy as np
 
 from vmri_jax.kernels.saddle import least_norm
 from vmri_jax.mechanics.arrays import QUICK
+from vmri_jax.mechanics.constraints import RANK
 from vmri_jax.mechanics.driving import driven
 from vmri_jax.mechanics.motion import motion
 from vmri_jax.mechanics.names import Names
@@ -31,8 +32,6 @@ growing motions for instabilities of the step."""
 LEAST_MOTION = 1e-8
 """Velocity v and acceleration a up to which a state is an equilibrium, in units of omega |q| and omega^2 |q|, with the largest rate omega and norms
 of the kinetic energy: round-off, and residuals of solved equilibria. A larger value takes slow motions for equilibria."""
-DEPENDENT = 1e-10
-"""Singular value, relative to the largest one, below which rows of length one are dependent. A larger value counts independent rows once."""
 ROWS_SHOWN, MOST_NAMED, LEAST_PART = 12, 3, 0.05
 """Vibrations in the printed table, coordinates named for each of them, and the least part of the kinetic energy of a named coordinate. With more
 rows the table is longer than a screen; with more names, or a smaller part, its lines are longer."""
@@ -104,12 +103,6 @@ class Linearisation:
         """(d,) frequencies of a single potential, a key of `hessians`, the largest first; zero where it is not convex."""
         hessian = self.hessians[name]
         return np.sqrt(np.maximum(np.linalg.eigvalsh((hessian + hessian.T) / 2)[::-1], 0.0))
-
-    @property
-    def omega(self) -> float:
-        """The largest frequency of W alone; if W has none, the largest rate of all motions."""
-        fast = self.frequencies_of("fast").max(initial=0.0)
-        return float(fast if fast > 0 else np.abs(self.rates).max(initial=0.0))
 
     @property
     def kinetic_shares(self) -> np.ndarray:
@@ -264,7 +257,7 @@ def tangents(rows: np.ndarray) -> np.ndarray:
     """Orthonormal basis (n, k), one vector per column, of the space orthogonal to rows (m, n); dependent rows count once."""
     lengths = np.linalg.norm(rows, axis=1, keepdims=True)
     _, sizes, directions = np.linalg.svd(rows / np.where(lengths > 0, lengths, 1.0))
-    return directions[np.count_nonzero(sizes > DEPENDENT * sizes.max(initial=0.0)) :].T
+    return directions[np.count_nonzero(sizes > RANK) :].T
 
 
 def mass_orthonormal(mass: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:

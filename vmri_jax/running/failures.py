@@ -32,10 +32,10 @@ def simulation_error(
         trajectory if whole is None else whole,
         moved=largest_motion_in_words(trajectory, step, save_every, float(macro_dt), num_micro),
     )
-    return error.advised(float(macro_dt), _labels(trajectory), _jump(trajectory, step, macro_dt, save_every))
+    return error.advised(float(macro_dt), _swapped(trajectory), _jump(trajectory, step, macro_dt, save_every))
 
 
-def _labels(trajectory: Trajectory) -> str:
+def _swapped(trajectory: Trajectory) -> str:
     """The advice of `Linearisation.swapped` at the first node of a run; empty if its labels are right or its system is not known."""
     if not trajectory.states.q_s.shape[-1] or not trajectory.states.q_f.shape[-1]:
         return ""  # nothing to swap: the linearisation would take seconds to compile

@@ -146,7 +146,7 @@ def stability_map(
     axis, labels = ("system", systems) if isinstance(system, Mapping) and len(schemes) == 1 else ("scheme", schemes)
     linear = [linearise(*start_of("stability_map", movable, state)) for movable in systems.values()]
     rows = dict(zip(labels, product(linear, schemes.values()), strict=True))
-    omega = linear[0].omega
+    omega = float(linear[0].frequencies_of("fast").max(initial=0.0) or np.abs(linear[0].rates).max(initial=0.0))
     if omega == 0:
         raise ValueError("stability_map: the system has no frequency that could scale omega_H; nothing vibrates there.")
     measured = mapped("stability_map", measure, [(*row, grid / omega, tolerance) for row in rows.values()], executor)
