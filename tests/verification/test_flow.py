@@ -103,7 +103,9 @@ def test_the_measure_of_users():
     assert defect(cart(), fully_implicit(1), 0.1) < 5e-15  # measured 5e-16
     chain = systems.fermi_pasta_ulam(1)
     damped = replace(chain, system=chain.system.replace(force=drag))
-    assert defect(damped, fully_explicit(2), 0.1) > 1e-8  # measured 1e-7, of terms that cancel to 1e-16 without the force
+    assert (
+        defect(damped, fully_explicit(2), 0.1) > 1e-8
+    )  # measured 1e-7, of terms that cancel to 1e-16 without the force
 
 
 def drag(t, q_s, q_f, v_s, v_f, params):

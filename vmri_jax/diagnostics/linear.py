@@ -16,6 +16,9 @@ from vmri_jax.schemes.equations import StepEquations
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.solver import Solver
 
+SWEEPS = 10
+"""Scalings of the rows and columns of a Newton matrix. With fewer their lengths are not one to round-off, with more nothing changes."""
+
 
 def phase_vector(state: State):
     """``z = (q_s, q_f, p_s, p_f)``, joined, (2 n,), or (k, 2 n) for k states."""
@@ -47,7 +50,7 @@ def with_slopes(function: Callable, x, directions):
     return jax.vmap(along, out_axes=(None, None, 0))(directions)
 
 
-def step_condition(system: Movable, scheme: Scheme, state: State | None = None, *, macro_dt, sweeps: int = 10) -> float:
+def step_condition(system: Movable, scheme: Scheme, state: State | None = None, *, macro_dt) -> float:
     """Condition number of the Newton matrix of a macro step, rows and columns scaled to length one.
 
     The Newton matrix of the first iteration, which starts from straight motion, is formed as a dense matrix: take few micro steps. Each
@@ -55,11 +58,10 @@ def step_condition(system: Movable, scheme: Scheme, state: State | None = None, 
 
     Args:
         system, scheme, state, macro_dt: as in `simulate`.
-        sweeps: number of sweeps.
     """
     system, state = start_of("step_condition", system, state)
     a = np.asarray(newton_matrix(system, scheme, state, macro_dt))
-    for _ in range(sweeps):
+    for _ in range(SWEEPS):
         rows, columns = np.linalg.norm(a, axis=1), np.linalg.norm(a, axis=0)
         if not (np.isfinite(a).all() and rows.all() and columns.all()):
             return np.inf

@@ -213,7 +213,7 @@ def linearise(system: Movable, state: State | None = None, names: Names | None =
         ValueError: derivatives that are not finite at the state.
     """
     system = opened(system)
-    names = names or getattr(system, "names", None) or Names()
+    coordinates = names or getattr(system, "names", None) or Names()
     system, state = start_of("linearise", system, state)
     terms = jax.tree.map(np.asarray, _expansion(system, state))
     broken = [name for name, term in terms.items() if not all(np.isfinite(part).all() for part in term)]
@@ -244,7 +244,7 @@ def linearise(system: Movable, state: State | None = None, names: Names | None =
         slow_force=-N.T @ terms["slow"][0],
         driven=driven(system, state),
         moves=False,
-        names=names,
+        names=coordinates,
     )
     omega, q = np.abs(linear.rates).max(initial=0.0), np.concatenate([state.q_s, state.q_f])
     size, speed = (np.sqrt(np.abs(x @ mass @ x)) for x in (q, v))
