@@ -68,11 +68,10 @@ def transcribed(
         )
     for name, function in aims.items():
         arguments = (state, u) if name in ("cost", "limits") else (state,)
-        shape, number = jax.eval_shape(lambda f=function, g=arguments: f(*g)).shape, name in ("cost", "final_cost")
-        if len(shape) != (0 if number else 1):
-            raise ValueError(
-                f"minimize: {name} has shape {shape}; it must be {'a number' if number else 'a vector, (n,)'}."
-            )
+        shape = jax.eval_shape(lambda f=function, g=arguments: f(*g)).shape
+        dimensions, words = (0, "a number") if name in ("cost", "final_cost") else (1, "a vector, (n,)")
+        if len(shape) != dimensions:
+            raise ValueError(f"minimize: {name} has shape {shape}; it must be {words}.")
     functions = {"final_cost": free, "goal": unaimed, **aims}
     return Transcription(
         system.replace(params=params),
