@@ -261,7 +261,10 @@ def tangents(rows: np.ndarray) -> np.ndarray:
 
 
 def mass_orthonormal(mass: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:
-    """N (n, d) with ``N^T M N = 1`` and ``G N = 0`` for rows G (m, n): a basis T of the null space of G, divided by the Cholesky factor of ``T^T M T``."""
+    """N (n, d) with ``N^T M N = 1`` and ``G N = 0`` for rows G (m, n); None for no rows.
+
+    It is a basis T of the null space of G, divided by the Cholesky factor of ``T^T M T``.
+    """
     rows = np.zeros((0, len(mass))) if rows is None else rows
     root = np.sqrt(np.diagonal(mass))  # in units of it, coordinates of different units are compared
     T = tangents(rows / root) / root[:, None]
