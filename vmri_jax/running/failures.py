@@ -3,6 +3,7 @@
 import numpy as np
 
 from vmri_jax.mechanics.jumps import in_words, jump_ahead
+from vmri_jax.mechanics.linearisation import linearise
 from vmri_jax.running.largest_motion import largest_motion_in_words
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.steppers.results import Result, SimulationError
@@ -19,10 +20,6 @@ def simulation_error(
         first: number of the macro step that starts at the first node of `trajectory`.
         whole: the run, where `trajectory` is a part of it.
     """
-    from vmri_jax.stability.vibrations import (
-        swapped_at_start,
-    )  # imported here: vmri_jax.stability imports vmri_jax.running
-
     failed_at = int(trajectory.failed_at)
     step = failed_at - first
     interval = step // save_every
@@ -35,7 +32,18 @@ def simulation_error(
         trajectory if whole is None else whole,
         moved=largest_motion_in_words(trajectory, step, save_every, float(macro_dt), num_micro),
     )
-    return error.advised(float(macro_dt), swapped_at_start(trajectory), _jump(trajectory, step, macro_dt, save_every))
+    return error.advised(float(macro_dt), _swapped(trajectory), _jump(trajectory, step, macro_dt, save_every))
+
+
+def _swapped(trajectory: Trajectory) -> str:
+    """The advice of `Linearisation.swapped` at the first node of a run; empty if its labels are right or its system is not known."""
+    if not trajectory.states.q_s.shape[-1] or not trajectory.states.q_f.shape[-1]:
+        return ""  # nothing to swap: the linearisation would take seconds to compile
+    try:
+        advice = linearise(trajectory.origin.system(), trajectory[0], trajectory.names).swapped()
+    except (ValueError, TypeError, IndexError):  # no expansion at the start: the error of the run says more about it
+        return ""
+    return advice[0] if advice else ""
 
 
 def _jump(trajectory: Trajectory, step: int, macro_dt, save_every: int) -> str:

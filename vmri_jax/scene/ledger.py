@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.diagnostics import frequencies
 from vmri_jax.mechanics import invariants
+from vmri_jax.mechanics.linearisation import linearise
 from vmri_jax.mechanics.masses import ConstantMass
 from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.state import Problem, State, initial_state
@@ -203,7 +203,7 @@ def _measure(sorting: Sorting, scheme, macro_dt) -> tuple[float, list[float]]:
 def _macro_step(system: System, scheme, state: State, macro_dt: float | None, frequency: float) -> float:
     """Microseconds of a macro step, by default of micro steps 0.1 / w, w the largest frequency or `frequency`."""
     if macro_dt is None:
-        macro_dt = scheme.num_micro * 0.1 / (float(frequencies(system, state).max(initial=0.0)) or frequency)
+        macro_dt = scheme.num_micro * 0.1 / (float(linearise(system, state).frequencies.max(initial=0.0)) or frequency)
     seconds = interleaved({"": prepare_steps(system, scheme, state, macro_dt).timed()}, 5)[""]
     return 1e6 * float(np.median(seconds)) / STEPS
 
