@@ -204,7 +204,7 @@ def measured(
 ) -> dict[str, Curve]:
     """Numbers of macro steps, errors of the positions at the end and milliseconds, by scheme."""
     tell(f"{case.title}, fine steps")
-    length = {"macro_dt": case.t_end / case.fine, "num_steps": case.fine, "save_every": case.fine}
+    length = {"macro_dt": case.t_end / case.fine, "num_steps": case.fine, "save": case.fine}
     exact, _ = joined(vm.simulate(problem, vm.compose(vm.fully_explicit(10), "kahan-li8"), **length))
     runs: dict[str, Callable[[], object]] = {}
     errors: dict[str, dict[int, float]] = {}

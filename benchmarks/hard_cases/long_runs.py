@@ -151,7 +151,7 @@ def chaotic_pendulum(full: bool) -> Outcome:
     steps, ends = 0.02 / 2.0 ** np.arange(5 if full else 4), []
     for h in steps:
         ends.append(positions(run(problem, scheme, h, round(1 / h), save=round(1 / h)))[-1])
-    order = vm.diagnostics.observed_order(steps[:-2], [difference(a, ends[-1]) for a in ends[:-2]])
+    order = vm.diagnostics.fit_order(steps[:-2], [difference(a, ends[-1]) for a in ends[:-2]]).order
     return Outcome(
         f"t = {t_end:g}: {status(trajectory)}, |g| {position:.1e}, energy error {change.band:.1e} of the fall; order {order:.2f} "
         "on t <= 1",

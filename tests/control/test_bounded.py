@@ -120,7 +120,7 @@ def test_against_the_sweep():
         ("bounds is 3.0; give", {"bounds": 3.0}),
         ("must be below the largest", {"bounds": (1.0, -1.0)}),
         ("bounds have shapes", {"bounds": ([1.0, 2.0], 3.0)}),
-        ("limits must return a vector", {"limits": lambda state, u: state.q_s[0]}),
+        (r"limits has shape \(\); it must be a vector", {"limits": lambda state, u: state.q_s[0]}),
         ("actuate is given, and the scene", {"actuate": lambda q_s, q_f, u, params: (u, q_f), "num_controls": 1}),
         ("num_controls is 2; the scene has 1", {"num_controls": 2}),
     ],

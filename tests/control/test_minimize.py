@@ -172,7 +172,7 @@ def wrong(q_s, q_f, u, params):
         ("actuate returns", {"actuate": wrong}),
         ("cost has shape", {"cost": lambda state, u: u}),
         ("final_cost has shape", {"final_cost": lambda state: state.q_s}),
-        ("goal must return a vector", {"goal": lambda state: state.q_s[0]}),
+        (r"goal has shape \(\); it must be a vector", {"goal": lambda state: state.q_s[0]}),
         ("grid is 'fine'", {"grid": "fine"}),
         ("num_controls is 0", {"num_controls": 0}),
         (r"start has shape \(3,\); the controls have \(10, 1\)", {"start": [1.0, 2.0, 3.0]}),

@@ -419,7 +419,7 @@ def test_the_functions_of_control_and_of_solvers_are_watched():
     custom = vm.Solver(stepper=by_global)
     f = traced_once(by_global)
     optimal = Transcription(
-        problem().system, problem().state(), SCHEME, vm.Solver(), 0.1, f, f, f, f, f, (np.zeros(1), np.ones(1)), 1
+        problem().system, problem().state(), SCHEME, vm.Solver(), 0.1, f, f, f, f, (np.zeros(1), np.ones(1)), 1, f
     )
     for value in (custom, optimal):
         here.STRENGTH = 1.0

@@ -6,7 +6,7 @@ import pytest
 from tests.scene.forced_bodies import DAMPING, STIFFNESS, convergence
 from tests.scene.gallery_scenes import gallery_scene
 from vmri_jax import fully_implicit, galerkin, simulate
-from vmri_jax.diagnostics import observed_order
+from vmri_jax.diagnostics import fit_order
 from vmri_jax.scene import Body, LinearDamping, MagneticField, Scene, SpringAnchor
 
 
@@ -14,7 +14,7 @@ from vmri_jax.scene import Body, LinearDamping, MagneticField, Scene, SpringAnch
 def test_order_and_energy_balance(scheme, steps):
     errors, balances = convergence(scheme, steps)
     for found, tolerance in ((errors, 0.2), (balances, 0.3)):
-        orders = {name: observed_order(1 / np.array(steps), e) for name, e in found.items()}
+        orders = {name: fit_order(1 / np.array(steps), e).order for name, e in found.items()}
         assert orders == pytest.approx(dict.fromkeys(orders, scheme.order), abs=tolerance), (orders, found)
 
 
@@ -53,7 +53,7 @@ def test_cyclotron_motion(scheme, steps):
         exact = radius * np.stack([np.cos(w * t), -np.sin(w * t)], axis=1)
         errors.append(np.abs(np.asarray(trajectory.q_s) - exact).max())
         assert np.abs(trajectory.energy / trajectory.energy[0] - 1).max() < 1e-4
-    assert observed_order(1 / np.array(steps), errors) == pytest.approx(scheme.order, abs=0.2), errors
+    assert fit_order(1 / np.array(steps), errors).order == pytest.approx(scheme.order, abs=0.2), errors
 
 
 def test_damped_run_keeps_its_constraints():

@@ -183,7 +183,6 @@ def main() -> None:
         driven = make()
         print(f"\n{name}: macro_dt = {driven.macro_dt:.4g}, motion {'stable' if driven.stable else 'unstable'}")
         print(vm.advise(driven.problem, driven.scheme, macro_dt=driven.macro_dt))
-        print(f"vibrations: {vm.stability.vibrations(driven.problem).note}")
         print(
             f"run of {PERIODS} periods: largest position {driven.largest():.3g} times that of the first 10", flush=True
         )

@@ -68,13 +68,12 @@ def triple_jump_radius(x):
     return np.abs(np.linalg.eigvals(product)).max()
 
 
-def test_rows_over_kappa_compositions_and_the_explicit_limit(tmp_path):
+def test_rows_over_systems_compositions_and_the_explicit_limit(tmp_path):
     limit = 3 * 2.0  # omega h = 2 at 3 micro steps; kappa adds its part
-    over_kappa = stability_map(
-        linear_model(), fully_explicit(3), np.linspace(0.95, 1.05, 11) * limit, kappa=[0.0, 25.0]
-    )
+    models = {kappa: linear_model(kappa=kappa) for kappa in (0.0, 25.0)}
+    over_kappa = stability_map(models, fully_explicit(3), np.linspace(0.95, 1.05, 11) * limit)
     assert over_kappa.rows == (0.0, 25.0)
-    assert over_kappa.axis == "kappa"
+    assert over_kappa.axis == "system"
     assert over_kappa.first_unstable(0.0) == pytest.approx(limit, abs=1e-5)
     assert over_kappa.first_unstable(25.0) < limit
     triple = stability_map(linear_model(kappa=0.0), compose(fully_explicit(1), "yoshida4"), [1.5, 1.6])
@@ -83,7 +82,7 @@ def test_rows_over_kappa_compositions_and_the_explicit_limit(tmp_path):
 
     over_kappa.to_csv(tmp_path / "map.csv")
     lines = (tmp_path / "map.csv").read_text().splitlines()
-    assert lines[0] == "kappa,omega_H,macro_dt,radius"
+    assert lines[0] == "system,omega_H,macro_dt,radius"
     assert len(lines) == 1 + 2 * 11
     figure = plot_stability({"kappa": over_kappa, "composition": triple}, "two maps")
     figure.savefig(tmp_path / "map.png")
@@ -106,14 +105,11 @@ def test_bad_input():
     for grid in ([1.0], [0.0, 1.0], [2.0, 1.0], [1.0, np.nan]):
         with pytest.raises(ValueError, match=r"omega_H has shape .* give two or more positive values"):
             stability_map(model, scheme, grid)
-    with pytest.raises(ValueError, match="got 2 scheme"):
-        stability_map(model, {1: scheme, 2: scheme}, GRID, kappa=[1.0])
-    with pytest.raises(ValueError, match="kappa is empty"):
-        stability_map(model, scheme, GRID, kappa=[])
+    for systems in ({}, {1: model, 2: model, 3: model}):
+        with pytest.raises(ValueError, match=f"{len(systems)} systems and 2 schemes; give one of either"):
+            stability_map(systems, {1: scheme, 2: scheme}, GRID)
     free = System(ConstantMass([1.0], [1.0]))
     zero = np.zeros(1)
-    with pytest.raises(ValueError, match="params None"):
-        stability_map(free, scheme, GRID, state=State(0.0, zero, zero, zero, zero), kappa=[1.0])
     with pytest.raises(ValueError, match="nothing vibrates"):
         stability_map(free, scheme, GRID, state=State(0.0, zero, zero, zero, zero))
     found = stability_map(model, {"verlet": scheme}, [1.0, 2.0])

@@ -6,7 +6,8 @@ import pytest
 
 from tests.stability.systems import double_pendulum
 from vmri_jax import fully_explicit, initial_state
-from vmri_jax.stability import linear_model, monodromy, multipliers, small_motions, stability_map
+from vmri_jax.diagnostics import linearise
+from vmri_jax.stability import linear_model, monodromy, multipliers, stability_map
 from vmri_jax.steppers.solver import Solver
 
 MARCH = Solver("masses")
@@ -19,7 +20,7 @@ def test_powers_of_a_linear_step():
     once = monodromy(problem, scheme, macro_dt=macro_dt, num_steps=1)
     often = monodromy(problem, scheme, macro_dt=macro_dt, num_steps=40)
     assert often.matrix == pytest.approx(np.linalg.matrix_power(once.matrix, 40), rel=1e-10, abs=1e-9)
-    expected = multipliers(small_motions(problem), scheme, [macro_dt]).radius[0]
+    expected = multipliers(linearise(problem), scheme, [macro_dt]).radius[0]
     assert expected > 1.01
     assert np.abs(often.multipliers[0]) == pytest.approx(expected**40, rel=1e-9)
     assert often.symplectic_defect < 1e-13
@@ -39,19 +40,19 @@ def test_on_a_constraint_manifold(swinging):
     """The derivative maps tangent vectors to tangent vectors, keeps the symplectic form, and predicts a neighbour."""
     system, state = swinging
     found = monodromy(system, fully_explicit(3), state, macro_dt=0.03, num_steps=30, solver=MARCH)
-    assert found.matrix.shape == (4, 4)
+    assert found.tangents.shape == found.images.shape == (4, 8)
     assert found.symplectic_defect < 1e-12  # 2e-14
     assert 0.1 < found.closure < 2
     direction = np.array([0.3, -0.5, 0.2, 0.7])
     ends = []
     for sign in (1, -1):
-        shift = 1e-5 * sign * direction @ found.start_basis
+        shift = 1e-5 * sign * direction @ found.tangents
         start = [np.asarray(a) for a in (state.q_s, state.q_f, state.p_s, state.p_f)]
         q_s, q_f, p_s, p_f = (a + d for a, d in zip(start, np.split(shift, 4), strict=True))
         moved = initial_state(system, q_s, q_f, p_s / 5, p_f, project=True)
         end = monodromy(system, fully_explicit(3), moved, macro_dt=0.03, num_steps=30, solver=MARCH).end
         ends.append(np.concatenate([end.q_s, end.q_f, end.p_s, end.p_f]))
-    predicted = found.end_basis.T @ (found.matrix @ direction)
+    predicted = direction @ found.images
     assert (ends[0] - ends[1]) / 2e-5 == pytest.approx(predicted, abs=1e-5 * np.abs(predicted).max())
 
 

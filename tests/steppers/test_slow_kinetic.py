@@ -7,7 +7,7 @@ import pytest
 
 from tests.support import NAMES, area_change, largest_difference, node
 from vmri_jax import ConstantMass, Problem, System, fully_implicit, galerkin, initial_state, simulate, textbook
-from vmri_jax.diagnostics import observed_order
+from vmri_jax.diagnostics import fit_order
 
 
 def arm(q_s, v_s, params):
@@ -68,7 +68,7 @@ def test_order(name):
     errors = [
         [largest_difference(a, b) for a, b in zip(end_of(problem(), scheme, n), reference, strict=True)] for n in steps
     ]
-    observed = [observed_order(1 / np.array(steps), e) for e in np.transpose(errors)]
+    observed = [fit_order(1 / np.array(steps), e).order for e in np.transpose(errors)]
     assert observed == pytest.approx([order] * 4, abs=0.2)
 
 

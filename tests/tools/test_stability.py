@@ -12,18 +12,15 @@ def monodromy(cell: Cell) -> None:
     assert str(product)
 
 
-def vibrations(cell: Cell) -> None:
-    small = stability.vibrations(cell.moving)
-    assert str(small)
-    found = np.array([row.frequency for row in small.rows])
-    if cell.problem.system.is_constrained:  # whose forces `frequencies` leaves out
-        assert np.isfinite(found).all()
-        assert (np.diff(found) <= 0).all()
-    else:
-        np.testing.assert_allclose(found, diagnostics.frequencies(cell.moving), atol=1e-6)
+def linearise(cell: Cell) -> None:
+    linear = diagnostics.linearise(cell.moving)
+    assert str(linear)
+    assert np.isfinite(linear.frequencies).all()
+    assert (np.diff(linear.frequencies) <= 0).all()
+    assert linear.kinetic_shares.sum(axis=0) == pytest.approx(1.0)
 
 
-TOOLS = {tool.__name__: tool for tool in (monodromy, vibrations)}
+TOOLS = {tool.__name__: tool for tool in (monodromy, linearise)}
 REFUSED = {}
 
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from vmri_jax import ConstantMass, Problem, System, fully_implicit, galerkin, simulate
-from vmri_jax.diagnostics import observed_order
+from vmri_jax.diagnostics import fit_order
 
 DAMPING, SLOW, FAST, DRIVE = 0.3, 1.0, 10.0, 4.0
 
@@ -72,7 +72,7 @@ def test_order_with_a_force(force, scheme, steps):
         q_s, v_s, q_f, v_f = exact(np.asarray(run.t) - (0.5 if force == "damping" else 0.0))
         pairs = ((run.q_s, q_s), (run.p_s, v_s), (run.q_f, q_f), (run.p_f, v_f))
         errors.append([np.abs(np.asarray(a)[:, 0] - b).max() for a, b in pairs])
-    observed = [observed_order(1 / np.array(steps), e) for e in np.transpose(errors)]
+    observed = [fit_order(1 / np.array(steps), e).order for e in np.transpose(errors)]
     assert observed == pytest.approx([scheme.order] * 4, abs=0.2)
 
 

@@ -6,7 +6,7 @@ import pytest
 from tests.support import PROBLEMS, convergence, ground_truth
 from tests.verification.schemes import SCHEMES
 from vmri_jax import Scheme, explicit_slow, fully_explicit, fully_implicit, macro, micro, quadrature
-from vmri_jax.diagnostics import observed_order
+from vmri_jax.diagnostics import fit_order
 
 TRUTH = {"fpu": "fpu3_t1", "tsp": "tsp_t1"}
 TRUTH_ACCURACY = 1e-14
@@ -31,7 +31,7 @@ def test_observed_order(scheme, name):
     """Least-squares slopes with the round-off plateau masked."""
     order = ORDERS[scheme]
     macro_dt, *errors = convergence(PROBLEMS[name](), SCHEMES[scheme], ground_truth(TRUTH[name]), STEPS[order])
-    observed = [observed_order(macro_dt, e, floor=TRUTH_ACCURACY) for e in errors]
+    observed = [fit_order(macro_dt, e, floor=TRUTH_ACCURACY).order for e in errors]
     assert observed == pytest.approx([order, order], abs=0.1)  # measured 0.041, 0.2 wanted
     assert SCHEMES[scheme].order == order
 
@@ -49,7 +49,7 @@ def test_observed_order_of_rules_over_several_micro_intervals(slow, num_micro, o
     rule = micro(quadrature.gauss(2))
     scheme = Scheme(num_micro, 2, kinetic=rule, slow=slow, fast=rule)
     macro_dt, *errors = convergence(PROBLEMS["fpu"](), scheme, ground_truth(TRUTH["fpu"]), STEPS[order])
-    observed = [observed_order(macro_dt, e, floor=TRUTH_ACCURACY) for e in errors]
+    observed = [fit_order(macro_dt, e, floor=TRUTH_ACCURACY).order for e in errors]
     assert min(observed) == pytest.approx(order, abs=0.1)  # momenta show order 4 down to far smaller steps
     assert scheme.order == order
 
@@ -75,5 +75,5 @@ def test_errors_and_orders_of_the_table(row):
     assert np.allclose(macro_dt[[0, 3]], [0.01, 0.001])
     ratios = np.array([e_q[[0, 3]] / q_errors, e_p[[0, 3]] / p_errors])
     assert np.abs(np.log(ratios)).max() < np.log(1.1)  # measured 0.96 to 1.04
-    fitted = [observed_order(macro_dt, e_q), observed_order(macro_dt, e_p)]
+    fitted = [fit_order(macro_dt, e_q).order, fit_order(macro_dt, e_p).order]
     assert fitted == pytest.approx(orders, abs=0.03)  # measured 0.011

@@ -35,6 +35,7 @@ from vmri_jax.accuracy.companions import (
 from vmri_jax.accuracy.families import Family, micro_steps_help, unit_of
 from vmri_jax.accuracy.trials import LEAST_TIME, Trial, seconds_of_steps
 from vmri_jax.mechanics.driving import Events
+from vmri_jax.mechanics.linearisation import Linearisation, linearise
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.progress import Progress, silent
@@ -344,25 +345,24 @@ class Search:
         return unit * int(np.clip(round(best / unit), 1, max(1, MOST_MICRO // unit)))
 
     @cached_property
-    def _small_motions(self):
+    def _linear(self) -> Linearisation | None:
         """The expansion of the system about its start; None for large systems, and for mechanisms whose drives
         prescribe all coordinates."""
-        # Imported here, since vmri_jax.stability imports matplotlib, which takes half a second.
-        from vmri_jax.stability.linear import small_motions
-
         if self.start.q_s.size + self.start.q_f.size > MOST_COORDINATES:
             return None
         try:
-            return small_motions(self.system, self.start)
+            linear = linearise(self.system, self.start)
         except ValueError:
             return None
+        return linear if linear.frequencies.size else None
 
     def beside_resonances(self, trial: Trial, num_steps: int) -> int:
         """This number of macro steps, or the next larger number for which small motions about the start do not grow."""
-        if trial.num_micro == 1 or self._small_motions is None:
+        if trial.num_micro == 1 or self._linear is None:
             return num_steps
+        # Imported here, since vmri_jax.stability imports matplotlib, which takes half a second.
         from vmri_jax.stability.multipliers import multipliers
 
         numbers = [self.rounded(int(np.ceil(num_steps / shorter)))[0] for shorter in SHORTER_STEPS]
-        radii = multipliers(self._small_motions, trial.run.scheme, [self.length / n for n in numbers]).radius
+        radii = multipliers(self._linear, trial.run.scheme, [self.length / n for n in numbers]).radius
         return next((n for n, radius in zip(numbers, radii, strict=True) if radius <= 1 + RESONANT_GROWTH), num_steps)

@@ -8,10 +8,11 @@ from rich.markup import escape
 from vmri_jax.catalogue import find_scene_or_problem, find_scheme
 from vmri_jax.cli import options
 from vmri_jax.cli.common import console, status
+from vmri_jax.mechanics.linearisation import linearise
 from vmri_jax.mechanics.state import Problem
 from vmri_jax.running.arguments import nothing_fast
 from vmri_jax.scene.ledger import ledger_of_functions
-from vmri_jax.stability.vibrations import vibrations
+from vmri_jax.stability.drive import growth_over_period
 
 
 def explain(
@@ -43,11 +44,14 @@ def explain(
             ledger = ledger_of_functions(moving, chosen, macro_dt, measure)
         else:
             ledger = moving.explain(chosen, macro_dt=macro_dt, measure=measure)
-        small = vibrations(moving)
+        small = linearise(moving)
+        growth = growth_over_period(moving, small)
+        vibrations = str(small) if growth is None else f"{small}\n{growth}"
     console.print(ledger.table())
     console.print()
     console.print(ledger.reasons())
-    console.print("\n[bold]Small vibrations[/bold] about the start, estimates where it is not at rest\n", small.table())
+    console.print("\n[bold]Small vibrations[/bold] about the start, estimates where it is not at rest\n")
+    console.print(escape(vibrations))
     useless = nothing_fast(chosen, sum(row.kind == "body" and row.grid != "macro" for row in ledger.rows))
     if useless:
         console.print(f"\n[yellow]{escape(useless)}[/yellow]")

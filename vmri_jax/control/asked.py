@@ -1,7 +1,6 @@
 """Arguments of `minimize`: their checks, the `Transcription` that they make, and the point where the iteration starts."""
 
 from collections.abc import Callable, Mapping
-from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -16,10 +15,7 @@ from vmri_jax.mechanics.functions import traced_once
 from vmri_jax.mechanics.order import order_of
 from vmri_jax.mechanics.state import start_of
 from vmri_jax.running.prepare import prepare
-from vmri_jax.schemes.composition import Composition
-from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.plan import plan
-from vmri_jax.steppers.solver import Solver
 
 
 def actuation_of(problem, actuate, num_controls) -> tuple[Callable, tuple[str, ...]]:
@@ -43,22 +39,12 @@ def actuation_of(problem, actuate, num_controls) -> tuple[Callable, tuple[str, .
 
 
 def transcribed(
-    problem,
-    actuate: Callable,
-    num_controls: int,
-    *,
-    cost: Callable,
-    final_cost: Callable | None,
-    goal: Callable | None,
-    limits: Callable | None,
-    bounds: Any,
-    scheme: Scheme | Composition,
-    macro_dt: float,
-    num_steps: int,
-    grid: Literal["macro", "micro"],
-    solver: Solver | None,
+    problem, actuate, num_controls: int, aims: Mapping, bounds, scheme, macro_dt, num_steps, grid, solver
 ) -> Transcription:
-    """The optimal control problem on the grid of the scheme, from the arguments of `minimize`, which are checked."""
+    """The optimal control problem on the grid of the scheme, from the arguments of `minimize`, which are checked.
+
+    `aims` has the functions cost, final_cost, goal and limits by name, as far as they are given.
+    """
     whole_number("minimize: num_steps", num_steps)
     if grid not in ("macro", "micro"):
         raise ValueError(f"minimize: grid is {grid!r}; it must be 'macro' or 'micro'.")
@@ -80,13 +66,13 @@ def transcribed(
             f"minimize: actuate returns {forces}; it must return forces on the slow and on the fast variables, of shapes "
             f"{expected[0]} and {expected[1]}."
         )
-    for name, function, arguments in (("cost", cost, (state, u)), ("final_cost", final_cost, (state,))):
-        shape = () if function is None else jax.eval_shape(lambda f=function, g=arguments: f(*g)).shape
-        if shape != ():
-            raise ValueError(f"minimize: {name} has shape {shape}; it must be a number.")
-    for name, function, arguments in (("goal", goal, (state,)), ("limits", limits, (state, u))):
-        if function is not None and len(jax.eval_shape(lambda f=function, g=arguments: f(*g)).shape) != 1:
-            raise ValueError(f"minimize: {name} must return a vector, (n,).")
+    for name, function in aims.items():
+        arguments = (state, u) if name in ("cost", "limits") else (state,)
+        shape = jax.eval_shape(lambda f=function, g=arguments: f(*g)).shape
+        dimensions, words = (0, "a number") if name in ("cost", "final_cost") else (1, "a vector, (n,)")
+        if len(shape) != dimensions:
+            raise ValueError(f"minimize: {name} has shape {shape}; it must be {words}.")
+    functions = {"final_cost": free, "goal": unaimed, **aims}
     return Transcription(
         system.replace(params=params),
         state,
@@ -94,12 +80,9 @@ def transcribed(
         solver,
         np.asarray(float(macro_dt)),
         traced_once(actuate),
-        traced_once(cost),
-        traced_once(final_cost or free),
-        traced_once(goal or unaimed),
-        None if limits is None else traced_once(limits),
-        _bounds(bounds, num_controls),
-        scheme.num_micro if grid == "micro" else 1,
+        **{name: traced_once(function) for name, function in functions.items()},
+        bounds=_bounds(bounds, num_controls),
+        parts=scheme.num_micro if grid == "micro" else 1,
     )
 
 

@@ -2,30 +2,23 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from typing import Any, Literal
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
+from vmri_jax.accuracy.simulate import simulate
 from vmri_jax.control import bounded
 from vmri_jax.control.asked import actuation_of, started, transcribed
 from vmri_jax.control.optimum import Optimum
-from vmri_jax.control.search import line_search, rolled, update
-from vmri_jax.control.transcription import Transcription
+from vmri_jax.control.search import line_search, update
 from vmri_jax.mechanics.arrays import whole_number
 from vmri_jax.mechanics.checks import check_number
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
-from vmri_jax.running.observables import observables, with_tolerance
-from vmri_jax.running.origin import Origin, names_of
 from vmri_jax.running.progress import ShowsProgress, progress_to
-from vmri_jax.running.trajectory import RunInfo, Trajectory, with_observables
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
-from vmri_jax.steppers.results import Result
+from vmri_jax.steppers.results import SimulationError
 from vmri_jax.steppers.solver import Solver
-from vmri_jax.steppers.stepper import StepStatus
 
 
 def minimize(
@@ -96,9 +89,10 @@ def minimize(
         raise ValueError(f"minimize: tolerance is {tolerance}; it must be positive.")
     actuate, labels = actuation_of(problem, actuate, num_controls)
     opened_problem = problem_of("minimize", problem)
-    aims: dict[str, Any] = {"cost": cost, "final_cost": final_cost, "goal": goal, "limits": limits, "bounds": bounds}
-    steps: dict[str, Any] = {"scheme": scheme, "macro_dt": macro_dt, "num_steps": num_steps, "grid": grid}
-    setup = transcribed(opened_problem, actuate, len(labels), **aims, **steps, solver=solver)
+    aims = {"cost": cost, "final_cost": final_cost, "goal": goal, "limits": limits}
+    aims = {name: function for name, function in aims.items() if function is not None}
+    steps = scheme, macro_dt, num_steps, grid, solver
+    setup = transcribed(opened_problem, actuate, len(labels), aims, bounds, *steps)
     point = started(setup, start, num_steps, len(labels), grid)
     rho, history, nu = 1.0, [], np.zeros(0)
     with progress_to("minimize", progress) as tell:
@@ -123,12 +117,13 @@ def minimize(
                 break
     last = history[-1]
     success = all(last[name] <= tolerance for name in ("update", "gap", "miss", "over"))
-    u = point.u
-    driven = setup.driven(u, setup.start.t)
-    origin = replace(Origin.of(driven), names=names_of(opened_problem))
+    driven = replace(opened_problem, system=setup.driven(point.u, setup.start.t))
     # The last nodes may have gaps; the trajectory is the motion that the controls make.
-    trajectory = _trajectory(setup, *rolled(setup, u), origin)
-    controls, times = np.asarray(u), setup.times(num_steps)
+    try:
+        trajectory = simulate(driven, scheme, macro_dt=macro_dt, num_steps=num_steps, solver=setup.solver)
+    except SimulationError as failure:
+        trajectory = failure.trajectory
+    controls, times = np.asarray(point.u), setup.times(num_steps)
     if grid == "macro":
         controls, times = controls[:, 0], times[:, 0]
     return Optimum(
@@ -144,18 +139,6 @@ def minimize(
         last["gap"],
         len(history),
         success,
-        replace(opened_problem, system=driven),
+        driven,
         history,
     )
-
-
-def _trajectory(setup: Transcription, z, status: StepStatus, origin: Origin) -> Trajectory:
-    """The run with nodes z (N, n) after the start."""
-    count = len(z)
-    nodes = jax.vmap(setup.state)(jnp.concatenate([setup.z_start[None], z]), jnp.arange(count + 1))
-    table = jax.jit(jax.vmap(partial(observables, setup.system)))(with_tolerance(nodes, 0.0))
-    failed = np.flatnonzero(np.asarray(status.result) > Result.CONVERGED_AT_ROUNDOFF)
-    info = RunInfo(status.method, status.iterations, status.residual)
-    result = status.result[failed[0]] if failed.size else jnp.max(status.result)
-    run = Trajectory(nodes, None, None, info, result, np.asarray(failed[0] if failed.size else -1))
-    return with_observables(run, table, origin)

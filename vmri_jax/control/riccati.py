@@ -55,6 +55,7 @@ class _Value(NamedTuple):
     W: Float[Numbers, "e e"]
 
 
+@jax.jit
 def solve(stages: Stages, final: Final) -> Solution:
     """The solution of the linear-quadratic problem.
 

@@ -32,12 +32,6 @@ class Point(NamedTuple):
     goal: Float[Numbers, "e"]
 
 
-linearised = eqx.filter_jit(Transcription.linearised)
-limited = eqx.filter_jit(Transcription.limited)
-steps = eqx.filter_jit(Transcription.steps)
-by_sweep = jax.jit(riccati.solve)
-
-
 @eqx.filter_jit
 def measured(setup: Transcription, point: Point):
     """Cost, sum of all violations, largest node and control, and largest value of a limit."""
@@ -55,11 +49,11 @@ def slope(setup: Transcription, point: Point, dz, du):
 
 def update(setup: Transcription, point: Point) -> tuple[riccati.Solution, float, riccati.Stages, riccati.Final]:
     """The solution of the linear-quadratic problem at a point, the largest absolute multiplier, and the problem."""
-    stages, final = linearised(setup, point.z, point.u)
+    stages, final = setup.linearised(point.z, point.u)
     if setup.bounded:
-        change, steepest = bounded.solve(stages, final, limited(setup, point.z, point.u))
+        change, steepest = bounded.solve(stages, final, setup.limited(point.z, point.u))
         return change, steepest, stages, final
-    change = by_sweep(stages, final)
+    change = riccati.solve(stages, final)
     return change, float(np.abs(change.nu).max(initial=0.0)), stages, final
 
 
@@ -80,7 +74,7 @@ def line_search(setup: Transcription, point: Point, change: riccati.Solution, rh
         z, u = point.z + part * dz, point.u + part * du
         # the last term allows for round-off: near the optimum the merit changes by less
         allowed = before + SUFFICIENT_DECREASE * part * min(expected, 0.0) + 1e-12 * (abs(cost) + rho * violation)
-        ends, _ = steps(setup, z, u, jnp.asarray(False))  # NaN where a step fails
+        ends, _ = setup.steps(z, u, jnp.asarray(False))  # NaN where a step fails
         trials = [_with_goal(setup, z, u, ends - z)]
         motion, _ = rolled(setup, u)
         trials.append(_with_goal(setup, motion, u, jnp.zeros_like(motion)))
@@ -107,7 +101,7 @@ def line_search(setup: Transcription, point: Point, change: riccati.Solution, rh
 
 def rolled(setup: Transcription, u):
     """Nodes of the motion with controls u, NaN from the first failed step on, and the `StepStatus` of the steps."""
-    return steps(setup, jnp.zeros((len(u), setup.z_start.size)), u, jnp.asarray(True))
+    return setup.steps(jnp.zeros((len(u), setup.z_start.size)), u, jnp.asarray(True))
 
 
 def _with_goal(setup: Transcription, z, u, gaps) -> Point:

@@ -19,12 +19,11 @@ from jaxtyping import Float
 
 from vmri_jax.control.bounded import Limits
 from vmri_jax.control.riccati import Final, Stages
-from vmri_jax.diagnostics.linear import phase_splits, phase_vector
+from vmri_jax.diagnostics.linear import phase_step, phase_vector, state_of, with_slopes
 from vmri_jax.mechanics.arrays import Numbers
 from vmri_jax.mechanics.functions import TracedOnce
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
-from vmri_jax.running.macro_step import macro_step
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.results import Result
@@ -48,9 +47,9 @@ class Transcription(eqx.Module):
         cost: cost per time, ``cost(state, u) -> ()``.
         final_cost: cost of the last state, ``final_cost(state) -> ()``.
         goal: equations for the last state, ``goal(state) -> (e,)``.
-        limits: ``limits(state, u) -> (c,)``, not above zero at the end of every macro interval, for each of its controls; None for none.
         bounds: least and largest controls, (m,) each.
         parts: number of controls that follow each other in a macro interval: 1, or num_micro.
+        limits: ``limits(state, u) -> (c,)``, not above zero at the end of every macro interval, for each of its controls; None for none.
     """
 
     system: System
@@ -62,9 +61,9 @@ class Transcription(eqx.Module):
     cost: TracedOnce
     final_cost: TracedOnce
     goal: TracedOnce
-    limits: TracedOnce | None
     bounds: tuple[np.ndarray, np.ndarray]
     parts: int = eqx.field(static=True)
+    limits: TracedOnce | None = None
 
     @property
     def bounded(self) -> bool:
@@ -84,7 +83,7 @@ class Transcription(eqx.Module):
 
     def state(self, z, k) -> State:
         """The state at node k."""
-        return State(self.start.t + k * self.macro_dt, *jnp.split(z, phase_splits(self.start)))
+        return state_of(z, self.start.t + k * self.macro_dt, self.start)
 
     @property
     def z_start(self) -> jax.Array:
@@ -97,10 +96,11 @@ class Transcription(eqx.Module):
 
     def step(self, z, u, k):
         """The end of the step from node k at z (n,) with controls u (parts, m), and the `StepStatus` of the step."""
-        state = self.state(z, k)
-        end, info = macro_step(self.driven(u, state.t), self.scheme, state, self.macro_dt, self.solver)
-        return phase_vector(end), info.status
+        t = self.start.t + k * self.macro_dt
+        driven, fixed = self.driven(u, t), {"macro_dt": self.macro_dt, "solver": self.solver}
+        return phase_step(driven, self.scheme, self.start, t, z, **fixed)
 
+    @eqx.filter_jit
     def steps(self, z, u, follow):
         """Ends (N, n) of all steps, NaN where a step fails, and their `StepStatus`.
 
@@ -135,6 +135,7 @@ class Transcription(eqx.Module):
 
         return jax.vmap(stage)(z, u, jnp.arange(len(u)))
 
+    @eqx.filter_jit
     def limited(self, z, u) -> Limits:
         """The inequalities, linearised at nodes z and controls u."""
 
@@ -145,6 +146,7 @@ class Transcription(eqx.Module):
         lower, upper = (jnp.tile(bound, self.parts) - u.reshape(len(u), -1) for bound in self.bounds)
         return Limits(C, D.reshape(*D.shape[:2], u[0].size), self.over(z, u), lower, upper)
 
+    @eqx.filter_jit
     def linearised(self, z, u) -> tuple[Stages, Final]:
         """The linear-quadratic problem at nodes z (N, n) and controls u (N, parts, m)."""
         count, n = len(u), z.shape[1]
@@ -152,25 +154,23 @@ class Transcription(eqx.Module):
 
         def stage(z, v, z_next, k):
             def end(x):
-                reached, _ = self.step(x[:n], x[n:].reshape(u.shape[1:]), k)
-                return reached, reached
+                return self.step(x[:n], x[n:].reshape(u.shape[1:]), k)
 
             def cost(y):
                 x, z_next = y[: n + v.size], y[n + v.size :]
                 return self.stage_cost(x[:n], x[n:].reshape(u.shape[1:]), z_next, k)
 
             x = jnp.concatenate([z, v])
-            slopes, reached = jax.jacfwd(end, has_aux=True)(x)
+            reached, _, slopes = with_slopes(end, x, jnp.eye(x.size))
             y = jnp.concatenate([x, z_next])
             gradient, hessian = jax.grad(cost)(y), convex(jax.hessian(cost)(y))
             # The cost depends on y = (z, u, z_next). To first order  dy = along (dz, du) + shift,  since the step gives
-            # dz_next = slopes (dz, du) + c;  this turns gradient and hessian by y into those by (z, u).
-            along = jnp.concatenate([jnp.eye(x.size), slopes])
+            # dz_next = slopes^T (dz, du) + c;  this turns gradient and hessian by y into those by (z, u).
+            along = jnp.concatenate([jnp.eye(x.size), slopes], axis=1)
             c = reached - z_next
             shift = jnp.concatenate([jnp.zeros(x.size), c])
-            return Stages(
-                along.T @ hessian @ along, along.T @ (gradient + hessian @ shift), slopes[:, :n], slopes[:, n:], c
-            )
+            A, B = slopes[:n].T, slopes[n:].T
+            return Stages(along @ hessian @ along.T, along @ (gradient + hessian @ shift), A, B, c)
 
         stages = jax.vmap(stage)(self.before(z), flat, z, jnp.arange(count))
 

@@ -1,7 +1,7 @@
 """Quantities that a discrete trajectory should conserve, and measurements of them."""
 
-from vmri_jax.diagnostics.linear import frequencies, step_condition, symplectic_defect, tangents
-from vmri_jax.diagnostics.orders import OrderFit, fit_order, observed_order
+from vmri_jax.diagnostics.linear import step_condition
+from vmri_jax.diagnostics.orders import OrderFit, fit_order
 from vmri_jax.diagnostics.shadow import ShadowEnergy, shadow_energy
 from vmri_jax.mechanics.invariants import (
     all_constraints,
@@ -14,8 +14,10 @@ from vmri_jax.mechanics.invariants import (
     translation_along,
     velocity,
 )
+from vmri_jax.mechanics.linearisation import Linearisation, linearise
 
 __all__ = [
+    "Linearisation",
     "OrderFit",
     "ShadowEnergy",
     "all_constraints",
@@ -23,15 +25,12 @@ __all__ = [
     "energy",
     "energy_parts",
     "fit_order",
-    "frequencies",
+    "linearise",
     "momentum_map",
-    "observed_order",
     "oscillatory_energies",
     "rotation_about",
     "shadow_energy",
     "step_condition",
-    "symplectic_defect",
-    "tangents",
     "translation_along",
     "velocity",
 ]

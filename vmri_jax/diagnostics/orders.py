@@ -50,8 +50,3 @@ def fit_order(macro_dt, errors, plateau: float = 10.0, floor: float = 0.0) -> Or
     (slope, _), covariance = np.polyfit(x, y, 1, cov=True)
     quantile = stdtrit(free, 0.975)  # of Student's t distribution
     return OrderFit(float(slope), float(quantile * np.sqrt(covariance[0, 0])), len(x))
-
-
-def observed_order(macro_dt, errors, plateau: float = 10.0, floor: float = 0.0) -> float:
-    """The order of `fit_order`, with the same arguments and exceptions."""
-    return fit_order(macro_dt, errors, plateau, floor).order

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax import diagnostics, textbook
+from vmri_jax import textbook
 from vmri_jax.accuracy.batch import simulate_batch
 from vmri_jax.accuracy.companions import positions
 from vmri_jax.diagnostics import step_condition
@@ -27,6 +27,7 @@ from vmri_jax.hard_cases.measures import (
     single_precision,
     status,
 )
+from vmri_jax.mechanics.linearisation import linearise
 from vmri_jax.mechanics.motion import motion
 from vmri_jax.mechanics.projection import legendre
 from vmri_jax.mechanics.state import HasProblem, Problem, State, problem_of
@@ -36,7 +37,6 @@ from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes.scheme import Scheme, fully_explicit, fully_implicit
 from vmri_jax.stability import advise
 from vmri_jax.stability.drive import drive_period
-from vmri_jax.stability.linear import small_motions
 from vmri_jax.steppers.results import Result
 from vmri_jax.steppers.solver import Solver
 
@@ -232,8 +232,9 @@ def resolved(problem: Problem) -> Resolved:
     at rest without forces.
     """
     state = problem.state()
-    turning = np.abs(np.imag(small_motions(problem.system, state).rates)).max(initial=0.0)  # also by magnetic fields
-    omega = float(max(diagnostics.frequencies(problem.system, state)[0], turning))
+    linear = linearise(problem.system, state)
+    turning = np.abs(np.imag(linear.rates)).max(initial=0.0)  # also by magnetic fields
+    omega = float(max(linear.frequencies.max(initial=0.0), turning))
     if not omega > 0:
         now = motion(problem.system, state)
         q, v, a = (

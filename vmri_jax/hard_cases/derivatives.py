@@ -68,14 +68,9 @@ def _terms(problem: Problem, scheme: Scheme, macro_dt: float) -> Iterator[tuple[
     points = np.concatenate([along.q_s, along.q_f, velocities], axis=1)
     points, t = points[np.isfinite(points).all(axis=1)], along.t[0]
     n = points.shape[1] // 2
-    params = system.params
-    if (slow := system.slow_potential) is not None:
-        yield "slow_potential", lambda q: slow(q[:n_s], q[n_s:], params)[None], points[:, :n]
-    if (fast := system.fast_potential) is not None:
-        yield "fast_potential", lambda q: fast(q, params)[None], points[:, n_s:n]
-    for name, potential in system.potentials:
-        values = partial(lambda potential, q: potential(q[:n_s], q[n_s:], params)[None], potential)
-        yield f"potential {name!r}", values, points[:, :n]
+    for term in system.of_kind("potential"):
+        values = partial(lambda term, q: term(system.params, q_s=q[:n_s], q_f=q[n_s:])[None], term)
+        yield term.place, values, points[:, :n]
     if not system.has_constant_mass:
         parts = (n_s, n, n + n_s)
         yield "kinetic", lambda z: system.kinetic_energy(*jnp.split(z, parts))[None], points

@@ -112,7 +112,7 @@ def check_system(system: System, q_s, q_f) -> None:
         )
 
 
-def shape_of(name: str, function: Any, *args):
+def shape_of(name: str, function: Callable, *args):
     """Shape and type of the value of a user function, by tracing; two derivatives in forward mode, by all arguments but params, must exist.
 
     Args:
@@ -124,14 +124,14 @@ def shape_of(name: str, function: Any, *args):
         ValueError: the function cannot be traced, differentiated, or evaluated.
     """
 
-    if not isinstance(function, TracedOnce | ConstantMass):  # these have the order of their system
-        function = ordered(function, order_of(args[-1]))
+    has_order = isinstance(function, TracedOnce | ConstantMass)  # the order of its system
+    called: Any = function if has_order else ordered(function, order_of(args[-1]))
 
     def differentiated_twice(*args):
         *moving, params = args
 
         def tangent(*moving):
-            return jax.jvp(lambda *moving: function(*moving, params), moving, moving)
+            return jax.jvp(lambda *moving: called(*moving, params), moving, moving)
 
         (value, _), _ = jax.jvp(tangent, moving, moving)
         return value
@@ -157,7 +157,7 @@ def shape_of(name: str, function: Any, *args):
     if not isinstance(function, ConstantMass):
         leaves, structure = jax.tree.flatten(args)
         fault = _fault(
-            traced_once(function), structure, tuple((np.shape(leaf), jnp.result_type(leaf)) for leaf in leaves)
+            traced_once(called), structure, tuple((np.shape(leaf), jnp.result_type(leaf)) for leaf in leaves)
         )
         if fault:
             raise ValueError(f"{name} {fault}.")

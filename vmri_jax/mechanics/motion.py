@@ -37,6 +37,12 @@ class Motion(NamedTuple):
     multipliers: Any
 
 
+def force_of(lagrangian, q, v):
+    """Force ``dL/dq - d2L/dvdq v`` (n,) of a Lagrangian ``L(q, v)`` at constant velocities."""
+    by_q, by_v = (jax.grad(lagrangian, argument) for argument in (0, 1))
+    return by_q(q, v) - jax.jvp(lambda q: by_v(q, v), (q,), (v,))[1]
+
+
 def motion(system: System, state: State) -> Motion:
     """Velocities, accelerations and multipliers of a state; of dependent constraints the least multipliers."""
     n_s = state.q_s.size
@@ -52,9 +58,8 @@ def motion(system: System, state: State) -> Motion:
 
     t = jnp.asarray(state.t)
     of_motion = partial(lagrangian, system, n_s)
-    momentum = jax.grad(of_motion, argnums=1)
-    mass = jax.jacfwd(momentum, argnums=1)(q, v)
-    forces = jax.grad(of_motion)(q, v) - jax.jvp(lambda q: momentum(q, v), (q,), (v,))[1]
+    mass = jax.jacfwd(jax.grad(of_motion, argnums=1), argnums=1)(q, v)
+    forces = force_of(of_motion, q, v)
     if system.force is not None:
         forces += jnp.concatenate(system.forces(t, state.q_s, state.q_f, v_s, v_f))
     jacobian = jax.jacrev(constraints, argnums=1)(t, q)

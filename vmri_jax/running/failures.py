@@ -6,6 +6,7 @@ import numpy as np
 
 from vmri_jax.mechanics.invariants import velocity
 from vmri_jax.mechanics.jumps import in_words, jump_ahead
+from vmri_jax.mechanics.linearisation import linearise
 from vmri_jax.mechanics.names import AXES, Names
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
@@ -105,9 +106,6 @@ def simulation_error(
         first: number of the macro step that starts at the first node of `trajectory`.
         whole: the run, where `trajectory` is a part of it.
     """
-    # imported here: vmri_jax.stability imports vmri_jax.running
-    from vmri_jax.stability.vibrations import swapped_at_start
-
     failed_at, dt = int(trajectory.failed_at), float(macro_dt)
     step = failed_at - first
     interval, moved, jump = step // save_every, None, ""
@@ -125,4 +123,15 @@ def simulation_error(
         trajectory if whole is None else whole,
         moved="" if moved is None else moved.sentence(dt),
     )
-    return error.advised(dt, swapped_at_start(trajectory), jump)
+    return error.advised(dt, _swapped(trajectory), jump)
+
+
+def _swapped(trajectory: Trajectory) -> str:
+    """The advice of `Linearisation.swapped` at the first node of a run; empty if its labels are right or its system is not known."""
+    if not trajectory.states.q_s.shape[-1] or not trajectory.states.q_f.shape[-1]:
+        return ""  # nothing to swap: the linearisation would take seconds to compile
+    try:
+        advice = linearise(trajectory.origin.system(), trajectory[0], trajectory.names).swapped()
+    except (ValueError, TypeError, IndexError):  # no expansion at the start: the error of the run says more about it
+        return ""
+    return advice[0] if advice else ""

@@ -9,14 +9,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.diagnostics import frequencies
 from vmri_jax.mechanics import invariants
+from vmri_jax.mechanics.linearisation import linearise
 from vmri_jax.mechanics.masses import ConstantMass
 from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.state import Problem, State, initial_state
 from vmri_jax.mechanics.surroundings import name_of
 from vmri_jax.mechanics.system import System
-from vmri_jax.mechanics.terms import label
+from vmri_jax.mechanics.terms import KINDS, Term
 from vmri_jax.running.prepare import prepare
 from vmri_jax.running.printed import PrintedTable
 from vmri_jax.running.simulation import Simulation
@@ -157,34 +157,32 @@ def ledger_of_functions(
         pace, grid = ("fast", "micro") if part == "f" else ("slow", "macro")
         rows.append(LedgerRow(name, "body", grid, f"{pace}: it is in q_{part}", intervals[grid] * size, 0, 0))
 
-    parts = []
-    for home in TERMS:
-        function = getattr(system, home, None)
-        if function is not None and not (home == "kinetic" and system.has_constant_mass):
-            rule = _rule(stage, home)
-            why = f"the rule of the scheme for it is on the {rule.grid} grid"
-            parts.append((function, TERMS[home], _alone(system, home, state), rule, why))
-    for name, function in system.potentials:
-        alone, rule = _alone(system, "", state).replace(potentials={name: function}), stage.rule_of(name)
-        parts.append(
-            (function, f"potential {label(name)}", alone, rule, f"the rule of the scheme for it: {rule.in_words()}")
-        )
-    for function, kind, alone, rule, why in parts:
+    for term in system.terms:
+        # T_s is a part of the row of T; masses cost nothing, and steps do not solve for implied rows
+        if term.kind == "implied" or term.name == "T_s" or isinstance(term.function, ConstantMass):
+            continue
+        rule, alone = stage.rule_of(term.name), _alone(system, term, state)
         multipliers = intervals[rule.grid] * sum(alone.num_constraints(state.q_s, state.q_f))
         count, microseconds = stages * rule.evaluations(stage.num_micro), None
         if measure:
             derivatives = _first_derivatives(alone, state.q_s.size, problem.v_s, problem.v_f)
             microseconds = 1e6 * seconds_each(derivatives, jnp.concatenate([state.q_s, state.q_f])) * count
-        rows.append(LedgerRow(name_of(function), kind, rule.grid, why, 0, multipliers, count, microseconds))
+        kind = f"{KINDS[term.field].in_words} {term.label}"
+        why = f"the rule of the scheme for it: {rule.in_words()}"
+        rows.append(LedgerRow(name_of(term.function), kind, rule.grid, why, 0, multipliers, count, microseconds))
     return Ledger(tuple(rows), _macro_step(system, scheme, state, macro_dt, DEFAULT_FREQUENCY) if measure else None)
 
 
-def _alone(system: System, home: str, state: State) -> System:
-    """The system with the function of the argument `home` alone, and with unit masses unless this is the kinetic energy."""
+def _alone(system: System, term: Term, state: State) -> System:
+    """The system with one term alone, and with unit masses unless this is the kinetic energy."""
     masses = ConstantMass(np.ones(state.q_s.size), np.ones(state.q_f.size))
-    absent = {name: None for name in TERMS if name not in (home, "kinetic", "control", "fast")}
-    absent["potentials"] = None
-    return system.replace(**absent, **({} if home == "kinetic" else {"kinetic": masses}))
+
+    def function(other: Term):
+        if other.name == term.name or other.kind == term.kind == "kinetic":
+            return other.function
+        return masses if other.name == "T" else None
+
+    return system.mapped(function)
 
 
 def _measure(sorting: Sorting, scheme, macro_dt) -> tuple[float, list[float]]:
@@ -203,7 +201,7 @@ def _measure(sorting: Sorting, scheme, macro_dt) -> tuple[float, list[float]]:
 def _macro_step(system: System, scheme, state: State, macro_dt: float | None, frequency: float) -> float:
     """Microseconds of a macro step, by default of micro steps 0.1 / w, w the largest frequency or `frequency`."""
     if macro_dt is None:
-        macro_dt = scheme.num_micro * 0.1 / (float(frequencies(system, state).max(initial=0.0)) or frequency)
+        macro_dt = scheme.num_micro * 0.1 / (float(linearise(system, state).frequencies.max(initial=0.0)) or frequency)
     seconds = interleaved({"": prepare_steps(system, scheme, state, macro_dt).timed()}, 5)[""]
     return 1e6 * float(np.median(seconds)) / STEPS
 

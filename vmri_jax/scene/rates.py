@@ -21,6 +21,8 @@ from scipy.linalg import block_diag
 
 from vmri_jax.mechanics.arrays import quickly_compiled
 from vmri_jax.mechanics.functions import TracedOnce
+from vmri_jax.mechanics.linearisation import mass_orthonormal
+from vmri_jax.mechanics.motion import force_of
 from vmri_jax.scene.body import LARGEST_POINT, Bodies, label_of, moving
 from vmri_jax.scene.effect import Effect
 
@@ -100,16 +102,15 @@ def _rates(effect: Effect, elements: Sequence[Linearised], mass: np.ndarray, siz
                 f"{effect.name}: the kinetic energy of {', '.join(names)} is not positive at the start; change masses or kinetic "
                 "effects, or give every body a pace and every potential between fast bodies a rate."
             )
-        root = np.linalg.cholesky(element_mass)
-        # w^2: the largest eigenvalue of M^-1 K, or the declared curvature k times the largest eigenvalue of A M^-1 A^T, where A v are the rates of
+        N = mass_orthonormal(element_mass)
+        # w^2: the largest eigenvalue of N^T K N, or the declared curvature k times the largest eigenvalue of A M^-1 A^T, where A v are the rates of
         # positions: k / m for a body of mass m
-        matrix = _scaled(root, (element.stiffness + element.stiffness.T) / 2)
-        mobility = np.linalg.solve(root, element.translation.T)
-        largest = max(np.linalg.eigvalsh(matrix).max(), curvatures[i] * np.linalg.norm(mobility, 2) ** 2)
+        matrix = N.T @ (element.stiffness + element.stiffness.T) @ N / 2
+        largest = max(np.linalg.eigvalsh(matrix).max(), curvatures[i] * np.linalg.norm(element.translation @ N, 2) ** 2)
         if largest > ROUND_OFF * np.abs(matrix).max(initial=0.0):
             frequency[i] = np.sqrt(largest)
-        frequency[i] = max(frequency[i], np.linalg.norm(_scaled(root, element.gyroscopic), 2))
-        acceleration = np.linalg.solve(element_mass, element.force)
+        frequency[i] = max(frequency[i], np.linalg.norm(N.T @ element.gyroscopic @ N, 2))
+        acceleration = N @ (N.T @ element.force)
         a, alpha = (np.abs(part @ acceleration).max(initial=0.0) for part in (element.translation, element.turning))
         rate[i] = max(frequency[i], np.sqrt(a / size), np.sqrt(alpha))
     # elements between the same bodies are terms of a series, as of a torsion: they get the rate of the fastest
@@ -119,11 +120,6 @@ def _rates(effect: Effect, elements: Sequence[Linearised], mass: np.ndarray, siz
     for numbers in same_bodies.values():
         frequency[numbers], rate[numbers] = frequency[numbers].max(), rate[numbers].max()
     return Rates(frequency, rate)
-
-
-def _scaled(root: np.ndarray, matrix: np.ndarray) -> np.ndarray:
-    """``R^-1 X R^-T``, which has the eigenvalues of ``M^-1 X`` for ``M = R R^T`` and is symmetric with X."""
-    return np.linalg.solve(root, np.linalg.solve(root, matrix).T).T
 
 
 def _linearise(effect: Effect, bodies: Bodies, columns: Mapping[str, np.ndarray]) -> list[Linearised]:
@@ -170,11 +166,7 @@ def _derivatives(function: TracedOnce, kinetic: bool, q, v, params):
     def lagrangian(q, v):
         return function(q, None, v, None, params)
 
-    def force(q, v):
-        """``f = L_q - L_vq v``."""
-        momentum = jax.grad(lagrangian, 1)
-        return jax.grad(lagrangian)(q, v) - jax.jvp(lambda q: momentum(q, v), (q,), (v,))[1]
-
+    force = partial(force_of, lagrangian)
     by_velocities = jax.jacfwd(force, 1)(q, v)
     at_rest = jax.grad(lagrangian)(q, jnp.zeros_like(v))
     gyroscopic = (by_velocities - by_velocities.T) / 2

@@ -6,17 +6,16 @@ from typing import Any
 
 import numpy as np
 
+from vmri_jax.mechanics.linearisation import Linearisation, linearise
 from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.mechanics.terms import label
 from vmri_jax.running.origin import names_of
 from vmri_jax.schemes.composition import Composition, stage_lengths, stage_scheme
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.stability.drive import LEAST_STEPS, drive_period, driven_motion, growth_of_run, in_words, periods_of_run
-from vmri_jax.stability.linear import SmallMotions, small_motions
 from vmri_jax.stability.map import TOLERANCE, Window, measure
 from vmri_jax.stability.multipliers import multipliers
 from vmri_jax.stability.oscillator import fast_limit, kick_limit, phase, slow_limit
-from vmri_jax.stability.vibrations import swapped
 from vmri_jax.study.table import Column, ResultTable
 
 SCANNED_STEPS = (0.5, 1.25)
@@ -132,7 +131,7 @@ def advise(
     """Judge a macro step before a long run, from the multipliers of the step of small motions about the state.
 
     Under a periodic drive: from the multipliers of the run and of the motion over a period. Elsewhere instability is measured, too: the
-    derivative of the step of the frozen problem (see `small_motions`) has a multiplier outside the unit circle, at macro_dt or in a window of
+    derivative of the step of the frozen problem (see `linearise`) has a multiplier outside the unit circle, at macro_dt or in a window of
     steps near it. Formulas only name the cause:
 
     * stability limit: the step is unstable for the fast or the slow potential alone; ``omega h`` or ``omega H`` exceeds
@@ -163,15 +162,15 @@ def advise(
         raise TypeError(f"advise: scheme is {type(scheme).__name__}; give a Scheme, e.g. fully_implicit(num_micro=10).")
     if not (np.ndim(macro_dt) == 0 and np.isfinite(macro_dt) and macro_dt > 0):
         raise ValueError(f"advise: macro_dt is {macro_dt}; it must be a positive number.")
-    macro_dt, motions = float(macro_dt), small_motions(system, state)
+    macro_dt, linear = float(macro_dt), linearise(system, state, names)
     period = drive_period(system, state, macro_dt)
     if period is None:
-        judged = _judged_at_rest(motions, scheme, macro_dt, tolerance, names)
+        judged = _judged_at_rest(linear, scheme, macro_dt, tolerance)
     else:
         judged = _judged_over_a_period(system, scheme, state, macro_dt, period)
     findings = [*judged.pop("findings"), *_stages(scheme)]
     judged["findings"] = tuple(sorted(findings, key=lambda f: ("error", "warning", "note").index(f.severity)))
-    fast, slow = motions.frequencies("fast"), motions.frequencies("slow")
+    fast, slow = linear.frequencies_of("fast"), linear.frequencies_of("slow")
     return Advice(macro_dt=macro_dt, fast_frequencies=fast, slow_frequencies=slow, **judged)
 
 
@@ -199,26 +198,26 @@ def _judged_over_a_period(system, scheme, state: State, macro_dt: float, period:
     }
 
 
-def _judged_at_rest(motions: SmallMotions, scheme, macro_dt: float, tolerance: float, names) -> dict[str, Any]:
+def _judged_at_rest(linear: Linearisation, scheme, macro_dt: float, tolerance: float) -> dict[str, Any]:
     """Fields of the `Advice` from the multipliers of a step of small motions, at macro_dt and at steps near it."""
     lower, upper = SCANNED_STEPS[0] * macro_dt, SCANNED_STEPS[1] * macro_dt
-    windows = _scan(motions, scheme, lower, upper, macro_dt, tolerance)
-    growth = float(multipliers(motions, scheme, [macro_dt]).radius[0]) - 1
+    windows = _scan(linear, scheme, lower, upper, macro_dt, tolerance)
+    growth = float(multipliers(linear, scheme, [macro_dt]).radius[0]) - 1
     growth = growth if growth > tolerance else 0.0
-    step_findings = list(_step_findings(motions, scheme, macro_dt, growth, windows))
+    step_findings = list(_step_findings(linear, scheme, macro_dt, growth, windows))
     safe = macro_dt
     for _ in range(MOST_SCANS if step_findings else 0):
         safe = _nearest_safe(macro_dt, windows, lower, upper)
         if not np.isnan(safe):
             break
         upper, lower = lower, lower / 3
-        windows = _scan(motions, scheme, lower, upper, upper, tolerance) + windows
-    findings = [*step_findings, *_kicks_in_phase(motions, scheme, macro_dt)]
-    if (swap := swapped(motions, names)) is not None:
+        windows = _scan(linear, scheme, lower, upper, upper, tolerance) + windows
+    findings = [*step_findings, *_kicks_in_phase(linear, scheme, macro_dt)]
+    if (swap := linear.swapped()) is not None:
         findings.append(Finding("warning", "labels", *swap))
-    rate = float(np.real(motions.growing).max(initial=0.0))
-    if motions.frozen and (rate or step_findings or motions.driven):
-        findings.append(Finding("note", "motion", motions.frozen, 0.0))
+    rate = float(np.real(linear.growing).max(initial=0.0))
+    if linear.frozen and (rate or step_findings or linear.driven):
+        findings.append(Finding("note", "motion", linear.frozen, 0.0))
     elif rate:
         sentence = f"Motion about this state grows by itself, like exp({rate:.3g} t); that is left out of the growth that is measured."
         findings.append(Finding("note", "motion", sentence, rate))
@@ -228,14 +227,14 @@ def _judged_at_rest(motions: SmallMotions, scheme, macro_dt: float, tolerance: f
         "windows": tuple(windows),
         "scanned": (lower, SCANNED_STEPS[1] * macro_dt),
         "safe_macro_dt": safe,
-        "about": "for small motions about this state" + (", held at rest" if motions.frozen else ""),
+        "about": "for small motions about this state" + (", held at rest" if linear.frozen else ""),
     }
 
 
-def _step_findings(motions: SmallMotions, scheme, macro_dt: float, growth: float, windows) -> Iterator[Finding]:
+def _step_findings(linear: Linearisation, scheme, macro_dt: float, growth: float, windows) -> Iterator[Finding]:
     """An error if the step is unstable, else a warning for every near window."""
     if growth:
-        kind, cause = _cause(motions, scheme, macro_dt)
+        kind, cause = _cause(linear, scheme, macro_dt)
         tenfold = max(1, round(np.log(10) / np.log1p(growth)))
         grows = f"Disturbances grow by {growth:.2g} per macro step, tenfold in {tenfold}."
         yield Finding("error", kind, f"{cause} {grows}", growth)
@@ -243,16 +242,16 @@ def _step_findings(motions: SmallMotions, scheme, macro_dt: float, growth: float
     for a, b, _ in windows:
         distance = max(a - macro_dt, macro_dt - b) / macro_dt
         if distance * macro_dt <= _margin(a, b, macro_dt):
-            kind, cause = _cause(motions, scheme, (a + b) / 2)
+            kind, cause = _cause(linear, scheme, (a + b) / 2)
             where = f"Steps from {a:.6g} to {b:.6g} are unstable, {100 * distance:.1f} % from this one."
             yield Finding("warning", kind, f"{where} There: {cause}", distance)
 
 
-def _scan(motions: SmallMotions, scheme, lower: float, upper: float, point: float, tolerance: float) -> list[Window]:
+def _scan(linear: Linearisation, scheme, lower: float, upper: float, point: float, tolerance: float) -> list[Window]:
     """Unstable windows of macro steps between lower and upper, measured on a grid that contains `point`."""
-    turn = motions.modes[0].max(initial=0.0) * (upper - lower)
+    turn = linear.frequencies.max(initial=0.0) * (upper - lower)
     grid = np.linspace(lower, upper, int(np.clip(turn / RADIANS_PER_POINT, *POINTS)))
-    return measure(motions, scheme, np.union1d(grid, [point]), tolerance, RESOLUTION)[1]
+    return measure(linear, scheme, np.union1d(grid, [point]), tolerance, RESOLUTION)[1]
 
 
 def _margin(a: float, b: float, macro_dt: float) -> float:
@@ -269,13 +268,13 @@ def _nearest_safe(macro_dt: float, windows, lower: float, upper: float) -> float
     return min(free, key=lambda end: abs(end - macro_dt), default=np.nan)
 
 
-def _cause(motions: SmallMotions, scheme: Scheme | Composition, macro_dt: float) -> tuple[str, str]:
+def _cause(linear: Linearisation, scheme: Scheme | Composition, macro_dt: float) -> tuple[str, str]:
     """Kind and description of an instability at this step."""
-    limit = _stability_limit(motions, scheme, macro_dt)
-    return ("stability limit", limit) if limit else _resonance(motions, scheme, macro_dt)
+    limit = _stability_limit(linear, scheme, macro_dt)
+    return ("stability limit", limit) if limit else _resonance(linear, scheme, macro_dt)
 
 
-def _stability_limit(motions: SmallMotions, scheme: Scheme | Composition, macro_dt: float) -> str:
+def _stability_limit(linear: Linearisation, scheme: Scheme | Composition, macro_dt: float) -> str:
     """A sentence about a potential for which alone the step is unstable; empty if there is none."""
     stage = stage_scheme(scheme)
     longest = macro_dt * np.abs(stage_lengths(scheme)).max()
@@ -285,16 +284,16 @@ def _stability_limit(motions: SmallMotions, scheme: Scheme | Composition, macro_
         ("fast", "fast potential", "the micro step", micro_dt, fast_limit(stage)),
         ("slow", "slow potential", "the macro step", longest, slow_limit(stage)),
     ]
-    if motions.hessians["force"].any():
+    if linear.hessians["force"].any():
         cases.append(("force", "force", "the micro step", micro_dt, np.inf))
-    for name, _ in motions.system.potentials:
+    for name, _ in linear.system.potentials:
         placed, words = stage.rule_of(name), f"further {name}" if name in ("fast", "slow") else label(name)
         span = stage.num_micro if placed.grid == "macro" else placed.every
         step_name = f"the step of {span} micro intervals"
         cases.append((f"potential {name}", f"{words} potential", step_name, span * micro_dt, kick_limit(placed)))
     for key, words, step_name, step, limit in cases:
-        frequency = motions.frequencies(key)[0]
-        alone = multipliers(motions.only(key), scheme, [macro_dt * (1 + LONGER_FOR_CAUSE)])
+        frequency = linear.frequencies_of(key)[0]
+        alone = multipliers(linear.only(key), scheme, [macro_dt * (1 + LONGER_FOR_CAUSE)])
         if alone.radius[0] > 1 + TOLERANCE and frequency > 0:
             bound = f"; its quadrature rule is stable below {limit:.4g}" if np.isfinite(limit) else ""
             return (
@@ -304,12 +303,12 @@ def _stability_limit(motions: SmallMotions, scheme: Scheme | Composition, macro_
     return ""
 
 
-def _resonance(motions: SmallMotions, scheme: Scheme | Composition, macro_dt: float) -> tuple[str, str]:
+def _resonance(linear: Linearisation, scheme: Scheme | Composition, macro_dt: float) -> tuple[str, str]:
     """Kind of resonance, and the vibrations with the most energy in the eigenvector of the largest multiplier."""
-    spectrum = multipliers(motions, scheme, [macro_dt])
+    spectrum = multipliers(linear, scheme, [macro_dt])
     worst = np.argmax(np.where(spectrum.growing[0], 0.0, np.abs(spectrum.values[0])))
     eta, pi = np.split(spectrum.vectors[0][:, worst], 2)
-    frequencies, modes = motions.modes
+    frequencies, modes = linear.frequencies, linear.modes
     energy = np.abs(modes.T @ eta) ** 2 * frequencies**2 + np.abs(modes.T @ pi) ** 2
     pair = np.argsort(-energy)[:2]
 
@@ -317,7 +316,7 @@ def _resonance(motions: SmallMotions, scheme: Scheme | Composition, macro_dt: fl
         return "stability limit", "The step is unstable for all terms together, and for none of them alone."
     kind = "impulse resonance" if stage_scheme(scheme).slow.grid == "macro" else "combination resonance"
     a, b = pair[0], pair[-1]
-    turns = [_turn(motions, scheme, macro_dt, i) / np.pi for i in (a, b)]
+    turns = [_turn(linear, scheme, macro_dt, i) / np.pi for i in (a, b)]
     if abs(spectrum.values[0, worst].imag) < 1e-6:  # a multiplier at 1 or -1: a vibration that resonates with itself
         return kind, (
             f"The vibration of frequency {frequencies[a]:.4g} turns by {turns[0]:.4g} pi in a macro step, close to a "
@@ -329,7 +328,7 @@ def _resonance(motions: SmallMotions, scheme: Scheme | Composition, macro_dt: fl
     )
 
 
-def _kicks_in_phase(motions: SmallMotions, scheme: Scheme | Composition, macro_dt: float) -> Iterator[Finding]:
+def _kicks_in_phase(linear: Linearisation, scheme: Scheme | Composition, macro_dt: float) -> Iterator[Finding]:
     """A warning for each vibration that kicks of the constant slow force f meet in phase.
 
     Between kicks H f the vibration turns by phi. The periodic motion has ``p = H f / 2`` after a kick and the amplitude
@@ -338,16 +337,16 @@ def _kicks_in_phase(motions: SmallMotions, scheme: Scheme | Composition, macro_d
     """
     if isinstance(scheme, Composition) or not scheme.slow.only_kicks or scheme.slow.mollified:
         return
-    frequencies, modes = motions.modes
-    forces = modes.T @ motions.slow_force
+    frequencies, modes = linear.frequencies, linear.modes
+    forces = modes.T @ linear.slow_force
     for i in np.flatnonzero(np.abs(forces) > LEAST_FORCE * np.linalg.norm(forces)):
-        if not frequencies[i] or not _is_fast(motions, i):
+        if not frequencies[i] or not _is_fast(linear, i):
             continue
-        turn = _turn(motions, scheme, macro_dt, i)
+        turn = _turn(linear, scheme, macro_dt, i)
         times = round(turn / (2 * np.pi))
         if times < 1 or abs(turn - 2 * np.pi * times) > RADIANS_IN_PHASE:
             continue
-        largest = np.abs(motions.shapes @ modes[:, i]).max()
+        largest = np.abs(linear.shapes @ modes[:, i]).max()
         held = largest * abs(forces[i]) / frequencies[i] ** 2
         with np.errstate(divide="ignore"):
             amplitude = held * frequencies[i] * macro_dt / 2 / abs(np.sin(turn / 2))
@@ -361,16 +360,16 @@ def _kicks_in_phase(motions: SmallMotions, scheme: Scheme | Composition, macro_d
         )
 
 
-def _is_fast(motions: SmallMotions, i) -> bool:
+def _is_fast(linear: Linearisation, i) -> bool:
     """Whether W has more than half of the stiffness of vibration i."""
-    frequencies, modes = motions.modes
-    return bool(modes[:, i] @ motions.hessians["fast"] @ modes[:, i] >= frequencies[i] ** 2 / 2)
+    frequencies, modes = linear.frequencies, linear.modes
+    return bool(modes[:, i] @ linear.hessians["fast"] @ modes[:, i] >= frequencies[i] ** 2 / 2)
 
 
-def _turn(motions: SmallMotions, scheme: Scheme | Composition, macro_dt: float, i) -> float:
+def _turn(linear: Linearisation, scheme: Scheme | Composition, macro_dt: float, i) -> float:
     """Angle by which vibration i turns in a macro step: the phase of the micro steps if W carries the vibration, else ``omega H``."""
-    exact = float(motions.modes[0][i] * macro_dt)
-    if not _is_fast(motions, i):
+    exact = float(linear.frequencies[i] * macro_dt)
+    if not _is_fast(linear, i):
         return exact
     stage = stage_scheme(scheme)
     phases = [phase(stage, exact * part / stage.num_micro) for part in np.asarray(stage_lengths(scheme))]

@@ -13,14 +13,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.diagnostics.linear import phase_splits
+from vmri_jax.diagnostics.linear import state_of
 from vmri_jax.mechanics.arrays import quickly_compiled
 from vmri_jax.mechanics.driving import driven
 from vmri_jax.mechanics.invariants import velocity
-from vmri_jax.mechanics.state import State
+from vmri_jax.mechanics.linearisation import Linearisation
+from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.mechanics.system import System
 from vmri_jax.schemes.composition import Composition, stage_scheme
-from vmri_jax.schemes.scheme import Scheme
+from vmri_jax.schemes.scheme import Scheme, fully_implicit
 from vmri_jax.stability.multipliers import monodromy
 
 SAMPLES = 1024
@@ -115,7 +116,7 @@ def _drive(system: System, state: State, times):
     direction = jnp.cos(2.0 + jnp.arange(z.size))
 
     def terms(t, z):
-        q_s, q_f, v_s, v_f = jnp.split(z, phase_splits(state))
+        _, q_s, q_f, v_s, v_f = vars(state_of(z, t, state)).values()
         return jnp.concatenate([*system.forces(t, q_s, q_f, v_s, v_f), system.constraints(t, q_s, q_f)])
 
     def terms_and_derivatives(t):
@@ -141,6 +142,14 @@ def growth_of_run(system: System, scheme, state: State, macro_dt: float, period:
         return np.inf, state
     growth = float(np.abs(product.multipliers).max(initial=0.0) ** (1 / periods) - 1)
     return growth if growth > LEAST_GROWTH else 0.0, product.end
+
+
+def growth_over_period(moving: Movable, linear: Linearisation) -> DrivenMotion | None:
+    """The growth of disturbances of a motion over a period of the drive, from `fully_implicit` steps; None if no period is seen."""
+    system, state = start_of("growth_over_period", moving, linear.state)
+    step = 1 / max(np.abs(linear.rates).max(initial=0.0), 1e-300)
+    period = drive_period(system, state, step)
+    return None if period is None else driven_motion(system, fully_implicit(1), state, step, period)
 
 
 def driven_motion(

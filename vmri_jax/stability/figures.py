@@ -19,11 +19,11 @@ COLUMNS = 3
 def plot_stability(maps: Mapping[str, StabilityMap], title: str = "", theme: Theme = LIGHT) -> NotebookFigure:
     """Unstable windows over ``omega H / pi`` and the rows of each map, one panel per map.
 
-    The colour of a window is its largest growth per step. Rows are stacked from the bottom: values of kappa at their heights, schemes in
-    their order.
+    The colour of a window is its largest growth per step. Rows are stacked from the bottom: systems with numbers as labels at these heights, all
+    others in their order.
 
     Args:
-        maps: maps by the title of their panel, e.g. one per scheme, each over num_micro or kappa.
+        maps: maps by the title of their panel, e.g. one per scheme, each over num_micro or systems.
         title: title above the panels.
         theme: colours.
     """
@@ -35,17 +35,15 @@ def plot_stability(maps: Mapping[str, StabilityMap], title: str = "", theme: The
     with new_figure(*size, title, theme) as figure:
         panels = panel_grid(figure, len(maps), columns)
         for axes, (name, stability) in zip(panels, maps.items(), strict=True):
-            over_kappa = stability.axis == "kappa"
-            y = np.array(stability.rows, dtype=float) if over_kappa else np.arange(len(stability.rows))
+            over_numbers = stability.axis == "system" and all(isinstance(row, float) for row in stability.rows)
+            y = np.array(stability.rows, dtype=float) if over_numbers else np.arange(len(stability.rows))
             edges = _cells(y)
             for windows, bottom, top in zip(stability.unstable, edges, edges[1:], strict=False):
                 shade = colors.to_rgba(np.array([window.growth for window in windows]))
                 spans = [(w.start / np.pi, (w.stop - w.start) / np.pi) for w in windows]
                 axes.broken_barh(spans, (bottom, top - bottom), facecolors=shade, edgecolors=shade, linewidth=0.7)
             axes.set(title=name, xlim=(0, stability.omega_H[-1] / np.pi), ylim=(edges[0], edges[-1]))
-            if over_kappa:
-                axes.set(ylabel=r"$\kappa$")
-            else:
+            if not over_numbers:
                 axes.set_yticks(y, [str(row) for row in stability.rows])
                 axes.grid(axis="y", visible=False)
             if all(isinstance(row, int) for row in stability.rows):

@@ -1,17 +1,17 @@
-"""Stability maps: the stable macro steps of a scheme, over ``omega H`` and over schemes or coupling strengths."""
+"""Stability maps: the stable macro steps of a scheme, over ``omega H`` and over schemes or systems."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from vmri_jax.executors.executor import mapped
+from vmri_jax.mechanics.linearisation import Linearisation, linearise
 from vmri_jax.mechanics.state import Movable, State, start_of
-from vmri_jax.mechanics.system import System
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
-from vmri_jax.stability.linear import SmallMotions, small_motions
 from vmri_jax.stability.multipliers import multipliers
 from vmri_jax.study.table import Column, ResultTable
 
@@ -44,7 +44,7 @@ def windows_text(windows: Sequence[Window]) -> str:
 class StabilityMap(ResultTable):
     """Largest multipliers of a macro step over a grid, and the windows of instability.
 
-    axis: "scheme" or "kappa", the meaning of the rows.
+    axis: "scheme" or "system", the meaning of the rows.
     rows: (m,) labels of the rows.
     omega: frequency that scales the grid, the largest frequency of the fast potential alone.
     omega_H: (n,) grid, macro step times omega.
@@ -52,7 +52,7 @@ class StabilityMap(ResultTable):
         infinite where the step failed.
     unstable: the windows of omega_H of each row in which radius > 1 + tolerance; they may be far narrower than the grid.
     tolerance: growth per step that counts as instability.
-    note: why the map does not tell whether the motion is stable, see `SmallMotions.frozen`; empty at an equilibrium.
+    note: why the map does not tell whether the motion is stable, see `Linearisation.frozen`; empty at an equilibrium.
     """
 
     columns = (
@@ -100,69 +100,66 @@ class StabilityMap(ResultTable):
 
 
 def stability_map(
-    system: Movable,
+    system: Movable | Mapping[Any, Movable],
     scheme: Scheme | Composition | Mapping[Any, Scheme | Composition],
     omega_H: Sequence[float] | np.ndarray,
     *,
     state: State | None = None,
-    kappa: Sequence[float] | None = None,
     tolerance: float = TOLERANCE,
     executor: Any = None,
 ) -> StabilityMap:
     """Stability of macro steps of length H, from the multipliers of the step of small motions about a state.
 
     At an equilibrium these are the eigenvalues of the derivative of `macro_step`; elsewhere the eigenvalues for the frozen problem
-    (see `small_motions`). Multipliers of opposite Krein signature that have passed each other between two grid points reveal a window there,
+    (see `linearise`). Multipliers of opposite Krein signature that have passed each other between two grid points reveal a window there,
     whose ends are refined by bisection.
 
     Args:
-        system: `linear_model()`, any other problem or scene, or a system with a state. The unit of the grid is its omega: the
-            largest frequency of the fast potential alone, or the largest rate of all motions if this potential has no frequency.
+        system: `linear_model()`, any other problem or scene, a system with a state, or several by label for a single scheme, e.g.
+            ``{k: linear_model(kappa=k) for k in (5.0, 25.0)}``. The unit of the grid is omega of the first: the largest frequency of its
+            fast potential alone, or the largest rate of all motions if this potential has no frequency.
         scheme: a scheme or composition, or several by label, e.g. ``{n: explicit_slow(n) for n in (2, 3, 5)}``; each
             num_micro and structure is compiled once.
         omega_H: (n,) increasing positive values of omega times the macro step. A spacing of 0.1 or less finds narrow
             windows; with a larger one a multiplier may pass several multipliers between two points, which hides windows.
-        kappa: values of ``params["kappa"]`` of the system, one row each, for a single scheme.
         state: point of expansion of the small motions; None for the start of the problem.
         tolerance: growth per macro step above which a step is unstable.
         executor: executor that computes the rows, as of `vmri_jax.ensemble`; None for this process.
 
     Raises:
         TypeError: a system or scheme of the wrong kind.
-        ValueError: a grid that is not increasing and positive; kappa for several schemes, or for a system without it.
+        ValueError: a grid that is not increasing and positive; several systems with several schemes.
     """
-    system, state = start_of("stability_map", system, state)
     grid = _grid(omega_H)
+    systems = system if isinstance(system, Mapping) else {"": system}
     schemes = scheme if isinstance(scheme, Mapping) else {"": scheme}
     if not schemes or not all(isinstance(s, Scheme | Composition) for s in schemes.values()):
         raise TypeError(
             f"stability_map: scheme is {scheme!r}; give a Scheme or Composition, e.g. explicit_slow(10), or a dict of them."
         )
-    if kappa is None:
-        motions = small_motions(system, state)
-        rows = {label: (motions, s) for label, s in schemes.items()}
-    else:
-        only = _single_scheme(schemes, system, kappa)
-        params = {float(k): {**system.params, "kappa": np.asarray(k, dtype=float)} for k in kappa}
-        rows = {k: (small_motions(system.replace(params=p), state), only) for k, p in params.items()}
-    omega = next(iter(rows.values()))[0].omega
+    if min(len(systems), len(schemes)) != 1:
+        raise ValueError(f"stability_map: {len(systems)} systems and {len(schemes)} schemes; give one of either.")
+    axis, labels = ("system", systems) if isinstance(system, Mapping) and len(schemes) == 1 else ("scheme", schemes)
+    linear = [linearise(*start_of("stability_map", movable, state)) for movable in systems.values()]
+    rows = dict(zip(labels, product(linear, schemes.values()), strict=True))
+    omega = float(linear[0].frequencies_of("fast").max(initial=0.0) or np.abs(linear[0].rates).max(initial=0.0))
     if omega == 0:
         raise ValueError("stability_map: the system has no frequency that could scale omega_H; nothing vibrates there.")
     measured = mapped("stability_map", measure, [(*row, grid / omega, tolerance) for row in rows.values()], executor)
     return StabilityMap(
-        axis="scheme" if kappa is None else "kappa",
+        axis=axis,
         rows=tuple(rows),
         omega=omega,
         omega_H=grid,
         radius=np.array([radius for radius, _ in measured]),
         unstable=tuple(tuple(Window(omega * a, omega * b, g) for a, b, g in windows) for _, windows in measured),
         tolerance=tolerance,
-        note=next(iter(rows.values()))[0].frozen,
+        note=linear[0].frozen,
     )
 
 
 def measure(
-    motions: SmallMotions,
+    linear: Linearisation,
     scheme: Scheme | Composition,
     macro_dt,
     tolerance: float = TOLERANCE,
@@ -171,15 +168,15 @@ def measure(
     """Spectral radius (n,) at n increasing macro steps, and the unstable windows between the first and the last of them."""
 
     def label(macro_dt):
-        return multipliers(motions, scheme, macro_dt).krein_signatures(tolerance)
+        return multipliers(linear, scheme, macro_dt).krein_signatures(tolerance)
 
-    spectra = multipliers(motions, scheme, macro_dt)
+    spectra = multipliers(linear, scheme, macro_dt)
     signatures = spectra.krein_signatures(tolerance)
     edges = find_windows(label, macro_dt, signatures, resolution * (macro_dt[-1] - macro_dt[0]))
     if not edges:
         return spectra.radius, []
     inside = np.array([a + (b - a) * POINTS_IN_WINDOW for a, b in edges])
-    peaks = multipliers(motions, scheme, inside.reshape(-1)).radius.reshape(inside.shape).max(axis=1) - 1
+    peaks = multipliers(linear, scheme, inside.reshape(-1)).radius.reshape(inside.shape).max(axis=1) - 1
     return spectra.radius, [Window(*ends, float(peak)) for ends, peak in zip(edges, peaks, strict=True)]
 
 
@@ -228,15 +225,3 @@ def _grid(omega_H) -> np.ndarray:
             "increasing, e.g. numpy.linspace(0.05, 12, 240)."
         )
     return grid
-
-
-def _single_scheme(schemes: Mapping[Any, Scheme | Composition], system: System, kappa) -> Scheme | Composition:
-    if not len(kappa):
-        raise ValueError("stability_map: kappa is empty; give at least one value.")
-    if len(schemes) > 1 or not isinstance(system.params, Mapping) or "kappa" not in system.params:
-        raise ValueError(
-            "stability_map: kappa goes with a single scheme and a system whose params are a dict with an entry 'kappa'; "
-            f"got {len(schemes)} scheme(s) and params {system.params!r}. Make one map per scheme."
-        )
-    [only] = schemes.values()
-    return only

@@ -1,4 +1,4 @@
-"""The test equation ``q'' = -omega^2 q`` under a quadrature rule: the phase of a step, and the stability limit of the rule.
+"""Oscillators: a model of two, and the test equation ``q'' = -omega^2 q`` under a quadrature rule, the phase of a step and the limit of the rule.
 
 A step of length tau with a path of degree r has the discrete Lagrangian ``q^T S q / (2 tau)`` in the control points,
 ``S = D - x^2 B``, x = omega tau, with D and B the sums of the rules over ``l_i' l_j'`` and ``l_i l_j``. Eliminating the
@@ -10,8 +10,12 @@ Midpoint rule: ``phi = 2 atan(x / 2)``; kicks at the ends (Verlet): ``2 asin(x /
 (Takahashi and Imada) replace x^2 by ``x^2 (1 - x^2 / 12)``: stable for x < 2 sqrt(3).
 """
 
+import jax.numpy as jnp
 import numpy as np
 
+from vmri_jax.mechanics.masses import ConstantMass
+from vmri_jax.mechanics.state import Problem
+from vmri_jax.mechanics.system import System
 from vmri_jax.schemes.path import lagrange_basis, lagrange_derivative
 from vmri_jax.schemes.quadrature import PlacedRule, Rule, midpoint
 from vmri_jax.schemes.scheme import Scheme
@@ -20,6 +24,35 @@ RESOLUTION = 0.05
 """Spacing of x along which the phase is unwrapped and limits are searched; with a larger value a narrow unstable interval is missed."""
 LARGEST_X = 30.0
 """Largest x searched for a limit; larger limits count as infinite."""
+
+
+def soft_spring(q_s, q_f, params):
+    """``V = kappa / 2 |q_s - q_f|^2``."""
+    return params["kappa"] / 2 * jnp.sum((q_s - q_f) ** 2)
+
+
+def stiff_spring(q_f, params):
+    """``W = omega^2 / 2 |q_f|^2``."""
+    return params["omega"] ** 2 / 2 * jnp.sum(q_f**2)
+
+
+def linear_model(omega=50.0, kappa=25.0) -> Problem:
+    """One slow and one fast variable of unit mass, ``V = kappa/2 (q_s - q_f)^2`` and ``W = omega^2/2 q_f^2``.
+
+    Starts at ``q_s = 1, q_f = 1 / omega`` with unit velocity of the fast variable.
+
+    Args:
+        omega: frequency of the fast variable alone.
+        kappa: stiffness of the spring between the two.
+    """
+    system = System(
+        ConstantMass([1.0], [1.0]),
+        soft_spring,
+        stiff_spring,
+        params={"omega": jnp.asarray(omega, dtype=float), "kappa": jnp.asarray(kappa, dtype=float)},
+    )
+    one = jnp.ones(1)
+    return Problem(system, one, one / omega, 0 * one, one)
 
 
 def phase(scheme: Scheme, x: float) -> float:

@@ -9,9 +9,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from vmri_jax import diagnostics, plots
+from vmri_jax import plots
 from vmri_jax.accuracy.families import Family
 from vmri_jax.accuracy.steps import check_extent, round_off
+from vmri_jax.mechanics.linearisation import linearise
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
 from vmri_jax.running.files import make_writable_folder
 from vmri_jax.running.progress import part, shows_progress
@@ -110,7 +111,7 @@ class CostReport(ResultTable):
 
 def default_t_end(problem: Problem) -> float:
     """PERIODS periods of the fastest vibration, rounded to one digit; 1 if nothing vibrates."""
-    frequency = float(diagnostics.frequencies(problem)[0])
+    frequency = float(linearise(problem).frequencies.max(initial=0.0))
     if not frequency > 0:
         return 1.0
     return float(f"{PERIODS * 2 * math.pi / frequency:.0e}")
