@@ -19,9 +19,6 @@ ELEMENTWISE = 16
 
 # Memory of the steppers from step to step, and special cases that they know. Results agree without them, up to the tolerance.
 
-SECANTS = 4
-"""Secant corrections of the slow update that steppers keep with constraints. With 2 or 8 of them steps of the atomic model with 100 micro steps take
-as many passes within a tenth; each costs a product and a sum of slow vectors in a pass."""
 SLOW_ORDER = 10
 """Highest order of the polynomial through the slow unknowns of the last steps that predicts the next step. With a lower order small steps take
 more passes; a higher order is never the best."""

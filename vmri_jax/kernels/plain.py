@@ -2,8 +2,6 @@
 
 import jax.numpy as jnp
 
-SECANTS = 0
-"""Steppers learn nothing from the updates of the slow variables."""
 SLOW_ORDER = 0
 """Order 0: slow unknowns start from their last values."""
 CONTRACTION = -1.0

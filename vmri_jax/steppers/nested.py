@@ -8,8 +8,7 @@ multipliers by the residual of the slow equations. All matrices are cheap approx
   rule, at the start of the macro step, or of an earlier one while that costs at most `EXTRA_PASSES`. Where the fast equations are explicit,
   ``K = -M_f`` and only the multipliers are unknown. ``G_1 K^-1 G_0^T`` is computed in the first pass and kept;
 * slow equations: the slow masses, the fast masses that constraints tie to them, and the slow constraint (`SlowEquations`). Without
-  constraints, the derivative of the slow forces is added where updates by the masses alone would cost a pass. With constraints, the updates
-  of the last passes correct it (`Secants`): fast variables that are stiff over a long macro step push back, which the masses do not know.
+  constraints, the derivative of the slow forces is added where updates by the masses alone would cost a pass.
 
 The slow unknowns start from a polynomial through the last steps (`PolynomialPredictor`), the fast increments from straight motion, the
 multipliers from the interval before. The residual is exact, so that these approximations change only the number of passes: mostly two
@@ -24,7 +23,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from vmri_jax.kernels import LINEARISES_FORCES, SECANTS, max_abs
+from vmri_jax.kernels import LINEARISES_FORCES, max_abs
 from vmri_jax.schemes.equations import StepEquations, Unknowns, multiplier_scales
 from vmri_jax.schemes.path import control_nodes
 from vmri_jax.steppers.accept import Accepted, expected
@@ -32,7 +31,6 @@ from vmri_jax.steppers.interval import Interval, Matrix, constant_mass
 from vmri_jax.steppers.micro_intervals import FastUnknowns, MicroSweep, SweepTotals
 from vmri_jax.steppers.predictors import PolynomialPredictor
 from vmri_jax.steppers.results import Method
-from vmri_jax.steppers.secants import Secants
 from vmri_jax.steppers.slow_equations import ConstraintInertia, SlowEquations
 from vmri_jax.steppers.solved import Solution, StepSolver, status_of
 from vmri_jax.steppers.solver import Solver, iterated
@@ -54,7 +52,6 @@ class NestedState(NamedTuple):
         ``|d_F - d| / |d_F|`` after a pass that moved by the update d_F with the derivative of the slow forces.
     fewest_passes: least number of passes of a step with this matrix.
     last_passes: number of passes of the last step.
-    secants: corrections of the slow update, with constraints; without these the derivative of the slow forces corrects it.
     """
 
     matrix: Matrix
@@ -63,7 +60,6 @@ class NestedState(NamedTuple):
     slow_model_error: Float[Array, ""]
     fewest_passes: Int[Array, ""]
     last_passes: Int[Array, ""]
-    secants: Secants
 
 
 class Pass(NamedTuple):
@@ -87,7 +83,6 @@ class Pass(NamedTuple):
     rows: Float[Array, ""]
     passes: Int[Array, ""]
     result: Int[Array, ""]
-    secants: Secants
 
 
 @dataclass(frozen=True)
@@ -108,8 +103,7 @@ class Nested(StepSolver):
         slow = PolynomialPredictor.constant(jnp.concatenate([increments.reshape(-1), jnp.zeros(r * n_gs)]))
         # with these numbers the first step renews the matrix
         fewest, last = jnp.asarray(0), jnp.asarray(2 * EXTRA_PASSES)
-        secants = Secants.none(increments.size, increments.size + r * n_gs)
-        return NestedState(matrix(equations), slow, jnp.zeros((r, n_g)), jnp.ones(()), fewest, last, secants)
+        return NestedState(matrix(equations), slow, jnp.zeros((r, n_g)), jnp.ones(()), fewest, last)
 
     def renew(self, equations: StepEquations, memory: NestedState) -> NestedState:
         """The memory with a new matrix K, unless K is constant.
@@ -145,7 +139,6 @@ class Nested(StepSolver):
             done.slow_model_error,
             jnp.minimum(memory.fewest_passes, done.passes),
             done.passes,
-            done.secants,
         )
         return Solution(x, end, status), learned
 
@@ -180,14 +173,7 @@ class _Passes:
         fast, totals = self.sweep.first_pass(self._apart(z)[0], self.memory.multiplier)
         inertia = self.slow_equations.constraint_inertia(jax.tree.map(lambda a: a[0], fast.schur_inverse))
         return self._judged(
-            z,
-            fast,
-            totals,
-            inertia,
-            error=self.memory.slow_model_error,
-            still_moves=totals.moved,
-            passes=1,
-            secants=self.memory.secants,
+            z, fast, totals, inertia, error=self.memory.slow_model_error, still_moves=totals.moved, passes=1
         )
 
     def next(self, last: Pass) -> Pass:
@@ -221,8 +207,6 @@ class _Passes:
             error=last.slow_model_error,
             still_moves=still_moves,
             passes=last.passes + 1,
-            secants=last.secants,
-            moved_by=d,
         )
 
     def _judged(
@@ -235,13 +219,10 @@ class _Passes:
         error,
         still_moves,
         passes,
-        secants: Secants,
-        moved_by=None,
     ) -> Pass:
         """A pass with slow unknowns z, with their next update d, and with the `Result` of the iteration so far.
 
-        `error` is its slow_model_error, `still_moves` the expected next correction of the fast increments, `moved_by` the update of z that
-        led to it.
+        `error` is its slow_model_error, `still_moves` the expected next correction of the fast increments.
         """
         equations, inverse_fast = self.equations, self.mass.fast_mass.inverse().times
         slow, slow_multiplier = self._apart(z)
@@ -250,22 +231,11 @@ class _Passes:
         arrives, leaves = inverse_fast(equations.micro_dt * equations.p_f), inverse_fast(totals.p_f)
         # size of the fast motion: largest |h M_f^-1 p_f| at both ends of the macro step
         motion = jnp.maximum(max_abs(arrives), max_abs(leaves))
-        d, secants = self._corrected(d, secants, moved_by, (max_abs(slow), motion), passes)
         changes = max_abs(d[: self.r * self.n_s]), still_moves
         result = self.newton.status(self.accepted.ratio(changes, (max_abs(slow), motion), passes), passes)
         rows = jnp.maximum(max_abs(rows), max_abs(self.mass.fast) * still_moves)
         passes = jnp.asarray(passes)
-        return Pass(slow, slow_multiplier, fast, totals, d, inertia, error, impulse, rows, passes, result, secants)
-
-    def _corrected(self, d, secants: Secants, moved_by, motions, passes):
-        """The slow update d with the corrections of the steps before, and with the one that the step `moved_by` to this pass shows."""
-        if not (SECANTS and self.equations.system.is_constrained and self.n_s):
-            return d, secants
-        if moved_by is None:
-            return secants.corrected(d), secants
-        goes_on = self.accepted.ratio((max_abs(d[: self.r * self.n_s]), 0.0), motions, passes) > 1
-        secants, d = secants.after(moved_by, d, goes_on)
-        return d, secants
+        return Pass(slow, slow_multiplier, fast, totals, d, inertia, error, impulse, rows, passes, result)
 
     def _apart(self, z):
         """Slow increments (r, n_s) and slow multipliers (r, n_gs) of z."""
