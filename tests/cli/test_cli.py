@@ -16,6 +16,7 @@ from typer.testing import CliRunner
 import vmri_jax as vm
 from vmri_jax import cli
 from vmri_jax.catalogue import SCHEMES, find_problem, find_scheme
+from vmri_jax.cli.run import default_save_every
 from vmri_jax.hard_cases import Outcome
 from vmri_jax.running.interrupts import Interrupted
 from vmri_jax.running.simulation import Simulation
@@ -298,7 +299,7 @@ def test_a_file_that_fails_to_run_says_where(vmri, tmp_path, source, message):
 
 @pytest.mark.parametrize(("steps", "save_every"), [(1, 1), (1000, 1), (2000, 2), (100_000, 100), (2003, 1), (3001, 1)])
 def test_about_a_thousand_nodes_are_saved(steps, save_every):
-    assert cli.run.default_save_every(steps) == save_every
+    assert default_save_every(steps) == save_every
 
 
 @pytest.fixture
