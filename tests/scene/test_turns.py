@@ -200,7 +200,7 @@ def test_starts_of_loops_count_the_turns_of_all_joints():
     scene = crank_rocker(coordinates="joint").with_joints({"hA": 7.0})
     (closed,) = cut(scene)
     x = dict(zip(scene.names.slow, np.asarray(scene.start[0]), strict=True))
-    (joint,) = (e for e in scene.bound if e.name == closed and isinstance(e, Hinge))
+    (joint,) = (e for e in scene.bound if e.name == closed and isinstance(e, Revolute))
     x[closed] = at_start(scene.sorting, joint, 0, "turn")
     assert x["hA"] == 7.0
     assert x["hA"] + x["hB"] + x["hC"] == pytest.approx(x["hD"], abs=1e-9)
