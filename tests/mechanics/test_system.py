@@ -45,6 +45,33 @@ def test_replace_changes_one_field_only():
     assert jax.tree.structure(system) == jax.tree.structure(changed)
 
 
+def test_terms_are_filtered_and_mapped(sam):
+    system = sam.system.replace(
+        potentials={"wells": double_well, 3: double_well}, params={**sam.system.params, "a": 2.0}
+    )
+    names = "T", "V", "W", "g", "g_s", "wells", 3
+    assert tuple(term.name for term in system.terms) == names
+    assert [term.label for term in system.of_kind("potential")] == ["V", "W", "wells", "V_3"]
+    assert [term.place for term in system.terms][-2:] == ["potentials['wells']", "potentials[3]"]
+    assert system.only(lambda term: True) == system
+    left = system.only(lambda term: term.name in ("W", 3))
+    assert [term.name for term in left.terms] == ["T", "W", 3]
+    assert not left.is_constrained
+
+    def twice(term):
+        return term.function if term.kind == "kinetic" else lambda *arguments: 2 * term.function(*arguments)
+
+    for values, doubled in (
+        (system.all_potentials(sam.q_s, sam.q_f), system.mapped(twice).all_potentials(sam.q_s, sam.q_f)),
+        (
+            {"g": system.constraints(0.0, sam.q_s, sam.q_f)},
+            {"g": system.mapped(twice).constraints(0.0, sam.q_s, sam.q_f)},
+        ),
+    ):
+        for name, value in values.items():
+            np.testing.assert_allclose(doubled[name], 2 * value, rtol=1e-15)
+
+
 def test_constraints_join_coupling_and_slow_ones(sam):
     values = sam.system.constraints(0.0, sam.q_s + 0.1, sam.q_f)
     assert values.shape == (4,)

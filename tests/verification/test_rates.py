@@ -202,6 +202,11 @@ def stiff(q_f, params):
     return 50 * jnp.sum(q_f**2 * (1 + q_f**2 / 10))
 
 
+def quartic(q_s, q_f, params):
+    """Of fast variables alone."""
+    return jnp.sum(q_f**4)
+
+
 def of_slow(q_s, q_f, params):
     """Of slow variables alone."""
     return jnp.sum(q_s**4)
@@ -240,6 +245,16 @@ PLACEMENTS = {
         vm.Scheme(
             6, kinetic=vm.micro(midpoint), slow=vm.macro(trapezoidal), fast=vm.micro(trapezoidal, every=2)
         ).with_potentials(a=KICKS),
+        FREE,
+    ),
+    "V, W and one more of fast variables between the grids": (
+        TWO.replace(slow_potential=middle, potentials={"slow": quartic}),
+        vm.Scheme(
+            6,
+            kinetic=vm.micro(midpoint),
+            slow=vm.micro(trapezoidal, every=2),
+            fast=vm.micro(trapezoidal, every=2),
+        ).with_potentials(slow=vm.micro(trapezoidal, every=2)),
         FREE,
     ),
     "of slow variables alone": (
