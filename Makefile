@@ -12,7 +12,7 @@ AS_USERS := tests/benchmarks tests/pages
 # Timed, or printed on a page: compiled as users compile.
 TOOLS := tests/tools tests/ensembles/test_workers.py
 
-.PHONY: reproduce test test-quick test-tools smoke notebooks docs bench lint lock clean
+.PHONY: reproduce test test-quick test-tools smoke notebooks docs bench lint release lock clean
 
 reproduce: .venv/installed  ## the quick reference study: figures, tables and out/report.html
 	$(BIN)/python -m benchmarks gail2014 --quick --out out
@@ -42,6 +42,9 @@ bench: .venv/installed  ## the quick measurements: time, memory, against C; out/
 
 lint: .venv/installed  ## format, lint and types, as pre-commit runs them
 	$(BIN)/ruff format --check . && $(BIN)/ruff check . && $(BIN)/pyright
+
+release:  ## dist/: source archive and wheel, and README's program in an empty environment with the wheel alone
+	.ci/release $(PYTHON)
 
 lock:  ## pin the newest versions for both: make lock OLDER=python3.11 NEWER=python3.13; see .ci/lock
 	$(OLDER) .ci/lock $(OLDER) $(NEWER)
