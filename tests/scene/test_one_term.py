@@ -1,16 +1,19 @@
 """Effects of one kind on one grid are one term of the system; their parameters, rows and names stay those of each effect."""
 
 from itertools import pairwise
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from vmri_jax.scene import (
     Anchor,
     Body,
     Box,
     Dashpot,
+    Drive,
     Gravity,
     JointSpring,
     LinearDamping,
@@ -20,8 +23,11 @@ from vmri_jax.scene import (
     RigidLink,
     Scene,
     Spring,
+    SpringAnchor,
     assembly,
 )
+from vmri_jax.scene.declare import effect_class, names, positive
+from vmri_jax.scene.effect import Effect
 
 N = 4
 BARS = [
@@ -112,3 +118,49 @@ def test_six_hinges_cost_what_six_elements_of_one_hinge_cost(monkeypatch):
     assert [*scene.names.slow_constraint] == [*(f"rigid {bar.name}" for bar in bars), *(hinge.name for hinge in hinges)]
     monkeypatch.setattr(assembly, "joined", lambda terms, in_order=False: tuple(terms))
     assert equations(scene) > 1.3 * alone  # measured: 1.47
+
+
+def test_a_number_in_a_list_is_the_number_of_a_single_element():
+    """Joined with others, an axis too many would make a table of all numbers with all elements."""
+    bodies = [Body("a", 1.0, [1.0, 0.0, 0.0]), Body("b", 2.0, [0.0, 1.0, 0.0])]
+
+    def energy(*stiffness):
+        springs = [
+            SpringAnchor([name], [0.0, 0.0, 0.0], k, name=f"to {name}") for name, k in zip("ab", stiffness, strict=True)
+        ]
+        scene = Scene(bodies, springs)
+        return sum(scene.system().all_potentials(*scene.start[:2]).values())
+
+    assert energy([4.0], [9.0]) == energy(4.0, [9.0]) == energy(4.0, 9.0) == (4.0 + 9.0) / 2
+
+
+@effect_class
+class Quartic(Effect):
+    """A potential of one body, written for one element."""
+
+    body: Any = names()
+    k: Any = positive()
+
+    kind = "potential"
+
+    @staticmethod
+    def function(q, params):
+        return params["k"] * jnp.sum(q[0] ** 2) ** 2
+
+
+def test_functions_of_the_user_are_not_joined():
+    bodies = [Body("a", 1.0, [1.0, 0.0, 0.0]), Body("b", 2.0, [0.0, 2.0, 0.0])]
+    scene = Scene(bodies, [Quartic("a", 1.0, name="x"), Quartic("b", 3.0, name="y")])
+    assert sum(scene.system().all_potentials(*scene.start[:2]).values()) == 1.0 * 1.0 + 3.0 * 16.0
+
+
+def test_a_drive_acts_on_a_point_in_a_rigid_body():
+    body = RigidBody("R", 2.0, Box((0.1, 0.2, 1.0)), [0.0, 0.0, 0.0])
+    drive = Drive(("R", [0.0, 0.0, 0.5]), lambda t, params: params["size"] * jnp.array([1.0, 0.0, 0.0]), {"size": 3.0})
+    scene = Scene([body], [drive], coordinates="directors")
+    q_s, q_f, v_s, v_f = scene.start
+    force = np.concatenate(scene.system().forces(0.0, q_s, q_f, v_s, v_f))
+    np.testing.assert_allclose(force[:3], [3.0, 0.0, 0.0])
+    np.testing.assert_allclose(force[9:12], [1.5, 0.0, 0.0])  # half the force on the third director
+    with pytest.raises(ValueError, match="params"):
+        Scene([body], [Drive("R", lambda t, params: jnp.ones(3), 2.0)])

@@ -247,14 +247,14 @@ PLACEMENTS = {
         ).with_potentials(a=KICKS),
         FREE,
     ),
-    "V, W and one more of fast variables between the grids": (
-        TWO.replace(slow_potential=middle, potentials={"slow": quartic}),
+    "V, W and more of fast variables between the grids": (
+        TWO.replace(slow_potential=middle, potentials={"slow": quartic, "V beside slow": middle}),
         vm.Scheme(
             6,
             kinetic=vm.micro(midpoint),
             slow=vm.micro(trapezoidal, every=2),
             fast=vm.micro(trapezoidal, every=2),
-        ).with_potentials(slow=vm.micro(trapezoidal, every=2)),
+        ).with_potentials(**{name: vm.micro(trapezoidal, every=2) for name in ("slow", "V beside slow")}),
         FREE,
     ),
     "of slow variables alone": (

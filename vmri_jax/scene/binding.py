@@ -13,7 +13,7 @@ from vmri_jax.mechanics.rows import Place, Rows
 from vmri_jax.scene.body import GROUND, Attachment, Bodies, Point, body_of, end_of, label_of, moving
 from vmri_jax.scene.declare import Elements, Parameter, effect_class, real_tree, stacked
 from vmri_jax.scene.layout import Key, Layout
-from vmri_jax.scene.terms import EffectTerm, Role, Source, choose
+from vmri_jax.scene.terms import EffectTerm, Role, Source, choose, is_of_package
 
 MOST_ROLES = 32
 """Most bodies of an element: the two bodies of each of sixteen joints that one equation couples. More are refused."""
@@ -41,8 +41,6 @@ class Bindable(ABC):
     """Names of parameters that are computed from fields and bodies, and have an entry for each element."""
     whole: ClassVar[bool] = False
     """Whether the function gets all coordinates of a rigid body instead of the coordinates of its centre."""
-    of_many: ClassVar[bool] = True
-    """Whether the function takes any number of elements; effects of one kind with such a function are one term of the system."""
     name: str = field(default="", kw_only=True)
     rate: Literal["slow", "fast", "auto"] | int = field(default="auto", kw_only=True)
 
@@ -200,7 +198,8 @@ class Bindable(ABC):
         """A function of some elements as a term."""
         select = None if len(group) == len(self.elements) else tuple(group)
         split, sources = self.split_of(self.parameters), (Source(self.name, len(group), select),)
-        is_joined = self.of_many and len(split) == len(self.parameters)  # no parameter is common to all elements
+        # A function of the user may be right for a single element alone; no parameter may be common to all elements.
+        is_joined = is_of_package(function) and len(split) == len(self.parameters)
         return EffectTerm(sources, function, tuple(roles), split, self.timed, is_joined)
 
     def _role(self, parameter: str, names: Sequence[str], places: Mapping[str, Place]) -> Role:

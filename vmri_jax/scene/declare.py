@@ -93,6 +93,8 @@ class Parameter:
             raise ValueError(
                 f"{about} has shape {value.shape}; give one number, or one for each of the {count} elements."
             )
+        if self.shape == "number" and count == 1:
+            return value.reshape(())  # a single element has no axis, also if its number is given in a list
         if self.shape in ("number", "array") or (self.may_be_number and value.ndim == 0):
             return value
         value = library(value).atleast_1d(value)

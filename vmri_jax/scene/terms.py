@@ -30,6 +30,16 @@ class Applied:
         return self.function(*self.arguments, *arguments)
 
 
+def is_of_package(function: Callable) -> bool:
+    """Whether a function, with all functions that are filled in, is part of this package: these act element by element on any number of elements.
+
+    A function of the user may be right for a single element alone, such as ``sum(q**2)**2``.
+    """
+    if isinstance(function, Applied):
+        return all(is_of_package(part) for part in (function.function, *function.arguments) if callable(part))
+    return str(getattr(function, "__module__", "")).startswith(f"{__name__.partition('.')[0]}.")
+
+
 def split(q):
     """Centre (..., 3) and directors (..., k, 3), a director per row, of the coordinates q (..., 3 + 3 k) of a rigid body."""
     triples = q.reshape(*q.shape[:-1], -1, 3)

@@ -66,8 +66,9 @@ def _part(
 ) -> tuple[System, Scheme]:
     """A part with its masses and the constraint of this field, and its scheme; W, or else V, is its fast potential."""
     main = next((part for name in ("W", "V") for part in potentials if part.term.name == name), None)
-    # beside W a potential must not be called V
-    further = {"V alone" if part.term.name == "V" else part.term.label: part for part in potentials if part is not main}
+    further = {part.term.label: part for part in potentials if part is not main}
+    if "V" in further:  # beside W a potential must not be called V, nor as any other one
+        further["V beside " + ", ".join(further)] = further.pop("V")
     rows = (Rheonomic(OfPart(term, *positions)) for term in system.terms if term.field == constraint)
     alone = System(
         ConstantMass(jnp.zeros(0), mass),

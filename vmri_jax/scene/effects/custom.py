@@ -49,7 +49,6 @@ class CustomEffect(Effect):
 
     same_size = False
     whole = True
-    of_many = False
 
     def __post_init__(self):
         if not callable(self.function):

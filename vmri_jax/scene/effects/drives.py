@@ -77,7 +77,7 @@ class Drive(Effect):
     Args:
         bodies: a name, or a list of names; each gets this force.
         history: ``history(t, params) -> (d,)``, N.
-        params: of `history`. They may change without a new compilation, and runs have derivatives with respect to them.
+        params: of `history`, numbers by name. They may change without a new compilation, and runs have derivatives with respect to them.
     """
 
     bodies: Any = names()
@@ -92,7 +92,10 @@ class Drive(Effect):
         return Applied(same_on_all, (self.history,))
 
     def _parameters(self):
-        return real_tree(f"{self.name}: params", self.params)
+        params = real_tree(f"{self.name}: params", self.params)
+        if not isinstance(params, dict):
+            raise ValueError(f"{self.name}: params is {self.params!r}; give numbers by name, such as {{'size': 2.0}}.")
+        return params | self.points
 
     def check_parameters(self):
         super().check_parameters()
