@@ -284,5 +284,8 @@ def test_forces_have_units_and_name_the_joints_without_curves(sliding_door, monk
     forces = {"stop": {"hinge": np.ones((5, 1)), "rail": np.ones((5, 1))}}
     monkeypatch.setattr(vm.Trajectory, "reaction_forces", lambda run: forces)
     figure = sliding_door.plot_forces()
-    assert [axes.get_ylabel() for axes in figure.axes] == ["reaction force\nN", "reaction torque\nN m"]
+    assert [axes.get_ylabel() for axes in figure.axes] == [
+        "reaction force\nN in SI units",
+        "reaction torque\nN m in SI units",
+    ]
     assert "by_directors" in figure.get_supxlabel()

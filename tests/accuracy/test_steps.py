@@ -47,8 +47,9 @@ def test_true_error_is_below_the_accuracy(name, accuracy):
 
 def test_a_scheme_of_ones_own_keeps_its_rules():
     told = []
-    how = {"accuracy": 1e-4, "t_end": LENGTH, "error": True, "progress": lambda *call: told.append(call)}
-    run = vm.simulate(SYSTEMS["no_constraint"], vm.fully_explicit(2), **how)
+    how = {"accuracy": 1e-4, "t_end": LENGTH, "error": True}
+    bar = vm.Save(progress=lambda *call: told.append(call))
+    run = vm.simulate(SYSTEMS["no_constraint"], vm.fully_explicit(2), save=bar, **how)
     assert told[0] == ("trial of own, 2 micro, 16 macro steps", 0, 5)
     assert [done for _, done, _ in told] == [*range(len(told))]
     assert run.error.largest <= 1e-4

@@ -134,7 +134,7 @@ def _moduli(run: SavedRun) -> dict[str, dict[str, np.ndarray]]:
         for name, size in largest.items():
             if not size > LEAST_SHOWN * max(largest.values()):
                 del curves[name]
-    return {f"reaction {unit}\n{UNITS[unit]}": curves for unit, curves in panels.items() if curves}
+    return {f"reaction {unit}\n{UNITS[unit]} in SI units": curves for unit, curves in panels.items() if curves}
 
 
 def position_panels(run: SavedRun) -> list[tuple[np.ndarray, list[str], str, np.ndarray | None]]:
