@@ -153,7 +153,7 @@ def cost_study(
                 progress(f"{label} {method}, {n} micro steps: compiling".strip(), len(runs), total)
                 num_steps = max(1, round(t_end / (n * micro_dt)))
                 start = time.perf_counter()
-                length = {"macro_dt": n * micro_dt, "num_steps": num_steps, "save_every": num_steps}
+                length = {"macro_dt": n * micro_dt, "num_steps": num_steps, "save": num_steps}
                 program = prepare(problem, scheme(n), **length, solver=solver)
                 first_call_seconds = time.perf_counter() - start
                 runs.append((method, program, first_call_seconds, program(throw=False)))
