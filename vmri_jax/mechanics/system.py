@@ -148,7 +148,7 @@ class System(eqx.Module):
         return tuple(term for term in self.terms if term.kind == kind)
 
     def only(self, keep: Callable[[Term], bool]) -> "System":
-        """The same kinetic energy, and those of the other terms for which `keep` is true."""
+        """The system with its kinetic energy, and with the other terms for which `keep` is true."""
         return self.mapped(lambda term: term.function if term.kind == "kinetic" or keep(term) else None)
 
     def mapped(self, changed: Callable[[Term], Any]) -> "System":
@@ -306,7 +306,7 @@ def _named_potentials(potentials, order: Order | None) -> "Potentials":
 
 
 def _check_function(name: str, function, before: str = "") -> None:
-    """Refuse a function without a hash, or whose arguments are not `before` and then those of its `Kind`."""
+    """Refuse a function without a hash, or whose arguments are not `before` and then the arguments of its `Kind`."""
     try:
         hash(function)
     except TypeError:

@@ -24,11 +24,11 @@ POSITIONS, VELOCITIES = ("q_s", "q_f"), ("v_s", "v_f")
 
 
 class Kind(NamedTuple):
-    """What `System` expects of one of its functions.
+    """The requirements of `System` on one of its functions.
 
     symbol: of the term; empty for further potentials, whose symbols are their names.
     kind: "kinetic", "potential", "constraint", "force" or "implied".
-    arguments: names of the arguments, without time and params.
+    arguments: names of the arguments, without params; rows may have t before them, see `Rheonomic`.
     in_words: for summaries, before the symbol or name.
     """
 
