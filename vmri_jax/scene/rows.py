@@ -1,10 +1,10 @@
 """The rows of a scene's constraints: names, also of coordinates, values and Jacobian at any positions."""
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
-from itertools import chain
+from functools import cached_property, partial
+from itertools import groupby
 from typing import Any, NamedTuple
 
 import jax
@@ -21,6 +21,7 @@ from vmri_jax.scene.effects.freedoms import ANGLES
 from vmri_jax.scene.layout import Key, join
 from vmri_jax.scene.rates import positions
 from vmri_jax.scene.sorting import HOMES, Home, Placed, Sorting
+from vmri_jax.scene.terms import EffectTerm, alike, is_of_package
 
 CANCELLED = 1e-14
 """An entry of the Jacobian dg/dq is the product of the row dg/dQ and the column dQ/dq. If it is below this fraction of the product of
@@ -30,6 +31,9 @@ short levers; with a smaller value round-off counts as an independent row."""
 REACHED = 1e-12
 """Newton's iteration ends when rows, relative to their sizes, are below this value, which is near round-off. With a larger value loops have a
 visible gap, which the initial state refuses, and dropped rows carry the remaining error."""
+COMPLEX_STEP = 1e-30
+"""Imaginary step h of derivatives, relative to coordinates of any unit: its square is below round-off of every value. A larger step is felt in
+values; a smaller one may underflow in products."""
 CORRECTIONS = 20
 """Most corrections of Newton's iteration; from nearby six reach round-off. More only delay the message that it fails."""
 
@@ -40,6 +44,7 @@ class Row(NamedTuple):
     label: of its element: the name of the effect and, if it has several elements, names of the bodies.
     name: of the effect and the bodies, with a number if an element has several rows.
     part: number of its entry in `Sorting.placed`, which has this effect and home.
+    element: number of its element in the effect.
     number: of the row in this entry, in the order of its terms.
     kept: False for a row that the scene leaves out.
     """
@@ -47,6 +52,7 @@ class Row(NamedTuple):
     label: str
     name: str
     part: int
+    element: int
     number: int
     effect: Effect
     home: Home
@@ -66,17 +72,41 @@ def rows_of(placed: Sequence[Placed]) -> list[Row]:
                 named = f"{effect.name} {'-'.join(map(label_of, effect.elements[element]))}"
                 label = effect.name if len(effect.elements) == 1 else named
                 for name in [named] if size == 1 else [f"{named} [{j}]" for j in range(size)]:
-                    rows.append(Row(label, name, i, number, effect, part.home, number not in part.dropped))
+                    rows.append(Row(label, name, i, element, number, effect, part.home, number not in part.dropped))
                     number += 1
     return rows
 
 
-class _Element(NamedTuple):
-    """An element of a constraint, see `Effect.element_term`, and numbers of its coordinates in (Q_s, Q_f)."""
+class _Group(NamedTuple):
+    """n elements of constraints that are one function of their c coordinates, see `Effect.element_term`.
 
-    value: TracedOnce
-    params: dict[str, Any]
+    params, columns, rows: with an axis for the elements; columns (n, c) are numbers of the coordinates in (Q_s, Q_f), rows (n, m) of the rows.
+    """
+
+    term: EffectTerm
+    is_analytic: bool
+    params: Any
     columns: np.ndarray
+    rows: np.ndarray
+
+    def at_complex(self, q: np.ndarray, t: float) -> tuple[np.ndarray, np.ndarray]:
+        """Values (n, m) and derivatives (n, m, c), by a complex step: ``g(q + i h e) = g + i h dg/dq e`` to round-off, with a tiny h."""
+        (n, c), x, params = self.columns.shape, q[self.columns], self.params
+        steps = 1j * COMPLEX_STEP * np.eye(c)[:, None]
+        if n == 1:  # a path of the user takes the params of a single element
+            x, steps, params = x[0], steps[:, 0], jax.tree.map(lambda a: a[0], params)
+        values = np.asarray(self.term.value(x + steps, None, params, t)).reshape(c, n, -1)
+        return values[0].real, np.moveaxis(values.imag, 0, -1) / COMPLEX_STEP
+
+
+@dataclass(frozen=True)
+class _Values:
+    """The rows (m,) of an element at the coordinates of its bodies."""
+
+    term: EffectTerm
+
+    def __call__(self, q, params, t):
+        return jnp.ravel(self.term.value(q, None, params, t))
 
 
 @dataclass(frozen=True)
@@ -90,7 +120,7 @@ class ConstraintRows:
     """
 
     rows: tuple[Row, ...]
-    elements: tuple[_Element, ...]
+    groups: tuple[_Group, ...]
     start: np.ndarray
     masses: np.ndarray
     scales: np.ndarray
@@ -112,20 +142,22 @@ class ConstraintRows:
         of_bodies = join(bodies, layout, "s", "masses"), join(bodies, layout, "f", "masses")
         is_known = is_concrete(of_bodies)
         masses = np.concatenate(of_bodies) @ (jacobian * jacobian) if is_known else np.ones_like(start)
-        elements = [element for part in constraints for element in _elements(part, columns)]
-        return cls(
-            tuple(rows_of(sorting.placed)), tuple(elements), start, masses, _scales(sorting), layout.sizes[0], to_bodies
-        )
+        rows = tuple(rows_of(sorting.placed))
+        groups = tuple(_groups(rows, columns))
+        return cls(rows, groups, start, masses, _scales(sorting), layout.sizes[0], to_bodies)
 
     def evaluate(self, t: float, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Values g (k,) and Jacobian dg/dq (k, n) at a time and at positions (n,)."""
         q_bodies, by_coordinates = self.to_bodies(q)
-        values, by_bodies, first = np.empty(len(self.rows)), np.zeros((len(self.rows), q_bodies.size)), 0
-        for element in self.elements:
-            value, entries = _value_and_jacobian(element.value, element.params, q_bodies[element.columns], t)
-            values[first : first + value.size] = value
-            by_bodies[first : first + value.size, element.columns] = entries
-            first += value.size
+        values, by_bodies = np.empty(len(self.rows)), np.zeros((len(self.rows), q_bodies.size))
+        compiled = [group for group in self.groups if not group.is_analytic]
+        functions = [TracedOnce(_Values(group.term)) for group in compiled]
+        arguments = [(q_bodies[group.columns], group.params) for group in compiled]
+        of_compiled = iter(jax.device_get(_values_and_jacobians(functions, arguments, t)) if compiled else ())
+        for group in self.groups:
+            of_rows, entries = group.at_complex(q_bodies, t) if group.is_analytic else next(of_compiled)
+            values[group.rows] = of_rows
+            by_bodies[group.rows[:, :, None], group.columns[:, None]] = entries
         # dg/dq = dg/dQ dQ/dq, without entries that are round-off
         jacobian = by_bodies @ by_coordinates
         lengths = np.linalg.norm(by_bodies, axis=1)[:, None] * np.sqrt((by_coordinates * by_coordinates).sum(axis=0))
@@ -176,26 +208,37 @@ class ConstraintRows:
         return [i for i, row in enumerate(self.rows) if row.kept and home in (None, row.home)]
 
 
-def _elements(part: Placed, columns: dict[str | Key, np.ndarray]):
-    """The elements of an effect, in the order of its terms."""
-    effect = part.effect
-    for i in chain(*effect.by_size(part.elements)):
+def _groups(rows: Sequence[Row], columns: dict[str | Key, np.ndarray]) -> Iterator[_Group]:
+    """The elements of all constraints, of which these are all rows."""
+    items = []
+    for _, numbers in groupby(range(len(rows)), key=lambda k: (rows[k].part, rows[k].element)):
+        effect, i = rows[(of_element := [*numbers])[0]].effect, rows[of_element[0]].element
         freedoms = [key for key in effect.freedoms_of(i) if key in columns]
-        of_element = np.concatenate([columns[name] for name in (*moving(effect.elements[i]), *freedoms)])
+        of_bodies = np.concatenate([columns[name] for name in (*moving(effect.elements[i]), *freedoms)])
         term, params = effect.element_term(i, freedoms)
-        yield _Element(TracedOnce(term.value), params, of_element)
+        # a function of the user may be right for a single element alone
+        alone = effect.is_analytic and not is_of_package(term.function) and of_element[0]
+        items.append(((term, effect.is_analytic, alone), (params, of_bodies, np.array(of_element))))
+    for (term, is_analytic, _), _, arrays in alike(items):
+        yield _Group(term, is_analytic, *arrays)
 
 
 @quickly_compiled
-def _value_and_jacobian(function: TracedOnce, params, q, t):
-    """Values (m,) of an element, and their derivatives with respect to the coordinates q of its bodies."""
+def _values_and_jacobians(functions: Sequence[TracedOnce], arguments, t):
+    """Values (n, m) of n elements of each function, and their derivatives (n, m, c) by the coordinates of their bodies."""
 
-    def values(q):
-        value = jnp.reshape(function(q, None, params, t), (-1,))
-        return value, value
+    def of_element(function, q, params):
+        def values(q):
+            value = function(q, params, t)
+            return value, value
 
-    jacobian, value = jax.jacfwd(values, has_aux=True)(q)
-    return value, jacobian
+        jacobian, value = jax.jacfwd(values, has_aux=True)(q)
+        return value, jacobian
+
+    return [
+        jax.vmap(partial(of_element, function))(*of_function)
+        for function, of_function in zip(functions, arguments, strict=True)
+    ]
 
 
 def _scales(sorting: Sorting) -> np.ndarray:

@@ -3,7 +3,7 @@
 All classes here are compared by value: scenes of the same structure give equal functions, which JAX compiles only once.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
 from itertools import chain, groupby
@@ -49,7 +49,7 @@ def split(q):
 def place(q, weights):
     """``phi + sum_i X_i d_i``, (..., 3), of the coordinates q of a body, which may have fewer than three directors, and the components X of a point."""
     phi, d = split(q)
-    return phi + jnp.sum(weights[..., : d.shape[-2], None] * d, axis=-2)
+    return phi + (weights[..., : d.shape[-2], None] * d).sum(axis=-2)
 
 
 @dataclass(frozen=True)
@@ -103,8 +103,7 @@ class Role:
         return self.rows.put(force, n_s, n_f)
 
     def _shaped(self, vector):
-        vector = jnp.asarray(vector)
-        return vector if self.count == 1 else jnp.broadcast_to(vector, (self.count, self.size))
+        return vector if self.count == 1 else np.broadcast_to(vector, (self.count, self.size))
 
 
 class Source(NamedTuple):
@@ -243,6 +242,18 @@ def _as_one(terms: Sequence[Any]) -> Any:
         return terms[0]
     roles = (Role.joined(roles) for roles in zip(*(term.roles for term in terms), strict=True))
     return replace(terms[0], sources=tuple(chain(*(term.sources for term in terms))), roles=tuple(roles))
+
+
+def alike(items: Iterable[tuple[Hashable, Any]]) -> Iterator[tuple[Any, list[int], Any]]:
+    """Pairs (key, pytree of NumPy arrays) in groups of equal keys and shapes: (key, numbers of the pairs, pytree with an axis for these)."""
+    groups: dict[Any, list[int]] = {}
+    trees = []
+    for number, (key, tree) in enumerate(items):
+        leaves, structure = jax.tree.flatten(tree)
+        groups.setdefault((key, structure, *map(np.shape, leaves)), []).append(number)
+        trees.append(tree)
+    for (key, *_), numbers in groups.items():
+        yield key, numbers, jax.tree.map(lambda *leaves: np.stack(leaves), *(trees[number] for number in numbers))
 
 
 def pick(values, select: Sequence[int]):
