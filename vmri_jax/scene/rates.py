@@ -10,7 +10,6 @@ acceleration alpha that it gives to bodies at rest, and the size L of the scene.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from itertools import chain, pairwise
 from typing import NamedTuple
@@ -26,7 +25,6 @@ from vmri_jax.mechanics.linearisation import mass_orthonormal
 from vmri_jax.mechanics.motion import force_of
 from vmri_jax.scene.body import LARGEST_POINT, Bodies, label_of, moving
 from vmri_jax.scene.effect import Effect
-from vmri_jax.scene.terms import EffectTerm, alike
 
 SEPARATION = 3.0
 """Smallest ratio of neighbouring rates that separates slow from fast: below it micro steps cost more than they save. With a larger value
@@ -69,7 +67,7 @@ def measure(bodies: Bodies, effects: Sequence[Effect]) -> dict[str, Rates]:
     columns = dict(zip(bodies, np.split(np.arange(sum(sizes)), np.cumsum(sizes)[:-1]), strict=True))
     # M = A^T diag(m) A with the motions A of each body, plus d2L/dv2 of kinetic effects
     mass = np.asarray(block_diag(*(body.motions.T @ (body.masses[:, None] * body.motions) for body in bodies.values())))
-    elements = dict(zip([effect.name for effect in effects], _linearise(effects, bodies, columns), strict=True))
+    elements = {effect.name: _linearise(effect, bodies, columns) for effect in effects}
     for element in chain(*elements.values()):
         mass[np.ix_(element.columns, element.columns)] += element.mass
     points = positions(bodies)
@@ -124,78 +122,55 @@ def _rates(effect: Effect, elements: Sequence[Linearised], mass: np.ndarray, siz
     return Rates(frequency, rate)
 
 
-def _linearise(effects: Sequence[Effect], bodies: Bodies, columns: Mapping[str, np.ndarray]) -> list[list[Linearised]]:
-    """The elements of each effect at the start; `columns` of each body, see `Linearised`. One program has the derivatives of all of them."""
-    items = []
-    for effect in effects:
-        for i, element in enumerate(map(moving, effect.elements)):
-            term, params = effect.element_term(i)
-            q, v = (np.concatenate([getattr(bodies[name], of) for name in element]) for of in ("coordinates", "rates"))
-            items.append((_Lagrangian(term, effect.kind == "kinetic"), (q, v, params)))
-    if not items:
-        return [[] for _ in effects]
-    functions, numbers, arguments = zip(*alike(items), strict=True)
-    derivatives = jax.device_get(_derivatives(list(map(TracedOnce, functions)), arguments))
-    of_item = {
-        k: [a[i] for a in group] for group, of in zip(derivatives, numbers, strict=True) for i, k in enumerate(of)
-    }
-    in_order = iter(range(len(items)))
-    return [
-        [_in_motions(effect, i, bodies, columns, of_item[next(in_order)]) for i in range(len(effect.elements))]
-        for effect in effects
-    ]
+def _linearise(effect: Effect, bodies: Bodies, columns: Mapping[str, np.ndarray]) -> list[Linearised]:
+    """The elements of an effect at the start; `columns` of each body, see `Linearised`."""
+    linearised = []
+    for i, element in enumerate(map(moving, effect.elements)):
+        term, element_params = effect.element_term(i)
+        q = np.concatenate([bodies[name].coordinates for name in element])
+        v = np.concatenate([bodies[name].rates for name in element])
+        is_kinetic = effect.kind == "kinetic"
+        function = TracedOnce(term.kinetic if is_kinetic else term.value)
+        force, *matrices = map(np.asarray, _derivatives(function, is_kinetic, q, v, element_params))
+        each = [bodies[name].motions for name in element]
+        motions = block_diag(*each)
+        force, (stiffness, gyroscopic, mass) = motions.T @ force, [motions.T @ matrix @ motions for matrix in matrices]
+        if not all(np.isfinite(part).all() for part in (force, stiffness, gyroscopic, mass)):
+            raise ValueError(
+                f"{effect.name}: its energy between {', '.join(map(label_of, effect.elements[i]))} has no finite derivatives at the "
+                "start; move these bodies, or smooth the energy."
+            )
+        # the first three coordinates of a rigid body are its centre, all others directors
+        centres = [(m, 3 if bodies[name].rigid else bodies[name].size) for m, name in zip(each, element, strict=True)]
+        translation = np.asarray(block_diag(*(m[:k] for m, k in centres)))
+        turning = np.asarray(block_diag(*(m[k:] for m, k in centres)))
+        joined_columns = np.concatenate([columns[name] for name in element])
+        linearised.append(Linearised(joined_columns, force, stiffness, gyroscopic, mass, translation, turning))
+    return linearised
 
 
-def _in_motions(effect: Effect, i: int, bodies: Bodies, columns, derivatives: Sequence[np.ndarray]) -> Linearised:
-    """Element i in the velocities of its bodies, from its force, K, G and d2L/dv2 in coordinates."""
-    element = moving(effect.elements[i])
-    each = [bodies[name].motions for name in element]
-    motions, (force, *matrices) = block_diag(*each), derivatives
-    force, (stiffness, gyroscopic, mass) = motions.T @ force, [motions.T @ matrix @ motions for matrix in matrices]
-    if not all(np.isfinite(part).all() for part in (force, stiffness, gyroscopic, mass)):
-        raise ValueError(
-            f"{effect.name}: its energy between {', '.join(map(label_of, effect.elements[i]))} has no finite derivatives at the "
-            "start; move these bodies, or smooth the energy."
-        )
-    # the first three coordinates of a rigid body are its centre, all others directors
-    centres = [(m, 3 if bodies[name].rigid else bodies[name].size) for m, name in zip(each, element, strict=True)]
-    translation = np.asarray(block_diag(*(m[:k] for m, k in centres)))
-    turning = np.asarray(block_diag(*(m[k:] for m, k in centres)))
-    joined_columns = np.concatenate([columns[name] for name in element])
-    return Linearised(joined_columns, force, stiffness, gyroscopic, mass, translation, turning)
+@partial(quickly_compiled, static_argnames="kinetic")
+def _derivatives(function: TracedOnce, kinetic: bool, q, v, params):
+    """The force, K, G and d2L/dv2 of an element, whose value or kinetic energy is `function`, in the coordinates of its bodies."""
+    # the derivatives of L = -V(q) by velocities are zero: tracing and compiling them would take time for nothing
+    if not kinetic:
 
+        def gradient(q):
+            values = jax.grad(function)(q, None, params)
+            return values, values
 
-@dataclass(frozen=True)
-class _Lagrangian:
-    """``L(q, v)`` of an element: its kinetic energy, or minus its potential."""
+        stiffness, values = jax.jacfwd(gradient, has_aux=True)(q)
+        zero = jnp.zeros_like(stiffness)
+        return -values, stiffness, zero, zero
 
-    term: EffectTerm
-    is_kinetic: bool
+    def lagrangian(q, v):
+        return function(q, None, v, None, params)
 
-    def __call__(self, q, v, params):
-        return self.term.kinetic(q, None, v, None, params) if self.is_kinetic else -self.term.value(q, None, params)
-
-
-@quickly_compiled
-def _derivatives(lagrangians: Sequence[TracedOnce], arguments):
-    """The force, K, G and d2L/dv2 of all elements of each L, in the coordinates of their bodies; `arguments` are their (q, v, params)."""
-
-    def of_element(function: TracedOnce, q, v, params):
-        # the derivatives of L = -V(q) by velocities are zero: tracing and compiling them would take time for nothing
-        if not function.function.is_kinetic:
-            gradient = jax.grad(function)
-            stiffness = -jax.jacfwd(gradient)(q, v, params)
-            return gradient(q, v, params), stiffness, jnp.zeros_like(stiffness), jnp.zeros_like(stiffness)
-
-        def lagrangian(q, v):
-            return function(q, v, params)
-
-        force = partial(force_of, lagrangian)
-        by_velocities, at_rest = jax.jacfwd(force, 1)(q, v), jax.grad(lagrangian)(q, jnp.zeros_like(v))
-        gyroscopic = (by_velocities - by_velocities.T) / 2
-        return at_rest, -jax.jacfwd(force)(q, v), gyroscopic, jax.hessian(lagrangian, 1)(q, v)
-
-    return [jax.vmap(partial(of_element, f))(*of_f) for f, of_f in zip(lagrangians, arguments, strict=True)]
+    force = partial(force_of, lagrangian)
+    by_velocities = jax.jacfwd(force, 1)(q, v)
+    at_rest = jax.grad(lagrangian)(q, jnp.zeros_like(v))
+    gyroscopic = (by_velocities - by_velocities.T) / 2
+    return at_rest, -jax.jacfwd(force)(q, v), gyroscopic, jax.hessian(lagrangian, 1)(q, v)
 
 
 def positions(bodies: Bodies) -> np.ndarray:

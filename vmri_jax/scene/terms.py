@@ -3,7 +3,7 @@
 All classes here are compared by value: scenes of the same structure give equal functions, which JAX compiles only once.
 """
 
-from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
 from itertools import chain, groupby
@@ -81,9 +81,12 @@ class Role:
 
     def positions(self, q_s, q_f, params):
         """(d,) or (n, d) coordinates or points."""
+        return self.of_bodies(None if self.rows is None else self.rows.take(q_s, q_f), params)
+
+    def of_bodies(self, q, params):
+        """Coordinates or points, from the coordinates of the bodies, which the ground does not need."""
         if self.rows is None:
             return params[self.point][..., : self.size] if self.point else self._shaped(GROUND_COORDINATES)
-        q = self.rows.take(q_s, q_f)
         return place(q, params[self.point]) if self.point else q
 
     def velocities(self, v_s, v_f, params):
@@ -242,18 +245,6 @@ def _as_one(terms: Sequence[Any]) -> Any:
         return terms[0]
     roles = (Role.joined(roles) for roles in zip(*(term.roles for term in terms), strict=True))
     return replace(terms[0], sources=tuple(chain(*(term.sources for term in terms))), roles=tuple(roles))
-
-
-def alike(items: Iterable[tuple[Hashable, Any]]) -> Iterator[tuple[Any, list[int], Any]]:
-    """Pairs (key, pytree of NumPy arrays) in groups of equal keys and shapes: (key, numbers of the pairs, pytree with an axis for these)."""
-    groups: dict[Any, list[int]] = {}
-    trees = []
-    for number, (key, tree) in enumerate(items):
-        leaves, structure = jax.tree.flatten(tree)
-        groups.setdefault((key, structure, *map(np.shape, leaves)), []).append(number)
-        trees.append(tree)
-    for (key, *_), numbers in groups.items():
-        yield key, numbers, jax.tree.map(lambda *leaves: np.stack(leaves), *(trees[number] for number in numbers))
 
 
 def pick(values, select: Sequence[int]):
