@@ -164,17 +164,16 @@ class Bindable(ABC):
         names = (*declared, *self.masses, *self.derived, *POINTS) if isinstance(params, dict) else ()
         return tuple(name for name in names if name in params)
 
-    def element_term(self, i: int, freedoms: Sequence[Key] = ()) -> tuple[EffectTerm, dict[str, Any]]:
+    def element_term(self, i: int) -> tuple[EffectTerm, dict[str, Any]]:
         """Element i as a term of the coordinates of its moving bodies, one after the other, and its part of the params of all elements.
 
-        The term takes these coordinates, followed by `freedoms` that are coordinates of the scene, as q_s, and no q_f.
+        The term takes these coordinates as q_s, and no q_f.
         """
         places, end = {}, 0
         for name in moving(self.elements[i]):
             places[name] = Place("s", end, self.by_name[name].size)
             end += self.by_name[name].size
-        of_freedoms = {key: Place("s", end + k, 1) for k, key in enumerate(freedoms)}
-        (term,) = self.terms((i,), Layout(places, {}, of_freedoms))
+        (term,) = self.terms((i,), Layout(places, {}))
         # without the name and number of the element, equal terms share a compiled program
         return replace(term, sources=(Source(ALONE, 1),)), {ALONE: self.params_of((i,))}
 

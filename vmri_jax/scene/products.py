@@ -27,8 +27,10 @@ def products(count: int, q: Sequence[Any], params: Mapping[str, Any]) -> Any:
     """
     xp = library(q, params)
     z = xp.concatenate([_triples(x, xp) for x in q], axis=-2)[..., None, :, :]
-    vectors = xp.sum(params["factors"][..., None] * z, axis=-2) + params["offsets"]
-    return xp.sum(vectors[..., :count, :] * vectors[..., count:, :], axis=-1)
+    vectors, offsets = xp.sum(params["factors"][..., None] * z, axis=-2), params["offsets"]
+    u, v = vectors[..., :count, :] + offsets[..., :count, :], vectors[..., count:, :]
+    # v_0 apart: a row with a constant v is linear, and `sizes_of_terms` finds the sizes of the terms that cancel in u
+    return xp.sum(u * v + u * offsets[..., count:, :], axis=-1)
 
 
 def _triples(x, xp):

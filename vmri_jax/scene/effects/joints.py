@@ -28,7 +28,7 @@ import numpy as np
 from vmri_jax.mechanics.arrays import library
 from vmri_jax.mechanics.kinematics import Move
 from vmri_jax.scene.declare import effect_class, number
-from vmri_jax.scene.effect import START
+from vmri_jax.scene.effect import START, Effect
 from vmri_jax.scene.effects.freedoms import M_PRIME, M, N, slide, turn_by_sine
 from vmri_jax.scene.effects.joint_base import GAP, PARALLEL, AboutAxis, Joint
 from vmri_jax.scene.products import products
@@ -117,6 +117,16 @@ class Cylindrical(AboutAxis):
     rows = (*ACROSS, *PARALLEL)
 
 
+def screwed(q, params):
+    """The rows of `Cylindrical` and ``m' . e cos a - m . e sin a``, (..., 5)."""
+    # rather than a difference of angles, which would jump by 2 pi after half a turn
+    angle, xp = 2 * np.pi * slide(q, params) / params["pitch"], library(q)
+    sine, cosine = turn_by_sine(q, params)
+    difference = sine * xp.cos(angle) - cosine * xp.sin(angle)
+    q = [xp.broadcast_to(x, (*difference.shape, x.shape[-1])) for x in q]
+    return xp.concatenate([products(len(Cylindrical.rows), q, params), difference[..., None]], axis=-1)
+
+
 @effect_class
 class Screw(AboutAxis):
     """Nuts on bolts: b moves along the axis as it turns; five rows, the four of `Cylindrical` and ``m' . e cos a = m . e sin a``.
@@ -148,26 +158,11 @@ class Screw(AboutAxis):
         pitch = self.parameters["pitch"]
         return pitch[i] if pitch.ndim else pitch
 
-    @property
-    def function(self):
-        return screwed
-
-    @property
-    def attached(self):
-        return self.elements
+    function = staticmethod(screwed)
+    attached = Effect.attached
 
     def _parameters(self):
         return super()._parameters() | self.frames
-
-
-def screwed(q, params):
-    """The rows of `Cylindrical` and ``m' . e cos a - m . e sin a``, (..., 5)."""
-    # rather than a difference of angles, which would jump by 2 pi after half a turn
-    angle, xp = 2 * np.pi * slide(q, params) / params["pitch"], library(q)
-    sine, cosine = turn_by_sine(q, params)
-    difference = sine * xp.cos(angle) - cosine * xp.sin(angle)
-    of_lengths = products(len(Screw.rows), [xp.broadcast_to(x, (*difference.shape, x.shape[-1])) for x in q], params)
-    return xp.concatenate([of_lengths, difference[..., None]], axis=-1)
 
 
 @effect_class
