@@ -40,7 +40,7 @@ Inside of a step
 
 Settings, errors and warnings
     configure, __version__
-    SimulationError, AccuracyNotReached, Interrupted
+    Refused, SimulationError, AccuracyNotReached, Interrupted
     CompiledAgainWarning, FailedLanesWarning, LostEnergyWarning, NotConfiguredWarning, SingularCoordinatesWarning,
     UncertifiedWarning
 """
@@ -59,6 +59,7 @@ from vmri_jax.mechanics.functions import CompiledAgainWarning
 from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.state import Problem, State, initial_state
 from vmri_jax.mechanics.system import ConstantMass, Rheonomic, System
+from vmri_jax.refusals import Refused
 from vmri_jax.running.arguments import Save
 from vmri_jax.running.interrupts import Interrupted
 from vmri_jax.running.macro_step import macro_step
@@ -144,6 +145,7 @@ __all__ = [
     "NotConfiguredWarning",
     "Plan",
     "Problem",
+    "Refused",
     "Result",
     "Rheonomic",
     "RunError",

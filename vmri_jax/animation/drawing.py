@@ -23,6 +23,7 @@ from vmri_jax.animation.plain_data import (
     read_solid,
 )
 from vmri_jax.mechanics.kinematics import Kinematics
+from vmri_jax.refusals import Refused
 
 KEYS = (
     *("bodies", "solids", "blocks", "links", "springs", "anchors", "planes", "spheres"),
@@ -80,7 +81,7 @@ class Drawing:
             try:
                 data = json.loads(data)
             except json.JSONDecodeError as error:
-                raise ValueError(f"drawing: not valid JSON ({error}).") from error
+                raise Refused(f"drawing: not valid JSON ({error}).") from error
         check_keys(data, (), KEYS, "drawing")
 
         def all_of(key: str, read: Callable) -> tuple:
@@ -90,10 +91,10 @@ class Drawing:
         bodies = (*chain(*(points for _, points in solids)), *bodies)
         names = [body.name for body in bodies]
         if not bodies and not blocks:
-            raise ValueError("drawing: there are no bodies and no blocks; there must be at least one.")
+            raise Refused("drawing: there are no bodies and no blocks; there must be at least one.")
         for name, count in Counter([*names, *(block.name for block in blocks)]).items():
             if count > 1:
-                raise ValueError(f"drawing: {count} bodies are named {name!r}; names must be unique.")
+                raise Refused(f"drawing: {count} bodies are named {name!r}; names must be unique.")
         links, springs = (all_of(f"{kind}s", partial(read_joint, kind, names)) for kind in KINDS)
         return cls(
             bodies=bodies,
@@ -205,7 +206,7 @@ def check_index(name: str, part: str, index: int, n_s: int, n_f: int) -> None:
     """Refuse a coordinate of a body or block that the run does not have."""
     size, pace = (n_s, "slow") if part == "s" else (n_f, "fast")
     if index >= size:
-        raise ValueError(
+        raise Refused(
             f"drawing: the body {name!r} uses [{part!r}, {index}], but the run has {size} {pace} coordinates; is this the "
             "drawing of another system?"
         )

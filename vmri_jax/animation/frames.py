@@ -13,6 +13,7 @@ from vmri_jax import plots
 from vmri_jax.animation.curves import Curves
 from vmri_jax.animation.motion import Motion
 from vmri_jax.animation.shapes import Stage
+from vmri_jax.refusals import Refused
 
 FRAMES_PER_SECOND = 20
 """Pictures of a GIF in a second; more make a larger file."""
@@ -45,7 +46,7 @@ def plot_strip(
     """
     moments = np.linspace(motion.t[0], motion.t[-1], times) if isinstance(times, int) else np.asarray(times, float)
     if moments.ndim != 1 or not moments.size:
-        raise ValueError(f"plot_strip: times is {times!r}; give at least one moment.")
+        raise Refused(f"plot_strip: times is {times!r}; give at least one moment.")
     stage = Stage.of(motion, theme)
     aspect = stage.aspect
     sizes = rows_of(len(moments), MOST_COLUMNS if aspect < 1.3 else 3 if aspect < 3.5 else 1)
@@ -110,7 +111,7 @@ def write_gif(
         OSError: the file cannot be written.
     """
     if not 0 < seconds < np.inf:
-        raise ValueError(f"write_gif: seconds is {seconds}; it must be a positive number.")
+        raise Refused(f"write_gif: seconds is {seconds}; it must be a positive number.")
     count = max(2, round(FRAMES_PER_SECOND * seconds))
     times = np.linspace(motion.t[0], motion.t[-1], count)
     trail = 1.2 * (motion.t[-1] - motion.t[0]) / seconds

@@ -16,6 +16,7 @@ from vmri_jax.animation.drawing import Drawing
 from vmri_jax.mechanics.checks import check_type
 from vmri_jax.mechanics.state import HasProblem, Problem, opened
 from vmri_jax.mechanics.system import System
+from vmri_jax.refusals import Refused
 from vmri_jax.running.micro_nodes import Nodes, why_not, with_micro_nodes
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.steppers.results import Result
@@ -70,7 +71,7 @@ class Motion:
         first, last = float(self.t[0]), float(self.t[-1])
         start, end = (first if start is None else start), (last if end is None else end)
         if not first <= start < end <= last and (start, end) != (first, last):
-            raise ValueError(
+            raise Refused(
                 f"from {start:g} to {end:g} is no part of the run, which goes from t = {first:g} to {last:g}."
             )
         low = int(np.searchsorted(self.t, start, side="right")) - 1
@@ -119,16 +120,14 @@ def motion(
         ValueError: a batch of runs, no node that is finite, a drawing or system of other coordinates.
     """
     if np.ndim(trajectory.t) != 1:
-        raise ValueError(
-            f"motion: the trajectory is a batch of shape {np.shape(trajectory.t)[:-1]}; give one run of it."
-        )
+        raise Refused(f"motion: the trajectory is a batch of shape {np.shape(trajectory.t)[:-1]}; give one run of it.")
     drawing = _drawing(trajectory, drawing)
     system = system or (trajectory.origin.system() if trajectory.origin.knows_system else None)
     q_s, q_f, t = (np.asarray(a, dtype=float) for a in (trajectory.states.q_s, trajectory.states.q_f, trajectory.t))
     finite = np.isfinite(np.concatenate([q_s, q_f, t[:, None]], axis=1)).all(axis=1)
     count = len(t) if finite.all() else int(np.argmin(finite))
     if count == 0:
-        raise ValueError("motion: the trajectory has no node with finite positions; there is nothing to draw.")
+        raise Refused("motion: the trajectory has no node with finite positions; there is nothing to draw.")
     t, q_s, q_f = t[:count], q_s[:count], q_f[:count]
     slow, fast, *_ = drawing.extended(q_s, q_f, 0 * q_s, 0 * q_f)
     drawing = with_bars(drawing, slow, fast)
@@ -198,10 +197,10 @@ def _velocities(system: System, trajectory: Trajectory, count: int) -> tuple[np.
         v_s, v_f = jax.jit(jax.vmap(partial(diagnostics.velocity, system)))(*phase)
     except (TypeError, ValueError, IndexError) as error:
         sizes = f"{phase[0].shape[1]} slow and {phase[1].shape[1]} fast coordinates"
-        raise ValueError(f"motion: the system does not go with a run of {sizes}: {error}") from error
+        raise Refused(f"motion: the system does not go with a run of {sizes}: {error}") from error
     run_energy = float(trajectory.energy[0])
     if abs(start_energy - run_energy) > 1e-6 * max(1.0, abs(run_energy)):
-        raise ValueError(
+        raise Refused(
             f"motion: the system has the energy {start_energy:.6g} at the start, the run {run_energy:.6g}; give the system that was simulated, with "
             "its parameters."
         )

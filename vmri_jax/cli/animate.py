@@ -20,6 +20,7 @@ from vmri_jax.animation.motion import Motion, motion
 from vmri_jax.animation.vtk import write_vtk
 from vmri_jax.catalogue import SYSTEMS, find_problem
 from vmri_jax.cli.common import PICTURES, check_target_file, console
+from vmri_jax.refusals import Refused
 from vmri_jax.running.progress import progress_shown
 from vmri_jax.running.store import StoredTrajectory
 from vmri_jax.running.trajectory import Trajectory
@@ -73,17 +74,17 @@ def _motion(run: Path, system: str | None, drawing: Path | None) -> Motion:
     (trajectory, description), problem = _load(run), None if system is None else find_problem(system)
     sizes = [np.shape(a)[-1] for a in (trajectory.states.q_s, trajectory.states.q_f)]
     if problem is not None and sizes != [np.size(problem.q_s), np.size(problem.q_f)]:
-        raise ValueError(
+        raise Refused(
             f"--system {system} has {np.size(problem.q_s)} slow and {np.size(problem.q_f)} fast coordinates, the run has "
             f"{sizes[0]} and {sizes[1]}; give the system that was simulated."
         )
     if drawing is not None:
         if not drawing.is_file():
-            raise ValueError(f"--drawing {drawing} does not exist.")
+            raise Refused(f"--drawing {drawing} does not exist.")
         try:
             description = json.loads(drawing.read_text(encoding="utf-8"))
         except ValueError as error:
-            raise ValueError(f"--drawing {drawing} is not valid JSON ({error}).") from error
+            raise Refused(f"--drawing {drawing} is not valid JSON ({error}).") from error
     if not description and problem is not None:
         description = problem.drawing or built_in(system or "", np.size(problem.q_s))
     parsed = Drawing.from_dict(description or bars(trajectory))
@@ -98,7 +99,7 @@ def _seen_from(shown: Motion, view: str | None) -> Motion:
     try:
         parts = [float(part) for part in parts]
     except ValueError:
-        raise ValueError(f"--view is {view!r}; it must be azimuth and elevation in degrees, e.g. -90,90.") from None
+        raise Refused(f"--view is {view!r}; it must be azimuth and elevation in degrees, e.g. -90,90.") from None
     return replace(shown, drawing=replace(shown.drawing, view=angles(parts, "--view")))
 
 

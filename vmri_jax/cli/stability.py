@@ -17,6 +17,7 @@ from vmri_jax.cli.common import (
     print_written,
     status,
 )
+from vmri_jax.refusals import Refused
 from vmri_jax.running.printed import PrintedTable
 from vmri_jax.stability import advise as advise_on
 from vmri_jax.stability import linear_model, plot_stability, stability_map
@@ -46,7 +47,7 @@ def advise(
     problem = find_problem(system)
     chosen = find_scheme(scheme, num_micro, compose, alpha=alpha, degree=degree, rule=rule)
     if macro_dt is None:
-        raise ValueError("--macro-dt is missing; give the macro step that is to be judged.")
+        raise Refused("--macro-dt is missing; give the macro step that is to be judged.")
     with status("judging this step and the steps around it"):
         advice = advise_on(problem, chosen, macro_dt=macro_dt)
     console.print(advice.table() if advice.findings else escape(advice.verdict))

@@ -29,6 +29,7 @@ from vmri_jax.ensembles.quantities import drawn_by_default
 from vmri_jax.executors.executor import local_workers
 from vmri_jax.mechanics.names import unknown
 from vmri_jax.mechanics.state import Problem
+from vmri_jax.refusals import Refused
 from vmri_jax.running.export import extra
 from vmri_jax.running.interrupts import Interrupted
 
@@ -64,7 +65,7 @@ def sweep(
         for package in ("xarray", "dask.array"):  # refuse a missing package now: the figure comes after all runs
             extra(package, "--plot", "ensemble")
     if workers is not None and scheduler is not None:
-        raise ValueError("--workers and --scheduler are given; choose one of them.")
+        raise Refused("--workers and --scheduler are given; choose one of them.")
     arguments = read_sweep(file)
     problem = find_problem(arguments["system"])
     arguments["vary"] = by_name(problem, list(arguments["design"].described()))
@@ -92,7 +93,7 @@ def _drawn(save: list[str], problem: Problem) -> str:
     """The array that --plot draws, chosen before anything runs."""
     drawn = drawn_by_default(save, problem)
     if not drawn:
-        raise ValueError(
+        raise Refused(
             f"--plot draws one number per run or per saved node, and save = {json.dumps(save)} keeps neither. Add one to the "
             f"file, e.g. save = {json.dumps([*save, 'energy_error'])}, or a function of your own that returns one, "
             "my_file.py:function."
@@ -107,13 +108,13 @@ def read_sweep(file: Path) -> dict[str, Any]:
     try:
         entries = tomllib.loads(file.read_text())
     except tomllib.TOMLDecodeError as error:
-        raise ValueError(f"{file} is no TOML: {error}.") from error
+        raise Refused(f"{file} is no TOML: {error}.") from error
     _check_entries(f"{file}", entries, ENTRIES)
     for name in ("system", "scheme", "out"):
         if name not in entries:
-            raise ValueError(f"{file}: {name} is missing; see the file of vmri sweep --example.")
+            raise Refused(f"{file}: {name} is missing; see the file of vmri sweep --example.")
     if ("axes" in entries) == ("draws" in entries):
-        raise ValueError(f"{file}: give either [axes] or [draws].")
+        raise Refused(f"{file}: give either [axes] or [draws].")
     if "axes" in entries:
         design = Product({name: _axis(f"{file}: the axis {name}", axis) for name, axis in entries["axes"].items()})
     else:
@@ -137,7 +138,7 @@ def _axis(subject: str, entry) -> Any:
     if "values" in entry:
         return Axis(entry["values"], *words)
     if not {"from", "to", "count"} <= set(entry):
-        raise ValueError(f"{subject}: give values, or from, to and count.")
+        raise Refused(f"{subject}: give values, or from, to and count.")
     spaced = np.geomspace if entry.get("log") else np.linspace
     return Axis(spaced(float(entry["from"]), float(entry["to"]), int(entry["count"])), *words)
 
@@ -145,7 +146,7 @@ def _axis(subject: str, entry) -> Any:
 def _draws(file: Path, entries: Mapping[str, Any]) -> Draws:
     _check_entries(f"{file}: draws", entries, DRAWS)
     if not {"count", "columns"} <= set(entries):
-        raise ValueError(f"{file}: draws need a count and columns, [draws.columns].")
+        raise Refused(f"{file}: draws need a count and columns, [draws.columns].")
     columns = dict(entries["columns"])
     for name, entry in columns.items():
         if isinstance(entry, Mapping):
@@ -158,7 +159,7 @@ def _draws(file: Path, entries: Mapping[str, Any]) -> Draws:
 def _check_entries(where: str, entries: Mapping[str, Any], known: Collection[str]) -> None:
     for name in entries:
         if name not in known:
-            raise ValueError(f"{where}: {unknown('entry', name, known)}")
+            raise Refused(f"{where}: {unknown('entry', name, known)}")
 
 
 def _located(name: str, folder: Path) -> str:
@@ -180,7 +181,7 @@ def _client(workers: int | None, scheduler: str | None) -> Iterator[Any]:
         try:
             opened = distributed.Client(scheduler, timeout=10)
         except (OSError, ValueError) as error:
-            raise ValueError(f"--scheduler {scheduler}: no scheduler of Dask answers there ({error}).") from error
+            raise Refused(f"--scheduler {scheduler}: no scheduler of Dask answers there ({error}).") from error
     with opened as client:
         if client.dashboard_link:
             console.print(f"dashboard: [bold]{escape(client.dashboard_link)}[/bold]", soft_wrap=True)

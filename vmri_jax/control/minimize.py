@@ -14,6 +14,7 @@ from vmri_jax.control.search import line_search, update
 from vmri_jax.mechanics.arrays import whole_number
 from vmri_jax.mechanics.checks import check_number
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
+from vmri_jax.refusals import Refused
 from vmri_jax.running.progress import ShowsProgress, progress_to
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
@@ -86,7 +87,7 @@ def minimize(
     """
     whole_number("minimize: max_iterations", max_iterations)
     if not check_number("minimize: tolerance", tolerance) > 0:
-        raise ValueError(f"minimize: tolerance is {tolerance}; it must be positive.")
+        raise Refused(f"minimize: tolerance is {tolerance}; it must be positive.")
     actuate, labels = actuation_of(problem, actuate, num_controls)
     opened_problem = problem_of("minimize", problem)
     aims = {"cost": cost, "final_cost": final_cost, "goal": goal, "limits": limits}

@@ -16,6 +16,7 @@ from vmri_jax.fitting.unknowns import Unknown, Unknowns
 from vmri_jax.mechanics.arrays import whole_number
 from vmri_jax.mechanics.checks import check_type
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
+from vmri_jax.refusals import Refused
 from vmri_jax.running.export import extra
 from vmri_jax.running.prepare import prepare
 from vmri_jax.running.progress import Progress, Working
@@ -93,7 +94,7 @@ def fit(
     # steps[i] are the numbers of the macro nodes at which the set i of data was measured
     steps = [m.steps(float(first.t), macro_dt) for m in data]
     if max(s.max() for s in steps) < 1:
-        raise ValueError("fit: all measurements are at the start of the problem; measure at later times, too.")
+        raise Refused("fit: all measurements are at the start of the problem; measure at later times, too.")
     with Working("fit") as tell:
         tell("a run with the first parameters", 0, NUM_PHASES)
         run = prepare(first, scheme, macro_dt=macro_dt, num_steps=max(int(s.max()) for s in steps), solver=solver)
@@ -109,7 +110,7 @@ def fit(
 
 def _model(problem, parameters: Mapping) -> Callable[[Mapping], Problem]:
     if not parameters:
-        raise ValueError(
+        raise Refused(
             "fit: parameters is empty; name the unknown parameters, e.g. {'stiffness': Unknown(3000.0, lower=0)}."
         )
     if not isinstance(problem, Problem) and callable(problem) and not hasattr(problem, "problem"):
@@ -119,16 +120,14 @@ def _model(problem, parameters: Mapping) -> Callable[[Mapping], Problem]:
     known, structure = _by_name(params if isinstance(params, Mapping) else {})
     for name, unknown in parameters.items():
         if name not in known and name not in START:
-            raise ValueError(
+            raise Refused(
                 f"fit: parameters has {name!r}, which is none of system.params ({', '.join(known) or 'no dict'}) nor of "
                 f"{', '.join(START)}. Give a function from parameters to a Problem for anything else."
             )
         expected = np.shape(known[name] if name in known else getattr(base, name))
         start = unknown.start if isinstance(unknown, Unknown) else unknown
         if np.shape(start) != expected:
-            raise ValueError(
-                f"fit: the start of {name!r} has shape {np.shape(start)}; in the problem it has {expected}."
-            )
+            raise Refused(f"fit: the start of {name!r} has shape {np.shape(start)}; in the problem it has {expected}.")
 
     def model(values: Mapping) -> Problem:
         inside = {name: value for name, value in values.items() if name in known}
@@ -147,11 +146,11 @@ def _by_name(params: Mapping) -> tuple[dict[str, Any], Any]:
 
 def _check(data: list, segments: int, starts: int, max_steps: int) -> None:
     if not data:
-        raise ValueError("fit: data is empty; give measurements, vm.fitting.Measured(t, values, sigma).")
+        raise Refused("fit: data is empty; give measurements, vm.fitting.Measured(t, values, sigma).")
     for m in data:
         check_type("fit: data", m, Measured, "vm.fitting.Measured(t, values, sigma), or several of them")
     if len({m.sigma is None for m in data}) > 1:
-        raise ValueError("fit: some of data have a sigma and some have none; give it for all or for none.")
+        raise Refused("fit: some of data have a sigma and some have none; give it for all or for none.")
     for name, value in (("segments", segments), ("starts", starts), ("max_steps", max_steps)):
         whole_number(f"fit: {name}", value)
 
@@ -165,7 +164,7 @@ class _Search:
         self.size = shooting.unknowns.size
         self.count = len(shooting.values)
         if self.count < self.size:
-            raise ValueError(
+            raise Refused(
                 f"fit: {self.count} values for {self.size} unknown numbers; measure more, or fix some of them."
             )
         u_start = np.zeros(self.size)
@@ -225,7 +224,7 @@ class _Search:
         dead = np.flatnonzero(~by_parameters.any(axis=0))
         if dead.size:
             labels = self.shooting.unknowns.labels
-            raise ValueError(
+            raise Refused(
                 f"fit: no measured value depends on {', '.join(labels[i] for i in dead)} at the start of the search. Leave this "
                 "parameter out, or start elsewhere."
             )

@@ -12,6 +12,7 @@ from scipy import stats
 from vmri_jax.accuracy.simulate import simulate
 from vmri_jax.fitting.shooting import Shooting
 from vmri_jax.mechanics.state import Problem
+from vmri_jax.refusals import Refused
 from vmri_jax.running.trajectory import Trajectory
 
 SINGULAR_VALUE_TOLERANCE = 1e-7
@@ -101,7 +102,7 @@ class Fit:
             ValueError: a level that is not between 0 and 1.
         """
         if not 0 < level < 1:
-            raise ValueError(f"intervals: level is {level}; it must lie between 0 and 1, e.g. 0.95.")
+            raise Refused(f"intervals: level is {level}; it must lie between 0 and 1, e.g. 0.95.")
         tail = (1 + level) / 2
         q = stats.norm.ppf(tail) if self.shooting.knows_sigma else stats.t.ppf(tail, max(self.freedom, 1))
         return {

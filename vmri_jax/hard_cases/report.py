@@ -12,6 +12,7 @@ from vmri_jax import plots
 from vmri_jax.hard_cases.case import Case, Outcome
 from vmri_jax.hard_cases.cases import cases_for
 from vmri_jax.mechanics.state import HasProblem, Problem
+from vmri_jax.refusals import Refused
 from vmri_jax.running.interrupts import Interrupted
 from vmri_jax.running.printed import PrintedTable
 from vmri_jax.running.progress import ShowsProgress, progress_to
@@ -114,7 +115,7 @@ def run_cases(
     known = [case.number for case in cases]
     unknown = sorted(set(numbers) - set(known))
     if unknown:
-        raise ValueError(f"run_cases: there is no case {', '.join(map(str, unknown))}; they go from 1 to {max(known)}.")
+        raise Refused(f"run_cases: there is no case {', '.join(map(str, unknown))}; they go from 1 to {max(known)}.")
     chosen, rows = [case for case in cases if not numbers or case.number in numbers], []
     with progress_to("check", progress) as tell:
         for k, case in enumerate(chosen):

@@ -17,6 +17,7 @@ from vmri_jax.plots.theme import (
     new_figure,
     panel_grid,
 )
+from vmri_jax.refusals import Refused
 from vmri_jax.steppers.results import Result
 
 if TYPE_CHECKING:
@@ -67,13 +68,13 @@ def plot_ensemble(
         return _plot_bands(data, values.where(~_failed(data, values)), title, theme)
     several = [name for name in values.dims if name in COORDINATES]
     if several:
-        raise ValueError(
+        raise Refused(
             f"plot_ensemble: {quantity} has several numbers per run; choose one, "
             f"data.isel({several[0]}=0) or data.sel({several[0]}={data[several[0]].values[0]!r})."
         )
     for name in (x, y):
         if name is not None and name not in data.coords:
-            raise ValueError(
+            raise Refused(
                 f"plot_ensemble: there is no axis or column {name!r}; there are {', '.join(map(str, data.coords))}."
             )
     axes = sorted((str(d) for d in values.dims if d != "lane"), key=lambda d: -values.sizes[d])
@@ -98,7 +99,7 @@ def _quantity(data: "xarray.Dataset", name: str | None) -> str:
     """The name of the quantity to draw, see `plot_ensemble`."""
     if name is not None:
         if name not in data:
-            raise ValueError(f"plot_ensemble: there is no {name!r}; there are {', '.join(map(str, data.data_vars))}.")
+            raise Refused(f"plot_ensemble: there is no {name!r}; there are {', '.join(map(str, data.data_vars))}.")
         return name
     arrays = {str(n): set(map(str, array.dims)) & set(COORDINATES) for n, array in data.data_vars.items()}
     arrays = {n: several for n, several in arrays.items() if n not in (*STATUS, "node_t")}
@@ -106,7 +107,7 @@ def _quantity(data: "xarray.Dataset", name: str | None) -> str:
         names = [n for n, dimensions in arrays.items() if dimensions == several]
         if names:
             return names[-1]
-    raise ValueError(
+    raise Refused(
         f"plot_ensemble: no quantity is one number per run; there are {', '.join(arrays) or 'none besides the status'}. Save one, "
         "save=('end', 'energy_error'), or choose one number of a quantity: plot_ensemble(data.isel(slow=0), 'q_s'). "
         "The status of the runs is drawn as 'result'."
@@ -123,7 +124,7 @@ def _panels(values, drawn: Sequence[str]) -> list[tuple[str, Any]]:
     panel_axes = [d for d in values.dims if d not in drawn]
     count = int(np.prod([values.sizes[d] for d in panel_axes], dtype=int))
     if count > MOST_PANELS:
-        raise ValueError(
+        raise Refused(
             f"plot_ensemble: besides {', '.join(drawn)} there are {', '.join(map(str, panel_axes))} with {count} combinations of values; "
             f"select some, data.sel({panel_axes[-1]}=...)."
         )

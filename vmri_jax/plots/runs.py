@@ -9,6 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 
 from vmri_jax.plots.theme import DARK, LIGHT, ROUNDOFF_FLOOR, NotebookFigure, Theme, legend_beside, new_figure
+from vmri_jax.refusals import Refused
 from vmri_jax.running.origin import SavedRun
 
 MOST_NAMED = 12
@@ -42,7 +43,7 @@ def plot_trajectory(trajectory: SavedRun, title: str = "", theme: Theme = LIGHT)
         ValueError: a batch of runs.
     """
     if np.ndim(trajectory.t) != 1:
-        raise ValueError("plot: this is a batch of runs; take one of them, run.lane(i).")
+        raise Refused("plot: this is a batch of runs; take one of them, run.lane(i).")
     t = np.asarray(trajectory.t)
     residual = np.asarray(trajectory.constraint_residual)
     constrained = bool(np.any(residual > 0))
@@ -92,7 +93,7 @@ def plot_forces(trajectory: SavedRun, title: str = "", theme: Theme = LIGHT) -> 
         ValueError: a batch of runs, a system without constraints, or a run that does not know its system.
     """
     if np.ndim(trajectory.t) != 1:
-        raise ValueError("plot_forces: this is a batch of runs; take one of them, run.lane(i).")
+        raise Refused("plot_forces: this is a batch of runs; take one of them, run.lane(i).")
     t, panels = np.asarray(trajectory.t), _moduli(trajectory)
     with new_figure(7.2, 0.4 + 1.85 * len(panels), title, theme) as figure:
         axes = figure.subplots(len(panels), sharex=True, squeeze=False)[:, 0]

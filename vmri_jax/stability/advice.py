@@ -9,6 +9,7 @@ import numpy as np
 from vmri_jax.mechanics.linearisation import Linearisation, linearise
 from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.mechanics.terms import label
+from vmri_jax.refusals import Refused
 from vmri_jax.running.origin import names_of
 from vmri_jax.schemes.composition import Composition, stage_lengths, stage_scheme
 from vmri_jax.schemes.scheme import Scheme
@@ -159,9 +160,9 @@ def advise(
     names = names_of(system)
     system, state = start_of("advise", system, state)
     if not isinstance(scheme, Scheme | Composition):
-        raise TypeError(f"advise: scheme is {type(scheme).__name__}; give a Scheme, e.g. fully_implicit(num_micro=10).")
+        raise Refused(f"advise: scheme is {type(scheme).__name__}; give a Scheme, e.g. fully_implicit(num_micro=10).")
     if not (np.ndim(macro_dt) == 0 and np.isfinite(macro_dt) and macro_dt > 0):
-        raise ValueError(f"advise: macro_dt is {macro_dt}; it must be a positive number.")
+        raise Refused(f"advise: macro_dt is {macro_dt}; it must be a positive number.")
     macro_dt, linear = float(macro_dt), linearise(system, state, names)
     period = drive_period(system, state, macro_dt)
     if period is None:

@@ -10,6 +10,7 @@ import numpy as np
 from vmri_jax.executors.executor import mapped
 from vmri_jax.mechanics.linearisation import Linearisation, linearise
 from vmri_jax.mechanics.state import Movable, State, start_of
+from vmri_jax.refusals import Refused
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.stability.multipliers import multipliers
@@ -79,7 +80,7 @@ class StabilityMap(ResultTable):
         """Intervals of omega H that are unstable, for one row (the first by default)."""
         row = self.rows[0] if row is None else row
         if row not in self.rows:
-            raise ValueError(f"windows: there is no row {row!r}; there are {', '.join(map(repr, self.rows))}.")
+            raise Refused(f"windows: there is no row {row!r}; there are {', '.join(map(repr, self.rows))}.")
         return list(self.unstable[self.rows.index(row)])
 
     def first_unstable(self, row=None) -> float:
@@ -134,17 +135,17 @@ def stability_map(
     systems = system if isinstance(system, Mapping) else {"": system}
     schemes = scheme if isinstance(scheme, Mapping) else {"": scheme}
     if not schemes or not all(isinstance(s, Scheme | Composition) for s in schemes.values()):
-        raise TypeError(
+        raise Refused(
             f"stability_map: scheme is {scheme!r}; give a Scheme or Composition, e.g. explicit_slow(10), or a dict of them."
         )
     if min(len(systems), len(schemes)) != 1:
-        raise ValueError(f"stability_map: {len(systems)} systems and {len(schemes)} schemes; give one of either.")
+        raise Refused(f"stability_map: {len(systems)} systems and {len(schemes)} schemes; give one of either.")
     axis, labels = ("system", systems) if isinstance(system, Mapping) and len(schemes) == 1 else ("scheme", schemes)
     linear = [linearise(*start_of("stability_map", movable, state)) for movable in systems.values()]
     rows = dict(zip(labels, product(linear, schemes.values()), strict=True))
     omega = float(linear[0].frequencies_of("fast").max(initial=0.0) or np.abs(linear[0].rates).max(initial=0.0))
     if omega == 0:
-        raise ValueError("stability_map: the system has no frequency that could scale omega_H; nothing vibrates there.")
+        raise Refused("stability_map: the system has no frequency that could scale omega_H; nothing vibrates there.")
     measured = mapped("stability_map", measure, [(*row, grid / omega, tolerance) for row in rows.values()], executor)
     return StabilityMap(
         axis=axis,
@@ -220,7 +221,7 @@ def _grid(omega_H) -> np.ndarray:
     grid = np.asarray(omega_H, dtype=float)
     if grid.ndim != 1 or grid.size < 2 or not (np.isfinite(grid).all() and grid[0] > 0 and (np.diff(grid) > 0).all()):
         values = f"{grid.flat[0]:g} to {grid.flat[-1]:g}" if grid.size else "none"
-        raise ValueError(
+        raise Refused(
             f"stability_map: omega_H has shape {grid.shape} and values {values}; give two or more positive values, "
             "increasing, e.g. numpy.linspace(0.05, 12, 240)."
         )

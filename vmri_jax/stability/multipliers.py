@@ -19,6 +19,7 @@ from vmri_jax.mechanics.invariants import all_constraints
 from vmri_jax.mechanics.linearisation import Linearisation, tangents
 from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.mechanics.system import System
+from vmri_jax.refusals import Refused
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.results import Result
@@ -83,7 +84,7 @@ def multipliers(linear: Linearisation, scheme: Scheme | Composition, macro_dt) -
     """
     macro_dt, size = np.asarray(macro_dt, dtype=float), 2 * linear.shapes.shape[1]
     if not size:
-        raise ValueError(
+        raise Refused(
             f"multipliers: the constraints leave none of the {len(linear.shapes)} coordinates free; nothing moves."
         )
     lanes = int(np.clip(LANES * 36 // size, 4, LANES))
@@ -184,7 +185,7 @@ def monodromy(
     system, state = start_of("monodromy", system, state)
     whole_number("monodromy: num_steps", num_steps)
     if is_concrete(macro_dt) and not (np.ndim(macro_dt) == 0 and np.isfinite(macro_dt) and macro_dt > 0):
-        raise ValueError(f"monodromy: macro_dt is {macro_dt}; it must be a positive number.")
+        raise Refused(f"monodromy: macro_dt is {macro_dt}; it must be a positive number.")
     start = State(*(jnp.asarray(a, dtype=float) for a in (state.t, state.q_s, state.q_f, state.p_s, state.p_f)))
     directions = tangents(np.asarray(_constraint_rows(system, start))).T
     z, images, steps, result = _followed(system, scheme, start, macro_dt, solver, num_steps, directions)

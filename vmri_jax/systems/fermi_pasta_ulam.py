@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.state import Problem
 from vmri_jax.mechanics.system import ConstantMass, System
+from vmri_jax.refusals import Refused
 
 
 def soft_springs(q_s, q_f, params):
@@ -33,7 +34,7 @@ def fermi_pasta_ulam(num_springs: int = 3, omega: float = 50.0) -> Problem:
         omega: frequency of the stiff springs.
     """
     if num_springs < 1:
-        raise ValueError(f"fermi_pasta_ulam: num_springs is {num_springs}; there must be at least 1.")
+        raise Refused(f"fermi_pasta_ulam: num_springs is {num_springs}; there must be at least 1.")
     ones, first = jnp.ones(num_springs), jnp.zeros(num_springs).at[0].set(1.0)
     system = System(
         kinetic=ConstantMass(ones, ones),
