@@ -105,7 +105,7 @@ if TYPE_CHECKING:
     from vmri_jax.stability import advise
     from vmri_jax.study import tune
 
-_ROOM_OF = {
+_PACKAGE_OF = {
     "advise": "stability",
     "check": "hard_cases",
     "ensemble": "ensembles",
@@ -114,15 +114,15 @@ _ROOM_OF = {
     "open_ensemble": "ensembles",
     "tune": "study",
 }
-"""Functions that are imported with their rooms when they are asked for. matplotlib and scipy.stats take half a second."""
+"""Functions that are imported with their packages when they are asked for. matplotlib and scipy.stats take half a second."""
 
 
 def __getattr__(name: str) -> Any:
-    """Import a public room, or a function of a room."""
+    """Import a public package or module, or a function of one."""
     if name not in __all__:
         raise AttributeError(f"module 'vmri_jax' has no attribute {name!r}")
-    room = import_module(f"vmri_jax.{_ROOM_OF.get(name, name)}")
-    value = getattr(room, name) if name in _ROOM_OF else room
+    module = import_module(f"vmri_jax.{_PACKAGE_OF.get(name, name)}")
+    value = getattr(module, name) if name in _PACKAGE_OF else module
     globals()[name] = value
     return value
 
