@@ -30,12 +30,17 @@ def entries(data: dict, key: str, where: str) -> list:
     return list(items)
 
 
+def _floats(value: Any) -> np.ndarray:
+    """An array of floats, of one NaN where the value is no array of numbers."""
+    try:
+        return np.asarray(value, dtype=float)
+    except (TypeError, ValueError):
+        return np.array(np.nan)
+
+
 def numbers(value: Any, where: str) -> tuple[float, ...]:
     """1 to 3 finite numbers."""
-    try:
-        array = np.asarray(value, dtype=float)
-    except (TypeError, ValueError):
-        array = np.array(np.nan)
+    array = _floats(value)
     if array.ndim != 1 or not 1 <= array.size <= 3 or not np.isfinite(array).all():
         raise Refused(f"{where} is {value!r}; it must be a list of 1 to 3 finite numbers.")
     return tuple(array.tolist())
@@ -51,12 +56,10 @@ def direction(value: Any, where: str) -> tuple[float, ...]:
 
 def angles(value: Any, where: str) -> tuple[float, ...]:
     """Azimuth and elevation in degrees."""
-    degrees = numbers(value, where)
-    if len(degrees) != 2 or abs(degrees[1]) > 90:
-        raise Refused(
-            f"{where} is {list(degrees)}; it must be azimuth and elevation in degrees, the latter from -90 to 90."
-        )
-    return degrees
+    degrees = _floats(value)
+    if degrees.shape != (2,) or not np.isfinite(degrees).all() or abs(degrees[1]) > 90:
+        raise Refused(f"{where} is {value!r}; it must be azimuth and elevation in degrees, the latter from -90 to 90.")
+    return tuple(degrees.tolist())
 
 
 def positive(value: Any, where: str) -> float:

@@ -102,7 +102,7 @@ class Motion:
 
 
 def motion(
-    trajectory: Trajectory, drawing: Drawing | Problem | HasProblem | dict, system: System | None = None
+    trajectory: Trajectory, drawing: Drawing | Problem | HasProblem | dict | str, system: System | None = None
 ) -> Motion:
     """The motion of a drawing along a run, up to a failure of the run: ``write_html(motion(run, scene), "run.html")``.
 
@@ -113,7 +113,7 @@ def motion(
     Args:
         trajectory: one run, of at least one node.
         drawing: of the system that was simulated. A scene or a problem stands for its drawing, a problem without a drawing for a bar
-            for each coordinate, a dictionary for `Drawing.from_dict` of it.
+            for each coordinate, a dictionary or its JSON text for `Drawing.from_dict` of it.
         system: the system that was simulated; None for the system that the run carries, if it does.
 
     Raises:
@@ -161,7 +161,7 @@ def _drawing(trajectory: Trajectory, shown: Any) -> Drawing:
     shown = opened(shown)
     if isinstance(shown, Problem):
         shown = shown.drawing or bars(trajectory)
-    if isinstance(shown, dict):
+    if isinstance(shown, dict | str):
         shown = Drawing.from_dict(shown)
     check_type("motion: drawing", shown, Drawing, "the scene or the problem of the run, or a Drawing")
     return shown

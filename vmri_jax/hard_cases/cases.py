@@ -1,6 +1,7 @@
 """The hard cases that apply to any system, with steps chosen from its frequencies."""
 
 from dataclasses import dataclass
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +10,7 @@ import numpy as np
 from vmri_jax import textbook
 from vmri_jax.accuracy.batch import simulate_batch
 from vmri_jax.accuracy.companions import positions
+from vmri_jax.accuracy.simulate import simulate
 from vmri_jax.diagnostics import step_condition
 from vmri_jax.diagnostics.linear import phase_vector
 from vmri_jax.hard_cases.case import Case, Outcome, draw_energy
@@ -21,16 +23,15 @@ from vmri_jax.hard_cases.measures import (
     energy,
     energy_scale,
     long_run,
-    relative_constraints,
-    reversal,
+    refusal,
     run,
-    single_precision,
     status,
 )
+from vmri_jax.mechanics.constraints import rows_at
 from vmri_jax.mechanics.linearisation import linearise
 from vmri_jax.mechanics.motion import motion
 from vmri_jax.mechanics.projection import legendre
-from vmri_jax.mechanics.state import HasProblem, Problem, State, problem_of
+from vmri_jax.mechanics.state import HasProblem, Problem, State, initial_state, problem_of
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.progress import Working
 from vmri_jax.running.trajectory import Trajectory
@@ -93,7 +94,9 @@ class Resolved:
         steps = 1_000_000 if full else 10_000
         trajectory = long_run(self.problem, self.scheme, self.macro_dt, steps)
         position, velocity = constraints(trajectory)
-        part = relative_constraints(self.problem, trajectory)
+        nodes = trajectory.states
+        rows = jax.jit(jax.vmap(partial(rows_at, self.problem.system)))(nodes.t, nodes.q_s, nodes.q_f)
+        part = float(np.max(np.abs(rows.values) / rows.sizes))
         return Outcome(
             f"{steps:.0e} steps: {status(trajectory)}, |g| {position:.1e}, |G v| {velocity:.1e}",
             trajectory.success and part < 1e-10,
@@ -147,9 +150,15 @@ class Resolved:
         )
 
     def reversal(self, full: bool) -> Outcome:
-        steps = 1_000 if full else 100
-        size = max(float(jnp.max(jnp.abs(q), initial=0.0)) for q in (self.problem.q_s, self.problem.q_f))
-        apart = reversal(self.problem, self.scheme, self.macro_dt, steps) / max(size, 1e-300)
+        """Forward and, from the end with reversed momenta, as far back."""
+        steps, apart = 1_000 if full else 100, np.inf
+        there = run(self.problem, self.scheme, self.macro_dt, steps, save=steps)
+        if there.success:
+            end = there.final_state
+            turned = State(0.0, end.q_s, end.q_f, -end.p_s, -end.p_f)
+            back = run(self.problem, self.scheme, self.macro_dt, steps, turned, save=steps)
+            start = positions(there)[0]
+            apart = difference(positions(back)[-1], start) / max(float(np.abs(start).max(initial=0.0)), 1e-300)
         return Outcome(f"{steps} steps there and back: {apart:.0e} from the start", apart < 1e-6, {"apart": apart})
 
     def explicit_limit(self, full: bool) -> Outcome:
@@ -218,7 +227,20 @@ class Resolved:
         return derivatives(self.problem, self.scheme, self.macro_dt)
 
     def single_precision(self, full: bool) -> Outcome:
-        return single_precision(self.problem, self.macro_dt)
+        """Whether the messages have the line that mends a run with the 64-bit mode off, and a start in float32."""
+        problem, steps = self.problem, {"macro_dt": self.macro_dt, "num_steps": 1}
+        state, short = problem.state(), (np.asarray(q, np.float32) for q in (problem.q_s, problem.q_f))
+        with jax.enable_x64(False):
+            off = refusal(lambda: simulate(problem.system, self.scheme, state, **steps))
+        data = refusal(lambda: initial_state(problem.system, *short, problem.v_s, problem.v_f))
+        fix = 'jax.config.update("jax_enable_x64", True)' in off
+        cast = "float32" in data and "astype(float)" in data
+        return Outcome(
+            f"64-bit mode off: {'refused with the line to add' if fix else off or 'accepted'}; float32 positions: "
+            f"{'refused with the cast' if cast else data or 'accepted'}",
+            fix and cast,
+            {"mode_refused": fix, "data_refused": cast},
+        )
 
     def advice(self, full: bool) -> Outcome:
         advice = advise(self.problem, self.scheme, macro_dt=self.macro_dt)

@@ -86,6 +86,9 @@ def _differences(function: Callable, points: np.ndarray) -> tuple[float, float, 
     points = points + DISPLACEMENT * size * random.uniform(-1, 1, points.shape)
     directions = random.uniform(-1, 1, (DIRECTIONS, points.shape[1]))
 
+    if not points.shape[1]:
+        return 0.0, 0.0, 0.0
+
     def value(z):
         values = function(z)
         return jnp.sum(values * jnp.linspace(1.0, 2.0, values.size))
@@ -93,39 +96,31 @@ def _differences(function: Callable, points: np.ndarray) -> tuple[float, float, 
     @jax.jit
     @jax.vmap
     def compared(z):
-        d = jnp.asarray(directions)
-        gradient = jax.grad(value)
+        d, gradient = jnp.asarray(directions), jax.grad(value)
         gradients, second_derivatives = jax.lax.map(lambda x: jax.jvp(gradient, (z,), (x,)), d)  # grad s and s'' d
-        quotients, gradient_quotients = (_quotients(f, z, d, size) for f in (value, gradient))
+        first = _from_quotients(value, z, d, jnp.sum(gradients * d, axis=1), size)
+        second = _from_quotients(gradient, z, d, second_derivatives, size)
         bilinear = second_derivatives @ d.T  # d_i . s'' d_j
-        first = _smallest_difference(jnp.sum(gradients * d, axis=1), quotients, jnp.abs(value(z)) / size)
-        second = _smallest_difference(second_derivatives, gradient_quotients, jnp.abs(gradient(z)).max() / size)
         scale = jnp.abs(bilinear).max() + ROUND_OFF * jnp.abs(gradient(z)).max() / size
         return first, second, jnp.abs(bilinear - bilinear.T).max() / jnp.where(scale > 0, scale, 1.0)
 
-    if not points.shape[1]:
-        return 0.0, 0.0, 0.0
     first, second, asymmetry = (float(np.max(np.asarray(x))) for x in compared(jnp.asarray(points)))
     return first, second, asymmetry
 
 
-def _quotients(f: Callable, z, directions, size: float):
-    """Difference quotients of order 4 of f along every direction for every h, (STEPS, DIRECTIONS, ...)."""
+def _from_quotients(f: Callable, z, directions, derivatives, size: float):
+    """Relative difference of the derivatives (DIRECTIONS, ...) of f from its quotients of order 4, for the h with the smallest one.
+
+    Less the round-off, which the size of the values divided by the size of the positions sets.
+    """
 
     def quotient(h, d):
         near, far = (f(z + k * h * d) - f(z - k * h * d) for k in (1, 2))
         return (8 * near - far) / (12 * h)
 
-    return jax.lax.map(lambda h: jax.lax.map(lambda d: quotient(h, d), directions), jnp.asarray(STEPS * size))
-
-
-def _smallest_difference(derivative, quotients, value_per_size):
-    """Relative difference of a derivative (DIRECTIONS, ...) from its quotients (STEPS, DIRECTIONS, ...) for the h with the smallest one.
-
-    Less the round-off, which the size of the values divided by the size of the positions sets.
-    """
-    difference = jnp.abs(quotients - derivative).reshape(len(STEPS), -1).max(axis=1)
+    quotients = jax.lax.map(lambda h: jax.lax.map(lambda d: quotient(h, d), directions), jnp.asarray(STEPS * size))
+    difference = jnp.abs(quotients - derivatives).reshape(len(STEPS), -1).max(axis=1)
     difference = jnp.where(jnp.isfinite(difference), difference, jnp.inf)
-    difference = jnp.maximum(difference - ROUND_OFF * value_per_size / STEPS, 0.0)
-    scale = jnp.maximum(jnp.abs(derivative).max(), jnp.abs(quotients[2]).max())
+    difference = jnp.maximum(difference - ROUND_OFF * jnp.abs(f(z)).max() / size / STEPS, 0.0)
+    scale = jnp.maximum(jnp.abs(derivatives).max(), jnp.abs(quotients[2]).max())
     return jnp.min(difference) / jnp.where(scale > 0, scale, 1.0)

@@ -217,7 +217,6 @@ def _plot_histogram(values, title: str, theme: Theme) -> NotebookFigure:
         axes.hist(numbers, bins=bins, color=theme.curves[0])
         axes.set(xlabel=_label(values), ylabel="runs")
         if logarithmic:
-            axes.set_xscale("log")
             log_ticks(axes.xaxis, numbers)
     return figure
 
@@ -269,8 +268,6 @@ def _norm(values: np.ndarray) -> Normalize:
 
 def _scale(axes: Axes, x, y) -> None:
     """Make an axis logarithmic if its values are positive and span more than `LOGARITHMIC_RATIO`."""
-    for values, axis, set_scale in ((x, axes.xaxis, axes.set_xscale), (y, axes.yaxis, axes.set_yscale)):
-        numbers = np.asarray(values)
-        if _is_wide(numbers.ravel()):
-            set_scale("log")
-            log_ticks(axis, numbers.ravel())
+    for values, axis in ((np.ravel(x), axes.xaxis), (np.ravel(y), axes.yaxis)):
+        if _is_wide(values):
+            log_ticks(axis, values)

@@ -14,8 +14,8 @@ from vmri_jax.running.origin import names_of
 from vmri_jax.schemes.composition import Composition, stage_lengths, stage_scheme
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.stability.drive import LEAST_STEPS, drive_period, driven_motion, growth_of_run, in_words, periods_of_run
-from vmri_jax.stability.map import TOLERANCE, Window, measure
-from vmri_jax.stability.multipliers import multipliers
+from vmri_jax.stability.map import Window, measure
+from vmri_jax.stability.multipliers import TOLERANCE, multipliers
 from vmri_jax.stability.oscillator import fast_limit, kick_limit, phase, slow_limit
 from vmri_jax.study.table import Column, ResultTable
 
@@ -127,7 +127,6 @@ def advise(
     state: State | None = None,
     *,
     macro_dt: float,
-    tolerance: float = TOLERANCE,
 ) -> Advice:
     """Judge a macro step before a long run, from the multipliers of the step of small motions about the state.
 
@@ -151,7 +150,6 @@ def advise(
 
     Args:
         system, scheme, state, macro_dt: as of the run; state None for the start of the problem or scene.
-        tolerance: growth per macro step above which a step is unstable.
 
     Raises:
         ValueError: a macro step that is not positive; second derivatives that are not finite at the state.
@@ -166,7 +164,7 @@ def advise(
     macro_dt, linear = float(macro_dt), linearise(system, state, names)
     period = drive_period(system, state, macro_dt)
     if period is None:
-        judged = _judged_at_rest(linear, scheme, macro_dt, tolerance)
+        judged = _judged_at_rest(linear, scheme, macro_dt)
     else:
         judged = _judged_over_a_period(system, scheme, state, macro_dt, period)
     findings = [*judged.pop("findings"), *_stages(scheme)]
@@ -199,12 +197,12 @@ def _judged_over_a_period(system, scheme, state: State, macro_dt: float, period:
     }
 
 
-def _judged_at_rest(linear: Linearisation, scheme, macro_dt: float, tolerance: float) -> dict[str, Any]:
+def _judged_at_rest(linear: Linearisation, scheme, macro_dt: float) -> dict[str, Any]:
     """Fields of the `Advice` from the multipliers of a step of small motions, at macro_dt and at steps near it."""
     lower, upper = SCANNED_STEPS[0] * macro_dt, SCANNED_STEPS[1] * macro_dt
-    windows = _scan(linear, scheme, lower, upper, macro_dt, tolerance)
+    windows = _scan(linear, scheme, lower, upper, macro_dt)
     growth = float(multipliers(linear, scheme, [macro_dt]).radius[0]) - 1
-    growth = growth if growth > tolerance else 0.0
+    growth = growth if growth > TOLERANCE else 0.0
     step_findings = list(_step_findings(linear, scheme, macro_dt, growth, windows))
     safe = macro_dt
     for _ in range(MOST_SCANS if step_findings else 0):
@@ -212,7 +210,7 @@ def _judged_at_rest(linear: Linearisation, scheme, macro_dt: float, tolerance: f
         if not np.isnan(safe):
             break
         upper, lower = lower, lower / 3
-        windows = _scan(linear, scheme, lower, upper, upper, tolerance) + windows
+        windows = _scan(linear, scheme, lower, upper, upper) + windows
     findings = [*step_findings, *_kicks_in_phase(linear, scheme, macro_dt)]
     if (swap := linear.swapped()) is not None:
         findings.append(Finding("warning", "labels", *swap))
@@ -248,11 +246,11 @@ def _step_findings(linear: Linearisation, scheme, macro_dt: float, growth: float
             yield Finding("warning", kind, f"{where} There: {cause}", distance)
 
 
-def _scan(linear: Linearisation, scheme, lower: float, upper: float, point: float, tolerance: float) -> list[Window]:
+def _scan(linear: Linearisation, scheme, lower: float, upper: float, point: float) -> list[Window]:
     """Unstable windows of macro steps between lower and upper, measured on a grid that contains `point`."""
     turn = linear.frequencies.max(initial=0.0) * (upper - lower)
     grid = np.linspace(lower, upper, int(np.clip(turn / RADIANS_PER_POINT, *POINTS)))
-    return measure(linear, scheme, np.union1d(grid, [point]), tolerance, RESOLUTION)[1]
+    return measure(linear, scheme, np.union1d(grid, [point]), RESOLUTION)[1]
 
 
 def _margin(a: float, b: float, macro_dt: float) -> float:

@@ -16,9 +16,6 @@ from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.stability.multipliers import multipliers
 from vmri_jax.study.table import Column, ResultTable
 
-TOLERANCE = 1e-6
-"""Growth per step that counts as instability. Round-off alone splits two equal multipliers by its square root, up to 2e-8; a larger value
-overlooks slow growth."""
 POINTS_IN_WINDOW = np.linspace(0.0, 1.0, 9)
 """Points of a window at which its growth is measured, in widths from its start."""
 RESOLUTION = 1e-7
@@ -51,8 +48,7 @@ class StabilityMap(ResultTable):
     omega_H: (n,) grid, macro step times omega.
     radius: (m, n) spectral radius of the derivative of the step, without the multipliers of motions of the system that grow;
         infinite where the step failed.
-    unstable: the windows of omega_H of each row in which radius > 1 + tolerance; they may be far narrower than the grid.
-    tolerance: growth per step that counts as instability.
+    unstable: the windows of omega_H of each row in which radius > 1 + 1e-6; they may be far narrower than the grid.
     note: why the map does not tell whether the motion is stable, see `Linearisation.frozen`; empty at an equilibrium.
     """
 
@@ -66,7 +62,6 @@ class StabilityMap(ResultTable):
     omega_H: np.ndarray
     radius: np.ndarray
     unstable: tuple[tuple[Window, ...], ...]
-    tolerance: float
     note: str = ""
 
     caption = property(lambda self: self.note, doc="The note.")
@@ -106,7 +101,6 @@ def stability_map(
     omega_H: Sequence[float] | np.ndarray,
     *,
     state: State | None = None,
-    tolerance: float = TOLERANCE,
     executor: Any = None,
 ) -> StabilityMap:
     """Stability of macro steps of length H, from the multipliers of the step of small motions about a state.
@@ -124,7 +118,6 @@ def stability_map(
         omega_H: (n,) increasing positive values of omega times the macro step. A spacing of 0.1 or less finds narrow
             windows; with a larger one a multiplier may pass several multipliers between two points, which hides windows.
         state: point of expansion of the small motions; None for the start of the problem.
-        tolerance: growth per macro step above which a step is unstable.
         executor: executor that computes the rows, as of `vmri_jax.ensemble`; None for this process.
 
     Raises:
@@ -146,7 +139,7 @@ def stability_map(
     omega = float(linear[0].frequencies_of("fast").max(initial=0.0) or np.abs(linear[0].rates).max(initial=0.0))
     if omega == 0:
         raise Refused("stability_map: the system has no frequency that could scale omega_H; nothing vibrates there.")
-    measured = mapped("stability_map", measure, [(*row, grid / omega, tolerance) for row in rows.values()], executor)
+    measured = mapped("stability_map", measure, [(*row, grid / omega) for row in rows.values()], executor)
     return StabilityMap(
         axis=axis,
         rows=tuple(rows),
@@ -154,26 +147,20 @@ def stability_map(
         omega_H=grid,
         radius=np.array([radius for radius, _ in measured]),
         unstable=tuple(tuple(Window(omega * a, omega * b, g) for a, b, g in windows) for _, windows in measured),
-        tolerance=tolerance,
         note=linear[0].frozen,
     )
 
 
 def measure(
-    linear: Linearisation,
-    scheme: Scheme | Composition,
-    macro_dt,
-    tolerance: float = TOLERANCE,
-    resolution: float = RESOLUTION,
+    linear: Linearisation, scheme: Scheme | Composition, macro_dt, resolution: float = RESOLUTION
 ) -> tuple[np.ndarray, list[Window]]:
     """Spectral radius (n,) at n increasing macro steps, and the unstable windows between the first and the last of them."""
 
     def label(macro_dt):
-        return multipliers(linear, scheme, macro_dt).krein_signatures(tolerance)
+        return multipliers(linear, scheme, macro_dt).krein_signatures
 
     spectra = multipliers(linear, scheme, macro_dt)
-    signatures = spectra.krein_signatures(tolerance)
-    edges = find_windows(label, macro_dt, signatures, resolution * (macro_dt[-1] - macro_dt[0]))
+    edges = find_windows(label, macro_dt, spectra.krein_signatures, resolution * (macro_dt[-1] - macro_dt[0]))
     if not edges:
         return spectra.radius, []
     inside = np.array([a + (b - a) * POINTS_IN_WINDOW for a, b in edges])

@@ -25,6 +25,9 @@ from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.results import Result
 from vmri_jax.steppers.solver import Solver
 
+TOLERANCE = 1e-6
+"""Growth per step that counts as instability. Round-off alone splits two equal multipliers by its square root, up to 2e-8; a larger value
+overlooks slow growth."""
 LANES = 64
 """Step sizes that a compiled call computes side by side for up to 18 degrees of freedom; larger systems get fewer, at least 4, to limit memory. With
 more lanes a call for a single step size, which is padded to this number, takes longer."""
@@ -51,7 +54,8 @@ class Multipliers:
         sizes = np.where(self.growing, 0.0, np.abs(self.values))
         return np.where(np.isnan(sizes).any(axis=1), np.inf, sizes.max(axis=1, initial=0.0))
 
-    def krein_signatures(self, tolerance: float) -> list[bytes | None]:
+    @property
+    def krein_signatures(self) -> list[bytes | None]:
         """Krein signatures along the upper half circle, by angle, for each of the k steps; None for an unstable step.
 
         The signature of the eigenvector (eta, pi) is the sign of ``Im(conj(eta) . pi)``.
@@ -59,12 +63,12 @@ class Multipliers:
         d = self.values.shape[1] // 2
         signatures: list[bytes | None] = []
         for values, x, radius in zip(self.values, self.vectors, self.radius, strict=True):
-            if radius > 1 + tolerance:
+            if radius > 1 + TOLERANCE:
                 signatures.append(None)
                 continue
             signs = np.sign(np.imag(np.sum(np.conj(x[:d]) * x[d:], axis=0)))
             angles = np.angle(values)
-            upper = np.flatnonzero((angles > FREE_MOTION_ANGLE) & (np.abs(np.abs(values) - 1) <= tolerance))
+            upper = np.flatnonzero((angles > FREE_MOTION_ANGLE) & (np.abs(np.abs(values) - 1) <= TOLERANCE))
             signatures.append(np.take(signs, upper[np.argsort(angles[upper])]).tobytes())
         return signatures
 

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.state import Problem
 from vmri_jax.mechanics.system import ConstantMass, System
+from vmri_jax.systems.drawn import point
 
 
 def weight(q_s, q_f, params):
@@ -33,6 +34,15 @@ def first_rod(q_s, params):
 def second_rod(q_s, q_f, params):
     """``g = (|q_2 - q_1|^2 - l_2^2) / 2``."""
     return (jnp.sum((q_f[:3] - q_s) ** 2, keepdims=True) - params["lengths"][1] ** 2) / 2
+
+
+DRAWING = {
+    "bodies": [point("heavy bob", "s", 0, 0.9), point("light bob", "f", 0, 0.4), point("last bob", "f", 1, 0.4)],
+    "links": [["heavy bob", "light bob"]],
+    "springs": [["light bob", "last bob"]],
+    "anchors": [{"body": "heavy bob", "point": [0.0, 0.0, 0.0], "kind": "link"}],
+}
+"""The bobs on two rods, the last one on a stiff spring."""
 
 
 def triple_spherical_pendulum(
@@ -69,4 +79,5 @@ def triple_spherical_pendulum(
         v_s=jnp.array([0.0, 1.0, 0.0]),
         v_f=jnp.array([0.0, 1.0, 0.0, 0.0, 1.0, 0.5]),
         names=Names({"bob 1": 3}, {"bob 2": 3, "bob 3": 3}, {"rod 2": 1}, {"rod 1": 1}),
+        drawing=DRAWING,
     )
