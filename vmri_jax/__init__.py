@@ -1,4 +1,5 @@
-"""Variational multirate integrators in JAX: write the physics, pick quadrature rules, get structure-preserving trajectories.
+"""Variational multirate integrators in JAX: write the physics, pick quadrature rules, get structure-preserving
+trajectories.
 
 The physics
     System, ConstantMass, Rheonomic     energies, constraints and forces as functions
@@ -114,7 +115,8 @@ _PACKAGE_OF = {
     "open_ensemble": "ensembles",
     "tune": "study",
 }
-"""Functions that are imported with their packages when they are asked for. matplotlib and scipy.stats take half a second."""
+"""Functions that are imported with their packages when they are asked for. matplotlib and scipy.stats take half a
+second."""
 
 
 def __getattr__(name: str) -> Any:

@@ -52,15 +52,16 @@ MODELS = (".xml", ".mjcf", ".urdf")
 
 
 def find_problem(name: str) -> Problem:
-    """A problem by name: a built-in one, ``my_file.py:my_problem``, ``my_package.my_module:my_problem`` of an installed package, or
-    a model of MuJoCo, ``model.xml``.
+    """A problem by name: a built-in one, ``my_file.py:my_problem``, ``my_package.my_module:my_problem`` of an installed
+    package, or a model of MuJoCo, ``model.xml``.
 
-    The name in the file stands for a `Problem`, a `Scene`, or a function without arguments that returns one of these. A file
-    name alone, ``my_file.py``, stands for the only problem in the file; in a file with several it stands for ``scene`` or
-    ``problem``, and a line on the error stream tells which one is taken.
+    The name in the file stands for a `Problem`, a `Scene`, or a function without arguments that returns one of these. A
+    file name alone, ``my_file.py``, stands for the only problem in the file; in a file with several it stands for
+    ``scene`` or ``problem``, and a line on the error stream tells which one is taken.
 
     Raises:
-        ValueError: an unknown name; a file that does not exist, fails to run, or lacks the name; a value that is no problem.
+        ValueError: an unknown name; a file that does not exist, fails to run, or lacks the name; a value that is no
+        problem.
     """
     scene_or_problem = find_scene_or_problem(name)
     try:
@@ -86,7 +87,8 @@ def find_scene_or_problem(name: str) -> Scene | Problem:
     if not file_name.endswith(".py"):
         if not colon or not all(part.isidentifier() for part in file_name.split(".")):
             raise Refused(
-                f"{unknown('system', name, SYSTEMS)} Your own: my_file.py:my_problem, or my_package.my_module:my_problem."
+                f"{unknown('system', name, SYSTEMS)} Your own: my_file.py:my_problem, or "
+                "my_package.my_module:my_problem."
             )
         return _problem_in(_import(file_name), file_name, attribute)
     module = _run_file(file_name)
@@ -170,7 +172,8 @@ def _import(name: str):
         return importlib.import_module(name)
     except ImportError as error:
         raise Refused(
-            f"the module {name} cannot be imported ({error}); install its package, or give the file, my_file.py:my_problem."
+            f"the module {name} cannot be imported ({error}); install its package, or give the file, "
+            "my_file.py:my_problem."
         ) from error
 
 

@@ -5,7 +5,8 @@ The command line shows them as messages; any other ValueError or TypeError is a 
 
 
 class Refused(ValueError, TypeError):
-    """An argument, a file or a function of the user is refused; the message says what to change. Caught as ValueError or as TypeError."""
+    """An argument, a file or a function of the user is refused; the message says what to change. Caught as ValueError
+    or as TypeError."""
 
 
 class NotInstalled(ImportError):

@@ -57,7 +57,7 @@ def write(folder: Path) -> None:
         module, listed, pages = import_module(place), [], []
         for name in names(place):
             thing = getattr(module, name)
-            first = with_bars((inspect.getdoc(thing) or "").split("\n")[0])
+            first = with_bars(" ".join((inspect.getdoc(thing) or "").split("\n\n")[0].split()))
             listed.append(f"   * - :doc:`{name} <api/{place}.{name}>`\n     - {first}")
             pages.append(f"   api/{place}.{name}")
             kind = "autoclass" if inspect.isclass(thing) else "autofunction"

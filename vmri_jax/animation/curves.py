@@ -13,7 +13,8 @@ from vmri_jax.animation.signals import fast_signal, slow_signal, window
 HEIGHT = 1.65
 """Height of the panels with their labels, in inches."""
 FEWEST_POINTS = 2000
-"""Smallest number of points of a curve: about one per pixel of a figure, so that the interpolation between nodes is seen as a curve."""
+"""Smallest number of points of a curve: about one per pixel of a figure, so that the interpolation between nodes is
+seen as a curve."""
 LEFT, RIGHT, BELOW, ABOVE = 0.62, 0.12, 0.42, 0.3
 """Margins of a panel for its labels, in inches."""
 
@@ -31,7 +32,8 @@ class Curves:
         return HEIGHT if self.slow or self.fast else 0.0
 
     def draw(self, figure: Figure, moments: Sequence[float] | np.ndarray) -> None:
-        """Draw the curves at the lower end of a figure in the style of the theme; dots mark the moments of the pictures."""
+        """Draw the curves at the lower end of a figure in the style of the theme; dots mark the moments of the
+        pictures."""
         motion, theme, (width, height) = self.motion, self.theme, figure.get_size_inches()
         span = float(motion.t[0]), float(motion.t[-1])
         panels = [] if self.slow is None else [(self.slow, span, "t")]

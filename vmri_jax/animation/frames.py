@@ -32,8 +32,8 @@ def plot_strip(
 ) -> plots.NotebookFigure:
     """Pictures of several moments side by side, from one point of view; wide scenes one below the other.
 
-    Rows have equal numbers of pictures, or differ by one; the shorter rows are centred. Below the pictures are two curves: the slow
-    motion along the whole run, with the moments as dots, and some periods of the fast motion.
+    Rows have equal numbers of pictures, or differ by one; the shorter rows are centred. Below the pictures are two
+    curves: the slow motion along the whole run, with the moments as dots, and some periods of the fast motion.
 
     Args:
         motion: from `vmri_jax.animation.motion`.

@@ -1,4 +1,5 @@
-"""Positions of all bodies at any time of a trajectory: nodes, velocities at the nodes, and a cubic polynomial between two nodes."""
+"""Positions of all bodies at any time of a trajectory: nodes, velocities at the nodes, and a cubic polynomial between
+two nodes."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -30,9 +31,9 @@ class Motion:
         drawing: with a body for each coordinate of its blocks, see `vmri_jax.animation.bars`.
         t: (k,) times of the nodes.
         points, velocities: (k, n_bodies, 3) in the coordinates of the picture, where z points upwards.
-        energy: (k, c) change of the energy since the start. For a system that keeps its energy it is relative to the energy at the
-            start, unless that is zero. For other systems there are further columns: the work of forces and of moving
-            constraints since the start, and the balance: the change of the energy minus both works.
+        energy: (k, c) change of the energy since the start. For a system that keeps its energy it is relative to the
+            energy at the start, unless that is zero. For other systems there are further columns: the work of forces
+            and of moving constraints since the start, and the balance: the change of the energy minus both works.
         energy_names: names of the c columns.
         relative: whether the change of the energy is relative.
         residual: (k, 2) largest value and largest rate of a constraint.
@@ -106,14 +107,14 @@ def motion(
 ) -> Motion:
     """The motion of a drawing along a run, up to a failure of the run: ``write_html(motion(run, scene), "run.html")``.
 
-    Velocities at the nodes follow from the momenta if the system is known, else from central differences. If the run kept the
-    micro nodes of all its macro steps, they are nodes as well; without the system, fast velocities are then the derivatives of a
-    cubic spline through all nodes.
+    Velocities at the nodes follow from the momenta if the system is known, else from central differences. If the run
+    kept the micro nodes of all its macro steps, they are nodes as well; without the system, fast velocities are then
+    the derivatives of a cubic spline through all nodes.
 
     Args:
         trajectory: one run, of at least one node.
-        drawing: of the system that was simulated. A scene or a problem stands for its drawing, a problem without a drawing for a bar
-            for each coordinate, a dictionary or its JSON text for `Drawing.from_dict` of it.
+        drawing: of the system that was simulated. A scene or a problem stands for its drawing, a problem without a
+            drawing for a bar for each coordinate, a dictionary or its JSON text for `Drawing.from_dict` of it.
         system: the system that was simulated; None for the system that the run carries, if it does.
 
     Raises:
@@ -190,7 +191,8 @@ def _differences(t, *values) -> list[np.ndarray]:
 
 
 def _velocities(system: System, trajectory: Trajectory, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """(count, n_s) and (count, n_f) velocities from the momenta of the first nodes; the system must be the one of the run."""
+    """(count, n_s) and (count, n_f) velocities from the momenta of the first nodes; the system must be the one of the
+    run."""
     phase = [jnp.asarray(a)[:count] for a in tuple(vars(trajectory.states).values())[1:]]
     try:
         start_energy = float(diagnostics.energy(system, *(a[0] for a in phase)))
@@ -201,8 +203,8 @@ def _velocities(system: System, trajectory: Trajectory, count: int) -> tuple[np.
     run_energy = float(trajectory.energy[0])
     if abs(start_energy - run_energy) > 1e-6 * max(1.0, abs(run_energy)):
         raise Refused(
-            f"motion: the system has the energy {start_energy:.6g} at the start, the run {run_energy:.6g}; give the system that was simulated, with "
-            "its parameters."
+            f"motion: the system has the energy {start_energy:.6g} at the start, the run {run_energy:.6g}; give the "
+            "system that was simulated, with its parameters."
         )
     return np.asarray(v_s), np.asarray(v_f)
 
@@ -213,4 +215,5 @@ def _ending(trajectory: Trajectory, count: int) -> str:
         return ""
     result = Result(int(trajectory.result))
     where = f"in macro step {failed}, " if failed >= 0 else ""
-    return f"The run failed {where}after t = {float(trajectory.t[count - 1]):.6g} ({result.name}); it is drawn up to there."
+    last = float(trajectory.t[count - 1])
+    return f"The run failed {where}after t = {last:.6g} ({result.name}); it is drawn up to there."

@@ -42,15 +42,15 @@ def read_solid(data: Any, where: str) -> tuple[Solid, list[Body]]:
     count = len(forms) // 3 - 1
     if len(forms) != 3 * (count + 1) or not 1 <= count <= 3 or corners.ndim != 2 or corners.shape[1] != count:
         raise Refused(
-            f"{where}: {len(forms)} coordinates and corners of shape {corners.shape}; give the 12 coordinates of a rigid body (or "
-            "fewer, of one with fewer directors) and a number along each director for every corner."
+            f"{where}: {len(forms)} coordinates and corners of shape {corners.shape}; give the 12 coordinates of a "
+            "rigid body (or fewer, of one with fewer directors) and a number along each director for every corner."
         )
     if any(not 0 <= i < len(corners) for face in faces for i in face):
         raise Refused(
             f"{where}: a face has the number of a corner that does not exist; there are {len(corners)} corners."
         )
-    # The points are the centre and, along each director, the point at the distance `size` of the farthest corner: points at a
-    # length of 1 could lie far outside the picture.
+    # The points are the centre and, along each director, the point at the distance `size` of the farthest corner:
+    # points at a length of 1 could lie far outside the picture.
     size = float(np.abs(corners).max()) or 1.0
     centre = tuple(forms[:3])
     bodies = [Body(name, centre, (0.0,) * 3, None, data.get("color"), "name")]

@@ -53,7 +53,8 @@ def animate(
 ) -> None:
     """Show a run: a page to open in a browser, a strip of pictures, or a GIF.
 
-    The drawing is the one stored with the run, else the drawing of --system; without a drawing every coordinate is a bar.
+    The drawing is the one stored with the run, else the drawing of --system; without a drawing every coordinate is a
+    bar.
     """
     out = run.with_suffix(".html") if out is None else out
     check_target_file("--out", out, (".html", *PICTURES, ".gif", ".pvd"))

@@ -32,7 +32,8 @@ FAULT = "This is no error of your command, but of the program. Please report it,
 
 @contextmanager
 def refusals() -> Iterator[None]:
-    """Within this context refusals of the library are shown as panels, and other errors of their classes as faults of the program."""
+    """Within this context refusals of the library are shown as panels, and other errors of their classes as faults of
+    the program."""
     try:
         yield
     except Refused as error:
@@ -52,7 +53,8 @@ def refusals() -> Iterator[None]:
 
 @contextmanager
 def status(text: str) -> Iterator[None]:
-    """Show a text while the block runs: beside a spinner, or in a line on the error stream if the output is no terminal."""
+    """Show a text while the block runs: beside a spinner, or in a line on the error stream if the output is no
+    terminal."""
     if console.is_terminal:
         with console.status(text):
             yield

@@ -28,10 +28,11 @@ def explain(
     ] = None,
     measure: Annotated[bool, typer.Option(help="Time a macro step, and the derivatives of every effect.")] = True,
 ) -> None:
-    """Show the grid of every body and effect of a scene, or function of a system, with the reason, its cost, and all frequencies.
+    """Show the grid of every body and effect of a scene, or function of a system, with the reason, its cost, and all
+    frequencies.
 
-    The cost: unknowns, evaluations, and the time of one evaluation of the first derivatives at all nodes. Frequencies are of
-    small vibrations about the start.
+    The cost: unknowns, evaluations, and the time of one evaluation of the first derivatives at all nodes. Frequencies
+    are of small vibrations about the start.
 
     Example:
 

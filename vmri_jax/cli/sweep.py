@@ -94,9 +94,9 @@ def _drawn(save: list[str], problem: Problem) -> str:
     drawn = drawn_by_default(save, problem)
     if not drawn:
         raise Refused(
-            f"--plot draws one number per run or per saved node, and save = {json.dumps(save)} keeps neither. Add one to the "
-            f"file, e.g. save = {json.dumps([*save, 'energy_error'])}, or a function of your own that returns one, "
-            "my_file.py:function."
+            f"--plot draws one number per run or per saved node, and save = {json.dumps(save)} keeps neither. Add one "
+            f"to the file, e.g. save = {json.dumps([*save, 'energy_error'])}, or a function of your own that returns "
+            "one, my_file.py:function."
         )
     return drawn[-1]
 

@@ -1,4 +1,5 @@
-"""Arguments of `minimize`: their checks, the `Transcription` that they make, and the point where the iteration starts."""
+"""Arguments of `minimize`: their checks, the `Transcription` that they make, and the point where the iteration
+starts."""
 
 from collections.abc import Callable, Mapping
 
@@ -25,7 +26,8 @@ def actuation_of(problem, actuate, num_controls) -> tuple[Callable, tuple[str, .
     if actuate is None:
         if scene_actuation is None:
             raise Refused(
-                'minimize: nothing is controlled; give a scene with Controlled effects, e.g. Controlled("hub", "torque"), or actuate= '
+                'minimize: nothing is controlled; give a scene with Controlled effects, e.g. Controlled("hub", '
+                '"torque"), or actuate= '
                 "and num_controls=."
             )
         if num_controls not in (None, len(scene_actuation.labels)):
@@ -56,7 +58,8 @@ def transcribed(
             f"minimize: system.params is {type(params).__name__}; the controls need it to be a dict, or None."
         )
     prepare(problem, scheme, macro_dt=macro_dt, num_steps=1, solver=solver)  # makes the checks of a run
-    # A fallback is a branch of the compiled step. `jax.vmap` over all steps would compute both of its sides for every step.
+    # A fallback is a branch of the compiled step. `jax.vmap` over all steps would compute both of its sides for every
+    # step.
     solver = solver or plan(system, scheme, state).first
     u = np.zeros(num_controls)
     actuate = traced_once(actuate, order_of(params))
@@ -64,8 +67,8 @@ def transcribed(
     expected = (state.q_s.shape, state.q_f.shape)
     if not isinstance(forces, tuple) or tuple(getattr(f, "shape", None) for f in forces) != expected:
         raise Refused(
-            f"minimize: actuate returns {forces}; it must return forces on the slow and on the fast variables, of shapes "
-            f"{expected[0]} and {expected[1]}."
+            f"minimize: actuate returns {forces}; it must return forces on the slow and on the fast variables, of "
+            f"shapes {expected[0]} and {expected[1]}."
         )
     for name, function in aims.items():
         arguments = (state, u) if name in ("cost", "limits") else (state,)
@@ -114,7 +117,8 @@ def _bounds(bounds, num_controls: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def started(setup: Transcription, start, num_steps: int, num_controls: int, grid: str) -> Point:
-    """Nodes and controls of the first iteration, without their gaps and the miss of the goal; `start` as of `minimize`."""
+    """Nodes and controls of the first iteration, without their gaps and the miss of the goal; `start` as of
+    `minimize`."""
     nodes, shape = None, (num_steps, setup.parts, num_controls)
     if isinstance(start, Optimum):
         nodes, controls = _resampled(setup, start, num_steps)
@@ -127,18 +131,21 @@ def started(setup: Transcription, start, num_steps: int, num_controls: int, grid
             raise Refused(f"minimize: start has shape {controls.shape}; the controls have {expected}.")
         controls = controls.reshape(shape)
     u = jnp.asarray(np.clip(controls, *setup.bounds))
-    # Given controls start from the motion that they make, without gaps; the nodes of an optimum are interpolated, with gaps.
+    # Given controls start from the motion that they make, without gaps; the nodes of an optimum are interpolated, with
+    # gaps.
     if nodes is None:
         nodes, _ = rolled(setup, u)
         if not np.isfinite(nodes).all():
             raise Refused(
-                "minimize: the motion with the first controls fails; give other controls, start=..., or a smaller macro_dt."
+                "minimize: the motion with the first controls fails; give other controls, start=..., or a smaller "
+                "macro_dt."
             )
     return Point(nodes, u, np.zeros(0), np.zeros(0))
 
 
 def _resampled(setup: Transcription, start: Optimum, num_steps: int):
-    """Nodes (N, n) and controls (N, parts, m) of an optimum, interpolated to the grid of another problem of the same duration."""
+    """Nodes (N, n) and controls (N, parts, m) of an optimum, interpolated to the grid of another problem of the same
+    duration."""
     run, m = start.trajectory, start.controls.shape[-1]
     old_nodes = np.asarray(phase_vector(run.states))
     duration, expected = float(run.t[-1] - run.t[0]), num_steps * setup.macro_dt

@@ -1,4 +1,5 @@
-"""A hard case: a set-up, a criterion, a function that measures it, and the picture of a long run: its energy error as a band."""
+"""A hard case: a set-up, a criterion, a function that measures it, and the picture of a long run: its energy error as a
+band."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field

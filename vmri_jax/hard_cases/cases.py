@@ -44,13 +44,14 @@ from vmri_jax.steppers.solver import Solver
 NUM_MICRO = 5
 """Micro steps per macro step of the cases."""
 PHASE = 0.2
-"""omega h of the fastest vibration, which resolves it; omega H = 1 is well below the first resonance. A larger value may meet resonances."""
+"""omega h of the fastest vibration, which resolves it; omega H = 1 is well below the first resonance. A larger value
+may meet resonances."""
 LONGER_RUN = 8
-"""Factor by which a run is lengthened if its energy has a trend. In the longer run the trend of a slow motion turns back or settles, and a
-drift goes on; a larger factor tells the two apart more safely and takes longer."""
+"""Factor by which a run is lengthened if its energy has a trend. In the longer run the trend of a slow motion turns
+back or settles, and a drift goes on; a larger factor tells the two apart more safely and takes longer."""
 DRIFT_RATIO = 0.75
-"""Rate of the trend in the longer run, as a part of the rate in the first run, above which the trend is a drift; a larger value overlooks
-drifts that slow down."""
+"""Rate of the trend in the longer run, as a part of the rate in the first run, above which the trend is a drift; a
+larger value overlooks drifts that slow down."""
 ROUND_OFF_BAND = 1e-9
 """Relative band of the energy up to which it is round-off; a larger value overlooks small drifts."""
 SHADOW_STEPS = 2_000
@@ -59,7 +60,10 @@ ROUND_OFF = 4 * np.finfo(float).eps
 """Round-off of a position in a step, as a part of the largest position; a larger value hides differences of momenta."""
 OVERFLOWING_MOMENTUM = 1e160
 """A momentum whose square, and so its kinetic energy, overflows float64."""
-ENERGY_CRITERION = "the linear trend is at most half of the largest energy error, or flattens in a longer run, or the error is below 1e-9"
+ENERGY_CRITERION = (
+    "the linear trend is at most half of the largest energy error, or flattens in a longer run, or the error is below "
+    "1e-9"
+)
 EXPLICIT_CRITERION = "runs at omega h = 1; at 2.5 every NaN is reported as a failure"
 DERIVATIVE_CRITERION = "gradients and Hessians are those of the functions, to 1e-4"
 LANE_CRITERION = "the bad lane reports its failure, the others equal their single runs to 1e-12"
@@ -67,7 +71,8 @@ LANE_CRITERION = "the bad lane reports its failure, the others equal their singl
 
 @dataclass(frozen=True)
 class Resolved:
-    """A problem with a scheme and a macro step that resolve its fastest vibration, of frequency omega; every public method is a case."""
+    """A problem with a scheme and a macro step that resolve its fastest vibration, of frequency omega; every public
+    method is a case."""
 
     problem: Problem
     scheme: Scheme
@@ -113,8 +118,8 @@ class Resolved:
             trend = change.drifts and abs(change.drift) > DRIFT_RATIO * abs(before.drift)
         e, shadow = np.asarray(trajectory.energy), drift_meter(self.problem, self.scheme, self.macro_dt, SHADOW_STEPS)
         return Outcome(
-            f"{steps:.0e} steps: {status(trajectory)}, relative band {change.band:.1e}, drift {change.drift:.0e} per 1e5 steps "
-            f"({change.share:.0%} of the band over the run)"
+            f"{steps:.0e} steps: {status(trajectory)}, relative band {change.band:.1e}, drift {change.drift:.0e} per "
+            f"1e5 steps ({change.share:.0%} of the band over the run)"
             + ("" if shadow is None else f"; first {SHADOW_STEPS} steps: {shadow}"),
             trajectory.success and not trend,
             {"band": change.band, "drift_per_1e5": change.drift},
@@ -185,7 +190,8 @@ class Resolved:
     def _from_textbook(self, scheme: Scheme, macro_dt: float, steps: int) -> float:
         """Largest difference of a run from the textbook, relative to the largest positions and momenta, less round-off.
 
-        A step divides the round-off of ``M (q_+ - q)`` by its micro step h, so that momenta have a round-off of ``eps |M| |q| / h``.
+        A step divides the round-off of ``M (q_+ - q)`` by its micro step h, so that momenta have a round-off of
+        ``eps |M| |q| / h``.
         """
         system, state = self.problem.system, self.problem.state()
         simulated = jax.jit(textbook.simulate, static_argnames="num_steps")
@@ -200,7 +206,8 @@ class Resolved:
         return max(difference(q, q_oracle) / largest_q, max(difference(p, p_oracle) - round_off, 0.0) / largest_p)
 
     def bad_lane(self, full: bool) -> Outcome:
-        """A batch whose lanes start at the nodes of a run, one of them with overflowing momenta, beside single runs of some lanes."""
+        """A batch whose lanes start at the nodes of a run, one of them with overflowing momenta, beside single runs of
+        some lanes."""
         lanes, options = 64 if full else 16, {"macro_dt": self.macro_dt, "num_steps": 20, "save": 20}
         bad = lanes // 3
         along = run(
@@ -218,7 +225,8 @@ class Resolved:
                 apart = max(apart, difference(getattr(batch, name)[lane], getattr(single, name)) / size)
         result = Result(int(batch.result[bad])).name
         return Outcome(
-            f"{lanes} lanes: lane {bad} {result}, {len(failed)} failed in all; others within {apart:.0e} of their single runs",
+            f"{lanes} lanes: lane {bad} {result}, {len(failed)} failed in all; others within {apart:.0e} of their "
+            "single runs",
             list(failed) == [bad] and apart < 1e-12,
             {"failed": len(failed), "apart": apart},
         )
@@ -248,10 +256,11 @@ class Resolved:
 
 
 def resolved(problem: Problem) -> Resolved:
-    """A problem with five micro steps of ``omega h = 0.2`` for its largest frequency at the start, or for the frequency of its drive if larger.
+    """A problem with five micro steps of ``omega h = 0.2`` for its largest frequency at the start, or for the frequency
+    of its drive if larger.
 
-    If nothing vibrates, ``omega = max(|q'_i| / |q_i|, sqrt(|q''_i| / |q_i|))``, the rate at which positions change by their size; 1 for a body
-    at rest without forces.
+    If nothing vibrates, ``omega = max(|q'_i| / |q_i|, sqrt(|q''_i| / |q_i|))``, the rate at which positions change by
+    their size; 1 for a body at rest without forces.
     """
     state = problem.state()
     linear = linearise(problem.system, state)
@@ -328,7 +337,8 @@ def _has_no_limit(system: System) -> str:
 
 
 def _turns_one_way(problem: Problem) -> str:
-    """The reason why reversed momenta do not lead a closed system back to the start; empty if its kinetic energy is even in the velocities."""
+    """The reason why reversed momenta do not lead a closed system back to the start; empty if its kinetic energy is
+    even in the velocities."""
     random, system = np.random.default_rng(0), problem.system
     v_s, v_f = (random.uniform(-1, 1, q.shape) for q in (problem.q_s, problem.q_f))
     there, back = (float(system.kinetic_energy(problem.q_s, problem.q_f, v_s * x, v_f * x)) for x in (1, -1))

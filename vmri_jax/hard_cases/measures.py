@@ -22,7 +22,8 @@ SAVED_NODES = 10_000
 
 
 def run(problem: Problem, scheme, macro_dt, num_steps: int, state: State | None = None, **options: Any) -> Trajectory:
-    """`vmri_jax.simulate` from a state, by default the start of the problem; a failure is in the trajectory and not raised."""
+    """`vmri_jax.simulate` from a state, by default the start of the problem; a failure is in the trajectory and not
+    raised."""
     start = problem.state() if state is None else state
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", LostEnergyWarning)  # the cases measure it
@@ -58,12 +59,14 @@ class Energy:
 
     @property
     def drifts(self) -> bool:
-        """Whether the linear trend is more than half of the band: chaotic motion alone moves the mean by a tenth or two."""
+        """Whether the linear trend is more than half of the band: chaotic motion alone moves the mean by a tenth or
+        two."""
         return not self.share <= 0.5
 
 
 def energy(trajectory: Trajectory, num_steps: int, scale: float = 1.0) -> Energy:
-    """Band and drift of the energy over a run of `num_steps` steps, in units of `scale`; infinite where the run failed."""
+    """Band and drift of the energy over a run of `num_steps` steps, in units of `scale`; infinite where the run
+    failed."""
     e = (np.asarray(trajectory.energy) - float(trajectory.energy[0])) / scale
     if not np.isfinite(e).all():
         return Energy(np.inf, np.inf, np.inf)
@@ -82,7 +85,8 @@ def energy_scale(problem: Problem, trajectory: Trajectory) -> float:
 
 
 def drift_meter(problem: Problem, scheme, macro_dt, num_steps: int) -> ShadowEnergy | None:
-    """The shadow energy of the first steps; None where there is none: forces, constraints that depend on time, a run that failed."""
+    """The shadow energy of the first steps; None where there is none: forces, constraints that depend on time, a run
+    that failed."""
     try:
         return diagnostics.shadow_energy(problem, scheme, run(problem, scheme, macro_dt, num_steps))
     except Refused:

@@ -105,8 +105,8 @@ def run_cases(
         cases: e.g. ``cases_for(problem)``.
         numbers: numbers of the cases to run; all cases by default.
         full: whether to run the full form instead of the quick one.
-        progress: True for a bar, or a function of (what, done, total), called before every case and at the end; with False a case that takes
-            more than two seconds prints a line.
+        progress: True for a bar, or a function of (what, done, total), called before every case and at the end; with
+            False a case that takes more than two seconds prints a line.
 
     Raises:
         ValueError: a number that no case has.

@@ -47,20 +47,22 @@ def plot_ensemble(
 ) -> NotebookFigure:
     """A result of an ensemble over its parameters.
 
-    The figure over two axes is a map in colours, with a panel for each value of a third and a fourth axis; failed runs are grey.
-    The figure over one axis has curves, or bands if there are more than six curves. Over a column of a table or of random draws it is a
-    scatter plot, and without parameters a histogram. A quantity of all saved nodes is drawn against time, with the bands that hold
-    half and nine tenths of the runs that did not fail.
+    The figure over two axes is a map in colours, with a panel for each value of a third and a fourth axis; failed runs
+    are grey. The figure over one axis has curves, or bands if there are more than six curves. Over a column of a table
+    or of random draws it is a scatter plot, and without parameters a histogram. A quantity of all saved nodes is drawn
+    against time, with the bands that hold half and nine tenths of the runs that did not fail.
 
     Args:
         data: from `vmri_jax.open_ensemble`, or a selection of it.
-        quantity: name of the result; if None the last result with a single number per run, else the last one with a number per saved node.
+        quantity: name of the result; if None the last result with a single number per run, else the last one with a
+            number per saved node.
         x, y: names of axes or columns; the two longest axes if both are None and the design has axes.
         title: title above the panels.
         theme: colours.
 
     Raises:
-        ValueError: an unknown name, a quantity with several numbers per run, no quantity to choose, or more panels than can be drawn.
+        ValueError: an unknown name, a quantity with several numbers per run, no quantity to choose, or more panels than
+        can be drawn.
     """
     quantity = _quantity(data, quantity)
     values = data[quantity]
@@ -108,9 +110,9 @@ def _quantity(data: "xarray.Dataset", name: str | None) -> str:
         if names:
             return names[-1]
     raise Refused(
-        f"plot_ensemble: no quantity is one number per run; there are {', '.join(arrays) or 'none besides the status'}. Save one, "
-        "save=('end', 'energy_error'), or choose one number of a quantity: plot_ensemble(data.isel(slow=0), 'q_s'). "
-        "The status of the runs is drawn as 'result'."
+        "plot_ensemble: no quantity is one number per run; there are "
+        f"{', '.join(arrays) or 'none besides the status'}. Save one, save=('end', 'energy_error'), or choose one "
+        "number of a quantity: plot_ensemble(data.isel(slow=0), 'q_s'). The status of the runs is drawn as 'result'."
     )
 
 
@@ -125,8 +127,8 @@ def _panels(values, drawn: Sequence[str]) -> list[tuple[str, Any]]:
     count = int(np.prod([values.sizes[d] for d in panel_axes], dtype=int))
     if count > MOST_PANELS:
         raise Refused(
-            f"plot_ensemble: besides {', '.join(drawn)} there are {', '.join(map(str, panel_axes))} with {count} combinations of values; "
-            f"select some, data.sel({panel_axes[-1]}=...)."
+            f"plot_ensemble: besides {', '.join(drawn)} there are {', '.join(map(str, panel_axes))} with {count} "
+            f"combinations of values; select some, data.sel({panel_axes[-1]}=...)."
         )
     panels = []
     for numbers in np.ndindex(*(values.sizes[d] for d in panel_axes)):

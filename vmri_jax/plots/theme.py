@@ -36,7 +36,8 @@ MARKERS = ("o", "s", "^", "D", "v", "P")
 LINES = ("-", "--", ":", "-.", (0, (7, 1.5, 1, 1.5, 1, 1.5)))
 """Styles of lines: the style changes after each pass through the colours, so that 30 curves differ."""
 ROUNDOFF_FLOOR = 1e-17
-"""Value at which a logarithmic axis of residuals draws zeros, below the round-off of numbers of order one; a smaller value stretches the axis."""
+"""Value at which a logarithmic axis of residuals draws zeros, below the round-off of numbers of order one; a smaller
+value stretches the axis."""
 DPI = 150
 """Dots per inch of a figure saved by its method `savefig` outside of `style`; a larger value makes larger files."""
 
@@ -203,7 +204,8 @@ def positive(values: Any) -> np.ndarray:
 
 
 def log_ticks(axis: Axis, values: Sequence[float] | np.ndarray) -> None:
-    """Make an axis logarithmic, with labels at powers of ten; or at 1, 2, 5 times powers of ten if the values span less than a factor of 30.
+    """Make an axis logarithmic, with labels at powers of ten; or at 1, 2, 5 times powers of ten if the values span less
+    than a factor of 30.
 
     Args:
         axis: an axis of a panel with or without curves.

@@ -19,10 +19,11 @@ from vmri_jax.study.table import Column, ResultTable
 POINTS_IN_WINDOW = np.linspace(0.0, 1.0, 9)
 """Points of a window at which its growth is measured, in widths from its start."""
 RESOLUTION = 1e-7
-"""Accuracy of the ends of windows, as a part of the range of omega H; narrower windows are left out. A larger value takes less time."""
+"""Accuracy of the ends of windows, as a part of the range of omega H; narrower windows are left out. A larger value
+takes less time."""
 POINTS_PER_CALL = 64
-"""Samples that all brackets together get in a call of `label`, the number that `multipliers` computes at a time for small systems; more samples
-divide brackets faster, and each costs an eigenvalue problem."""
+"""Samples that all brackets together get in a call of `label`, the number that `multipliers` computes at a time for
+small systems; more samples divide brackets faster, and each costs an eigenvalue problem."""
 
 
 class Window(NamedTuple):
@@ -46,8 +47,8 @@ class StabilityMap(ResultTable):
     rows: (m,) labels of the rows.
     omega: frequency that scales the grid, the largest frequency of the fast potential alone.
     omega_H: (n,) grid, macro step times omega.
-    radius: (m, n) spectral radius of the derivative of the step, without the multipliers of motions of the system that grow;
-        infinite where the step failed.
+    radius: (m, n) spectral radius of the derivative of the step, without the multipliers of motions of the system that
+        grow; infinite where the step failed.
     unstable: the windows of omega_H of each row in which radius > 1 + 1e-6; they may be far narrower than the grid.
     note: why the map does not tell whether the motion is stable, see `Linearisation.frozen`; empty at an equilibrium.
     """
@@ -105,18 +106,20 @@ def stability_map(
 ) -> StabilityMap:
     """Stability of macro steps of length H, from the multipliers of the step of small motions about a state.
 
-    At an equilibrium these are the eigenvalues of the derivative of `macro_step`; elsewhere the eigenvalues for the frozen problem
-    (see `linearise`). Multipliers of opposite Krein signature that have passed each other between two grid points reveal a window there,
-    whose ends are refined by bisection.
+    At an equilibrium these are the eigenvalues of the derivative of `macro_step`; elsewhere the eigenvalues for the
+    frozen problem (see `linearise`). Multipliers of opposite Krein signature that have passed each other between two
+    grid points reveal a window there, whose ends are refined by bisection.
 
     Args:
-        system: `linear_model()`, any other problem or scene, a system with a state, or several by label for a single scheme, e.g.
-            ``{k: linear_model(kappa=k) for k in (5.0, 25.0)}``. The unit of the grid is omega of the first: the largest frequency of its
-            fast potential alone, or the largest rate of all motions if this potential has no frequency.
+        system: `linear_model()`, any other problem or scene, a system with a state, or several by label for a single
+            scheme, e.g. ``{k: linear_model(kappa=k) for k in (5.0, 25.0)}``. The unit of the grid is omega of the
+            first: the largest frequency of its fast potential alone, or the largest rate of all motions if this
+            potential has no frequency.
         scheme: a scheme or composition, or several by label, e.g. ``{n: explicit_slow(n) for n in (2, 3, 5)}``; each
             num_micro and structure is compiled once.
         omega_H: (n,) increasing positive values of omega times the macro step. A spacing of 0.1 or less finds narrow
-            windows; with a larger one a multiplier may pass several multipliers between two points, which hides windows.
+            windows; with a larger one a multiplier may pass several multipliers between two points, which hides
+            windows.
         state: point of expansion of the small motions; None for the start of the problem.
         executor: executor that computes the rows, as of `vmri_jax.ensemble`; None for this process.
 
@@ -129,7 +132,8 @@ def stability_map(
     schemes = scheme if isinstance(scheme, Mapping) else {"": scheme}
     if not schemes or not all(isinstance(s, Scheme | Composition) for s in schemes.values()):
         raise Refused(
-            f"stability_map: scheme is {scheme!r}; give a Scheme or Composition, e.g. explicit_slow(10), or a dict of them."
+            f"stability_map: scheme is {scheme!r}; give a Scheme or Composition, e.g. explicit_slow(10), or a dict of "
+            "them."
         )
     if min(len(systems), len(schemes)) != 1:
         raise Refused(f"stability_map: {len(systems)} systems and {len(schemes)} schemes; give one of either.")
@@ -154,7 +158,8 @@ def stability_map(
 def measure(
     linear: Linearisation, scheme: Scheme | Composition, macro_dt, resolution: float = RESOLUTION
 ) -> tuple[np.ndarray, list[Window]]:
-    """Spectral radius (n,) at n increasing macro steps, and the unstable windows between the first and the last of them."""
+    """Spectral radius (n,) at n increasing macro steps, and the unstable windows between the first and the last of
+    them."""
 
     def label(macro_dt):
         return multipliers(linear, scheme, macro_dt).krein_signatures
@@ -176,7 +181,8 @@ def find_windows(
     Between neighbouring samples with different labels lies an end of a window, or a whole window. All such brackets are
     divided at the same time, until they are shorter than `resolution`; shorter windows are left out.
 
-    ``label(samples)`` has a label for each sample, None for unstable, else any value to compare; `labels` are the labels of x (k,).
+    ``label(samples)`` has a label for each sample, None for unstable, else any value to compare; `labels` are the
+    labels of x (k,).
     """
     edges = [x[0]] if labels[0] is None else []
     samples = zip(x, x[1:], labels, labels[1:], strict=False)
@@ -193,8 +199,8 @@ def find_windows(
             pieces = zip(nodes, nodes[1:], node_labels, node_labels[1:], strict=False)
             divided += [piece for piece in pieces if piece[2] != piece[3]]
         brackets = [piece for piece in divided if piece[1] - piece[0] > resolution]
-        # Of a short bracket with an unstable side, the stable end: the window includes the bracket. Two different stable labels hide a
-        # window shorter than the resolution.
+        # Of a short bracket with an unstable side, the stable end: the window includes the bracket. Two different
+        # stable labels hide a window shorter than the resolution.
         for a, b, label_a, label_b in divided:
             if b - a <= resolution and None in (label_a, label_b):
                 edges.append(a if label_b is None else b)
