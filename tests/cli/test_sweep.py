@@ -155,7 +155,7 @@ def test_axes_and_files_are_seen_from_the_folder(tmp_path):
     ("change", "message"),
     [
         (("out =", "oout ="), "no entry 'oout'. Did you mean out?"),
-        (('system = "fpu"\n', ""), "system is missing"),
+        (('system = "fpu"\n', ""), "lacks the entry 'system'"),
         (("omega = [20.0, 50.0]", "omega = { from = 1 }"), "the axis omega: give values, or from, to and count"),
         (("omega = [20.0, 50.0]", "omega = { form = 1 }"), "no entry 'form'. Did you mean from?"),
         (("omega", "omga"), "the column 'omga' sets no number of the problem. Did you mean omega?"),

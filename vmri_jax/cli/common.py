@@ -51,18 +51,6 @@ def refusals() -> Iterator[None]:
         raise typer.Exit(1) from error
 
 
-@contextmanager
-def status(text: str) -> Iterator[None]:
-    """Show a text while the block runs: beside a spinner, or in a line on the error stream if the output is no
-    terminal."""
-    if console.is_terminal:
-        with console.status(text):
-            yield
-    else:
-        Console(stderr=True).print(f"{text} ...")
-        yield
-
-
 def print_failure(title: str, text: str) -> None:
     """Print a red panel on the error stream."""
     Console(stderr=True).print(Panel(Text(text), title=title, title_align="left", border_style="red"))

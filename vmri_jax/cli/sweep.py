@@ -3,7 +3,7 @@
 import json
 import os
 import tomllib
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
@@ -13,21 +13,14 @@ import typer
 from rich.markup import escape
 
 from vmri_jax import plots
+from vmri_jax.animation.checks import check_keys
 from vmri_jax.catalogue import find_problem
 from vmri_jax.cli.columns import by_name
-from vmri_jax.cli.common import (
-    PICTURES,
-    check_target_file,
-    console,
-    print_failure,
-    print_named,
-    print_written,
-)
+from vmri_jax.cli.common import PICTURES, check_target_file, console, print_failure, print_named, print_written
 from vmri_jax.ensembles import Axis, Draw, Draws, Ensemble, EnsembleError, Product, ensemble
 from vmri_jax.ensembles.quantities import drawn_by_default
 from vmri_jax.executors.executor import local_workers
 from vmri_jax.mechanics.arrays import whole_number
-from vmri_jax.mechanics.names import unknown
 from vmri_jax.mechanics.state import Problem
 from vmri_jax.refusals import Refused
 from vmri_jax.running.export import extra
@@ -35,9 +28,6 @@ from vmri_jax.running.interrupts import Interrupted
 
 SETTINGS = ("t_end", "num_steps", "macro_dt", "num_micro", "save", "num_saves", "project", "chunk")
 """Entries whose names and values are arguments of `ensemble`."""
-ENTRIES = ("system", "scheme", "out", *SETTINGS, "axes", "draws")
-AXIS = ("from", "to", "count", "log", "values", "unit", "description")
-DRAWS = ("count", "seed", "method", "columns")
 
 
 def sweep(
@@ -109,10 +99,7 @@ def read_sweep(file: Path) -> dict[str, Any]:
         entries = tomllib.loads(file.read_text())
     except tomllib.TOMLDecodeError as error:
         raise Refused(f"{file} is no TOML: {error}.") from error
-    _check_entries(f"{file}", entries, ENTRIES)
-    for name in ("system", "scheme", "out"):
-        if name not in entries:
-            raise Refused(f"{file}: {name} is missing; see the file of vmri new sweep.toml.")
+    check_keys(entries, ("system", "scheme", "out"), (*SETTINGS, "axes", "draws"), f"{file}")
     if ("axes" in entries) == ("draws" in entries):
         raise Refused(f"{file}: give either [axes] or [draws].")
     if "axes" in entries:
@@ -133,7 +120,7 @@ def read_sweep(file: Path) -> dict[str, Any]:
 def _axis(subject: str, entry) -> Any:
     if not isinstance(entry, Mapping):
         return np.atleast_1d(np.asarray(entry))
-    _check_entries(subject, entry, AXIS)
+    check_keys(entry, (), ("from", "to", "count", "log", "values", "unit", "description"), subject)
     words = entry.get("unit", ""), entry.get("description", "")
     if "values" in entry:
         return Axis(entry["values"], *words)
@@ -144,9 +131,7 @@ def _axis(subject: str, entry) -> Any:
 
 
 def _draws(file: Path, entries: Mapping[str, Any]) -> Draws:
-    _check_entries(f"{file}: draws", entries, DRAWS)
-    if not {"count", "columns"} <= set(entries):
-        raise Refused(f"{file}: draws need a count and columns, [draws.columns].")
+    check_keys(entries, ("count", "columns"), ("seed", "method"), f"{file}: draws")
     columns = dict(entries["columns"])
     for name, entry in columns.items():
         if isinstance(entry, Mapping):
@@ -154,12 +139,6 @@ def _draws(file: Path, entries: Mapping[str, Any]) -> Draws:
             columns[name] = Draw(kind, tuple(numbers), entry.get("unit", ""), entry.get("description", ""))
     chosen = {name: entries[name] for name in ("seed", "method") if name in entries}
     return Draws(entries["count"], columns, **chosen)
-
-
-def _check_entries(where: str, entries: Mapping[str, Any], known: Collection[str]) -> None:
-    for name in entries:
-        if name not in known:
-            raise Refused(f"{where}: {unknown('entry', name, known)}")
 
 
 def _located(name: str, folder: Path) -> str:

@@ -116,14 +116,14 @@ class Resolved:
             steps *= LONGER_RUN
             before, (trajectory, change) = change, self._energy(steps)
             trend = change.drifts and abs(change.drift) > DRIFT_RATIO * abs(before.drift)
-        e, shadow = np.asarray(trajectory.energy), drift_meter(self.problem, self.scheme, self.macro_dt, SHADOW_STEPS)
+        shadow = drift_meter(self.problem, self.scheme, self.macro_dt, SHADOW_STEPS)
         return Outcome(
             f"{steps:.0e} steps: {status(trajectory)}, relative band {change.band:.1e}, drift {change.drift:.0e} per "
             f"1e5 steps ({change.share:.0%} of the band over the run)"
             + ("" if shadow is None else f"; first {SHADOW_STEPS} steps: {shadow}"),
             trajectory.success and not trend,
             {"band": change.band, "drift_per_1e5": change.drift},
-            {"t": trajectory.t, "energy error": e - e[0]},
+            partial(draw_energy, {"": trajectory}),
         )
 
     def _energy(self, steps: int) -> tuple[Trajectory, Energy]:
@@ -311,9 +311,8 @@ def cases_for(problem: Problem | HasProblem) -> tuple[Case, ...]:
         ("one bad lane in a batch", step, LANE_CRITERION, cases.bad_lane),
         ("derivatives", step, DERIVATIVE_CRITERION, cases.derivatives),
     ]
-    pictures = {"energy for long": draw_energy}
     return tuple(
-        Case(number, title, setup, criterion, run, pictures.get(title), "".join(reason))
+        Case(number, title, setup, criterion, run, "".join(reason))
         for number, (title, setup, criterion, run, *reason) in enumerate(rows, start=1)
     )
 

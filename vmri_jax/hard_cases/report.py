@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from matplotlib.figure import Figure
 from rich.text import Text
 
 from vmri_jax import plots
@@ -61,10 +62,9 @@ class Report(ResultTable):
         """The rows, with lines between them, for the terminal."""
         return rich_table(self.columns, self.rows, ruled=True)
 
-    def pictures(self, theme: plots.Theme = plots.LIGHT) -> dict:
+    def pictures(self) -> dict[str, Figure]:
         """Figures by the title of the case, for all cases with a picture."""
-        drawn = [(row.case.title, row.case.draw, row.details) for row in self.rows]
-        return {title: draw(details, theme) for title, draw, details in drawn if draw is not None and details}
+        return {row.case.title: row.picture() for row in self.rows if row.picture is not None}
 
     def write(self, folder: str | Path) -> list[Path]:
         """Write cases.csv and the pictures into a folder, made if it does not exist; returns their paths."""
