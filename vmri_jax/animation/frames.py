@@ -10,7 +10,7 @@ from matplotlib.lines import Line2D
 from PIL import Image
 
 from vmri_jax import plots
-from vmri_jax.animation.curves import Curves
+from vmri_jax.animation import curves
 from vmri_jax.animation.motion import Motion
 from vmri_jax.animation.shapes import Stage
 from vmri_jax.refusals import Refused
@@ -52,19 +52,20 @@ def plot_strip(
     sizes = rows_of(len(moments), MOST_COLUMNS if aspect < 1.3 else 3 if aspect < 3.5 else 1)
     rows, columns = len(sizes), max(sizes)
     trail = 0.5 * (motion.t[-1] - motion.t[0]) / max(len(moments), 4)
-    curves = Curves(motion, theme)
+    panels = curves.panels_of(motion)
+    below = curves.HEIGHT if panels else 0.0
     with plots.style(theme):
         width = WIDTH / columns
         head = TITLE_HEIGHT * (1 + bool(motion.drawing.caption))
-        height = rows * width / aspect + head + curves.height
+        height = rows * width / aspect + head + below
         figure = plots.NotebookFigure(figsize=(WIDTH, height))
         figure.set_layout_engine("none")
         cells = [(row, (columns - size) / 2 + column) for row, size in enumerate(sizes) for column in range(size)]
         for k, (time, (row, column)) in enumerate(zip(moments, cells, strict=True)):
-            bottom = (curves.height + (rows - 1 - row) * width / aspect) / height
+            bottom = (below + (rows - 1 - row) * width / aspect) / height
             place = (column / columns, bottom, 1 / columns, width / aspect / height)
             stage.draw(figure, place, time, trail, names=k == 0)
-        curves.draw(figure, moments)
+        curves.draw(figure, motion, panels, moments, theme)
         _write_head(figure, title, stage)
     return figure
 
