@@ -237,10 +237,11 @@ class Resolved:
     def single_precision(self, full: bool) -> Outcome:
         """Whether the messages have the line that mends a run with the 64-bit mode off, and a start in float32."""
         problem, steps = self.problem, {"macro_dt": self.macro_dt, "num_steps": 1}
-        state, short = problem.state(), (np.asarray(q, np.float32) for q in (problem.q_s, problem.q_f))
+        state = problem.state()
+        q_s, q_f = (np.asarray(q, np.float32) for q in (problem.q_s, problem.q_f))
         with jax.enable_x64(False):
             off = refusal(lambda: simulate(problem.system, self.scheme, state, **steps))
-        data = refusal(lambda: initial_state(problem.system, *short, problem.v_s, problem.v_f))
+        data = refusal(lambda: initial_state(problem.system, q_s, q_f, problem.v_s, problem.v_f))
         fix = 'jax.config.update("jax_enable_x64", True)' in off
         cast = "float32" in data and "astype(float)" in data
         return Outcome(

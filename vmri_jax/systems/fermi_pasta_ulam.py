@@ -70,5 +70,4 @@ def fermi_pasta_ulam(num_springs: int = 3, omega: float = 50.0) -> Problem:
         params={"omega": jnp.asarray(omega)},
     )
     names = Names({"centres": num_springs}, {"elongations": num_springs}, numbered=("centres", "elongations"))
-    start = {"q_s": first, "q_f": first / omega, "v_s": first, "v_f": first}
-    return Problem(system, **start, names=names, drawing=drawing(num_springs))
+    return Problem(system, first, first / omega, first, first, names=names, drawing=drawing(num_springs))
