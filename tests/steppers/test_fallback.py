@@ -42,7 +42,9 @@ def test_a_plan_says_how_a_step_is_solved(fpu, tsp):
     assert "masses:" not in str(plan(fpu, explicit_slow(4)))
     assert "masses:" in str(plan(forced, explicit_slow(4), fpu.state()))
     assert str(plan(fpu, inside)).startswith(whole)
-    assert str(plan(double_pendulum(), fully_implicit(3))).startswith("masses: micro intervals in order with matrices of the masses")
+    assert str(plan(double_pendulum(), fully_implicit(3))).startswith(
+        "masses: micro intervals in order with matrices of the masses"
+    )
     assert str(plan(double_pendulum(), fully_implicit(3), solver=Solver("exact"))).startswith(whole)
     with pytest.raises(ValueError, match="the matrix 'masses' needs a ConstantMass, and potentials"):
         plan(fpu, inside, solver=Solver("masses"))

@@ -58,7 +58,9 @@ def test_all_take_the_direction_of_the_derivative_of_the_residual(name):
         found = {"dense": ravel_pytree(newton_direction(equations, x, residual))[0]}
         for inverted in (inverse_with_multipliers, inverse_without_multipliers):
             march = MarchEquations(equations, inverted)
-            direction = solve(march, linearised_pass(march, *march.flat(x), corrects=False)[::2], *march.flat(residual))
+            z, of_intervals = march.flat(x)
+            factors = linearised_pass(march, z, of_intervals, of_intervals[-1], from_last=False, corrects=False)[::2]
+            direction = solve(march, factors, *march.flat(residual))
             found[inverted.__name__] = ravel_pytree(march.by_name(*direction))[0]
         return found
 

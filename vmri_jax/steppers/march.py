@@ -279,12 +279,16 @@ class Passed(NamedTuple):
     worst: Worst
 
 
-def linearised_pass(march: MarchEquations, z, x, corrects: bool = True) -> tuple[Matrices, Passed, list]:
+def linearised_pass(
+    march: MarchEquations, z, x, last, from_last, corrects: bool = True
+) -> tuple[Matrices, Passed, list]:
     """A pass that computes the matrices at its unknowns: ``dR/d(z, x)`` after block elimination of the intervals.
 
     Args:
         march: the equations.
         z, x: unknowns.
+        last: (k,) unknowns of the last interval of the step before.
+        from_last: whether each interval starts from the unknowns of the interval before, instead of its unknowns in x.
         corrects: whether every interval starts from the corrected end of the interval before, so that far from the solution the matrices are those
             of a path that is closer to it; else the matrices are those of z and x.
 
@@ -295,7 +299,8 @@ def linearised_pass(march: MarchEquations, z, x, corrects: bool = True) -> tuple
     slow, unit, n_f = march.seen(z), jnp.eye(march.num_seen), march.n_f
 
     def interval(carry, unknowns):
-        (arriving, sensitivities, worst), (m, x) = carry, unknowns
+        (arriving, sensitivities, last, worst), (m, x) = carry, unknowns
+        x = jnp.where(from_last, last, x)
         values, push = jax.linearize(partial(march.interval, m), x, arriving, slow)
 
         # Columns: the unknowns of the interval, the slow increments together with the sensitivities d(arriving)/dz of the intervals before, and the
@@ -318,30 +323,32 @@ def linearised_pass(march: MarchEquations, z, x, corrects: bool = True) -> tuple
             x, on, worst = march.corrected(m, (inverse, hands_on), x, slow, arriving, values, worst)
         else:
             on = Handed(arriving.position + march.last_increment(x), values[1])
-        return (on, sensitivities, worst), (x, inverse, hands_on, response, by_position, hands_on_by_position)
+        return (on, sensitivities, x, worst), (x, inverse, hands_on, response, by_position, hands_on_by_position)
 
     start = march.start()
     none = Handed(*(jnp.zeros((a.size, march.num_seen)) for a in start))
-    (end, sensitivities, worst), stacked = jax.lax.scan(interval, (start, none, Worst.none()), (jnp.arange(march.n), x))
+    carry = start, none, last, Worst.none()
+    (end, sensitivities, _, worst), stacked = jax.lax.scan(interval, carry, (jnp.arange(march.n), x))
     x, inverse, hands_on, response, *by_positions = stacked
     slow_inverse, slow_values = march.slow_inverse(z, end, sensitivities)
     matrices = Matrices(inverse, hands_on, response, slow_inverse)
     return matrices, march.passed(matrices, z, x, worst, end, slow_values), by_positions
 
 
-def kept_pass(march: MarchEquations, matrices: Matrices, z, x) -> Passed:
-    """A pass with matrices of earlier unknowns: every interval starts from the corrected end of the interval before."""
+def kept_pass(march: MarchEquations, matrices: Matrices, z, x, last, from_last) -> Passed:
+    """A pass with matrices of earlier unknowns: every interval starts from the corrected end of the interval before. Arguments as of `linearised_pass`."""
     slow = march.seen(z)
 
     def interval(carry, unknowns_and_matrices):
-        arriving, worst = carry
+        arriving, last, worst = carry
         m, x, *of_interval = unknowns_and_matrices
+        x = jnp.where(from_last, last, x)
         values = march.interval(m, x, arriving, slow)
         x, on, worst = march.corrected(m, of_interval, x, slow, arriving, values, worst)
-        return (on, worst), x
+        return (on, x, worst), x
 
     intervals = jnp.arange(march.n), x, matrices.inverse, matrices.hands_on
-    (end, worst), x = jax.lax.scan(interval, (march.start(), Worst.none()), intervals)
+    (end, _, worst), x = jax.lax.scan(interval, (march.start(), last, Worst.none()), intervals)
     return march.passed(matrices, z, x, worst, end, march.slow_equations(z, end))
 
 

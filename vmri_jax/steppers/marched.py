@@ -120,17 +120,17 @@ class Marched(StepSolver):
     def _has_multipliers(self) -> bool:
         return self.newton.matrix != "null_space"
 
-    def _pass(self, march: MarchEquations, renews, last: Progress, z, x) -> tuple[Matrices, Passed]:
-        """A pass from z and x, with new matrices if `renews`, else with the last ones."""
+    def _pass(self, march: MarchEquations, renews, last: Progress, start) -> tuple[Matrices, Passed]:
+        """A pass from `start`, the unknowns as in `linearised_pass`, with new matrices if `renews`, else with the last ones."""
         if self.is_exact:
-            matrices, now = only_if(renews, lambda _: linearised_pass(march, z, x)[:2], (last.matrices, last.passed))
-            return matrices, only_if(~renews, lambda _: kept_pass(march, matrices, z, x), now)
+            matrices, now = only_if(renews, lambda _: linearised_pass(march, *start)[:2], (last.matrices, last.passed))
+            return matrices, only_if(~renews, lambda _: kept_pass(march, matrices, *start), now)
 
         def by_masses(_):
-            return linearised_pass(march.by_masses(z, x), z, x, corrects=False)[0]
+            return linearised_pass(march.by_masses(*start[:2]), *start, corrects=False)[0]
 
         matrices = only_if(renews, by_masses, last.matrices)
-        return matrices, kept_pass(march, matrices, z, x)
+        return matrices, kept_pass(march, matrices, *start)
 
     def _march(self, equations: StepEquations) -> MarchEquations:
         inverted = inverse_with_multipliers if self._has_multipliers else null_space.inverse_without_multipliers
@@ -168,12 +168,12 @@ class Marched(StepSolver):
             return before._replace(passed=now, size=size, still_moves=still_moves, passes=passes, result=result)
 
         def step(last: Progress) -> Progress:
-            z, x = last.passed.z + last.passed.dz, last.passed.x + last.passed.dx
-            # every interval of the very first pass starts from the last unknowns of the step before
-            x = jnp.where(is_first & (last.passes == 0), memory.fast, x)
+            # every interval of the very first pass starts from the corrected unknowns of the interval before
+            from_last = is_first & (last.passes == 0)
+            start = last.passed.z + last.passed.dz, last.passed.x + last.passed.dx, memory.fast, from_last
             # new matrices where the old ones contract too slowly; those of the masses once per attempt
             renews = ~(last.rate <= CONTRACTION) & (self.is_exact | (last.new_size == jnp.inf))
-            matrices, now = self._pass(march, renews, last, z, x)
+            matrices, now = self._pass(march, renews, last, start)
             after = judged(now, last)
             at_floor = renews & self.is_exact & accepted.at_floor(after.size, last.size, FLOOR_OF_NEWTON)
             result = jnp.where(at_floor & (after.result == RUNNING), Result.CONVERGED_AT_ROUNDOFF, after.result)

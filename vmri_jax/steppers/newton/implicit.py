@@ -23,7 +23,8 @@ ONLY_FIRST_DERIVATIVES = (
 def _direction(equations: StepEquations, x: Unknowns):
     """The map ``residual -> -(dR/dx)^-1 residual``, with the matrix at x as a constant for derivatives."""
     march = MarchEquations(equations)
-    matrices, _, by_positions = linearised_pass(march, *march.flat(x), corrects=False)
+    z, x_flat = march.flat(x)
+    matrices, _, by_positions = linearised_pass(march, z, x_flat, x_flat[-1], from_last=False, corrects=False)
     factors = jax.lax.stop_gradient((matrices, by_positions))
     return lambda residual: march.by_name(*solve(march, factors, *march.flat(residual)))
 
