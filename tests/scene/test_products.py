@@ -1,5 +1,7 @@
 """Rows of joints and of rigidity as products of vectors, against the vectors themselves and against derivatives by JAX, at random coordinates."""
 
+from typing import Any
+
 import jax
 import numpy as np
 
@@ -18,6 +20,7 @@ from vmri_jax.scene import (
     Universal,
 )
 from vmri_jax.scene.effects.freedoms import gap, triads
+from vmri_jax.scene.effects.joint_base import Joint
 from vmri_jax.scene.rows import ConstraintRows
 
 RANDOM = np.random.default_rng(0)
@@ -41,7 +44,7 @@ JOINTS = [
 ]
 SCENE = Scene(BODIES, JOINTS, coordinates="directors", redundant="drop")
 """Each joint has a pair with another kind of body, or with the ground."""
-ROWS = ConstraintRows.of(SCENE.sorting)
+ROWS: Any = ConstraintRows.of(SCENE.sorting)
 Q = RANDOM.normal(size=ROWS.start.size)
 
 
@@ -50,7 +53,7 @@ def test_rows_are_the_products_of_the_table():
     values, _ = ROWS.evaluate(0.0, Q)
     coordinates = {name: Q[place.start : place.start + place.size] for name, place in SCENE.places.items()}
     coordinates["ground"] = np.append(np.zeros(3), np.eye(3))
-    for joint in [part.effect for part in SCENE.sorting.placed if hasattr(part.effect, "frames")]:
+    for joint in [part.effect for part in SCENE.sorting.placed if isinstance(part.effect, Joint)]:
         of_joint = [value for value, row in zip(values, ROWS.rows, strict=True) if row.effect is joint]
         expected = []
         for i in [i for group in joint.by_size() for i in group]:

@@ -88,7 +88,7 @@ class Bindable(ABC):
         """The points at the start that the function gets for every element, one for each role."""
         return tuple(tuple(end_of(self.by_name, name, self.whole) for name in element) for element in self.attached)
 
-    @property
+    @cached_property
     def attached(self) -> Elements:
         """Names of the bodies whose coordinates the function gets for every element, one for each role: those of `elements`."""
         return self.elements

@@ -94,8 +94,8 @@ def _derivatives(
     values = values.reshape(*columns.shape[::-1], -1)  # of each step, element, and row of the element
     rows, jacobian = np.arange(values[0].size).reshape(*values.shape[1:], 1), np.zeros((values[0].size, q.size))
     # added: a body that stands in for the ground has its columns twice
-    np.add.at(jacobian, (rows, columns[:, None]), np.moveaxis(values.imag, 0, -1) / COMPLEX_STEP)
-    return values[0].real.ravel(), jacobian
+    np.add.at(jacobian, (rows, columns[:, None]), np.moveaxis(np.imag(values), 0, -1) / COMPLEX_STEP)
+    return np.real(values[0]).ravel(), jacobian
 
 
 def _columns(role: Role, num_slow: int) -> np.ndarray:

@@ -28,7 +28,7 @@ import numpy as np
 from vmri_jax.mechanics.arrays import library
 from vmri_jax.mechanics.kinematics import Move
 from vmri_jax.scene.declare import effect_class, number
-from vmri_jax.scene.effect import START, Effect
+from vmri_jax.scene.effect import START
 from vmri_jax.scene.effects.freedoms import M_PRIME, M, N, slide, turn_by_sine
 from vmri_jax.scene.effects.joint_base import GAP, PARALLEL, AboutAxis, Joint
 from vmri_jax.scene.products import products
@@ -158,8 +158,13 @@ class Screw(AboutAxis):
         pitch = self.parameters["pitch"]
         return pitch[i] if pitch.ndim else pitch
 
-    function = staticmethod(screwed)
-    attached = Effect.attached
+    @property
+    def function(self):
+        return screwed
+
+    @cached_property
+    def attached(self):
+        return self.elements
 
     def _parameters(self):
         return super()._parameters() | self.frames
