@@ -27,13 +27,17 @@ def reference_of(name: str):
     return reference_solution(SYSTEMS[name], LENGTH, num_saves=NUM_SAVES)
 
 
-@pytest.mark.parametrize("accuracy", [1e-2, 1e-4, 1e-7])
+QUICK = ("no_constraint", 1e-4), ("slow_alone", 1e-2), ("slow_alone", 1e-7)
+"""What runs always: with and without micro steps, errors of every size."""
+KINDS = ("no_constraint", "slow_alone", "constraint", "damped", "kinetic_function")
+
+
 @pytest.mark.parametrize(
-    "name",
+    ("name", "accuracy"),
     [
-        "no_constraint",
-        "slow_alone",
-        *(pytest.param(n, marks=pytest.mark.full) for n in ("constraint", "damped", "kinetic_function")),
+        pytest.param(name, accuracy, marks=() if (name, accuracy) in QUICK else pytest.mark.full)
+        for name in KINDS
+        for accuracy in (1e-2, 1e-4, 1e-7)
     ],
 )
 def test_true_error_is_below_the_accuracy(name, accuracy):
