@@ -43,7 +43,7 @@ CASES = {
 }
 
 
-QUICK = ("kicks", "order 1", "composition", "slow alone", "constraint, order 8", "damped")
+QUICK = ("order 1", "composition", "constraint, order 8")
 
 
 @pytest.mark.parametrize(
