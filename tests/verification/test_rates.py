@@ -276,12 +276,13 @@ PLACEMENTS = {
 }
 
 
+ALIKE = ("another rule", "degree 2", "kinetic function", "W between the grids", "slow and fast, on the micro grid")
+"""For --full: rules and kinetic functions are in `tests/textbook`, W between the grids is beside V there, and `hinge` is on other grids."""
+
+
 @pytest.mark.parametrize(
     "name",
-    [
-        pytest.param(n, marks=pytest.mark.full if n in ("another rule", "degree 2", "kinetic function") else ())
-        for n in PLACEMENTS
-    ],
+    [pytest.param(n, marks=pytest.mark.full if n in ALIKE else ()) for n in PLACEMENTS],
 )
 def test_every_placement_is_that_of_the_textbook(name):
     system, scheme, start = PLACEMENTS[name]
