@@ -10,8 +10,8 @@ The plan chooses the cheapest stepper that the rules and the system allow, from 
 * *free flight*: only kinetic energy of constant masses is left;
 * *linear*: only fast variables with linear equations are left;
 * else an iteration, by the matrix of `Solver`: masses and constraints, for the multipliers of a drift alone (*Rattle*) or for the micro
-  intervals in order (*nested*); modes of time, for one interval of high degree (*collocation*); or exact (*march*), which is also the
-  *fallback* of the other three.
+  intervals in order (*nested*, with masses that vary *march*); modes of time, for one interval of high degree (*collocation*); or exact
+  (*march*), which is also the *fallback* of the others.
 """
 
 from collections.abc import Callable
@@ -95,7 +95,7 @@ class Plan:
     def has_fallback(self) -> bool:
         """Whether the steps are taken by another matrix than the exact one, which "auto" has chosen: a run with `Solver.exact` may solve what fails."""
         chosen = self.solver.matrix == "auto" and self.solver.stepper is None
-        return chosen and any(not isinstance(solver, Marched) for solver in _solvers(self.stepper))
+        return chosen and not all(solver.is_exact for solver in _solvers(self.stepper))
 
     @property
     def first(self) -> Solver:
@@ -200,7 +200,9 @@ def _between_kicks(system: System, scheme: Scheme, choice: _Choice, q_s, q_f) ->
         return Solved(system, scheme, custom, rows, choice.reverse_only)
     if not can_be_nested or solver.matrix in ("exact", "null_space"):
         n_g, n_gs = system.num_constraints(q_s, q_f)
-        marched = Marched(solver, (q_s.size, n_gs, q_f.size, n_g, scheme.degree))
+        first = "exact" if system.has_constant_mass else "masses"
+        chosen = replace(solver, matrix=first) if solver.matrix == "auto" else solver
+        marched = Marched(chosen, (q_s.size, n_gs, q_f.size, n_g, scheme.degree))
         return Solved(system, scheme, marched, rows, choice.reverse_only)
     interval = Interval.of(system, scheme, q_s, q_f)
     if _is_linear(system, scheme, interval, q_s):
@@ -222,7 +224,7 @@ def _approximate(
 
 def _check_matrix(matrix: str, system: System, scheme: Scheme, can_be_nested: bool) -> None:
     """Refuse a matrix that the structure of the system and the scheme does not allow."""
-    if matrix in ("masses", "modes") and not can_be_nested:
+    if (matrix == "modes" or (matrix == "masses" and system.has_constant_mass)) and not can_be_nested:
         raise ValueError(
             f"Solver: the matrix {matrix!r} needs a ConstantMass, and potentials and forces on the micro grid or as kicks at the macro nodes or "
             "at every k-th micro node; a term of this scheme has other nodes inside the macro interval. Take the matrix 'auto' or 'exact'."
