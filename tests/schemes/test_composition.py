@@ -112,14 +112,6 @@ def test_keeps_constraints_and_symmetry():
     np.testing.assert_allclose(back.q_f, problem.q_f, atol=1e-10)
 
 
-@pytest.mark.parametrize("name", ["fpu", pytest.param("tsp", marks=pytest.mark.full)])
-def test_keeps_the_area(name):
-    """With constraints it follows from the symplectic step, and from the stages one by one."""
-    problem, scheme = PROBLEMS[name](), compose(fully_explicit(2), "kahan-li6")
-    solver = without_fallback(problem, scheme)
-    assert vm.stability.monodromy(problem, scheme, macro_dt=0.01, num_steps=1, solver=solver).symplectic_defect < 1e-11
-
-
 def test_derivative_by_the_step():
     problem = PROBLEMS["fpu"]()
     scheme = compose(fully_explicit(3), "yoshida4")
