@@ -28,6 +28,7 @@ from vmri_jax.mechanics.constraint_pattern import all_rows
 from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.mechanics.structure import depends_on
 from vmri_jax.mechanics.system import System
+from vmri_jax.refusals import Refused
 from vmri_jax.schemes.composition import Composition, stage_scheme
 from vmri_jax.schemes.discrete_lagrangian import Placed, TermOnNodes, lagrangian, placed_potentials
 from vmri_jax.schemes.quadrature import macro
@@ -225,12 +226,12 @@ def _approximate(
 def _check_matrix(matrix: str, system: System, scheme: Scheme, can_be_nested: bool) -> None:
     """Refuse a matrix that the structure of the system and the scheme does not allow."""
     if (matrix == "modes" or (matrix == "masses" and system.has_constant_mass)) and not can_be_nested:
-        raise ValueError(
+        raise Refused(
             f"Solver: the matrix {matrix!r} needs a ConstantMass, and potentials and forces on the micro grid or as kicks at the macro nodes or "
             "at every k-th micro node; a term of this scheme has other nodes inside the macro interval. Take the matrix 'auto' or 'exact'."
         )
     if matrix == "modes" and not _has_modes(system, scheme):
-        raise ValueError(
+        raise Refused(
             f"Solver: the matrix 'modes' needs a scheme with num_micro = 1 and a degree above 1, such as galerkin(1, 3), and a System without "
             f"force; here num_micro = {scheme.num_micro}, degree = {scheme.degree}. Take the matrix 'auto' or 'exact'."
         )
@@ -333,11 +334,11 @@ def _average(system: System, scheme: Scheme, choice: _Choice) -> Callable | None
     if scheme.fast.every > 1 or on_micro_grid:
         every = f"W has nodes on every {scheme.fast.every}th micro node" if scheme.fast.every > 1 else ""
         others = every or f"the potentials {', '.join(on_micro_grid)} are on the micro grid"
-        raise ValueError(
+        raise Refused(
             f"Scheme: the slow potential is mollified, which averages over the motion under W alone; here {others}. Give W the rule micro(...) and the others macro(trapezoidal), or take a scheme without mollified kicks, e.g. explicit_slow(num_micro)."
         )
     if not system.has_constant_mass or system.is_rheonomic:
-        raise ValueError(
+        raise Refused(
             "Scheme: a mollified slow potential needs a System whose kinetic is a ConstantMass, without Rheonomic constraints."
         )
 

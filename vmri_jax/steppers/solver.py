@@ -26,6 +26,7 @@ import jax.numpy as jnp
 
 from vmri_jax.mechanics.arrays import is_concrete, real_array
 from vmri_jax.mechanics.functions import TracedOnce, traced_once
+from vmri_jax.refusals import Refused
 from vmri_jax.steppers.results import RUNNING, Result
 
 MATRICES = ("auto", "masses", "modes", "exact", "null_space")
@@ -61,18 +62,18 @@ class Solver(eqx.Module):
 
     def __check_init__(self):
         if self.matrix not in MATRICES:
-            raise ValueError(f"Solver: matrix is {self.matrix!r}; it must be one of {', '.join(MATRICES)}.")
+            raise Refused(f"Solver: matrix is {self.matrix!r}; it must be one of {', '.join(MATRICES)}.")
         for name, value in {"tolerance": self.tolerance, "max_iterations": self.max_iterations}.items():
             if is_concrete(value) and not real_array(f"Solver: {name}", value, 0) > 0:
-                raise ValueError(f"Solver: {name} is {value}; it must be positive.")
+                raise Refused(f"Solver: {name} is {value}; it must be positive.")
         if self.stepper is None:
             return
         if not callable(getattr(self.stepper, "function", None)):
-            raise TypeError(
+            raise Refused(
                 f"Solver: stepper is {self.stepper!r}; give a function of (system, scheme) that makes a Stepper."
             )
         if self.matrix != "auto":
-            raise ValueError(
+            raise Refused(
                 f"Solver: matrix is {self.matrix!r} beside a stepper, which has its own way to solve; leave one of them out."
             )
 

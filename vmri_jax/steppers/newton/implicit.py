@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
+from vmri_jax.refusals import Refused
 from vmri_jax.schemes.equations import StepEquations, Unknowns
 from vmri_jax.steppers.march import MarchEquations, linearised_pass, solve
 
@@ -119,4 +120,4 @@ def only_once(tree):
 
 @only_once.defjvp
 def _refused(primals, tangents):
-    raise TypeError(ONLY_FIRST_DERIVATIVES)
+    raise Refused(ONLY_FIRST_DERIVATIVES)
