@@ -58,7 +58,6 @@ MANY_CORES = ("gpu", "kills", "ensemble-kills")
 
 HELP = {
     "only": "Cases of these names, or whose names begin so; may be repeated.",
-    "shared": "Count processor time: other processes use the core too.",
     "peers": "Integrators, e.g. heyoka; may be repeated. Ours always runs.",
     "way": "Ways that begin so, e.g. joint; may be repeated.",
     "python": "Python of the other checkout; by default that in its .venv, else this one.",

@@ -41,7 +41,7 @@ def assemble(folder: Path, commit: str) -> dict:
         for row in against["rows"]
         if row[f"{SIDE}, ms"] is not None
     ]
-    return _rounded(found | {"calls": {"clock": against["clock"], "rows": one_side}})
+    return _rounded(found | {"calls": {"rows": one_side}})
 
 
 def _rounded(value):

@@ -8,13 +8,15 @@ from itertools import product
 
 from matplotlib.figure import Figure
 
-from benchmarks import linear, paper
+from benchmarks import linear
 from benchmarks.curves import TIME, Case, Curves, draw, measure
 from benchmarks.measure import silent
 from benchmarks.programs import SCHEMES
 from benchmarks.report import Claim, Report
 
 COLUMNS = ("case", "method", "num_micro", "unknowns", "micro_dt", TIME, "to cheapest", "iterations", "result")
+FPU_DT, RIGID_DT = 0.001, 0.0002
+"""Micro steps of chains, and of systems with constraints: a macro step of 100 of them still converges."""
 ALL = (1, 4, 8, 12, 20, 40, 60, 100)
 ONCE = (
     Case("FPU l=3", "fully implicit", 0.001, (100,), (100,), dense=50.0),
@@ -28,33 +30,29 @@ ONCE = (
 class Size:
     """How much is run.
 
-    turning: cases in which cost must not turn up, by figure.
+    turning: cases in which cost must not turn up.
     once: single points against the dense solve.
-    paper: cases of the figures of the reference study.
     linear: cases run up to a large num_micro.
     most_unknowns: the dense solve is left out beyond.
     """
 
-    turning: dict[str, tuple[Case, ...]]
+    turning: tuple[Case, ...]
     once: tuple[Case, ...]
-    paper: dict[str, tuple[Case, ...]]
     linear: tuple[Case, ...]
     most_unknowns: int
     repeats: int
     seconds: float
 
 
-def _turning(num_micro, chains, dense_num_micro, fpu_dt: float, rigid_dt: float) -> tuple[Case, ...]:
+def _turning(num_micro, chains, dense_num_micro) -> tuple[Case, ...]:
     """Every system under every scheme."""
     systems = [*(f"FPU l={length}" for length in chains), "TSP", "SAM"]
     cases = []
     for system, scheme in product(systems, SCHEMES):
         chain = system.startswith("FPU")
-        case = Case(system, scheme, fpu_dt if chain else rigid_dt, num_micro, dense_num_micro, 1.8, 10.0)
+        case = Case(system, scheme, FPU_DT if chain else RIGID_DT, num_micro, dense_num_micro, 1.8, 10.0)
         if chain and scheme != "fully implicit":
             case = replace(case, turn=1.05)
-        if chain and fpu_dt == paper.FPU_DT:
-            case = paper.at_paper_steps(case)
         cases.append(case)
     return tuple(cases)
 
@@ -63,9 +61,8 @@ def sizes(name: str) -> Size:
     """ "quick" or "full"."""
     if name == "quick":
         return Size(
-            turning={"cost": _turning((1, 20, 100), (10, 200), (20,), 0.001, 0.0002)},
+            turning=_turning((1, 20, 100), (10, 200), (20,)),
             once=ONCE,
-            paper=paper.cases((1, 4, 20, 60, 100), (1, 8, 20), {"fully implicit": (30,), "explicit slow": (30,)}),
             linear=linear.cases((10, 200, 5000)),
             most_unknowns=310,
             repeats=5,
@@ -73,12 +70,8 @@ def sizes(name: str) -> Size:
         )
     chains = (10, 50, 100, 200)
     return Size(
-        turning={
-            "cost": _turning(ALL, chains, ALL, 0.001, 0.0002),
-            "cost_paper_steps": _turning(ALL, chains, (), paper.FPU_DT, paper.SAM_DT),
-        },
+        turning=_turning(ALL, chains, ALL),
         once=ONCE,
-        paper=paper.cases(ALL, ALL, dict.fromkeys(SCHEMES, (10, 40, 70, 100, 150, 200))),
         linear=linear.cases((10, 50, 100, 500, 1000, 2500, 5000)),
         most_unknowns=700,
         repeats=9,
@@ -89,12 +82,10 @@ def sizes(name: str) -> Size:
 def run(size: Size, name: str, tell=silent) -> Iterator[Report]:
     """Measure all of it, a report after each case."""
     everything: list[Curves] = []
-    figures: dict[str, list[Curves]] = {}
-    rows, claims = [], []
+    rows, claims, turning = [], [], []
 
     def report() -> Report:
-        drawn = {file: partial(_draw, file, part) for file, part in figures.items()}
-        return Report("cost", name, rows, claims, _notes(size, everything), drawn)
+        return Report("cost", name, rows, claims, _notes(size, everything), {"cost": partial(_draw, turning)})
 
     def add(curves: Curves) -> Curves:
         everything.append(curves)
@@ -102,11 +93,9 @@ def run(size: Size, name: str, tell=silent) -> Iterator[Report]:
         claims.extend(_claims(curves))
         return curves
 
-    for file, cases in {**size.turning, **size.paper}.items():
-        for case in cases:
-            curves = add(measure(case.affordable(size.most_unknowns), size.repeats, size.seconds, tell))
-            figures.setdefault(file, []).append(curves)
-            yield report()
+    for case in size.turning:
+        turning.append(add(measure(case.affordable(size.most_unknowns), size.repeats, size.seconds, tell)))
+        yield report()
     for case in size.once:
         add(measure(case, max(3, size.repeats // 2), size.seconds, tell))
         yield report()
@@ -117,9 +106,7 @@ def run(size: Size, name: str, tell=silent) -> Iterator[Report]:
         yield report()
 
 
-def _draw(file: str, part: list[Curves]) -> Figure:
-    if file in paper.TITLES:
-        return draw(part, paper.TITLES[file], len({curves.case.system for curves in part}))
+def _draw(part: list[Curves]) -> Figure:
     dt = " and ".join(f"{h:g}" for h in dict.fromkeys(curves.case.micro_dt for curves in part))
     return draw(part, f"Computing time does not turn up (micro steps {dt})", len(SCHEMES))
 

@@ -31,9 +31,6 @@ class Case:
     dense_num_micro: where the dense solve runs too.
     turn: the most that the largest num_micro may cost per micro step, over the cheapest.
     dense: the least that the dense solve must cost over the default one, from FROM micro steps on.
-    paper_minimum: the num_micro that was cheapest in the reference study.
-    t_end: simulated time, by default as much as makes a run long enough.
-    amplitude: of the start of a chain; with a small one explicit schemes are stable at large macro steps.
     """
 
     system: str
@@ -43,9 +40,6 @@ class Case:
     dense_num_micro: tuple[int, ...] = ()
     turn: float | None = None
     dense: float | None = None
-    paper_minimum: int | None = None
-    t_end: float | None = None
-    amplitude: float = 1.0
 
     @property
     def label(self) -> str:
@@ -94,17 +88,14 @@ def measure(case: Case, repeats: int, seconds: float, tell: Tell = silent) -> Cu
 
     The default solve takes every num_micro over the same simulated time, the dense one, much slower, a few macro steps.
     """
-    problem = programs.problem(case.system, case.amplitude)
+    problem = programs.problem(case.system)
     runs, results, total = {}, {}, 0
     for n in case.num_micro:
         tell(f"{case.label}, num_micro {n}")
         run = programs.program(problem, programs.SCHEMES[case.scheme](n), n * case.micro_dt)
         if not total:  # of micro steps, one that all num_micro divide
             unit = math.lcm(*case.num_micro)
-            if case.t_end is None:
-                total = n * steps_for(run, seconds, unit // n)
-            else:
-                total = unit * max(1, round(case.t_end / case.micro_dt / unit))
+            total = n * steps_for(run, seconds, unit // n)
         runs["auto", n] = partial(run, total // n), total
         results["auto", n] = run(total // n)
     whole = problem
@@ -146,7 +137,7 @@ def _row(curves: Curves, problem, method: str, n: int, micro_steps: int, traject
 
 
 def draw(curves: list[Curves], title: str, columns: int) -> Figure:
-    """One panel per case: the default solve, the dense one, the cheapest point of each, and the paper's."""
+    """One panel per case: the default solve, the dense one, and the cheapest point of each."""
     lines = -(-len(curves) // columns)
     with plots.new_figure(max(6.0, 0.6 + 2.6 * columns), 1.1 + 2.1 * lines, title, plots.LIGHT) as figure:
         panels = figure.subplots(lines, columns, squeeze=False, sharex=True).reshape(-1)
@@ -174,9 +165,6 @@ def _panel(axes: Axes, found: Curves) -> None:
         best = np.argmin(us)
         axes.plot(num_micro[best], us[best], "o", markersize=11, markerfacecolor="none", color=theme.curves[i])
         values += list(us)
-    if found.case.paper_minimum is not None:
-        line = {"color": theme.ink, "linestyle": ":", "linewidth": 1.1, "label": "minimum in the paper"}
-        axes.axvline(found.case.paper_minimum, **line)
     axes.set_title(found.case.label, fontsize=9)
     if values:
         axes.set_ylim(min(values) / 2, max(max(values), 10 * min(values)) * 2)

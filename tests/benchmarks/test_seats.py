@@ -28,7 +28,7 @@ def test_schemes_in_words():
 
 @pytest.fixture(scope="module")
 def workers():
-    with Worker(Seat()) as one, Worker(Seat(options=(worker.PROCESSOR_TIME,))) as other:
+    with Worker(Seat()) as one, Worker(Seat()) as other:
         yield {"one": one, "other": other}
 
 
