@@ -10,7 +10,6 @@ import typer
 from benchmarks import (
     adjoints,
     against,
-    baseline,
     batch,
     chains,
     compilation,
@@ -131,16 +130,6 @@ def ensembles_command(
     prepare()
     for name in only or ensembles.PARTS:
         _measure(f"ensembles, {name}", ensembles.part(name), full, out)
-
-
-@app.command("baseline")
-def baseline_command(
-    commit: Annotated[str, typer.Argument(help="Of the code that was measured.")],
-    folder: Annotated[Path, typer.Option("--from", help="Folder with what the benchmarks wrote.")] = OUT,
-) -> None:
-    """Put all figures of one commit into benchmarks/baseline.json."""
-    baseline.write(folder, commit)
-    console.print(f"written to {baseline.FILE}")
 
 
 @app.command("all")

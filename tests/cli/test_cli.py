@@ -450,7 +450,7 @@ def test_a_page_that_cannot_be_drawn_leaves_the_runs(tmp_path, monkeypatch):
     page = importlib.import_module("vmri_jax.study.cost_report")
 
     def failing(problem, name, out, **_):
-        page._write(page.CostReport(out / "cost.html", name, 1.0, (page.Answer(1e-2, None),), NOTHING), problem)
+        page._write(page.CostReport(out / "cost.html", name, 1.0, (1e-2,), NOTHING), problem)
 
     def broken(*_, **__):
         return int("no figure")

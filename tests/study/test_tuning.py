@@ -43,7 +43,7 @@ def test_it_prints_the_best_few_and_keeps_all(best, tmp_path, monkeypatch):
     monkeypatch.delenv("COLUMNS", raising=False)  # that workers of pytest have
     head, *rows, last = str(best).splitlines()
     assert head.split()[:2] == ["scheme", "H"]
-    assert len(rows) == min(5, 1 + len(best.others))
+    assert len(rows) == min(5, len(best.keeping(1e-5)))
     assert rows[0].startswith(best.setting.scheme)
     assert last.startswith("For an error of 1e-05 take the first: its .scheme, .macro_dt and .num_steps.")
     assert repr(best) == str(best)

@@ -7,6 +7,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from vmri_jax import plots
 from vmri_jax.accuracy.families import Family
 from vmri_jax.accuracy.steps import check_extent, round_off
@@ -49,7 +51,7 @@ class CostReport(ResultTable):
     path: of the page, cost.html; its figures and runs lie beside it.
     name: of the system.
     t_end: simulated time.
-    rows: the answers by error, the largest first.
+    errors: accepted errors of a position.
     runs: every run of the search.
     bound: seconds and error of the runs of the Pareto front, if the time of a run were that of its gradients alone;
         empty with constraints.
@@ -65,9 +67,15 @@ class CostReport(ResultTable):
     path: Path
     name: str
     t_end: float
-    rows: tuple[Answer, ...]
+    errors: tuple[float, ...]
     runs: WorkPrecision
     bound: tuple[tuple[float, float], ...] = ()
+
+    @property
+    def rows(self) -> list[Answer]:
+        """The answers by error, the largest first: the fastest run that keeps the error, for whichever error the search made it."""
+        errors = sorted(self.errors, reverse=True)
+        return [Answer(error, next(iter(self.runs.keeping(error)), None)) for error in errors]
 
     @property
     def caption(self) -> str:
@@ -145,8 +153,8 @@ def cost_report(
         )
     tuning, answered = Tuning(problem, t_end, menu, progress=progress), []
     with interruptible(tuning.runs):  # around the drawing as well, so that Ctrl-C there keeps the runs, too
+        tuning.search.first_trials(tuning.menu[:1], np.inf)  # they tell how far the system moves
         errors = sorted(_default_errors(tuning, problem, t_end) if errors is None else errors)
-        tuning.extent()
         check_extent("cost_report: the largest of errors", tuning.search, errors[-1])
         try:
             # The smallest error first: families that are given up for it are hopeless for larger errors.
@@ -155,7 +163,10 @@ def cost_report(
                 tuning.look_for("cost_report: error", error)
                 answered.append(error)
         finally:
-            report = _report(tuning, problem, t_end, answered, name, out)
+            report = CostReport(out / "cost.html", name, t_end, tuple(answered), tuning.runs())
+            # Constraints cost more than their evaluations: the runs have no bound.
+            if report.reached and not problem.system.is_constrained:
+                report = replace(report, bound=bound_of(prices(problem), report.curves.pareto()))
             if answered:
                 _write(report, problem)
     progress("done", 1, 1)
@@ -164,7 +175,7 @@ def cost_report(
 
 def _default_errors(tuning: Tuning, problem: Problem, t_end: float) -> list[float]:
     """RELATIVE_ERRORS of a power of ten near how far the system moves, without errors that round-off hides."""
-    moved, least = tuning.extent(), round_off(problem)[1]
+    moved, least = tuning.search.extent(), round_off(problem)[1]
     motion = 10.0 ** math.floor(math.log10(moved)) if moved > 0 else 0.0
     errors = [motion * error for error in RELATIVE_ERRORS if motion * error > least]
     if not errors:
@@ -174,19 +185,6 @@ def _default_errors(tuning: Tuning, problem: Problem, t_end: float) -> list[floa
             "certified. Give a start that moves, another t_end, or the errors that you accept."
         )
     return errors
-
-
-def _report(
-    tuning: Tuning, problem: Problem, t_end: float, errors: Sequence[float], name: str, out: Path
-) -> CostReport:
-    """The report of the fastest settings that keep the errors, whichever of them the search found them for."""
-    kept = {error: next(iter(tuning.keeping(error)), None) for error in sorted(errors, reverse=True)}
-    answers = tuple(Answer(error, row) for error, row in kept.items())
-    report = CostReport(out / "cost.html", name, t_end, answers, tuning.runs())
-    # Constraints cost more than their evaluations: the runs have no bound.
-    if not report.reached or problem.system.is_constrained:
-        return report
-    return replace(report, bound=bound_of(prices(problem), report.curves.pareto()))
 
 
 def _write(report: CostReport, problem: Problem) -> None:

@@ -16,7 +16,7 @@ from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
 from vmri_jax.running.failures import simulation_error
 from vmri_jax.running.progress import Progress, shows_progress, silent
 from vmri_jax.steppers.solver import Solver
-from vmri_jax.study.row import Row, RunTable, row_of
+from vmri_jax.study.row import Row, row_of
 from vmri_jax.study.table import interruptible
 from vmri_jax.study.work import WorkPrecision
 
@@ -52,24 +52,12 @@ class Tuning:
         row = row_of(label, run.system, run.scheme, trial.trajectory, *numbers, **measured)
         self._rows[trial.python, run.num_steps] = row
 
-    def extent(self) -> float:
-        """How far the system moves in the first trials, of the first family if there are none yet; NaN if no error of
-        them is certified."""
-        if not self.search.extent() > 0:
-            self.search.first_trials(self.menu[:1], np.inf)
-        return self.search.extent()
-
-    def look_for(self, name: str, error: float, exhaustive: bool = False) -> list[Row]:
-        """Search for an error, and return the runs that keep it, the fastest first; `name` begins messages."""
+    def look_for(self, name: str, error: float, exhaustive: bool = False) -> WorkPrecision:
+        """Search for an error, and return the table of all runs so far; `name` begins messages."""
         menu = by_promise(self.menu, digits_of(self.search, error))
         finals = reached(name, self.search, menu, error, finalists=FINALISTS, exhaustive=exhaustive)
         self.search.measure([trial for trial in finals if np.isfinite(trial.error)])
-        return self.keeping(error)
-
-    def keeping(self, error: float) -> list[Row]:
-        """The runs that keep an error and whose time is known, the fastest first."""
-        kept = [row for row in self.runs().rows if row.error_q <= error and np.isfinite(row.seconds)]
-        return sorted(kept, key=attrgetter("seconds"))
+        return self.runs()
 
     def runs(self) -> WorkPrecision:
         """The table of all runs so far, sorted by scheme and number of steps; seconds are those of the steps, NaN where
@@ -89,32 +77,27 @@ class NothingReached(ValueError):
 
 
 @dataclass(frozen=True)
-class Recommendation(RunTable):
-    """The cheapest setting for an error, and the search that led to it; prints as a table of the best few settings.
+class Recommendation(WorkPrecision):
+    """The cheapest setting for an error, and all runs of the search that led to it; prints as a table of the best few settings.
 
-    `to_csv` and `to_pandas` have all runs of the search.
-
-    scheme, macro_dt, num_steps: arguments for `vmri_jax.simulate`; `setting.settings.arguments` are all of them.
     error: the accepted error, in the unit of the positions.
-    setting: the recommended run, with its error and time.
-    others: the runners-up, the fastest first.
-    runs: all runs of the search; ``runs.pareto()`` is their Pareto front.
     """
 
-    error: float
-    setting: Row
-    others: tuple[Row, ...]
-    runs: WorkPrecision
-    columns = WorkPrecision.columns
+    error: float = 0.0
 
     @property
-    def rows(self) -> tuple[Row, ...]:
-        """All runs of the search."""
-        return self.runs.rows
+    def setting(self) -> Row:
+        """The recommended run, with its error and time; `setting.settings.arguments` are all arguments for `vmri_jax.simulate`."""
+        return self.keeping(self.error)[0]
+
+    @property
+    def runs(self) -> WorkPrecision:
+        """The runs by their errors and their work; prints as their Pareto front."""
+        return WorkPrecision(self.rows)
 
     def shown(self) -> list[Row]:
         """The best settings, the recommended one first."""
-        return [self.setting, *self.others][:SETTINGS_PRINTED]
+        return self.keeping(self.error)[:SETTINGS_PRINTED]
 
     @property
     def caption(self) -> str:
@@ -189,12 +172,12 @@ def tune(
     check_target(error, t_end, problem)
     tuning = Tuning(problem, t_end, menu, num_saves, solver, progress)
     with interruptible(tuning.runs):
-        rows = tuning.look_for("tune: error", error, exhaustive)
-        if not rows:
+        choice = Recommendation(tuning.look_for("tune: error", error, exhaustive).rows, error=error)
+        if not choice.keeping(error):
             raise _nothing(tuning, error)
     progress("done", 1, 1)
-    warn_of_events("tune", tuning.search, rows[0].settings.scheme, stacklevel=4)
-    return Recommendation(error, rows[0], tuple(rows[1:]), tuning.runs())
+    warn_of_events("tune", tuning.search, choice.scheme, stacklevel=4)
+    return choice
 
 
 def _nothing(tuning: Tuning, error: float) -> Exception:
