@@ -1,12 +1,13 @@
 """Cost of accuracy in the fast variables: time per micro step against num_micro, and against the dense solve."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
 
 import jax
 import numpy as np
+from matplotlib.figure import Figure
 
 from benchmarks import linear, programs
 from benchmarks.gail2014.cost import CostStudy, Curve, cost_study, plot_cost
@@ -176,7 +177,9 @@ def run(size: Size, name: str, tell=silent) -> Iterator[Report]:
 
     def report() -> Report:
         title = "Computing time does not turn up"
-        figures = {"cost": partial(plot_cost, dict(turning), None, title)} if turning else {}
+        figures: dict[str, Callable[[], Figure]] = {}
+        if turning:
+            figures["cost"] = partial(plot_cost, dict(turning), title=title)
         return Report("cost", name, rows, claims, _notes(size, rows), figures)
 
     for case in size.turning:

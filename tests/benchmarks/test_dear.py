@@ -35,9 +35,9 @@ def test_two_molecules(monkeypatch):
 
 def test_sizes():
     quick, full = dear.sizes("quick"), dear.sizes("full", ("256", "network"))
-    assert len(quick.cases) == 2
-    assert [case.title for case in full.cases] == ["network", "256 molecules"]
-    for case in dear.sizes("full").cases:
+    assert len(quick) == 2
+    assert [case.title for case in full] == ["network", "256 molecules"]
+    for case in dear.sizes("full"):
         assert not case.every or max(case.num_micro) % case.every == 0
 
 
