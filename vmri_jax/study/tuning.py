@@ -13,6 +13,7 @@ from vmri_jax.accuracy.search import Search
 from vmri_jax.accuracy.steps import check_error, digits_of, reached, warn_of_events
 from vmri_jax.accuracy.trials import Trial
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
+from vmri_jax.refusals import Refused
 from vmri_jax.running.failures import simulation_error
 from vmri_jax.running.progress import Progress, shows_progress, silent
 from vmri_jax.steppers.solver import Solver
@@ -126,7 +127,7 @@ class Recommendation(WorkPrecision):
 def check_target(error: float, t_end: float, problem: Problem) -> None:
     """Refuse errors and times that no run can meet."""
     if not (np.isfinite(t_end) and t_end > 0):
-        raise ValueError(f"tune: t_end is {t_end}; it must be a positive number.")
+        raise Refused(f"tune: t_end is {t_end}; it must be a positive number.")
     check_error("tune: error", error, problem)
 
 
