@@ -131,6 +131,7 @@ class Search:
         self._runs: dict[tuple[str, int], Simulation] = {}
         self._firsts: dict[tuple[str, int], Trial] = {}
         self._chosen: dict[str, Trial] = {}
+        self._times: dict[str, Callable[[int], float]] = {}
 
         def make(scheme: Scheme | Composition) -> Simulation:
             run = simulation(moving, scheme, state, solver, Steps(self.length, num_steps=1))
@@ -289,10 +290,10 @@ class Search:
 
     def settings(self, trial: Trial) -> Settings:
         """The arguments of `vmri_jax.simulate` that repeat the run of a trial."""
-        run = trial.run
-        return Settings(
-            run.scheme, trial.python, trial.family.options, float(run.macro_dt), run.num_steps, run.save_every
-        )
+        run, time = trial.run, self._times.get(trial.family.python)
+        numbers = float(run.macro_dt), run.num_steps, run.save_every
+        gain = 1.0 if time is None else time(1) / time(trial.num_micro)
+        return Settings(run.scheme, trial.python, trial.family.options, *numbers, gain)
 
     def _with_best_num_micro(self, trial: Trial, error: float) -> Trial:
         """A trial with the number of micro steps of the least time.
@@ -328,6 +329,7 @@ class Search:
             """Time of a run with a given error, ``(a + b N) (S + F / N^p)^(1 / p)``, up to a factor without N."""
             return (macro_seconds + n * micro_seconds) * (slow + fast / n**p) ** (1 / p)
 
+        self._times[trial.family.python] = time
         unit = unit_of(self.system, run.scheme)  # the rates of the rules divide num_micro
         best = (macro_seconds / micro_seconds * fast / slow) ** (1 / (p + 1))
         best = unit * int(np.clip(round(best / unit), 1, max(1, MOST_MICRO // unit)))
