@@ -20,8 +20,8 @@ class Settings:
         macro_dt: macro step H.
         num_steps: macro steps of the run.
         save_every: macro steps from one saved node to the next.
-        gain: computing time with one micro step per macro step, divided by the time with the chosen number, for the
-            same error; computed from the prices and error shares of the trial runs.
+        gain: computing time with one micro step per macro step, divided by the time with the chosen number, for the same error; computed
+            from the prices and error shares of the trial runs.
     """
 
     scheme: Scheme | Composition = field(compare=False)  # `python` and the numbers identify it
