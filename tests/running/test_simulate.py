@@ -292,7 +292,7 @@ def test_ends_of_runs(fpu):
 
 
 def test_lengths_of_runs_share_a_program(fpu, request):
-    """Six step sizes, all nodes saved: one program. A node is the same whatever the length of its run."""
+    """Six step sizes, all nodes saved, and the companion of an error: one program. A node is the same whatever the length of its run."""
     compiled = []
 
     def note(event: str, duration_secs: float, **_: str | int) -> None:
@@ -309,6 +309,7 @@ def test_lengths_of_runs_share_a_program(fpu, request):
     for num_steps in (10, 20, 40, 80, 160, 320):
         run = simulate(fpu, scheme, macro_dt=1 / num_steps, num_steps=num_steps)
         assert len(run) == num_steps + 1 == len(run.info.iterations) + 1
+    assert simulate(fpu, scheme, macro_dt=1 / 320, num_steps=320, error=True).error.is_certified
     assert not compiled
     longest = simulate(fpu, scheme, macro_dt=0.05, num_steps=36)
     for num_steps in (33, 34, 35):
