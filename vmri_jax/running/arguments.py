@@ -33,7 +33,7 @@ class Save:
         every: macro steps from one saved node to the next; 1 where neither `every` nor `number` is given.
         number: in place of `every`, the number of saved intervals, equally spaced, of which there is one node more.
         micro: also keep the fast positions at the micro nodes of the macro step that ends at each saved node.
-        adjoint: states that a run keeps for derivatives, see `vmri_jax.running.adjoints`: "stored" for all modes, "checkpoint" for reverse
+        adjoint: states that a run keeps for derivatives, see `vmri_jax.running.engine`: "stored" for all modes, "checkpoint" for reverse
             mode in little memory; "auto" chooses by length. Outside of transformations of JAX it changes nothing.
         progress: True for a bar of the nodes saved so far, or a function of (what, done, total); Ctrl-C then raises `Interrupted` with
             these nodes. With False a run that takes more than two seconds prints lines on the error stream.

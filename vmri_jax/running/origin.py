@@ -138,14 +138,11 @@ def at_nodes(function, origin: Origin, nodes, *static):
     """
     arrays, structure = jax.tree.flatten(origin.system())  # raises if the system is not known
     with Working("quantities of the run"):
-        return evaluated(function, structure, of_one_type(arrays), nodes, *static)
+        return _evaluated(function, structure, of_one_type(arrays), nodes, *static)
 
 
-def evaluated(function, structure, arrays: list, nodes, *static):
-    """`at_nodes` of the system with this structure and these leaves, which have the axes of lanes in a batch; concrete values as arrays of NumPy.
-
-    A call of the program gets a room of nodes, of which it evaluates the first blocks; long runs take several calls.
-    """
+def _evaluated(function, structure, arrays: list, nodes, *static):
+    """`at_nodes`; a call of the program gets a room of nodes, of which it evaluates the first blocks, and long runs take several calls."""
     shape = np.shape(jax.tree.leaves(nodes)[0])
     axes, count = len(shape), math.prod(shape)
     # Arrays that all lanes share go in once: for each node they would be copied.
@@ -164,9 +161,7 @@ def evaluated(function, structure, arrays: list, nodes, *static):
         node, size = np.minimum(np.arange(first, first + room), count - 1), min(room, count - first)
         parts = _rows(of_lanes, node // shape[-1]), _rows(of_nodes, node)  # the last node fills up the room
         values = program(shared, *parts, -(-size // NODES_AT_ONCE))
-        as_array = (
-            np.asarray if is_concrete(values) else jnp.asarray
-        )  # tracers, where JAX is tracing a function around this one
+        as_array = np.asarray if is_concrete(values) else jnp.asarray  # JAX may be tracing a function around this one
         pieces.append(jax.tree.map(lambda a, size=size, as_array=as_array: as_array(a)[:size], values))
 
     def joined(*parts):

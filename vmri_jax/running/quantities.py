@@ -19,7 +19,7 @@ from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.summary import has_values, summary
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.micro_nodes import Nodes, why_not, with_micro_nodes
-from vmri_jax.running.observables import LostEnergyWarning, concerns, observables, with_tolerance
+from vmri_jax.running.observables import LostEnergyWarning, concerns, observables
 from vmri_jax.running.origin import Origin, SavedRun, at_nodes
 
 RANDOM_RATIO = 0.5
@@ -269,7 +269,7 @@ class Quantities(ABC):
             ValueError: the run does not know its system.
         """
         run = _concrete("concerns", self.whole())
-        table, t = np.asarray(at_nodes(observables, run.origin, with_tolerance(run.states, 0.0))), np.asarray(run.t)
+        table, t = np.asarray(at_nodes(observables, run.origin, run.states)), np.asarray(run.t)
         return concerns(table, t, run.origin.system(t.ndim - 1), np.mean(np.diff(t), axis=-1), 1)
 
     def plot(self, title: str = ""):

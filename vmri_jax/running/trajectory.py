@@ -14,21 +14,15 @@ from vmri_jax.mechanics.arrays import Numbers, is_concrete
 from vmri_jax.mechanics.state import HasProblem, Problem, State
 from vmri_jax.mechanics.summary import has_values, summary
 from vmri_jax.mechanics.system import System
-from vmri_jax.running.export import MICRO, Exports
+from vmri_jax.running.export import INFO, MICRO, NODES, STATUS, Exports, named_arrays
 from vmri_jax.running.files import replaced
 from vmri_jax.running.origin import UNKNOWN, Origin
 from vmri_jax.running.run_error import RunError
 from vmri_jax.running.settings import Settings
 from vmri_jax.running.summaries import summary_of
-from vmri_jax.schemes.composition import Composition
-from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.results import Method, Result, Status
 
 FORMAT = "vmri_jax trajectory 2"
-NODES = ("t", "q_s", "q_f", "p_s", "p_f", "energy", "constraint_residual")
-"""Arrays with a row for each saved node; all arrays but `NODES`, `STATUS` and `ERROR` have a row for each saved interval."""
-STATUS = ("result", "failed_at")
-"""Arrays with one value for the run."""
 ERROR = tuple(f"error_{name}" for name in RunError._fields)
 """Arrays of the estimated error; absent in runs without one."""
 STATUS_ARRAYS = jax.Array, np.ndarray
@@ -70,11 +64,6 @@ class MicroNodes(NamedTuple):
 
     t: Float[Numbers, "k-1 num_micro"]
     q_f: Float[Numbers, "k-1 num_micro n_f"]
-
-    @classmethod
-    def of(cls, t, scheme: Scheme | Composition, macro_dt, q_f) -> "MicroNodes":
-        """The micro nodes of the macro steps that end at the times t[1:]; micro node i lies ``H (1 - c_i)`` before the end."""
-        return cls(t[..., 1:, None] - macro_dt[..., None, None] * (1 - scheme.micro_times), q_f)
 
 
 @jax.tree_util.register_dataclass
@@ -236,7 +225,7 @@ class Trajectory(Exports):
         Raises:
             OSError: the file cannot be written.
         """
-        arrays = {name: np.asarray(value) for name, value in named_arrays(self).items() if value is not None}
+        arrays = {name: np.asarray(value) for name, value in named_arrays(self).items()}
         if drawing is not None:
             arrays["drawing"] = np.array(json.dumps(drawing))
         if self.origin.names is not None:
@@ -265,26 +254,24 @@ class Trajectory(Exports):
             )
         try:
             with path.open("rb") as file, np.load(file, allow_pickle=False) as data:
-                arrays = dict(data)
+                arrays = {
+                    name: data[name] for name in data.files if name not in ("drawing", "slow_names", "fast_names")
+                }
         except Exception as error:
             raise ValueError(
                 f"{path} cannot be read as a .npz file ({error}); it is damaged or something else."
             ) from error
         if str(arrays.pop("format", "")) != FORMAT:
             raise ValueError(f"{path} is a .npz file but not a trajectory saved by Trajectory.save.")
-        names, settings = (
-            None if text is None else json.loads(str(text))
-            for text in (arrays.pop("names", None), arrays.pop("settings", None))
-        )
-        for name in ("drawing", "slow_names", "fast_names"):
-            arrays.pop(name, None)
-        missing = _FIELDS - set(arrays) - set(MICRO)
-        if missing or set(arrays) - _FIELDS - set(ERROR):
+        texts = [arrays.pop(name, None) for name in ("names", "settings")]
+        needed = {*NODES, *INFO, *STATUS}
+        missing = needed - set(arrays)
+        if missing or set(arrays) - needed - {*MICRO, *ERROR}:
             raise ValueError(
                 f"{path} is a damaged trajectory: it lacks {sorted(missing)}, or has arrays of another kind."
             )
         try:
-            origin = Origin.from_file(names, settings)
+            origin = Origin.from_file(*(None if text is None else json.loads(str(text)) for text in texts))
         except (KeyError, TypeError, ValueError) as error:
             raise ValueError(
                 f"{path} is a damaged trajectory: its names or settings cannot be read ({error!r})."
@@ -300,50 +287,10 @@ def with_origin(trajectory: Trajectory, origin: Origin, **arrays) -> Trajectory:
     return replace(trajectory, result=result, origin=origin, **arrays)
 
 
-def with_observables(run: Trajectory, table, origin: Origin = UNKNOWN) -> Trajectory:
-    """A run with energy and constraints from its `Observables` (..., k, 9), and with its origin."""
-    return with_origin(run, origin, energy=table[..., 0], constraint_residual=table[..., 1:3])
-
-
-Piece = tuple[Trajectory, Any]
-"""A run or a piece of it in arrays of NumPy, without an origin, and the table of its `Observables` (k, 9)."""
-
-
-def join(pieces: list[Piece]) -> Piece:
-    """One piece of consecutive ones, each of which starts with the last node of the previous piece, and has the worst status."""
-    if len(pieces) == 1:
-        return pieces[0]
-    intervals = len(pieces[0][0]) - 1
-
-    def joined(first, *others):
-        if not np.ndim(first):
-            return np.max([first, *others])  # failures have larger codes than successes, and later steps larger numbers
-        repeated = (
-            len(first) - intervals
-        )  # 1 where there is a row for each node, of which the first repeats the last one before
-        return np.concatenate([first, *(other[repeated:] for other in others)])
-
-    return jax.tree.map(joined, *pieces)
-
-
-def named_arrays(trajectory: Trajectory) -> dict:
-    """All arrays of a trajectory by name, positions as vectors; None for micro nodes that were not saved."""
-    arrays = dict(vars(trajectory.states)) | {
-        name: getattr(trajectory, name) for name in ("energy", "constraint_residual")
-    }
-    arrays |= trajectory.info._asdict() | {name: getattr(trajectory, name) for name in STATUS}
-    arrays |= dict(zip(MICRO, trajectory.micro or (None, None), strict=True))
-    return arrays | ({} if trajectory.error is None else dict(zip(ERROR, trajectory.error, strict=True)))
-
-
 def from_named_arrays(arrays: dict) -> Trajectory:
     """The inverse of `named_arrays`; arrays of micro nodes and of the error may be absent."""
-    states = State(*(arrays[name] for name in ("t", "q_s", "q_f", "p_s", "p_f")))
-    info = RunInfo(*(arrays[name] for name in RunInfo._fields))
-    fields = {name: arrays[name] for name in ("energy", "constraint_residual", *STATUS)}
-    micro = None if arrays.get(MICRO[0]) is None else MicroNodes(*(arrays[name] for name in MICRO))
-    error: Any = None if arrays.get(ERROR[0]) is None else RunError(*(arrays.get(name) for name in ERROR))
-    return Trajectory(states, info=info, micro=micro, error=error, **fields)
-
-
-_FIELDS = {*NODES, *STATUS, *MICRO, *RunInfo._fields}
+    states = State(*(arrays[name] for name in NODES[:5]))
+    fields = {name: arrays[name] for name in (*NODES[5:], *STATUS)}
+    micro = MicroNodes(*(arrays[name] for name in MICRO)) if MICRO[0] in arrays else None
+    error: Any = RunError(*map(arrays.get, ERROR)) if ERROR[0] in arrays else None
+    return Trajectory(states, info=RunInfo(*(arrays[name] for name in INFO)), micro=micro, error=error, **fields)

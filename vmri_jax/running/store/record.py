@@ -9,18 +9,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.running.simulation import Checkpoint
+from vmri_jax.running.engine import Cursor
+from vmri_jax.running.simulation import Checkpoint, Simulation
 from vmri_jax.running.store import layout
 from vmri_jax.steppers.results import Result
 
 
 class Record(NamedTuple):
-    """A run as far as its chunks are committed.
+    """A `Checkpoint` in a store: a run as far as its chunks are committed.
 
     saved: number of committed saved intervals.
-    result, failed_at: status of these intervals, as in `Trajectory`.
-    step, fell_back: as in `Cursor` and `Checkpoint`.
-    leaves: state and memory of the `Checkpoint` as a list of arrays.
+    result, failed_at, step, fell_back: of these intervals, as in `Cursor` and `Checkpoint`.
+    leaves: state and memory of the cursor.
     """
 
     saved: int = 0
@@ -35,7 +35,7 @@ class Record(NamedTuple):
         """The record of a checkpoint."""
         state, memory, *counts = checkpoint.cursor
         step, result, failed_at = map(int, counts)
-        leaves = [np.asarray(leaf) for leaf in jax.tree.leaves((state, memory))]
+        leaves = list(map(np.asarray, jax.tree.leaves((state, memory))))
         return cls(saved, result, failed_at, step, checkpoint.fell_back, leaves)
 
     @classmethod
@@ -54,19 +54,17 @@ class Record(NamedTuple):
 
     def packed(self) -> bytes:
         """The bytes of an .npz file."""
-        out, counts = io.BytesIO(), np.array(self[:-1], dtype=np.int64)
-        leaves = {f"leaf_{k}": leaf for k, leaf in enumerate(self.leaves)}
-        np.savez(out, counts=counts, **leaves)  # pyright: ignore[reportArgumentType]
+        out, leaves = io.BytesIO(), {f"leaf_{k}": leaf for k, leaf in enumerate(self.leaves)}
+        np.savez(out, counts=np.array(self[:-1], dtype=np.int64), **leaves)  # pyright: ignore[reportArgumentType]
         return out.getvalue()
 
-    def checkpoint(self, like: Checkpoint) -> Checkpoint:
-        """The checkpoint, in the structure of `like`, the blank one of the run; a ValueError if the arrays do not fit."""
+    def checkpoint(self, run: Simulation) -> Checkpoint:
+        """The checkpoint of the run; a ValueError if the arrays do not fit the memory of its stepper."""
         if not self.leaves:
-            return like
-        cursor = like.cursor
-        expected, structure = jax.tree.flatten((cursor.state, cursor.memory))
+            return run.start()
+        expected, structure = jax.tree.flatten((run.state, run.blank_memory(self.fell_back)))
         if [(leaf.shape, leaf.dtype) for leaf in self.leaves] != [(leaf.shape, leaf.dtype) for leaf in expected]:
             raise ValueError("the checkpoint was made by a version of vmri_jax whose steps remember something else")
         state, memory = jax.tree.unflatten(structure, map(jnp.asarray, self.leaves))
         status = map(np.asarray, (self.step, self.result, self.failed_at))
-        return Checkpoint(type(cursor)(state, memory, *status), fell_back=self.fell_back)
+        return Checkpoint(Cursor(state, memory, *status), self.fell_back)

@@ -10,12 +10,12 @@ from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.state import HasProblem, Problem, State
 from vmri_jax.mechanics.summary import summary
 from vmri_jax.mechanics.system import System
-from vmri_jax.running.export import MICRO, Exports
+from vmri_jax.running.export import INFO, MICRO, NODES, Exports
 from vmri_jax.running.origin import Origin
 from vmri_jax.running.store.layout import chunk_file, read_attributes
 from vmri_jax.running.store.record import Record
 from vmri_jax.running.summaries import named_coordinates
-from vmri_jax.running.trajectory import NODES, RunInfo, Trajectory, from_named_arrays, with_origin
+from vmri_jax.running.trajectory import Trajectory, from_named_arrays, with_origin
 from vmri_jax.steppers.results import Result
 
 
@@ -114,7 +114,7 @@ class StoredTrajectory(Exports):
 
     def _part(self, first: int, last: int, stride: int) -> Trajectory:
         arrays = {name: self._rows(name, slice(first, last + 1, stride)) for name in NODES}
-        for name in RunInfo._fields:  # the maximum over the intervals between two nodes
+        for name in INFO:  # the maximum over the intervals between two nodes
             rows = self._rows(name, slice(first + 1, last + 1))
             arrays[name] = np.maximum.reduceat(rows, range(0, len(rows), stride)) if len(rows) else rows
         if self.attributes["save_micro"]:
