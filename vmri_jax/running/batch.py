@@ -130,12 +130,11 @@ def batch(
         raise ValueError(
             "simulate_batch: t_end with steps or start times that differ; give num_steps, the same for all lanes."
         )
-    differs = not all(map(is_repeated, params))
+    differs = not all(map(is_repeated, jax.tree.leaves(params)))
     if states is None and differs and not (system.has_constant_mass and not system.is_constrained):
         # momenta M v, and their projection onto constraints, depend on parameters
-        of_lanes = jax.tree.unflatten(jax.tree.structure(system.params), params)
         fixed = tuple(getattr(problem, name) for name in ("t", "q_s", "q_f", "v_s", "v_f"))
-        start = consistent_states(system, of_lanes, fixed, problem.project, starts_differ=False)
+        start = consistent_states(system, params, fixed, problem.project, starts_differ=False)
     start = State(*map(np.asarray, vars(start).values()))
     first, steps = jax.tree.map(lambda a: a[0], start), replace(steps, macro_dt=macro_dt[0])
     run, lanes = simulation(problem, scheme, first, solver, steps), len(macro_dt)
@@ -144,10 +143,8 @@ def batch(
     check_memory("simulate_batch", run, lanes)
     width = (lanes_at_once(run) if chunk is None else chunk) * devices
     runs = jax.tree.map(lambda a: shared(a, lanes), run)
-    of_lanes = jax.tree.unflatten(jax.tree.structure(system.params), params)
-    return Batch(
-        replace(runs, macro_dt=macro_dt, state=start, system=runs.system.with_params(of_lanes)), width, devices
-    )
+    runs = replace(runs, macro_dt=macro_dt, state=start, system=runs.system.with_params(params))
+    return Batch(runs, width, devices)
 
 
 def _taken(runs: Simulation, index: np.ndarray) -> Simulation:
@@ -177,14 +174,6 @@ def consistent_states(system: System, params, start: tuple, project: bool, start
     return jax.vmap(of_lane, (None if params is None else 0, 0 if starts_differ else None))(params, start)
 
 
-def _names(params) -> list[str]:
-    """Names of all parameters, with dots in names of nested ones."""
-    return [
-        jax.tree_util.keystr(path, simple=True, separator=".")
-        for path, _ in jax.tree_util.tree_leaves_with_path(params)
-    ]
-
-
 def _named(values, known: Collection[str], path: tuple[str, ...] = ()) -> Iterator[tuple[str, Any]]:
     """Name and value of each parameter in a part of the parameters, nested or with dots in its names.
 
@@ -202,7 +191,7 @@ def _named(values, known: Collection[str], path: tuple[str, ...] = ()) -> Iterat
         yield from _named(entry, known, (*path, jax.tree_util.keystr((key,), simple=True)))
 
 
-def _with_lanes(all_params, params, start: State, macro_dt) -> tuple[list, State, np.ndarray]:
+def _with_lanes(all_params, params, start: State, macro_dt) -> tuple[Any, State, np.ndarray]:
     """Parameters, starts and macro steps of all lanes, with the lanes as their first axis.
 
     Args:
@@ -212,37 +201,32 @@ def _with_lanes(all_params, params, start: State, macro_dt) -> tuple[list, State
     Raises:
         ValueError: arrays of other shapes, axes of different lengths, or no axis of lanes at all.
     """
-    values = dict(zip(_names(all_params), jax.tree.leaves(all_params), strict=True))
+    leaves, structure = jax.tree_util.tree_flatten_with_path(all_params)
+    values = {jax.tree_util.keystr(path, simple=True, separator="."): value for path, value in leaves}
     new = {} if params is None else dict(_named(params, values))
     check_params(new)
     arrays = {f"params[{name!r}]": (new.get(name, value), np.shape(value)) for name, value in values.items()}
-    arrays |= {
-        f"states.{name}": (value, np.shape(value)[-1:] if name != "t" else ()) for name, value in vars(start).items()
-    }
+    for name, value in vars(start).items():
+        arrays[f"states.{name}"] = value, np.shape(value)[-1:] if name != "t" else ()
     arrays["macro_dt"] = real_array("simulate_batch: macro_dt", macro_dt), ()
-    lengths = {}
+    lengths = {name: len(value) for name, (value, shape) in arrays.items() if np.ndim(value) > len(shape)}
     for name, (value, shape) in arrays.items():
-        if np.ndim(value) > len(shape) and np.shape(value)[1:] == shape:
-            lengths[name] = len(value)
-        elif np.shape(value) != shape:
+        if np.shape(value)[name in lengths :] != shape:
             raise ValueError(
                 f"simulate_batch: {name} has shape {np.shape(value)}; give {shape} for all lanes, or an axis of lanes in front of it."
             )
     if len(set(lengths.values())) != 1 or 0 in lengths.values():
-        listed = (
-            ", ".join(f"{name} has {length}" for name, length in lengths.items()) or "no argument has an axis of lanes"
-        )
+        listed = ", ".join(f"{name} has {length}" for name, length in lengths.items())
         raise ValueError(
-            f"simulate_batch: {listed}; give params, states or steps with one value for each lane, all of the same number."
+            f"simulate_batch: {listed or 'no argument has an axis of lanes'}; give params, states or steps with one value for each lane, "
+            "all of the same number."
         )
     (lanes,) = set(lengths.values())
-    whole = {
-        name: np.asarray(value) if name in lengths else shared(value, lanes) for name, (value, _) in arrays.items()
-    }
-    if all(map(is_repeated, whole.values())):  # the user gave such views, and `jax.vmap` wants an axis
-        whole["states.t"] = np.array(whole["states.t"])
-    starts = (whole[f"states.{name}"] for name in vars(start))
-    return [whole[f"params[{name!r}]"] for name in values], State(*starts), whole["macro_dt"]
+    whole = [np.asarray(a) if name in lengths else shared(a, lanes) for name, (a, _) in arrays.items()]
+    *of_params, t, q_s, q_f, p_s, p_f, steps = whole
+    if all(map(is_repeated, whole)):  # the user gave such views, and `jax.vmap` wants an axis
+        t = np.array(t)
+    return jax.tree.unflatten(structure, of_params), State(t, q_s, q_f, p_s, p_f), steps
 
 
 def _check_devices(devices, chunk) -> None:

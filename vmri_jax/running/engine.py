@@ -9,10 +9,11 @@ the steps from the last to the first and needs the state at which each step star
 
 * *stored*: the run keeps the start of every step and the solution of its equations; works in forward and reverse mode, up to second
   derivatives; third derivatives are NaN where equations are solved by iteration;
-* *checkpoint*: the run keeps the starts of some steps and computes the steps between them again, see `Recursive`; works in reverse mode,
+* *checkpoint*: the run keeps the starts of some steps and computes the steps between them again, see `Adjoint`; works in reverse mode,
   once.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
 from typing import Any, NamedTuple
@@ -24,7 +25,7 @@ from jaxtyping import Float, Int
 
 from vmri_jax.mechanics.arrays import Numbers, options_of_runs
 from vmri_jax.mechanics.state import State
-from vmri_jax.running.loops import MOST_STORED_STEPS, PLAIN, Loops, Recursive, Stored
+from vmri_jax.running.loops import MOST_STORED_STEPS, Adjoint, plain
 from vmri_jax.running.observables import observables
 from vmri_jax.running.origin import NODES_AT_ONCE
 from vmri_jax.running.saved import Saved
@@ -82,7 +83,7 @@ class Engine:
         memory = stepper.init(begin.state, run.macro_dt)
         if cursor is not None:
             memory = jax.tree.map(partial(jnp.where, is_first), memory, cursor.memory)
-        interval = _interval(stepper, run, PLAIN)
+        interval = _interval(stepper, run, plain)
 
         def goes_on(loop):
             number, cursor, _ = loop
@@ -121,9 +122,10 @@ class Engine:
 
         def by_scan(leaves: list, save_every: int, adjoint: str) -> Saved:
             run: Any = jax.tree.unflatten(self.structure, leaves)
-            recursive = adjoint == "checkpoint" and self.num_saves * save_every > MOST_STORED_STEPS
-            loops, stepper = Recursive(save_every) if recursive else Stored(), run.stepper(adjoint == "checkpoint")
-            interval = _interval(stepper, run, loops)
+            once = adjoint == "checkpoint"
+            loops = Adjoint(save_every, is_recursive=once and self.num_saves * save_every > MOST_STORED_STEPS)
+            stepper = run.stepper(reverse_only=once)
+            interval = _interval(stepper, run, loops.repeat)
 
             def save(cursor: Cursor, _):
                 cursor, info, micro = interval(cursor, save_every)
@@ -186,7 +188,7 @@ def _nothing(run) -> tuple[RunInfo, Any]:
     return RunInfo(np.asarray(0), np.asarray(0), np.zeros(())), jnp.zeros((num_micro, run.state.q_f.shape[0]))
 
 
-def _interval(stepper: Plan, run, loops: Loops):
+def _interval(stepper: Plan, run, repeat: Callable):
     """``cursor, info, micro = interval(cursor, count)``: the `count` macro steps between two saved nodes."""
     t_start, macro_dt = run.state.t, run.macro_dt
 
@@ -207,7 +209,7 @@ def _interval(stepper: Plan, run, loops: Loops):
         return Cursor(state, memory, cursor.step + 1, result, failed_at), worst, micro
 
     def interval(cursor: Cursor, count):
-        cursor, info, micro = loops.repeat(count, step, (cursor, *_nothing(run)))
+        cursor, info, micro = repeat(count, step, (cursor, *_nothing(run)))
         if stepper.defers_projection:  # between saved nodes a projection would not change the motion
             state, memory = stepper.project(cursor.state, cursor.memory)
             cursor = cursor._replace(state=state, memory=memory)

@@ -98,15 +98,10 @@ class Exports(Quantities):
     def to_csv(self, path) -> None:
         """Write `columns` to a .csv file, with a line of names; an existing file is replaced.
 
-        Args:
-            path: of the file.
-
         Raises:
-            ValueError: this is a batch.
             OSError: the file cannot be written.
         """
-        columns = self.columns()
-        head = io.StringIO()
+        columns, head = self.columns(), io.StringIO()
         csv.writer(head, lineterminator="\n").writerow(columns)
         with replaced(Path(path)) as file:
             file.write(head.getvalue().encode())
@@ -116,21 +111,14 @@ class Exports(Quantities):
         """`columns` as a `pandas.DataFrame` over time (pandas comes with the extra ``vmri_jax[xarray]``).
 
         Raises:
-            ValueError: this is a batch.
             ImportError: pandas is not installed.
         """
-        pandas = extra("pandas", "to_pandas")
-        columns = self.columns()
-        return pandas.DataFrame(columns).set_index("t")
+        return extra("pandas", "to_pandas").DataFrame(self.columns()).set_index("t")
 
     def to_parquet(self, path) -> None:
-        """Write `columns` to a .parquet file, time first (needs the extra ``vmri_jax[parquet]``).
-
-        Args:
-            path: of the file; an existing file is replaced.
+        """Write `columns` to a .parquet file, time first (needs the extra ``vmri_jax[parquet]``); an existing file is replaced.
 
         Raises:
-            ValueError: this is a batch.
             ImportError: pyarrow is not installed.
             OSError: the file cannot be written.
         """

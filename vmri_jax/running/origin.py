@@ -2,7 +2,7 @@
 
 import math
 import pickle
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import Any, TypeAlias
 
@@ -60,10 +60,6 @@ class Origin:
         """The origin of a run that was read from a file: names and settings from plain data, without a system."""
         known_names = None if names is None else Names.from_dict(names)
         return cls(known_names, settings=None if settings is None else Settings.from_dict(settings))
-
-    def with_params(self, params) -> "Origin":
-        """The origin of a run with other parameters."""
-        return self if self.simulated is None else replace(self, simulated=self.simulated.with_params(params))
 
     def repeated(self, lanes: tuple[int, ...]) -> "Origin":
         """The origin of a batch of runs: a view of every array with the axes of lanes, without copies."""

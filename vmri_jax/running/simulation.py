@@ -22,12 +22,12 @@ import numpy as np
 
 from vmri_jax.configure import warn_if_slow
 from vmri_jax.mechanics.arrays import Known, is_concrete, of_one_type
-from vmri_jax.mechanics.checks import check_params
+from vmri_jax.mechanics.checks import check_arrays, check_params
 from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.state import Movable, State, opened, start_of
 from vmri_jax.mechanics.summary import numbers, summary
 from vmri_jax.mechanics.system import System
-from vmri_jax.running.arguments import Save, Steps, check_once, check_run, check_vectors, nothing_fast
+from vmri_jax.running.arguments import Save, Steps, check_once, check_run, nothing_fast
 from vmri_jax.running.engine import Cursor, Engine, engine
 from vmri_jax.running.failures import simulation_error
 from vmri_jax.running.fallback import FALLING_BACK, solved_again, unsolved
@@ -138,11 +138,11 @@ class Simulation:
         """The run with other arguments, see `__call__`, by the same program."""
         changes: dict[str, Any] = {} if macro_dt is None else {"macro_dt": _float(macro_dt)}
         if state is not None:
-            check_vectors(state)
-            shapes, new = ([a.shape for a in vars(start).values()] for start in (self.state, _with_arrays(state)))
+            check_arrays(q_s=state.q_s, q_f=state.q_f, p_s=state.p_s, p_f=state.p_f)
+            changes["state"] = _with_arrays(state)
+            new, shapes = ([a.shape for a in vars(start).values()] for start in (changes["state"], self.state))
             if new != shapes:
                 raise ValueError(f"the arrays of state have shapes {new}; the run was prepared for {shapes}.")
-            changes["state"] = _with_arrays(state)
         if params is not None:
             check_params(params)
             (old, expected), (new, structure) = map(jax.tree.flatten, (self.system.params, params))

@@ -10,13 +10,6 @@ MIN_SECONDS = 0.02
 """Least seconds of a sample; shorter runs are called several times. It is long against the resolution of clocks and the time slices of
 schedulers; a larger value makes measurements take longer."""
 
-Tell = Callable[[str], None]
-"""Called with the name of a run before it is measured."""
-
-
-def silent(_: str) -> None:
-    """A `Tell` that prints nothing."""
-
 
 def interleaved(
     runs: Mapping[str, Callable[[], object]],
@@ -35,11 +28,11 @@ def interleaved(
         min_seconds: seconds of a sample, the mean of several calls.
         clock: `time.process_time` where other processes share the core.
     """
-    calls, seconds = {}, {name: [] for name in runs}
+    calls, names = {}, list(runs)
     for name, run in runs.items():
         seconds_per_call(run, 1, clock)
         calls[name] = max(1, round(min_seconds / seconds_per_call(run, 1, clock)))
-    names = list(runs)
+    seconds: dict[str, list[float]] = {name: [] for name in names}
     for i in range(repeats):
         start = i % max(1, len(names))
         for name in names[start:] + names[:start]:

@@ -1,6 +1,7 @@
 """`Trajectory`, the result of a run: saved nodes, work of the solver, energy and constraints, and status."""
 
 import json
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path as FilePath
 from typing import Any, NamedTuple
@@ -178,22 +179,14 @@ class Trajectory(Exports):
         """The nodes first, first + stride, ..., last; the work of the solver between two of them is the maximum, and a failure after the last is left out."""
         if not is_concrete(self.energy):
             raise TypeError("Trajectory: the run is traced by JAX; take slices of its arrays, run.q_s[a:b].")
-        lanes, starts = (slice(None),) * (np.ndim(self.t) - 1), range(0, last - first, stride)
-        nodes, ends = slice(first, last + 1, stride), slice(first + stride - 1, last, stride)
+        arrays, lanes = named_arrays(self), (slice(None),) * (np.ndim(self.t) - 1)
 
-        def largest(value):
-            between = np.asarray(value)[*lanes, first:last]
-            return np.maximum.reduceat(between, starts, axis=len(lanes)) if starts else between
+        def rows(name: str, chosen: slice):
+            return np.asarray(arrays[name])[*lanes, chosen]
 
-        at_nodes = (self.states, self.energy, self.constraint_residual)
-        states, energy, residual = jax.tree.map(lambda a: np.asarray(a)[*lanes, nodes], at_nodes)
-        fails_later = (np.asarray(self.failed_at) >= 0) & ~np.isnan(energy).any(axis=-1)
-        result = np.where(fails_later, int(Result.CONVERGED), self.result)
-        failed_at = np.where(fails_later, -1, self.failed_at)
-        micro = jax.tree.map(lambda a: np.asarray(a)[*lanes, ends], self.micro)
-        error: Any = None if self.error is None else self.error.part(nodes)
-        info = jax.tree.map(largest, self.info)
-        return with_origin(Trajectory(states, energy, residual, info, result, failed_at, micro, error), self.origin)
+        part = part_of(rows, self.result, self.failed_at, (first, last, stride), self.micro is not None)
+        error: Any = None if self.error is None else self.error.part(slice(first, last + 1, stride))
+        return with_origin(part, self.origin, error=error)
 
     def lane(self, i: int) -> "Trajectory":
         """One run of a batch.
@@ -294,3 +287,25 @@ def from_named_arrays(arrays: dict) -> Trajectory:
     micro = MicroNodes(*(arrays[name] for name in MICRO)) if MICRO[0] in arrays else None
     error: Any = RunError(*map(arrays.get, ERROR)) if ERROR[0] in arrays else None
     return Trajectory(states, info=RunInfo(*(arrays[name] for name in INFO)), micro=micro, error=error, **fields)
+
+
+def part_of(rows: Callable[[str, slice], np.ndarray], result, failed_at, nodes: tuple, has_micro: bool) -> Trajectory:
+    """The nodes first, first + stride, ..., last of a run; the work of the solver between two of them is the maximum, and a failure after the last is
+    left out.
+
+    Args:
+        rows: gives some rows of an array by its name; row i of the arrays of intervals belongs to the nodes i and i + 1.
+        result, failed_at: status of the run.
+        nodes: (first, last, stride).
+        has_micro: whether there are micro nodes.
+    """
+    first, last, stride = nodes
+    arrays = {name: rows(name, slice(first, last + 1, stride)) for name in NODES}
+    for name in INFO:
+        between, starts = rows(name, slice(first, last)), range(0, last - first, stride)
+        arrays[name] = np.maximum.reduceat(between, starts, axis=arrays["t"].ndim - 1) if starts else between
+    if has_micro:
+        arrays |= {name: rows(name, slice(first + stride - 1, last, stride)) for name in MICRO}
+    fails_later = (np.asarray(failed_at) >= 0) & ~np.isnan(arrays["energy"]).any(axis=-1)
+    arrays["result"] = np.where(fails_later, int(Result.CONVERGED), result)
+    return from_named_arrays(arrays | {"failed_at": np.where(fails_later, -1, failed_at)})

@@ -10,12 +10,12 @@ from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.state import HasProblem, Problem, State
 from vmri_jax.mechanics.summary import summary
 from vmri_jax.mechanics.system import System
-from vmri_jax.running.export import INFO, MICRO, NODES, Exports
+from vmri_jax.running.export import NODES, Exports
 from vmri_jax.running.origin import Origin
 from vmri_jax.running.store.layout import chunk_file, read_attributes
 from vmri_jax.running.store.record import Record
 from vmri_jax.running.summaries import named_coordinates
-from vmri_jax.running.trajectory import Trajectory, from_named_arrays, with_origin
+from vmri_jax.running.trajectory import Trajectory, part_of, with_origin
 from vmri_jax.steppers.results import Result
 
 
@@ -113,16 +113,8 @@ class StoredTrajectory(Exports):
         return self[number : number + 1][0]
 
     def _part(self, first: int, last: int, stride: int) -> Trajectory:
-        arrays = {name: self._rows(name, slice(first, last + 1, stride)) for name in NODES}
-        for name in INFO:  # the maximum over the intervals between two nodes
-            rows = self._rows(name, slice(first + 1, last + 1))
-            arrays[name] = np.maximum.reduceat(rows, range(0, len(rows), stride)) if len(rows) else rows
-        if self.attributes["save_micro"]:
-            arrays |= {name: self._rows(name, slice(first + stride, last + 1, stride)) for name in MICRO}
-        arrays |= {"result": np.asarray(int(Result.CONVERGED)), "failed_at": np.asarray(-1)}
-        if self.failed_at < last * self.save_every:
-            arrays |= {"result": np.asarray(int(self.result)), "failed_at": np.asarray(self.failed_at)}
-        return with_origin(from_named_arrays(arrays), self.origin)
+        nodes, has_micro = (first, last, stride), self.attributes["save_micro"]
+        return with_origin(part_of(self._rows, int(self.result), self.failed_at, nodes, has_micro), self.origin)
 
     def chunks(self):
         """The trajectory in pieces of a chunk each; a piece starts with the last node of the previous piece."""
@@ -130,15 +122,16 @@ class StoredTrajectory(Exports):
             yield self[first : first + self.chunk + 1]
 
     def _rows(self, name: str, rows: slice) -> np.ndarray:
-        """Committed rows of an array; a ValueError if one of their files is missing or damaged."""
+        """Committed rows of an array, see `part_of`; a ValueError if one of their files is missing or damaged."""
         import zarr
 
+        shift = name not in NODES  # the first row of arrays of intervals is blank
+        rows = slice(rows.start + shift, rows.stop + shift, rows.step)
         try:
             array = zarr.open_array(self.path / name, mode="r")
             for k in range(rows.start // self.chunk, -(-rows.stop // self.chunk)):
-                if (
-                    array.size and not chunk_file(self.path / name, array.ndim, k).is_file()
-                ):  # zarr would return fill values
+                # zarr would return fill values
+                if array.size and not chunk_file(self.path / name, array.ndim, k).is_file():
                     raise ValueError(f"chunk {k} is missing")
             return np.asarray(array[rows])
         except Exception as error:
