@@ -27,11 +27,14 @@ from vmri_jax.mechanics.arrays import Numbers, options_of_runs
 from vmri_jax.mechanics.state import State
 from vmri_jax.running.loops import MOST_STORED_STEPS, Adjoint, plain
 from vmri_jax.running.observables import observables
-from vmri_jax.running.origin import NODES_AT_ONCE
 from vmri_jax.running.saved import Saved
 from vmri_jax.running.trajectory import RunInfo
 from vmri_jax.steppers.plan import Plan
 from vmri_jax.steppers.results import Result
+
+NODES_AT_ONCE = 16
+"""Nodes whose observables are computed side by side. With fewer nodes XLA uses no vector instructions; with 64 the matrices of scenes no longer fit into
+the first-level cache, and a run of a few nodes takes longer."""
 
 
 class Cursor(NamedTuple):

@@ -5,6 +5,7 @@ import importlib
 import io
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -150,17 +151,12 @@ class Exports(Quantities):
         if lanes and np.any(rows["t"] != rows["t"][0]):
             coordinates["t"] = ("t", np.arange(rows["t"].shape[1]))
             data["time"] = (("lane", "t"), rows["t"])
-        return xarray.Dataset(data, coords=coordinates, attrs=attributes(run))
-
-
-def attributes(run: SavedRun) -> dict:
-    """The status of a run, and the names of bodies and constraints as JSON."""
-    if np.ndim(run.t) > 1:
-        status = {"result": np.asarray(run.result), "failed_at": np.asarray(run.failed_at)}
-    else:
-        status = {"result": Result(int(run.result)).name, "failed_at": int(run.failed_at)}
-    names = run.origin.names
-    return status | ({} if names is None else {"names": json.dumps(names.to_dict())})
+        result, failed_at = np.asarray(run.result), np.asarray(run.failed_at)
+        status = (result, failed_at) if lanes else (Result(int(result)).name, int(failed_at))
+        attributes: dict[str, Any] = dict(zip(STATUS, status, strict=True))
+        if run.origin.names is not None:
+            attributes["names"] = json.dumps(run.origin.names.to_dict())
+        return xarray.Dataset(data, coords=coordinates, attrs=attributes)
 
 
 def extra(package: str, caller: str, name: str = "xarray"):

@@ -12,6 +12,7 @@ All of them return `Saved`. With the matrix "auto" a piece that is not solved is
 
 import warnings
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, partial
 from typing import Any, NamedTuple
@@ -174,13 +175,13 @@ class Simulation:
         def steps(run: Simulation) -> Callable[[list], Saved]:
             return lambda leaves: run.engine.differentiable(leaves, run.save_every, adjoint)
 
-        saved = (
-            steps(self)(self.leaves)
-            if not self.plan.has_fallback
-            else solved_again(
-                steps(self), steps(self.exact), lambda saved: unsolved(saved.result, self._method(saved)), self.leaves
-            )
-        )
+        def failed(saved: Saved):
+            return unsolved(saved.result, self._method(saved))
+
+        run = steps(self)
+        if self.plan.has_fallback:
+            run = partial(solved_again, run, steps(self.exact), failed)
+        saved = run(self.leaves)
         return self.engine.observed(self.leaves, saved, self.save_every).trajectory(self)
 
     def warn(self, caller: str, table, t, stacklevel: int = 3) -> bool:
@@ -308,8 +309,9 @@ class Simulation:
         nodes = np.array(np.asarray(rows)[: saves + 1])  # a copy, which holds no memory of a whole piece
         saved = Saved(nodes, np.asarray(cursor.result), np.asarray(cursor.failed_at))
         saved = saved.marked(self.columns, self.save_every, step)
-        status = {"step": step + saves * self.save_every, "result": saved.result, "failed_at": saved.failed_at}
-        return saved, checkpoint._replace(cursor=cursor._replace(**status))
+        reached = np.asarray(step + saves * self.save_every)
+        cursor = cursor._replace(step=reached, result=saved.result, failed_at=saved.failed_at)
+        return saved, checkpoint._replace(cursor=cursor)
 
     def unsolved(self, saved: Saved) -> np.ndarray:
         """Whether the fallback may solve a run or a piece, or (lanes,) the runs of a batch."""
@@ -327,27 +329,24 @@ class Simulation:
 
         With the name of a `caller` it warns about the motion, see `warn`.
         """
-        if self.save.progress is False:
-            with Working("the run", running=STEPPING):
-                saved, _ = self.advance(self.start(), self.num_saves)
-        else:
-            saved = self._with_a_bar()
-        trajectory = saved.trajectory(self)
-        if caller:
-            self.warn(caller, saved.table, trajectory.states.t, stacklevel=4)
-        return trajectory
-
-    def _with_a_bar(self) -> Saved:
-        size, checkpoint, pieces = -(-self.num_saves // PARTS_OF_A_BAR), self.start(), []
-        with interrupts_noted() as interrupted, progress_to("simulate", self.save.progress) as tell:
+        bar, checkpoint, pieces = self.save.progress is not False, self.start(), []
+        size = -(-self.num_saves // (PARTS_OF_A_BAR if bar else 1))
+        noted = interrupts_noted() if bar else nullcontext(lambda: False)
+        shown = progress_to("simulate", self.save.progress) if bar else Working("the run", running=STEPPING)
+        with noted as interrupted, shown as tell:
             for done in range(0, self.num_saves, size):
-                tell("simulating", done, self.num_saves)
+                if bar:
+                    tell("simulating", done, self.num_saves)
                 piece, checkpoint = self.advance(checkpoint, min(size, self.num_saves - done))
                 pieces.append(piece)
                 if interrupted():
                     steps = int(checkpoint.cursor.step)
                     raise Interrupted(joined(pieces).trajectory(self), steps, self.num_steps, "macro steps")
-        return joined(pieces)
+        saved = joined(pieces)
+        trajectory = saved.trajectory(self)
+        if caller:
+            self.warn(caller, saved.table, trajectory.states.t, stacklevel=4)
+        return trajectory
 
 
 def simulation(moving: Movable, scheme, state: State | None, solver: Solver | None, steps: Steps) -> Simulation:

@@ -11,14 +11,14 @@ import numpy as np
 from vmri_jax.mechanics.arrays import whole_number
 from vmri_jax.mechanics.state import Movable, State
 from vmri_jax.running.arguments import Save, Steps
-from vmri_jax.running.export import DIMENSIONS, INFO, MICRO, NODES, rows_of
+from vmri_jax.running.export import DIMENSIONS, rows_of
 from vmri_jax.running.failures import simulation_error
 from vmri_jax.running.files import explained
 from vmri_jax.running.interrupts import Interrupted, interrupts_noted
 from vmri_jax.running.observables import Observables, observables
 from vmri_jax.running.origin import at_nodes
 from vmri_jax.running.progress import Progress, progress_to
-from vmri_jax.running.saved import BYTES_PER_NUMBER
+from vmri_jax.running.saved import BYTES_PER_NUMBER, Saved
 from vmri_jax.running.simulation import Simulation, simulation
 from vmri_jax.running.store import layout
 from vmri_jax.running.store.identity import check_same, environment, identity
@@ -80,8 +80,7 @@ def stream(
     """
     path = Path(out)
     layout.check_place("stream", path, "run", resume, overwrite)
-    steps = Steps(macro_dt, num_steps, t_end, save)
-    run = simulation(system, scheme, state, solver, steps)
+    run = simulation(system, scheme, state, solver, Steps(macro_dt, num_steps, t_end, save))
     num_steps = run.num_steps
     if not run.is_concrete:
         raise ValueError("stream: arguments are tracers; it writes files, call it outside of jax.jit, vmap and grad.")
@@ -115,9 +114,7 @@ def stream(
     stored = StoredTrajectory(path)
     stored = stored.with_origin(run.origin) if len(stored) else stored
     if not stored.success:
-        interval = stored.failed_at // run.save_every
-        part, first = stored[interval : interval + 2], interval * run.save_every
-        raise simulation_error(part, run.macro_dt, run.save_every, scheme.num_micro, first, stored)
+        raise simulation_error(stored, run.macro_dt, run.save_every, scheme.num_micro)
     return stored
 
 
@@ -162,19 +159,13 @@ def _advice(step: int) -> str:
 
 
 def _arrays(run: Simulation) -> dict[str, Kept]:
-    """The arrays of the store of a run."""
-    sizes = {"slow": run.state.q_s.size, "fast": run.state.q_f.size, "level": 2, "micro": run.scheme.num_micro}
-    arrays = {}
-    for name in (*NODES, *INFO, *(MICRO if run.save_micro else ())):
-        axes = DIMENSIONS[name][1:]
-        kind = np.int64 if name in INFO[:2] else np.float64
-        arrays[name] = Kept(np.empty([sizes[axis] for axis in axes], kind), axes)
-    return arrays
+    """The arrays of the store of a run: a row of each, as two blank nodes have them."""
+    blank = Saved(np.zeros((2, run.columns.width)), np.asarray(0), np.asarray(-1)).trajectory(run)
+    return {name: Kept(rows[0], DIMENSIONS[name][1:]) for name, rows in rows_of(blank).items()}
 
 
 def _chunk(run: Simulation) -> int:
     """Saved intervals per chunk where the user gives none."""
-    num_micro = run.scheme.num_micro
-    size = BYTES_PER_NUMBER * run.columns.width
-    seconds = MICRO_STEP_SECONDS * num_micro * run.save_every
-    return max(1, min(int(layout.rows_per_chunk(run.num_saves, seconds, size, CHUNKS_PER_RUN)), run.num_saves))
+    seconds = MICRO_STEP_SECONDS * run.scheme.num_micro * run.save_every
+    rows = layout.rows_per_chunk(run.num_saves, seconds, BYTES_PER_NUMBER * run.columns.width, CHUNKS_PER_RUN)
+    return max(1, min(int(rows), run.num_saves))
