@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 from vmri_jax.mechanics.arrays import Numbers, is_concrete, library
 from vmri_jax.mechanics.state import State
 from vmri_jax.running.observables import Observables
-from vmri_jax.running.trajectory import MicroNodes, RunInfo, Trajectory, with_origin
+from vmri_jax.running.trajectory import MicroNodes, RunInfo, Trajectory, status
 from vmri_jax.steppers.results import Result
 
 NUMBERS_PER_PIECE = 2**15
@@ -120,8 +120,8 @@ class Saved(NamedTuple):
             shape = *residual.shape, before_end.shape[-1], states.q_f.shape[-1]
             micro = MicroNodes(t[..., 1:, None] - before_end, rows[..., 1:, columns.micro].reshape(shape))
         info = RunInfo(method.astype(int), iterations.astype(int), residual)
-        plain = Trajectory(states, table[..., 0], table[..., 1:3], info, self.result, self.failed_at, micro)
-        return with_origin(plain, run.origin)
+        result, residuals = status(self.result), table[..., 1:3]
+        return Trajectory(states, table[..., 0], residuals, info, result, self.failed_at, micro, origin=run.origin)
 
 
 def joined(pieces: list[Saved]) -> Saved:

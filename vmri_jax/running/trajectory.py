@@ -26,8 +26,6 @@ from vmri_jax.steppers.results import Method, Result, Status
 FORMAT = "vmri_jax trajectory 2"
 ERROR = tuple(f"error_{name}" for name in RunError._fields)
 """Arrays of the estimated error; absent in runs without one."""
-STATUS_ARRAYS = jax.Array, np.ndarray
-"""Types of `Trajectory.result` before `with_origin` replaces it by a `Status`, which prints as a sentence."""
 
 
 class RunInfo(NamedTuple):
@@ -273,11 +271,14 @@ class Trajectory(Exports):
 
 
 def with_origin(trajectory: Trajectory, origin: Origin, **arrays) -> Trajectory:
-    """A trajectory of the engine with its origin, and with a status that prints as a sentence; `arrays` replace other fields."""
-    result = trajectory.result
-    if isinstance(result, STATUS_ARRAYS) and result.ndim == 0 and is_concrete(result):
-        result = Status(result)
-    return replace(trajectory, result=result, origin=origin, **arrays)
+    """A trajectory with its origin, and with a status that prints as a sentence; `arrays` replace other fields."""
+    return replace(trajectory, result=status(trajectory.result), origin=origin, **arrays)
+
+
+def status(result) -> Any:
+    """A concrete result of one run as a `Status`, which prints as a sentence; any other result unchanged."""
+    is_array = isinstance(result, jax.Array | np.ndarray) and result.ndim == 0
+    return Status(result) if is_array and is_concrete(result) else result
 
 
 def from_named_arrays(arrays: dict) -> Trajectory:
