@@ -20,8 +20,7 @@ from vmri_jax.mechanics.names import unknown
 from vmri_jax.mechanics.state import Movable, State, initial_state, opened, start_of
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.arguments import Steps, check_step_size
-from vmri_jax.running.engine import Engine
-from vmri_jax.running.fallback import FALLING_BACK
+from vmri_jax.running.engine import FALLING_BACK, Engine
 from vmri_jax.running.origin import is_repeated
 from vmri_jax.running.progress import Working
 from vmri_jax.running.saved import Saved, check_memory

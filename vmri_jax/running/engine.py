@@ -11,6 +11,9 @@ the steps from the last to the first and needs the state at which each step star
   derivatives; third derivatives are NaN where equations are solved by iteration;
 * *checkpoint*: the run keeps the starts of some steps and computes the steps between them again, see `Adjoint`; works in reverse mode,
   once.
+
+The fallback: what the first matrix of "auto" does not solve is solved again with exact matrices, in a program of its own. `unsolved` decides for all
+runs: for a step (`macro_step`), a run or a piece of it, the lanes of a batch, and runs under transformations of JAX (`solved_again`).
 """
 
 from collections.abc import Callable
@@ -30,8 +33,10 @@ from vmri_jax.running.observables import observables
 from vmri_jax.running.saved import Saved
 from vmri_jax.running.trajectory import RunInfo
 from vmri_jax.steppers.plan import Plan
-from vmri_jax.steppers.results import Result
+from vmri_jax.steppers.results import Method, Result
 
+FALLING_BACK = 'a step was not solved: computing its part of the run again with exact matrices (matrix "exact"), as accurate but slower'
+"""Line about a fallback that takes more than two seconds."""
 NODES_AT_ONCE = 16
 """Nodes whose observables are computed side by side. With fewer nodes XLA uses no vector instructions; with 64 the matrices of scenes no longer fit into
 the first-level cache, and a run of a few nodes takes longer."""
@@ -219,3 +224,37 @@ def _interval(stepper: Plan, run, repeat: Callable):
         return cursor, info, micro
 
     return interval
+
+
+def unsolved(result, method):
+    """Whether steps failed that exact matrices may solve.
+
+    They cannot help explicit and linear equations, the methods up to `Method.LINEAR`, nor steps that were solved but violate implied
+    constraints, `Result.NOT_IMPLIED`.
+
+    Args:
+        result: worst `Result` of the steps, of one run or (lanes,).
+        method: largest `Method` of the steps.
+    """
+    return (result > Result.CONVERGED_AT_ROUNDOFF) & (result != Result.NOT_IMPLIED) & (method > Method.LINEAR)
+
+
+def solved_again(first: Callable, exact: Callable, failed: Callable, arguments: Any) -> Any:
+    """``first(arguments)``, or ``exact(arguments)`` where that has failed, in one program, to be transformed.
+
+    The derivative is the derivative of `exact`, with its value: to differentiate both would compile two programs. Values of the two differ by
+    the tolerance of the solver.
+
+    Args:
+        first, exact: the run with the first matrix and with exact matrices, functions of one pytree of arrays.
+        failed: whether a value of `first` is to be computed again.
+        arguments: of both.
+    """
+
+    @jax.custom_jvp
+    def run(arguments):
+        value = first(arguments)
+        return jax.lax.cond(failed(value), lambda: exact(arguments), lambda: value)
+
+    run.defjvp(lambda primals, tangents: jax.jvp(exact, primals, tangents))
+    return run(arguments)

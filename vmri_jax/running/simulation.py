@@ -7,7 +7,7 @@
 | ``run.traced()`` | `Engine.differentiable`, with derivatives | `simulate` under transformations |
 
 All of them return `Saved`. With the matrix "auto" a piece that is not solved is computed again with exact matrices
-(`vmri_jax.running.fallback`), with the same tolerance and limit of iterations; so are all pieces after it.
+(`vmri_jax.running.engine`), with the same tolerance and limit of iterations; so are all pieces after it.
 """
 
 import warnings
@@ -29,9 +29,8 @@ from vmri_jax.mechanics.state import Movable, State, opened, start_of
 from vmri_jax.mechanics.summary import numbers, summary
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.arguments import Save, Steps, check_once, check_run, nothing_fast
-from vmri_jax.running.engine import Cursor, Engine, engine
+from vmri_jax.running.engine import FALLING_BACK, Cursor, Engine, engine, solved_again, unsolved
 from vmri_jax.running.failures import simulation_error
-from vmri_jax.running.fallback import FALLING_BACK, solved_again, unsolved
 from vmri_jax.running.interrupts import Interrupted, interrupts_noted
 from vmri_jax.running.observables import concerns
 from vmri_jax.running.origin import Origin, names_of

@@ -23,8 +23,7 @@ from vmri_jax.running.simulation import Simulation, simulation
 from vmri_jax.running.store import layout
 from vmri_jax.running.store.identity import check_same, environment, identity
 from vmri_jax.running.store.layout import Kept
-from vmri_jax.running.store.record import Record
-from vmri_jax.running.store.stored import StoredTrajectory
+from vmri_jax.running.store.stored import Record, StoredTrajectory
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.solver import Solver
