@@ -25,12 +25,12 @@ from rich.table import Table
 
 import vmri_jax as vm
 from benchmarks.gail2014.dense import named
-from benchmarks.measure import Tell, silent
 from tests.support import until_failure
 from tests.verification import random_systems as rs
 from vmri_jax.mechanics.checks import is_refusal
 from vmri_jax.mechanics.constraints import CONSTRAINT_TOLERANCE
 from vmri_jax.running.progress import progress_shown
+from vmri_jax.running.timing import Tell, silent
 
 DRAWS = 50
 """Runs of a structure, which share its compiled programs."""

@@ -10,6 +10,13 @@ MIN_SECONDS = 0.02
 """Least seconds of a sample; shorter runs are called several times. It is long against the resolution of clocks and the time slices of
 schedulers; a larger value makes measurements take longer."""
 
+Tell = Callable[[str], None]
+"""Called with the name of a run before it is measured."""
+
+
+def silent(_: str) -> None:
+    """A `Tell` that prints nothing."""
+
 
 def interleaved(
     runs: Mapping[str, Callable[[], object]],
@@ -28,11 +35,11 @@ def interleaved(
         min_seconds: seconds of a sample, the mean of several calls.
         clock: `time.process_time` where other processes share the core.
     """
-    calls, names = {}, list(runs)
+    calls, seconds = {}, {name: [] for name in runs}
     for name, run in runs.items():
         seconds_per_call(run, 1, clock)
         calls[name] = max(1, round(min_seconds / seconds_per_call(run, 1, clock)))
-    seconds: dict[str, list[float]] = {name: [] for name in names}
+    names = list(runs)
     for i in range(repeats):
         start = i % max(1, len(names))
         for name in names[start:] + names[:start]:
