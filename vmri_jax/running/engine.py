@@ -131,7 +131,7 @@ class Engine:
         def by_scan(leaves: list, save_every: int, adjoint: str) -> Saved:
             run: Any = jax.tree.unflatten(self.structure, leaves)
             once = adjoint == "checkpoint"
-            loops = Adjoint(save_every, is_recursive=once and self.num_saves * save_every > MOST_STORED_STEPS)
+            loops = Adjoint(save_every, in_parts=once and self.num_saves * save_every > MOST_STORED_STEPS)
             stepper = run.stepper(reverse_only=once)
             interval = _interval(stepper, run, loops.repeat)
 
