@@ -28,6 +28,7 @@ from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.state import Movable, State, opened, start_of
 from vmri_jax.mechanics.summary import numbers, summary
 from vmri_jax.mechanics.system import System
+from vmri_jax.refusals import Refused
 from vmri_jax.running.arguments import Save, Steps, check_once, check_run, nothing_fast
 from vmri_jax.running.engine import FALLING_BACK, Cursor, Engine, engine, solved_again, unsolved
 from vmri_jax.running.failures import simulation_error
@@ -142,16 +143,16 @@ class Simulation:
             changes["state"] = _with_arrays(state)
             new, shapes = ([a.shape for a in vars(start).values()] for start in (changes["state"], self.state))
             if new != shapes:
-                raise ValueError(f"the arrays of state have shapes {new}; the run was prepared for {shapes}.")
+                raise Refused(f"the arrays of state have shapes {new}; the run was prepared for {shapes}.")
         if params is not None:
             check_params(params)
             (old, expected), (new, structure) = map(jax.tree.flatten, (self.system.params, params))
             if structure != expected or list(map(np.shape, new)) != list(map(np.shape, old)):
-                raise ValueError(f"params is {params!r}; give the pytree of system.params with other numbers in it.")
+                raise Refused(f"params is {params!r}; give the pytree of system.params with other numbers in it.")
             changes["system"] = self.system.with_params(jax.tree.map(np.asarray, params))
         if num_steps is not None:
             if num_steps < 1 or num_steps % self.num_saves:
-                raise ValueError(f"num_steps is {num_steps}; it must be a positive multiple of {self.num_saves}.")
+                raise Refused(f"num_steps is {num_steps}; it must be a positive multiple of {self.num_saves}.")
             changes |= {"num_steps": num_steps, "save_every": num_steps // self.num_saves}
         if not changes:
             return self

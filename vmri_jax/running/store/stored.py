@@ -14,6 +14,7 @@ from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.state import HasProblem, Problem, State
 from vmri_jax.mechanics.summary import summary
 from vmri_jax.mechanics.system import System
+from vmri_jax.refusals import Refused
 from vmri_jax.running.engine import Cursor
 from vmri_jax.running.export import NODES, Exports
 from vmri_jax.running.origin import Origin
@@ -60,7 +61,7 @@ class Record(NamedTuple):
                 leaves = [data[f"leaf_{k}"] for k in range(len(data.files) - 1)]
                 return cls._make((*counts, bool(fell_back), leaves))
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-            raise ValueError(f"{path}: the checkpoint is damaged ({error}); the run cannot go on.") from error
+            raise Refused(f"{path}: the checkpoint is damaged ({error}); the run cannot go on.") from error
 
     def packed(self) -> bytes:
         """The bytes of an .npz file."""
@@ -74,7 +75,7 @@ class Record(NamedTuple):
             return run.start()
         expected, structure = jax.tree.flatten((run.state, run.blank_memory(self.fell_back)))
         if [(leaf.shape, leaf.dtype) for leaf in self.leaves] != [(leaf.shape, leaf.dtype) for leaf in expected]:
-            raise ValueError("the checkpoint was made by a version of vmri_jax whose steps remember something else")
+            raise Refused("the checkpoint was made by a version of vmri_jax whose steps remember something else")
         state, memory = jax.tree.unflatten(structure, map(jnp.asarray, self.leaves))
         status = map(np.asarray, (self.step, self.result, self.failed_at))
         return Checkpoint(Cursor(state, memory, *status), self.fell_back)
@@ -107,7 +108,7 @@ class StoredTrajectory(Exports):
     def __init__(self, path):
         self.path = Path(path)
         if self.path.is_file():
-            raise ValueError(
+            raise Refused(
                 f"{path} is not a stored run but a file; a run written by Trajectory.save is read by "
                 f"Trajectory.load({str(path)!r})."
             )
@@ -193,7 +194,7 @@ class StoredTrajectory(Exports):
             for k in range(rows.start // self.chunk, -(-rows.stop // self.chunk)):
                 # zarr would return fill values
                 if array.size and not chunk_file(self.path / name, array.ndim, k).is_file():
-                    raise ValueError(f"chunk {k} is missing")
+                    raise Refused(f"chunk {k} is missing")
             return np.asarray(array[rows])
         except Exception as error:
-            raise ValueError(f"{self.path}: {name} cannot be read ({error}); the store is damaged.") from error
+            raise Refused(f"{self.path}: {name} cannot be read ({error}); the store is damaged.") from error
