@@ -10,7 +10,6 @@ from vmri_jax.accuracy.steps import with_accuracy
 from vmri_jax.mechanics.checks import check_system
 from vmri_jax.mechanics.state import Movable, State
 from vmri_jax.refusals import Refused
-from vmri_jax.running.adjoints import traced_run
 from vmri_jax.running.arguments import Save, Steps
 from vmri_jax.running.failures import simulation_error
 from vmri_jax.running.progress import progress_to
@@ -103,8 +102,9 @@ def simulate(
                 "simulate: an error compares runs with numbers; call simulate outside of jax.jit, vmap and grad."
             )
         check_system(run.system, run.state.q_s, run.state.q_f)
-        return traced_run(run)
-    run.check()
+        return run.traced()
+    if state is not None:  # the start of a problem is checked when it is made
+        run.check()
     check_memory("simulate", run)
     check_function_of_run(of, run)
     trajectory = run.in_pieces("simulate")

@@ -138,8 +138,10 @@ def real_array(name: str, value, ndim: int | None = None):
         ValueError: floats of less than 64 bits, or another number of dimensions.
     """
     advice = "give a real number" if ndim == 0 else "give real numbers, an array of float64"
-    is_float64 = isinstance(value, float) or (isinstance(value, np.ndarray) and value.dtype == np.float64)
-    array = np.asarray(value) if is_float64 else _converted(name, value, advice)
+    if isinstance(value, np.ndarray | jax.Array) and value.dtype == np.float64:
+        array = value  # no conversion by JAX, which takes some ten microseconds
+    else:
+        array = np.asarray(value) if isinstance(value, float) else _converted(name, value, advice)
     if ndim is not None and array.ndim != ndim:
         raise Refused(f"{name} has shape {array.shape}; {advice}.")
     return array

@@ -124,7 +124,7 @@ def initial_state(
             check_mass(system, q_s, q_f)
         return _start(arguments, project)[0]
     state, violation = _checked_start(Known(arguments), project, tolerance)
-    at_rest = not (np.any(v_s) or np.any(v_f))
+    at_rest = not any(np.asarray(v).any() for v in (v_s, v_f))
     tell_of_velocities("initial_state", violation, project, at_rest=at_rest)
     return state
 
