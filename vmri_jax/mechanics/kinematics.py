@@ -20,8 +20,10 @@ A joint of several coordinates is a chain of links. Bodies without a joint, the 
 Source: F. C. Park, J. E. Bobrow, S. R. Ploen, A Lie group formulation of robot dynamics, Int. J. Robot. Res. 14 (1995).
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from itertools import pairwise
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -40,6 +42,8 @@ MASS = "mass"
 """Key of the masses of body coordinates in the params of a system; its entries are "slow" and "fast"."""
 SIZE = 12
 """Number of coordinates of a body on a joint: centre and directors."""
+LARGEST_MATRIX = 16
+"""Most links whose sums are products with a matrix, which take the square of their number. A smaller number makes programs of small trees larger."""
 UNMOVED = np.concatenate([np.zeros((1, 3)), np.eye(3)])
 """(4, 3) the motion of nothing; centre and directors of the ground."""
 
@@ -136,8 +140,7 @@ class Kinematics:
         frames, _ = placed(self, x, *constants, joints["zero"][body : body + len(self.bodies)])
         frames = after(frames, self._roots(q_s, q_f)) if any(b.root != GROUND for b in self.bodies) else frames
         return tuple(
-            jnp.concatenate([q, of_part.reshape(-1)])
-            for q, of_part in ((q_s, frames[:slow]), (q_f, frames[slow:]))
+            jnp.concatenate([q, of_part.reshape(-1)]) for q, of_part in ((q_s, frames[:slow]), (q_f, frames[slow:]))
         )
 
     def velocities(self, q_s, q_f, v_s, v_f, joints: dict[str, Any]):
@@ -170,14 +173,46 @@ class Kinematics:
         return tuple(places)
 
     @cached_property
+    def lasts(self) -> np.ndarray:
+        """(bodies + links,) number of the last link before each body and before each link; -1 for none."""
+        return np.array([*(body.link for body in self.bodies), *(link.parent for link in self.links)], int)
+
+    @cached_property
     def before(self) -> np.ndarray:
         """(bodies + links, links) 1 for the links between the root and each body, and between the root and each link, without the link itself."""
-        lasts = [*(body.link for body in self.bodies), *(link.parent for link in self.links)]
-        before = np.zeros((len(lasts), len(self.links)))
-        for row, last in zip(before, lasts, strict=True):
+        before = np.zeros((len(self.lasts), len(self.links)))
+        for row, last in zip(before, self.lasts, strict=True):
             while last >= 0:
                 row[last], last = 1.0, self.links[last].parent
         return before
+
+    @property
+    def is_deep(self) -> bool:
+        """Whether a link hangs on another one."""
+        return any(link.parent >= 0 for link in self.links)
+
+    def jumps(self) -> Iterator[np.ndarray]:
+        """Numbers of the links 1, 2, 4, ... links before each link, -1 for none, as long as there are some."""
+        parents = np.array([link.parent for link in self.links], int)
+        while (parents >= 0).any():
+            yield parents
+            parents = np.append(parents, -1)[parents]
+
+    def summed(self, of_links):
+        """Sums of (n, 4, 3) of the links before each body (bodies, 4, 3), and of the links before each link (n, 4, 3).
+
+        By a product with the matrix `before`, whose program is small; beyond `LARGEST_MATRIX` links over 1, 2, 4, ... links at once, so that
+        the time grows nearly in proportion to the number of links.
+        """
+        rows = of_links.reshape(-1, SIZE)
+        if len(self.links) <= LARGEST_MATRIX:
+            # without deep links the lower part is zero
+            sums = matmul(self.before if self.is_deep else self.before[: len(self.bodies)], rows)
+        else:
+            for parents in self.jumps():
+                rows = rows + _taken(rows, parents)
+            sums = _taken(rows, self.lasts)
+        return jnp.split(sums.reshape(-1, 4, 3), [len(self.bodies)])
 
     def _roots(self, q_s, q_f):
         """(bodies, 4, 3) centre and directors of the root of each body."""
@@ -197,16 +232,13 @@ def _placed(tree: Kinematics, x, turn, slide, zero):
     """
     sine, versine = jnp.sin(x)[:, None, None], (1 - jnp.cos(x))[:, None, None]
     motions = UNMOVED + sine * turn + versine * matmul(turn, turn[:, 1:]) + _first_row(x[:, None] * slide)
-    parents = np.array([link.parent for link in tree.links], int)
-    while (parents >= 0).any():
+    for parents in tree.jumps():
         motions = after(motions, _with_unmoved(motions)[parents])  # after k turns, motions of the last 2^k links
-        parents = np.append(parents, -1)[parents]
     inverse = jnp.swapaxes(motions[:, 1:], 1, 2)
     twists = matmul(turn + _first_row(slide), motions[:, 1:])
     turning = matmul(inverse, twists[:, 1:])
     moving = twists[:, :1] - matmul(motions[:, :1], turning)
-    lasts = np.array([body.link for body in tree.bodies], int)
-    frames = after(zero, _with_unmoved(motions)[lasts])
+    frames = after(zero, _with_unmoved(motions)[tree.lasts[: len(tree.bodies)]])
     return frames, jnp.concatenate([moving, turning], axis=1)
 
 
@@ -220,15 +252,15 @@ def _change(tree: Kinematics, arguments, tangents):
     frames, twists = placed(tree, *arguments)
     d_frames, d_twists = jnp.zeros_like(frames), jnp.zeros_like(twists)
     if not isinstance(dx, SymbolicZero):
-        # W of the bodies, and of the links, which is zero unless a link hangs on another one
-        of_bodies, of_links = np.split(tree.before, [len(frames)])
-        by_links = (dx[:, None, None] * twists).reshape(-1, SIZE)
-        d_frames = after(frames, matmul(of_bodies, by_links).reshape(-1, 4, 3))
-        if of_links.any():
-            before = matmul(of_links, by_links).reshape(-1, 4, 3)
-            d_twists = matmul(twists, before[:, 1:]) - matmul(before, twists[:, 1:])
+        of_bodies, of_links = tree.summed(dx[:, None, None] * twists)
+        d_frames = after(frames, of_bodies)
+        if tree.is_deep:
+            d_twists = matmul(twists, of_links[:, 1:]) - matmul(of_links, twists[:, 1:])
     if not all(isinstance(change, SymbolicZero) for change in changes):
-        changes = [jnp.zeros_like(c) if isinstance(change, SymbolicZero) else change for c, change in zip(constants, changes, strict=True)]
+        changes = [
+            jnp.zeros_like(c) if isinstance(change, SymbolicZero) else change
+            for c, change in zip(constants, changes, strict=True)
+        ]
         by_constants = jax.jvp(partial(_placed, tree, x), constants, changes)[1]
         d_frames, d_twists = d_frames + by_constants[0], d_twists + by_constants[1]
     return (frames, twists), (d_frames, d_twists)
@@ -242,6 +274,20 @@ def after(rows, bodies):
         bodies: (n, 4, 3).
     """
     return matmul(rows, bodies[:, 1:]) + _pad(bodies[:, :1])
+
+
+def _taken(rows, numbers):
+    """Rows (n, k) by their numbers, zeros for -1, by static slices: derivatives in reverse mode are no scatters."""
+    ends = [
+        0,
+        *(i for i in range(1, len(numbers)) if numbers[i] - numbers[i - 1] != (numbers[i - 1] >= 0)),
+        len(numbers),
+    ]
+    pieces = [
+        rows[numbers[i] : numbers[i] + j - i] if numbers[i] >= 0 else jnp.zeros((j - i, rows.shape[1]))
+        for i, j in pairwise(ends)
+    ]
+    return jnp.concatenate(pieces)
 
 
 def _pad(first):

@@ -22,7 +22,8 @@ def joint_constants(bodies: Bodies, branches: Sequence[Branch]) -> dict[str, Any
         centre, directors = _frame(bodies, root)
         origin, axes = _frame(bodies, branch.child)
         # a vector y in space has the components y D^T along the directors of the root, the rows of D
-        zeros.append(library(shift).concatenate([(origin + shift - centre)[None], axes]) @ directors.T)
+        place = origin + shift - centre
+        zeros.append(library(place, axes).concatenate([place[None], axes]) @ directors.T)
         point = (branch.points[1] + shift - centre) @ directors.T
         for move, _ in branch.moves:
             axis = branch.sign * branch.joint.triads[branch.element][move.axis] @ directors.T
