@@ -20,6 +20,7 @@ from vmri_jax.mechanics.masses import ConstantMass
 from vmri_jax.mechanics.order import InOrder, Order, in_order
 from vmri_jax.mechanics.system import System
 from vmri_jax.mechanics.terms import Term
+from vmri_jax.refusals import Refused
 
 SLOW, FAST = ("q_s", "v_s"), ("q_f", "v_f")
 """Names of the arguments that are slow, and fast, positions or velocities."""
@@ -44,9 +45,7 @@ class Layout:
         """
         for body in arrays:
             if not isinstance(body, str) or not body:
-                raise TypeError(
-                    f"{name} has the key {body!r}; give arrays by names of bodies, {{'load': [0.0, -5.0]}}."
-                )
+                raise Refused(f"{name} has the key {body!r}; give arrays by names of bodies, {{'load': [0.0, -5.0]}}.")
         return cls(tuple((body, real_array(f"{name}[{body!r}]", array).shape) for body, array in arrays.items()))
 
     @classmethod
@@ -75,7 +74,7 @@ class Layout:
         unknown = [body for body in arrays if body not in bodies]
         absent = [body for body in bodies if body not in arrays]
         if unknown or (absent and not zeros):
-            raise ValueError(
+            raise Refused(
                 f"{name} has the keys {', '.join(map(str, arrays)) or 'none'}; give {', '.join(bodies) or 'none'}."
             )
         pieces = []
@@ -92,7 +91,7 @@ class Layout:
                     if per_row and shape
                     else "an array of"
                 )
-                raise ValueError(
+                raise Refused(
                     f"{name}[{body!r}] has shape {seen}, and the position has {shape}; give {rows} shape {shape}."
                 )
             pieces.append(library(value).broadcast_to(value, shape).reshape(-1))
@@ -214,7 +213,7 @@ def _flat_mass(name: str, mass, layout: Layout | None):
     if not isinstance(mass, Mapping):
         return mass
     if layout is None:
-        raise ValueError(
+        raise Refused(
             f"ConstantMass: {name} has masses by name, {', '.join(mass)}, but the {name} coordinates are a vector; give both as dictionaries, "
             "or both as arrays."
         )

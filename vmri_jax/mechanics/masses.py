@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from vmri_jax import kernels
 from vmri_jax.mechanics.arrays import Numbers, is_concrete, real_array
+from vmri_jax.refusals import Refused
 
 
 class Diagonal(eqx.Module):
@@ -69,18 +70,18 @@ def mass_array(name: str, mass):
     """
     mass = real_array(f"ConstantMass: {name}", mass)
     if mass.ndim not in (1, 2) or (mass.ndim == 2 and mass.shape[0] != mass.shape[1]):
-        raise ValueError(f"ConstantMass: {name} has shape {mass.shape}; give (n,) masses or an (n, n) mass matrix.")
+        raise Refused(f"ConstantMass: {name} has shape {mass.shape}; give (n,) masses or an (n, n) mass matrix.")
     if not is_concrete(mass):
         return mass
     values = np.asarray(mass)
     if not np.all(np.isfinite(values)):
-        raise ValueError(f"ConstantMass: {name} = {values} is not finite.")
+        raise Refused(f"ConstantMass: {name} = {values} is not finite.")
     if mass.ndim == 1 and np.any(values <= 0):
-        raise ValueError(f"ConstantMass: {name} = {values}; every mass must be positive.")
+        raise Refused(f"ConstantMass: {name} = {values}; every mass must be positive.")
     if mass.ndim == 2:
         scaled = correlation(values)
         if not np.allclose(scaled, scaled.T) or np.any(np.linalg.eigvalsh(scaled) <= 0):
-            raise ValueError(f"ConstantMass: {name} must be a symmetric positive definite matrix.")
+            raise Refused(f"ConstantMass: {name} must be a symmetric positive definite matrix.")
     return mass
 
 
@@ -142,13 +143,13 @@ def _masses(name: str, mass):
 def _positive(name: str, mass):
     mass = real_array(name, mass)
     if is_concrete(mass) and not (np.isfinite(mass).all() and np.all(np.asarray(mass) > 0)):
-        raise ValueError(f"{name} = {mass}; every mass must be positive and finite.")
+        raise Refused(f"{name} = {mass}; every mass must be positive and finite.")
     return mass
 
 
 def _operator(mass) -> Diagonal | Dense:
     if isinstance(mass, dict):
-        raise ValueError(
+        raise Refused(
             f"ConstantMass: the masses of {', '.join(mass)} are given by name, and the sizes of these bodies are not known. Give the start "
             "as dictionaries, too: vmri_jax.Problem(system, q_s={...}, q_f={...})."
         )

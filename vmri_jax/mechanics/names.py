@@ -11,6 +11,7 @@ from vmri_jax.mechanics.by_name import Layout
 from vmri_jax.mechanics.kinematics import Kinematics
 from vmri_jax.mechanics.rows import Part, Place
 from vmri_jax.mechanics.system import System
+from vmri_jax.refusals import Refused
 
 AXES = "xyz"
 """Coordinates of a point of two or three dimensions."""
@@ -56,13 +57,13 @@ class Names:
             sizes = getattr(self, field_name)
             named = isinstance(sizes, Mapping) and all(isinstance(name, str) for name in sizes)
             if not (named and all(isinstance(size, int) and size > 0 for size in sizes.values())):
-                raise TypeError(
+                raise Refused(
                     f"Names: {field_name} is {sizes!r}; give a dictionary of names and sizes in the order of the coordinates or "
                     "rows, e.g. {'hook': 2, 'load': 2}."
                 )
         both = sorted(set(self.slow) & set(self.fast))
         if both:
-            raise ValueError(f"Names: {', '.join(both)} in slow and in fast; give every body one place.")
+            raise Refused(f"Names: {', '.join(both)} in slow and in fast; give every body one place.")
 
     @property
     def bodies(self) -> dict[str, Place]:
@@ -112,7 +113,7 @@ class Names:
             ValueError: no body of this name.
         """
         if body not in self.bodies:
-            raise ValueError(unknown("body", body, {**self.bodies, **self.carried}))
+            raise Refused(unknown("body", body, {**self.bodies, **self.carried}))
         return self.bodies[body]
 
     def place_of(self, body: str) -> Place:
@@ -146,7 +147,7 @@ class Names:
     def _completed(self, field_name: str, plain: str, number: int) -> dict[str, int]:
         sizes = dict(getattr(self, field_name)) or ({plain: number} if number else {})
         if sum(sizes.values()) != number:
-            raise ValueError(
+            raise Refused(
                 f"Names: {field_name} is {sizes}, which names {sum(sizes.values())}; the system has {number}. The sizes must add up "
                 "to that."
             )
