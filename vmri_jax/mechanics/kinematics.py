@@ -139,9 +139,7 @@ class Kinematics:
         x = Rows.of([link.place for link in self.links]).take(q_s, q_f).reshape(-1) if self.links else jnp.zeros(0)
         frames, _ = placed(self, x, *constants, joints["zero"][body : body + len(self.bodies)])
         frames = after(frames, self._roots(q_s, q_f)) if any(b.root != GROUND for b in self.bodies) else frames
-        return tuple(
-            jnp.concatenate([q, of_part.reshape(-1)]) for q, of_part in ((q_s, frames[:slow]), (q_f, frames[slow:]))
-        )
+        return jnp.concatenate([q_s, frames[:slow].reshape(-1)]), jnp.concatenate([q_f, frames[slow:].reshape(-1)])
 
     def velocities(self, q_s, q_f, v_s, v_f, joints: dict[str, Any]):
         """Rates of (Q_s, Q_f)."""
@@ -278,11 +276,8 @@ def after(rows, bodies):
 
 def _taken(rows, numbers):
     """Rows (n, k) by their numbers, zeros for -1, by static slices: derivatives in reverse mode are no scatters."""
-    ends = [
-        0,
-        *(i for i in range(1, len(numbers)) if numbers[i] - numbers[i - 1] != (numbers[i - 1] >= 0)),
-        len(numbers),
-    ]
+    follows = [b - a == (a >= 0) for a, b in pairwise(numbers)]
+    ends = [0, *(i for i, goes_on in enumerate(follows, 1) if not goes_on), len(numbers)]
     pieces = [
         rows[numbers[i] : numbers[i] + j - i] if numbers[i] >= 0 else jnp.zeros((j - i, rows.shape[1]))
         for i, j in pairwise(ends)
