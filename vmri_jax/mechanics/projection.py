@@ -29,21 +29,19 @@ def legendre(system: System, q_s, q_f, v_s, v_f):
     return jax.grad(system.kinetic_energy, argnums=(2, 3))(q_s, q_f, v_s, v_f)
 
 
+def mass_matrix(system: System, q_s, q_f, v_s, v_f):
+    """Mass matrix ``d2T/dv2`` (n, n)."""
+    n_s = v_s.size
+    return jax.hessian(lambda v: system.kinetic_energy(q_s, q_f, v[:n_s], v[n_s:]))(jnp.append(v_s, v_f))
+
+
 def mass_diagonal(system: System, q_s, q_f):
-    """Diagonal of the mass matrix ``d2T/dv2`` at rest: (n_s,) and (n_f,)."""
+    """Diagonal of the mass matrix at rest: (n_s,) and (n_f,)."""
     if system.has_constant_mass:
         masses = system.kinetic.slow, system.kinetic.fast
         return tuple(mass if mass.ndim == 1 else jnp.diagonal(mass) for mass in masses)
-    n_s, n = q_s.shape[0], q_s.shape[0] + q_f.shape[0]
-
-    def second(direction):
-        def kinetic(step):
-            v = step * direction
-            return system.kinetic_energy(q_s, q_f, v[:n_s], v[n_s:])
-
-        return jax.jvp(lambda step: jax.jvp(kinetic, (step,), (1.0,))[1], (0.0,), (1.0,))[1]
-
-    return tuple(jnp.split(jax.vmap(second)(jnp.eye(n)), [n_s]))
+    matrix = mass_matrix(system, q_s, q_f, jnp.zeros_like(q_s), jnp.zeros_like(q_f))
+    return tuple(jnp.split(jnp.diagonal(matrix), [q_s.size]))
 
 
 def project_momentum(system: System, state, guess=None, sparsity: Sparsity | None = None):
