@@ -27,8 +27,8 @@ import vmri_jax as vm
 from benchmarks.gail2014.dense import named
 from tests.support import until_failure
 from tests.verification import random_systems as rs
-from vmri_jax.mechanics.checks import is_refusal
 from vmri_jax.mechanics.constraints import CONSTRAINT_TOLERANCE
+from vmri_jax.refusals import Refused
 from vmri_jax.running.progress import progress_shown
 from vmri_jax.running.timing import Tell, silent
 
@@ -102,8 +102,8 @@ HONEST = "REFUSED", *vm.Result.__members__
 
 
 def refusal(error: Exception) -> str:
-    """ "REFUSED" for a ValueError or TypeError that this package raised itself, else what it was and where."""
-    if is_refusal(error):
+    """ "REFUSED" for a refusal of this package, else the error and its place."""
+    if isinstance(error, Refused):
         return "REFUSED"
     frame, _ = list(traceback.walk_tb(error.__traceback__))[-1]
     where = frame.f_globals.get("__name__", "?")

@@ -3,10 +3,16 @@
 import re
 import subprocess
 import sys
+import tomllib
+from pathlib import Path
 
 import pytest
 
 import vmri_jax as vm
+from vmri_jax.running import trajectory
+from vmri_jax.running.store import layout
+
+ROOT = Path(__file__).parents[1]
 
 
 def test_every_name_is_there_and_stands_in_a_group():
@@ -27,3 +33,14 @@ def test_the_first_import_draws_nothing():
     program = "import sys, vmri_jax as vm; print({'matplotlib', 'vmri_jax.scene'} & set(sys.modules)); vm.scene.Scene; vm.tune"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "set()"
+
+
+def test_the_page_of_what_stays_names_the_formats_of_files():
+    page = (ROOT / "docs" / "what_stays.md").read_text(encoding="utf-8")
+    assert all(f"`{name}`" in page for name in (trajectory.FORMAT, layout.FORMAT))
+
+
+def test_versions_agree():
+    version = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
+    assert f"\nversion: {version}\n" in (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    assert f"\n## {version}\n" in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")

@@ -1,4 +1,5 @@
-"""Variational multirate integrators in JAX: write the physics, pick quadrature rules, get structure-preserving trajectories.
+"""Variational multirate integrators in JAX: write the physics, pick quadrature rules, get structure-preserving
+trajectories.
 
 The physics
     System, ConstantMass, Rheonomic     energies, constraints and forces as functions
@@ -40,7 +41,7 @@ Inside of a step
 
 Settings, errors and warnings
     configure, __version__
-    SimulationError, AccuracyNotReached, Interrupted
+    Refused, SimulationError, AccuracyNotReached, Interrupted
     CompiledAgainWarning, FailedLanesWarning, LostEnergyWarning, NotConfiguredWarning, SingularCoordinatesWarning,
     UncertifiedWarning
 """
@@ -59,6 +60,7 @@ from vmri_jax.mechanics.functions import CompiledAgainWarning
 from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.state import Problem, State, initial_state
 from vmri_jax.mechanics.system import ConstantMass, Rheonomic, System
+from vmri_jax.refusals import Refused
 from vmri_jax.running.arguments import Save
 from vmri_jax.running.interrupts import Interrupted
 from vmri_jax.running.macro_step import macro_step
@@ -104,7 +106,7 @@ if TYPE_CHECKING:
     from vmri_jax.stability import advise
     from vmri_jax.study import tune
 
-_ROOM_OF = {
+_PACKAGE_OF = {
     "advise": "stability",
     "check": "hard_cases",
     "ensemble": "ensembles",
@@ -113,15 +115,16 @@ _ROOM_OF = {
     "open_ensemble": "ensembles",
     "tune": "study",
 }
-"""Functions that are imported with their rooms when they are asked for. matplotlib and scipy.stats take half a second."""
+"""Functions that are imported with their packages when they are asked for. matplotlib and scipy.stats take half a
+second."""
 
 
 def __getattr__(name: str) -> Any:
-    """Import a public room, or a function of a room."""
+    """Import a public package or module, or a function of one."""
     if name not in __all__:
         raise AttributeError(f"module 'vmri_jax' has no attribute {name!r}")
-    room = import_module(f"vmri_jax.{_ROOM_OF.get(name, name)}")
-    value = getattr(room, name) if name in _ROOM_OF else room
+    module = import_module(f"vmri_jax.{_PACKAGE_OF.get(name, name)}")
+    value = getattr(module, name) if name in _PACKAGE_OF else module
     globals()[name] = value
     return value
 
@@ -144,6 +147,7 @@ __all__ = [
     "NotConfiguredWarning",
     "Plan",
     "Problem",
+    "Refused",
     "Result",
     "Rheonomic",
     "RunError",

@@ -11,6 +11,7 @@ from pathlib import Path
 from vmri_jax import systems
 from vmri_jax.mechanics.names import near, unknown
 from vmri_jax.mechanics.state import Problem
+from vmri_jax.refusals import Refused
 from vmri_jax.scene import Scene
 from vmri_jax.schemes import composition
 from vmri_jax.schemes.composition import Composition
@@ -51,21 +52,22 @@ MODELS = (".xml", ".mjcf", ".urdf")
 
 
 def find_problem(name: str) -> Problem:
-    """A problem by name: a built-in one, ``my_file.py:my_problem``, ``my_package.my_module:my_problem`` of an installed package, or
-    a model of MuJoCo, ``model.xml``.
+    """A problem by name: a built-in one, ``my_file.py:my_problem``, ``my_package.my_module:my_problem`` of an installed
+    package, or a model of MuJoCo, ``model.xml``.
 
-    The name in the file stands for a `Problem`, a `Scene`, or a function without arguments that returns one of these. A file
-    name alone, ``my_file.py``, stands for the only problem in the file; in a file with several it stands for ``scene`` or
-    ``problem``, and a line on the error stream tells which one is taken.
+    The name in the file stands for a `Problem`, a `Scene`, or a function without arguments that returns one of these. A
+    file name alone, ``my_file.py``, stands for the only problem in the file; in a file with several it stands for
+    ``scene`` or ``problem``, and a line on the error stream tells which one is taken.
 
     Raises:
-        ValueError: an unknown name; a file that does not exist, fails to run, or lacks the name; a value that is no problem.
+        ValueError: an unknown name; a file that does not exist, fails to run, or lacks the name; a value that is no
+        problem.
     """
     scene_or_problem = find_scene_or_problem(name)
     try:
         return scene_or_problem.problem() if isinstance(scene_or_problem, Scene) else scene_or_problem
     except Exception as error:
-        raise ValueError(f"{name} is a scene that makes no system: {type(error).__name__}: {error}") from error
+        raise Refused(f"{name} is a scene that makes no system: {type(error).__name__}: {error}") from error
 
 
 def find_scene_or_problem(name: str) -> Scene | Problem:
@@ -81,11 +83,12 @@ def find_scene_or_problem(name: str) -> Scene | Problem:
         try:
             return Scene.from_mujoco(name)
         except ImportError as error:
-            raise ValueError(str(error)) from error
+            raise Refused(str(error)) from error
     if not file_name.endswith(".py"):
         if not colon or not all(part.isidentifier() for part in file_name.split(".")):
-            raise ValueError(
-                f"{unknown('system', name, SYSTEMS)} Your own: my_file.py:my_problem, or my_package.my_module:my_problem."
+            raise Refused(
+                f"{unknown('system', name, SYSTEMS)} Your own: my_file.py:my_problem, or "
+                "my_package.my_module:my_problem."
             )
         return _problem_in(_import(file_name), file_name, attribute)
     module = _run_file(file_name)
@@ -102,7 +105,7 @@ def _only_name(module, file_name: str) -> str:
         listed = (
             f"it has {', '.join(f'{file_name}:{name}' for name in names)}" if names else f"e.g. {file_name}:my_problem"
         )
-        raise ValueError(f"{file_name}: say which problem in that file; {listed}.")
+        raise Refused(f"{file_name}: say which problem in that file; {listed}.")
     not_taken = [f"{file_name}:{name}" for name in names if name != named[0]]
     if not_taken:
         print(f"{file_name}: taking {named[0]}; there is also {', '.join(not_taken)}.", file=sys.stderr)
@@ -128,14 +131,14 @@ def find_scheme(name: str, num_micro: int, compose: str | None = None, **options
     """
     scheme = SCHEMES.get(name.lower().replace("_", "-"))
     if scheme is None:
-        raise ValueError(unknown("scheme", name, SCHEMES))
+        raise Refused(unknown("scheme", name, SCHEMES))
     arguments = {key: value for key, value in options.items() if value is not None}
     for key in arguments:
         if key not in options_of(scheme):
             takers = [label for label, other in SCHEMES.items() if key in options_of(other)]
-            raise ValueError(f"the scheme {name} has no {key}; leave --{key} out or use {' or '.join(takers)}.")
+            raise Refused(f"the scheme {name} has no {key}; leave --{key} out or use {' or '.join(takers)}.")
     if scheme is galerkin and "degree" not in arguments:
-        raise ValueError("the scheme galerkin needs the degree of its path; give e.g. --degree 2.")
+        raise Refused("the scheme galerkin needs the degree of its path; give e.g. --degree 2.")
     made = scheme(num_micro, **arguments)
     return made if compose is None else composition.compose(made, compose)
 
@@ -144,11 +147,11 @@ def _run_file(file_name: str):
     """The module of a Python file of the user."""
     path = Path(file_name)
     if not path.is_file():
-        raise ValueError(f"the file {file_name} does not exist (looked in {path.resolve().parent}).")
+        raise Refused(f"the file {file_name} does not exist (looked in {path.resolve().parent}).")
     name = f"vmri_user_{path.stem}"  # not the bare stem, which may be the name of a module
     spec = importlib.util.spec_from_file_location(name, path)
     if spec is None or spec.loader is None:
-        raise ValueError(f"{path} is not a Python file; give my_file.py:my_problem.")
+        raise Refused(f"{path} is not a Python file; give my_file.py:my_problem.")
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module  # dataclasses and equinox modules look themselves up there
     sys.path.insert(0, str(path.resolve().parent))
@@ -157,7 +160,7 @@ def _run_file(file_name: str):
     except (Exception, SystemExit) as error:
         lines = [f.lineno for f in traceback.extract_tb(error.__traceback__) if Path(f.filename).name == path.name]
         where = f"line {lines[-1]} of {path}" if lines else f"{path}"
-        raise ValueError(f"{where} failed: {type(error).__name__}: {error}") from error
+        raise Refused(f"{where} failed: {type(error).__name__}: {error}") from error
     finally:
         sys.path.pop(0)
     return module
@@ -168,8 +171,9 @@ def _import(name: str):
     try:
         return importlib.import_module(name)
     except ImportError as error:
-        raise ValueError(
-            f"the module {name} cannot be imported ({error}); install its package, or give the file, my_file.py:my_problem."
+        raise Refused(
+            f"the module {name} cannot be imported ({error}); install its package, or give the file, "
+            "my_file.py:my_problem."
         ) from error
 
 
@@ -190,7 +194,7 @@ def _attribute(module, where: str, attribute: str):
     if attribute not in public:
         problems = _problems_in(module)
         listed = f" Problems in it: {', '.join(problems)}." if problems else ""
-        raise ValueError(f"{where} has no name {attribute!r}.{near(attribute, public)}{listed}")
+        raise Refused(f"{where} has no name {attribute!r}.{near(attribute, public)}{listed}")
     return public[attribute]
 
 
@@ -201,9 +205,9 @@ def _problem_in(module, path: str, attribute: str) -> Problem | Scene:
         try:
             problem = problem()
         except Exception as error:
-            raise ValueError(f"{attribute}() in {path} failed: {type(error).__name__}: {error}") from error
+            raise Refused(f"{attribute}() in {path} failed: {type(error).__name__}: {error}") from error
     if not isinstance(problem, Problem | Scene):
-        raise ValueError(
+        raise Refused(
             f"{attribute} in {path} is {type(problem).__name__}; it must be a vmri_jax.Problem, or a function without "
             "arguments that returns one; a vmri_jax.scene.Scene will do as well."
         )

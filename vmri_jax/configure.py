@@ -1,6 +1,7 @@
 """`configure`: the settings of JAX that have to be made before JAX starts.
 
-Importing this module changes no setting. The command line and the benchmarks call `configure`; other programs start with
+Importing this module changes no setting. The command line and the benchmarks call `configure`; other programs start
+with
 
     import vmri_jax as vm
 
@@ -28,9 +29,12 @@ FAST_LOOPS = (
 - sums over many lanes stay in the kernel instead of calling a library (batches of high order 2.6 times).
 XLA ignores names of passes that it does not know."""
 SECONDS_WORTH_KEEPING = 0.0
-"""Seconds of compilation from which JAX keeps a program in the cache on disk. With 0.2 s every process compiles hundreds of small programs
-anew: 0.7 to 2 s of the time to the first result of a scene."""
-ALREADY_STARTED = "configure: JAX has already started, its settings can no longer change; call vm.configure() before any array is made."
+"""Seconds of compilation from which JAX keeps a program in the cache on disk. With 0.2 s every process compiles
+hundreds of small programs anew: 0.7 to 2 s of the time to the first result of a scene."""
+ALREADY_STARTED = (
+    "configure: JAX has already started, its settings can no longer change; call vm.configure() before any array is "
+    "made."
+)
 
 
 class NotConfiguredWarning(UserWarning):
@@ -38,15 +42,18 @@ class NotConfiguredWarning(UserWarning):
 
 
 def configure(*, devices: int | None = None, cache: str | Path | bool | None = True) -> None:
-    """Set up JAX for this toolkit: 64-bit floats, and loops that are compiled into one kernel, unless ``XLA_FLAGS`` has options of this kind.
+    """Set up JAX for this toolkit: 64-bit floats, and loops that are compiled into one kernel, unless ``XLA_FLAGS`` has
+    options of this kind.
 
-    The loops of steppers have many small operations, and a call of a kernel costs more than such an operation: without this option a macro step
-    of a small system takes 2 to 5 times as long. Programs also run in the thread that calls them, which saves some ten microseconds per call.
+    The loops of steppers have many small operations, and a call of a kernel costs more than such an operation: without
+    this option a macro step of a small system takes 2 to 5 times as long. Programs also run in the thread that calls
+    them, which saves some ten microseconds per call.
 
     Args:
         devices: number of CPU devices, for `simulate_batch(..., devices=...)`; one device uses one core.
-        cache: folder in which JAX keeps compiled programs between processes; True for `cache_folder()`, unless JAX has a folder
-            already; False or None leave the setting of JAX. The folder grows with every new program; it may be deleted at any time.
+        cache: folder in which JAX keeps compiled programs between processes; True for `cache_folder()`, unless JAX has
+            a folder already; False or None leave the setting of JAX. The folder grows with every new program; it may be
+            deleted at any time.
 
     Raises:
         RuntimeError: JAX has already started without these settings.
@@ -81,8 +88,8 @@ def warn_if_slow() -> None:
     """Warn, once per process, that runs on the CPU are slow because `configure` was not called."""
     if jax.default_backend() == "cpu" and not loops_are_fast():
         warnings.warn(
-            "runs take 2 to 5 times as long as they could, because JAX started without the settings of vmri_jax; results are "
-            "the same. Add this line at the start of the program, before any array is made: vm.configure() "
+            "runs take 2 to 5 times as long as they could, because JAX started without the settings of vmri_jax; "
+            "results are the same. Add this line at the start of the program, before any array is made: vm.configure() "
             "(with import vmri_jax as vm)",
             NotConfiguredWarning,
             stacklevel=4,
@@ -90,12 +97,14 @@ def warn_if_slow() -> None:
 
 
 def cache_folder() -> Path:
-    """Where compiled programs are kept between processes: ``$XDG_CACHE_HOME/vmri_jax``, by default ``~/.cache/vmri_jax``."""
+    """Where compiled programs are kept between processes: ``$XDG_CACHE_HOME/vmri_jax``, by default
+    ``~/.cache/vmri_jax``."""
     return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "vmri_jax"
 
 
 def processor() -> str:
-    """A name for processors with this instruction set: a compiled program runs only on the kind of processor that it was compiled for."""
+    """A name for processors with this instruction set: a compiled program runs only on the kind of processor that it
+    was compiled for."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
         features = sorted({line for line in lines if line.startswith(("model name", "flags", "CPU part", "Features"))})

@@ -31,6 +31,7 @@ from numpy.polynomial import Polynomial
 
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import ConstantMass, System
+from vmri_jax.refusals import Refused
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.quadrature import NODE_TOLERANCE, PlacedRule, macro
 from vmri_jax.schemes.scheme import Scheme
@@ -285,14 +286,14 @@ def step(system: System, scheme: Scheme | Composition, state: State, macro_dt) -
 def check(system: System, scheme: Scheme) -> None:
     """Refuse schemes that this page leaves out."""
     if scheme.slow.mollified:
-        raise ValueError(
+        raise Refused(
             "textbook.step: the slow potential of this scheme is mollified, which the textbook leaves out; "
             "take macro_step or simulate, or a scheme without mollified kicks, e.g. explicit_slow(num_micro)."
         )
     if (scheme.slow.gradient_corrected or scheme.fast.gradient_corrected) and not isinstance(
         system.kinetic, ConstantMass
     ):
-        raise ValueError("textbook.step: corrected kicks need a System whose kinetic is a ConstantMass.")
+        raise Refused("textbook.step: corrected kicks need a System whose kinetic is a ConstantMass.")
 
 
 def simulate(system: System, scheme: Scheme | Composition, state: State, macro_dt, num_steps: int) -> State:

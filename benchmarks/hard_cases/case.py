@@ -14,11 +14,11 @@ def iterations(trajectory: Trajectory) -> int:
     return int(np.max(np.asarray(trajectory.info.iterations)))
 
 
-def hard_case(title: str, draw=None) -> Callable[..., Case]:
+def hard_case(title: str) -> Callable[..., Case]:
     """Makes a `Case` of ``run(full)``, whose docstring is the set-up, an empty line and the criterion; the catalogue numbers it."""
 
     def made(run: Callable[[bool], Outcome]) -> Case:
         setup, criterion = inspect.cleandoc(run.__doc__ or "").split("\n\n")
-        return Case(0, title, setup, criterion, run, draw)
+        return Case(0, title, setup, criterion, run)
 
     return made

@@ -1,5 +1,7 @@
 """Constraints and energy over long runs, a loose tolerance, chaos."""
 
+from functools import partial
+
 import jax.numpy as jnp
 import numpy as np
 
@@ -47,7 +49,7 @@ def smooth_shift(trajectory: vm.Trajectory, num_steps: int, scale: float) -> flo
     return float(weights @ (e[-half:] - e[:half]) / weights.sum() / (num_steps - num_steps / 2) * 1e5)
 
 
-@hard_case("constraints for long", draw_energy)
+@hard_case("constraints for long")
 def constraints_for_long(full: bool) -> Outcome:
     """triple pendulum, fully_implicit, num_micro 5, H = 0.01, 1e6 steps
 
@@ -75,11 +77,11 @@ def constraints_for_long(full: bool) -> Outcome:
             "shadow_drift": meter.drift,
             "shadow_drift_error": meter.drift_error,
         },
-        _energy_picture(trajectory),
+        partial(draw_energy, {"": trajectory}),
     )
 
 
-@hard_case("energy for long", draw_energy)
+@hard_case("energy for long")
 def energy_for_long(full: bool) -> Outcome:
     """FPU chain, fully_implicit, num_micro 10, H = 0.03, 1e6 steps
 
@@ -104,11 +106,11 @@ def energy_for_long(full: bool) -> Outcome:
             "shadow_drift": meter.drift,
             "shadow_drift_error": meter.drift_error,
         },
-        _energy_picture(trajectory),
+        partial(draw_energy, {"": trajectory}),
     )
 
 
-@hard_case("loose Newton tolerance", draw_energy)
+@hard_case("loose Newton tolerance")
 def loose_tolerance(full: bool) -> Outcome:
     """the energy for long with tolerance 1e-4, 1e-8, and 1e-12, the default
 
@@ -116,19 +118,19 @@ def loose_tolerance(full: bool) -> Outcome:
     """
     steps = 1_000_000 if full else 300_000  # in fewer chaotic motion alone may hide the drift of the loosest tolerance
     problem = vm.systems.fermi_pasta_ulam()
-    changes, details = {}, {}
+    changes, runs = {}, {}
     newtons = {name: vm.Solver("masses", tolerance=float(name)) for name in ("1e-4", "1e-8", "1e-12")}
     for name, solver in newtons.items():
         trajectory = long_run(problem, vm.fully_implicit(10), CHAIN_DT, steps, solver=solver)
         changes[name] = energy(trajectory, steps)
-        details |= {f"{key} {name}": value for key, value in _energy_picture(trajectory).items()}
+        runs[f"tolerance {name}"] = trajectory
     loose, middle, default = changes.values()
     return Outcome(
         "drift of the energy per 1e5 steps: "
         + ", ".join(f"{c.drift:.0e} ({name}: {c.share:.0%} of the band)" for name, c in changes.items()),
         loose.drifts and abs(middle.drift) < abs(loose.drift) / 3 and not default.drifts,
         {f"drift_{name}": change.drift for name, change in changes.items()},
-        details,
+        partial(draw_energy, runs),
     )
 
 
@@ -158,8 +160,3 @@ def chaotic_pendulum(full: bool) -> Outcome:
         position < 1e-12 and change.band < 1e-2 and abs(order - 2) < 0.2,
         {"constraint": position, "band": change.band, "order": order},
     )
-
-
-def _energy_picture(trajectory: vm.Trajectory) -> dict:
-    e = np.asarray(trajectory.energy)
-    return {"t": trajectory.t, "energy error": e - e[0]}

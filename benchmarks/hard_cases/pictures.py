@@ -4,45 +4,47 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from vmri_jax import plots
-from vmri_jax.hard_cases.case import Details
+from vmri_jax.running.trajectory import Trajectory
+
+THEME = plots.LIGHT
 
 
-def draw_windows(details: Details, theme: plots.Theme) -> Figure:
+def draw_windows(windows_of: dict[str, list]) -> Figure:
     """Unstable intervals of omega H / pi of the linear model, one line per num_micro."""
-    with plots.new_figure(7.2, 2.6, "", theme) as figure:
+    with plots.new_figure(7.2, 2.6, "", THEME) as figure:
         axes = figure.subplots()
-        for k, ((_, windows), color) in enumerate(zip(details.items(), theme.curves, strict=False)):
-            bars = [(start / np.pi, (stop - start) / np.pi) for start, stop in windows]
+        for k, (windows, color) in enumerate(zip(windows_of.values(), THEME.curves, strict=False)):
+            bars = [(start / np.pi, (stop - start) / np.pi) for start, stop, _ in windows]
             axes.broken_barh(bars, (k - 0.35, 0.7), facecolor=color, edgecolor=color, linewidth=1.0)
         axes.set(xlabel=r"$\omega H / \pi$", ylabel="num_micro", xlim=(0, 4), title="unstable steps")
-        axes.set_yticks(range(len(details)), details)
+        axes.set_yticks(range(len(windows_of)), windows_of)
         axes.grid(axis="y", visible=False)
     return figure
 
 
-def draw_singular(details: Details, theme: plots.Theme) -> Figure:
+def draw_singular(linkage: Trajectory, chain: Trajectory) -> Figure:
     """Height of the crank through the collinear position, and the falling chain, started straight."""
-    with plots.new_figure(7.2, 3.2, "", theme) as figure:
+    with plots.new_figure(7.2, 3.2, "", THEME) as figure:
         left, right = figure.subplots(1, 2)
-        left.plot(details["t"], details["height"], color=theme.curves[0])
-        left.axhline(0.0, color=theme.ink, linewidth=0.5, linestyle=":")
+        left.plot(linkage.t[:201], linkage.q_f[:201, 1], color=THEME.curves[0])
+        left.axhline(0.0, color=THEME.ink, linewidth=0.5, linestyle=":")
         left.set(xlabel="time", ylabel="height of the crank", title="four-bar linkage, collinear at 0")
-        shapes = details["chain"].reshape(len(details["chain"]), -1, 2)
-        for k, points in enumerate(shapes):
+        shapes = chain.q_f[:201:20]
+        for k, points in enumerate(shapes.reshape(len(shapes), -1, 2)):
             last = k == len(shapes) - 1
-            color = theme.curves[1] if last else theme.curves[0]
+            color = THEME.curves[1] if last else THEME.curves[0]
             right.plot(*points.T, color=color, linewidth=1.3 if last else 0.7, alpha=1.0 if last else 0.6)
         right.set(xlabel="x", ylabel="y", title="chain, started straight", aspect="equal")
     return figure
 
 
-def draw_oscillatory_energies(details: Details, theme: plots.Theme) -> Figure:
+def draw_oscillatory_energies(t: np.ndarray, coarse: np.ndarray, fine: np.ndarray) -> Figure:
     """Oscillatory energies of the three stiff springs, large steps over resolved ones."""
-    with plots.new_figure(7.2, 3.2, "", theme) as figure:
+    with plots.new_figure(7.2, 3.2, "", THEME) as figure:
         axes = figure.subplots()
-        for i, color in zip(range(2), theme.curves, strict=False):
-            axes.plot(details["t"], details["fine"][:, i], color=color, linewidth=0.7, alpha=0.5)
-            axes.plot(details["t"], details["coarse"][:, i], color=color, linewidth=1.0, label=f"$I_{i + 1}$")
-        axes.set(xlabel="time", ylabel="oscillatory energy", xlim=(0, details["t"][-1]))
+        for i, color in zip(range(2), THEME.curves, strict=False):
+            axes.plot(t, fine[:, i], color=color, linewidth=0.7, alpha=0.5)
+            axes.plot(t, coarse[:, i], color=color, linewidth=1.0, label=f"$I_{i + 1}$")
+        axes.set(xlabel="time", ylabel="oscillatory energy", xlim=(0, t[-1]))
         axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
     return figure

@@ -1,5 +1,7 @@
 """Three time scales."""
 
+from functools import partial
+
 import numpy as np
 
 import vmri_jax as vm
@@ -10,7 +12,7 @@ from vmri_jax.hard_cases import Outcome
 from vmri_jax.hard_cases.measures import run, status
 
 
-@hard_case("three scales", draw_oscillatory_energies)
+@hard_case("three scales")
 def three_time_scales(full: bool) -> Outcome:
     """FPU chain with omega = 50, 70, 5000, fully_implicit, h = 0.02, t = 50
 
@@ -27,5 +29,5 @@ def three_time_scales(full: bool) -> Outcome:
         f"I_3 stays below {third:.0e}",
         coarse.success and at_end[:2].max() < 0.05 and third < 0.05,
         {"I_1": at_end[0], "I_2": at_end[1], "I_3": third},
-        {"t": coarse.t, "coarse": actions[0], "fine": actions[1]},
+        partial(draw_oscillatory_energies, np.asarray(coarse.t), *actions),
     )

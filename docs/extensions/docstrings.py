@@ -13,7 +13,8 @@ def as_rest(app, what, name, obj, options, lines):
 
 
 def fields(lines: list[str]) -> list[str]:
-    """Paragraphs of ``name: what it is`` before the first section as attributes; bars outside of code and tables as they stand."""
+    """Paragraphs of ``name: what it is`` before the first section as attributes; bars outside of code and tables as
+    they stand."""
     found, listed, before = [], False, True
     for line in lines:
         before = before and not SECTION.match(line)

@@ -1,4 +1,5 @@
-"""The page of effects: for each of them its docstring, with formula, parameters and units, and a picture where it draws something."""
+"""The page of effects: for each of them its docstring, with formula, parameters and units, and a picture where it draws
+something."""
 
 from dataclasses import replace
 from pathlib import Path

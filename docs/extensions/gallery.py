@@ -14,8 +14,9 @@ from extensions.files import keep
 HEAD = """Scenes
 ======
 
-Each of these is a file as a user writes one. ``vmri simulate`` runs it, ``vmri animate`` shows it, ``vmri explain`` says in which
-term and on which grid each effect is, and its time. The pages play in the browser: drag to turn, the wheel to come closer.
+Each of these is a file as a user writes one. ``vmri simulate`` runs it, ``vmri animate`` shows it, ``vmri explain``
+says in which term and on which grid each effect is, and its time. The pages play in the browser: drag to turn, the
+wheel to come closer.
 """
 
 

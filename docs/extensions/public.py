@@ -1,4 +1,4 @@
-"""The reference: a page for every public name, and one for every room of the package that lists them."""
+"""The reference: a page for every public name, and one for every package and module that lists them."""
 
 import inspect
 from importlib import import_module
@@ -9,7 +9,7 @@ from extensions.files import keep
 from vmri_jax.running.quantities import Quantities
 from vmri_jax.study import ResultTable
 
-ROOMS = {
+PLACES = {
     "vmri_jax": "Problems, schemes and runs",
     "vmri_jax.scene": "Scenes: bodies and effects",
     "vmri_jax.schemes.quadrature": "Quadrature rules",
@@ -30,10 +30,10 @@ SHARED = (Quantities, ResultTable)
 """Bases whose members stand on the pages of their subclasses."""
 
 
-def names(room: str) -> list[str]:
-    """The public names of a room: classes and functions."""
-    module = import_module(room)
-    own = [name for name, thing in vars(module).items() if name[0] != "_" and getattr(thing, "__module__", "") == room]
+def names(place: str) -> list[str]:
+    """The public names of a package or module: classes and functions."""
+    module = import_module(place)
+    own = [name for name, thing in vars(module).items() if name[0] != "_" and getattr(thing, "__module__", "") == place]
     found = getattr(module, "__all__", own)
     return [
         name for name in found if inspect.isclass(getattr(module, name)) or inspect.isroutine(getattr(module, name))
@@ -42,7 +42,7 @@ def names(room: str) -> list[str]:
 
 def undocumented() -> list[str]:
     """Public names without a docstring of their own."""
-    things = [(f"{room}.{name}", getattr(import_module(room), name)) for room in ROOMS for name in names(room)]
+    things = [(f"{place}.{name}", getattr(import_module(place), name)) for place in PLACES for name in names(place)]
     return [name for name, thing in things if not (thing.__doc__ or "").strip()]
 
 
@@ -53,24 +53,24 @@ def write(folder: Path) -> None:
         folder: where they go.
     """
     (folder / "api").mkdir(parents=True, exist_ok=True)
-    for room, title in ROOMS.items():
-        module, listed, pages = import_module(room), [], []
-        for name in names(room):
+    for place, title in PLACES.items():
+        module, listed, pages = import_module(place), [], []
+        for name in names(place):
             thing = getattr(module, name)
-            first = with_bars((inspect.getdoc(thing) or "").split("\n")[0])
-            listed.append(f"   * - :doc:`{name} <api/{room}.{name}>`\n     - {first}")
-            pages.append(f"   api/{room}.{name}")
+            first = with_bars(" ".join((inspect.getdoc(thing) or "").split("\n\n")[0].split()))
+            listed.append(f"   * - :doc:`{name} <api/{place}.{name}>`\n     - {first}")
+            pages.append(f"   api/{place}.{name}")
             kind = "autoclass" if inspect.isclass(thing) else "autofunction"
             members = "   :members:\n   :exclude-members: set\n" if inspect.isclass(thing) else ""
             if inspect.isclass(thing) and issubclass(thing, SHARED):
                 members += "   :inherited-members: Module\n"
             keep(
-                folder / "api" / f"{room}.{name}.rst",
-                f"{_titled(name)}.. currentmodule:: {room}\n\n.. {kind}:: {name}\n{members}",
+                folder / "api" / f"{place}.{name}.rst",
+                f"{_titled(name)}.. currentmodule:: {place}\n\n.. {kind}:: {name}\n{members}",
             )
         table = ".. list-table::\n   :widths: 1 3\n\n" + "\n".join(listed)
         hidden = ".. toctree::\n   :hidden:\n\n" + "\n".join(pages)
-        keep(folder / f"{room}.rst", f"{_titled(title)}``{room}``\n\n{table}\n\n{hidden}\n")
+        keep(folder / f"{place}.rst", f"{_titled(title)}``{place}``\n\n{table}\n\n{hidden}\n")
 
 
 def _titled(text: str) -> str:

@@ -2,13 +2,15 @@
 
 import copy
 import json
+import sys
 
 import numpy as np
 import pytest
 
 from tests.animation.support import PENDULUM, reference_run, swinging
-from vmri_jax.animation import Drawing, Joint, bars, built_in, motion
-from vmri_jax.animation import defaults as defaults_module
+from vmri_jax import systems
+from vmri_jax.animation import Drawing, Joint, bars, motion
+from vmri_jax.catalogue import SYSTEMS
 
 
 def positions(drawing: Drawing, q_s, q_f):
@@ -123,7 +125,7 @@ def test_missing_coordinates_are_zero():
 @pytest.mark.compiles
 def test_links_of_built_in_drawings_keep_their_length_along_a_run(name, macro_dt):
     run = reference_run(name, macro_dt)
-    drawing = Drawing.from_dict(built_in(name[:3], run.q_s.shape[1]))
+    drawing = Drawing.from_dict(SYSTEMS[name[:3]]().drawing)
     points = motion(run, drawing).points
     index = {body.name: i for i, body in enumerate(drawing.bodies)}
     links = [joint for joint in drawing.joints if joint.kind == "link"]
@@ -140,9 +142,9 @@ def test_links_of_built_in_drawings_keep_their_length_along_a_run(name, macro_dt
 
 @pytest.mark.compiles
 def test_the_drawn_chain_stretches_as_its_potentials_say(fpu, monkeypatch):
-    monkeypatch.setattr(defaults_module, "MAGNIFICATION", 1.0)
+    monkeypatch.setattr(sys.modules["vmri_jax.systems.fermi_pasta_ulam"], "MAGNIFICATION", 1.0)
     run = reference_run("fpu3_fully_implicit_p1", 0.05)
-    drawing = Drawing.from_dict(built_in("fpu", 3))
+    drawing = Drawing.from_dict(systems.fermi_pasta_ulam(3).drawing)
     x = motion(run, drawing).points[..., 0]
     walls = [joint.point[0] for joint in drawing.joints if joint.point is not None]
     x = np.concatenate([np.full((len(x), 1), walls[0]), x, np.full((len(x), 1), walls[1])], axis=1)
@@ -193,7 +195,3 @@ def test_a_block_of_coordinates_that_the_run_does_not_have():
     blocks = [{"name": "modes", "coordinates": [["f", 2]]}]
     with pytest.raises(ValueError, match=r"'modes' uses \['f', 2\], but the run has 2 fast"):
         motion(swinging(), Drawing.from_dict({"blocks": blocks}))
-
-
-def test_there_are_drawings_of_built_in_systems_only():
-    assert built_in("my_file.py:mine", 3) is None

@@ -483,7 +483,7 @@ def test_ctrl_c_leaves_the_cases_that_were_done(vmri, tmp_path, monkeypatch):
     def stopped(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("vmri_jax.hard_cases.cases.single_precision", lambda *_: Outcome("refused", True))
+    monkeypatch.setattr("vmri_jax.hard_cases.cases.Resolved.single_precision", lambda *_: Outcome("refused", True))
     monkeypatch.setattr("vmri_jax.hard_cases.cases.Resolved.bad_lane", stopped)
     code, text = vmri("check", "user.py:my_problem", "--case", "10", "--case", "11", "--out", "cases")
     assert code == 130

@@ -33,6 +33,20 @@ def test_rows_do_not_depend_on_the_part(method):
 
 
 @pytest.mark.parametrize(
+    ("method", "first", "last"),
+    [
+        ("sobol", 0.286169162020087, 0.773987294174731),
+        ("latin-hypercube", 0.912620681570396, 0.22209836940681),
+        ("random", 0.303568034306759, 0.337422794010803),
+    ],
+)
+def test_the_random_streams_stay(method, first, last):
+    """docs/what_stays.md promises these rows for every 1.x."""
+    rows = Draws(8, {"a": ("uniform", 0, 1), "b": ("uniform", 0, 1)}, method=method, seed=1).rows(0, 8)
+    assert [rows["a"][0], rows["b"][7]] == pytest.approx([first, last], abs=1e-12)
+
+
+@pytest.mark.parametrize(
     ("draw", "mean", "deviation"),
     [
         (("uniform", 2, 6), 4.0, 4 / 12**0.5),

@@ -1,6 +1,9 @@
 """Reports of hard cases: a case that raises is a failed row, tables and files say the same, and the command ends plainly."""
 
 import csv
+from functools import partial
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -10,6 +13,7 @@ from vmri_jax.cli import app as vmri
 from vmri_jax.hard_cases import Case, Outcome, run_cases
 from vmri_jax.hard_cases.case import draw_energy
 from vmri_jax.running.progress import Working
+from vmri_jax.running.trajectory import Trajectory
 
 RAISES = "bad | luck"
 
@@ -67,13 +71,14 @@ def test_lines_in_a_pipe_are_no_wider_than_a_page(monkeypatch):
     assert max(map(len, str(run_cases([long])).splitlines())) <= 120
 
 
-def test_pictures_are_drawn_from_details():
+def test_pictures_are_drawn_where_a_case_has_one():
     t = np.linspace(0, 1, 1001)
+    long = cast(Trajectory, SimpleNamespace(t=t, energy=3.0 + np.sin(50 * t)))
 
     def run(full: bool) -> Outcome:
-        return Outcome("", True, {}, {"t": t, "energy error": np.sin(50 * t)})
+        return Outcome("", True, {}, partial(draw_energy, {"": long}))
 
-    report = run_cases([Case(1, "energy for long", "", "", run, draw_energy), CASES[0]])
+    report = run_cases([Case(1, "energy for long", "", "", run), CASES[0]])
     [(name, figure)] = report.pictures().items()
     assert name == "energy for long"
     low, high = figure.axes[0].get_ylim()

@@ -33,8 +33,8 @@ def drag(t, q_s, q_f, v_s, v_f, params):
 
 
 def test_a_plan_says_how_a_step_is_solved(fpu, tsp):
-    """Only kicks by V let slow and fast variables go their own ways, a force couples them; a term inside the macro interval, or a
-    kinetic energy that is a function, needs the whole equations."""
+    """Only kicks by V let slow and fast variables go their own ways, a force couples them; a term inside the macro interval needs the whole
+    equations with exact matrices, a kinetic energy that is a function the matrices of its masses."""
     rule = micro(quadrature.midpoint)
     inside = Scheme(4, kinetic=rule, slow=macro(quadrature.gauss(2)), fast=rule)
     forced, whole = fpu.system.replace(force=drag), "exact: micro intervals in order with exact matrices"
@@ -42,7 +42,10 @@ def test_a_plan_says_how_a_step_is_solved(fpu, tsp):
     assert "masses:" not in str(plan(fpu, explicit_slow(4)))
     assert "masses:" in str(plan(forced, explicit_slow(4), fpu.state()))
     assert str(plan(fpu, inside)).startswith(whole)
-    assert str(plan(double_pendulum(), fully_implicit(3))).startswith(whole)
+    assert str(plan(double_pendulum(), fully_implicit(3))).startswith(
+        "masses: micro intervals in order with matrices of the masses"
+    )
+    assert str(plan(double_pendulum(), fully_implicit(3), solver=Solver("exact"))).startswith(whole)
     with pytest.raises(ValueError, match="the matrix 'masses' needs a ConstantMass, and potentials"):
         plan(fpu, inside, solver=Solver("masses"))
     with pytest.raises(ValueError, match=r"the matrix 'modes' needs .* here num_micro = 4, degree = 1"):

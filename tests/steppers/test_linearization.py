@@ -1,5 +1,7 @@
 """The Newton matrix, factored interval by interval, against the derivative of the whole residual, on a system with everything in it."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,7 +12,7 @@ from benchmarks.gail2014.dense import newton_direction
 from tests.user_systems import bent_system
 from vmri_jax import Scheme, explicit_slow, fully_explicit, fully_implicit, galerkin, macro, micro, quadrature
 from vmri_jax.schemes.equations import StepEquations
-from vmri_jax.steppers.march import MarchEquations, factor, inverse_with_multipliers, solve
+from vmri_jax.steppers.march import MarchEquations, inverse_with_multipliers, linearised_pass, solve
 from vmri_jax.steppers.newton.null_space import inverse_without_multipliers
 
 SCHEMES = {
@@ -58,7 +60,9 @@ def test_all_take_the_direction_of_the_derivative_of_the_residual(name):
         found = {"dense": ravel_pytree(newton_direction(equations, x, residual))[0]}
         for inverted in (inverse_with_multipliers, inverse_without_multipliers):
             march = MarchEquations(equations, inverted)
-            direction = solve(march, factor(march, *march.flat(x)), *march.flat(residual))
+            z, of_intervals = march.flat(x)
+            factors = linearised_pass(march, z, of_intervals, of_intervals[-1], from_last=False, corrects=False)[::2]
+            direction = solve(march, factors, *march.flat(residual))
             found[inverted.__name__] = ravel_pytree(march.by_name(*direction))[0]
         return found
 
@@ -66,3 +70,27 @@ def test_all_take_the_direction_of_the_derivative_of_the_residual(name):
     for direction in found.values():
         worst = float(jnp.max(jnp.abs(direction - found["dense"])) / jnp.max(jnp.abs(found["dense"])))
         assert worst < 5e-14  # measured 4.9e-15
+
+
+def test_the_masses_at_the_start_stand_in_for_a_kinetic_energy():
+    """Matrices of the masses are the exact ones of the system with ``v^T M v / 2`` in place of T, M at the start of the step."""
+    equations, x = equations_and_unknowns(SCHEMES["gauss 2"])
+    z, of_intervals = MarchEquations(equations).flat(x)
+    q_s, q_f, n_s = equations.q_s, equations.q_f, equations.q_s.size
+    v = jnp.concatenate([x.slow[-1] / equations.macro_dt, x.fast[0, -1] / equations.micro_dt])
+    mass = jax.hessian(lambda v: equations.system.kinetic_energy(q_s, q_f, v[:n_s], v[n_s:]))(v)
+
+    def energy(q_s, q_f, v_s, v_f, params):
+        v = jnp.concatenate([v_s, v_f])
+        return v @ mass @ v / 2
+
+    constant = replace(equations, system=equations.system.replace(kinetic=energy, slow_kinetic=None))
+
+    def matrices(march):
+        return linearised_pass(march, z, of_intervals, of_intervals[-1], from_last=False, corrects=False)[0]
+
+    masses, exact = jax.jit(
+        lambda: (matrices(MarchEquations(equations).by_masses(z, of_intervals)), matrices(MarchEquations(constant)))
+    )()
+    for of_masses, of_constant in zip(masses, exact, strict=True):
+        np.testing.assert_allclose(of_masses, of_constant, atol=1e-13 * np.abs(of_constant).max())

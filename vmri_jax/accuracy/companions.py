@@ -30,6 +30,7 @@ import numpy as np
 
 from vmri_jax.mechanics.arrays import of_one_type
 from vmri_jax.mechanics.driving import Events, events
+from vmri_jax.refusals import Refused
 from vmri_jax.running.arguments import Save
 from vmri_jax.running.observables import SingularCoordinatesWarning
 from vmri_jax.running.run_error import RunError, largest_of
@@ -231,11 +232,11 @@ def check_function_of_run(of: Callable | None, run: Simulation) -> None:
         return
     value = of(resting(run))
     if np.asarray(value).dtype.kind not in "fiu":
-        raise TypeError(
+        raise Refused(
             f"simulate: the function error returned {value!r} for a run; it must return a number or an array of numbers."
         )
     if not np.array_equal(value, of(resting(run)), equal_nan=True):
-        raise ValueError(
+        raise Refused(
             "simulate: the function error returns other numbers for the same run; it must be pure, or differences of runs say nothing."
         )
 

@@ -9,6 +9,7 @@ from vmri_jax.accuracy.companions import check_function_of_run, with_error
 from vmri_jax.accuracy.steps import with_accuracy
 from vmri_jax.mechanics.checks import check_system
 from vmri_jax.mechanics.state import Movable, State
+from vmri_jax.refusals import Refused
 from vmri_jax.running.adjoints import traced_run
 from vmri_jax.running.arguments import Save, Steps
 from vmri_jax.running.failures import simulation_error
@@ -79,7 +80,7 @@ def simulate(
     """
     of = error if callable(error) else None
     if not (of or isinstance(error, bool)):
-        raise TypeError(f"simulate: error is {error!r}; it must be True or False, or a function of a run.")
+        raise Refused(f"simulate: error is {error!r}; it must be True or False, or a function of a run.")
     steps = Steps(macro_dt, num_steps, t_end, save)
     if accuracy is not None:
         length = {"t_end": _end(steps), "num_saves": Save.of(save).number}
@@ -92,13 +93,13 @@ def simulate(
             warnings.warn(type(concern)(f"simulate: {concern}"), stacklevel=2)
         return with_error(run, trajectory, of, shares=bool(error), trial=(best.halved, best.errors))
     if scheme is None:
-        raise ValueError(
+        raise Refused(
             "simulate: scheme is None without an accuracy; give a scheme, or accuracy=1e-5 to have one chosen."
         )
     run = simulation(system, scheme, state, solver, steps)
     if not run.is_concrete:
         if error:
-            raise ValueError(
+            raise Refused(
                 "simulate: an error compares runs with numbers; call simulate outside of jax.jit, vmap and grad."
             )
         check_system(run.system, run.state.q_s, run.state.q_f)
@@ -119,10 +120,10 @@ def _end(steps: Steps) -> float:
     if replace(save, every=None if save.every == 1 else save.every, number=None, progress=False) != Save():
         refused.append(f"save={steps.save!r}")
     if refused:
-        raise ValueError(
+        raise Refused(
             f"simulate: got {' and '.join(refused)} with an accuracy, which chooses steps and saved nodes; leave them out, or the "
             "accuracy. Of what is saved, Save(number=) is left to you."
         )
     if steps.t_end is None:
-        raise ValueError("simulate: an accuracy needs t_end, the time until which it is to be kept.")
+        raise Refused("simulate: an accuracy needs t_end, the time until which it is to be kept.")
     return steps.t_end

@@ -14,6 +14,7 @@ from vmri_jax.mechanics.checks import check_number, check_type
 from vmri_jax.mechanics.driving import events
 from vmri_jax.mechanics.invariants import velocity
 from vmri_jax.mechanics.state import Movable, Problem, State, start_of
+from vmri_jax.refusals import Refused
 from vmri_jax.running.arguments import Steps
 from vmri_jax.running.progress import Progress, silent
 from vmri_jax.running.saved import check_memory
@@ -60,12 +61,12 @@ def with_accuracy(
     check_type("simulate: scheme", scheme, Scheme | Composition | None, a_scheme)
     opened_system, start = start_of("simulate", system, state)
     if not is_concrete((vars(start), opened_system.params, t_end)):
-        raise ValueError(
+        raise Refused(
             "simulate: an accuracy compares runs with numbers; call simulate outside of jax.jit, vmap and grad."
         )
     check_error("simulate: accuracy", accuracy, start)
     if not t_end > start.t:
-        raise ValueError(f"simulate: t_end is {float(t_end - start.t):g} after the start; it must be later.")
+        raise Refused(f"simulate: t_end is {float(t_end - start.t):g} after the start; it must be later.")
     search = search_of(system, state, solver, t_end, num_saves, of, progress)
     best = reached("simulate: accuracy", search, usual_menu(search, scheme, accuracy), accuracy)[0]
     warn_of_events("simulate", search, best, stacklevel=4)
@@ -118,7 +119,7 @@ def check_extent(name: str, search: Search, accuracy: float) -> None:
     extent = search.extent()
     # Driven systems: positions at few saved nodes may hide the motion, and all trials see the events.
     if accuracy > extent and not search.drives.names:
-        raise ValueError(
+        raise Refused(
             f"{name} is {accuracy:g}, and no position moves by more than {extent:.3g} until t = "
             f"{float(search.start.t) + search.length:g}: any run is as accurate. Give a smaller one, in the unit of the "
             "positions."
@@ -161,7 +162,7 @@ def check_error(name: str, error: float, start: State | Problem) -> None:
     check_number(name, error)
     size, floor = round_off(start)
     if not error > floor:
-        raise ValueError(
+        raise Refused(
             f"{name} is {error:g}; the largest position is {size:.3g}, so that round-off of float64 alone is about "
             f"{floor:.0e}. Give a larger one, in the unit of the positions."
         )

@@ -13,7 +13,8 @@ FILLED_PART = 0.9
 
 @dataclass(frozen=True)
 class Camera:
-    """A camera that looks at `target` from `distance` in the direction of azimuth and elevation (radians); z points upwards.
+    """A camera that looks at `target` from `distance` in the direction of azimuth and elevation (radians); z points
+    upwards.
 
     Heights in the view go from -1 to 1.
     """
@@ -31,17 +32,20 @@ class Camera:
         return np.array([right, np.cross(back, right), back])
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Positions (..., 2) in the view and scales (...), the size in the view of a unit length at the point; 0 behind the camera."""
+        """Positions (..., 2) in the view and scales (...), the size in the view of a unit length at the point; 0 behind
+        the camera."""
         right, up, depth = np.moveaxis((points - self.target) @ self.axes.T, -1, 0)
         depth = self.distance - depth
         scale = np.where(depth > 1e-3 * self.distance, FIELD / np.maximum(depth, 1e-300), 0.0)
         return np.stack([scale * right, scale * up], axis=-1), scale
 
     def fitted(self, points: np.ndarray, radius: float, aspect: float) -> "Camera":
-        """A camera in the same direction that sees all balls of this radius at the points, in a view `aspect` times as wide as high."""
+        """A camera in the same direction that sees all balls of this radius at the points, in a view `aspect` times as
+        wide as high."""
         camera = replace(self, target=(points.min(axis=0) + points.max(axis=0)) / 2)
         camera = replace(camera, distance=2 * float(np.linalg.norm(np.ptp(points, axis=0))) + 4 * radius)
-        # Sizes in the view are nearly proportional to 1 / distance; a dozen corrections settle them to round-off of a pixel.
+        # Sizes in the view are nearly proportional to 1 / distance; a dozen corrections settle them to round-off of a
+        # pixel.
         for _ in range(12):
             low, high = camera.bounds(points, radius)
             shift = (low + high) / 2 * camera.distance / FIELD

@@ -1,4 +1,5 @@
-"""The drawing of a system: its parts, where they are for given coordinates, and plain data that is stored next to a run."""
+"""The drawing of a system: its parts, where they are for given coordinates, and plain data that is stored next to a
+run."""
 
 import json
 from collections import Counter
@@ -23,6 +24,7 @@ from vmri_jax.animation.plain_data import (
     read_solid,
 )
 from vmri_jax.mechanics.kinematics import Kinematics
+from vmri_jax.refusals import Refused
 
 KEYS = (
     *("bodies", "solids", "blocks", "links", "springs", "anchors", "planes", "spheres"),
@@ -32,16 +34,17 @@ KEYS = (
 
 @dataclass(frozen=True)
 class Drawing:
-    """The picture of a system: bodies, solids, blocks of general coordinates, joints between bodies, fixed planes and spheres.
+    """The picture of a system: bodies, solids, blocks of general coordinates, joints between bodies, fixed planes and
+    spheres.
 
     Attributes:
-        up: the direction that points upwards in the picture, in coordinates of the bodies; None for the last coordinate (bodies of one
-            coordinate move sideways).
-        view: azimuth and elevation of the camera, in degrees; None for a view that depends on the dimension. (-90, 0) is from the front, with
-            x to the right; (-90, 90) from above.
+        up: the direction that points upwards in the picture, in coordinates of the bodies; None for the last coordinate
+            (bodies of one coordinate move sideways).
+        view: azimuth and elevation of the camera, in degrees; None for a view that depends on the dimension. (-90, 0)
+            is from the front, with x to the right; (-90, 90) from above.
         caption: a line of text for the picture.
-        carried: for runs in joint coordinates, the map from the coordinates of the run to the coordinates of the bodies, and the arrays of
-            its joints, see `vmri_jax.mechanics.kinematics`; else None.
+        carried: for runs in joint coordinates, the map from the coordinates of the run to the coordinates of the
+            bodies, and the arrays of its joints, see `vmri_jax.mechanics.kinematics`; else None.
     """
 
     bodies: tuple[Body, ...]
@@ -62,16 +65,17 @@ class Drawing:
         Args:
             data: a dict (or its JSON text) of
 
-                - ``bodies``: dicts of ``name``; ``coordinates``, 1 to 3 entries ``["s" or "f", index]``, or linear forms
-                  ``[[weight, "s" or "f", index], ...]``; optionally ``offset``, ``radius``, ``color``, ``shown``.
-                - ``solids``: dicts of ``name``; ``coordinates`` of a rigid body, its centre and its directors; ``corners``, along
-                  the directors; ``faces``; optionally ``color``.
-                - ``blocks``: dicts of ``name``; ``coordinates``, any number of entries ``["s" or "f", index]``; optionally
-                  ``labels``, a name for each coordinate.
+                - ``bodies``: dicts of ``name``; ``coordinates``, 1 to 3 entries ``["s" or "f", index]``, or linear
+                  forms ``[[weight, "s" or "f", index], ...]``; optionally ``offset``, ``radius``, ``color``, ``shown``.
+                - ``solids``: dicts of ``name``; ``coordinates`` of a rigid body, its centre and its directors;
+                  ``corners``, along the directors; ``faces``; optionally ``color``.
+                - ``blocks``: dicts of ``name``; ``coordinates``, any number of entries ``["s" or "f", index]``;
+                  optionally ``labels``, a name for each coordinate.
                 - ``links``, ``springs``: pairs of names, with an optional third entry "slow" or "fast".
                 - ``anchors``: dicts of ``body``, ``point``, ``kind`` ("link" or "spring"), optionally ``pace``.
                 - ``planes``: dicts of ``point``, ``normal``; ``spheres``: dicts of ``center``, ``radius``.
-                - ``up``, ``view``, ``caption``: see above; ``kinematics``: "map" and "joints" of `carried`, which a scene writes.
+                - ``up``, ``view``, ``caption``: see above; ``kinematics``: "map" and "joints" of `carried`, which a
+                  scene writes.
 
         Raises:
             ValueError: other data; the message names the wrong entry.
@@ -80,7 +84,7 @@ class Drawing:
             try:
                 data = json.loads(data)
             except json.JSONDecodeError as error:
-                raise ValueError(f"drawing: not valid JSON ({error}).") from error
+                raise Refused(f"drawing: not valid JSON ({error}).") from error
         check_keys(data, (), KEYS, "drawing")
 
         def all_of(key: str, read: Callable) -> tuple:
@@ -90,10 +94,10 @@ class Drawing:
         bodies = (*chain(*(points for _, points in solids)), *bodies)
         names = [body.name for body in bodies]
         if not bodies and not blocks:
-            raise ValueError("drawing: there are no bodies and no blocks; there must be at least one.")
+            raise Refused("drawing: there are no bodies and no blocks; there must be at least one.")
         for name, count in Counter([*names, *(block.name for block in blocks)]).items():
             if count > 1:
-                raise ValueError(f"drawing: {count} bodies are named {name!r}; names must be unique.")
+                raise Refused(f"drawing: {count} bodies are named {name!r}; names must be unique.")
         links, springs = (all_of(f"{kind}s", partial(read_joint, kind, names)) for kind in KINDS)
         return cls(
             bodies=bodies,
@@ -154,14 +158,16 @@ class Drawing:
 
     @property
     def dimension(self) -> int:
-        """Number of coordinates of a point: 1, 2 or 3, the largest number of any body, point or direction of the drawing."""
+        """Number of coordinates of a point: 1, 2 or 3, the largest number of any body, point or direction of the
+        drawing."""
         points = [joint.point or () for joint in self.joints] + [sphere.center for sphere in self.spheres]
         points += [vector for plane in self.planes for vector in (plane.point, plane.normal)]
         points += [vector for body in self.bodies for vector in (body.forms, body.offset)] + [self.up or ()]
         return max((len(point) for point in points), default=1)
 
     def frame(self) -> np.ndarray:
-        """(3, dimension) matrix from coordinates of the bodies to coordinates of the picture, where z points upwards."""
+        """(3, dimension) matrix from coordinates of the bodies to coordinates of the picture, where z points
+        upwards."""
         return frame(self.up, self.dimension)
 
     def place(self, points: Sequence[tuple[float, ...]]) -> np.ndarray:
@@ -175,7 +181,8 @@ class Drawing:
         return padded @ self.frame().T
 
     def maps(self, n_s: int, n_f: int) -> tuple[np.ndarray, np.ndarray]:
-        """Offset (n, 3) and matrix (n, 3, n_s + n_f) of the positions of the bodies in the picture, ``offset + matrix @ q``.
+        """Offset (n, 3) and matrix (n, 3, n_s + n_f) of the positions of the bodies in the picture,
+        ``offset + matrix @ q``.
 
         Args:
             n_s, n_f: numbers of slow and of fast coordinates that `extended` returns.
@@ -194,7 +201,8 @@ class Drawing:
 
 
 def frame(up: tuple[float, ...] | None, dimension: int) -> np.ndarray:
-    """(3, dimension) matrix of orthonormal columns from coordinates of the bodies to coordinates of the picture, see `Drawing.up`."""
+    """(3, dimension) matrix of orthonormal columns from coordinates of the bodies to coordinates of the picture, see
+    `Drawing.up`."""
     if up is None:
         return np.array([[1.0], [0.0], [0.0]]) if dimension == 1 else _upright(np.eye(dimension)[-1])
     padded = np.pad(up, (0, dimension - len(up)))
@@ -205,14 +213,15 @@ def check_index(name: str, part: str, index: int, n_s: int, n_f: int) -> None:
     """Refuse a coordinate of a body or block that the run does not have."""
     size, pace = (n_s, "slow") if part == "s" else (n_f, "fast")
     if index >= size:
-        raise ValueError(
-            f"drawing: the body {name!r} uses [{part!r}, {index}], but the run has {size} {pace} coordinates; is this the "
-            "drawing of another system?"
+        raise Refused(
+            f"drawing: the body {name!r} uses [{part!r}, {index}], but the run has {size} {pace} coordinates; is this "
+            "the drawing of another system?"
         )
 
 
 def _upright(up: np.ndarray) -> np.ndarray:
-    """Matrix of a rotation that takes the unit vector `up` to z, and leaves the x axis in place if it is at a right angle to `up`."""
+    """Matrix of a rotation that takes the unit vector `up` to z, and leaves the x axis in place if it is at a right
+    angle to `up`."""
     if up.size == 1:
         return np.array([[0.0], [0.0], [up[0]]])
     if up.size == 2:

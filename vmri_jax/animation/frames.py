@@ -10,9 +10,10 @@ from matplotlib.lines import Line2D
 from PIL import Image
 
 from vmri_jax import plots
-from vmri_jax.animation.curves import Curves
+from vmri_jax.animation import curves
 from vmri_jax.animation.motion import Motion
 from vmri_jax.animation.shapes import Stage
+from vmri_jax.refusals import Refused
 
 FRAMES_PER_SECOND = 20
 """Pictures of a GIF in a second; more make a larger file."""
@@ -31,8 +32,8 @@ def plot_strip(
 ) -> plots.NotebookFigure:
     """Pictures of several moments side by side, from one point of view; wide scenes one below the other.
 
-    Rows have equal numbers of pictures, or differ by one; the shorter rows are centred. Below the pictures are two curves: the slow
-    motion along the whole run, with the moments as dots, and some periods of the fast motion.
+    Rows have equal numbers of pictures, or differ by one; the shorter rows are centred. Below the pictures are two
+    curves: the slow motion along the whole run, with the moments as dots, and some periods of the fast motion.
 
     Args:
         motion: from `vmri_jax.animation.motion`.
@@ -45,25 +46,26 @@ def plot_strip(
     """
     moments = np.linspace(motion.t[0], motion.t[-1], times) if isinstance(times, int) else np.asarray(times, float)
     if moments.ndim != 1 or not moments.size:
-        raise ValueError(f"plot_strip: times is {times!r}; give at least one moment.")
+        raise Refused(f"plot_strip: times is {times!r}; give at least one moment.")
     stage = Stage.of(motion, theme)
     aspect = stage.aspect
     sizes = rows_of(len(moments), MOST_COLUMNS if aspect < 1.3 else 3 if aspect < 3.5 else 1)
     rows, columns = len(sizes), max(sizes)
     trail = 0.5 * (motion.t[-1] - motion.t[0]) / max(len(moments), 4)
-    curves = Curves(motion, theme)
+    panels = curves.panels_of(motion)
+    below = curves.HEIGHT if panels else 0.0
     with plots.style(theme):
         width = WIDTH / columns
         head = TITLE_HEIGHT * (1 + bool(motion.drawing.caption))
-        height = rows * width / aspect + head + curves.height
+        height = rows * width / aspect + head + below
         figure = plots.NotebookFigure(figsize=(WIDTH, height))
         figure.set_layout_engine("none")
         cells = [(row, (columns - size) / 2 + column) for row, size in enumerate(sizes) for column in range(size)]
         for k, (time, (row, column)) in enumerate(zip(moments, cells, strict=True)):
-            bottom = (curves.height + (rows - 1 - row) * width / aspect) / height
+            bottom = (below + (rows - 1 - row) * width / aspect) / height
             place = (column / columns, bottom, 1 / columns, width / aspect / height)
             stage.draw(figure, place, time, trail, names=k == 0)
-        curves.draw(figure, moments)
+        curves.draw(figure, motion, panels, moments, theme)
         _write_head(figure, title, stage)
     return figure
 
@@ -110,7 +112,7 @@ def write_gif(
         OSError: the file cannot be written.
     """
     if not 0 < seconds < np.inf:
-        raise ValueError(f"write_gif: seconds is {seconds}; it must be a positive number.")
+        raise Refused(f"write_gif: seconds is {seconds}; it must be a positive number.")
     count = max(2, round(FRAMES_PER_SECOND * seconds))
     times = np.linspace(motion.t[0], motion.t[-1], count)
     trail = 1.2 * (motion.t[-1] - motion.t[0]) / seconds

@@ -1,8 +1,8 @@
 """Shapes at rest, as points, for strips, GIFs and the page.
 
-Grids and helices are computed here once; the page gets them as numbers. Shapes that depend on time (the ends of a joint, a helix
-between two bodies) are computed by the script of the page at play time, from the same numbers: every node of a long run with
-every turn of its springs would make a page of many megabytes.
+Grids and helices are computed here once; the page gets them as numbers. Shapes that depend on time (the ends of a
+joint, a helix between two bodies) are computed by the script of the page at play time, from the same numbers: every
+node of a long run with every turn of its springs would make a page of many megabytes.
 """
 
 import numpy as np
@@ -10,17 +10,20 @@ import numpy as np
 LAMP = (-0.45, 0.7, 0.55)
 """Direction to the lamp: right, up, back of the view."""
 JOINT_END = 0.8
-"""Distance of the end of a joint from the centre of its ball, over the radius of the ball; below 1 the ball hides the end."""
+"""Distance of the end of a joint from the centre of its ball, over the radius of the ball; below 1 the ball hides the
+end."""
 STRAIGHT_PART = 0.1
 """Length of the straight piece at each end of a spring, over the length of the spring."""
 PIECES_PER_LINE = 16
-"""Number of pieces of a line of a grid, each with its own strength; more make the fading smoother and the page larger."""
+"""Number of pieces of a line of a grid, each with its own strength; more make the fading smoother and the page
+larger."""
 
 
 def helix(turns: int, per_turn: int = 16) -> np.ndarray:
     """A spring whose number of turns stays when it stretches: one row (share, radius, cos, sin) per point.
 
-    The point of a row is ``start + share (end - start) + radius coil (cos n + sin m)``, with unit vectors n and m across the axis.
+    The point of a row is ``start + share (end - start) + radius coil (cos n + sin m)``, with unit vectors n and m
+    across the axis.
     """
     turn = np.arange(turns * per_turn + 1) / per_turn
     radius = np.minimum(1, np.minimum(turn, turns - turn))

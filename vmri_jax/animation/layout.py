@@ -12,10 +12,11 @@ from vmri_jax.animation.motion import Motion
 TURNS_RANGE = (4, 14)
 """Smallest and largest number of turns of a spring."""
 FLOOR_IN_VIEW = 0.45
-"""Part of the floor that the view has to contain, from its middle to its corners; the rest has faded away. A larger part makes the scene
-smaller."""
+"""Part of the floor that the view has to contain, from its middle to its corners; the rest has faded away. A larger
+part makes the scene smaller."""
 HIDDEN_RADIUS = 0.01
-"""Radius of a point that is not drawn as a ball, over the default radius of a ball: joints end at this distance from it."""
+"""Radius of a point that is not drawn as a ball, over the default radius of a ball: joints end at this distance from
+it."""
 LEVEL_COSINE = 0.9
 """Smallest cosine between the vertical and the normal of a plane that counts as level."""
 

@@ -1,4 +1,5 @@
-"""Positions of all bodies at any time of a trajectory: nodes, velocities at the nodes, and a cubic polynomial between two nodes."""
+"""Positions of all bodies at any time of a trajectory: nodes, velocities at the nodes, and a cubic polynomial between
+two nodes."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -16,6 +17,7 @@ from vmri_jax.animation.drawing import Drawing
 from vmri_jax.mechanics.checks import check_type
 from vmri_jax.mechanics.state import HasProblem, Problem, opened
 from vmri_jax.mechanics.system import System
+from vmri_jax.refusals import Refused
 from vmri_jax.running.micro_nodes import Nodes, why_not, with_micro_nodes
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.steppers.results import Result
@@ -29,9 +31,9 @@ class Motion:
         drawing: with a body for each coordinate of its blocks, see `vmri_jax.animation.bars`.
         t: (k,) times of the nodes.
         points, velocities: (k, n_bodies, 3) in the coordinates of the picture, where z points upwards.
-        energy: (k, c) change of the energy since the start. For a system that keeps its energy it is relative to the energy at the
-            start, unless that is zero. For other systems there are further columns: the work of forces and of moving
-            constraints since the start, and the balance: the change of the energy minus both works.
+        energy: (k, c) change of the energy since the start. For a system that keeps its energy it is relative to the
+            energy at the start, unless that is zero. For other systems there are further columns: the work of forces
+            and of moving constraints since the start, and the balance: the change of the energy minus both works.
         energy_names: names of the c columns.
         relative: whether the change of the energy is relative.
         residual: (k, 2) largest value and largest rate of a constraint.
@@ -70,7 +72,7 @@ class Motion:
         first, last = float(self.t[0]), float(self.t[-1])
         start, end = (first if start is None else start), (last if end is None else end)
         if not first <= start < end <= last and (start, end) != (first, last):
-            raise ValueError(
+            raise Refused(
                 f"from {start:g} to {end:g} is no part of the run, which goes from t = {first:g} to {last:g}."
             )
         low = int(np.searchsorted(self.t, start, side="right")) - 1
@@ -101,34 +103,32 @@ class Motion:
 
 
 def motion(
-    trajectory: Trajectory, drawing: Drawing | Problem | HasProblem | dict, system: System | None = None
+    trajectory: Trajectory, drawing: Drawing | Problem | HasProblem | dict | str, system: System | None = None
 ) -> Motion:
     """The motion of a drawing along a run, up to a failure of the run: ``write_html(motion(run, scene), "run.html")``.
 
-    Velocities at the nodes follow from the momenta if the system is known, else from central differences. If the run kept the
-    micro nodes of all its macro steps, they are nodes as well; without the system, fast velocities are then the derivatives of a
-    cubic spline through all nodes.
+    Velocities at the nodes follow from the momenta if the system is known, else from central differences. If the run
+    kept the micro nodes of all its macro steps, they are nodes as well; without the system, fast velocities are then
+    the derivatives of a cubic spline through all nodes.
 
     Args:
         trajectory: one run, of at least one node.
-        drawing: of the system that was simulated. A scene or a problem stands for its drawing, a problem without a drawing for a bar
-            for each coordinate, a dictionary for `Drawing.from_dict` of it.
+        drawing: of the system that was simulated. A scene or a problem stands for its drawing, a problem without a
+            drawing for a bar for each coordinate, a dictionary or its JSON text for `Drawing.from_dict` of it.
         system: the system that was simulated; None for the system that the run carries, if it does.
 
     Raises:
         ValueError: a batch of runs, no node that is finite, a drawing or system of other coordinates.
     """
     if np.ndim(trajectory.t) != 1:
-        raise ValueError(
-            f"motion: the trajectory is a batch of shape {np.shape(trajectory.t)[:-1]}; give one run of it."
-        )
+        raise Refused(f"motion: the trajectory is a batch of shape {np.shape(trajectory.t)[:-1]}; give one run of it.")
     drawing = _drawing(trajectory, drawing)
     system = system or (trajectory.origin.system() if trajectory.origin.knows_system else None)
     q_s, q_f, t = (np.asarray(a, dtype=float) for a in (trajectory.states.q_s, trajectory.states.q_f, trajectory.t))
     finite = np.isfinite(np.concatenate([q_s, q_f, t[:, None]], axis=1)).all(axis=1)
     count = len(t) if finite.all() else int(np.argmin(finite))
     if count == 0:
-        raise ValueError("motion: the trajectory has no node with finite positions; there is nothing to draw.")
+        raise Refused("motion: the trajectory has no node with finite positions; there is nothing to draw.")
     t, q_s, q_f = t[:count], q_s[:count], q_f[:count]
     slow, fast, *_ = drawing.extended(q_s, q_f, 0 * q_s, 0 * q_f)
     drawing = with_bars(drawing, slow, fast)
@@ -162,7 +162,7 @@ def _drawing(trajectory: Trajectory, shown: Any) -> Drawing:
     shown = opened(shown)
     if isinstance(shown, Problem):
         shown = shown.drawing or bars(trajectory)
-    if isinstance(shown, dict):
+    if isinstance(shown, dict | str):
         shown = Drawing.from_dict(shown)
     check_type("motion: drawing", shown, Drawing, "the scene or the problem of the run, or a Drawing")
     return shown
@@ -191,19 +191,20 @@ def _differences(t, *values) -> list[np.ndarray]:
 
 
 def _velocities(system: System, trajectory: Trajectory, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """(count, n_s) and (count, n_f) velocities from the momenta of the first nodes; the system must be the one of the run."""
+    """(count, n_s) and (count, n_f) velocities from the momenta of the first nodes; the system must be the one of the
+    run."""
     phase = [jnp.asarray(a)[:count] for a in tuple(vars(trajectory.states).values())[1:]]
     try:
         start_energy = float(diagnostics.energy(system, *(a[0] for a in phase)))
         v_s, v_f = jax.jit(jax.vmap(partial(diagnostics.velocity, system)))(*phase)
     except (TypeError, ValueError, IndexError) as error:
         sizes = f"{phase[0].shape[1]} slow and {phase[1].shape[1]} fast coordinates"
-        raise ValueError(f"motion: the system does not go with a run of {sizes}: {error}") from error
+        raise Refused(f"motion: the system does not go with a run of {sizes}: {error}") from error
     run_energy = float(trajectory.energy[0])
     if abs(start_energy - run_energy) > 1e-6 * max(1.0, abs(run_energy)):
-        raise ValueError(
-            f"motion: the system has the energy {start_energy:.6g} at the start, the run {run_energy:.6g}; give the system that was simulated, with "
-            "its parameters."
+        raise Refused(
+            f"motion: the system has the energy {start_energy:.6g} at the start, the run {run_energy:.6g}; give the "
+            "system that was simulated, with its parameters."
         )
     return np.asarray(v_s), np.asarray(v_f)
 
@@ -214,4 +215,5 @@ def _ending(trajectory: Trajectory, count: int) -> str:
         return ""
     result = Result(int(trajectory.result))
     where = f"in macro step {failed}, " if failed >= 0 else ""
-    return f"The run failed {where}after t = {float(trajectory.t[count - 1]):.6g} ({result.name}); it is drawn up to there."
+    last = float(trajectory.t[count - 1])
+    return f"The run failed {where}after t = {last:.6g} ({result.name}); it is drawn up to there."

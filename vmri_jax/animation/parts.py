@@ -8,7 +8,8 @@ PACES = ("slow", "fast")
 
 @dataclass(frozen=True)
 class Body:
-    """A point with 1 to 3 coordinates. Each is a linear form ``sum_k weight_k q[index_k]`` over q_s and q_f; without terms it is zero.
+    """A point with 1 to 3 coordinates. Each is a linear form ``sum_k weight_k q[index_k]`` over q_s and q_f; without
+    terms it is zero.
 
     Attributes:
         name: unique in a drawing.
@@ -16,7 +17,8 @@ class Body:
         offset: added to the linear forms: the position of the body at q = 0.
         radius: in the unit of the coordinates; None for a radius that depends on the size of the picture.
         color: as in CSS, ``#rrggbb``; None for the colour of its pace.
-        shown: "ball"; "name" for the centre of a solid, which shows its name alone; or "" for a point that is not shown.
+        shown: "ball"; "name" for the centre of a solid, which shows its name alone; or "" for a point that is not
+            shown.
     """
 
     name: str
@@ -34,7 +36,8 @@ class Body:
 
 @dataclass(frozen=True)
 class Solid:
-    """A convex solid that moves with four points x_i: a corner with the weights c is at ``x_0 + sum_i c_i (x_i - x_0)``.
+    """A convex solid that moves with four points x_i: a corner with the weights c is at
+    ``x_0 + sum_i c_i (x_i - x_0)``.
 
     Attributes:
         points: names of the four bodies at the points, the centre first.

@@ -11,6 +11,7 @@ from vmri_jax.animation.checks import check_keys, entries, numbers, positive
 from vmri_jax.animation.parts import KINDS, PACES, Block, Body, Joint, Solid
 from vmri_jax.mechanics.kinematics import Kinematics
 from vmri_jax.mechanics.names import near
+from vmri_jax.refusals import Refused
 
 
 def read_body(data: Any, where: str) -> Body:
@@ -18,16 +19,16 @@ def read_body(data: Any, where: str) -> Body:
     check_keys(data, ("name", "coordinates"), ("offset", "radius", "color", "shown"), where)
     coordinates = data["coordinates"]
     if not isinstance(coordinates, list | tuple) or not 1 <= len(coordinates) <= 3:
-        raise ValueError(f"{where}: coordinates is {coordinates!r}; it must be a list of 1 to 3 entries.")
+        raise Refused(f"{where}: coordinates is {coordinates!r}; it must be a list of 1 to 3 entries.")
     radius = None if data.get("radius") is None else positive(data["radius"], f"{where}: radius")
     color = data.get("color")
     if color is not None and not (isinstance(color, str) and re.fullmatch("#[0-9a-fA-F]{6}", color)):
-        raise ValueError(f"{where}: color is {color!r}; it must be like '#0072b2'.")
+        raise Refused(f"{where}: color is {color!r}; it must be like '#0072b2'.")
     forms = tuple(_form(entry, where) for entry in coordinates)
     offset = numbers(data.get("offset") or [0.0] * len(forms), f"{where}: offset")
     shown = data.get("shown", "ball")
     if shown not in ("ball", "name", ""):
-        raise ValueError(f"{where}: shown is {shown!r}; it must be 'ball', 'name' or ''.")
+        raise Refused(f"{where}: shown is {shown!r}; it must be 'ball', 'name' or ''.")
     return Body(str(data["name"]), forms, offset, radius, color, shown)
 
 
@@ -40,16 +41,16 @@ def read_solid(data: Any, where: str) -> tuple[Solid, list[Body]]:
     faces = tuple(tuple(operator.index(i) for i in face) for face in entries(data, "faces", where))
     count = len(forms) // 3 - 1
     if len(forms) != 3 * (count + 1) or not 1 <= count <= 3 or corners.ndim != 2 or corners.shape[1] != count:
-        raise ValueError(
-            f"{where}: {len(forms)} coordinates and corners of shape {corners.shape}; give the 12 coordinates of a rigid body (or "
-            "fewer, of one with fewer directors) and a number along each director for every corner."
+        raise Refused(
+            f"{where}: {len(forms)} coordinates and corners of shape {corners.shape}; give the 12 coordinates of a "
+            "rigid body (or fewer, of one with fewer directors) and a number along each director for every corner."
         )
     if any(not 0 <= i < len(corners) for face in faces for i in face):
-        raise ValueError(
+        raise Refused(
             f"{where}: a face has the number of a corner that does not exist; there are {len(corners)} corners."
         )
-    # The points are the centre and, along each director, the point at the distance `size` of the farthest corner: points at a
-    # length of 1 could lie far outside the picture.
+    # The points are the centre and, along each director, the point at the distance `size` of the farthest corner:
+    # points at a length of 1 could lie far outside the picture.
     size = float(np.abs(corners).max()) or 1.0
     centre = tuple(forms[:3])
     bodies = [Body(name, centre, (0.0,) * 3, None, data.get("color"), "name")]
@@ -67,12 +68,12 @@ def read_block(data: Any, where: str) -> Block:
     check_keys(data, ("name", "coordinates"), ("labels",), where)
     forms = [_form(entry, where) for entry in entries(data, "coordinates", where)]
     if not forms or any(len(form) != 1 or form[0][0] != 1.0 for form in forms):
-        raise ValueError(f"{where}: coordinates is {data['coordinates']!r}; it must be a list of ['s' or 'f', index].")
+        raise Refused(f"{where}: coordinates is {data['coordinates']!r}; it must be a list of ['s' or 'f', index].")
     labels = [str(label) for label in entries(data, "labels", where)] or [
         f"{data['name']}[{i}]" for i in range(len(forms))
     ]
     if len(labels) != len(forms):
-        raise ValueError(f"{where}: there are {len(labels)} labels for {len(forms)} coordinates; give one for each.")
+        raise Refused(f"{where}: there are {len(labels)} labels for {len(forms)} coordinates; give one for each.")
     return Block(str(data["name"]), tuple((part, index) for ((_, part, index),) in forms), tuple(labels))
 
 
@@ -84,7 +85,7 @@ def _form(entry: Any, where: str) -> tuple[tuple[float, str, int], ...]:
     except (TypeError, ValueError):
         terms = [(np.nan, "", 0)]
     if not all(part in ("s", "f") and i >= 0 and np.isfinite(weight) for weight, part, i in terms):
-        raise ValueError(
+        raise Refused(
             f"{where}: the coordinate {entry!r} must be ['s' or 'f', index] or a list of [weight, 's' or 'f', index]."
         )
     return tuple(terms)
@@ -93,10 +94,10 @@ def _form(entry: Any, where: str) -> tuple[tuple[float, str, int], ...]:
 def read_joint(kind: str, names: Sequence[str], entry: Any, where: str) -> Joint:
     """The line between two bodies of a pair of names, or of a pair and its pace; `names` of all bodies."""
     if not isinstance(entry, list | tuple) or len(entry) not in (2, 3):
-        raise ValueError(f"{where} is {entry!r}; it must be a pair of names, or a pair of names and 'slow' or 'fast'.")
+        raise Refused(f"{where} is {entry!r}; it must be a pair of names, or a pair of names and 'slow' or 'fast'.")
     a, b = (_body_name(name, names, where) for name in entry[:2])
     if a == b:
-        raise ValueError(f"{where} joins {a!r} with itself.")
+        raise Refused(f"{where} joins {a!r} with itself.")
     return Joint(kind, (a, b), pace=_pace(entry[2] if len(entry) == 3 else None, where))
 
 
@@ -104,7 +105,7 @@ def read_anchor(names: Sequence[str], data: Any, where: str) -> Joint:
     """The line from a body to a fixed point of a dict; `names` of all bodies."""
     check_keys(data, ("body", "point", "kind"), ("pace",), where)
     if data["kind"] not in KINDS:
-        raise ValueError(f"{where}: kind is {data['kind']!r}; it must be {' or '.join(KINDS)}.")
+        raise Refused(f"{where}: kind is {data['kind']!r}; it must be {' or '.join(KINDS)}.")
     point = numbers(data["point"], f"{where}: point")
     body = _body_name(data["body"], names, where)
     return Joint(data["kind"], (body,), point, _pace(data.get("pace"), where))
@@ -119,7 +120,7 @@ def read_record(kind: type, readers: dict[str, Callable], data: Any, where: str)
 def _body_name(name: Any, names: Sequence[str], where: str) -> str:
     if name not in names:
         listed = ", ".join(names[:12]) + (", ..." if len(names) > 12 else "")
-        raise ValueError(
+        raise Refused(
             f"{where} names the body {name!r}, which does not exist.{near(str(name), names)} There are {listed}."
         )
     return name
@@ -127,7 +128,7 @@ def _body_name(name: Any, names: Sequence[str], where: str) -> str:
 
 def _pace(pace: Any, where: str) -> str | None:
     if pace is not None and pace not in PACES:
-        raise ValueError(f"{where}: the pace is {pace!r}; it must be {' or '.join(PACES)}.")
+        raise Refused(f"{where}: the pace is {pace!r}; it must be {' or '.join(PACES)}.")
     return pace
 
 

@@ -1,4 +1,5 @@
-"""One moment of a motion in a matplotlib panel, painted from the farthest part to the nearest, as in the script of the page."""
+"""One moment of a motion in a matplotlib panel, painted from the farthest part to the nearest, as in the script of the
+page."""
 
 import math
 from dataclasses import dataclass
@@ -39,7 +40,8 @@ class Stage:
 
     @classmethod
     def of(cls, motion: Motion, theme: plots.Theme) -> "Stage":
-        """The stage of a motion with its first view; the frame is as wide as the scene, between half and eight times its height."""
+        """The stage of a motion with its first view; the frame is as wide as the scene, between half and eight times
+        its height."""
         sizes = layout(motion)
         radius = float(sizes.radii.max())
         start = Camera(sizes.azimuth, sizes.elevation, np.zeros(3), 1.0)
@@ -137,7 +139,8 @@ class Stage:
 
 
 class _Pen:
-    """Draws parts in a panel, as a camera sees them; `points` is the length of a unit of the view in typographic points."""
+    """Draws parts in a panel, as a camera sees them; `points` is the length of a unit of the view in typographic
+    points."""
 
     def __init__(self, axes: Axes, camera: Camera, theme: plots.Theme, points: float):
         self.axes, self.camera, self.theme, self.points = axes, camera, theme, points
@@ -154,7 +157,8 @@ class _Pen:
         self.axes.add_collection(lines, autolim=False)
 
     def ball(self, center, radius: float, color) -> None:
-        """A ball as discs that grow smaller and lighter towards the lamp. Nearer parts have a larger scale and are drawn later."""
+        """A ball as discs that grow smaller and lighter towards the lamp. Nearer parts have a larger scale and are
+        drawn later."""
         (x, y), scale = self.camera.project(center)
         share = np.linspace(0, 1, int(np.clip(2 * self.points * scale * radius, 12, 60)))
         r = scale * radius * (1 - 0.93 * share)
@@ -220,7 +224,8 @@ class _Pen:
         self.lines(segments, color, 0.5 + 0.9 * young, behind, alpha=0.7 * young**1.5, capstyle="butt")
 
     def names(self, points, radii, names: list[str]) -> None:
-        """Names to the right or left of the balls, the largest ball first; a name that would cover a ball or another name is left out."""
+        """Names to the right or left of the balls, the largest ball first; a name that would cover a ball or another
+        name is left out."""
         places, scale = self.camera.project(points)
         letter, sizes = NAME_SIZE / self.points, scale * radii
         edge = np.array(self.axes.get_xlim())
@@ -247,7 +252,8 @@ class _Pen:
             self.polygons([ground.corners], self.theme.faint, 0.4, -4)
 
     def shadows(self, ground: Ground, points, radii, joints, rod: float) -> None:
-        """Shadows of balls and joints, straight down onto a ground. Balls are one path and joints another, so that overlaps are no darker."""
+        """Shadows of balls and joints, straight down onto a ground. Balls are one path and joints another, so that
+        overlaps are no darker."""
         angle = np.linspace(0, 2 * np.pi, 25)[:-1]
         circle = np.stack([np.cos(angle), np.sin(angle)], axis=1) @ ground.sides
         color, strength = "#000000", 1.0 if self.theme is plots.LIGHT else 2.0

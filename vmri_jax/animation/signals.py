@@ -9,11 +9,11 @@ from vmri_jax.animation.motion import Motion
 from vmri_jax.mechanics.names import AXES
 
 MOST_RADIANS_PER_NODE = 1.5
-"""Largest phase change from node to node, in radians, of a signal that is drawn. Above pi the drawn curve would have a false, lower
-frequency; half of that leaves a margin, since frequencies are estimates."""
+"""Largest phase change from node to node, in radians, of a signal that is drawn. Above pi the drawn curve would have a
+false, lower frequency; half of that leaves a margin, since frequencies are estimates."""
 LEAST_RELATIVE_SIZE = 0.02
-"""Smallest size of a signal, over the largest size of the signals of its kind; a smaller part would also draw motion that nobody sees in the
-pictures."""
+"""Smallest size of a signal, over the largest size of the signals of its kind; a smaller part would also draw motion
+that nobody sees in the pictures."""
 PERIODS = 8
 """Number of periods in the window of a fast signal; with more they run together."""
 
@@ -45,7 +45,8 @@ def slow_signal(motion: Motion) -> Signal | None:
 
 
 def fast_signal(motion: Motion) -> Signal | None:
-    """The length of a fast spring that moves most: of those whose frequency the nodes resolve, the largest speed times frequency.
+    """The length of a fast spring that moves most: of those whose frequency the nodes resolve, the largest speed times
+    frequency.
 
     Without such a spring, a coordinate of a fast body, chosen likewise.
     """

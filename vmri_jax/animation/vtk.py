@@ -1,4 +1,5 @@
-"""Files for ParaView and other programs that read VTK: bodies as points, links and springs as lines, solids as polygons."""
+"""Files for ParaView and other programs that read VTK: bodies as points, links and springs as lines, solids as
+polygons."""
 
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
@@ -47,13 +48,15 @@ def write_vtk(motion: Motion, path: str | Path) -> None:
         entries.append(f'    <DataSet timestep="{float(t)!r}" file={quoteattr(f"{folder.name}/{file.name}")}/>')
     listed = "\n".join(entries)
     path.write_text(
-        f'<?xml version="1.0"?>\n<VTKFile type="Collection" version="0.1">\n  <Collection>\n{listed}\n  </Collection>\n</VTKFile>\n',
+        '<?xml version="1.0"?>\n<VTKFile type="Collection" version="0.1">\n'
+        f"  <Collection>\n{listed}\n  </Collection>\n</VTKFile>\n",
         encoding="utf-8",
     )
 
 
 def _cells(drawing: Drawing) -> tuple[list, dict]:
-    """Cells for meshio, and the data of each block of cells. Points are the bodies, fixed ends of joints, corners of solids, in this order."""
+    """Cells for meshio, and the data of each block of cells. Points are the bodies, fixed ends of joints, corners of
+    solids, in this order."""
     index = {body.name: i for i, body in enumerate(drawing.bodies)}
     next_point = len(drawing.bodies)
     cells_by_type: dict[str, list[tuple[list[int], str, bool]]] = {}

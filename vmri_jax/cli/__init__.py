@@ -24,7 +24,7 @@ COMMANDS = {
     "Run and see:  vmri simulate fpu --macro-dt 0.05 --steps 400 --out run.npz": (new, simulate, animate),
     "Is it right:  vmri check my_system.py:problem": (advise, stability, explain, check),
     "What it costs:  vmri tune fpu --error 1e-4 --t-end 2": (tune, cost),
-    "Many runs, and what there is:  vmri sweep --example": (systems, schemes, sweep),
+    "Many runs, and what there is:  vmri new sweep.toml": (systems, schemes, sweep),
 }
 """The commands by the title of their group in the help of `vmri`, which has an example."""
 

@@ -1,6 +1,5 @@
 """The command ``vmri animate``: a run as a page, a strip of pictures or a GIF."""
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
@@ -12,8 +11,6 @@ from rich.markup import escape
 from vmri_jax import plots
 from vmri_jax.animation.bars import bars
 from vmri_jax.animation.checks import angles
-from vmri_jax.animation.defaults import built_in
-from vmri_jax.animation.drawing import Drawing
 from vmri_jax.animation.frames import plot_strip, write_gif
 from vmri_jax.animation.html import write_html
 from vmri_jax.animation.motion import Motion, motion
@@ -42,7 +39,7 @@ def animate(
         str | None, typer.Option(help="System of the run: fpu, tsp, sam, or my_file.py:my_problem.")
     ] = None,
     drawing: Annotated[
-        Path | None, typer.Option(help="Drawing in a .json file, in place of the one in the run.")
+        Path | None, typer.Option(help="Drawing in a .json file, in place of the one in the run.", exists=True)
     ] = None,
     title: Annotated[str | None, typer.Option(help="Over the picture. [dim]name of the system or file[/dim]")] = None,
     start: Annotated[float | None, typer.Option("--from", help="Start at this time.")] = None,
@@ -56,11 +53,14 @@ def animate(
 ) -> None:
     """Show a run: a page to open in a browser, a strip of pictures, or a GIF.
 
-    The drawing is the one stored with the run, else the drawing of --system; without a drawing every coordinate is a bar.
+    The drawing is the one stored with the run, else the drawing of --system; without a drawing every coordinate is a
+    bar.
     """
     out = run.with_suffix(".html") if out is None else out
     check_target_file("--out", out, (".html", *PICTURES, ".gif", ".pvd"))
-    shown = _seen_from(_motion(run, system, drawing).between(start, end), view)
+    shown = _motion(run, system, drawing).between(start, end)
+    if view is not None:
+        shown = replace(shown, drawing=replace(shown.drawing, view=angles(view.split(","), "--view")))
     name = title or (system if system in SYSTEMS else run.stem)
     _write(shown, out, name, frames, seconds, plots.DARK if dark else plots.LIGHT)
     if shown.ending:
@@ -70,36 +70,11 @@ def animate(
 
 def _motion(run: Path, system: str | None, drawing: Path | None) -> Motion:
     """The motion of a saved run, with the drawing of --drawing, of the run or of --system, else with bars."""
-    (trajectory, description), problem = _load(run), None if system is None else find_problem(system)
-    sizes = [np.shape(a)[-1] for a in (trajectory.states.q_s, trajectory.states.q_f)]
-    if problem is not None and sizes != [np.size(problem.q_s), np.size(problem.q_f)]:
-        raise ValueError(
-            f"--system {system} has {np.size(problem.q_s)} slow and {np.size(problem.q_f)} fast coordinates, the run has "
-            f"{sizes[0]} and {sizes[1]}; give the system that was simulated."
-        )
+    trajectory, description = _load(run)
+    problem = None if system is None else find_problem(system)
     if drawing is not None:
-        if not drawing.is_file():
-            raise ValueError(f"--drawing {drawing} does not exist.")
-        try:
-            description = json.loads(drawing.read_text(encoding="utf-8"))
-        except ValueError as error:
-            raise ValueError(f"--drawing {drawing} is not valid JSON ({error}).") from error
-    if not description and problem is not None:
-        description = problem.drawing or built_in(system or "", np.size(problem.q_s))
-    parsed = Drawing.from_dict(description or bars(trajectory))
-    return motion(trajectory, parsed, None if problem is None else problem.system)
-
-
-def _seen_from(shown: Motion, view: str | None) -> Motion:
-    """The motion with the view of --view, if it is given."""
-    if view is None:
-        return shown
-    parts: list = [part.strip() for part in view.split(",")]
-    try:
-        parts = [float(part) for part in parts]
-    except ValueError:
-        raise ValueError(f"--view is {view!r}; it must be azimuth and elevation in degrees, e.g. -90,90.") from None
-    return replace(shown, drawing=replace(shown.drawing, view=angles(parts, "--view")))
+        description = drawing.read_text(encoding="utf-8")
+    return motion(trajectory, description or problem or bars(trajectory), None if problem is None else problem.system)
 
 
 def _load(run: Path) -> tuple[Trajectory, str | dict]:

@@ -16,6 +16,7 @@ import numpy as np
 from vmri_jax.ensembles.columns import SCHEMES, START, STEPS, Row, columns_of_problems
 from vmri_jax.mechanics.names import Names, near
 from vmri_jax.mechanics.state import Problem
+from vmri_jax.refusals import Refused
 
 Place = tuple[int, tuple[int, ...]]
 """Number of an array among the `_arrays` of a problem, and the index of a number in it."""
@@ -23,7 +24,8 @@ Place = tuple[int, tuple[int, ...]]
 
 @dataclass(frozen=True)
 class ByName:
-    """A function ``(problem, row) -> problem`` that puts the value of each column in its place, and that pickle can send."""
+    """A function ``(problem, row) -> problem`` that puts the value of each column in its place, and that pickle can
+    send."""
 
     places: dict[str, Place]
 
@@ -48,13 +50,13 @@ def by_name(problem: Problem, columns: Sequence[str]) -> ByName | None:
     for name in columns_of_problems(columns):
         if name not in known:
             listed = [other for other in known if "[" not in other]
-            raise ValueError(
+            raise Refused(
                 f"the column {name!r} sets no number of the problem.{near(name, [*known, *STEPS, *SCHEMES])} There are "
                 f"{', '.join([*listed, *STEPS, *SCHEMES])}, and numbers of arrays, {START[1]}[0] for example."
             )
         twice = [other for other, place in places.items() if place == known[name]]
         if twice:
-            raise ValueError(f"the columns {twice[0]!r} and {name!r} set the same number; leave one of them out.")
+            raise Refused(f"the columns {twice[0]!r} and {name!r} set the same number; leave one of them out.")
         places[name] = known[name]
     return ByName(places) if places else None
 

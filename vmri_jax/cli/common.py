@@ -10,7 +10,7 @@ from rich.markup import escape
 from rich.panel import Panel
 from rich.text import Text
 
-from vmri_jax.mechanics.checks import is_refusal
+from vmri_jax.refusals import NotInstalled, Refused
 from vmri_jax.running.files import check_writable, make_writable_folder
 from vmri_jax.running.printed import OutputConsole, PrintedTable
 
@@ -32,33 +32,23 @@ FAULT = "This is no error of your command, but of the program. Please report it,
 
 @contextmanager
 def refusals() -> Iterator[None]:
-    """Within this context refusals of the library are shown as panels, and other errors of their classes as faults of the program."""
+    """Within this context refusals of the library are shown as panels, and other errors of their classes as faults of
+    the program."""
     try:
         yield
-    except (ValueError, TypeError, ImportError) as error:
-        if not is_refusal(error):
-            print_failure("A fault inside", FAULT)
-            raise
-        if isinstance(error, ImportError):
-            print_failure("Not installed", str(error))
-            raise typer.Exit(1) from error
+    except Refused as error:
         raise BadInput(str(error)) from error
+    except NotInstalled as error:
+        print_failure("Not installed", str(error))
+        raise typer.Exit(1) from error
+    except (ValueError, TypeError, ImportError):
+        print_failure("A fault inside", FAULT)
+        raise
     except (FileExistsError, FileNotFoundError) as error:
         raise BadInput(str(error)) from error
     except OSError as error:
         print_failure("Not written", error.strerror or str(error))
         raise typer.Exit(1) from error
-
-
-@contextmanager
-def status(text: str) -> Iterator[None]:
-    """Show a text while the block runs: beside a spinner, or in a line on the error stream if the output is no terminal."""
-    if console.is_terminal:
-        with console.status(text):
-            yield
-    else:
-        Console(stderr=True).print(f"{text} ...")
-        yield
 
 
 def print_failure(title: str, text: str) -> None:
@@ -86,15 +76,13 @@ def check_target_file(option: str, path: Path | None, endings: tuple[str, ...]) 
     if path is None:
         return
     if path.suffix.lower() not in endings:
-        raise ValueError(f"{option} {path}: the file must end in {' or '.join(endings)}.")
+        raise Refused(f"{option} {path}: the file must end in {' or '.join(endings)}.")
     if not path.resolve().parent.is_dir():
-        raise ValueError(f"{option} {path}: the folder {path.parent} does not exist; make it first.")
+        raise Refused(f"{option} {path}: the folder {path.parent} does not exist; make it first.")
     try:
         check_writable(path)
     except OSError as error:
-        raise ValueError(
-            f"{option} {path} cannot be written ({error.strerror or error}); give another file."
-        ) from error
+        raise Refused(f"{option} {path} cannot be written ({error.strerror or error}); give another file.") from error
 
 
 def check_target_folder(option: str, path: Path | None) -> None:
@@ -104,4 +92,4 @@ def check_target_folder(option: str, path: Path | None) -> None:
     try:
         make_writable_folder(path)
     except OSError as error:
-        raise ValueError(f"{option} {path}: {error.strerror or error}; give a folder that can be written.") from error
+        raise Refused(f"{option} {path}: {error.strerror or error}; give a folder that can be written.") from error

@@ -40,5 +40,5 @@ def schemes() -> None:
 
 
 def _first_sentence(function: Callable) -> str:
-    """The first line of the docstring of a system or scheme."""
-    return (function.__doc__ or "").partition("\n")[0].replace("`", "")
+    """The first paragraph of the docstring of a system or scheme."""
+    return " ".join((function.__doc__ or "").partition("\n\n")[0].replace("`", "").split())

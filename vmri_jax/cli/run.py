@@ -18,6 +18,7 @@ from vmri_jax.accuracy.simulate import simulate as run_at_once
 from vmri_jax.catalogue import find_problem, find_scheme
 from vmri_jax.cli import options
 from vmri_jax.cli.common import PICTURES, check_target_file, console, print_failure, print_named
+from vmri_jax.refusals import Refused
 from vmri_jax.running.arguments import Save, nothing_fast
 from vmri_jax.running.interrupts import Interrupted
 from vmri_jax.running.settings import Settings
@@ -30,9 +31,11 @@ from vmri_jax.steppers.solver import Solver
 DEFAULT_SCHEME = "fully-implicit"
 """The scheme of a run without --scheme and --accuracy."""
 DEFAULT_SAVED_NODES = 1000
-"""Approximate number of saved nodes of a run without --save-every; more make larger files, and figures do not show them."""
+"""Approximate number of saved nodes of a run without --save-every; more make larger files, and figures do not show
+them."""
 MOST_READ_NODES = 10_000
-"""Largest number of nodes of a run in its summary and figure; more are not seen, and take longer to read and to draw."""
+"""Largest number of nodes of a run in its summary and figure; more are not seen, and take longer to read and to
+draw."""
 
 
 def simulate(
@@ -98,7 +101,7 @@ def simulate(
         chosen = find_scheme(scheme, num_micro, compose, alpha=alpha, degree=degree, rule=rule)
     elif any(value is not None for value in of_scheme.values()):
         without = " and ".join(name for name, value in of_scheme.items() if value is not None)
-        raise ValueError(f"got {without} without --scheme, which --accuracy chooses then; give --scheme with it.")
+        raise Refused(f"got {without} without --scheme, which --accuracy chooses then; give --scheme with it.")
     before = StoredTrajectory(out) if out is not None and resume and out.exists() else None
     if save_every is None and steps is not None and not save_micro:
         save_every = default_save_every(steps) if before is None else before.save_every
@@ -156,12 +159,12 @@ def _check_steps(steps: int | None, accuracy: float | None, t_end: float | None,
     """Refuse options that do not fix the length of a run, or contradict each other."""
     if (steps is None) == (accuracy is None):
         got = "neither" if steps is None else "both"
-        raise ValueError(f"got {got} of --steps and --accuracy; give exactly one of them.")
+        raise Refused(f"got {got} of --steps and --accuracy; give exactly one of them.")
     if (t_end is None) != (accuracy is None):
-        raise ValueError("--accuracy and --t-end go together: the largest error, and the time until which it is kept.")
+        raise Refused("--accuracy and --t-end go together: the largest error, and the time until which it is kept.")
     if streamed and (error or accuracy is not None):
         option = "--error" if error else "--accuracy"
-        raise ValueError(f"{option} compares runs that are in memory; give --out with a file that ends in .npz.")
+        raise Refused(f"{option} compares runs that are in memory; give --out with a file that ends in .npz.")
 
 
 def _print_again(chosen: Settings, system: str, matrix: str) -> None:
@@ -203,7 +206,7 @@ def _check_out(out: Path | None, resume: bool, overwrite: bool) -> bool:
     streamed = out is not None and out.suffix.lower() == ".zarr"
     if (resume or overwrite) and not streamed:
         option = "--resume" if resume else "--overwrite"
-        raise ValueError(
+        raise Refused(
             f"{option} is for a run that is written while it goes; give --out with a file that ends in .zarr."
         )
     if out is not None and not (streamed and out.is_dir()):  # `stream` checks an existing store
@@ -224,7 +227,8 @@ def _compile_clock() -> list[float]:
 
 
 def _energy_balance(trajectory: Trajectory | StoredTrajectory) -> dict[str, str]:
-    """Work of forces and of moving constraints, and the remainder of their balance, in words; a stored run is read piece by piece."""
+    """Work of forces and of moving constraints, and the remainder of their balance, in words; a stored run is read
+    piece by piece."""
     pieces = [trajectory] if isinstance(trajectory, Trajectory) else trajectory.chunks()
     works = [piece.work() for piece in pieces]
     forces, constraints, left = (sum(part[-1] for part in parts) for parts in zip(*(w[:3] for w in works), strict=True))

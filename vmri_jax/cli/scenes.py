@@ -7,10 +7,11 @@ from rich.markup import escape
 
 from vmri_jax.catalogue import find_scene_or_problem, find_scheme
 from vmri_jax.cli import options
-from vmri_jax.cli.common import console, status
+from vmri_jax.cli.common import console
 from vmri_jax.mechanics.linearisation import linearise
 from vmri_jax.mechanics.state import Problem
 from vmri_jax.running.arguments import nothing_fast
+from vmri_jax.running.progress import Working
 from vmri_jax.scene.ledger import ledger_of_functions
 from vmri_jax.stability.drive import growth_over_period
 
@@ -28,10 +29,11 @@ def explain(
     ] = None,
     measure: Annotated[bool, typer.Option(help="Time a macro step, and the derivatives of every effect.")] = True,
 ) -> None:
-    """Show the grid of every body and effect of a scene, or function of a system, with the reason, its cost, and all frequencies.
+    """Show the grid of every body and effect of a scene, or function of a system, with the reason, its cost, and all
+    frequencies.
 
-    The cost: unknowns, evaluations, and the time of one evaluation of the first derivatives at all nodes. Frequencies are of
-    small vibrations about the start.
+    The cost: unknowns, evaluations, and the time of one evaluation of the first derivatives at all nodes. Frequencies
+    are of small vibrations about the start.
 
     Example:
 
@@ -39,7 +41,7 @@ def explain(
     """
     chosen = find_scheme(scheme, num_micro, compose, alpha=alpha, degree=degree, rule=rule)
     moving = find_scene_or_problem(system)
-    with status("compiling and timing a macro step, and frequencies" if measure else "frequencies"):
+    with Working("compiling and timing a macro step, and frequencies" if measure else "frequencies"):
         if isinstance(moving, Problem):
             ledger = ledger_of_functions(moving, chosen, macro_dt, measure)
         else:

@@ -10,14 +10,10 @@ from rich.markup import escape
 from vmri_jax import plots
 from vmri_jax.catalogue import find_problem, find_scheme
 from vmri_jax.cli import options
-from vmri_jax.cli.common import (
-    PICTURES,
-    check_target_file,
-    console,
-    print_written,
-    status,
-)
+from vmri_jax.cli.common import PICTURES, check_target_file, console, print_written
+from vmri_jax.refusals import Refused
 from vmri_jax.running.printed import PrintedTable
+from vmri_jax.running.progress import Working
 from vmri_jax.stability import advise as advise_on
 from vmri_jax.stability import linear_model, plot_stability, stability_map
 from vmri_jax.stability.map import windows_text
@@ -46,8 +42,8 @@ def advise(
     problem = find_problem(system)
     chosen = find_scheme(scheme, num_micro, compose, alpha=alpha, degree=degree, rule=rule)
     if macro_dt is None:
-        raise ValueError("--macro-dt is missing; give the macro step that is to be judged.")
-    with status("judging this step and the steps around it"):
+        raise Refused("--macro-dt is missing; give the macro step that is to be judged.")
+    with Working("judging this step and the steps around it"):
         advice = advise_on(problem, chosen, macro_dt=macro_dt)
     console.print(advice.table() if advice.findings else escape(advice.verdict))
     if not advice.ok:
@@ -86,7 +82,7 @@ def stability(
         name: {n: find_scheme(name, n, compose, alpha=alpha, degree=degree, rule=rule) for n in numbers}
         for name in scheme or ["explicit-slow"]
     }
-    with status("multipliers of the steps"):
+    with Working("multipliers of the steps"):
         maps = {name: stability_map(problem, schemes, grid) for name, schemes in chosen.items()}
     if out is not None:
         plots.save(plot_stability(maps, system or "one slow and one stiff spring"), out)

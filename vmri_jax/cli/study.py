@@ -12,13 +12,7 @@ from rich.markup import escape
 from vmri_jax import study
 from vmri_jax.catalogue import find_problem
 from vmri_jax.cli import options
-from vmri_jax.cli.common import (
-    check_target_file,
-    check_target_folder,
-    console,
-    print_failure,
-    print_written,
-)
+from vmri_jax.cli.common import check_target_file, check_target_folder, console, print_failure, print_written
 from vmri_jax.running.interrupts import Interrupted
 from vmri_jax.running.progress import Progress, progress_shown
 from vmri_jax.steppers.results import SimulationError

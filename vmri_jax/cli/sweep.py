@@ -3,9 +3,8 @@
 import json
 import os
 import tomllib
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -14,62 +13,54 @@ import typer
 from rich.markup import escape
 
 from vmri_jax import plots
+from vmri_jax.animation.checks import check_keys
 from vmri_jax.catalogue import find_problem
 from vmri_jax.cli.columns import by_name
-from vmri_jax.cli.common import (
-    PICTURES,
-    check_target_file,
-    console,
-    print_failure,
-    print_named,
-    print_written,
-)
+from vmri_jax.cli.common import PICTURES, check_target_file, console, print_failure, print_named, print_written
 from vmri_jax.ensembles import Axis, Draw, Draws, Ensemble, EnsembleError, Product, ensemble
 from vmri_jax.ensembles.quantities import drawn_by_default
 from vmri_jax.executors.executor import local_workers
-from vmri_jax.mechanics.names import unknown
+from vmri_jax.mechanics.arrays import whole_number
 from vmri_jax.mechanics.state import Problem
+from vmri_jax.refusals import Refused
 from vmri_jax.running.export import extra
 from vmri_jax.running.interrupts import Interrupted
 
-EXAMPLE = Path("sweep.toml")
 SETTINGS = ("t_end", "num_steps", "macro_dt", "num_micro", "save", "num_saves", "project", "chunk")
 """Entries whose names and values are arguments of `ensemble`."""
-ENTRIES = ("system", "scheme", "out", *SETTINGS, "axes", "draws")
-AXIS = ("from", "to", "count", "log", "values", "unit", "description")
-DRAWS = ("count", "seed", "method", "columns")
 
 
 def sweep(
-    file: Annotated[Path, typer.Argument(help="The sweep, a .toml; see --example.")] = EXAMPLE,
-    workers: Annotated[int | None, typer.Option(help="Workers on this machine. [dim]this process[/dim]", min=1)] = None,
-    scheduler: Annotated[str | None, typer.Option(help="Address of a scheduler of Dask, tcp://host:port.")] = None,
+    file: Annotated[Path, typer.Argument(help="The sweep, a .toml; vmri new sweep.toml writes one.")] = Path(
+        "sweep.toml"
+    ),
+    workers: Annotated[
+        str | None,
+        typer.Option(
+            help="Number of workers on this machine, or the address of a scheduler of Dask, tcp://host:port. "
+            "[dim]this process[/dim]"
+        ),
+    ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Compute the missing runs of the store.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the store.")] = False,
     plot: Annotated[
         Path | None,
         typer.Option(help="Draw the last saved number of each run against the longest axes: .png, .svg or .pdf."),
     ] = None,
-    example: Annotated[bool, typer.Option("--example", help="Write a commented file that runs, and stop.")] = False,
 ) -> None:
     """Run a sweep of parameters, starts, steps and schemes, on one core or on a cluster, into a store on disk.
 
     Finished runs stay if a worker or this program dies; --resume computes the others.
     """
-    if example:
-        _write_example(file)
-        return
     check_target_file("--plot", plot, PICTURES)
     if plot is not None:
         for package in ("xarray", "dask.array"):  # refuse a missing package now: the figure comes after all runs
             extra(package, "--plot", "ensemble")
-    if workers is not None and scheduler is not None:
-        raise ValueError("--workers and --scheduler are given; choose one of them.")
     arguments = read_sweep(file)
     problem = find_problem(arguments["system"])
     arguments["vary"] = by_name(problem, list(arguments["design"].described()))
     drawn = "" if plot is None else _drawn(arguments["save"], problem)
-    with _client(workers, scheduler) as client:
+    with _client(workers) as client:
         try:
             runs = ensemble(**arguments, executor=client, resume=resume, overwrite=overwrite, progress=True)
         except EnsembleError as error:
@@ -92,10 +83,10 @@ def _drawn(save: list[str], problem: Problem) -> str:
     """The array that --plot draws, chosen before anything runs."""
     drawn = drawn_by_default(save, problem)
     if not drawn:
-        raise ValueError(
-            f"--plot draws one number per run or per saved node, and save = {json.dumps(save)} keeps neither. Add one to the "
-            f"file, e.g. save = {json.dumps([*save, 'energy_error'])}, or a function of your own that returns one, "
-            "my_file.py:function."
+        raise Refused(
+            f"--plot draws one number per run or per saved node, and save = {json.dumps(save)} keeps neither. Add one "
+            f"to the file, e.g. save = {json.dumps([*save, 'energy_error'])}, or a function of your own that returns "
+            "one, my_file.py:function."
         )
     return drawn[-1]
 
@@ -103,17 +94,14 @@ def _drawn(save: list[str], problem: Problem) -> str:
 def read_sweep(file: Path) -> dict[str, Any]:
     """Arguments of `ensemble` from a file, which is checked; paths in it are relative to its folder."""
     if not file.is_file():
-        raise FileNotFoundError(f"{file} does not exist; write one with: vmri sweep --example")
+        raise FileNotFoundError(f"{file} does not exist; write one with: vmri new sweep.toml")
     try:
         entries = tomllib.loads(file.read_text())
     except tomllib.TOMLDecodeError as error:
-        raise ValueError(f"{file} is no TOML: {error}.") from error
-    _check_entries(f"{file}", entries, ENTRIES)
-    for name in ("system", "scheme", "out"):
-        if name not in entries:
-            raise ValueError(f"{file}: {name} is missing; see the file of vmri sweep --example.")
+        raise Refused(f"{file} is no TOML: {error}.") from error
+    check_keys(entries, ("system", "scheme", "out"), (*SETTINGS, "axes", "draws"), f"{file}")
     if ("axes" in entries) == ("draws" in entries):
-        raise ValueError(f"{file}: give either [axes] or [draws].")
+        raise Refused(f"{file}: give either [axes] or [draws].")
     if "axes" in entries:
         design = Product({name: _axis(f"{file}: the axis {name}", axis) for name, axis in entries["axes"].items()})
     else:
@@ -132,20 +120,18 @@ def read_sweep(file: Path) -> dict[str, Any]:
 def _axis(subject: str, entry) -> Any:
     if not isinstance(entry, Mapping):
         return np.atleast_1d(np.asarray(entry))
-    _check_entries(subject, entry, AXIS)
+    check_keys(entry, (), ("from", "to", "count", "log", "values", "unit", "description"), subject)
     words = entry.get("unit", ""), entry.get("description", "")
     if "values" in entry:
         return Axis(entry["values"], *words)
     if not {"from", "to", "count"} <= set(entry):
-        raise ValueError(f"{subject}: give values, or from, to and count.")
+        raise Refused(f"{subject}: give values, or from, to and count.")
     spaced = np.geomspace if entry.get("log") else np.linspace
     return Axis(spaced(float(entry["from"]), float(entry["to"]), int(entry["count"])), *words)
 
 
 def _draws(file: Path, entries: Mapping[str, Any]) -> Draws:
-    _check_entries(f"{file}: draws", entries, DRAWS)
-    if not {"count", "columns"} <= set(entries):
-        raise ValueError(f"{file}: draws need a count and columns, [draws.columns].")
+    check_keys(entries, ("count", "columns"), ("seed", "method"), f"{file}: draws")
     columns = dict(entries["columns"])
     for name, entry in columns.items():
         if isinstance(entry, Mapping):
@@ -155,12 +141,6 @@ def _draws(file: Path, entries: Mapping[str, Any]) -> Draws:
     return Draws(entries["count"], columns, **chosen)
 
 
-def _check_entries(where: str, entries: Mapping[str, Any], known: Collection[str]) -> None:
-    for name in entries:
-        if name not in known:
-            raise ValueError(f"{where}: {unknown('entry', name, known)}")
-
-
 def _located(name: str, folder: Path) -> str:
     """The name of a system or function, with the path of its file, if it has one, relative to a folder."""
     file, colon, function = name.partition(":")
@@ -168,19 +148,19 @@ def _located(name: str, folder: Path) -> str:
 
 
 @contextmanager
-def _client(workers: int | None, scheduler: str | None) -> Iterator[Any]:
-    """A client of workers on this machine, or of a scheduler, whose dashboard it prints; None without either option."""
-    if workers is None and scheduler is None:
+def _client(workers: str | None) -> Iterator[Any]:
+    """A client of workers on this machine, or of a scheduler, whose dashboard it prints; None without either."""
+    if workers is None:
         yield None
         return
-    if workers is not None:
-        opened = local_workers(workers)
+    if workers.isdigit():
+        opened = local_workers(whole_number("--workers", int(workers)))
     else:
-        distributed = extra("distributed", "--scheduler", "ensemble")
+        distributed = extra("distributed", "--workers", "ensemble")
         try:
-            opened = distributed.Client(scheduler, timeout=10)
+            opened = distributed.Client(workers, timeout=10)
         except (OSError, ValueError) as error:
-            raise ValueError(f"--scheduler {scheduler}: no scheduler of Dask answers there ({error}).") from error
+            raise Refused(f"--workers {workers}: no scheduler of Dask answers there ({error}).") from error
     with opened as client:
         if client.dashboard_link:
             console.print(f"dashboard: [bold]{escape(client.dashboard_link)}[/bold]", soft_wrap=True)
@@ -196,13 +176,3 @@ def _print_summary(runs: Ensemble) -> None:
         "store": f'{runs.path}; read it with vmri_jax.open_ensemble("{os.path.relpath(runs.path)}")',
     }
     print_named(texts)
-
-
-def _write_example(file: Path) -> None:
-    if file.exists():
-        raise FileExistsError(f"{file} exists already; give another name.")
-    file.write_text(files("vmri_jax.cli").joinpath("sweep.toml").read_text())
-    console.print(
-        f"wrote {escape(str(file))}; run it with: [bold]vmri sweep {escape(str(file))} --workers 2[/bold]",
-        soft_wrap=True,
-    )

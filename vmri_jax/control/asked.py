@@ -1,4 +1,5 @@
-"""Arguments of `minimize`: their checks, the `Transcription` that they make, and the point where the iteration starts."""
+"""Arguments of `minimize`: their checks, the `Transcription` that they make, and the point where the iteration
+starts."""
 
 from collections.abc import Callable, Mapping
 
@@ -14,6 +15,7 @@ from vmri_jax.mechanics.arrays import real_array, whole_number
 from vmri_jax.mechanics.functions import traced_once
 from vmri_jax.mechanics.order import order_of
 from vmri_jax.mechanics.state import start_of
+from vmri_jax.refusals import Refused
 from vmri_jax.running.prepare import prepare
 from vmri_jax.steppers.plan import plan
 
@@ -23,17 +25,18 @@ def actuation_of(problem, actuate, num_controls) -> tuple[Callable, tuple[str, .
     scene_actuation = getattr(problem, "actuation", None)
     if actuate is None:
         if scene_actuation is None:
-            raise ValueError(
-                'minimize: nothing is controlled; give a scene with Controlled effects, e.g. Controlled("hub", "torque"), or actuate= '
+            raise Refused(
+                'minimize: nothing is controlled; give a scene with Controlled effects, e.g. Controlled("hub", '
+                '"torque"), or actuate= '
                 "and num_controls=."
             )
         if num_controls not in (None, len(scene_actuation.labels)):
-            raise ValueError(
+            raise Refused(
                 f"minimize: num_controls is {num_controls}; the scene has {len(scene_actuation.labels)} controls."
             )
         return scene_actuation, scene_actuation.labels
     if scene_actuation is not None:
-        raise ValueError("minimize: actuate is given, and the scene has Controlled effects; leave one of them out.")
+        raise Refused("minimize: actuate is given, and the scene has Controlled effects; leave one of them out.")
     whole_number("minimize: num_controls", num_controls)
     return actuate, tuple(f"u {i}" for i in range(num_controls)) if num_controls > 1 else ("u",)
 
@@ -47,31 +50,32 @@ def transcribed(
     """
     whole_number("minimize: num_steps", num_steps)
     if grid not in ("macro", "micro"):
-        raise ValueError(f"minimize: grid is {grid!r}; it must be 'macro' or 'micro'.")
+        raise Refused(f"minimize: grid is {grid!r}; it must be 'macro' or 'micro'.")
     system, state = start_of("minimize", problem, None)
     params = {} if system.params is None else system.params
     if not isinstance(params, Mapping):
-        raise TypeError(
+        raise Refused(
             f"minimize: system.params is {type(params).__name__}; the controls need it to be a dict, or None."
         )
     prepare(problem, scheme, macro_dt=macro_dt, num_steps=1, solver=solver)  # makes the checks of a run
-    # A fallback is a branch of the compiled step. `jax.vmap` over all steps would compute both of its sides for every step.
+    # A fallback is a branch of the compiled step. `jax.vmap` over all steps would compute both of its sides for every
+    # step.
     solver = solver or plan(system, scheme, state).first
     u = np.zeros(num_controls)
     actuate = traced_once(actuate, order_of(params))
     forces = jax.eval_shape(lambda: actuate(state.q_s, state.q_f, u, params))
     expected = (state.q_s.shape, state.q_f.shape)
     if not isinstance(forces, tuple) or tuple(getattr(f, "shape", None) for f in forces) != expected:
-        raise ValueError(
-            f"minimize: actuate returns {forces}; it must return forces on the slow and on the fast variables, of shapes "
-            f"{expected[0]} and {expected[1]}."
+        raise Refused(
+            f"minimize: actuate returns {forces}; it must return forces on the slow and on the fast variables, of "
+            f"shapes {expected[0]} and {expected[1]}."
         )
     for name, function in aims.items():
         arguments = (state, u) if name in ("cost", "limits") else (state,)
         shape = jax.eval_shape(lambda f=function, g=arguments: f(*g)).shape
         dimensions, words = (0, "a number") if name in ("cost", "final_cost") else (1, "a vector, (n,)")
         if len(shape) != dimensions:
-            raise ValueError(f"minimize: {name} has shape {shape}; it must be {words}.")
+            raise Refused(f"minimize: {name} has shape {shape}; it must be {words}.")
     functions = {"final_cost": free, "goal": unaimed, **aims}
     return Transcription(
         system.replace(params=params),
@@ -100,20 +104,21 @@ def _bounds(bounds, num_controls: int) -> tuple[np.ndarray, np.ndarray]:
     """The least and the largest controls, (m,) each."""
     bounds = (None, None) if bounds is None else bounds
     if not isinstance(bounds, tuple) or len(bounds) != 2:
-        raise ValueError(f"minimize: bounds is {bounds!r}; give (least, largest), each a number or ({num_controls},).")
+        raise Refused(f"minimize: bounds is {bounds!r}; give (least, largest), each a number or ({num_controls},).")
     ends = [unbounded if side is None else side for side, unbounded in zip(bounds, (-np.inf, np.inf), strict=True)]
     sides = [np.asarray(real_array("minimize: bounds", end)) for end in ends]
     if any(side.shape not in ((), (num_controls,)) for side in sides):
         shapes = " and ".join(str(side.shape) for side in sides)
-        raise ValueError(f"minimize: bounds have shapes {shapes}; each is a number or ({num_controls},).")
+        raise Refused(f"minimize: bounds have shapes {shapes}; each is a number or ({num_controls},).")
     lower, upper = (np.broadcast_to(side, (num_controls,)) for side in sides)
     if not np.all(lower < upper):
-        raise ValueError(f"minimize: bounds are {lower} and {upper}; the least controls must be below the largest.")
+        raise Refused(f"minimize: bounds are {lower} and {upper}; the least controls must be below the largest.")
     return lower, upper
 
 
 def started(setup: Transcription, start, num_steps: int, num_controls: int, grid: str) -> Point:
-    """Nodes and controls of the first iteration, without their gaps and the miss of the goal; `start` as of `minimize`."""
+    """Nodes and controls of the first iteration, without their gaps and the miss of the goal; `start` as of
+    `minimize`."""
     nodes, shape = None, (num_steps, setup.parts, num_controls)
     if isinstance(start, Optimum):
         nodes, controls = _resampled(setup, start, num_steps)
@@ -123,30 +128,33 @@ def started(setup: Transcription, start, num_steps: int, num_controls: int, grid
         controls = np.asarray(real_array("minimize: start", start))
         expected = shape if grid == "micro" else (shape[0], shape[2])
         if controls.shape != expected:
-            raise ValueError(f"minimize: start has shape {controls.shape}; the controls have {expected}.")
+            raise Refused(f"minimize: start has shape {controls.shape}; the controls have {expected}.")
         controls = controls.reshape(shape)
     u = jnp.asarray(np.clip(controls, *setup.bounds))
-    # Given controls start from the motion that they make, without gaps; the nodes of an optimum are interpolated, with gaps.
+    # Given controls start from the motion that they make, without gaps; the nodes of an optimum are interpolated, with
+    # gaps.
     if nodes is None:
         nodes, _ = rolled(setup, u)
         if not np.isfinite(nodes).all():
-            raise ValueError(
-                "minimize: the motion with the first controls fails; give other controls, start=..., or a smaller macro_dt."
+            raise Refused(
+                "minimize: the motion with the first controls fails; give other controls, start=..., or a smaller "
+                "macro_dt."
             )
     return Point(nodes, u, np.zeros(0), np.zeros(0))
 
 
 def _resampled(setup: Transcription, start: Optimum, num_steps: int):
-    """Nodes (N, n) and controls (N, parts, m) of an optimum, interpolated to the grid of another problem of the same duration."""
+    """Nodes (N, n) and controls (N, parts, m) of an optimum, interpolated to the grid of another problem of the same
+    duration."""
     run, m = start.trajectory, start.controls.shape[-1]
     old_nodes = np.asarray(phase_vector(run.states))
     duration, expected = float(run.t[-1] - run.t[0]), num_steps * setup.macro_dt
     if abs(duration - expected) > 1e-9 * expected:
-        raise ValueError(
+        raise Refused(
             f"minimize: start is an Optimum of duration {duration:g}; num_steps macro steps last {expected:g}."
         )
     if m != len(setup.bounds[0]) or old_nodes.shape[1] != setup.z_start.size:
-        raise ValueError(
+        raise Refused(
             "minimize: start is an Optimum of another system or other controls; give an Optimum of this problem."
         )
     t = float(setup.start.t) + setup.macro_dt * np.arange(1, num_steps + 1)

@@ -4,10 +4,12 @@
     dz_{k+1} = A_k dz_k + B_k du_k + c_k        dz_0 = 0        G dz_N + g = 0
     lower <= u_k + du_k <= upper        C_k dz_{k+1} + D_k du_k + l_k <= 0
 
-If the goal and the inequalities have no common solution, slack variables take up the violation of the goal and of the limits, and
-their sum enters the cost with a large weight. Unknowns are ordered by stages, so that the solver's matrices are banded.
+If the goal and the inequalities have no common solution, slack variables take up the violation of the goal and of the
+limits, and their sum enters the cost with a large weight. Unknowns are ordered by stages, so that the solver's matrices
+are banded.
 
-Source: R. Schwan, Y. Jiang, D. Kuhn, C. N. Jones, PIQP: a proximal interior-point quadratic programming solver, CDC (2023);
+Source: R. Schwan, Y. Jiang, D. Kuhn, C. N. Jones, PIQP: a proximal interior-point quadratic programming solver, CDC
+(2023);
 relaxation: R. Fletcher, Practical methods of optimization, Wiley (1987), section 14.4.
 """
 
@@ -23,11 +25,12 @@ from vmri_jax.mechanics.arrays import Numbers
 from vmri_jax.running import export
 
 RELAXATION_WEIGHT = 1e4
-"""Cost of one unit of slack, relative to the largest slope of the cost. It has to exceed the multipliers of goal and limits, else the
-solution violates goals and limits that it could fulfil; a larger cost makes the problem ill-conditioned."""
+"""Cost of one unit of slack, relative to the largest slope of the cost. It has to exceed the multipliers of goal and
+limits, else the solution violates goals and limits that it could fulfil; a larger cost makes the problem
+ill-conditioned."""
 TOLERANCE = 1e-10
-"""Absolute and relative tolerance of PIQP, two decades below the default tolerance of `minimize`; with a larger one the updates of the
-last iterations would be errors of PIQP."""
+"""Absolute and relative tolerance of PIQP, two decades below the default tolerance of `minimize`; with a larger one the
+updates of the last iterations would be errors of PIQP."""
 
 
 class Limits(NamedTuple):
@@ -57,19 +60,20 @@ def solve(stages: Stages, final: Final, limits: Limits) -> tuple[Solution, float
         solution = _solved(stages, final, limits, RELAXATION_WEIGHT * max(1.0, *slopes))
     if solution is None:
         raise Unsolved(
-            "minimize: PIQP solves neither the linear-quadratic problem of an iteration nor its relaxation. Look at the sizes of cost, "
-            "goal and limits: they should be of one order."
+            "minimize: PIQP solves neither the linear-quadratic problem of an iteration nor its relaxation. Look at "
+            "the sizes of cost, goal and limits: they should be of one order."
         )
     return solution
 
 
 def _solved(stages: Stages, final: Final, limits: Limits, weight: float | None) -> tuple[Solution, float] | None:
-    """The solution, and its largest multiplier, of the problem as it is or of its relaxation with this weight; None if PIQP fails."""
+    """The solution, and its largest multiplier, of the problem as it is or of its relaxation with this weight; None if
+    PIQP fails."""
     piqp = export.extra("piqp", "minimize with bounds or limits of controls", "control")
     (count, n, m), c, e = stages.B.shape, limits.value.shape[1], len(final.g)
     num_slacks = 0 if weight is None else c
-    # Unknowns, stage by stage: the control du_k, the node dz_{k+1}, the slacks of its limits; slacks of the goal at the end.
-    # U, Z, SLACK (count, ...) and GOAL_SLACK (2, e) hold their numbers in the vector of unknowns x of
+    # Unknowns, stage by stage: the control du_k, the node dz_{k+1}, the slacks of its limits; slacks of the goal at the
+    # end. U, Z, SLACK (count, ...) and GOAL_SLACK (2, e) hold their numbers in the vector of unknowns x of
     #     min 1/2 x P x + slope . x    with    A x = b,    G x <= -value,    lower <= x <= upper.
     offset = (m + n + num_slacks) * np.arange(count)[:, None]
     U, Z, SLACK = offset + np.arange(m), offset + m + np.arange(n), offset + m + n + np.arange(num_slacks)
@@ -88,7 +92,8 @@ def _solved(stages: Stages, final: Final, limits: Limits, weight: float | None) 
     slope = np.zeros(size)
     slope[before], slope[first], slope[last] = stages.gradient[1:], stages.gradient[:1, n:], slope[last] + final.s
 
-    # A dz_k + B du_k - dz_{k+1} = -c    and    G dz_N = -g, where the relaxation has  G dz_N - e_+ + e_- = -g  with e_+, e_- >= 0
+    # A dz_k + B du_k - dz_{k+1} = -c    and    G dz_N = -g, where the relaxation has  G dz_N - e_+ + e_- = -g  with
+    # e_+, e_- >= 0
     rows, goal = np.arange(count * n).reshape(count, n), count * n + np.arange(e)[None]
     step_blocks = [
         (stages.B, rows, U),

@@ -14,6 +14,7 @@ from vmri_jax.control.search import line_search, update
 from vmri_jax.mechanics.arrays import whole_number
 from vmri_jax.mechanics.checks import check_number
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
+from vmri_jax.refusals import Refused
 from vmri_jax.running.progress import ShowsProgress, progress_to
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
@@ -41,7 +42,8 @@ def minimize(
     solver: Solver | None = None,
     progress: ShowsProgress = False,
 ) -> Optimum:
-    """Minimise ``sum_k H (C(z_k, u_k) + C(z_{k+1}, u_k)) / 2 + final_cost(z_N)`` subject to the steps of the scheme and ``goal = 0``.
+    """Minimise ``sum_k H (C(z_k, u_k) + C(z_{k+1}, u_k)) / 2 + final_cost(z_N)`` subject to the steps of the scheme and
+    ``goal = 0``.
 
         scene = Scene([Body("cart", 1.0, [0.0])], [Controlled("cart", "force")])
 
@@ -51,13 +53,14 @@ def minimize(
         )
 
     Sequential quadratic programming with the nodes among the unknowns: all steps are linearised side by side, and the
-    linear-quadratic problem is solved by a Riccati sweep (`vmri_jax.control.riccati`), or by the interior-point method of PIQP
-    where there are bounds or limits (extra ``control``), so that time grows with the number of steps.
-    Costs enter with their second derivatives, without negative curvature; steps and limits with their first derivatives.
+    linear-quadratic problem is solved by a Riccati sweep (`vmri_jax.control.riccati`), or by the interior-point method
+    of PIQP where there are bounds or limits (extra ``control``), so that time grows with the number of steps.
+    Costs enter with their second derivatives, without negative curvature; steps and limits with their first
+    derivatives.
 
     Args:
-        problem: system and start, a scene with `vmri_jax.scene.Controlled` effects or a problem; its ``system.params`` is a
-            dict or None.
+        problem: system and start, a scene with `vmri_jax.scene.Controlled` effects or a problem; its ``system.params``
+            is a dict or None.
         cost: C, cost per time, ``cost(state, u) -> ()``, with a positive second derivative in u.
         scheme, macro_dt, num_steps, solver: as in `simulate`. Forces act on the grid of the scheme for forces.
         actuate: generalised forces of the controls, ``actuate(q_s, q_f, u, params) -> (f_s, f_f)``; None for
@@ -67,14 +70,14 @@ def minimize(
         goal: equations for the last state, ``goal(state) -> (e,)``, zero where the goal is reached.
         bounds: the least and the largest controls, numbers or (m,); None and infinite ones do not bound.
         limits: inequalities, ``limits(state, u) -> (c,)``, not above zero at the end of every interval.
-        start: controls of the first iteration, of the shape of `Optimum.controls`, or an `Optimum` of the same duration, perhaps on
-            a coarser grid; zero if None.
+        start: controls of the first iteration, of the shape of `Optimum.controls`, or an `Optimum` of the same
+            duration, perhaps on a coarser grid; zero if None.
         grid: controls for every macro interval, or for every micro interval.
-        tolerance: largest update, gap, miss of the goal and violation of a limit of a converged optimum; updates and gaps are relative to
-            the largest node and the largest control.
+        tolerance: largest update, gap, miss of the goal and violation of a limit of a converged optimum; updates and
+            gaps are relative to the largest node and the largest control.
         max_iterations: largest number of linear-quadratic problems that are solved.
-        progress: show cost and misses of each iteration as a bar; without it, a search of more than two seconds prints a line now
-            and then.
+        progress: show cost and misses of each iteration as a bar; without it, a search of more than two seconds prints
+            a line now and then.
 
     Returns:
         The `Optimum`. If the iteration does not converge, its last point, with ``success`` false.
@@ -86,7 +89,7 @@ def minimize(
     """
     whole_number("minimize: max_iterations", max_iterations)
     if not check_number("minimize: tolerance", tolerance) > 0:
-        raise ValueError(f"minimize: tolerance is {tolerance}; it must be positive.")
+        raise Refused(f"minimize: tolerance is {tolerance}; it must be positive.")
     actuate, labels = actuation_of(problem, actuate, num_controls)
     opened_problem = problem_of("minimize", problem)
     aims = {"cost": cost, "final_cost": final_cost, "goal": goal, "limits": limits}
@@ -104,7 +107,8 @@ def minimize(
                 if not history:
                     raise
                 break
-            # The merit  cost + rho sum |misses|  is exact for rho above the largest multiplier; twice that leaves a margin.
+            # The merit  cost + rho sum |misses|  is exact for rho above the largest multiplier; twice that leaves a
+            # margin.
             nu, rho = change.nu, max(rho, 2 * steepest)
             point, record = line_search(setup, point._replace(gaps=stages.c, goal=final.g), change, rho)
             history.append(record)

@@ -4,7 +4,8 @@
     dz_{k+1} = A_k dz_k + B_k du_k + c_k        dz_0 = 0        G dz_N + g = 0
 
 The cost from a stage on is quadratic in dz and in the multipliers nu of the goal,
-``1/2 dz S dz + s . dz + nu . (M^T dz + m) - 1/2 nu W nu``; the sweep back carries its coefficients, W is the Gramian of the goal.
+``1/2 dz S dz + s . dz + nu . (M^T dz + m) - 1/2 nu W nu``; the sweep back carries its coefficients, W is the Gramian of
+the goal.
 
 Source: A. E. Bryson, Y.-C. Ho, Applied Optimal Control, Hemisphere (1975), section 5.3.
 """
@@ -68,7 +69,8 @@ def solve(stages: Stages, final: Final) -> Solution:
         Q, N, R = stage.hessian[:n, :n], stage.hessian[n:, :n], stage.hessian[n:, n:]
         q, r = stage.gradient[:n], stage.gradient[n:]
         S, s, M = value.S, value.s, value.M
-        # du = K dz + k + K_nu nu minimises the cost of the stage plus the cost from the next stage on, at  dz' = A dz + B du + c:
+        # du = K dz + k + K_nu nu minimises the cost of the stage plus the cost from the next stage on, at  dz' = A dz +
+        # B du + c:
         #     (R + B^T S B) du = -(H_ux dz + r + B^T (S c + s) + B^T M nu)    with    H_ux = N + B^T S A
         ahead = S @ c + s
         H_ux = N + B.T @ S @ A

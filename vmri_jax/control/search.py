@@ -15,7 +15,8 @@ from vmri_jax.mechanics.arrays import Numbers
 SHORTEST_PART = 2.0**-10
 """Smallest part of an update that the line search tries, after ten halvings; a larger one gives up earlier."""
 SUFFICIENT_DECREASE = 1e-4
-"""Armijo's constant: the decrease of the merit has to be this part of the predicted one. A larger one refuses more updates."""
+"""Armijo's constant: the decrease of the merit has to be this part of the predicted one. A larger one refuses more
+updates."""
 
 
 class Point(NamedTuple):
@@ -60,8 +61,10 @@ def update(setup: Transcription, point: Point) -> tuple[riccati.Solution, float,
 def line_search(setup: Transcription, point: Point, change: riccati.Solution, rho: float) -> tuple[Point, dict]:
     """The first point along an update with a sufficient decrease of the merit, and its entry in the history.
 
-    The merit is ``cost + rho (sum |gaps| + sum |goal| + sum max(limits, 0))``. The update is halved until one of two trials is
-    accepted: nodes and controls updated alike, which unstable motions need; and the motion of the updated controls, which has
+    The merit is ``cost + rho (sum |gaps| + sum |goal| + sum max(limits, 0))``. The update is halved until one of two
+    trials is
+    accepted: nodes and controls updated alike, which unstable motions need; and the motion of the updated controls,
+        which has
     no gaps and suits bodies that turn far. The point stays, and ``part`` is 0, if no part of the update is accepted.
     """
     dz, du = change.dz, jnp.reshape(change.du, point.u.shape)

@@ -1,11 +1,12 @@
 """Discrete mechanics and optimal control: stages of a controlled motion, and their derivatives.
 
-A stage is a macro step of the scheme, ``z_{k+1} = Phi(z_k, u_k)`` with ``z = (q_s, q_f, p_s, p_f)``; its discrete forced equations
-are the constraints of the optimisation. Controls are constant over a macro interval, or over each micro interval.
+A stage is a macro step of the scheme, ``z_{k+1} = Phi(z_k, u_k)`` with ``z = (q_s, q_f, p_s, p_f)``; its discrete
+forced equations are the constraints of the optimisation. Controls are constant over a macro interval, or over each
+micro interval.
 
-Source: S. Ober-Bloebaum, O. Junge, J. E. Marsden, Discrete mechanics and optimal control, ESAIM: COCV 17 (2011); S. Leyendecker,
-S. Ober-Bloebaum, J. E. Marsden, M. Ortiz, Optim. Control Appl. Meth. 31 (2010), with constraints; T. Lishkova, S. Ober-Bloebaum,
-M. Cannon, S. Leyendecker, IFAC-PapersOnLine 53 (2020), on two grids.
+Source: S. Ober-Bloebaum, O. Junge, J. E. Marsden, Discrete mechanics and optimal control, ESAIM: COCV 17 (2011); S.
+Leyendecker, S. Ober-Bloebaum, J. E. Marsden, M. Ortiz, Optim. Control Appl. Meth. 31 (2010), with constraints; T.
+Lishkova, S. Ober-Bloebaum, M. Cannon, S. Leyendecker, IFAC-PapersOnLine 53 (2020), on two grids.
 """
 
 from collections.abc import Callable, Mapping
@@ -33,8 +34,9 @@ CONTROL = "vmri_jax.control"
 """Entry of ``system.params`` with the controls: u, the time when the first one starts, and the duration of each."""
 
 BORDER_WIDTH = 1e-6
-"""Half the width of the border between two controls, relative to the duration of a control: within it a time counts as the border, so that round-off
-of a node's time does not choose a control. A larger one would mix controls at micro nodes beside the border."""
+"""Half the width of the border between two controls, relative to the duration of a control: within it a time counts as
+the border, so that round-off of a node's time does not choose a control. A larger one would mix controls at micro nodes
+beside the border."""
 
 
 class Transcription(eqx.Module):
@@ -49,7 +51,8 @@ class Transcription(eqx.Module):
         goal: equations for the last state, ``goal(state) -> (e,)``.
         bounds: least and largest controls, (m,) each.
         parts: number of controls that follow each other in a macro interval: 1, or num_micro.
-        limits: ``limits(state, u) -> (c,)``, not above zero at the end of every macro interval, for each of its controls; None for none.
+        limits: ``limits(state, u) -> (c,)``, not above zero at the end of every macro interval, for each of its
+            controls; None for none.
     """
 
     system: System
@@ -104,8 +107,8 @@ class Transcription(eqx.Module):
     def steps(self, z, u, follow):
         """Ends (N, n) of all steps, NaN where a step fails, and their `StepStatus`.
 
-        Each step starts from its node in z, or from the end of the step before if `follow` is true. One program computes both,
-        since a step takes long to compile.
+        Each step starts from its node in z, or from the end of the step before if `follow` is true. One program
+        computes both, since a step takes long to compile.
         """
 
         def step(end, stage):
@@ -198,8 +201,9 @@ def _forces(system_force: Callable | None, actuate: Callable) -> Callable:
 def held(t, u, t_start, length):
     """The control (m,) at time t.
 
-    At the border of two intervals it is the mean of both controls, so that quadrature rules with nodes at the ends of intervals
-    weight each control by its duration. The controls u (k, m) follow each other, each of duration `length`, the first from t_start on.
+    At the border of two intervals it is the mean of both controls, so that quadrature rules with nodes at the ends of
+    intervals weight each control by its duration. The controls u (k, m) follow each other, each of duration `length`,
+    the first from t_start on.
     """
     sides = (t - t_start) / length + jnp.array([-BORDER_WIDTH, BORDER_WIDTH])
     return jnp.mean(u[jnp.clip(jnp.floor(sides).astype(int), 0, len(u) - 1)], axis=0)

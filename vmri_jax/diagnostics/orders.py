@@ -4,6 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from vmri_jax.refusals import Refused
+
 
 class OrderFit(NamedTuple):
     """An observed order, half the width of its 95 % confidence interval (NaN for two points), and the points fitted."""
@@ -33,7 +35,7 @@ def fit_order(macro_dt, errors, plateau: float = 10.0, floor: float = 0.0) -> Or
     h, e = np.asarray(macro_dt, dtype=float), np.asarray(errors, dtype=float)
     good = np.isfinite(e) & (e > 0)
     if good.sum() < 2:
-        raise ValueError(f"fit_order: {good.sum()} usable errors of {np.size(errors)}; at least 2 are needed.")
+        raise Refused(f"fit_order: {good.sum()} usable errors of {np.size(errors)}; at least 2 are needed.")
     order = np.argsort(-h[good])
     h, e = h[good][order], e[good][order]
     slopes = np.diff(np.log(e)) / np.diff(np.log(h))

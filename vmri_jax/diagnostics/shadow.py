@@ -25,6 +25,7 @@ from vmri_jax.mechanics.arrays import whole_number
 from vmri_jax.mechanics.invariants import velocity
 from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.mechanics.system import System
+from vmri_jax.refusals import Refused
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes.composition import Composition, stage_lengths, stage_scheme
 from vmri_jax.schemes.discrete_lagrangian import lagrangian
@@ -106,7 +107,7 @@ def shadow_energy(system: Movable, scheme: Scheme | Composition, trajectory: Tra
     macro_dt = (t[-1] - t[0]) / (len(t) - 1)
     actions, miss, result = _actions(system, scheme, nodes, macro_dt)
     if int(result) > Result.CONVERGED_AT_ROUNDOFF or not float(miss) < LARGEST_MISS:
-        raise ValueError(
+        raise Refused(
             f"shadow_energy: steps of {macro_dt:.6g} from the nodes of the trajectory miss the next ones by {float(miss):.1e} of "
             "a step. It must be a run of this system and scheme with every macro node saved (save=1)."
         )
@@ -126,14 +127,14 @@ def _checked(system: Movable, scheme: Scheme | Composition, trajectory: Trajecto
     system, _ = start_of("shadow_energy", system, start)
     if system.force is not None or system.is_rheonomic:
         cause = "forces" if system.force is not None else "constraints that depend on time"
-        raise ValueError(f"shadow_energy: the system has {cause}: no energy is kept. Leave them out.")
+        raise Refused(f"shadow_energy: the system has {cause}: no energy is kept. Leave them out.")
     if stage_scheme(scheme).slow.mollified:
-        raise ValueError("shadow_energy: the action of a mollified scheme depends on more than the nodes of a step.")
+        raise Refused("shadow_energy: the action of a mollified scheme depends on more than the nodes of a step.")
     if int(np.max(trajectory.failed_at)) >= 0 or not np.isfinite(trajectory.energy).all():
-        raise ValueError("shadow_energy: the run failed; take its first part, trajectory[:n].")
+        raise Refused("shadow_energy: the run failed; take its first part, trajectory[:n].")
     fewest = 2 * k + BLOCKS + 1
     if np.ndim(trajectory.t) != 1 or len(trajectory.t) < fewest:
-        raise ValueError(
+        raise Refused(
             f"shadow_energy: the times have shape {np.shape(trajectory.t)}; with k = {k} one run of at least {fewest} nodes is "
             "needed. Simulate longer, or take a smaller k."
         )

@@ -13,6 +13,7 @@ from vmri_jax.ensembles.design import Rows
 from vmri_jax.mechanics.checks import check_type, is_concrete
 from vmri_jax.mechanics.names import near
 from vmri_jax.mechanics.state import Problem
+from vmri_jax.refusals import Refused
 
 STEPS = ("macro_dt", "num_steps")
 SCHEMES = ("scheme", "num_micro")
@@ -37,7 +38,7 @@ def numbers_in(rows: Rows) -> Rows:
     columns = {name: rows[name] for name in columns_of_problems(list(rows))}
     for name, values in columns.items():
         if values.dtype.kind not in "if":
-            raise ValueError(
+            raise Refused(
                 f"ensemble: the column {name!r} has labels; only the column 'scheme' may have them. Give numbers."
             )
     return columns
@@ -60,7 +61,7 @@ def lane_function(
     """
     if vary is None and columns:
         name = columns[0]
-        raise ValueError(
+        raise Refused(
             f"ensemble: the column {name!r} is neither a step nor a scheme.{near(name, (*STEPS, *SCHEMES))} Give vary=, a "
             f"function (problem, row) -> problem that puts row[{name!r}] into the problem of a run."
         )
@@ -72,7 +73,7 @@ def lane_function(
         )
         _check_only_values_differ(problem, changed)
         if time_is_fixed and changed.t is not problem.t:
-            raise ValueError(
+            raise Refused(
                 "ensemble: vary changes t, so that t_end does not fix the number of steps; give num_steps and a step."
             )
         is_same = changed.system.params is problem.system.params
@@ -91,7 +92,7 @@ def _check_only_values_differ(problem: Problem, changed: Problem) -> None:
     before, after = ((entry.system.params, [getattr(entry, part) for part in START]) for entry in (problem, changed))
     same_shapes = jax.tree.map(np.shape, before) == jax.tree.map(np.shape, after)
     if not (same_system and same_shapes):
-        raise ValueError(
+        raise Refused(
             "ensemble: vary(problem, row) may change the values of system.params, positions, velocities and t. It changes "
             f"{'the system besides its params' if same_shapes else 'the structure or shape of one of them'}; such runs need an ensemble of their own."
         )

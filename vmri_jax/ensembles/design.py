@@ -17,6 +17,7 @@ import numpy as np
 
 from vmri_jax.mechanics.arrays import whole_number
 from vmri_jax.mechanics.names import near
+from vmri_jax.refusals import Refused
 
 Rows = dict[str, np.ndarray]
 """Some rows of a design: an array for each column, its first axis the rows."""
@@ -67,7 +68,7 @@ class Draw:
         distribution = getattr(stats, name, None)
         if not isinstance(distribution, stats.rv_continuous):
             known = [*ALIASES, *(n for n, d in vars(stats).items() if isinstance(d, stats.rv_continuous))]
-            raise ValueError(
+            raise Refused(
                 f"Draws: there is no distribution {self.name!r}.{near(self.name, known)} Give uniform, loguniform, normal, or "
                 "another continuous distribution of scipy.stats."
             )
@@ -78,9 +79,9 @@ class Draw:
                 arguments = low, high - low if high > low else np.nan
             values = np.asarray(distribution.ppf(at, *arguments), dtype=float)
         except (TypeError, ValueError) as error:
-            raise ValueError(f"Draws: {self.name} with the arguments {self.arguments}: {error}.") from None
+            raise Refused(f"Draws: {self.name} with the arguments {self.arguments}: {error}.") from None
         if not np.isfinite(values).all():
-            raise ValueError(
+            raise Refused(
                 f"Draws: {self.name} with the arguments {self.arguments} gives no numbers; uniform and loguniform take the "
                 "lowest and the highest value, normal the mean and the standard deviation."
             )
@@ -104,11 +105,11 @@ class Product:
         for name, axis in axes.items():
             values = axis.values
             if values.ndim != 1 or not values.size:
-                raise ValueError(
+                raise Refused(
                     f"Product: the axis {name!r} has values of shape {values.shape}; give a list of one or more."
                 )
             if len(np.unique(values)) < values.size:
-                raise ValueError(f"Product: the axis {name!r} has a value more than once: {values.tolist()}.")
+                raise Refused(f"Product: the axis {name!r} has a value more than once: {values.tolist()}.")
         object.__setattr__(self, "axes", axes)
 
     @property
@@ -152,7 +153,7 @@ class Table:
             lengths_text = ", ".join(
                 f"{name} {shape[0] if shape else 'a single value'}" for name, shape in lengths.items()
             )
-            raise ValueError(
+            raise Refused(
                 f"Table: columns must have one value for each run, but their lengths are: {lengths_text or 'no columns'}. For all "
                 "combinations of values take Product."
             )
@@ -196,15 +197,15 @@ class Draws:
         whole_number("Draws: count", self.count)
         whole_number("Draws: seed", self.seed, least=0)
         if self.method not in list(MOST_POINTS):
-            raise ValueError(
+            raise Refused(
                 f"Draws: method is {self.method!r}.{near(str(self.method), MOST_POINTS)} Give one of {', '.join(MOST_POINTS)}."
             )
         if self.count > MOST_POINTS[self.method]:
-            raise ValueError(
+            raise Refused(
                 f"Draws: count is {self.count}, more than the {MOST_POINTS[self.method]} of the method {self.method}; take method='random'."
             )
         if not self.columns:
-            raise ValueError("Draws: there are no columns; give at least one, e.g. {'omega': ('uniform', 10, 50)}.")
+            raise Refused("Draws: there are no columns; give at least one, e.g. {'omega': ('uniform', 10, 50)}.")
         columns = {name: _draw(name, draw) for name, draw in self.columns.items()}
         for draw in columns.values():
             draw.quantiles(np.array([0.5]))
@@ -221,7 +222,7 @@ class Draws:
     def combinations(self, names: Sequence[str]) -> Rows:
         """No rows. Drawn values are all different, and each would need a program of its own, so that names are refused."""
         if names:
-            raise ValueError(
+            raise Refused(
                 f"Draws: {', '.join(names)} cannot be drawn: each value needs a program of its own. Give the runs as a Table."
             )
         return {}
@@ -294,7 +295,7 @@ def _draw(name: str, entry) -> Draw:
     if isinstance(entry, Draw):
         return entry
     if not (isinstance(entry, Sequence) and len(entry) and isinstance(entry[0], str)) or isinstance(entry, str):
-        raise ValueError(
+        raise Refused(
             f"Draws: the column {name!r} is {entry!r}; give the name of a distribution and its arguments, "
             "('uniform', 10, 50) or ('normal', 0, 0.1)."
         )
@@ -313,7 +314,7 @@ def _values(subject: str, values) -> np.ndarray:
     if array.dtype.kind in "US":
         return array.astype(str)
     if array.dtype.kind not in "iuf" or not np.isfinite(array).all():
-        raise ValueError(f"{subject} has the values {values!r}; give finite numbers, or labels of schemes.")
+        raise Refused(f"{subject} has the values {values!r}; give finite numbers, or labels of schemes.")
     return array.astype(np.int64 if array.dtype.kind in "iu" else np.float64)
 
 

@@ -14,6 +14,7 @@ from vmri_jax.ensembles.quantities import Quantity, label_of, quantity, what_is_
 from vmri_jax.ensembles.work import Work, all_groups
 from vmri_jax.mechanics.arrays import whole_number
 from vmri_jax.mechanics.names import Names
+from vmri_jax.refusals import Refused
 from vmri_jax.running.batch import lanes_at_once
 from vmri_jax.running.simulation import Simulation
 from vmri_jax.running.store.identity import describe, environment, identity, operations
@@ -38,7 +39,7 @@ def prepared(work: Work, design: Design, chunk: int | None = None) -> tuple[dict
     runs[0].check("ensemble: the start", constraints=False)
     over_nodes = [str(name) for name, quantity in zip(work.save, work.quantities, strict=True) if quantity.over_nodes]
     if over_nodes and work.num_saves == 1:
-        raise ValueError(
+        raise Refused(
             f"ensemble: {', '.join(over_nodes)} looks at the saved nodes of a run, and only its end is saved; give num_saves, "
             "for example 50."
         )

@@ -11,6 +11,7 @@ from vmri_jax.catalogue import imported
 from vmri_jax.mechanics.functions import TracedOnce
 from vmri_jax.mechanics.names import near
 from vmri_jax.mechanics.state import Problem
+from vmri_jax.refusals import Refused
 from vmri_jax.running.arguments import Steps
 from vmri_jax.running.export import DIMENSIONS
 from vmri_jax.running.simulation import Simulation, simulation
@@ -114,17 +115,17 @@ def quantity(saved: Saved) -> Quantity:
     if isinstance(saved, str) and saved in QUANTITIES:
         return QUANTITIES[saved]
     if not callable(saved) and not (isinstance(saved, str) and ":" in saved):
-        raise ValueError(
+        raise Refused(
             f"ensemble: save has {saved!r}.{near(saved, QUANTITIES)} There are {', '.join(QUANTITIES)}; your own functions are given as they are, "
             "or as my_file.py:function, or my_package.my_module:function."
         )
     user_function, label = saved if callable(saved) else imported(saved), label_of(saved)
     if not callable(user_function):
-        raise ValueError(
+        raise Refused(
             f"ensemble: save has {saved!r}, which is {type(user_function).__name__}; give a function of a trajectory."
         )
     if not label.isidentifier():
-        raise ValueError(
+        raise Refused(
             f"ensemble: save has {saved!r}, a function without a name for its array in the store; define it with def."
         )
 
@@ -151,7 +152,7 @@ def kept(quantities: Sequence[Quantity], run: Trajectory) -> dict[str, Kept]:
         part = item.function(run)
         both = sorted(set(arrays) & set(part))
         if both:
-            raise ValueError(f"ensemble: save has two arrays called {', '.join(both)}; give one of them another name.")
+            raise Refused(f"ensemble: save has two arrays called {', '.join(both)}; give one of them another name.")
         arrays |= part
     return arrays
 

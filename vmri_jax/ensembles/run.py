@@ -22,6 +22,7 @@ from vmri_jax.executors.executor import as_done, executor_of, submitter
 from vmri_jax.executors.worker import NotAWorker
 from vmri_jax.mechanics.arrays import require_x64, whole_number
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
+from vmri_jax.refusals import Refused
 from vmri_jax.running.files import explained
 from vmri_jax.running.interrupts import Interrupted, interrupts_noted
 from vmri_jax.running.progress import Progress, ShowsProgress, progress_to
@@ -193,7 +194,7 @@ def ensemble(
     schemes, design = _schemes(scheme), _design(design)
     if len(schemes) > 1 and "scheme" not in design.described():
         if not isinstance(design, Product):
-            raise ValueError(
+            raise Refused(
                 "ensemble: there are several schemes, but the design has no column 'scheme' that chooses one for each run."
             )
         design = Product({"scheme": list(schemes), **design.axes})
@@ -321,7 +322,7 @@ def _schemes(scheme) -> dict[str, AnyScheme]:
         isinstance(label, str) and (isinstance(entry, str | Scheme | Composition) or callable(entry))
         for label, entry in scheme.items()
     ):
-        raise TypeError(
+        raise Refused(
             f"ensemble: scheme is {scheme!r}; give a Scheme, the name of one, a function that makes one for a num_micro, or several "
             "by label."
         )
@@ -332,7 +333,7 @@ def _design(design) -> Design:
     if isinstance(design, Mapping):
         return Product(design)
     if not isinstance(design, Product | Table | Draws):
-        raise TypeError(
+        raise Refused(
             f"ensemble: design is {type(design).__name__}; give a Product, Table or Draws of vmri_jax.ensembles, or a mapping of axes, "
             "{'omega': [10, 50]}."
         )

@@ -26,6 +26,7 @@ from vmri_jax.ensembles.quantities import Quantity, Saved, of_lanes, quantity
 from vmri_jax.mechanics.checks import digest
 from vmri_jax.mechanics.names import near
 from vmri_jax.mechanics.state import Problem
+from vmri_jax.refusals import Refused
 from vmri_jax.running import arguments
 from vmri_jax.running.arguments import Save, steps_until
 from vmri_jax.running.batch import consistent_states
@@ -93,7 +94,7 @@ class Work:
                     "my_package.my_module:name."
                 )
             if digest(Path(file).read_bytes()) != digest_at_start:
-                raise ValueError(
+                raise Refused(
                     f"{file} differs from the file where the ensemble was started; give all workers the same file."
                 )
 
@@ -153,7 +154,7 @@ class Work:
         """The first run of a group, after a check of its arguments."""
         macro_dt, num_steps = float(np.ravel(group.macro_dt)[0]), group.num_steps
         if num_steps % self.num_saves:
-            raise ValueError(
+            raise Refused(
                 f"ensemble: {num_steps} macro steps are no multiple of num_saves = {self.num_saves}, so that the last saved node "
                 "would not be the end."
             )
@@ -198,25 +199,25 @@ class Work:
     def _scheme(self, values: Mapping[str, Any]) -> Scheme | Composition:
         label = str(values.get("scheme", next(iter(self.schemes))))
         if label not in self.schemes:
-            raise ValueError(
+            raise Refused(
                 f"ensemble: there is no scheme {label!r}.{near(label, self.schemes)} There are {', '.join(self.schemes)}."
             )
         scheme = self.schemes[label]
         num_micro = _whole("num_micro", values["num_micro"]) if "num_micro" in values else self.num_micro
         if isinstance(scheme, Scheme | Composition):
             if num_micro is not None:
-                raise ValueError(
+                raise Refused(
                     f"ensemble: the scheme {label!r} has its num_micro already; give a function of num_micro, for example "
                     "vmri_jax.fully_implicit, or the name of a scheme."
                 )
             return scheme
         if num_micro is None:
-            raise ValueError(
+            raise Refused(
                 f"ensemble: num_micro is missing for the scheme {label!r}; give num_micro, or a column of this name."
             )
         made = find_scheme(scheme, num_micro) if isinstance(scheme, str) else scheme(num_micro)
         if not isinstance(made, Scheme | Composition):
-            raise TypeError(f"ensemble: the scheme {label!r} makes {type(made).__name__}; it must make a Scheme.")
+            raise Refused(f"ensemble: the scheme {label!r} makes {type(made).__name__}; it must make a Scheme.")
         return made
 
     def _steps(self, values: Mapping[str, Any]) -> tuple[Any, int]:
@@ -224,11 +225,11 @@ class Work:
         values_by_name = dict(self.steps)
         twice = sorted(set(values_by_name) & set(values))
         if twice:
-            raise ValueError(f"ensemble: {', '.join(twice)} is a column and an argument; leave one of them out.")
+            raise Refused(f"ensemble: {', '.join(twice)} is a column and an argument; leave one of them out.")
         values_by_name |= {name: values[name] for name in STEPS if name in values}
         names = set(values_by_name)
         if len(names) != 2:
-            raise ValueError(
+            raise Refused(
                 f"ensemble: of the steps {', '.join(sorted(names)) or 'nothing'} is given; give two of t_end, "
                 "num_steps and macro_dt, as arguments or columns."
             )
@@ -239,7 +240,7 @@ class Work:
             return (float(values_by_name["t_end"]) - start) / values_by_name["num_steps"], values_by_name["num_steps"]
         macro_dt = np.asarray(values_by_name["macro_dt"], dtype=float)
         if not np.all(macro_dt > 0):
-            raise ValueError(f"ensemble: a step is {np.min(macro_dt)}; steps must be positive.")
+            raise Refused(f"ensemble: a step is {np.min(macro_dt)}; steps must be positive.")
         macro_dt = float(macro_dt) if macro_dt.ndim == 0 else macro_dt
         return macro_dt, values_by_name.get("num_steps") or steps_until(values_by_name["t_end"], start, macro_dt)
 
@@ -255,5 +256,5 @@ def all_groups(work: Work, design: Design) -> Iterator[Group]:
 
 def _whole(name: str, value) -> int:
     if float(value) != int(value) or value < 1:
-        raise ValueError(f"ensemble: a value of {name} is {value}; it must be a whole number of at least 1.")
+        raise Refused(f"ensemble: a value of {name} is {value}; it must be a whole number of at least 1.")
     return int(value)

@@ -10,6 +10,7 @@ from typing import Any
 
 from vmri_jax.executors.worker import NotAWorker, in_worker, known_versions, packed
 from vmri_jax.mechanics.arrays import whole_number
+from vmri_jax.refusals import Refused
 from vmri_jax.running.export import extra
 from vmri_jax.running.interrupts import Interrupted, interrupts_noted
 
@@ -40,14 +41,14 @@ class Here(Executor):
 def executor_of(caller: str, executor: Any, processes: int | None = None) -> Iterator[Executor]:
     """The `concurrent.futures.Executor` that computes the tasks of a call; `executor` and `processes` are those of `ensemble`."""
     if executor is not None and processes is not None:
-        raise ValueError(f"{caller}: executor and processes are given; choose one of them.")
+        raise Refused(f"{caller}: executor and processes are given; choose one of them.")
     with ExitStack() as resources:
         if processes is not None:
             executor = resources.enter_context(local_workers(whole_number(f"{caller}: processes", processes)))
         if executor is not None and hasattr(executor, "get_executor"):
             executor = executor.get_executor(retries=DASK_RETRIES, pure=False)
         if not isinstance(executor, Executor | None):
-            raise TypeError(
+            raise Refused(
                 f"{caller}: executor is {type(executor).__name__}; give a dask.distributed.Client or a concurrent.futures.Executor, "
                 "or the number of processes on this machine."
             )

@@ -11,6 +11,7 @@ from functools import lru_cache
 from importlib.metadata import version
 
 from vmri_jax.configure import cache_folder, configure, processor
+from vmri_jax.refusals import Refused
 
 PACKAGES = ("vmri_jax", "jax", "jaxlib")
 """Packages on whose versions the last digits of a run depend."""
@@ -33,7 +34,7 @@ def packed(caller: str, task: Callable, *shared) -> bytes:
         if b"__main__" in data:
             raise pickle.PicklingError("it has functions of the running program")
     except (pickle.PicklingError, AttributeError, TypeError) as error:
-        raise ValueError(
+        raise Refused(
             f"{caller}: workers cannot import this system or scheme ({error}). Workers cannot find functions of the running program or of an "
             "interactive session, nor lambdas and functions within functions. Put the "
             "problem into a file and give its name, 'my_file.py:my_problem', or into a package that workers have, "

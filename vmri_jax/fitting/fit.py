@@ -16,6 +16,7 @@ from vmri_jax.fitting.unknowns import Unknown, Unknowns
 from vmri_jax.mechanics.arrays import whole_number
 from vmri_jax.mechanics.checks import check_type
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
+from vmri_jax.refusals import Refused
 from vmri_jax.running.export import extra
 from vmri_jax.running.prepare import prepare
 from vmri_jax.running.progress import Progress, Working
@@ -26,15 +27,16 @@ from vmri_jax.steppers.solver import Solver
 START = ("q_s", "q_f", "v_s", "v_f")
 """Unknowns of these names are the start of the problem."""
 GAP_WEIGHTS = (1e-2, 1.0, 1e2, 1e4, 1e6)
-"""Weights of the gaps between the parts of multiple shooting, for searches one after the other, each from the end of the one before. A
-gap as large as the motion counts like a miss of every value by this many standard deviations. A larger first weight makes the search as
-hard as one with a single run; a smaller last weight leaves gaps in the result."""
+"""Weights of the gaps between the parts of multiple shooting, for searches one after the other, each from the end of
+the one before. A gap as large as the motion counts like a miss of every value by this many standard deviations. A
+larger first weight makes the search as hard as one with a single run; a smaller last weight leaves gaps in the
+result."""
 TOLERANCE = 1e-6
-"""Absolute and relative change of the search variables at which a search ends. A larger one leaves errors of this size beside the
-standard errors of the parameters."""
+"""Absolute and relative change of the search variables at which a search ends. A larger one leaves errors of this size
+beside the standard errors of the parameters."""
 FAILED_MISS = 1e6
-"""Miss of a value, in standard deviations, that a failed run counts as: far above the misses of runs that work, so that the search turns
-back. Squares of much larger values would drown the others in round-off."""
+"""Miss of a value, in standard deviations, that a failed run counts as: far above the misses of runs that work, so that
+the search turns back. Squares of much larger values would drown the others in round-off."""
 NUM_PHASES = 4
 """Number of phases that the display of a long fit tells apart."""
 
@@ -59,19 +61,22 @@ def fit(
         result = vm.fit(problem, data, {"stiffness": vm.fitting.Unknown(3000.0, lower=0)}, scheme=scheme, macro_dt=0.01)
         print(result)
 
-    The method of Levenberg and Marquardt (`optimistix`) minimises ``sum ((predicted - measured) / sigma)^2``, with the Jacobian in
-    forward mode. A fit that takes more than two seconds shows its phases on the error stream.
+    The method of Levenberg and Marquardt (`optimistix`) minimises ``sum ((predicted - measured) / sigma)^2``, with the
+    Jacobian in forward mode. A fit that takes more than two seconds shows its phases on the error stream.
 
     Args:
-        problem: a problem whose ``system.params`` is a dict; `parameters` name its entries, or "q_s", "q_f", "v_s", "v_f" for the
-            start. Or a function ``{name: value} -> Problem``, for everything else.
+        problem: a problem whose ``system.params`` is a dict; `parameters` name its entries, or "q_s", "q_f", "v_s",
+            "v_f" for the start. Or a function ``{name: value} -> Problem``, for everything else.
         data: one or several sets of measurements.
-        parameters: an `Unknown` for each name, or the number where its search starts. Names of nested params have dots, "bonds.stiffness".
-        scheme, macro_dt, solver: as in `simulate`. The times of measurement must be macro nodes. Where the solver is not chosen,
-            runs have no fallback.
+        parameters: an `Unknown` for each name, or the number where its search starts. Names of nested params have dots,
+            "bonds.stiffness".
+        scheme, macro_dt, solver: as in `simulate`. The times of measurement must be macro nodes. Where the solver is
+            not chosen, runs have no fallback.
         segments: parts of multiple shooting; more than one for long or chaotic motion.
-        starts: number of searches side by side, the first from the starts of `parameters`, the others from random ones around them.
-        spread: standard deviation of the search variables of the random starts, about the relative change of a parameter.
+        starts: number of searches side by side, the first from the starts of `parameters`, the others from random ones
+            around them.
+        spread: standard deviation of the search variables of the random starts, about the relative change of a
+            parameter.
         max_steps: largest number of iterations of a search.
         seed: of the random starts.
 
@@ -93,12 +98,13 @@ def fit(
     # steps[i] are the numbers of the macro nodes at which the set i of data was measured
     steps = [m.steps(float(first.t), macro_dt) for m in data]
     if max(s.max() for s in steps) < 1:
-        raise ValueError("fit: all measurements are at the start of the problem; measure at later times, too.")
+        raise Refused("fit: all measurements are at the start of the problem; measure at later times, too.")
     with Working("fit") as tell:
         tell("a run with the first parameters", 0, NUM_PHASES)
         run = prepare(first, scheme, macro_dt=macro_dt, num_steps=max(int(s.max()) for s in steps), solver=solver)
         run()
-        # A fallback is a branch of the compiled step; `jax.vmap` over searches and derivatives would compute both of its sides.
+        # A fallback is a branch of the compiled step; `jax.vmap` over searches and derivatives would compute both of
+        # its sides.
         shooting = Shooting(model, unknowns, data, steps, scheme, solver or run.plan.first, float(macro_dt), segments)
         search = _Search(shooting, max_steps)
         u = np.zeros((starts, unknowns.size))
@@ -109,7 +115,7 @@ def fit(
 
 def _model(problem, parameters: Mapping) -> Callable[[Mapping], Problem]:
     if not parameters:
-        raise ValueError(
+        raise Refused(
             "fit: parameters is empty; name the unknown parameters, e.g. {'stiffness': Unknown(3000.0, lower=0)}."
         )
     if not isinstance(problem, Problem) and callable(problem) and not hasattr(problem, "problem"):
@@ -119,16 +125,14 @@ def _model(problem, parameters: Mapping) -> Callable[[Mapping], Problem]:
     known, structure = _by_name(params if isinstance(params, Mapping) else {})
     for name, unknown in parameters.items():
         if name not in known and name not in START:
-            raise ValueError(
-                f"fit: parameters has {name!r}, which is none of system.params ({', '.join(known) or 'no dict'}) nor of "
-                f"{', '.join(START)}. Give a function from parameters to a Problem for anything else."
+            raise Refused(
+                f"fit: parameters has {name!r}, which is none of system.params ({', '.join(known) or 'no dict'}) nor "
+                f"of {', '.join(START)}. Give a function from parameters to a Problem for anything else."
             )
         expected = np.shape(known[name] if name in known else getattr(base, name))
         start = unknown.start if isinstance(unknown, Unknown) else unknown
         if np.shape(start) != expected:
-            raise ValueError(
-                f"fit: the start of {name!r} has shape {np.shape(start)}; in the problem it has {expected}."
-            )
+            raise Refused(f"fit: the start of {name!r} has shape {np.shape(start)}; in the problem it has {expected}.")
 
     def model(values: Mapping) -> Problem:
         inside = {name: value for name, value in values.items() if name in known}
@@ -140,18 +144,19 @@ def _model(problem, parameters: Mapping) -> Callable[[Mapping], Problem]:
 
 
 def _by_name(params: Mapping) -> tuple[dict[str, Any], Any]:
-    """The numbers in nested dictionaries by name, ``"bonds.stiffness"``, and the structure that makes the dictionaries from them."""
+    """The numbers in nested dictionaries by name, ``"bonds.stiffness"``, and the structure that makes the dictionaries
+    from them."""
     numbers, structure = jax.tree.flatten_with_path(params, is_leaf=lambda value: not isinstance(value, Mapping))
     return {jax.tree_util.keystr(path, simple=True, separator="."): number for path, number in numbers}, structure
 
 
 def _check(data: list, segments: int, starts: int, max_steps: int) -> None:
     if not data:
-        raise ValueError("fit: data is empty; give measurements, vm.fitting.Measured(t, values, sigma).")
+        raise Refused("fit: data is empty; give measurements, vm.fitting.Measured(t, values, sigma).")
     for m in data:
         check_type("fit: data", m, Measured, "vm.fitting.Measured(t, values, sigma), or several of them")
     if len({m.sigma is None for m in data}) > 1:
-        raise ValueError("fit: some of data have a sigma and some have none; give it for all or for none.")
+        raise Refused("fit: some of data have a sigma and some have none; give it for all or for none.")
     for name, value in (("segments", segments), ("starts", starts), ("max_steps", max_steps)):
         whole_number(f"fit: {name}", value)
 
@@ -165,7 +170,7 @@ class _Search:
         self.size = shooting.unknowns.size
         self.count = len(shooting.values)
         if self.count < self.size:
-            raise ValueError(
+            raise Refused(
                 f"fit: {self.count} values for {self.size} unknown numbers; measure more, or fix some of them."
             )
         u_start = np.zeros(self.size)
@@ -175,9 +180,11 @@ class _Search:
         self.scale = np.where(scale > 0, scale, scale.max() or 1.0)
 
     def residual(self, x, args):
-        """Misses of all values in standard deviations, and weighted gaps between the parts; `args` are the values and the weight of gaps.
+        """Misses of all values in standard deviations, and weighted gaps between the parts; `args` are the values and
+        the weight of gaps.
 
-        x is (u, z), search variables of the parameters, and starts of the parts after the first one in units of `scale`.
+        x is (u, z), search variables of the parameters, and starts of the parts after the first one in units of
+        `scale`.
         """
         (u, z), (values, weight) = x, args
         predicted, gaps = self.shooting.predict(u, z * self.scale)
@@ -204,7 +211,8 @@ class _Search:
         return u, z, misses, jnp.sum(iterations), good[-1], jnp.max(jnp.abs(gaps), initial=0.0)
 
     def jacobian(self, u, z, values):
-        """Jacobians of misses and gaps, the gaps with their last weight: by the parameters themselves, and by the starts of the parts."""
+        """Jacobians of misses and gaps, the gaps with their last weight: by the parameters themselves, and by the
+        starts of the parts."""
 
         def joined(x):
             u, z = jnp.split(x, [self.size])
@@ -225,9 +233,9 @@ class _Search:
         dead = np.flatnonzero(~by_parameters.any(axis=0))
         if dead.size:
             labels = self.shooting.unknowns.labels
-            raise ValueError(
-                f"fit: no measured value depends on {', '.join(labels[i] for i in dead)} at the start of the search. Leave this "
-                "parameter out, or start elsewhere."
+            raise Refused(
+                f"fit: no measured value depends on {', '.join(labels[i] for i in dead)} at the start of the search. "
+                "Leave this parameter out, or start elsewhere."
             )
 
     def result(self, u, tell: Progress) -> Fit:
@@ -244,7 +252,8 @@ class _Search:
         return Fit.of(self.shooting, u, misses, jacobians, **end, again=partial(self.again, u, z))
 
     def again(self, u, z, values):
-        """Parameters (k, p) and covariances (k, p, p) of fits to other values (k, m); each search starts at the end u, z of the first fit."""
+        """Parameters (k, p) and covariances (k, p, p) of fits to other values (k, m); each search starts at the end u,
+        z of the first fit."""
         unknowns = self.shooting.unknowns
 
         @jax.jit

@@ -9,10 +9,11 @@ import numpy as np
 
 from vmri_jax.mechanics.arrays import real_array
 from vmri_jax.mechanics.state import State
+from vmri_jax.refusals import Refused
 
 NODE_TOLERANCE = 1e-6
-"""Largest distance of a time of measurement from a macro node, in macro steps: round-off of the time, no more. A larger one would take
-values between nodes for values at nodes."""
+"""Largest distance of a time of measurement from a macro node, in macro steps: round-off of the time, no more. A larger
+one would take values between nodes for values at nodes."""
 
 
 def positions(state: State):
@@ -29,8 +30,9 @@ class Measured:
     Attributes:
         t: (k,) times, nodes of the macro grid of the fit.
         values: (k, m) or (k,), NaN for a missing one.
-        sigma: standard deviation of the errors of the values, positive: a number, (m,) where k is not m, (1, m), (k, 1), or the shape of values. None if it is not known: the fit
-            estimates it from its residuals; then sigma is None for all sets of measurements.
+        sigma: standard deviation of the errors of the values, positive: a number, (m,) where k is not m, (1, m),
+            (k, 1), or the shape of values. None if it is not known: the fit estimates it from its residuals; then sigma
+            is None for all sets of measurements.
         observe: the measured quantity, ``observe(state) -> (m,)`` or ``()``; all positions by default.
 
     Raises:
@@ -46,24 +48,25 @@ class Measured:
         t = np.asarray(real_array("Measured: t", self.t, ndim=1))
         values = np.asarray(real_array("Measured: values", self.values))
         if values.ndim not in (1, 2) or len(values) != len(t) or not len(t):
-            raise ValueError(
+            raise Refused(
                 f"Measured: values have shape {values.shape} for times of shape {t.shape}; give one row for each time."
             )
         shape, values = values.shape, values.reshape(len(t), -1)
         if not np.isfinite(t).all() or not np.isfinite(values).any():
-            raise ValueError("Measured: t must be finite, and at least one value must be a number.")
+            raise Refused("Measured: t must be finite, and at least one value must be a number.")
         if self.sigma is not None:
             sigma = np.asarray(real_array("Measured: sigma", self.sigma))
             if not (np.isfinite(sigma).all() and np.all(sigma > 0)):
-                raise ValueError(
-                    f"Measured: sigma is {self.sigma}; it must be positive. Leave an unknown sigma out: the fit estimates it."
+                raise Refused(
+                    f"Measured: sigma is {self.sigma}; it must be positive. Leave an unknown sigma out: the fit "
+                    "estimates it."
                 )
             k, m = values.shape
             # (m,) of as many times as quantities could be one for each time
             if sigma.shape not in ((), shape, (1, m), (k, 1)) and (sigma.shape != (m,) or k == m):
-                raise ValueError(
-                    f"Measured: sigma has shape {sigma.shape}; values have {shape}. Give a number, one for each quantity, {(1, m)}, one for each "
-                    f"time, {(k, 1)}, or one for each value."
+                raise Refused(
+                    f"Measured: sigma has shape {sigma.shape}; values have {shape}. Give a number, one for each "
+                    f"quantity, {(1, m)}, one for each time, {(k, 1)}, or one for each value."
                 )
             sigma = sigma.reshape(k, m) if sigma.shape == shape else np.broadcast_to(sigma, (k, m))
             object.__setattr__(self, "sigma", sigma)
@@ -81,11 +84,12 @@ class Measured:
         off = np.flatnonzero(np.abs(exact - steps) > NODE_TOLERANCE)
         if off.size:
             t = self.t[off[0]]
-            raise ValueError(
-                f"fit: macro_dt is {macro_dt:g}, and the time {t:g} lies between its nodes {t_start + int(exact[off[0]]) * macro_dt:g} "
-                f"and {t_start + (int(exact[off[0]]) + 1) * macro_dt:g}. Values are not interpolated: take a step that divides the "
-                "times, or interpolate the measurements to the nodes."
+            raise Refused(
+                f"fit: macro_dt is {macro_dt:g}, and the time {t:g} lies between its nodes "
+                f"{t_start + int(exact[off[0]]) * macro_dt:g} and {t_start + (int(exact[off[0]]) + 1) * macro_dt:g}. "
+                "Values are not interpolated: take a step that divides the times, or interpolate the measurements to "
+                "the nodes."
             )
         if steps.min() < 0:
-            raise ValueError(f"fit: the time {self.t.min():g} lies before the start of the problem, {t_start:g}.")
+            raise Refused(f"fit: the time {self.t.min():g} lies before the start of the problem, {t_start:g}.")
         return steps

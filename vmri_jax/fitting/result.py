@@ -12,23 +12,27 @@ from scipy import stats
 from vmri_jax.accuracy.simulate import simulate
 from vmri_jax.fitting.shooting import Shooting
 from vmri_jax.mechanics.state import Problem
+from vmri_jax.refusals import Refused
 from vmri_jax.running.trajectory import Trajectory
 
 SINGULAR_VALUE_TOLERANCE = 1e-7
-"""Least singular value of the Jacobian in relative changes of the parameters, as a part of the largest one, of a direction that the data
-determines. Below it round-off of the runs hides the change of the predictions; a larger one also drops directions that are determined badly."""
+"""Least singular value of the Jacobian in relative changes of the parameters, as a part of the largest one, of a
+direction that the data determines. Below it round-off of the runs hides the change of the predictions; a larger one
+also drops directions that are determined badly."""
 STARTS_RANK_TOLERANCE = 1e-12
 """Smallest singular value, over the largest one, of a direction in the range of the Jacobian in the starts; below it a
 direction is round-off. A larger one leaves real effects of the starts to the parameters."""
 DOUBTED_PROBABILITY = 1e-6
-"""Probability of a chi^2 as large as that of the fit, below which the report doubts the fit. A larger one doubts good fits by chance."""
+"""Probability of a chi^2 as large as that of the fit, below which the report doubts the fit. A larger one doubts good
+fits by chance."""
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
     """Fitted parameters, their covariance, and the quality of the fit.
 
-    Further results are properties: `standard_errors`, `values`, `problem`, `doubts`, `probability`, and the method `intervals`.
+    Further results are properties: `standard_errors`, `values`, `problem`, `doubts`, `probability`, and the method
+    `intervals`.
 
     Attributes:
         parameters: values by name.
@@ -101,7 +105,7 @@ class Fit:
             ValueError: a level that is not between 0 and 1.
         """
         if not 0 < level < 1:
-            raise ValueError(f"intervals: level is {level}; it must lie between 0 and 1, e.g. 0.95.")
+            raise Refused(f"intervals: level is {level}; it must lie between 0 and 1, e.g. 0.95.")
         tail = (1 + level) / 2
         q = stats.norm.ppf(tail) if self.shooting.knows_sigma else stats.t.ppf(tail, max(self.freedom, 1))
         return {
@@ -111,7 +115,8 @@ class Fit:
 
     @property
     def probability(self) -> float:
-        """Probability of a sum of squares at least as large, if model and sigma are right; 1 where sigma is estimated."""
+        """Probability of a sum of squares at least as large, if model and sigma are right; 1 where sigma is
+        estimated."""
         if not self.shooting.knows_sigma:
             return 1.0
         return float(stats.chi2.sf(np.sum(self.residuals**2), max(self.freedom, 1)))
@@ -122,7 +127,8 @@ class Fit:
         return simulate(self.problem, self.shooting.scheme, **settings)
 
     def bootstrap(self, repeats: int, seed: int = 0) -> "Bootstrap":
-        """Fits to synthetic measurements: the predictions of this fit plus normal errors of its sigma. They show how good the intervals are.
+        """Fits to synthetic measurements: the predictions of this fit plus normal errors of its sigma. They show how
+        good the intervals are.
 
         Args:
             repeats: number of synthetic sets of measurements.
@@ -141,7 +147,8 @@ class Fit:
         sentences = []
         if not self.success:
             sentences.append(
-                "The search did not end by its tolerance: raise max_steps, start closer, fit a shorter time first, or cut the motion into segments."
+                "The search did not end by its tolerance: raise max_steps, start closer, fit a shorter time first, or "
+                "cut the motion into segments."
             )
         if self.probability < DOUBTED_PROBABILITY:
             remedies = [] if len(self.squares) > 1 else ["starts=8"]
@@ -200,7 +207,8 @@ class Bootstrap:
 
 
 def without_starts(by_parameters, by_starts):
-    """The Jacobian (m, p) with respect to the parameters, projected on the complement of the range of the Jacobian (m, k) with respect to the starts.
+    """The Jacobian (m, p) with respect to the parameters, projected on the complement of the range of the Jacobian
+    (m, k) with respect to the starts.
 
     Changes of the predictions that other starts make as well say nothing about the parameters.
     """

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.mechanics.arrays import real_array
+from vmri_jax.refusals import Refused
 
 
 @dataclass(frozen=True)
@@ -38,30 +39,28 @@ class Unknown:
 
     def __post_init__(self):
         if isinstance(self.start, Mapping):
-            raise TypeError(
+            raise Refused(
                 'Unknown: start is a dictionary; name its numbers one by one, {"bonds.stiffness": Unknown(...)}.'
             )
         start = np.asarray(real_array("Unknown: start", self.start))
         object.__setattr__(self, "start", start)
         if not np.isfinite(start).all():
-            raise ValueError(f"Unknown: start is {self.start}; it must be finite.")
+            raise Refused(f"Unknown: start is {self.start}; it must be finite.")
         for name in ("lower", "upper", "scale"):
             value = getattr(self, name)
             if value is not None:
                 value = np.asarray(real_array(f"Unknown: {name}", value))
                 if value.shape not in ((), start.shape):
-                    raise ValueError(
+                    raise Refused(
                         f"Unknown: {name} has shape {value.shape}; give a number, or the shape of start, {start.shape}."
                     )
                 object.__setattr__(self, name, np.broadcast_to(value, start.shape))
         too_small = self.lower is not None and not np.all(self.lower < start)
         too_large = self.upper is not None and not np.all(start < self.upper)
         if too_small or too_large:
-            raise ValueError(
-                f"Unknown: start is {start}; it must lie between lower={self.lower} and upper={self.upper}."
-            )
+            raise Refused(f"Unknown: start is {start}; it must lie between lower={self.lower} and upper={self.upper}.")
         if self.scale is not None and not np.all(self.scale > 0):
-            raise ValueError(f"Unknown: scale is {self.scale}; it must be positive.")
+            raise Refused(f"Unknown: scale is {self.scale}; it must be positive.")
 
     def at(self, u):
         """The parameter for a search variable of the same shape; 0 is the start."""

@@ -1,6 +1,7 @@
 """The hard cases that apply to any system, with steps chosen from its frequencies."""
 
 from dataclasses import dataclass
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +10,7 @@ import numpy as np
 from vmri_jax import textbook
 from vmri_jax.accuracy.batch import simulate_batch
 from vmri_jax.accuracy.companions import positions
+from vmri_jax.accuracy.simulate import simulate
 from vmri_jax.diagnostics import step_condition
 from vmri_jax.diagnostics.linear import phase_vector
 from vmri_jax.hard_cases.case import Case, Outcome, draw_energy
@@ -21,16 +23,15 @@ from vmri_jax.hard_cases.measures import (
     energy,
     energy_scale,
     long_run,
-    relative_constraints,
-    reversal,
+    refusal,
     run,
-    single_precision,
     status,
 )
+from vmri_jax.mechanics.constraints import rows_at
 from vmri_jax.mechanics.linearisation import linearise
 from vmri_jax.mechanics.motion import motion
 from vmri_jax.mechanics.projection import legendre
-from vmri_jax.mechanics.state import HasProblem, Problem, State, problem_of
+from vmri_jax.mechanics.state import HasProblem, Problem, State, initial_state, problem_of
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.progress import Working
 from vmri_jax.running.trajectory import Trajectory
@@ -43,13 +44,14 @@ from vmri_jax.steppers.solver import Solver
 NUM_MICRO = 5
 """Micro steps per macro step of the cases."""
 PHASE = 0.2
-"""omega h of the fastest vibration, which resolves it; omega H = 1 is well below the first resonance. A larger value may meet resonances."""
+"""omega h of the fastest vibration, which resolves it; omega H = 1 is well below the first resonance. A larger value
+may meet resonances."""
 LONGER_RUN = 8
-"""Factor by which a run is lengthened if its energy has a trend. In the longer run the trend of a slow motion turns back or settles, and a
-drift goes on; a larger factor tells the two apart more safely and takes longer."""
+"""Factor by which a run is lengthened if its energy has a trend. In the longer run the trend of a slow motion turns
+back or settles, and a drift goes on; a larger factor tells the two apart more safely and takes longer."""
 DRIFT_RATIO = 0.75
-"""Rate of the trend in the longer run, as a part of the rate in the first run, above which the trend is a drift; a larger value overlooks
-drifts that slow down."""
+"""Rate of the trend in the longer run, as a part of the rate in the first run, above which the trend is a drift; a
+larger value overlooks drifts that slow down."""
 ROUND_OFF_BAND = 1e-9
 """Relative band of the energy up to which it is round-off; a larger value overlooks small drifts."""
 SHADOW_STEPS = 2_000
@@ -58,7 +60,10 @@ ROUND_OFF = 4 * np.finfo(float).eps
 """Round-off of a position in a step, as a part of the largest position; a larger value hides differences of momenta."""
 OVERFLOWING_MOMENTUM = 1e160
 """A momentum whose square, and so its kinetic energy, overflows float64."""
-ENERGY_CRITERION = "the linear trend is at most half of the largest energy error, or flattens in a longer run, or the error is below 1e-9"
+ENERGY_CRITERION = (
+    "the linear trend is at most half of the largest energy error, or flattens in a longer run, or the error is below "
+    "1e-9"
+)
 EXPLICIT_CRITERION = "runs at omega h = 1; at 2.5 every NaN is reported as a failure"
 DERIVATIVE_CRITERION = "gradients and Hessians are those of the functions, to 1e-4"
 LANE_CRITERION = "the bad lane reports its failure, the others equal their single runs to 1e-12"
@@ -66,7 +71,8 @@ LANE_CRITERION = "the bad lane reports its failure, the others equal their singl
 
 @dataclass(frozen=True)
 class Resolved:
-    """A problem with a scheme and a macro step that resolve its fastest vibration, of frequency omega; every public method is a case."""
+    """A problem with a scheme and a macro step that resolve its fastest vibration, of frequency omega; every public
+    method is a case."""
 
     problem: Problem
     scheme: Scheme
@@ -93,7 +99,9 @@ class Resolved:
         steps = 1_000_000 if full else 10_000
         trajectory = long_run(self.problem, self.scheme, self.macro_dt, steps)
         position, velocity = constraints(trajectory)
-        part = relative_constraints(self.problem, trajectory)
+        nodes = trajectory.states
+        rows = jax.jit(jax.vmap(partial(rows_at, self.problem.system)))(nodes.t, nodes.q_s, nodes.q_f)
+        part = float(np.max(np.abs(rows.values) / rows.sizes))
         return Outcome(
             f"{steps:.0e} steps: {status(trajectory)}, |g| {position:.1e}, |G v| {velocity:.1e}",
             trajectory.success and part < 1e-10,
@@ -108,14 +116,14 @@ class Resolved:
             steps *= LONGER_RUN
             before, (trajectory, change) = change, self._energy(steps)
             trend = change.drifts and abs(change.drift) > DRIFT_RATIO * abs(before.drift)
-        e, shadow = np.asarray(trajectory.energy), drift_meter(self.problem, self.scheme, self.macro_dt, SHADOW_STEPS)
+        shadow = drift_meter(self.problem, self.scheme, self.macro_dt, SHADOW_STEPS)
         return Outcome(
-            f"{steps:.0e} steps: {status(trajectory)}, relative band {change.band:.1e}, drift {change.drift:.0e} per 1e5 steps "
-            f"({change.share:.0%} of the band over the run)"
+            f"{steps:.0e} steps: {status(trajectory)}, relative band {change.band:.1e}, drift {change.drift:.0e} per "
+            f"1e5 steps ({change.share:.0%} of the band over the run)"
             + ("" if shadow is None else f"; first {SHADOW_STEPS} steps: {shadow}"),
             trajectory.success and not trend,
             {"band": change.band, "drift_per_1e5": change.drift},
-            {"t": trajectory.t, "energy error": e - e[0]},
+            partial(draw_energy, {"": trajectory}),
         )
 
     def _energy(self, steps: int) -> tuple[Trajectory, Energy]:
@@ -147,9 +155,15 @@ class Resolved:
         )
 
     def reversal(self, full: bool) -> Outcome:
-        steps = 1_000 if full else 100
-        size = max(float(jnp.max(jnp.abs(q), initial=0.0)) for q in (self.problem.q_s, self.problem.q_f))
-        apart = reversal(self.problem, self.scheme, self.macro_dt, steps) / max(size, 1e-300)
+        """Forward and, from the end with reversed momenta, as far back."""
+        steps, apart = 1_000 if full else 100, np.inf
+        there = run(self.problem, self.scheme, self.macro_dt, steps, save=steps)
+        if there.success:
+            end = there.final_state
+            turned = State(0.0, end.q_s, end.q_f, -end.p_s, -end.p_f)
+            back = run(self.problem, self.scheme, self.macro_dt, steps, turned, save=steps)
+            start = positions(there)[0]
+            apart = difference(positions(back)[-1], start) / max(float(np.abs(start).max(initial=0.0)), 1e-300)
         return Outcome(f"{steps} steps there and back: {apart:.0e} from the start", apart < 1e-6, {"apart": apart})
 
     def explicit_limit(self, full: bool) -> Outcome:
@@ -176,7 +190,8 @@ class Resolved:
     def _from_textbook(self, scheme: Scheme, macro_dt: float, steps: int) -> float:
         """Largest difference of a run from the textbook, relative to the largest positions and momenta, less round-off.
 
-        A step divides the round-off of ``M (q_+ - q)`` by its micro step h, so that momenta have a round-off of ``eps |M| |q| / h``.
+        A step divides the round-off of ``M (q_+ - q)`` by its micro step h, so that momenta have a round-off of
+        ``eps |M| |q| / h``.
         """
         system, state = self.problem.system, self.problem.state()
         simulated = jax.jit(textbook.simulate, static_argnames="num_steps")
@@ -191,7 +206,8 @@ class Resolved:
         return max(difference(q, q_oracle) / largest_q, max(difference(p, p_oracle) - round_off, 0.0) / largest_p)
 
     def bad_lane(self, full: bool) -> Outcome:
-        """A batch whose lanes start at the nodes of a run, one of them with overflowing momenta, beside single runs of some lanes."""
+        """A batch whose lanes start at the nodes of a run, one of them with overflowing momenta, beside single runs of
+        some lanes."""
         lanes, options = 64 if full else 16, {"macro_dt": self.macro_dt, "num_steps": 20, "save": 20}
         bad = lanes // 3
         along = run(
@@ -209,7 +225,8 @@ class Resolved:
                 apart = max(apart, difference(getattr(batch, name)[lane], getattr(single, name)) / size)
         result = Result(int(batch.result[bad])).name
         return Outcome(
-            f"{lanes} lanes: lane {bad} {result}, {len(failed)} failed in all; others within {apart:.0e} of their single runs",
+            f"{lanes} lanes: lane {bad} {result}, {len(failed)} failed in all; others within {apart:.0e} of their "
+            "single runs",
             list(failed) == [bad] and apart < 1e-12,
             {"failed": len(failed), "apart": apart},
         )
@@ -218,7 +235,21 @@ class Resolved:
         return derivatives(self.problem, self.scheme, self.macro_dt)
 
     def single_precision(self, full: bool) -> Outcome:
-        return single_precision(self.problem, self.macro_dt)
+        """Whether the messages have the line that mends a run with the 64-bit mode off, and a start in float32."""
+        problem, steps = self.problem, {"macro_dt": self.macro_dt, "num_steps": 1}
+        state = problem.state()
+        q_s, q_f = (np.asarray(q, np.float32) for q in (problem.q_s, problem.q_f))
+        with jax.enable_x64(False):
+            off = refusal(lambda: simulate(problem.system, self.scheme, state, **steps))
+        data = refusal(lambda: initial_state(problem.system, q_s, q_f, problem.v_s, problem.v_f))
+        fix = 'jax.config.update("jax_enable_x64", True)' in off
+        cast = "float32" in data and "astype(float)" in data
+        return Outcome(
+            f"64-bit mode off: {'refused with the line to add' if fix else off or 'accepted'}; float32 positions: "
+            f"{'refused with the cast' if cast else data or 'accepted'}",
+            fix and cast,
+            {"mode_refused": fix, "data_refused": cast},
+        )
 
     def advice(self, full: bool) -> Outcome:
         advice = advise(self.problem, self.scheme, macro_dt=self.macro_dt)
@@ -226,10 +257,11 @@ class Resolved:
 
 
 def resolved(problem: Problem) -> Resolved:
-    """A problem with five micro steps of ``omega h = 0.2`` for its largest frequency at the start, or for the frequency of its drive if larger.
+    """A problem with five micro steps of ``omega h = 0.2`` for its largest frequency at the start, or for the frequency
+    of its drive if larger.
 
-    If nothing vibrates, ``omega = max(|q'_i| / |q_i|, sqrt(|q''_i| / |q_i|))``, the rate at which positions change by their size; 1 for a body
-    at rest without forces.
+    If nothing vibrates, ``omega = max(|q'_i| / |q_i|, sqrt(|q''_i| / |q_i|))``, the rate at which positions change by
+    their size; 1 for a body at rest without forces.
     """
     state = problem.state()
     linear = linearise(problem.system, state)
@@ -280,9 +312,8 @@ def cases_for(problem: Problem | HasProblem) -> tuple[Case, ...]:
         ("one bad lane in a batch", step, LANE_CRITERION, cases.bad_lane),
         ("derivatives", step, DERIVATIVE_CRITERION, cases.derivatives),
     ]
-    pictures = {"energy for long": draw_energy}
     return tuple(
-        Case(number, title, setup, criterion, run, pictures.get(title), "".join(reason))
+        Case(number, title, setup, criterion, run, "".join(reason))
         for number, (title, setup, criterion, run, *reason) in enumerate(rows, start=1)
     )
 
@@ -306,7 +337,8 @@ def _has_no_limit(system: System) -> str:
 
 
 def _turns_one_way(problem: Problem) -> str:
-    """The reason why reversed momenta do not lead a closed system back to the start; empty if its kinetic energy is even in the velocities."""
+    """The reason why reversed momenta do not lead a closed system back to the start; empty if its kinetic energy is
+    even in the velocities."""
     random, system = np.random.default_rng(0), problem.system
     v_s, v_f = (random.uniform(-1, 1, q.shape) for q in (problem.q_s, problem.q_f))
     there, back = (float(system.kinetic_energy(problem.q_s, problem.q_f, v_s * x, v_f * x)) for x in (1, -1))

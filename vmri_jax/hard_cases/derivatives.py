@@ -4,8 +4,8 @@ With s(z) a function of positions (and velocities), or a weighted sum of its com
 
     grad s(z) . d = (8 (s(z + h d) - s(z - h d)) - (s(z + 2 h d) - s(z - 2 h d))) / (12 h) + O(h^4)
 
-must hold for at least one h: higher derivatives spoil a large h, round-off a small one. The second derivative of a potential is
-compared with differences of the gradient in the same way, and must be symmetric.
+must hold for at least one h: higher derivatives spoil a large h, round-off a small one. The second derivative of a
+potential is compared with differences of the gradient in the same way, and must be symmetric.
 """
 
 from collections.abc import Callable, Iterator
@@ -26,10 +26,11 @@ DIRECTIONS = 6
 STEPS = 10.0 ** -np.arange(2, 7)
 """Values of h, in units of the largest position."""
 DISPLACEMENT = 1e-4
-"""Largest random displacement of the points, as a part of the largest position: a function with a bend exactly at a point has no derivative
-there. A larger value leaves the states of the run."""
+"""Largest random displacement of the points, as a part of the largest position: a function with a bend exactly at a
+point has no derivative there. A larger value leaves the states of the run."""
 WRONG = 1e-4
-"""Relative difference from which a derivative is wrong; right derivatives differ by at most 1e-7. A larger value overlooks small errors."""
+"""Relative difference from which a derivative is wrong; right derivatives differ by at most 1e-7. A larger value
+overlooks small errors."""
 ROUND_OFF = 1e-14
 """Round-off of a difference of values, as a part of the value; a larger value hides errors of small derivatives."""
 
@@ -49,15 +50,17 @@ def derivatives(problem: Problem, scheme: Scheme, macro_dt: float) -> Outcome:
         return Outcome(f"at most {largest:.0e} from differences", True, {"apart": largest})
     words = "; ".join(f"{comparison} differs by {difference:.2g}" for comparison, difference in wrong.items())
     return Outcome(
-        f"relative to its size, {words}. Likely cause: a custom derivative (jax.custom_jvp, custom_vjp) that differs from the derivative of "
-        "the function, or jax.lax.stop_gradient, which hides a part of it. Forces without a potential belong into force.",
+        f"relative to its size, {words}. Likely cause: a custom derivative (jax.custom_jvp, custom_vjp) that differs "
+        "from the derivative of the function, or jax.lax.stop_gradient, which hides a part of it. Forces without a "
+        "potential belong into force.",
         False,
         {"apart": largest},
     )
 
 
 def _terms(problem: Problem, scheme: Scheme, macro_dt: float) -> Iterator[tuple[str, Callable, np.ndarray]]:
-    """The functions of the system by name, each as a function of a vector, ``function(z) -> (m,)``, with (k, n) points z.
+    """The functions of the system by name, each as a function of a vector, ``function(z) -> (m,)``, with (k, n) points
+    z.
 
     The points are the start and nodes of a short run up to a failure.
     """
@@ -79,12 +82,15 @@ def _terms(problem: Problem, scheme: Scheme, macro_dt: float) -> Iterator[tuple[
 
 
 def _differences(function: Callable, points: np.ndarray) -> tuple[float, float, float]:
-    """Largest relative differences over all points: of the gradient and of the second derivative from differences, and of the second
-    derivative from its transpose."""
+    """Largest relative differences over all points: of the gradient and of the second derivative from differences, and
+    of the second derivative from its transpose."""
     random = np.random.default_rng(0)
     size = float(np.abs(points).max(initial=0.0)) or 1.0
     points = points + DISPLACEMENT * size * random.uniform(-1, 1, points.shape)
     directions = random.uniform(-1, 1, (DIRECTIONS, points.shape[1]))
+
+    if not points.shape[1]:
+        return 0.0, 0.0, 0.0
 
     def value(z):
         values = function(z)
@@ -93,39 +99,32 @@ def _differences(function: Callable, points: np.ndarray) -> tuple[float, float, 
     @jax.jit
     @jax.vmap
     def compared(z):
-        d = jnp.asarray(directions)
-        gradient = jax.grad(value)
+        d, gradient = jnp.asarray(directions), jax.grad(value)
         gradients, second_derivatives = jax.lax.map(lambda x: jax.jvp(gradient, (z,), (x,)), d)  # grad s and s'' d
-        quotients, gradient_quotients = (_quotients(f, z, d, size) for f in (value, gradient))
+        first = _from_quotients(value, z, d, jnp.sum(gradients * d, axis=1), size)
+        second = _from_quotients(gradient, z, d, second_derivatives, size)
         bilinear = second_derivatives @ d.T  # d_i . s'' d_j
-        first = _smallest_difference(jnp.sum(gradients * d, axis=1), quotients, jnp.abs(value(z)) / size)
-        second = _smallest_difference(second_derivatives, gradient_quotients, jnp.abs(gradient(z)).max() / size)
         scale = jnp.abs(bilinear).max() + ROUND_OFF * jnp.abs(gradient(z)).max() / size
         return first, second, jnp.abs(bilinear - bilinear.T).max() / jnp.where(scale > 0, scale, 1.0)
 
-    if not points.shape[1]:
-        return 0.0, 0.0, 0.0
     first, second, asymmetry = (float(np.max(np.asarray(x))) for x in compared(jnp.asarray(points)))
     return first, second, asymmetry
 
 
-def _quotients(f: Callable, z, directions, size: float):
-    """Difference quotients of order 4 of f along every direction for every h, (STEPS, DIRECTIONS, ...)."""
+def _from_quotients(f: Callable, z, directions, derivatives, size: float):
+    """Relative difference of the derivatives (DIRECTIONS, ...) of f from its quotients of order 4, for the h with the
+    smallest one.
+
+    Less the round-off, which the size of the values divided by the size of the positions sets.
+    """
 
     def quotient(h, d):
         near, far = (f(z + k * h * d) - f(z - k * h * d) for k in (1, 2))
         return (8 * near - far) / (12 * h)
 
-    return jax.lax.map(lambda h: jax.lax.map(lambda d: quotient(h, d), directions), jnp.asarray(STEPS * size))
-
-
-def _smallest_difference(derivative, quotients, value_per_size):
-    """Relative difference of a derivative (DIRECTIONS, ...) from its quotients (STEPS, DIRECTIONS, ...) for the h with the smallest one.
-
-    Less the round-off, which the size of the values divided by the size of the positions sets.
-    """
-    difference = jnp.abs(quotients - derivative).reshape(len(STEPS), -1).max(axis=1)
+    quotients = jax.lax.map(lambda h: jax.lax.map(lambda d: quotient(h, d), directions), jnp.asarray(STEPS * size))
+    difference = jnp.abs(quotients - derivatives).reshape(len(STEPS), -1).max(axis=1)
     difference = jnp.where(jnp.isfinite(difference), difference, jnp.inf)
-    difference = jnp.maximum(difference - ROUND_OFF * value_per_size / STEPS, 0.0)
-    scale = jnp.maximum(jnp.abs(derivative).max(), jnp.abs(quotients[2]).max())
+    difference = jnp.maximum(difference - ROUND_OFF * jnp.abs(f(z)).max() / size / STEPS, 0.0)
+    scale = jnp.maximum(jnp.abs(derivatives).max(), jnp.abs(quotients[2]).max())
     return jnp.min(difference) / jnp.where(scale > 0, scale, 1.0)

@@ -6,12 +6,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from matplotlib.figure import Figure
 from rich.text import Text
 
 from vmri_jax import plots
 from vmri_jax.hard_cases.case import Case, Outcome
 from vmri_jax.hard_cases.cases import cases_for
 from vmri_jax.mechanics.state import HasProblem, Problem
+from vmri_jax.refusals import Refused
 from vmri_jax.running.interrupts import Interrupted
 from vmri_jax.running.printed import PrintedTable
 from vmri_jax.running.progress import ShowsProgress, progress_to
@@ -60,10 +62,9 @@ class Report(ResultTable):
         """The rows, with lines between them, for the terminal."""
         return rich_table(self.columns, self.rows, ruled=True)
 
-    def pictures(self, theme: plots.Theme = plots.LIGHT) -> dict:
+    def pictures(self) -> dict[str, Figure]:
         """Figures by the title of the case, for all cases with a picture."""
-        drawn = [(row.case.title, row.case.draw, row.details) for row in self.rows]
-        return {title: draw(details, theme) for title, draw, details in drawn if draw is not None and details}
+        return {row.case.title: row.picture() for row in self.rows if row.picture is not None}
 
     def write(self, folder: str | Path) -> list[Path]:
         """Write cases.csv and the pictures into a folder, made if it does not exist; returns their paths."""
@@ -104,8 +105,8 @@ def run_cases(
         cases: e.g. ``cases_for(problem)``.
         numbers: numbers of the cases to run; all cases by default.
         full: whether to run the full form instead of the quick one.
-        progress: True for a bar, or a function of (what, done, total), called before every case and at the end; with False a case that takes
-            more than two seconds prints a line.
+        progress: True for a bar, or a function of (what, done, total), called before every case and at the end; with
+            False a case that takes more than two seconds prints a line.
 
     Raises:
         ValueError: a number that no case has.
@@ -114,7 +115,7 @@ def run_cases(
     known = [case.number for case in cases]
     unknown = sorted(set(numbers) - set(known))
     if unknown:
-        raise ValueError(f"run_cases: there is no case {', '.join(map(str, unknown))}; they go from 1 to {max(known)}.")
+        raise Refused(f"run_cases: there is no case {', '.join(map(str, unknown))}; they go from 1 to {max(known)}.")
     chosen, rows = [case for case in cases if not numbers or case.number in numbers], []
     with progress_to("check", progress) as tell:
         for k, case in enumerate(chosen):

@@ -8,12 +8,13 @@ comes from `cpu` in both cases.
 import os
 
 from vmri_jax.kernels import cpu, plain
+from vmri_jax.refusals import Refused
 
 CHOICES = {"plain": plain, "cpu": cpu}
 
 _name = os.environ.get("VMRI_KERNELS", "cpu")
 if _name not in CHOICES:
-    raise ValueError(f"VMRI_KERNELS is {_name!r}; it must be one of {', '.join(CHOICES)}.")
+    raise Refused(f"VMRI_KERNELS is {_name!r}; it must be one of {', '.join(CHOICES)}.")
 _chosen = CHOICES[_name]
 
 inverse = _chosen.inverse

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from vmri_jax.mechanics.functions import TracedOnce
+from vmri_jax.refusals import Refused
 
 Numbers: TypeAlias = Any
 """Arrays in annotations: ``Float[Numbers, "n_s"]`` is an array of n_s floats, of JAX or of NumPy."""
@@ -98,7 +99,7 @@ def of_one_type(tree):
 def require_x64() -> None:
     """Raise unless JAX's 64-bit mode is on."""
     if jnp.result_type(float) != np.float64:
-        raise ValueError(
+        raise Refused(
             "vmri_jax needs 64-bit floats: Newton and the constraints are solved to round-off. Switch them on at the start "
             "of the program with vm.configure() (vm is vmri_jax), which also makes runs fast, or with "
             'jax.config.update("jax_enable_x64", True).'
@@ -121,7 +122,7 @@ def check_precision(name: str, value) -> None:
         if is_short(leaf):
             if isinstance(leaf, jax.Array):
                 require_x64()
-            raise ValueError(f"{name} has dtype {leaf.dtype}; {ADVICE}.")
+            raise Refused(f"{name} has dtype {leaf.dtype}; {ADVICE}.")
 
 
 def real_array(name: str, value, ndim: int | None = None):
@@ -141,12 +142,12 @@ def real_array(name: str, value, ndim: int | None = None):
         array = np.asarray(value)
     else:
         if is_concrete(value) and not (is_short(value) or _is_real(value)):
-            raise TypeError(f"{name} is {value!r}; {advice}.")
+            raise Refused(f"{name} is {value!r}; {advice}.")
         check_precision(name, value)
         is_jax = isinstance(value, jax.Array) or not is_concrete(value)
         array = (jnp if is_jax else np).asarray(value, dtype=float)
     if ndim is not None and array.ndim != ndim:
-        raise ValueError(f"{name} has shape {array.shape}; {advice}.")
+        raise Refused(f"{name} has shape {array.shape}; {advice}.")
     return array
 
 
@@ -168,5 +169,5 @@ def whole_number(name: str, value, least: int = 1, otherwise: str = "") -> int:
         ValueError: another value.
     """
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
-        raise ValueError(f"{name} is {value!r}; it must be an integer of at least {least}{otherwise}.")
+        raise Refused(f"{name} is {value!r}; it must be an integer of at least {least}{otherwise}.")
     return int(value)

@@ -18,6 +18,7 @@ from vmri_jax.mechanics.order import InOrder, Order, in_order
 from vmri_jax.mechanics.slots import Slots
 from vmri_jax.mechanics.system import System
 from vmri_jax.mechanics.terms import Term
+from vmri_jax.refusals import Refused
 
 
 @dataclass(frozen=True)
@@ -106,7 +107,7 @@ def _flat_mass(name: str, mass, slots: Slots | None):
     if not isinstance(mass, Mapping):
         return mass
     if slots is None:
-        raise ValueError(
+        raise Refused(
             f"ConstantMass: {name} has masses by name, {', '.join(mass)}, but the {name} coordinates are a vector; give both as dictionaries, "
             "or both as arrays."
         )

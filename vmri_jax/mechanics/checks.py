@@ -1,7 +1,6 @@
 """Checks of user input before any computation; messages name the value, the expected value and a remedy."""
 
 import hashlib
-import linecache
 import re
 import traceback
 from collections.abc import Callable
@@ -21,6 +20,7 @@ from vmri_jax.mechanics.masses import ConstantMass
 from vmri_jax.mechanics.order import order_of, ordered
 from vmri_jax.mechanics.surroundings import name_of
 from vmri_jax.mechanics.system import System
+from vmri_jax.refusals import Refused
 
 
 def check_arrays(**arrays):
@@ -29,15 +29,13 @@ def check_arrays(**arrays):
     for name, value in arrays.items():
         array = real_array(name, value)
         if array.ndim != 1:
-            raise ValueError(f"{name} has shape {array.shape}; it must be a vector of coordinates, shape (n,).")
+            raise Refused(f"{name} has shape {array.shape}; it must be a vector of coordinates, shape (n,).")
         if is_concrete(array) and not np.isfinite(array).all():
-            raise ValueError(
-                f"{name} has entries that are not finite at {np.flatnonzero(~np.isfinite(array)).tolist()}."
-            )
+            raise Refused(f"{name} has entries that are not finite at {np.flatnonzero(~np.isfinite(array)).tolist()}.")
         out[name] = array
     for a, b in (("q_s", "v_s"), ("q_f", "v_f"), ("q_s", "p_s"), ("q_f", "p_f")):
         if a in out and b in out and out[a].shape != out[b].shape:
-            raise ValueError(f"{b} has shape {out[b].shape}, {a} has {out[a].shape}; they must be equal.")
+            raise Refused(f"{b} has shape {out[b].shape}, {a} has {out[a].shape}; they must be equal.")
     return tuple(out.values())
 
 
@@ -45,7 +43,7 @@ def check_number(name: str, value):
     """A finite real number, as an array of shape ()."""
     array = real_array(name, value, 0)
     if is_concrete(array) and not np.isfinite(array):
-        raise ValueError(f"{name} is {value}; it must be finite.")
+        raise Refused(f"{name} is {value}; it must be finite.")
     return array
 
 
@@ -53,13 +51,13 @@ def check_flags(**flags) -> None:
     """Refuse values that are neither True nor False: Python would read an array or a text as one of them."""
     for name, value in flags.items():
         if not isinstance(value, bool | np.bool_):
-            raise TypeError(f"{name} is {value!r}; it must be True or False.")
+            raise Refused(f"{name} is {value!r}; it must be True or False.")
 
 
 def check_type(name: str, value, kind: type | UnionType, example: str) -> None:
     """Refuse objects of another class; `example` in the message names a right object."""
     if not isinstance(value, kind):
-        raise TypeError(f"{name} is {type(value).__name__}; give {example}.")
+        raise Refused(f"{name} is {type(value).__name__}; give {example}.")
 
 
 def check_params(params) -> None:
@@ -72,13 +70,13 @@ def check_params(params) -> None:
         name = f"System: params{jax.tree_util.keystr(path)}"
         check_precision(name, leaf)
         if is_concrete(leaf) and getattr(leaf, "dtype", np.asarray(leaf).dtype).kind not in "biufc":
-            raise TypeError(
+            raise Refused(
                 f"{name} is {leaf!r}; give arrays of numbers, which are handed to every function. Keep all other objects "
                 "inside the functions. A class of your own becomes a pytree by "
                 "jax.tree_util.register_dataclass or as an equinox.Module."
             )
         if is_concrete(leaf) and not np.isfinite(leaf).all():
-            raise ValueError(f"{name} is {leaf}, which is not finite; every function would be handed it.")
+            raise Refused(f"{name} is {leaf}, which is not finite; every function would be handed it.")
 
 
 def check_system(system: System, q_s, q_f) -> None:
@@ -87,26 +85,24 @@ def check_system(system: System, q_s, q_f) -> None:
     if isinstance(system.kinetic, ConstantMass):
         for name, mass, n in (("slow", system.kinetic.slow_mass, n_s), ("fast", system.kinetic.fast_mass, n_f)):
             if mass.size != n:
-                raise ValueError(f"ConstantMass: {name} is for {mass.size} coordinates, the state has {n} {name} ones.")
+                raise Refused(f"ConstantMass: {name} is for {mass.size} coordinates, the state has {n} {name} ones.")
     values = {"t": jnp.zeros(()), "q_s": q_s, "q_f": q_f, "v_s": q_s, "v_f": q_f}
     for term in system.terms:
         name = f"System: {term.place}"
         shape = shape_of(name, term.function, *term.of_arguments(values), system.params)
         if term.kind in ("kinetic", "potential") and getattr(shape, "shape", None) != ():
-            raise ValueError(f"{name} returns {describe(shape)}; it must return a scalar, shape ().")
+            raise Refused(f"{name} returns {describe(shape)}; it must return a scalar, shape ().")
         if term.kind in ("constraint", "implied") and len(getattr(shape, "shape", ())) != 1:
-            raise ValueError(
-                f"{name} returns {describe(shape)}; it must return a vector, shape (n_g,), or rows by name."
-            )
+            raise Refused(f"{name} returns {describe(shape)}; it must return a vector, shape (n_g,), or rows by name.")
         is_pair = isinstance(shape, tuple) and [getattr(s, "shape", None) for s in shape] == [(n_s,), (n_f,)]
         if term.kind == "force" and not is_pair:
-            raise ValueError(
+            raise Refused(
                 f"{name} returns {describe(shape)}; it must return (F_s, F_f) of shapes ({n_s},) and ({n_f},)."
             )
         for part in shape if isinstance(shape, tuple) else (shape,):
             _check_float64(term.place, part)
     if system.implied is not None and not system.is_constrained:
-        raise ValueError(
+        raise Refused(
             "System: implied is given, but neither constraint nor slow_constraint: its rows are watched, not solved for, and must "
             "follow from rows that are. Give it as constraint."
         )
@@ -139,17 +135,17 @@ def shape_of(name: str, function: Callable, *args):
     try:
         shape = jax.eval_shape(differentiated_twice, *args)
     except (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError) as error:
-        raise ValueError(
+        raise Refused(
             f"{name} cannot be traced{_line_of(error)}: JAX knows shapes there, no numbers. Use jax.numpy (jnp.sin) instead of "
             "numpy and math, jnp.where(condition, a, b) instead of if, and no float(...) or int(...)."
         ) from None
     except Exception as error:
         if "custom_vjp" in str(error) or "custom_lin" in str(error):
-            raise ValueError(
+            raise Refused(
                 f"{name} has no derivative in forward mode{_line_of(error)}: implicit steps take second derivatives, "
                 "which a jax.custom_vjp does not give. Use jax.custom_jvp, which gives both modes."
             ) from error
-        raise ValueError(
+        raise Refused(
             f"{name} could not be evaluated on arguments of shapes "
             f"{[getattr(a, 'shape', type(a).__name__) for a in args[:-1]]} and {'params=None' if args[-1] is None else 'the params'}"
             f"{_line_of(error)}: {type(error).__name__}: {error}"
@@ -160,7 +156,7 @@ def shape_of(name: str, function: Callable, *args):
             traced_once(called), structure, tuple((np.shape(leaf), jnp.result_type(leaf)) for leaf in leaves)
         )
         if fault:
-            raise ValueError(f"{name} {fault}.")
+            raise Refused(f"{name} {fault}.")
     return shape
 
 
@@ -215,7 +211,7 @@ def _line_of(error: Exception) -> str:
 
 def _check_float64(name: str, value) -> None:
     if value.dtype != np.float64:
-        raise ValueError(
+        raise Refused(
             f"System: {name} returns {value.dtype}; it must return float64. Whole numbers become floats as 0.0 instead of 0, "
             "arrays by .astype(float)."
         )
@@ -226,14 +222,3 @@ def describe(value) -> str:
     if isinstance(value, tuple):
         return "(" + ", ".join(describe(v) for v in value) + ")"
     return f"shape {value.shape}" if hasattr(value, "shape") else type(value).__name__
-
-
-def is_refusal(error: Exception) -> bool:
-    """Whether an error is a refusal: a ValueError, TypeError, or ImportError (missing optional package) from a ``raise`` of this package.
-
-    Errors of other libraries, and of Python itself (e.g. of ``zip(strict=True)``), are faults.
-    """
-    frame, line = list(traceback.walk_tb(error.__traceback__))[-1]
-    in_package = frame.f_globals.get("__name__", "").partition(".")[0] == "vmri_jax"
-    raised = linecache.getline(frame.f_code.co_filename, line).lstrip().startswith("raise ")
-    return isinstance(error, ValueError | TypeError | ImportError) and in_package and raised

@@ -26,6 +26,7 @@ from vmri_jax.mechanics.masses import correlation
 from vmri_jax.mechanics.projection import legendre, mass_diagonal, mass_matrix
 from vmri_jax.mechanics.system import System
 from vmri_jax.mechanics.terms_of_rows import sizes_of_terms
+from vmri_jax.refusals import Refused
 
 START = 1e-9
 """Largest value of a row at the start, relative to its size. A larger one would start runs off the constraints; a smaller one would refuse numbers
@@ -191,9 +192,7 @@ def check_mass(system: System, q_s, q_f) -> None:
         velocities = (SPEED * random.normal(size=np.size(q)) for q in (q_s, q_f))
         mass = np.asarray(_mass_matrix(system, q_s, q_f, *velocities))
     if not np.isfinite(mass).all():
-        raise ValueError(
-            "System: the mass matrix d2T/dv2 of kinetic is not finite at these positions (a norm at zero?)."
-        )
+        raise Refused("System: the mass matrix d2T/dv2 of kinetic is not finite at these positions (a norm at zero?).")
     values, vectors = np.linalg.eigh(correlation(mass))
     without = (
         np.abs(vectors[:, values <= LEAST_EIGENVALUE * np.abs(values).max()]).max(axis=1, initial=0.0)
@@ -202,7 +201,7 @@ def check_mass(system: System, q_s, q_f) -> None:
     if without.any():
         n_s = np.size(q_s)
         names = [f"q_s[{i}]" if i < n_s else f"q_f[{i - n_s}]" for i in np.flatnonzero(without)]
-        raise ValueError(
+        raise Refused(
             f"System: the mass matrix d2T/dv2 of kinetic is not positive definite at these positions, along {', '.join(names)} "
             f"(with a diagonal of ones, its eigenvalues go from {values[0]:.3g} to {values[-1]:.3g}). Give every coordinate a mass, one that "
             "constraints move too."
@@ -241,9 +240,9 @@ def check_constraints(
     rows, weights = jax.device_get(_rows_and_weights(system, state.t, state.q_s, state.q_f))
     solved = rows.values[: n_g + n_gs]
     if not np.isfinite(solved).all():
-        raise ValueError(f"{place}: the constraints are {solved} there, which is not finite.")
+        raise Refused(f"{place}: the constraints are {solved} there, which is not finite.")
     if not (np.isfinite(rows.gradients).all()):
-        raise ValueError("System: the Jacobian of the constraints is not finite at these positions (a norm at zero?).")
+        raise Refused("System: the Jacobian of the constraints is not finite at these positions (a norm at zero?).")
 
     def gradients(rows: Rows):
         """dg/dq_s, dg/dq_f and dg_slow/dq_s over the weights."""
@@ -256,14 +255,14 @@ def check_constraints(
         _check_gradients(system, state, rows, weights, in_words)  # of a square, which no start fulfils to round-off
         worst = int(np.argmax(np.abs(solved) / np.where(violated, allowed, np.inf)))
         row = in_words([worst], "constraint") if worst < n_g else in_words([worst - n_g], "slow_constraint")
-        raise ValueError(
+        raise Refused(
             f"{place} violate {'constraint' if worst < n_g else 'slow_constraint'}, row {row.strip('[]')}, by {abs(solved[worst]):.3e} (allowed: "
             f"{allowed[worst]:.0e}, {tolerance:.0e} of its size, and round-off); {advice}"
         )
     implied, allowed = rows.values[n_g + n_gs :], rows.allowed(CONSTRAINT_TOLERANCE)[n_g + n_gs :]
     opened = np.flatnonzero(~(np.abs(implied) <= allowed))
     if opened.size:
-        raise ValueError(
+        raise Refused(
             f"System: implied does not follow from the constraints: {place} keep these, and row(s) {opened.tolist()} of implied are "
             f"{implied[opened]} there (allowed: {allowed[opened]}). Take parameters for which they follow, or hold them as constraint."
         )
@@ -271,7 +270,7 @@ def check_constraints(
     size = np.linalg.norm(np.concatenate([slow, fast], axis=1), axis=1)
     slow_only = np.flatnonzero((size > 0) & (np.linalg.norm(fast, axis=1) <= LEAST_FAST_PART * size))
     if slow_only.size:
-        raise ValueError(
+        raise Refused(
             f"System: row(s) {in_words(slow_only, 'constraint')} of constraint do not depend on the fast variables q_f. {MICRO_GRID} "
             "Give them as System(slow_constraint=...), a function of (q_s, params), which is held at the macro nodes; or make the "
             "variables that they hold fast."
@@ -298,7 +297,7 @@ def _check_gradients(system: System, state, rows: Rows, weights, in_words) -> No
     parts = {"constraint": vanishes[:n_g], "slow_constraint": vanishes[n_g : n_g + n_gs]}
     for name, rows_of_name in parts.items():
         if rows_of_name.any():
-            raise ValueError(
+            raise Refused(
                 f"System: the gradient of row(s) {in_words(np.flatnonzero(rows_of_name), name)} of {name} vanishes at these positions, and no force "
                 "along it can hold the constraint. A square, (|x| - L)**2, has such a gradient wherever it is 0: take its root, |x| - L."
             )
@@ -312,11 +311,11 @@ def _rows_and_weights(system, t, q_s, q_f):
 def _check_counts(fast, alone) -> None:
     (n_g, n_f), (n_gs, n_s) = fast.shape, alone.shape
     if n_gs > n_s:
-        raise ValueError(
+        raise Refused(
             f"System: slow_constraint returns {n_gs} values for {n_s} slow variables; at most {n_s} can be satisfied."
         )
     if n_g > n_f:
-        raise ValueError(
+        raise Refused(
             f"System: constraint returns {n_g} values for {n_f} fast variables; at most {n_f} can be satisfied. {MICRO_GRID} "
             "Remove rows, or make the variables that they hold fast."
         )
@@ -336,7 +335,7 @@ def _rows_in_words(constraint, rows, *arguments) -> str:
 def _check_rank(name: str, jacobian, of: str, in_words) -> None:
     rank, dependent = rank_of(jacobian)
     if dependent:
-        raise ValueError(
+        raise Refused(
             f"System: rows {in_words(dependent, name)} of {name} depend on each other: {len(jacobian)} rows have rank {rank} in the {of} Remove "
             "redundant ones of these rows, or make the variables they need fast."
         )

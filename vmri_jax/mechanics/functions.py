@@ -11,6 +11,7 @@ import jax
 
 from vmri_jax.mechanics.order import Order, ordered
 from vmri_jax.mechanics.surroundings import Surroundings, innermost, name_of
+from vmri_jax.refusals import Refused
 
 COPIES_UNTIL_WARNING = 5
 """Number of surroundings of one piece of code, each compiled anew, at which the user is warned. A larger number warns late; a smaller one warns
@@ -54,7 +55,7 @@ class TracedOnce:
         """The value of the function, by its Python code."""
         around = Surroundings(self.function)
         if self.seen not in (None, around.key):
-            raise ValueError(
+            raise Refused(
                 f"{name_of(self)} reads something else from around it than when its run was made. Make the run again; what varies is better "
                 "handed over in params."
             )
@@ -176,7 +177,7 @@ def check_arguments(place: str, function: Callable, arguments: str, instead: str
     else:
         advice = "Give it all of these arguments in this order, whether it uses them or not."
     name = getattr(function, "__name__", type(function).__name__)
-    raise TypeError(f"{place} is {name}{signature}; it is called with ({arguments}). {advice}")
+    raise Refused(f"{place} is {name}{signature}; it is called with ({arguments}). {advice}")
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=["function"], meta_fields=[])
@@ -196,4 +197,4 @@ class Rheonomic:
 
     def __post_init__(self):
         if not callable(self.function):
-            raise TypeError(f"Rheonomic: function is {self.function!r}; give a function of (t, q_s, q_f, params).")
+            raise Refused(f"Rheonomic: function is {self.function!r}; give a function of (t, q_s, q_f, params).")

@@ -25,6 +25,7 @@ from vmri_jax.mechanics.motion import motion
 from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.state import Movable, State, opened, start_of
 from vmri_jax.mechanics.system import System
+from vmri_jax.refusals import Refused
 
 LEAST_GROWTH = 1e-6
 """Growth rate up to which a motion does not grow, as a part of the largest rate: round-off of the eigenvalues. A larger value takes slowly
@@ -218,7 +219,7 @@ def linearise(system: Movable, state: State | None = None, names: Names | None =
     terms = jax.tree.map(np.asarray, _expansion(system, state))
     broken = [name for name, term in terms.items() if not all(np.isfinite(part).all() for part in term)]
     if broken:
-        raise ValueError(
+        raise Refused(
             f"linearise: the expansion of {', '.join(broken)} is not finite at the state (a norm at zero, a point "
             "outside a function's domain?). Give a state where second derivatives exist."
         )

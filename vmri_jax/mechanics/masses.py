@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from vmri_jax import kernels
 from vmri_jax.mechanics.arrays import Numbers, is_concrete, real_array
+from vmri_jax.refusals import Refused
 
 
 class MassMatrix(eqx.Module):
@@ -98,24 +99,24 @@ def _masses(name: str, masses):
     if masses.ndim == 1:
         return _positive(name, masses)
     if masses.ndim != 2 or masses.shape[0] != masses.shape[1]:
-        raise ValueError(f"{name} has shape {masses.shape}; give (n,) masses or an (n, n) mass matrix.")
+        raise Refused(f"{name} has shape {masses.shape}; give (n,) masses or an (n, n) mass matrix.")
     if is_concrete(masses):
         with np.errstate(invalid="ignore"):  # of infinities, which are not symmetric below
             scaled = correlation(np.asarray(masses))
         if not np.allclose(scaled, scaled.T) or np.any(np.linalg.eigvalsh(scaled) <= 0):
-            raise ValueError(f"{name} must be a symmetric positive definite matrix.")
+            raise Refused(f"{name} must be a symmetric positive definite matrix.")
     return masses
 
 
 def _positive(name: str, masses):
     if is_concrete(masses) and not (np.isfinite(masses).all() and np.all(np.asarray(masses) > 0)):
-        raise ValueError(f"{name} = {masses}; every mass must be positive and finite.")
+        raise Refused(f"{name} = {masses}; every mass must be positive and finite.")
     return masses
 
 
 def _operator(masses) -> MassMatrix:
     if isinstance(masses, dict):
-        raise ValueError(
+        raise Refused(
             f"ConstantMass: the masses of {', '.join(masses)} are given by name, and the sizes of these bodies are not known. Give the start "
             "as dictionaries, too: vmri_jax.Problem(system, q_s={...}, q_f={...})."
         )

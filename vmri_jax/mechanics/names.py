@@ -12,6 +12,7 @@ from vmri_jax.mechanics.kinematics import Kinematics
 from vmri_jax.mechanics.rows import Part, Place
 from vmri_jax.mechanics.slots import Slots
 from vmri_jax.mechanics.system import System
+from vmri_jax.refusals import Refused
 
 AXES = "xyz"
 """Coordinates of a point of two or three dimensions."""
@@ -58,13 +59,13 @@ class Names:
             sizes = getattr(self, field_name)
             named = isinstance(sizes, Mapping) and all(isinstance(name, str) for name in sizes)
             if not (named and all(isinstance(n, tuple) or (isinstance(n, int) and n > 0) for n in sizes.values())):
-                raise TypeError(
+                raise Refused(
                     f"Names: {field_name} is {sizes!r}; give a dictionary of names and sizes in the order of the coordinates or "
                     "rows, e.g. {'hook': 2, 'load': 2}."
                 )
         both = sorted(set(self.slow) & set(self.fast))
         if both:
-            raise ValueError(f"Names: {', '.join(both)} in slow and in fast; give every body one place.")
+            raise Refused(f"Names: {', '.join(both)} in slow and in fast; give every body one place.")
 
     def slots(self, part: Part) -> Slots:
         """The bodies in q_s or q_f."""
@@ -127,7 +128,7 @@ class Names:
         """
         places = {**self.bodies, **self.carried}
         if body not in places:
-            raise ValueError(unknown("body", body, places))
+            raise Refused(unknown("body", body, places))
         return places[body]
 
     def of(self, system: System, n_s: int, n_f: int) -> "Names":
@@ -156,7 +157,7 @@ class Names:
             complete[name] = dict(getattr(self, name)) or ({plain: number} if number else {})
             size = Slots.of_sizes(complete[name]).size
             if size != number:
-                raise ValueError(
+                raise Refused(
                     f"Names: {name} is {complete[name]}, which names {size}; the system has {number}. The sizes must add up to that."
                 )
         return replace(self, **complete)

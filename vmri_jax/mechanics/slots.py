@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from vmri_jax.mechanics.arrays import library, real_array
+from vmri_jax.refusals import Refused
 
 
 @dataclass(frozen=True)
@@ -29,9 +30,7 @@ class Slots:
         """
         for body in arrays:
             if not isinstance(body, str) or not body:
-                raise TypeError(
-                    f"{name} has the key {body!r}; give arrays by names of bodies, {{'load': [0.0, -5.0]}}."
-                )
+                raise Refused(f"{name} has the key {body!r}; give arrays by names of bodies, {{'load': [0.0, -5.0]}}.")
         return cls(tuple((body, real_array(f"{name}[{body!r}]", array).shape) for body, array in arrays.items()))
 
     @classmethod
@@ -74,7 +73,7 @@ class Slots:
         """
         bodies = dict(self.shapes)
         if not arrays.keys() <= bodies.keys() or (not zeros and arrays.keys() != bodies.keys()):
-            raise ValueError(
+            raise Refused(
                 f"{name} has the keys {', '.join(map(str, arrays)) or 'none'}; give {', '.join(bodies) or 'none'}."
             )
         pieces = []
@@ -87,7 +86,7 @@ class Slots:
                 value = value.reshape(*seen, *(1,) * (len(shape) - value.ndim))
             if value.shape != shape and not (per_row and _repeats(value.shape, shape)):
                 row = f"one number, an array {shape[:1]} with a number for each row, or" if per_row and shape else ""
-                raise ValueError(
+                raise Refused(
                     f"{name}[{body!r}] has shape {seen}, and the position has {shape}; give {row or 'an array of'} shape {shape}."
                 )
             pieces.append(library(value).broadcast_to(value, shape).reshape(-1))

@@ -22,6 +22,7 @@ from vmri_jax.mechanics.rows import Part
 from vmri_jax.mechanics.slots import Slots
 from vmri_jax.mechanics.summary import coordinates, has_values, listed, numbers, summary
 from vmri_jax.mechanics.system import System
+from vmri_jax.refusals import Refused
 
 REPORTED_VIOLATION = 1e-6
 """Violation of the constraints by the velocities, relative to their norm (of the kinetic energy), above which a warning is given. A smaller value
@@ -99,14 +100,14 @@ def initial_state(
     check_type("initial_state: system", system, System, f"a vmri_jax.Problem, a scene, or {A_SYSTEM}")
     q_s, q_f, v_s, v_f, t = start.values()
     if q_s is None or q_f is None:
-        raise TypeError(
+        raise Refused(
             "initial_state: a System has no start; give q_s and q_f, or a Problem(system, q_s, q_f, v_s, v_f) alone."
         )
     check_params(system.params)
     system = of_one_type(system)
     for name, value in start.items():
         if isinstance(value, Mapping):
-            raise TypeError(
+            raise Refused(
                 f"initial_state: {name} is a dictionary; give real numbers, or Problem(system, q_s, q_f, v_s, v_f).state(): a problem "
                 "knows the order of the bodies."
             )
@@ -151,7 +152,7 @@ def _checked_start(known: Known, project: bool, tolerance: float) -> tuple[State
     )
     check_constraints(system, state, "initial_state: the initial positions", tolerance, advice)
     if not all(np.isfinite(p).all() for p in (state.p_s, state.p_f)):
-        raise ValueError(
+        raise Refused(
             "initial_state: the momenta are not finite. The mass matrix d2T/dv2 or the constraint Jacobian is "
             "singular at the initial positions, or a function returned NaN there."
         )
@@ -183,7 +184,7 @@ def tell_of_velocities(
             stacklevel=3,
         )
     elif violation > REFUSED_VIOLATION:
-        raise ValueError(
+        raise Refused(
             f"{message}. Correct the velocities, or pass project=True for the nearest consistent velocities; {scenes}."
         )
     elif violation > REPORTED_VIOLATION:
@@ -254,7 +255,7 @@ class Problem:
             velocity = np.zeros(np.shape(position))
         elif isinstance(velocity, Mapping):
             if slots is None:
-                raise TypeError(
+                raise Refused(
                     f"Problem: v_{part} is a dictionary and q_{part} is none; give both as dictionaries, or both as arrays."
                 )
             velocity = slots.flat(f"Problem: v_{part}", velocity, zeros=True)
@@ -317,7 +318,7 @@ def problem_of(caller: str, movable: Problem | HasProblem) -> Problem:
     require_x64()
     problem = opened(movable)
     if not isinstance(problem, Problem):
-        raise TypeError(
+        raise Refused(
             f"{caller}: problem is {type(problem).__name__}; give a vmri_jax.Problem or a Scene. A System needs a start: "
             "Problem(system, q_s, q_f, v_s, v_f)."
         )
@@ -339,12 +340,12 @@ def start_of(caller: str, system, state=None) -> tuple[System, State]:
     if isinstance(system, Problem):
         system, state = system.system, system.state() if state is None else state
     if not isinstance(system, System):
-        raise TypeError(
+        raise Refused(
             f"{caller}: system is {type(system).__name__}; give a vmri_jax.Problem or a Scene, or a System and a State."
         )
     if not isinstance(state, State):
         got = "a System has no start" if state is None else f"state is {type(state).__name__}"
-        raise TypeError(
+        raise Refused(
             f"{caller}: {got}; give a State, e.g. from initial_state(...), or a Problem(system, q_s, q_f, v_s, v_f) alone."
         )
     return system, state

@@ -27,6 +27,8 @@ from typing import Any
 import jax
 import numpy as np
 
+from vmri_jax.refusals import Refused
+
 LARGEST_COPIED = 1024
 """Bytes of the largest array that is compared by its numbers; larger arrays are compared by a digest. A larger value fills the keys of programs
 with copies of arrays."""
@@ -118,7 +120,7 @@ class Surroundings:
 
     def _of_array(self, array) -> Hashable:
         if isinstance(array, jax.core.Tracer):  # pyright: ignore[reportAttributeAccessIssue]
-            raise ValueError(
+            raise Refused(
                 f"{name_of(self._function)} reads {self._name}, which jax.grad, jit, vmap or jvp traces, and which is not among its arguments. Hand "
                 "it over in the params: System(..., params={'k': k}), and params['k'] in the function."
             )

@@ -23,6 +23,7 @@ from vmri_jax.mechanics.order import Order, order_of
 from vmri_jax.mechanics.summary import numbers, parameters, summary
 from vmri_jax.mechanics.surroundings import name_of
 from vmri_jax.mechanics.terms import KINDS, Term, label
+from vmri_jax.refusals import Refused
 
 RESERVED = ("kinetic", "path", "order", "solves", *(kind.symbol for kind in KINDS.values() if kind.symbol))
 """Names that potentials in `System.potentials` must not have: symbols of other terms, and names of rows in the description of a scheme."""
@@ -96,12 +97,12 @@ class System(eqx.Module):
     def __post_init__(self):
         order = order_of(self.params)
         if not callable(self.kinetic):
-            raise TypeError(
+            raise Refused(
                 f"System: kinetic is {self.kinetic!r}; give ConstantMass(slow, fast) or a function "
                 "kinetic(q_s, q_f, v_s, v_f, params)."
             )
         if self.has_constant_mass and self.slow_kinetic is not None:
-            raise ValueError(
+            raise Refused(
                 "System: slow_kinetic is given besides a ConstantMass, which has the masses of all slow variables; give the whole kinetic "
                 "energy as ConstantMass, or kinetic as a function."
             )
@@ -250,9 +251,9 @@ def _checked(name: str, function, order: Order | None):
         _check_function(name, function.function, "t, ")
         return Rheonomic(traced_once(function.function, order))
     if isinstance(function, ConstantMass):
-        raise TypeError(f"System: {name} is a ConstantMass; masses come first, System(ConstantMass(slow, fast), V, W).")
+        raise Refused(f"System: {name} is a ConstantMass; masses come first, System(ConstantMass(slow, fast), V, W).")
     if not callable(function):
-        raise TypeError(f"System: {name} is {function!r}; it must be a function or None.")
+        raise Refused(f"System: {name} is {function!r}; it must be a function or None.")
     _check_function(name, function)
     return traced_once(function, order)
 
@@ -262,24 +263,22 @@ def _named_potentials(potentials, order: Order | None) -> "Potentials":
     try:
         named = dict(potentials)
     except (TypeError, ValueError):
-        raise TypeError(
+        raise Refused(
             f"System: potentials is {potentials!r}; give functions by name, e.g. potentials={{'bends': V_1, 'bonds': V_2}}."
         ) from None
     for name, function in named.items():
         if isinstance(name, bool) or not isinstance(name, str | int) or (isinstance(name, int) and name < 1):
-            raise ValueError(
+            raise Refused(
                 f"System: potentials has the name {name!r}; give a text, or a whole number k of at least 1 for a potential on every k-th "
                 "micro node."
             )
         if name in RESERVED or [label(other) for other in named].count(label(name)) > 1:
-            raise ValueError(
+            raise Refused(
                 f"System: potentials has the name {name!r}, which is the name of another term: one of {', '.join(RESERVED)}, or V_k of the "
                 "potential k. Take another name."
             )
         if function is None or isinstance(function, ConstantMass) or not callable(function):
-            raise TypeError(
-                f"System: potentials[{name!r}] is {function!r}; it must be a function of (q_s, q_f, params)."
-            )
+            raise Refused(f"System: potentials[{name!r}] is {function!r}; it must be a function of (q_s, q_f, params).")
         _check_function("potentials", function)
     return Potentials((name, traced_once(function, order)) for name, function in named.items())
 
@@ -289,7 +288,7 @@ def _check_function(name: str, function, before: str = "") -> None:
     try:
         hash(function)
     except TypeError:
-        raise TypeError(
+        raise Refused(
             f"System: {name} is {function!r}, which has no hash: programs are compiled once per function. Give a plain "
             "function, with what varies in params."
         ) from None

@@ -17,6 +17,7 @@ from vmri_jax.plots.theme import (
     new_figure,
     panel_grid,
 )
+from vmri_jax.refusals import Refused
 from vmri_jax.steppers.results import Result
 
 if TYPE_CHECKING:
@@ -46,20 +47,22 @@ def plot_ensemble(
 ) -> NotebookFigure:
     """A result of an ensemble over its parameters.
 
-    The figure over two axes is a map in colours, with a panel for each value of a third and a fourth axis; failed runs are grey.
-    The figure over one axis has curves, or bands if there are more than six curves. Over a column of a table or of random draws it is a
-    scatter plot, and without parameters a histogram. A quantity of all saved nodes is drawn against time, with the bands that hold
-    half and nine tenths of the runs that did not fail.
+    The figure over two axes is a map in colours, with a panel for each value of a third and a fourth axis; failed runs
+    are grey. The figure over one axis has curves, or bands if there are more than six curves. Over a column of a table
+    or of random draws it is a scatter plot, and without parameters a histogram. A quantity of all saved nodes is drawn
+    against time, with the bands that hold half and nine tenths of the runs that did not fail.
 
     Args:
         data: from `vmri_jax.open_ensemble`, or a selection of it.
-        quantity: name of the result; if None the last result with a single number per run, else the last one with a number per saved node.
+        quantity: name of the result; if None the last result with a single number per run, else the last one with a
+            number per saved node.
         x, y: names of axes or columns; the two longest axes if both are None and the design has axes.
         title: title above the panels.
         theme: colours.
 
     Raises:
-        ValueError: an unknown name, a quantity with several numbers per run, no quantity to choose, or more panels than can be drawn.
+        ValueError: an unknown name, a quantity with several numbers per run, no quantity to choose, or more panels than
+        can be drawn.
     """
     quantity = _quantity(data, quantity)
     values = data[quantity]
@@ -67,13 +70,13 @@ def plot_ensemble(
         return _plot_bands(data, values.where(~_failed(data, values)), title, theme)
     several = [name for name in values.dims if name in COORDINATES]
     if several:
-        raise ValueError(
+        raise Refused(
             f"plot_ensemble: {quantity} has several numbers per run; choose one, "
             f"data.isel({several[0]}=0) or data.sel({several[0]}={data[several[0]].values[0]!r})."
         )
     for name in (x, y):
         if name is not None and name not in data.coords:
-            raise ValueError(
+            raise Refused(
                 f"plot_ensemble: there is no axis or column {name!r}; there are {', '.join(map(str, data.coords))}."
             )
     axes = sorted((str(d) for d in values.dims if d != "lane"), key=lambda d: -values.sizes[d])
@@ -98,7 +101,7 @@ def _quantity(data: "xarray.Dataset", name: str | None) -> str:
     """The name of the quantity to draw, see `plot_ensemble`."""
     if name is not None:
         if name not in data:
-            raise ValueError(f"plot_ensemble: there is no {name!r}; there are {', '.join(map(str, data.data_vars))}.")
+            raise Refused(f"plot_ensemble: there is no {name!r}; there are {', '.join(map(str, data.data_vars))}.")
         return name
     arrays = {str(n): set(map(str, array.dims)) & set(COORDINATES) for n, array in data.data_vars.items()}
     arrays = {n: several for n, several in arrays.items() if n not in (*STATUS, "node_t")}
@@ -106,10 +109,10 @@ def _quantity(data: "xarray.Dataset", name: str | None) -> str:
         names = [n for n, dimensions in arrays.items() if dimensions == several]
         if names:
             return names[-1]
-    raise ValueError(
-        f"plot_ensemble: no quantity is one number per run; there are {', '.join(arrays) or 'none besides the status'}. Save one, "
-        "save=('end', 'energy_error'), or choose one number of a quantity: plot_ensemble(data.isel(slow=0), 'q_s'). "
-        "The status of the runs is drawn as 'result'."
+    raise Refused(
+        "plot_ensemble: no quantity is one number per run; there are "
+        f"{', '.join(arrays) or 'none besides the status'}. Save one, save=('end', 'energy_error'), or choose one "
+        "number of a quantity: plot_ensemble(data.isel(slow=0), 'q_s'). The status of the runs is drawn as 'result'."
     )
 
 
@@ -123,9 +126,9 @@ def _panels(values, drawn: Sequence[str]) -> list[tuple[str, Any]]:
     panel_axes = [d for d in values.dims if d not in drawn]
     count = int(np.prod([values.sizes[d] for d in panel_axes], dtype=int))
     if count > MOST_PANELS:
-        raise ValueError(
-            f"plot_ensemble: besides {', '.join(drawn)} there are {', '.join(map(str, panel_axes))} with {count} combinations of values; "
-            f"select some, data.sel({panel_axes[-1]}=...)."
+        raise Refused(
+            f"plot_ensemble: besides {', '.join(drawn)} there are {', '.join(map(str, panel_axes))} with {count} "
+            f"combinations of values; select some, data.sel({panel_axes[-1]}=...)."
         )
     panels = []
     for numbers in np.ndindex(*(values.sizes[d] for d in panel_axes)):
@@ -216,7 +219,6 @@ def _plot_histogram(values, title: str, theme: Theme) -> NotebookFigure:
         axes.hist(numbers, bins=bins, color=theme.curves[0])
         axes.set(xlabel=_label(values), ylabel="runs")
         if logarithmic:
-            axes.set_xscale("log")
             log_ticks(axes.xaxis, numbers)
     return figure
 
@@ -268,8 +270,6 @@ def _norm(values: np.ndarray) -> Normalize:
 
 def _scale(axes: Axes, x, y) -> None:
     """Make an axis logarithmic if its values are positive and span more than `LOGARITHMIC_RATIO`."""
-    for values, axis, set_scale in ((x, axes.xaxis, axes.set_xscale), (y, axes.yaxis, axes.set_yscale)):
-        numbers = np.asarray(values)
-        if _is_wide(numbers.ravel()):
-            set_scale("log")
-            log_ticks(axis, numbers.ravel())
+    for values, axis in ((np.ravel(x), axes.xaxis), (np.ravel(y), axes.yaxis)):
+        if _is_wide(values):
+            log_ticks(axis, values)

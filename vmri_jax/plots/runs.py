@@ -9,28 +9,32 @@ from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 
 from vmri_jax.plots.theme import DARK, LIGHT, ROUNDOFF_FLOOR, NotebookFigure, Theme, legend_beside, new_figure
+from vmri_jax.refusals import Refused
 from vmri_jax.running.origin import SavedRun
 
 MOST_NAMED = 12
-"""Most curves of a panel that the legend names; of more curves it names this number, evenly chosen. A larger number makes the legend higher
-than the panel."""
+"""Most curves of a panel that the legend names; of more curves it names this number, evenly chosen. A larger number
+makes the legend higher than the panel."""
 BAND_OPACITY = 0.25
 """Opacity of the bands of errors; a larger value hides the curves of other coordinates."""
 LEAST_SHOWN = 1e-9
 """Least reaction that is drawn, as a part of the largest one in its unit; a smaller value draws curves of round-off."""
 LEAST_SPAN = 1e-13
-"""Least span of an axis of energies, as a part of the largest value; a smaller one magnifies round-off to the height of the panel."""
+"""Least span of an axis of energies, as a part of the largest value; a smaller one magnifies round-off to the height of
+the panel."""
 
 
 def plot_trajectory(trajectory: SavedRun, title: str = "", theme: Theme = LIGHT) -> NotebookFigure:
     """Slow and fast positions, energy and, where there are constraints, their residual, against time.
 
-    Rigid bodies are drawn by their centres of mass. Curves have the units of the system; angles of joints have a panel of their own.
+    Rigid bodies are drawn by their centres of mass. Curves have the units of the system; angles of joints have a panel
+    of their own.
 
-    A run with an estimated error has bands of this error about its positions, and a panel of the largest error and its shares.
+    A run with an estimated error has bands of this error about its positions, and a panel of the largest error and its
+    shares.
 
-    If the system keeps its energy, the figure shows the error of the energy; if forces or moving constraints do work, it shows the change
-    of the energy, the work, and their difference. Of a scheme with kicks, which act at the
+    If the system keeps its energy, the figure shows the error of the energy; if forces or moving constraints do work,
+    it shows the change of the energy, the work, and their difference. Of a scheme with kicks, which act at the
     macro nodes, this balance has terms of H^2, a drift among them, unless the run saves its micro nodes.
 
     Args:
@@ -42,7 +46,7 @@ def plot_trajectory(trajectory: SavedRun, title: str = "", theme: Theme = LIGHT)
         ValueError: a batch of runs.
     """
     if np.ndim(trajectory.t) != 1:
-        raise ValueError("plot: this is a batch of runs; take one of them, run.lane(i).")
+        raise Refused("plot: this is a batch of runs; take one of them, run.lane(i).")
     t = np.asarray(trajectory.t)
     residual = np.asarray(trajectory.constraint_residual)
     constrained = bool(np.any(residual > 0))
@@ -78,10 +82,11 @@ def plot_trajectory(trajectory: SavedRun, title: str = "", theme: Theme = LIGHT)
 def plot_forces(trajectory: SavedRun, title: str = "", theme: Theme = LIGHT) -> NotebookFigure:
     """Moduli of the reaction forces of all constraints against time, a curve for each constraint by name.
 
-    There is a panel for each unit: forces on points and on centres of rigid bodies; torques about these centres, ``sum_i d_i x F_i`` of the
-    forces on directors, and on angles of joints; forces on generalised coordinates. The axes have the units of a system in m, kg and s. Joints
-    that carry bodies have no multiplier, and a line below the panels says so. The modulus is the largest over the bodies of the
-    constraint; the two bodies of a link have the same. Forces themselves are those of ``run.reaction_forces()``.
+    There is a panel for each unit: forces on points and on centres of rigid bodies; torques about these centres,
+    ``sum_i d_i x F_i`` of the forces on directors, and on angles of joints; forces on generalised coordinates. The axes
+    have the units of a system in m, kg and s. Joints that carry bodies have no multiplier, and a line below the panels
+    says so. The modulus is the largest over the bodies of the constraint; the two bodies of a link have the same.
+    Forces themselves are those of ``run.reaction_forces()``.
 
     Args:
         trajectory: a run of a system with constraints; of a scene in joint coordinates ``scene.by_directors(run)``.
@@ -92,7 +97,7 @@ def plot_forces(trajectory: SavedRun, title: str = "", theme: Theme = LIGHT) -> 
         ValueError: a batch of runs, a system without constraints, or a run that does not know its system.
     """
     if np.ndim(trajectory.t) != 1:
-        raise ValueError("plot_forces: this is a batch of runs; take one of them, run.lane(i).")
+        raise Refused("plot_forces: this is a batch of runs; take one of them, run.lane(i).")
     t, panels = np.asarray(trajectory.t), _moduli(trajectory)
     with new_figure(7.2, 0.4 + 1.85 * len(panels), title, theme) as figure:
         axes = figure.subplots(len(panels), sharex=True, squeeze=False)[:, 0]
@@ -114,7 +119,8 @@ UNITS = {"force": "N", "torque": "N m", "generalised force": "N, or N m for an a
 
 
 def _moduli(run: SavedRun) -> dict[str, dict[str, np.ndarray]]:
-    """For each unit, the largest modulus (k,) of the reaction on a body of each constraint by name; reactions that are round-off are left out."""
+    """For each unit, the largest modulus (k,) of the reaction on a body of each constraint by name; reactions that are
+    round-off are left out."""
     names, panels = run.names, {unit: {} for unit in UNITS}
     for constraint, by_body in run.reaction_forces().items():
         for body, force in by_body.items():
@@ -138,7 +144,8 @@ def _moduli(run: SavedRun) -> dict[str, dict[str, np.ndarray]]:
 
 
 def position_panels(run: SavedRun) -> list[tuple[np.ndarray, list[str], str, np.ndarray | None]]:
-    """For slow and fast positions and angles of a run, if there are any: values (k, n), names, label of the axis, and errors (k, n) or None.
+    """For slow and fast positions and angles of a run, if there are any: values (k, n), names, label of the axis, and
+    errors (k, n) or None.
 
     Directors of rigid bodies are left out.
     """
@@ -157,14 +164,16 @@ def position_panels(run: SavedRun) -> list[tuple[np.ndarray, list[str], str, np.
 
 
 def limit_times(axes: Axes, t) -> None:
-    """Set the limits of a time axis to the first and the last node reached; leave the default limits if these are the same node."""
+    """Set the limits of a time axis to the first and the last node reached; leave the default limits if these are the
+    same node."""
     reached = t[np.isfinite(t)]
     if reached.size and reached[0] < reached[-1]:
         axes.set_xlim(reached[0], reached[-1])
 
 
 def coordinates(axes: Axes, t, values, names: Sequence[str], theme: Theme, error=None) -> None:
-    """One curve for each coordinate, with a band of its error, and names beside the panel, at most `MOST_NAMED` of them."""
+    """One curve for each coordinate, with a band of its error, and names beside the panel, at most `MOST_NAMED` of
+    them."""
     n = values.shape[1]
     colors: Any = theme.curves
     if n > len(theme.curves):
@@ -201,7 +210,8 @@ def _position_error(axes: Axes, t, error: Any, theme: Theme) -> None:
 
 
 def _energy_error(axes: Axes, trajectory: SavedRun, theme: Theme) -> None:
-    """Energy minus the energy at the start, divided by the latter unless it is zero; called a change if the system is not known."""
+    """Energy minus the energy at the start, divided by the latter unless it is zero; called a change if the system is
+    not known."""
     t, energy = np.asarray(trajectory.t), np.asarray(trajectory.energy)
     kind = "error" if trajectory.keeps_energy else "change"
     error, label = energy - energy[0], rf"energy {kind} $\Delta E$"

@@ -18,6 +18,7 @@ from vmri_jax.plots.theme import (
     new_figure,
     positive,
 )
+from vmri_jax.refusals import Refused
 
 
 def plot_convergence(study: Any, orders: Sequence[int] = (), title: str = "", theme: Theme = LIGHT) -> NotebookFigure:
@@ -92,7 +93,7 @@ def plot_work_precision(
         ValueError: work is another string.
     """
     if work not in WORK:
-        raise ValueError(f"plot_work_precision: work is {work!r}; it must be one of {', '.join(WORK)}.")
+        raise Refused(f"plot_work_precision: work is {work!r}; it must be one of {', '.join(WORK)}.")
     front = [row for row in study.pareto(work) if getattr(row, work) > 0]
     with new_figure(7.2, 4.3, title, theme) as figure:
         axes = figure.subplots()

@@ -36,9 +36,13 @@ MARKERS = ("o", "s", "^", "D", "v", "P")
 LINES = ("-", "--", ":", "-.", (0, (7, 1.5, 1, 1.5, 1, 1.5)))
 """Styles of lines: the style changes after each pass through the colours, so that 30 curves differ."""
 ROUNDOFF_FLOOR = 1e-17
-"""Value at which a logarithmic axis of residuals draws zeros, below the round-off of numbers of order one; a smaller value stretches the axis."""
+"""Value at which a logarithmic axis of residuals draws zeros, below the round-off of numbers of order one; a smaller
+value stretches the axis."""
 DPI = 150
 """Dots per inch of a figure saved by its method `savefig` outside of `style`; a larger value makes larger files."""
+
+LEGEND_SIZE = 9.0
+"""Size of the letters of a legend, in points."""
 
 
 class NotebookFigure(Figure):
@@ -87,7 +91,7 @@ def style(theme: Theme = LIGHT):
             "lines.linewidth": 1.3,
             "lines.markersize": 5.0,
             "legend.frameon": False,
-            "legend.fontsize": 9,
+            "legend.fontsize": LEGEND_SIZE,
             "svg.fonttype": "path",
             "svg.hashsalt": "vmri_jax",
         }
@@ -155,14 +159,13 @@ def curve_look(i: int, theme: Theme) -> dict[str, Any]:
     }
 
 
-def legend_below(figure: Figure, size: float = 9.0) -> None:
+def legend_below(figure: Figure) -> None:
     """Names of all curves under the panels, each name once, in as many columns as fit.
 
     The figure grows by the height of the legend, so that the panels keep their height.
 
     Args:
         figure: a figure with its panels drawn.
-        size: size of the letters, in points.
     """
     curves: dict[str, Any] = {}
     for axes in figure.axes:
@@ -170,7 +173,7 @@ def legend_below(figure: Figure, size: float = 9.0) -> None:
         curves = dict(zip(labels, handles, strict=True)) | curves
     if not curves:
         return
-    width, height = figure.get_size_inches()
+    (width, height), size = figure.get_size_inches(), LEGEND_SIZE
     # Inches of a column: 4 letters for the line before the name, and 0.56 of the size for a letter of the name.
     column = size / 72 * (4 + 0.56 * max(map(len, curves)))
     columns = max(1, min(len(curves), int(width / column)))
@@ -180,7 +183,7 @@ def legend_below(figure: Figure, size: float = 9.0) -> None:
     figure.legend(curves.values(), curves.keys(), loc="outside lower left", ncols=columns, **look)
 
 
-def legend_beside(axes: Axes, title: str | None = None, size: float = 9.0) -> None:
+def legend_beside(axes: Axes, title: str | None = None, size: float = LEGEND_SIZE) -> None:
     """Names of the curves to the right of a panel, in letters of `size` points."""
     look = {"handlelength": 1.2, "fontsize": size, "title_fontsize": size, "labelspacing": 0.3}
     axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), title=title, **look)
@@ -201,7 +204,8 @@ def positive(values: Any) -> np.ndarray:
 
 
 def log_ticks(axis: Axis, values: Sequence[float] | np.ndarray) -> None:
-    """Make an axis logarithmic, with labels at powers of ten; or at 1, 2, 5 times powers of ten if the values span less than a factor of 30.
+    """Make an axis logarithmic, with labels at powers of ten; or at 1, 2, 5 times powers of ten if the values span less
+    than a factor of 30.
 
     Args:
         axis: an axis of a panel with or without curves.

@@ -10,6 +10,7 @@ from vmri_jax.mechanics.arrays import Known, is_concrete, real_array, require_x6
 from vmri_jax.mechanics.checks import check_arrays, check_flags, check_number, check_params, check_system
 from vmri_jax.mechanics.constraints import check_constraints, check_mass
 from vmri_jax.mechanics.state import State
+from vmri_jax.refusals import Refused
 from vmri_jax.running.progress import ShowsProgress, check_progress
 from vmri_jax.schemes.composition import Composition, stage_scheme
 from vmri_jax.schemes.scheme import Scheme
@@ -54,11 +55,11 @@ class Save:
             if getattr(self, name) is not None:
                 whole_number(f"Save: {name}", getattr(self, name), otherwise=", or None")
         if self.every is not None and self.number is not None:
-            raise ValueError(f"Save: got every = {self.every} and number = {self.number}; give one of them.")
+            raise Refused(f"Save: got every = {self.every} and number = {self.number}; give one of them.")
         check_flags(micro=self.micro)
         check_progress("Save", self.progress)
         if self.adjoint not in ADJOINTS:
-            raise ValueError(
+            raise Refused(
                 f"Save: adjoint is {self.adjoint!r}; it must be one of {', '.join(map(repr, ADJOINTS))}. For derivatives with "
                 "respect to few numbers without stored steps take jax.jacfwd with adjoint='stored'."
             )
@@ -71,7 +72,7 @@ class Save:
     def without_bar(self, name: str) -> None:
         """Refuse a bar of a run of the function of this name, which is one program without parts."""
         if self.progress is not False:
-            raise ValueError(
+            raise Refused(
                 f"{name}: a run that is one program has no progress; leave it out, or call simulate or stream."
             )
 
@@ -80,7 +81,7 @@ class Save:
         every = self.every or 1
         if num_steps % (self.number or every):
             counts = f"the {self.number} saved intervals" if self.number else f"save = {every}"
-            raise ValueError(
+            raise Refused(
                 f"simulate: num_steps = {num_steps} is not a multiple of {counts}; the last saved node would not be the end."
             )
         return num_steps // self.number if self.number else every
@@ -100,18 +101,16 @@ def check_run(system, scheme, state, solver, steps: Steps) -> tuple[int, int]:
     """Refuse bad arguments of `simulate`; returns the number of macro steps, and how many of them lie between two saved nodes."""
     require_x64()
     if not isinstance(scheme, Scheme | Composition):
-        raise TypeError(
-            f"simulate: scheme is {type(scheme).__name__}; give a Scheme, e.g. fully_implicit(num_micro=10)."
-        )
+        raise Refused(f"simulate: scheme is {type(scheme).__name__}; give a Scheme, e.g. fully_implicit(num_micro=10).")
     check_params(system.params)
     if not isinstance(solver, Solver | None):
-        raise TypeError(f"simulate: solver is {solver!r}; give a Solver, e.g. vm.Solver(tolerance=1e-10).")
+        raise Refused(f"simulate: solver is {solver!r}; give a Solver, e.g. vm.Solver(tolerance=1e-10).")
     dt, num_steps, t_end = steps.macro_dt, steps.num_steps, steps.t_end
     check_step_size(dt)
     check_number("simulate: the t of state", state.t)
     if (num_steps is None) == (t_end is None):
         got = "neither" if num_steps is None else "both"
-        raise ValueError(f"simulate: got {got} of num_steps and t_end; give exactly one of them.")
+        raise Refused(f"simulate: got {got} of num_steps and t_end; give exactly one of them.")
     num_steps = steps_until(t_end, state.t, dt) if num_steps is None else whole_number("simulate: num_steps", num_steps)
     every = Save.of(steps.save).macro_steps(num_steps)
     if is_concrete(vars(state)):
@@ -137,16 +136,14 @@ def nothing_fast(scheme: Scheme | Composition, num_fast: int) -> str:
 def steps_until(t_end, t, macro_dt) -> int:
     """The number of macro steps from t to t_end."""
     if not is_concrete((t_end, t, macro_dt)):
-        raise ValueError("simulate: t_end needs times that are known; under transformations of JAX give num_steps.")
+        raise Refused("simulate: t_end needs times that are known; under transformations of JAX give num_steps.")
     check_number("simulate: t_end", t_end)
     steps = float((t_end - t) / macro_dt)
     whole = round(steps)
     if whole < 1:
-        raise ValueError(
-            f"simulate: t_end is {t_end:g}, less than a macro step of {macro_dt:g} after the start at {t:g}."
-        )
+        raise Refused(f"simulate: t_end is {t_end:g}, less than a macro step of {macro_dt:g} after the start at {t:g}.")
     if abs(steps - whole) > WHOLE_NUMBER_TOLERANCE * whole:
-        raise ValueError(
+        raise Refused(
             f"simulate: from {t:g} to t_end = {t_end:g} there are {steps:.6g} macro steps of {macro_dt:g}, no whole number. "
             f"Take macro_dt = {float(t_end - t) / np.ceil(steps):.10g}, or give num_steps."
         )
@@ -156,9 +153,9 @@ def steps_until(t_end, t, macro_dt) -> int:
 def check_step_size(macro_dt) -> None:
     """Refuse a missing step size, or one that is not positive."""
     if macro_dt is None:
-        raise ValueError("simulate: macro_dt is missing; give the macro step H, num_micro times the micro step.")
+        raise Refused("simulate: macro_dt is missing; give the macro step H, num_micro times the micro step.")
     if is_concrete(real_array("simulate: macro_dt", macro_dt, 0)) and not (np.isfinite(macro_dt) and macro_dt > 0):
-        raise ValueError(f"simulate: macro_dt is {macro_dt}; it must be a positive number.")
+        raise Refused(f"simulate: macro_dt is {macro_dt}; it must be a positive number.")
 
 
 def check_vectors(state: State) -> None:

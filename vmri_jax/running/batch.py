@@ -19,6 +19,7 @@ from vmri_jax.mechanics.checks import check_params
 from vmri_jax.mechanics.names import unknown
 from vmri_jax.mechanics.state import Movable, State, initial_state, opened, start_of
 from vmri_jax.mechanics.system import System
+from vmri_jax.refusals import Refused
 from vmri_jax.running.arguments import Steps, check_step_size
 from vmri_jax.running.engine import NUM_STATE, Engine
 from vmri_jax.running.fallback import FALLING_BACK
@@ -115,7 +116,7 @@ def batch(
 ) -> Batch:
     """The `Batch` with these arguments of `simulate_batch`; bad arguments raise."""
     if not is_concrete((states, steps.macro_dt, params)):
-        raise ValueError(
+        raise Refused(
             "simulate_batch: arguments are tracers; call it outside of jax.jit, vmap and grad, or take jax.vmap of simulate."
         )
     _check_devices(devices, chunk)
@@ -125,9 +126,9 @@ def batch(
         check_step_size(None)
     params, start, macro_dt = _with_lanes(system.params, params, start, steps.macro_dt)
     if not (np.all(np.isfinite(macro_dt)) and np.all(macro_dt > 0)):
-        raise ValueError(f"simulate_batch: every macro_dt must be a positive number, got {macro_dt}.")
+        raise Refused(f"simulate_batch: every macro_dt must be a positive number, got {macro_dt}.")
     if steps.t_end is not None and any(np.ptp(array) > 0 for array in (start.t, macro_dt)):
-        raise ValueError(
+        raise Refused(
             "simulate_batch: t_end with steps or start times that differ; give num_steps, the same for all lanes."
         )
     differs = not all(map(is_repeated, params))
@@ -195,7 +196,7 @@ def _named(values, known: Collection[str], path: tuple[str, ...] = ()) -> Iterat
         return
     entries, _ = jax.tree_util.tree_flatten_with_path(values, is_leaf=lambda node: node is not values)
     if entries[:1] == [((), values)] or (name and not any(other.startswith(f"{name}.") for other in known)):
-        raise ValueError(f"simulate_batch: params: {unknown('parameter', name, known)}")
+        raise Refused(f"simulate_batch: params: {unknown('parameter', name, known)}")
     for (key,), entry in entries:
         yield from _named(entry, known, (*path, jax.tree_util.keystr((key,), simple=True)))
 
@@ -223,14 +224,14 @@ def _with_lanes(all_params, params, start: State, macro_dt) -> tuple[list, State
         if np.ndim(value) > len(shape) and np.shape(value)[1:] == shape:
             lengths[name] = len(value)
         elif np.shape(value) != shape:
-            raise ValueError(
+            raise Refused(
                 f"simulate_batch: {name} has shape {np.shape(value)}; give {shape} for all lanes, or an axis of lanes in front of it."
             )
     if len(set(lengths.values())) != 1 or 0 in lengths.values():
         listed = (
             ", ".join(f"{name} has {length}" for name, length in lengths.items()) or "no argument has an axis of lanes"
         )
-        raise ValueError(
+        raise Refused(
             f"simulate_batch: {listed}; give params, states or steps with one value for each lane, all of the same number."
         )
     (lanes,) = set(lengths.values())
@@ -245,7 +246,7 @@ def _with_lanes(all_params, params, start: State, macro_dt) -> tuple[list, State
 
 def _check_devices(devices, chunk) -> None:
     if not 1 <= devices <= jax.device_count():
-        raise ValueError(
+        raise Refused(
             f"simulate_batch: devices is {devices}, but JAX has {jax.device_count()}; call vm.configure(devices={devices}) "
             "before JAX starts."
         )

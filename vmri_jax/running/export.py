@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from vmri_jax.refusals import NotInstalled, Refused
 from vmri_jax.running.files import replaced
 from vmri_jax.running.origin import SavedRun
 from vmri_jax.running.quantities import Quantities
@@ -74,7 +75,7 @@ class Exports(Quantities):
         run = self.whole()
         names = run.names
         if np.ndim(run.t) != 1:
-            raise ValueError("columns: this is a batch of runs; take one of them, run.lane(i).")
+            raise Refused("columns: this is a batch of runs; take one of them, run.lane(i).")
         rows = rows_of(run)
         parts = [("", rows["q_s"], rows["q_f"]), ("p ", rows["p_s"], rows["p_f"])]
         if run.origin.knows_system:
@@ -185,4 +186,4 @@ def extra(package: str, caller: str, name: str = "xarray"):
     try:
         return importlib.import_module(package)
     except ImportError as error:
-        raise ImportError(f"{caller} needs {package}; install it with pip install 'vmri_jax[{name}]'.") from error
+        raise NotInstalled(f"{caller} needs {package}; install it with pip install 'vmri_jax[{name}]'.") from error

@@ -16,6 +16,7 @@ from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.rows import Part
 from vmri_jax.mechanics.state import HasProblem, Problem, opened
 from vmri_jax.mechanics.system import System
+from vmri_jax.refusals import Refused
 from vmri_jax.running.progress import Working
 from vmri_jax.running.settings import Settings
 
@@ -52,7 +53,7 @@ class Origin:
         system = opened(moving)
         system = system.system if isinstance(system, Problem) else system
         if not isinstance(system, System):
-            raise TypeError(f"of: got {type(moving).__name__}; give the vmri_jax.System, Problem or Scene of the run.")
+            raise Refused(f"of: got {type(moving).__name__}; give the vmri_jax.System, Problem or Scene of the run.")
         return cls(names, system)
 
     @classmethod
@@ -84,7 +85,7 @@ class Origin:
             ValueError: the run does not know its system.
         """
         if self.simulated is None:
-            raise ValueError(
+            raise Refused(
                 "this run does not know its system, since it was read from a file, or pickled with functions that Python cannot "
                 "pickle. Give it: run.of(problem), with the Problem, Scene or System that was simulated."
             )
@@ -103,7 +104,7 @@ class Origin:
         try:
             check_system(self.system(), np.zeros(n_s), np.zeros(n_f))
         except ValueError as error:
-            raise ValueError(f"of: the run has {n_s} slow and {n_f} fast coordinates. {error}") from None
+            raise Refused(f"of: the run has {n_s} slow and {n_f} fast coordinates. {error}") from None
 
     def __getstate__(self) -> dict:
         """All fields for pickle; without the system if Python cannot pickle one of its functions, such as a lambda."""

@@ -5,6 +5,7 @@ from dataclasses import replace
 import jax
 
 from vmri_jax.mechanics.state import Movable, State
+from vmri_jax.refusals import Refused
 from vmri_jax.running.arguments import Save, Steps
 from vmri_jax.running.progress import Working
 from vmri_jax.running.saved import check_memory
@@ -44,7 +45,7 @@ def prepare(
     """
     run = simulation(system, scheme, state, solver, Steps(macro_dt, num_steps, t_end, save))
     if not run.is_concrete:
-        raise ValueError("prepare: arguments are tracers; call it outside of jax.jit, vmap and grad, or take simulate.")
+        raise Refused("prepare: arguments are tracers; call it outside of jax.jit, vmap and grad, or take simulate.")
     run.check()
     run.save.without_bar("prepare")
     check_memory("prepare", run)

@@ -15,6 +15,8 @@ from typing import ParamSpec, TypeVar, cast
 
 import jax.monitoring
 
+from vmri_jax.refusals import Refused
+
 Progress = Callable[[str, int, int], None]
 """Called as ``progress(what, done, total)`` before every piece of work and once at the end: `what` names the piece, `done` of `total` pieces
 are finished."""
@@ -167,7 +169,7 @@ def progress_to(name: str, progress: ShowsProgress) -> AbstractContextManager[Pr
 def check_progress(name: str, progress: ShowsProgress) -> None:
     """Refuse an argument `progress` of the function of this name that is neither True nor False nor a function."""
     if not (isinstance(progress, bool) or callable(progress)):
-        raise TypeError(
+        raise Refused(
             f"{name}: progress is {progress!r}; it must be True or False, or a function of (what, done, total)."
         )
 

@@ -18,6 +18,7 @@ from vmri_jax.mechanics.rows import Place
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.summary import has_values, summary
 from vmri_jax.mechanics.system import System
+from vmri_jax.refusals import Refused
 from vmri_jax.running.micro_nodes import Nodes, why_not, with_micro_nodes
 from vmri_jax.running.observables import LostEnergyWarning, concerns, observables, with_tolerance
 from vmri_jax.running.origin import Origin, SavedRun, at_nodes
@@ -94,10 +95,10 @@ class Quantities(ABC):
         if isinstance(nodes, int | np.integer):
             return self._node(range(count)[nodes])  # raises IndexError beyond the ends
         if not isinstance(nodes, slice):
-            raise TypeError(f"{kind}: the index is {nodes!r}; give the number of a node, or a slice as in run[:100].")
+            raise Refused(f"{kind}: the index is {nodes!r}; give the number of a node, or a slice as in run[:100].")
         first, stop, stride = nodes.indices(count)
         if stride < 1 or first >= stop:
-            raise ValueError(f"{kind}: no nodes {first}:{stop}:{stride}; it has {count}, and they are taken forwards.")
+            raise Refused(f"{kind}: no nodes {first}:{stop}:{stride}; it has {count}, and they are taken forwards.")
         return self._part(first, first + (stop - 1 - first) // stride * stride, stride)
 
     @property
@@ -218,7 +219,7 @@ class Quantities(ABC):
                 if constraint is None
                 else unknown("constraint", constraint, names.rows)
             )
-            raise ValueError(f"reaction_forces: {missing}{hint}")
+            raise Refused(f"reaction_forces: {missing}{hint}")
         forces, touched = map(
             np.asarray, at_nodes(reaction_forces, run.origin, _states(run, micro), tuple(rows.values()))
         )
@@ -247,7 +248,7 @@ class Quantities(ABC):
 
         run = _concrete("work", self.whole())
         if np.ndim(run.t) != 1:
-            raise ValueError("work: the run is a batch; take one lane of it, run.lane(i).")
+            raise Refused("work: the run is a batch; take one lane of it, run.lane(i).")
         micro = why_not(run.t, run.t_micro) == "" and bool(np.isfinite(run.energy[1]))
         states = _states(run, micro, with_start=True)
         power = np.asarray(at_nodes(powers, run.origin, states))  # (m, 2): F . v and lambda . dg/dt
@@ -296,7 +297,7 @@ class Quantities(ABC):
 def _concrete(method: str, run: SavedRun) -> SavedRun:
     """The run; refused by `method` if its numbers are tracers of a transformation."""
     if not is_concrete(run.energy):
-        raise ValueError(
+        raise Refused(
             f"{method}: the run is traced by JAX, inside of jit, grad or vmap. Return the run and ask outside, "
             f"run.of(problem).{method}(...); of one state, vmri_jax.mechanics.motion.motion(system, run[-1]) can be traced."
         )
@@ -341,7 +342,7 @@ def _states(run: SavedRun, micro: bool, with_start: bool = False) -> State:
         return run.states
     reason = why_not(run.t, run.t_micro)
     if reason:
-        raise ValueError(f"micro nodes: they do not fill all intervals of the run: {reason}.")
+        raise Refused(f"micro nodes: they do not fill all intervals of the run: {reason}.")
     nodes = _all_nodes(run)
     p_s, p_f = at_nodes(_momenta, run.origin, nodes)
     states = State(nodes.t, nodes.q_s, nodes.q_f, p_s, p_f)
@@ -354,7 +355,7 @@ def _all_nodes(run: SavedRun) -> Nodes:
     finite = np.isfinite(np.column_stack(nodes)).all(axis=1)
     count = len(nodes.t) if np.all(finite) else int(np.argmin(finite))
     if count < 2:
-        raise ValueError("micro nodes: the run failed in its first step; there are none.")
+        raise Refused("micro nodes: the run failed in its first step; there are none.")
     macro_nodes = Nodes(*(a[:count] for a in nodes))  # splines take finite values only
     all_nodes = with_micro_nodes(macro_nodes, run.t_micro[: count - 1], run.micro.q_f[: count - 1])
     missing = (len(nodes.t) - count) * run.t_micro.shape[1]

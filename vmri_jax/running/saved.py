@@ -14,6 +14,7 @@ from jaxtyping import Float
 
 from vmri_jax.mechanics.arrays import Numbers
 from vmri_jax.mechanics.state import State
+from vmri_jax.refusals import Refused
 from vmri_jax.running.observables import Observables
 from vmri_jax.running.trajectory import MicroNodes, RunInfo, Trajectory
 
@@ -102,7 +103,7 @@ def check_memory(caller: str, run: Any, lanes: int = 1, num_saves: int | None = 
         return
     free = psutil.virtual_memory().available
     if needed > free:
-        raise ValueError(
+        raise Refused(
             f"{caller}: {nodes} saved nodes{f' of {lanes} runs' if lanes > 1 else ''} would take {needed / 1e9:.3g} GB, and "
             f"{free / 1e9:.3g} GB of memory are free. Save fewer of them (save=...), or write them to disk as they come "
             "(vmri_jax.stream)."

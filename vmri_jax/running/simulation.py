@@ -29,6 +29,7 @@ from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.state import Movable, State, opened, start_of
 from vmri_jax.mechanics.summary import numbers, summary
 from vmri_jax.mechanics.system import System
+from vmri_jax.refusals import Refused
 from vmri_jax.running.arguments import Save, Steps, check_once, check_run, check_vectors, nothing_fast
 from vmri_jax.running.engine import NUM_STATE, Cursor, Engine, Motion, engine
 from vmri_jax.running.failures import simulation_error
@@ -137,14 +138,14 @@ class Simulation:
             check_vectors(state)
             shapes, start = [a.shape for a in start], _arrays(state)
             if [a.shape for a in start] != shapes:
-                raise ValueError(
+                raise Refused(
                     f"the arrays of state have shapes {[a.shape for a in start]}; the run was prepared for {shapes}."
                 )
         if params is not None:
             model = self._with_params(model, params)
         if num_steps is not None:
             if num_steps < 1 or num_steps % self.num_saves:
-                raise ValueError(f"num_steps is {num_steps}; it must be a positive multiple of {self.num_saves}.")
+                raise Refused(f"num_steps is {num_steps}; it must be a positive multiple of {self.num_saves}.")
             save_every = num_steps // self.num_saves
         return [dt if macro_dt is None else np.asarray(macro_dt, dtype=float), *start, *model], save_every
 
@@ -154,7 +155,7 @@ class Simulation:
         expected, expected_structure = jax.tree.flatten(self.system.params)
         new, structure = jax.tree.flatten(params)
         if structure != expected_structure or list(map(np.shape, new)) != list(map(np.shape, expected)):
-            raise ValueError(f"params is {params!r}; give the pytree of system.params with other numbers in it.")
+            raise Refused(f"params is {params!r}; give the pytree of system.params with other numbers in it.")
         return model[: len(model) - len(expected)] + [np.asarray(leaf) for leaf in new]
 
     def whole(self, leaves: list, save_every: int) -> Piece:

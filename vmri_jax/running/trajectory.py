@@ -14,6 +14,7 @@ from vmri_jax.mechanics.arrays import Numbers, is_concrete
 from vmri_jax.mechanics.state import HasProblem, Problem, State
 from vmri_jax.mechanics.summary import has_values, summary
 from vmri_jax.mechanics.system import System
+from vmri_jax.refusals import Refused
 from vmri_jax.running.export import MICRO, Exports
 from vmri_jax.running.files import replaced
 from vmri_jax.running.origin import UNKNOWN, Origin
@@ -188,7 +189,7 @@ class Trajectory(Exports):
     def _part(self, first: int, last: int, stride: int) -> "Trajectory":
         """The nodes first, first + stride, ..., last; the work of the solver between two of them is the maximum, and a failure after the last is left out."""
         if not is_concrete(self.energy):
-            raise TypeError("Trajectory: the run is traced by JAX; take slices of its arrays, run.q_s[a:b].")
+            raise Refused("Trajectory: the run is traced by JAX; take slices of its arrays, run.q_s[a:b].")
         lanes, starts = (slice(None),) * (np.ndim(self.t) - 1), range(0, last - first, stride)
         nodes, ends = slice(first, last + 1, stride), slice(first + stride - 1, last, stride)
 
@@ -216,7 +217,7 @@ class Trajectory(Exports):
             ValueError: this is no batch.
         """
         if np.ndim(self.t) != 2:
-            raise ValueError("lane: this is one run, no batch of runs.")
+            raise Refused("lane: this is one run, no batch of runs.")
         return with_origin(jax.tree.map(lambda a: a[i], self), jax.tree.map(lambda a: a[i], self.origin))
 
     @property
@@ -260,18 +261,16 @@ class Trajectory(Exports):
         if not path.exists():
             raise FileNotFoundError(f"{path} does not exist; give the .npz file of a saved trajectory.")
         if path.is_dir():
-            raise ValueError(
-                f"{path} is a folder; a run written by stream is opened by StoredTrajectory({str(path)!r})."
-            )
+            raise Refused(f"{path} is a folder; a run written by stream is opened by StoredTrajectory({str(path)!r}).")
         try:
             with path.open("rb") as file, np.load(file, allow_pickle=False) as data:
                 arrays = dict(data)
         except Exception as error:
-            raise ValueError(
+            raise Refused(
                 f"{path} cannot be read as a .npz file ({error}); it is damaged or something else."
             ) from error
         if str(arrays.pop("format", "")) != FORMAT:
-            raise ValueError(f"{path} is a .npz file but not a trajectory saved by Trajectory.save.")
+            raise Refused(f"{path} is a .npz file but not a trajectory saved by Trajectory.save.")
         names, settings = (
             None if text is None else json.loads(str(text))
             for text in (arrays.pop("names", None), arrays.pop("settings", None))
@@ -280,13 +279,11 @@ class Trajectory(Exports):
             arrays.pop(name, None)
         missing = _FIELDS - set(arrays) - set(MICRO)
         if missing or set(arrays) - _FIELDS - set(ERROR):
-            raise ValueError(
-                f"{path} is a damaged trajectory: it lacks {sorted(missing)}, or has arrays of another kind."
-            )
+            raise Refused(f"{path} is a damaged trajectory: it lacks {sorted(missing)}, or has arrays of another kind.")
         try:
             origin = Origin.from_file(names, settings)
         except (KeyError, TypeError, ValueError) as error:
-            raise ValueError(
+            raise Refused(
                 f"{path} is a damaged trajectory: its names or settings cannot be read ({error!r})."
             ) from error
         return with_origin(from_named_arrays(arrays), origin)

@@ -10,6 +10,7 @@ import numpy as np
 
 from vmri_jax.mechanics.arrays import library
 from vmri_jax.mechanics.rows import Place, Rows
+from vmri_jax.refusals import Refused
 from vmri_jax.scene.body import GROUND, Attachment, Bodies, Point, body_of, end_of, label_of, moving
 from vmri_jax.scene.declare import Elements, Parameter, effect_class, real_tree, stacked
 from vmri_jax.scene.layout import Key, Layout
@@ -112,11 +113,11 @@ class Bindable(ABC):
         """The mass () of a body, refused if it has none or several."""
         mass = end_of(self.by_name, name).mass
         if mass is None:
-            raise ValueError(
+            raise Refused(
                 f"{self.name}: {label_of(name)} has no mass; this effect needs the mass of a whole body. Name a body with mass, without a point."
             )
         if mass.ndim:
-            raise ValueError(
+            raise Refused(
                 f"{self.name}: {name} has a mass for each coordinate; this effect needs one mass for each body. Leave this body out, or give it one mass."
             )
         return mass

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.mechanics.arrays import is_concrete, real_array
+from vmri_jax.refusals import Refused
 
 Pace = Literal["slow", "fast", "auto"]
 LARGEST_POINT = 3
@@ -125,13 +126,13 @@ class AnyBody(ABC):
     def _check_names(self) -> None:
         kind = type(self).__name__
         if not isinstance(self.name, str) or not self.name:
-            raise ValueError(f"{kind}: name is {self.name!r}; it must be a string that is not empty.")
+            raise Refused(f"{kind}: name is {self.name!r}; it must be a string that is not empty.")
         if self.name == GROUND:
-            raise ValueError(
+            raise Refused(
                 f"{kind}: name is {GROUND!r}, which effects call the body that does not move; take another name."
             )
         if self.pace not in ("slow", "fast", "auto"):
-            raise ValueError(f"{kind} {self.name}: pace is {self.pace!r}; it must be 'slow', 'fast' or 'auto'.")
+            raise Refused(f"{kind} {self.name}: pace is {self.pace!r}; it must be 'slow', 'fast' or 'auto'.")
 
     def _numbers(self, name: str, argument):
         """An argument as an array of float64; of NumPy unless it is traced, so that the precision does not depend on JAX's mode."""
@@ -140,7 +141,7 @@ class AnyBody(ABC):
         if not is_concrete(numbers):
             return numbers
         if not np.isfinite(numbers).all():
-            raise ValueError(f"{about} is {np.asarray(numbers)}, which is not finite.")
+            raise Refused(f"{about} is {np.asarray(numbers)}, which is not finite.")
         return np.asarray(numbers)
 
 
@@ -182,17 +183,17 @@ class Body(AnyBody):
         velocity = np.zeros(position.shape) if self.velocity is None else self._vector("velocity", self.velocity)
         mass = self._numbers("mass", self.mass)
         if velocity.shape != position.shape:
-            raise ValueError(
+            raise Refused(
                 f"Body {self.name}: velocity has shape {velocity.shape}, position has {position.shape}; they must be equal."
             )
         if mass.shape not in ((), position.shape):
-            raise ValueError(
+            raise Refused(
                 f"Body {self.name}: mass has shape {mass.shape}; give one number, or one for each of {position.size} coordinates."
             )
         if is_concrete(mass) and not np.all(mass > 0):
-            raise ValueError(f"Body {self.name}: mass is {mass}; every mass must be positive.")
+            raise Refused(f"Body {self.name}: mass is {mass}; every mass must be positive.")
         if self.radius is not None and is_concrete(self.radius) and not 0 < self.radius < np.inf:
-            raise ValueError(f"Body {self.name}: radius is {self.radius!r}; it must be a positive number, or None.")
+            raise Refused(f"Body {self.name}: radius is {self.radius!r}; it must be a positive number, or None.")
         block = self.block or position.size > LARGEST_POINT
         for name, value in (("position", position), ("velocity", velocity), ("mass", mass), ("block", block)):
             object.__setattr__(self, name, value)
@@ -201,7 +202,7 @@ class Body(AnyBody):
         value = self._numbers(name, argument)
         value = value[None] if value.ndim == 0 else value
         if value.ndim != 1 or not value.size:
-            raise ValueError(f"Body {self.name}: {name} has shape {value.shape}; give a vector of coordinates, (n,).")
+            raise Refused(f"Body {self.name}: {name} has shape {value.shape}; give a vector of coordinates, (n,).")
         return value
 
     @property
@@ -222,7 +223,7 @@ class Body(AnyBody):
     def point(self, offset: Any = None) -> Point:
         """The position of the body at the start; an offset, as if the body were rigid, is refused."""
         if offset is not None:
-            raise ValueError(f"{self.name} is no rigid body, so that no point is fixed in it; give its name alone.")
+            raise Refused(f"{self.name} is no rigid body, so that no point is fixed in it; give its name alone.")
         return Point(self.name, self.position, self.mass, self.block)
 
     def with_rates(self, rates: np.ndarray) -> "Body":
@@ -238,7 +239,7 @@ class Ground(AnyBody):
     def point(self, offset: Any = None) -> Point:
         """A point in space that does not move."""
         if offset is None:
-            raise ValueError('the ground has no centre; give a point of it, ("ground", [x, y, z]).')
+            raise Refused('the ground has no centre; give a point of it, ("ground", [x, y, z]).')
         return Point(GROUND, offset)
 
 
@@ -272,7 +273,7 @@ class Frame(AnyBody):
         self._check_names()
         position = self._numbers("position", self.position)
         if position.shape != (3,):
-            raise ValueError(f"Frame {self.name}: position has shape {position.shape}; give (3,).")
+            raise Refused(f"Frame {self.name}: position has shape {position.shape}; give (3,).")
         object.__setattr__(self, "position", position)
 
     @property

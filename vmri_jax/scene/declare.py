@@ -19,6 +19,7 @@ import numpy as np
 
 from vmri_jax.mechanics.arrays import is_concrete, library, real_array
 from vmri_jax.mechanics.order import in_order, order_of
+from vmri_jax.refusals import Refused
 from vmri_jax.scene.body import Bodies, Frame, Point, entry, is_entry
 
 Elements = tuple[tuple[str, ...], ...]
@@ -51,7 +52,7 @@ class Names:
         flat = bool(items) and all(is_entry(item) for item in items)
         if self.pairs and flat:
             if len(items) < 2:
-                raise ValueError(f"{about} is {argument!r}; give at least two bodies, or a list of pairs.")
+                raise Refused(f"{about} is {argument!r}; give at least two bodies, or a list of pairs.")
             return tuple(combinations(map(entry, items), 2))
         if self.count > 1 and flat:
             items = (items,)
@@ -61,7 +62,7 @@ class Names:
         wrong = any(len(element) != self.count or not all(map(is_entry, element)) for element in elements)
         if not elements or wrong:
             expected = "the name of a body" if self.count == 1 else f"{self.count} names of bodies"
-            raise ValueError(
+            raise Refused(
                 f"{about} is {argument!r}; give {expected}, or a list of such. A point in a rigid body is (name, [x, y, z])."
             )
         return tuple(tuple(map(entry, element)) for element in elements)
@@ -90,9 +91,7 @@ class Parameter:
         value = np.asarray(value) if is_concrete(value) else value
         count, size = len(bodies), bodies[0].size
         if self.shape == "number" and value.shape not in ((), (count,)):
-            raise ValueError(
-                f"{about} has shape {value.shape}; give one number, or one for each of the {count} elements."
-            )
+            raise Refused(f"{about} has shape {value.shape}; give one number, or one for each of the {count} elements.")
         if self.shape == "number" and count == 1:
             return value.reshape(())  # a single element has no axis, also if its number is given in a list
         if self.shape in ("number", "array") or (self.may_be_number and value.ndim == 0):
@@ -101,13 +100,13 @@ class Parameter:
         if self.shape == "common":
             for body in bodies:
                 if value.shape != (body.size,):
-                    raise ValueError(
+                    raise Refused(
                         f"{about} has shape {value.shape}, {body.name} has dimension {body.size}; they must agree."
                     )
             return value
         if value.shape not in ((size,), (count, size)):
             for_each = f", or one for each, ({count}, {size})." if count > 1 else "."
-            raise ValueError(
+            raise Refused(
                 f"{about} has shape {value.shape}; its bodies have dimension {size}, give ({size},){for_each}"
             )
         return value.reshape(size) if count == 1 else library(value).broadcast_to(value, (count, size))

@@ -12,6 +12,7 @@ import numpy as np
 from vmri_jax.mechanics.arrays import is_concrete, library
 from vmri_jax.mechanics.functions import check_arguments
 from vmri_jax.mechanics.names import unknown
+from vmri_jax.refusals import Refused
 from vmri_jax.scene.binding import MOST_ROLES, Bindable
 from vmri_jax.scene.body import GROUND, Attachment, end_of, label_of, moving
 from vmri_jax.scene.declare import effect_class, lasting
@@ -74,15 +75,13 @@ class Effect(Bindable):
         """
         about = f"the class of effects {cls.__name__}"
         if any(isinstance(value, Field) for value in vars(cls).values()):  # the decorator replaces them
-            raise TypeError(f"{about} has no decorator; write @effect_class of vmri_jax.scene.declare above it.")
+            raise Refused(f"{about} has no decorator; write @effect_class of vmri_jax.scene.declare above it.")
         if getattr(cls, "kind", None) not in get_args(Kind):
-            raise TypeError(f"{about} has no kind; write kind = one of {', '.join(map(repr, get_args(Kind)))} in it.")
+            raise Refused(f"{about} has no kind; write kind = one of {', '.join(map(repr, get_args(Kind)))} in it.")
         if cls._elements is Effect._elements and not any("names" in f.metadata for f in fields(cls)):
-            raise TypeError(
-                f"{about} has no field with names of bodies; declare one, bodies: Any = names(2) for pairs."
-            )
+            raise Refused(f"{about} has no field with names of bodies; declare one, bodies: Any = names(2) for pairs.")
         if isfunction(getattr_static(cls, "function", None)):
-            raise TypeError(
+            raise Refused(
                 f"{about} has a function without @staticmethod; write it above the function, which gets no self."
             )
         return super().__new__(cls)
@@ -95,12 +94,12 @@ class Effect(Bindable):
             object.__setattr__(self, argument.name, value)
             if "of_time" in argument.metadata:
                 if not callable(value):
-                    raise TypeError(f"{about} is {value!r}; give a function of (t, params).")
+                    raise Refused(f"{about} is {value!r}; give a function of (t, params).")
                 check_arguments(about, value, "t, params")
         is_number = isinstance(self.rate, int) and not isinstance(self.rate, bool) and self.rate > 0
         if not (is_number and self.kind == "potential") and self.rate not in ("slow", "fast", "auto"):
             number = ", or of a potential a whole number k, for every k-th micro node"
-            raise ValueError(f"{self.name}: rate is {self.rate!r}; it must be 'slow', 'fast' or 'auto'{number}.")
+            raise Refused(f"{self.name}: rate is {self.rate!r}; it must be 'slow', 'fast' or 'auto'{number}.")
 
     def check(self, moved: bool = False) -> None:
         """Refuse bodies and parameters that do not fit this effect, which is bound.
@@ -124,26 +123,26 @@ class Effect(Bindable):
         """Refuse names of no body, and bodies whose coordinates the function cannot take."""
         for element in self.elements:
             if len(element) > MOST_ROLES:
-                raise ValueError(
+                raise Refused(
                     f"{self.name}: an element of {len(element)} bodies, {', '.join(map(str, element[:3]))}, ...; at most {MOST_ROLES} bodies "
                     "may share a function. Write the function with vmri_jax.System, or join bodies to one with more coordinates."
                 )
             if not moving(element):
-                raise ValueError(f"{self.name}: {element} is about the ground alone, which does not move; name a body.")
+                raise Refused(f"{self.name}: {element} is about the ground alone, which does not move; name a body.")
             for name in element:
                 if name not in self.by_name and name != GROUND:
-                    raise ValueError(f"{self.name}: {unknown('body', str(name), [*self.by_name, GROUND])}")
+                    raise Refused(f"{self.name}: {unknown('body', str(name), [*self.by_name, GROUND])}")
                 if element.count(name) > 1:
-                    raise ValueError(
+                    raise Refused(
                         f"{self.name}: {name} occurs twice in {element}; an element is between different bodies."
                     )
                 try:
                     end = end_of(self.by_name, name, self.whole)
                 except ValueError as error:
-                    raise ValueError(f"{self.name}: {error}") from None
+                    raise Refused(f"{self.name}: {error}") from None
                 if self.dimensions and (end.block or end.size not in self.dimensions):
                     general, allowed = "general " if end.block else "", " or ".join(map(str, self.dimensions))
-                    raise ValueError(
+                    raise Refused(
                         f"{self.name}: {name} has {end.size} {general}coordinates; this effect is between points of dimension {allowed}."
                     )
             if self.same_size:
@@ -158,7 +157,7 @@ class Effect(Bindable):
         for name, value in self.parameters.items():
             for leaf in jax.tree.leaves(value):
                 if is_concrete(leaf) and not np.isfinite(leaf).all():
-                    raise ValueError(f"{self.name}: {name} is {np.asarray(leaf)}, which is not finite.")
+                    raise Refused(f"{self.name}: {name} is {np.asarray(leaf)}, which is not finite.")
         for name, parameter in self.declared.items():
             value = getattr(self, name)
             if parameter.sign and value is not None and is_concrete(value):
@@ -201,7 +200,7 @@ class Effect(Bindable):
         """Raise ValueError, "{quantity} is {value}; {expected}.", unless a condition is true everywhere, or traced."""
         if is_concrete(condition) and not np.all(condition):
             shown = np.asarray(value) if is_concrete(value) else value
-            raise ValueError(f"{self.name}: {quantity} is {shown}; {expected}.")
+            raise Refused(f"{self.name}: {quantity} is {shown}; {expected}.")
 
     def require_apart(self) -> None:
         """Refuse elements whose neighbouring bodies are at the same point at the start."""
@@ -215,7 +214,7 @@ class Effect(Bindable):
         sizes = {name: end_of(self.by_name, name, self.whole).size for name in names}
         if len(set(sizes.values())) > 1:
             described = ", ".join(f"{name} {size}" for name, size in sizes.items())
-            raise ValueError(f"{self.name}: bodies of different dimension ({described}); they must have the same.")
+            raise Refused(f"{self.name}: bodies of different dimension ({described}); they must have the same.")
 
     def check_start(self) -> None:
         """Refuse a constraint that the start violates, such as a link whose length is not the distance of its ends."""

@@ -17,6 +17,7 @@ from vmri_jax.mechanics.state import Problem, State, initial_state
 from vmri_jax.mechanics.surroundings import name_of
 from vmri_jax.mechanics.system import System
 from vmri_jax.mechanics.terms import KINDS, Term
+from vmri_jax.refusals import Refused
 from vmri_jax.running.prepare import prepare
 from vmri_jax.running.printed import PrintedTable
 from vmri_jax.running.simulation import Simulation
@@ -101,7 +102,7 @@ class Ledger:
 def ledger(sorting: Sorting, scheme: Scheme | Composition, macro_dt: float | None, measure: bool) -> Ledger:
     """The ledger of a scene, see `Scene.explain`."""
     if not isinstance(scheme, Scheme | Composition):
-        raise TypeError(f"Scene.explain: scheme is {scheme!r}; give a Scheme, e.g. fully_implicit(num_micro=10).")
+        raise Refused(f"Scene.explain: scheme is {scheme!r}; give a Scheme, e.g. fully_implicit(num_micro=10).")
     stage, stages, intervals = _intervals(scheme)
     rows = []
     sizes = {name: place.size for name, place in sorting.layout.bodies.items()}

@@ -22,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.mechanics.names import unknown
+from vmri_jax.refusals import NotInstalled, Refused
 from vmri_jax.scene.body import Frame
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.effects.custom import Potential
@@ -48,22 +49,22 @@ def bodies_and_effects(
     try:
         import mujoco  # pyright: ignore[reportMissingImports]
     except ImportError as error:
-        raise ImportError("Scene.from_mujoco needs the package mujoco: pip install 'vmri_jax[mujoco]'.") from error
+        raise NotInstalled("Scene.from_mujoco needs the package mujoco: pip install 'vmri_jax[mujoco]'.") from error
     if int(mujoco.__version__.split(".")[0]) < OLDEST_VERSION:
-        raise ImportError(
+        raise NotInstalled(
             f"Scene.from_mujoco needs mujoco {OLDEST_VERSION}.0 or newer, and finds {mujoco.__version__}: pip install 'vmri_jax[mujoco]'."
         )
     if isinstance(model, str | PathLike):
         if not Path(model).is_file():
-            raise ValueError(f"Scene.from_mujoco: the file {model} does not exist.")
+            raise Refused(f"Scene.from_mujoco: the file {model} does not exist.")
         try:
             model = mujoco.MjModel.from_xml_path(str(model))  # pyright: ignore
         except ValueError as error:
-            raise ValueError(f"Scene.from_mujoco: MuJoCo cannot read {model}: {error}") from error
+            raise Refused(f"Scene.from_mujoco: MuJoCo cannot read {model}: {error}") from error
     if not isinstance(model, mujoco.MjModel):  # pyright: ignore
-        raise TypeError(f"Scene.from_mujoco: model is {type(model).__name__}; give a path, or a mujoco.MjModel.")
+        raise Refused(f"Scene.from_mujoco: model is {type(model).__name__}; give a path, or a mujoco.MjModel.")
     if limits not in ("refuse", "spring"):
-        raise ValueError(f"Scene.from_mujoco: limits is {limits!r}; it must be 'refuse' or 'spring'.")
+        raise Refused(f"Scene.from_mujoco: limits is {limits!r}; it must be 'refuse' or 'spring'.")
     reader = _Reader(mujoco, model, coordinates, _start(mujoco, model, qpos, qvel, key))
     reader.refuse([*ignore, "limits"] if limits == "spring" and not isinstance(ignore, str) else ignore)
     close(reader)
@@ -77,15 +78,13 @@ def _start(mujoco: Any, model: Any, qpos: Any, qvel: Any, key: str | int | None)
     data = mujoco.MjData(model)
     if key is not None:
         if qpos is not None or qvel is not None:
-            raise ValueError(
-                "Scene.from_mujoco: key and qpos or qvel are given; both define the start. Give one of them."
-            )
+            raise Refused("Scene.from_mujoco: key and qpos or qvel are given; both define the start. Give one of them.")
         names = [model.key(i).name for i in range(model.nkey)]
         if isinstance(key, str) and key not in names:
-            raise ValueError(f"Scene.from_mujoco: {unknown('keyframe', key, names)}")
+            raise Refused(f"Scene.from_mujoco: {unknown('keyframe', key, names)}")
         number = names.index(key) if isinstance(key, str) else key
         if not 0 <= number < model.nkey:
-            raise ValueError(f"Scene.from_mujoco: key is {key}; the model has {model.nkey} keyframes, counted from 0.")
+            raise Refused(f"Scene.from_mujoco: key is {key}; the model has {model.nkey} keyframes, counted from 0.")
         mujoco.mj_resetDataKeyframe(model, data, number)
         qpos, qvel = model.key_qpos[number], model.key_qvel[number]
     for name, value in (("qpos", qpos), ("qvel", qvel)):
@@ -93,9 +92,9 @@ def _start(mujoco: Any, model: Any, qpos: Any, qvel: Any, key: str | int | None)
             continue
         value, target = np.asarray(value, dtype=float), getattr(data, name)
         if value.shape != target.shape:
-            raise ValueError(f"Scene.from_mujoco: {name} has shape {value.shape}; the model needs {target.shape}.")
+            raise Refused(f"Scene.from_mujoco: {name} has shape {value.shape}; the model needs {target.shape}.")
         if not np.isfinite(value).all():
-            raise ValueError(f"Scene.from_mujoco: {name} is {value}, which is not finite.")
+            raise Refused(f"Scene.from_mujoco: {name} is {value}, which is not finite.")
         target[:] = value
     mujoco.mj_forward(model, data)
     return data
@@ -188,7 +187,7 @@ class _Reader(Compiled):
         unfit = [model.joint(int(j)).name or f"joint {j}" for j in np.flatnonzero(model.jnt_limited & self.turning)]
         unfit += [model.tendon(int(i)).name or f"tendon {i}" for i in np.flatnonzero(model.tendon_limited)]
         if unfit and not ignored:
-            raise ValueError(
+            raise Refused(
                 f"Scene.from_mujoco: limits='spring' is for limits of hinges and slides, and {', '.join(unfit)} have limits of another "
                 "kind. Leave these out of the motion, ignore=['limits'], or change the model."
             )

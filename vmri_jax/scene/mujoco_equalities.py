@@ -24,6 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from vmri_jax.refusals import Refused
 from vmri_jax.scene.effects.couplings import JointCoupling
 from vmri_jax.scene.mujoco_model import Compiled
 
@@ -107,7 +108,7 @@ def _refuse_gaps(compiled: Compiled, widest: float, phrase: str) -> None:
             angle = f" and {distances[1]:.3g} rad" if loop.welded else ""
             gaps.append(f"{compiled.name('equality', loop.number)} {phrase} {distances[0]:.3g} m{angle}")
     if gaps:
-        raise ValueError(f"Scene.from_mujoco: {'; '.join(gaps)}. {ADVICE}")
+        raise Refused(f"Scene.from_mujoco: {'; '.join(gaps)}. {ADVICE}")
 
 
 def _size(compiled: Compiled, loop: Loop) -> float:
@@ -174,7 +175,7 @@ def couplings(compiled: Compiled) -> Iterator[JointCoupling]:
         name = compiled.name("equality", i)
         violation = abs(float(polynomial(jnp.zeros(len(joints)), params)))
         if violation > WIDEST_GAP:
-            raise ValueError(f"Scene.from_mujoco: {name} is violated by {violation:.3g} at the start. {ADVICE}")
+            raise Refused(f"Scene.from_mujoco: {name} is violated by {violation:.3g} at the start. {ADVICE}")
         yield JointCoupling([compiled.name("joint", j) for j in joints], polynomial, params, name=name)
 
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from vmri_jax.mechanics.names import unknown
+from vmri_jax.refusals import Refused
 from vmri_jax.scene.body import GROUND
 from vmri_jax.scene.mujoco_fields import CONSTRAINTS, PASSIVE, REFUSED, Refusal
 
@@ -118,18 +119,18 @@ class Compiled:
     def refuse(self, ignore: Collection[str]) -> None:
         """Raise ValueError with all features of the model that a scene does not express, except those in `ignore`, see `REFUSED`."""
         if isinstance(ignore, str):
-            raise TypeError(f"Scene.from_mujoco: ignore is {ignore!r}; give a list, ignore=[{ignore!r}].")
+            raise Refused(f"Scene.from_mujoco: ignore is {ignore!r}; give a list, ignore=[{ignore!r}].")
         ignorable = [kind for kind, refusal in REFUSED.items() if refusal.ignorable]
         for kind in ignore:
             if kind not in REFUSED:
-                raise ValueError(f"Scene.from_mujoco: ignore: {unknown('name', kind, ignorable)}")
+                raise Refused(f"Scene.from_mujoco: ignore: {unknown('name', kind, ignorable)}")
         refused = {kind: part for kind, part in self.beyond() if kind not in ignore or not REFUSED[kind].ignorable}
         if not refused:
             return
         leave_out = [kind for kind in refused if REFUSED[kind].ignorable]
         advice = [f"leave them out of the motion, ignore={leave_out}"] if leave_out else []
         advice += [f"for {kind}, {REFUSED[kind].without}" for kind in refused if not REFUSED[kind].ignorable]
-        raise ValueError(
+        raise Refused(
             "Scene.from_mujoco: the model has features that a scene of rigid bodies does not express: "
             f"{'; '.join(f'{kind} ({part})' for kind, part in refused.items())}. Change the model, or {'; '.join(advice)}."
         )

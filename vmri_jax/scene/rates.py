@@ -23,6 +23,7 @@ from vmri_jax.mechanics.arrays import quickly_compiled
 from vmri_jax.mechanics.functions import TracedOnce
 from vmri_jax.mechanics.linearisation import mass_orthonormal
 from vmri_jax.mechanics.motion import force_of
+from vmri_jax.refusals import Refused
 from vmri_jax.scene.body import LARGEST_POINT, Bodies, label_of, moving
 from vmri_jax.scene.effect import Effect
 
@@ -98,7 +99,7 @@ def _rates(effect: Effect, elements: Sequence[Linearised], mass: np.ndarray, siz
     for i, (names, element) in enumerate(zip(effect.elements, elements, strict=True)):
         element_mass = mass[np.ix_(element.columns, element.columns)]
         if not np.linalg.eigvalsh(element_mass).min() > 0:
-            raise ValueError(
+            raise Refused(
                 f"{effect.name}: the kinetic energy of {', '.join(names)} is not positive at the start; change masses or kinetic "
                 "effects, or give every body a pace and every potential between fast bodies a rate."
             )
@@ -136,7 +137,7 @@ def _linearise(effect: Effect, bodies: Bodies, columns: Mapping[str, np.ndarray]
         motions = block_diag(*each)
         force, (stiffness, gyroscopic, mass) = motions.T @ force, [motions.T @ matrix @ motions for matrix in matrices]
         if not all(np.isfinite(part).all() for part in (force, stiffness, gyroscopic, mass)):
-            raise ValueError(
+            raise Refused(
                 f"{effect.name}: its energy between {', '.join(map(label_of, effect.elements[i]))} has no finite derivatives at the "
                 "start; move these bodies, or smooth the energy."
             )

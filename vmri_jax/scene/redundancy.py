@@ -14,6 +14,7 @@ import numpy as np
 from scipy.linalg import qr
 
 from vmri_jax.mechanics.constraints import RANK, rank_of
+from vmri_jax.refusals import Refused
 from vmri_jax.scene.effects.joint_base import Joint
 from vmri_jax.scene.rigid import Rigidity
 from vmri_jax.scene.rows import ConstraintRows
@@ -58,7 +59,7 @@ def check_constraints(sorting: Sorting) -> None:
         return
     opening = find_opening(rows)
     if opening is not None:
-        raise ValueError(f'Scene: redundant="drop" would change the motion: {_in_words(rows, opening)}.')
+        raise Refused(f'Scene: redundant="drop" would change the motion: {_in_words(rows, opening)}.')
     macro, micro = (rows.numbers(home) for home in HOMES)
     _refuse(rows, macro + micro, 0, lambda: _cure(sorting))
     if micro:
@@ -195,7 +196,7 @@ def _refuse(rows: ConstraintRows, numbers: list[int], first: int, advice: Callab
     # the user did not write the rows of rigidity, so they are named only if no others are involved
     named = [name for name in all_named if not name.startswith(Rigidity.default_name + " ")] or all_named
     among = "among " if len(named) < len(involved) else ""
-    raise ValueError(
+    raise Refused(
         f"Scene: over-constrained at the start: {_listed(named)} are {among}{len(involved)} constraints of "
         f"rank {rank_of(jacobian[involved])[0]}; {advice()}."
     )

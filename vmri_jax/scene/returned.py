@@ -11,6 +11,7 @@ from jax.flatten_util import ravel_pytree
 from vmri_jax.mechanics.arrays import is_concrete
 from vmri_jax.mechanics.checks import describe, shape_of
 from vmri_jax.mechanics.constraints import START, Rows
+from vmri_jax.refusals import Refused
 from vmri_jax.scene.declare import arrays
 
 LIBRARY = "vmri_jax."
@@ -37,7 +38,7 @@ def check_function(effect: Any, moved: bool) -> None:
         if effect.kind == "constraint" and not moved and is_concrete(arguments):
             rows = _rows(effect.function, *arguments)
             if np.any(np.abs(rows.values) > rows.allowed(START)):
-                raise ValueError(
+                raise Refused(
                     f"{effect.name}: the positions at the start violate this constraint by {np.abs(rows.values).max():.3g}; move the "
                     "bodies, or let the scene do so, Scene(..., project=True)."
                 )
@@ -64,4 +65,4 @@ def _check_value(effect: Any, value: Any, sizes: list[tuple[int, ...]], count: i
     else:
         fits, expected = shape == (), "an energy, a scalar of shape (), the sum over all elements"
     if not fits:
-        raise ValueError(f"{effect.name}: function returns {describe(value)}; it must return {expected}.")
+        raise Refused(f"{effect.name}: function returns {describe(value)}; it must return {expected}.")

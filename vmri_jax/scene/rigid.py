@@ -17,6 +17,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from vmri_jax.mechanics.arrays import is_concrete, library
+from vmri_jax.refusals import Refused
 from vmri_jax.scene.body import AnyBody, Pace, Point, joined
 from vmri_jax.scene.declare import effect_class, names
 from vmri_jax.scene.effect import Effect
@@ -85,7 +86,7 @@ class RigidBody(AnyBody):
         self._check_names()
         mass = self._numbers("mass", self.mass)
         if mass.shape or (is_concrete(mass) and not mass > 0):
-            raise ValueError(f"RigidBody {self.name}: mass is {mass}; it must be one positive number.")
+            raise Refused(f"RigidBody {self.name}: mass is {mass}; it must be one positive number.")
         shape = self.inertia if isinstance(self.inertia, Shape) else self.shape
         inertia = self.inertia
         tensor = inertia.inertia(mass) if isinstance(inertia, Shape) else self._numbers("inertia", inertia)
@@ -94,7 +95,7 @@ class RigidBody(AnyBody):
         for name in ("position", "velocity", "spin"):
             value = np.zeros(3) if getattr(self, name) is None else self._numbers(name, getattr(self, name))
             if value.shape != (3,):
-                raise ValueError(f"RigidBody {self.name}: {name} has shape {value.shape}; give (3,).")
+                raise Refused(f"RigidBody {self.name}: {name} has shape {value.shape}; give (3,).")
             fields[name] = value
         fields["rotation"] = self._matrix()
         for name, value in fields.items():
@@ -106,23 +107,23 @@ class RigidBody(AnyBody):
         axes = np.eye(3)
         if inertia.shape == (3, 3) and is_concrete(inertia):
             if np.abs(inertia - inertia.T).max() > ORTHONORMAL * np.abs(inertia).max():
-                raise ValueError(f"{about} is {inertia.tolist()}; it must be a symmetric matrix.")
+                raise Refused(f"{about} is {inertia.tolist()}; it must be a symmetric matrix.")
             if np.count_nonzero(inertia - np.diag(np.diagonal(inertia))):
                 inertia, axes = np.linalg.eigh(inertia)
                 axes[:, 2] *= np.linalg.det(axes)  # eigenvectors may form a left-handed triad
             else:
                 inertia = np.diagonal(inertia)  # keeps the order of the axes, which eigh would sort
         if inertia.shape != (3,):
-            raise ValueError(f"{about} has shape {inertia.shape}; give (3,) principal moments, a matrix, or a shape.")
+            raise Refused(f"{about} has shape {inertia.shape}; give (3,) principal moments, a matrix, or a shape.")
         if is_concrete(inertia):
             inertia = np.asarray(inertia)
             largest, other_two = inertia.max(), inertia.sum() - inertia.max()
             if inertia.min() < 0 or largest <= 0:
-                raise ValueError(
+                raise Refused(
                     f"{about} has the principal moments {inertia}; they must not be negative, nor all be zero."
                 )
             if largest > other_two * (1 + ORTHONORMAL):
-                raise ValueError(
+                raise Refused(
                     f"{about} has the principal moments {inertia}, which no body has: the largest, {largest:g}, must not be larger than "
                     f"the sum of the others, {other_two:g}."
                 )
@@ -134,19 +135,19 @@ class RigidBody(AnyBody):
             return np.eye(3)
         about, rotation = f"RigidBody {self.name}: rotation", self._numbers("rotation", self.rotation)
         if rotation.shape not in ((3, 3), (4,), (3,)):
-            raise ValueError(
+            raise Refused(
                 f"{about} has shape {rotation.shape}; give a matrix (3, 3), a quaternion (w, x, y, z) or a rotation vector (3,)."
             )
         if not is_concrete(rotation):
             return matrix_of(rotation)
         if rotation.shape == (4,) and abs(np.linalg.norm(rotation) - 1) > ORTHONORMAL:
-            raise ValueError(
+            raise Refused(
                 f"{about} is the quaternion {rotation} of length {np.linalg.norm(rotation):.12g}; divide it by its length, which must be 1."
             )
         if rotation.shape == (3, 3):
             error = np.abs(rotation.T @ rotation - np.eye(3)).max()
             if error > ORTHONORMAL or np.linalg.det(rotation) < 0:
-                raise ValueError(
+                raise Refused(
                     f"{about} is {rotation.tolist()}, which is no rotation: R^T R differs from 1 by {error:.2g} and the determinant is "
                     f"{np.linalg.det(rotation):.3g}."
                 )
@@ -207,7 +208,7 @@ class RigidBody(AnyBody):
         if thin and is_concrete(components):
             sizes = np.abs(np.asarray(components))
             if np.any(sizes[thin] > ORTHONORMAL * sizes.max()):
-                raise ValueError(
+                raise Refused(
                     f"{np.asarray(vector)} sticks out of {self.name}: with the moments of inertia {np.asarray(self.moments)} it is a plate "
                     "or a rod without width in this direction. Give the body some width."
                 )
@@ -255,7 +256,7 @@ class RigidBody(AnyBody):
         if offset is None:
             return Point(self.name, self.position, self.mass)
         if offset.shape != (3,):
-            raise ValueError(f"the point in {self.name} has shape {offset.shape}; give (3,), in the axes of the body.")
+            raise Refused(f"the point in {self.name} has shape {offset.shape}; give (3,), in the axes of the body.")
         self.components(offset)  # refuses a point outside a plate or a rod
         return Point(self.name, self.position + self.rotation @ offset)
 
@@ -323,7 +324,7 @@ def rotation(q):
         ValueError: coordinates of another number.
     """
     if np.shape(q)[-1] != 12:
-        raise ValueError(f"rotation: q has shape {np.shape(q)}; give the 12 coordinates of a rigid body, (..., 12).")
+        raise Refused(f"rotation: q has shape {np.shape(q)}; give the 12 coordinates of a rigid body, (..., 12).")
     return np.swapaxes(np.asarray(split(np.asarray(q))[1]), -1, -2)
 
 

@@ -16,6 +16,7 @@ from vmri_jax.mechanics.rows import Place
 from vmri_jax.mechanics.state import Problem, State, initial_state, tell_of_velocities
 from vmri_jax.mechanics.summary import listed, summary
 from vmri_jax.mechanics.system import System
+from vmri_jax.refusals import Refused
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.scene.assembly import actuation, build
 from vmri_jax.scene.binding import bound
@@ -96,28 +97,28 @@ class Scene:
     def __post_init__(self):
         require_x64()
         if self.redundant not in ("refuse", "drop"):
-            raise ValueError(f"Scene: redundant is {self.redundant!r}; it must be 'refuse' or 'drop'.")
+            raise Refused(f"Scene: redundant is {self.redundant!r}; it must be 'refuse' or 'drop'.")
         if self.coordinates not in ("joint", "directors", "auto"):
-            raise ValueError(f"Scene: coordinates is {self.coordinates!r}; it must be 'joint', 'directors' or 'auto'.")
+            raise Refused(f"Scene: coordinates is {self.coordinates!r}; it must be 'joint', 'directors' or 'auto'.")
         lists = (("bodies", AnyBody, "Body, RigidBody or Frame"), ("effects", Effect, "Effect"))
         for name, kind, expected in lists:
             items = getattr(self, name)
             if isinstance(items, kind) or not isinstance(items, Iterable):
-                raise TypeError(f"Scene: {name} is {items!r}; give a list.")
+                raise Refused(f"Scene: {name} is {items!r}; give a list.")
             object.__setattr__(self, name, tuple(items))
             for item in getattr(self, name):
                 if not isinstance(item, kind):
-                    raise TypeError(f"Scene: {item!r} is among {name}; it must be {expected}.")
+                    raise Refused(f"Scene: {item!r} is among {name}; it must be {expected}.")
         if not self.bodies:
-            raise ValueError("Scene: there are no bodies; give at least one.")
+            raise Refused("Scene: there are no bodies; give at least one.")
         for name, count in Counter(item.name for item in (*self.bodies, *self.everything)).items():
             if count > 1:
-                raise ValueError(
+                raise Refused(
                     f"Scene: the name {name!r} occurs twice; give each body and effect its own name, e.g. name=..."
                 )
         for name, content in RESERVED.items():
             if name in [effect.name for effect in self.effects]:
-                raise ValueError(
+                raise Refused(
                     f"Scene: an effect is called {name!r}, where the params keep {content}; give it another name."
                 )
         for effect in self.everything:
@@ -281,7 +282,7 @@ class Scene:
         """
         frames = [body.name for body in self.bodies if isinstance(body, Frame)]
         if frames:
-            raise ValueError(
+            raise Refused(
                 f"Scene.by_directors: {', '.join(frames)} have no mass, which bodies with directors need. Reaction forces are known of scenes "
                 "without frames: join bodies by Universal, Cylindrical or Planar, or put bodies of small mass in place of the frames."
             )
@@ -329,11 +330,11 @@ class Scene:
         """
         items = {item.name: item for item in (*self.bodies, *self.effects)}
         if name not in items:
-            raise ValueError(f"Scene.replace: {unknown('body or effect', name, items)}")
+            raise Refused(f"Scene.replace: {unknown('body or effect', name, items)}")
         fields = items[name].__dataclass_fields__
         for key in changes:
             if key not in fields:
-                raise ValueError(f"Scene.replace: {name}: {unknown('argument', key, fields)}")
+                raise Refused(f"Scene.replace: {name}: {unknown('argument', key, fields)}")
         items[name] = replace(items[name], **changes)
         changed = list(items.values())
         return replace(self, bodies=changed[: len(self.bodies)], effects=changed[len(self.bodies) :])
@@ -395,5 +396,5 @@ class Scene:
         known = [effect.name for effect in self.effects]
         for name in names:
             if name not in known:
-                raise ValueError(f"Scene.{method}: {unknown('effect', name, known)}")
+                raise Refused(f"Scene.{method}: {unknown('effect', name, known)}")
         return [effect for effect in self.effects if effect.name in names]

@@ -37,6 +37,7 @@ from scipy.sparse import eye_array
 
 from vmri_jax.mechanics.arrays import is_concrete, library, quickly_compiled
 from vmri_jax.mechanics.kinematics import Kinematics
+from vmri_jax.refusals import Refused
 from vmri_jax.scene.body import GROUND, Bodies
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.joint_constants import joint_constants
@@ -242,7 +243,7 @@ def sort(bodies: Bodies, effects: Sequence[Effect], branches: Sequence[Branch] =
     layout, links = make_layout(bodies, paces, branches)
     if not any(layout.sizes):
         joints = dict.fromkeys(branch.joint.name for branch in branches)
-        raise ValueError(
+        raise Refused(
             f"Scene: nothing can move: {', '.join(joints)} leave no freedom to any body. Leave one of these joints out."
         )
     return Sorting(bodies, paces, layout, tuple(placed), links)
@@ -260,7 +261,7 @@ def _measure(bodies, energies, owned: Mapping[str, Sequence[Owners]]) -> dict[st
     kinetic = any(effect.kind == "kinetic" for effect in energies)
     numbers = [(body.masses, body.coordinates, body.rates if kinetic else None) for body in bodies.values()]
     if not is_concrete((numbers, [effect.parameters for effect in energies])):
-        raise ValueError(
+        raise Refused(
             f"Scene: whether {', '.join(undecided or bodies)} is slow or fast depends on numbers that jax.jit, grad or vmap traces, so that "
             "their values are unknown. Give every body a pace and every potential between fast bodies a rate, or build the system outside of "
             "jit and vary its params."

@@ -19,6 +19,7 @@ import numpy as np
 from vmri_jax.mechanics.arrays import is_concrete
 from vmri_jax.mechanics.kinematics import Frames, Grid, Kinematics, Move
 from vmri_jax.mechanics.rows import Part, Place, Rows
+from vmri_jax.refusals import Refused
 from vmri_jax.scene.body import GROUND, Bodies, Frame
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.effects.freedoms import ANGLES
@@ -175,12 +176,12 @@ def check_frames(bodies: Bodies, branches: Sequence[Branch]) -> None:
         if not isinstance(body, Frame):
             continue
         if not branches:
-            raise ValueError(
+            raise Refused(
                 f'Scene: {name} is a frame without mass, which moves with joints alone; give the scene coordinates="joint".'
             )
         if name not in hanging or name not in carrying:
             lack = f"no joint carries the frame {name}" if name not in hanging else f"the frame {name} carries no body"
-            raise ValueError(
+            raise Refused(
                 f"Scene: {lack}, and it has no mass; join it to the body that it hangs on and to a body that it "
                 "carries by joints with coordinates, such as Revolute, or leave it out."
             )

@@ -11,6 +11,7 @@ import jax
 import numpy as np
 
 from vmri_jax.mechanics.arrays import is_concrete
+from vmri_jax.refusals import Refused
 from vmri_jax.scene.body import moving
 from vmri_jax.scene.effects.freedoms import ANGLES, REACH
 from vmri_jax.scene.effects.joint_base import Joint, OfFreedoms, freedom_of
@@ -40,7 +41,7 @@ def along_run(sorting: Sorting, joint: Joint, run: Any, of: str, pair: int) -> n
     unknown = np.argwhere((fastest * dt >= np.pi) | (excess >= np.pi / 2))
     if unknown.size:
         node = unknown[0, -1]
-        raise ValueError(
+        raise Refused(
             f"Scene.joint_motion: {joint.label(pair)} may turn by half a turn or more between the saved nodes {node} and "
             f"{node + 1}, and its angle comes from directors, which know no whole turns. Save nodes less than "
             f'{np.pi / 2 / np.nanmax(fastest):.2g} s apart, save=..., or give the scene coordinates="joint".'

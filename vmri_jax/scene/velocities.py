@@ -12,6 +12,7 @@ from vmri_jax.mechanics.arrays import is_concrete, real_array
 from vmri_jax.mechanics.constraints import RANK
 from vmri_jax.mechanics.projection import legendre
 from vmri_jax.mechanics.system import System
+from vmri_jax.refusals import Refused
 from vmri_jax.scene.body import AnyBody, moving
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.effects.freedoms import ANGLES
@@ -38,7 +39,7 @@ def with_rates(
     of the kinetic energy: with ``M = R R^T``, ``x = R^T (v - v_0)`` is the shortest solution of ``C R^-T x = b - C v_0``.
     """
     if not is_concrete((sorting.start, system, rates)):
-        raise TypeError(
+        raise Refused(
             "Scene.with_rates: jax.jit, grad or vmap traces numbers of the scene or rates; call with_rates outside of these."
         )
     q_s, q_f, v_s, v_f = sorting.start
@@ -77,7 +78,7 @@ def with_rates(
     v = v + np.linalg.solve(root.T, np.linalg.lstsq(c_by_root, b - c @ v, rcond=None)[0])
     errors = np.abs(c @ v - b)
     if errors.max() > RATE_ERROR * size:
-        raise ValueError(
+        raise Refused(
             f"Scene.with_rates: no velocities have these rates of {', '.join(rates)} and keep the constraints: the nearest ones differ by "
             f"{(errors * lengths).max():.3g}. Give fewer rates: the rate of a joint follows from those of others, or the joint cannot move here."
         )
@@ -104,7 +105,7 @@ def joint_starts(sorting: Sorting, effects: Sequence[Effect], starts: Mapping[st
         for i in range(count):
             key = name, i, freedom
             if key not in sorting.layout.freedoms:
-                raise ValueError(
+                raise Refused(
                     f"Scene.with_joints: {joint.label(i)} has no coordinate of its own: it closes a loop, where you may set "
                     'the other joints, or its bodies have directors: then give the scene coordinates="joint".'
                 )
@@ -139,7 +140,7 @@ def with_closed_loops(sorting: Sorting, starts: dict[Key, tuple[Any, Any]]) -> d
         worst = numbers[np.argmax(np.abs(values[numbers]))]
         row, size = rows.rows[worst].name, abs(values[worst]) * rows.sizes[worst]
         named = " and ".join(f"{joint} at {value:.4g}" for (joint, *_), value in zip(starts, reached, strict=True))
-        raise ValueError(
+        raise Refused(
             f"Scene.with_joints: no configuration of the other joints keeps {row}, which stays open by {size:.3g}. It is kept up to "
             f"{named}; give values up to there, or values of fewer joints."
         )
@@ -170,14 +171,14 @@ def _of_joints_alone(sorting: Sorting, rows: ConstraintRows) -> np.ndarray:
 def _by_freedom(method: str, effects: Sequence[Effect], numbers: Mapping[str, Any]) -> Iterator[tuple[Joint, str, Any]]:
     """(joint, freedom, numbers) from a mapping by names of joints, whose values may be mappings by freedoms; `method` begins messages."""
     if not isinstance(numbers, Mapping):
-        raise TypeError(f'{method}: got {numbers!r}; give numbers by the names of joints, {{"hinge": 0.3}}.')
+        raise Refused(f'{method}: got {numbers!r}; give numbers by the names of joints, {{"hinge": 0.3}}.')
     for name, of_joint in numbers.items():
         joint = joint_named(method, name, effects)
         for freedom, of_freedom in of_joint.items() if isinstance(of_joint, Mapping) else [("auto", of_joint)]:
             try:
                 known = freedom_of(joint, freedom)
             except ValueError as error:
-                raise ValueError(f'{method}: {error} Give a dictionary, {{"turn": ..., "slide": ...}}.') from None
+                raise Refused(f'{method}: {error} Give a dictionary, {{"turn": ..., "slide": ...}}.') from None
             yield joint, known, of_freedom
 
 
@@ -186,7 +187,7 @@ def _for_pairs(about: str, numbers: Any, count: int, form: str):
     values = real_array(about, numbers)
     if values.shape not in ((), (count,)):
         for_pairs = f", or one for each pair, ({count},)" if count > 1 else ""
-        raise ValueError(f"{about} has shape {values.shape}; give {form}{for_pairs}.")
+        raise Refused(f"{about} has shape {values.shape}; give {form}{for_pairs}.")
     if is_concrete(values) and not np.isfinite(values).all():
-        raise ValueError(f"{about} is {values}; it must be finite.")
+        raise Refused(f"{about} is {values}; it must be finite.")
     return values

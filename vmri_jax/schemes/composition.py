@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Float
 
 from vmri_jax.mechanics.arrays import Numbers, is_concrete, real_array
+from vmri_jax.refusals import Refused
 from vmri_jax.schemes.description import Description, printed
 from vmri_jax.schemes.scheme import Scheme
 
@@ -170,13 +171,13 @@ def compose(scheme: Scheme | Composition, coefficients: str | Sequence[float]) -
             not cancel; coefficients that do not sum to 1, or zeros among them.
     """
     if not isinstance(scheme, Scheme | Composition):
-        raise TypeError(f"compose: scheme is {type(scheme).__name__}; give a Scheme, e.g. fully_explicit(10).")
+        raise Refused(f"compose: scheme is {type(scheme).__name__}; give a Scheme, e.g. fully_explicit(10).")
     if isinstance(coefficients, str):
         if coefficients not in COMPOSITIONS:
-            raise ValueError(f"compose: there is no composition {coefficients!r}; there are {', '.join(COMPOSITIONS)}.")
+            raise Refused(f"compose: there is no composition {coefficients!r}; there are {', '.join(COMPOSITIONS)}.")
         if is_concrete(scheme) and not (scheme.is_symmetric and scheme.order == 2):
             kind = "symmetric" if scheme.is_symmetric else "not symmetric"
-            raise ValueError(
+            raise Refused(
                 f"compose: {coefficients} is made for symmetric schemes of order 2; this one has order {scheme.order} and is "
                 f"{kind}. Take e.g. fully_explicit(num_micro, alpha=0.5), or give coefficients of your own."
             )
@@ -184,11 +185,9 @@ def compose(scheme: Scheme | Composition, coefficients: str | Sequence[float]) -
     c = real_array("compose: coefficients", coefficients)
     c = np.asarray(c) if is_concrete(c) else c
     if c.ndim != 1 or not c.size:
-        raise ValueError(f"compose: coefficients have shape {c.shape}; give a sequence of parts of the macro step.")
+        raise Refused(f"compose: coefficients have shape {c.shape}; give a sequence of parts of the macro step.")
     if is_concrete(c) and not (np.all(np.isfinite(c)) and np.all(c != 0) and abs(c.sum() - 1) < 1e-10):
-        raise ValueError(
-            f"compose: coefficients {c.tolist()} sum to {c.sum():.15g}; give numbers, none zero, of sum 1."
-        )
+        raise Refused(f"compose: coefficients {c.tolist()} sum to {c.sum():.15g}; give numbers, none zero, of sum 1.")
     if isinstance(scheme, Composition):
         return Composition(scheme.scheme, (c[:, None] * scheme.coefficients).reshape(-1))
     return Composition(scheme, c)

@@ -26,6 +26,7 @@ import numpy as np
 from vmri_jax.kernels import matmul
 from vmri_jax.mechanics.system import ConstantMass, System
 from vmri_jax.mechanics.terms import Term
+from vmri_jax.refusals import Refused
 from vmri_jax.schemes.path import (
     Nodes,
     Path,
@@ -207,7 +208,7 @@ def _corrections(system: System, scheme: Scheme) -> list[TermOnNodes]:
     if not scheme.slow.gradient_corrected and not scheme.fast.gradient_corrected:
         return []
     if not isinstance(system.kinetic, ConstantMass):
-        raise ValueError("Scheme: corrected kicks need a System whose kinetic is a ConstantMass.")
+        raise Refused("Scheme: corrected kicks need a System whose kinetic is a ConstantMass.")
     slow_potential, fast_potential, mass = system.slow_potential, system.fast_potential, system.kinetic
     both = scheme.fast.gradient_corrected and fast_potential is not None
 
@@ -261,15 +262,13 @@ def discrete_lagrangian(system: System, scheme: Scheme) -> Callable:
     the last of these, see `discrete_legendre`.
     """
     if scheme.slow.mollified:
-        raise ValueError(
-            "discrete_lagrangian: a mollified potential depends on more than the control points of a step."
-        )
+        raise Refused("discrete_lagrangian: a mollified potential depends on more than the control points of a step.")
     terms = lagrangian(system, scheme)
 
     def L_d(slow, fast, macro_dt):
         expected = (scheme.degree + 1, scheme.num_micro * scheme.degree + 1)
         if (slow.shape[0], fast.shape[0]) != expected:
-            raise ValueError(
+            raise Refused(
                 f"L_d: got {slow.shape[0]} slow and {fast.shape[0]} fast control points; this scheme has {expected[0]} "
                 f"and {expected[1]}."
             )

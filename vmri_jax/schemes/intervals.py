@@ -20,6 +20,8 @@ Terms of slow variables alone, such as `System.slow_kinetic`, belong to no inter
 These are the equations of `vmri_jax.schemes.equations`, in the order in which a march over the intervals meets them.
 """
 
+from copy import copy
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -28,7 +30,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from vmri_jax.kernels import matmul
+from vmri_jax.kernels import matmul, matvec
 from vmri_jax.mechanics.rows import Entries
 from vmri_jax.mechanics.structure import entries_seen
 from vmri_jax.schemes.discrete_lagrangian import QuadraticKinetic, TermOnNodes, lagrangian
@@ -186,6 +188,16 @@ class Intervals:
         n, r = equations.scheme.num_micro, equations.scheme.degree
         self._slow_basis = slow_basis_at_control_nodes(n, r)[..., 1:]  # at the control nodes, by slow increments
 
+    def by_masses(self, v_s, v_f) -> "Intervals":
+        """The equations with ``v^T M v / 2`` in place of kinetic energies T that are functions, ``M = d2T/dv2`` at these velocities and at the start of
+        the step: their derivatives contain none of T.
+        """
+        values = {"q_s": self.equations.q_s, "q_f": self.equations.q_f, "v_s": v_s, "v_f": v_f}
+        by_masses = copy(self)
+        by_masses._terms = [(_by_masses(term, values), nodes) for term, nodes in self._terms]
+        by_masses._slow_terms = [_by_masses(term, values) for term in self._slow_terms]
+        return by_masses
+
     def _seen(self) -> Entries:
         """The slow variables whose positions or velocities the functions on the micro grid can depend on."""
         equations, system = self.equations, self.equations.system
@@ -301,6 +313,24 @@ class Intervals:
         rows = jnp.concatenate([(equations.micro_dt * equations.p_s + start - d.sum(0))[None], d[:-1]]) - impulses
         p_s = equations.p_s + (start - impulses.sum(0)) / equations.micro_dt
         return (rows, jax.vmap(equations.system.g_slow)(times[1:], nodes[1:])), p_s
+
+
+def _by_masses(term: TermOnNodes, values: dict) -> TermOnNodes:
+    """The term, or for a kinetic energy ``v^T M v / 2`` with ``M = d2T/dv2`` at these values."""
+    names = [name for name in term.arguments if name.startswith("v")]
+    if not names:
+        return term
+    positions = [values[name] for name in term.arguments if name not in names]
+    ends = np.cumsum([values[name].size for name in names])[:-1]
+    v = jnp.concatenate([values[name] for name in names])
+    times_mass = jax.linearize(jax.grad(lambda v: term.integrand(*positions, *jnp.split(v, ends))), v)[1]
+    mass = jax.vmap(times_mass)(jnp.eye(v.size))
+
+    def energy(*arguments):
+        v = jnp.concatenate(arguments[-len(names) :])
+        return v @ matvec(mass, v) / 2
+
+    return replace(term, integrand=energy)
 
 
 def _where_there_are_nodes(nodes: IntervalNodes, m, function, *paths):

@@ -19,6 +19,7 @@ from jaxtyping import Float
 
 from vmri_jax.kernels import matmul
 from vmri_jax.mechanics.arrays import Number, Numbers
+from vmri_jax.refusals import Refused
 from vmri_jax.schemes.quadrature import NODE_TOLERANCE, PlacedRule, Rule, lobatto
 
 
@@ -182,7 +183,7 @@ def velocity_nodes(placed: PlacedRule, num_micro: int, degree: int) -> Nodes:
     groups = tuple(_group(placed, i, num_micro) for i in range(len(placed.rule.nodes)))
     for g in groups:
         if g.c == 0.0 and g.first > 0:
-            raise ValueError(
+            raise Refused(
                 f"macro rule: node {g.first / num_micro} falls on the border of two of the {num_micro} micro intervals, "
                 "where the velocity is not defined; place this term with micro(...) or choose another rule."
             )

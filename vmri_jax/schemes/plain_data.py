@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 
+from vmri_jax.refusals import Refused
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.description import RULES
 from vmri_jax.schemes.quadrature import PlacedRule, Rule
@@ -32,7 +33,7 @@ def from_plain(data: dict[str, Any]) -> Scheme | Composition:
     if "coefficients" in data:
         scheme = from_plain(data["scheme"])
         if isinstance(scheme, Composition):
-            raise ValueError("from_plain: the stages of a composition must be steps of a scheme, not of a composition.")
+            raise Refused("from_plain: the stages of a composition must be steps of a scheme, not of a composition.")
         return Composition(scheme, np.asarray(data["coefficients"]))
     rules = {name: _placed_rule(data[name]) for name in RULES.values()}
     potentials = {name: _placed_rule(placed) for name, placed in data["potentials"]}

@@ -22,6 +22,7 @@ from jaxtyping import Float
 from numpy.polynomial import legendre
 
 from vmri_jax.mechanics.arrays import Numbers, is_concrete, real_array, whole_number
+from vmri_jax.refusals import Refused
 
 NODE_TOLERANCE = 1e-12
 """Nodes closer than this are the same node."""
@@ -46,13 +47,13 @@ class Rule(eqx.Module):
         self.nodes = tuple(real_array("Rule: nodes", nodes, 1).tolist())
         self.weights = real_array("Rule: weights", weights)
         if not self.nodes or self.weights.shape != (len(self.nodes),):
-            raise ValueError(
+            raise Refused(
                 f"Rule: got {len(self.nodes)} nodes and weights of shape {self.weights.shape}; give one weight per node, and at least one node."
             )
         if any(not -NODE_TOLERANCE <= node <= 1 + NODE_TOLERANCE for node in self.nodes):
-            raise ValueError(f"Rule: nodes {self.nodes} must lie in [0, 1], the unit interval.")
+            raise Refused(f"Rule: nodes {self.nodes} must lie in [0, 1], the unit interval.")
         if any(b - a <= NODE_TOLERANCE for a, b in zip(self.nodes, self.nodes[1:], strict=False)):
-            raise ValueError(f"Rule: nodes {self.nodes} must increase strictly; add two rules to merge their nodes.")
+            raise Refused(f"Rule: nodes {self.nodes} must increase strictly; add two rules to merge their nodes.")
 
     def __add__(self, other: "Rule") -> "Rule":
         if not isinstance(other, Rule):
@@ -97,7 +98,7 @@ class Rule(eqx.Module):
         function over an interval of length h is O(h^(p+1)).
         """
         if not is_concrete(self.weights):
-            raise ValueError("Rule.order needs concrete weights; ask for it outside jit, vmap and grad.")
+            raise Refused("Rule.order needs concrete weights; ask for it outside jit, vmap and grad.")
         x, w = 2 * np.array(self.nodes) - 1, np.asarray(self.weights)
         for k in range(2 * len(x) + 1):  # in Legendre polynomials, whose moments are well scaled
             moment = w @ legendre.legval(x, np.eye(k + 1)[k])
@@ -175,7 +176,7 @@ def radau(n: int, end: Literal["left", "right"] = "right") -> Rule:
     """
     whole_number("radau: the number of nodes", n)
     if end not in ("left", "right"):
-        raise ValueError(f"radau: end is {end!r}; it must be 'left' or 'right'.")
+        raise Refused(f"radau: end is {end!r}; it must be 'left' or 'right'.")
     interior = np.zeros(0)
     if n > 1:  # roots of (P_{n-1} + P_n) / (1 + x): the other nodes of the rule that includes x = -1
         quotient, _ = legendre.legdiv(np.eye(n + 1)[n] + np.eye(n + 1)[n - 1], [1.0, 1.0])
@@ -197,7 +198,7 @@ def affine(alpha) -> Rule:
     """
     value = real_array("affine: alpha", alpha, 0)
     if is_concrete(value) and not 0 <= value <= 1:
-        raise ValueError(
+        raise Refused(
             f"affine: alpha is {alpha}; it must be from 0 to 1: it is the part of a kick that is given at the start of an interval, and "
             "1 - alpha at its end. With other numbers one of these parts points backwards, and momenta at the nodes are off by more than half a kick."
         )
@@ -311,7 +312,7 @@ def micro(rule: Rule, every: int = 1) -> PlacedRule:
 
 def _placed(rule: Rule, grid: Literal["macro", "micro"]) -> PlacedRule:
     if not isinstance(rule, Rule):
-        raise TypeError(f"{grid}: rule is {rule!r}; give a Rule, e.g. midpoint or gauss(2).")
+        raise Refused(f"{grid}: rule is {rule!r}; give a Rule, e.g. midpoint or gauss(2).")
     return PlacedRule(rule, grid)
 
 
@@ -324,7 +325,7 @@ def mollified(placed: PlacedRule) -> PlacedRule:
     differential equations* (1998), the mollified impulse method with LongAverage.
     """
     if not isinstance(placed, PlacedRule) or placed.grid != "macro" or not placed.only_ends:
-        raise ValueError(f"mollified: got {placed!r}; give kicks at the macro nodes, e.g. macro(trapezoidal).")
+        raise Refused(f"mollified: got {placed!r}; give kicks at the macro nodes, e.g. macro(trapezoidal).")
     return PlacedRule(placed.rule, placed.grid, mollified=True)
 
 
@@ -338,7 +339,7 @@ def gradient_corrected(placed: PlacedRule) -> PlacedRule:
     4. Frequencies of harmonic vibrations do not depend on coordinates, and are of order 4 without that change.
     """
     if not isinstance(placed, PlacedRule) or not placed.only_ends or placed.mollified or placed.every > 1:
-        raise ValueError(
+        raise Refused(
             f"gradient_corrected: got {placed!r}; give kicks at the nodes of a grid, e.g. micro(trapezoidal)."
         )
     return PlacedRule(placed.rule, placed.grid, gradient_corrected=True)

@@ -27,6 +27,7 @@ import numpy as np
 from vmri_jax.mechanics.arrays import is_concrete
 from vmri_jax.mechanics.system import RATE_OF
 from vmri_jax.mechanics.terms import label
+from vmri_jax.refusals import Refused
 from vmri_jax.schemes.description import RULES, Description, printed
 from vmri_jax.schemes.path import control_nodes, lagrange_derivative
 from vmri_jax.schemes.quadrature import (
@@ -89,7 +90,7 @@ class Scheme(eqx.Module):
         for name in RULES.values():
             _check_placed(name, getattr(self, name))
             if getattr(self, name).every > 1 and name not in ("slow", "fast"):
-                raise ValueError(
+                raise Refused(
                     f"Scheme: {name} is placed with every={getattr(self, name).every}; only potentials can be: slow, fast, and those of "
                     "with_potentials(...). Take micro(rule) or macro(rule)."
                 )
@@ -99,18 +100,18 @@ class Scheme(eqx.Module):
             _check_placed(name, placed)
             if placed.mollified or placed.gradient_corrected:
                 how = "mollified" if placed.mollified else "corrected"
-                raise ValueError(
+                raise Refused(
                     f"Scheme: {name} is {how}; only the rules of V and W can be. Give micro(rule) or macro(rule)."
                 )
             self.potentials[name] = _on_grid(name, placed, self.num_micro)
         if self.kinetic.grid != "micro":
-            raise ValueError(
+            raise Refused(
                 "Scheme: the kinetic rule must be placed with micro(...); each micro interval has a velocity."
             )
         _check_kinetic(self.kinetic.rule, self.degree)
         filtered = [name for name in ("kinetic", "fast", "force", "constraint") if getattr(self, name).mollified]
         if filtered or (self.slow.mollified and self.fast.grid != "micro"):
-            raise ValueError(
+            raise Refused(
                 f"Scheme: {filtered or 'slow'} is mollified; only kicks of the slow potential can be, along fast motion on the "
                 "micro grid: slow=mollified(macro(...)) with fast=micro(...)."
             )
@@ -118,7 +119,7 @@ class Scheme(eqx.Module):
         for name in ("kinetic", "slow", "fast", "force", "constraint"):
             placed = getattr(self, name)
             if placed.gradient_corrected and (placed.grid != grids.get(name) or self.degree > 1):
-                raise ValueError(
+                raise Refused(
                     f"Scheme: {name} on the {placed.grid} grid, degree {self.degree}, is corrected; only kicks of a path of degree 1 "
                     "can be: slow=gradient_corrected(macro(...)), fast=gradient_corrected(micro(...))."
                 )
@@ -126,12 +127,12 @@ class Scheme(eqx.Module):
             placed = getattr(self, name)
             nodes, needed = np.array(placed.rule.nodes), control_nodes(self.degree)
             if placed.grid != grid or nodes.shape != needed.shape or np.abs(nodes - needed).max() > NODE_TOLERANCE:
-                raise ValueError(
+                raise Refused(
                     f"Scheme: {name} must be held at the control nodes {needed.tolist()} of degree {self.degree}; "
                     f"give {grid}(lobatto({self.degree + 1})), got {placed.grid} rule with nodes {nodes.tolist()}."
                 )
             if is_concrete(placed) and np.any(np.asarray(placed.rule.weights) == 0):
-                raise ValueError(f"Scheme: a weight of the {name} rule is zero; its multiplier would be undefined.")
+                raise Refused(f"Scheme: a weight of the {name} rule is zero; its multiplier would be undefined.")
 
     @property
     def order(self) -> int:
@@ -205,7 +206,7 @@ class Scheme(eqx.Module):
         if name in RATE_OF.values():
             placed = getattr(self, name)
             return PlacedRule(placed.rule, placed.grid, every=placed.every)
-        raise ValueError(
+        raise Refused(
             f"Scheme: there is no rule for the potential {name!r} of the system; the scheme has rules for {list(self.potentials) or 'V and W only'}. "
             f"Give it one, e.g. scheme.with_potentials({name}=vm.micro(vm.quadrature.trapezoidal, every=2))."
         )
@@ -247,7 +248,7 @@ def _on_grid(name: str, placed: PlacedRule, num_micro: int) -> PlacedRule:
     """The placed rule, moved to the macro grid if one copy of it spans the macro interval."""
     if placed.every > 1 and num_micro % placed.every:
         divisors = [k for k in range(1, num_micro + 1) if num_micro % k == 0]
-        raise ValueError(
+        raise Refused(
             f"Scheme: {name} is placed with every={placed.every}, which does not divide num_micro={num_micro}: its last copy would end in "
             f"the next macro step. Take one of {divisors}, or another num_micro."
         )
@@ -256,9 +257,9 @@ def _on_grid(name: str, placed: PlacedRule, num_micro: int) -> PlacedRule:
 
 def _positive_integer(name: str, value) -> int:
     if isinstance(value, bool) or not isinstance(value, int | np.integer):
-        raise TypeError(f"Scheme: {name} is {value!r}; it must be an integer of at least 1.")
+        raise Refused(f"Scheme: {name} is {value!r}; it must be an integer of at least 1.")
     if value < 1:
-        raise ValueError(f"Scheme: {name} is {value}; it must be at least 1.")
+        raise Refused(f"Scheme: {name} is {value}; it must be at least 1.")
     return int(value)
 
 
@@ -267,7 +268,7 @@ def _check_kinetic(rule: Rule, degree: int) -> None:
     slopes = lagrange_derivative(degree, np.array(rule.nodes))[:, 1:]
     weights = np.asarray(rule.weights) if is_concrete(rule) else np.ones(len(rule.nodes))
     if np.linalg.eigvalsh(slopes.T @ (weights[:, None] * slopes)).min() <= 1e-9:
-        raise ValueError(
+        raise Refused(
             f"Scheme: the kinetic rule with nodes {list(rule.nodes)} gives no positive kinetic energy to some motion of a path of "
             f"degree {degree}: it has too few nodes, or a negative weight. Give another, e.g. micro(gauss({degree}))."
         )
@@ -275,13 +276,13 @@ def _check_kinetic(rule: Rule, degree: int) -> None:
 
 def _check_placed(name: str, placed) -> None:
     if isinstance(placed, Rule):
-        raise TypeError(f"Scheme: {name} is a bare rule; say on which grid it lives, macro(rule) or micro(rule).")
+        raise Refused(f"Scheme: {name} is a bare rule; say on which grid it lives, macro(rule) or micro(rule).")
     if not isinstance(placed, PlacedRule):
-        raise TypeError(f"Scheme: {name} is {placed!r}; give macro(rule) or micro(rule).")
+        raise Refused(f"Scheme: {name} is {placed!r}; give macro(rule) or micro(rule).")
     if is_concrete(placed):
         total = float(placed.rule.weights.sum())
         if not abs(total - 1) < 1e-10:
-            raise ValueError(f"Scheme: the weights of the {name} rule sum to {total:.15g}; they must sum to 1.")
+            raise Refused(f"Scheme: the weights of the {name} rule sum to {total:.15g}; they must sum to 1.")
 
 
 def fully_implicit(num_micro: int) -> Scheme:
@@ -376,6 +377,6 @@ def galerkin(num_micro: int, degree: int, rule: Rule | str = "gauss") -> Scheme:
     degree = _positive_integer("degree", degree)
     if isinstance(rule, str):
         if rule not in ("gauss", "lobatto"):
-            raise ValueError(f"galerkin: rule is {rule!r}; it must be 'gauss', 'lobatto' or a Rule.")
+            raise Refused(f"galerkin: rule is {rule!r}; it must be 'gauss', 'lobatto' or a Rule.")
         rule = gauss(degree) if rule == "gauss" else lobatto(degree + 1)
     return Scheme(num_micro, degree, kinetic=micro(rule), slow=micro(rule), fast=micro(rule))

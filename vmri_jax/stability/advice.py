@@ -9,38 +9,41 @@ import numpy as np
 from vmri_jax.mechanics.linearisation import Linearisation, linearise
 from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.mechanics.terms import label
+from vmri_jax.refusals import Refused
 from vmri_jax.running.origin import names_of
 from vmri_jax.schemes.composition import Composition, stage_lengths, stage_scheme
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.stability.drive import LEAST_STEPS, drive_period, driven_motion, growth_of_run, in_words, periods_of_run
-from vmri_jax.stability.map import TOLERANCE, Window, measure
-from vmri_jax.stability.multipliers import multipliers
+from vmri_jax.stability.map import Window, measure
+from vmri_jax.stability.multipliers import TOLERANCE, multipliers
 from vmri_jax.stability.oscillator import fast_limit, kick_limit, phase, slow_limit
 from vmri_jax.study.table import Column, ResultTable
 
 SCANNED_STEPS = (0.5, 1.25)
 """Least and largest macro step of the first scan, in units of the step in question; a wider scan takes longer."""
 RADIANS_PER_POINT = 0.15
-"""Spacing of the scanned macro steps: the angle by which the fastest vibration turns more from one to the next. With a larger value two
-multipliers may pass each other twice between points, which hides a window."""
+"""Spacing of the scanned macro steps: the angle by which the fastest vibration turns more from one to the next. With a
+larger value two multipliers may pass each other twice between points, which hides a window."""
 POINTS = (48, 384)
 """Fewest and most points of a scan; more points take longer."""
 RESOLUTION = 1e-5
 """Accuracy of the ends of windows, as a part of the scan; narrower windows are left out."""
 NEAR_STEP = 0.05
-"""Largest distance of a near window of unstable steps, as a part of the step: along a trajectory frequencies change, and windows move. A larger
-value warns of more windows."""
+"""Largest distance of a near window of unstable steps, as a part of the step: along a trajectory frequencies change,
+and windows move. A larger value warns of more windows."""
 NEAR_WIDTHS = 3.0
-"""Largest distance of a near window, in its widths: width and displacement of a window both grow with the coupling. A larger value warns of
-more windows. A window is near if it is within both distances."""
+"""Largest distance of a near window, in its widths: width and displacement of a window both grow with the coupling. A
+larger value warns of more windows. A window is near if it is within both distances."""
 LONGER_FOR_CAUSE = 0.01
-"""Part by which the step is lengthened to find the cause: V and W together become unstable at a slightly shorter step than each alone. A larger
-value may blame a limit that is not yet reached."""
+"""Part by which the step is lengthened to find the cause: V and W together become unstable at a slightly shorter step
+than each alone. A larger value may blame a limit that is not yet reached."""
 RADIANS_IN_PHASE = 0.2
-"""Distance of the turn of a vibration in a macro step from a multiple of 2 pi, below which kicks of a constant force are said to be in phase: they
-make the vibration 10 times as large as kicks at odd multiples of pi do. A larger value warns of more steps."""
+"""Distance of the turn of a vibration in a macro step from a multiple of 2 pi, below which kicks of a constant force
+are said to be in phase: they make the vibration 10 times as large as kicks at odd multiples of pi do. A larger value
+warns of more steps."""
 LEAST_FORCE = 1e-6
-"""Smallest part of the constant slow force in a vibration for which its kicks are judged; a smaller value warns of round-off."""
+"""Smallest part of the constant slow force in a vibration for which its kicks are judged; a smaller value warns of
+round-off."""
 MOST_SCANS = 5
 """Most scans, each over smaller steps than the previous one, until one of them contains a safe step."""
 
@@ -49,11 +52,14 @@ MOST_SCANS = 5
 class Finding:
     """One result of `advise`.
 
-    severity: "error" if the step is unstable, "warning" if an unstable step is near or slow and fast are swapped, or "note".
-    kind: "impulse resonance", "combination resonance", "stability limit", "kicks in phase", "labels", "stages", "drive" or "motion".
+    severity: "error" if the step is unstable, "warning" if an unstable step is near or slow and fast are swapped, or
+        "note".
+    kind: "impulse resonance", "combination resonance", "stability limit", "kicks in phase", "labels", "stages", "drive"
+        or "motion".
     sentence: the result in words.
-    number: its measure: growth per step of an error, relative distance of a window, ratio of frequencies, amplitude, longest
-        stage, micro steps in a period of the drive, growth rate of the motion (NaN if each period has another one).
+    number: its measure: growth per step of an error, relative distance of a window, ratio of frequencies, amplitude,
+        longest stage, micro steps in a period of the drive, growth rate of the motion (NaN if each period has another
+        one).
     """
 
     severity: str
@@ -71,9 +77,10 @@ class Advice(ResultTable):
     findings: results in words, the most severe first.
     windows: unstable intervals of macro_dt in the range `scanned`.
     scanned: least and largest macro step of all scans.
-    safe_macro_dt: the stable step nearest to macro_dt without a near window, macro_dt itself if it is such a step; NaN if no scan has one. Of a
-        periodic drive a part of the period.
-    fast_frequencies, slow_frequencies: (d,) frequencies of the fast and of the slow potential at the state, the largest first.
+    safe_macro_dt: the stable step nearest to macro_dt without a near window, macro_dt itself if it is such a step; NaN
+        if no scan has one. Of a periodic drive a part of the period.
+    fast_frequencies, slow_frequencies: (d,) frequencies of the fast and of the slow potential at the state, the largest
+        first.
     about: the motions that are judged, in words.
     """
 
@@ -126,31 +133,32 @@ def advise(
     state: State | None = None,
     *,
     macro_dt: float,
-    tolerance: float = TOLERANCE,
 ) -> Advice:
     """Judge a macro step before a long run, from the multipliers of the step of small motions about the state.
 
-    Under a periodic drive: from the multipliers of the run and of the motion over a period. Elsewhere instability is measured, too: the
-    derivative of the step of the frozen problem (see `linearise`) has a multiplier outside the unit circle, at macro_dt or in a window of
-    steps near it. Formulas only name the cause:
+    Under a periodic drive: from the multipliers of the run and of the motion over a period. Elsewhere instability is
+    measured, too: the derivative of the step of the frozen problem (see `linearise`) has a multiplier outside the unit
+    circle, at macro_dt or in a window of steps near it. Formulas only name the cause:
 
     * stability limit: the step is unstable for the fast or the slow potential alone; ``omega h`` or ``omega H`` exceeds
       the limit of its quadrature rule (2 for kicks at the ends);
-    * impulse resonance: the slow potential is on the macro grid, and the phases of two vibrations (or twice the phase of one) add up to a
-      multiple of 2 pi per macro step, counted as the micro steps turn them (midpoint rule: 2 atan(omega h / 2) per micro step);
-    * combination resonance: the same with V on the micro grid, where the slow path, one polynomial per macro step, couples the vibrations;
-    * kicks in phase: a constant part of the slow force, such as a weight, meets a vibration that turns by a multiple of 2 pi per macro step;
-      no disturbance grows, but the vibration becomes large;
+    * impulse resonance: the slow potential is on the macro grid, and the phases of two vibrations (or twice the phase
+      of one) add up to a multiple of 2 pi per macro step, counted as the micro steps turn them (midpoint rule: 2
+      atan(omega h / 2) per micro step);
+    * combination resonance: the same with V on the micro grid, where the slow path, one polynomial per macro step,
+      couples the vibrations;
+    * kicks in phase: a constant part of the slow force, such as a weight, meets a vibration that turns by a multiple of
+      2 pi per macro step; no disturbance grows, but the vibration becomes large;
     * labels: the fastest vibration is one of the slow variables;
-    * stages, motion (notes): a composition with backward steps; a motion that is itself unstable, or that the frozen problem does not judge.
+    * stages, motion (notes): a composition with backward steps; a motion that is itself unstable, or that the frozen
+      problem does not judge.
 
-    It takes one compilation and some hundred eigenvalue problems. All motions are small here. Large motions, such as in a hot molecule,
-    change the frequencies along a trajectory and meet resonances that a single state does not show: call `advise` at several states of a
-    run, and plot the energy of a long run.
+    It takes one compilation and some hundred eigenvalue problems. All motions are small here. Large motions, such as in
+    a hot molecule, change the frequencies along a trajectory and meet resonances that a single state does not show:
+    call `advise` at several states of a run, and plot the energy of a long run.
 
     Args:
         system, scheme, state, macro_dt: as of the run; state None for the start of the problem or scene.
-        tolerance: growth per macro step above which a step is unstable.
 
     Raises:
         ValueError: a macro step that is not positive; second derivatives that are not finite at the state.
@@ -159,13 +167,13 @@ def advise(
     names = names_of(system)
     system, state = start_of("advise", system, state)
     if not isinstance(scheme, Scheme | Composition):
-        raise TypeError(f"advise: scheme is {type(scheme).__name__}; give a Scheme, e.g. fully_implicit(num_micro=10).")
+        raise Refused(f"advise: scheme is {type(scheme).__name__}; give a Scheme, e.g. fully_implicit(num_micro=10).")
     if not (np.ndim(macro_dt) == 0 and np.isfinite(macro_dt) and macro_dt > 0):
-        raise ValueError(f"advise: macro_dt is {macro_dt}; it must be a positive number.")
+        raise Refused(f"advise: macro_dt is {macro_dt}; it must be a positive number.")
     macro_dt, linear = float(macro_dt), linearise(system, state, names)
     period = drive_period(system, state, macro_dt)
     if period is None:
-        judged = _judged_at_rest(linear, scheme, macro_dt, tolerance)
+        judged = _judged_at_rest(linear, scheme, macro_dt)
     else:
         judged = _judged_over_a_period(system, scheme, state, macro_dt, period)
     findings = [*judged.pop("findings"), *_stages(scheme)]
@@ -198,12 +206,12 @@ def _judged_over_a_period(system, scheme, state: State, macro_dt: float, period:
     }
 
 
-def _judged_at_rest(linear: Linearisation, scheme, macro_dt: float, tolerance: float) -> dict[str, Any]:
+def _judged_at_rest(linear: Linearisation, scheme, macro_dt: float) -> dict[str, Any]:
     """Fields of the `Advice` from the multipliers of a step of small motions, at macro_dt and at steps near it."""
     lower, upper = SCANNED_STEPS[0] * macro_dt, SCANNED_STEPS[1] * macro_dt
-    windows = _scan(linear, scheme, lower, upper, macro_dt, tolerance)
+    windows = _scan(linear, scheme, lower, upper, macro_dt)
     growth = float(multipliers(linear, scheme, [macro_dt]).radius[0]) - 1
-    growth = growth if growth > tolerance else 0.0
+    growth = growth if growth > TOLERANCE else 0.0
     step_findings = list(_step_findings(linear, scheme, macro_dt, growth, windows))
     safe = macro_dt
     for _ in range(MOST_SCANS if step_findings else 0):
@@ -211,7 +219,7 @@ def _judged_at_rest(linear: Linearisation, scheme, macro_dt: float, tolerance: f
         if not np.isnan(safe):
             break
         upper, lower = lower, lower / 3
-        windows = _scan(linear, scheme, lower, upper, upper, tolerance) + windows
+        windows = _scan(linear, scheme, lower, upper, upper) + windows
     findings = [*step_findings, *_kicks_in_phase(linear, scheme, macro_dt)]
     if (swap := linear.swapped()) is not None:
         findings.append(Finding("warning", "labels", *swap))
@@ -219,7 +227,8 @@ def _judged_at_rest(linear: Linearisation, scheme, macro_dt: float, tolerance: f
     if linear.frozen and (rate or step_findings or linear.driven):
         findings.append(Finding("note", "motion", linear.frozen, 0.0))
     elif rate:
-        sentence = f"Motion about this state grows by itself, like exp({rate:.3g} t); that is left out of the growth that is measured."
+        growth_of_motion = f"Motion about this state grows by itself, like exp({rate:.3g} t)"
+        sentence = f"{growth_of_motion}; that is left out of the growth that is measured."
         findings.append(Finding("note", "motion", sentence, rate))
     return {
         "growth": growth,
@@ -247,11 +256,11 @@ def _step_findings(linear: Linearisation, scheme, macro_dt: float, growth: float
             yield Finding("warning", kind, f"{where} There: {cause}", distance)
 
 
-def _scan(linear: Linearisation, scheme, lower: float, upper: float, point: float, tolerance: float) -> list[Window]:
+def _scan(linear: Linearisation, scheme, lower: float, upper: float, point: float) -> list[Window]:
     """Unstable windows of macro steps between lower and upper, measured on a grid that contains `point`."""
     turn = linear.frequencies.max(initial=0.0) * (upper - lower)
     grid = np.linspace(lower, upper, int(np.clip(turn / RADIANS_PER_POINT, *POINTS)))
-    return measure(linear, scheme, np.union1d(grid, [point]), tolerance, RESOLUTION)[1]
+    return measure(linear, scheme, np.union1d(grid, [point]), RESOLUTION)[1]
 
 
 def _margin(a: float, b: float, macro_dt: float) -> float:
@@ -297,8 +306,8 @@ def _stability_limit(linear: Linearisation, scheme: Scheme | Composition, macro_
         if alone.radius[0] > 1 + TOLERANCE and frequency > 0:
             bound = f"; its quadrature rule is stable below {limit:.4g}" if np.isfinite(limit) else ""
             return (
-                f"The step is unstable for the {words} alone: its frequency {frequency:.4g} times {step_name}{of_stage} "
-                f"is {frequency * step:.4g}{bound}."
+                f"The step is unstable for the {words} alone: its frequency {frequency:.4g} times "
+                f"{step_name}{of_stage} is {frequency * step:.4g}{bound}."
             )
     return ""
 
@@ -353,9 +362,9 @@ def _kicks_in_phase(linear: Linearisation, scheme: Scheme | Composition, macro_d
         yield Finding(
             "warning",
             "kicks in phase",
-            f"The vibration of frequency {frequencies[i]:.4g} turns by {turn / np.pi:.4g} pi in a macro step, close to a multiple of 2 pi, and the "
-            f"slow force has a constant part along it: its kicks add up to an amplitude of {amplitude:.2g}, where the force itself moves it by "
-            f"{held:.2g}. Take another step.",
+            f"The vibration of frequency {frequencies[i]:.4g} turns by {turn / np.pi:.4g} pi in a macro step, close to "
+            "a multiple of 2 pi, and the slow force has a constant part along it: its kicks add up to an amplitude of "
+            f"{amplitude:.2g}, where the force itself moves it by {held:.2g}. Take another step.",
             float(amplitude),
         )
 
@@ -367,7 +376,8 @@ def _is_fast(linear: Linearisation, i) -> bool:
 
 
 def _turn(linear: Linearisation, scheme: Scheme | Composition, macro_dt: float, i) -> float:
-    """Angle by which vibration i turns in a macro step: the phase of the micro steps if W carries the vibration, else ``omega H``."""
+    """Angle by which vibration i turns in a macro step: the phase of the micro steps if W carries the vibration, else
+    ``omega H``."""
     exact = float(linear.frequencies[i] * macro_dt)
     if not _is_fast(linear, i):
         return exact
@@ -383,7 +393,8 @@ def _stages(scheme: Scheme | Composition) -> Iterator[Finding]:
     if not (parts > 0).all():
         longest = float(np.abs(parts).max())
         sentence = (
-            f"The {len(parts)} stages of the composition make steps of {parts.min():.3g} to {parts.max():.3g} macro steps, some "
-            f"backwards: the largest stable macro step of the composition is about that of its scheme divided by {longest:.3g}."
+            f"The {len(parts)} stages of the composition make steps of {parts.min():.3g} to {parts.max():.3g} macro "
+            "steps, some backwards: the largest stable macro step of the composition is about that of its scheme "
+            f"divided by {longest:.3g}."
         )
         yield Finding("note", "stages", sentence, longest)

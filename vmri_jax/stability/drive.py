@@ -1,7 +1,8 @@
 """Systems that are driven in time: the period T of the drive, and the growth of disturbances over a period.
 
-Disturbances of a motion under a periodic drive are multiplied by the monodromy matrix M in every period (Floquet): they stay bounded if all
-multipliers of M lie on the unit circle or inside. A run with macro steps H has a matrix of its own, the product of N steps with ``N H = m T``.
+Disturbances of a motion under a periodic drive are multiplied by the monodromy matrix M in every period (Floquet): they
+stay bounded if all multipliers of M lie on the unit circle or inside. A run with macro steps H has a matrix of its own,
+the product of N steps with ``N H = m T``.
 """
 
 from collections.abc import Callable
@@ -25,21 +26,28 @@ from vmri_jax.schemes.scheme import Scheme, fully_implicit
 from vmri_jax.stability.multipliers import monodromy
 
 SAMPLES = 1024
-"""Times at which the drive is compared with itself, one period later or earlier; with fewer of them narrow pulses are missed."""
+"""Times at which the drive is compared with itself, one period later or earlier; with fewer of them narrow pulses are
+missed."""
 SPANS = 8.0 ** np.arange(-1, 5)
-"""Lengths of the sampled intervals, in macro steps: periods of 1/500 to 2000 macro steps are seen. Longer ones take longer to measure."""
+"""Lengths of the sampled intervals, in macro steps: periods of 1/500 to 2000 macro steps are seen. Longer ones take
+longer to measure."""
 CANDIDATES = 8
 """Lags that are tried as the period in an interval; more of them find drives with many harmonics."""
 SAME = 1e-7
-"""Difference of the drive from itself a period later, as a part of its amplitude. A larger value takes drives for periodic that change slowly."""
+"""Difference of the drive from itself a period later, as a part of its amplitude. A larger value takes drives for
+periodic that change slowly."""
 STEPS_FOLLOWED = 64
-"""Macro steps that are followed at most where they are no part of the period, so that N steps are nearly m periods; more steps come nearer."""
+"""Macro steps that are followed at most where they are no part of the period, so that N steps are nearly m periods;
+more steps come nearer."""
 LEAST_GROWTH = 1e-4
-"""Growth per period that counts: round-off of the product of thousands of steps is below. A larger value overlooks slow growth."""
+"""Growth per period that counts: round-off of the product of thousands of steps is below. A larger value overlooks slow
+growth."""
 LEAST_STEPS = 4
-"""Micro steps that a period of the drive needs at least; with fewer of them steps pass over it. A larger value warns of steps that are right."""
+"""Micro steps that a period of the drive needs at least; with fewer of them steps pass over it. A larger value warns of
+steps that are right."""
 CONVERGED_STEPS, MOST_STEPS = 32, 20_000
-"""Micro steps in a period from which halved steps confirm the growth of the motion, and macro steps at which halving ends; more take longer."""
+"""Micro steps in a period from which halved steps confirm the growth of the motion, and macro steps at which halving
+ends; more take longer."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +66,8 @@ class DrivenMotion:
     steps: tuple[float, ...]
 
     def agrees(self, growth: float) -> bool:
-        """Whether disturbances of a run with this growth per period grow if those of the motion do, and about as fast."""
+        """Whether disturbances of a run with this growth per period grow if those of the motion do, and about as
+        fast."""
         return self.growth / 3 <= growth <= 3 * self.growth
 
     def __str__(self) -> str:
@@ -73,10 +82,11 @@ def in_words(growth: float) -> str:
 
 
 def drive_period(system: System, state: State, scale: float) -> float | None:
-    """The smallest period of all terms that depend on time and of their derivatives, with positions and velocities of the state.
+    """The smallest period of all terms that depend on time and of their derivatives, with positions and velocities of
+    the state.
 
-    Periods of 1/500 to 2000 times `scale`, such as the macro step, are seen. None if nothing depends on time, or no period is seen, as for
-    pulses, chirps, and drives with jumps.
+    Periods of 1/500 to 2000 times `scale`, such as the macro step, are seen. None if nothing depends on time, or no
+    period is seen, as for pulses, chirps, and drives with jumps.
     """
     if not driven(system, state) or not 0 < scale < np.inf:
         return None
@@ -100,7 +110,8 @@ def drive_period(system: System, state: State, scale: float) -> float | None:
 
 
 def _signal(system: System, state: State, times: np.ndarray) -> Callable[[np.ndarray], tuple]:
-    """One function of times (k,) for all terms, each in units of its amplitude at the given times, and its rate of change, (k,) both."""
+    """One function of times (k,) for all terms, each in units of its amplitude at the given times, and its rate of
+    change, (k,) both."""
     values = np.nan_to_num(_drive(system, state, times)[0], posinf=0.0, neginf=0.0)
     amplitude = np.ptp(values, axis=0)
     moves = amplitude > 1e-9 * np.abs(values).max(axis=0)
@@ -111,7 +122,8 @@ def _signal(system: System, state: State, times: np.ndarray) -> Callable[[np.nda
 
 @quickly_compiled
 def _drive(system: System, state: State, times):
-    """Forces and constraints at k times with their derivative along one direction of (q, v), and the rates of change of both, (k, m) each."""
+    """Forces and constraints at k times with their derivative along one direction of (q, v), and the rates of change of
+    both, (k, m) each."""
     z = jnp.concatenate([state.q_s, state.q_f, *velocity(system, state.q_s, state.q_f, state.p_s, state.p_f)])
     direction = jnp.cos(2.0 + jnp.arange(z.size))
 
@@ -126,13 +138,16 @@ def _drive(system: System, state: State, times):
 
 
 def periods_of_run(macro_dt: float, period: float) -> int:
-    """The number m of periods of the drive after which a run is compared with the motion: nearly a whole number of macro steps."""
+    """The number m of periods of the drive after which a run is compared with the motion: nearly a whole number of
+    macro steps."""
     return Fraction(period / macro_dt).limit_denominator(max(1, int(STEPS_FOLLOWED * macro_dt / period))).denominator
 
 
 def growth_of_run(system: System, scheme, state: State, macro_dt: float, period: float, periods: int) -> tuple:
-    """Growth of disturbances of a run per period, over a number of periods, 0 if they do not grow, infinite if a step fails; and the last state."""
-    # the nearest step of which a whole number takes these periods: the product of steps over another time is no monodromy matrix
+    """Growth of disturbances of a run per period, over a number of periods, 0 if they do not grow, infinite if a step
+    fails; and the last state."""
+    # the nearest step of which a whole number takes these periods: the product of steps over another time is no
+    # monodromy matrix
     steps = max(1, round(periods * period / macro_dt))
     try:
         product = monodromy(system, scheme, state, macro_dt=periods * period / steps, num_steps=steps)
@@ -145,7 +160,8 @@ def growth_of_run(system: System, scheme, state: State, macro_dt: float, period:
 
 
 def growth_over_period(moving: Movable, linear: Linearisation) -> DrivenMotion | None:
-    """The growth of disturbances of a motion over a period of the drive, from `fully_implicit` steps; None if no period is seen."""
+    """The growth of disturbances of a motion over a period of the drive, from `fully_implicit` steps; None if no period
+    is seen."""
     system, state = start_of("growth_over_period", moving, linear.state)
     step = 1 / max(np.abs(linear.rates).max(initial=0.0), 1e-300)
     period = drive_period(system, state, step)

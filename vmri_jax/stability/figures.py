@@ -19,8 +19,8 @@ COLUMNS = 3
 def plot_stability(maps: Mapping[str, StabilityMap], title: str = "", theme: Theme = LIGHT) -> NotebookFigure:
     """Unstable windows over ``omega H / pi`` and the rows of each map, one panel per map.
 
-    The colour of a window is its largest growth per step. Rows are stacked from the bottom: systems with numbers as labels at these heights, all
-    others in their order.
+    The colour of a window is its largest growth per step. Rows are stacked from the bottom: systems with numbers as
+    labels at these heights, all others in their order.
 
     Args:
         maps: maps by the title of their panel, e.g. one per scheme, each over num_micro or systems.

@@ -10,21 +10,20 @@ import numpy as np
 from vmri_jax.executors.executor import mapped
 from vmri_jax.mechanics.linearisation import Linearisation, linearise
 from vmri_jax.mechanics.state import Movable, State, start_of
+from vmri_jax.refusals import Refused
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.stability.multipliers import multipliers
 from vmri_jax.study.table import Column, ResultTable
 
-TOLERANCE = 1e-6
-"""Growth per step that counts as instability. Round-off alone splits two equal multipliers by its square root, up to 2e-8; a larger value
-overlooks slow growth."""
 POINTS_IN_WINDOW = np.linspace(0.0, 1.0, 9)
 """Points of a window at which its growth is measured, in widths from its start."""
 RESOLUTION = 1e-7
-"""Accuracy of the ends of windows, as a part of the range of omega H; narrower windows are left out. A larger value takes less time."""
+"""Accuracy of the ends of windows, as a part of the range of omega H; narrower windows are left out. A larger value
+takes less time."""
 POINTS_PER_CALL = 64
-"""Samples that all brackets together get in a call of `label`, the number that `multipliers` computes at a time for small systems; more samples
-divide brackets faster, and each costs an eigenvalue problem."""
+"""Samples that all brackets together get in a call of `label`, the number that `multipliers` computes at a time for
+small systems; more samples divide brackets faster, and each costs an eigenvalue problem."""
 
 
 class Window(NamedTuple):
@@ -48,10 +47,9 @@ class StabilityMap(ResultTable):
     rows: (m,) labels of the rows.
     omega: frequency that scales the grid, the largest frequency of the fast potential alone.
     omega_H: (n,) grid, macro step times omega.
-    radius: (m, n) spectral radius of the derivative of the step, without the multipliers of motions of the system that grow;
-        infinite where the step failed.
-    unstable: the windows of omega_H of each row in which radius > 1 + tolerance; they may be far narrower than the grid.
-    tolerance: growth per step that counts as instability.
+    radius: (m, n) spectral radius of the derivative of the step, without the multipliers of motions of the system that
+        grow; infinite where the step failed.
+    unstable: the windows of omega_H of each row in which radius > 1 + 1e-6; they may be far narrower than the grid.
     note: why the map does not tell whether the motion is stable, see `Linearisation.frozen`; empty at an equilibrium.
     """
 
@@ -65,7 +63,6 @@ class StabilityMap(ResultTable):
     omega_H: np.ndarray
     radius: np.ndarray
     unstable: tuple[tuple[Window, ...], ...]
-    tolerance: float
     note: str = ""
 
     caption = property(lambda self: self.note, doc="The note.")
@@ -79,7 +76,7 @@ class StabilityMap(ResultTable):
         """Intervals of omega H that are unstable, for one row (the first by default)."""
         row = self.rows[0] if row is None else row
         if row not in self.rows:
-            raise ValueError(f"windows: there is no row {row!r}; there are {', '.join(map(repr, self.rows))}.")
+            raise Refused(f"windows: there is no row {row!r}; there are {', '.join(map(repr, self.rows))}.")
         return list(self.unstable[self.rows.index(row)])
 
     def first_unstable(self, row=None) -> float:
@@ -105,25 +102,25 @@ def stability_map(
     omega_H: Sequence[float] | np.ndarray,
     *,
     state: State | None = None,
-    tolerance: float = TOLERANCE,
     executor: Any = None,
 ) -> StabilityMap:
     """Stability of macro steps of length H, from the multipliers of the step of small motions about a state.
 
-    At an equilibrium these are the eigenvalues of the derivative of `macro_step`; elsewhere the eigenvalues for the frozen problem
-    (see `linearise`). Multipliers of opposite Krein signature that have passed each other between two grid points reveal a window there,
-    whose ends are refined by bisection.
+    At an equilibrium these are the eigenvalues of the derivative of `macro_step`; elsewhere the eigenvalues for the
+    frozen problem (see `linearise`). Multipliers of opposite Krein signature that have passed each other between two
+    grid points reveal a window there, whose ends are refined by bisection.
 
     Args:
-        system: `linear_model()`, any other problem or scene, a system with a state, or several by label for a single scheme, e.g.
-            ``{k: linear_model(kappa=k) for k in (5.0, 25.0)}``. The unit of the grid is omega of the first: the largest frequency of its
-            fast potential alone, or the largest rate of all motions if this potential has no frequency.
+        system: `linear_model()`, any other problem or scene, a system with a state, or several by label for a single
+            scheme, e.g. ``{k: linear_model(kappa=k) for k in (5.0, 25.0)}``. The unit of the grid is omega of the
+            first: the largest frequency of its fast potential alone, or the largest rate of all motions if this
+            potential has no frequency.
         scheme: a scheme or composition, or several by label, e.g. ``{n: explicit_slow(n) for n in (2, 3, 5)}``; each
             num_micro and structure is compiled once.
         omega_H: (n,) increasing positive values of omega times the macro step. A spacing of 0.1 or less finds narrow
-            windows; with a larger one a multiplier may pass several multipliers between two points, which hides windows.
+            windows; with a larger one a multiplier may pass several multipliers between two points, which hides
+            windows.
         state: point of expansion of the small motions; None for the start of the problem.
-        tolerance: growth per macro step above which a step is unstable.
         executor: executor that computes the rows, as of `vmri_jax.ensemble`; None for this process.
 
     Raises:
@@ -134,18 +131,19 @@ def stability_map(
     systems = system if isinstance(system, Mapping) else {"": system}
     schemes = scheme if isinstance(scheme, Mapping) else {"": scheme}
     if not schemes or not all(isinstance(s, Scheme | Composition) for s in schemes.values()):
-        raise TypeError(
-            f"stability_map: scheme is {scheme!r}; give a Scheme or Composition, e.g. explicit_slow(10), or a dict of them."
+        raise Refused(
+            f"stability_map: scheme is {scheme!r}; give a Scheme or Composition, e.g. explicit_slow(10), or a dict of "
+            "them."
         )
     if min(len(systems), len(schemes)) != 1:
-        raise ValueError(f"stability_map: {len(systems)} systems and {len(schemes)} schemes; give one of either.")
+        raise Refused(f"stability_map: {len(systems)} systems and {len(schemes)} schemes; give one of either.")
     axis, labels = ("system", systems) if isinstance(system, Mapping) and len(schemes) == 1 else ("scheme", schemes)
     linear = [linearise(*start_of("stability_map", movable, state)) for movable in systems.values()]
     rows = dict(zip(labels, product(linear, schemes.values()), strict=True))
     omega = float(linear[0].frequencies_of("fast").max(initial=0.0) or np.abs(linear[0].rates).max(initial=0.0))
     if omega == 0:
-        raise ValueError("stability_map: the system has no frequency that could scale omega_H; nothing vibrates there.")
-    measured = mapped("stability_map", measure, [(*row, grid / omega, tolerance) for row in rows.values()], executor)
+        raise Refused("stability_map: the system has no frequency that could scale omega_H; nothing vibrates there.")
+    measured = mapped("stability_map", measure, [(*row, grid / omega) for row in rows.values()], executor)
     return StabilityMap(
         axis=axis,
         rows=tuple(rows),
@@ -153,26 +151,21 @@ def stability_map(
         omega_H=grid,
         radius=np.array([radius for radius, _ in measured]),
         unstable=tuple(tuple(Window(omega * a, omega * b, g) for a, b, g in windows) for _, windows in measured),
-        tolerance=tolerance,
         note=linear[0].frozen,
     )
 
 
 def measure(
-    linear: Linearisation,
-    scheme: Scheme | Composition,
-    macro_dt,
-    tolerance: float = TOLERANCE,
-    resolution: float = RESOLUTION,
+    linear: Linearisation, scheme: Scheme | Composition, macro_dt, resolution: float = RESOLUTION
 ) -> tuple[np.ndarray, list[Window]]:
-    """Spectral radius (n,) at n increasing macro steps, and the unstable windows between the first and the last of them."""
+    """Spectral radius (n,) at n increasing macro steps, and the unstable windows between the first and the last of
+    them."""
 
     def label(macro_dt):
-        return multipliers(linear, scheme, macro_dt).krein_signatures(tolerance)
+        return multipliers(linear, scheme, macro_dt).krein_signatures
 
     spectra = multipliers(linear, scheme, macro_dt)
-    signatures = spectra.krein_signatures(tolerance)
-    edges = find_windows(label, macro_dt, signatures, resolution * (macro_dt[-1] - macro_dt[0]))
+    edges = find_windows(label, macro_dt, spectra.krein_signatures, resolution * (macro_dt[-1] - macro_dt[0]))
     if not edges:
         return spectra.radius, []
     inside = np.array([a + (b - a) * POINTS_IN_WINDOW for a, b in edges])
@@ -188,7 +181,8 @@ def find_windows(
     Between neighbouring samples with different labels lies an end of a window, or a whole window. All such brackets are
     divided at the same time, until they are shorter than `resolution`; shorter windows are left out.
 
-    ``label(samples)`` has a label for each sample, None for unstable, else any value to compare; `labels` are the labels of x (k,).
+    ``label(samples)`` has a label for each sample, None for unstable, else any value to compare; `labels` are the
+    labels of x (k,).
     """
     edges = [x[0]] if labels[0] is None else []
     samples = zip(x, x[1:], labels, labels[1:], strict=False)
@@ -205,8 +199,8 @@ def find_windows(
             pieces = zip(nodes, nodes[1:], node_labels, node_labels[1:], strict=False)
             divided += [piece for piece in pieces if piece[2] != piece[3]]
         brackets = [piece for piece in divided if piece[1] - piece[0] > resolution]
-        # Of a short bracket with an unstable side, the stable end: the window includes the bracket. Two different stable labels hide a
-        # window shorter than the resolution.
+        # Of a short bracket with an unstable side, the stable end: the window includes the bracket. Two different
+        # stable labels hide a window shorter than the resolution.
         for a, b, label_a, label_b in divided:
             if b - a <= resolution and None in (label_a, label_b):
                 edges.append(a if label_b is None else b)
@@ -220,7 +214,7 @@ def _grid(omega_H) -> np.ndarray:
     grid = np.asarray(omega_H, dtype=float)
     if grid.ndim != 1 or grid.size < 2 or not (np.isfinite(grid).all() and grid[0] > 0 and (np.diff(grid) > 0).all()):
         values = f"{grid.flat[0]:g} to {grid.flat[-1]:g}" if grid.size else "none"
-        raise ValueError(
+        raise Refused(
             f"stability_map: omega_H has shape {grid.shape} and values {values}; give two or more positive values, "
             "increasing, e.g. numpy.linspace(0.05, 12, 240)."
         )

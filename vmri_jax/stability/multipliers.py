@@ -1,9 +1,10 @@
-"""Multipliers of a macro step, the eigenvalues of its derivative, and their Krein signatures; the derivative of many steps.
+"""Multipliers of a macro step, the eigenvalues of its derivative, and their Krein signatures; the derivative of many
+steps.
 
-The multipliers of a symplectic map come in pairs (a, 1/a). They stay on the unit circle, and the motion stays bounded, until two multipliers
-of opposite Krein signature meet; multipliers of equal signature pass through each other (Krein, Gelfand and Lidskii; Arnold,
-*Mathematical Methods of Classical Mechanics*, 42). Therefore the sequence of the signatures, in the order of the angles, changes only across
-such a meeting, however narrow the unstable window is.
+The multipliers of a symplectic map come in pairs (a, 1/a). They stay on the unit circle, and the motion stays bounded,
+until two multipliers of opposite Krein signature meet; multipliers of equal signature pass through each other (Krein,
+Gelfand and Lidskii; Arnold, *Mathematical Methods of Classical Mechanics*, 42). Therefore the sequence of the
+signatures, in the order of the angles, changes only across such a meeting, however narrow the unstable window is.
 """
 
 from dataclasses import dataclass
@@ -19,16 +20,22 @@ from vmri_jax.mechanics.invariants import all_constraints
 from vmri_jax.mechanics.linearisation import Linearisation, tangents
 from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.mechanics.system import System
+from vmri_jax.refusals import Refused
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.results import Result
 from vmri_jax.steppers.solver import Solver
 
+TOLERANCE = 1e-6
+"""Growth per step that counts as instability. Round-off alone splits two equal multipliers by its square root, up to
+2e-8; a larger value overlooks slow growth."""
 LANES = 64
-"""Step sizes that a compiled call computes side by side for up to 18 degrees of freedom; larger systems get fewer, at least 4, to limit memory. With
-more lanes a call for a single step size, which is padded to this number, takes longer."""
+"""Step sizes that a compiled call computes side by side for up to 18 degrees of freedom; larger systems get fewer, at
+least 4, to limit memory. With more lanes a call for a single step size, which is padded to this number, takes
+longer."""
 FREE_MOTION_ANGLE = 1e-5
-"""Angle in radians up to which a multiplier belongs to a free motion, which has no signature; a larger value leaves slow vibrations out."""
+"""Angle in radians up to which a multiplier belongs to a free motion, which has no signature; a larger value leaves
+slow vibrations out."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +57,8 @@ class Multipliers:
         sizes = np.where(self.growing, 0.0, np.abs(self.values))
         return np.where(np.isnan(sizes).any(axis=1), np.inf, sizes.max(axis=1, initial=0.0))
 
-    def krein_signatures(self, tolerance: float) -> list[bytes | None]:
+    @property
+    def krein_signatures(self) -> list[bytes | None]:
         """Krein signatures along the upper half circle, by angle, for each of the k steps; None for an unstable step.
 
         The signature of the eigenvector (eta, pi) is the sign of ``Im(conj(eta) . pi)``.
@@ -58,12 +66,12 @@ class Multipliers:
         d = self.values.shape[1] // 2
         signatures: list[bytes | None] = []
         for values, x, radius in zip(self.values, self.vectors, self.radius, strict=True):
-            if radius > 1 + tolerance:
+            if radius > 1 + TOLERANCE:
                 signatures.append(None)
                 continue
             signs = np.sign(np.imag(np.sum(np.conj(x[:d]) * x[d:], axis=0)))
             angles = np.angle(values)
-            upper = np.flatnonzero((angles > FREE_MOTION_ANGLE) & (np.abs(np.abs(values) - 1) <= tolerance))
+            upper = np.flatnonzero((angles > FREE_MOTION_ANGLE) & (np.abs(np.abs(values) - 1) <= TOLERANCE))
             signatures.append(np.take(signs, upper[np.argsort(angles[upper])]).tobytes())
         return signatures
 
@@ -71,7 +79,8 @@ class Multipliers:
 def multipliers(linear: Linearisation, scheme: Scheme | Composition, macro_dt) -> Multipliers:
     """Multipliers of a macro step for k lengths of the step.
 
-    The derivative of the step is exact: of `macro_step` of the expansion at rest, on the tangent space of the constraint manifold.
+    The derivative of the step is exact: of `macro_step` of the expansion at rest, on the tangent space of the
+    constraint manifold.
 
     Args:
         linear: of `linearise`.
@@ -83,7 +92,7 @@ def multipliers(linear: Linearisation, scheme: Scheme | Composition, macro_dt) -
     """
     macro_dt, size = np.asarray(macro_dt, dtype=float), 2 * linear.shapes.shape[1]
     if not size:
-        raise ValueError(
+        raise Refused(
             f"multipliers: the constraints leave none of the {len(linear.shapes)} coordinates free; nothing moves."
         )
     lanes = int(np.clip(LANES * 36 // size, 4, LANES))
@@ -115,10 +124,12 @@ def _step_matrices(system: System, scheme, rest: State, embed, read, macro_dt):
 
 @dataclass(frozen=True)
 class Monodromy:
-    """Derivative of the end of a trajectory with respect to its start, between the tangent spaces of the constraint manifold at both.
+    """Derivative of the end of a trajectory with respect to its start, between the tangent spaces of the constraint
+    manifold at both.
 
     start, end: states.
-    tangents: (k, 2 n) orthonormal tangent vectors (q_s, q_f, p_s, p_f) at the start, one per row; k = 2 (n_s + n_f - n_g - n_gs).
+    tangents: (k, 2 n) orthonormal tangent vectors (q_s, q_f, p_s, p_f) at the start, one per row; k = 2 (n_s + n_f -
+        n_g - n_gs).
     images: (k, 2 n) tangent vectors at the end that they become.
     """
 
@@ -131,7 +142,8 @@ class Monodromy:
     def matrix(self) -> np.ndarray:
         """M, (k, k) derivative in the coordinates of `tangents`.
 
-        It is meaningful only for a trajectory that closes, or ends near its start (small `closure`): then both ends share a tangent space.
+        It is meaningful only for a trajectory that closes, or ends near its start (small `closure`): then both ends
+        share a tangent space.
         """
         return self.tangents @ self.images.T
 
@@ -143,7 +155,8 @@ class Monodromy:
 
     @property
     def stretch(self) -> np.ndarray:
-        """(k,) singular values of the derivative, the largest first: the growth of disturbances of the start, for closed and open trajectories."""
+        """(k,) singular values of the derivative, the largest first: the growth of disturbances of the start, for
+        closed and open trajectories."""
         return np.linalg.svd(self.images, compute_uv=False)
 
     @property
@@ -154,8 +167,8 @@ class Monodromy:
 
     @property
     def symplectic_defect(self) -> float:
-        """Largest entry of ``X^T J X - T^T J T``, with ``J = [[0, 1], [-1, 0]]``, tangents T and images X, relative to the larger of 1 and the
-        largest ``|X_ij|^2``: round-off of symplectic steps."""
+        """Largest entry of ``X^T J X - T^T J T``, with ``J = [[0, 1], [-1, 0]]``, tangents T and images X, relative to
+        the larger of 1 and the largest ``|X_ij|^2``: round-off of symplectic steps."""
         J = np.kron([[0.0, 1.0], [-1.0, 0.0]], np.eye(self.images.shape[1] // 2))
         before, after = (rows @ J @ rows.T for rows in (self.tangents, self.images))
         return float(np.abs(after - before).max(initial=0.0) / max(1.0, np.abs(self.images).max(initial=0.0) ** 2))
@@ -170,12 +183,14 @@ def monodromy(
     num_steps: int,
     solver: Solver | None = None,
 ) -> Monodromy:
-    """Product of the step's derivatives along a trajectory, ``DPhi(z_(N-1)) ... DPhi(z_0)``, on the tangent space of the constraint manifold.
+    """Product of the step's derivatives along a trajectory, ``DPhi(z_(N-1)) ... DPhi(z_0)``, on the tangent space of
+    the constraint manifold.
 
     Args:
         system, scheme, macro_dt, solver: as in `macro_step`.
         state: consistent start; None for the start of the problem or scene.
-        num_steps: macro steps; one period of a periodic orbit gives its Floquet multipliers, one step its symplectic defect.
+        num_steps: macro steps; one period of a periodic orbit gives its Floquet multipliers, one step its symplectic
+            defect.
 
     Raises:
         ValueError: num_steps below 1, a macro step that is not positive.
@@ -184,7 +199,7 @@ def monodromy(
     system, state = start_of("monodromy", system, state)
     whole_number("monodromy: num_steps", num_steps)
     if is_concrete(macro_dt) and not (np.ndim(macro_dt) == 0 and np.isfinite(macro_dt) and macro_dt > 0):
-        raise ValueError(f"monodromy: macro_dt is {macro_dt}; it must be a positive number.")
+        raise Refused(f"monodromy: macro_dt is {macro_dt}; it must be a positive number.")
     start = State(*(jnp.asarray(a, dtype=float) for a in (state.t, state.q_s, state.q_f, state.p_s, state.p_f)))
     directions = tangents(np.asarray(_constraint_rows(system, start))).T
     z, images, steps, result = _followed(system, scheme, start, macro_dt, solver, num_steps, directions)
@@ -203,8 +218,8 @@ def _constraint_rows(system: System, state: State):
 
 @quickly_compiled
 def _followed(system: System, scheme: Scheme | Composition, start: State, macro_dt, solver, num_steps, directions):
-    """The end z_N (2 n,), the images (k, 2 n) of directions at the start, the number of steps that were taken, and the result of the last one: a
-    step that fails is the last."""
+    """The end z_N (2 n,), the images (k, 2 n) of directions at the start, the number of steps that were taken, and the
+    result of the last one: a step that fails is the last."""
 
     def advance(carry):
         z, images, k, _ = carry

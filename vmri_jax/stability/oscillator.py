@@ -1,4 +1,5 @@
-"""Oscillators: a model of two, and the test equation ``q'' = -omega^2 q`` under a quadrature rule, the phase of a step and the limit of the rule.
+"""Oscillators: a model of two, and the test equation ``q'' = -omega^2 q`` under a quadrature rule, the phase of a step
+and the limit of the rule.
 
 A step of length tau with a path of degree r has the discrete Lagrangian ``q^T S q / (2 tau)`` in the control points,
 ``S = D - x^2 B``, x = omega tau, with D and B the sums of the rules over ``l_i' l_j'`` and ``l_i l_j``. Eliminating the
@@ -6,8 +7,8 @@ control points inside leaves a symmetric 2 x 2 matrix, and the step turns by the
 
     cos(phi) = -(S_00 + S_11) / (2 S_01),          unstable where |cos(phi)| > 1.
 
-Midpoint rule: ``phi = 2 atan(x / 2)``; kicks at the ends (Verlet): ``2 asin(x / 2)``, stable for x < 2. Kicks with gradient correction
-(Takahashi and Imada) replace x^2 by ``x^2 (1 - x^2 / 12)``: stable for x < 2 sqrt(3).
+Midpoint rule: ``phi = 2 atan(x / 2)``; kicks at the ends (Verlet): ``2 asin(x / 2)``, stable for x < 2. Kicks with
+gradient correction (Takahashi and Imada) replace x^2 by ``x^2 (1 - x^2 / 12)``: stable for x < 2 sqrt(3).
 """
 
 import jax.numpy as jnp
@@ -21,7 +22,8 @@ from vmri_jax.schemes.quadrature import PlacedRule, Rule, midpoint
 from vmri_jax.schemes.scheme import Scheme
 
 RESOLUTION = 0.05
-"""Spacing of x along which the phase is unwrapped and limits are searched; with a larger value a narrow unstable interval is missed."""
+"""Spacing of x along which the phase is unwrapped and limits are searched; with a larger value a narrow unstable
+interval is missed."""
 LARGEST_X = 30.0
 """Largest x searched for a limit; larger limits count as infinite."""
 
@@ -81,7 +83,8 @@ def fast_limit(scheme: Scheme) -> float:
 
 
 def kick_limit(placed: PlacedRule) -> float:
-    """The smallest unstable ``omega tau`` of a vibration under kicks alone, tau the time from kick to kick; infinite for other rules."""
+    """The smallest unstable ``omega tau`` of a vibration under kicks alone, tau the time from kick to kick; infinite
+    for other rules."""
     return _limit(1, midpoint, placed.rule, False) if placed.only_ends else np.inf
 
 

@@ -36,7 +36,7 @@ from vmri_jax.steppers.accept import Accepted, expected
 from vmri_jax.steppers.interval import constant_mass
 from vmri_jax.steppers.results import RUNNING, Method
 from vmri_jax.steppers.solved import Solution, StepSolver, status_of
-from vmri_jax.steppers.solver import Solver, iterated
+from vmri_jax.steppers.solver import Solver, iterated, only_if
 from vmri_jax.steppers.time_modes import TimeModes, product, times_i
 
 
@@ -261,11 +261,6 @@ class Evaluated(NamedTuple):
 
 at_nodes = partial(jax.vmap, in_axes=-1, out_axes=-1)
 """Maps a function over the nodes, the last axis."""
-
-
-def only_if(wanted, function, x):
-    """``function(x)`` if `wanted`, else x. A loop of at most one turn: in a batch `jax.lax.cond` would compute both branches."""
-    return jax.lax.while_loop(lambda a: a[0], lambda a: (jnp.asarray(False), function(a[1])), (wanted, x))[1]
 
 
 @dataclass(frozen=True)

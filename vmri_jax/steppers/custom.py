@@ -11,6 +11,7 @@ from vmri_jax.mechanics.checks import check_type
 from vmri_jax.mechanics.projection import project_momentum
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
+from vmri_jax.refusals import Refused
 from vmri_jax.schemes.discrete_lagrangian import lagrangian
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.kicked import Kicked, KickedState
@@ -77,7 +78,7 @@ def check_shapes(stepper: Stepper, system: System, scheme: Scheme, state: State)
     for owner, name, shape in expected:
         returned = np.shape(getattr(owner, name))
         if returned != shape:
-            raise ValueError(
+            raise Refused(
                 f"plan: advance of the stepper of Solver.stepper returns {type(owner).__name__}.{name} of shape {returned}; it must be {shape} for num_micro = {micro}, "
                 f"degree = {r}, {n_g} constraints and {n_gs} slow ones."
             )

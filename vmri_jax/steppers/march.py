@@ -1,4 +1,4 @@
-"""The march: a macro step of any Lagrangian, micro interval by micro interval, with exact matrices.
+"""The march: a macro step of any Lagrangian, micro interval by micro interval.
 
 A micro interval is a map ``(q_f, p_f, slow path) -> (q_f, p_f, impulses on the slow path)``, given by its equations R_m = 0 for its
 unknowns x_m (`vmri_jax.schemes.intervals`). The macro step has the unknowns x_m of all intervals, and z: slow increments and slow
@@ -16,13 +16,16 @@ pass starts with it,
 
 with S the total derivative of R_s by z, the Schur complement of the intervals: z acts on R_s itself, and through all x_m.
 
-An *exact* pass computes the matrices, the derivatives of the intervals in forward mode. It carries along how x_m and the numbers that
-are handed on change with z, so that S is known at the end. Further passes, also those of the next steps, keep all matrices while the
-corrections shrink, and cost one gradient of the action each.
+The matrices, the derivatives of the intervals in forward mode, come from a pass that computes them (`linearised_pass`). It carries along how x_m
+and the numbers that are handed on change with z, so that S is known at the end. They are exact, or of the *masses*: with the quadratic form
+``v^T M v / 2`` in place of a kinetic energy T that is a function, ``M = d2T/dv2`` at the start of the step. The residual is exact in both cases, so
+that the matrices change only the number of passes. Passes keep all matrices, also those of the steps before, while the corrections shrink, and
+cost one gradient of the action each.
 
 This module remembers nothing from step to step: the guess and the kept matrices come from `vmri_jax.steppers.marched`.
 """
 
+from copy import copy
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -38,7 +41,7 @@ from vmri_jax.steppers.accept import NO_WEIGHTS, Weights, largest
 
 
 class Matrices(NamedTuple):
-    """The matrices of an exact pass, which further passes keep: k unknowns of an interval, r n_v slow increments that it sees.
+    """The matrices, which passes keep: k unknowns of an interval, r n_v slow increments that it sees.
 
     inverse: ``(dR/dx)^-1`` of the residual R of an interval by its unknowns x.
     hands_on: derivative of the o gradients that are handed on (`Handed`) by these unknowns.
@@ -84,6 +87,14 @@ class MarchEquations:
         self.n_g, self.n_gs = equations.system.num_constraints(equations.q_s, equations.q_f)
         self.n_v = self.intervals.seen.count  # the slow variables that intervals see
         self.num_fast, self.num_slow, self.num_seen = self.r * self.n_f, self.r * self.n_s, self.r * self.n_v
+
+    def by_masses(self, z, x) -> "MarchEquations":
+        """The equations with the quadratic form of the masses in place of a kinetic energy that is a function, with the mean velocities of z and x."""
+        slow, fast = z[self.num_slow - self.n_s : self.num_slow], self.last_increment(x[0])
+        v_s, v_f = slow / self.equations.macro_dt, fast / self.equations.micro_dt
+        march = copy(self)
+        march.intervals = self.intervals.by_masses(v_s, v_f)
+        return march
 
     def flat(self, x: Unknowns):
         """The unknowns as arrays z (b,) and x (num_micro, k)."""
@@ -174,8 +185,8 @@ class MarchEquations:
         """The fast increment (n_f, ...) from the start of the interval to its end, out of the unknowns (k, ...)."""
         return x[self.num_fast - self.n_f : self.num_fast]
 
-    def corrected(self, m, matrices, x, slow, arriving: Handed, values) -> tuple[Any, Handed]:
-        """The correction ``d = -(dR/dx)^-1 R`` of interval m, and its end position and gradients, corrected to first order.
+    def corrected(self, m, matrices, x, slow, arriving: Handed, values, worst: "Worst") -> tuple[Any, Handed, "Worst"]:
+        """Interval m after the correction ``d = -(dR/dx)^-1 R``: x + d, its end position and gradients, corrected to first order, and the maxima.
 
         The impulses of constraints are taken at x itself. Kept matrices would give them a direction of earlier positions, and the multipliers
         follow the round-off of the constraints: momenta would get errors that no projection onto the hidden constraints removes.
@@ -183,6 +194,7 @@ class MarchEquations:
         Args:
             matrices: ``(dR/dx)^-1``, and the derivative of the gradients that are handed on.
             values: of `interval`.
+            worst: maxima over the intervals before.
         """
         (inverse, hands_on), (residual, gradients), n = matrices, values, self.num_fast
         d = -matvec(inverse, residual)
@@ -191,7 +203,8 @@ class MarchEquations:
             dmu = self._named(d).multiplier
             named = self._named(x), self._apart(arriving), self._by_node(slow)
             gradients += _gradients(self.intervals.impulses(m, *named, dmu))
-        return d, Handed(arriving.position + self.last_increment(x + d), gradients)
+        worst = worst.add(residual, d, largest(residual[:n], self.of_momenta.fast), self.fast_size(d))
+        return x + d, Handed(arriving.position + self.last_increment(x + d), gradients), worst
 
     def passed(self, matrices: Matrices, z, x, worst: "Worst", end: Handed, slow_values) -> "Passed":
         """The pass after its last interval: the slow correction ``dz = -S^-1 R_s``, and ``dx_m = (dx_m/dz) dz``.
@@ -208,11 +221,6 @@ class MarchEquations:
         dx = jnp.sum(matrices.response * self.seen(dz), axis=-1)
         rows = largest(residual[: self.num_slow], self.of_momenta.slow)
         return Passed(z, x, dz, dx, end, p_s, worst.add(residual, dz, rows, worst.moved))
-
-    def worse(self, worst: "Worst", residual, d) -> "Worst":
-        """The maxima with one more interval included, from its residual and its correction d."""
-        rows = largest(residual[: self.num_fast], self.of_momenta.fast)
-        return worst.add(residual, d, rows, self.fast_size(d))
 
 
 def _gradients(on: Arriving):
@@ -271,50 +279,39 @@ class Passed(NamedTuple):
     worst: Worst
 
 
-def exact_pass(march: MarchEquations, z, x, last, from_last) -> tuple[Matrices, Passed]:
-    """A pass that computes all matrices; every interval starts from the corrected end of the interval before.
+def linearised_pass(
+    march: MarchEquations, z, x, last, from_last, corrects: bool = True
+) -> tuple[Matrices, Passed, list]:
+    """A pass that computes the matrices at its unknowns: ``dR/d(z, x)`` after block elimination of the intervals.
 
     Args:
         march: the equations.
         z, x: unknowns.
         last: (k,) unknowns of the last interval of the step before.
         from_last: whether each interval starts from the unknowns of the interval before, instead of its unknowns in x.
-    """
-    matrices, passed, _ = _linearised(march, z, x, last, from_last)
-    return matrices, passed
-
-
-def _linearised(
-    march: MarchEquations, z, x, last, from_last, at_solution: bool = False
-) -> tuple[Matrices, Passed, list]:
-    """`exact_pass`, or with `at_solution` the matrices at z and x, which no interval then corrects.
+        corrects: whether every interval starts from the corrected end of the interval before, so that far from the solution the matrices are those
+            of a path that is closer to it; else the matrices are those of z and x.
 
     Returns:
-        The matrices, the pass, and with `at_solution` the derivatives (num_micro, k, n_f) and (num_micro, o, n_f) of the residual of every
-        interval and of the gradients that it hands on, with respect to the position that arrives; else an empty list.
+        The matrices, the pass, and the derivatives (num_micro, k, n_f) and (num_micro, o, n_f) of the residual of every interval and of the
+        gradients that it hands on, with respect to the position that arrives: `solve` needs them.
     """
     slow, unit, n_f = march.seen(z), jnp.eye(march.num_seen), march.n_f
-    num_positions = n_f if at_solution else 0
 
     def interval(carry, unknowns):
-        arriving, sensitivities, last, worst = carry
-        m, x = unknowns
+        (arriving, sensitivities, last, worst), (m, x) = carry, unknowns
         x = jnp.where(from_last, last, x)
-        (residual, gradients), push = jax.linearize(partial(march.interval, m), x, arriving, slow)
+        values, push = jax.linearize(partial(march.interval, m), x, arriving, slow)
 
-        # Columns: the unknowns of the interval, then the slow increments together with the sensitivities d(arriving)/dz of the intervals before.
-        # One vmap for both kinds of columns: the tangents of the action are most of the program, and two calls would compile them twice.
-        # Further columns at the solution: the arriving position alone.
+        # Columns: the unknowns of the interval, the slow increments together with the sensitivities d(arriving)/dz of the intervals before, and the
+        # arriving position alone. One vmap for all of them: the tangents of the action are most of the program, and each call compiles them.
         ends = x.size, x.size + march.num_seen
-        by_unknowns = jnp.eye(x.size, ends[1] + num_positions)
-        columns = jax.tree.map(lambda a: jnp.pad(a, ((0, 0), (x.size, num_positions))), (sensitivities, unit))
-        if at_solution:
-            by_arriving, by_slow = columns
-            position = by_arriving.position.at[:, ends[1] :].set(jnp.eye(n_f))
-            columns = by_arriving._replace(position=position), by_slow
-        by_all = jax.vmap(push, in_axes=-1, out_axes=-1)(by_unknowns, *columns)
-        (by_x, by_z, *by_position), (hands_on, hands_on_by_z, *hands_on_by_position) = (
-            jnp.split(a, ends[: 1 + at_solution], axis=1) for a in by_all
+        by_unknowns = jnp.eye(x.size, ends[1] + n_f)
+        by_arriving, by_slow = jax.tree.map(lambda a: jnp.pad(a, ((0, 0), (x.size, n_f))), (sensitivities, unit))
+        by_arriving = by_arriving._replace(position=by_arriving.position.at[:, ends[1] :].set(jnp.eye(n_f)))
+        by_all = jax.vmap(push, in_axes=-1, out_axes=-1)(by_unknowns, by_arriving, by_slow)
+        (by_x, by_z, by_position), (hands_on, hands_on_by_z, hands_on_by_position) = (
+            jnp.split(a, ends, axis=1) for a in by_all
         )
         inverse = march.inverse(by_x, march.num_fast)
         # dx_m/dz = -(dR_m/dx_m)^-1 dR_m/dz, with the dependence of the arriving quantities on z inside dR_m/dz
@@ -322,14 +319,11 @@ def _linearised(
         sensitivities = Handed(
             sensitivities.position + march.last_increment(response), hands_on_by_z + matmul(hands_on, response)
         )
-
-        # d_m = -(dR_m/dx_m)^-1 R_m
-        if at_solution:
-            on = Handed(arriving.position + march.last_increment(x), gradients)
+        if corrects:
+            x, on, worst = march.corrected(m, (inverse, hands_on), x, slow, arriving, values, worst)
         else:
-            d, on = march.corrected(m, (inverse, hands_on), x, slow, arriving, (residual, gradients))
-            x, worst = x + d, march.worse(worst, residual, d)
-        return (on, sensitivities, x, worst), (x, inverse, hands_on, response, *by_position, *hands_on_by_position)
+            on = Handed(arriving.position + march.last_increment(x), values[1])
+        return (on, sensitivities, x, worst), (x, inverse, hands_on, response, by_position, hands_on_by_position)
 
     start = march.start()
     none = Handed(*(jnp.zeros((a.size, march.num_seen)) for a in start))
@@ -341,27 +335,21 @@ def _linearised(
     return matrices, march.passed(matrices, z, x, worst, end, slow_values), by_positions
 
 
-def further_pass(march: MarchEquations, matrices: Matrices, z, x, last, from_last) -> Passed:
-    """A pass with kept matrices, of an earlier pass of this step or of a step before. Arguments as of `exact_pass`."""
+def kept_pass(march: MarchEquations, matrices: Matrices, z, x, last, from_last) -> Passed:
+    """A pass with matrices of earlier unknowns: every interval starts from the corrected end of the interval before. Arguments as of `linearised_pass`."""
     slow = march.seen(z)
 
     def interval(carry, unknowns_and_matrices):
         arriving, last, worst = carry
-        m, x, inverse, hands_on = unknowns_and_matrices
+        m, x, *of_interval = unknowns_and_matrices
         x = jnp.where(from_last, last, x)
         values = march.interval(m, x, arriving, slow)
-        d, on = march.corrected(m, (inverse, hands_on), x, slow, arriving, values)
-        return (on, x + d, march.worse(worst, values[0], d)), x + d
+        x, on, worst = march.corrected(m, of_interval, x, slow, arriving, values, worst)
+        return (on, x, worst), x
 
     intervals = jnp.arange(march.n), x, matrices.inverse, matrices.hands_on
     (end, _, worst), x = jax.lax.scan(interval, (march.start(), last, Worst.none()), intervals)
     return march.passed(matrices, z, x, worst, end, march.slow_equations(z, end))
-
-
-def factor(march: MarchEquations, z, x) -> tuple[Matrices, list]:
-    """The matrix ``dR/d(z, x)`` after block elimination of the intervals, for the derivative of the solution: see `_linearised`."""
-    matrices, _, by_positions = _linearised(march, z, x, x[-1], from_last=False, at_solution=True)
-    return matrices, by_positions
 
 
 def solve(march: MarchEquations, factors: tuple[Matrices, list], rows_z, rows_x):

@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
@@ -16,15 +15,15 @@ from vmri_jax.steppers.march import (
     Matrices,
     Passed,
     Worst,
-    exact_pass,
-    further_pass,
     inverse_with_multipliers,
+    kept_pass,
+    linearised_pass,
 )
 from vmri_jax.steppers.newton import null_space
 from vmri_jax.steppers.predictors import PolynomialPredictor
 from vmri_jax.steppers.results import RUNNING, Method, Result
 from vmri_jax.steppers.solved import Solution, StepSolver, status_of
-from vmri_jax.steppers.solver import Solver, iterated
+from vmri_jax.steppers.solver import Solver, iterated, only_if
 
 PLAIN_PASSES = 30
 """Most passes of an attempt at the whole step, before parts of the step are tried. Newton's method needs at most 15 exact passes from a good
@@ -36,7 +35,7 @@ class MarchMemory(NamedTuple):
 
     slow: predictor of the slow unknowns z.
     fast: unknowns of the last micro interval.
-    matrices: of the last exact pass.
+    matrices: the last ones.
     rate: ratio of the last two corrections with these matrices; infinite if there are none.
     """
 
@@ -50,12 +49,12 @@ class Progress(NamedTuple):
     """State of the iteration.
 
     passed: the last pass.
-    matrices: of the last exact pass.
+    matrices: the last ones.
     size: largest correction ``|d|`` of slow and fast increments in the last pass.
     rate: expected ratio ``|d_next| / |d|`` with the kept matrices.
-    curvature: kappa, with ``|d_next| = kappa |d_exact| |d|`` for passes that keep the matrices of an exact pass: the simplified Newton
-        iteration converges linearly, at a rate that is proportional to the correction d_exact of the exact pass.
-    exact_size: ``|d_exact|``.
+    curvature: kappa, with ``|d_next| = kappa |d_new| |d|`` for passes that keep exact matrices: the simplified Newton iteration converges
+        linearly, at a rate that is proportional to the correction d_new of the first pass with them.
+    new_size: ``|d_new|``; infinite before there are new matrices.
     still_moves: correction of the fast increments that the next pass is expected to make.
     passes, result: number of passes, and `Result` or RUNNING.
     """
@@ -65,7 +64,7 @@ class Progress(NamedTuple):
     size: Float[Array, ""]
     rate: Float[Array, ""]
     curvature: Float[Array, ""]
-    exact_size: Float[Array, ""]
+    new_size: Float[Array, ""]
     still_moves: Float[Array, ""]
     passes: Int[Array, ""]
     result: Int[Array, ""]
@@ -75,8 +74,10 @@ class Progress(NamedTuple):
 class Marched(StepSolver):
     """Passes until the next one would change neither the slow nor the fast increments.
 
-    newton: settings; its matrix "null_space" eliminates without multipliers, any other one with them.
+    newton: settings; its matrix is "exact", "masses", or "null_space", which is exact and eliminates without multipliers.
     sizes: (n_s, n_gs, n_f, n_g) and the degree r, for `describe` of the null space method.
+
+    Of the masses there are new matrices at the first pass of a step, if the old ones contract too slowly, and in later passes of exact ones, too.
     """
 
     newton: Solver
@@ -97,7 +98,7 @@ class Marched(StepSolver):
             size=infinite,
             rate=memory.rate,
             curvature=zero,
-            exact_size=infinite,
+            new_size=infinite,
             still_moves=zero,
             passes=jnp.asarray(0),
             result=jnp.asarray(RUNNING),
@@ -112,8 +113,24 @@ class Marched(StepSolver):
         return self._solution(march, done, parts.result, parts.iterations), self._learned(march, memory, done)
 
     @property
+    def is_exact(self) -> bool:
+        return self.newton.matrix != "masses"
+
+    @property
     def _has_multipliers(self) -> bool:
         return self.newton.matrix != "null_space"
+
+    def _pass(self, march: MarchEquations, renews, last: Progress, start) -> tuple[Matrices, Passed]:
+        """A pass from `start`, the unknowns as in `linearised_pass`, with new matrices if `renews`, else with the last ones."""
+        if self.is_exact:
+            matrices, now = only_if(renews, lambda _: linearised_pass(march, *start)[:2], (last.matrices, last.passed))
+            return matrices, only_if(~renews, lambda _: kept_pass(march, matrices, *start), now)
+
+        def by_masses(_):
+            return linearised_pass(march.by_masses(*start[:2]), *start, corrects=False)[0]
+
+        matrices = only_if(renews, by_masses, last.matrices)
+        return matrices, kept_pass(march, matrices, *start)
 
     def _march(self, equations: StepEquations) -> MarchEquations:
         inverted = inverse_with_multipliers if self._has_multipliers else null_space.inverse_without_multipliers
@@ -150,33 +167,23 @@ class Marched(StepSolver):
             result = jnp.where(jnp.isfinite(ratio), result, broken)
             return before._replace(passed=now, size=size, still_moves=still_moves, passes=passes, result=result)
 
-        def unknowns(last: Progress) -> tuple:
-            passed = last.passed
+        def step(last: Progress) -> Progress:
             # every interval of the very first pass starts from the corrected unknowns of the interval before
-            return passed.z + passed.dz, passed.x + passed.dx, memory.fast, is_first & (last.passes == 0)
-
-        def exact(last: Progress) -> Progress:
-            matrices, now = exact_pass(march, *unknowns(last))
+            from_last = is_first & (last.passes == 0)
+            start = last.passed.z + last.passed.dz, last.passed.x + last.passed.dx, memory.fast, from_last
+            # new matrices where the old ones contract too slowly; those of the masses once per attempt
+            renews = ~(last.rate <= CONTRACTION) & (self.is_exact | (last.new_size == jnp.inf))
+            matrices, now = self._pass(march, renews, last, start)
             after = judged(now, last)
-            at_floor = (after.result == RUNNING) & accepted.at_floor(after.size, last.size, FLOOR_OF_NEWTON)
-            result = jnp.where(at_floor, Result.CONVERGED_AT_ROUNDOFF, after.result)
-            rate = after.curvature * after.size  # kappa |d_exact|
-            return after._replace(matrices=matrices, rate=rate, exact_size=after.size, result=result)
+            at_floor = renews & self.is_exact & accepted.at_floor(after.size, last.size, FLOOR_OF_NEWTON)
+            result = jnp.where(at_floor & (after.result == RUNNING), Result.CONVERGED_AT_ROUNDOFF, after.result)
+            kept_rate = jnp.where(last.passes > 0, after.size / last.size, last.rate)
+            curvature = jnp.maximum(last.curvature, jnp.where(renews, 0.0, kept_rate / last.new_size))
+            rate = jnp.where(renews, curvature * after.size, kept_rate)  # kappa |d_new|
+            new_size = jnp.where(renews, after.size, last.new_size)
+            return after._replace(matrices=matrices, rate=rate, curvature=curvature, new_size=new_size, result=result)
 
-        def further(last: Progress) -> Progress:
-            now = judged(further_pass(march, last.matrices, *unknowns(last)), last)
-            rate = jnp.where(last.passes > 0, now.size / last.size, last.rate)
-            return now._replace(rate=rate, curvature=jnp.maximum(last.curvature, rate / last.exact_size))
-
-        def passes(last: Progress) -> Progress:
-            """Passes with kept matrices while these contract fast enough, then exact passes.
-
-            Both are loops: in a batch `jax.lax.cond` would compute both branches in every turn, for all lanes.
-            """
-            last = jax.lax.while_loop(lambda p: (p.result == RUNNING) & (p.rate <= CONTRACTION), further, last)
-            return jax.lax.while_loop(lambda p: (p.result == RUNNING) & ~(p.rate <= CONTRACTION), exact, last)
-
-        return iterated(passes, progress)
+        return iterated(step, progress)
 
     def _solution(self, march: MarchEquations, done: Progress, result, passes) -> Solution:
         equations, passed = march.equations, done.passed
@@ -186,7 +193,7 @@ class Marched(StepSolver):
         # |R| = |R before the correction| min(1, expected correction / last correction).
         shrinks = done.still_moves / jnp.maximum(passed.worst.moved, jnp.finfo(float).tiny)
         rows = passed.worst.rows * jnp.minimum(shrinks, 1.0)
-        method = Method.EXACT if self._has_multipliers else Method.NULL_SPACE
+        method = Method[self.newton.matrix.upper()]
         status = status_of(equations, result, method, passes, rows=rows, end=end, weights=march.weights)
         return Solution(x, end, with_dependent_constraints(equations, status))
 
@@ -195,6 +202,8 @@ class Marched(StepSolver):
         return MarchMemory(memory.slow.add(passed.z, march.num_slow), passed.x[-1], done.matrices, done.rate)
 
     def describe(self) -> list[str]:
+        if not self.is_exact:
+            return ["masses: micro intervals in order with matrices of the masses at the start of the step"]
         if self._has_multipliers:
             return ["exact: micro intervals in order with exact matrices"]
         head = "null_space: micro intervals in order with exact matrices, without multipliers"

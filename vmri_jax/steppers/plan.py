@@ -10,8 +10,8 @@ The plan chooses the cheapest stepper that the rules and the system allow, from 
 * *free flight*: only kinetic energy of constant masses is left;
 * *linear*: only fast variables with linear equations are left;
 * else an iteration, by the matrix of `Solver`: masses and constraints, for the multipliers of a drift alone (*Rattle*) or for the micro
-  intervals in order (*nested*); modes of time, for one interval of high degree (*collocation*); or exact (*march*), which is also the
-  *fallback* of the other three.
+  intervals in order (*nested*, with masses that vary *march*); modes of time, for one interval of high degree (*collocation*); or exact
+  (*march*), which is also the *fallback* of the others.
 """
 
 from collections.abc import Callable
@@ -28,6 +28,7 @@ from vmri_jax.mechanics.constraint_pattern import all_rows
 from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.mechanics.structure import depends_on
 from vmri_jax.mechanics.system import System
+from vmri_jax.refusals import Refused
 from vmri_jax.schemes.composition import Composition, stage_scheme
 from vmri_jax.schemes.discrete_lagrangian import Placed, TermOnNodes, lagrangian, placed_potentials
 from vmri_jax.schemes.quadrature import macro
@@ -95,7 +96,7 @@ class Plan:
     def has_fallback(self) -> bool:
         """Whether the steps are taken by another matrix than the exact one, which "auto" has chosen: a run with `Solver.exact` may solve what fails."""
         chosen = self.solver.matrix == "auto" and self.solver.stepper is None
-        return chosen and any(not isinstance(solver, Marched) for solver in _solvers(self.stepper))
+        return chosen and not all(solver.is_exact for solver in _solvers(self.stepper))
 
     @property
     def first(self) -> Solver:
@@ -200,7 +201,9 @@ def _between_kicks(system: System, scheme: Scheme, choice: _Choice, q_s, q_f) ->
         return Solved(system, scheme, custom, rows, choice.reverse_only)
     if not can_be_nested or solver.matrix in ("exact", "null_space"):
         n_g, n_gs = system.num_constraints(q_s, q_f)
-        marched = Marched(solver, (q_s.size, n_gs, q_f.size, n_g, scheme.degree))
+        first = "exact" if system.has_constant_mass else "masses"
+        chosen = replace(solver, matrix=first) if solver.matrix == "auto" else solver
+        marched = Marched(chosen, (q_s.size, n_gs, q_f.size, n_g, scheme.degree))
         return Solved(system, scheme, marched, rows, choice.reverse_only)
     interval = Interval.of(system, scheme, q_s, q_f)
     if _is_linear(system, scheme, interval, q_s):
@@ -222,13 +225,13 @@ def _approximate(
 
 def _check_matrix(matrix: str, system: System, scheme: Scheme, can_be_nested: bool) -> None:
     """Refuse a matrix that the structure of the system and the scheme does not allow."""
-    if matrix in ("masses", "modes") and not can_be_nested:
-        raise ValueError(
+    if (matrix == "modes" or (matrix == "masses" and system.has_constant_mass)) and not can_be_nested:
+        raise Refused(
             f"Solver: the matrix {matrix!r} needs a ConstantMass, and potentials and forces on the micro grid or as kicks at the macro nodes or "
             "at every k-th micro node; a term of this scheme has other nodes inside the macro interval. Take the matrix 'auto' or 'exact'."
         )
     if matrix == "modes" and not _has_modes(system, scheme):
-        raise ValueError(
+        raise Refused(
             f"Solver: the matrix 'modes' needs a scheme with num_micro = 1 and a degree above 1, such as galerkin(1, 3), and a System without "
             f"force; here num_micro = {scheme.num_micro}, degree = {scheme.degree}. Take the matrix 'auto' or 'exact'."
         )
@@ -331,11 +334,11 @@ def _average(system: System, scheme: Scheme, choice: _Choice) -> Callable | None
     if scheme.fast.every > 1 or on_micro_grid:
         every = f"W has nodes on every {scheme.fast.every}th micro node" if scheme.fast.every > 1 else ""
         others = every or f"the potentials {', '.join(on_micro_grid)} are on the micro grid"
-        raise ValueError(
+        raise Refused(
             f"Scheme: the slow potential is mollified, which averages over the motion under W alone; here {others}. Give W the rule micro(...) and the others macro(trapezoidal), or take a scheme without mollified kicks, e.g. explicit_slow(num_micro)."
         )
     if not system.has_constant_mass or system.is_rheonomic:
-        raise ValueError(
+        raise Refused(
             "Scheme: a mollified slow potential needs a System whose kinetic is a ConstantMass, without Rheonomic constraints."
         )
 

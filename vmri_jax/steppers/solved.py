@@ -40,6 +40,11 @@ class StepSolver(ABC):
     First ``memory = init(equations, velocity)``, then ``solution, memory = solve(equations, guess, memory)`` for every step.
     """
 
+    @property
+    def is_exact(self) -> bool:
+        """Whether its matrices are exact, so that no other ones may solve what it does not solve."""
+        return False
+
     def init(self, equations: StepEquations, velocity) -> Any:
         """The memory of the first step.
 

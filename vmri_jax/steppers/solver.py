@@ -2,13 +2,13 @@
 
 | matrix | Newton matrix |
 |---|---|
-| "masses" | approximate: masses, W'' and constraints. Passes over the slow path; in each pass every micro interval takes one Newton step with a small matrix, the fewest operations. A single drift along the constraints between kicks is solved for its multipliers alone (RATTLE) |
+| "masses" | approximate: masses, W'' and constraints. Passes over the slow path; in each pass every micro interval takes one Newton step with a small matrix, the fewest operations. A single drift along the constraints between kicks is solved for its multipliers alone (RATTLE). With a kinetic energy T that is a function: the exact matrix, but for ``v^T M v / 2`` in place of T, ``M = d2T/dv2`` at the start of the step |
 | "modes" | approximate, for a single interval of higher degree (``galerkin(1, degree)``): all variables at once, in modes of time |
 | "exact" | exact, by elimination of the micro intervals in order; kept over passes and steps while corrections shrink |
 | "null_space" | as "exact", in coordinates of the free motions: no multipliers among the unknowns |
 
-"masses" needs constant masses, and every term in single micro intervals, or as kicks at the macro nodes or at every k-th micro node; "modes"
-needs constant masses and no forces. "auto" takes the first matrix that the structure allows: "modes" with at most 16 fast variables,
+"masses" needs a kinetic energy that is a function, or every term in single micro intervals, or as kicks at the macro nodes or at every k-th micro
+node; "modes" needs constant masses and no forces. "auto" takes the first matrix that the structure allows: "modes" with at most 16 fast variables,
 unless W is a sum over single coordinates, else "masses", else "exact". What "auto" does not solve is solved again with "exact": the step
 (`macro_step`), the whole run (`prepare`), the lane (batches), or the piece that failed and all pieces after it (`simulate`, `stream`); see
 `vmri_jax.running.fallback`. ``print(vm.plan(problem, scheme))`` says beforehand which matrix a step takes, ``StepInfo.method`` and
@@ -26,6 +26,7 @@ import jax.numpy as jnp
 
 from vmri_jax.mechanics.arrays import is_concrete, real_array
 from vmri_jax.mechanics.functions import TracedOnce, traced_once
+from vmri_jax.refusals import Refused
 from vmri_jax.steppers.results import RUNNING, Result
 
 MATRICES = ("auto", "masses", "modes", "exact", "null_space")
@@ -61,18 +62,18 @@ class Solver(eqx.Module):
 
     def __check_init__(self):
         if self.matrix not in MATRICES:
-            raise ValueError(f"Solver: matrix is {self.matrix!r}; it must be one of {', '.join(MATRICES)}.")
+            raise Refused(f"Solver: matrix is {self.matrix!r}; it must be one of {', '.join(MATRICES)}.")
         for name, value in {"tolerance": self.tolerance, "max_iterations": self.max_iterations}.items():
             if is_concrete(value) and not real_array(f"Solver: {name}", value, 0) > 0:
-                raise ValueError(f"Solver: {name} is {value}; it must be positive.")
+                raise Refused(f"Solver: {name} is {value}; it must be positive.")
         if self.stepper is None:
             return
         if not callable(getattr(self.stepper, "function", None)):
-            raise TypeError(
+            raise Refused(
                 f"Solver: stepper is {self.stepper!r}; give a function of (system, scheme) that makes a Stepper."
             )
         if self.matrix != "auto":
-            raise ValueError(
+            raise Refused(
                 f"Solver: matrix is {self.matrix!r} beside a stepper, which has its own way to solve; leave one of them out."
             )
 
@@ -94,3 +95,8 @@ class Solver(eqx.Module):
 def iterated(step, iterate):
     """Repeat ``iterate = step(iterate)`` while ``iterate.result`` is RUNNING."""
     return jax.lax.while_loop(lambda iterate: iterate.result == RUNNING, step, iterate)
+
+
+def only_if(wanted, function, x):
+    """``function(x)`` if `wanted`, else x. A loop of at most one turn: in a batch `jax.lax.cond` would compute both branches."""
+    return jax.lax.while_loop(lambda a: a[0], lambda a: (jnp.asarray(False), function(a[1])), (wanted, x))[1]

@@ -18,6 +18,7 @@ from vmri_jax import diagnostics, plots
 from vmri_jax.diagnostics import OrderFit
 from vmri_jax.executors.executor import mapped
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
+from vmri_jax.refusals import Refused
 from vmri_jax.running.interrupts import Interrupted
 from vmri_jax.running.prepare import prepare
 from vmri_jax.running.progress import Progress, shows_progress
@@ -132,7 +133,7 @@ class ConvergenceStudy(RunTable):
         rows = sorted((r for r in self.rows if (r.scheme, r.case) == (scheme, case)), key=lambda row: -row.macro_dt)
         if not rows:
             cases = f" and the cases {', '.join(self.cases)}" if len(self.cases) > 1 else ""
-            raise ValueError(f"errors: no scheme {scheme!r} in this study; it has {', '.join(self.schemes)}{cases}.")
+            raise Refused(f"errors: no scheme {scheme!r} in this study; it has {', '.join(self.schemes)}{cases}.")
         return np.array([row.macro_dt for row in rows]), np.array([getattr(row, f"error_{quantity}") for row in rows])
 
     def usable(self, scheme: str, quantity: str = "q", case: str | None = None) -> tuple[np.ndarray, np.ndarray]:
@@ -225,12 +226,10 @@ def convergence_study(
     """
     problem = problem_of("convergence_study", problem)
     if not schemes:
-        raise ValueError(
-            "convergence_study: schemes is empty; give at least one, e.g. {'midpoint': fully_implicit(5)}."
-        )
+        raise Refused("convergence_study: schemes is empty; give at least one, e.g. {'midpoint': fully_implicit(5)}.")
     steps = [_num_steps(t_end, dt, num_saves) for dt in macro_dt]
     if not steps:
-        raise ValueError("convergence_study: macro_dt is empty; give the macro steps to run.")
+        raise Refused("convergence_study: macro_dt is empty; give the macro steps to run.")
     total = len(schemes) * len(steps) * (1 if params is None else len(params))
     told = lambda message, *_: progress(message, 0, total)  # noqa: E731
     cases = _cases(problem, params, reference, t_end, num_saves, told)
@@ -266,7 +265,7 @@ def convergence_study(
 def _cases(problem: Problem, params, reference, t_end: float, num_saves: int, progress: Progress) -> list[Case]:
     """The cases of `convergence_study`; refuses references with other labels or of another shape."""
     if params is not None and not params:
-        raise ValueError("convergence_study: params is empty; give a set of parameters by label, or leave it out.")
+        raise Refused("convergence_study: params is empty; give a set of parameters by label, or leave it out.")
     problems = (
         {"": problem}
         if params is None
@@ -280,14 +279,14 @@ def _cases(problem: Problem, params, reference, t_end: float, num_saves: int, pr
     by_label = isinstance(reference, Mapping)
     references: dict[str, Any] = dict(reference if by_label else dict.fromkeys(problems, reference))
     if set(references) != set(problems) or (len(problems) > 1 and not by_label):
-        raise ValueError(
+        raise Refused(
             f"convergence_study: params has the labels {list(problems)}, so reference must be a mapping with the same labels."
         )
     for label, problem in problems.items():
         shape = (num_saves + 1, problem.q_s.size + problem.q_f.size)
         q, p = references[label].q, references[label].p
         if q.shape != shape or p.shape != shape:
-            raise ValueError(
+            raise Refused(
                 f"convergence_study: reference has q of shape {q.shape} and p of shape {p.shape}; both "
                 f"must be {shape}: num_saves + 1 nodes from the start to t_end, slow coordinates first."
             )
@@ -312,7 +311,7 @@ def _num_steps(t_end: float, macro_dt: float, num_saves: int) -> int:
     """The number of macro steps up to `t_end`."""
     num_steps = round(t_end / macro_dt) if macro_dt > 0 else 0
     if num_steps < 1 or abs(num_steps * macro_dt - t_end) > 1e-9 * t_end or num_steps % num_saves:
-        raise ValueError(
+        raise Refused(
             f"convergence_study: macro_dt = {macro_dt:g} makes {t_end / macro_dt if macro_dt else float('inf'):.6g} steps "
             f"up to t_end = {t_end:g}; it must make a multiple of num_saves = {num_saves} whole steps, so that every run "
             "saves the same times."

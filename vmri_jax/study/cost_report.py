@@ -14,6 +14,7 @@ from vmri_jax.accuracy.families import Family
 from vmri_jax.accuracy.steps import check_extent, round_off
 from vmri_jax.mechanics.linearisation import linearise
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
+from vmri_jax.refusals import Refused
 from vmri_jax.running.files import make_writable_folder
 from vmri_jax.running.progress import part, shows_progress
 from vmri_jax.study.html import embedded, write_page
@@ -153,9 +154,7 @@ def cost_report(
     make_writable_folder(out)
     t_end = default_t_end(problem) if t_end is None else t_end
     if errors is not None and (not errors or min(errors) <= 0):
-        raise ValueError(
-            f"cost_report: errors are {list(errors)}; give positive numbers, in the unit of the positions."
-        )
+        raise Refused(f"cost_report: errors are {list(errors)}; give positive numbers, in the unit of the positions.")
     tuning, answered = Tuning(problem, t_end, menu, progress=progress), []
     with interruptible(tuning.runs):  # around the drawing as well, so that Ctrl-C there keeps the runs, too
         errors = sorted(_default_errors(tuning) if errors is None else errors)
@@ -182,7 +181,7 @@ def _default_errors(tuning: Tuning) -> list[float]:
     motion = 10.0 ** math.floor(math.log10(moved)) if moved > 0 else 0.0
     errors = [motion * error for error in RELATIVE_ERRORS if motion * error > least]
     if not errors:
-        raise ValueError(
+        raise Refused(
             f"cost_report: until t_end = {tuning.t_end:g} the positions are those of the start up to {moved:.1e}, and "
             f"errors below {least:.1e} cannot be told from round-off: the system is at rest, or no run until then is "
             "certified. Give a start that moves, another t_end, or the errors that you accept."

@@ -19,6 +19,7 @@ from vmri_jax.accuracy.search import Trial
 from vmri_jax.accuracy.steps import check_error, digits_of, reached, search_of, warn_of_events
 from vmri_jax.mechanics.projection import legendre, project_momentum
 from vmri_jax.mechanics.state import HasProblem, Problem, State, problem_of
+from vmri_jax.refusals import Refused
 from vmri_jax.running.failures import simulation_error
 from vmri_jax.running.progress import Progress, shows_progress, silent
 from vmri_jax.steppers.solver import Solver
@@ -179,7 +180,7 @@ class Recommendation(RunTable):
 def check_target(error: float, t_end: float, problem: Problem) -> None:
     """Refuse errors and times that no run can meet."""
     if not (np.isfinite(t_end) and t_end > 0):
-        raise ValueError(f"tune: t_end is {t_end}; it must be a positive number.")
+        raise Refused(f"tune: t_end is {t_end}; it must be a positive number.")
     check_error("tune: error", error, problem)
 
 

@@ -4,11 +4,20 @@ Slow variables are the (scaled) centres of the stiff springs, fast ones their (s
 Hairer, Lubich, Wanner, *Geometric Numerical Integration*, I.5.1.
 """
 
+import math
+from itertools import pairwise
+from typing import Any
+
 import jax.numpy as jnp
 
 from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.state import Problem
 from vmri_jax.mechanics.system import ConstantMass, System
+from vmri_jax.refusals import Refused
+
+MAGNIFICATION = 10.0
+"""Drawn over real elongation of the stiff springs, which stretch by a few percent. With 1 the stretching could not be
+seen."""
 
 
 def soft_springs(q_s, q_f, params):
@@ -23,6 +32,25 @@ def stiff_springs(q_f, params):
     return params["omega"] ** 2 / 2 * jnp.sum(q_f**2)
 
 
+def drawing(num_springs: int) -> dict[str, Any]:
+    """The chain between two walls: masses displaced by ``(s_i - f_i) / sqrt 2`` and ``(s_i + f_i) / sqrt 2`` from their
+    places at rest."""
+    bodies, w, look = [], 1 / math.sqrt(2), {"radius": 0.3, "color": "#8a97a1"}
+    for i in range(num_springs):
+        for sign, place in ((-1.0, 4.5 * i + 3.0), (1.0, 4.5 * i + 4.5)):
+            form = [[w, "s", i], [sign * MAGNIFICATION * w, "f", i]]
+            bodies.append({"name": f"mass {len(bodies) + 1}", "coordinates": [form], "offset": [place], **look})
+    names = [body["name"] for body in bodies]
+    walls = [(names[0], 0.0), (names[-1], 4.5 * num_springs + 3.0)]
+    return {
+        "bodies": bodies,
+        "springs": [[a, b, "slow" if i % 2 else "fast"] for i, (a, b) in enumerate(pairwise(names))],
+        "anchors": [{"body": name, "point": [x], "kind": "spring", "pace": "slow"} for name, x in walls],
+        "planes": [{"point": [x], "normal": [normal]} for (_, x), normal in zip(walls, (1.0, -1.0), strict=True)],
+        "caption": f"Elongations of the stiff springs are drawn {MAGNIFICATION:g} times as large as they are.",
+    }
+
+
 def fermi_pasta_ulam(num_springs: int = 3, omega: float = 50.0) -> Problem:
     """FPU chain of `num_springs` stiff springs of frequency `omega`, unit masses, started as in HLW.
 
@@ -33,7 +61,7 @@ def fermi_pasta_ulam(num_springs: int = 3, omega: float = 50.0) -> Problem:
         omega: frequency of the stiff springs.
     """
     if num_springs < 1:
-        raise ValueError(f"fermi_pasta_ulam: num_springs is {num_springs}; there must be at least 1.")
+        raise Refused(f"fermi_pasta_ulam: num_springs is {num_springs}; there must be at least 1.")
     ones, first = jnp.ones(num_springs), jnp.zeros(num_springs).at[0].set(1.0)
     system = System(
         kinetic=ConstantMass(ones, ones),
@@ -42,4 +70,4 @@ def fermi_pasta_ulam(num_springs: int = 3, omega: float = 50.0) -> Problem:
         params={"omega": jnp.asarray(omega)},
     )
     names = Names({"centres": num_springs}, {"elongations": num_springs}, numbered=("centres", "elongations"))
-    return Problem(system, q_s=first, q_f=first / omega, v_s=first, v_f=first, names=names)
+    return Problem(system, first, first / omega, first, first, names=names, drawing=drawing(num_springs))

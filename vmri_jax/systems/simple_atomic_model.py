@@ -6,6 +6,7 @@ import numpy as np
 from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.state import Problem
 from vmri_jax.mechanics.system import ConstantMass, System
+from vmri_jax.systems.drawn import point
 
 TETRAHEDRON = np.sqrt(np.array([1 / 3, 1 / 12, 2 / 3]))  # with unit edges: circumradius and inradius of a face, height
 
@@ -40,6 +41,18 @@ def bonds(q_s, q_f, params):
     q_2, q_3 = q_s[3:], q_f[:3]
     bond = q_f[3:].reshape(3, 3) - jnp.concatenate([jnp.tile(q_2, 2), q_3]).reshape(3, 3)
     return (jnp.sum(bond**2, axis=1) - params["length"] ** 2) / 2
+
+
+DRAWING = {
+    "bodies": [
+        *(point(f"atom {i + 1}", "s", i, radius) for i, radius in enumerate((2.6, 2.0))),
+        *(point(f"atom {i + 3}", "f", i, 1.3) for i in range(4)),
+    ],
+    "links": [[f"atom {i}", f"atom {j}"] for i, j in ((2, 4), (2, 5), (3, 6))],
+    "springs": [[f"atom {i}", f"atom {j}"] for i, j in ((1, 2), (2, 3), (3, 4), (4, 5), (5, 3))],
+    "anchors": [{"body": "atom 1", "point": [0.0, 0.0, 0.0], "kind": "link"}],
+}
+"""Two heavy atoms and four light ones, rigid bonds as links."""
 
 
 def simple_atomic_model(
@@ -87,4 +100,5 @@ def simple_atomic_model(
         constraint={"bond 2-4": 1, "bond 2-5": 1, "bond 3-6": 1},
         slow_constraint={"bond 1": 1},
     )
-    return Problem(system, *(jnp.asarray(a).reshape(-1) for a in (q_s, q_f, v_s, v_f)), project=True, names=names)
+    start = (jnp.asarray(a).reshape(-1) for a in (q_s, q_f, v_s, v_f))
+    return Problem(system, *start, project=True, names=names, drawing=DRAWING)

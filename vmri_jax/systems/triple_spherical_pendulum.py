@@ -5,6 +5,7 @@ import jax.numpy as jnp
 from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.state import Problem
 from vmri_jax.mechanics.system import ConstantMass, System
+from vmri_jax.systems.drawn import point
 
 
 def weight(q_s, q_f, params):
@@ -35,10 +36,20 @@ def second_rod(q_s, q_f, params):
     return (jnp.sum((q_f[:3] - q_s) ** 2, keepdims=True) - params["lengths"][1] ** 2) / 2
 
 
+DRAWING = {
+    "bodies": [point("heavy bob", "s", 0, 0.9), point("light bob", "f", 0, 0.4), point("last bob", "f", 1, 0.4)],
+    "links": [["heavy bob", "light bob"]],
+    "springs": [["light bob", "last bob"]],
+    "anchors": [{"body": "heavy bob", "point": [0.0, 0.0, 0.0], "kind": "link"}],
+}
+"""The bobs on two rods, the last one on a stiff spring."""
+
+
 def triple_spherical_pendulum(
     masses=(100.0, 1.0, 1.0), stiffness=5000.0, lengths=(10.0, 2.0, 3.0), gravity=9.81, quartic=False
 ) -> Problem:
-    """Triple spherical pendulum in R^3: q_1 slow, (q_2, q_3) fast; started with rod 1 along x, rod 2 along y and the spring along z.
+    """Triple spherical pendulum in R^3: q_1 slow, (q_2, q_3) fast; started with rod 1 along x, rod 2 along y and the
+    spring along z.
 
     Args:
         masses: of the three bobs.
@@ -69,4 +80,5 @@ def triple_spherical_pendulum(
         v_s=jnp.array([0.0, 1.0, 0.0]),
         v_f=jnp.array([0.0, 1.0, 0.0, 0.0, 1.0, 0.5]),
         names=Names({"bob 1": 3}, {"bob 2": 3, "bob 3": 3}, {"rod 2": 1}, {"rod 1": 1}),
+        drawing=DRAWING,
     )

@@ -15,6 +15,7 @@ from vmri_jax.mechanics.functions import TracedOnce
 from vmri_jax.mechanics.masses import ConstantMass
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import Potentials, System
+from vmri_jax.refusals import Refused
 from vmri_jax.running.simulation import Simulation
 
 MOST_NUMBERS_PRINTED = 8
@@ -56,7 +57,7 @@ def check_same(path: Path, attributes: dict, stored: dict, chunk: int | None, co
     if chunk not in (None, stored["chunk"]):
         changes.append(f"chunk: {chunk} here, {stored['chunk']} in the store")
     if changes:
-        raise ValueError(
+        raise Refused(
             f"{path} holds another {kind} and cannot go on with this one. Differences: {'; '.join(changes)}. Give the arguments it was started "
             "with, or another name."
         )

@@ -24,6 +24,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from vmri_jax.refusals import Refused
 from vmri_jax.running.export import FILL
 from vmri_jax.running.files import check_writable, clear_partial, explained, made_beside, replaced, synchronize
 from vmri_jax.steppers.results import Result
@@ -74,7 +75,7 @@ def rows_per_chunk(rows: int, seconds: float, size: int, most_chunks: int) -> fl
 def check_place(caller: str, path: Path, kind: str, resume: bool, overwrite: bool) -> None:
     """Refuse a place where no store of a kind can be made, or where one is that shall neither go on nor be replaced."""
     if resume and overwrite:
-        raise ValueError(f"{caller}: both resume and overwrite are true; choose one of them.")
+        raise Refused(f"{caller}: both resume and overwrite are true; choose one of them.")
     if not path.resolve().parent.is_dir():
         raise FileNotFoundError(f"{caller}: out is {path}, but the folder {path.parent} does not exist; make it first.")
     if not path.exists():
@@ -204,15 +205,15 @@ def read_attributes(path: Path, kind: str) -> dict[str, Any]:
         attributes = json.loads((path / METADATA).read_text())["attributes"]
         known = attributes["format"]
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise ValueError(f"{path} is not a stored {kind} ({type(error).__name__}: {error}).") from error
+        raise Refused(f"{path} is not a stored {kind} ({type(error).__name__}: {error}).") from error
     if known != FORMAT:
         version = attributes.get("made_with", {}).get("vmri_jax", "of another format")
-        raise ValueError(
+        raise Refused(
             f"{path} has the format {known!r}, and this version of vmri_jax reads {FORMAT!r}; read it with the version that "
             f"wrote it, vmri_jax {version}, or compute it again."
         )
     if attributes["kind"] != kind:
-        raise ValueError(f"{path} is not a stored {kind} but a stored {attributes['kind']}.")
+        raise Refused(f"{path} is not a stored {kind} but a stored {attributes['kind']}.")
     return attributes
 
 

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from vmri_jax.refusals import Refused
 from vmri_jax.running.simulation import Checkpoint
 from vmri_jax.running.store import layout
 from vmri_jax.steppers.results import Result
@@ -50,7 +51,7 @@ class Record(NamedTuple):
                 leaves = [data[f"leaf_{k}"] for k in range(len(data.files) - 1)]
                 return cls._make((*counts, bool(fell_back), leaves))
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-            raise ValueError(f"{path}: the checkpoint is damaged ({error}); the run cannot go on.") from error
+            raise Refused(f"{path}: the checkpoint is damaged ({error}); the run cannot go on.") from error
 
     def packed(self) -> bytes:
         """The bytes of an .npz file."""
@@ -66,7 +67,7 @@ class Record(NamedTuple):
         cursor = like.cursor
         expected, structure = jax.tree.flatten((cursor.state, cursor.memory))
         if [(leaf.shape, leaf.dtype) for leaf in self.leaves] != [(leaf.shape, leaf.dtype) for leaf in expected]:
-            raise ValueError("the checkpoint was made by a version of vmri_jax whose steps remember something else")
+            raise Refused("the checkpoint was made by a version of vmri_jax whose steps remember something else")
         state, memory = jax.tree.unflatten(structure, map(jnp.asarray, self.leaves))
         status = map(np.asarray, (self.step, self.result, self.failed_at))
         return Checkpoint(type(cursor)(state, memory, *status), fell_back=self.fell_back)

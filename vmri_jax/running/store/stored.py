@@ -10,6 +10,7 @@ from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.state import HasProblem, Problem, State
 from vmri_jax.mechanics.summary import summary
 from vmri_jax.mechanics.system import System
+from vmri_jax.refusals import Refused
 from vmri_jax.running.export import MICRO, Exports
 from vmri_jax.running.origin import Origin
 from vmri_jax.running.store.layout import chunk_file, read_attributes
@@ -46,7 +47,7 @@ class StoredTrajectory(Exports):
     def __init__(self, path):
         self.path = Path(path)
         if self.path.is_file():
-            raise ValueError(
+            raise Refused(
                 f"{path} is not a stored run but a file; a run written by Trajectory.save is read by "
                 f"Trajectory.load({str(path)!r})."
             )
@@ -139,7 +140,7 @@ class StoredTrajectory(Exports):
                 if (
                     array.size and not chunk_file(self.path / name, array.ndim, k).is_file()
                 ):  # zarr would return fill values
-                    raise ValueError(f"chunk {k} is missing")
+                    raise Refused(f"chunk {k} is missing")
             return np.asarray(array[rows])
         except Exception as error:
-            raise ValueError(f"{self.path}: {name} cannot be read ({error}); the store is damaged.") from error
+            raise Refused(f"{self.path}: {name} cannot be read ({error}); the store is damaged.") from error

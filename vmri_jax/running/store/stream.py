@@ -9,6 +9,7 @@ import numpy as np
 
 from vmri_jax.mechanics.arrays import whole_number
 from vmri_jax.mechanics.state import Movable, State
+from vmri_jax.refusals import Refused
 from vmri_jax.running.arguments import Save, Steps
 from vmri_jax.running.export import DIMENSIONS, MICRO, rows_of
 from vmri_jax.running.failures import simulation_error
@@ -83,7 +84,7 @@ def stream(
     run = simulation(system, scheme, state, solver, steps)
     num_steps = run.num_steps
     if not run.is_concrete:
-        raise ValueError("stream: arguments are tracers; it writes files, call it outside of jax.jit, vmap and grad.")
+        raise Refused("stream: arguments are tracers; it writes files, call it outside of jax.jit, vmap and grad.")
     run.check("stream: the positions of the state")
     length = {"rows": run.num_saves + 1, "num_steps": num_steps}
     attributes = length | {
@@ -104,7 +105,7 @@ def stream(
         stored = StoredTrajectory(path)
         check_same(path, attributes, stored.attributes, chunk, stored.complete)
         if num_steps < stored.step:
-            raise ValueError(f"stream: num_steps is {num_steps}, but {path} has {stored.step} already; open it.")
+            raise Refused(f"stream: num_steps is {num_steps}, but {path} has {stored.step} already; open it.")
         if num_steps != stored.num_steps:
             with explained(path, _advice(stored.step)):
                 layout.change_attributes(path, **length)
@@ -129,7 +130,7 @@ def _continue(stored: StoredTrajectory, run: Simulation, tell: Progress) -> Iter
     try:
         checkpoint = record.checkpoint(like=run.start(record.fell_back))
     except ValueError as error:
-        raise ValueError(f"{path} can be read, but its run cannot go on: {error}.") from error
+        raise Refused(f"{path} can be read, but its run cannot go on: {error}.") from error
     with explained(path, _advice(record.step)):
         writer = layout.Writer(path)
     # The start and the largest values so far, as a node before each chunk: energies are compared with the start of the run.

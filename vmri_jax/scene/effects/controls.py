@@ -10,6 +10,7 @@ import numpy as np
 
 from vmri_jax.mechanics.arrays import real_array
 from vmri_jax.mechanics.names import AXES
+from vmri_jax.refusals import Refused
 from vmri_jax.scene.body import Attachment, body_of, entry, is_entry, label_of
 from vmri_jax.scene.declare import effect_class, names, vector
 from vmri_jax.scene.effect import Effect
@@ -80,7 +81,7 @@ class Controlled(Effect):
         if not isinstance(self.body, str) or self.body not in joints:
             return self
         if self.along is not None:
-            raise ValueError(f"{self.name}: along is {self.along!r}; a joint has an axis of its own. Leave it out.")
+            raise Refused(f"{self.name}: along is {self.along!r}; a joint has an axis of its own. Leave it out.")
         freedom: Any = "turn" if self.load == "torque" else "slide"
         return ControlledJoint(joints[self.body], of=freedom, name=self.name)
 
@@ -90,7 +91,7 @@ class Controlled(Effect):
 
     def _elements(self):
         if not is_entry(self.body):
-            raise ValueError(f"{self.name}: body is {self.body!r}; give one body or joint, and a Controlled for each.")
+            raise Refused(f"{self.name}: body is {self.body!r}; give one body or joint, and a Controlled for each.")
         return ((str(entry(self.body)),),)
 
     def _parameters(self):
@@ -112,13 +113,13 @@ class Controlled(Effect):
             )
         directors = body.size // 3 - 1 if body.rigid else 0
         if isinstance(name, Attachment) and not body.rigid:
-            raise ValueError(
+            raise Refused(
                 f"{self.name}: {name} is a point; only rigid bodies have points in them. Give the name alone."
             )
         if (self.load == "torque" or self.axes == "body") and directors < 3:
             load = "a torque" if self.load == "torque" else "axes of its own"
             directors_of_body = f"{directors} of three directors" if body.rigid else "no directors"
-            raise ValueError(f"{self.name}: {name} has {directors_of_body}; {load} needs a rigid body with three.")
+            raise Refused(f"{self.name}: {name} has {directors_of_body}; {load} needs a rigid body with three.")
 
     def components(self) -> tuple[str, ...]:
         """Names of the controls."""

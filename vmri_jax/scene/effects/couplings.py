@@ -13,6 +13,7 @@ from vmri_jax.mechanics.arrays import real_array
 from vmri_jax.mechanics.checks import describe, shape_of
 from vmri_jax.mechanics.functions import NO_VELOCITY, check_arguments
 from vmri_jax.mechanics.rows import Rows
+from vmri_jax.refusals import Refused
 from vmri_jax.scene.binding import MOST_ROLES
 from vmri_jax.scene.declare import effect_class, real_tree
 from vmri_jax.scene.effect import START
@@ -48,7 +49,7 @@ class _Coupling(OfFreedoms):
         super().__post_init__()
         joints = () if isinstance(self.joints, str) else tuple(self.joints)
         if not 1 <= len(joints) <= MOST_ROLES // 2:
-            raise ValueError(
+            raise Refused(
                 f"{self.name}: joints is {self.joints!r}; give names of 1 to {MOST_ROLES // 2} joints, ['motor', 'wheel']."
             )
         object.__setattr__(self, "joints", joints)
@@ -141,9 +142,7 @@ class JointCoupling(_Coupling):
     def check_parameters(self):
         value: Any = shape_of(f"{self.name}: law", self.law, jnp.zeros(len(self.joints)), self.numbers())
         if getattr(value, "ndim", 2) > 1:
-            raise ValueError(
-                f"{self.name}: law returns {describe(value)}; it must return one value () or several (k,)."
-            )
+            raise Refused(f"{self.name}: law returns {describe(value)}; it must return one value () or several (k,).")
         super().check_parameters()
 
 

@@ -12,6 +12,7 @@ from dataclasses import field
 from typing import Any, Literal
 
 from vmri_jax.mechanics.functions import NO_TIME, NO_VELOCITY, check_arguments
+from vmri_jax.refusals import Refused
 from vmri_jax.scene.body import end_of, entry, is_entry
 from vmri_jax.scene.declare import effect_class, real_tree
 from vmri_jax.scene.effect import DRAWN, Effect
@@ -52,7 +53,7 @@ class CustomEffect(Effect):
 
     def __post_init__(self):
         if not callable(self.function):
-            raise TypeError(f"{type(self).__name__}: function is {self.function!r}; give a function of (q, ...).")
+            raise Refused(f"{type(self).__name__}: function is {self.function!r}; give a function of (q, ...).")
         if not self.name:
             object.__setattr__(self, "name", getattr(self.function, "__name__", type(self).__name__.lower()))
         instead = {"constraint": NO_VELOCITY, "force": ""}.get(self.kind, NO_TIME).format(**_INSTEAD)
@@ -60,13 +61,13 @@ class CustomEffect(Effect):
         check_arguments(f"{type(self).__name__}: function", self.function, arguments, instead)
         super().__post_init__()
         if self.drawn_as not in (None, *DRAWN):
-            raise ValueError(f"{self.name}: drawn_as is {self.drawn_as!r}; it must be 'link', 'spring' or None.")
+            raise Refused(f"{self.name}: drawn_as is {self.drawn_as!r}; it must be 'link', 'spring' or None.")
 
     def _elements(self):
         names = (self.bodies,) if is_entry(self.bodies) else tuple(self.bodies)
         if not names or not all(map(is_entry, names)):
             kind = type(self).__name__
-            raise ValueError(
+            raise Refused(
                 f"{self.name}: bodies is {self.bodies!r}; give the names of the bodies that the function takes. A custom effect has one "
                 f"element: for several tuples of bodies write a {kind}(...) for each, with name=..."
             )
@@ -75,7 +76,7 @@ class CustomEffect(Effect):
     def _parameters(self):
         params, points = real_tree(f"{self.name}: params", self.params), self.points
         if points and not isinstance(params, dict):
-            raise TypeError(
+            raise Refused(
                 f"{self.name}: params is {self.params!r}; with points in rigid bodies it must be a dictionary."
             )
         return params | points if points else params

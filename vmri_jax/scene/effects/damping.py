@@ -6,6 +6,7 @@ from typing import Any
 import jax.numpy as jnp
 
 from vmri_jax.mechanics.names import unknown
+from vmri_jax.refusals import Refused
 from vmri_jax.scene.declare import array, effect_class, names, positive
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.effects.points import BetweenPoints
@@ -132,7 +133,7 @@ class RayleighDamping(Effect):
         names = potentials if self.of is None else [self.of] if isinstance(self.of, str) else self.of
         for name in names:
             if name not in potentials:
-                raise ValueError(f"{self.name}: {unknown('potential', name, potentials)}")
+                raise Refused(f"{self.name}: {unknown('potential', name, potentials)}")
         return replace(self, of=tuple(potentials[name] for name in names))
 
     def _elements(self):
@@ -140,7 +141,7 @@ class RayleighDamping(Effect):
 
     def check_parameters(self):
         if self.mass is None and self.stiffness is None:
-            raise ValueError(f"{self.name}: mass and stiffness are both None; give at least one of them.")
+            raise Refused(f"{self.name}: mass and stiffness are both None; give at least one of them.")
         super().check_parameters()
 
     def terms(self, select, layout):

@@ -7,6 +7,7 @@ from typing import Any
 import jax.numpy as jnp
 
 from vmri_jax.mechanics.checks import shape_of
+from vmri_jax.refusals import Refused
 from vmri_jax.scene.body import end_of
 from vmri_jax.scene.declare import effect_class, names, number, of_time, positive, real_tree, vector
 from vmri_jax.scene.effect import Effect
@@ -94,7 +95,7 @@ class Drive(Effect):
     def _parameters(self):
         params = real_tree(f"{self.name}: params", self.params)
         if not isinstance(params, dict):
-            raise ValueError(f"{self.name}: params is {self.params!r}; give numbers by name, such as {{'size': 2.0}}.")
+            raise Refused(f"{self.name}: params is {self.params!r}; give numbers by name, such as {{'size': 2.0}}.")
         return params | self.points
 
     def check_parameters(self):
@@ -104,7 +105,7 @@ class Drive(Effect):
         for (name,) in self.elements:
             size = end_of(self.by_name, name).size
             if shape != (size,) and (shape, size) != ((), 1):
-                raise ValueError(
+                raise Refused(
                     f"{self.name}: history returns shape {shape}; {name} has dimension {size}, return ({size},)."
                 )
 

@@ -5,6 +5,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from vmri_jax.refusals import Refused
 from vmri_jax.scene.body import end_of
 from vmri_jax.scene.declare import array, common, effect_class, names, number
 from vmri_jax.scene.effect import Effect
@@ -80,7 +81,7 @@ class MagneticField(Effect):
             size = end_of(self.by_name, name).size
             needed = () if size == 2 else (3,)
             if shape != needed:
-                raise ValueError(
+                raise Refused(
                     f"{self.name}: field has shape {shape} and {name} has dimension {size}; give a number in the "
                     "plane, a vector (3,) in space."
                 )

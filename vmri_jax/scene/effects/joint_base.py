@@ -14,6 +14,7 @@ import numpy as np
 from vmri_jax.mechanics.arrays import is_concrete, library, real_array
 from vmri_jax.mechanics.kinematics import Move
 from vmri_jax.mechanics.names import unknown
+from vmri_jax.refusals import Refused
 from vmri_jax.scene.body import GROUND, GROUND_COORDINATES, Attachment, body_of, label_of
 from vmri_jax.scene.declare import effect_class, names, stacked
 from vmri_jax.scene.effect import START, Effect
@@ -82,7 +83,7 @@ class Joint(Effect):
             for name in element:
                 body = body_of(self.by_name, name)
                 if not body.rigid and (body.block or body.size != 3):
-                    raise ValueError(
+                    raise Refused(
                         f"{self.name}: {name} has {body.size} coordinates; joints are between rigid bodies and points in space."
                     )
 
@@ -117,9 +118,7 @@ class Joint(Effect):
         pairs = super()._elements()  # as the user wrote them: `Attachment` where a name came with a point
         if self.at is not None:
             if any(isinstance(name, Attachment) for pair in pairs for name in pair):
-                raise ValueError(
-                    f"{self.name}: between has points in the bodies, and at is given too; give one of them."
-                )
+                raise Refused(f"{self.name}: between has points in the bodies, and at is given too; give one of them.")
             return [(point, point) for point in _vectors(f"{self.name}: at", self.at, len(pairs))]
         joining = []
         for pair in pairs:
@@ -130,7 +129,7 @@ class Joint(Effect):
                 if isinstance(name, Attachment) or (name != GROUND and not self.by_name[name].rigid)
             ]
             if not points:
-                raise ValueError(
+                raise Refused(
                     f"{self.name}: nothing says where {pair[0]} and {pair[1]} are joined; give at=[x, y, z], or a point in one of "
                     f"them, as in ({pair[0]!r}, ({pair[1]!r}, [x, y, z]))."
                 )
@@ -145,7 +144,7 @@ class Joint(Effect):
             for role, name, point in zip("ab", element, points[i], strict=True):
                 body = body_of(self.by_name, name)
                 if not body.rigid and triads is not None:
-                    raise ValueError(
+                    raise Refused(
                         f"{self.name}: {name} is a point, which has no axes; a point can be joined by Spherical alone."
                     )
                 # X = R^T (x - phi): the point in the axes of the body
@@ -155,7 +154,7 @@ class Joint(Effect):
                     try:
                         rows = [body.weights(vector @ body.rotation) for vector in triads[i]]
                     except ValueError as error:
-                        raise ValueError(f"{self.name}: {error}") from None
+                        raise Refused(f"{self.name}: {error}") from None
                     components.setdefault(f"frame_{role}", []).append(library(rows).stack(rows))
         return components
 
@@ -192,12 +191,12 @@ def joint_named(about: str, name: str, effects: Iterable[Effect]) -> Joint:
     """The joint with a name among effects; `about` begins the message if there is none."""
     joints = {effect.name: effect for effect in effects if isinstance(effect, Joint)}
     if not isinstance(name, str):
-        raise TypeError(
+        raise Refused(
             f"{about}: joint is {name!r}; give the name of one joint. Each joint has an effect of its own with a name=, or several pairs of "
             "bodies are one joint."
         )
     if name not in joints:
-        raise ValueError(f"{about}: {unknown('joint', name, joints)}")
+        raise Refused(f"{about}: {unknown('joint', name, joints)}")
     return joints[name]
 
 
@@ -207,7 +206,7 @@ def freedom_of(joint: Joint, of: str, about: str = "") -> Freedom:
     if len(fitting) == 1:
         return fitting[0]
     free = " and ".join(joint.freedoms) or "neither an angle nor a displacement along an axis"
-    raise ValueError(f"{about}of is {of!r}; {joint.name} leaves {free} free.")
+    raise Refused(f"{about}of is {of!r}; {joint.name} leaves {free} free.")
 
 
 @effect_class
@@ -245,5 +244,5 @@ def _vectors(argument: str, numbers, count: int):
     vectors = real_array(argument, numbers)
     if vectors.shape not in ((3,), (count, 3)):
         for_pairs = f", or one for each pair, ({count}, 3)" if count > 1 else ""
-        raise ValueError(f"{argument} has shape {vectors.shape}; give (3,){for_pairs}.")
+        raise Refused(f"{argument} has shape {vectors.shape}; give (3,){for_pairs}.")
     return library(vectors).broadcast_to(vectors, (count, 3))

@@ -10,6 +10,7 @@ import numpy as np
 from vmri_jax.mechanics.arrays import is_concrete
 from vmri_jax.mechanics.checks import check_type
 from vmri_jax.mechanics.names import unknown
+from vmri_jax.refusals import Refused
 from vmri_jax.scene.declare import array, effect_class, names, number, positive, real_tree, stacked
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.effects.points import distance
@@ -62,16 +63,16 @@ class _Nonbonded(Effect):
         known, left_out = {name for pair in pairs for name in pair}, set()
         for pair in self.exclude:
             if isinstance(pair, str) or len(pair) != 2:
-                raise ValueError(
+                raise Refused(
                     f"{self.name}: {pair!r} is in exclude; give pairs of names, as from within_bonds(bonds, 3)."
                 )
             for name in pair:
                 if name not in self.by_name:
-                    raise ValueError(f"{self.name}: exclude: {unknown('body', name, sorted(known))}")
+                    raise Refused(f"{self.name}: exclude: {unknown('body', name, sorted(known))}")
             left_out.add(frozenset(pair))
         kept = tuple(pair for pair in pairs if frozenset(pair) not in left_out)
         if not kept:
-            raise ValueError(f"{self.name}: exclude leaves no pair; leave the effect out.")
+            raise Refused(f"{self.name}: exclude leaves no pair; leave the effect out.")
         return kept
 
 
@@ -134,7 +135,7 @@ class Coulomb(_Nonbonded):
         pairs = super()._elements()
         for name in (name for pair in pairs for name in pair):
             if name not in self.charges:
-                raise ValueError(f"{self.name}: {name} has no charge; there are charges of {', '.join(self.charges)}.")
+                raise Refused(f"{self.name}: {name} has no charge; there are charges of {', '.join(self.charges)}.")
         return pairs
 
     def _parameters(self):

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.mechanics.arrays import library
+from vmri_jax.refusals import Refused
 from vmri_jax.scene.body import end_of, label_of
 from vmri_jax.scene.declare import effect_class, names, of_time, real_tree, vector
 from vmri_jax.scene.effect import Effect
@@ -81,7 +82,7 @@ class ToFixedPoint(ToPoint):
     def __post_init__(self):
         super().__post_init__()
         if callable(self.point):
-            raise TypeError(
+            raise Refused(
                 f"{self.name}: point is {self.point!r}; {type(self).__name__} holds bodies at fixed points, give (d,) or (n, d). For a "
                 "point that moves take MovingPivot (a rigid link), Guide (the point itself) or MovingAnchor (a spring)."
             )
@@ -124,6 +125,6 @@ class ToPath(ToPoint):
         for (name,) in self.elements:
             size = end_of(self.by_name, name).size
             if shape != (size,):
-                raise ValueError(
+                raise Refused(
                     f"{self.name}: path returns shape {shape}; {name} has dimension {size}, return ({size},)."
                 )

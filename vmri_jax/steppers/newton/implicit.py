@@ -10,8 +10,9 @@ import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
+from vmri_jax.refusals import Refused
 from vmri_jax.schemes.equations import StepEquations, Unknowns
-from vmri_jax.steppers.march import MarchEquations, factor, solve
+from vmri_jax.steppers.march import MarchEquations, linearised_pass, solve
 
 ONLY_FIRST_DERIVATIVES = (
     "the adjoint of this run has first derivatives in reverse mode only. For second derivatives and forward mode take "
@@ -22,7 +23,9 @@ ONLY_FIRST_DERIVATIVES = (
 def _direction(equations: StepEquations, x: Unknowns):
     """The map ``residual -> -(dR/dx)^-1 residual``, with the matrix at x as a constant for derivatives."""
     march = MarchEquations(equations)
-    factors = jax.lax.stop_gradient(factor(march, *march.flat(x)))
+    z, x_flat = march.flat(x)
+    matrices, _, by_positions = linearised_pass(march, z, x_flat, x_flat[-1], from_last=False, corrects=False)
+    factors = jax.lax.stop_gradient((matrices, by_positions))
     return lambda residual: march.by_name(*solve(march, factors, *march.flat(residual)))
 
 
@@ -117,4 +120,4 @@ def only_once(tree):
 
 @only_once.defjvp
 def _refused(primals, tangents):
-    raise TypeError(ONLY_FIRST_DERIVATIVES)
+    raise Refused(ONLY_FIRST_DERIVATIVES)
