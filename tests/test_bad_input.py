@@ -264,7 +264,7 @@ def test_constraints_of_slow_coordinates_alone(num_fast):
     [
         ([1.0, 0.0], r"slow = \[1. 0.\]; every mass must be positive"),
         ([1.0, -2.0], "every mass must be positive"),
-        ([1.0, np.nan], "is not finite"),
+        ([1.0, np.nan], "every mass must be positive and finite"),
         (1.0, r"slow has shape \(\); give \(n,\) masses"),
         (np.diag([1.0, -1.0]), "slow must be a symmetric positive definite matrix"),
         (np.array([[1.0, 0.5], [0.0, 1.0]]), "slow must be a symmetric positive definite matrix"),
