@@ -265,7 +265,7 @@ def test_an_equal_start_is_made_once(monkeypatch):
     """Its checks take longer than a short run; another number makes another start."""
     problem, equal = triple_spherical_pendulum(), triple_spherical_pendulum()
     state = problem.state()
-    monkeypatch.setattr("vmri_jax.mechanics.state._consistent", None)
+    monkeypatch.setattr("vmri_jax.mechanics.state.consistent_momenta", None)
     assert equal.state() == state
     with pytest.raises(TypeError, match="not callable"):
         replace(problem, v_s=2 * np.asarray(problem.v_s)).state()

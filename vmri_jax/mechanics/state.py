@@ -12,12 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from vmri_jax.mechanics.arrays import Known, Number, Numbers, is_concrete, of_one_type, quickly_compiled, require_x64
+from vmri_jax.mechanics.arrays import Known, Number, Numbers, is_concrete, of_one_type, require_x64
 from vmri_jax.mechanics.by_name import constraint_sizes, flat_system
 from vmri_jax.mechanics.checks import check_arrays, check_flags, check_number, check_params, check_system, check_type
-from vmri_jax.mechanics.constraints import START, check_constraints, check_mass, project_positions
+from vmri_jax.mechanics.consistent import consistent_momenta, project_positions
+from vmri_jax.mechanics.constraints import START, check_constraints, check_mass
 from vmri_jax.mechanics.names import Names
-from vmri_jax.mechanics.projection import legendre, project_momentum
 from vmri_jax.mechanics.rows import Part
 from vmri_jax.mechanics.slots import Slots
 from vmri_jax.mechanics.summary import coordinates, has_values, listed, numbers, summary
@@ -130,11 +130,13 @@ def initial_state(
 
 
 def _start(arguments, project: bool):
-    """`_consistent` of these arguments, with projected positions if `project`."""
+    """The state with projected momenta, with projected positions if `project`, and the violation of `consistent_momenta`."""
     system, t, q_s, q_f, *velocities = arguments
-    if project:
-        q_s, q_f = _projected_positions(system, t, q_s, q_f)
-    return _consistent(system, t, q_s, q_f, *velocities)
+    if project and system.is_constrained:
+        q_s, q_f = project_positions(system, t, q_s, q_f)
+    check_system(system, q_s, q_f)
+    p_s, p_f, violation = consistent_momenta(system, t, q_s, q_f, *velocities)
+    return State(t, q_s, q_f, p_s, p_f), violation
 
 
 @lru_cache(maxsize=256)
@@ -144,7 +146,7 @@ def _checked_start(known: Known, project: bool, tolerance: float) -> tuple[State
     if not system.has_constant_mass:  # before the projection, which divides by the masses
         check_system(system, q_s, q_f)
         check_mass(system, q_s, q_f)
-    state, violation = _start(known.tree, project)
+    state, violation = jax.device_put(_start(known.tree, project))
     advice = (
         "projection did not reach the constraints; start closer to them."
         if project
@@ -166,7 +168,7 @@ def tell_of_velocities(
 
     Args:
         caller: name of the caller in the message.
-        violation: as of `_consistent`.
+        violation: as of `consistent_momenta`.
         project: whether the user wants the projected velocities.
         constraints: name of the constraints in the message.
         at_rest: whether all velocities of the user are zero; moving constraints may demand others, which are then taken.
@@ -349,23 +351,3 @@ def start_of(caller: str, system, state=None) -> tuple[System, State]:
             f"{caller}: {got}; give a State, e.g. from initial_state(...), or a Problem(system, q_s, q_f, v_s, v_f) alone."
         )
     return system, state
-
-
-@quickly_compiled
-def _consistent(system, t, q_s, q_f, v_s, v_f):
-    """The state with projected momenta, and the violation of the hidden constraints, between 0 and 1.
-
-    The violation is ``|v - v'| / max(|v|, |v'|)`` in the norm of the kinetic energy, with the projected velocities v': constraints may take
-    velocity away, and moving constraints may add it. The values of the user's functions are checked while JAX traces this function.
-    """
-    check_system(system, q_s, q_f)
-    momenta = legendre(system, q_s, q_f, v_s, v_f)
-    p_s, p_f, *velocities = project_momentum(system, State(t, q_s, q_f, *momenta), (v_s, v_f))
-    v, projected_v, p, projected_p = (jnp.concatenate(a) for a in ((v_s, v_f), velocities, momenta, (p_s, p_f)))
-    # |v - v'|^2 / max(|v|^2, |v'|^2) with |v|^2 = v . p
-    size = jnp.maximum(v @ p, projected_v @ projected_p)
-    part = jnp.where(size > 0, (v - projected_v) @ (p - projected_p) / jnp.where(size > 0, size, 1.0), 0.0)
-    return State(t, q_s, q_f, p_s, p_f), jnp.sqrt(jnp.clip(part, 0.0, 1.0))
-
-
-_projected_positions = quickly_compiled(project_positions)
