@@ -13,8 +13,8 @@ import numpy as np
 import vmri_jax as vm
 from benchmarks.measure import Tell, silent
 from benchmarks.report import Report
+from vmri_jax.running.export import STATUS, named_arrays
 from vmri_jax.running.store.layout import committed
-from vmri_jax.running.trajectory import STATUS, named_arrays
 
 COLUMNS = ("kill", "after, s", "chunks", "new", "moment", "identical")
 CHUNKS, PER_CHUNK = 40, 5

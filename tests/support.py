@@ -7,8 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax import SimulationError, Solver, State, Trajectory, initial_state, macro_step, plan, simulate, systems
-from vmri_jax.running.origin import UNKNOWN
-from vmri_jax.running.trajectory import join, with_origin
+from vmri_jax.running.export import NODES, named_arrays
 
 DATA = Path(__file__).parent / "data"
 PROBLEMS = {
@@ -47,9 +46,16 @@ def until_failure(*arguments, **options) -> Trajectory:
 
 
 def joined(runs) -> Trajectory:
-    """One run of runs each of which goes on from the one before."""
-    bare = [(with_origin(run, UNKNOWN), np.asarray(run.energy)) for run in runs]
-    return with_origin(join(bare)[0], runs[0].origin)
+    """One run of runs each of which goes on from the one before, with the worst of their statuses."""
+    first, *others = map(named_arrays, runs)
+
+    def join(name: str):
+        arrays = [run[name] for run in (first, *others)]
+        if not np.ndim(arrays[0]):
+            return np.max(arrays)
+        return np.concatenate([arrays[0], *(array[name in NODES :] for array in arrays[1:])])
+
+    return runs[0].with_arrays(**{name: join(name) for name in first})
 
 
 def without_fallback(moving, scheme, state=None) -> Solver:

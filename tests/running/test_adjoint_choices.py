@@ -7,7 +7,7 @@ import pytest
 
 import vmri_jax as vm
 from tests.running.test_adjoints import simple_cost, simple_gradient
-from vmri_jax.running import adjoints
+from vmri_jax.running import simulation
 
 
 def test_lanes_of_gradients():
@@ -37,7 +37,7 @@ def test_stored_steps_have_second_derivatives():
 def test_what_auto_chooses(monkeypatch):
     """Values with the derivatives that `checkpoint` refuses tell which adjoint has been taken."""
     cost, at = simple_cost("auto")
-    monkeypatch.setattr(adjoints, "LONGEST_STORED_RUN", 5)
+    monkeypatch.setattr(simulation, "LONGEST_STORED_RUN", 5)
     np.testing.assert_allclose(jax.jit(jax.grad(cost))(at), simple_gradient("stored")(at), rtol=1e-11, atol=1e-12)
     with pytest.raises(TypeError, match="stored"):
         jax.jacfwd(jax.grad(cost))(at)

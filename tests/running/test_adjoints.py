@@ -93,25 +93,25 @@ def test_the_adjoints_agree(case):
 
 
 @pytest.fixture
-def three_parts_a_level(monkeypatch):
-    monkeypatch.setattr(loops, "PARTS_PER_LEVEL", 3)
+def short_parts(monkeypatch):
+    monkeypatch.setattr(loops, "MOST_UNDIVIDED", 3)
     monkeypatch.setattr(engine, "MOST_STORED_STEPS", 1)
-    engine.engine.cache_clear()  # programs with other levels
+    engine.engine.cache_clear()  # programs without parts
     yield
     engine.engine.cache_clear()
 
 
-@pytest.mark.usefixtures("three_parts_a_level")
+@pytest.mark.usefixtures("short_parts")
 @pytest.mark.parametrize("every", [1, 5])
-def test_levels_of_checkpoints(every):
-    """Four levels of saved nodes; two of saved nodes and two of the steps between."""
+def test_parts_of_checkpoints(every):
+    """Parts of saved nodes; and of the steps between them."""
     assert_agree(gradient("kicks", every, "checkpoint"), gradient("kicks", every, "stored"), 1e-11)
 
 
 @pytest.mark.full
-@pytest.mark.usefixtures("three_parts_a_level")
-def test_levels_of_checkpoints_of_steps_that_are_solved():
-    """Two levels of the steps between."""
+@pytest.mark.usefixtures("short_parts")
+def test_parts_of_checkpoints_of_steps_that_are_solved():
+    """Parts of the steps between."""
     cost, p_f = simple_cost("checkpoint")
     assert_agree(jax.jit(jax.grad(cost))(p_f), simple_gradient("stored")(p_f), 1e-11)
 
@@ -125,7 +125,7 @@ def memory(adjoint: str, steps: int, every: int) -> float:
 
 
 def test_memory_of_long_gradients():
-    """From 10^3 to 10^6 steps: measured 1.9 for three levels of checkpoints."""
+    """From 10^3 to 10^6 steps: measured MEASURED for a thousand parts."""
     checkpoint = [memory("checkpoint", steps, steps) for steps in (1000, 1_000_000)]
     assert checkpoint[1] < 4 * checkpoint[0]
 

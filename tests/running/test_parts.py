@@ -40,13 +40,13 @@ CASES = {  # system of a parameter, positions, scheme, adjoints
         lambda k: vm.System(vm.ConstantMass([1.0], []), slow_spring, params=k),
         ([1.0], []),
         vm.fully_explicit(1),
-        ("stored", "checkpoint"),
+        ("stored",),
     ),
     "no slow part": (
         lambda k: vm.System(vm.ConstantMass([], [1.0]), fast_potential=fast_spring, params=k),
         ([], [1.0]),
         vm.fully_explicit(1),
-        ("stored", "checkpoint"),
+        ("checkpoint",),
     ),
     "solved": (
         lambda k: vm.System(vm.ConstantMass([1.0], []), slow_spring, params=k),
@@ -67,10 +67,10 @@ STEPS = {"macro_dt": 0.1, "num_steps": 5}
 
 @pytest.fixture(autouse=True)
 def debug_nans(monkeypatch):
-    """`jax_debug_nans`, which must not stop sound runs; and checkpoints of two levels in short runs."""
-    monkeypatch.setattr(loops, "PARTS_PER_LEVEL", 3)
+    """`jax_debug_nans`, which must not stop sound runs; and checkpoints in parts in short runs."""
+    monkeypatch.setattr(loops, "MOST_UNDIVIDED", 3)
     monkeypatch.setattr(engine, "MOST_STORED_STEPS", 1)
-    engine.engine.cache_clear()  # programs with other levels
+    engine.engine.cache_clear()  # programs without parts
     with jax.debug_nans(True):
         yield
     engine.engine.cache_clear()

@@ -14,7 +14,7 @@ from vmri_jax.running.arguments import Save, Steps
 from vmri_jax.running.batch import Batch, batch
 from vmri_jax.running.progress import Working
 from vmri_jax.running.run_error import RunError
-from vmri_jax.running.trajectory import Trajectory, with_observables, with_origin
+from vmri_jax.running.trajectory import Trajectory, with_origin
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.results import Result
@@ -74,11 +74,10 @@ def simulate_batch(
     steps = Steps(macro_dt, num_steps, t_end, save)
     with Working("simulate_batch: the starts"):
         lanes = batch(system, scheme, states, steps, params, solver, chunk, devices)
-    plain, table = lanes()
-    plain = with_observables(plain, table)
-    errors = _errors(lanes, plain) if error else None
-    trajectory = with_origin(plain, lanes.origin, error=errors)
-    lanes.run.warn("simulate_batch", table, plain.states.t, lanes.leaves[0])
+    saved = lanes()
+    plain = saved.trajectory(lanes.runs)
+    trajectory = with_origin(plain, plain.origin, error=_errors(lanes, plain) if error else None)
+    lanes.runs.warn("simulate_batch", saved.table, plain.states.t)
     for kind, message in ((FailedLanesWarning, _failures(trajectory)), (UncertifiedWarning, _uncertified(trajectory))):
         if warn and message:
             warnings.warn(f"simulate_batch: {message}", kind, stacklevel=2)
@@ -86,11 +85,12 @@ def simulate_batch(
 
 
 def _errors(lanes: Batch, plain: Trajectory) -> RunError:
-    """The errors of all lanes, from batches of companions; `plain` are the runs, with arrays of NumPy and without an origin."""
+    """The errors of all lanes, from batches of companions; `plain` are the runs, with arrays of NumPy."""
 
     @cache
     def companions(parts: int, whole: int = 1) -> Trajectory:
-        return with_observables(*lanes.with_steps(finer(lanes.run, parts, whole))())
+        finer_lanes = lanes.with_steps(finer(lanes.run, parts, whole))
+        return finer_lanes().trajectory(finer_lanes.runs)
 
     def error(i: int) -> RunError:
         run, coarse, halved = lanes.lane(i), plain.lane(i), companions(2).lane(i)

@@ -30,8 +30,8 @@ from vmri_jax.refusals import Refused
 from vmri_jax.running import arguments
 from vmri_jax.running.arguments import Save, steps_until
 from vmri_jax.running.batch import consistent_states
+from vmri_jax.running.export import STATUS
 from vmri_jax.running.simulation import Simulation, simulation
-from vmri_jax.running.trajectory import STATUS
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.solver import Solver

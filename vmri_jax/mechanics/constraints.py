@@ -23,7 +23,7 @@ from vmri_jax.mechanics.arrays import Numbers, is_concrete, library, quickly_com
 from vmri_jax.mechanics.by_name import constraint_sizes
 from vmri_jax.mechanics.functions import Rheonomic
 from vmri_jax.mechanics.masses import correlation
-from vmri_jax.mechanics.projection import mass_diagonal, time_rates
+from vmri_jax.mechanics.projection import mass_diagonal, mass_matrix, time_rates
 from vmri_jax.mechanics.system import System
 from vmri_jax.mechanics.terms_of_rows import sizes_of_terms
 from vmri_jax.refusals import Refused
@@ -216,10 +216,7 @@ def check_mass(system: System, q_s, q_f) -> None:
         )
 
 
-@quickly_compiled
-def _mass_matrix(system, q_s, q_f, v_s, v_f):
-    n_s = v_s.size
-    return jax.hessian(lambda v: system.kinetic_energy(q_s, q_f, v[:n_s], v[n_s:]))(jnp.append(v_s, v_f))
+_mass_matrix = quickly_compiled(mass_matrix)
 
 
 def check_constraints(
@@ -271,7 +268,13 @@ def check_constraints(
             f"{place} violate {'constraint' if worst < n_g else 'slow_constraint'}, row {row.strip('[]')}, by {abs(solved[worst]):.3e} (allowed: "
             f"{allowed[worst]:.0e}, {tolerance:.0e} of its size, and round-off); {advice}"
         )
-    _check_implied(rows, n_g + n_gs, place)
+    implied, allowed = rows.values[n_g + n_gs :], rows.allowed(CONSTRAINT_TOLERANCE)[n_g + n_gs :]
+    opened = np.flatnonzero(~(np.abs(implied) <= allowed))
+    if opened.size:
+        raise Refused(
+            f"System: implied does not follow from the constraints: {place} keep these, and row(s) {opened.tolist()} of implied are "
+            f"{implied[opened]} there (allowed: {allowed[opened]}). Take parameters for which they follow, or hold them as constraint."
+        )
 
     size = np.linalg.norm(np.concatenate([slow, fast], axis=1), axis=1)
     slow_only = np.flatnonzero((size > 0) & (np.linalg.norm(fast, axis=1) <= LEAST_FAST_PART * size))

@@ -29,8 +29,14 @@ def legendre(system: System, q_s, q_f, v_s, v_f):
     return jax.grad(system.kinetic_energy, argnums=(2, 3))(q_s, q_f, v_s, v_f)
 
 
+def mass_matrix(system: System, q_s, q_f, v_s, v_f):
+    """Mass matrix ``d2T/dv2`` (n, n)."""
+    n_s = v_s.size
+    return jax.hessian(lambda v: system.kinetic_energy(q_s, q_f, v[:n_s], v[n_s:]))(jnp.append(v_s, v_f))
+
+
 def mass_diagonal(system: System, q_s, q_f):
-    """Diagonal of the mass matrix ``d2T/dv2`` at rest: (n_s,) and (n_f,)."""
+    """Diagonal of the mass matrix at rest, in fewer operations than the matrix: (n_s,) and (n_f,)."""
     if system.has_constant_mass:
         masses = system.kinetic.slow, system.kinetic.fast
         return tuple(mass if mass.ndim == 1 else jnp.diagonal(mass) for mass in masses)

@@ -9,7 +9,6 @@ import numpy as np
 from vmri_jax.mechanics.arrays import Known, is_concrete, real_array, require_x64, whole_number
 from vmri_jax.mechanics.checks import check_arrays, check_flags, check_number, check_params, check_system
 from vmri_jax.mechanics.constraints import check_constraints, check_mass
-from vmri_jax.mechanics.state import State
 from vmri_jax.refusals import Refused
 from vmri_jax.running.progress import ShowsProgress, check_progress
 from vmri_jax.schemes.composition import Composition, stage_scheme
@@ -34,7 +33,7 @@ class Save:
         every: macro steps from one saved node to the next; 1 where neither `every` nor `number` is given.
         number: in place of `every`, the number of saved intervals, equally spaced, of which there is one node more.
         micro: also keep the fast positions at the micro nodes of the macro step that ends at each saved node.
-        adjoint: states that a run keeps for derivatives, see `vmri_jax.running.adjoints`: "stored" for all modes, "checkpoint" for reverse
+        adjoint: states that a run keeps for derivatives, see `vmri_jax.running.engine`: "stored" for all modes, "checkpoint" for reverse
             mode in little memory; "auto" chooses by length. Outside of transformations of JAX it changes nothing.
         progress: True for a bar of the nodes saved so far, or a function of (what, done, total); Ctrl-C then raises `Interrupted` with
             these nodes. With False a run that takes more than two seconds prints lines on the error stream.
@@ -113,8 +112,7 @@ def check_run(system, scheme, state, solver, steps: Steps) -> tuple[int, int]:
         raise Refused(f"simulate: got {got} of num_steps and t_end; give exactly one of them.")
     num_steps = steps_until(t_end, state.t, dt) if num_steps is None else whole_number("simulate: num_steps", num_steps)
     every = Save.of(steps.save).macro_steps(num_steps)
-    if is_concrete(vars(state)):
-        check_vectors(state)
+    check_arrays(q_s=state.q_s, q_f=state.q_f, p_s=state.p_s, p_f=state.p_f)
     return num_steps, every
 
 
@@ -156,16 +154,6 @@ def check_step_size(macro_dt) -> None:
         raise Refused("simulate: macro_dt is missing; give the macro step H, num_micro times the micro step.")
     if is_concrete(real_array("simulate: macro_dt", macro_dt, 0)) and not (np.isfinite(macro_dt) and macro_dt > 0):
         raise Refused(f"simulate: macro_dt is {macro_dt}; it must be a positive number.")
-
-
-def check_vectors(state: State) -> None:
-    """Refuse positions and momenta that are not finite vectors of float64 of matching lengths."""
-    vectors = {name: getattr(state, name) for name in ("q_s", "q_f", "p_s", "p_f")}
-    q_s, q_f, p_s, p_f = arrays = [np.asarray(a) for a in vectors.values()]
-    fits = q_s.shape == p_s.shape and q_f.shape == p_f.shape
-    good = all(a.dtype == float and a.ndim == 1 and np.isfinite(a).all() for a in arrays)
-    if not (fits and good):
-        check_arrays(**vectors)
 
 
 @lru_cache(maxsize=256)

@@ -6,7 +6,7 @@ get it once.
 
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any
 
 import equinox as eqx
@@ -21,13 +21,11 @@ from vmri_jax.mechanics.state import Movable, State, initial_state, opened, star
 from vmri_jax.mechanics.system import System
 from vmri_jax.refusals import Refused
 from vmri_jax.running.arguments import Steps, check_step_size
-from vmri_jax.running.engine import NUM_STATE, Engine
-from vmri_jax.running.fallback import FALLING_BACK
-from vmri_jax.running.origin import Origin, is_repeated
+from vmri_jax.running.engine import FALLING_BACK, Engine
+from vmri_jax.running.origin import is_repeated
 from vmri_jax.running.progress import Working
-from vmri_jax.running.saved import check_memory
-from vmri_jax.running.simulation import STEPPING, Simulation, simulation
-from vmri_jax.running.trajectory import Piece
+from vmri_jax.running.saved import Saved, check_memory
+from vmri_jax.running.simulation import LENGTH, STEPPING, Simulation, simulation
 from vmri_jax.schemes.composition import Composition, stage_scheme
 from vmri_jax.schemes.scheme import Scheme
 
@@ -45,63 +43,64 @@ class Batch:
     """Runs side by side, with checked arguments.
 
     Attributes:
-        run: the run of the first lane.
-        leaves: (lanes, ...) the leaves of the motions of all lanes.
+        runs: the runs of all lanes, whose arrays have an axis of lanes.
         width: lanes that are computed side by side.
         devices: CPU devices that share the lanes.
     """
 
-    run: Simulation
-    leaves: list
+    runs: Simulation
     width: int
     devices: int
 
-    def __call__(self) -> Piece:
-        """The runs and their observables, see `Simulation.observed`; lanes that are not solved are computed again by the fallback."""
-        run, lanes = self.run, len(self.leaves[0])
+    def __call__(self) -> Saved:
+        """The runs; lanes that are not solved are computed again by the fallback."""
+        lanes, run = len(self), self.run
         with Working(f"simulate_batch, {lanes} lanes", running=STEPPING):
             done = self._in_chunks()
-        failed = np.flatnonzero(run.unsolved(done[0]))
+        failed = np.flatnonzero(run.unsolved(done))
         if failed.size:
             # Failed lanes are padded to a power of two with copies of the last one, so that few programs serve all numbers of failures.
             padded_size = 2 ** int(failed.size - 1).bit_length()
             padded = failed[np.minimum(np.arange(padded_size), failed.size - 1)]
             with Working(f"simulate_batch, {failed.size} of {lanes} lanes: {FALLING_BACK}"):
-                again = replace(self, run=run.exact, leaves=_taken(self.leaves, padded))._in_chunks()
-            for old, new in zip(jax.tree.leaves(done), jax.tree.leaves(again), strict=True):
+                exact = jax.tree.unflatten(jax.tree.structure(run.exact), self.runs.leaves)
+                again = replace(self, runs=_taken(exact, padded))._in_chunks()
+            for old, new in zip(done, again, strict=True):
                 old[failed] = new[: failed.size]
         return done
 
-    @property
-    def origin(self) -> Origin:
-        """The origin of its trajectories."""
-        structure, count = self.run._system
-        return Origin(self.run.names, jax.tree.unflatten(structure, self.leaves[len(self.leaves) - count :]))
+    def __len__(self) -> int:
+        """Number of lanes."""
+        return len(self.runs.macro_dt)
+
+    @cached_property
+    def run(self) -> Simulation:
+        """The run of the first lane."""
+        return self.lane(0)
 
     def lane(self, i: int) -> Simulation:
         """The run of a lane."""
-        return replace(self.run, **self.run.engine.motion([a[i] for a in self.leaves])._asdict())
+        return jax.tree.map(lambda a: a[i], self.runs)
 
     def with_steps(self, run: Simulation) -> "Batch":
         """The batch with the steps of another run of its first lane, in the same ratio for all lanes."""
-        macro_dt, *others = self.leaves
-        all_alike = shared(run.macro_dt, len(macro_dt))
+        macro_dt = self.runs.macro_dt
+        all_alike = shared(run.macro_dt, len(self))
         macro_dt = all_alike if is_repeated(macro_dt) else macro_dt * (run.macro_dt / macro_dt[0])
-        return replace(self, run=run, leaves=[macro_dt, *others])
+        length = {name: getattr(run, name) for name in LENGTH}
+        return replace(self, runs=replace(self.runs, macro_dt=macro_dt, **length))
 
-    def _in_chunks(self) -> Piece:
+    def _in_chunks(self) -> Saved:
         """All lanes, `width` at a time; the last chunk is padded with copies of its last lane, so that one program computes all chunks."""
-        lanes = len(self.leaves[0])
+        run, lanes = self.run, len(self)
         width = min(self.width, -(-lanes // self.devices) * self.devices)
-        program = _side_by_side(self.run.engine, tuple(not is_repeated(a) for a in self.leaves), self.devices)
-        pieces = []
+        program = _side_by_side(run.engine, tuple(not is_repeated(a) for a in self.runs.leaves), self.devices)
+        chunks = []
         for start in range(0, lanes, width):
-            part = _taken(self.leaves, np.minimum(np.arange(start, start + width), lanes - 1))
-            part = [a[0] if is_repeated(a) else a for a in part]
-            pieces.append(program(part, self.run.save_every))
-        saved, result, failed_at = jax.tree.map(lambda *parts: np.concatenate(parts)[:lanes], *pieces)
-        run = self.run.unpacked(saved, self.leaves, result, failed_at, self.run.save_every)
-        return self.run.observed(run, self.leaves)
+            part = _taken(self.runs, np.minimum(np.arange(start, start + width), lanes - 1))
+            chunks.append(program([a[0] if is_repeated(a) else a for a in part.leaves], run.save_every))
+        rows, status = jax.tree.map(lambda *parts: np.concatenate(parts)[:lanes], *chunks)
+        return Saved(rows, status[..., 0].copy(), status[..., 1].copy()).marked(run.columns, run.save_every)
 
 
 def batch(
@@ -131,27 +130,26 @@ def batch(
         raise Refused(
             "simulate_batch: t_end with steps or start times that differ; give num_steps, the same for all lanes."
         )
-    differs = not all(map(is_repeated, params))
+    differs = not all(map(is_repeated, jax.tree.leaves(params)))
     if states is None and differs and not (system.has_constant_mass and not system.is_constrained):
         # momenta M v, and their projection onto constraints, depend on parameters
-        of_lanes = jax.tree.unflatten(jax.tree.structure(system.params), params)
         fixed = tuple(getattr(problem, name) for name in ("t", "q_s", "q_f", "v_s", "v_f"))
-        start = consistent_states(system, of_lanes, fixed, problem.project, starts_differ=False)
-    state = tuple(map(np.asarray, vars(start).values()))
-    first, steps = State(*(a[0] for a in state)), replace(steps, macro_dt=macro_dt[0])
-    run, lanes = simulation(problem, scheme, first, solver, steps), len(state[0])
+        start = consistent_states(system, params, fixed, problem.project, starts_differ=False)
+    start = State(*map(np.asarray, vars(start).values()))
+    first, steps = jax.tree.map(lambda a: a[0], start), replace(steps, macro_dt=macro_dt[0])
+    run, lanes = simulation(problem, scheme, first, solver, steps), len(macro_dt)
     run.save.without_bar("simulate_batch")
     run.check("simulate_batch: the positions of the first state", constraints=not differs)
     check_memory("simulate_batch", run, lanes)
-    model = run.leaves[NUM_STATE:]  # the parameters come last, see `Motion`
-    model = [shared(leaf, lanes) for leaf in model[: len(model) - len(params)]] + params
     width = (lanes_at_once(run) if chunk is None else chunk) * devices
-    return Batch(run, [macro_dt, *state, *model], width, devices)
+    runs = jax.tree.map(lambda a: shared(a, lanes), run)
+    runs = replace(runs, macro_dt=macro_dt, state=start, system=runs.system.with_params(params))
+    return Batch(runs, width, devices)
 
 
-def _taken(leaves: list, index: np.ndarray) -> list:
+def _taken(runs: Simulation, index: np.ndarray) -> Simulation:
     """The lanes with these numbers."""
-    return [shared(a[0], len(index)) if is_repeated(a) else a[index] for a in leaves]
+    return jax.tree.map(lambda a: shared(a[0], len(index)) if is_repeated(a) else a[index], runs)
 
 
 def shared(value, lanes: int) -> np.ndarray:
@@ -176,14 +174,6 @@ def consistent_states(system: System, params, start: tuple, project: bool, start
     return jax.vmap(of_lane, (None if params is None else 0, 0 if starts_differ else None))(params, start)
 
 
-def _names(params) -> list[str]:
-    """Names of all parameters, with dots in names of nested ones."""
-    return [
-        jax.tree_util.keystr(path, simple=True, separator=".")
-        for path, _ in jax.tree_util.tree_leaves_with_path(params)
-    ]
-
-
 def _named(values, known: Collection[str], path: tuple[str, ...] = ()) -> Iterator[tuple[str, Any]]:
     """Name and value of each parameter in a part of the parameters, nested or with dots in its names.
 
@@ -201,7 +191,7 @@ def _named(values, known: Collection[str], path: tuple[str, ...] = ()) -> Iterat
         yield from _named(entry, known, (*path, jax.tree_util.keystr((key,), simple=True)))
 
 
-def _with_lanes(all_params, params, start: State, macro_dt) -> tuple[list, State, np.ndarray]:
+def _with_lanes(all_params, params, start: State, macro_dt) -> tuple[Any, State, np.ndarray]:
     """Parameters, starts and macro steps of all lanes, with the lanes as their first axis.
 
     Args:
@@ -211,37 +201,32 @@ def _with_lanes(all_params, params, start: State, macro_dt) -> tuple[list, State
     Raises:
         ValueError: arrays of other shapes, axes of different lengths, or no axis of lanes at all.
     """
-    values = dict(zip(_names(all_params), jax.tree.leaves(all_params), strict=True))
+    leaves, structure = jax.tree_util.tree_flatten_with_path(all_params)
+    values = {jax.tree_util.keystr(path, simple=True, separator="."): value for path, value in leaves}
     new = {} if params is None else dict(_named(params, values))
     check_params(new)
     arrays = {f"params[{name!r}]": (new.get(name, value), np.shape(value)) for name, value in values.items()}
-    arrays |= {
-        f"states.{name}": (value, np.shape(value)[-1:] if name != "t" else ()) for name, value in vars(start).items()
-    }
+    for name, value in vars(start).items():
+        arrays[f"states.{name}"] = value, np.shape(value)[-1:] if name != "t" else ()
     arrays["macro_dt"] = real_array("simulate_batch: macro_dt", macro_dt), ()
-    lengths = {}
+    lengths = {name: len(value) for name, (value, shape) in arrays.items() if np.ndim(value) > len(shape)}
     for name, (value, shape) in arrays.items():
-        if np.ndim(value) > len(shape) and np.shape(value)[1:] == shape:
-            lengths[name] = len(value)
-        elif np.shape(value) != shape:
+        if np.shape(value)[name in lengths :] != shape:
             raise Refused(
                 f"simulate_batch: {name} has shape {np.shape(value)}; give {shape} for all lanes, or an axis of lanes in front of it."
             )
     if len(set(lengths.values())) != 1 or 0 in lengths.values():
-        listed = (
-            ", ".join(f"{name} has {length}" for name, length in lengths.items()) or "no argument has an axis of lanes"
-        )
+        listed = ", ".join(f"{name} has {length}" for name, length in lengths.items())
         raise Refused(
-            f"simulate_batch: {listed}; give params, states or steps with one value for each lane, all of the same number."
+            f"simulate_batch: {listed or 'no argument has an axis of lanes'}; give params, states or steps with one value for each lane, "
+            "all of the same number."
         )
     (lanes,) = set(lengths.values())
-    whole = {
-        name: np.asarray(value) if name in lengths else shared(value, lanes) for name, (value, _) in arrays.items()
-    }
-    if all(map(is_repeated, whole.values())):  # the user gave such views, and `jax.vmap` wants an axis
-        whole["states.t"] = np.array(whole["states.t"])
-    starts = (whole[f"states.{name}"] for name in vars(start))
-    return [whole[f"params[{name!r}]"] for name in values], State(*starts), whole["macro_dt"]
+    whole = [np.asarray(a) if name in lengths else shared(a, lanes) for name, (a, _) in arrays.items()]
+    *of_params, t, q_s, q_f, p_s, p_f, steps = whole
+    if all(map(is_repeated, whole)):  # the user gave such views, and `jax.vmap` wants an axis
+        t = np.array(t)
+    return jax.tree.unflatten(structure, of_params), State(t, q_s, q_f, p_s, p_f), steps
 
 
 def _check_devices(devices, chunk) -> None:
@@ -263,8 +248,8 @@ def lanes_at_once(run: Simulation) -> int:
 
 @lru_cache(maxsize=32)
 def _side_by_side(engine: Engine, differs: tuple[bool, ...], devices: int):
-    """``program(leaves, save_every)``: `Engine.run` for each lane; `differs` says which of the leaves have an axis of lanes."""
-    program = jax.vmap(engine.run, ([0 if differ else None for differ in differs], None))
+    """``program(leaves, save_every)``: `Engine.steps` for each lane; `differs` says which of the leaves have an axis of lanes."""
+    program = jax.vmap(engine.steps, ([0 if differ else None for differ in differs], None))
     if devices > 1:
         mesh = jax.sharding.Mesh(np.array(jax.devices()[:devices]), ("lanes",))
         spread = PartitionSpec("lanes")

@@ -1,9 +1,22 @@
-"""The engine of all runs: a loop of macro steps inside a loop over saved nodes, compiled once per structure. It returns states and statuses alone.
+"""The engine of all runs: a loop of macro steps inside a loop over saved nodes, compiled once per structure. It returns states and statuses, and
+beside each saved state its `Observables`, which it computes after all steps.
 
 Names: `save_every` macro steps lie between two saved nodes; `num_saves` saved intervals fit into the arrays of an engine; a call computes
 the first `saves` of them.
+
+The derivative of a step is the derivative of the root of its equations (`vmri_jax.steppers.newton.implicit`). Reverse mode visits
+the steps from the last to the first and needs the state at which each step started. Two adjoints provide this state:
+
+* *stored*: the run keeps the start of every step and the solution of its equations; works in forward and reverse mode, up to second
+  derivatives; third derivatives are NaN where equations are solved by iteration;
+* *checkpoint*: the run keeps the starts of some steps and computes the steps between them again, see `Adjoint`; works in reverse mode,
+  once.
+
+The fallback: what the first matrix of "auto" does not solve is solved again with exact matrices, in a program of its own. `unsolved` decides for all
+runs: for a step (`macro_step`), a run or a piece of it, the lanes of a batch, and runs under transformations of JAX (`solved_again`).
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
 from typing import Any, NamedTuple
@@ -11,42 +24,22 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
 from vmri_jax.mechanics.arrays import Numbers, options_of_runs
 from vmri_jax.mechanics.state import State
-from vmri_jax.mechanics.system import System
-from vmri_jax.running.loops import MOST_STORED_STEPS, PLAIN, Loops, Recursive, Stored
-from vmri_jax.running.observables import observables, with_tolerance
+from vmri_jax.running.loops import MOST_STORED_STEPS, Adjoint, plain
+from vmri_jax.running.observables import observables
 from vmri_jax.running.saved import Saved
-from vmri_jax.running.trajectory import MicroNodes, RunInfo, Trajectory
-from vmri_jax.schemes.composition import Composition
-from vmri_jax.schemes.scheme import Scheme
-from vmri_jax.steppers.plan import Plan, plan
-from vmri_jax.steppers.results import Result
-from vmri_jax.steppers.solver import Solver
+from vmri_jax.running.trajectory import RunInfo
+from vmri_jax.steppers.plan import Plan
+from vmri_jax.steppers.results import Method, Result
 
-
-class Motion(NamedTuple):
-    """The numbers and functions that a motion follows from; the programs of an `Engine` get it as a list of leaves.
-
-    A system is flattened once: to flatten it at every call would take longer than a short run. Two places in the list are fixed: first
-    macro_dt and the five arrays of the state; last the leaves of the parameters, since `params` is the last of the fields of a `System` that have leaves.
-    """
-
-    macro_dt: Any
-    state: State
-    solver: Solver
-    scheme: Scheme | Composition
-    system: System
-
-    def stepper(self, reverse_only: bool = False) -> Plan:
-        """The `Plan` that takes the steps."""
-        return plan(self.system, self.scheme, self.state, self.solver, reverse_only=reverse_only)
-
-
-NUM_STATE = 6
-"""Leaves of macro_dt and of the state in a list of leaves."""
+FALLING_BACK = 'a step was not solved: computing its part of the run again with exact matrices (matrix "exact"), as accurate but slower'
+"""Line about a fallback that takes more than two seconds."""
+NODES_AT_ONCE = 16
+"""Nodes whose observables are computed side by side. With fewer nodes XLA uses no vector instructions; with 64 the matrices of scenes no longer fit into
+the first-level cache, and a run of a few nodes takes longer."""
 
 
 class Cursor(NamedTuple):
@@ -59,194 +52,156 @@ class Cursor(NamedTuple):
     failed_at: Int[Numbers, ""]
 
     @classmethod
-    def at_start(cls, state: State, memory) -> "Cursor":
+    def at_start(cls, state: State, memory=None) -> "Cursor":
         """The cursor of a run that begins."""
         return cls(state, memory, np.asarray(0), np.asarray(int(Result.CONVERGED)), np.asarray(-1))
 
 
 @dataclass(frozen=True)
 class Engine:
-    """Compiled runs of all systems and schemes of one structure, as functions of the leaves of a `Motion` and of numbers of steps.
+    """Compiled runs of all systems and schemes of one structure, as functions of the leaves of a `Simulation` and of numbers of steps.
 
-    Two kinds of loops: `whole` and `piece` use `jax.lax.while_loop`, which is fast, and the numbers of steps are traced arguments; `stored`
-    and `checkpointed` use `jax.lax.scan`, which reverse mode can differentiate, but the numbers of steps are static.
+    A run is flattened once: to flatten a system at every call would take longer than a short run.
 
     Attributes:
-        structure: structure of the pytree `Motion`.
+        structure: structure of the pytree of a run, without its length and names.
         num_saves: saved intervals that fit into the arrays of a run.
-        save_micro: whether micro nodes are saved.
     """
 
     structure: Any
     num_saves: int
-    save_micro: bool
 
     @cached_property
-    def whole(self):
-        """``whole(leaves, save_every, saves)``: the nodes of `run`, in each row its `Observables` beside, and (2,) result and failed step.
+    def program(self):
+        """`steps`, compiled; the numbers of steps are traced arguments."""
+        return jax.jit(self.steps, compiler_options=options_of_runs())
 
-        Only the first `saves` of the saved intervals are computed. A call of a prepared run is short: observables of a program of their own would add
-        a third to it, and each array that it returns some 20 microseconds.
+    def steps(self, leaves: list, save_every, saves=None, cursor: Cursor | None = None, is_first=None):
+        """The first `saves` saved intervals: an array of `Saved` rows, and the cursor after them.
+
+        Args:
+            saves: None for all intervals, failed or not: the end of the loop then depends on no lane of a batch, and `jax.vmap` need not select
+                between old and new values in every lane.
+            cursor: None for the start of the run. In place of a cursor the program then returns (2,) result and failed step, since each array
+                costs some microseconds.
+            is_first: whether the memory of a first step replaces the memory of the cursor.
         """
-
-        def whole(leaves: list, save_every, saves):
-            motion, (saved, *status) = self.motion(leaves), self.run(leaves, save_every, saves)
-            steps = jnp.arange(self.num_saves + 1) * save_every
-            states = saved.states(motion.state, motion.state.t + steps * motion.macro_dt)
-            nodes = with_tolerance(states, motion.solver.tolerance)
-            table = jax.vmap(partial(observables, motion.system))(nodes)
-            return Saved(jnp.concatenate([saved.rows, table], axis=1), saved.micros), jnp.stack(status)
-
-        return jax.jit(whole, compiler_options=options_of_runs())
-
-    @cached_property
-    def stored(self):
-        """``stored(leaves, save_every)``: a run with `save_every` static, to be differentiated in any mode."""
-        return jax.jit(partial(self._by_scan, loops=Stored()), static_argnums=1)
-
-    @cached_property
-    def checkpointed(self):
-        """`stored` with derivatives in reverse mode only, whose memory grows like the logarithm of the number of steps."""
-
-        def checkpointed(leaves: list, save_every):
-            loops = Stored() if self.num_saves * save_every <= MOST_STORED_STEPS else Recursive(save_every)
-            return self._by_scan(leaves, save_every, loops, reverse_only=True)
-
-        return jax.jit(checkpointed, static_argnums=1)
-
-    @cached_property
-    def piece(self):
-        """``piece(saved, leaves, cursor, is_first, save_every, saves)``: the next `saves` saved intervals of a run, and its cursor.
-
-        If the piece `is_first`, the memory of a first step replaces the memory of the cursor. The nodes are written into the arrays `saved`, which are
-        donated: the caller must not use them again.
-        """
-
-        def piece(saved: Saved, leaves: list, cursor: Cursor, is_first, save_every, saves):
-            motion = self.motion(leaves)
-            stepper = motion.stepper()
-            first = stepper.init(cursor.state, motion.macro_dt)
-            cursor = cursor._replace(memory=jax.tree.map(partial(jnp.where, is_first), first, cursor.memory))
-            return self._by_while_loop(stepper, motion, cursor, saved, save_every, saves)
-
-        return jax.jit(piece, donate_argnums=0, compiler_options=options_of_runs())
-
-    def next_piece(
-        self, leaves: list, cursor: Cursor, is_first: bool, save_every: int, saves: int
-    ) -> tuple[Saved, Cursor]:
-        """`piece` with its nodes in arrays of NumPy; nodes after a failure have old data."""
-        free = self._room(leaves)[1]
-        try:
-            room = free.pop()
-        except IndexError:  # the first piece, or all arrays are in use by other threads
-            room = self._empty(self.motion(leaves))
-        saved, cursor = self.piece(room, leaves, cursor, is_first, save_every, saves)
-        nodes = saved.first(saves)
-        free.append(saved)
-        return nodes, cursor
-
-    def blank_memory(self, leaves: list):
-        """Zeros in the shapes of the memory of the stepper, for a first piece."""
-        return self._room(leaves)[0]
-
-    def _room(self, leaves: list) -> tuple[Any, list[Saved]]:
-        """Blank memory, and arrays for saved nodes that no piece uses at present, for a motion of these shapes."""
-        shapes = tuple((a.shape, a.dtype) for a in leaves)
-        if shapes not in self._rooms:
-            blank = jax.eval_shape(self._first_memory, [jax.ShapeDtypeStruct(*shape) for shape in shapes])
-            self._rooms[shapes] = jax.device_put(jax.tree.map(lambda a: np.zeros(a.shape, a.dtype), blank)), []
-        return self._rooms[shapes]
-
-    @cached_property
-    def _rooms(self) -> dict[tuple, tuple[Any, list[Saved]]]:
-        return {}
-
-    def _first_memory(self, leaves: list):
-        motion = self.motion(leaves)
-        return motion.stepper().init(motion.state, motion.macro_dt)
-
-    def run(self, leaves: list, save_every, saves=None) -> tuple[Saved, Any, Any]:
-        """The nodes of a run from its first step, its result, and the failed step, not jitted; of all saved intervals, or of the first `saves` of them."""
-        motion = self.motion(leaves)
-        stepper = motion.stepper()
-        cursor = Cursor.at_start(motion.state, stepper.init(motion.state, motion.macro_dt))
-        saved, cursor = self._by_while_loop(stepper, motion, cursor, self._empty(motion), save_every, saves)
-        return saved, cursor.result, cursor.failed_at
-
-    def motion(self, leaves: list) -> Motion:
-        """The `Motion` with these leaves."""
-        return jax.tree.unflatten(self.structure, leaves)
-
-    def _by_while_loop(
-        self, stepper: Plan, motion: Motion, cursor: Cursor, saved: Saved, save_every, saves
-    ) -> tuple[Saved, Cursor]:
-        """``saves * save_every`` macro steps, or fewer if one fails.
-
-        With `saves` None all `num_saves` intervals, failed or not: the end of the loop then depends on no lane of a batch, and `jax.vmap` need
-        not select between old and new values in every lane.
-        """
-        interval = self._interval(stepper, motion, PLAIN)
+        run: Any = jax.tree.unflatten(self.structure, leaves)
+        stepper, begin = run.stepper(), cursor or Cursor.at_start(run.state)
+        memory = stepper.init(begin.state, run.macro_dt)
+        if cursor is not None:
+            memory = jax.tree.map(partial(jnp.where, is_first), memory, cursor.memory)
+        interval = _interval(stepper, run, plain)
 
         def goes_on(loop):
             number, cursor, _ = loop
             return number <= self.num_saves if saves is None else (number <= saves) & (cursor.failed_at < 0)
 
         def save(loop):
-            number, cursor, saved = loop
+            number, cursor, rows = loop
             is_later = number > 0  # turn 0 saves the start, so that the code for nodes is compiled once
             moved, info, micro = interval(cursor, jnp.where(is_later, save_every, 0))
             cursor = jax.tree.map(lambda a, b: a if a is b else jnp.where(is_later, a, b), moved, cursor)
-            return number + 1, cursor, saved.write(number, cursor.state, info, micro)
+            row = _row(cursor.state, info, micro)
+            return number + 1, cursor, jax.lax.dynamic_update_slice(rows, row[None], (number, 0))
 
-        _, cursor, saved = jax.lax.while_loop(goes_on, save, (jnp.asarray(0), jax.tree.map(jnp.asarray, cursor), saved))
-        return saved, cursor
+        begin = jax.tree.map(jnp.asarray, begin._replace(memory=memory))
+        rows = jnp.zeros((self.num_saves + 1, run.columns.width))  # `jax_debug_nans` stops a program that returns NaN
+        _, end, rows = jax.lax.while_loop(goes_on, save, (jnp.asarray(0), begin, rows))
+        rows = self._observed(run, rows, begin.step, save_every, self.num_saves if saves is None else saves)
+        return rows, jnp.stack([end.result, end.failed_at]) if cursor is None else end
 
-    def _by_scan(self, leaves: list, save_every: int, loops: Loops, reverse_only: bool = False) -> Trajectory:
-        """A whole run from its first step, by loops that reverse mode can differentiate."""
-        motion = self.motion(leaves)
-        stepper = motion.stepper(reverse_only)
-        interval = self._interval(stepper, motion, loops)
+    def _observed(self, run, rows, step, save_every, saves):
+        """The rows with their `Observables`, of blocks of `NODES_AT_ONCE` nodes side by side, up to the node `saves`."""
+        size, start = min(NODES_AT_ONCE, self.num_saves + 1), run.columns.observables.start
 
-        def save(cursor: Cursor, _):
-            cursor, info, micro = interval(cursor, save_every)
-            return cursor, (cursor.state, info, micro)
+        def block(i, rows):
+            first = jnp.minimum(i * size, self.num_saves + 1 - size)
+            number = jnp.minimum(first + jnp.arange(size), saves)  # beyond the last node there may be no state
+            table = _observables(run, rows[number], step + number * save_every)
+            return jax.lax.dynamic_update_slice(rows, table, (first, start))
 
-        cursor = Cursor.at_start(motion.state, stepper.init(motion.state, motion.macro_dt))
-        cursor, (states, info, micros) = loops.scan(save, jax.tree.map(jnp.asarray, cursor), self.num_saves)
-        states = jax.tree.map(lambda a, b: jnp.concatenate([jnp.asarray(a)[None], b]), motion.state, states)
-        micro = None if micros is None else MicroNodes.of(states.t, motion.scheme, motion.macro_dt, micros)
-        return Trajectory(states, None, None, info, cursor.result, cursor.failed_at, micro)
+        return jax.lax.fori_loop(0, saves // size + 1, block, rows)
 
-    def _interval(self, stepper: Plan, motion: Motion, loops: Loops):
-        """``cursor, info, micro = interval(cursor, count)``: the `count` macro steps between two saved nodes."""
-        no_info = RunInfo(np.asarray(0), np.asarray(0), np.zeros(()))
-        no_micro = jnp.zeros((stepper.scheme.num_micro, motion.state.q_f.shape[0])) if self.save_micro else None
-        take_step = _step_of(stepper, motion, self.save_micro)
+    @cached_property
+    def differentiable(self):
+        """``differentiable(leaves, save_every, adjoint)``: a whole run as `Saved` without observables, by `jax.lax.scan`, which reverse mode can
+        differentiate; the numbers of steps are static."""
 
-        def interval(cursor: Cursor, count):
-            cursor, info, micro = loops.repeat(count, take_step, (cursor, no_info, no_micro))
-            if stepper.defers_projection:  # between saved nodes a projection would not change the motion
-                state, memory = stepper.project(cursor.state, cursor.memory)
-                cursor = cursor._replace(state=state, memory=memory)
-            return cursor, info, micro
+        def by_scan(leaves: list, save_every: int, adjoint: str) -> Saved:
+            run: Any = jax.tree.unflatten(self.structure, leaves)
+            once = adjoint == "checkpoint"
+            loops = Adjoint(save_every, in_parts=once and self.num_saves * save_every > MOST_STORED_STEPS)
+            stepper = run.stepper(reverse_only=once)
+            interval = _interval(stepper, run, loops.repeat)
 
-        return interval
+            def save(cursor: Cursor, _):
+                cursor, info, micro = interval(cursor, save_every)
+                return cursor, _row(cursor.state, info, micro)
 
-    def _empty(self, motion: Motion) -> Saved:
-        return Saved.none(motion.state, self.num_saves, motion.scheme.num_micro if self.save_micro else None)
+            cursor = Cursor.at_start(run.state, stepper.init(run.state, run.macro_dt))
+            cursor, rows = loops.scan(save, jax.tree.map(jnp.asarray, cursor), self.num_saves)
+            first = _row(run.state, *_nothing(run))
+            return Saved(jnp.concatenate([first[None], rows]), cursor.result, cursor.failed_at)
+
+        return jax.jit(by_scan, static_argnums=(1, 2))
+
+    @cached_property
+    def observed(self):
+        """``observed(leaves, saved, save_every)``: the nodes of `differentiable` with their observables and failures."""
+
+        def observed(leaves: list, saved: Saved, save_every) -> Saved:
+            run: Any = jax.tree.unflatten(self.structure, leaves)
+            table = _observables(run, saved.rows, jnp.arange(self.num_saves + 1) * save_every)
+            rows = jnp.concatenate([saved.rows, table], axis=1)
+            return saved._replace(rows=rows).marked(run.columns, save_every)
+
+        return jax.jit(observed)  # else JAX would compile the operations of a gradient outside of jit one by one
+
+    def blank_memory(self, leaves: list):
+        """Zeros in the shapes of the memory of the stepper, for a first piece."""
+        return _blank_memory(self, tuple((a.shape, a.dtype) for a in leaves))
 
 
 engine = lru_cache(maxsize=32)(Engine)
-"""``engine(structure, num_saves, save_micro)``: the `Engine` with these attributes, made once. The 33rd structure displaces the one used
+"""``engine(structure, num_saves)``: the `Engine` with these attributes, made once. The 33rd structure displaces the one used
 least recently, which compiles again when it is needed: each program takes memory maps, of which a process has a limited number."""
 
 
-def _step_of(stepper: Plan, motion: Motion, save_micro: bool):
-    """A macro step as the body of a loop."""
-    t_start, macro_dt = motion.state.t, motion.macro_dt
+@lru_cache(maxsize=256)
+def _blank_memory(engine: Engine, shapes: tuple):
+    def first_memory(leaves):
+        run = jax.tree.unflatten(engine.structure, leaves)
+        return run.stepper().init(run.state, run.macro_dt)
+
+    blank = jax.eval_shape(first_memory, [jax.ShapeDtypeStruct(*shape) for shape in shapes])
+    return jax.device_put(jax.tree.map(lambda a: np.zeros(a.shape, a.dtype), blank))
+
+
+def _observables(run, rows, steps) -> Float[Numbers, "k 9"]:
+    """The `Observables` of nodes after these numbers of macro steps."""
+    states = run.columns.states(rows, run.state.t + steps * run.macro_dt)
+    return jax.vmap(lambda state: observables(run.system, state, run.solver.tolerance))(states)
+
+
+def _row(state: State, info: RunInfo, micro) -> Float[Numbers, "numbers"]:
+    """The row of a node before its observables."""
+    phase = state.q_s, state.q_f, state.p_s, state.p_f
+    return jnp.concatenate([*phase, *(jnp.asarray(a, float)[None] for a in info), micro.reshape(-1)])
+
+
+def _nothing(run) -> tuple[RunInfo, Any]:
+    """The work of the solver, and the micro nodes, before the first step."""
+    num_micro = run.scheme.num_micro if run.save_micro else 0
+    return RunInfo(np.asarray(0), np.asarray(0), np.zeros(())), jnp.zeros((num_micro, run.state.q_f.shape[0]))
+
+
+def _interval(stepper: Plan, run, repeat: Callable):
+    """``cursor, info, micro = interval(cursor, count)``: the `count` macro steps between two saved nodes."""
+    t_start, macro_dt = run.state.t, run.macro_dt
 
     def step(_, carry):
-        cursor, worst, _ = carry
+        cursor, worst, micro = carry
         alive = cursor.failed_at < 0
         state, info, memory = stepper.step(cursor.state, cursor.memory, macro_dt)
         ok = alive & (info.result <= Result.CONVERGED_AT_ROUNDOFF)
@@ -258,7 +213,48 @@ def _step_of(stepper: Plan, motion: Motion, save_micro: bool):
         state = State(t_start + (cursor.step + 1) * macro_dt, state.q_s, state.q_f, p_s, p_f)
         result = jnp.where(alive, jnp.maximum(cursor.result, info.result), cursor.result)
         failed_at = jnp.where(alive & ~ok, cursor.step, cursor.failed_at)
-        micro = jnp.where(ok, info.q_f_micro, jnp.nan) if save_micro else None
+        micro = jnp.where(ok, info.q_f_micro, jnp.nan) if run.save_micro else micro
         return Cursor(state, memory, cursor.step + 1, result, failed_at), worst, micro
 
-    return step
+    def interval(cursor: Cursor, count):
+        cursor, info, micro = repeat(count, step, (cursor, *_nothing(run)))
+        if stepper.defers_projection:  # between saved nodes a projection would not change the motion
+            state, memory = stepper.project(cursor.state, cursor.memory)
+            cursor = cursor._replace(state=state, memory=memory)
+        return cursor, info, micro
+
+    return interval
+
+
+def unsolved(result, method):
+    """Whether steps failed that exact matrices may solve.
+
+    They cannot help explicit and linear equations, the methods up to `Method.LINEAR`, nor steps that were solved but violate implied
+    constraints, `Result.NOT_IMPLIED`.
+
+    Args:
+        result: worst `Result` of the steps, of one run or (lanes,).
+        method: largest `Method` of the steps.
+    """
+    return (result > Result.CONVERGED_AT_ROUNDOFF) & (result != Result.NOT_IMPLIED) & (method > Method.LINEAR)
+
+
+def solved_again(first: Callable, exact: Callable, failed: Callable, arguments: Any) -> Any:
+    """``first(arguments)``, or ``exact(arguments)`` where that has failed, in one program, to be transformed.
+
+    The derivative is the derivative of `exact`, with its value: to differentiate both would compile two programs. Values of the two differ by
+    the tolerance of the solver.
+
+    Args:
+        first, exact: the run with the first matrix and with exact matrices, functions of one pytree of arrays.
+        failed: whether a value of `first` is to be computed again.
+        arguments: of both.
+    """
+
+    @jax.custom_jvp
+    def run(arguments):
+        value = first(arguments)
+        return jax.lax.cond(failed(value), lambda: exact(arguments), lambda: value)
+
+    run.defjvp(lambda primals, tangents: jax.jvp(exact, primals, tangents))
+    return run(arguments)

@@ -5,6 +5,7 @@ import importlib
 import io
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -33,10 +34,22 @@ DIMENSIONS = {
     "q_f_micro": ("t", "micro", "fast"),
 }
 """Names of the axes of every array that has a row for each saved node."""
-MICRO = "t_micro", "q_f_micro"
-"""Names of the arrays of micro nodes."""
+NODES = tuple(DIMENSIONS)[:7]
+"""Arrays that a run has for each saved node, the start included; it has all others of `DIMENSIONS` for the intervals between them, or none of them."""
+INFO = ("method", "iterations", "residual")
+MICRO = ("t_micro", "q_f_micro")
+STATUS = ("result", "failed_at")
+"""Arrays with one value for the run."""
 FILL = {"f": np.nan, "i": -1}
 """Fill values of floats and of integers: for the solver's work before the start, and for rows not yet written."""
+
+
+def named_arrays(run: SavedRun) -> dict:
+    """All arrays of a run by name, positions as vectors, as far as it has them."""
+    arrays = vars(run.states) | {name: getattr(run, name) for name in ("energy", "constraint_residual", *STATUS)}
+    arrays |= run.info._asdict() | dict(zip(MICRO, run.micro or (), strict=False))
+    error = {} if run.error is None else {f"error_{name}": value for name, value in run.error._asdict().items()}
+    return {name: value for name, value in (arrays | error).items() if value is not None}
 
 
 def rows_of(run: SavedRun) -> dict[str, np.ndarray]:
@@ -45,19 +58,11 @@ def rows_of(run: SavedRun) -> dict[str, np.ndarray]:
     Args:
         run: one run, or a batch.
     """
-    micro = {} if run.micro is None else dict(zip(MICRO, run.micro, strict=True))
-    fields = dict(vars(run.states)) | run.info._asdict() | micro
-    fields |= {"energy": run.energy, "constraint_residual": run.constraint_residual}
-    if run.error is not None:
-        fields |= {
-            name: getattr(run.error, name.removeprefix("error_")) for name in DIMENSIONS if name.startswith("error_")
-        }
-    arrays = {name: np.asarray(value) for name, value in fields.items() if value is not None}
+    arrays = {name: np.asarray(value) for name, value in named_arrays(run).items() if name in DIMENSIONS}
     axis = arrays["t"].ndim - 1
     for name, array in arrays.items():
-        missing = len(run) - array.shape[axis]
-        if missing:
-            widths = [(missing if i == axis else 0, 0) for i in range(array.ndim)]
+        if array.shape[axis] < len(run):
+            widths = [(int(i == axis), 0) for i in range(array.ndim)]
             arrays[name] = np.pad(array, widths, constant_values=FILL[array.dtype.kind])
     return arrays
 
@@ -90,20 +95,15 @@ class Exports(Quantities):
         if run.error is not None:
             shares = {"slow share": rows["error_slow"], "fast share": rows["error_fast"]}
             columns |= {"error": run.error.positions} | {f"error, {name}": share for name, share in shares.items()}
-        return columns | {name: rows[name] for name in ("method", "iterations", "residual")}
+        return columns | {name: rows[name] for name in INFO}
 
     def to_csv(self, path) -> None:
         """Write `columns` to a .csv file, with a line of names; an existing file is replaced.
 
-        Args:
-            path: of the file.
-
         Raises:
-            ValueError: this is a batch.
             OSError: the file cannot be written.
         """
-        columns = self.columns()
-        head = io.StringIO()
+        columns, head = self.columns(), io.StringIO()
         csv.writer(head, lineterminator="\n").writerow(columns)
         with replaced(Path(path)) as file:
             file.write(head.getvalue().encode())
@@ -113,21 +113,14 @@ class Exports(Quantities):
         """`columns` as a `pandas.DataFrame` over time (pandas comes with the extra ``vmri_jax[xarray]``).
 
         Raises:
-            ValueError: this is a batch.
             ImportError: pandas is not installed.
         """
-        pandas = extra("pandas", "to_pandas")
-        columns = self.columns()
-        return pandas.DataFrame(columns).set_index("t")
+        return extra("pandas", "to_pandas").DataFrame(self.columns()).set_index("t")
 
     def to_parquet(self, path) -> None:
-        """Write `columns` to a .parquet file, time first (needs the extra ``vmri_jax[parquet]``).
-
-        Args:
-            path: of the file; an existing file is replaced.
+        """Write `columns` to a .parquet file, time first (needs the extra ``vmri_jax[parquet]``); an existing file is replaced.
 
         Raises:
-            ValueError: this is a batch.
             ImportError: pyarrow is not installed.
             OSError: the file cannot be written.
         """
@@ -159,17 +152,12 @@ class Exports(Quantities):
         if lanes and np.any(rows["t"] != rows["t"][0]):
             coordinates["t"] = ("t", np.arange(rows["t"].shape[1]))
             data["time"] = (("lane", "t"), rows["t"])
-        return xarray.Dataset(data, coords=coordinates, attrs=attributes(run))
-
-
-def attributes(run: SavedRun) -> dict:
-    """The status of a run, and the names of bodies and constraints as JSON."""
-    if np.ndim(run.t) > 1:
-        status = {"result": np.asarray(run.result), "failed_at": np.asarray(run.failed_at)}
-    else:
-        status = {"result": Result(int(run.result)).name, "failed_at": int(run.failed_at)}
-    names = run.origin.names
-    return status | ({} if names is None else {"names": json.dumps(names.to_dict())})
+        result, failed_at = np.asarray(run.result), np.asarray(run.failed_at)
+        status = (result, failed_at) if lanes else (Result(int(result)).name, int(failed_at))
+        attributes: dict[str, Any] = dict(zip(STATUS, status, strict=True))
+        if run.origin.names is not None:
+            attributes["names"] = json.dumps(run.origin.names.to_dict())
+        return xarray.Dataset(data, coords=coordinates, attrs=attributes)
 
 
 def extra(package: str, caller: str, name: str = "xarray"):

@@ -10,7 +10,7 @@ from vmri_jax.mechanics.linearisation import linearise
 from vmri_jax.mechanics.names import AXES, Names
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
-from vmri_jax.running.trajectory import Trajectory
+from vmri_jax.running.origin import SavedRun
 from vmri_jax.steppers.results import Result, SimulationError
 
 LARGE_TURN = 0.5
@@ -95,43 +95,33 @@ def largest_motion(system: System, state: State, names: Names | None, macro_dt: 
     return max((motion for motion in motions if np.isfinite(motion.amount)), key=lambda m: m.size, default=None)
 
 
-def simulation_error(
-    trajectory: Trajectory, macro_dt, save_every: int, num_micro: int, first: int = 0, whole=None
-) -> SimulationError:
-    """The `SimulationError` of a failed run: the failing step, its status, and the largest motion before it.
+def simulation_error(run: SavedRun, macro_dt, save_every: int, num_micro: int) -> SimulationError:
+    """The `SimulationError` of a failed run, in memory or in a store: the failing step, its status, and the largest motion before it.
 
     Args:
-        trajectory: the run, or a part of it with the node before the failure.
         macro_dt, save_every, num_micro: of the run.
-        first: number of the macro step that starts at the first node of `trajectory`.
-        whole: the run, where `trajectory` is a part of it.
     """
-    failed_at, dt = int(trajectory.failed_at), float(macro_dt)
-    step = failed_at - first
-    interval, moved, jump = step // save_every, None, ""
-    if trajectory.origin.knows_system:
-        system, before, names = trajectory.origin.system(), trajectory[interval], trajectory.names
-        moved = largest_motion(system, before, names, dt, num_micro)
-        if np.ndim(trajectory.t) == 1:  # a force that jumps in the failing step or in the next one
-            jump = in_words(jump_ahead(system, before, (step - interval * save_every + 2) * dt), names)
-    error = SimulationError(
-        Result(int(trajectory.result)),
-        failed_at,
-        float(trajectory.t[0] + step * macro_dt),
-        int(trajectory.info.iterations[interval]),
-        float(trajectory.info.residual[interval]),
-        trajectory if whole is None else whole,
-        moved="" if moved is None else moved.sentence(dt),
-    )
-    return error.advised(dt, _swapped(trajectory), jump)
+    failed_at, dt = int(run.failed_at), float(macro_dt)
+    interval, step = divmod(failed_at, save_every)
+    part, moved, jump = run[interval : interval + 2], "", ""  # from the node before the failure
+    if run.origin.knows_system:
+        system, before = run.origin.system(), part[0]
+        motion = largest_motion(system, before, part.names, dt, num_micro)
+        moved = "" if motion is None else motion.sentence(dt)
+        jump = in_words(
+            jump_ahead(system, before, (step + 2) * dt), part.names
+        )  # in the failing step or in the next one
+    t, work = float(part.t[0] + step * macro_dt), (int(part.info.iterations[0]), float(part.info.residual[0]))
+    error = SimulationError(Result(int(run.result)), failed_at, t, *work, run, moved=moved)
+    return error.advised(dt, _swapped(run[:1]), jump)
 
 
-def _swapped(trajectory: Trajectory) -> str:
-    """The advice of `Linearisation.swapped` at the first node of a run; empty if its labels are right or its system is not known."""
-    if not trajectory.states.q_s.shape[-1] or not trajectory.states.q_f.shape[-1]:
+def _swapped(start: SavedRun) -> str:
+    """The advice of `Linearisation.swapped` at the start of a run; empty if its labels are right or its system is not known."""
+    if not start.states.q_s.shape[-1] or not start.states.q_f.shape[-1]:
         return ""  # nothing to swap: the linearisation would take seconds to compile
     try:
-        advice = linearise(trajectory.origin.system(), trajectory[0], trajectory.names).swapped()
+        advice = linearise(start.origin.system(), start[0], start.names).swapped()
     except (ValueError, TypeError, IndexError):  # no expansion at the start: the error of the run says more about it
         return ""
     return advice[0] if advice else ""

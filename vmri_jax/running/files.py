@@ -27,7 +27,7 @@ def replaced(path: str | Path) -> Iterator[IO[bytes]]:
     except BaseException:
         partial.unlink(missing_ok=True)
         raise
-    synchronize(path.parent)
+    synchronize(path)
 
 
 @contextmanager
@@ -44,7 +44,7 @@ def made_beside(path: Path) -> Iterator[Path]:
         shutil.rmtree(partial, ignore_errors=True)
         raise
     shutil.rmtree(old, ignore_errors=True)
-    synchronize(path.parent)
+    synchronize(path)
 
 
 @contextmanager
@@ -111,12 +111,13 @@ def make_writable_folder(path: Path) -> None:
     check_writable(path / "attempt")
 
 
-def synchronize(path: Path) -> None:
-    """Wait until a file, or the list of files of a folder, is on disk."""
+def synchronize(*paths: Path) -> None:
+    """Wait until these files, as far as they exist, and the lists of files of their folders are on disk."""
     if os.name == "nt":  # Windows opens no folders, and files for synchronisation only if they are writable
         return
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+    for path in (*filter(Path.exists, paths), *{path.parent for path in paths}):
+        descriptor = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)

@@ -8,7 +8,7 @@ from vmri_jax.mechanics.checks import check_type
 from vmri_jax.mechanics.constraints import are_kept
 from vmri_jax.mechanics.state import A_SYSTEM, State
 from vmri_jax.mechanics.system import System
-from vmri_jax.running.fallback import solved_again, unsolved
+from vmri_jax.running.engine import solved_again, unsolved
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.plan import plan

@@ -1,25 +1,21 @@
 """Observables of a run at its saved nodes, and the one place that looks at them: failures, and warnings about the motion.
 
-An observable is a function of the system and the state. It is evaluated after the steps: in pieces of a run, and in batches, by one program for all schemes
-and lengths (`evaluated`), in prepared and traced runs as a part of their program. All roads look at the same `Observables`: `failures` ends a run that has left its constraints or
-its domain, `concerns` says what is wrong with the motion of a run whose steps all succeeded.
+An observable is a function of the system and the state, evaluated after the steps, in the same program. All roads look at the same `Observables`:
+`Saved.marked` ends a run that has left its constraints or its domain, `concerns` says what is wrong with the motion of a run whose steps all
+succeeded.
 """
 
-from dataclasses import replace
-from functools import partial
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from vmri_jax.mechanics.arrays import Numbers, library
+from vmri_jax.mechanics.arrays import Numbers
 from vmri_jax.mechanics.constraints import are_kept
 from vmri_jax.mechanics.invariants import constraint_residual, energy_parts, velocity_and_masses
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
-from vmri_jax.steppers.results import Result
 
 
 class LostEnergyWarning(UserWarning):
@@ -93,17 +89,8 @@ class Observables(NamedTuple):
         return np.array([[self.energy[0], *(column.max() for column in self[1:-1]), self.volume[-1]]])
 
 
-KEPT = slice(3, 5)
-"""Columns `solved` and `implied` of a table of `Observables`."""
-
-
-def observables(system: System, node: tuple[State, Any]):
-    """The `Observables` of a state, as an array (9,).
-
-    Args:
-        node: the state, and the tolerance of the solver.
-    """
-    state, tolerance = node
+def observables(system: System, state: State, tolerance: Any = 0.0):
+    """The `Observables` of a state, as an array (9,), for a tolerance of the solver."""
     phase = state.q_s, state.q_f, state.p_s, state.p_f
     velocities, masses = velocity_and_masses(system, *phase)
     parts = list(energy_parts(system, *phase, velocities).values())
@@ -116,64 +103,6 @@ def observables(system: System, node: tuple[State, Any]):
     terms, kept = sum(map(jnp.abs, parts)), are_kept(system, state, tolerance)
     values = sum(parts), position, rate, *kept, parts[0], terms, rounding, volume
     return jnp.stack([jnp.asarray(value, dtype=float) for value in values])
-
-
-def with_tolerance(states: State, tolerance) -> tuple[State, Any]:
-    """The arguments of `observables` at all nodes; one tolerance for all."""
-    return states, library((states, tolerance)).broadcast_to(tolerance, np.shape(states.t))
-
-
-def failures(run, table, save_every: int, step: int = 0):
-    """A run, or a batch of runs, whose nodes from its failure on are NaN; a node that cannot be right is a failure.
-
-    A node may be wrong although its steps succeeded, for four reasons: the energy is not finite although its gradient is (a logarithm beyond its pole);
-    a lane of a batch started off its constraints; the rows of ``system.implied``, redundant constraints that the solver leaves out, are violated; or
-    a stepper of the user leaves the constraints. The last step before the first such node counts as the failed one.
-
-    Args:
-        run: a `Trajectory`, of whose nodes after a failed step anything may be there.
-        table: its `Observables` (..., k, 9).
-        save_every: macro steps from one saved node to the next.
-        step: macro steps before the first node.
-
-    Returns:
-        The run and its table.
-    """
-    if library(table) is jnp:  # one program: JAX compiles operations of a gradient outside of jit one by one
-        return _marked_in_a_program(run, table, save_every, step)
-    # a prepared run is called many times, and an operation of JAX takes as long as many steps
-    if (run.failed_at < 0).all() and np.isfinite(table[..., 0]).all() and table[..., KEPT].all():
-        return run, table
-    return _marked(np, run, table, save_every, step)
-
-
-def _marked(module, run, table, save_every, step):
-    """`failures` by NumPy or `jax.numpy`."""
-    now = Observables.of(table)
-    wrong = ~(module.isfinite(now.energy) & (now.solved > 0) & (now.implied > 0))
-    node, num_nodes = wrong.argmax(axis=-1), wrong.shape[-1]
-    after_step = module.where(run.failed_at < 0, num_nodes, (run.failed_at - step) // save_every + 1)
-    breaks = wrong.any(axis=-1) & (node < after_step)
-    energy, solved = (module.take_along_axis(a, node[..., None], axis=-1)[..., 0] for a in (now.energy, now.solved))
-    # If the solved rows are kept, the implied rows are to blame.
-    violated = module.where(solved > 0, int(Result.NOT_IMPLIED), int(Result.CONSTRAINT_VIOLATED))
-    cause = module.where(module.isfinite(energy), violated, int(Result.NON_FINITE))
-    result = module.where(breaks, cause, run.result)
-    failed_at = module.where(breaks, step + module.maximum(node * save_every - 1, 0), run.failed_at)
-    is_lost = np.arange(num_nodes) >= module.where(breaks, node, after_step)[..., None]
-    is_unreached = np.arange(num_nodes) > module.where(breaks, num_nodes, after_step)[..., None]
-
-    def masked(array, lost=is_lost, instead=np.nan):
-        lost = lost[..., -array.shape[wrong.ndim - 1] :]  # arrays of intervals have no row for the start
-        return module.where(lost.reshape(*lost.shape, *(1,) * (array.ndim - lost.ndim)), instead, array)
-
-    states = State(run.states.t, *map(masked, list(vars(run.states).values())[1:]))
-    info = jax.tree.map(partial(masked, lost=is_unreached, instead=0), run.info)
-    micro = None if run.micro is None else run.micro._replace(q_f=masked(run.micro.q_f))
-    return replace(run, states=states, info=info, result=result, failed_at=failed_at, micro=micro), masked(table)
-
-
-_marked_in_a_program = jax.jit(partial(_marked, jnp))
 
 
 def concerns(table: np.ndarray, t, system: System, macro_dt, save_every: int) -> list[LostEnergyWarning]:

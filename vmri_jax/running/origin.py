@@ -2,7 +2,8 @@
 
 import math
 import pickle
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import Any, TypeAlias
 
@@ -10,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.mechanics.arrays import is_concrete, library, of_one_type, options_of_runs
+from vmri_jax.mechanics.arrays import is_concrete, library, of_one_type
 from vmri_jax.mechanics.checks import check_system
 from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.rows import Part
@@ -23,12 +24,9 @@ from vmri_jax.running.settings import Settings
 SavedRun: TypeAlias = Any
 """A `vmri_jax.Trajectory` in annotations of modules that its own module imports."""
 
-NODES_AT_ONCE = 16
-"""Nodes of a block, evaluated side by side. With fewer nodes XLA uses no vector instructions; with 64 the matrices of scenes no longer fit into the
-first-level cache, and a run of a few nodes takes longer."""
-NUMBERS_PER_CALL = 4096
-"""Numbers in the nodes of a call, 32 kB. A larger value makes calls for short runs slower, which copy all of them; a smaller value divides long runs
-into more calls of some 20 microseconds each."""
+NODES_PER_CALL = 64
+"""Nodes of a call, evaluated side by side. With a larger value runs of a few nodes take longer; with a smaller one long runs take more calls of some
+20 microseconds each."""
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=["simulated"], meta_fields=["names", "settings"])
@@ -61,10 +59,6 @@ class Origin:
         """The origin of a run that was read from a file: names and settings from plain data, without a system."""
         known_names = None if names is None else Names.from_dict(names)
         return cls(known_names, settings=None if settings is None else Settings.from_dict(settings))
-
-    def with_params(self, params) -> "Origin":
-        """The origin of a run with other parameters."""
-        return self if self.simulated is None else replace(self, simulated=self.simulated.with_params(params))
 
     def repeated(self, lanes: tuple[int, ...]) -> "Origin":
         """The origin of a batch of runs: a view of every array with the axes of lanes, without copies."""
@@ -138,40 +132,21 @@ def at_nodes(function, origin: Origin, nodes, *static):
         ValueError: the system is not known.
     """
     arrays, structure = jax.tree.flatten(origin.system())  # raises if the system is not known
-    with Working("quantities of the run"):
-        return evaluated(function, structure, of_one_type(arrays), nodes, *static)
-
-
-def evaluated(function, structure, arrays: list, nodes, *static):
-    """`at_nodes` of the system with this structure and these leaves, which have the axes of lanes in a batch; concrete values as arrays of NumPy.
-
-    A call of the program gets a room of nodes, of which it evaluates the first blocks; long runs take several calls.
-    """
-    shape = np.shape(jax.tree.leaves(nodes)[0])
-    axes, count = len(shape), math.prod(shape)
+    arrays, shape = of_one_type(arrays), np.shape(jax.tree.leaves(nodes)[0])
+    axes, count = len(shape) - 1, math.prod(shape)
     # Arrays that all lanes share go in once: for each node they would be copied.
-    is_shared = [axes == 1 or is_repeated(array, axes - 1) for array in arrays]
-    shared = [array[(0,) * (axes - 1)] if once else None for array, once in zip(arrays, is_shared, strict=True)]
-    of_lanes = _in_a_row([None if once else array for array, once in zip(arrays, is_shared, strict=True)], axes - 1)
-    of_nodes = _in_a_row(nodes, axes)
-    if not is_concrete((arrays, nodes)):
-        of_nodes_lanes = _rows(of_lanes, np.arange(count) // shape[-1])
-        values = _at_all(function, structure, static, True)(shared, of_nodes_lanes, of_nodes)
-        return jax.tree.map(lambda a: a.reshape(*shape, *a.shape[1:]), values)
-    numbers = sum(math.prod(leaf.shape[1:]) for leaf in jax.tree.leaves((of_lanes, of_nodes)))
-    room = max(NUMBERS_PER_CALL // numbers // NODES_AT_ONCE, 1) * NODES_AT_ONCE
-    program, pieces = _at_all(function, structure, static, False), []
-    for first in range(0, count, room):
-        node, size = np.minimum(np.arange(first, first + room), count - 1), min(room, count - first)
-        parts = _rows(of_lanes, node // shape[-1]), _rows(of_nodes, node)  # the last node fills up the room
-        values = program(shared, *parts, -(-size // NODES_AT_ONCE))
-        as_array = (
-            np.asarray if is_concrete(values) else jnp.asarray
-        )  # tracers, where JAX is tracing a function around this one
-        pieces.append(jax.tree.map(lambda a, size=size, as_array=as_array: as_array(a)[:size], values))
+    is_shared = [not axes or is_repeated(array, axes) for array in arrays]
+    shared = [array[(0,) * axes] if once else None for array, once in zip(arrays, is_shared, strict=True)]
+    of_lanes = _in_a_row([None if once else array for array, once in zip(arrays, is_shared, strict=True)], axes)
+    of_nodes, program, pieces = _in_a_row(nodes, axes + 1), _at_all(function, structure, static), []
+    size = NODES_PER_CALL if is_concrete((arrays, nodes)) else count
+    with Working("quantities of the run"):
+        for first in range(0, count, size):
+            node = np.minimum(np.arange(first, first + size), count - 1)  # the last node fills up the last call
+            pieces.append(program(shared, _rows(of_lanes, node // shape[-1]), _rows(of_nodes, node)))
 
     def joined(*parts):
-        return library(parts).concatenate(parts).reshape(*shape, *parts[0].shape[1:])
+        return library(parts).concatenate(parts)[:count].reshape(*shape, *parts[0].shape[1:])
 
     return jax.tree.map(joined, *pieces)
 
@@ -192,27 +167,11 @@ def _rows(tree, rows: np.ndarray):
 
 
 @lru_cache(maxsize=64)
-def _at_all(function, structure, static: tuple, traced: bool):
-    """``program(shared, of_lanes, of_nodes, blocks)``: values at the nodes of the first blocks, zeros for all others; traced at all nodes."""
+def _at_all(function, structure, static: tuple) -> Callable:
+    """``program(shared, of_lanes, of_nodes)``: values at all nodes."""
 
     def at_node(shared, of_lane, node):
         arrays = [lane if array is None else array for array, lane in zip(shared, of_lane, strict=True)]
         return function(jax.tree.unflatten(structure, arrays), node, *static)
 
-    at_block = jax.vmap(jax.jit(at_node), (None, 0, 0))  # jitted, so that shapes and values take one trace
-
-    def program(shared, of_lanes, of_nodes, blocks):
-        def block(i, values):
-            part = jax.tree.map(lambda a: slice_in_dim(a, i * NODES_AT_ONCE, NODES_AT_ONCE), (of_lanes, of_nodes))
-            new = at_block(shared, *part)
-            return jax.tree.map(lambda a, b: update_in_dim(a, b, i * NODES_AT_ONCE, 0), values, new)
-
-        slice_in_dim, update_in_dim = jax.lax.dynamic_slice_in_dim, jax.lax.dynamic_update_slice_in_dim
-        shapes = jax.eval_shape(at_block, shared, of_lanes, of_nodes)
-        return jax.lax.fori_loop(0, blocks, block, jax.tree.map(lambda of: jnp.zeros(of.shape, of.dtype), shapes))
-
-    return (
-        jax.jit(lambda *arrays: at_block(*arrays[:3]))
-        if traced
-        else jax.jit(program, compiler_options=options_of_runs())
-    )
+    return jax.jit(jax.vmap(at_node, (None, 0, 0)))

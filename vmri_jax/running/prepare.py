@@ -1,7 +1,5 @@
 """`prepare`: a run that is checked and compiled once, to be called many times."""
 
-from dataclasses import replace
-
 import jax
 
 from vmri_jax.mechanics.state import Movable, State
@@ -49,8 +47,7 @@ def prepare(
     run.check()
     run.save.without_bar("prepare")
     check_memory("prepare", run)
-    on_device = ("system", "scheme", "solver", "state", "macro_dt")
-    run = replace(run, **jax.device_put({name: getattr(run, name) for name in on_device}))
+    run = jax.device_put(run)
     with Working("prepare: the program of the run"):
-        jax.block_until_ready(run.engine.whole(run.leaves, 0, 0))  # no steps: it only compiles
+        jax.block_until_ready(run.engine.program(run.leaves, 0, 0))  # no steps: it only compiles
     return run

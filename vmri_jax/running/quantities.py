@@ -14,13 +14,12 @@ from vmri_jax.mechanics.kinematics import JOINTS, Kinematics
 from vmri_jax.mechanics.motion import motion, powers, reaction_forces
 from vmri_jax.mechanics.names import Names, unknown
 from vmri_jax.mechanics.projection import legendre
-from vmri_jax.mechanics.rows import Place
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.summary import has_values, summary
 from vmri_jax.mechanics.system import System
 from vmri_jax.refusals import Refused
 from vmri_jax.running.micro_nodes import Nodes, why_not, with_micro_nodes
-from vmri_jax.running.observables import LostEnergyWarning, concerns, observables, with_tolerance
+from vmri_jax.running.observables import LostEnergyWarning, concerns, observables
 from vmri_jax.running.origin import Origin, SavedRun, at_nodes
 
 RANDOM_RATIO = 0.5
@@ -135,7 +134,8 @@ class Quantities(ABC):
     @property
     def velocities(self) -> Any:
         """Vectors (..., k, n_s) and (..., k, n_f) of all velocities."""
-        return _velocities(self.whole())
+        run = self.whole()
+        return at_nodes(_velocity, run.origin, run.states)
 
     def position(self, body: str):
         """Positions (..., k, size) of a body, or of a coordinate that has a name.
@@ -147,35 +147,33 @@ class Quantities(ABC):
             ValueError: no body of this name.
         """
         run = self.whole()
-        return _of_body(run, body, _bodies, run.states.q_s, run.states.q_f)
+        return self._of_body(body, _bodies, body in run.names.carried, (run.states.q_s, run.states.q_f))
 
     def momentum(self, body: str):
         """Momenta of a body at the saved nodes, (..., k, size); for a rigid body in joint coordinates its own ``M v``, without bodies that it carries.
 
-        Args:
-            body: its name; "q_s" or "q_f" for all coordinates of a system without names.
-
-        Raises:
-            ValueError: no body of this name.
+        Args, Raises: as of `position`.
         """
         run = self.whole()
-        names = run.names
         # The coordinate p of a root includes all bodies that it carries.
-        if names.kinematics is not None and body in names.rigid:
-            return _part(at_nodes(_body_momenta, run.origin, run.states, names.kinematics), names.place_of(body))
-        return _of_body(run, body, _body_momenta, run.states.p_s, run.states.p_f)
+        in_joints = run.names.kinematics is not None and body in (*run.names.rigid, *run.names.carried)
+        return self._of_body(body, _body_momenta, in_joints, (run.states.p_s, run.states.p_f))
 
     def velocity(self, body: str):
         """Velocities (..., k, size) of a body, or of a coordinate that has a name.
 
-        Args:
-            body: its name.
-
-        Raises:
-            ValueError: no body of this name, or the run does not know its system.
+        Args, Raises: as of `position`; a ValueError, too, if the run does not know its system.
         """
+        in_joints = body in self.names.carried
+        return self._of_body(body, _body_rates, in_joints, None if in_joints else self.velocities)
+
+    def _of_body(self, body: str, of_bodies: Callable, in_joints: bool, values: Any):
+        """(..., k, size) of a body: a part of the `values` (slow, fast) of all coordinates, or of `of_bodies` for a body in joint coordinates."""
         run = self.whole()
-        return _of_body(run, body, _body_rates, *(() if body in run.names.carried else _velocities(run)))
+        if in_joints:
+            values = at_nodes(of_bodies, run.origin, run.states, run.names.kinematics)
+        part, start, size = run.names.place_of(body)
+        return values[part == "f"][..., start : start + size]
 
     def multipliers(self, micro: bool = False) -> dict:
         """Lagrange multipliers of the equations of motion at the saved nodes, (..., k, rows) for each constraint by name.
@@ -191,7 +189,7 @@ class Quantities(ABC):
             ValueError: the run does not know its system, or did not keep the micro nodes.
         """
         run = _concrete("multipliers", self.whole())
-        values = np.asarray(at_nodes(_multipliers, run.origin, _states(run, micro)))
+        values = at_nodes(_multipliers, run.origin, _states(run, micro))
         return {name: _shaped(run, values[..., rows], micro) for name, rows in run.names.rows.items()}
 
     def reaction_forces(self, constraint: str | None = None, micro: bool = False) -> dict:
@@ -209,20 +207,14 @@ class Quantities(ABC):
         names = run.names
         rows = {name: tuple(rows) for name, rows in names.rows.items() if constraint in (None, name)}
         if not rows:
-            hint = (
-                " Joints that carry bodies have no rows; scene.by_directors(run) gives the run that has."
-                if names.carried
-                else ""
-            )
+            hint = " Joints that carry bodies have no rows; scene.by_directors(run) gives the run that has."
             missing = (
                 "the system has no constraints."
                 if constraint is None
                 else unknown("constraint", constraint, names.rows)
             )
-            raise Refused(f"reaction_forces: {missing}{hint}")
-        forces, touched = map(
-            np.asarray, at_nodes(reaction_forces, run.origin, _states(run, micro), tuple(rows.values()))
-        )
+            raise Refused(f"reaction_forces: {missing}{hint if names.carried else ''}")
+        forces, touched = at_nodes(reaction_forces, run.origin, _states(run, micro), tuple(rows.values()))
         first = {"s": 0, "f": run.states.q_s.shape[-1]}
         by_constraint: dict[str, dict] = {name: {} for name in rows}
         for body, (part, start, size) in names.bodies.items():
@@ -251,7 +243,7 @@ class Quantities(ABC):
             raise Refused("work: the run is a batch; take one lane of it, run.lane(i).")
         micro = why_not(run.t, run.t_micro) == "" and bool(np.isfinite(run.energy[1]))
         states = _states(run, micro, with_start=True)
-        power = np.asarray(at_nodes(powers, run.origin, states))  # (m, 2): F . v and lambda . dg/dt
+        power = at_nodes(powers, run.origin, states)  # (m, 2): F . v and lambda . dg/dt
         t, stride = np.asarray(states.t), run.t_micro.shape[1] if micro else 1
         trapezoidal = cumulative_trapezoid(power, t, axis=0, initial=0.0)
         simpson = cumulative_simpson(power, x=t, axis=0, initial=0.0) if len(t) > 2 else trapezoidal
@@ -270,7 +262,7 @@ class Quantities(ABC):
             ValueError: the run does not know its system.
         """
         run = _concrete("concerns", self.whole())
-        table, t = np.asarray(at_nodes(observables, run.origin, with_tolerance(run.states, 0.0))), np.asarray(run.t)
+        table, t = at_nodes(observables, run.origin, run.states), np.asarray(run.t)
         return concerns(table, t, run.origin.system(t.ndim - 1), np.mean(np.diff(t), axis=-1), 1)
 
     def plot(self, title: str = ""):
@@ -304,20 +296,6 @@ def _concrete(method: str, run: SavedRun) -> SavedRun:
     return run
 
 
-def _of_body(run: SavedRun, body: str, carried: Callable, slow=None, fast=None):
-    """Values (..., k, size) of a body: of `slow` and `fast`, values of all coordinates, or of `carried` for a body in joint coordinates."""
-    names = run.names
-    if body in names.carried:
-        slow, fast = tuple(at_nodes(carried, run.origin, run.states, names.kinematics))
-    return _part((slow, fast), names.place_of(body))
-
-
-def _part(values: Any, place: Place):
-    """Values of a single body, out of the values (slow, fast) of all bodies."""
-    part, start, size = place
-    return values[part == "f"][..., start : start + size]
-
-
 def _bodies(system: System, state: State, kinematics: Kinematics) -> tuple:
     return kinematics(state.q_s, state.q_f, system.params[JOINTS])
 
@@ -330,10 +308,6 @@ def _body_rates(system: System, state: State, kinematics: Kinematics):
 def _body_momenta(system: System, state: State, kinematics: Kinematics):
     v_s, v_f = _velocity(system, state)
     return kinematics.momenta(state.q_s, state.q_f, v_s, v_f, system.params)
-
-
-def _velocities(run: SavedRun):
-    return at_nodes(_velocity, run.origin, run.states)
 
 
 def _states(run: SavedRun, micro: bool, with_start: bool = False) -> State:
@@ -351,7 +325,7 @@ def _states(run: SavedRun, micro: bool, with_start: bool = False) -> State:
 
 def _all_nodes(run: SavedRun) -> Nodes:
     """Times, positions and velocities at all nodes, macro and micro, in order; NaN after a failure."""
-    nodes = Nodes(*(np.asarray(a) for a in (run.t, run.states.q_s, run.states.q_f, *_velocities(run))))
+    nodes = Nodes(*(np.asarray(a) for a in (run.t, run.states.q_s, run.states.q_f, *run.velocities)))
     finite = np.isfinite(np.column_stack(nodes)).all(axis=1)
     count = len(nodes.t) if np.all(finite) else int(np.argmin(finite))
     if count < 2:

@@ -1,4 +1,4 @@
-"""Saved nodes of a run while it is computed, one row of numbers for each node, and the run made from the rows.
+"""Saved nodes of a run: one row of numbers for each node, and the status of the run.
 
 A node is a single write into a single array: XLA on CPU would take longer for one write into each field.
 """
@@ -6,82 +6,129 @@ A node is a single write into a single array: XLA on CPU would take longer for o
 from itertools import accumulate, pairwise
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import psutil
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
-from vmri_jax.mechanics.arrays import Numbers
+from vmri_jax.mechanics.arrays import Numbers, is_concrete, library
 from vmri_jax.mechanics.state import State
 from vmri_jax.refusals import Refused
 from vmri_jax.running.observables import Observables
-from vmri_jax.running.trajectory import MicroNodes, RunInfo, Trajectory
+from vmri_jax.running.trajectory import MicroNodes, RunInfo, Trajectory, status
+from vmri_jax.steppers.results import Result
 
-NUMBERS_PER_PIECE = 2**17
-"""Numbers in the nodes of a piece of a run, a megabyte. A larger value takes more memory in processes with many systems; a smaller one
-divides long runs into more calls of some 30 microseconds each."""
-SOLVER_NUMBERS = len(RunInfo._fields)
-"""Numbers of a row for the work of the solver since the previous node."""
+NUMBERS_PER_PIECE = 2**15
+"""Numbers in the nodes of a piece of a run, 256 kB. With a larger value short runs wait for memory that they do not use; a smaller one divides
+long runs into more calls of some 50 microseconds each."""
 BYTES_PER_NUMBER = 8
 UNCHECKED_BYTES = 100e6
 """Bytes of a trajectory up to which free memory is not looked up: the look-up takes some ten microseconds, as long as a short run. With a
 larger value more runs may fill a small machine."""
 
 
-class Saved(NamedTuple):
-    """Arrays for the nodes of a run, of JAX or of NumPy, in a batch with an axis of lanes.
+class Columns(NamedTuple):
+    """Columns of a row: positions and momenta of the `State`; `RunInfo` of the steps since the node before, and fast positions at the micro nodes of
+    the last of them; `Observables` of the state."""
 
-    rows: a row for each node: positions and momenta of its `State`, and the `RunInfo` since the previous node.
-    micros: fast positions at micro nodes; None unless micro nodes are saved.
-    """
-
-    rows: Float[Numbers, "room+1 numbers"]
-    micros: Float[Numbers, "room num_micro n_f"] | None
+    q_s: slice
+    q_f: slice
+    p_s: slice
+    p_f: slice
+    info: slice
+    micro: slice
+    observables: slice
 
     @classmethod
-    def none(cls, state: State, room: int, num_micro: int | None) -> "Saved":
-        """Arrays without nodes; zeros, since `jax_debug_nans` stops a program that returns NaN. `num_micro` is None unless micro nodes are saved."""
-        micros = None if num_micro is None else jnp.zeros((room, num_micro, state.q_f.shape[0]))
-        return cls(jnp.zeros((room + 1, numbers_per_node(state))), micros)
+    def of(cls, state: State, num_micro: int = 0) -> "Columns":
+        """The columns of nodes shaped like a state, or like the states of a batch, with `num_micro` saved micro nodes."""
+        n_s, n_f = state.q_s.shape[-1], state.q_f.shape[-1]
+        sizes = n_s, n_f, n_s, n_f, len(RunInfo._fields), num_micro * n_f, len(Observables._fields)
+        return cls(*(slice(*ends) for ends in pairwise(accumulate(sizes, initial=0))))
 
-    def write(self, number, state: State, info: RunInfo, micro) -> "Saved":
-        """The arrays with node `number` written into them; node 0, the start, has no micro nodes before it."""
-        row = jnp.concatenate([*vars(state).values()][1:] + [jnp.asarray(a, float)[None] for a in info])
-        rows = jax.lax.dynamic_update_index_in_dim(self.rows, row, number, 0)
-        micros = self.micros
-        if micros is not None:
-            micros = jax.lax.dynamic_update_index_in_dim(micros, micro, jnp.maximum(number - 1, 0), 0)
-        return Saved(rows, micros)
+    @property
+    def width(self) -> int:
+        """Numbers of a row."""
+        return self.observables.stop
 
-    def first(self, saves: int) -> "Saved":
-        """The first `saves` saved intervals as arrays of NumPy."""
-        rows = np.array(np.asarray(self.rows)[: saves + 1])
-        return Saved(rows, None if self.micros is None else np.array(np.asarray(self.micros)[:saves]))
+    @property
+    def saves_of_a_piece(self) -> int:
+        """Saved intervals of a piece of a run, the same for runs of all lengths, so that they share one program."""
+        return max(NUMBERS_PER_PIECE // self.width, 1)
 
-    def states(self, start: State, t) -> State:
-        """The nodes as states at the times t; `start` has the numbers of variables."""
-        ends = accumulate(a.shape[-1] for a in (start.q_s, start.q_f, start.p_s, start.p_f))
-        return State(t, *(self.rows[..., a:b] for a, b in pairwise([0, *ends])))
+    def states(self, rows, t) -> State:
+        """The states of rows at the times t."""
+        return State(t, *(rows[..., columns] for columns in self[:4]))
 
-    def run(self, start: State, t, result, failed_at, scheme, macro_dt) -> Trajectory:
-        """All nodes at their times t as a trajectory without observables, with this status."""
-        first = 2 * (start.q_s.shape[-1] + start.q_f.shape[-1])
-        method, iterations, residual = (self.rows[..., 1:, first + k] for k in range(SOLVER_NUMBERS))
+
+class Saved(NamedTuple):
+    """Nodes of a run and its status, of JAX or of NumPy, in a batch with an axis of lanes.
+
+    rows: a row for each node, see `Columns`.
+    result, failed_at: of a `Trajectory`.
+    """
+
+    rows: Float[Numbers, "k width"]
+    result: Int[Numbers, ""]
+    failed_at: Int[Numbers, ""]
+
+    @property
+    def table(self) -> Any:
+        """(k, 9) the `Observables` of the nodes."""
+        return self.rows[..., -len(Observables._fields) :]
+
+    def marked(self, columns: Columns, save_every: int, step: int = 0) -> "Saved":
+        """The nodes, NaN from a failure on; a node that cannot be right is a failure.
+
+        A node may be wrong although its steps succeeded, for four reasons: the energy is not finite although its gradient is (a logarithm beyond
+        its pole); a lane of a batch started off its constraints; the rows of ``system.implied``, redundant constraints that the solver leaves
+        out, are violated; or a stepper of the user leaves the constraints. The last step before the first such node counts as the failed one.
+
+        Args:
+            columns: of the rows, in which there may be anything after a failed step.
+            save_every: macro steps from one saved node to the next.
+            step: macro steps before the first node.
+        """
+        rows, result, failed_at = self
+        module, now = library(self), Observables.of(self.table)
+        right = module.isfinite(now.energy) & (now.solved > 0) & (now.implied > 0)
+        # a prepared run is called many times, and an operation of JAX takes as long as many steps
+        if module is np and right.all() and (failed_at < 0).all():
+            return self
+        node, num_nodes = right.argmin(axis=-1), right.shape[-1]
+        after_step = module.where(failed_at < 0, num_nodes, (failed_at - step) // save_every + 1)
+        breaks = ~right.all(axis=-1) & (node < after_step)
+        energy, solved = (module.take_along_axis(a, node[..., None], -1)[..., 0] for a in (now.energy, now.solved))
+        # If the solved rows are kept, the implied rows are to blame.
+        violated = module.where(solved > 0, int(Result.NOT_IMPLIED), int(Result.CONSTRAINT_VIOLATED))
+        cause = module.where(module.isfinite(energy), violated, int(Result.NON_FINITE))
+        number, is_info = np.arange(num_nodes)[:, None], np.zeros(columns.width, bool)
+        is_info[columns.info] = True
+        lost = number >= module.where(breaks, node, after_step)[..., None, None]
+        unreached = number > module.where(breaks, num_nodes, after_step)[..., None, None]
+        rows = module.where(lost & ~is_info, np.nan, module.where(unreached & is_info, 0.0, rows))
+        failed_here = step + module.maximum(node * save_every - 1, 0)
+        return Saved(rows, module.where(breaks, cause, result), module.where(breaks, failed_here, failed_at))
+
+    def trajectory(self, run: Any, step: int = 0) -> Trajectory:
+        """The nodes as a trajectory of a `Simulation`, in a batch one whose arrays have an axis of lanes, after a number of macro steps."""
+        columns, rows, table, micro = run.columns, self.rows, self.table, None
+        t_start, macro_dt = (np.asarray(a) if is_concrete(a) else a for a in (run.state.t, run.macro_dt))
+        t = t_start[..., None] + (step + np.arange(rows.shape[-2]) * run.save_every) * macro_dt[..., None]
+        states, first = columns.states(rows, t), columns.info.start
+        method, iterations, residual = (rows[..., 1:, first + i] for i in range(len(RunInfo._fields)))
+        if run.save_micro:  # micro node i lies H (1 - c_i) before the end of its macro step
+            before_end = macro_dt[..., None, None] * (1 - run.scheme.micro_times)
+            shape = *residual.shape, before_end.shape[-1], states.q_f.shape[-1]
+            micro = MicroNodes(t[..., 1:, None] - before_end, rows[..., 1:, columns.micro].reshape(shape))
         info = RunInfo(method.astype(int), iterations.astype(int), residual)
-        micro = None if self.micros is None else MicroNodes.of(t, scheme, macro_dt, self.micros)
-        return Trajectory(self.states(start, t), None, None, info, result, failed_at, micro)
+        result, residuals = status(self.result), table[..., 1:3]
+        return Trajectory(states, table[..., 0], residuals, info, result, self.failed_at, micro, origin=run.origin)
 
 
-def numbers_per_node(state: State, num_micro: int = 0) -> int:
-    """Numbers of a saved node, with `num_micro` micro nodes."""
-    row = 2 * (state.q_s.size + state.q_f.size) + SOLVER_NUMBERS
-    return row + num_micro * (state.q_f.size + 1)
-
-
-def room_of_a_piece(state: State, num_micro: int, save_micro: bool) -> int:
-    """Saved intervals that fit into a piece of a run: the same for runs of all lengths, so that they share one program."""
-    return max(NUMBERS_PER_PIECE // numbers_per_node(state, num_micro if save_micro else 0), 1)
+def joined(pieces: list[Saved]) -> Saved:
+    """Consecutive pieces as one; each starts with the last node of the piece before, and has the worst status of all before it."""
+    rows = [piece.rows[min(i, 1) :] for i, piece in enumerate(pieces)]
+    return pieces[-1]._replace(rows=rows[0] if len(rows) == 1 else np.concatenate(rows))
 
 
 def check_memory(caller: str, run: Any, lanes: int = 1, num_saves: int | None = None) -> None:
@@ -97,8 +144,7 @@ def check_memory(caller: str, run: Any, lanes: int = 1, num_saves: int | None = 
         ValueError: the trajectory is larger than the free memory.
     """
     nodes = 1 + (num_saves or run.num_saves)
-    micro = run.scheme.num_micro if run.save_micro else 0
-    needed = BYTES_PER_NUMBER * (numbers_per_node(run.state, micro) + len(Observables._fields)) * nodes * lanes
+    needed = BYTES_PER_NUMBER * run.columns.width * nodes * lanes
     if needed < UNCHECKED_BYTES:
         return
     free = psutil.virtual_memory().available

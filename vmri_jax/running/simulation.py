@@ -2,20 +2,19 @@
 
 | call | program | used by |
 |---|---|---|
-| ``run()`` | `Engine.whole`, compiled for its number of saved nodes | `prepare` |
-| ``run.in_pieces()``, ``run.advance(...)`` | `Engine.piece`, one program for runs of all lengths | `simulate`, `stream` |
-| `vmri_jax.running.adjoints` | `Engine.stored`, `Engine.checkpointed`, with derivatives | `simulate` under transformations |
+| ``run()`` | `Engine.program` from the start, compiled for its number of saved nodes | `prepare` |
+| ``run.in_pieces()``, ``run.advance(...)`` | `Engine.program` from a cursor, one for runs of all lengths | `simulate`, `stream` |
+| ``run.traced()`` | `Engine.differentiable`, with derivatives | `simulate` under transformations |
 
-All of them return states and statuses; `Simulation.observed` adds energy, constraints and failures of the nodes.
-
-With the matrix "auto" a piece that is not solved is computed again with exact matrices (`vmri_jax.running.fallback`), with the same tolerance and
-limit of iterations; so are all pieces after it.
+All of them return `Saved`. With the matrix "auto" a piece that is not solved is computed again with exact matrices
+(`vmri_jax.running.engine`), with the same tolerance and limit of iterations; so are all pieces after it.
 """
 
 import warnings
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from functools import cache, cached_property, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -24,27 +23,28 @@ import numpy as np
 
 from vmri_jax.configure import warn_if_slow
 from vmri_jax.mechanics.arrays import Known, is_concrete, of_one_type
-from vmri_jax.mechanics.checks import check_params
+from vmri_jax.mechanics.checks import check_arrays, check_params
 from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.state import Movable, State, opened, start_of
 from vmri_jax.mechanics.summary import numbers, summary
 from vmri_jax.mechanics.system import System
 from vmri_jax.refusals import Refused
-from vmri_jax.running.arguments import Save, Steps, check_once, check_run, check_vectors, nothing_fast
-from vmri_jax.running.engine import NUM_STATE, Cursor, Engine, Motion, engine
+from vmri_jax.running.arguments import Save, Steps, check_once, check_run, nothing_fast
+from vmri_jax.running.engine import FALLING_BACK, Cursor, Engine, engine, solved_again, unsolved
 from vmri_jax.running.failures import simulation_error
-from vmri_jax.running.fallback import FALLING_BACK, unsolved
 from vmri_jax.running.interrupts import Interrupted, interrupts_noted
-from vmri_jax.running.observables import Observables, concerns, failures, observables, with_tolerance
-from vmri_jax.running.origin import Origin, evaluated, names_of
+from vmri_jax.running.observables import concerns
+from vmri_jax.running.origin import Origin, names_of
 from vmri_jax.running.progress import Working, progress_to
-from vmri_jax.running.saved import Saved, room_of_a_piece
-from vmri_jax.running.trajectory import Piece, Trajectory, join, with_observables
+from vmri_jax.running.saved import Columns, Saved, joined
+from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.plan import Plan, plan, with_rules_for
 from vmri_jax.steppers.solver import Solver
 
+LONGEST_STORED_RUN = 10_000
+"""Macro steps of the longest run for which the adjoint "auto" stores the start of every step; a larger value takes more memory."""
 PARTS_OF_A_BAR = 50
 """Parts of a run with a progress bar. More parts move the bar more smoothly, and each costs a call of some 30 microseconds."""
 STEPPING = "stepping"
@@ -54,36 +54,42 @@ STEPPING = "stepping"
 class Checkpoint(NamedTuple):
     """A run between two steps: everything that its next steps depend on, to the last bit.
 
-    cursor: state, memory of the stepper such as the start of Newton's next iteration, steps done, and status so far.
-    is_first: whether the stepper has no memory of earlier steps, so that the memory of the cursor is blank.
+    cursor: state, memory of the stepper such as the start of Newton's next iteration, steps done, and status so far. The memory is None where the
+        stepper has none of earlier steps.
     fell_back: whether the fallback has replaced the first matrix.
     """
 
     cursor: Cursor
-    is_first: bool = False
     fell_back: bool = False
 
 
+MOTION = ("macro_dt", "state", "solver", "scheme", "system")
+"""The fields of a `Simulation` with the numbers and functions that its motion follows from."""
+LENGTH = ("num_steps", "save_every", "save", "names", "may_fall_back")
+"""All other fields."""
+
+
+@partial(jax.tree_util.register_dataclass, data_fields=MOTION, meta_fields=LENGTH)
 @dataclass(frozen=True, eq=False)
 class Simulation:
-    """A run with checked arguments, ready to be computed.
+    """A run with checked arguments, ready to be computed; a pytree of the numbers that its motion follows from.
 
     The matrix of its plan computes the run. If it fails in a run or a piece, the fallback computes the run or piece again; the program
     of the fallback is compiled only then.
 
     Attributes:
-        system, scheme, solver, state, num_steps, save: as of `simulate`.
         macro_dt: macro step H, an array of shape ().
+        state, solver, scheme, system, num_steps, save: as of `simulate`.
         save_every: macro steps from one saved node to the next.
         names: names of bodies and constraints; None if there are none.
         may_fall_back: whether the fallback is tried where the first matrix fails; else the run fails.
     """
 
-    system: System
-    scheme: Scheme | Composition
-    solver: Solver
-    state: State
     macro_dt: Any
+    state: State
+    solver: Solver
+    scheme: Scheme | Composition
+    system: System
     num_steps: int
     save_every: int
     save: Save
@@ -102,109 +108,85 @@ class Simulation:
             ValueError: arrays whose shapes differ from the shapes of the run.
             SimulationError: a step failed.
         """
-        leaves, save_every = self._arguments(state, macro_dt, params, num_steps)
-        origin = self.origin if params is None else self.origin.with_params(params)
+        run = self.with_arguments(state, macro_dt, params, num_steps)
         with Working("the run", running=STEPPING):
-            run, table = self.whole(leaves, save_every)
-        if self.unsolved(run):
+            saved = run._whole()
+        if run.unsolved(saved):
             with Working(FALLING_BACK):
-                run, table = self.exact.whole(leaves, save_every)
-        trajectory = with_observables(run, table, origin)
-        if throw and int(trajectory.failed_at) >= 0:
-            raise simulation_error(trajectory, leaves[0], save_every, self.scheme.num_micro)
-        self.warn("run", table, run.states.t, leaves[0], save_every)
+                saved = run.exact._whole()
+        trajectory = saved.trajectory(run)
+        if throw and saved.failed_at >= 0:
+            raise simulation_error(trajectory, run.macro_dt, run.save_every, run.scheme.num_micro)
+        run.warn("run", saved.table, trajectory.states.t)
         return trajectory
 
     def compiled(self) -> jax.stages.Compiled:
         """The compiled program of the run without its fallback, for inspection."""
-        return self.engine.whole.lower(*self._arguments(None, None, None, None), self.num_saves).compile()
+        return self.engine.program.lower(self.leaves, self.save_every, self.num_saves).compile()
 
     def timed(self, state=None, *, macro_dt=None, params=None, num_steps=None) -> Callable[[], None]:
         """A function without arguments that computes the run and waits for its result, to be timed.
 
         It runs the program that succeeds, with the first matrix or of the fallback. Arguments as of a call.
         """
-        leaves, save_every = self._arguments(state, macro_dt, params, num_steps)
-        solves = self.exact if self.unsolved(self.whole(leaves, save_every)[0]) else self
-        program, arguments = solves.engine.whole, (jax.device_put(leaves), save_every, self.num_saves)
+        run = self.with_arguments(state, macro_dt, params, num_steps)
+        run = run.exact if run.unsolved(run._whole()) else run
+        program, arguments = run.engine.program, (jax.device_put(run.leaves), run.save_every, run.num_saves)
         program(*arguments)
         return lambda: program(*arguments)[1].block_until_ready()  # the arrays of one program are ready together
 
-    def _arguments(self, state, macro_dt, params, num_steps) -> tuple[list, int]:
-        """The leaves of the motion, and the macro steps from one saved node to the next."""
-        dt, *start = self.leaves[:NUM_STATE]
-        model, save_every = self.leaves[NUM_STATE:], self.save_every
+    def with_arguments(self, state=None, macro_dt=None, params=None, num_steps: int | None = None) -> "Simulation":
+        """The run with other arguments, see `__call__`, by the same program."""
+        changes: dict[str, Any] = {} if macro_dt is None else {"macro_dt": _float(macro_dt)}
         if state is not None:
-            check_vectors(state)
-            shapes, start = [a.shape for a in start], _arrays(state)
-            if [a.shape for a in start] != shapes:
-                raise Refused(
-                    f"the arrays of state have shapes {[a.shape for a in start]}; the run was prepared for {shapes}."
-                )
+            check_arrays(q_s=state.q_s, q_f=state.q_f, p_s=state.p_s, p_f=state.p_f)
+            changes["state"] = _with_arrays(state)
+            new, shapes = ([a.shape for a in vars(start).values()] for start in (changes["state"], self.state))
+            if new != shapes:
+                raise Refused(f"the arrays of state have shapes {new}; the run was prepared for {shapes}.")
         if params is not None:
-            model = self._with_params(model, params)
+            check_params(params)
+            (old, expected), (new, structure) = map(jax.tree.flatten, (self.system.params, params))
+            if structure != expected or list(map(np.shape, new)) != list(map(np.shape, old)):
+                raise Refused(f"params is {params!r}; give the pytree of system.params with other numbers in it.")
+            changes["system"] = self.system.with_params(jax.tree.map(np.asarray, params))
         if num_steps is not None:
             if num_steps < 1 or num_steps % self.num_saves:
                 raise Refused(f"num_steps is {num_steps}; it must be a positive multiple of {self.num_saves}.")
-            save_every = num_steps // self.num_saves
-        return [dt if macro_dt is None else np.asarray(macro_dt, dtype=float), *start, *model], save_every
+            changes |= {"num_steps": num_steps, "save_every": num_steps // self.num_saves}
+        if not changes:
+            return self
+        run = replace(self, **changes)
+        vars(run)["engine"] = self.engine  # of the same structure, whose comparison takes as long as a short run
+        return run
 
-    def _with_params(self, model: list, params) -> list:
-        """The leaves of the model with other parameters."""
-        check_params(params)
-        expected, expected_structure = jax.tree.flatten(self.system.params)
-        new, structure = jax.tree.flatten(params)
-        if structure != expected_structure or list(map(np.shape, new)) != list(map(np.shape, expected)):
-            raise Refused(f"params is {params!r}; give the pytree of system.params with other numbers in it.")
-        return model[: len(model) - len(expected)] + [np.asarray(leaf) for leaf in new]
+    def _whole(self) -> Saved:
+        """The run by one program, without the fallback."""
+        rows, status = self.engine.program(self.leaves, self.save_every, self.num_saves)
+        status = np.asarray(status)
+        return Saved(np.asarray(rows), status[..., 0], status[..., 1]).marked(self.columns, self.save_every)
 
-    def whole(self, leaves: list, save_every: int) -> Piece:
-        """The run by one program, without the fallback; arguments of `Engine.whole`."""
-        saved, status = self.engine.whole(leaves, save_every, self.num_saves)
-        saved, status = Saved(*(None if a is None else np.asarray(a) for a in saved)), np.asarray(status)
-        run = self.unpacked(saved, leaves, status[..., 0], status[..., 1], save_every)
-        return failures(run, saved.rows[:, -len(Observables._fields) :], save_every)
+    def traced(self) -> Trajectory:
+        """All steps of a run, some of whose arrays are tracers."""
+        adjoint = self.save.adjoint
+        if adjoint == "auto":
+            adjoint = "stored" if self.num_steps <= LONGEST_STORED_RUN else "checkpoint"
 
-    def unpacked(self, saved: Saved, leaves: list, result, failed_at, save_every: int, step: int = 0) -> Trajectory:
-        """Nodes in arrays of NumPy as a trajectory without observables, or a batch of them.
+        def steps(run: Simulation) -> Callable[[list], Saved]:
+            return lambda leaves: run.engine.differentiable(leaves, run.save_every, adjoint)
 
-        Args:
-            saved, result, failed_at: of an engine.
-            leaves: of the motion; in a batch with an axis of lanes.
-            step: macro steps before the first node.
-        """
-        macro_dt, t_start = map(np.asarray, leaves[:2])
-        steps = step + np.arange(saved.rows.shape[-2]) * save_every
-        t = t_start[..., None] + steps * macro_dt[..., None]
-        return saved.run(self.state, t, result, failed_at, self.scheme, macro_dt)
+        def failed(saved: Saved):
+            return unsolved(saved.result, self._method(saved))
 
-    def observed(self, run: Trajectory, leaves: list, step: int = 0) -> Piece:
-        """A run, or a batch, and its `Observables` (..., k, 9), both NaN from a failure on; failures that the nodes show are in its status.
+        run = steps(self)
+        if self.plan.has_fallback:
+            run = partial(solved_again, run, steps(self.exact), failed)
+        saved = run(self.leaves)
+        return self.engine.observed(self.leaves, saved, self.save_every).trajectory(self)
 
-        Args:
-            run: of the engine.
-            leaves: of the motion, of which the last ones are the leaves of the system; in a batch with an axis of lanes.
-            step: macro steps before its first node.
-        """
-        return failures(run, self._observables(run.states, leaves), self.save_every, step)
-
-    def at_start(self) -> np.ndarray:
-        """(1, 9) the `Observables` of the start."""
-        return self._observables(jax.tree.map(lambda a: a[None], self.state), self.leaves)
-
-    def _observables(self, states: State, leaves: list) -> Any:
-        structure, count = self._system
-        nodes = with_tolerance(states, self.solver.tolerance)
-        return evaluated(observables, structure, leaves[len(leaves) - count :], nodes)
-
-    def traced(self, run: Trajectory) -> Trajectory:
-        """The trajectory of a run some of whose arrays are tracers: its observables are a part of the trace."""
-        return with_observables(*self.observed(run, self.leaves), self.origin)
-
-    def warn(self, caller: str, table, t, macro_dt=None, save_every: int | None = None, stacklevel: int = 3) -> bool:
-        """Give the warnings about the motion of a run, or of a batch, see `concerns`, with its arguments; returns whether there are any."""
-        macro_dt, save_every = self.macro_dt if macro_dt is None else macro_dt, save_every or self.save_every
-        all_concerns = concerns(table, t, self.system, macro_dt, save_every)
+    def warn(self, caller: str, table, t, stacklevel: int = 3) -> bool:
+        """Give the warnings about the motion of a run, or of runs with an axis of lanes, see `concerns`; returns whether there are any."""
+        all_concerns = concerns(table, t, self.system, self.macro_dt, self.save_every)
         for concern in all_concerns:
             warnings.warn(type(concern)(f"{caller}: {concern}"), stacklevel=stacklevel)
         return bool(all_concerns)
@@ -238,40 +220,49 @@ class Simulation:
         return is_concrete(self.leaves)
 
     @cached_property
+    def columns(self) -> Columns:
+        """The columns of its saved nodes."""
+        return Columns.of(self.state, self.scheme.num_micro if self.save_micro else 0)
+
+    def stepper(self, reverse_only: bool = False) -> Plan:
+        """The `Plan` that takes its steps."""
+        return plan(self.system, self.scheme, self.state, self.solver, reverse_only=reverse_only)
+
+    @cached_property
     def plan(self) -> Plan:
         """The `Plan`, which ``print`` shows in words."""
-        return plan(self.system, self.scheme, self.state, self.solver)
+        return self.stepper()
 
     @cached_property
     def origin(self) -> Origin:
         """The origin of its trajectories."""
         return Origin(self.names, self.system)
 
-    @property
+    @cached_property
     def leaves(self) -> list:
-        """The leaves of its `Motion`, the arguments of its programs."""
-        return self._motion[0]
+        """The arguments of its programs."""
+        return jax.tree.leaves(self)
 
     @cached_property
     def engine(self) -> Engine:
         """Its programs, without the fallback."""
-        return engine(self._motion[1], self.num_saves, self.save_micro)
+        return self._engine(self.num_saves)
+
+    @cached_property
+    def _pieces(self) -> Engine:
+        """Its programs for pieces, of a size for runs of all lengths, without the fallback."""
+        return self._engine(self.columns.saves_of_a_piece)
+
+    def _engine(self, num_saves: int) -> Engine:
+        without_length = replace(
+            self, num_steps=0, save_every=0, save=Save(micro=self.save_micro), names=None, may_fall_back=True
+        )
+        return engine(jax.tree.structure(without_length), num_saves)
 
     @cached_property
     def exact(self) -> "Simulation":
         """The fallback: the same run with exact matrices."""
         return replace(self, solver=self.solver.exact())
-
-    @cached_property
-    def _motion(self) -> tuple[list, Any]:
-        """Leaves and structure of the `Motion`."""
-        return jax.tree.flatten(Motion(self.macro_dt, self.state, self.solver, self.scheme, self.system))
-
-    @cached_property
-    def _system(self) -> tuple[Any, int]:
-        """Structure of the system, and the number of its leaves."""
-        structure = self._motion[1].children()[Motion._fields.index("system")]
-        return structure, structure.num_leaves
 
     def check(self, state_name: str = "simulate: the positions of the state", constraints: bool = True) -> None:
         """Refuse a system whose functions return wrong types or shapes, and a state that violates the constraints; equal ones are checked once.
@@ -283,80 +274,79 @@ class Simulation:
         with Working("checks of the system"):
             check_once(Known((self.system, replace(self.state, p_s=None, p_f=None))), state_name, constraints)
 
-    def start(self, fell_back: bool = False) -> Checkpoint:
+    def start(self) -> Checkpoint:
         """The checkpoint before the first step."""
-        return self._blank(Cursor.at_start(self.state, None), fell_back)
+        return Checkpoint(Cursor.at_start(self.state))
 
-    def _blank(self, cursor: Cursor, fell_back: bool) -> Checkpoint:
-        """A checkpoint whose stepper has no memory of earlier steps."""
-        memory = self._piece_engine(fell_back).blank_memory(self.leaves)
-        return Checkpoint(cursor._replace(memory=memory), is_first=True, fell_back=fell_back)
+    def blank_memory(self, fell_back: bool) -> Any:
+        """Zeros in the shapes of the memory of its stepper."""
+        run = self.exact if fell_back else self
+        return run._pieces.blank_memory(run.leaves)
 
-    def _piece_engine(self, fell_back: bool) -> Engine:
-        return (self.exact if fell_back else self)._pieces
-
-    @cached_property
-    def _pieces(self) -> Engine:
-        """Its programs for pieces, without the fallback."""
-        room = room_of_a_piece(self.state, self.scheme.num_micro, self.save_micro)
-        return engine(self._motion[1], room, self.save_micro)
-
-    def advance(self, checkpoint: Checkpoint, saves: int) -> tuple[Piece, Checkpoint]:
-        """The next `saves` saved intervals, as of `observed`; from the first piece that is not solved, with the fallback.
+    def advance(self, checkpoint: Checkpoint, saves: int) -> tuple[Saved, Checkpoint]:
+        """The next `saves` saved intervals; from the first piece that is not solved, with the fallback.
 
         After a failure nothing is computed, and all further nodes are NaN.
         """
-        pieces, room = [], self._piece_engine(checkpoint.fell_back).num_saves
+        pieces, room = [], self._pieces.num_saves
         for done in range(0, saves, room):
             size = min(room, saves - done)
             piece, after = self._advance(checkpoint, size)
-            if not checkpoint.fell_back and int(checkpoint.cursor.failed_at) < 0 and self.unsolved(piece[0]):
+            if not checkpoint.fell_back and checkpoint.cursor.failed_at < 0 and self.unsolved(piece):
                 with Working(FALLING_BACK):
-                    piece, after = self._advance(self._blank(checkpoint.cursor, fell_back=True), size)
+                    again = Checkpoint(checkpoint.cursor._replace(memory=None), fell_back=True)
+                    piece, after = self._advance(again, size)
             pieces.append(piece)
             checkpoint = after
-        return join(pieces), checkpoint
+        return joined(pieces), checkpoint
 
-    def _advance(self, checkpoint: Checkpoint, saves: int) -> tuple[Piece, Checkpoint]:
-        cursor, is_first, fell_back = checkpoint
-        step, leaves = int(cursor.step), self.leaves
-        saved, cursor = self._piece_engine(fell_back).next_piece(leaves, cursor, is_first, self.save_every, saves)
-        result, failed_at = np.asarray(cursor.result), np.asarray(cursor.failed_at)
-        run, table = self.observed(self.unpacked(saved, leaves, result, failed_at, self.save_every, step), leaves, step)
-        after = cursor._replace(step=step + saves * self.save_every, result=run.result, failed_at=run.failed_at)
-        return (run, table), Checkpoint(after, fell_back=fell_back)
+    def _advance(self, checkpoint: Checkpoint, saves: int) -> tuple[Saved, Checkpoint]:
+        cursor, run = checkpoint.cursor, self.exact if checkpoint.fell_back else self
+        step, is_first, engine = int(cursor.step), cursor.memory is None, run._pieces
+        if is_first:
+            cursor = cursor._replace(memory=engine.blank_memory(run.leaves))
+        rows, cursor = engine.program(run.leaves, self.save_every, saves, cursor, is_first)
+        nodes = np.array(np.asarray(rows)[: saves + 1])  # a copy, which holds no memory of a whole piece
+        saved = Saved(nodes, np.asarray(cursor.result), np.asarray(cursor.failed_at))
+        saved = saved.marked(self.columns, self.save_every, step)
+        reached = np.asarray(step + saves * self.save_every)
+        cursor = cursor._replace(step=reached, result=saved.result, failed_at=saved.failed_at)
+        return saved, checkpoint._replace(cursor=cursor)
 
-    def unsolved(self, run: Trajectory) -> np.ndarray:
+    def unsolved(self, saved: Saved) -> np.ndarray:
         """Whether the fallback may solve a run or a piece, or (lanes,) the runs of a batch."""
-        is_alive = np.asarray(run.failed_at) < 0
+        is_alive = np.asarray(saved.failed_at < 0)
         if is_alive.all() or not (self.may_fall_back and self.plan.has_fallback):
             return np.zeros(is_alive.shape, dtype=bool)
-        return unsolved(np.asarray(run.result), np.max(run.info.method, axis=-1))
+        return unsolved(saved.result, self._method(saved))
+
+    def _method(self, saved: Saved):
+        """The largest `Method` of the steps."""
+        return saved.rows[..., self.columns.info.start].max(axis=-1)
 
     def in_pieces(self, caller: str = "") -> Trajectory:
         """The whole run; with a progress bar Ctrl-C raises `Interrupted` with the trajectory computed so far.
 
         With the name of a `caller` it warns about the motion, see `warn`.
         """
-        if self.save.progress is False:
-            with Working("the run", running=STEPPING):
-                return self._finished(self.advance(self.start(), self.num_saves)[0], caller)
-        size, checkpoint, pieces = -(-self.num_saves // PARTS_OF_A_BAR), self.start(), []
-        with interrupts_noted() as interrupted, progress_to("simulate", self.save.progress) as tell:
+        bar, checkpoint, pieces = self.save.progress is not False, self.start(), []
+        size = -(-self.num_saves // (PARTS_OF_A_BAR if bar else 1))
+        noted = interrupts_noted() if bar else nullcontext(lambda: False)
+        shown = progress_to("simulate", self.save.progress) if bar else Working("the run", running=STEPPING)
+        with noted as interrupted, shown as tell:
             for done in range(0, self.num_saves, size):
-                tell("simulating", done, self.num_saves)
+                if bar:
+                    tell("simulating", done, self.num_saves)
                 piece, checkpoint = self.advance(checkpoint, min(size, self.num_saves - done))
                 pieces.append(piece)
                 if interrupted():
                     steps = int(checkpoint.cursor.step)
-                    raise Interrupted(self._finished(join(pieces)), steps, self.num_steps, "macro steps")
-        return self._finished(join(pieces), caller)
-
-    def _finished(self, piece: Piece, caller: str = "") -> Trajectory:
-        run, table = piece
+                    raise Interrupted(joined(pieces).trajectory(self), steps, self.num_steps, "macro steps")
+        saved = joined(pieces)
+        trajectory = saved.trajectory(self)
         if caller:
-            self.warn(caller, table, run.states.t, stacklevel=5)
-        return with_observables(run, table, self.origin)
+            self.warn(caller, saved.table, trajectory.states.t, stacklevel=4)
+        return trajectory
 
 
 def simulation(moving: Movable, scheme, state: State | None, solver: Solver | None, steps: Steps) -> Simulation:
@@ -370,10 +360,8 @@ def simulation(moving: Movable, scheme, state: State | None, solver: Solver | No
     advice = nothing_fast(scheme, state.q_f.size) if moving is not problem else ""
     if advice:
         warnings.warn(f"simulate: {advice}", stacklevel=3)
-    chosen_solver, scheme, system = of_one_type((solver or _usual_solver(), scheme, system))
-    state, macro_dt, names = State(*_arrays(state)), _float(steps.macro_dt), names_of(problem)
-    save = Save.of(steps.save)
-    return Simulation(system, scheme, chosen_solver, state, macro_dt, num_steps, save_every, save, names)
+    motion = _float(steps.macro_dt), _with_arrays(state), *of_one_type((solver or _usual_solver(), scheme, system))
+    return Simulation(*motion, num_steps, save_every, Save.of(steps.save), names_of(problem))
 
 
 @cache
@@ -381,8 +369,8 @@ def _usual_solver() -> Solver:
     return Solver()
 
 
-def _arrays(state: State) -> tuple:
-    return tuple(_float(a) for a in (state.t, state.q_s, state.q_f, state.p_s, state.p_f))
+def _with_arrays(state: State) -> State:
+    return State(*map(_float, vars(state).values()))
 
 
 def _float(value):

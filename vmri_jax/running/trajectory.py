@@ -1,6 +1,7 @@
 """`Trajectory`, the result of a run: saved nodes, work of the solver, energy and constraints, and status."""
 
 import json
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path as FilePath
 from typing import Any, NamedTuple
@@ -15,25 +16,17 @@ from vmri_jax.mechanics.state import HasProblem, Problem, State
 from vmri_jax.mechanics.summary import has_values, summary
 from vmri_jax.mechanics.system import System
 from vmri_jax.refusals import Refused
-from vmri_jax.running.export import MICRO, Exports
+from vmri_jax.running.export import INFO, MICRO, NODES, STATUS, Exports, named_arrays
 from vmri_jax.running.files import replaced
 from vmri_jax.running.origin import UNKNOWN, Origin
 from vmri_jax.running.run_error import RunError
 from vmri_jax.running.settings import Settings
 from vmri_jax.running.summaries import summary_of
-from vmri_jax.schemes.composition import Composition
-from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.results import Method, Result, Status
 
 FORMAT = "vmri_jax trajectory 2"
-NODES = ("t", "q_s", "q_f", "p_s", "p_f", "energy", "constraint_residual")
-"""Arrays with a row for each saved node; all arrays but `NODES`, `STATUS` and `ERROR` have a row for each saved interval."""
-STATUS = ("result", "failed_at")
-"""Arrays with one value for the run."""
 ERROR = tuple(f"error_{name}" for name in RunError._fields)
 """Arrays of the estimated error; absent in runs without one."""
-STATUS_ARRAYS = jax.Array, np.ndarray
-"""Types of `Trajectory.result` before `with_origin` replaces it by a `Status`, which prints as a sentence."""
 
 
 class RunInfo(NamedTuple):
@@ -71,11 +64,6 @@ class MicroNodes(NamedTuple):
 
     t: Float[Numbers, "k-1 num_micro"]
     q_f: Float[Numbers, "k-1 num_micro n_f"]
-
-    @classmethod
-    def of(cls, t, scheme: Scheme | Composition, macro_dt, q_f) -> "MicroNodes":
-        """The micro nodes of the macro steps that end at the times t[1:]; micro node i lies ``H (1 - c_i)`` before the end."""
-        return cls(t[..., 1:, None] - macro_dt[..., None, None] * (1 - scheme.micro_times), q_f)
 
 
 @jax.tree_util.register_dataclass
@@ -190,22 +178,14 @@ class Trajectory(Exports):
         """The nodes first, first + stride, ..., last; the work of the solver between two of them is the maximum, and a failure after the last is left out."""
         if not is_concrete(self.energy):
             raise Refused("Trajectory: the run is traced by JAX; take slices of its arrays, run.q_s[a:b].")
-        lanes, starts = (slice(None),) * (np.ndim(self.t) - 1), range(0, last - first, stride)
-        nodes, ends = slice(first, last + 1, stride), slice(first + stride - 1, last, stride)
+        arrays, lanes = named_arrays(self), (slice(None),) * (np.ndim(self.t) - 1)
 
-        def largest(value):
-            between = np.asarray(value)[*lanes, first:last]
-            return np.maximum.reduceat(between, starts, axis=len(lanes)) if starts else between
+        def rows(name: str, chosen: slice):
+            return np.asarray(arrays[name])[*lanes, chosen]
 
-        at_nodes = (self.states, self.energy, self.constraint_residual)
-        states, energy, residual = jax.tree.map(lambda a: np.asarray(a)[*lanes, nodes], at_nodes)
-        fails_later = (np.asarray(self.failed_at) >= 0) & ~np.isnan(energy).any(axis=-1)
-        result = np.where(fails_later, int(Result.CONVERGED), self.result)
-        failed_at = np.where(fails_later, -1, self.failed_at)
-        micro = jax.tree.map(lambda a: np.asarray(a)[*lanes, ends], self.micro)
-        error: Any = None if self.error is None else self.error.part(nodes)
-        info = jax.tree.map(largest, self.info)
-        return with_origin(Trajectory(states, energy, residual, info, result, failed_at, micro, error), self.origin)
+        part = part_of(rows, self.result, self.failed_at, (first, last, stride), self.micro is not None)
+        error: Any = None if self.error is None else self.error.part(slice(first, last + 1, stride))
+        return with_origin(part, self.origin, error=error)
 
     def lane(self, i: int) -> "Trajectory":
         """One run of a batch.
@@ -237,7 +217,7 @@ class Trajectory(Exports):
         Raises:
             OSError: the file cannot be written.
         """
-        arrays = {name: np.asarray(value) for name, value in named_arrays(self).items() if value is not None}
+        arrays = {name: np.asarray(value) for name, value in named_arrays(self).items()}
         if drawing is not None:
             arrays["drawing"] = np.array(json.dumps(drawing))
         if self.origin.names is not None:
@@ -264,24 +244,22 @@ class Trajectory(Exports):
             raise Refused(f"{path} is a folder; a run written by stream is opened by StoredTrajectory({str(path)!r}).")
         try:
             with path.open("rb") as file, np.load(file, allow_pickle=False) as data:
-                arrays = dict(data)
+                arrays = {
+                    name: data[name] for name in data.files if name not in ("drawing", "slow_names", "fast_names")
+                }
         except Exception as error:
             raise Refused(
                 f"{path} cannot be read as a .npz file ({error}); it is damaged or something else."
             ) from error
         if str(arrays.pop("format", "")) != FORMAT:
             raise Refused(f"{path} is a .npz file but not a trajectory saved by Trajectory.save.")
-        names, settings = (
-            None if text is None else json.loads(str(text))
-            for text in (arrays.pop("names", None), arrays.pop("settings", None))
-        )
-        for name in ("drawing", "slow_names", "fast_names"):
-            arrays.pop(name, None)
-        missing = _FIELDS - set(arrays) - set(MICRO)
-        if missing or set(arrays) - _FIELDS - set(ERROR):
+        texts = [arrays.pop(name, None) for name in ("names", "settings")]
+        needed = {*NODES, *INFO, *STATUS}
+        missing = needed - set(arrays)
+        if missing or set(arrays) - needed - {*MICRO, *ERROR}:
             raise Refused(f"{path} is a damaged trajectory: it lacks {sorted(missing)}, or has arrays of another kind.")
         try:
-            origin = Origin.from_file(names, settings)
+            origin = Origin.from_file(*(None if text is None else json.loads(str(text)) for text in texts))
         except (KeyError, TypeError, ValueError) as error:
             raise Refused(
                 f"{path} is a damaged trajectory: its names or settings cannot be read ({error!r})."
@@ -290,57 +268,42 @@ class Trajectory(Exports):
 
 
 def with_origin(trajectory: Trajectory, origin: Origin, **arrays) -> Trajectory:
-    """A trajectory of the engine with its origin, and with a status that prints as a sentence; `arrays` replace other fields."""
-    result = trajectory.result
-    if isinstance(result, STATUS_ARRAYS) and result.ndim == 0 and is_concrete(result):
-        result = Status(result)
-    return replace(trajectory, result=result, origin=origin, **arrays)
+    """A trajectory with its origin, and with a status that prints as a sentence; `arrays` replace other fields."""
+    return replace(trajectory, result=status(trajectory.result), origin=origin, **arrays)
 
 
-def with_observables(run: Trajectory, table, origin: Origin = UNKNOWN) -> Trajectory:
-    """A run with energy and constraints from its `Observables` (..., k, 9), and with its origin."""
-    return with_origin(run, origin, energy=table[..., 0], constraint_residual=table[..., 1:3])
-
-
-Piece = tuple[Trajectory, Any]
-"""A run or a piece of it in arrays of NumPy, without an origin, and the table of its `Observables` (k, 9)."""
-
-
-def join(pieces: list[Piece]) -> Piece:
-    """One piece of consecutive ones, each of which starts with the last node of the previous piece, and has the worst status."""
-    if len(pieces) == 1:
-        return pieces[0]
-    intervals = len(pieces[0][0]) - 1
-
-    def joined(first, *others):
-        if not np.ndim(first):
-            return np.max([first, *others])  # failures have larger codes than successes, and later steps larger numbers
-        repeated = (
-            len(first) - intervals
-        )  # 1 where there is a row for each node, of which the first repeats the last one before
-        return np.concatenate([first, *(other[repeated:] for other in others)])
-
-    return jax.tree.map(joined, *pieces)
-
-
-def named_arrays(trajectory: Trajectory) -> dict:
-    """All arrays of a trajectory by name, positions as vectors; None for micro nodes that were not saved."""
-    arrays = dict(vars(trajectory.states)) | {
-        name: getattr(trajectory, name) for name in ("energy", "constraint_residual")
-    }
-    arrays |= trajectory.info._asdict() | {name: getattr(trajectory, name) for name in STATUS}
-    arrays |= dict(zip(MICRO, trajectory.micro or (None, None), strict=True))
-    return arrays | ({} if trajectory.error is None else dict(zip(ERROR, trajectory.error, strict=True)))
+def status(result) -> Any:
+    """A concrete result of one run as a `Status`, which prints as a sentence; any other result unchanged."""
+    is_array = isinstance(result, jax.Array | np.ndarray) and result.ndim == 0
+    return Status(result) if is_array and is_concrete(result) else result
 
 
 def from_named_arrays(arrays: dict) -> Trajectory:
     """The inverse of `named_arrays`; arrays of micro nodes and of the error may be absent."""
-    states = State(*(arrays[name] for name in ("t", "q_s", "q_f", "p_s", "p_f")))
-    info = RunInfo(*(arrays[name] for name in RunInfo._fields))
-    fields = {name: arrays[name] for name in ("energy", "constraint_residual", *STATUS)}
-    micro = None if arrays.get(MICRO[0]) is None else MicroNodes(*(arrays[name] for name in MICRO))
-    error: Any = None if arrays.get(ERROR[0]) is None else RunError(*(arrays.get(name) for name in ERROR))
-    return Trajectory(states, info=info, micro=micro, error=error, **fields)
+    states = State(*(arrays[name] for name in NODES[:5]))
+    fields = {name: arrays[name] for name in (*NODES[5:], *STATUS)}
+    micro = MicroNodes(*(arrays[name] for name in MICRO)) if MICRO[0] in arrays else None
+    error: Any = RunError(*map(arrays.get, ERROR)) if ERROR[0] in arrays else None
+    return Trajectory(states, info=RunInfo(*(arrays[name] for name in INFO)), micro=micro, error=error, **fields)
 
 
-_FIELDS = {*NODES, *STATUS, *MICRO, *RunInfo._fields}
+def part_of(rows: Callable[[str, slice], np.ndarray], result, failed_at, nodes: tuple, has_micro: bool) -> Trajectory:
+    """The nodes first, first + stride, ..., last of a run; the work of the solver between two of them is the maximum, and a failure after the last is
+    left out.
+
+    Args:
+        rows: gives some rows of an array by its name; row i of the arrays of intervals belongs to the nodes i and i + 1.
+        result, failed_at: status of the run.
+        nodes: (first, last, stride).
+        has_micro: whether there are micro nodes.
+    """
+    first, last, stride = nodes
+    arrays = {name: rows(name, slice(first, last + 1, stride)) for name in NODES}
+    for name in INFO:
+        between, starts = rows(name, slice(first, last)), range(0, last - first, stride)
+        arrays[name] = np.maximum.reduceat(between, starts, axis=arrays["t"].ndim - 1) if starts else between
+    if has_micro:
+        arrays |= {name: rows(name, slice(first + stride - 1, last, stride)) for name in MICRO}
+    fails_later = (np.asarray(failed_at) >= 0) & ~np.isnan(arrays["energy"]).any(axis=-1)
+    arrays["result"] = np.where(fails_later, int(Result.CONVERGED), result)
+    return from_named_arrays(arrays | {"failed_at": np.where(fails_later, -1, failed_at)})

@@ -136,7 +136,7 @@ def plan(
         scheme: a `Scheme` or a `Composition`.
         state: any state of the system; only the shapes of its arrays matter.
         solver: for implicit equations, by default ``Solver()``. The plan of the matrix "auto" has the first matrix that the structure allows; runs
-            solve again what it does not solve (`vmri_jax.running.fallback`).
+            solve again what it does not solve (`vmri_jax.running.engine`).
         reverse_only: whether steps are differentiated in reverse mode only, once, in half the time.
 
     Raises:

@@ -11,7 +11,7 @@
 node; "modes" needs constant masses and no forces. "auto" takes the first matrix that the structure allows: "modes" with at most 16 fast variables,
 unless W is a sum over single coordinates, else "masses", else "exact". What "auto" does not solve is solved again with "exact": the step
 (`macro_step`), the whole run (`prepare`), the lane (batches), or the piece that failed and all pieces after it (`simulate`, `stream`); see
-`vmri_jax.running.fallback`. ``print(vm.plan(problem, scheme))`` says beforehand which matrix a step takes, ``StepInfo.method`` and
+`vmri_jax.running.engine`. ``print(vm.plan(problem, scheme))`` says beforehand which matrix a step takes, ``StepInfo.method`` and
 ``Trajectory.info.method`` afterwards.
 
 An iteration ends if its next correction is below a tenth of the tolerance times the motion (of slow variables over the macro step, of

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from vmri_jax import Save, StoredTrajectory, Trajectory, fully_implicit, stream
-from vmri_jax.running.trajectory import named_arrays
+from vmri_jax.running.export import named_arrays
 
 H, CHUNK, EVERY, STEPS = 0.02, 4, 2, 24
 

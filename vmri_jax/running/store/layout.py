@@ -135,7 +135,7 @@ def _create(path: Path, attributes, arrays, dimension: str = "t", table=None) ->
         if table:
             np.savez(partial / TABLE, **table)
         _consolidate(partial)
-        _synchronize([file for file in partial.rglob("*") if file.is_file()])
+        synchronize(*(file for file in partial.rglob("*") if file.is_file()))
 
 
 class Writer:
@@ -154,7 +154,7 @@ class Writer:
             array.resize((rows, *array.shape[1:]))
         if changed:
             _consolidate(path)
-            _synchronize(list(path.rglob(METADATA)))
+            synchronize(*path.rglob(METADATA))
 
     def write(self, first: int, values: Mapping[str, np.ndarray], note: bytes) -> None:
         """Write rows from number `first` on, and commit their chunks with a note."""
@@ -164,7 +164,7 @@ class Writer:
             array = self._arrays[name]
             array[first : last + 1] = value
             files += [chunk_file(self._path / name, array.ndim, number) for number in numbers]
-        _synchronize(files)  # after all writes: while the system writes the first file, it writes most of the others
+        synchronize(*files)  # after all writes: while the system writes the first file, it writes most of the others
         for number in numbers:
             commit(self._path, number, note)
 
@@ -251,12 +251,3 @@ def _consolidate(path: Path) -> None:
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Consolidated metadata is currently not part")  # of format 3, but widely read
         zarr.consolidate_metadata(path)
-
-
-def _synchronize(files: list[Path]) -> None:
-    """Wait until these files and the lists of files of their folders are on disk."""
-    for file in files:
-        if file.exists():  # arrays without coordinates have no files
-            synchronize(file)
-    for folder in {file.parent for file in files}:
-        synchronize(folder)

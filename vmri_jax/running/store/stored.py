@@ -1,9 +1,13 @@
-"""`StoredTrajectory`: reads the status of a store and any part of its trajectory."""
+"""`StoredTrajectory`: reads the status of a store and any part of its trajectory; `Record`, the note of a chunk, with which a run goes on."""
 
+import io
+import zipfile
 from copy import copy
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.mechanics.names import Names
@@ -11,13 +15,70 @@ from vmri_jax.mechanics.state import HasProblem, Problem, State
 from vmri_jax.mechanics.summary import summary
 from vmri_jax.mechanics.system import System
 from vmri_jax.refusals import Refused
-from vmri_jax.running.export import MICRO, Exports
+from vmri_jax.running.engine import Cursor
+from vmri_jax.running.export import NODES, Exports
 from vmri_jax.running.origin import Origin
+from vmri_jax.running.simulation import Checkpoint, Simulation
+from vmri_jax.running.store import layout
 from vmri_jax.running.store.layout import chunk_file, read_attributes
-from vmri_jax.running.store.record import Record
 from vmri_jax.running.summaries import named_coordinates
-from vmri_jax.running.trajectory import NODES, RunInfo, Trajectory, from_named_arrays, with_origin
+from vmri_jax.running.trajectory import Trajectory, part_of, with_origin
 from vmri_jax.steppers.results import Result
+
+
+class Record(NamedTuple):
+    """A `Checkpoint` in a store: a run as far as its chunks are committed.
+
+    saved: number of committed saved intervals.
+    result, failed_at, step, fell_back: of these intervals, as in `Cursor` and `Checkpoint`.
+    leaves: state and memory of the cursor.
+    """
+
+    saved: int = 0
+    result: int = int(Result.CONVERGED)
+    failed_at: int = -1
+    step: int = 0
+    fell_back: bool = False
+    leaves: list[np.ndarray] = []  # noqa: RUF012 (never changed)
+
+    @classmethod
+    def of(cls, checkpoint: Checkpoint, saved: int) -> "Record":
+        """The record of a checkpoint."""
+        state, memory, *counts = checkpoint.cursor
+        step, result, failed_at = map(int, counts)
+        leaves = list(map(np.asarray, jax.tree.leaves((state, memory))))
+        return cls(saved, result, failed_at, step, checkpoint.fell_back, leaves)
+
+    @classmethod
+    def last_of(cls, path: Path) -> "Record":
+        """The record of the last committed chunk of a store; a ValueError if it is damaged."""
+        numbers = layout.committed(path)
+        if not numbers:
+            return cls()
+        try:
+            with np.load(io.BytesIO(layout.note(path, numbers[-1])), allow_pickle=False) as data:
+                *counts, fell_back = data["counts"].tolist()
+                leaves = [data[f"leaf_{k}"] for k in range(len(data.files) - 1)]
+                return cls._make((*counts, bool(fell_back), leaves))
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+            raise Refused(f"{path}: the checkpoint is damaged ({error}); the run cannot go on.") from error
+
+    def packed(self) -> bytes:
+        """The bytes of an .npz file."""
+        out, leaves = io.BytesIO(), {f"leaf_{k}": leaf for k, leaf in enumerate(self.leaves)}
+        np.savez(out, counts=np.array(self[:-1], dtype=np.int64), **leaves)  # pyright: ignore[reportArgumentType]
+        return out.getvalue()
+
+    def checkpoint(self, run: Simulation) -> Checkpoint:
+        """The checkpoint of the run; a ValueError if the arrays do not fit the memory of its stepper."""
+        if not self.leaves:
+            return run.start()
+        expected, structure = jax.tree.flatten((run.state, run.blank_memory(self.fell_back)))
+        if [(leaf.shape, leaf.dtype) for leaf in self.leaves] != [(leaf.shape, leaf.dtype) for leaf in expected]:
+            raise Refused("the checkpoint was made by a version of vmri_jax whose steps remember something else")
+        state, memory = jax.tree.unflatten(structure, map(jnp.asarray, self.leaves))
+        status = map(np.asarray, (self.step, self.result, self.failed_at))
+        return Checkpoint(Cursor(state, memory, *status), self.fell_back)
 
 
 class StoredTrajectory(Exports):
@@ -114,16 +175,8 @@ class StoredTrajectory(Exports):
         return self[number : number + 1][0]
 
     def _part(self, first: int, last: int, stride: int) -> Trajectory:
-        arrays = {name: self._rows(name, slice(first, last + 1, stride)) for name in NODES}
-        for name in RunInfo._fields:  # the maximum over the intervals between two nodes
-            rows = self._rows(name, slice(first + 1, last + 1))
-            arrays[name] = np.maximum.reduceat(rows, range(0, len(rows), stride)) if len(rows) else rows
-        if self.attributes["save_micro"]:
-            arrays |= {name: self._rows(name, slice(first + stride, last + 1, stride)) for name in MICRO}
-        arrays |= {"result": np.asarray(int(Result.CONVERGED)), "failed_at": np.asarray(-1)}
-        if self.failed_at < last * self.save_every:
-            arrays |= {"result": np.asarray(int(self.result)), "failed_at": np.asarray(self.failed_at)}
-        return with_origin(from_named_arrays(arrays), self.origin)
+        nodes, has_micro = (first, last, stride), self.attributes["save_micro"]
+        return with_origin(part_of(self._rows, int(self.result), self.failed_at, nodes, has_micro), self.origin)
 
     def chunks(self):
         """The trajectory in pieces of a chunk each; a piece starts with the last node of the previous piece."""
@@ -131,15 +184,16 @@ class StoredTrajectory(Exports):
             yield self[first : first + self.chunk + 1]
 
     def _rows(self, name: str, rows: slice) -> np.ndarray:
-        """Committed rows of an array; a ValueError if one of their files is missing or damaged."""
+        """Committed rows of an array, see `part_of`; a ValueError if one of their files is missing or damaged."""
         import zarr
 
+        shift = name not in NODES  # the first row of arrays of intervals is blank
+        rows = slice(rows.start + shift, rows.stop + shift, rows.step)
         try:
             array = zarr.open_array(self.path / name, mode="r")
             for k in range(rows.start // self.chunk, -(-rows.stop // self.chunk)):
-                if (
-                    array.size and not chunk_file(self.path / name, array.ndim, k).is_file()
-                ):  # zarr would return fill values
+                # zarr would return fill values
+                if array.size and not chunk_file(self.path / name, array.ndim, k).is_file():
                     raise Refused(f"chunk {k} is missing")
             return np.asarray(array[rows])
         except Exception as error:

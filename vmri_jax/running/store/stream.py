@@ -5,26 +5,26 @@ from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
 
+import jax
 import numpy as np
 
 from vmri_jax.mechanics.arrays import whole_number
 from vmri_jax.mechanics.state import Movable, State
 from vmri_jax.refusals import Refused
 from vmri_jax.running.arguments import Save, Steps
-from vmri_jax.running.export import DIMENSIONS, MICRO, rows_of
+from vmri_jax.running.export import DIMENSIONS, rows_of
 from vmri_jax.running.failures import simulation_error
 from vmri_jax.running.files import explained
 from vmri_jax.running.interrupts import Interrupted, interrupts_noted
-from vmri_jax.running.observables import Observables
+from vmri_jax.running.observables import Observables, observables
+from vmri_jax.running.origin import at_nodes
 from vmri_jax.running.progress import Progress, progress_to
-from vmri_jax.running.saved import numbers_per_node
+from vmri_jax.running.saved import BYTES_PER_NUMBER, Saved
 from vmri_jax.running.simulation import Simulation, simulation
 from vmri_jax.running.store import layout
 from vmri_jax.running.store.identity import check_same, environment, identity
 from vmri_jax.running.store.layout import Kept
-from vmri_jax.running.store.record import Record
-from vmri_jax.running.store.stored import StoredTrajectory
-from vmri_jax.running.trajectory import NODES, RunInfo, with_observables
+from vmri_jax.running.store.stored import Record, StoredTrajectory
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.solver import Solver
@@ -80,8 +80,7 @@ def stream(
     """
     path = Path(out)
     layout.check_place("stream", path, "run", resume, overwrite)
-    steps = Steps(macro_dt, num_steps, t_end, save)
-    run = simulation(system, scheme, state, solver, steps)
+    run = simulation(system, scheme, state, solver, Steps(macro_dt, num_steps, t_end, save))
     num_steps = run.num_steps
     if not run.is_concrete:
         raise Refused("stream: arguments are tracers; it writes files, call it outside of jax.jit, vmap and grad.")
@@ -115,9 +114,7 @@ def stream(
     stored = StoredTrajectory(path)
     stored = stored.with_origin(run.origin) if len(stored) else stored
     if not stored.success:
-        interval = stored.failed_at // run.save_every
-        part, first = stored[interval : interval + 2], interval * run.save_every
-        raise simulation_error(part, run.macro_dt, run.save_every, scheme.num_micro, first, stored)
+        raise simulation_error(stored, run.macro_dt, run.save_every, scheme.num_micro)
     return stored
 
 
@@ -128,24 +125,24 @@ def _continue(stored: StoredTrajectory, run: Simulation, tell: Progress) -> Iter
     if record.saved == rows or not stored.success:
         return
     try:
-        checkpoint = record.checkpoint(like=run.start(record.fell_back))
+        checkpoint = record.checkpoint(run)
     except ValueError as error:
         raise Refused(f"{path} can be read, but its run cannot go on: {error}.") from error
     with explained(path, _advice(record.step)):
         writer = layout.Writer(path)
     # The start and the largest values so far, as a node before each chunk: energies are compared with the start of the run.
-    before, has_warned = run.at_start(), False
+    before, has_warned = at_nodes(observables, run.origin, jax.tree.map(lambda a: a[None], run.state)), False
     # Every write but the last ends at a multiple of `chunk` rows, so that no file is written twice.
     ends = [*range((record.saved + 1) // chunk * chunk + chunk, rows + 1, chunk), rows + 1]
     sizes = [end - begin for begin, end in pairwise([record.saved + 1, *ends])]
     for size in sizes:
         tell("simulating", record.saved, rows)
-        piece, checkpoint = run.advance(checkpoint, size)
-        table, t = np.concatenate([before, piece[1]]), np.append(run.state.t, piece[0].states.t)
-        has_warned = has_warned or run.warn("stream", table, t, stacklevel=4)
+        saved, checkpoint = run.advance(checkpoint, size)
+        piece, table = saved.trajectory(run, record.step), np.concatenate([before, saved.table])
+        has_warned = has_warned or run.warn("stream", table, np.append(run.state.t, piece.states.t), stacklevel=4)
         before = Observables.of(table).so_far()
         first = record.saved + 1 if record.saved else 0  # the first chunk has the start
-        values = {name: value[1 if record.saved else 0 :] for name, value in rows_of(with_observables(*piece)).items()}
+        values = {name: value[1 if record.saved else 0 :] for name, value in rows_of(piece).items()}
         with explained(path, _advice(record.step)):
             record = Record.of(checkpoint, record.saved + size)
             writer.write(first, values, record.packed())
@@ -162,19 +159,13 @@ def _advice(step: int) -> str:
 
 
 def _arrays(run: Simulation) -> dict[str, Kept]:
-    """The arrays of the store of a run."""
-    sizes = {"slow": run.state.q_s.size, "fast": run.state.q_f.size, "level": 2, "micro": run.scheme.num_micro}
-    arrays = {}
-    for name in (*NODES, *RunInfo._fields, *(MICRO if run.save_micro else ())):
-        axes = DIMENSIONS[name][1:]
-        kind = np.int64 if name in ("method", "iterations") else np.float64
-        arrays[name] = Kept(np.empty([sizes[axis] for axis in axes], kind), axes)
-    return arrays
+    """The arrays of the store of a run: a row of each, as two blank nodes have them."""
+    blank = Saved(np.zeros((2, run.columns.width)), np.asarray(0), np.asarray(-1)).trajectory(run)
+    return {name: Kept(rows[0], DIMENSIONS[name][1:]) for name, rows in rows_of(blank).items()}
 
 
 def _chunk(run: Simulation) -> int:
     """Saved intervals per chunk where the user gives none."""
-    num_micro = run.scheme.num_micro
-    size = 8 * numbers_per_node(run.state, num_micro if run.save_micro else 0)
-    seconds = MICRO_STEP_SECONDS * num_micro * run.save_every
-    return max(1, min(int(layout.rows_per_chunk(run.num_saves, seconds, size, CHUNKS_PER_RUN)), run.num_saves))
+    seconds = MICRO_STEP_SECONDS * run.scheme.num_micro * run.save_every
+    rows = layout.rows_per_chunk(run.num_saves, seconds, BYTES_PER_NUMBER * run.columns.width, CHUNKS_PER_RUN)
+    return max(1, min(int(rows), run.num_saves))
