@@ -12,13 +12,18 @@ AS_USERS := tests/benchmarks tests/pages
 # Timed, or printed on a page: compiled as users compile.
 TOOLS := tests/tools tests/ensembles/test_workers.py
 
-.PHONY: reproduce test test-quick test-tools smoke notebooks docs bench lint release lock clean
+.PHONY: reproduce test test-quick test-tenth test-tools smoke notebooks docs bench lint release lock clean
 
 reproduce: .venv/installed  ## the quick reference study: figures, tables and out/report.html
 	$(BIN)/python -m benchmarks gail2014 --quick --out out
 
+LIBRARY := $(addprefix --ignore=,tests/smoke $(TOOLS) $(AS_USERS))
+
 test: .venv/installed  ## the library; the same instructions, compiled without LLVM's optimisations: most of the time is compiling
-	$(PYTEST) --unoptimised $(addprefix --ignore=,tests/smoke $(TOOLS) $(AS_USERS)) $(OPTIONS)
+	$(PYTEST) --unoptimised $(LIBRARY) $(OPTIONS)
+
+test-tenth: .venv/installed  ## a tenth of these files, others every day, compiled as users compile
+	$(PYTEST) --tenth $(LIBRARY) $(OPTIONS)
 
 test-quick: .venv/installed  ## below a minute: refusals and structure, which compile nothing; tests/quick.py holds the list
 	$(BIN)/python -m pytest --quick --unoptimised tests $(OPTIONS)

@@ -10,7 +10,6 @@ import typer
 from benchmarks import (
     adjoints,
     against,
-    baseline,
     batch,
     chains,
     compilation,
@@ -58,7 +57,6 @@ MANY_CORES = ("gpu", "kills", "ensemble-kills")
 
 HELP = {
     "only": "Cases of these names, or whose names begin so; may be repeated.",
-    "shared": "Count processor time: other processes use the core too.",
     "peers": "Integrators, e.g. heyoka; may be repeated. Ours always runs.",
     "way": "Ways that begin so, e.g. joint; may be repeated.",
     "python": "Python of the other checkout; by default that in its .venv, else this one.",
@@ -132,16 +130,6 @@ def ensembles_command(
     prepare()
     for name in only or ensembles.PARTS:
         _measure(f"ensembles, {name}", ensembles.part(name), full, out)
-
-
-@app.command("baseline")
-def baseline_command(
-    commit: Annotated[str, typer.Argument(help="Of the code that was measured.")],
-    folder: Annotated[Path, typer.Option("--from", help="Folder with what the benchmarks wrote.")] = OUT,
-) -> None:
-    """Put all figures of one commit into benchmarks/baseline.json."""
-    baseline.write(folder, commit)
-    console.print(f"written to {baseline.FILE}")
 
 
 @app.command("all")

@@ -10,7 +10,7 @@ import numpy as np
 from benchmarks.measure import Tell, quartiles, ratio, silent
 from benchmarks.report import Claim, Report
 from benchmarks.seats import Outcome, Seat, Worker, first_results, take_turns
-from benchmarks.worker import PROCESSOR_TIME, Case
+from benchmarks.worker import Case
 
 COLUMNS = ("group", "case", "steps", "before, ms", "after, ms", "after/before", "quartiles", "differs", "result")
 BEFORE, AFTER = "before", "after"
@@ -108,8 +108,8 @@ class Size:
     seconds: float
 
 
-def sizes(name: str, before: Path, python: Path | None = None, only: Sequence[str] = (), shared: bool = False) -> Size:
-    """ "quick" or "full"; `only` some of `GROUPS`; `shared` counts processor time."""
+def sizes(name: str, before: Path, python: Path | None = None, only: Sequence[str] = ()) -> Size:
+    """ "quick" or "full"; `only` some of `GROUPS`."""
     if not (before / "vmri_jax").is_dir():
         raise ValueError(f"against: {before} has no folder vmri_jax; give a checkout of this repository.")
     if unknown := [group for group in only if group not in GROUPS]:
@@ -117,7 +117,7 @@ def sizes(name: str, before: Path, python: Path | None = None, only: Sequence[st
     groups = {group: entries for group, entries in GROUPS.items() if not only or group in only}
     own = before / ".venv" / "bin" / "python"
     python = python or (own if own.exists() else Seat().python)
-    new = Seat(options=(PROCESSOR_TIME,) if shared else ())
+    new = Seat()
     old = replace(new, checkout=before.absolute(), python=python.absolute())
     if name == "full":
         return Size(old, new, groups, 15, 3, 0.1)
@@ -128,7 +128,6 @@ def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
     """Compare all of it, a report after each case."""
     seats = {BEFORE: size.before, AFTER: size.after}
     about: dict = {side: {"commit": seat.commit, "checkout": str(seat.checkout)} for side, seat in seats.items()}
-    about["clock"] = "processor time, on a shared core" if PROCESSOR_TIME in size.after.options else "wall time"
     rows, claims = [], []
     notes = [", ".join(f"{side}: {about[side]['commit']}" for side in seats)]
     for group, entry, outcome in _outcomes(size, seats, tell):

@@ -1,6 +1,5 @@
 """Linear in the number of bodies: time of one step of hinged chains and stars, by directors (a band, the full matrix) and in joint coordinates."""
 
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
@@ -14,7 +13,7 @@ from benchmarks.measure import Ratio, Tell, silent
 from benchmarks.report import Claim, Report, growing
 from vmri_jax.mechanics import constraint_pattern
 from vmri_jax.running.engine import engine
-from vmri_jax.running.timing import seconds_per_call
+from vmri_jax.running.timing import seconds_per_call, stopwatch
 from vmri_jax.scene import Box, Gravity, JointSpring, Revolute, RigidBody, Scene
 
 Coordinates = Literal["joint", "directors"]
@@ -31,7 +30,6 @@ JOINT_FROM = 10
 """The same in joint coordinates."""
 LEVEL = [[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]]
 """The rotation that lays the long axis of a bar along x."""
-CLOCK = time.process_time
 """Seconds in which this process runs: others may share its core."""
 
 
@@ -101,16 +99,16 @@ def measure(shape: str, bodies: int, coordinates: Coordinates, few: int, repeats
     before, constraint_pattern.MOST_ROWS_OF_FULL_MATRIX = constraint_pattern.MOST_ROWS_OF_FULL_MATRIX, few
     engine.cache_clear()  # another limit is another program of the same scene
     try:
-        begin, seconds = CLOCK(), {}
+        elapsed, seconds = stopwatch(), {}
         scene = SHAPES[shape](bodies, coordinates)
         run = vm.prepare(
             scene, vm.fully_explicit(1), macro_dt=MACRO_DT, num_steps=1
         )  # compiled once, for any number of steps
         run()
-        first = CLOCK() - begin
+        first = elapsed()
         for steps in (SHORT, LONG):
             run(num_steps=steps)
-            seconds[steps] = min(seconds_per_call(partial(run, num_steps=steps), 1, CLOCK) for _ in range(repeats))
+            seconds[steps] = min(seconds_per_call(partial(run, num_steps=steps), 1) for _ in range(repeats))
     finally:
         constraint_pattern.MOST_ROWS_OF_FULL_MATRIX = before
         engine.cache_clear()

@@ -1,25 +1,117 @@
 """Cost of accuracy in the fast variables: time per micro step against num_micro, and against the dense solve."""
 
-import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
 
+import jax
+import numpy as np
 from matplotlib.figure import Figure
 
-from benchmarks import linear, paper
-from benchmarks.curves import TIME, Case, Curves, draw, measure
-from benchmarks.measure import silent
+from benchmarks import linear, programs
+from benchmarks.gail2014.cost import CostStudy, Curve, cost_study, plot_cost
+from benchmarks.gail2014.reference import unstructured
+from benchmarks.measure import Ratio, quartiles, ratio, silent
 from benchmarks.programs import SCHEMES
-from benchmarks.report import Claim, Report
+from benchmarks.report import Claim, Report, spread
 
+TIME = "µs/micro step"
 COLUMNS = ("case", "method", "num_micro", "unknowns", "micro_dt", TIME, "to cheapest", "iterations", "result")
+FPU_DT, RIGID_DT = 0.001, 0.0002
+"""Micro steps of chains, and of systems with constraints: a macro step of 100 of them still converges."""
 ALL = (1, 4, 8, 12, 20, 40, 60, 100)
+MACRO_STEPS, DENSE_MACRO_STEPS = 20, 3
+"""Macro steps with the most micro steps, of the default solve and of the dense one, which is slower: all runs of a method
+have the same length. With fewer steps the call counts."""
+LEAST_COMPARED = 10
+"""Fewest micro steps with which the default solve is held against the dense one."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """One system under one scheme, over the same simulated time for every num_micro.
+
+    dense_num_micro: where the dense solve runs too.
+    turn: the most that the largest num_micro may cost per micro step, over the cheapest.
+    dense: the least that the dense solve must cost over the default one, from `LEAST_COMPARED` micro steps on.
+    """
+
+    system: str
+    scheme: str
+    micro_dt: float
+    num_micro: tuple[int, ...]
+    dense_num_micro: tuple[int, ...] = ()
+    turn: float | None = None
+    dense: float | None = None
+
+    @property
+    def label(self) -> str:
+        """Name in tables and figures."""
+        return f"{self.system}, {self.scheme}"
+
+    def affordable(self, most_unknowns: int) -> "Case":
+        """The dense solve only where it has at most this number of unknowns."""
+        problem = programs.problem(self.system)
+        dense = tuple(n for n in self.dense_num_micro if programs.unknowns(problem, n) <= most_unknowns)
+        return replace(self, dense_num_micro=dense)
+
+    def measure(self, repeats: int, seconds: float, tell=silent) -> CostStudy:
+        """Time every program in turns, the dense solve over fewer macro steps."""
+        problem = whole = programs.problem(self.system)
+        if self.system.startswith("FPU") and self.scheme != "fully implicit":
+            whole = unstructured(problem)  # explicit schemes solve for the whole macro step too, as the paper did
+        t_end = MACRO_STEPS * max(self.num_micro) * self.micro_dt
+        curves = [Curve("auto", problem, self.num_micro, t_end)]
+        if self.dense_num_micro:
+            t_end = DENSE_MACRO_STEPS * max(self.dense_num_micro) * self.micro_dt
+            curves.append(Curve("dense", whole, self.dense_num_micro, t_end))
+        how = {"micro_dt": self.micro_dt, "repeats": repeats, "min_seconds": seconds}
+        study = cost_study(self.label, SCHEMES[self.scheme], curves, **how, progress=lambda what, *_: tell(what))
+        jax.clear_caches()  # hundreds of programs are more memory maps than a process may have
+        return study
+
+    def rows(self, study: CostStudy) -> list[dict]:
+        """Rows of a report."""
+        costs = {method: study.curve(label, method)[1] for label, method in study.curves}
+        cheapest = {method: np.min(cost, where=np.isfinite(cost), initial=np.inf) for method, cost in costs.items()}
+        return [
+            {
+                "case": row.label,
+                "method": row.method,
+                "num_micro": row.num_micro,
+                "unknowns": row.num_unknowns,
+                "micro_dt": self.micro_dt,
+                **spread(TIME, quartiles(row.samples)),
+                "to cheapest": row.us_per_micro_step / float(cheapest[row.method]),
+                "iterations": row.iterations,
+                "result": row.result,
+            }
+            for row in study.rows
+        ]
+
+    def claims(self, study: CostStudy) -> list[Claim]:
+        """The largest num_micro over the cheapest, if it ran, and the dense solve over the default one where they are closest."""
+        default, dense, claims = study.samples("auto"), study.samples("dense"), []
+        most = max(self.num_micro)
+        if most in default and len(self.num_micro) > 1:
+            what = f"{self.label}, h = {self.micro_dt:g}: num_micro {most} over the cheapest"
+            cheapest = min(default.values(), key=np.median)
+            claims.append(Claim(what, ratio(default[most], cheapest), at_most=self.turn))
+        ratios: Mapping[int, Ratio] = {
+            n: ratio(dense[n], default[n]) for n in dense if n in default and n >= LEAST_COMPARED
+        }
+        if ratios:
+            where = f"num_micro {min(ratios)}" + (f" to {max(ratios)}, least" if len(ratios) > 1 else "")
+            least = min(ratios.values(), key=lambda ratio: ratio.value)
+            claims.append(Claim(f"{self.label}, {where}: dense over default", least, at_least=self.dense))
+        return claims
+
+
 ONCE = (
-    Case("FPU l=3", "fully implicit", 0.001, (100,), (100,), dense=50.0),
-    Case("FPU l=50", "fully implicit", 0.001, (30,), (30,), dense=2000.0),
-    Case("SAM", "fully implicit", 0.0002, (50,), (50,), dense=100.0),
+    Case("FPU l=3", "fully implicit", FPU_DT, (100,), (100,), dense=50.0),
+    Case("FPU l=50", "fully implicit", FPU_DT, (30,), (30,), dense=2000.0),
+    Case("SAM", "fully implicit", RIGID_DT, (50,), (50,), dense=100.0),
 )
 """Single points at which the dense solve is held against the default one, however slow it is."""
 
@@ -28,123 +120,85 @@ ONCE = (
 class Size:
     """How much is run.
 
-    turning: cases in which cost must not turn up, by figure.
+    turning: cases in which cost must not turn up.
     once: single points against the dense solve.
-    paper: cases of the figures of the reference study.
     linear: cases run up to a large num_micro.
     most_unknowns: the dense solve is left out beyond.
     """
 
-    turning: dict[str, tuple[Case, ...]]
+    turning: tuple[Case, ...]
     once: tuple[Case, ...]
-    paper: dict[str, tuple[Case, ...]]
     linear: tuple[Case, ...]
     most_unknowns: int
     repeats: int
     seconds: float
 
 
-def _turning(num_micro, chains, dense_num_micro, fpu_dt: float, rigid_dt: float) -> tuple[Case, ...]:
+def _turning(num_micro, chains, dense_num_micro) -> tuple[Case, ...]:
     """Every system under every scheme."""
     systems = [*(f"FPU l={length}" for length in chains), "TSP", "SAM"]
     cases = []
     for system, scheme in product(systems, SCHEMES):
         chain = system.startswith("FPU")
-        case = Case(system, scheme, fpu_dt if chain else rigid_dt, num_micro, dense_num_micro, 1.8, 10.0)
-        if chain and scheme != "fully implicit":
-            case = replace(case, turn=1.05)
-        if chain and fpu_dt == paper.FPU_DT:
-            case = paper.at_paper_steps(case)
-        cases.append(case)
+        turn = 1.05 if chain and scheme != "fully implicit" else 1.8
+        dt = FPU_DT if chain else RIGID_DT
+        cases.append(Case(system, scheme, dt, num_micro, dense_num_micro, turn, 10.0))
     return tuple(cases)
+
+
+def _linear(num_micro: tuple[int, ...]) -> tuple[Case, ...]:
+    """One of each kind of step; micro steps so small that the largest macro step is still an ordinary one."""
+    pairs = (
+        ("FPU l=3", "fully implicit"),
+        ("FPU l=50", "explicit slow"),
+        ("TSP", "fully explicit"),
+        ("SAM", "fully implicit"),
+    )
+    return tuple(Case(*pair, 1e-5, num_micro) for pair in pairs)
 
 
 def sizes(name: str) -> Size:
     """ "quick" or "full"."""
     if name == "quick":
-        return Size(
-            turning={"cost": _turning((1, 20, 100), (10, 200), (20,), 0.001, 0.0002)},
-            once=ONCE,
-            paper=paper.cases((1, 4, 20, 60, 100), (1, 8, 20), {"fully implicit": (30,), "explicit slow": (30,)}),
-            linear=linear.cases((10, 200, 5000)),
-            most_unknowns=310,
-            repeats=5,
-            seconds=0.05,
-        )
-    chains = (10, 50, 100, 200)
-    return Size(
-        turning={
-            "cost": _turning(ALL, chains, ALL, 0.001, 0.0002),
-            "cost_paper_steps": _turning(ALL, chains, (), paper.FPU_DT, paper.SAM_DT),
-        },
-        once=ONCE,
-        paper=paper.cases(ALL, ALL, dict.fromkeys(SCHEMES, (10, 40, 70, 100, 150, 200))),
-        linear=linear.cases((10, 50, 100, 500, 1000, 2500, 5000)),
-        most_unknowns=700,
-        repeats=9,
-        seconds=0.1,
-    )
+        return Size(_turning((1, 20, 100), (10, 200), (20,)), ONCE, _linear((10, 200, 5000)), 310, 5, 0.05)
+    num_micro = (10, 50, 100, 500, 1000, 2500, 5000)
+    return Size(_turning(ALL, (10, 50, 100, 200), ALL), ONCE, _linear(num_micro), 700, 9, 0.1)
 
 
 def run(size: Size, name: str, tell=silent) -> Iterator[Report]:
     """Measure all of it, a report after each case."""
-    everything: list[Curves] = []
-    figures: dict[str, list[Curves]] = {}
-    rows, claims = [], []
+    rows, claims, turning = [], [], {}
+
+    def measured(case: Case, repeats: int) -> CostStudy:
+        study = case.measure(repeats, size.seconds, tell)
+        rows.extend(case.rows(study))
+        claims.extend(case.claims(study))
+        return study
 
     def report() -> Report:
-        drawn = {file: partial(_draw, file, part) for file, part in figures.items()}
-        return Report("cost", name, rows, claims, _notes(size, everything), drawn)
+        title = "Computing time does not turn up"
+        figures: dict[str, Callable[[], Figure]] = {}
+        if turning:
+            figures["cost"] = partial(plot_cost, dict(turning), title=title)
+        return Report("cost", name, rows, claims, _notes(size, rows), figures)
 
-    def add(curves: Curves) -> Curves:
-        everything.append(curves)
-        rows.extend(curves.rows)
-        claims.extend(_claims(curves))
-        return curves
-
-    for file, cases in {**size.turning, **size.paper}.items():
-        for case in cases:
-            curves = add(measure(case.affordable(size.most_unknowns), size.repeats, size.seconds, tell))
-            figures.setdefault(file, []).append(curves)
-            yield report()
+    for case in size.turning:
+        turning[case.label] = measured(case.affordable(size.most_unknowns), size.repeats)
+        yield report()
     for case in size.once:
-        add(measure(case, max(3, size.repeats // 2), size.seconds, tell))
+        measured(case, max(3, size.repeats // 2))
         yield report()
     for case in size.linear:
-        more_rows, more_claims = linear.measure(case, size.repeats, size.seconds, tell)
-        rows += more_rows
+        study = case.measure(size.repeats, size.seconds, tell)
+        bytes_of, more_claims = linear.slopes(case, study)
+        rows += [row | {"bytes": bytes_of.get(row["num_micro"])} for row in case.rows(study)]
         claims += more_claims
         yield report()
 
 
-def _draw(file: str, part: list[Curves]) -> Figure:
-    if file in paper.TITLES:
-        return draw(part, paper.TITLES[file], len({curves.case.system for curves in part}))
-    dt = " and ".join(f"{h:g}" for h in dict.fromkeys(curves.case.micro_dt for curves in part))
-    return draw(part, f"Computing time does not turn up (micro steps {dt})", len(SCHEMES))
-
-
-def _claims(curves: Curves) -> list[Claim]:
-    case, claims = curves.case, []
-    turn, dense = curves.turn(), curves.dense()
-    if turn is not None and len(case.num_micro) > 1:
-        what = f"{case.label}, h = {case.micro_dt:g}: num_micro {max(case.num_micro)} over the cheapest"
-        claims.append(Claim(what, turn, at_most=case.turn))
-    if dense is not None:
-        at = [n for n in case.dense_num_micro if n >= 10]
-        where = f"num_micro {min(at)}" + (f" to {max(at)}, least" if len(at) > 1 else "")
-        claims.append(Claim(f"{case.label}, {where}: dense over default", dense, at_least=case.dense))
-    return claims
-
-
-def _notes(size: Size, everything: list[Curves]) -> list[str]:
+def _notes(size: Size, rows: list[dict]) -> list[str]:
     notes = [f"The dense solve was left out beyond {size.most_unknowns} unknowns, the single points aside."]
-    missing = [
-        f"{row['case']}, num_micro {row['num_micro']} ({row['result']})"
-        for curves in everything
-        for row in curves.rows
-        if math.isnan(row[TIME])
-    ]
+    missing = [f"{r['case']}, num_micro {r['num_micro']} ({r['result']})" for r in rows if np.isnan(r[TIME])]
     if missing:
         notes.append(f"Runs that failed and were not timed: {'; '.join(missing)}.")
     return notes

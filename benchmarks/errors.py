@@ -127,7 +127,7 @@ def _of_estimate(case: Case) -> dict:
         step = {"macro_dt": case.t_end / case.num_steps / parts, "num_steps": case.num_steps * parts}
         return vm.simulate(problem, scheme, **step, save=case.num_steps * parts // NODES, **more)
 
-    run = simulated(scheme, error=True)
+    run = simulated(scheme, error="shares")
     reference = reference_solution(problem, case.t_end, num_saves=NODES)
     true = reference.errors(run)[0]
     row = {

@@ -2,11 +2,9 @@
 
 import os
 import platform
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
-from typing import Generic, TypeVar
 
 import jax
 import numpy as np
@@ -17,7 +15,6 @@ from vmri_jax.study.html import processor
 
 __all__ = [
     "Ratio",
-    "Size",
     "Tell",
     "interleaved",
     "machine",
@@ -28,30 +25,6 @@ __all__ = [
     "silent",
     "steps_for",
 ]
-
-
-Case = TypeVar("Case")
-
-
-@dataclass(frozen=True)
-class Size(Generic[Case]):
-    """The cases of a benchmark, and the clock of its times.
-
-    shared: other processes share the core, so that times are processor times, not wall times.
-    """
-
-    cases: list[Case]
-    shared: bool = False
-
-    @property
-    def clock(self) -> Callable[[], float]:
-        """The clock, in seconds."""
-        return time.process_time if self.shared else time.perf_counter
-
-    @property
-    def clock_name(self) -> str:
-        """The kind of times, for reports."""
-        return "processor time" if self.shared else "wall time"
 
 
 @dataclass(frozen=True)

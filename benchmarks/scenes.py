@@ -1,6 +1,5 @@
 """A scene against the system written by hand: time per micro step and instructions of the reference systems, in turns."""
 
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -58,7 +57,7 @@ def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
                 for key, problem in problems.items()
             }
             timed = {key: run.timed() for key, run in prepared.items()}
-            seconds = interleaved(timed, size.repeats, clock=time.process_time)
+            seconds = interleaved(timed, size.repeats)
             for key, run in prepared.items():
                 program, us = run.compiled(), quartiles(seconds[key], 1e6 / size.num_steps / size.num_micro)
                 row = {"system": system, "scheme": scheme, "program": key, "µs/micro step": us.value}

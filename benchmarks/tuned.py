@@ -11,12 +11,12 @@ import numpy as np
 import vmri_jax as vm
 from benchmarks import errors
 from benchmarks.dear.systems import molecules
-from benchmarks.measure import Size, Tell, ratio, silent
+from benchmarks.measure import Tell, ratio, silent
 from benchmarks.report import Claim, Report
 from vmri_jax.accuracy.companions import UncertifiedWarning
 from vmri_jax.accuracy.steps import AccuracyNotReached
 from vmri_jax.mechanics.state import problem_of
-from vmri_jax.running.timing import interleaved
+from vmri_jax.running.timing import interleaved, stopwatch
 from vmri_jax.study import families, reference_solution, tune
 from vmri_jax.study.tuning import NothingReached
 
@@ -55,13 +55,12 @@ class Case:
     menu: tuple[str, ...] | None = None
 
 
-def sizes(name: str, only: Sequence[str] = (), shared: bool = False) -> Size[Case]:
+def sizes(name: str, only: Sequence[str] = ()) -> list[Case]:
     """ "quick": two systems and four families of schemes; "full": eight systems and all families.
 
     Args:
         name: "quick" or "full".
         only: systems; none for all.
-        shared: count processor time.
     """
 
     def of(system: str) -> Callable[[], Any]:
@@ -80,22 +79,21 @@ def sizes(name: str, only: Sequence[str] = (), shared: bool = False) -> Size[Cas
     few = ("fully explicit", "fully explicit, suzuki4", "fully explicit, kahan-li6", "galerkin 4")
     menu = few if name == "quick" else None
     chosen = list(systems)[:2] if name == "quick" else list(systems)
-    cases = [
+    return [
         Case(system, systems[system][0], systems[system][1], error, menu)
         for system in chosen
         if not only or system in only
         for error in ERRORS
     ]
-    return Size(cases, shared)
 
 
-def run(size: Size[Case], name: str, tell: Tell = silent) -> Iterator[Report]:
+def run(cases: list[Case], name: str, tell: Tell = silent) -> Iterator[Report]:
     """A report after each case."""
     rows, notes = [], []
-    for case in size.cases:
+    for case in cases:
         tell(f"{case.system}, {case.error:g}")
         try:
-            rows.append(_row(case, size.clock))
+            rows.append(_row(case))
         except (NothingReached, ValueError) as refused:
             notes.append(f"{case.system}, {case.error:g}: {refused}")
         ratios = [row["ratio"] for row in rows]
@@ -108,31 +106,30 @@ def run(size: Size[Case], name: str, tell: Tell = silent) -> Iterator[Report]:
                     at_most=AT_MOST,
                 )
             )
-        about = {"clock": size.clock_name}
-        yield Report("tuned", name, list(rows), claims, list(notes), about=about)
+        yield Report("tuned", name, list(rows), claims, list(notes))
 
 
-def _row(case: Case, clock: Callable[[], float]) -> dict:
+def _row(case: Case) -> dict:
     """Both runs, timed in turn."""
     problem = problem_of("tuned", case.problem())
-    begun = clock()
+    elapsed = stopwatch()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UncertifiedWarning)
         warnings.simplefilter("ignore", AccuracyNotReached)
         settings = vm.simulate(problem, accuracy=case.error, t_end=case.t_end, save=vm.Save(number=NODES)).settings
-    seconds = clock() - begun
+    seconds = elapsed()
     reference = reference_solution(problem, case.t_end, num_saves=NODES)
     menu = None if case.menu is None else [f for f in families() if f.name in case.menu]
-    begun = clock()
-    best = tune(problem, case.error, case.t_end, menu=menu, num_saves=NODES, verify=False)
-    of_search = clock() - begun
+    elapsed = stopwatch()
+    best = tune(problem, case.error, case.t_end, menu=menu, num_saves=NODES)
+    of_search = elapsed()
     runs = [
         vm.prepare(problem, it.scheme, macro_dt=it.macro_dt, num_steps=it.num_steps, save=it.num_steps // NODES)
         for it in (settings, best)
     ]
     true, true_of_search = (reference.errors(run(throw=False))[0] for run in runs)
     timed = (run.timed() for run in runs)
-    samples = interleaved(dict(zip(("ours", "theirs"), timed, strict=True)), REPEATS, clock=clock)
+    samples = interleaved(dict(zip(("ours", "theirs"), timed, strict=True)), REPEATS)
     return {
         "system": case.system,
         "error": case.error,

@@ -28,9 +28,6 @@ import vmri_jax as vm
 SYSTEMS = {"FPU": "fermi_pasta_ulam", "TSP": "triple_spherical_pendulum", "SAM": "simple_atomic_model"}
 SCENES = {"satellite": "notebooks/scenes/rigid_satellite.py"}
 """Files of scenes, whose kinetic energy is a function of joint coordinates."""
-PROCESSOR_TIME = "--processor-time"
-"""The option that counts seconds in which this process runs, where others share its core."""
-CLOCK = time.process_time if PROCESSOR_TIME in sys.argv else time.perf_counter
 SPREAD = 0.01
 """Of the velocities in a batch."""
 COMPARED = 8
@@ -276,10 +273,11 @@ KINDS = {
 
 
 def _seconds(function, *arguments) -> float:
-    start = CLOCK()
+    clocks = time.perf_counter, time.process_time  # as `vmri_jax.running.timing.stopwatch`, which older sides lack
+    before = [clock() for clock in clocks]
     run = function(*arguments)
     jax.block_until_ready(getattr(run, "failed_at", run))  # the arrays of a run are ready together
-    return CLOCK() - start
+    return min(clock() - start for clock, start in zip(clocks, before, strict=True))
 
 
 def _steps_for(simulate, seconds: float, first: int = 1, factor: int = 4) -> int:
@@ -313,7 +311,6 @@ def use_plain(name: str) -> None:
 def main() -> None:
     """Answer until there are no more questions."""
     parser = argparse.ArgumentParser()
-    parser.add_argument(PROCESSOR_TIME, action="store_true", help="do not count seconds of other processes")
     parser.add_argument("--as-imported", action="store_true", help="leave the settings of JAX alone")
     parser.add_argument("--plain", action="append", default=[], help="a function of the kernels in its plain form")
     options = parser.parse_args()

@@ -3,23 +3,26 @@
 import os
 import signal
 import sys
+from datetime import date
 from pathlib import Path
+from zlib import crc32
 
 import psutil
 import pytest
 from hypothesis import settings
 
 from tests.compiling import forget_programs, trace_quickly, unoptimised
-from tests.durations import Durations
 
 settings.register_profile("repeatable", derandomize=True, deadline=None, database=None, max_examples=50)
 settings.load_profile("repeatable")
 
 MANY_MAPS = 20_000
 """Memory maps of a process from which on compiled programs are forgotten; Linux allows 65 530."""
-MUCH_MEMORY = 1.2e9
-"""Bytes of a process from which on compiled programs are forgotten after a file of tests. A larger value saves the compiling of the
-few programs that files share, and two workers need more than a small machine has."""
+MUCH_MEMORY = 1.1e9
+"""Bytes of a process from which on compiled programs are forgotten after a test. A larger value saves the compiling of the few programs
+that tests share; two workers with 1.5 GiB each fit into a small machine."""
+GROWTH = 2e8
+"""Fewest bytes that tests add between two times when programs are forgotten: else a process that stays large would forget after every test."""
 LONGEST = ("textbook", "verification", "steppers", "pages")
 """Folders whose files take longest come first, so that workers end together."""
 
@@ -29,7 +32,7 @@ def pytest_addoption(parser):
     parser.addoption(
         "--budget",
         action="store_true",
-        help="fail if a test or a file takes more processor time than tests/durations.py allows",
+        help="fail if a test or a file compiles more programs than tests/durations.py allows",
     )
     parser.addoption("--quick", action="store_true", help="refusals and structure, tests that compile nothing")
     parser.addoption(
@@ -37,6 +40,7 @@ def pytest_addoption(parser):
         action="store_true",
         help="programs are compiled without LLVM's optimisations, in about a third of the time",
     )
+    parser.addoption("--tenth", action="store_true", help="one tenth of the files, others every day")
     parser.addoption("--matrix", help="matrix of solvers wherever a test does not choose one; default auto")
     parser.addoption(
         "--kernels", choices=["plain", "cpu"], help="which small dense algebra; default: the package's own"
@@ -51,8 +55,8 @@ def pytest_configure(config):
                 "--kernels: vmri_jax is imported already; import it in fixtures of conftest.py only"
             )
         os.environ["VMRI_KERNELS"] = kernels  # read where the package is imported, also in processes of tests
-    programs = config.cache.mkdir("programs")
-    os.environ["XDG_CACHE_HOME"] = str(programs)  # processes of tests that call `vmri` or workers of ensembles
+    cache = config.cache.mkdir("programs")
+    os.environ["XDG_CACHE_HOME"] = str(cache)  # processes of tests that call `vmri` or workers of ensembles
     from vmri_jax.configure import SECONDS_WORTH_KEEPING, cache_folder, configure
 
     os.environ["JAX_COMPILATION_CACHE_DIR"] = str(cache_folder())  # all other processes of tests
@@ -61,15 +65,26 @@ def pytest_configure(config):
         unoptimised()
     configure(cache=cache_folder())
     trace_quickly()
-    config.pluginmanager.register(Durations(config.getoption("--budget")), "durations")
-    if config.getoption("--quick"):
-        from tests.quick import Quick  # imports JAX, which is configured by now
+    from tests.durations import Durations
+    from tests.programs import Programs  # they import JAX, which is configured by now
+    from tests.quick import Quick
 
-        config.pluginmanager.register(Quick(), "quick")
+    programs = Programs()
+    config.pluginmanager.register(programs, "programs")
+    config.pluginmanager.register(Durations(programs, config.getoption("--budget")), "durations")
+    if config.getoption("--quick"):
+        config.pluginmanager.register(Quick(programs), "quick")
     # Tests make functions of one piece of code again for each case, runs that lose their energy, and starts with random velocities.
     config.addinivalue_line("filterwarnings", "ignore::vmri_jax.CompiledAgainWarning")
     config.addinivalue_line("filterwarnings", "ignore::vmri_jax.LostEnergyWarning")
     config.addinivalue_line("filterwarnings", "ignore:.*project=True has replaced them")
+
+
+def pytest_ignore_collect(collection_path, config):
+    """With --tenth: files are in the tenth of a day by a checksum of the date and their names."""
+    if not config.getoption("--tenth") or not collection_path.name.startswith("test_"):
+        return None
+    return crc32(f"{date.today()} {collection_path.name}".encode()) % 10 > 0 or None
 
 
 def pytest_collection_modifyitems(config, items):
@@ -80,14 +95,21 @@ def pytest_collection_modifyitems(config, items):
                 item.add_marker(pytest.mark.skip(reason="takes long; run with --full"))
 
 
-@pytest.fixture(scope="module", autouse=True)
-def few_programs():
-    """Compiled programs go when they hold too many memory maps or too much memory; until then other modules share them."""
+@pytest.fixture(scope="session")
+def left():
+    """Bytes that were left when programs were forgotten last, in a list of one."""
+    return [0.0]
+
+
+@pytest.fixture(autouse=True)
+def few_programs(left):
+    """Compiled programs go when they hold too many memory maps or too much memory; until then tests share them."""
     yield
-    maps = Path("/proc/self/maps")
-    many_maps = maps.exists() and len(maps.read_text().splitlines()) > MANY_MAPS
-    if many_maps or psutil.Process().memory_info().rss > MUCH_MEMORY:
+    maps, process = Path("/proc/self/maps"), psutil.Process()
+    many_maps = maps.exists() and maps.read_bytes().count(b"\n") > MANY_MAPS
+    if many_maps or process.memory_info().rss > max(MUCH_MEMORY, left[0] + GROWTH):
         forget_programs()
+        left[0] = process.memory_info().rss
 
 
 @pytest.fixture(scope="session", autouse=True)

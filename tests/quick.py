@@ -1,14 +1,13 @@
 """`make test-quick`: refusals and structure, tests that compile no program.
 
-Operations of JAX that a test calls outside of `jax.jit`, such as ``jnp.ones``, are programs of one operation, which compile in
-milliseconds; they do not count. Any other program that a test compiles fails the run, so that the list stays true.
+A program that a test compiles, see `tests/programs.py`, fails the run, so that the list stays true.
 """
 
-from collections import defaultdict
 from pathlib import Path
 
-import jax
 import pytest
+
+from tests.programs import Programs
 
 FOLDER = Path(__file__).parent
 FILES = (
@@ -20,25 +19,13 @@ FILES = (
     *(f"schemes/test_{name}.py" for name in ("path", "plain_data", "quadrature", "scheme")),
 )
 """Files whose tests are run with --quick, but for tests with the mark `compiles`."""
-COMPILED = "/jax/core/compile/backend_compile_duration"
-"""The event of `jax.monitoring` for a compiled program."""
-OPERATIONS = {name for module in (jax.lax, jax.numpy, jax.numpy.linalg) for name in dir(module)}
-"""Names of programs of a single operation."""
 
 
 class Quick:
     """Collects the quick tests alone, and fails a run whose tests compile programs."""
 
-    def __init__(self):
-        self.programs: dict[str, list[str]] = defaultdict(list)
-        self.test = "import of a file"
-        jax.monitoring.register_event_duration_secs_listener(self.note)
-
-    def note(self, event: str, duration_secs: float, **about: str | int) -> None:
-        """Listen to `jax.monitoring`."""
-        name = str(about.get("fun_name", "")).removeprefix("jit_").removeprefix("jit(").removesuffix(")")
-        if event == COMPILED and name.replace("-", "_") not in OPERATIONS and not name.startswith("_"):
-            self.programs[self.test].append(name)
+    def __init__(self, programs: Programs):
+        self.programs = programs
 
     def pytest_ignore_collect(self, collection_path: Path):
         is_file = collection_path.name.startswith("test_")
@@ -49,15 +36,10 @@ class Quick:
         config.hook.pytest_deselected(items=compiling)
         items[:] = [item for item in items if item not in compiling]
 
-    @pytest.hookimpl(wrapper=True)
-    def pytest_runtest_protocol(self, item):
-        self.test = item.nodeid
-        return (yield)
-
     def pytest_sessionfinish(self, session, exitstatus):
-        if self.programs and exitstatus == pytest.ExitCode.OK:
+        if self.programs.names and exitstatus == pytest.ExitCode.OK:
             session.exitstatus = pytest.ExitCode.TESTS_FAILED
 
     def pytest_terminal_summary(self, terminalreporter):
-        for test, names in self.programs.items():
+        for test, names in self.programs.names.items():
             terminalreporter.write_line(f"COMPILES: {test}: {', '.join(names)}; give it the mark `compiles`")

@@ -1,6 +1,5 @@
 """Time to an error: single and micro steps of kicks, compositions, three rates, one interval of high degree, and other programs."""
 
-import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -15,12 +14,12 @@ from benchmarks.dear.figures import draw_errors, draw_gains
 from benchmarks.dear.peers import FIXED_STEPS, PEERS, chosen
 from benchmarks.dear.spacecraft import spacecraft
 from benchmarks.dear.systems import MIDDLE, molecules, teacher
-from benchmarks.measure import Ratio, Size, Tell, silent
+from benchmarks.measure import Ratio, Tell, silent
 from benchmarks.report import Claim, Report
 from benchmarks.savings import ratio_at
 from vmri_jax import plots
 from vmri_jax.running.simulation import Simulation
-from vmri_jax.running.timing import interleaved, seconds_each
+from vmri_jax.running.timing import interleaved, seconds_each, stopwatch
 from vmri_jax.study.reference_solution import joined
 
 COLUMNS = ("system", "scheme", "H", "error", "ms", "gain", "bound")
@@ -68,15 +67,14 @@ class Case:
     peers: bool = True
 
 
-def sizes(name: str, only: Sequence[str] = (), shared: bool = False) -> Size[Case]:
+def sizes(name: str, only: Sequence[str] = ()) -> list[Case]:
     """ "quick": 8 molecules, and the spacecraft in a field of degree 20; "full": 8 to 256 molecules, the teacher, and the spacecraft.
 
     Args:
         name: "quick" or "full".
         only: beginnings of titles; none for all.
-        shared: count processor time.
     """
-    return Size([case for case in _cases(name) if not only or case.title.startswith(tuple(only))], shared)
+    return [case for case in _cases(name) if not only or case.title.startswith(tuple(only))]
 
 
 def _cases(name: str) -> list[Case]:
@@ -123,15 +121,14 @@ class Gain:
     bound: float
 
 
-def run(size: Size[Case], name: str, tell: Tell = silent) -> Iterator[Report]:
+def run(cases: list[Case], name: str, tell: Tell = silent) -> Iterator[Report]:
     """A report after each system."""
-    clock = size.clock
     rows, claims, notes, curves, gains = [], [], [], {}, []
-    for case in size.cases:
+    for case in cases:
         problem = case.problem()
-        slow, fast = _prices(problem, clock)
+        slow, fast = _prices(problem)
         peers, missing = chosen(problem) if case.peers else ([], [])
-        of_case = measured(case, problem, peers, tell, clock)
+        of_case = measured(case, problem, peers, tell)
         rows += [
             _row(case, of_case, scheme, i, slow / fast) for scheme in of_case for i in range(len(of_case[scheme][0]))
         ]
@@ -148,7 +145,7 @@ def run(size: Size[Case], name: str, tell: Tell = silent) -> Iterator[Report]:
         for suffix, theme in (("", plots.LIGHT), ("_dark", plots.DARK)):
             figures[f"dear{suffix}"] = partial(draw_errors, dict(curves), list(gains), TARGET, theme)
             figures[f"dear_gain{suffix}"] = partial(draw_gains, list(gains), theme)
-        about = {"clock": size.clock_name, "gains": [vars(gain) for gain in gains]}
+        about = {"gains": [vars(gain) for gain in gains]}
         yield Report("dear", name, list(rows), list(claims), list(notes), figures, about)
 
 
@@ -199,9 +196,7 @@ def _gain(case: Case, to_target: dict[str, float], price: float) -> list[Gain]:
     return [Gain(case.title, price, best, ms[1] / ms[best], bound(best, price))]
 
 
-def measured(
-    case: Case, problem: vm.Problem, peers: Iterable[str], tell: Tell, clock: Callable[[], float] = time.perf_counter
-) -> dict[str, Curve]:
+def measured(case: Case, problem: vm.Problem, peers: Iterable[str], tell: Tell) -> dict[str, Curve]:
     """Numbers of macro steps, errors of the positions at the end and milliseconds, by scheme."""
     tell(f"{case.title}, fine steps")
     length = {"macro_dt": case.t_end / case.fine, "num_steps": case.fine, "save": case.fine}
@@ -215,9 +210,9 @@ def measured(
         errors[scheme] = {}
         for n, positions, timed in rungs:
             tell(f"{case.title}, {scheme}, {n}")
-            start = clock()
+            elapsed = stopwatch()
             error = float(np.abs(positions() - exact[-1]).max())
-            seconds = clock() - start
+            seconds = elapsed()
             if error <= case.errors[0]:
                 errors[scheme][n] = error
                 if seconds > LONG:
@@ -236,7 +231,7 @@ def measured(
         rungs = PEERS[peer](problem, case.t_end, fastest)
         climb(name, ((n, positions, positions) for n, positions in rungs), SLOWEST_PEER)
     tell(f"{case.title}, measuring times")
-    seconds = samples | interleaved(runs, case.repeats, clock=clock)
+    seconds = samples | interleaved(runs, case.repeats)
     return {
         scheme: (
             np.array(list(ladder)),
@@ -273,13 +268,13 @@ def _rungs(run: Simulation, first: int) -> Rungs:
         n = round(n * RATIO)
 
 
-def _prices(problem: vm.Problem, clock: Callable[[], float]) -> tuple[float, float]:
+def _prices(problem: vm.Problem) -> tuple[float, float]:
     """Seconds of a gradient of V and of W."""
     q = jnp.asarray(problem.q_f)
     slow, fast = (
         jax.grad(lambda q, name=name: problem.system.all_potentials(jnp.zeros(0), q)[name]) for name in ("slow", "fast")
     )
-    return seconds_each(slow, q, 100, clock), seconds_each(fast, q, 1000, clock)
+    return seconds_each(slow, q, 100), seconds_each(fast, q, 1000)
 
 
 def time_to(error: float, steps: np.ndarray, errors: np.ndarray, ms: np.ndarray) -> float:

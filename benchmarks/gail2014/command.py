@@ -32,7 +32,7 @@ def gail2014(
         raise BadInput(f"--out {out}: {error.strerror}; give a folder that can be written.") from error
     with progress_shown() as show:
         report = reproduce(out, size, only or [], show, _figure_done)
-    console.print(f"\nReport: [bold]{escape(str(report.path))}[/bold]", soft_wrap=True)
+    console.print("\n" + escape("\n".join(report.in_five_lines())), soft_wrap=True)
     if report.failed:
         reasons = "\n".join(f"{figure.name}: {figure.error}" for figure in report.failed)
         print_failure("Figures that failed", reasons)

@@ -1,7 +1,6 @@
 """Cost studies: computing time of a fixed simulated time against num_micro, at a constant micro step."""
 
 import math
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -12,15 +11,15 @@ from matplotlib.ticker import FixedLocator, NullLocator
 
 from benchmarks.gail2014.dense import named
 from vmri_jax import plots
-from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
+from vmri_jax.mechanics.state import Problem
 from vmri_jax.running.prepare import prepare
-from vmri_jax.running.progress import shows_progress
+from vmri_jax.running.progress import Progress, silent
 from vmri_jax.running.simulation import Simulation
-from vmri_jax.running.timing import interleaved
+from vmri_jax.running.timing import interleaved, stopwatch
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.results import Method, Result
-from vmri_jax.study.table import Column, ResultTable, interruptible
+from vmri_jax.study.table import Column, ResultTable
 
 
 @dataclass(frozen=True)
@@ -28,7 +27,7 @@ class CostRow:
     """One program: its size and its times.
 
     label: of the system or the scheme, as passed to `cost_study`.
-    method: name of the solver, see `benchmarks.gail2014.dense.named`.
+    method: name of the curve.
     num_unknowns: unknowns of one macro step, ``r n_s + r n_gs + num_micro r (n_f + n_g)``, r the degree.
     num_steps: macro steps of the timed run.
     seconds_per_unit: computing time per unit of simulated time; the figures of the reference paper up to a constant.
@@ -37,6 +36,7 @@ class CostRow:
     iterations: most Newton iterations of a step.
     solved_by: name of the `Method` that took the steps, which "auto" chooses, as in ``run.info.method``.
     result: name of the `Result` of the run.
+    samples: microseconds per micro step, in turns with all other programs of the study; not in files.
     """
 
     label: str
@@ -50,11 +50,12 @@ class CostRow:
     iterations: int
     solved_by: str
     result: str
+    samples: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
 class CostStudy(ResultTable):
-    """Rows of one or several cost studies; each row is a run of ``simulate(..., solver=named(row.method))``."""
+    """Rows of one or several cost studies."""
 
     columns = (
         Column("what", lambda row: row.label),
@@ -81,112 +82,101 @@ class CostStudy(ResultTable):
             raise ValueError(f"curve: no {(label, method)} in this study; it has {self.curves}.")
         return np.array([row.num_micro for row in rows]), np.array([row.us_per_micro_step for row in rows])
 
-    def plot(self, title: str = "", theme: plots.Theme = plots.LIGHT):
-        """Computing time against num_micro, the cheapest point of each curve circled, see `plot_cost`."""
-        return plot_cost({"": self}, title=title, theme=theme)
+    def samples(self, method: str) -> dict[int, tuple[float, ...]]:
+        """Samples of the runs of a method that were timed, by num_micro."""
+        rows = (row for row in self.rows if row.method == method and np.isfinite(row.us_per_micro_step))
+        return {row.num_micro: row.samples for row in rows}
+
+    def records(self) -> list[dict[str, Any]]:
+        return [{name: value for name, value in vars(row).items() if name != "samples"} for row in self.rows]
 
     def __add__(self, other: "CostStudy") -> "CostStudy":
         return CostStudy(self.rows + other.rows)
 
 
-@shows_progress
+@dataclass(frozen=True)
+class Curve:
+    """What one curve of a cost study runs.
+
+    method: of Newton's iteration: a matrix of `vmri_jax.Solver`, or "dense", the method of the reference paper.
+    problem: system and start.
+    num_micro: numbers of micro steps per macro step.
+    t_end: simulated time, rounded to whole macro steps: long enough (thousands of micro steps for small systems) that the start of a program
+        takes a negligible part of the time.
+    name: of the curve, by default the method.
+    """
+
+    method: str
+    problem: Problem
+    num_micro: Sequence[int]
+    t_end: float
+    name: str = ""
+
+
 def cost_study(
-    problem: Problem | HasProblem,
+    label: str,
     scheme: Callable[[int], Scheme],
-    num_micro: Sequence[int],
+    curves: Sequence[Curve],
     *,
     micro_dt: float,
-    t_end: float,
-    methods: Sequence[str] = ("auto", "dense"),
     repeats: int = 5,
     min_seconds: float = 0.1,
-    label: str = "",
-    progress: Any = False,
-    clock: Callable[[], float] = time.perf_counter,
+    progress: Progress = silent,
 ) -> CostStudy:
-    """Time ``scheme(n)`` for every n in `num_micro` with every method of Newton's iteration, over the same simulated time.
+    """Time ``scheme(n)`` for every num_micro n of every curve; times are per unit of simulated time and per micro step.
 
-    "auto" is the default of `simulate`, and "dense" is the method of the reference paper.
-
-    The number of macro steps is rounded if `t_end` is not a multiple of one; times are per unit of simulated time and
-    per micro step. A timed call starts one compiled program; choose `t_end` long enough (thousands of micro steps for
-    small systems) that the start takes a negligible part of it.
-
-    Times scatter if the linear algebra has several threads: set OPENBLAS_NUM_THREADS=1 before the first simulation.
-    Programs take turns in every repeat, so that a slow moment of the machine hits all of them; a row has the median.
+    All programs take turns in every repeat, so that a slow moment of the machine hits all of them; a row has the median.
 
     Args:
-        problem: system and start; a `Problem` or a scene.
-        scheme: the scheme for a num_micro, e.g. `vmri_jax.fully_implicit`.
-        num_micro: numbers of micro steps per macro step.
-        micro_dt: the constant micro step h.
-        t_end: simulated time of every timed run.
-        methods: the matrices of `vmri_jax.Solver`, and "dense".
-        repeats: timed runs of each program.
-        min_seconds: runs shorter than this are called several times and averaged.
         label: name of this scheme or system in the rows.
-        progress: True for a bar, or a function (what, done, total) that is told about every program before it is compiled, and once
-            before times are measured.
-        clock: `time.process_time` where other processes share the core.
-
-    Raises:
-        ValueError: an empty or bad argument.
-        Interrupted: Ctrl-C; carries the rows of the programs that were run, with NaN for times not measured yet.
+        scheme: the scheme for a num_micro, e.g. `vmri_jax.fully_implicit`.
+        curves: at least one.
+        micro_dt: the constant micro step h.
+        repeats: timed samples of each program.
+        min_seconds: seconds of a sample, the mean of several calls.
+        progress: told about every program before it is compiled, and once before times are measured.
     """
-    problem = problem_of("cost_study", problem)
-    if not num_micro or not methods or repeats < 1 or not (micro_dt > 0 and t_end > 0):
-        raise ValueError(
-            f"cost_study: num_micro = {list(num_micro)}, methods = {list(methods)}, repeats = {repeats}, "
-            f"micro_dt = {micro_dt}, t_end = {t_end}; give at least one of each, and positive times."
-        )
-    total = len(num_micro) * len(methods) + 1
-    runs: list[tuple[str, Simulation, float, Trajectory]] = []
-    seconds: dict[str, list[float]] = {}
-
-    def study() -> CostStudy:
-        return CostStudy(tuple(_row(label, *run, seconds.get(str(i), [np.nan])) for i, run in enumerate(runs)))
-
-    with interruptible(study):
-        for method in methods:
-            solver = named(method)
-            for n in num_micro:
-                progress(f"{label} {method}, {n} micro steps: compiling".strip(), len(runs), total)
-                num_steps = max(1, round(t_end / (n * micro_dt)))
-                start = time.perf_counter()
-                length = {"macro_dt": n * micro_dt, "num_steps": num_steps, "save": num_steps}
-                program = prepare(problem, scheme(n), **length, solver=solver)
-                first_call_seconds = time.perf_counter() - start
-                runs.append((method, program, first_call_seconds, program(throw=False)))
-        progress(f"{label} measuring times".strip(), total - 1, total)
-        calls = {str(i): program.timed() for i, (_, program, _, run) in enumerate(runs) if run.success}
-        seconds = interleaved(calls, repeats, min_seconds, clock=clock)
-    progress("done", total, total)
-    return study()
+    points = [(curve, n) for curve in curves for n in curve.num_micro]
+    runs: list[tuple[Curve, Simulation, float, Trajectory]] = []
+    for curve, n in points:
+        name = curve.name or curve.method
+        progress(f"{label} {name}, {n} micro steps: compiling".strip(), len(runs), len(points) + 1)
+        num_steps, elapsed = max(1, round(curve.t_end / (n * micro_dt))), stopwatch()
+        length = {"macro_dt": n * micro_dt, "num_steps": num_steps, "save": num_steps}
+        program = prepare(curve.problem, scheme(n), **length, solver=named(curve.method))
+        runs.append((curve, program, elapsed(), program(throw=False)))
+    progress(f"{label} measuring times".strip(), len(points), len(points) + 1)
+    calls = {str(i): program.timed() for i, (_, program, _, run) in enumerate(runs) if run.success}
+    seconds = interleaved(calls, repeats, min_seconds)
+    progress("done", 1, 1)
+    return CostStudy(tuple(_row(label, *run, seconds.get(str(i), [np.nan])) for i, run in enumerate(runs)))
 
 
 def _row(
     label: str,
-    method: str,
+    curve: Curve,
     program: Simulation,
     first_call_seconds: float,
     trajectory: Trajectory,
     seconds: Sequence[float],
 ) -> CostRow:
-    """The row of a run with the median of its samples of seconds."""
-    scheme, state, median = program.scheme, program.state, float(np.median(seconds))
+    """The row of a run with its samples of seconds."""
+    scheme, state = program.scheme, program.state
     n_g, n_gs = program.system.num_constraints(state.q_s, state.q_f)
+    micro_steps = program.num_steps * scheme.num_micro
     return CostRow(
         label=label,
-        method=method,
+        method=curve.name or curve.method,
         num_micro=scheme.num_micro,
         num_unknowns=scheme.degree * (state.q_s.size + n_gs + scheme.num_micro * (state.q_f.size + n_g)),
         num_steps=program.num_steps,
-        seconds_per_unit=median / (program.num_steps * float(program.macro_dt)),
-        us_per_micro_step=1e6 * median / (program.num_steps * scheme.num_micro),
+        seconds_per_unit=float(np.median(seconds)) / (program.num_steps * float(program.macro_dt)),
+        us_per_micro_step=1e6 * float(np.median(seconds)) / micro_steps,
         first_call_seconds=first_call_seconds,
         iterations=int(np.max(trajectory.info.iterations)),
         solved_by=Method(int(np.max(trajectory.info.method))).name,
         result=Result(int(trajectory.result)).name,
+        samples=tuple(1e6 * s / micro_steps for s in seconds),
     )
 
 

@@ -1,16 +1,17 @@
 """Kinds of figures of a study: what is run, what is expected, and how it is judged and drawn."""
 
-import time
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import reduce
 from operator import add
 
+import jax
 import numpy as np
 from matplotlib.figure import Figure
 
 import vmri_jax as vm
-from benchmarks.gail2014.cost import CostStudy, cost_study, plot_cost
+from benchmarks.gail2014.cost import CostStudy, Curve, cost_study, plot_cost
 from vmri_jax import plots
 from vmri_jax.running.progress import Progress, part
 from vmri_jax.study import ConvergenceStudy, convergence_study, reference_solution
@@ -24,15 +25,28 @@ SETTLED = 10
 """From about so many micro steps on, the structured solve should cost the same per micro step."""
 
 
+@contextmanager
+def compiled_quickly() -> Iterator[None]:
+    """Within this context programs are compiled without most optimisations, in half the time: for errors, not for times."""
+    before = jax.config.read("jax_disable_most_optimizations")
+    jax.config.update("jax_disable_most_optimizations", True)
+    try:
+        yield
+    finally:
+        jax.config.update("jax_disable_most_optimizations", before)
+
+
 @dataclass(frozen=True)
 class Check:
-    """One number held against what the source, e.g. "paper" or "theory", expects of it."""
+    """One number held against what the source, e.g. "paper" or "theory", expects of it; its kind is "order", "turn" or "minimum" of the dense
+    solve, or "structured"."""
 
     quantity: str
     expected: str
     source: str
     seen: str
     agrees: bool
+    kind: str = "order"
 
 
 @dataclass(frozen=True)
@@ -70,9 +84,11 @@ class ConvergenceFigure:
         problem = self.problem()
         if self.problem not in references:
             progress("reference solution", 0, 1)
-            references[self.problem] = reference_solution(problem, self.t_end)
+            with compiled_quickly():
+                references[self.problem] = reference_solution(problem, self.t_end)
         how = {"reference": references[self.problem], "progress": progress}
-        study = convergence_study(problem, self.schemes, self.macro_dt, self.t_end, **how)
+        with compiled_quickly():
+            study = convergence_study(problem, self.schemes, self.macro_dt, self.t_end, **how)
         orders = sorted(set(self.orders.values()))
         return Findings(
             seen=self._seen(study),
@@ -107,6 +123,7 @@ class CostPanel:
     paper_minimum: the num_micro that was cheapest in the paper, None if it does not say.
     others: further matrices of `vmri_jax.Solver`, on the structured problem.
     minimal: makes the problem in coordinates without constraints, by "exact"; None where it has none to lose.
+    method: matrix of the structured solver.
     """
 
     title: str
@@ -122,35 +139,18 @@ class CostPanel:
     repeats: int
     others: tuple[str, ...] = ()
     minimal: Callable[[], vm.Problem] | None = None
+    method: str = "exact"
 
     def measure(self, progress: Progress) -> CostStudy:
-        """Time all solvers."""
-        runs = [(method, self.structured, self.num_micro, self.t_end) for method in ("exact", *self.others)]
+        """Time all solvers in turns."""
+        structured = self.structured()
+        curves = [Curve(method, structured, self.num_micro, self.t_end) for method in (self.method, *self.others)]
         if self.dense_num_micro:
-            runs.insert(0, ("dense", self.dense, self.dense_num_micro, self.dense_t_end))
+            curves.insert(0, Curve("dense", self.dense(), self.dense_num_micro, self.dense_t_end))
         if self.minimal is not None:
-            runs.append((MINIMAL, self.minimal, self.num_micro, self.t_end))
-        studies = [
-            cost_study(
-                problem(),
-                self.scheme,
-                num_micro,
-                micro_dt=self.micro_dt,
-                t_end=t_end,
-                methods=("exact" if solver == MINIMAL else solver,),
-                repeats=self.repeats,
-                label=self.title,
-                progress=part(progress, i, len(runs)),
-                clock=time.process_time,  # other processes may share the core
-            )
-            for i, (solver, problem, num_micro, t_end) in enumerate(runs)
-        ]
-        return reduce(add, [_called(study, run[0]) for study, run in zip(studies, runs, strict=True)])
-
-
-def _called(study: CostStudy, solver: str) -> CostStudy:
-    """The study with its rows under this name of a solver."""
-    return CostStudy(tuple(replace(row, method=solver) for row in study.rows))
+            curves.append(Curve("exact", self.minimal(), self.num_micro, self.t_end, MINIMAL))
+        how = {"micro_dt": self.micro_dt, "repeats": self.repeats, "progress": progress}
+        return cost_study(self.title, self.scheme, curves, **how)
 
 
 @dataclass(frozen=True)
@@ -201,14 +201,17 @@ def _cost_checks(panel: CostPanel, study: CostStudy) -> list[Check]:
     if panel.dense_num_micro:
         best, _, last, ratio = _summary(study, panel.title, "dense")
         seen = f"{ratio:.1f} × its minimum at {last}"
-        checks.append(Check(f"{panel.title}, dense: cost turns up again", "yes", "paper", seen, bool(ratio > UPTURN)))
+        checks.append(
+            Check(f"{panel.title}, dense: cost turns up again", "yes", "paper", seen, bool(ratio > UPTURN), "turn")
+        )
         if panel.paper_minimum is not None:
             quantity = f"{panel.title}, dense: cheapest number of micro steps"
             agrees = panel.paper_minimum / 2 <= best <= 2 * panel.paper_minimum
-            checks.append(Check(quantity, f"{panel.paper_minimum}", "paper", f"{best}", agrees))
+            checks.append(Check(quantity, f"{panel.paper_minimum}", "paper", f"{best}", agrees, "minimum"))
     num_micro, cost = study.curve(panel.title, "exact")
     settled = int(np.argmin(np.abs(num_micro - SETTLED)))
     ratio = cost[-1] / cost[settled]
     quantity = f"{panel.title}, exact: cost at {num_micro[-1]} micro steps over that at {num_micro[settled]}"
-    checks.append(Check(quantity, f"at most {UPTURN:g}", "theory", f"{ratio:.2f}", bool(ratio <= UPTURN)))
+    agrees = bool(ratio <= UPTURN)
+    checks.append(Check(quantity, f"at most {UPTURN:g}", "theory", f"{ratio:.2f}", agrees, "structured"))
     return checks

@@ -47,6 +47,8 @@ class Size:
     fpu_steps, tsp_steps: macro steps of the convergence figures.
     fpu_num_micro, sam_num_micro: micro steps per macro step in Fig. 4.
     chain_lengths, chain_num_micro: l by scheme, and micro steps per macro step, in Fig. 5.
+    least_structured: fewest micro steps of the structured solve; its cost is compared from `SETTLED` on.
+    others: solvers beside the dense and the structured one in Fig. 4.
     largest_dense: most unknowns for which the dense solve is run.
     degree_num_micro: micro steps per macro step in the figures of degree 2 and 3.
     """
@@ -57,6 +59,8 @@ class Size:
     sam_num_micro: tuple[int, ...]
     chain_lengths: Mapping[str, tuple[int, ...]]
     chain_num_micro: tuple[int, ...]
+    least_structured: int
+    others: tuple[str, ...]
     largest_dense: int
     repeats: int
     degree_num_micro: tuple[int, ...]
@@ -66,12 +70,14 @@ SIZES = {
     "quick": Size(
         fpu_steps=PAPER_STEPS[:-1],
         tsp_steps=PAPER_STEPS[1:-2],
-        fpu_num_micro=(1, 10, 40, 100),
+        fpu_num_micro=(1, 10, 60, 100),
         sam_num_micro=(1, 10, 40),
-        chain_lengths={"fully implicit": (10, 30), "explicit slow": (30,), "fully explicit": (30,)},
+        chain_lengths=dict.fromkeys(SCHEMES, (30,)),
         chain_num_micro=(1, 8, 20),
+        least_structured=8,
+        others=(),
         largest_dense=1000,
-        repeats=3,
+        repeats=5,
         degree_num_micro=(5,),
     ),
     "full": Size(
@@ -81,6 +87,8 @@ SIZES = {
         sam_num_micro=(1, 4, 8, 12, 16, 20, 24, 32, 40, 60, 80, 100),
         chain_lengths=dict.fromkeys(SCHEMES, (10, 40, 70, 100, 150, 200)),
         chain_num_micro=(1, 4, 8, 12, 16, 20, 40, 60, 100),
+        least_structured=1,
+        others=("null_space",),
         largest_dense=2500,
         repeats=5,
         degree_num_micro=(5, 10),
@@ -99,9 +107,10 @@ def reference_figures(size: str = "quick") -> tuple[ConvergenceFigure | CostFigu
 def _cost_figures(size: Size) -> tuple[CostFigure, ...]:
     chain, atoms = systems.fermi_pasta_ulam, systems.simple_atomic_model
     n, m = size.fpu_num_micro, size.sam_num_micro
+    of_chain, of_atoms = (tuple(k for k in counts if k >= size.least_structured) for counts in (n, m))
     small = (
-        CostPanel("FPU, l = 3", chain, chain, vm.fully_implicit, 60, n, n, 0.01, 20.0, 20.0, size.repeats),
-        CostPanel("SAM", atoms, atoms, vm.fully_implicit, 20, m, m, 0.001, 0.2, 1.0, size.repeats, ("null_space",)),
+        CostPanel("FPU, l = 3", chain, chain, vm.fully_implicit, 60, n, of_chain, 0.01, 20.0, 20.0, size.repeats),
+        CostPanel("SAM", atoms, atoms, vm.fully_implicit, 20, m, of_atoms, 0.001, 0.2, 1.0, size.repeats, size.others),
     )
     pendulum = systems.triple_spherical_pendulum
     constrained = tuple(
@@ -146,7 +155,7 @@ def _chain_panel(size: Size, scheme: str, num_springs: int) -> CostPanel:
         scheme=SCHEMES[scheme],
         paper_minimum=paper_minimum(scheme, num_springs),
         dense_num_micro=feasible,
-        num_micro=size.chain_num_micro,
+        num_micro=tuple(n for n in size.chain_num_micro if n >= size.least_structured),
         micro_dt=0.01,
         dense_t_end=0.5,
         t_end=10.0 if scheme == "fully explicit" else min(10.0, max(0.5, 4000 / num_springs**2)),  # solves cost l^3

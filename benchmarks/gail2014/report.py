@@ -2,12 +2,13 @@
 
 import time
 import traceback
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from benchmarks.gail2014.figures import Check, ConvergenceFigure, CostFigure
+from benchmarks.gail2014.figures import SETTLED, Check, ConvergenceFigure, CostFigure
 from benchmarks.gail2014.reference import reference_figures
 from vmri_jax import plots
 from vmri_jax.running.progress import Progress, part, silent
@@ -43,6 +44,26 @@ class Report:
     def failed(self) -> list[FigureResult]:
         """Figures that could not be made."""
         return [figure for figure in self.figures if figure.error]
+
+    @property
+    def checks(self) -> list[Check]:
+        """The checks of all figures."""
+        return [check for figure in self.figures for check in figure.checks]
+
+    def in_five_lines(self) -> list[str]:
+        """The orders, the dense solve, the structured solve, the differences, and the path of the page."""
+        agreeing = Counter(check.kind for check in self.checks if check.agrees)
+        of = {kind: f"{agreeing[kind]} of {n}" for kind, n in Counter(check.kind for check in self.checks).items()}
+        seen = {kind: [check.seen for check in self.checks if check.kind == kind] for kind in of}
+        differing = [check.quantity for check in self.checks if not check.agrees]
+        return [
+            f"Orders: {of.get('order', 'none')} as expected, of positions and of momenta.",
+            f"Dense solve: {of.get('turn', 'no')} curves of cost turn up again; {of.get('minimum', 'no')} minima are near the paper's.",
+            "Structured solve: with the most micro steps a micro step costs "
+            f"{max(map(float, seen.get('structured', ['nan'])))} times as much as with about {SETTLED}, or less.",
+            f"Different from what was expected: {'; '.join(differing) or 'nothing'}.",
+            f"Page: {self.path}",
+        ]
 
 
 def reproduce(
@@ -101,6 +122,6 @@ def _run_figure(figure, out: Path, references: dict, progress: Progress) -> Figu
 
 
 def _write_html(path: Path, results: list[FigureResult], size: str, seconds: float) -> None:
-    agreeing = [check.agrees for figure in results for check in figure.checks]
+    agreeing = [check.agrees for check in Report(path, tuple(results)).checks]
     about = {"agreeing": sum(agreeing), "num_checks": len(agreeing), "size": size, "minutes": seconds / 60}
     write_page(path, TEMPLATE, figures=results, **about)

@@ -1,6 +1,5 @@
 """Explicit limit, large and tiny steps, mass ratios, very many micro steps."""
 
-import time
 from functools import partial
 
 import numpy as np
@@ -147,7 +146,7 @@ def many_micro_steps(full: bool) -> Outcome:
 
     steps = {n: (20 if full else 5) * micro[-1] // n for n in micro}  # as many micro steps for each
     runs = {f"{n}": partial(end, n, steps[n]) for n in micro}
-    seconds = interleaved(runs, 40 if full else 20, min_seconds=0.0, clock=time.process_time)
+    seconds = interleaved(runs, 40 if full else 20, min_seconds=0.0)
     best = {n: min(seconds[f"{n}"]) / steps[n] for n in micro}
     slope = np.polyfit(np.log(micro), np.log(list(best.values())), 1)[0]
     apart = difference(end(micro[0], 3), end(micro[0], 3, dense()))

@@ -1,6 +1,5 @@
 """Mechanisms by directors, in joint coordinates and by other integrators: the time to reach an error."""
 
-import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -22,7 +21,6 @@ LEVELS = (1e-3, 1e-5)
 FINEST = 1e-8
 """The smallest error asked for in full runs."""
 COLUMNS = ("mechanism", "level", "way", "setting", "step, s", "error", "µs per s", "quartiles", "to best", "first, s")
-CLOCK = time.process_time
 """Seconds in which this process runs: others may share its core."""
 OURS = ("joint", "directors", "functions")
 """How the names of this toolkit's ways begin."""
@@ -106,7 +104,7 @@ def scanned(mechanism: Mechanism, title: str, size: Size, notes: list[str], tell
             _note(notes, f"{title}: {way.partition(' ')[0]} was left out: {error}.")
         else:
             judge = Judged(other if way.startswith(("scipy", "diffrax")) else end, mechanism.size, centres)
-            found[way] = scan(way, [ladder], judge, size.seconds, size.levels, CLOCK)
+            found[way] = scan(way, [ladder], judge, size.seconds, size.levels)
     return found
 
 
@@ -121,7 +119,7 @@ def timed(mechanism: Mechanism, title: str, found: dict[str, list[Point]], size:
     rows = []
     for level in size.levels:
         best = {way: some[0] for way, points in found.items() if (some := candidates(points, level))}
-        seconds = interleaved({way: point.run for way, point in best.items()}, size.repeats, clock=CLOCK)
+        seconds = interleaved({way: point.run for way, point in best.items()}, size.repeats)
         least = min((float(np.median(samples)) for samples in seconds.values()), default=np.nan)
         for way, points in found.items():
             row: dict = {"mechanism": title, "level": level, "way": way}

@@ -1,6 +1,5 @@
 """One run of every setting: its error and a rough time, so that only those that count are timed with care."""
 
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
@@ -9,6 +8,7 @@ import jax
 import numpy as np
 
 from benchmarks.peers.cases import LEVELS, Ladder
+from vmri_jax.running.timing import seconds_per_call, stopwatch
 
 FINE = 0.1
 """A ladder ends at the first error below so many times the finest level."""
@@ -55,7 +55,6 @@ def scan(
     case: Judged,
     seconds: float,
     levels: Sequence[float] = LEVELS,
-    clock: Callable[[], float] = time.perf_counter,
 ) -> list[Point]:
     """Climb every ladder until it is fine enough, a run takes longer than `seconds`, or another ladder was faster.
 
@@ -63,7 +62,7 @@ def scan(
     """
     climbed: list[Climb] = []
     for ladder in ladders:
-        climb = Climb(peer, ladder, case, clock)
+        climb = Climb(peer, ladder, case)
         enough = min((p.seconds for c in climbed for p in c.points() if p.settled <= min(levels)), default=np.inf)
         for setting in ladder.settings:
             rung = climb.add(setting)
@@ -81,14 +80,14 @@ def scan(
 class Climb:
     """The settings of a ladder that were run, from coarse to fine."""
 
-    def __init__(self, peer: str, ladder: Ladder, case: Judged, clock: Callable[[], float] = time.perf_counter):
-        self.peer, self.ladder, self.case, self.clock = peer, ladder, case, clock
+    def __init__(self, peer: str, ladder: Ladder, case: Judged):
+        self.peer, self.ladder, self.case = peer, ladder, case
         self.rungs: dict[float, Point] = {}
 
     def add(self, setting) -> Point:
         """Run one more."""
         compiled = next((p.compile for p in self.rungs.values()), None)
-        self.rungs[setting] = _try(self.peer, self.ladder, setting, self.case, compiled, self.clock)
+        self.rungs[setting] = _try(self.peer, self.ladder, setting, self.case, compiled)
         return self.rungs[setting]
 
     @property
@@ -134,30 +133,28 @@ def front(points: Sequence[Point]) -> list[Point]:
     return kept
 
 
-def _try(peer: str, ladder: Ladder, setting, case: Judged, compiled: float | None, clock: Callable[[], float]) -> Point:
+def _try(peer: str, ladder: Ladder, setting, case: Judged, compiled: float | None) -> Point:
     """One setting; `compiled` is what compiling took before, None if this is the first call."""
-    start = clock()
+    elapsed = stopwatch()
     run = ladder.build(setting)
-    built = clock()
+    built, elapsed = elapsed(), stopwatch()
     try:
         q = jax.block_until_ready(run())
     except (RuntimeError, ArithmeticError):  # an integrator that gives up, where others return NaN
         q = np.full(case.q_end.shape, np.nan)
-    first = clock() - built
+    first = elapsed()
     error = case.error(q)
     seconds = 0.0
     if np.isfinite(error):
-        seconds = _rough(run, None if compiled is None else first, clock)
+        seconds = _rough(run, None if compiled is None else first)
     if compiled is None:
         compiled = max(0.0, first - seconds)
-    return Point(peer, ladder.label(setting), error, error, seconds, built - start, compiled, run)
+    return Point(peer, ladder.label(setting), error, error, seconds, built, compiled, run)
 
 
-def _rough(run: Callable[[], Any], first: float | None, clock: Callable[[], float]) -> float:
+def _rough(run: Callable[[], Any], first: float | None) -> float:
     """Seconds of the fastest of up to five calls; the first one counts if nothing was compiled in it."""
     taken = [] if first is None else [first]
     while not taken or (len(taken) < 5 and sum(taken) < ENOUGH):
-        start = clock()
-        jax.block_until_ready(run())
-        taken.append(clock() - start)
+        taken.append(seconds_per_call(run, 1))
     return min(taken)

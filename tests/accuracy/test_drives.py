@@ -102,10 +102,7 @@ def test_twenty_drives(drive, accuracy):
 
 def test_steps_over_a_pulse_are_not_certified():
     problem = oscillator(GAUSS, 3.3, 1e-3, 400.0)
-    with pytest.warns(
-        UncertifiedWarning,
-        match=r"from t = 3\.298 on no error is certified: force of the system.*take macro_dt = 0\.00059",
-    ):
+    with pytest.warns(UncertifiedWarning, match=r"from t = 3\.298 on no error is certified: force of the system.*take"):
         run = vm.simulate(problem, vm.fully_explicit(1), macro_dt=0.1, t_end=LENGTH, error=True)
     assert (
         2.0 <= float(run.error.certified_until) <= 3.2
@@ -117,9 +114,7 @@ def test_steps_over_a_pulse_are_not_certified():
 
 def test_events_demand_many_steps(monkeypatch):
     monkeypatch.setattr("vmri_jax.accuracy.steps.MANY_STEPS", 100)
-    with pytest.warns(
-        UserWarning, match="force of the system changes and changes back within 0.03, so that the run takes at least"
-    ):
+    with pytest.warns(UserWarning, match="force of the system changes and changes back within 0.03"):
         vm.simulate(oscillator(RECTANGLE, 7.123, 0.03, 20.0), vm.fully_explicit(1), accuracy=1e-1, t_end=LENGTH)
 
 

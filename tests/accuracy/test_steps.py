@@ -11,7 +11,7 @@ import pytest
 import vmri_jax as vm
 from tests.accuracy.test_run_error import double_pendulum
 from tests.small_systems import SYSTEMS, no_constraint
-from vmri_jax.accuracy import search, steps
+from vmri_jax.accuracy import search
 from vmri_jax.accuracy.families import of_order_2
 from vmri_jax.schemes.composition import stage_scheme
 from vmri_jax.stability import linear_model
@@ -27,13 +27,17 @@ def reference_of(name: str):
     return reference_solution(SYSTEMS[name], LENGTH, num_saves=NUM_SAVES)
 
 
-@pytest.mark.parametrize("accuracy", [1e-2, 1e-4, 1e-7])
+QUICK = ("no_constraint", 1e-4), ("slow_alone", 1e-2), ("slow_alone", 1e-7)
+"""What runs always: with and without micro steps, errors of every size."""
+KINDS = ("no_constraint", "slow_alone", "constraint", "damped", "kinetic_function")
+
+
 @pytest.mark.parametrize(
-    "name",
+    ("name", "accuracy"),
     [
-        "no_constraint",
-        "slow_alone",
-        *(pytest.param(n, marks=pytest.mark.full) for n in ("constraint", "damped", "kinetic_function")),
+        pytest.param(name, accuracy, marks=() if (name, accuracy) in QUICK else pytest.mark.full)
+        for name in KINDS
+        for accuracy in (1e-2, 1e-4, 1e-7)
     ],
 )
 def test_true_error_is_below_the_accuracy(name, accuracy):
@@ -47,7 +51,7 @@ def test_true_error_is_below_the_accuracy(name, accuracy):
 
 def test_a_scheme_of_ones_own_keeps_its_rules():
     told = []
-    how = {"accuracy": 1e-4, "t_end": LENGTH, "error": True}
+    how = {"accuracy": 1e-4, "t_end": LENGTH, "error": "shares"}
     bar = vm.Save(progress=lambda *call: told.append(call))
     run = vm.simulate(SYSTEMS["no_constraint"], vm.fully_explicit(2), save=bar, **how)
     assert told[0] == ("trial of own, 2 micro, 16 macro steps", 0, 5)
@@ -95,7 +99,7 @@ def test_number_of_saved_nodes():
 def test_steps_beside_resonances():
     """A slow kick once in half a turn of the fast oscillator is resonant; a few percent more steps are not."""
     problem, length, family = linear_model(omega=50.0, kappa=25.0), 20.0, of_order_2(vm.explicit_slow)
-    trials = steps.search_of(problem, None, None, length)
+    trials = search.Search(problem, None, None, length)
     trial = trials.trial(family, 40, 2048)
     resonant = round(length / 0.0625)  # within the window from 0.06223 to 0.06286 of `vmri_jax.stability.advise`
     beside = trials.beside_resonances(trial, resonant)
@@ -169,6 +173,6 @@ def test_wrong_types(arguments, message):
 def test_chaotic_motion_misses_the_accuracy(monkeypatch):
     monkeypatch.setattr(search, "MOST_TRIAL_SECONDS", 0.0)
     monkeypatch.setattr(search, "FEWEST_STEPS", 1024)
-    with pytest.warns(steps.AccuracyNotReached, match="no error is certified"), pytest.warns(match="chaotic"):
+    with pytest.warns(vm.AccuracyNotReached, match="no error is certified"), pytest.warns(match="chaotic"):
         run = vm.simulate(double_pendulum(), vm.galerkin(1, 3), accuracy=1e-3, t_end=40.0)
     assert run.error.largest == np.inf

@@ -19,7 +19,7 @@ from vmri_jax.study.reference_solution import joined
 def test_two_molecules(monkeypatch):
     monkeypatch.setattr(compare, "TARGET", 1e-4)
     case = compare.Case("2 molecules", partial(systems.molecules, 2), (1, 4), every=2, degree=2, errors=(1e-2, 1e-5))
-    *_, report = dear.run(compare.Size([case], shared=True), "quick")
+    *_, report = dear.run([case], "quick")
     schemes = {row["scheme"] for row in report.rows}
     ours = {"kicks, N = 1", "kicks, N = 4", "suzuki4, N = 1", "suzuki4, N = 4", "one interval, degree 2"}
     assert {*ours, "three rates, N = 4 and 2"} <= schemes
@@ -35,9 +35,9 @@ def test_two_molecules(monkeypatch):
 
 def test_sizes():
     quick, full = dear.sizes("quick"), dear.sizes("full", ("256", "network"))
-    assert len(quick.cases) == 2
-    assert [case.title for case in full.cases] == ["network", "256 molecules"]
-    for case in dear.sizes("full").cases:
+    assert len(quick) == 2
+    assert [case.title for case in full] == ["network", "256 molecules"]
+    for case in dear.sizes("full"):
         assert not case.every or max(case.num_micro) % case.every == 0
 
 

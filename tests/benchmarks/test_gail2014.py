@@ -196,7 +196,7 @@ def test_the_command_one_figure(gail2014, tmp_path, monkeypatch):
     code, text = gail2014("--only", "fig6", "--out", "study")
     assert code == 0
     assert "fig6 4 of 4" in text
-    assert "Report: study/report.html" in text
+    assert "Page: study/report.html" in text
     assert {path.name for path in (tmp_path / "study").iterdir()} == {
         "report.html",
         "fig6.csv",

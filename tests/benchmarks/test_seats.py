@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import pytest
 
 import vmri_jax as vm
-from benchmarks import against, baseline, seats, tricks, worker
+from benchmarks import against, seats, tricks, worker
 from benchmarks.measure import Ratio
 from benchmarks.seats import Seat, Worker, take_turns
 from benchmarks.worker import Case
@@ -28,7 +28,7 @@ def test_schemes_in_words():
 
 @pytest.fixture(scope="module")
 def workers():
-    with Worker(Seat()) as one, Worker(Seat(options=(worker.PROCESSOR_TIME,))) as other:
+    with Worker(Seat()) as one, Worker(Seat()) as other:
         yield {"one": one, "other": other}
 
 
@@ -116,10 +116,3 @@ def test_a_trick_stays_if_it_buys_enough_somewhere():
     assert (row["FPU l=3"], row["FPU l=3, batch"], row["TSP"]) == (1.5, 1.1, None)
     assert (row["most"], row["keep"]) == (1.5, "yes")
     assert tricks._row("solve", {chain: Ratio(1.5, 1.2, 1.6)})["keep"] == "no"
-
-
-def test_baseline():
-    found = baseline._rounded({"rows": [{"us": 1.23456789, "what": "one"}]})
-    assert found == {"rows": [{"us": 1.2346, "what": "one"}]}
-    with pytest.raises(ValueError, match="has no floor, batch"):
-        baseline.assemble(Path("nowhere"), "b597b06")

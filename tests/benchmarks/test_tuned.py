@@ -9,7 +9,7 @@ from benchmarks.dear.systems import molecules
 
 def test_a_row_and_a_refusal():
     case = tuned.Case("2 molecules", partial(molecules, 2), 0.1, 1e-2, ("fully explicit",))
-    *_, report = tuned.run(tuned.Size([case, replace(case, error=1e-20)], shared=True), "quick")
+    *_, report = tuned.run([case, replace(case, error=1e-20)], "quick")
     (row,) = report.rows
     assert set(row) == set(tuned.COLUMNS)
     assert max(row["its error"], row["error there"]) <= row["error"]
@@ -19,6 +19,6 @@ def test_a_row_and_a_refusal():
 
 
 def test_sizes():
-    assert {case.system for case in tuned.sizes("quick").cases} < {case.system for case in tuned.sizes("full").cases}
-    assert len(tuned.sizes("full").cases) == 16
-    assert {case.system for case in tuned.sizes("full", ("TSP",)).cases} == {"TSP"}
+    assert {case.system for case in tuned.sizes("quick")} < {case.system for case in tuned.sizes("full")}
+    assert len(tuned.sizes("full")) == 16
+    assert {case.system for case in tuned.sizes("full", ("TSP",))} == {"TSP"}

@@ -87,10 +87,7 @@ def test_unique_rows():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (
-            lambda: Table({"a": [1.0, 2.0], "b": [1.0]}),
-            r"their lengths are: a 2, b 1\. For all combinations of values take",
-        ),
+        (lambda: Table({"a": [1.0, 2.0], "b": [1.0]}), r"their lengths are: a 2, b 1\. For all combinations of values"),
         (lambda: Table({"a": 1.0}), r"a a single value"),
         (lambda: Table({}), r"no columns"),
         (lambda: Product({"a": []}), r"the axis 'a' has values of shape \(0,\)"),

@@ -84,9 +84,7 @@ def test_one_vector_is_no_force_on_several_elements():
             """None: `Drive` would check its history."""
 
     bodies = [Body("a", 1.0, [0.0, 0.0]), Body("b", 1.0, [1.0, 0.0])]
-    with pytest.raises(
-        ValueError, match=r"function returns \(shape \(2,\)\); .* a force for each body, of shapes \(2, 2\)"
-    ):
+    with pytest.raises(ValueError, match=r"function returns \(shape \(2,\)\); .* a force for each body"):
         Scene(bodies, [Uniform(["a", "b"], np.sin, {"force": np.array([0.0, 1.0])})]).system()
 
 

@@ -96,9 +96,7 @@ def test_velocities_against_a_constraint_are_said_or_refused():
         start(0.5)  # 0.5 / sqrt(1.25)
     with pytest.warns(UserWarning, match=r"differ by 0.10%"):
         assert np.allclose(start(1e-3).p_f, [0.0, 1.0], atol=1e-15)
-    with pytest.warns(
-        UserWarning, match=r"differ by 89.44% .* project=True has replaced them; for a scene, with_rates"
-    ):
+    with pytest.warns(UserWarning, match=r"differ by 89.44% .* project=True has replaced them; for a scene"):
         assert np.allclose(start(2.0, project=True).p_f, [0.0, 1.0], atol=1e-14)
     for quiet in (start(1e-8), start(0.5, project=True)):
         assert np.allclose(quiet.p_f, [0.0, 1.0], atol=1e-15)
@@ -207,10 +205,7 @@ def test_more_constraints_than_variables_are_refused():
 def test_redundant_constraints_are_refused():
     system = bent_system().replace(constraint=the_same_twice, slow_constraint=None)
     q_s, q_f = jnp.array([1.0, 0.0, 0.0]), jnp.array([0.0, 1.0, 0.0])
-    with pytest.raises(
-        ValueError,
-        match=r"rows \[0, 1\] of constraint depend on each other: 2 rows have rank 1 in the fast variables.*Remove",
-    ):
+    with pytest.raises(ValueError, match=r"rows \[0, 1\] of constraint depend on each other: 2 rows have rank 1 in"):
         initial_state(system, q_s, q_f, q_s, q_f)
 
 
@@ -270,7 +265,7 @@ def test_an_equal_start_is_made_once(monkeypatch):
     """Its checks take longer than a short run; another number makes another start."""
     problem, equal = triple_spherical_pendulum(), triple_spherical_pendulum()
     state = problem.state()
-    monkeypatch.setattr("vmri_jax.mechanics.state._consistent", None)
+    monkeypatch.setattr("vmri_jax.mechanics.state.consistent_momenta", None)
     assert equal.state() == state
     with pytest.raises(TypeError, match="not callable"):
         replace(problem, v_s=2 * np.asarray(problem.v_s)).state()

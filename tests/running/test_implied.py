@@ -69,9 +69,7 @@ def test_what_cannot_be_implied_is_refused():
     alone = System(mass, implied=on_a_line)
     with pytest.raises(ValueError, match="implied is given, but neither constraint nor slow_constraint"):
         vm.initial_state(alone, [], [0.0, 0.0], [], [0.0, 1.0])
-    with pytest.raises(
-        ValueError, match=r"implied does not follow from the constraints: .* row\(s\) \[0\] .* are \[0.5\]"
-    ):
+    with pytest.raises(ValueError, match=r"implied does not follow from the constraints: .* row\(s\) \[0\] .* are"):
         Problem(falling(0.5).system, [], [0.0, 1.0]).state()
     scalar = System(mass, constraint=on_a_line, implied=lambda q_s, q_f, params: q_f[0])
     with pytest.raises(ValueError, match=r"System: implied returns shape \(\); it must return a vector"):

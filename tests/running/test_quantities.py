@@ -69,12 +69,10 @@ def test_the_tension_of_a_pendulum(swing, micro):
 
 
 def test_micro_nodes_must_be_there():
-    for num_micro in (2, 10):
-        scheme = vm.fully_implicit(num_micro)
-        few = vm.simulate(pendulum(), scheme, macro_dt=0.05, num_steps=8, save=vm.Save(2, micro=True))
-        with pytest.raises(ValueError, match="some macro steps only; simulate with save"):
-            few.multipliers(micro=True)
-    jumping = vm.compose(vm.fully_implicit(2), "suzuki4")
+    few = vm.simulate(pendulum(), vm.fully_explicit(2), macro_dt=0.05, num_steps=8, save=vm.Save(2, micro=True))
+    with pytest.raises(ValueError, match="some macro steps only; simulate with save"):
+        few.multipliers(micro=True)
+    jumping = vm.compose(vm.fully_explicit(2), "suzuki4")
     back = vm.simulate(pendulum(), jumping, macro_dt=0.05, num_steps=4, save=vm.Save(micro=True))
     with pytest.raises(ValueError, match=r"the stages of its composition go back in time"):
         back.multipliers(micro=True)
@@ -341,9 +339,7 @@ def test_kinds_of_runs_on_disk_that_are_mixed_up(swing, tmp_path):
 
 
 def test_a_scene_where_a_system_is_needed(hanging):
-    with pytest.raises(
-        TypeError, match=r"Problem: system is Scene; give a vmri_jax.System; of a scene its .system\(\)"
-    ):
+    with pytest.raises(TypeError, match=r"Problem: system is Scene; give a vmri_jax.System"):
         vm.Problem(hanging, [], [], [], [])
     with pytest.raises(TypeError, match=r"macro_step: system is Scene"):
         vm.macro_step(hanging, vm.fully_implicit(1), hanging.state(), 0.1)

@@ -64,9 +64,7 @@ def test_a_loaded_run_is_resumed(tsp, trajectory, tmp_path):
 
 
 def test_missing_file(tmp_path):
-    with pytest.raises(
-        FileNotFoundError, match=r"nowhere.npz does not exist; give the .npz file of a saved trajectory"
-    ):
+    with pytest.raises(FileNotFoundError, match=r"nowhere.npz does not exist; give the .npz file of a saved"):
         Trajectory.load(tmp_path / "nowhere.npz")
 
 

@@ -15,18 +15,19 @@ from vmri_jax.scene import JointSpring, Revolute, RigidBody, Scene
 EXPLICIT, MIDPOINT = vm.fully_explicit(1), vm.fully_implicit(1)
 
 
-# --- causes ----------------------------------------------------------------------------------------------------------
-def stiff(q_f, params):
-    return params["k"] * q_f[0] ** 2 / 2
+# --- causes: systems of one structure, so that a road compiles one program for all causes of a structure -------------
+def potential(q_f, params):
+    """A spring, and a logarithm that is no number for negative q, though its force is: it acts on a point that passes q = 0."""
+    beyond = jnp.log(jnp.where(params["pole"] > 0.0, q_f[0], 1.0))
+    return params["k"] * q_f[0] ** 2 / 2 + 1e-9 * params["pole"] * beyond
+
+
+def push(t, q_s, q_f, v_s, v_f, params):
+    return jnp.zeros(0), params["push"] * jnp.cos(3.0 * t) * jnp.ones(1)
 
 
 def kinetic(q_s, q_f, v_s, v_f, params):
     return jnp.sum(v_f**2) / 2
-
-
-def beyond_its_pole(q_f, params):
-    """No number for negative q, though its force is: it acts on a point that passes q = 0."""
-    return 1e-9 * params["k"] * jnp.log(q_f[0])
 
 
 def line(q_s, q_f, params):
@@ -45,23 +46,26 @@ def weight(q_f, params):
     return -9.81 * params["k"] * jnp.cos(q_f[0])
 
 
-def push(t, q_s, q_f, v_s, v_f, params):
-    return jnp.zeros(0), jnp.cos(3.0 * t) * jnp.ones(1)
-
-
-def problem(masses, potential, q, v, k=1.0, **terms) -> vm.Problem:
-    return vm.Problem(vm.System(masses, None, potential, params={"k": np.array(k)}, **terms), [], q, [], v)
+def problem(masses, W, q, v, k=1.0, **terms) -> vm.Problem:
+    params = {"k": np.array(k)} | {name: np.array(terms.pop(name, 0.0)) for name in ("pole", "push")}
+    return vm.Problem(vm.System(masses, None, W, params=params, **terms), [], q, [], v)
 
 
 def of_masses(*masses):
     return vm.ConstantMass([], masses)
 
 
+def one(masses, q, v, **params) -> vm.Problem:
+    return problem(masses, potential, [q], [v], **params)
+
+
+STIFF = {"q": 0.1, "v": 0.0, "k": 1e4}
+PASSES_ZERO = {"q": 0.105, "v": -1.0, "k": 1.0, "pole": 1.0}
+DRIVEN: dict[str, Any] = {"q": 0.0, "v": 0.0, "k": 9.0, "push": 1.0, "force": push}
 CAUSES = {  # problem, scheme, macro step, steps, outcome
-    "lost energy": (problem(of_masses(1.0), stiff, [0.1], [0.0], 1e4), EXPLICIT, 0.0205, 40, vm.LostEnergyWarning),
-    "lost energy, T(q, v)": (problem(kinetic, stiff, [0.1], [0.0], 1e4), EXPLICIT, 0.0205, 40, vm.LostEnergyWarning),
-    "NaN": (problem(of_masses(1.0), beyond_its_pole, [0.105], [-1.0]), EXPLICIT, 0.01, 40, vm.Result.NON_FINITE),
-    "NaN, T(q, v)": (problem(kinetic, beyond_its_pole, [0.105], [-1.0]), EXPLICIT, 0.01, 40, vm.Result.NON_FINITE),
+    "lost energy": (one(of_masses(1.0), **STIFF), EXPLICIT, 0.0205, 40, vm.LostEnergyWarning),
+    "NaN": (one(of_masses(1.0), **PASSES_ZERO), EXPLICIT, 0.01, 40, vm.Result.NON_FINITE),
+    "driven": (one(of_masses(1.0), **DRIVEN), EXPLICIT, 0.05, 400, None),
     "off constraints": (
         problem(of_masses(1.0, 1.0), None, [0.0, 0.0], [0.0, 1.0], constraint=line, implied=tilted_line),
         EXPLICIT,
@@ -71,8 +75,9 @@ CAUSES = {  # problem, scheme, macro step, steps, outcome
     ),
     # constant masses have no poles
     "pole": (problem(in_angles, weight, [1.0, 0.0], [0.0, 0.001]), MIDPOINT, 0.002, 400, vm.SingularCoordinatesWarning),
-    "driven": (problem(of_masses(1.0), stiff, [0.0], [0.0], 9.0, force=push), EXPLICIT, 0.05, 400, None),
-    "driven, T(q, v)": (problem(kinetic, stiff, [0.0], [0.0], 9.0, force=push), EXPLICIT, 0.05, 400, None),
+    "lost energy, T(q, v)": (one(kinetic, **STIFF), EXPLICIT, 0.0205, 40, vm.LostEnergyWarning),
+    "NaN, T(q, v)": (one(kinetic, **PASSES_ZERO), EXPLICIT, 0.01, 40, vm.Result.NON_FINITE),
+    "driven, T(q, v)": (one(kinetic, **DRIVEN), EXPLICIT, 0.05, 400, None),
 }
 
 
@@ -96,13 +101,15 @@ def by_batch(moving, scheme, steps, out):
 
 def by_lanes_with_parameters(moving, scheme, steps, out):
     states = jax.tree.map(lambda a: jnp.stack([a] * 2), moving.state())
-    params = {"k": np.repeat(moving.system.params["k"], 2)}
+    params = {name: np.repeat(value, 2) for name, value in moving.system.params.items()}
     return vm.simulate_batch(moving, scheme, states, params=params, warn=False, **steps).result[1]
 
 
 def by_ensemble(moving, scheme, steps, out):
     design = {"k": float(moving.system.params["k"]) * np.array([0.999, 1.0])}
-    vary = lambda problem, row: replace(problem, system=problem.system.with_params({"k": row["k"]}))  # noqa: E731
+    vary = lambda problem, row: replace(  # noqa: E731
+        problem, system=problem.system.with_params(problem.system.params | {"k": row["k"]})
+    )
     vm.ensemble(moving, scheme, design, vary=vary, out=out, num_saves=steps["num_steps"], **steps)
     return int(vm.open_ensemble(out)["result"].values.ravel()[1])
 
@@ -118,9 +125,12 @@ def by_trace(moving, scheme, steps, out):
 ROADS = (by_simulate, by_prepare, by_stream, by_batch, by_lanes_with_parameters, by_ensemble, by_trace)
 
 
-@pytest.mark.parametrize("cause", CAUSES)
-@pytest.mark.parametrize("road", ROADS, ids=lambda road: road.__name__)
+@pytest.mark.parametrize(
+    ("road", "cause"),
+    [(road, cause) for road in ROADS for cause in CAUSES if road is by_simulate or "T(q, v)" not in cause],
+)
 def test_every_road_says_it(road, cause, tmp_path):
+    """Observables of a run do not ask how its steps were taken: one road suffices for a kinetic energy that is a function."""
     moving, scheme, macro_dt, num_steps, expected = CAUSES[cause]
     with warnings.catch_warnings(record=True) as given:
         warnings.simplefilter("always")
@@ -138,12 +148,11 @@ def test_every_road_says_it(road, cause, tmp_path):
         assert "the coordinates are singular near t = 0.53" in str(given[0].message)
 
 
-@pytest.mark.parametrize("coordinates", ["joint", "directors"])
-def test_scenes_say_it(coordinates):
-    """A stiff hinge beyond stability; for all other causes scenes are systems. Imports are scenes. By directors more steps do not converge."""
+def test_scenes_say_it():
+    """A stiff hinge beyond stability; for all other causes scenes are systems."""
     body = RigidBody("b", 1.0, [1.0, 1.0, 1.0], [0, 0, 0], spin=[0, 0, 0.1])
     hinge = Revolute(("ground", "b"), at=[0, 0, 0], axis=[0, 0, 1.0], name="h")
-    scene = Scene([body], [hinge, JointSpring("h", 1e4)], coordinates=coordinates)
+    scene = Scene([body], [hinge, JointSpring("h", 1e4)], coordinates="joint")
     with pytest.warns(vm.LostEnergyWarning, match="the computed motion is wrong"):
         vm.simulate(scene, EXPLICIT, macro_dt=0.0205, num_steps=10)
 
@@ -156,7 +165,7 @@ def pumped(t, q_s, q_f, v_s, v_f, params):
 @pytest.mark.parametrize(
     ("moving", "scheme", "macro_dt", "t_end", "said"),
     [
-        (problem(of_masses(1.0), stiff, [1.0], [0.0], force=pumped), EXPLICIT, 0.3, 24.0, "Take smaller steps"),
+        (problem(of_masses(1.0), potential, [1.0], [0.0], force=pumped), EXPLICIT, 0.3, 24.0, "Take smaller steps"),
         (CAUSES["pole"][0], MIDPOINT, 0.002, 2.0, "the coordinates are singular near t = 0.53"),
     ],
 )

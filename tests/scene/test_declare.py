@@ -55,19 +55,11 @@ def test_one_class_is_enough():
     ("bodies", "effect", "message"),
     [
         (POINTERS, TorsionSpring("a", -1.0), "torsion_springs: stiffness is -1.0; it must be positive"),
-        (
-            POINTERS,
-            TorsionSpring("a", [1.0, 2.0]),
-            r"stiffness has shape \(2,\); give one number, or one for each of the 1",
-        ),
+        (POINTERS, TorsionSpring("a", [1.0, 2.0]), r"stiffness has shape \(2,\); give one number"),
         (POINTERS, TorsionSpring("c", 1.0), "there is no body 'c'"),
         (POINTERS, TorsionSpring("a", 1.0, np.inf), "torsion_springs: angle is inf, which is not finite"),
         ([Body("a", 1.0, np.ones(3))], TorsionSpring("a", 1.0), "a has 3 coordinates; .* points of dimension 2"),
-        (
-            POINTERS,
-            TorsionSpring([], 1.0),
-            r"torsion_springs: bodies is \[\]; give the name of a body, or a list of such",
-        ),
+        (POINTERS, TorsionSpring([], 1.0), r"torsion_springs: bodies is \[\]; give the name of a body"),
     ],
 )
 def test_declarations_are_checked(bodies, effect, message):
@@ -118,9 +110,7 @@ def test_kinds_of_fields():
     assert params["wind"]["direction"].shape == (2,)
     with pytest.raises(ValueError, match=r"everything: radius is -1.0; it must be at least zero"):
         Scene(bodies, [Everything(radius=-1.0)])
-    with pytest.raises(
-        ValueError, match=r"everything: line has shape \(3,\); its bodies have dimension 2, give \(2,\)"
-    ):
+    with pytest.raises(ValueError, match=r"everything: line has shape \(3,\); its bodies have dimension 2"):
         Scene(bodies, [Everything(line=np.ones(3))])
     with pytest.raises(ValueError, match=r"wind: direction has shape \(3,\), a has dimension 2; they must agree"):
         Scene(bodies, [Wind(direction=np.ones(3))])

@@ -130,9 +130,7 @@ def test_a_run_that_loses_its_energy_is_told_about():
     )
     run = vm.simulate(scene, vm.fully_explicit(1), macro_dt=0.05, num_steps=200)
     assert run.success
-    with pytest.warns(
-        vm.LostEnergyWarning, match=r"the energy, which the system keeps, has changed by .*stability.advise"
-    ):
+    with pytest.warns(vm.LostEnergyWarning, match=r"the energy, which the system keeps"):
         vm.simulate(scene, vm.fully_explicit(1), macro_dt=0.201, num_steps=200)
 
 

@@ -99,9 +99,7 @@ def in_a_box(places, size=100.0):
 )
 def test_rows_that_follow_along_the_motion_are_dropped(parts, dropped):
     assert len(Scene(*parts, redundant="drop").dropped) == dropped
-    with pytest.raises(
-        ValueError, match=r'over-constrained at the start: .* or let the scene choose, redundant="drop"'
-    ):
+    with pytest.raises(ValueError, match=r"over-constrained at the start: .* or let the scene choose"):
         Scene(*parts)
 
 
@@ -122,9 +120,7 @@ def test_rows_in_time_follow_in_time():
 def test_rows_that_contradict_others_are_not_dropped():
     bodies, _ = molecule(SQUARE)
     again = RigidLink(("a", "b"), length=1.01, name="again")
-    with pytest.raises(
-        ValueError, match=r"(\S+ a-b) contradicts the other constraints.* \1 by .*e-0[23]. Correct its numbers"
-    ):
+    with pytest.raises(ValueError, match=r"(\S+ a-b) contradicts the other constraints.* \1 by .*e-0[23]"):
         Scene(bodies, [RigidLink(("a", "b")), again], redundant="drop", project=True)
 
 

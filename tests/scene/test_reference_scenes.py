@@ -1,4 +1,4 @@
-"""The reference systems as scenes: the trajectories of the hand-written ones, bit for bit."""
+"""The reference systems as scenes: functions and, bit for bit, trajectories of the hand-written ones."""
 
 import dataclasses
 from concurrent.futures import ProcessPoolExecutor
@@ -15,8 +15,10 @@ from vmri_jax.mechanics import arrays
 
 NAMES = ("fermi_pasta_ulam", "triple_spherical_pendulum", "simple_atomic_model")
 FPU, TSP, SAM = NAMES
-CASES = [(FPU, "fully_explicit"), (TSP, "fully_implicit"), (SAM, "fully_explicit")]
+CASES = [(FPU, "fully_explicit")]
 MORE = [
+    (TSP, "fully_implicit"),
+    (SAM, "fully_explicit"),
     (SAM, "fully_implicit"),
     (FPU, "fully_implicit"),
     (TSP, "explicit_slow"),
@@ -46,7 +48,7 @@ def test_trajectories_are_equal(name, scheme, monkeypatch):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_structure_is_that_of_the_system(name):
+def test_functions_are_those_of_the_system(name):
     scene, problem = gallery_scene(name), getattr(systems, name)()
     system, hand = scene.system(), problem.system
     for field in dataclasses.fields(system):
@@ -55,6 +57,22 @@ def test_structure_is_that_of_the_system(name):
     assert system.fast_potential is not None
     assert all(map(np.array_equal, jax.tree.leaves(system.kinetic), jax.tree.leaves(hand.kinetic)))
     assert system.num_constraints(problem.q_s, problem.q_f) == hand.num_constraints(problem.q_s, problem.q_f)
-    assert float(system.fast_potential(problem.q_f, system.params)) == pytest.approx(
-        float(hand.fast_potential(problem.q_f, hand.params)), abs=1e-20
-    )
+    random = np.random.default_rng(0)
+    q_s, q_f = (q + 0.1 * random.normal(size=q.shape) for q in (problem.q_s, problem.q_f))
+    ours, theirs = (forces_and_rows(each, q_s, q_f) for each in (system, hand))
+    for mine, expected in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
+        np.testing.assert_allclose(mine, expected, rtol=1e-13, atol=1e-14 * np.abs(expected).max(initial=0.0))
+
+
+@jax.jit
+def forces_and_rows(system, q_s, q_f):
+    """Gradients of all potentials, values and Jacobian of all rows: a step needs nothing else of a system."""
+
+    def potential(q_s, q_f):
+        return sum(system.all_potentials(q_s, q_f).values())
+
+    def rows(q_s, q_f):
+        return system.constraints(0.0, q_s, q_f)
+
+    arguments = q_s, q_f
+    return *jax.grad(potential, (0, 1))(*arguments), rows(*arguments), jax.jacrev(rows, (0, 1))(*arguments)

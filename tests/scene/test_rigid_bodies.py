@@ -6,6 +6,7 @@ import pytest
 from scipy.special import ellipj
 
 import vmri_jax as vm
+from tests.scene.mechanics import mechanics
 from vmri_jax.scene import (
     Ball,
     Body,
@@ -46,7 +47,7 @@ def free_motion(t):
     return sizes * np.stack([cn, sn, dn], axis=-1)
 
 
-@pytest.mark.parametrize("degree", [1, pytest.param(2, marks=pytest.mark.full), 3])
+@pytest.mark.parametrize("degree", [*(pytest.param(degree, marks=pytest.mark.full) for degree in (1, 2)), 3])
 def test_a_free_body_turns_as_jacobi_says_with_order_2_degree(degree):
     scene = Scene([RigidBody("hub", 1.0, MOMENTS, np.zeros(3), spin=SPIN)])
     errors = []
@@ -69,6 +70,8 @@ def test_a_free_body_keeps_energy_and_angular_momentum():
     assert np.abs(run.constraint_residual).max() < 1e-13
     turned = rotation(run.position("hub"))
     np.testing.assert_allclose(np.swapaxes(turned, 1, 2) @ turned, np.broadcast_to(np.eye(3), turned.shape), atol=1e-12)
+    quaternions = quaternion(run.position("hub"))  # of ten turns
+    assert np.abs(np.diff(quaternions, axis=0)).max() < 0.1
 
 
 def test_a_steady_top_precesses_without_nutation_to_second_order():
@@ -131,9 +134,9 @@ def test_bodies_without_width_have_fewer_axes():
     np.testing.assert_allclose(rod.masses, [3, 3, 3, 1, 1, 1])
     np.testing.assert_allclose(rod.coordinates[3:], [1, 0, 0], atol=1e-15)
     np.testing.assert_allclose(rod.rates[3:], [0, 0, -0.7], atol=1e-15)
-    run = vm.simulate(Scene([rod, plate]), ONE, macro_dt=0.05, num_steps=20)
-    assert run.names.slow_constraint == {"rigid rod": 1, "rigid plate": 3}
-    assert run.energy[0] == pytest.approx(3.0 * 2.0**2 / 12 * 0.7**2 / 2)
+    scene = Scene([rod, plate])
+    assert scene.names.slow_constraint == {"rigid rod": 1, "rigid plate": 3}
+    assert mechanics(scene).kinetic == pytest.approx(3.0 * 2.0**2 / 12 * 0.7**2 / 2)
 
 
 def test_a_matrix_of_inertia_is_turned_into_principal_axes():
@@ -143,12 +146,12 @@ def test_a_matrix_of_inertia_is_turned_into_principal_axes():
     principal = RigidBody("hub", 2.0, MOMENTS, np.zeros(3), turned, spin=SPIN)
     np.testing.assert_allclose(given.moments, MOMENTS)
     weight = Body("weight", 1.0, [2.0, 2.0, 2.0])
-    ends = []
+    energies = []
     for body, point in ((given, at), (principal, np.asarray(turned).T @ at)):
         spring = Spring((("hub", point), "weight"), 3.0)
         np.testing.assert_allclose(body.point(np.asarray(point)).position, at, atol=1e-15)
-        ends.append(vm.simulate(Scene([body, weight], [spring]), ONE, macro_dt=0.1, num_steps=10).position("weight"))
-    np.testing.assert_allclose(ends[0], ends[1], atol=1e-11)
+        energies.append(mechanics(Scene([body, weight], [spring]))[1:3])
+    np.testing.assert_allclose(energies[0], energies[1], rtol=1e-12)
 
 
 def test_rotations_are_given_as_people_have_them():
@@ -161,13 +164,6 @@ def test_rotations_are_given_as_people_have_them():
         np.testing.assert_allclose(body.rotation, matrix, atol=1e-14)
         np.testing.assert_allclose(quaternion(body.coordinates), w_xyz, atol=1e-14)
     np.testing.assert_allclose(matrix_of(jnp.asarray(vector)), matrix, atol=1e-14)
-
-
-def test_quaternions_along_a_run_do_not_jump():
-    run = vm.simulate(
-        Scene([RigidBody("hub", 1.0, MOMENTS, np.zeros(3), spin=[0.0, 0.0, 3.0])]), ONE, macro_dt=0.1, t_end=6.0
-    )
-    assert np.abs(np.diff(quaternion(run.position("hub")), axis=0)).max() < 0.2
 
 
 def slow_energy(scene):
@@ -186,9 +182,11 @@ def test_an_effect_on_a_point_of_a_body_is_that_on_its_coordinates():
     weight = Body("weight", 1.0, [1.0, 1.0, 0.0], pace="fast")
     by_point = Scene([hub, weight], [RigidLink((("hub", [0.5, 0.0, 0.0]), "weight")), Gravity(1.0)], project=True)
     by_hand = Scene([hub, weight], [Constraint(pinned, ("hub", "weight")), Gravity(1.0)], project=True)
-    runs = [vm.simulate(scene, ONE, macro_dt=0.05, num_steps=20) for scene in (by_point, by_hand)]
-    np.testing.assert_allclose(runs[0].q_s, runs[1].q_s, atol=1e-12)
-    np.testing.assert_allclose(runs[0].q_f, runs[1].q_f, atol=1e-12)
+    random = np.random.default_rng(0)
+    start = [random.normal(size=x.shape) for x in by_point.start]
+    ours, theirs = (mechanics(scene, start) for scene in (by_point, by_hand))
+    np.testing.assert_allclose(np.sort(ours.rows), np.sort(theirs.rows), atol=1e-14)
+    assert ours.potential == pytest.approx(theirs.potential, rel=1e-14)
 
     pushed = Scene([hub], [ConstantForce(("hub", [0.5, 0.0, 0.0]), [0.0, 3.0, 0.0])])
     system, (q_s, q_f, v_s, v_f) = pushed.system(), pushed.start
@@ -202,7 +200,6 @@ def test_points_of_the_ground_stay_where_they_are():
         [hub], [Spring((("hub", [0.5, 0, 0]), ("ground", [2.0, 0, 0])), 7.0, 1.0), Gravity(), LinearDamping(0.1)]
     )
     assert slow_energy(scene) == pytest.approx(7.0 * 0.5**2 / 2)
-    assert vm.simulate(scene, ONE, macro_dt=0.05, num_steps=5).success
     plane = Scene([Body("bob", 1.0, [1.0, 0.0])], [Spring(("bob", ("ground", [0.0, 0.0])), 2.0)])
     assert plane.drawing()["anchors"] == [{"body": "bob", "point": [0.0, 0.0], "kind": "spring"}]
 
@@ -218,10 +215,7 @@ def test_many_bodies_are_taken_by_slices():
 
 BAD = [
     ({"mass": -1.0}, "mass is -1.0; it must be one positive number"),
-    (
-        {"inertia": [1.0, 1.0, 2.5]},
-        r"which no body has: the largest, 2.5, must not be larger than the sum of the others, 2\.",
-    ),
+    ({"inertia": [1.0, 1.0, 2.5]}, r"which no body has: the largest, 2.5, must not be larger than the sum of the"),
     ({"inertia": [0.0, 0.0, 0.0]}, "they must not be negative, nor all be zero"),
     ({"inertia": [[1.0, 0.5, 0], [0, 1, 0], [0, 0, 1]]}, "it must be a symmetric matrix"),
     ({"inertia": [1.0, 2.0]}, r"inertia has shape \(2,\); give \(3,\) principal moments, a matrix, or a shape"),
@@ -271,7 +265,7 @@ def test_coordinates_are_called_by_centre_and_directors():
     assert names.slow_coordinates == ["hub x", "hub y", "hub z", *directors]
     assert names.fast_coordinates == ["bar x", "bar y", "bar z", "bar d1 x", "bar d1 y", "bar d1 z"]
     assert [names.positions(part) for part in ("s", "f")] == [[0, 1, 2], [0, 1, 2]]
-    run = vm.simulate(scene, ONE, macro_dt=0.1, num_steps=2)
+    run = vm.simulate(scene, vm.fully_explicit(1), macro_dt=0.1, num_steps=2)
     panel = run.plot().axes[0]
     np.testing.assert_array_equal(panel.lines[2].get_ydata(), run.position("hub")[:, 2])
     assert len(panel.lines) == 3

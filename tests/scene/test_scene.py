@@ -123,18 +123,6 @@ def test_same_structure_is_compiled_once():
     assert len(traces) == 2
 
 
-def test_gradient_by_a_parameter():
-    system, state = SPRINGS.system(), SPRINGS.state()
-
-    def height(stiffness):
-        params = system.params | {"springs": system.params["springs"] | {"stiffness": stiffness}}
-        return macro_step(system.replace(params=params), fully_explicit(2), state, 0.02)[0].p_f[3]
-
-    slope = jax.jit(jax.grad(height))(5000.0)
-    value = jax.jit(height)
-    assert slope == pytest.approx(float(value(5010.0) - value(4990.0)) / 20, rel=1e-5)
-
-
 def counting(counts, name):
     def energy(q, params):
         counts[name] += 1

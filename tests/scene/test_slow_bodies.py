@@ -53,13 +53,13 @@ def operations_of_an_interval(march: MarchEquations) -> float:
 
 def test_a_micro_interval_does_not_cost_more_with_more_slow_bodies():
     costs = {}
-    for wheels in (0, 4, 19):
+    for wheels in (0, 2, 6):
         march, state = march_of(satellite(wheels))
         assert (state.q_s.size, march.n_v) == (12 + wheels, 12)
         costs[wheels] = operations_of_an_interval(march)
     assert costs[0] > 500
-    assert costs[4] == costs[19]
-    assert costs[19] < 1.05 * costs[0]  # what is seen is taken from more: measured 1.00
+    assert costs[2] == costs[6]
+    assert costs[6] < 1.05 * costs[0]  # what is seen is taken from more: measured 1.00
 
 
 def test_what_carries_a_fast_body_is_seen():

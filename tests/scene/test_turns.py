@@ -1,6 +1,7 @@
 """Whole turns of the angles of joints: effects that count them, loops, starts, and how they are read from runs."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import permutations
 from typing import Any
 
@@ -191,6 +192,7 @@ def test_a_spring_in_a_loop_counts_its_turns():
     """The angle of the crank at the end is that of DOP853 with one angle."""
     scene = crank_rocker(JointSpring("hB", 0.2), order=(1, 2, 3, 0), coordinates="joint").with_rates({"hA": 12.0})
     run = vm.simulate(scene, ONE, macro_dt=0.002, t_end=3.0)
+    assert np.abs(run.constraint_residual).max() < 1e-12
     assert scene.joint_motion(run, "hA")[-1] == pytest.approx(12.186, abs=1e-3)  # measured 12.18589
     angles = {hinge: scene.joint_motion(run, hinge) for hinge in HINGES}  # one of them without a coordinate
     np.testing.assert_allclose(angles["hA"] + angles["hB"] + angles["hC"], angles["hD"], atol=1e-9)
@@ -207,15 +209,16 @@ def test_starts_of_loops_count_the_turns_of_all_joints():
     assert max(abs(x["hB"]), abs(x["hC"])) > 5.0
     names = ("hA", "pin", "hC", "hD")  # equal joints are cut by name: here the one that turns with the crank
     sprung = crank_rocker(*(JointSpring(hinge, 0.2, name=f"spring {hinge}") for hinge in names), names=names)
-    with pytest.raises(
-        ValueError, match=r"spring pin: the start is -[67].*angle of pin comes .*leave one of these out"
-    ):
+    with pytest.raises(ValueError, match=r"spring pin: the start is -[67].*angle of pin comes .*leave one of these"):
         sprung.with_joints({"hA": 7.0})
 
 
 def test_gears_start_with_their_turns():
     geared = wheels(Gear(["hinge", "other"], [1.0, -4.0])).with_joints({"hinge": 7.0})
     np.testing.assert_allclose(geared.start[0], [7.0, 1.75], atol=1e-12)
+
+
+STEPS = {"macro_dt": 0.01, "num_steps": 500, "save": 5}
 
 
 def sprung(stiffness):
@@ -226,7 +229,7 @@ def test_springs_and_limits_beyond_half_a_turn():
     """A spring of 2 N m/rad at 8 rad/s turns by 8 / sqrt(2) = 5.657 rad, a limit at 4.15 rad turns back at about 4.2 rad."""
     effects = sprung(2.0)
     scene = wheels(*effects, spin=(8.0, 2.0))
-    run = vm.simulate(scene, ONE, macro_dt=0.01, num_steps=500, save=5)
+    run = vm.simulate(scene, ONE, **STEPS)
     largest = [np.abs(scene.joint_motion(run, name)).max() for name in ("hinge", "other")]
     assert largest == pytest.approx([5.657, 4.2], abs=0.04)
     with pytest.raises(ValueError, match=r"joint_springs: the largest angle of the run is 5\.6.*directors"):
@@ -237,36 +240,31 @@ def test_springs_and_limits_beyond_half_a_turn():
         wheels(JointSpring("hinge", 2.0, 7.0), coordinates="directors")
 
 
-def test_a_run_by_directors_ends_before_half_a_turn():
+def test_runs_by_directors():
+    """A spring ends a run before half a turn. Where nothing counts them, turns are counted from node to node, here of a motion that is put in."""
     scene = wheels(JointSpring("hinge", 2.0), coordinates="directors", spin=(8.0, 0.0))
     run = until_failure(scene, ONE, macro_dt=0.01, num_steps=100)
     assert Result(int(run.result)) == Result.NON_FINITE
     assert 'coordinates="joint"' in str(run.result)
     reached = run.position("wheel")[int(run.failed_at), 3:5]
     assert np.arctan2(*reached[::-1]) == pytest.approx(REACH, abs=0.1)
-
-
-SPINNING = {"macro_dt": 0.001, "num_steps": 1000, "save": 10}
-"""A second, in nodes 0.01 s apart."""
+    angles = np.stack([np.linspace(0.0, 100.0, 101), np.zeros(101)], axis=1)
+    free = wheels(coordinates="directors")
+    q, motions = zip(*(turned(free, angle) for angle in angles), strict=True)
+    masses: Any = free.system().kinetic
+    spinning = replace(run, q_s=np.stack(q), p_s=masses.slow * (np.stack(motions) @ np.array([100.0, 0.0])))
+    assert free.joint_motion(spinning, "hinge")[-1] == pytest.approx(100.0, abs=1e-12)
+    with pytest.raises(ValueError, match=r"hinge may turn by half a turn or more .* nodes 0 and 1.*save="):
+        free.joint_motion(spinning[::5], "hinge")
 
 
 def test_turns_are_coordinates():
-    """100 rad/s for a second; a spring as soft as none makes the program that of the springs above."""
+    """100 rad/s; a spring as soft as none makes the program that of the springs above."""
     scene = wheels(*sprung(1e-12), spin=(100.0, 0.0))
     for start in (0.0, 7.0):
         turned = scene.with_joints({"hinge": (start, 100.0)})
-        run = vm.simulate(turned, ONE, **SPINNING)
-        angle = turned.joint_motion(run[::50], "hinge")
-        np.testing.assert_allclose(angle, start + np.array([0.0, 50.0, 100.0]), atol=1e-8)
-
-
-def test_turns_of_directors_are_counted_from_node_to_node():
-    scene = wheels(coordinates="directors", spin=(100.0, 0.0))
-    run = vm.simulate(scene, ONE, **SPINNING)
-    # the scheme is ahead by 0.17 rad, as it turns by 0.1 rad in a step
-    assert scene.joint_motion(run, "hinge")[-1] == pytest.approx(100.0, abs=0.2)
-    with pytest.raises(ValueError, match=r"hinge may turn by half a turn or more .* nodes 0 and 1.*save="):
-        scene.joint_motion(run[::5], "hinge")
+        angle = turned.joint_motion(vm.simulate(turned, ONE, **STEPS), "hinge")
+        np.testing.assert_allclose(angle[[0, 50, 100]], start + np.array([0.0, 250.0, 500.0]), atol=1e-8)
 
 
 def test_dense_loops_keep_the_angles_that_effects_need():

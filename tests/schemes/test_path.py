@@ -87,9 +87,7 @@ def test_velocity_nodes_sample_the_path(degree, num_micro, placed):
 
 def test_velocities_on_the_border_of_two_micro_intervals_are_refused():
     assert len(velocity_nodes(macro(midpoint), 3, 1).groups) == 1
-    with pytest.raises(
-        ValueError, match=r"node 0.5 falls on the border of two of the 2 micro intervals.*micro\(\.\.\.\)"
-    ):
+    with pytest.raises(ValueError, match=r"node 0.5 falls on the border of two of the 2 micro"):
         velocity_nodes(macro(midpoint), 2, 1)
 
 

@@ -78,9 +78,7 @@ def test_unknown_rule_name_is_refused():
 
 def test_kinetic_rule_that_misses_a_velocity_is_refused():
     rule = micro(quadrature.gauss(2))
-    with pytest.raises(
-        ValueError, match=r"kinetic rule .* gives no positive kinetic energy to some motion of a path of degree 3"
-    ):
+    with pytest.raises(ValueError, match=r"kinetic rule .* gives no positive kinetic energy to some motion of a path"):
         Scheme(2, 3, kinetic=rule, slow=rule, fast=rule)
 
 
@@ -119,16 +117,8 @@ def test_potentials_have_rules_by_name():
             ValueError,
             r"bends is placed with every=3, which does not divide num_micro=8: .* Take one of \[1, 2, 4, 8\]",
         ),
-        (
-            lambda: fully_explicit(8).rule_of(3),
-            ValueError,
-            r"the potential 3 is placed with every=3, which does not divide",
-        ),
-        (
-            lambda: fully_explicit(8).rule_of("bends"),
-            ValueError,
-            r"no rule for the potential 'bends' .* scheme.with_potentials\(bends=",
-        ),
+        (lambda: fully_explicit(8).rule_of(3), ValueError, r"the potential 3 is placed with every=3"),
+        (lambda: fully_explicit(8).rule_of("bends"), ValueError, r"no rule for the potential 'bends'"),
         (lambda: fully_explicit(8).with_potentials(bends=quadrature.midpoint), TypeError, "bends is a bare rule"),  # pyright: ignore[reportArgumentType]
         (
             lambda: Scheme(

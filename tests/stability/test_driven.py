@@ -13,9 +13,7 @@ from vmri_jax.stability.drive import drive_period, driven_motion
 QUICK = (
     "Paul trap, q = 0.25, 2 steps",
     "Mathieu, first tongue",
-    "Mathieu, between, 32.5 steps",
     "moon on its orbit",
-    "pendulum, not driven",
 )
 
 

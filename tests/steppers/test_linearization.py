@@ -45,8 +45,8 @@ def equations_and_unknowns(scheme):
     return equations, unravel(flat + 0.1 * rng.normal(size=flat.size))
 
 
-SIMILAR = ("explicit slow", "gauss 2")
-"""Their blocks are those of others: V on the macro and W on the micro grid, Gauss rules of a higher degree."""
+SIMILAR = ("fully implicit", "explicit slow", "gauss 2", "lobatto 2")
+"""Their blocks are those of others: V on the macro and W on the micro grid, Gauss and Lobatto rules of a higher degree."""
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.full if n in SIMILAR else ()) for n in SCHEMES])

@@ -113,9 +113,9 @@ def dumbbell_start(x=(0.0,) * 6) -> State:
     return initial_state(DUMBBELL, q_s, q_s + along, v_s, v_s + (2.0 + x[5]) * np.array([along[1], -along[0]]))
 
 
-def dumbbell_run(scheme=None, matrix: str = "auto", start=None):
-    scheme, start = scheme or mollified_impulse(3), start or dumbbell_start()
-    return simulate(DUMBBELL, scheme, start, macro_dt=0.02, num_steps=50, solver=Solver(matrix))
+def dumbbell_run(matrix: str = "masses", start=None):
+    start = start or dumbbell_start()
+    return simulate(DUMBBELL, mollified_impulse(2), start, macro_dt=0.02, num_steps=50, solver=Solver(matrix))
 
 
 def test_structure_with_constraints():

@@ -80,9 +80,7 @@ def test_trajectories_of_rigid_bodies(name, num_micro):
 
 
 def test_steps_are_symplectic():
-    problem = systems.triple_spherical_pendulum()
-    scheme = vm.fully_implicit(num_micro=3)
-    product = vm.stability.monodromy(problem, scheme, macro_dt=0.02, num_steps=1, solver=NULL_SPACE)
+    product = vm.stability.monodromy(cart(), vm.fully_implicit(2), macro_dt=0.1, num_steps=1, solver=NULL_SPACE)
     assert product.symplectic_defect < 1e-11
 
 

@@ -61,7 +61,7 @@ def test_a_step_is_that_of_the_textbook(name):
         np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-13)
 
 
-@pytest.mark.parametrize("name", SCHEMES)
+@pytest.mark.parametrize("name", ["gauss 2", pytest.param("fully implicit", marks=pytest.mark.full)])
 def test_order(name):
     scheme, steps, order = SCHEMES[name]
     reference = end_of(problem(), SCHEMES["gauss 2"][0], 640)
@@ -84,9 +84,10 @@ def test_symplectic():
     assert area_change(ends, 4) < 1e-11
 
 
-@pytest.mark.parametrize("name", SCHEMES)
-def test_constant_inertia_may_be_on_either_grid(name):
-    apart, together = (end_of(p, SCHEMES[name][0], 20) for p in (problem(steady_arm), problem(None, steady_together)))
+def test_constant_inertia_may_be_on_either_grid():
+    apart, together = (
+        end_of(p, SCHEMES["fully implicit"][0], 20) for p in (problem(steady_arm), problem(None, steady_together))
+    )
     for a, b in zip(apart, together, strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-11)
 

@@ -129,8 +129,7 @@ def test_asking_for_a_scheme_that_was_not_run(study):
         study.order("third order")
 
 
-def test_energy_momentum_and_confidence(reference):
-    maps = [vm.diagnostics.translation_along([1.0, 0.0, 0.0])]
+def test_energy_and_confidence(reference):
     free = dataclasses.replace(
         PROBLEM,
         system=vm.System(vm.ConstantMass(jnp.ones(3), jnp.ones(3)), lambda q_s, q_f, _: jnp.sum((q_s - q_f) ** 4)),
@@ -140,9 +139,7 @@ def test_energy_momentum_and_confidence(reference):
         v_f=jnp.ones(3),
     )
     schemes = {"impulse": vm.fully_explicit(2)}
-    study = convergence_study(free, schemes, (0.05, 0.025, 0.0125), 1.0, num_saves=10, momentum_maps=maps)
-    assert all(row.momentum_error < 1e-13 for row in study.rows)
-    assert all(row.energy_band <= 2 * row.energy_error for row in study.rows)
+    study = convergence_study(free, schemes, (0.05, 0.025, 0.0125), 1.0, num_saves=10)
     errors = [row.energy_error for row in study.rows]
     assert errors[0] / errors[2] == pytest.approx(16, rel=0.3)
     fit = study.fit("impulse")
@@ -192,7 +189,6 @@ def test_the_energy_of_a_driven_system_has_an_error_too():
     assert abs(run.energy - run.energy[0]).max() > 3.0  # measured 6.3
     assert coarse / fine == pytest.approx(4, rel=0.05)  # measured 4.04
     assert fine < 2e-3  # measured 3.8e-4
-    assert all(row.energy_band <= 2 * row.energy_error for row in study.rows)
 
 
 def test_a_reference_refines_itself_until_it_agrees():
@@ -209,7 +205,7 @@ def test_work_is_counted_and_timed(reference):
     assert (impulse[0].slow_evaluations, impulse[0].fast_evaluations, impulse[0].solves) == (50, 200, 0)
     assert midpoint[1].solves == 100
     assert midpoint[1].fast_evaluations >= 400
-    assert all(0 < row.low <= row.seconds <= row.high for row in study.rows)
+    assert all(row.seconds > 0 for row in study.rows)
     assert {row.scheme for row in work.pareto()} <= set(schemes)
     labels = {kind: work.plot(work=kind).axes[0].get_xlabel() for kind in ("seconds", "solves")}
     assert labels == {"seconds": "computing time of the run", "solves": "systems of equations solved"}

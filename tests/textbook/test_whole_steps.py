@@ -14,7 +14,7 @@ STRUCTURES = {
         rs.Structure(1, 2, 2, **SPRINGS, force="drag", scheme="gauss", num_micro=3, degree=3, method="exact"),
     ),
     "kinetic function and all else": (
-        Method.EXACT,
+        Method.MASSES,
         rs.Structure(
             2, 1, 1, "bent", **SPRINGS, constraint="rod", moving=True, slow_constraint="norm", force="drag", num_micro=2
         ),

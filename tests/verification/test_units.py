@@ -180,7 +180,15 @@ def numbers_of(system, units):
     }
 
 
-@pytest.mark.parametrize("system", SYSTEMS, ids=lambda system: system.__name__)
+LONG = (sam, on_a_spiral)
+"""Runs for --full: terms of sam are in tsp and in fpu; a constraint between a length and an angle is refused in all units below."""
+
+
+@pytest.mark.parametrize(
+    "system",
+    [pytest.param(system, marks=pytest.mark.full if system in LONG else ()) for system in SYSTEMS],
+    ids=lambda system: system.__name__,
+)
 def test_a_run_in_other_units(system):
     here = numbers_of(system, (0, 0, 0))
     for units in SCALES:

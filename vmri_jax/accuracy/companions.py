@@ -1,14 +1,17 @@
-"""The error of a run and its slow and fast shares, from two companion runs.
+"""The error of a run from a companion run, its slow and fast shares from a second one.
 
 A run with macro steps H and micro steps h = H / N has, with a scheme of order p, the error
 
     x_{H,h}(t) - x(t) = S(t) H^p + F(t) h^p + ...
 
-The slow share ``S H^p`` vanishes with H at fixed h, the fast share ``F h^p`` with h at fixed H. Two companion runs from the same start
-separate them: the first halves H and h, the second halves h alone. With ``r = 2^p / (2^p - 1)`` (Richardson's extrapolation)
+The slow share ``S H^p`` vanishes with H at fixed h, the fast share ``F h^p`` with h at fixed H. With ``r = 2^p / (2^p - 1)`` (Richardson's
+extrapolation), from companion runs from the same start,
 
     half the macro step:        S H^p + F h^p = r (x_{H,h} - x_{H/2,h/2})
     twice the micro steps:              F h^p = r (x_{H,h} - x_{H,h/2})
+
+The first companion halves H and h: it is the program of the run with other numbers. The second one is another program, and is run where the
+shares are asked for.
 
 A jump of a force can act at the same node in steps of H and of H / 2, too early or too late in both. In systems that are driven in time, and where an
 estimate is small beyond belief, a third companion takes about 1.6 times the steps, with few nodes in common with the run, and a fourth one 2.6
@@ -72,13 +75,13 @@ def with_error(
     run: Simulation,
     trajectory: Trajectory,
     of: Callable | None = None,
-    shares: bool = True,
+    shares: bool = False,
     trial: tuple[Trajectory, np.ndarray] | None = None,
 ) -> Trajectory:
     """The trajectory of a run without a failed step, with its `RunError`; warns if the error is not certified over the whole run.
 
-    A `trial` has the companion with half the macro step and the errors (k, n_s + n_f), if they have been computed. The companion of the shares
-    has twice the micro steps, another program.
+    A `trial` has the companion with half the macro step and the errors (k, n_s + n_f), if they have been computed. With `shares` the error has
+    its slow and its fast share.
     """
     halved = companion(run, 2) if trial is None else trial[0]
     if int(halved.failed_at) >= 0:

@@ -18,7 +18,7 @@ of two families, `vmri_jax.tune` compares the best of many.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -26,6 +26,7 @@ import numpy as np
 from vmri_jax.accuracy.companions import (
     FEWEST_DIVIDED,
     certified_nodes,
+    check_function_of_run,
     companion,
     estimated_errors,
     extent_of,
@@ -34,26 +35,23 @@ from vmri_jax.accuracy.companions import (
 )
 from vmri_jax.accuracy.families import Family, micro_steps_help, unit_of
 from vmri_jax.accuracy.trials import LEAST_TIME, Trial, seconds_of_steps
-from vmri_jax.mechanics.driving import Events
+from vmri_jax.mechanics.driving import events
 from vmri_jax.mechanics.linearisation import Linearisation, linearise
-from vmri_jax.mechanics.state import State
-from vmri_jax.mechanics.system import System
+from vmri_jax.mechanics.state import Movable, State, start_of
+from vmri_jax.running.arguments import Steps
 from vmri_jax.running.progress import Progress, silent
 from vmri_jax.running.run_error import largest_of
+from vmri_jax.running.saved import check_memory
 from vmri_jax.running.settings import Settings
-from vmri_jax.running.simulation import Simulation
+from vmri_jax.running.simulation import Simulation, simulation
 from vmri_jax.running.timing import stopwatch
-from vmri_jax.schemes.composition import Composition, stage_scheme
+from vmri_jax.schemes.composition import Composition, stage_lengths, stage_scheme
 from vmri_jax.schemes.scheme import Scheme
+from vmri_jax.steppers.solver import Solver
 
 AIMED_PART = 0.5
 """Part of the accuracy for which steps are chosen. Trials predict errors of finer runs to about a factor of 2: with a
 larger part more runs miss the accuracy and are repeated, with a smaller part all runs take more steps."""
-AIMED_PART_OF_FEWEST = 0.95
-"""The same part where the fewest steps are looked for, which takes runs that miss the accuracy anyway."""
-STEPS_RATIO = 1.1
-"""The fewest steps that keep an accuracy are at most this many times a number that misses it; a ratio nearer 1 takes
-more runs."""
 MOST_SAVED = 1000
 """Most saved intervals of a run with an accuracy whose user gives no number; a larger value takes more memory in long
 runs."""
@@ -82,9 +80,9 @@ NUM_MICRO = (1, 2, 3, 5, 8, 12, 20, 30, 50)
 MOST_MICRO = 64
 """Most micro steps chosen; more save little unless an evaluation of the slow force takes a hundred times as long as of
 the fast force."""
-SAME_COST = 1.3
-"""Ratio of two numbers of micro steps up to which they count as equally fast, so that the second is not compiled. A
-larger value misses savings."""
+WORTH_COMPILING = 1.5
+"""Time of a run over the time that a third number of micro steps promises, above which its program is compiled. A larger
+value misses savings; a smaller one compiles for seconds to save milliseconds."""
 LEAST_SHARE = 1e-3
 """Least slow share of the error, as a part of the fast share: the number of micro steps stays finite where the slow
 share vanishes. A larger value allows fewer micro steps."""
@@ -98,39 +96,51 @@ faster."""
 RESONANT_GROWTH = 1e-6
 """Growth of disturbances per macro step above which a step is resonant, see `vmri_jax.stability.advise`; a larger value
 accepts steps of weak resonances."""
+LEAST_RESONANT_ANGLE = 2.5
+"""Angle in radians that the fastest vibration turns in a macro step, below which no step is resonant: multipliers of
+opposite signature meet at an angle of pi at the earliest, which kicks with two micro steps have at 2.8. A larger value
+overlooks the first resonance; a smaller one compiles the step of the linear system for nothing."""
 SHORTER_STEPS = (1.0, 0.98, 0.96, 0.93, 0.9, 0.86, 0.82, 0.78)
 """Macro steps that are tried in this order until one is not resonant, in units of the largest step for the accuracy."""
 
 
-@dataclass
 class Search:
-    """Trial runs of several schemes from the same start over the same time, the `length`.
+    """Trial runs of several schemes from the same start until `t_end`; arguments as of `vmri_jax.simulate`.
 
-    make: function of a scheme that returns a `Simulation` of a single macro step.
-    system, start: of all runs.
-    num_saves: saved intervals; None for at most `MOST_SAVED`.
+    system, start, length: of all runs.
     drives: events of the system in this time; all runs have steps that see them.
-    fewest: whether to look for the fewest steps that keep an accuracy, within `STEPS_RATIO`; else the first ones that
-        keep it are taken.
     seen: called with each trial.
     seconds: measured seconds of a macro step by the Python expression of the scheme.
     """
 
-    make: Callable[[Scheme | Composition], Simulation]
-    system: System
-    start: State
-    length: float
-    num_saves: int | None = None
-    progress: Progress = silent
-    drives: Events = Events()  # noqa: RUF009 (immutable)
-    fewest: bool = False
-    seen: Callable[[Trial], None] = lambda trial: None
-    seconds: dict[str, float] = field(default_factory=dict)
-    num_trials: int = 0
-    _runs: dict[tuple[str, int], Simulation] = field(default_factory=dict)
-    _firsts: dict[tuple[str, int], Trial] = field(default_factory=dict)
-    _chosen: dict[str, Trial] = field(default_factory=dict)
-    _relative_times: dict[str, Callable[[int], float]] = field(default_factory=dict)
+    def __init__(
+        self,
+        moving: Movable,
+        state: State | None,
+        solver: Solver | None,
+        t_end: float,
+        num_saves: int | None = None,
+        of: Callable | None = None,
+        progress: Progress = silent,
+        seen: Callable[[Trial], None] = lambda trial: None,
+    ):
+        self.system, self.start = start_of("simulate", moving, state)
+        self.length, self.drives = float(t_end - self.start.t), events(self.system, self.start, t_end)
+        self.num_saves, self.progress, self.seen, self.num_trials = num_saves, progress, seen, 0
+        self.seconds: dict[str, float] = {}
+        self._runs: dict[tuple[str, int], Simulation] = {}
+        self._firsts: dict[tuple[str, int], Trial] = {}
+        self._chosen: dict[str, Trial] = {}
+        self._times: dict[str, Callable[[int], float]] = {}
+
+        def make(scheme: Scheme | Composition) -> Simulation:
+            run = simulation(moving, scheme, state, solver, Steps(self.length, num_steps=1))
+            run.check()
+            check_memory("simulate", run, num_saves=num_saves or MOST_SAVED)
+            check_function_of_run(of, run)
+            return run
+
+        self._make = make
 
     @cached_property
     def has_two_rates(self) -> bool:
@@ -201,14 +211,14 @@ class Search:
             self.num_trials += 1
             elapsed = stopwatch()
             trajectory, halved = run.in_pieces(), companion(run, 2)
-            seconds = elapsed()
-            trial = Trial(family, num_micro, run, trajectory, halved, np.zeros(0), np.inf)
-            if trial.succeeded and accuracy is not None:
+            seconds, succeeded = elapsed(), max(int(trajectory.failed_at), int(halved.failed_at)) < 0
+            if succeeded and accuracy is not None:
                 errors = estimated_errors(run, trajectory, halved, self.drives, accuracy)
             else:
                 errors = extrapolated(run.order, trajectory, halved)
-            certified = trial.succeeded and bool(certified_nodes(trajectory, errors)[0].all())
-            trial = replace(trial, errors=errors, error=float(largest_of(errors).max()) if certified else np.inf)
+            certified = succeeded and bool(certified_nodes(trajectory, errors)[0].all())
+            error = float(largest_of(errors).max()) if certified else np.inf
+            trial = Trial(family, num_micro, run, trajectory, halved, errors, error)
             self.seen(trial)
             # The seconds of the first trial include compiling, which later trials do not repeat.
             is_late = seconds > most and run.num_steps > FEWEST_STEPS
@@ -219,30 +229,20 @@ class Search:
     def accurate(self, trial: Trial, accuracy: float) -> Trial:
         """A trial of the same scheme with an error of at most the accuracy; the last trial if `MOST_REPEATS` of them
         miss it."""
-        aimed = accuracy * (AIMED_PART_OF_FEWEST if self.fewest else AIMED_PART)
         order = 1.0 if self.drives.jump else float(trial.run.order)
-        kept, too_few = None, 0 if trial.error <= accuracy else trial.run.num_steps
-        for _ in range(MOST_REPEATS * (2 if self.fewest else 1)):
-            if not np.isfinite(trial.error):
+        for _ in range(MOST_REPEATS):
+            before, run = trial, trial.run
+            if not np.isfinite(before.error):
                 break
-            wanted = max(min(trial.steps_for(aimed, order), MOST_GROWTH * trial.run.num_steps), too_few + 1)
-            if kept is not None:
-                wanted = max(min(wanted, int(kept.run.num_steps / STEPS_RATIO)), too_few + 1)
-            num_steps = self.beside_resonances(trial, wanted)
-            if num_steps > max(MOST_STEPS, fewest_steps(trial.run.scheme, self.drives, self.length)):
+            wanted = min(before.steps_for(AIMED_PART * accuracy, order), MOST_GROWTH * run.num_steps)
+            num_steps = self.beside_resonances(before, wanted)
+            if num_steps > max(MOST_STEPS, fewest_steps(run.scheme, self.drives, self.length)):
                 break
-            if kept is not None and self.run(trial.family, trial.num_micro, num_steps).num_steps >= kept.run.num_steps:
-                break
-            before, falls_back = trial, trial.run.may_fall_back
-            trial = self.trial(trial.family, trial.num_micro, num_steps, falls_back, accuracy)
+            trial = self.trial(before.family, before.num_micro, num_steps, run.may_fall_back, accuracy)
             if trial.error <= accuracy:
-                kept = trial
-            else:
-                too_few = trial.run.num_steps
-            if kept is not None and (not self.fewest or kept.run.num_steps <= max(too_few + 1, STEPS_RATIO * too_few)):
                 break
             order = self._observed_order(before, trial)
-        return kept or trial
+        return trial
 
     def _observed_order(self, before: Trial, after: Trial) -> float:
         """The order between two trials, from 1 to the order of the scheme: kinks of a force lower it."""
@@ -264,7 +264,7 @@ class Search:
         """The run with at least `num_steps` macro steps, and with steps that see all events."""
         key = family.python, num_micro
         if key not in self._runs:
-            self._runs[key] = self.make(family.make(num_micro))
+            self._runs[key] = self._make(family.make(num_micro))
         fewest = fewest_steps(self._runs[key].scheme, self.drives, self.length)
         num_steps, save_every = self.rounded(max(num_steps, fewest))
         dt = np.asarray(self.length / num_steps)
@@ -290,59 +290,53 @@ class Search:
 
     def settings(self, trial: Trial) -> Settings:
         """The arguments of `vmri_jax.simulate` that repeat the run of a trial."""
-        run, relative_time = trial.run, self._relative_times.get(trial.family.python)
+        run, time = trial.run, self._times.get(trial.family.python)
         numbers = float(run.macro_dt), run.num_steps, run.save_every
-        gain = 1.0
-        if relative_time is not None and trial.num_micro > 1:
-            gain = relative_time(1) / relative_time(trial.num_micro)
+        gain = 1.0 if time is None else time(1) / time(trial.num_micro)
         return Settings(run.scheme, trial.python, trial.family.options, *numbers, gain)
 
     def _with_best_num_micro(self, trial: Trial, error: float) -> Trial:
-        """A trial with the number of micro steps of the least time; `trial` itself if its number is about as fast.
+        """A trial with the number of micro steps of the least time.
 
         A single interval of high degree (above 1) stays single: it resolves the fast variables by its degree.
         """
         can_choose = self.has_two_rates and stage_scheme(trial.run.scheme).degree == 1
         if not (can_choose and 0 < trial.error < np.inf):
             return trial
-        python = trial.family.python
+        python, run = trial.family.python, trial.run
         if python not in self._chosen:
-            best = self._best_num_micro(trial)
-            if max(best, trial.num_micro) > SAME_COST * min(best, trial.num_micro):
-                num_steps = max(
-                    1, round(trial.run.num_steps * trial.num_micro / best)
-                )  # micro steps of the same length
-                new_trial = self.trial(trial.family, best, num_steps, trial.run.may_fall_back)
-                trial = min((trial, new_trial), key=lambda candidate: self.time_for(candidate, error))
-            self._chosen[python] = trial
+            finer = self.trial(trial.family, 2 * trial.num_micro, run.num_steps, run.may_fall_back)
+            comparable = np.isfinite(finer.error) and finer.run.num_steps == run.num_steps
+            trials = [trial, finer, *self._third(trial, finer)] if comparable else [trial]
+            self._chosen[python] = min(trials, key=lambda candidate: self.time_for(candidate, error))
         return self._chosen[python]
 
-    def _best_num_micro(self, trial: Trial) -> int:
-        """The number of micro steps of the least time for an error, ``N^(p + 1) = (a / b) (F / S)``."""
-        num_micro, p = trial.num_micro, trial.run.order
-        finer = self.run(trial.family, 2 * num_micro, trial.run.num_steps)
-        finer_trajectory = finer.in_pieces()
-        if int(finer_trajectory.failed_at) >= 0:
-            return num_micro
-        fast_share = extrapolated(p, trial.trajectory, finer_trajectory)
+    def _third(self, trial: Trial, finer: Trial) -> list[Trial]:
+        """A trial with the number of micro steps of the least time for an error, ``N^(p + 1) = (a / b) (F / S)``, if it
+        promises less time than the number N of a trial, and 2 N of a `finer` one with the same macro steps."""
+        num_micro, p, run = trial.num_micro, trial.run.order, trial.run
+        fast_share = extrapolated(p, trial.trajectory, finer.trajectory)
         fast, slow = (float(largest_of(share).max()) for share in (fast_share, trial.errors - fast_share))
+        slow, fast = max(slow, LEAST_SHARE * fast), num_micro**p * fast
         # time(N) = a + b N: b = (time(2 N) - time(N)) / N and a = time(N) - N b
-        seconds, finer_seconds = seconds_of_steps(trial.run, finer)
+        self.measure([trial, finer])
+        seconds, finer_seconds = self.seconds[trial.python], self.seconds[finer.python]
         least = LEAST_TIME * seconds
         micro_seconds = max(finer_seconds - seconds, least) / num_micro
         macro_seconds = max(seconds - num_micro * micro_seconds, least)
-        slow = max(slow, LEAST_SHARE * fast)
-        fast = num_micro**p * fast
 
-        def relative_time(num_micro: int) -> float:
-            """Time of a run with a given error, ``(a + b N) (S + F / N^p)^(1 / p)``, up to a factor that does not
-            depend on N."""
-            return (macro_seconds + num_micro * micro_seconds) * (slow + fast / num_micro**p) ** (1 / p)
+        def time(n: int) -> float:
+            """Time of a run with a given error, ``(a + b N) (S + F / N^p)^(1 / p)``, up to a factor without N."""
+            return (macro_seconds + n * micro_seconds) * (slow + fast / n**p) ** (1 / p)
 
-        self._relative_times[trial.family.python] = relative_time
+        self._times[trial.family.python] = time
+        unit = unit_of(self.system, run.scheme)  # the rates of the rules divide num_micro
         best = (macro_seconds / micro_seconds * fast / slow) ** (1 / (p + 1))
-        unit = unit_of(self.system, trial.run.scheme)  # the rates of the rules divide num_micro
-        return unit * int(np.clip(round(best / unit), 1, max(1, MOST_MICRO // unit)))
+        best = unit * int(np.clip(round(best / unit), 1, max(1, MOST_MICRO // unit)))
+        if min(time(num_micro), time(2 * num_micro)) < WORTH_COMPILING * time(best):
+            return []
+        num_steps = max(1, round(run.num_steps * num_micro / best))  # micro steps of the same length
+        return [self.trial(trial.family, best, num_steps, run.may_fall_back)]
 
     @cached_property
     def _linear(self) -> Linearisation | None:
@@ -359,6 +353,9 @@ class Search:
     def beside_resonances(self, trial: Trial, num_steps: int) -> int:
         """This number of macro steps, or the next larger number for which small motions about the start do not grow."""
         if trial.num_micro == 1 or self._linear is None:
+            return num_steps
+        longest = max(1.0, float(np.abs(stage_lengths(trial.run.scheme)).max())) * self.length / num_steps
+        if self._linear.frequencies.max() * longest < LEAST_RESONANT_ANGLE:
             return num_steps
         # Imported here, since vmri_jax.stability imports matplotlib, which takes half a second.
         from vmri_jax.stability.multipliers import multipliers

@@ -32,7 +32,7 @@ def simulate(
     save: int | Save = 1,
     solver: Solver | None = None,
     accuracy: float | None = None,
-    error: bool | Callable[[Trajectory], Any] = False,
+    error: bool | str | Callable[[Trajectory], Any] = False,
 ) -> Trajectory:
     """Simulate `num_steps` macro steps, or up to `t_end`, and save every `save`-th macro node.
 
@@ -63,10 +63,10 @@ def simulate(
             step, at most 1000, unless ``save=vm.Save(number=200)`` says how many, for a smooth curve.
         solver: for implicit equations; None for ``Solver()``.
         accuracy: largest error of a position at a saved node, in the unit of the positions; replaces the step size, and needs `t_end`.
-        error: True to estimate the error of the positions and its slow and fast share, ``run.error``, a `RunError`; or a function of a run
-            (without micro nodes) whose error is estimated, too, ``run.error.of``. It returns numbers, such as
-            ``lambda run: run.position("load")``. This takes two more runs: one with half the macro step, one with twice the micro steps,
-            which needs another program. A failed run has no error.
+        error: True to estimate the error of the positions, ``run.error``, a `RunError`, by a run of the same program with half the macro step;
+            or a function of a run (without micro nodes) whose error is estimated, too, ``run.error.of``. It returns numbers, such as
+            ``lambda run: run.position("load")``. "shares" for the slow and the fast share of the error as well, by a run with twice the
+            micro steps, which is another program. A failed run has no error.
 
     Returns:
         The `Trajectory`, with ``num_steps / save + 1`` saved nodes. Times are ``t_0 + k macro_dt``, computed from
@@ -78,8 +78,8 @@ def simulate(
         Interrupted: Ctrl-C while a bar is shown; it carries the trajectory computed so far.
     """
     of = error if callable(error) else None
-    if not (of or isinstance(error, bool)):
-        raise Refused(f"simulate: error is {error!r}; it must be True or False, or a function of a run.")
+    if not (of or isinstance(error, bool) or error == "shares"):
+        raise Refused(f"simulate: error is {error!r}; it must be True or False, 'shares', or a function of a run.")
     steps = Steps(macro_dt, num_steps, t_end, save)
     if accuracy is not None:
         length = {"t_end": _end(steps), "num_saves": Save.of(save).number}
@@ -90,7 +90,7 @@ def simulate(
             raise simulation_error(trajectory, run.macro_dt, run.save_every, run.scheme.num_micro)
         for concern in trajectory.concerns():
             warnings.warn(type(concern)(f"simulate: {concern}"), stacklevel=2)
-        return with_error(run, trajectory, of, shares=bool(error), trial=(best.halved, best.errors))
+        return with_error(run, trajectory, of, error == "shares", trial=(best.halved, best.errors))
     if scheme is None:
         raise Refused(
             "simulate: scheme is None without an accuracy; give a scheme, or accuracy=1e-5 to have one chosen."
@@ -110,7 +110,7 @@ def simulate(
     trajectory = run.in_pieces("simulate")
     if int(trajectory.failed_at) >= 0:
         raise simulation_error(trajectory, run.macro_dt, run.save_every, scheme.num_micro)
-    return with_error(run, trajectory, of) if error else trajectory
+    return with_error(run, trajectory, of, error == "shares") if error else trajectory
 
 
 def _end(steps: Steps) -> float:

@@ -6,20 +6,16 @@ from collections.abc import Callable
 
 import numpy as np
 
-from vmri_jax.accuracy.companions import check_function_of_run, fewest_steps
+from vmri_jax.accuracy.companions import fewest_steps
 from vmri_jax.accuracy.families import Family, for_system, of_scheme, two_families
-from vmri_jax.accuracy.search import MOST_COORDINATES, MOST_SAVED, Search, Trial
+from vmri_jax.accuracy.search import MOST_COORDINATES, Search, Trial
 from vmri_jax.mechanics.arrays import is_concrete
 from vmri_jax.mechanics.checks import check_number, check_type
-from vmri_jax.mechanics.driving import events
 from vmri_jax.mechanics.invariants import velocity
 from vmri_jax.mechanics.state import Movable, Problem, State, start_of
 from vmri_jax.refusals import Refused
-from vmri_jax.running.arguments import Steps
 from vmri_jax.running.progress import Progress, silent
-from vmri_jax.running.saved import check_memory
 from vmri_jax.running.settings import Settings
-from vmri_jax.running.simulation import Simulation, simulation
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.solver import Solver
@@ -67,9 +63,9 @@ def with_accuracy(
     check_error("simulate: accuracy", accuracy, start)
     if not t_end > start.t:
         raise Refused(f"simulate: t_end is {float(t_end - start.t):g} after the start; it must be later.")
-    search = search_of(system, state, solver, t_end, num_saves, of, progress)
+    search = Search(system, state, solver, t_end, num_saves, of, progress)
     best = reached("simulate: accuracy", search, usual_menu(search, scheme, accuracy), accuracy)[0]
-    warn_of_events("simulate", search, best, stacklevel=4)
+    warn_of_events("simulate", search, best.run.scheme, stacklevel=4)
     if not best.error <= accuracy:
         uncertified = "no error is certified over its length"
         reached_error = f"its error is {best.error:.1e}" if np.isfinite(best.error) else uncertified
@@ -80,30 +76,6 @@ def with_accuracy(
             stacklevel=3,
         )
     return best, search.settings(best)
-
-
-def search_of(
-    system: Movable,
-    state: State | None,
-    solver: Solver | None,
-    t_end: float,
-    num_saves: int | None = None,
-    of: Callable | None = None,
-    progress: Progress = silent,
-) -> Search:
-    """A search without trials; arguments as of `vmri_jax.simulate`."""
-    opened_system, start = start_of("simulate", system, state)
-    length = float(t_end - start.t)
-
-    def make(scheme: Scheme | Composition) -> Simulation:
-        run = simulation(system, scheme, state, solver, Steps(length, num_steps=1))
-        run.check()
-        check_memory("simulate", run, num_saves=num_saves or MOST_SAVED)
-        check_function_of_run(of, run)
-        return run
-
-    drives = events(opened_system, start, t_end)
-    return Search(make, opened_system, start, length, num_saves, progress, drives)
 
 
 def reached(name: str, search: Search, menu: list[Family], accuracy: float, **how) -> list[Trial]:
@@ -145,9 +117,9 @@ def digits_of(search: Search, accuracy: float) -> float:
     return float(np.log10(max((size or speed * search.length) / accuracy, 10.0)))
 
 
-def warn_of_events(caller: str, search: Search, trial: Trial, stacklevel: int = 3) -> None:
+def warn_of_events(caller: str, search: Search, scheme: Scheme | Composition, stacklevel: int) -> None:
     """Warn if the events of a driven system demand `MANY_STEPS` of a run."""
-    drives, fewest = search.drives, fewest_steps(trial.run.scheme, search.drives, search.length)
+    drives, fewest = search.drives, fewest_steps(scheme, search.drives, search.length)
     if fewest > MANY_STEPS:
         warnings.warn(
             f"{caller}: {' and '.join(drives.names)} of the system changes and changes back within "

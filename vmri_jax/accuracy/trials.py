@@ -46,11 +46,6 @@ class Trial:
         """The Python expression of the scheme, which identifies it in a search."""
         return self.family.python.format(self.num_micro)
 
-    @property
-    def succeeded(self) -> bool:
-        """Whether no step failed, nor one of the companion."""
-        return max(int(self.trajectory.failed_at), int(self.halved.failed_at)) < 0
-
     def steps_for(self, error: float, order: float | None = None) -> int:
         """Macro steps for this error, ``n (e / error)^(1 / p)``, with the order of the scheme if None is given."""
         return max(1, int(np.ceil(self.run.num_steps * (self.error / error) ** (1 / (order or self.run.order)))))

@@ -58,9 +58,7 @@ def simulate(
         typer.Option(help="Largest error of a position; steps, and without --scheme the scheme, are chosen for it."),
     ] = None,
     t_end: Annotated[float | None, typer.Option(help="End of the run, with --accuracy.")] = None,
-    error: Annotated[
-        bool, typer.Option("--error", help="Estimate the error of the positions, its slow and its fast share.")
-    ] = False,
+    error: Annotated[bool, typer.Option("--error", help="Estimate the error of the positions.")] = False,
     save_every: Annotated[
         int | None, typer.Option(help=f"Macro steps between saved nodes. [dim]about {DEFAULT_SAVED_NODES} nodes[/dim]")
     ] = None,

@@ -16,7 +16,7 @@ from vmri_jax.cli.common import check_target_file, check_target_folder, console,
 from vmri_jax.running.interrupts import Interrupted
 from vmri_jax.running.progress import Progress, progress_shown
 from vmri_jax.steppers.results import SimulationError
-from vmri_jax.study.cost_report import PERIODS, PageFailed
+from vmri_jax.study.cost_report import PERIODS
 from vmri_jax.study.table import ResultTable
 from vmri_jax.study.tuning import NothingReached, check_target
 
@@ -75,13 +75,8 @@ def cost(
     for target in error or [np.finfo(float).max]:
         check_target(target, 1.0 if t_end is None else t_end, problem)
     check_target_folder("--out", out)
-    try:
-        with _search(None) as tell:
-            report = study.cost_report(problem, system, out, t_end=t_end, errors=error, progress=tell)
-    except PageFailed as failure:
-        console.print(failure.report.table())
-        print_written("\nRuns", out / "cost.csv")
-        raise failure.__cause__ or failure from None
+    with _search(None) as tell:
+        report = study.cost_report(problem, system, out, t_end=t_end, errors=error, progress=tell)
     console.print(report.table())
     print_written("\nPage", report.path)
 

@@ -177,7 +177,7 @@ def _stage(system: System, scheme: Scheme, state: State, macro_dt):
     n_g, n_gs = system.num_constraints(state.q_s, state.q_f)
     v_s, v_f = velocity(system, start.q_s, start.q_f, start.p_s, start.p_f)
     guess = equations.guess(v_s, v_f, jnp.zeros(n_g), jnp.zeros(n_gs))
-    solver = Marched(Solver())
+    solver = Marched(Solver("exact"))
     solution, _ = solver.solve(equations, guess, solver.init(equations, (v_s, v_f)))
     q_s, (q_f, p_s, p_f) = state.q_s + solution.x.slow[-1], solution.end
     end = with_kicks(State(state.t + macro_dt, q_s, q_f, p_s, p_f), end=1.0)

@@ -20,9 +20,10 @@ def regularized(a):
 
 def least_norm(a, rows):
     """``a^+ rows`` for a = ``G M^-1 G^T`` (n, n) with a diagonal of ones, in which the units of rows cancel: of dependent rows the least multipliers."""
-    diagonal = jnp.diagonal(a)
-    root = jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1.0))
-    return jnp.linalg.lstsq(a / root[:, None] / root, rows / root)[0] / root
+    xp = np if isinstance(a, np.ndarray) else jnp
+    diagonal = xp.diagonal(a)
+    root = xp.sqrt(xp.where(diagonal > 0, diagonal, 1.0))
+    return xp.linalg.lstsq(a / root[:, None] / root, rows / root)[0] / root
 
 
 def saddle(a, b, c):

@@ -140,25 +140,24 @@ def real_array(name: str, value, ndim: int | None = None):
     advice = "give a real number" if ndim == 0 else "give real numbers, an array of float64"
     if isinstance(value, np.ndarray | jax.Array) and value.dtype == np.float64:
         array = value  # no conversion by JAX, which takes some ten microseconds
+    elif isinstance(value, float):
+        array = np.asarray(value)
     else:
-        array = np.asarray(value) if isinstance(value, float) else _converted(name, value, advice)
+        if is_concrete(value) and not (is_short(value) or _is_real(value)):
+            raise Refused(f"{name} is {value!r}; {advice}.")
+        check_precision(name, value)
+        is_jax = isinstance(value, jax.Array) or not is_concrete(value)
+        array = (jnp if is_jax else np).asarray(value, dtype=float)
     if ndim is not None and array.ndim != ndim:
         raise Refused(f"{name} has shape {array.shape}; {advice}.")
     return array
 
 
-def _converted(name: str, value, advice: str):
-    """Numbers as an array of float64, see `real_array`; refuses numbers that are not real or have less than 64 bits."""
-    if is_concrete(value):
-        try:
-            kind = "f" if is_short(value) else np.asarray(value).dtype.kind
-        except Exception:  # ragged lists, and errors of the user's own classes
-            kind = ""
-        if kind not in tuple("biuf"):
-            raise Refused(f"{name} is {value!r}; {advice}.")
-    check_precision(name, value)
-    is_jax = isinstance(value, jax.Array) or not is_concrete(value)
-    return jnp.asarray(value, dtype=float) if is_jax else np.asarray(value, dtype=float)
+def _is_real(value) -> bool:
+    try:
+        return np.asarray(value).dtype.kind in "biuf"
+    except Exception:  # ragged lists, and errors of the user's own classes
+        return False
 
 
 def whole_number(name: str, value, least: int = 1, otherwise: str = "") -> int:

@@ -7,7 +7,7 @@ import numpy as np
 
 from vmri_jax.kernels.band import Full, Sparsity, sparsity
 from vmri_jax.mechanics.arrays import is_concrete
-from vmri_jax.mechanics.masses import ConstantMass, Diagonal
+from vmri_jax.mechanics.masses import ConstantMass
 from vmri_jax.mechanics.system import System
 
 MOST_ROWS_OF_FULL_MATRIX = 80
@@ -22,9 +22,8 @@ iterations; a smaller one takes round-off for a dependence."""
 def all_rows(system: System, q_s, q_f) -> Sparsity:
     """Sparsity of ``G M^-1 G^T`` with all constraints, for coordinates of these shapes."""
     count = sum(system.num_constraints(q_s, q_f))
-    diagonal = isinstance(system.kinetic, ConstantMass) and all(
-        isinstance(mass, Diagonal) for mass in (system.kinetic.slow_mass, system.kinetic.fast_mass)
-    )
+    kinetic = system.kinetic
+    diagonal = isinstance(kinetic, ConstantMass) and kinetic.slow_mass.is_diagonal and kinetic.fast_mass.is_diagonal
     if count <= MOST_ROWS_OF_FULL_MATRIX or not diagonal:
         return Full(count)
     return _shared(system, q_s.shape[0], q_f.shape[0])

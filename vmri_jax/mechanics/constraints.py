@@ -1,4 +1,4 @@
-"""Checks of constraints and masses at one configuration (kept, independent, regular), and projection of positions onto the constraints.
+"""Checks of constraints and masses at one configuration (kept, independent, regular).
 
 Every number is judged in its own unit. A row ``g_i(t, q)`` of the constraints counts as kept below
 
@@ -17,13 +17,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
+from scipy.linalg import block_diag
 
-from vmri_jax.kernels.saddle import least_norm
-from vmri_jax.mechanics.arrays import Numbers, is_concrete, quickly_compiled
+from vmri_jax.mechanics.arrays import Numbers, is_concrete, library, quickly_compiled
 from vmri_jax.mechanics.by_name import constraint_sizes
 from vmri_jax.mechanics.functions import Rheonomic
 from vmri_jax.mechanics.masses import correlation
-from vmri_jax.mechanics.projection import legendre, mass_diagonal
+from vmri_jax.mechanics.projection import mass_diagonal, mass_matrix, time_rates
 from vmri_jax.mechanics.system import System
 from vmri_jax.mechanics.terms_of_rows import sizes_of_terms
 from vmri_jax.refusals import Refused
@@ -55,8 +55,6 @@ VANISHING_GRADIENT = 1e-6
 refuses constraints that are nearly singular at the start."""
 NEARBY = 1e-2
 """Distance to a configuration nearby, relative to the distance over which rows change by their size. From a larger one rows may be others."""
-PROJECTION_STEPS = 20
-"""Gauss-Newton steps onto the constraints. They converge quadratically from close positions; a larger number takes longer."""
 MICRO_GRID = (
     "A constraint held on the micro grid must be satisfiable by the fast variables: the slow path is one polynomial per macro step, of degree r, "
     "so that a slow-only constraint held at every micro node is over-determined (rank deficit r (num_micro - 1) per row)."
@@ -119,21 +117,23 @@ class Rows(NamedTuple):
         return cls(function(q), jnp.maximum(terms, jnp.minimum(radius, reach)), terms + reach, gradients)
 
 
-def rows_at(system: System, t, q_s, q_f) -> Rows:
-    """The `Rows` of a system."""
+def rows_at(system: System, t, q_s, q_f, weights=None) -> Rows:
+    """The `Rows` of a system; the weights w of coordinates are those of the masses by default."""
     n_s = q_s.shape[0]
 
     def rows(q):
         configuration = t, q[:n_s], q[n_s:]
         return jnp.concatenate([system.constraints(*configuration), system.g_implied(*configuration)])
 
-    return Rows.of(rows, jnp.concatenate([q_s, q_f]), weights_of(system, q_s, q_f))
+    if weights is None:
+        weights = weights_of(jnp.concatenate(mass_diagonal(system, q_s, q_f)))
+    return Rows.of(rows, jnp.concatenate([q_s, q_f]), weights)
 
 
-def weights_of(system: System, q_s, q_f):
-    """(n_s + n_f,) the weights w: square roots of masses, 1 for a coordinate without a mass."""
-    masses = jnp.concatenate(mass_diagonal(system, q_s, q_f))
-    return jnp.sqrt(jnp.where(masses > 0, masses, 1.0))
+def weights_of(masses):
+    """(n,) the weights w: square roots of masses, 1 for a coordinate without a mass."""
+    xp = library(masses)
+    return xp.sqrt(xp.where(masses > 0, masses, 1.0))
 
 
 def are_kept(system: System, state, tolerance):
@@ -150,29 +150,37 @@ def are_kept(system: System, state, tolerance):
     return jnp.all(kept[:solved]), jnp.all(kept[solved:])
 
 
-def project_positions(system: System, t, q_s, q_f):
-    """Positions moved onto the constraints at a time, along ``M^-1 G^T`` of the start: to first order the nearest point in the mass metric."""
-    n_s = q_s.shape[0]
-    q0 = jnp.concatenate([q_s, q_f])
+class Configuration(NamedTuple):
+    """The `Rows` at a configuration, and of the rows that are solved for the Jacobian G, and dg/dt."""
 
-    def constraints(q):
-        return system.constraints(t, q[:n_s], q[n_s:])
+    rows: Rows
+    jacobian: np.ndarray
+    rates: np.ndarray
 
-    def momentum(v):
-        return jnp.concatenate(legendre(system, q_s, q_f, v[:n_s], v[n_s:]))
+    @property
+    def solved(self) -> tuple[np.ndarray, np.ndarray]:
+        """g and G."""
+        return self.rows.values[: len(self.rates)], self.jacobian
 
-    # D = M^-1 G^T at the start, with rows of coordinates over the square roots of masses: all have the same unit
-    mass, jacobian = jax.jacfwd(momentum)(jnp.zeros_like(q0)), jax.jacrev(constraints)(q0)
-    root = jnp.sqrt(jnp.diagonal(mass))
-    directions = jnp.linalg.solve(mass / (root[:, None] * root), (jacobian / root).T) / root[:, None]
 
-    # q <- q - D (G D)^+ g
-    def corrected(_, q):
-        return q - directions @ least_norm(jax.jacrev(constraints)(q) @ directions, constraints(q))
+def configuration(system: System, t, q_s, q_f) -> Configuration:
+    """The `Configuration` at numbers: one program for the projection of a start, its momenta, and its checks."""
+    weights = weights_of(np.diagonal(known_mass(system, q_s, q_f)))
+    rows, rates = jax.device_get(_rows_and_rates(system, t, q_s, q_f, weights))
+    return Configuration(rows, rows.gradients[: len(rates)] * weights, rates)
 
-    # a loop, since its body is compiled once
-    q = jax.lax.fori_loop(0, PROJECTION_STEPS, corrected, q0)
-    return q[:n_s], q[n_s:]
+
+@quickly_compiled
+def _rows_and_rates(system, t, q_s, q_f, weights):
+    return rows_at(system, t, q_s, q_f, weights), time_rates(system, t, q_s, q_f)
+
+
+def known_mass(system: System, q_s, q_f) -> np.ndarray:
+    """Mass matrix (n, n) at rest, of numbers; constant masses need no program."""
+    if system.has_constant_mass:
+        masses = map(np.asarray, (system.kinetic.slow, system.kinetic.fast))
+        return np.asarray(block_diag(*(np.diag(mass) if mass.ndim == 1 else mass for mass in masses if mass.size)))
+    return np.asarray(_mass_matrix(system, q_s, q_f, np.zeros(np.shape(q_s)), np.zeros(np.shape(q_f))))
 
 
 def check_mass(system: System, q_s, q_f) -> None:
@@ -208,10 +216,7 @@ def check_mass(system: System, q_s, q_f) -> None:
         )
 
 
-@quickly_compiled
-def _mass_matrix(system, q_s, q_f, v_s, v_f):
-    n_s = v_s.size
-    return jax.hessian(lambda v: system.kinetic_energy(q_s, q_f, v[:n_s], v[n_s:]))(jnp.append(v_s, v_f))
+_mass_matrix = quickly_compiled(mass_matrix)
 
 
 def check_constraints(
@@ -240,7 +245,8 @@ def check_constraints(
         return _rows_in_words(getattr(system, name), rows, *arguments, system.params)
 
     n_s, (n_g, n_gs) = np.size(state.q_s), system.num_constraints(state.q_s, state.q_f)
-    rows, weights = jax.device_get(_rows_and_weights(system, state.t, state.q_s, state.q_f))
+    rows = configuration(system, state.t, state.q_s, state.q_f).rows
+    weights = weights_of(np.diagonal(known_mass(system, state.q_s, state.q_f)))
     solved = rows.values[: n_g + n_gs]
     if not np.isfinite(solved).all():
         raise Refused(f"{place}: the constraints are {solved} there, which is not finite.")
@@ -262,7 +268,13 @@ def check_constraints(
             f"{place} violate {'constraint' if worst < n_g else 'slow_constraint'}, row {row.strip('[]')}, by {abs(solved[worst]):.3e} (allowed: "
             f"{allowed[worst]:.0e}, {tolerance:.0e} of its size, and round-off); {advice}"
         )
-    _check_implied(rows, n_g + n_gs, place)
+    implied, allowed = rows.values[n_g + n_gs :], rows.allowed(CONSTRAINT_TOLERANCE)[n_g + n_gs :]
+    opened = np.flatnonzero(~(np.abs(implied) <= allowed))
+    if opened.size:
+        raise Refused(
+            f"System: implied does not follow from the constraints: {place} keep these, and row(s) {opened.tolist()} of implied are "
+            f"{implied[opened]} there (allowed: {allowed[opened]}). Take parameters for which they follow, or hold them as constraint."
+        )
 
     size = np.linalg.norm(np.concatenate([slow, fast], axis=1), axis=1)
     slow_only = np.flatnonzero((size > 0) & (np.linalg.norm(fast, axis=1) <= LEAST_FAST_PART * size))
@@ -277,7 +289,7 @@ def check_constraints(
     if any(dependent for _, dependent in map(rank_of, (alone, fast))):
         # At a singular configuration (a linkage folded flat) rows are dependent there and nowhere else, and runs pass it: only rows that are
         # dependent at a generic configuration nearby are refused.
-        rows, _ = jax.device_get(_rows_and_weights(system, state.t, *_nearby(state, rows, weights)))
+        rows = configuration(system, state.t, *_nearby(state, rows, weights)).rows
         _, fast, alone = gradients(rows)
         _check_rank("slow_constraint", alone, "slow variables.", in_words)
         _check_rank("constraint", fast, f"fast variables. {MICRO_GRID}", in_words)
@@ -288,7 +300,7 @@ def _check_gradients(system: System, state, rows: Rows, weights, in_words) -> No
     q, n_s = np.concatenate([state.q_s, state.q_f]), np.size(state.q_s)
     n_g, n_gs = system.num_constraints(state.q_s, state.q_f)
     change = NEARBY * np.abs(weights * q).max() * np.random.default_rng(0).normal(size=q.size) / weights
-    nearby, _ = jax.device_get(_rows_and_weights(system, state.t, *np.split(q + change, [n_s])))
+    nearby = configuration(system, state.t, *np.split(q + change, [n_s])).rows
     size, size_nearby = (np.linalg.norm(a.gradients, axis=1) for a in (rows, nearby))
     vanishes = (size_nearby > 0) & (size <= VANISHING_GRADIENT * size_nearby)
     parts = {"constraint": vanishes[:n_g], "slow_constraint": vanishes[n_g : n_g + n_gs]}
@@ -298,11 +310,6 @@ def _check_gradients(system: System, state, rows: Rows, weights, in_words) -> No
                 f"System: the gradient of row(s) {in_words(np.flatnonzero(rows_of_name), name)} of {name} vanishes at these positions, and no force "
                 "along it can hold the constraint. A square, (|x| - L)**2, has such a gradient wherever it is 0: take its root, |x| - L."
             )
-
-
-@quickly_compiled
-def _rows_and_weights(system, t, q_s, q_f):
-    return rows_at(system, t, q_s, q_f), weights_of(system, q_s, q_f)
 
 
 def _check_implied(rows: Rows, solved: int, place: str) -> None:

@@ -104,9 +104,8 @@ def velocity_and_masses(system: System, q_s, q_f, p_s, p_f):
     v = jnp.zeros_like(p) if is_quadratic else jnp.concatenate(velocity(system, q_s, q_f, p_s, p_f))
     gradient, times_masses = jax.linearize(jax.grad(kinetic), v)
     masses = jax.vmap(times_masses)(jnp.eye(p.size))
-    if (
-        is_quadratic
-    ):  # p = M v + dT/dv(0); a library's solver: it is one instruction, and large matrices are not unrolled
+    if is_quadratic:
+        # p = M v + dT/dv(0); a library's solver: it is one instruction, and large matrices are not unrolled
         v = jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(masses), True), p - gradient)
     return (v[:n_s], v[n_s:]), masses
 

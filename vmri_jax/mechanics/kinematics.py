@@ -1,41 +1,51 @@
-"""Bodies of a tree as functions of joint coordinates.
+"""Bodies of trees as functions of joint coordinates.
 
-A joint with one coordinate x, or with none, connects a body b to a body a or to the ground. The joint lies at the points X_a and X_b of the
-bodies, and has a triad of unit vectors in each body, the rows of F_a and F_b. Points and triads are given by components along the directors
-of their body, the rows of D. At x = 0 both points and triads coincide; x turns b about the vector k of the triad, or moves b along it. With
-the centres phi, and the rotation T(x) by x about the vector k,
+A body hangs on the root of its tree, or on the ground, by a chain of links, each with a coordinate x that turns all bodies behind the link about
+an axis, moves them along the axis, or both. At x = 0 all bodies have known places. Motions are rows (r, M) of a vector and a matrix (4, 3) in the
+axes of the root: a point y goes to ``r + y M``. So are the rates of motions, the twists (m, K): the point y has the velocity ``m + y K = m + k x y``.
 
-    D_b = M D_a,   phi_b = phi_a + r D_a,
-    M = F_b^T T(x) F_a,   r = X_a - X_b M + (distance along k) F_a[k]
+    E_i = exp(x_i Y_i) E_parent      exp(x Y) = 1 + sin x T + (1 - cos x) T T + x S      Y = T + S, turn T and slide S
+    A_b = Z_b E_b                    origin and axes of body b, of Z_b at x = 0, moved by the last link of b
+    phi_b, D_b = A_b (phi, D)        in space, by centre phi and directors D of the root, which need not be orthonormal
 
-So the four rows (r, M) are ``C + P cos x + S sin x + E x``, with constants C, P, S, E that are computed once. The rows are multiplied from
-the roots outwards, along the paths to all outermost bodies at once; a loop over the depth keeps programs small.
+A coordinate x_i moves all bodies behind it by the twist ``J_i = E_i^-1 Y_i E_i``. So positions and twists have derivatives in closed form,
 
-A joint of several coordinates is a chain of such joints with frames between them. Bodies without a joint, the roots, have their centres and
-directors among the coordinates.
+    dA_b = A_b W_b      dJ_i = J_i W_i - W_i J_i      W = sum of J_j dx_j over the links j before
 
-Source: R. Featherstone, Rigid Body Dynamics Algorithms, Springer (2008), chapter 4.
+W_i without link i itself. `placed` gives them to JAX: velocities, kinetic energies, forces and all their derivatives consist of sums over trees
+and of products of (4, 3) rows, and never differentiate the chains of motions.
+
+A joint of several coordinates is a chain of links. Bodies without a joint, the roots, have their centres and directors among the coordinates.
+
+Source: F. C. Park, J. E. Bobrow, S. R. Ploen, A Lie group formulation of robot dynamics, Int. J. Robot. Res. 14 (1995).
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
+from itertools import pairwise
 from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.custom_derivatives import SymbolicZero
 
 from vmri_jax.kernels import matmul
-from vmri_jax.mechanics.rows import Part, Place, Rows, Run
+from vmri_jax.mechanics.rows import Part, Place, Rows
 
 GROUND = -1
-"""The number of the body that does not move."""
+"""The number of the root that does not move."""
 JOINTS = "kinematics"
 """Key of the joint constants in the params of a system."""
 MASS = "mass"
 """Key of the masses of body coordinates in the params of a system; its entries are "slow" and "fast"."""
-Grid = Literal["s", "f", "sf"]
-"""The coordinates that a body depends on: slow ones, fast ones, both."""
+SIZE = 12
+"""Number of coordinates of a body on a joint: centre and directors."""
+LARGEST_MATRIX = 16
+"""Most links whose sums are products with a matrix, which take the square of their number. A smaller number makes programs of small trees larger."""
+UNMOVED = np.concatenate([np.zeros((1, 3)), np.eye(3)])
+"""(4, 3) the motion of nothing; centre and directors of the ground."""
 
 
 class Move(NamedTuple):
@@ -49,111 +59,87 @@ class Move(NamedTuple):
     axis: int
 
 
-@dataclass(frozen=True)
-class Frames:
-    """Bodies that depend on coordinates of one kind, and frames between them; compared by value.
+class Link(NamedTuple):
+    """A coordinate of a joint.
 
-    Args:
-        grid: kind of the coordinates.
-        first: number of the first of these frames among all frames of the kinematics.
-        roots: start of each path to an outermost body: `GROUND`, or a number among the roots of the kinematics followed by the bodies of
-            earlier `Frames`. Paths with a common part repeat its frames.
-        coordinates: rows of the moving frames; None if no frame moves.
-        moving: number of the coordinate of each frame, -1 for a fixed frame; the first frames of all paths, then the second ones, and so on.
-        slides: whether some frame moves along its axis.
-        bodies: numbers of the frames that are bodies.
-        directors: numbers of the directors of each body.
+    place: of the coordinate in q_s or q_f.
+    parent: number of the link before it on the way from the root; -1 for the first one.
     """
 
-    grid: Grid
-    first: int
-    roots: tuple[int, ...]
-    coordinates: Rows | None
-    moving: tuple[int, ...]
-    slides: bool
-    bodies: tuple[int, ...]
-    directors: tuple[tuple[int, ...], ...]
+    place: Place
+    parent: int
 
-    @property
-    def sizes(self) -> list[int]:
-        """Number of coordinates of each body: centre and directors."""
-        return [3 + 3 * len(kept) for kept in self.directors]
 
-    def relative(self, q_s, q_f, joints: dict[str, Any]):
-        """(n, 4, 3) the rows (r, M) of every frame, relative to the frame before it on its path.
+class Carried(NamedTuple):
+    """A body on joints.
 
-        Args:
-            joints: the constants C, P, S, E of all frames.
-        """
-        joints = {name: values[self.first : self.first + len(self.moving)] for name, values in joints.items()}
-        rows = joints["constant"]
-        if self.coordinates is None:
-            return rows
-        # the last number, -1, is the coordinate of fixed frames
-        x = jnp.append(self.coordinates.take(q_s, q_f), 0.0)
-        x = x[np.array(self.moving)][:, None, None]
-        rows = rows + jnp.cos(x) * joints["cosine"] + jnp.sin(x) * joints["sine"]
-        return rows + x * joints["way"] if self.slides else rows
+    part: "f" if the body depends on fast coordinates, else "s".
+    root: number of the root of its tree, or `GROUND`.
+    link: number of the last link on the way to the body; -1 if it does not move against the root.
+    """
 
-    def in_space(self, rows, roots):
-        """(n, 4, 3) origins and directors of all frames.
-
-        Args:
-            rows: (n, 4, 3) rows (r, M) of every frame, relative to the frame before it.
-            roots: (paths, 4, 3) origins and directors of the starts of the paths.
-        """
-
-        def outwards(inner, rows):
-            return (outer := after(rows, inner)), outer
-
-        return jax.lax.scan(outwards, roots, rows.reshape(-1, *roots.shape))[1].reshape(rows.shape)
+    part: Part
+    root: int
+    link: int
 
 
 @dataclass(frozen=True)
 class Kinematics:
     """The map from coordinates q to those of points and rigid bodies Q; compared by value.
 
-    Q_s is q_s followed by centres and directors of the bodies that depend on slow coordinates alone; Q_f is q_f followed by the bodies that
-    depend on fast coordinates alone, then by all other bodies.
+    Q_s is q_s followed by centres and directors of the bodies that depend on slow coordinates alone; Q_f is q_f followed by those of all others.
 
     Args:
         roots: places of the coordinates of root bodies in q_s and q_f.
-        frames: at most four entries, in this order: bodies that depend on q_s and carry bodies that depend on q_f, bodies that depend on q_f,
-            bodies that depend on both, bodies that depend on q_s and carry no body that depends on q_f.
+        links: first the slow ones that carry no fast body, then slow ones that do, then those that carry fast bodies alone.
+        bodies: the slow ones first.
         sizes: (n_s, n_f), numbers of coordinates.
-        num_fast: number of the first entries of `frames` that Q_f needs.
+        first: numbers of the first link and of the first body in the joint constants.
     """
 
     roots: tuple[Place, ...]
-    frames: tuple[Frames, ...]
+    links: tuple[Link, ...]
+    bodies: tuple[Carried, ...]
     sizes: tuple[int, int]
-    num_fast: int
+    first: tuple[int, int] = (0, 0)
 
     @property
     def of_slow(self) -> "Kinematics":
         """The map from q_s to Q_s, with q_f as Q_f."""
-        return replace(self, frames=tuple(frames for frames in self.frames if frames.grid == "s"))
+        return self._of("s")
 
     @property
     def of_fast(self) -> "Kinematics":
-        """The map from q to Q_f; its Q_s has only the bodies that carry bodies of Q_f."""
-        return replace(self, frames=self.frames[: self.num_fast])
+        """The map from q to Q_f, with q_s as Q_s."""
+        return self._of("f")
+
+    def _of(self, part: Part) -> "Kinematics":
+        """The map with the bodies of one part, and the links that move them."""
+        numbers = [i for i, body in enumerate(self.bodies) if body.part == part]
+        moving = np.flatnonzero(self.before[numbers].any(axis=0))
+        first = int(moving.min(initial=len(self.links)))
+        links = self.links[first : int(moving.max(initial=-1)) + 1]
+        return replace(
+            self,
+            links=tuple(link._replace(parent=max(link.parent - first, -1)) for link in links),
+            bodies=tuple(self.bodies[i]._replace(link=max(self.bodies[i].link - first, -1)) for i in numbers),
+            first=(self.first[0] + first, self.first[1] + min(numbers, default=0)),
+        )
 
     def __call__(self, q_s, q_f, joints: dict[str, Any]) -> tuple[Any, Any]:
         """(Q_s, Q_f).
 
         Args:
             q_s, q_f: coordinates.
-            joints: the constants C, P, S, E (n, 4, 3) of all frames, "constant", "cosine", "sine", "way".
+            joints: the constants in the axes of the roots, "turn" T (n, 4, 3) and "slide", the first row of S (n, 3), of all links, "zero" Z
+                (n, 4, 3) of all bodies.
         """
-        known = self._roots(q_s, q_f)
-        slow, fast = [q_s], [q_f]
-        for frames in self.frames:
-            roots = jnp.stack([known[root] for root in frames.roots])
-            rows = frames.in_space(frames.relative(q_s, q_f, joints), roots)
-            known |= {len(known) - 1 + i: rows[k] for i, k in enumerate(frames.bodies)}
-            (slow if frames.grid == "s" else fast).append(_coordinates(rows, frames))
-        return jnp.concatenate(slow), jnp.concatenate(fast)
+        (link, body), slow = self.first, sum(body.part == "s" for body in self.bodies)
+        constants = [joints[name][link : link + len(self.links)] for name in ("turn", "slide")]
+        x = Rows.of([link.place for link in self.links]).take(q_s, q_f).reshape(-1) if self.links else jnp.zeros(0)
+        frames, _ = placed(self, x, *constants, joints["zero"][body : body + len(self.bodies)])
+        frames = after(frames, self._roots(q_s, q_f)) if any(b.root != GROUND for b in self.bodies) else frames
+        return jnp.concatenate([q_s, frames[:slow].reshape(-1)]), jnp.concatenate([q_f, frames[slow:].reshape(-1)])
 
     def velocities(self, q_s, q_f, v_s, v_f, joints: dict[str, Any]):
         """Rates of (Q_s, Q_f)."""
@@ -167,54 +153,148 @@ class Kinematics:
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> "Kinematics":
         """The inverse of `dataclasses.asdict`, also after a round trip through JSON."""
-        frames = []
-        for entry in data["frames"]:
-            rows = entry["coordinates"]
-            runs = None if rows is None else tuple(Run(*run) for run in rows["runs"])
-            fields: dict[str, Any] = {name: tuple(entry[name]) for name in ("roots", "moving", "bodies")}
-            fields["coordinates"] = None if rows is None else Rows(**(rows | {"runs": runs}))
-            fields["directors"] = tuple(map(tuple, entry["directors"]))
-            frames.append(Frames(**(entry | fields)))
-        roots = tuple(Place(*root) for root in data["roots"])
-        return cls(roots, tuple(frames), tuple(data["sizes"]), data["num_fast"])
+        return cls(
+            tuple(Place(*root) for root in data["roots"]),
+            tuple(Link(Place(*place), parent) for place, parent in data["links"]),
+            tuple(Carried(*body) for body in data["bodies"]),
+            tuple(data["sizes"]),
+            tuple(data["first"]),
+        )
 
     @cached_property
     def places(self) -> tuple[Place, ...]:
-        """Places of the bodies in Q_s and Q_f, in the order of the frames."""
-        ends, places = {"s": self.sizes[0], "f": self.sizes[1]}, []
-        for frames in self.frames:
-            part: Part = "s" if frames.grid == "s" else "f"
-            for size in frames.sizes:
-                places.append(Place(part, ends[part], size))
-                ends[part] += size
+        """Places of the bodies in Q_s and Q_f."""
+        ends, places = dict(zip("sf", self.sizes, strict=True)), []
+        for part, *_ in self.bodies:
+            places.append(Place(part, ends[part], SIZE))
+            ends[part] += SIZE
         return tuple(places)
 
-    def _roots(self, q_s, q_f) -> dict[int, Any]:
-        """Centre and directors (4, 3) of the ground and of the roots, by number."""
-        known: dict[int, Any] = {GROUND: jnp.asarray(UNMOVED)}
-        for number, (part, start, size) in enumerate(self.roots):
-            rows = (q_s if part == "s" else q_f)[start : start + size].reshape(-1, 3)
-            known[number] = jnp.pad(rows, ((0, 4 - len(rows)), (0, 0)))
-        return known
+    @cached_property
+    def lasts(self) -> np.ndarray:
+        """(bodies + links,) number of the last link before each body and before each link; -1 for none."""
+        return np.array([*(body.link for body in self.bodies), *(link.parent for link in self.links)], int)
+
+    @cached_property
+    def before(self) -> np.ndarray:
+        """(bodies + links, links) 1 for the links between the root and each body, and between the root and each link, without the link itself."""
+        before = np.zeros((len(self.lasts), len(self.links)))
+        for row, last in zip(before, self.lasts, strict=True):
+            while last >= 0:
+                row[last], last = 1.0, self.links[last].parent
+        return before
+
+    @property
+    def is_deep(self) -> bool:
+        """Whether a link hangs on another one."""
+        return any(link.parent >= 0 for link in self.links)
+
+    def jumps(self) -> Iterator[np.ndarray]:
+        """Numbers of the links 1, 2, 4, ... links before each link, -1 for none, as long as there are some."""
+        parents = np.array([link.parent for link in self.links], int)
+        while (parents >= 0).any():
+            yield parents
+            parents = np.append(parents, -1)[parents]
+
+    def summed(self, of_links):
+        """Sums of (n, 4, 3) of the links before each body (bodies, 4, 3), and of the links before each link (n, 4, 3).
+
+        By a product with the matrix `before`, whose program is small; beyond `LARGEST_MATRIX` links over 1, 2, 4, ... links at once, so that
+        the time grows nearly in proportion to the number of links.
+        """
+        rows = of_links.reshape(-1, SIZE)
+        if len(self.links) <= LARGEST_MATRIX:
+            # without deep links the lower part is zero
+            sums = matmul(self.before if self.is_deep else self.before[: len(self.bodies)], rows)
+        else:
+            for parents in self.jumps():
+                rows = rows + _taken(rows, parents)
+            sums = _taken(rows, self.lasts)
+        return jnp.split(sums.reshape(-1, 4, 3), [len(self.bodies)])
+
+    def _roots(self, q_s, q_f):
+        """(bodies, 4, 3) centre and directors of the root of each body."""
+        roots = [(q_s if part == "s" else q_f)[start : start + size] for part, start, size in self.roots]
+        if len({body.root for body in self.bodies}) == 1:
+            return roots[self.bodies[0].root].reshape(1, 4, 3)
+        chosen = np.array([body.root for body in self.bodies])[:, None] == [*range(len(roots)), GROUND]
+        return matmul(chosen.astype(float), jnp.stack([*roots, UNMOVED.ravel()])).reshape(-1, 4, 3)
 
 
-UNMOVED = np.concatenate([np.zeros((1, 3)), np.eye(3)])
-"""(4, 3) centre and directors of the ground."""
+def _placed(tree: Kinematics, x, turn, slide, zero):
+    """A (bodies, 4, 3) and J (links, 4, 3).
+
+    Args:
+        x: (n,) coordinates of the links.
+        turn, slide, zero: T (n, 4, 3), the first row of S (n, 3), and Z (bodies, 4, 3).
+    """
+    sine, versine = jnp.sin(x)[:, None, None], (1 - jnp.cos(x))[:, None, None]
+    motions = UNMOVED + sine * turn + versine * matmul(turn, turn[:, 1:]) + _first_row(x[:, None] * slide)
+    for parents in tree.jumps():
+        motions = after(motions, _with_unmoved(motions)[parents])  # after k turns, motions of the last 2^k links
+    inverse = jnp.swapaxes(motions[:, 1:], 1, 2)
+    twists = matmul(turn + _first_row(slide), motions[:, 1:])
+    turning = matmul(inverse, twists[:, 1:])
+    moving = twists[:, :1] - matmul(motions[:, :1], turning)
+    frames = after(zero, _with_unmoved(motions)[tree.lasts[: len(tree.bodies)]])
+    return frames, jnp.concatenate([moving, turning], axis=1)
+
+
+placed = jax.custom_jvp(_placed, nondiff_argnums=(0,))
+"""`_placed` with derivatives in closed form."""
+
+
+@partial(placed.defjvp, symbolic_zeros=True)
+def _change(tree: Kinematics, arguments, tangents):
+    (x, *constants), (dx, *changes) = arguments, tangents
+    frames, twists = placed(tree, *arguments)
+    d_frames, d_twists = jnp.zeros_like(frames), jnp.zeros_like(twists)
+    if not isinstance(dx, SymbolicZero):
+        of_bodies, of_links = tree.summed(dx[:, None, None] * twists)
+        d_frames = after(frames, of_bodies)
+        if tree.is_deep:
+            d_twists = matmul(twists, of_links[:, 1:]) - matmul(of_links, twists[:, 1:])
+    if not all(isinstance(change, SymbolicZero) for change in changes):
+        changes = [
+            jnp.zeros_like(c) if isinstance(change, SymbolicZero) else change
+            for c, change in zip(constants, changes, strict=True)
+        ]
+        by_constants = jax.jvp(partial(_placed, tree, x), constants, changes)[1]
+        d_frames, d_twists = d_frames + by_constants[0], d_twists + by_constants[1]
+    return (frames, twists), (d_frames, d_twists)
 
 
 def after(rows, bodies):
-    """Origins and directors of frames with the relative rows (r, M), in bodies with the rows (s, D): ``(s + r D, M D)``.
+    """Origins and axes of frames with the relative rows (r, M), in bodies with the rows (s, D): ``(s + r D, M D)``.
 
     Args:
         rows: (n, 4, 3) of the frames.
         bodies: (n, 4, 3).
     """
-    return matmul(rows, bodies[:, 1:]) + jnp.pad(bodies[:, :1], ((0, 0), (0, 3), (0, 0)))
+    return matmul(rows, bodies[:, 1:]) + _pad(bodies[:, :1])
 
 
-def _coordinates(rows, frames: Frames):
-    """Coordinates of the frames that are bodies, one body after the other."""
-    if any(len(kept) < 3 for kept in frames.directors):
-        pieces = [rows[i, [0, *(k + 1 for k in kept)]] for i, kept in zip(frames.bodies, frames.directors, strict=True)]
-        return jnp.concatenate(pieces).reshape(-1)
-    return rows[np.array(frames.bodies)].reshape(-1)
+def _taken(rows, numbers):
+    """Rows (n, k) by their numbers, zeros for -1, by static slices: derivatives in reverse mode are no scatters."""
+    follows = [b - a == (a >= 0) for a, b in pairwise(numbers)]
+    ends = [0, *(i for i, goes_on in enumerate(follows, 1) if not goes_on), len(numbers)]
+    pieces = [
+        rows[numbers[i] : numbers[i] + j - i] if numbers[i] >= 0 else jnp.zeros((j - i, rows.shape[1]))
+        for i, j in pairwise(ends)
+    ]
+    return jnp.concatenate(pieces)
+
+
+def _pad(first):
+    """(n, 4, 3) rows of which only the first one (n, 1, 3) is not zero."""
+    return jnp.pad(first, ((0, 0), (0, 3), (0, 0)))
+
+
+def _first_row(vectors):
+    """(n, 4, 3) rows of which only the first one (n, 3) is not zero."""
+    return _pad(vectors[:, None])
+
+
+def _with_unmoved(motions):
+    """Motions (n, 4, 3), and the motion of nothing as the last one, number -1."""
+    return jnp.concatenate([motions, UNMOVED[None]])

@@ -12,77 +12,32 @@ from vmri_jax.mechanics.arrays import Numbers, is_concrete, real_array
 from vmri_jax.refusals import Refused
 
 
-class Diagonal(eqx.Module):
-    """A diagonal mass matrix of positive masses."""
+class MassMatrix(eqx.Module):
+    """A constant mass matrix: positive masses, its diagonal, or a full symmetric positive definite matrix."""
 
-    masses: Float[Numbers, "n"]
+    entries: Float[Numbers, "n"] | Float[Numbers, "n n"]
+
+    @property
+    def is_diagonal(self) -> bool:
+        """Whether the entries are masses."""
+        return self.entries.ndim == 1
 
     @property
     def size(self) -> int:
         """Number of coordinates n."""
-        return self.masses.shape[0]
-
-    @property
-    def matrix(self):
-        """``M`` as an array (n, n)."""
-        return jnp.diag(self.masses)
+        return self.entries.shape[0]
 
     def times(self, v):
         """``M v`` for (..., n)."""
-        return self.masses * v
+        return self.entries * v if self.is_diagonal else kernels.matvec(self.entries, v)
 
     def solve(self, p):
         """``M^-1 p`` for (..., n)."""
-        return p * (1 / self.masses)
+        return p * (1 / self.entries) if self.is_diagonal else jnp.linalg.solve(self.entries, p[..., None])[..., 0]
 
-    def inverse(self) -> "Diagonal":
+    def inverse(self) -> "MassMatrix":
         """``M^-1`` as an operator, computed once."""
-        return Diagonal(1 / self.masses)
-
-
-class Dense(eqx.Module):
-    """A full mass matrix, symmetric positive definite."""
-
-    matrix: Float[Numbers, "n n"]
-
-    @property
-    def size(self) -> int:
-        """Number of coordinates n."""
-        return self.matrix.shape[0]
-
-    def times(self, v):
-        """``M v`` for (..., n)."""
-        return kernels.matvec(self.matrix, v)
-
-    def solve(self, p):
-        """``M^-1 p`` for (..., n)."""
-        return jnp.linalg.solve(self.matrix, p[..., None])[..., 0]
-
-    def inverse(self) -> "Dense":
-        """``M^-1`` as an operator, computed once."""
-        return Dense(kernels.inverse(self.matrix))
-
-
-def mass_array(name: str, mass):
-    """Masses (n,), or a mass matrix (n, n), as `ConstantMass` takes them: an array of float64.
-
-    Lists and NumPy arrays become a NumPy array, which keeps all digits even before 64-bit mode is on.
-    """
-    mass = real_array(f"ConstantMass: {name}", mass)
-    if mass.ndim not in (1, 2) or (mass.ndim == 2 and mass.shape[0] != mass.shape[1]):
-        raise Refused(f"ConstantMass: {name} has shape {mass.shape}; give (n,) masses or an (n, n) mass matrix.")
-    if not is_concrete(mass):
-        return mass
-    values = np.asarray(mass)
-    if not np.all(np.isfinite(values)):
-        raise Refused(f"ConstantMass: {name} = {values} is not finite.")
-    if mass.ndim == 1 and np.any(values <= 0):
-        raise Refused(f"ConstantMass: {name} = {values}; every mass must be positive.")
-    if mass.ndim == 2:
-        scaled = correlation(values)
-        if not np.allclose(scaled, scaled.T) or np.any(np.linalg.eigvalsh(scaled) <= 0):
-            raise Refused(f"ConstantMass: {name} must be a symmetric positive definite matrix.")
-    return mass
+        return MassMatrix(1 / self.entries if self.is_diagonal else kernels.inverse(self.entries))
 
 
 def correlation(matrix: np.ndarray) -> np.ndarray:
@@ -109,15 +64,15 @@ class ConstantMass(eqx.Module):
     fast: Float[Numbers, "n_f"] | Float[Numbers, "n_f n_f"]
 
     def __init__(self, slow, fast):
-        self.slow, self.fast = _masses("slow", slow), _masses("fast", fast)
+        self.slow, self.fast = _masses("ConstantMass: slow", slow), _masses("ConstantMass: fast", fast)
 
     @property
-    def slow_mass(self) -> Diagonal | Dense:
+    def slow_mass(self) -> MassMatrix:
         """``M_s`` as an operator."""
         return _operator(self.slow)
 
     @property
-    def fast_mass(self) -> Diagonal | Dense:
+    def fast_mass(self) -> MassMatrix:
         """``M_f`` as an operator."""
         return _operator(self.fast)
 
@@ -134,23 +89,35 @@ class ConstantMass(eqx.Module):
         return self.slow_mass.solve(p_s), self.fast_mass.solve(p_f)
 
 
-def _masses(name: str, mass):
-    if isinstance(mass, Mapping):
-        return {body: _positive(f"ConstantMass: {name}[{body!r}]", value) for body, value in mass.items()}
-    return mass_array(name, mass)
+def _masses(name: str, masses):
+    """Masses as `ConstantMass` takes them, as float64: lists and NumPy arrays as NumPy arrays, which keep all digits before 64-bit mode is on."""
+    if isinstance(masses, Mapping):
+        return {
+            body: _positive(f"{name}[{body!r}]", real_array(f"{name}[{body!r}]", mass)) for body, mass in masses.items()
+        }
+    masses = real_array(name, masses)
+    if masses.ndim == 1:
+        return _positive(name, masses)
+    if masses.ndim != 2 or masses.shape[0] != masses.shape[1]:
+        raise Refused(f"{name} has shape {masses.shape}; give (n,) masses or an (n, n) mass matrix.")
+    if is_concrete(masses):
+        with np.errstate(invalid="ignore"):  # of infinities, which are not symmetric below
+            scaled = correlation(np.asarray(masses))
+        if not np.allclose(scaled, scaled.T) or np.any(np.linalg.eigvalsh(scaled) <= 0):
+            raise Refused(f"{name} must be a symmetric positive definite matrix.")
+    return masses
 
 
-def _positive(name: str, mass):
-    mass = real_array(name, mass)
-    if is_concrete(mass) and not (np.isfinite(mass).all() and np.all(np.asarray(mass) > 0)):
-        raise Refused(f"{name} = {mass}; every mass must be positive and finite.")
-    return mass
+def _positive(name: str, masses):
+    if is_concrete(masses) and not (np.isfinite(masses).all() and np.all(np.asarray(masses) > 0)):
+        raise Refused(f"{name} = {masses}; every mass must be positive and finite.")
+    return masses
 
 
-def _operator(mass) -> Diagonal | Dense:
-    if isinstance(mass, dict):
+def _operator(masses) -> MassMatrix:
+    if isinstance(masses, dict):
         raise Refused(
-            f"ConstantMass: the masses of {', '.join(mass)} are given by name, and the sizes of these bodies are not known. Give the start "
+            f"ConstantMass: the masses of {', '.join(masses)} are given by name, and the sizes of these bodies are not known. Give the start "
             "as dictionaries, too: vmri_jax.Problem(system, q_s={...}, q_f={...})."
         )
-    return Diagonal(mass) if mass.ndim == 1 else Dense(mass)
+    return MassMatrix(masses)

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 
 from vmri_jax.kernels.saddle import least_norm
 from vmri_jax.mechanics.invariants import lagrangian, velocity
+from vmri_jax.mechanics.projection import mass_matrix
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
 
@@ -58,7 +59,7 @@ def motion(system: System, state: State) -> Motion:
 
     t = jnp.asarray(state.t)
     of_motion = partial(lagrangian, system, n_s)
-    mass = jax.jacfwd(jax.grad(of_motion, argnums=1), argnums=1)(q, v)
+    mass = mass_matrix(system, state.q_s, state.q_f, v_s, v_f)
     forces = force_of(of_motion, q, v)
     if system.force is not None:
         forces += jnp.concatenate(system.forces(t, state.q_s, state.q_f, v_s, v_f))

@@ -1,20 +1,23 @@
 """Names of coordinates, bodies and constraints: for labels, files, and access to quantities by name."""
 
 import difflib
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
-from vmri_jax.mechanics.by_name import Layout
 from vmri_jax.mechanics.kinematics import Kinematics
 from vmri_jax.mechanics.rows import Part, Place
+from vmri_jax.mechanics.slots import Slots
 from vmri_jax.mechanics.system import System
 from vmri_jax.refusals import Refused
 
 AXES = "xyz"
 """Coordinates of a point of two or three dimensions."""
+Sizes = Mapping[str, int | tuple[int, ...]]
+"""Numbers of entries by name, or shapes of arrays."""
 
 
 @dataclass(frozen=True)
@@ -24,39 +27,38 @@ class Names:
         Names(slow={"trolley": 1}, fast={"hook": 2, "load": 2}, constraint={"rope": 1})
 
     Args:
-        slow, fast: bodies, or single coordinates, in the order of q_s and q_f, with their numbers of coordinates.
+        slow, fast: bodies, or single coordinates, in the order of q_s and q_f, with their numbers of coordinates; with the shapes of their
+            arrays if the user gave dictionaries of arrays: a run then returns its positions in the same form.
         constraint, slow_constraint: constraints in the order of the values of these functions, with their numbers of rows.
         numbered: bodies with generalised coordinates: these have the names "name[0]", "name[1]", not "name x", "name y".
         rigid: bodies whose coordinates are a centre and directors: "name x", "name y", "name z", "name d1 x" and so on.
         carried: places in Q_s and Q_f of the bodies that are functions of the coordinates, by name.
         kinematics: the map from q_s, q_f to Q_s, Q_f, see `vmri_jax.mechanics.kinematics`; None without such bodies.
         angles: coordinates of `slow` and `fast` that are angles, rad.
-        layouts: of q_s and of q_f if the user gave dictionaries of arrays, None for vectors; a run returns its positions in the same form.
 
     Raises:
         TypeError: an argument that is no mapping from names to whole numbers.
         ValueError: a body that is slow and fast.
     """
 
-    slow: Mapping[str, int] = field(default_factory=dict)
-    fast: Mapping[str, int] = field(default_factory=dict)
+    slow: Sizes = field(default_factory=dict)
+    fast: Sizes = field(default_factory=dict)
     constraint: Mapping[str, int] = field(default_factory=dict)
     slow_constraint: Mapping[str, int] = field(default_factory=dict)
     numbered: Sequence[str] = ()
     rigid: Sequence[str] = ()
     carried: Mapping[str, Place] = field(default_factory=dict)
     kinematics: Kinematics | None = None
-    layouts: tuple[Layout | None, Layout | None] = (None, None)
     angles: Sequence[str] = ()
 
     def __hash__(self) -> int:
-        return hash((*map(tuple, (self.slow, self.fast, self.constraint, self.slow_constraint)), self.layouts))
+        return hash((self.slots("s"), self.slots("f"), *self.constraint, *self.slow_constraint))
 
     def __post_init__(self):
         for field_name in ("slow", "fast", "constraint", "slow_constraint"):
             sizes = getattr(self, field_name)
             named = isinstance(sizes, Mapping) and all(isinstance(name, str) for name in sizes)
-            if not (named and all(isinstance(size, int) and size > 0 for size in sizes.values())):
+            if not (named and all(isinstance(n, tuple) or (isinstance(n, int) and n > 0) for n in sizes.values())):
                 raise Refused(
                     f"Names: {field_name} is {sizes!r}; give a dictionary of names and sizes in the order of the coordinates or "
                     "rows, e.g. {'hook': 2, 'load': 2}."
@@ -65,18 +67,30 @@ class Names:
         if both:
             raise Refused(f"Names: {', '.join(both)} in slow and in fast; give every body one place.")
 
+    def slots(self, part: Part) -> Slots:
+        """The bodies in q_s or q_f."""
+        return Slots.of_sizes(self.slow if part == "s" else self.fast)
+
     @property
     def bodies(self) -> dict[str, Place]:
         """The place of every body."""
-        parts: list[tuple[Part, Mapping[str, int]]] = [("s", self.slow), ("f", self.fast)]
-        return {
-            name: Place(part, start, size) for part, sizes in parts for name, start, size in _one_after_another(sizes)
-        }
+        bodies: dict[str, Place] = {}
+        parts: tuple[Part, Part] = "s", "f"
+        for part in parts:
+            pieces = self.slots(part).slices.items()
+            bodies |= {name: Place(part, piece.start, piece.stop - piece.start) for name, piece in pieces}
+        return bodies
+
+    def arrays(self, part: Part, size: int) -> Slots | None:
+        """The arrays in q_s or q_f, of `size` coordinates, if the user gave a dictionary, else None. An empty part is like the other one."""
+        parts = (self.slow, self.fast) if part == "s" else (self.fast, self.slow)
+        sizes = parts[0] if size else parts[0] or parts[1]
+        return self.slots(part) if any(isinstance(shape, tuple) for shape in sizes.values()) else None
 
     def shaped(self, part: Part, vectors) -> Any:
         """Vectors (..., n) in the form of the start: a dictionary of arrays by name, or the vectors themselves."""
-        layout = self.layouts[part == "f"]
-        return vectors if layout is None else layout.by_name(vectors)
+        slots = self.arrays(part, vectors.shape[-1])
+        return vectors if slots is None else slots.by_name(vectors)
 
     @property
     def slow_coordinates(self) -> list[str]:
@@ -100,29 +114,22 @@ class Names:
     def rows(self) -> dict[str, list[int]]:
         """Indices of the values of every constraint among the values of `constraint` followed by `slow_constraint`."""
         rows: dict[str, list[int]] = {}
-        total = sum(self.constraint.values())
-        for first, sizes in ((0, self.constraint), (total, self.slow_constraint)):
-            for name, start, size in _one_after_another(sizes):
-                rows.setdefault(name, []).extend(range(first + start, first + start + size))
+        number = 0
+        for name, size in [*self.constraint.items(), *self.slow_constraint.items()]:
+            rows.setdefault(name, []).extend(range(number, number + size))
+            number += size
         return rows
 
-    def place(self, body: str) -> Place:
-        """The place of a body.
-
-        Raises:
-            ValueError: no body of this name.
-        """
-        if body not in self.bodies:
-            raise Refused(unknown("body", body, {**self.bodies, **self.carried}))
-        return self.bodies[body]
-
     def place_of(self, body: str) -> Place:
-        """The place of a body in (Q_s, Q_f) of the kinematics, or as `place`.
+        """The place of a body, in (Q_s, Q_f) of the kinematics if it is a function of the coordinates.
 
         Raises:
             ValueError: no body of this name.
         """
-        return self.carried[body] if body in self.carried else self.place(body)
+        places = {**self.bodies, **self.carried}
+        if body not in places:
+            raise Refused(unknown("body", body, places))
+        return places[body]
 
     def of(self, system: System, n_s: int, n_f: int) -> "Names":
         """These names, completed by plain names for coordinates and constraints of a system without a name.
@@ -131,9 +138,8 @@ class Names:
             ValueError: sizes that do not add up to the numbers of coordinates and of constraint rows.
         """
         n_g, n_gs = system.num_constraints(np.zeros(n_s), np.zeros(n_f))
-        constraint = self._completed("constraint", "constraint", n_g)
-        slow_constraint = self._completed("slow_constraint", "slow_constraint", n_gs)
-        return replace(self.of_coordinates(n_s, n_f), constraint=constraint, slow_constraint=slow_constraint)
+        rows = {"constraint": ("constraint", n_g), "slow_constraint": ("slow_constraint", n_gs)}
+        return self._completed(rows).of_coordinates(n_s, n_f)
 
     def of_coordinates(self, n_s: int, n_f: int) -> "Names":
         """These names, completed by plain names for coordinates without a name.
@@ -141,22 +147,26 @@ class Names:
         Raises:
             ValueError: sizes that do not add up to these numbers.
         """
-        slow, fast = self._completed("slow", "q_s", n_s), self._completed("fast", "q_f", n_f)
-        return replace(self, slow=slow, fast=fast, numbered=(*self.numbered, "q_s", "q_f"))
+        names = self._completed({"slow": ("q_s", n_s), "fast": ("q_f", n_f)})
+        return replace(names, numbered=(*self.numbered, "q_s", "q_f"))
 
-    def _completed(self, field_name: str, plain: str, number: int) -> dict[str, int]:
-        sizes = dict(getattr(self, field_name)) or ({plain: number} if number else {})
-        if sum(sizes.values()) != number:
-            raise Refused(
-                f"Names: {field_name} is {sizes}, which names {sum(sizes.values())}; the system has {number}. The sizes must add up "
-                "to that."
-            )
-        return sizes
+    def _completed(self, fields: Mapping[str, tuple[str, int]]) -> "Names":
+        """These names, with a plain name for the entries of each field without names; fields have a plain name and the number of entries."""
+        complete = {}
+        for name, (plain, number) in fields.items():
+            complete[name] = dict(getattr(self, name)) or ({plain: number} if number else {})
+            size = Slots.of_sizes(complete[name]).size
+            if size != number:
+                raise Refused(
+                    f"Names: {name} is {complete[name]}, which names {size}; the system has {number}. The sizes must add up to that."
+                )
+        return replace(self, **complete)
 
-    def _coordinates(self, sizes: Mapping[str, int]) -> list[str]:
-        names, shapes = [], {name: shape for layout in self.layouts if layout for name, shape in layout.shapes}
-        for name, size in sizes.items():
-            *rows, columns = shapes.get(name, (size,)) or (1,)
+    def _coordinates(self, sizes: Sizes) -> list[str]:
+        names = []
+        for name, shape in Slots.of_sizes(sizes).shapes:
+            size = math.prod(shape)
+            *rows, columns = shape or (1,)
             # entries of an array of points, e.g. of atoms, are called "atoms[3] x"; of other arrays "name[i,j]"
             if rows:
                 are_points = columns <= len(AXES)
@@ -185,8 +195,8 @@ class Names:
         fields["carried"] = {name: Place(*place) for name, place in data.get("carried", {}).items()}
         if data.get("kinematics") is not None:
             fields["kinematics"] = Kinematics.from_dict(data["kinematics"])
-        layouts = data.get("layouts", (None, None))
-        fields["layouts"] = tuple(None if layout is None else Layout.from_dict(layout) for layout in layouts)
+        for part in {"slow", "fast"} & data.keys():
+            fields[part] = {name: n if isinstance(n, int) else tuple(n) for name, n in data[part].items()}
         return cls(**fields)
 
 
@@ -204,12 +214,3 @@ def near(name: Any, known: Iterable[str]) -> str:
     """A question with the most similar known name; empty if no name is similar."""
     close = difflib.get_close_matches(str(name), list(known), n=1)
     return f" Did you mean {close[0]}?" if close else ""
-
-
-def _one_after_another(sizes: Mapping[str, int]) -> list[tuple[str, int, int]]:
-    """(name, start, size) of every entry, one after the other."""
-    starts, end = [], 0
-    for name, size in sizes.items():
-        starts.append((name, end, size))
-        end += size
-    return starts

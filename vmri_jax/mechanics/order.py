@@ -7,15 +7,13 @@ back into its order before a function is called, while JAX traces.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 
 
-@dataclass(frozen=True)
-class Order:
-    """Names in a dictionary in the order of writing, and orders of its entries; compared by value.
+class Order(NamedTuple):
+    """Names in a dictionary in the order of writing, and orders of its entries.
 
     Args:
         names: keys of the dictionary; None for a list, a tuple or another node of a pytree.
@@ -24,13 +22,6 @@ class Order:
 
     names: tuple[Any, ...] | None
     parts: tuple["Order | None", ...]
-
-    def __hash__(self) -> int:
-        return self._hash
-
-    @cached_property
-    def _hash(self) -> int:  # kept: JAX takes the hash at every call of a compiled function
-        return hash((self.names, self.parts))
 
 
 @dataclass(frozen=True)

@@ -29,8 +29,14 @@ def legendre(system: System, q_s, q_f, v_s, v_f):
     return jax.grad(system.kinetic_energy, argnums=(2, 3))(q_s, q_f, v_s, v_f)
 
 
+def mass_matrix(system: System, q_s, q_f, v_s, v_f):
+    """Mass matrix ``d2T/dv2`` (n, n)."""
+    n_s = v_s.size
+    return jax.hessian(lambda v: system.kinetic_energy(q_s, q_f, v[:n_s], v[n_s:]))(jnp.append(v_s, v_f))
+
+
 def mass_diagonal(system: System, q_s, q_f):
-    """Diagonal of the mass matrix ``d2T/dv2`` at rest: (n_s,) and (n_f,)."""
+    """Diagonal of the mass matrix at rest, in fewer operations than the matrix: (n_s,) and (n_f,)."""
     if system.has_constant_mass:
         masses = system.kinetic.slow, system.kinetic.fast
         return tuple(mass if mass.ndim == 1 else jnp.diagonal(mass) for mass in masses)
@@ -80,7 +86,7 @@ def _by_one_solve(system: System, state, sparsity: Sparsity | None):
         pushed = jax.vmap(lambda *p: push(*velocity(*p)))(*(jnp.concatenate([a, p[None]]) for a, p in impulses))
         products, rates = pushed[:-1], pushed[-1]
         if system.is_rheonomic:
-            rates = rates + _time_rates(system, t, q_s, q_f)
+            rates = rates + time_rates(system, t, q_s, q_f)
         mu = sparsity.solve(products, rates)
         pull_s, pull_f = pull(mu)
         p_s, p_f = p_s - pull_s, p_f - pull_f
@@ -90,7 +96,7 @@ def _by_one_solve(system: System, state, sparsity: Sparsity | None):
 def _by_newton(system: System, state, guess):
     t, q_s, q_f, n_s = state.t, state.q_s, state.q_f, state.q_s.shape[0]
     jacobian = jnp.concatenate(jax.jacrev(system.constraints, argnums=(1, 2))(t, q_s, q_f), axis=1)  # (n_g + n_gs, n)
-    rates = _time_rates(system, t, q_s, q_f)
+    rates = time_rates(system, t, q_s, q_f)
     p = jnp.concatenate([state.p_s, state.p_f])
     guess = jnp.zeros_like(p) if guess is None else jnp.concatenate(guess)
     v, impulse = _velocity_and_impulse(system, q_s, q_f, (jacobian, rates), p, guess)
@@ -99,7 +105,7 @@ def _by_newton(system: System, state, guess):
     return p[:n_s], p[n_s:], v[:n_s], v[n_s:]
 
 
-def _time_rates(system: System, t, q_s, q_f):
+def time_rates(system: System, t, q_s, q_f):
     """``dg/dt`` of all constraints (n_g + n_gs,) at fixed positions."""
     if not system.is_rheonomic:
         return jnp.zeros(sum(system.num_constraints(q_s, q_f)))

@@ -114,7 +114,10 @@ class Rows:
         return all(end <= most[part] for part, end in ends)
 
     def take(self, q_s, q_f):
-        """The rows of q_s and q_f, which may also be velocities."""
+        """The rows of q_s and q_f, which may also be velocities; for a single place (..., n) arrays."""
+        if self.single:
+            ((part, start, _, _),) = self.runs
+            return (q_s if part == "s" else q_f)[..., start : start + self.size]
         pieces = []
         for part, start, count, same in self.runs:
             q = q_s if part == "s" else q_f
@@ -124,8 +127,7 @@ class Rows:
             else:
                 whole = q[start : start + self.stride * count].reshape(count, self.stride)
                 pieces.append(whole[:, : self.size].reshape(-1))
-        flat = jnp.concatenate(pieces)
-        return flat if self.single else flat.reshape(-1, self.size)
+        return jnp.concatenate(pieces).reshape(-1, self.size)
 
     def put(self, rows, n_s: int, n_f: int):
         """The transpose of `take`.

@@ -12,12 +12,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from vmri_jax.mechanics import by_name
-from vmri_jax.mechanics.arrays import Known, Number, Numbers, is_concrete, of_one_type, quickly_compiled, require_x64
+from vmri_jax.mechanics.arrays import Known, Number, Numbers, is_concrete, of_one_type, require_x64
+from vmri_jax.mechanics.by_name import constraint_sizes, flat_system
 from vmri_jax.mechanics.checks import check_arrays, check_flags, check_number, check_params, check_system, check_type
-from vmri_jax.mechanics.constraints import START, check_constraints, check_mass, project_positions
+from vmri_jax.mechanics.consistent import consistent_momenta, project_positions
+from vmri_jax.mechanics.constraints import START, check_constraints, check_mass
 from vmri_jax.mechanics.names import Names
-from vmri_jax.mechanics.projection import legendre, project_momentum
+from vmri_jax.mechanics.rows import Part
+from vmri_jax.mechanics.slots import Slots
 from vmri_jax.mechanics.summary import coordinates, has_values, listed, numbers, summary
 from vmri_jax.mechanics.system import System
 from vmri_jax.refusals import Refused
@@ -32,8 +34,6 @@ REPORTED_PROJECTION = 0.85
 is hardly intended. A larger value passes over mistakes."""
 A_SYSTEM = "a vmri_jax.System; of a scene its .system(), of a problem its .system"
 """A right argument in messages about objects that are no system."""
-Layouts = tuple[by_name.Layout | None, by_name.Layout | None]
-"""Layouts of q_s and of q_f, None for vectors."""
 
 
 @jax.tree_util.register_dataclass
@@ -130,11 +130,13 @@ def initial_state(
 
 
 def _start(arguments, project: bool):
-    """`_consistent` of these arguments, with projected positions if `project`."""
+    """The state with projected momenta, with projected positions if `project`, and the violation of `consistent_momenta`."""
     system, t, q_s, q_f, *velocities = arguments
-    if project:
-        q_s, q_f = _projected_positions(system, t, q_s, q_f)
-    return _consistent(system, t, q_s, q_f, *velocities)
+    if project and system.is_constrained:
+        q_s, q_f = project_positions(system, t, q_s, q_f)
+    check_system(system, q_s, q_f)
+    p_s, p_f, violation = consistent_momenta(system, t, q_s, q_f, *velocities)
+    return State(t, q_s, q_f, p_s, p_f), violation
 
 
 @lru_cache(maxsize=256)
@@ -144,7 +146,7 @@ def _checked_start(known: Known, project: bool, tolerance: float) -> tuple[State
     if not system.has_constant_mass:  # before the projection, which divides by the masses
         check_system(system, q_s, q_f)
         check_mass(system, q_s, q_f)
-    state, violation = _start(known.tree, project)
+    state, violation = jax.device_put(_start(known.tree, project))
     advice = (
         "projection did not reach the constraints; start closer to them."
         if project
@@ -166,7 +168,7 @@ def tell_of_velocities(
 
     Args:
         caller: name of the caller in the message.
-        violation: as of `_consistent`.
+        violation: as of `consistent_momenta`.
         project: whether the user wants the projected velocities.
         constraints: name of the constraints in the message.
         at_rest: whether all velocities of the user are zero; moving constraints may demand others, which are then taken.
@@ -230,51 +232,49 @@ class Problem:
         check_type("Problem: system", self.system, System, A_SYSTEM)
         if self.names is not None:
             check_type("Problem: names", self.names, Names, "vmri_jax.Names(slow={...}, fast={...})")
-        layouts = self._make_flat()
+        slots = [self._make_flat(part) for part in ("s", "f")]
         names = "q_s", "q_f", "v_s", "v_f"
         for name, array in zip(names, check_arrays(**{name: getattr(self, name) for name in names}), strict=True):
             object.__setattr__(self, name, array)
-        if any(layouts):
-            object.__setattr__(self, "system", by_name.flat_system(self.system, *layouts))
-        if self.names is not None or any(layouts):
-            check_system(self.system, self.q_s, self.q_f)
-        if any(layouts):
-            object.__setattr__(self, "names", self._names_of(layouts))
-        if self.names is not None:
-            self.names.of(self.system, self.q_s.size, self.q_f.size)
+        if slots != [None, None]:
+            object.__setattr__(self, "system", flat_system(self.system, *slots))
+        if self.names is None:
+            return
+        check_system(self.system, self.q_s, self.q_f)
+        if slots != [None, None]:
+            object.__setattr__(self, "names", self._with_rows(self.names))
+        self.names.of(self.system, self.q_s.size, self.q_f.size)
 
-    def _make_flat(self) -> "Layouts":
-        """Replace dictionaries by vectors and missing velocities by zeros; returns the layouts of q_s and of q_f."""
-        known, layouts = (self.names or Names()).layouts, []
-        for part, layout in zip("sf", known, strict=True):
-            position, velocity = (getattr(self, f"{kind}_{part}") for kind in "qv")
-            if isinstance(position, Mapping):
-                layout = layout or by_name.Layout.of(f"Problem: q_{part}", position)
-                position = layout.flat(f"Problem: q_{part}", position)
-            if velocity is None:
-                velocity = np.zeros(np.shape(position))
-            elif isinstance(velocity, Mapping):
-                if layout is None:
-                    raise Refused(
-                        f"Problem: v_{part} is a dictionary and q_{part} is none; give both as dictionaries, or both as arrays."
-                    )
-                velocity = layout.flat(f"Problem: v_{part}", velocity, zeros=True)
-            object.__setattr__(self, f"q_{part}", position)
-            object.__setattr__(self, f"v_{part}", velocity)
-            layouts.append(layout)
-        return layouts[0], layouts[1]
+    def _make_flat(self, part: Part) -> Slots | None:
+        """Replace dictionaries by vectors, and missing velocities by zeros; the arrays of the dictionary, None if the user gave vectors."""
+        position, velocity = (getattr(self, f"{kind}_{part}") for kind in "qv")
+        names, is_named = self.names or Names(), isinstance(position, Mapping)
+        slots = names.arrays(part, len(position) if is_named else np.size(position))
+        if is_named:
+            slots = slots or Slots.of(f"Problem: q_{part}", position)
+            position = slots.flat(f"Problem: q_{part}", position)
+        if velocity is None:
+            velocity = np.zeros(np.shape(position))
+        elif isinstance(velocity, Mapping):
+            if slots is None:
+                raise Refused(
+                    f"Problem: v_{part} is a dictionary and q_{part} is none; give both as dictionaries, or both as arrays."
+                )
+            velocity = slots.flat(f"Problem: v_{part}", velocity, zeros=True)
+        object.__setattr__(self, f"q_{part}", position)
+        object.__setattr__(self, f"v_{part}", velocity)
+        if slots is not None:
+            bodies = {"slow" if part == "s" else "fast": dict(slots.shapes)}
+            object.__setattr__(self, "names", replace(names, **bodies))
+        return slots
 
-    def _names_of(self, layouts: "Layouts") -> Names:
-        """The names of the problem, with the names of bodies and rows in the dictionaries."""
-        names, system = self.names or Names(), self.system
-        values = {"t": jnp.zeros(()), "q_s": self.q_s, "q_f": self.q_f}
-        sizes = {"constraint": names.constraint, "slow_constraint": names.slow_constraint}
-        for term in system.of_kind("constraint"):
-            of_rows = by_name.constraint_sizes(term.function, *term.of_arguments(values), system.params)
-            sizes[term.field] = of_rows or sizes[term.field]
-        for name, layout in zip(("slow", "fast"), layouts, strict=True):
-            sizes[name] = getattr(names, name) if layout is None else layout.sizes
-        return replace(names, **sizes, layouts=layouts)
+    def _with_rows(self, names: Names) -> Names:
+        """Names with the rows that constraints return by name."""
+        values, sizes = {"t": jnp.zeros(()), "q_s": self.q_s, "q_f": self.q_f}, {}
+        for term in self.system.of_kind("constraint"):
+            rows = constraint_sizes(term.function, *term.of_arguments(values), self.system.params)
+            sizes |= {term.field: rows} if rows else {}
+        return replace(names, **sizes)
 
     def __repr__(self) -> str:
         names = (self.names or Names()).of_coordinates(np.shape(self.q_s)[-1], np.shape(self.q_f)[-1])
@@ -351,23 +351,3 @@ def start_of(caller: str, system, state=None) -> tuple[System, State]:
             f"{caller}: {got}; give a State, e.g. from initial_state(...), or a Problem(system, q_s, q_f, v_s, v_f) alone."
         )
     return system, state
-
-
-@quickly_compiled
-def _consistent(system, t, q_s, q_f, v_s, v_f):
-    """The state with projected momenta, and the violation of the hidden constraints, between 0 and 1.
-
-    The violation is ``|v - v'| / max(|v|, |v'|)`` in the norm of the kinetic energy, with the projected velocities v': constraints may take
-    velocity away, and moving constraints may add it. The values of the user's functions are checked while JAX traces this function.
-    """
-    check_system(system, q_s, q_f)
-    momenta = legendre(system, q_s, q_f, v_s, v_f)
-    p_s, p_f, *velocities = project_momentum(system, State(t, q_s, q_f, *momenta), (v_s, v_f))
-    v, projected_v, p, projected_p = (jnp.concatenate(a) for a in ((v_s, v_f), velocities, momenta, (p_s, p_f)))
-    # |v - v'|^2 / max(|v|^2, |v'|^2) with |v|^2 = v . p
-    size = jnp.maximum(v @ p, projected_v @ projected_p)
-    part = jnp.where(size > 0, (v - projected_v) @ (p - projected_p) / jnp.where(size > 0, size, 1.0), 0.0)
-    return State(t, q_s, q_f, p_s, p_f), jnp.sqrt(jnp.clip(part, 0.0, 1.0))
-
-
-_projected_positions = quickly_compiled(project_positions)

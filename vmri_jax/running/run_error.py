@@ -16,7 +16,7 @@ class RunError(NamedTuple):
     Attributes:
         q_s, q_f: (k, n_s), (k, n_f) positions of the run minus positions of the exact motion.
         slow, fast: (k,) largest modulus of the slow and of the fast share of the error over all coordinates. Shares have signs and add up
-            to the error, so that each may be larger. NaN without shares, or if their companion run failed.
+            to the error, so that each may be larger. NaN unless ``error="shares"`` asked for them, or if their companion run failed.
         of: error of the user's function of the run, in its shape; None without a function.
         certified_until: time of the last node whose error is certified.
         growth: factor by which the error grows in the second half of the time up to `certified_until`.

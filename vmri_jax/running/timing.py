@@ -9,6 +9,8 @@ import numpy as np
 MIN_SECONDS = 0.02
 """Least seconds of a sample; shorter runs are called several times. It is long against the resolution of clocks and the time slices of
 schedulers; a larger value makes measurements take longer."""
+LEAST_SECONDS = 1e-7
+"""Seconds of a call that is too short for the clock, or only waits; a smaller value repeats calls that wait for minutes."""
 
 Tell = Callable[[str], None]
 """Called with the name of a run before it is measured."""
@@ -22,9 +24,8 @@ def interleaved(
     runs: Mapping[str, Callable[[], object]],
     repeats: int,
     min_seconds: float = MIN_SECONDS,
-    clock: Callable[[], float] = time.perf_counter,
 ) -> dict[str, list[float]]:
-    """Seconds per call of every run, `repeats` samples each, after one call that is not counted.
+    """Seconds per call of every run by a `stopwatch`, `repeats` samples each, after one call that is not counted.
 
     The runs take turns, and every round starts with another run, so that a slow moment of the machine, or the caches as the previous run
     left them, affect all runs alike.
@@ -33,26 +34,25 @@ def interleaved(
         runs: callables by name; the clock stops when their results are ready (`jax.block_until_ready`).
         repeats: samples of each run.
         min_seconds: seconds of a sample, the mean of several calls.
-        clock: `time.process_time` where other processes share the core.
     """
     calls, seconds = {}, {name: [] for name in runs}
     for name, run in runs.items():
-        seconds_per_call(run, 1, clock)
-        calls[name] = max(1, round(min_seconds / seconds_per_call(run, 1, clock)))
+        seconds_per_call(run, 1)
+        calls[name] = max(1, round(min_seconds / max(seconds_per_call(run, 1), LEAST_SECONDS)))
     names = list(runs)
     for i in range(repeats):
         start = i % max(1, len(names))
         for name in names[start:] + names[:start]:
-            seconds[name].append(seconds_per_call(runs[name], calls[name], clock))
+            seconds[name].append(seconds_per_call(runs[name], calls[name]))
     return seconds
 
 
-def seconds_per_call(run: Callable[[], object], calls: int, clock: Callable[[], float] = time.perf_counter) -> float:
-    """Mean seconds of `calls` calls, up to the moment when their results are ready."""
-    start = clock()
+def seconds_per_call(run: Callable[[], object], calls: int) -> float:
+    """Mean seconds of `calls` calls by a `stopwatch`, up to the moment when their results are ready."""
+    elapsed = stopwatch()
     for _ in range(calls):
         jax.block_until_ready(run())
-    return (clock() - start) / calls
+    return elapsed() / calls
 
 
 def stopwatch() -> Callable[[], float]:
@@ -70,25 +70,22 @@ def least_seconds(runs: Sequence[Callable[[], object]], samples: int) -> list[fl
     """Estimated seconds of every run on an idle machine: the least of `samples` samples by a `stopwatch`, taken in turns."""
     least = [float("inf")] * len(runs)
     for i in [*range(len(runs))] * samples:
-        elapsed = stopwatch()
-        jax.block_until_ready(runs[i]())
-        least[i] = min(least[i], elapsed())
+        least[i] = min(least[i], seconds_per_call(runs[i], 1))
     return least
 
 
-def seconds_each(function: Callable, q, count: int = 2000, clock: Callable[[], float] = time.perf_counter) -> float:
+def seconds_each(function: Callable, q, count: int = 2000) -> float:
     """Seconds per evaluation in a compiled loop in which every evaluation depends on the previous one.
 
     Args:
         function: ``function(q)``, shaped like q.
         q: point of evaluation.
         count: evaluations in the loop.
-        clock: as of `interleaved`.
     """
 
     @jax.jit
     def loop(q, zero):  # an argument, since XLA would remove the function behind a constant zero
         return jax.lax.fori_loop(0, count, lambda _, q: q + zero * function(q), q)
 
-    seconds = interleaved({"": lambda: loop(q, 0.0)}, 3, 0.005, clock=clock)[""]
+    seconds = interleaved({"": lambda: loop(q, 0.0)}, 3, 0.005)[""]
     return float(np.median(seconds)) / count

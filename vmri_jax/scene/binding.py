@@ -36,6 +36,8 @@ class Bindable(ABC):
     """``rest(q, params) -> (n,)``: the values of a `measured` parameter of n elements at the start; () of a single element."""
     timed: ClassVar[bool] = False
     """Whether a constraint depends on time."""
+    is_analytic: ClassVar[bool] = False
+    """Whether the function is an analytic function of the coordinates, and takes complex arrays of NumPy: its derivatives need no program."""
     masses: ClassVar[tuple[str, ...]] = ()
     """Names of parameters that hold the masses of the bodies, one for each role."""
     derived: ClassVar[tuple[str, ...]] = ()
@@ -83,8 +85,13 @@ class Bindable(ABC):
 
     @cached_property
     def ends(self) -> tuple[tuple[Point, ...], ...]:
-        """The points at the start that every element acts on, one for each role."""
-        return tuple(tuple(end_of(self.by_name, name, self.whole) for name in element) for element in self.elements)
+        """The points at the start that the function gets for every element, one for each role."""
+        return tuple(tuple(end_of(self.by_name, name, self.whole) for name in element) for element in self.attached)
+
+    @property
+    def attached(self) -> Elements:
+        """Names of the bodies whose coordinates the function gets for every element, one for each role: those of `elements`."""
+        return self.elements
 
     def _elements(self) -> Elements:
         """See `elements`."""
@@ -158,17 +165,16 @@ class Bindable(ABC):
         names = (*declared, *self.masses, *self.derived, *POINTS) if isinstance(params, dict) else ()
         return tuple(name for name in names if name in params)
 
-    def element_term(self, i: int, freedoms: Sequence[Key] = ()) -> tuple[EffectTerm, dict[str, Any]]:
+    def element_term(self, i: int) -> tuple[EffectTerm, dict[str, Any]]:
         """Element i as a term of the coordinates of its moving bodies, one after the other, and its part of the params of all elements.
 
-        The term takes these coordinates, followed by `freedoms` that are coordinates of the scene, as q_s, and no q_f.
+        The term takes these coordinates as q_s, and no q_f.
         """
         places, end = {}, 0
         for name in moving(self.elements[i]):
             places[name] = Place("s", end, self.by_name[name].size)
             end += self.by_name[name].size
-        of_freedoms = {key: Place("s", end + k, 1) for k, key in enumerate(freedoms)}
-        (term,) = self.terms((i,), Layout(places, {}, of_freedoms))
+        (term,) = self.terms((i,), Layout(places, {}))
         # without the name and number of the element, equal terms share a compiled program
         return replace(term, sources=(Source(ALONE, 1),)), {ALONE: self.params_of((i,))}
 
@@ -182,7 +188,7 @@ class Bindable(ABC):
         for i in range(len(self.elements)) if select is None else select:
             kinds = tuple(
                 (name == GROUND, isinstance(name, Attachment), body_of(self.by_name, name).size, end.size)
-                for name, end in zip(self.elements[i], self.ends[i], strict=True)
+                for name, end in zip(self.attached[i], self.ends[i], strict=True)
             )
             groups.setdefault(kinds, []).append(i)
         return list(groups.values())
@@ -191,7 +197,7 @@ class Bindable(ABC):
         """The terms of some elements, one for each group `by_size`."""
         terms = []
         for group in self.by_size(select):
-            roles = zip(POINTS, zip(*(self.elements[i] for i in group), strict=True), strict=False)
+            roles = zip(POINTS, zip(*(self.attached[i] for i in group), strict=True), strict=False)
             terms.append(self._term(self.function, [self._role(*role, layout.bodies) for role in roles], group))
         return tuple(terms)
 

@@ -25,22 +25,13 @@ from vmri_jax.running.timing import interleaved, seconds_each
 from vmri_jax.scene.assembly import build
 from vmri_jax.scene.sorting import Sorting
 from vmri_jax.schemes.composition import Composition, stage_scheme
-from vmri_jax.schemes.quadrature import PlacedRule
 from vmri_jax.schemes.scheme import Scheme
 
-TERMS: dict[Any, str] = {
-    "kinetic": "kinetic energy T",
-    "slow_potential": "slow potential V",
-    "fast_potential": "fast potential W",
-    "constraint": "constraint g",
-    "slow_constraint": "constraint g_s",
-    "force": "force F",
-    "control": "control u",
-    "fast": "potential on the micro grid",
+OTHER_TERMS: dict[Any, tuple[str, str]] = {
+    "control": ("F", "control u"),
+    "fast": ("fast", "potential on the micro grid"),
 }
-"""For each argument of `System` that an effect may be part of, its name in the ledger."""
-RULES: dict[Any, str] = {"slow_potential": "slow", "fast_potential": "fast", "control": "force"}
-"""For each argument of `System` whose rule has another name in a `Scheme`, this name."""
+"""For each term of an effect that is no argument of `System`, the key of its rule in `Scheme.rule_of`, and its name in the ledger."""
 STEPS = 20
 """Macro steps of the program that is timed: enough that the call of the program takes little of the time. More take longer."""
 DEFAULT_FREQUENCY = 10.0
@@ -122,11 +113,11 @@ def ledger(sorting: Sorting, scheme: Scheme | Composition, macro_dt: float | Non
         rows.append(LedgerRow(name, "body", grid, f"{pace.value}: {pace.reason}", unknowns, 0, 0))
     step_time, times = _measure(sorting, scheme, macro_dt) if measure else (None, [None] * len(sorting.placed))
     for part, nanoseconds in zip(sorting.placed, times, strict=True):
-        rule = _rule(stage, part.home)
+        symbol, kind = _term(part.home)
+        rule = stage.rule_of(symbol)
         multipliers = intervals[rule.grid] * sum(build(sorting, [part]).num_constraints(*sorting.start[:2]))
         count = 0 if part.home == "control" else stages * rule.evaluations(stage.num_micro)
         microseconds = None if nanoseconds is None else nanoseconds * count / 1e3
-        kind = TERMS.get(part.home, f"potential on one in {part.home} micro nodes")
         rows.append(LedgerRow(part.effect.name, kind, rule.grid, part.reason, 0, multipliers, count, microseconds))
     return Ledger(tuple(rows), step_time)
 
@@ -138,12 +129,12 @@ def _intervals(scheme: Scheme | Composition) -> tuple[Scheme, int, dict[str, int
     return stage, stages, {"macro": stages * stage.degree, "micro": stages * stage.degree * stage.num_micro}
 
 
-def _rule(scheme: Scheme, home: Any) -> PlacedRule:
-    """The rule of the scheme for an argument of `System`, or for one of the further potentials by its rate."""
-    if home == "fast" or isinstance(home, int):
-        return scheme.rule_of(home)
-    name: str = RULES.get(home, home)  # pyright: ignore[reportAssignmentType]
-    return getattr(scheme, name)
+def _term(home: Any) -> tuple[Any, str]:
+    """The key of the rule in `Scheme.rule_of`, and the name, of the term of a scene that an effect is part of."""
+    if home in KINDS:
+        kind = KINDS[home]
+        return kind.symbol, f"{kind.in_words} {kind.symbol}"
+    return OTHER_TERMS.get(home, (home, f"potential on one in {home} micro nodes"))
 
 
 def ledger_of_functions(

@@ -21,6 +21,7 @@ from vmri_jax.refusals import Refused
 from vmri_jax.scene.body import AnyBody, Pace, Point, joined
 from vmri_jax.scene.declare import effect_class, names
 from vmri_jax.scene.effect import Effect
+from vmri_jax.scene.products import FRAME, products
 from vmri_jax.scene.shapes import Ball, Rod, Shape, box_of
 from vmri_jax.scene.terms import split
 
@@ -272,21 +273,17 @@ class Rigidity(Effect):
     bodies: Any = names()
 
     kind = "constraint"
+    is_analytic = True
     default_name = "rigid"
     whole = True
 
     @staticmethod
     def function(q, params):
-        d = split(q[0])[1]
-        products = d @ jnp.swapaxes(d, -1, -2)  # d_i . d_j
-        rows, columns = np.triu_indices(d.shape[-2])
-        return jnp.stack(
-            [
-                (products[..., i, j] - 1) / 2 if i == j else products[..., i, j]
-                for i, j in zip(rows, columns, strict=True)
-            ],
-            axis=-1,
-        )
+        i, j = np.triu_indices(q[0].shape[-1] // 3 - 1)
+        is_same, directors = i == j, np.eye(FRAME)[1:]
+        weights = 1 / (1.0 + is_same)
+        factors = np.concatenate([weights[:, None] * directors[i], directors[j]])
+        return products(i.size, q, {"factors": factors, "offsets": np.zeros((2 * i.size, 3))}) - weights * is_same
 
 
 def matrix_of(rotation):

@@ -4,7 +4,6 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import chain
 from typing import Any, NamedTuple
 
 import jax
@@ -15,12 +14,14 @@ from vmri_jax.mechanics.arrays import is_concrete, quickly_compiled
 from vmri_jax.mechanics.constraints import RANK
 from vmri_jax.mechanics.functions import TracedOnce
 from vmri_jax.mechanics.names import Names
-from vmri_jax.scene.body import LARGEST_POINT, label_of, moving
+from vmri_jax.scene.body import LARGEST_POINT, label_of
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.effects.freedoms import ANGLES
-from vmri_jax.scene.layout import Key, join
+from vmri_jax.scene.functions import MicroConstraint
+from vmri_jax.scene.layout import join
 from vmri_jax.scene.rates import positions
 from vmri_jax.scene.sorting import HOMES, Home, Placed, Sorting
+from vmri_jax.scene.terms import EffectTerm, Role
 
 CANCELLED = 1e-14
 """An entry of the Jacobian dg/dq is the product of the row dg/dQ and the column dQ/dq. If it is below this fraction of the product of
@@ -30,6 +31,9 @@ short levers; with a smaller value round-off counts as an independent row."""
 REACHED = 1e-12
 """Newton's iteration ends when rows, relative to their sizes, are below this value, which is near round-off. With a larger value loops have a
 visible gap, which the initial state refuses, and dropped rows carry the remaining error."""
+COMPLEX_STEP = 1e-30
+"""Imaginary step h of derivatives, in any unit: its square is below round-off of every value. A larger step is felt in values; a smaller one may
+underflow in products."""
 CORRECTIONS = 20
 """Most corrections of Newton's iteration; from nearby six reach round-off. More only delay the message that it fails."""
 
@@ -71,30 +75,69 @@ def rows_of(placed: Sequence[Placed]) -> list[Row]:
     return rows
 
 
-class _Element(NamedTuple):
-    """An element of a constraint, see `Effect.element_term`, and numbers of its coordinates in (Q_s, Q_f)."""
+def _derivatives(
+    term: EffectTerm, params: Any, t: float, q: np.ndarray, num_slow: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Values (k,) of a term of analytic functions and their derivatives (k, n) by q = (Q_s, Q_f), by complex steps for all elements at once.
 
-    value: TracedOnce
-    params: dict[str, Any]
-    columns: np.ndarray
+    ``g(q + i h e) = g + i h dg/dq e`` to round-off, with a tiny h.
+    """
+    of_roles = [_columns(role, num_slow) for role in term.roles]
+    columns = np.concatenate(of_roles, axis=-1)  # (n, c), or (c,) of a single element
+    steps = 1j * COMPLEX_STEP * np.eye(columns.shape[-1])
+    x = q[columns] + (steps if columns.ndim == 1 else steps[:, None])
+    parts = np.split(x, np.cumsum([of_role.shape[-1] for of_role in of_roles])[:-1], axis=-1)
+    params = term.params_of(params)
+    points = tuple(role.of_bodies(x, params) for role, x in zip(term.roles, parts, strict=True))
+    values = np.asarray(term.function(*((np.asarray(t),) if term.timed else ()), points, params))
+    columns = np.atleast_2d(columns)
+    values = values.reshape(*columns.shape[::-1], -1)  # of each step, element, and row of the element
+    rows, jacobian = np.arange(values[0].size).reshape(*values.shape[1:], 1), np.zeros((values[0].size, q.size))
+    # added: a body that stands in for the ground has its columns twice
+    np.add.at(jacobian, (rows, columns[:, None]), np.moveaxis(values.imag, 0, -1) / COMPLEX_STEP)
+    return values[0].real.ravel(), jacobian
+
+
+def _columns(role: Role, num_slow: int) -> np.ndarray:
+    """Numbers in (Q_s, Q_f) of the coordinates of a role, (n, c), or (c,) of a single element; none for the ground."""
+    if role.rows is None:
+        return np.zeros((0,) if role.count == 1 else (role.count, 0), int)
+    starts = np.array([place.start + (num_slow if place.part == "f" else 0) for place in role.rows.places])
+    columns = starts[:, None] + np.arange(role.rows.size)
+    return columns[0] if role.rows.single else columns
+
+
+@quickly_compiled
+def _compiled_derivatives(functions: Sequence[TracedOnce], params, t, q_s, q_f):
+    """Values and derivatives as of `_derivatives` of each function, which may be of the user: one program for all."""
+
+    def values(q, function):
+        value = function(t, q[: q_s.size], q[q_s.size :], params)
+        return value, value
+
+    q = jnp.concatenate([q_s, q_f])
+    return [jax.jacfwd(values, has_aux=True)(q, function)[::-1] for function in functions]
 
 
 @dataclass(frozen=True)
 class ConstraintRows:
     """The k rows of all constraints, in the order of `Sorting.placed`, over the n coordinates, slow ones first.
 
+    terms, params: of the rows, and whether the functions are analytic, see `Effect.is_analytic`.
     masses: (n,) of the coordinates; 1 for traced masses, since they only weigh the choice of the rows to drop.
     scales: (n,) change of each coordinate in a large motion: the extent of the scene for positions, 1 for
         directors of rigid bodies and angles of joints, and for general coordinates their largest value, or 1 if all are zero.
-    to_bodies: (Q_s, Q_f) as one vector at q, and its Jacobian dQ/dq.
+    to_bodies: (Q_s, Q_f) as one vector at q, and its Jacobian dQ/dq; Q_s has the length `num_slow_of_bodies`.
     """
 
     rows: tuple[Row, ...]
-    elements: tuple[_Element, ...]
+    terms: tuple[tuple[EffectTerm, bool], ...]
+    params: dict[str, Any]
     start: np.ndarray
     masses: np.ndarray
     scales: np.ndarray
     num_slow: int
+    num_slow_of_bodies: int
     to_bodies: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
     @classmethod
@@ -106,26 +149,31 @@ class ConstraintRows:
             (sorting.positions, sorting.joints, [part.effect.parameters for part in constraints])
         ):
             return None
-        start, columns = np.concatenate(sorting.positions), layout.columns
+        start = np.concatenate(sorting.positions)
         _, jacobian = to_bodies(start)
         # the diagonal of J^T M J with J = dQ/dq
         of_bodies = join(bodies, layout, "s", "masses"), join(bodies, layout, "f", "masses")
         is_known = is_concrete(of_bodies)
         masses = np.concatenate(of_bodies) @ (jacobian * jacobian) if is_known else np.ones_like(start)
-        elements = [element for part in constraints for element in _elements(part, columns)]
-        return cls(
-            tuple(rows_of(sorting.placed)), tuple(elements), start, masses, _scales(sorting), layout.sizes[0], to_bodies
+        terms = tuple(
+            (term, part.effect.is_analytic) for part in constraints for term in part.effect.terms(part.elements, layout)
         )
+        params = {part.effect.name: part.effect.parameters for part in constraints}
+        sizes, rows = (layout.sizes[0], layout.ends[0]), tuple(rows_of(sorting.placed))
+        return cls(rows, terms, params, start, masses, _scales(sorting), *sizes, to_bodies)
 
     def evaluate(self, t: float, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Values g (k,) and Jacobian dg/dq (k, n) at a time and at positions (n,)."""
         q_bodies, by_coordinates = self.to_bodies(q)
-        values, by_bodies, first = np.empty(len(self.rows)), np.zeros((len(self.rows), q_bodies.size)), 0
-        for element in self.elements:
-            value, entries = _value_and_jacobian(element.value, element.params, q_bodies[element.columns], t)
-            values[first : first + value.size] = value
-            by_bodies[first : first + value.size, element.columns] = entries
-            first += value.size
+        n_s, others = self.num_slow_of_bodies, [term for term, is_analytic in self.terms if not is_analytic]
+        functions = [TracedOnce(MicroConstraint((term,))) for term in others]
+        arguments = self.params, float(t), q_bodies[:n_s], q_bodies[n_s:]
+        of_others = iter(jax.device_get(_compiled_derivatives(functions, *arguments)) if others else ())
+        parts = [
+            _derivatives(term, self.params, t, q_bodies, n_s) if is_analytic else next(of_others)
+            for term, is_analytic in self.terms
+        ]
+        values, by_bodies = (np.concatenate(of_parts) for of_parts in zip(*parts, strict=True))
         # dg/dq = dg/dQ dQ/dq, without entries that are round-off
         jacobian = by_bodies @ by_coordinates
         lengths = np.linalg.norm(by_bodies, axis=1)[:, None] * np.sqrt((by_coordinates * by_coordinates).sum(axis=0))
@@ -174,28 +222,6 @@ class ConstraintRows:
     def numbers(self, home: Home | None = None) -> list[int]:
         """Numbers of the kept rows, all or only the rows with a certain home."""
         return [i for i, row in enumerate(self.rows) if row.kept and home in (None, row.home)]
-
-
-def _elements(part: Placed, columns: dict[str | Key, np.ndarray]):
-    """The elements of an effect, in the order of its terms."""
-    effect = part.effect
-    for i in chain(*effect.by_size(part.elements)):
-        freedoms = [key for key in effect.freedoms_of(i) if key in columns]
-        of_element = np.concatenate([columns[name] for name in (*moving(effect.elements[i]), *freedoms)])
-        term, params = effect.element_term(i, freedoms)
-        yield _Element(TracedOnce(term.value), params, of_element)
-
-
-@quickly_compiled
-def _value_and_jacobian(function: TracedOnce, params, q, t):
-    """Values (m,) of an element, and their derivatives with respect to the coordinates q of its bodies."""
-
-    def values(q):
-        value = jnp.reshape(function(q, None, params, t), (-1,))
-        return value, value
-
-    jacobian, value = jax.jacfwd(values, has_aux=True)(q)
-    return value, jacobian
 
 
 def _scales(sorting: Sorting) -> np.ndarray:

@@ -43,7 +43,7 @@ from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.joint_constants import joint_constants
 from vmri_jax.scene.layout import DecidedPace, Layout, join
 from vmri_jax.scene.rates import SEPARATION, Rates, border, measure
-from vmri_jax.scene.trees import Branch, Link, make_layout, with_weight
+from vmri_jax.scene.trees import Branch, make_layout, with_weight
 
 NAMED = 3
 """Most bodies that a reason names; with more the table of reasons is too wide."""
@@ -84,7 +84,7 @@ class Placed(NamedTuple):
 class Sorting:
     """Bodies with their paces and places, and the effects, each with its home.
 
-    links: of bodies on joints, in the order of the kinematics; None where a chain of joints is shorter than the longest one.
+    branches: the bodies on joints, in the order of the kinematics.
     joint_starts: values and rates of freedoms of joints at the start, by the keys of `Layout.freedoms`. Other freedoms start at zero,
         with the rates that follow from the velocities of bodies.
     """
@@ -93,13 +93,8 @@ class Sorting:
     paces: dict[str, DecidedPace]
     layout: Layout
     placed: tuple[Placed, ...]
-    links: tuple[Link | None, ...] = ()
+    branches: tuple[Branch, ...] = ()
     joint_starts: Mapping[tuple[str, int, str], tuple[Any, Any]] = field(default_factory=dict)
-
-    @property
-    def branches(self) -> tuple[Branch, ...]:
-        """The bodies on joints."""
-        return tuple(dict.fromkeys(link.branch for link in self.links if link is not None))
 
     @property
     def start(self) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
@@ -151,7 +146,7 @@ class Sorting:
     @cached_property
     def joints(self) -> dict[str, Any]:
         """Constants of the joints that carry bodies, see `joint_constants`; empty if no joint does."""
-        return joint_constants(self.bodies, self.links) if self.links else {}
+        return joint_constants(self.bodies, self.branches) if self.branches else {}
 
 
 @partial(quickly_compiled, static_argnames="kinematics")
@@ -240,13 +235,13 @@ def sort(bodies: Bodies, effects: Sequence[Effect], branches: Sequence[Branch] =
             home, reason = _home(effect, i, slow, len(names), measured, limit)
             homes.setdefault(home, {})[i] = reason
         placed += [Placed(effect, tuple(reasons), home, _summary(reasons.values())) for home, reasons in homes.items()]
-    layout, links = make_layout(bodies, paces, branches)
+    layout, ordered = make_layout(bodies, paces, branches)
     if not any(layout.sizes):
         joints = dict.fromkeys(branch.joint.name for branch in branches)
         raise Refused(
             f"Scene: nothing can move: {', '.join(joints)} leave no freedom to any body. Leave one of these joints out."
         )
-    return Sorting(bodies, paces, layout, tuple(placed), links)
+    return Sorting(bodies, paces, layout, tuple(placed), ordered)
 
 
 def _measure(bodies, energies, owned: Mapping[str, Sequence[Owners]]) -> dict[str, Rates]:

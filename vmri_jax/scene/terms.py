@@ -49,7 +49,7 @@ def split(q):
 def place(q, weights):
     """``phi + sum_i X_i d_i``, (..., 3), of the coordinates q of a body, which may have fewer than three directors, and the components X of a point."""
     phi, d = split(q)
-    return phi + jnp.sum(weights[..., : d.shape[-2], None] * d, axis=-2)
+    return phi + (weights[..., : d.shape[-2], None] * d).sum(axis=-2)
 
 
 @dataclass(frozen=True)
@@ -81,9 +81,12 @@ class Role:
 
     def positions(self, q_s, q_f, params):
         """(d,) or (n, d) coordinates or points."""
+        return self.of_bodies(None if self.rows is None else self.rows.take(q_s, q_f), params)
+
+    def of_bodies(self, q, params):
+        """Coordinates or points, from the coordinates of the bodies, which the ground does not need."""
         if self.rows is None:
             return params[self.point][..., : self.size] if self.point else self._shaped(GROUND_COORDINATES)
-        q = self.rows.take(q_s, q_f)
         return place(q, params[self.point]) if self.point else q
 
     def velocities(self, v_s, v_f, params):
@@ -103,8 +106,7 @@ class Role:
         return self.rows.put(force, n_s, n_f)
 
     def _shaped(self, vector):
-        vector = jnp.asarray(vector)
-        return vector if self.count == 1 else jnp.broadcast_to(vector, (self.count, self.size))
+        return vector if self.count == 1 else np.broadcast_to(vector, (self.count, self.size))
 
 
 class Source(NamedTuple):

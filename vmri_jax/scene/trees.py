@@ -12,13 +12,13 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from heapq import heappop, heappush
 from itertools import count
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from vmri_jax.mechanics.arrays import is_concrete
-from vmri_jax.mechanics.kinematics import Frames, Grid, Kinematics, Move
-from vmri_jax.mechanics.rows import Part, Place, Rows
+from vmri_jax.mechanics.kinematics import Carried, Kinematics, Link, Move
+from vmri_jax.mechanics.rows import Part, Place
 from vmri_jax.refusals import Refused
 from vmri_jax.scene.body import GROUND, Bodies, Frame
 from vmri_jax.scene.effect import Effect
@@ -53,11 +53,6 @@ class Branch(NamedTuple):
     forward: bool
 
     @property
-    def size(self) -> int:
-        """Number of links from the parent to the child, see `Link`."""
-        return max(1, len(self.joint.moves))
-
-    @property
     def keys(self) -> list[Key]:
         """The freedoms of the joint as keys of `Layout.freedoms`."""
         return [(self.joint.name, self.element, freedom) for freedom in self.joint.freedoms]
@@ -68,42 +63,22 @@ class Branch(NamedTuple):
         freedoms = self.joint.freedoms
         return [name] if len(freedoms) == 1 else [f"{name} {freedom}" for freedom in freedoms]
 
-
-class Link(NamedTuple):
-    """One elementary motion of a joint, with one freedom or none, and the frame (coordinate system) behind it.
-
-    The last frame of a branch is its child; those before it lie between two motions of the joint. No such frame is a body `Frame`.
-
-    step: number of the motion, counted from the parent of the branch.
-    """
-
-    branch: Branch
-    step: int
-
     @property
-    def coordinate(self) -> int | None:
-        """Number of the move among the moves of the joint; None if the joint has no freedom."""
-        count = len(self.branch.joint.moves)
-        if not count:
-            return None
+    def moves(self) -> list[tuple[Move, Key]]:
+        """The motions of the joint, each with the key of its freedom, in the order from the parent to the child."""
         # the moves are defined from body a to body b of the joint; a child that is body a undoes them, the last one first
-        return self.step if self.branch.forward else count - 1 - self.step
+        return list(zip(self.joint.moves, self.keys, strict=True))[:: 1 if self.forward else -1]
 
     @property
-    def move(self) -> Move | None:
-        """The motion of this frame by its coordinate."""
-        return None if self.coordinate is None else self.branch.joint.moves[self.coordinate]
+    def sign(self) -> float:
+        """1 if a positive value of a freedom moves the child along its axis, -1 if against it."""
+        return 1.0 if self.forward else -1.0
 
     @property
-    def key(self) -> Key | None:
-        """The freedom of this frame as a key of `Layout.freedoms`."""
-        return None if self.coordinate is None else self.branch.keys[self.coordinate]
-
-    def amount(self, kind: Literal["turn", "slide"]) -> float:
-        """1 (forwards) or -1 (backwards) if the coordinate of this frame turns or slides it, as `kind` asks; else 0."""
-        kinds = ("turn", "screw") if kind == "turn" else ("slide",)
-        sign = 1.0 if self.branch.forward else -1.0
-        return sign if self.move is not None and self.move.kind in kinds else 0.0
+    def points(self) -> tuple[Any, Any]:
+        """The point of the joint in space, as the parent has it and as the child has it, (3,) at the start."""
+        a, b = self.joint.joining_points[self.element]
+        return (a, b) if self.forward else (b, a)
 
 
 def grow(bodies: Bodies, effects: Sequence[Effect], everywhere: bool = True) -> tuple[Branch, ...]:
@@ -201,8 +176,8 @@ def with_weight(bodies: Bodies, branches: Sequence[Branch]) -> Bodies:
 
 def make_layout(
     bodies: Bodies, paces: Mapping[str, DecidedPace], branches: Sequence[Branch] = ()
-) -> tuple[Layout, tuple[Link | None, ...]]:
-    """The places of all coordinates in q_s and q_f, and the links of the frames of the kinematics, in their order.
+) -> tuple[Layout, tuple[Branch, ...]]:
+    """The places of all coordinates in q_s and q_f, and the branches in the order of the kinematics.
 
     A body on a joint has the freedoms of this joint as coordinates.
     """
@@ -222,76 +197,38 @@ def make_layout(
             ends[part] += 1
     if not branches:
         return Layout(places, coordinates), ()
-    return _with_kinematics(bodies, branches, places, coordinates, freedoms, (ends["s"], ends["f"]))
+    kinematics, ordered = _kinematics(branches, places, freedoms, (ends["s"], ends["f"]))
+    on_joint = {branch.child: place for branch, place in zip(ordered, kinematics.places, strict=True)}
+    all_places = {name: places.get(name) or on_joint[name] for name in bodies}
+    return Layout(all_places, coordinates, freedoms, kinematics), ordered
 
 
-def _with_kinematics(bodies: Bodies, branches: Sequence[Branch], places, coordinates, freedoms, sizes):
-    """The layout with the bodies on joints, and the links of their frames; `places` of the bodies on no joint."""
-    grids: dict[str, Grid] = {name: place.part for name, place in places.items()}
-    grids[GROUND] = "s"
-    depths: dict[str, int] = {}
+def _kinematics(branches: Sequence[Branch], places, freedoms, sizes) -> tuple[Kinematics, tuple[Branch, ...]]:
+    """The kinematics of the branches, parents first, and the branches in the order of its bodies; `places` of the bodies on no joint."""
+    fast = {name for name, place in places.items() if place.part == "f"}  # bodies that depend on fast coordinates
     for branch in branches:
-        parts = {freedoms[key].part for key in branch.keys}
-        parts |= set() if branch.parent == GROUND else {*grids[branch.parent]}
-        grids[branch.child] = "sf" if len(parts) > 1 else parts.pop() if parts else "s"
-        depths[branch.child] = depths.get(branch.parent, 0) + 1
-    roots = list(dict.fromkeys(branch.parent for branch in branches if branch.parent in places))
-    numbers = {GROUND: -1} | {name: i for i, name in enumerate(roots)}
-    carriers: set[str] = set()  # the bodies that carry, at any depth, bodies which depend on fast coordinates
-    for branch in reversed(branches):  # children before parents
-        if grids[branch.child] != "s" or branch.child in carriers:
+        if branch.parent in fast or any(freedoms[key].part == "f" for key in branch.keys):
+            fast.add(branch.child)
+    carriers: set[str] = set()  # the bodies that carry, at any depth, fast ones
+    for branch in reversed(branches):
+        if branch.child in fast or branch.child in carriers:
             carriers.add(branch.parent)
-    # branches by grid, and by whether the positions of fast bodies depend on them; in the order of `Kinematics.frames`
-    order: tuple[tuple[Grid, bool], ...] = (("s", True), ("f", True), ("sf", True), ("s", False))
-    groups: dict[tuple[Grid, bool], list[Branch]] = {group: [] for group in order}
+    ordered = sorted(branches, key=lambda branch: 2 if branch.child in fast else branch.child in carriers)
+    firsts = dict(zip((branch.child for branch in ordered), _firsts(ordered), strict=True))
+    numbers = {name: i for i, name in enumerate(dict.fromkeys(b.parent for b in branches if b.parent in places))}
+    numbers[GROUND] = -1
+    links, lasts = {}, {}
     for branch in branches:
-        grid = grids[branch.child]
-        groups[grid, grid != "s" or branch.child in carriers].append(branch)
-    frames, links, carried, num_fast = [], [], [], 0
-    for (grid, is_needed), group in groups.items():
-        group.sort(key=lambda branch: depths[branch.child])  # by depth, so that few slices take the frames in order
-        if group:
-            of_group, links_of_group = _frames(grid, len(links), group, bodies, freedoms, numbers)
-            numbers |= {branch.child: len(roots) + len(carried) + i for i, branch in enumerate(group)}
-            frames.append(of_group)
-            links += links_of_group
-            carried += [branch.child for branch in group]
-            num_fast += is_needed
-    kinematics = Kinematics(tuple(places[name] for name in roots), tuple(frames), sizes, num_fast)
-    on_joints = dict(zip(carried, kinematics.places, strict=True))
-    all_places = {name: places.get(name) or on_joints[name] for name in bodies}
-    return Layout(all_places, coordinates, freedoms, kinematics), tuple(links)
+        numbers[branch.child] = numbers[branch.parent]
+        last = lasts.get(branch.parent, -1)
+        for number, (_, key) in enumerate(branch.moves, firsts[branch.child]):
+            links[number], last = Link(freedoms[key], last), number
+        lasts[branch.child] = last
+    carried = (Carried("f" if b.child in fast else "s", numbers[b.child], lasts[b.child]) for b in ordered)
+    roots = tuple(places[name] for name in numbers if name in places)
+    return Kinematics(roots, tuple(links[i] for i in range(len(links))), tuple(carried), sizes), tuple(ordered)
 
 
-def _frames(grid: Grid, first: int, branches: Sequence[Branch], bodies: Bodies, freedoms, numbers: Mapping[str, int]):
-    """The frames of bodies on one grid, numbered from `first` on, and their links; paths are padded with None.
-
-    `numbers` are indices of the bodies that the branches may hang on.
-    """
-    branch_of = {branch.child: branch for branch in branches}
-    parents = {branch.parent for branch in branches}
-    paths = [_path(branch, branch_of) for branch in branches if branch.child not in parents]
-    depth = max(map(len, paths))
-    links = [path[level] if level < len(path) else None for level in range(depth) for path in paths]
-    coordinates = [freedoms[link.key] for link in links if link is not None and link.key is not None]
-    numbers_of_coordinates = iter(range(len(coordinates)))
-    frames = Frames(
-        grid,
-        first,
-        tuple(numbers[path[0].branch.parent] for path in paths),
-        Rows.of(coordinates) if coordinates else None,
-        tuple(-1 if link is None or link.key is None else next(numbers_of_coordinates) for link in links),
-        any(link is not None and link.move is not None and link.move.kind != "turn" for link in links),
-        tuple(links.index(Link(branch, branch.size - 1)) for branch in branches),
-        tuple(bodies[branch.child].wide for branch in branches),
-    )
-    return frames, links
-
-
-def _path(branch: Branch | None, branch_of: Mapping[str, Branch]) -> list[Link]:
-    """The links from a root to the child of a branch."""
-    path: list[Link] = []
-    while branch is not None:
-        path = [*(Link(branch, step) for step in range(branch.size)), *path]
-        branch = branch_of.get(branch.parent)
-    return path
+def _firsts(branches: Sequence[Branch]) -> list[int]:
+    """The number of the first link of each branch."""
+    return [0, *np.cumsum([len(branch.joint.moves) for branch in branches])[:-1].tolist()]

@@ -8,7 +8,7 @@ signatures, in the order of the angles, changes only across such a meeting, howe
 """
 
 from dataclasses import dataclass
-from functools import partial
+from functools import partial, reduce
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +21,7 @@ from vmri_jax.mechanics.linearisation import Linearisation, tangents
 from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.mechanics.system import System
 from vmri_jax.refusals import Refused
-from vmri_jax.schemes.composition import Composition
+from vmri_jax.schemes.composition import Composition, stage_lengths, stage_scheme
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.results import Result
 from vmri_jax.steppers.solver import Solver
@@ -80,7 +80,8 @@ def multipliers(linear: Linearisation, scheme: Scheme | Composition, macro_dt) -
     """Multipliers of a macro step for k lengths of the step.
 
     The derivative of the step is exact: of `macro_step` of the expansion at rest, on the tangent space of the
-    constraint manifold.
+    constraint manifold. The derivative of a composition is the product of the derivatives of its stages, which one
+    program of the stage computes.
 
     Args:
         linear: of `linearise`.
@@ -96,9 +97,11 @@ def multipliers(linear: Linearisation, scheme: Scheme | Composition, macro_dt) -
             f"multipliers: the constraints leave none of the {len(linear.shapes)} coordinates free; nothing moves."
         )
     lanes = int(np.clip(LANES * 36 // size, 4, LANES))
-    padded = np.pad(macro_dt, (0, -len(macro_dt) % lanes), mode="edge").reshape(-1, lanes)
-    fixed = linear.system, scheme, linear.rest, linear.embed, linear.read
-    matrices = np.concatenate([_step_matrices(*fixed, part) for part in padded])[: len(macro_dt)]
+    stages = np.outer(macro_dt, stage_lengths(scheme))
+    padded = np.pad(stages.ravel(), (0, -stages.size % lanes), mode="edge").reshape(-1, lanes)
+    fixed = linear.system, stage_scheme(scheme), linear.rest, linear.embed, linear.read
+    factors = np.concatenate([_step_matrices(*fixed, part) for part in padded])[: stages.size]
+    matrices = reduce(lambda a, b: b @ a, np.moveaxis(factors.reshape(*stages.shape, size, size), 1, 0))
     failed = ~np.asarray(np.isfinite(matrices).all(axis=(1, 2)))
     values, vectors = np.linalg.eig(np.where(failed[:, None, None], np.eye(size), matrices))
     values = np.where(failed[:, None], np.nan, values.astype(complex))

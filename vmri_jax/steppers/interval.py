@@ -29,7 +29,7 @@ from vmri_jax.kernels.band import Band, BandInverse, Full, FullInverse, Sparsity
 from vmri_jax.kernels.saddle import regularized
 from vmri_jax.mechanics.arrays import is_concrete
 from vmri_jax.mechanics.constraint_pattern import MOST_ROWS_OF_FULL_MATRIX, fast_rows
-from vmri_jax.mechanics.masses import ConstantMass, Diagonal
+from vmri_jax.mechanics.masses import ConstantMass
 from vmri_jax.mechanics.structure import has_constant_hessian, has_diagonal_hessian, is_linear
 from vmri_jax.mechanics.system import System
 from vmri_jax.schemes.discrete_lagrangian import QuadraticKinetic, TermOnNodes, lagrangian, placed_potentials
@@ -130,7 +130,7 @@ class Interval:
         sums = sums and all(term.name in ("V", "W") for term in terms)
         linear = all(is_linear(partial(_of_fast, term, q_s), q_f) for term in terms)
         linear &= scheme.degree == 1 or q_f.size > SMALL  # few variables and a high degree: one full matrix is cheaper
-        is_diagonal = DIAGONAL_MATRICES and isinstance(constant_mass(system).fast_mass, Diagonal) and (linear or sums)
+        is_diagonal = DIAGONAL_MATRICES and constant_mass(system).fast_mass.is_diagonal and (linear or sums)
         is_explicit = scheme.degree == 1 and not terms and system.force is None
         varies = system.force is not None or (scheme.degree > 1 and system.constraint is not None)
         q = {"q_s": q_s, "q_f": q_f}

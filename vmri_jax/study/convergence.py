@@ -5,7 +5,7 @@ The error of a run is the largest difference over all saved nodes and all coordi
     error_q = max |q - q_ref|        error_p = max |p - p_ref|.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import product
@@ -55,12 +55,12 @@ class Case:
         phase = [part for array in (self.reference.q, self.reference.p) for part in np.split(array, [n_s], axis=1)]
         return np.asarray(jax.jit(jax.vmap(partial(diagnostics.energy, self.problem.system)))(*phase))
 
-    def row(self, name: str, scheme, num_steps: int, t_end: float, maps: Sequence[Callable], run, seconds) -> Row:
-        """The row of a run of a scheme to `t_end`, with samples of its seconds."""
+    def row(self, name: str, scheme, num_steps: int, t_end: float, run: Trajectory) -> Row:
+        """The row of a run of a scheme to `t_end`."""
         error_q, error_p = self.reference.errors(run)
-        counts = t_end / num_steps, num_steps
+        numbers, system = (t_end / num_steps, num_steps), self.problem.system
         measured = {"error_q": error_q, "error_p": error_p, "case": self.label}
-        return row_of(name, self.problem.system, scheme, run, *counts, self.energies, maps, **measured).timed(seconds)
+        return row_of(name, system, scheme, run, *numbers, self.energies, **measured)
 
 
 @dataclass(frozen=True)
@@ -71,10 +71,16 @@ class SchemeSummary:
     fit_q: OrderFit
     fit_p: OrderFit
 
+    def of_finest(self, name: str, form: str = ".1e") -> str:
+        """The text of an attribute of the run with the smallest step that did not fail."""
+        finest = min((row for row in self.runs if not row.failed), key=lambda row: row.macro_dt, default=None)
+        return "-" if finest is None else format(getattr(finest, name), form)
+
     @property
-    def finest(self) -> Row | None:
-        """The run with the smallest step that did not fail."""
-        return min((row for row in self.runs if not row.failed), key=lambda row: row.macro_dt, default=None)
+    def failures(self) -> str:
+        """The number of failed runs; empty if no run failed."""
+        failed = sum(row.failed for row in self.runs)
+        return f"{failed} of {len(self.runs)}" if failed else ""
 
 
 def _order(fit: OrderFit) -> str:
@@ -82,17 +88,6 @@ def _order(fit: OrderFit) -> str:
     if not np.isfinite(fit.order):
         return "-"
     return f"{fit.order:.2f}" + (f" ± {fit.half_width:.2f}" if np.isfinite(fit.half_width) else "")
-
-
-def _failures(summary: SchemeSummary) -> str:
-    """The number of failed runs; empty if no run failed."""
-    failed = sum(row.failed for row in summary.runs)
-    return f"{failed} of {len(summary.runs)}" if failed else ""
-
-
-def _of_finest(name: str, form: str = ".1e") -> Callable[[SchemeSummary], str]:
-    """A function that formats the attribute `name` of the finest run of a summary."""
-    return lambda summary: "-" if summary.finest is None else format(getattr(summary.finest, name), form)
 
 
 @dataclass(frozen=True)
@@ -109,11 +104,11 @@ class ConvergenceStudy(RunTable):
         Column("case", lambda summary: summary.runs[0].case),
         Column("order of q", lambda summary: _order(summary.fit_q), right=True),
         Column("order of p", lambda summary: _order(summary.fit_p), right=True),
-        Column("smallest H", _of_finest("macro_dt", "g"), right=True),
-        Column("error of q", _of_finest("error_q"), right=True),
-        Column("error of p", _of_finest("error_p"), right=True),
-        Column("energy", _of_finest("energy_error"), right=True),
-        Column("failed", _failures, right=True),
+        Column("smallest H", lambda summary: summary.of_finest("macro_dt", "g"), right=True),
+        Column("error of q", lambda summary: summary.of_finest("error_q"), right=True),
+        Column("error of p", lambda summary: summary.of_finest("error_p"), right=True),
+        Column("energy", lambda summary: summary.of_finest("energy_error"), right=True),
+        Column("failed", lambda summary: summary.failures, right=True),
     )
     rows: tuple[Row, ...]
     references: Mapping[str, ReferenceSolution]
@@ -191,7 +186,6 @@ def convergence_study(
     *,
     num_saves: int = 10,
     params: Mapping[str, Any] | None = None,
-    momentum_maps: Sequence[Callable] = (),
     reference: ReferenceSolution | Mapping[str, ReferenceSolution] | None = None,
     solver: Solver | None = None,
     repeats: int = 0,
@@ -210,14 +204,12 @@ def convergence_study(
         num_saves: nodes compared, equally spaced over `t_end`.
         params: parameters of the system by label, if there are several sets; positions and velocities at the start are
             those of `problem`.
-        momentum_maps: infinitesimal generators of symmetries, see `vmri_jax.diagnostics.momentum_map`.
         reference: the solution that errors are measured against, by label of the parameters if there are several; by default
             `reference_solution`.
         solver: how implicit equations are solved.
-        repeats: timed samples of every run; 0 for no times. In this process the runs take turns on the clock, so that a slow
+        repeats: timed samples of every run; 0 for no times. The runs take turns on the clock of this process, so that a slow
             moment of the machine hits all of them; a row has the median.
-        executor: where runs are computed and timed, as of `vmri_jax.ensemble`; None for this process. A worker that measures
-            times needs a core of its own.
+        executor: where runs are computed, as of `vmri_jax.ensemble`; None for this process.
         progress: True for a bar, or a function (what, done, total) that is told about every run before it starts.
 
     Raises:
@@ -233,31 +225,33 @@ def convergence_study(
     total = len(schemes) * len(steps) * (1 if params is None else len(params))
     told = lambda message, *_: progress(message, 0, total)  # noqa: E731
     cases = _cases(problem, params, reference, t_end, num_saves, told)
-    labels = [(label, case, num_steps) for label in schemes for case in cases for num_steps in steps]
-    arguments = lambda label, case, num_steps: (case.problem, schemes[label], t_end, num_saves, solver, num_steps)  # noqa: E731
+    labels = [(label, case, n) for label in schemes for case in cases for n in steps]
+    arguments = [(case.problem, schemes[label], t_end, num_saves, solver, n) for label, case, n in labels]
+
+    def tell(done: int, i: int) -> None:
+        progress(f"{labels[i][0]}, H = {t_end / labels[i][2]:g}", done, total)
+
     stopped = None
     try:
-        runs = mapped(
-            "convergence_study",
-            _run,
-            [(*arguments(*run), 0 if executor is None else repeats) for run in labels],
-            executor,
-            lambda done, i: progress(f"{labels[i][0]}, H = {t_end / labels[i][2]:g}", done, total),
-        )
+        runs = mapped("convergence_study", _run, arguments, executor, tell)
     except Interrupted as interrupted:
         runs, stopped = interrupted.done, interrupted
     done = [(labels[i], run) for i, run in enumerate(runs) if run is not None]
-    rows = [case.row(label, schemes[label], n, t_end, momentum_maps, *run) for (label, case, n), run in done]
+    rows = [case.row(label, schemes[label], n, t_end, run) for (label, case, n), run in done]
     study = ConvergenceStudy(tuple(rows), {case.label: case.reference for case in cases})
     if stopped is not None:
-        raise Interrupted(study, len(study.rows), None, "runs") from None
-    if repeats and executor is None:
+        raise Interrupted(study, len(rows), None, "runs") from None
+    if repeats:
         with interruptible(lambda: study):
             progress("measuring times", total, total)
-            calls = {str(i): _prepared(*arguments(*labels[i])).timed() for i, row in enumerate(rows) if not row.failed}
-            samples = interleaved(calls, repeats)
-        rows = [row.timed(samples.get(str(i), ())) for i, row in enumerate(rows)]
-        study = replace(study, rows=tuple(rows))
+            timed = {str(i): _prepared(*arguments[i]).timed() for i, row in enumerate(rows) if not row.failed}
+            samples = interleaved(timed, repeats)
+        study = replace(
+            study,
+            rows=tuple(
+                replace(row, seconds=float(np.median(samples.get(str(i), [np.nan])))) for i, row in enumerate(rows)
+            ),
+        )
     progress("done", total, total)
     return study
 
@@ -266,31 +260,26 @@ def _cases(problem: Problem, params, reference, t_end: float, num_saves: int, pr
     """The cases of `convergence_study`; refuses references with other labels or of another shape."""
     if params is not None and not params:
         raise Refused("convergence_study: params is empty; give a set of parameters by label, or leave it out.")
-    problems = (
-        {"": problem}
-        if params is None
-        else {label: replace(problem, system=problem.system.replace(params=p)) for label, p in params.items()}
-    )
+    sets = {"": problem.system.params} if params is None else params
+    problems = {label: replace(problem, system=problem.system.replace(params=p)) for label, p in sets.items()}
     if reference is None:
-        return [
-            Case(label, problem, reference_solution(problem, t_end, num_saves=num_saves, progress=progress))
-            for label, problem in problems.items()
-        ]
-    by_label = isinstance(reference, Mapping)
-    references: dict[str, Any] = dict(reference if by_label else dict.fromkeys(problems, reference))
-    if set(references) != set(problems) or (len(problems) > 1 and not by_label):
+        how = {"num_saves": num_saves, "progress": progress}
+        reference = {label: reference_solution(problem, t_end, **how) for label, problem in problems.items()}
+    elif not isinstance(reference, Mapping) and len(problems) == 1:
+        reference = dict.fromkeys(problems, reference)
+    if not isinstance(reference, Mapping) or set(reference) != set(problems):
         raise Refused(
             f"convergence_study: params has the labels {list(problems)}, so reference must be a mapping with the same labels."
         )
-    for label, problem in problems.items():
-        shape = (num_saves + 1, problem.q_s.size + problem.q_f.size)
-        q, p = references[label].q, references[label].p
+    shape = (num_saves + 1, problem.q_s.size + problem.q_f.size)
+    for label in problems:
+        q, p = reference[label].q, reference[label].p
         if q.shape != shape or p.shape != shape:
             raise Refused(
                 f"convergence_study: reference has q of shape {q.shape} and p of shape {p.shape}; both "
                 f"must be {shape}: num_saves + 1 nodes from the start to t_end, slow coordinates first."
             )
-    return [Case(label, problem, references[label]) for label, problem in problems.items()]
+    return [Case(label, problem, reference[label]) for label, problem in problems.items()]
 
 
 def _prepared(problem: Problem, scheme, t_end: float, num_saves: int, solver, num_steps: int) -> Simulation:
@@ -298,13 +287,9 @@ def _prepared(problem: Problem, scheme, t_end: float, num_saves: int, solver, nu
     return prepare(problem, scheme, **steps, solver=solver)
 
 
-def _run(*arguments) -> tuple[Trajectory, list[float]]:
-    """A run with arguments of `_prepared`, and samples of its seconds, as many as the last argument says."""
-    *arguments, repeats = arguments
-    run = _prepared(*arguments)
-    trajectory = run(throw=False)
-    is_timed = repeats and trajectory.success
-    return trajectory, interleaved({"": run.timed()}, repeats)[""] if is_timed else []
+def _run(*arguments) -> Trajectory:
+    """A run with arguments of `_prepared`."""
+    return _prepared(*arguments)(throw=False)
 
 
 def _num_steps(t_end: float, macro_dt: float, num_saves: int) -> int:

@@ -1,13 +1,13 @@
-"""A page on the cost of accuracy for a system: the cheapest scheme for each of a few errors, drawn from the runs of one
-search."""
+"""A page on the cost of accuracy for a system: what one search for a few errors has seen."""
 
 import math
-from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from vmri_jax import plots
 from vmri_jax.accuracy.families import Family
@@ -18,7 +18,7 @@ from vmri_jax.refusals import Refused
 from vmri_jax.running.files import make_writable_folder
 from vmri_jax.running.progress import part, shows_progress
 from vmri_jax.study.html import embedded, write_page
-from vmri_jax.study.prices import prices, seconds_of_gradients
+from vmri_jax.study.prices import bound_of, prices
 from vmri_jax.study.row import Row, record
 from vmri_jax.study.table import Column, ResultTable, interruptible
 from vmri_jax.study.tuning import Tuning
@@ -40,25 +40,9 @@ class Answer:
     setting: Row | None
 
 
-class PageFailed(RuntimeError):
-    """The search came to its end, but its page could not be drawn or written; its results are in `.report` and in
-    cost.csv."""
-
-    def __init__(self, report: "CostReport"):
-        self.report = report
-        super().__init__(
-            f"{report.path} could not be drawn or written; all runs are in {report.path.with_name('cost.csv')}."
-        )
-
-
 def _of_setting(form: Callable[[Row], str]) -> Callable[[Answer], str]:
     """The text of a column: `form` of the run, empty if none keeps the error."""
     return lambda answer: "" if answer.setting is None else form(answer.setting)
-
-
-def _gain(row: Row) -> str:
-    """The gain of more than one micro step."""
-    return f"{row.settings.gain:.2g}" if row.num_micro > row.stages else ""
 
 
 @dataclass(frozen=True)
@@ -68,9 +52,8 @@ class CostReport(ResultTable):
     path: of the page, cost.html; its figures and runs lie beside it.
     name: of the system.
     t_end: simulated time.
-    rows: the answers by error, the largest first.
+    errors: accepted errors of a position.
     runs: every run of the search.
-    curves: the best runs of each family, named by it.
     bound: seconds and error of the runs of the Pareto front, if the time of a run were that of its gradients alone;
         empty with constraints.
     """
@@ -81,20 +64,34 @@ class CostReport(ResultTable):
         Column("macro step", _of_setting(lambda row: f"{row.macro_dt:.4g}"), right=True),
         Column("reached", _of_setting(lambda row: f"{row.error_q:.1e}"), right=True),
         Column("time", _of_setting(lambda row: duration(row.seconds)), right=True),
-        Column("gain of micro steps", _of_setting(_gain), right=True),
     )
     path: Path
     name: str
     t_end: float
-    rows: tuple[Answer, ...]
+    errors: tuple[float, ...]
     runs: WorkPrecision
-    curves: WorkPrecision
     bound: tuple[tuple[float, float], ...] = ()
+
+    @property
+    def rows(self) -> list[Answer]:
+        """The answers by error, the largest first: the fastest run that keeps the error, for whichever error the search made it."""
+        errors = sorted(self.errors, reverse=True)
+        return [Answer(error, next(iter(self.runs.keeping(error)), None)) for error in errors]
 
     @property
     def caption(self) -> str:
         """The simulated time, and what the errors are."""
         return f"Runs to t = {self.t_end:g}, with the largest errors of the positions on the way."
+
+    @property
+    def curves(self) -> WorkPrecision:
+        """The Pareto fronts of the families, each with the name of the family as its scheme."""
+        by_family = {row.family: [] for row in self.runs.rows}
+        for row in self.runs.rows:
+            by_family[row.family].append(replace(row, scheme=row.family))
+        return WorkPrecision(
+            tuple(row for rows in by_family.values() for row in pareto_front(rows, "seconds", "error_q"))
+        )
 
     @property
     def reached(self) -> list[Row]:
@@ -147,18 +144,16 @@ def cost_report(
         ValueError: errors that are not positive, or above the extent of the motion; no errors are passed, and the
             system does not move.
         Interrupted: Ctrl-C; carries the runs of the search.
-        PageFailed: the page could not be drawn or written; carries the report.
     """
-    problem = problem_of("cost_report", problem)
-    out = Path(out)
+    problem, out = problem_of("cost_report", problem), Path(out)
     make_writable_folder(out)
     t_end = default_t_end(problem) if t_end is None else t_end
     if errors is not None and (not errors or min(errors) <= 0):
         raise Refused(f"cost_report: errors are {list(errors)}; give positive numbers, in the unit of the positions.")
     tuning, answered = Tuning(problem, t_end, menu, progress=progress), []
     with interruptible(tuning.runs):  # around the drawing as well, so that Ctrl-C there keeps the runs, too
-        errors = sorted(_default_errors(tuning) if errors is None else errors)
-        tuning.extent()
+        tuning.search.first_trials(tuning.menu[:1], np.inf)  # they tell how far the system moves
+        errors = sorted(_default_errors(tuning, problem, t_end) if errors is None else errors)
         check_extent("cost_report: the largest of errors", tuning.search, errors[-1])
         try:
             # The smallest error first: families that are given up for it are hopeless for larger errors.
@@ -166,73 +161,39 @@ def cost_report(
                 tuning.search.progress = part(progress, i, len(errors))
                 tuning.look_for("cost_report: error", error)
                 answered.append(error)
-        except BaseException:
+        finally:
+            report = CostReport(out / "cost.html", name, t_end, tuple(answered), tuning.runs())
+            # Constraints cost more than their evaluations: the runs have no bound.
+            if report.reached and not problem.system.is_constrained:
+                report = replace(report, bound=bound_of(prices(problem), report.curves.pareto()))
             if answered:
-                _write(tuning, answered, name, out)
-            raise
-        report = _write(tuning, answered, name, out)
+                _write(report, problem)
     progress("done", 1, 1)
     return report
 
 
-def _default_errors(tuning: Tuning) -> list[float]:
+def _default_errors(tuning: Tuning, problem: Problem, t_end: float) -> list[float]:
     """RELATIVE_ERRORS of a power of ten near how far the system moves, without errors that round-off hides."""
-    moved, least = tuning.extent(), round_off(tuning.problem)[1]
+    moved, least = tuning.search.extent(), round_off(problem)[1]
     motion = 10.0 ** math.floor(math.log10(moved)) if moved > 0 else 0.0
     errors = [motion * error for error in RELATIVE_ERRORS if motion * error > least]
     if not errors:
         raise Refused(
-            f"cost_report: until t_end = {tuning.t_end:g} the positions are those of the start up to {moved:.1e}, and "
+            f"cost_report: until t_end = {t_end:g} the positions are those of the start up to {moved:.1e}, and "
             f"errors below {least:.1e} cannot be told from round-off: the system is at rest, or no run until then is "
             "certified. Give a start that moves, another t_end, or the errors that you accept."
         )
     return errors
 
 
-def _write(tuning: Tuning, errors: Sequence[float], name: str, out: Path) -> CostReport:
-    """Write the page of the fastest settings that keep the errors, whichever of them they were found for, and hand back
-    its report."""
-    errors = sorted(errors, reverse=True)
-    kept = [next(iter(tuning.keeping(error)), None) for error in errors]
-    answers = tuple(map(Answer, errors, kept))
-    runs, curves = tuning.runs(), _curves(tuning)
-    # Constraints cost more than their evaluations: the runs have no bound.
-    has_bound = any(kept) and not tuning.problem.system.is_constrained
-    bound = bound_of(prices(tuning.problem), curves.pareto()) if has_bound else ()
-    report = CostReport(
-        path=out / "cost.html",
-        name=name,
-        t_end=tuning.t_end,
-        rows=answers,
-        runs=runs,
-        curves=curves,
-        bound=bound,
-    )
-    runs.to_csv(out / "cost.csv")
+def _write(report: CostReport, problem: Problem) -> None:
+    """The runs, the figures and the page of a report."""
+    report.runs.to_csv(report.path.parent / "cost.csv")
     try:
-        _draw(report, tuning.problem)
-    except Exception as error:
-        raise PageFailed(report) from error
-    return report
-
-
-def _curves(tuning: Tuning) -> WorkPrecision:
-    """The Pareto fronts of the families, each with the name of the family as its scheme."""
-    by_family, rows = defaultdict(list), []
-    for row in tuning.rows():
-        by_family[tuning.family_of(row).name].append(row)
-    for family, runs in by_family.items():
-        rows += [replace(row, scheme=family) for row in pareto_front(runs, "seconds", "error_q")]
-    return WorkPrecision(tuple(rows))
-
-
-def bound_of(price: dict[str, float], rows: Sequence[Row]) -> tuple[tuple[float, float], ...]:
-    """Seconds and error of runs whose time is that of their gradients alone.
-
-    A gradient that is evaluated in a loop of its own may take longer than in the run, so that the time of the run
-    bounds it.
-    """
-    return tuple((min(seconds_of_gradients(price, row), row.seconds), row.error_q) for row in rows)
+        _draw(report, problem)
+    except Exception as fault:
+        fault.add_note(f"{report.path} could not be drawn or written; all runs are in cost.csv beside it.")
+        raise
 
 
 def _draw(report: CostReport, problem: Problem) -> None:

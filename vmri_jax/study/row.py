@@ -1,13 +1,11 @@
 """The row of a run in a study: its errors, invariants, evaluations and time."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
-import jax
 import numpy as np
 
-from vmri_jax import diagnostics
 from vmri_jax.mechanics.system import System
 from vmri_jax.mechanics.terms import label
 from vmri_jax.running.settings import Settings
@@ -23,17 +21,14 @@ class Row:
     """One run of a study; NaN, or None, where a study does not measure.
 
     scheme: label.
+    family: name of the family of schemes that a search took the scheme from.
     error_q, error_p: largest error over the compared nodes, see `ReferenceSolution`; in a search `error_q` is the estimated
         error of the run, see `vmri_jax.accuracy.companions`.
     case: label of the parameters, "" if there is one set only.
     energy_error: largest error of the energy: its change since the start where the system keeps its energy; its difference
         from the energy of the reference where forces or moving constraints do work.
-    energy_drift: change, over the run, of the straight line fitted to the error of the energy.
-    energy_band: largest distance of the error of the energy from this line.
-    momentum_error: largest change of a momentum map since the start.
     constraint_residual: largest constraint value, of positions or velocities.
-    seconds, low, high: median and quartiles of the wall time of the run, without compiling; in a search `seconds` are those
-        of the steps.
+    seconds: median of the time of the run, without compiling; in a search of the time of its steps.
     slow_evaluations, fast_evaluations: evaluations of the gradients of V and of W in the whole run, counted from the scheme
         and the Newton passes that the run reports, one evaluation per pass.
     evaluations: evaluations of the gradients of further potentials, by name.
@@ -52,14 +47,10 @@ class Row:
     error_q: float
     error_p: float = np.nan
     case: str = ""
+    family: str = ""
     energy_error: float = np.nan
-    energy_drift: float = np.nan
-    energy_band: float = np.nan
-    momentum_error: float = np.nan
     constraint_residual: float = np.nan
     seconds: float = np.nan
-    low: float = np.nan
-    high: float = np.nan
     slow_evaluations: int = 0
     fast_evaluations: int = 0
     evaluations: Mapping[str | int, int] = field(default_factory=dict)
@@ -75,13 +66,6 @@ class Row:
     def failed(self) -> bool:
         """Whether a step failed, or the error is not known."""
         return not np.isfinite(self.error_q)
-
-    def timed(self, seconds: Sequence[float]) -> "Row":
-        """The row with the median and the quartiles of these samples, as it is without any."""
-        if not len(seconds):
-            return self
-        low, middle, high = (float(x) for x in np.quantile(seconds, (0.25, 0.5, 0.75)))
-        return replace(self, seconds=middle, low=low, high=high)
 
 
 class RunTable(ResultTable):
@@ -115,14 +99,12 @@ def row_of(
     macro_dt: float,
     num_steps: int,
     energies: np.ndarray | None = None,
-    momentum_maps: Sequence[Callable] = (),
     **measured,
 ) -> Row:
     """The row of a run, with its invariants and evaluations, and without a time.
 
     Args:
         energies: right energies at the saved nodes; None for the energy at the start.
-        momentum_maps: infinitesimal generators of symmetries.
         measured: errors of the run, and further fields that are known.
     """
     cost, passes = scheme.describe(), np.maximum(np.asarray(run.info.iterations), 1)
@@ -132,9 +114,6 @@ def row_of(
     stage, further = stage_scheme(scheme), dict(system.potentials)
     energy = np.asarray(run.energy)
     energy_error = energy - (energy[0] if energies is None else energies)
-    drift, band = _drift_and_band(np.asarray(run.t), energy_error)
-    _, *phase = vars(run.states).values()
-    maps = [np.asarray(jax.vmap(lambda *z, xi=xi: diagnostics.momentum_map(xi, *z))(*phase)) for xi in momentum_maps]
     return Row(
         scheme=name,
         num_micro=scheme.num_micro,
@@ -142,9 +121,6 @@ def row_of(
         num_steps=num_steps,
         macro_dt=macro_dt,
         energy_error=float(np.abs(energy_error).max()),
-        energy_drift=drift,
-        energy_band=band,
-        momentum_error=float(max((np.abs(m - m[0]).max() for m in maps), default=np.nan)),
         constraint_residual=float(np.max(run.constraint_residual)),
         slow_evaluations=round(evaluations * cost.slow_evaluations),
         fast_evaluations=round(evaluations * cost.fast_evaluations),
@@ -157,11 +133,3 @@ def row_of(
         degree=cost.degree,
         **measured,
     )
-
-
-def _drift_and_band(t: np.ndarray, energy_error: np.ndarray) -> tuple[float, float]:
-    """Change over the run of the straight line fitted to the error of the energy, and the largest distance from the line."""
-    if not np.isfinite(energy_error).all():
-        return float("nan"), float("nan")
-    line = np.polynomial.Polynomial.fit(t, energy_error, 1)(t)
-    return float(line[-1] - line[0]), float(np.abs(energy_error - line).max())

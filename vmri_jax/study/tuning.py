@@ -1,29 +1,23 @@
 """Advice: the scheme, num_micro and macro step that reach an accepted error in the least time, from the search for an
-accuracy over a whole menu.
+accuracy over a whole menu."""
 
-Settings are checked by runs from another start, the fastest first, and the first one that keeps the error there too is
-recommended: at one start an error may be small by chance, as where its leading term changes sign.
-"""
-
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from operator import attrgetter
 from typing import Any
 
-import jax
 import numpy as np
 
 from vmri_jax.accuracy.families import Family, by_promise, families, for_system
-from vmri_jax.accuracy.search import Trial
-from vmri_jax.accuracy.steps import check_error, digits_of, reached, search_of, warn_of_events
-from vmri_jax.mechanics.projection import legendre, project_momentum
-from vmri_jax.mechanics.state import HasProblem, Problem, State, problem_of
+from vmri_jax.accuracy.search import Search
+from vmri_jax.accuracy.steps import check_error, digits_of, reached, warn_of_events
+from vmri_jax.accuracy.trials import Trial
+from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
 from vmri_jax.refusals import Refused
 from vmri_jax.running.failures import simulation_error
 from vmri_jax.running.progress import Progress, shows_progress, silent
 from vmri_jax.steppers.solver import Solver
-from vmri_jax.study.row import Row, RunTable, row_of
+from vmri_jax.study.row import Row, row_of
 from vmri_jax.study.table import interruptible
 from vmri_jax.study.work import WorkPrecision
 
@@ -32,15 +26,6 @@ FINALISTS = 4
 longer."""
 SETTINGS_PRINTED = 5
 """Number of settings, the recommended one included, that a recommendation and `vmri tune` print."""
-RELATIVE_VELOCITY_CHANGE = 0.01
-"""Standard deviation of the change of velocities over the largest velocity. The motion is another one with the same
-time scales; a larger change may lead to a motion of another kind, with another error."""
-MORE_STEPS = 1.1
-"""Steps of a setting that misses the error from another start, over the steps that its miss predicts; a smaller number
-needs more checks, a larger one leads to slower settings."""
-MAX_CHECKS = 8
-"""Settings that are checked, the fastest first, until one keeps the error from another start; a larger number searches
-longer in vain."""
 
 
 class Tuning:
@@ -55,54 +40,33 @@ class Tuning:
         solver: Solver | None = None,
         progress: Progress = silent,
     ):
-        self.problem, self.t_end, self.solver = problem, t_end, solver
-        self.search = search_of(problem, None, solver, problem.t + t_end, num_saves, progress=progress)
-        self.search.seen = self._add
+        self.search = Search(problem, None, solver, problem.t + t_end, num_saves, None, progress, self._add)
         whole = families() if menu is None else menu
         self.menu = for_system(whole, self.search.system, self.search.has_two_rates)
-        self._seen: dict[tuple[str, int], tuple[Family, Row]] = {}
+        self._rows: dict[tuple[str, int], Row] = {}
 
     def _add(self, trial: Trial) -> None:
         """Add the row of a trial; a failed or uncertified run has an error of NaN."""
         run, error = trial.run, trial.error if np.isfinite(trial.error) else np.nan
         label, numbers = trial.family.label(trial.num_micro), (float(run.macro_dt), run.num_steps)
-        measured = {"error_q": error, "settings": self.search.settings(trial)}
+        measured = {"error_q": error, "settings": self.search.settings(trial), "family": trial.family.name}
         row = row_of(label, run.system, run.scheme, trial.trajectory, *numbers, **measured)
-        self._seen[trial.python, run.num_steps] = trial.family, row
+        self._rows[trial.python, run.num_steps] = row
 
-    def extent(self) -> float:
-        """How far the system moves in the first trials, of the first family if there are none yet; NaN if no error of
-        them is certified."""
-        if not self.search.extent() > 0:
-            self.search.first_trials(self.menu[:1], np.inf)
-        return self.search.extent()
-
-    def look_for(self, name: str, error: float, exhaustive: bool = False) -> list[Row]:
-        """Search for an error, and return the runs that keep it, the fastest first; `name` begins messages."""
+    def look_for(self, name: str, error: float, exhaustive: bool = False) -> WorkPrecision:
+        """Search for an error, and return the table of all runs so far; `name` begins messages."""
         menu = by_promise(self.menu, digits_of(self.search, error))
         finals = reached(name, self.search, menu, error, finalists=FINALISTS, exhaustive=exhaustive)
         self.search.measure([trial for trial in finals if np.isfinite(trial.error)])
-        return self.keeping(error)
-
-    def family_of(self, row: Row) -> Family:
-        """The family of the scheme of a run."""
-        return next(family for family, seen in self._seen.values() if seen.scheme == row.scheme)
-
-    def rows(self) -> list[Row]:
-        """All runs so far, sorted by scheme and number of steps; seconds are those of the steps, NaN where they were
-        not measured."""
-        rows = sorted((row for _, row in self._seen.values()), key=attrgetter("scheme", "num_steps"))
-        seconds = self.search.seconds
-        return [replace(row, seconds=seconds.get(row.settings.python, np.nan) * row.num_steps) for row in rows]
-
-    def keeping(self, error: float) -> list[Row]:
-        """The runs that keep an error and whose time is known, the fastest first."""
-        kept = [row for row in self.rows() if row.error_q <= error and np.isfinite(row.seconds)]
-        return sorted(kept, key=attrgetter("seconds"))
+        return self.runs()
 
     def runs(self) -> WorkPrecision:
-        """The table of all runs so far."""
-        return WorkPrecision(tuple(self.rows()))
+        """The table of all runs so far, sorted by scheme and number of steps; seconds are those of the steps, NaN where
+        they were not measured."""
+        rows = sorted(self._rows.values(), key=attrgetter("scheme", "num_steps"))
+        seconds = self.search.seconds
+        timed = (replace(row, seconds=seconds.get(row.settings.python, np.nan) * row.num_steps) for row in rows)
+        return WorkPrecision(tuple(timed))
 
 
 class NothingReached(ValueError):
@@ -114,50 +78,33 @@ class NothingReached(ValueError):
 
 
 @dataclass(frozen=True)
-class Verification:
-    """A run from another start: its error, infinite if it is not certified, and the ratio of the error to the error in
-    the search."""
+class Recommendation(WorkPrecision):
+    """The cheapest setting for an error, and all runs of the search that led to it; prints as a table of the best few settings.
 
-    error_q: float
-    error_ratio: float
-
-
-@dataclass(frozen=True)
-class Recommendation(RunTable):
-    """The cheapest setting for an error, and the search that led to it; prints as a table of the best few settings.
-
-    `to_csv` and `to_pandas` have all runs of the search.
-
-    scheme, macro_dt, num_steps: arguments for `vmri_jax.simulate`; `setting.settings.arguments` are all of them.
     error: the accepted error, in the unit of the positions.
-    setting: the recommended run, with its error and time.
-    others: the runners-up, the fastest first.
-    verification: the same scheme and steps from another start; None if it was not checked.
-    runs: all runs of the search; ``runs.pareto()`` is their Pareto front.
     """
 
-    error: float
-    setting: Row
-    others: tuple[Row, ...]
-    verification: Verification | None
-    runs: WorkPrecision
-    columns = WorkPrecision.columns
+    error: float = 0.0
 
     @property
-    def rows(self) -> tuple[Row, ...]:
-        """All runs of the search."""
-        return self.runs.rows
+    def setting(self) -> Row:
+        """The recommended run, with its error and time; `setting.settings.arguments` are all arguments for `vmri_jax.simulate`."""
+        return self.keeping(self.error)[0]
+
+    @property
+    def runs(self) -> WorkPrecision:
+        """The runs by their errors and their work; prints as their Pareto front."""
+        return WorkPrecision(self.rows)
 
     def shown(self) -> list[Row]:
         """The best settings, the recommended one first."""
-        return [self.setting, *self.others][:SETTINGS_PRINTED]
+        return self.keeping(self.error)[:SETTINGS_PRINTED]
 
     @property
     def caption(self) -> str:
-        """The recommended setting, and its error from another start."""
-        again = f" From another start its error is {self.verification.error_q:.1e}." if self.verification else ""
+        """The recommended setting."""
         return (
-            f"For an error of {self.error:g} take the first: its .scheme, .macro_dt and .num_steps.{again} "
+            f"For an error of {self.error:g} take the first: its .scheme, .macro_dt and .num_steps. "
             f"All {len(self.rows)} runs are in .runs and .to_csv(path)."
         )
 
@@ -193,24 +140,23 @@ def tune(
     menu: Sequence[Family] | None = None,
     num_saves: int | None = None,
     solver: Solver | None = None,
-    verify: bool = True,
     exhaustive: bool = False,
     progress: Any = False,
 ) -> Recommendation:
     """Find the scheme, num_micro and macro step that reach an error in the least time on this machine.
 
-    Errors are those of ``simulate(..., error=True)``: estimated by companion runs, the largest over all positions and
-    saved nodes, and certified.
+    The search is that of ``simulate(..., accuracy=)`` over the whole menu in place of two families. Errors are those of
+    ``simulate(..., error=True)``: estimated by companion runs, the largest over all positions and saved nodes, and
+    certified. They belong to this start: run the choice from another start with ``error=True`` to know its error there.
 
     Args:
         problem: system and start; a `Problem` or a scene.
-        error: largest accepted error of a position, in the unit of the positions, from this start and from another one.
+        error: largest accepted error of a position, in the unit of the positions.
         t_end: simulated time.
         menu: families to choose from, by default `families()`.
         num_saves: saved intervals, equally spaced, at whose ends errors are compared; None for one per macro step, at
             most 1000.
         solver: how implicit equations are solved.
-        verify: run settings from another start, too, and recommend one that keeps the error there.
         exhaustive: try every num_micro of every family, to check the staged search.
         progress: True for a bar, or a function (what, done, total) that is told about every trial run.
 
@@ -221,79 +167,27 @@ def tune(
         Interrupted: Ctrl-C during the search; carries the runs.
 
     Warns:
-        UserWarning: no setting keeps the error from another start; events of forces demand many steps.
+        UserWarning: events of forces demand many steps.
     """
     problem = problem_of("tune", problem)
     check_target(error, t_end, problem)
     tuning = Tuning(problem, t_end, menu, num_saves, solver, progress)
-    tuning.search.fewest = True
     with interruptible(tuning.runs):
-        rows = tuning.look_for("tune: error", error, exhaustive)
-        if not rows:
+        choice = Recommendation(tuning.look_for("tune: error", error, exhaustive).rows, error=error)
+        if not choice.keeping(error):
             raise _nothing(tuning, error)
-        setting, verification = rows[0], None
-        if verify:
-            mean_speed = tuning.extent() / t_end
-            setting, verification = first_verified(tuning, rows, error, another_start(problem, mean_speed))
     progress("done", 1, 1)
-    others = tuple(row for row in tuning.keeping(error) if row.settings != setting.settings)
-    return Recommendation(error, setting, others, verification, tuning.runs())
+    warn_of_events("tune", tuning.search, choice.scheme, stacklevel=4)
+    return choice
 
 
 def _nothing(tuning: Tuning, error: float) -> Exception:
     """The reason why no setting keeps the error: all runs failed, or none is as accurate."""
-    rows, trial = tuning.rows(), tuning.search.first_trials(tuning.menu, error)[0]
-    if all(row.result not in ("CONVERGED", "CONVERGED_AT_ROUNDOFF") for row in rows):
+    runs, trial = tuning.runs(), tuning.search.first_trials(tuning.menu, error)[0]
+    if all(row.result not in ("CONVERGED", "CONVERGED_AT_ROUNDOFF") for row in runs.rows):
         return simulation_error(trial.trajectory, trial.run.macro_dt, trial.run.save_every, trial.run.scheme.num_micro)
-    best = min(rows, key=lambda row: np.nan_to_num(row.error_q, nan=np.inf))
+    best = min(runs.rows, key=lambda row: np.nan_to_num(row.error_q, nan=np.inf))
     certified = f"the best error was {best.error_q:.1e}, with {best.scheme} and {best.num_steps} steps"
     reason = certified if np.isfinite(best.error_q) else "no error is certified until t_end"
-    text = f"tune: no setting reached {error:g} in {len(rows)} runs; {reason}. Give a larger error or a shorter t_end."
-    return NothingReached(text, tuning.runs())
-
-
-def another_start(problem: Problem, speed: float) -> Problem:
-    """The problem with velocities that differ by about a hundredth and satisfy its constraints, moving ones included.
-
-    Random numbers are added to the velocities; the momenta of the sums are projected onto the hidden constraints
-    ``G v + dg/dt = 0``. `speed` is the mean speed of the run: the size of velocities where the run starts at rest.
-    """
-    system, state, random = problem.system, problem.state(), np.random.default_rng(1)
-    velocities = problem.v_s, problem.v_f
-    size = RELATIVE_VELOCITY_CHANGE * max(speed, *(float(np.abs(v).max(initial=0.0)) for v in velocities))
-    changed = [np.asarray(v) + size * random.normal(size=np.shape(v)) for v in velocities]
-    momenta = legendre(system, state.q_s, state.q_f, *changed)
-    *_, v_s, v_f = jax.jit(project_momentum)(system, State(state.t, state.q_s, state.q_f, *momenta), velocities)
-    return replace(problem, q_s=state.q_s, q_f=state.q_f, v_s=v_s, v_f=v_f, project=False)
-
-
-def first_verified(tuning: Tuning, rows: Sequence[Row], error: float, other: Problem) -> tuple[Row, Verification]:
-    """The fastest setting whose run from another start, too, keeps the error; warns if none of `MAX_CHECKS` settings
-    does.
-
-    A setting that misses the error there waits again, with more steps, among the settings that are slower.
-    """
-    search = search_of(other, None, tuning.solver, other.t + tuning.t_end, tuning.search.num_saves)
-    waiting, checked = list(rows), []
-    for i in range(MAX_CHECKS):
-        row = min(waiting, key=attrgetter("seconds"))
-        waiting.remove(row)
-        tuning.search.progress(f"{row.scheme} from another start", i, MAX_CHECKS)
-        family, num_micro, num_steps = tuning.family_of(row), row.num_micro // row.stages, row.num_steps
-        trial = search.trial(family, num_micro, num_steps, True, error)
-        certified = trial.error if trial.run.num_steps == num_steps else np.inf
-        # A search in which nothing moves has errors of exactly 0.
-        checked.append((row, Verification(certified, certified / row.error_q if row.error_q else 1.0)))
-        if max(certified, row.error_q) <= error:
-            warn_of_events("tune", search, trial, stacklevel=5)
-            return checked[-1]
-        miss = max(certified, row.error_q) / error
-        more = MORE_STEPS * miss ** (1 / row.order) if np.isfinite(miss) else trial.run.num_steps / num_steps
-        again = tuning.search.trial(family, num_micro, int(np.ceil(more * num_steps)), True, error)
-        waiting += [row for row in tuning.rows() if row.settings == tuning.search.settings(again)]
-    warnings.warn(
-        f"tune: none of {MAX_CHECKS} settings keeps the error {error:g} from another start; the best of them is "
-        "recommended.",
-        stacklevel=4,
-    )
-    return min(checked, key=lambda pair: pair[1].error_q)
+    text = f"tune: no setting reached {error:g} in {len(runs.rows)} runs; {reason}. Give a larger error or a shorter t_end."
+    return NothingReached(text, runs)

@@ -62,6 +62,11 @@ class WorkPrecision(RunTable):
         """
         return pareto_front(self.rows, work, "error_q")
 
+    def keeping(self, error: float) -> list[Row]:
+        """The runs that keep an error of the positions and whose time is known, the fastest first."""
+        kept = [row for row in self.rows if row.error_q <= error and np.isfinite(row.seconds)]
+        return sorted(kept, key=attrgetter("seconds"))
+
     def shown(self) -> list[Row]:
         """The Pareto front, by numbers of steps where no run has a time."""
         return self.pareto() or self.pareto("num_steps")

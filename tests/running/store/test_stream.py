@@ -165,9 +165,7 @@ def test_a_full_disk_keeps_what_was_written(run, uninterrupted, out, monkeypatch
     with monkeypatch.context() as patch:
         full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         stop_after(patch, 1, layout.Writer, "write", full)
-        with pytest.raises(
-            OSError, match=r"No space left on device. The run is kept up to macro step 6: resume it"
-        ) as caught:
+        with pytest.raises(OSError, match=r"No space left on device. The run is kept up to macro step 6:") as caught:
             run(out)
     assert caught.value.errno == errno.ENOSPC
     assert_identical(StoredTrajectory(out).load(), uninterrupted[:CHUNK])

@@ -74,7 +74,7 @@ class _Coupling(OfFreedoms):
         return Applied(equation, (self.law, tuple(self.by_directors(freedom) for _, freedom in self.joints)))
 
     def _parameters(self):
-        return {"law": self.numbers(), "joints": tuple(joint.parameters for joint, _ in self.joints)}
+        return {"law": self.numbers(), "joints": tuple(joint.frames for joint, _ in self.joints)}
 
     def terms(self, select, layout):
         roles, freedoms = [], []

@@ -27,27 +27,11 @@ def triads(q, params):
 
 def dot(u, v):
     """``u . v`` over the last axis."""
-    return jnp.sum(u * v, axis=-1)
-
-
-def aligned(q, params, *pairs: tuple[int, int]):
-    """Dot products of the i-th vector of the triad of a with the j-th vector of the triad of b, for all `pairs` (i, j): (..., pairs)."""
-    of_a, of_b = triads(q, params)
-    return jnp.stack([dot(of_a[..., i, :], of_b[..., j, :]) for i, j in pairs], axis=-1)
+    return (u * v).sum(axis=-1)
 
 
 M, M_PRIME, N = range(3)
 """Rows of a triad."""
-PARALLEL = ((N, M), (N, M_PRIME))
-"""Pairs of vectors of both triads whose dot products vanish if the axes n and f are parallel."""
-UNTURNED = (M, M_PRIME)
-"""Pair of vectors of both triads whose dot product vanishes if b has not turned about the axis."""
-
-
-def across(q, params):
-    """``(m . D, m' . D)``, (..., 2)."""
-    d, (of_a, _) = gap(q, params), triads(q, params)
-    return jnp.stack([dot(of_a[..., i, :], d) for i in (M, M_PRIME)], axis=-1)
 
 
 def turn_by_sine(q, params):
@@ -64,9 +48,9 @@ def tilt_by_sine(q, params):
     return dot(of_b[..., M_PRIME, :], n), dot(of_b[..., N, :], n)
 
 
-def slide(q, params):
-    """How far b has moved along the axis from the given position, ``n . D``, m, (...)."""
-    return dot(triads(q, params)[0][..., N, :], gap(q, params))
+def slide(q, params, axis: int = N):
+    """How far b has moved from the given position along n, or along another vector of the triad of a: ``n . D``, m, (...)."""
+    return dot(triads(q, params)[0][..., axis, :], gap(q, params))
 
 
 ANGLES: dict[str, Any] = {"turn": turn_by_sine, "tilt": tilt_by_sine}
@@ -80,9 +64,9 @@ FREEDOMS: dict[str, Any] = {
     "turn": lambda q, params: jnp.arctan2(*turn_by_sine(q, params)),
     "slide": slide,
     "tilt": lambda q, params: jnp.arctan2(*tilt_by_sine(q, params)),
-    "along": lambda q, params: across(q, params)[..., 0],
-    "across": lambda q, params: across(q, params)[..., 1],
-    COORDINATE: lambda q, params: jnp.squeeze(q[0], -1),
+    "along": lambda q, params: slide(q, params, M),
+    "across": lambda q, params: slide(q, params, M_PRIME),
+    COORDINATE: lambda q, params: q[0][..., 0],
 }
 """For each freedom, the function ``(q, params) -> (...)`` of the coordinates of both bodies that gives its value against the given position: rad,
 between -pi and pi, or m."""

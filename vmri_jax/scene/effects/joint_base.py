@@ -18,9 +18,18 @@ from vmri_jax.refusals import Refused
 from vmri_jax.scene.body import GROUND, GROUND_COORDINATES, Attachment, body_of, label_of
 from vmri_jax.scene.declare import effect_class, names, stacked
 from vmri_jax.scene.effect import START, Effect
-from vmri_jax.scene.effects.freedoms import FREEDOMS, IN_REACH, PARALLEL, Freedom, aligned, gap
+from vmri_jax.scene.effects.freedoms import FREEDOMS, IN_REACH, Freedom
 from vmri_jax.scene.layout import Key
+from vmri_jax.scene.products import FRAME, products
 from vmri_jax.scene.rigid import RigidBody
+from vmri_jax.scene.terms import Applied
+
+GAP = (("D", "x"), ("D", "y"), ("D", "z"))
+"""Rows that keep the points of both bodies at one place: the components of D along the axes of space."""
+PARALLEL = (("n", "e"), ("n", "e'"))
+"""Rows that keep the axes n and f parallel."""
+AXES = dict(zip("xyz", np.eye(3), strict=True))
+"""The axes of space, which a row may have as one of its two vectors."""
 
 
 @effect_class
@@ -40,9 +49,12 @@ class Joint(Effect):
     at: Any = None
 
     kind = "constraint"
+    is_analytic = True
     whole = True
     same_size = False
-    derived = ("point_a", "point_b", "frame_a", "frame_b")
+    derived = ("point_a", "point_b", "frame_a", "frame_b", "factors", "offsets")
+    rows: ClassVar[tuple[tuple[str, str], ...]] = GAP
+    """Pairs of vectors whose scalar products are the rows: of the gap D, both triads, and the axes x, y, z of space."""
     carries: ClassVar[bool] = False
     """Whether the joint can carry a body, whose position is then a function of the freedoms: these must be coordinates without a singularity."""
     moves: ClassVar[tuple[Move, ...]] = ()
@@ -53,8 +65,41 @@ class Joint(Effect):
     def _elements(self):
         return tuple(tuple(map(str, element)) for element in super()._elements())
 
+    @property
+    def function(self):
+        return Applied(products, (len(self.rows),))
+
+    @cached_property
+    def attached(self):
+        # the numbers of a row hold what it has from the ground, so that the other body may stand in for it: joints to the ground and joints
+        # between bodies are one term
+        return tuple((b if a == GROUND else a, a if b == GROUND else b) for a, b in self.elements)
+
     def _parameters(self):
-        return super()._parameters() | {name: stacked(values) for name, values in self._frames().items()}
+        return super()._parameters() | self._factors()
+
+    @cached_property
+    def frames(self) -> dict[str, Any]:
+        """Points and triads of all pairs as components along the directors of each body: "point_a", "point_b", "frame_a", "frame_b"."""
+        return {name: stacked(values) for name, values in self._frames().items()}
+
+    def _factors(self) -> dict[str, Any]:
+        """The numbers of the rows of all pairs, see `products`."""
+        frames = {name: library(values).stack(values) for name, values in self._frames().items()}
+        xp, count = library(frames), len(self.elements)
+        named, zero = [name for side in zip(*self.rows, strict=True) for name in side], np.zeros((count, FRAME))
+        offsets, halves = np.stack([AXES.get(name, np.zeros(3)) for name in named]), []
+        for role, names_of_role, sign in (("a", ("m", "m'", "n"), -1.0), ("b", ("e", "e'", "f"), 1.0)):
+            # the gap D has the centres and points of both bodies, with opposite signs; the vectors of a triad have no centre
+            vectors = {"D": sign * xp.concatenate([np.ones((count, 1)), frames[f"point_{role}"]], axis=-1)}
+            for i, name in enumerate(names_of_role if f"frame_{role}" in frames else ()):
+                vectors[name] = xp.concatenate([np.zeros((count, 1)), frames[f"frame_{role}"][:, i]], axis=-1)
+            half = xp.stack([vectors.get(name, zero) for name in named], axis=1)
+            is_ground = np.array([pair["ab".index(role)] == GROUND for pair in self.elements])[:, None, None]
+            offsets = offsets + is_ground * (half @ GROUND_COORDINATES.reshape(FRAME, 3))
+            halves.append(~is_ground * half)
+        factors = xp.concatenate(halves, axis=-1)
+        return {"factors": stacked([*factors]), "offsets": stacked([*offsets])}
 
     def label(self, i: int) -> str:
         """The name of the joint, followed by the names of both bodies of the i-th pair if the joint has several pairs."""
@@ -69,7 +114,8 @@ class Joint(Effect):
         values = []
         for i in pairs:
             ends = (GROUND_COORDINATES if name == GROUND else coordinates[name] for name in self.elements[i])
-            values.append(FREEDOMS[freedom](tuple(map(jnp.asarray, ends)), self.params_of((i,))))
+            params = self.params_of((i,), self.parameters | self.frames)
+            values.append(FREEDOMS[freedom](tuple(map(jnp.asarray, ends)), params))
         return jnp.stack(values)
 
     @cached_property
@@ -99,8 +145,7 @@ class Joint(Effect):
             self.require(coincide, f"the distance of the points of {a}-{b}", f"{float(distance):.6g}", expected)
 
     def drawn_points(self):
-        params = self.parameters
-        points = {role: np.atleast_2d(params[f"point_{role}"]) for role in "ab"}
+        points = {role: np.atleast_2d(self.frames[f"point_{role}"]) for role in "ab"}
         return {
             f"{self.name} {'-'.join(element)} in {name}": (name, points[role][i])
             for i, element in enumerate(self.elements)
@@ -166,14 +211,7 @@ class AboutAxis(Joint):
     axis: Any = (0.0, 0.0, 1.0)
 
     carries = True
-    lengths: ClassVar[Any] = staticmethod(gap)
-    """Rows that are components of the gap D, (..., k)."""
-    products: ClassVar[tuple[tuple[int, int], ...]] = PARALLEL
-    """Pairs of vectors of both triads whose dot products are rows, see `aligned`."""
-
-    @classmethod
-    def function(cls, q, params):
-        return jnp.concatenate([cls.lengths(q, params), aligned(q, params, *cls.products)], axis=-1)
+    rows = (*GAP, *PARALLEL)
 
     @cached_property
     def triads(self):

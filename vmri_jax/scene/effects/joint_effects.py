@@ -44,8 +44,8 @@ def prescribed_motion(law, freedom: str, t, q, params):
     a = law(t, params["path"])
     if freedom not in ANGLES:
         return FREEDOMS[freedom](q, params) - a
-    sine, cosine = ANGLES[freedom](q, params)
-    return sine * jnp.cos(a) - cosine * jnp.sin(a)
+    (sine, cosine), xp = ANGLES[freedom](q, params), library(a)
+    return sine * xp.cos(a) - cosine * xp.sin(a)
 
 
 @effect_class
@@ -100,7 +100,7 @@ class InJoint(OfFreedoms):
         return (*terms, self._term(Applied(self.along, (self.law, COORDINATE)), [role], carrying))
 
     def _parameters(self):
-        return super()._parameters() | self.joint.parameters
+        return super()._parameters() | self.joint.frames
 
     def check_bodies(self):
         """Refuse a joint without this freedom; the joint checks its bodies itself."""
@@ -260,6 +260,7 @@ class JointMotion(InJoint):
     params: Any = field(default_factory=dict)
 
     kind = "constraint"
+    is_analytic = True
     counts_turns = False
     default_name = "joint_motion"
     along = staticmethod(prescribed_motion)

@@ -23,25 +23,20 @@ Source: P. Betsch, S. Leyendecker, Int. J. Numer. Meth. Engng 67 (2006).
 from functools import cached_property
 from typing import Any
 
-import jax.numpy as jnp
+import numpy as np
 
 from vmri_jax.mechanics.arrays import library
 from vmri_jax.mechanics.kinematics import Move
 from vmri_jax.scene.declare import effect_class, number
-from vmri_jax.scene.effect import START
-from vmri_jax.scene.effects.freedoms import (
-    M_PRIME,
-    PARALLEL,
-    UNTURNED,
-    M,
-    N,
-    across,
-    aligned,
-    gap,
-    slide,
-    turn_by_sine,
-)
-from vmri_jax.scene.effects.joint_base import AboutAxis, Joint
+from vmri_jax.scene.effect import START, Effect
+from vmri_jax.scene.effects.freedoms import M_PRIME, M, N, slide, turn_by_sine
+from vmri_jax.scene.effects.joint_base import GAP, PARALLEL, AboutAxis, Joint
+from vmri_jax.scene.products import products
+
+ACROSS = (("m", "D"), ("m'", "D"))
+"""Rows that keep the points of both bodies on one line along the axis n."""
+UNTURNED = ("m", "e'")
+"""Row that keeps b from turning about the axis n."""
 
 
 @effect_class
@@ -53,7 +48,6 @@ class Spherical(Joint):
     """
 
     default_name = "spherical"
-    function = staticmethod(gap)
 
 
 @effect_class
@@ -87,7 +81,7 @@ class Universal(AboutAxis):
     default_name = "universal"
     moves = (Move("turn", N), Move("turn", M))
     freedoms = ("turn", "tilt")
-    products = ((N, M),)
+    rows = (*GAP, ("n", "e"))
 
     @cached_property
     def triads(self):
@@ -106,7 +100,7 @@ class Fixed(AboutAxis):
     """
 
     default_name = "fixed"
-    products = (*PARALLEL, UNTURNED)
+    rows = (*GAP, *PARALLEL, UNTURNED)
 
 
 @effect_class
@@ -120,7 +114,17 @@ class Cylindrical(AboutAxis):
     default_name = "cylindrical"
     moves = (Move("turn", N), Move("slide", N))
     freedoms = ("turn", "slide")
-    lengths = staticmethod(across)
+    rows = (*ACROSS, *PARALLEL)
+
+
+def screwed(q, params):
+    """The rows of `Cylindrical` and ``m' . e cos a - m . e sin a``, (..., 5)."""
+    # rather than a difference of angles, which would jump by 2 pi after half a turn
+    angle, xp = 2 * np.pi * slide(q, params) / params["pitch"], library(q)
+    sine, cosine = turn_by_sine(q, params)
+    difference = sine * xp.cos(angle) - cosine * xp.sin(angle)
+    q = [xp.broadcast_to(x, (*difference.shape, x.shape[-1])) for x in q]
+    return xp.concatenate([products(len(Cylindrical.rows), q, params), difference[..., None]], axis=-1)
 
 
 @effect_class
@@ -143,6 +147,7 @@ class Screw(AboutAxis):
     default_name = "screw"
     moves = (Move("screw", N),)
     freedoms = ("turn",)
+    rows = Cylindrical.rows
 
     def check_parameters(self):
         super().check_parameters()
@@ -153,13 +158,11 @@ class Screw(AboutAxis):
         pitch = self.parameters["pitch"]
         return pitch[i] if pitch.ndim else pitch
 
-    @staticmethod
-    def function(q, params):
-        # m' . e cos a - m . e sin a = 0 rather than a difference of angles, which would jump by 2 pi after half a turn
-        angle = 2 * jnp.pi * slide(q, params) / params["pitch"]
-        sine, cosine = turn_by_sine(q, params)
-        difference = sine * jnp.cos(angle) - cosine * jnp.sin(angle)
-        return jnp.concatenate([across(q, params), aligned(q, params, *PARALLEL), difference[..., None]], axis=-1)
+    function = staticmethod(screwed)
+    attached = Effect.attached
+
+    def _parameters(self):
+        return super()._parameters() | self.frames
 
 
 @effect_class
@@ -176,10 +179,7 @@ class Planar(AboutAxis):
     default_name = "planar"
     moves = (Move("slide", M), Move("slide", M_PRIME), Move("turn", N))
     freedoms = ("along", "across", "turn")
-
-    @staticmethod
-    def lengths(q, params):
-        return slide(q, params)[..., None]
+    rows = (("n", "D"), *PARALLEL)
 
 
 @effect_class
@@ -193,5 +193,4 @@ class Prismatic(AboutAxis):
     default_name = "prismatic"
     moves = (Move("slide", N),)
     freedoms = ("slide",)
-    lengths = staticmethod(across)
-    products = (*PARALLEL, UNTURNED)
+    rows = (*ACROSS, *PARALLEL, UNTURNED)

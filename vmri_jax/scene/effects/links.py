@@ -2,8 +2,6 @@
 
 from typing import Any
 
-import jax.numpy as jnp
-
 from vmri_jax.mechanics.arrays import library
 from vmri_jax.scene.declare import effect_class, positive
 from vmri_jax.scene.effect import START, Effect
@@ -17,12 +15,13 @@ class _Rigid(Effect):
     length: Any = positive(default=None, measured=True)
 
     kind = "constraint"
+    is_analytic = True
     apart = True
     dimensions = (1, 2, 3)
 
     @staticmethod
     def law(line, params):
-        return (jnp.sum(line**2, axis=-1) - params["length"] ** 2) / 2
+        return ((line**2).sum(axis=-1) - params["length"] ** 2) / 2
 
 
 @effect_class
@@ -98,6 +97,7 @@ class Guide(ToPath):
     """
 
     kind = "constraint"
+    is_analytic = True
     default_name = "guides"
 
     @staticmethod

@@ -1,0 +1,127 @@
+"""Consistent starts: positions moved onto the constraints, and momenta onto the hidden constraints ``G v + dg/dt = 0``.
+
+Of traced numbers these functions are parts of programs. Of known numbers NumPy does the linear algebra, and the `Configuration` has values and
+Jacobians: a program of its own for every step of the start would take seconds to compile.
+"""
+
+from contextlib import suppress
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vmri_jax.kernels.saddle import least_norm, regularized
+from vmri_jax.mechanics.arrays import is_concrete, library, quickly_compiled
+from vmri_jax.mechanics.constraints import configuration, known_mass
+from vmri_jax.mechanics.projection import legendre, project_momentum
+from vmri_jax.mechanics.structure import has_constant_hessian
+from vmri_jax.mechanics.system import System
+
+PROJECTION_STEPS = 20
+"""Gauss-Newton steps onto the constraints. They converge quadratically from close positions; a larger number takes longer."""
+
+
+def project_positions(system: System, t, q_s, q_f):
+    """Positions moved onto the constraints at a time, along ``M^-1 G^T`` of the start: to first order the nearest point in the mass metric."""
+    n_s, q0 = q_s.shape[0], library(q_s, q_f).concatenate([q_s, q_f])
+    is_known = _is_known((system, t, q0))
+
+    def constraints(q):
+        return system.constraints(t, q[:n_s], q[n_s:])
+
+    def values_and_jacobian(q):
+        if is_known:
+            return configuration(system, t, q[:n_s], q[n_s:]).solved
+        return constraints(q), jax.jacrev(constraints)(q)
+
+    # D = M^-1 G^T at the start, with rows of coordinates over the square roots of masses: all have the same unit
+    mass = known_mass(system, q_s, q_f) if is_known else _mass_at_rest(system, q_s, q_f)
+    jacobian, xp = values_and_jacobian(q0)[1], library(mass, q0)
+    root = xp.sqrt(xp.diagonal(mass))
+    directions = xp.linalg.solve(mass / (root[:, None] * root), (jacobian / root).T) / root[:, None]
+
+    # q <- q - D (G D)^+ g
+    def corrected(_, q):
+        values, jacobian = values_and_jacobian(q)
+        return q - directions @ least_norm(jacobian @ directions, values)
+
+    if not is_known:
+        q = jax.lax.fori_loop(0, PROJECTION_STEPS, corrected, q0)  # a loop, since its body is compiled once
+        return q[:n_s], q[n_s:]
+    q = q0
+    with (
+        np.errstate(all="ignore"),
+        suppress(np.linalg.LinAlgError),
+    ):  # of positions that are not finite, which the checks name
+        for k in range(PROJECTION_STEPS):
+            q = corrected(k, q)
+    return q[:n_s], q[n_s:]
+
+
+def consistent_momenta(system: System, t, q_s, q_f, v_s, v_f):
+    """(p_s, p_f, violation): momenta projected onto the hidden constraints, and the violation of the hidden constraints, between 0 and 1.
+
+    The violation is ``|v - v'| / max(|v|, |v'|)`` in the norm of the kinetic energy, with the projected velocities v': constraints may take
+    velocity away, and moving constraints may add it.
+    """
+    n_s, arguments = np.shape(q_s)[0], (system, t, q_s, q_f, v_s, v_f)
+
+    def kinetic(v):
+        return system.kinetic_energy(q_s, q_f, v[:n_s], v[n_s:])
+
+    v = library(v_s, v_f).concatenate([v_s, v_f])
+    is_quadratic = system.has_constant_mass or has_constant_hessian(kinetic, v)
+    momenta = _momenta_of_numbers if is_quadratic and _is_known(arguments) else _momenta
+    p, projected_p, projected_v = momenta(*arguments)
+    # |v - v'|^2 / max(|v|^2, |v'|^2) with |v|^2 = v . p
+    xp = library(v, p, projected_p)
+    size = xp.maximum(v @ p, projected_v @ projected_p)
+    part = xp.where(size > 0, (v - projected_v) @ (p - projected_p) / xp.where(size > 0, size, 1.0), 0.0)
+    return projected_p[:n_s], projected_p[n_s:], xp.sqrt(xp.clip(part, 0.0, 1.0))
+
+
+def _is_known(arguments) -> bool:
+    """Whether the arguments are numbers outside of a program: while JAX stages a program, all new arrays are tracers."""
+    return is_concrete((arguments, jnp.zeros(())))
+
+
+def _mass_at_rest(system: System, q_s, q_f):
+    def momentum(v):
+        return jnp.concatenate(legendre(system, q_s, q_f, v[: q_s.size], v[q_s.size :]))
+
+    return jax.jacfwd(momentum)(jnp.zeros(q_s.size + q_f.size))
+
+
+class At(NamedTuple):
+    """Time, positions and momenta, as of a `State`."""
+
+    t: Any
+    q_s: Any
+    q_f: Any
+    p_s: Any
+    p_f: Any
+
+
+@quickly_compiled
+def _momenta(system, t, q_s, q_f, v_s, v_f):
+    """p = dT/dv, and p and v after the projection onto the hidden constraints."""
+    momenta = legendre(system, q_s, q_f, v_s, v_f)
+    p_s, p_f, *velocities = project_momentum(system, At(t, q_s, q_f, *momenta), (v_s, v_f))
+    return tuple(jnp.concatenate(a) for a in (momenta, (p_s, p_f), velocities))
+
+
+def _momenta_of_numbers(system, t, q_s, q_f, v_s, v_f):
+    """`_momenta` by NumPy, of a T that is quadratic in v: a program would take seconds to compile."""
+    mass, v = known_mass(system, q_s, q_f), np.concatenate([v_s, v_f])
+    p = mass @ v
+    if not system.is_constrained:
+        return p, p, v
+    # G M^-1 G^T mu = G v + dg/dt
+    _, jacobian, rates = configuration(system, t, q_s, q_f)
+    directions = np.linalg.solve(mass, jacobian.T)
+    try:
+        mu = np.linalg.solve(regularized(jacobian @ directions), jacobian @ v + rates)
+    except np.linalg.LinAlgError:
+        mu = np.full(rates.shape, np.nan)  # a gradient that vanishes, which the checks name
+    return p, p - jacobian.T @ mu, v - directions @ mu

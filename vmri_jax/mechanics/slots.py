@@ -1,0 +1,98 @@
+"""The one map from names to the entries of a flat vector."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from vmri_jax.mechanics.arrays import library, real_array
+from vmri_jax.refusals import Refused
+
+
+@dataclass(frozen=True)
+class Slots:
+    """Names and shapes of arrays, in their order in a flat vector; compared by value."""
+
+    shapes: tuple[tuple[str, tuple[int, ...]], ...]
+
+    @classmethod
+    def of(cls, name: str, arrays: Mapping[str, Any]) -> "Slots":
+        """The slots of a dictionary, in its own order.
+
+        Args:
+            name: name of the dictionary in messages.
+            arrays: real numbers by name.
+
+        Raises:
+            TypeError: a name that is no text, a value that is no array of real numbers.
+        """
+        for body in arrays:
+            if not isinstance(body, str) or not body:
+                raise Refused(f"{name} has the key {body!r}; give arrays by names of bodies, {{'load': [0.0, -5.0]}}.")
+        return cls(tuple((body, real_array(f"{name}[{body!r}]", array).shape) for body, array in arrays.items()))
+
+    @classmethod
+    def of_sizes(cls, sizes: Mapping[str, int | tuple[int, ...]]) -> "Slots":
+        """The slots of arrays with these shapes, or of vectors with these numbers of entries."""
+        return cls(tuple((name, (size,) if isinstance(size, int) else size) for name, size in sizes.items()))
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        """Number of entries of each array."""
+        return {name: math.prod(shape) for name, shape in self.shapes}
+
+    @property
+    def size(self) -> int:
+        """Number of all entries."""
+        return sum(self.sizes.values())
+
+    @property
+    def slices(self) -> dict[str, slice]:
+        """The entries of each array in the flat vector."""
+        ends = np.cumsum([0, *self.sizes.values()]).tolist()
+        return {name: slice(*ends[i : i + 2]) for i, (name, _) in enumerate(self.shapes)}
+
+    def by_name(self, vectors) -> dict[str, Any]:
+        """Arrays (..., *shape) by name of vectors (..., n)."""
+        pieces = zip(self.shapes, self.slices.values(), strict=True)
+        return {name: vectors[..., entries].reshape(*vectors.shape[:-1], *shape) for (name, shape), entries in pieces}
+
+    def flat(self, name: str, arrays: Mapping[str, Any], *, zeros: bool = False, per_row: bool = False):
+        """The vector (n,) of a dictionary of arrays.
+
+        Args:
+            name: name of the dictionary in messages.
+            arrays: by name, each of the shape of its position; one number only for one number.
+            zeros: whether bodies without an entry have zeros; else every body needs an entry.
+            per_row: whether a value may have the leading axes of its position alone, as masses do, see `ConstantMass`.
+
+        Raises:
+            ValueError: names or shapes of another configuration.
+        """
+        bodies = dict(self.shapes)
+        if not arrays.keys() <= bodies.keys() or (not zeros and arrays.keys() != bodies.keys()):
+            raise Refused(
+                f"{name} has the keys {', '.join(map(str, arrays)) or 'none'}; give {', '.join(bodies) or 'none'}."
+            )
+        pieces = []
+        for body, shape in self.shapes:
+            value = real_array(f"{name}[{body!r}]", arrays.get(body, np.zeros(shape)))
+            seen = value.shape
+            if value.size == math.prod(shape) == 1:
+                value = value.reshape(shape)
+            elif per_row:  # the axes that the value lacks are the last ones, where NumPy would put them first
+                value = value.reshape(*seen, *(1,) * (len(shape) - value.ndim))
+            if value.shape != shape and not (per_row and _repeats(value.shape, shape)):
+                row = f"one number, an array {shape[:1]} with a number for each row, or" if per_row and shape else ""
+                raise Refused(
+                    f"{name}[{body!r}] has shape {seen}, and the position has {shape}; give {row or 'an array of'} shape {shape}."
+                )
+            pieces.append(library(value).broadcast_to(value, shape).reshape(-1))
+        return library(pieces).concatenate([*pieces, library(pieces).zeros(0)])
+
+
+def _repeats(shape: tuple[int, ...], whole: tuple[int, ...]) -> bool:
+    """Whether an array of the first shape may be repeated along its axes of length 1 to fill the second shape."""
+    return len(shape) == len(whole) and all(n in (1, full) for n, full in zip(shape, whole, strict=True))
