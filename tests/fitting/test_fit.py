@@ -16,9 +16,9 @@ SCHEME = vm.fully_explicit(2)
 DT = 0.05
 
 
-def measured(steps=60, sigma=1e-3, seed=0):
+def measured(steps=60, sigma=1e-3, seed=0, problem=CHAIN, dt=DT, scheme=SCHEME):
     """Noisy positions of a run."""
-    run = vm.simulate(CHAIN, SCHEME, macro_dt=DT, num_steps=steps)
+    run = vm.simulate(problem, scheme, macro_dt=dt, num_steps=steps)
     q = np.concatenate([run.q_s, run.q_f], axis=1)
     noise = np.random.default_rng(seed).standard_normal(q.shape)
     return Measured(run.t, q + sigma * noise, sigma=sigma)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import vmri_jax as vm
-from tests.fitting.test_fit import CHAIN, DT, IMPLICIT, SCHEME, measured, product
+from tests.fitting.test_fit import CHAIN, DT, SCHEME, measured, product
 from tests.support import PROBLEMS
 from vmri_jax.fitting import Unknown
 
@@ -44,11 +44,11 @@ def test_several_starts_find_the_best_one():
 
 @pytest.mark.full
 def test_constrained_motion_in_one_part_and_in_several():
-    problem = PROBLEMS["tsp"]()
-    data = measured(steps=60, sigma=1e-4, problem=problem, dt=0.01, scheme=IMPLICIT)
+    problem, scheme = PROBLEMS["tsp"](), vm.fully_implicit(1)
+    data = measured(steps=60, sigma=1e-4, problem=problem, dt=0.01, scheme=scheme)
     start = {"gravity": Unknown(9.0, lower=0)}
     for segments in (1, 4):
-        fit = vm.fit(problem, data, start, scheme=IMPLICIT, macro_dt=0.01, segments=segments)
+        fit = vm.fit(problem, data, start, scheme=scheme, macro_dt=0.01, segments=segments)
         assert fit.values[0] == pytest.approx(9.81, abs=5 * fit.standard_errors["gravity"])
 
 

@@ -76,7 +76,7 @@ class Engine:
         """`steps`, compiled; the numbers of steps are traced arguments."""
         return jax.jit(self.steps, compiler_options=options_of_runs())
 
-    def steps(self, leaves: list, save_every, saves=None, cursor: Cursor | None = None, is_first=None):
+    def steps(self, leaves: list, save_every, saves=None, cursor: Cursor | None = None, is_first: Any = True):
         """The first `saves` saved intervals: an array of `Saved` rows, and the cursor after them.
 
         Args:

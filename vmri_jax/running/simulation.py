@@ -360,7 +360,8 @@ def simulation(moving: Movable, scheme, state: State | None, solver: Solver | No
     advice = nothing_fast(scheme, state.q_f.size) if moving is not problem else ""
     if advice:
         warnings.warn(f"simulate: {advice}", stacklevel=3)
-    motion = _float(steps.macro_dt), _with_arrays(state), *of_one_type((solver or _usual_solver(), scheme, system))
+    chosen_solver, scheme, system = of_one_type((solver or _usual_solver(), scheme, system))
+    motion = (_float(steps.macro_dt), _with_arrays(state), chosen_solver, scheme, system)
     return Simulation(*motion, num_steps, save_every, Save.of(steps.save), names_of(problem))
 
 
