@@ -96,7 +96,7 @@ class Kinematics:
 
     Args:
         roots: places of the coordinates of root bodies in q_s and q_f.
-        links: first slow links that carry no fast body, then slow links that do, then links that carry fast bodies alone.
+        links: slow links that carry no fast body, then slow links that do, then links that carry fast bodies alone.
         bodies: the slow ones first.
         sizes: (n_s, n_f), numbers of coordinates.
         first: numbers of the first link and of the first body in the joint constants.
