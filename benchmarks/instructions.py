@@ -90,8 +90,8 @@ PROGRAMS: dict[str, Program] = {
     "SAM, fully_implicit(5)": Program(SAM, vm.fully_implicit(5), 6470),
     "SAM, fully_implicit(5), exact matrices": Program(SAM, vm.fully_implicit(5), 7020, "exact"),
     "satellite in joint coordinates, fully_explicit(5)": Program(SATELLITE, vm.fully_explicit(5), 11810),
-    "squeezer by directors, fully_implicit(1)": Program(SQUEEZER, vm.fully_implicit(1), 6430),
-    "engine by directors, explicit_slow(5)": Program(ENGINE, vm.explicit_slow(5), 13120),
+    "squeezer by directors, fully_implicit(1)": Program(SQUEEZER, vm.fully_implicit(1), 5020),
+    "engine by directors, explicit_slow(5)": Program(ENGINE, vm.explicit_slow(5), 10220),
     "gradient: double pendulum, fully_implicit(1)": Program(
         double_pendulum, vm.fully_implicit(1), 5310, is_gradient=True
     ),

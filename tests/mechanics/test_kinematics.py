@@ -15,7 +15,7 @@ LINKS, BODIES = 6, 5
 
 
 def random_tree(seed: int):
-    """A tree with two roots, whose links turn, slide or screw; x, and axes, points and ways of the links, and places of the bodies at x = 0."""
+    """A tree on a free root and the ground, whose links turn, slide or screw; x; axes, points and places at x = 0."""
     random = np.random.default_rng(seed)
     parents = [int(random.integers(-1, i)) for i in range(LINKS)]
     links = tuple(Link(Place("f", i, 1), parent) for i, parent in enumerate(parents))
@@ -28,7 +28,7 @@ def random_tree(seed: int):
 
 
 def energy(of_tree, kinds, weights, x, v, joints):
-    """A sum of squares of the rates of frames and of a sum of frames, by the function `of_tree`, (x, T, S, Z) -> frames and twists."""
+    """Weighted squares of the rates of frames, and weighted frames, by ``of_tree(x, T, S, Z)`` -> frames and twists."""
     (axis, point, zero), (turns, ways) = joints, kinds
     axis = axis / jnp.linalg.norm(axis, axis=1, keepdims=True)
     arms = jnp.concatenate([-point[:, None], jnp.broadcast_to(jnp.eye(3), (LINKS, 3, 3))], axis=1)

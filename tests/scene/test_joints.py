@@ -83,7 +83,7 @@ def test_a_joint_holds_what_it_says_and_leaves_the_rest(name):
     assert np.ptp(run.energy) < 2e-3 * run.energy[0]
     turned = np.abs(relative - relative[0]).max()
     assert (turned > 0.05) == (not isinstance(joint, Fixed | Prismatic)), turned
-    held = joint.bound(scene.by_name).parameters
+    held = joint.bound(scene.by_name).frames
     if isinstance(joint, Revolute | Cylindrical):
         axes = [held[f"frame_{role}"][2] @ q[:, 3:].reshape(-1, 3, 3) for role, q in zip("ab", (a, b), strict=True)]
         np.testing.assert_allclose(axes[0], axes[1], atol=1e-12)

@@ -1,21 +1,24 @@
 """Bodies of trees as functions of joint coordinates.
 
-A body hangs on the root of its tree, or on the ground, by a chain of links, each with a coordinate x that turns all bodies behind the link about
-an axis, moves them along the axis, or both. At x = 0 all bodies have known places. Motions are rows (r, M) of a vector and a matrix (4, 3) in the
-axes of the root: a point y goes to ``r + y M``. So are the rates of motions, the twists (m, K): the point y has the velocity ``m + y K = m + k x y``.
+A body hangs on the root of its tree, or on the ground, by a chain of links, each with a coordinate x that turns all
+bodies behind the link about an axis, moves them along the axis, or both. At x = 0 all bodies have known places. Motions
+are rows (r, M) of a vector and a matrix (4, 3) in the axes of the root: a point y goes to ``r + y M``. Rates of motions
+are twists (m, K), rows of the same kind: the point y has the velocity ``m + y K = m + k x y``.
 
     E_i = exp(x_i Y_i) E_parent      exp(x Y) = 1 + sin x T + (1 - cos x) T T + x S      Y = T + S, turn T and slide S
     A_b = Z_b E_b                    origin and axes of body b, of Z_b at x = 0, moved by the last link of b
     phi_b, D_b = A_b (phi, D)        in space, by centre phi and directors D of the root, which need not be orthonormal
 
-A coordinate x_i moves all bodies behind it by the twist ``J_i = E_i^-1 Y_i E_i``. So positions and twists have derivatives in closed form,
+A coordinate x_i moves all bodies behind it by the twist ``J_i = E_i^-1 Y_i E_i``. So positions and twists have
+derivatives in closed form,
 
     dA_b = A_b W_b      dJ_i = J_i W_i - W_i J_i      W = sum of J_j dx_j over the links j before
 
-W_i without link i itself. `placed` gives them to JAX: velocities, kinetic energies, forces and all their derivatives consist of sums over trees
-and of products of (4, 3) rows, and never differentiate the chains of motions.
+W_i without link i itself. `placed` gives these derivatives to JAX: velocities, kinetic energies, forces and all their
+derivatives consist of sums over trees and of products of (4, 3) rows, and never differentiate the chains of motions.
 
-A joint of several coordinates is a chain of links. Bodies without a joint, the roots, have their centres and directors among the coordinates.
+A joint of several coordinates is a chain of links. Bodies without a joint, the roots, have their centres and directors
+among the coordinates.
 
 Source: F. C. Park, J. E. Bobrow, S. R. Ploen, A Lie group formulation of robot dynamics, Int. J. Robot. Res. 14 (1995).
 """
@@ -43,7 +46,8 @@ MASS = "mass"
 SIZE = 12
 """Number of coordinates of a body on a joint: centre and directors."""
 LARGEST_MATRIX = 16
-"""Most links whose sums are products with a matrix, which take the square of their number. A smaller number makes programs of small trees larger."""
+"""Most links whose sums are products with a matrix: their time grows with the square of the number of links. A smaller
+number makes the programs of small trees larger."""
 UNMOVED = np.concatenate([np.zeros((1, 3)), np.eye(3)])
 """(4, 3) the motion of nothing; centre and directors of the ground."""
 
@@ -87,11 +91,12 @@ class Carried(NamedTuple):
 class Kinematics:
     """The map from coordinates q to those of points and rigid bodies Q; compared by value.
 
-    Q_s is q_s followed by centres and directors of the bodies that depend on slow coordinates alone; Q_f is q_f followed by those of all others.
+    Q_s is q_s followed by centres and directors of the bodies that depend on slow coordinates alone; Q_f is q_f
+    followed by centres and directors of all other bodies.
 
     Args:
         roots: places of the coordinates of root bodies in q_s and q_f.
-        links: first the slow ones that carry no fast body, then slow ones that do, then those that carry fast bodies alone.
+        links: slow links that carry no fast body, then slow links that do, then links that carry fast bodies alone.
         bodies: the slow ones first.
         sizes: (n_s, n_f), numbers of coordinates.
         first: numbers of the first link and of the first body in the joint constants.
@@ -131,8 +136,8 @@ class Kinematics:
 
         Args:
             q_s, q_f: coordinates.
-            joints: the constants in the axes of the roots, "turn" T (n, 4, 3) and "slide", the first row of S (n, 3), of all links, "zero" Z
-                (n, 4, 3) of all bodies.
+            joints: the constants in the axes of the roots: "turn" T (n, 4, 3) and "slide", the first row of S (n, 3),
+                of all links, "zero" Z (n, 4, 3) of all bodies.
         """
         (link, body), slow = self.first, sum(body.part == "s" for body in self.bodies)
         constants = [joints[name][link : link + len(self.links)] for name in ("turn", "slide")]
@@ -177,7 +182,10 @@ class Kinematics:
 
     @cached_property
     def before(self) -> np.ndarray:
-        """(bodies + links, links) 1 for the links between the root and each body, and between the root and each link, without the link itself."""
+        """(bodies + links, links) 1 for the links between the root and each body, and between the root and each link.
+
+        No link is before itself.
+        """
         before = np.zeros((len(self.lasts), len(self.links)))
         for row, last in zip(before, self.lasts, strict=True):
             while last >= 0:
@@ -199,8 +207,8 @@ class Kinematics:
     def summed(self, of_links):
         """Sums of (n, 4, 3) of the links before each body (bodies, 4, 3), and of the links before each link (n, 4, 3).
 
-        By a product with the matrix `before`, whose program is small; beyond `LARGEST_MATRIX` links over 1, 2, 4, ... links at once, so that
-        the time grows nearly in proportion to the number of links.
+        By a product with the matrix `before`, whose program is small; beyond `LARGEST_MATRIX` links over 1, 2, 4, ...
+        links at once, so that the time grows nearly in proportion to the number of links.
         """
         rows = of_links.reshape(-1, SIZE)
         if len(self.links) <= LARGEST_MATRIX:

@@ -38,7 +38,8 @@ def joint_constants(bodies: Bodies, branches: Sequence[Branch]) -> dict[str, Any
 def _root(branch: Branch | None, on_joints: Mapping[str, Branch]) -> tuple[str, Any]:
     """The root of a child, and the displacement of the child from its place as the user gave it to its place at x = 0.
 
-    There both points of each joint coincide. As the user gave them they differ by round-off, or by what a derivative varies.
+    There both points of each joint coincide. As the user gave them they differ by round-off, or by the numbers that a
+    derivative varies.
     """
     shift, name = np.zeros(3), ""
     while branch is not None:

@@ -62,7 +62,8 @@ def _derivative(count: int, primals, tangents):
     """The rows and dg; by autodiff a Jacobian would take the products with U and V once more for each of its columns."""
     factors, offsets, z = primals
     *of_numbers, dz = tangents
-    u, v = _vectors(count, factors, offsets, z)
+    # XLA would compute the vectors anew for each entry of J
+    u, v = jax.lax.optimization_barrier(_vectors(count, factors, offsets, z))
     v = v + offsets[..., count:, :]
     change = jnp.zeros(u.shape[:-1])
     if not isinstance(dz, SymbolicZero):

@@ -204,7 +204,10 @@ def make_layout(
 
 
 def _kinematics(branches: Sequence[Branch], places, freedoms, sizes) -> tuple[Kinematics, tuple[Branch, ...]]:
-    """The kinematics of the branches, parents first, and the branches in the order of its bodies; `places` of the bodies on no joint."""
+    """The kinematics of the branches, parents first, and the branches in the order of its bodies.
+
+    `places` are of the bodies on no joint.
+    """
     fast = {name for name, place in places.items() if place.part == "f"}  # bodies that depend on fast coordinates
     for branch in branches:
         if branch.parent in fast or any(freedoms[key].part == "f" for key in branch.keys):
