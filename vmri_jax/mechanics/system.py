@@ -2,7 +2,6 @@
 
 import dataclasses
 from collections.abc import Callable
-from dataclasses import KW_ONLY
 from functools import partial
 from typing import Any
 
@@ -82,34 +81,56 @@ class System(eqx.Module):
     which is the innermost ``function`` of it.
     """
 
-    kinetic: Callable
-    slow_potential: Callable | None = None
-    fast_potential: Callable | None = None
-    constraint: Callable | Rheonomic | None = None
-    slow_constraint: Callable | Rheonomic | None = None
-    force: Callable | None = None
-    _: KW_ONLY
+    kinetic: Any
+    slow_potential: TracedOnce | None = None
+    fast_potential: TracedOnce | None = None
+    constraint: TracedOnce | Rheonomic | None = None
+    slow_constraint: TracedOnce | Rheonomic | None = None
+    force: TracedOnce | None = None
     params: Any = None
-    implied: Callable | Rheonomic | None = None
-    slow_kinetic: Callable | None = None
-    potentials: Any = ()
+    implied: TracedOnce | Rheonomic | None = None
+    slow_kinetic: TracedOnce | None = None
+    potentials: Potentials = Potentials()
 
-    def __post_init__(self):
-        order = order_of(self.params)
-        if not callable(self.kinetic):
-            raise Refused(
-                f"System: kinetic is {self.kinetic!r}; give ConstantMass(slow, fast) or a function "
-                "kinetic(q_s, q_f, v_s, v_f, params)."
-            )
-        if self.has_constant_mass and self.slow_kinetic is not None:
+    def __init__(  # Equinox flattens the arguments of a generated one, and potentials may have names of two types
+        self,
+        kinetic,
+        slow_potential=None,
+        fast_potential=None,
+        constraint=None,
+        slow_constraint=None,
+        force=None,
+        *,
+        params=None,
+        implied=None,
+        slow_kinetic=None,
+        potentials=None,
+    ):
+        functions = {
+            "slow_potential": slow_potential,
+            "fast_potential": fast_potential,
+            "constraint": constraint,
+            "slow_constraint": slow_constraint,
+            "force": force,
+            "implied": implied,
+            "slow_kinetic": slow_kinetic,
+        }
+        order = order_of(params)
+        for name, function in functions.items():
+            setattr(self, name, _checked(name, function, order))
+        if isinstance(kinetic, ConstantMass) and slow_kinetic is not None:
             raise Refused(
                 "System: slow_kinetic is given besides a ConstantMass, which has the masses of all slow variables; give the whole kinetic "
                 "energy as ConstantMass, or kinetic as a function."
             )
-        for field in KINDS:
-            if field != "potentials" and not (field == "kinetic" and self.has_constant_mass):
-                setattr(self, field, _checked(field, getattr(self, field), order))
-        self.potentials = _named_potentials(self.potentials or (), order)
+        if not callable(kinetic):
+            raise Refused(
+                f"System: kinetic is {kinetic!r}; give ConstantMass(slow, fast) or a function "
+                "kinetic(q_s, q_f, v_s, v_f, params)."
+            )
+        self.kinetic = kinetic if isinstance(kinetic, ConstantMass) else _checked("kinetic", kinetic, order)
+        self.params = params
+        self.potentials = _named_potentials(potentials or (), order)
 
     def __repr__(self) -> str:
         return summary("System", self.in_words())
