@@ -70,7 +70,9 @@ def test_missing_file(tmp_path):
 
 def test_foreign_npz_file(tmp_path):
     np.savez(tmp_path / "foreign.npz", t=np.arange(3.0))
-    with pytest.raises(ValueError, match=r"foreign.npz is a .npz file but not a trajectory saved by Trajectory.save"):
+    with pytest.raises(
+        ValueError, match=r"foreign.npz is a .npz file but not a trajectory saved by Trajectory.save of this version"
+    ):
         Trajectory.load(tmp_path / "foreign.npz")
 
 

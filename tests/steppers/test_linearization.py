@@ -61,8 +61,9 @@ def test_all_take_the_direction_of_the_derivative_of_the_residual(name):
         for inverted in (inverse_with_multipliers, inverse_without_multipliers):
             march = MarchEquations(equations, inverted)
             z, of_intervals = march.flat(x)
-            factors = linearised_pass(march, z, of_intervals, of_intervals[-1], from_last=False, corrects=False)[::2]
-            direction = solve(march, factors, *march.flat(residual))
+            at_x = z, of_intervals, of_intervals[-1]
+            matrices, _, by_positions = linearised_pass(march, *at_x, from_last=False, corrects=False)
+            direction = solve(march, (matrices, by_positions), *march.flat(residual))
             found[inverted.__name__] = ravel_pytree(march.by_name(*direction))[0]
         return found
 

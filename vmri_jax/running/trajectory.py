@@ -24,7 +24,7 @@ from vmri_jax.running.settings import Settings
 from vmri_jax.running.summaries import summary_of
 from vmri_jax.steppers.results import Method, Result, Status
 
-FORMAT = "vmri_jax trajectory 2"
+FORMAT = "vmri_jax trajectory 3"
 ERROR = tuple(f"error_{name}" for name in RunError._fields)
 """Arrays of the estimated error; absent in runs without one."""
 
@@ -251,8 +251,12 @@ class Trajectory(Exports):
             raise Refused(
                 f"{path} cannot be read as a .npz file ({error}); it is damaged or something else."
             ) from error
-        if str(arrays.pop("format", "")) != FORMAT:
-            raise Refused(f"{path} is a .npz file but not a trajectory saved by Trajectory.save.")
+        known = str(arrays.pop("format", ""))
+        if known != FORMAT:
+            other = f" It has the format {known!r}, this version of vmri_jax reads {FORMAT!r}." if known else ""
+            raise Refused(
+                f"{path} is a .npz file but not a trajectory saved by Trajectory.save of this version.{other}"
+            )
         texts = [arrays.pop(name, None) for name in ("names", "settings")]
         needed = {*NODES, *INFO, *STATUS}
         missing = needed - set(arrays)

@@ -19,6 +19,7 @@ fast variables over a micro step) plus the round-off of the positions: the formu
 """
 
 from dataclasses import replace
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -97,6 +98,6 @@ def iterated(step, iterate):
     return jax.lax.while_loop(lambda iterate: iterate.result == RUNNING, step, iterate)
 
 
-def only_if(wanted, function, x):
+def only_if(wanted, function, x) -> Any:
     """``function(x)`` if `wanted`, else x. A loop of at most one turn: in a batch `jax.lax.cond` would compute both branches."""
     return jax.lax.while_loop(lambda a: a[0], lambda a: (jnp.asarray(False), function(a[1])), (wanted, x))[1]

@@ -29,7 +29,7 @@ from vmri_jax.running.export import FILL
 from vmri_jax.running.files import check_writable, clear_partial, explained, made_beside, replaced, synchronize
 from vmri_jax.steppers.results import Result
 
-FORMAT = "vmri_jax store 3"
+FORMAT = "vmri_jax store 4"
 METADATA = "zarr.json"
 NOTES = Path("resume", "chunks")
 """Folder of the notes within a store; in a group of its own, which datasets leave out."""
