@@ -148,9 +148,10 @@ def test_a_matrix_of_inertia_is_turned_into_principal_axes():
     weight = Body("weight", 1.0, [2.0, 2.0, 2.0])
     energies = []
     for body, point in ((given, at), (principal, np.asarray(turned).T @ at)):
-        spring = Spring((("hub", point), "weight"), 3.0)
+        spring = Spring((("hub", point), "weight"), 3.0, length=1.0)
         np.testing.assert_allclose(body.point(np.asarray(point)).position, at, atol=1e-15)
         energies.append(mechanics(Scene([body, weight], [spring]))[1:3])
+    assert np.all(np.asarray(energies) > 1.0)
     np.testing.assert_allclose(energies[0], energies[1], rtol=1e-12)
 
 
