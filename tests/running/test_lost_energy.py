@@ -3,6 +3,7 @@
 import warnings
 
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
 import vmri_jax as vm
@@ -33,3 +34,28 @@ def test_rest_up_to_roundoff_is_no_loss(fast_potential, slow_potential):
     moved = vm.initial_state(system, [], [0.31, 0.6], [], [0.0, 0.0])
     with pytest.warns(vm.LostEnergyWarning, match=r"the computed motion is wrong: the energy.* has changed by"):
         vm.simulate(system, vm.fully_explicit(1), moved, macro_dt=0.25, num_steps=3)
+
+
+def rotating_frame(q_s, q_f, v_s, v_f, turn):
+    velocity = v_f + turn * jnp.stack([-q_f[1], q_f[0]])
+    return velocity @ velocity / 2
+
+
+def ring(q_f, turn):
+    return 5.0 * (jnp.linalg.norm(q_f) - 1.0) ** 2
+
+
+def ellipse(q_s, q_f, turn):
+    return jnp.stack([q_f[0] ** 2 + 4 * q_f[1] ** 2 - 1.0])
+
+
+def test_a_frame_that_turns():
+    """T has terms of degree 0 and 1 in v: momenta are ``M v + dT/dv(0)``, and ``p . v - T`` is negative here."""
+    for constraint in (None, ellipse):
+        system = vm.System(rotating_frame, None, ring, constraint=constraint, params=2.0)
+        seen = vm.Problem(system, [], [1.0, 0.0], [], [0.0, 0.5])
+        np.testing.assert_allclose(seen.state().p_f, [0.0, 2.5])
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            run = vm.simulate(seen, vm.fully_implicit(1), macro_dt=0.01, num_steps=20)
+        assert abs(run.energy - run.energy[0]).max() < 1e-4

@@ -13,7 +13,7 @@ import numpy as np
 
 from vmri_jax.kernels.saddle import least_norm, regularized
 from vmri_jax.mechanics.arrays import is_concrete, library, quickly_compiled
-from vmri_jax.mechanics.constraints import configuration, known_mass
+from vmri_jax.mechanics.constraints import configuration, known_mass, known_mass_and_momentum
 from vmri_jax.mechanics.projection import legendre, project_momentum
 from vmri_jax.mechanics.structure import has_constant_hessian
 from vmri_jax.mechanics.system import System
@@ -113,8 +113,8 @@ def _momenta(system, t, q_s, q_f, v_s, v_f):
 
 def _momenta_of_numbers(system, t, q_s, q_f, v_s, v_f):
     """`_momenta` by NumPy, of a T that is quadratic in v: a program would take seconds to compile."""
-    mass, v = known_mass(system, q_s, q_f), np.concatenate([v_s, v_f])
-    p = mass @ v
+    v = np.concatenate([v_s, v_f])
+    mass, p = known_mass_and_momentum(system, q_s, q_f, v_s, v_f)
     if not system.is_constrained:
         return p, p, v
     # G M^-1 G^T mu = G v + dg/dt

@@ -23,7 +23,7 @@ from vmri_jax.mechanics.arrays import Numbers, is_concrete, library, quickly_com
 from vmri_jax.mechanics.by_name import constraint_sizes
 from vmri_jax.mechanics.functions import Rheonomic
 from vmri_jax.mechanics.masses import correlation
-from vmri_jax.mechanics.projection import mass_diagonal, mass_matrix, time_rates
+from vmri_jax.mechanics.projection import mass_and_momentum, mass_diagonal, time_rates
 from vmri_jax.mechanics.system import System
 from vmri_jax.mechanics.terms_of_rows import sizes_of_terms
 from vmri_jax.refusals import Refused
@@ -176,11 +176,18 @@ def _rows_and_rates(system, t, q_s, q_f, weights):
 
 
 def known_mass(system: System, q_s, q_f) -> np.ndarray:
-    """Mass matrix (n, n) at rest, of numbers; constant masses need no program."""
+    """Mass matrix (n, n) at rest, of numbers."""
+    return known_mass_and_momentum(system, q_s, q_f, np.zeros(np.shape(q_s)), np.zeros(np.shape(q_f)))[0]
+
+
+def known_mass_and_momentum(system: System, q_s, q_f, v_s, v_f) -> tuple[np.ndarray, np.ndarray]:
+    """Mass matrix ``d2T/dv2`` (n, n) and momentum ``dT/dv`` (n,) of numbers; constant masses need no program."""
     if system.has_constant_mass:
         masses = map(np.asarray, (system.kinetic.slow, system.kinetic.fast))
-        return np.asarray(block_diag(*(np.diag(mass) if mass.ndim == 1 else mass for mass in masses if mass.size)))
-    return np.asarray(_mass_matrix(system, q_s, q_f, np.zeros(np.shape(q_s)), np.zeros(np.shape(q_f))))
+        mass = np.asarray(block_diag(*(np.diag(mass) if mass.ndim == 1 else mass for mass in masses if mass.size)))
+        return mass, mass @ np.concatenate([v_s, v_f])
+    mass, momentum = _mass_and_momentum(system, q_s, q_f, v_s, v_f)
+    return np.asarray(mass), np.asarray(momentum)
 
 
 def check_mass(system: System, q_s, q_f) -> None:
@@ -198,7 +205,7 @@ def check_mass(system: System, q_s, q_f) -> None:
     with jax.ensure_compile_time_eval() if is_staged else nullcontext():
         random = np.random.default_rng(0)
         velocities = (SPEED * random.normal(size=np.size(q)) for q in (q_s, q_f))
-        mass = np.asarray(_mass_matrix(system, q_s, q_f, *velocities))
+        mass, _ = known_mass_and_momentum(system, q_s, q_f, *velocities)
     if not np.isfinite(mass).all():
         raise Refused("System: the mass matrix d2T/dv2 of kinetic is not finite at these positions (a norm at zero?).")
     values, vectors = np.linalg.eigh(correlation(mass))
@@ -216,7 +223,7 @@ def check_mass(system: System, q_s, q_f) -> None:
         )
 
 
-_mass_matrix = quickly_compiled(mass_matrix)
+_mass_and_momentum = quickly_compiled(mass_and_momentum)
 
 
 def check_constraints(

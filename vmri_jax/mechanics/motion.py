@@ -18,7 +18,7 @@ import jax.numpy as jnp
 
 from vmri_jax.kernels.saddle import least_norm
 from vmri_jax.mechanics.invariants import lagrangian, velocity
-from vmri_jax.mechanics.projection import mass_matrix
+from vmri_jax.mechanics.projection import mass_and_momentum
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
 
@@ -59,7 +59,7 @@ def motion(system: System, state: State) -> Motion:
 
     t = jnp.asarray(state.t)
     of_motion = partial(lagrangian, system, n_s)
-    mass = mass_matrix(system, state.q_s, state.q_f, v_s, v_f)
+    mass, _ = mass_and_momentum(system, state.q_s, state.q_f, v_s, v_f)
     forces = force_of(of_motion, q, v)
     if system.force is not None:
         forces += jnp.concatenate(system.forces(t, state.q_s, state.q_f, v_s, v_f))

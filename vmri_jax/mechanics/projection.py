@@ -29,10 +29,12 @@ def legendre(system: System, q_s, q_f, v_s, v_f):
     return jax.grad(system.kinetic_energy, argnums=(2, 3))(q_s, q_f, v_s, v_f)
 
 
-def mass_matrix(system: System, q_s, q_f, v_s, v_f):
-    """Mass matrix ``d2T/dv2`` (n, n)."""
+def mass_and_momentum(system: System, q_s, q_f, v_s, v_f):
+    """Mass matrix ``d2T/dv2`` (n, n) and momentum ``dT/dv`` (n,)."""
     n_s = v_s.size
-    return jax.hessian(lambda v: system.kinetic_energy(q_s, q_f, v[:n_s], v[n_s:]))(jnp.append(v_s, v_f))
+    momentum = jax.grad(lambda v: system.kinetic_energy(q_s, q_f, v[:n_s], v[n_s:]))
+    p, times_mass = jax.linearize(momentum, jnp.append(v_s, v_f))
+    return jax.vmap(times_mass)(jnp.eye(p.size)), p
 
 
 def mass_diagonal(system: System, q_s, q_f):

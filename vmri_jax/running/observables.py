@@ -63,7 +63,7 @@ class Observables(NamedTuple):
     energy: Hamiltonian.
     position, velocity: largest |g| and largest |G v + dg/dt|, implied rows included.
     solved, implied: 1 where the rows that are solved for, and the implied rows, are kept, see `are_kept`; else 0.
-    kinetic: ``p . v - T``.
+    kinetic: ``v . M v / 2``: T may have terms of lower degree in v, as in a frame that turns, and ``p . v - T`` is then no size.
     terms: ``|T| + |V| + |W| + sum_i |V_i|``.
     rounding: ``q . M q / 2``, whose part eps^2 / H^2 is the kinetic energy of velocities that come from round-off of the positions.
     volume: log det M of a mass matrix M that depends on positions; 0 for constant masses.
@@ -96,12 +96,14 @@ def observables(system: System, state: State, tolerance: Any = 0.0):
     parts = list(energy_parts(system, *phase, velocities).values())
     position, rate = constraint_residual(system, state, velocities)
     if masses is None:
-        rounding, volume = system.kinetic_energy(state.q_s, state.q_f, state.q_s, state.q_f), 0.0
+        kinetic, volume = parts[0], 0.0
+        rounding = system.kinetic_energy(state.q_s, state.q_f, state.q_s, state.q_f)
     else:
-        q = jnp.concatenate([state.q_s, state.q_f])
+        q, v = jnp.concatenate([state.q_s, state.q_f]), jnp.concatenate(velocities)
+        kinetic = v @ masses @ v / 2
         rounding, volume = q @ masses @ q / 2, 2 * jnp.sum(jnp.log(jnp.diagonal(jnp.linalg.cholesky(masses))))
     terms, kept = sum(map(jnp.abs, parts)), are_kept(system, state, tolerance)
-    values = sum(parts), position, rate, *kept, parts[0], terms, rounding, volume
+    values = sum(parts), position, rate, *kept, kinetic, terms, rounding, volume
     return jnp.stack([jnp.asarray(value, dtype=float) for value in values])
 
 
