@@ -252,7 +252,8 @@ def test_runs_by_directors():
     free = wheels(coordinates="directors")
     q, motions = zip(*(turned(free, angle) for angle in angles), strict=True)
     masses: Any = free.system().kinetic
-    spinning = replace(run, q_s=np.stack(q), p_s=np.asarray(masses.slow) * (np.stack(motions) @ np.array([100.0, 0.0])))
+    momenta = np.asarray(masses.slow) * (np.stack(motions) @ np.array([100.0, 0.0]))
+    spinning = replace(run, states=replace(run.states, q_s=np.stack(q), p_s=momenta))
     assert free.joint_motion(spinning, "hinge")[-1] == pytest.approx(100.0, abs=1e-12)
     with pytest.raises(ValueError, match=r"hinge may turn by half a turn or more .* nodes 0 and 1.*save="):
         free.joint_motion(spinning[::5], "hinge")

@@ -152,7 +152,8 @@ def check_step_size(macro_dt) -> None:
     """Refuse a missing step size, or one that is not positive."""
     if macro_dt is None:
         raise Refused("simulate: macro_dt is missing; give the macro step H, num_micro times the micro step.")
-    if is_concrete(real_array("simulate: macro_dt", macro_dt, 0)) and not (np.isfinite(macro_dt) and macro_dt > 0):
+    size = real_array("simulate: macro_dt", macro_dt, 0)
+    if is_concrete(size) and not 0 < np.asarray(size) < np.inf:  # of NumPy: in a program JAX would trace the comparison
         raise Refused(f"simulate: macro_dt is {macro_dt}; it must be a positive number.")
 
 
