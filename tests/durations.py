@@ -13,7 +13,7 @@ import pytest
 
 from tests.programs import Programs
 
-PROGRAMS_OF_A_TEST = 40
+PROGRAMS_OF_A_TEST = 80
 """Most programs of one test; a developer who runs this test alone waits for them."""
 PROGRAMS_OF_A_FILE = 160
 """Most programs of one file: a worker takes whole files, so a longer one may leave the other worker without work."""
