@@ -34,8 +34,8 @@ def mechanics(scene: Scene, start=None, t: float = 0.0) -> Mechanics:
         name: tuple(np.asarray(x[part == "f"][first : first + size]) for x in (q, v))
         for name, (part, first, size) in layout.bodies.items()
     }
-    *numbers, rows = values(scene.system(), t, *start)
-    return Mechanics(bodies, *map(float, numbers), np.asarray(rows))
+    kinetic, potential, power, rows = values(scene.system(), t, *start)
+    return Mechanics(bodies, float(kinetic), float(potential), float(power), np.asarray(rows))
 
 
 @jax.jit
