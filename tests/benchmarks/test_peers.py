@@ -203,7 +203,13 @@ def test_command(tmp_path, monkeypatch):
     """With ours, one that is absent, one that cannot, and one that is slower and coarse."""
 
     def slow(case):
-        return [Ladder("slow", "steps", [1, 2], lambda n: lambda: (time.sleep(0.01), case.q_end + 1e-3)[1])]
+        def run():
+            end = time.process_time() + 0.01
+            while time.process_time() < end:  # a process that sleeps takes no processor time
+                pass
+            return case.q_end + 1e-3
+
+        return [Ladder("slow", "steps", [1, 2], lambda n: run)]
 
     def absent(case):
         raise ModuleNotFoundError(name="nowhere")
