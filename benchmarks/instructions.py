@@ -93,7 +93,7 @@ PROGRAMS: dict[str, Program] = {
     "squeezer by directors, fully_implicit(1)": Program(SQUEEZER, vm.fully_implicit(1), 5020),
     "engine by directors, explicit_slow(5)": Program(ENGINE, vm.explicit_slow(5), 10220),
     "gradient: double pendulum, fully_implicit(1)": Program(
-        double_pendulum, vm.fully_implicit(1), 6800, is_gradient=True
+        double_pendulum, vm.fully_implicit(1), 6290, is_gradient=True
     ),
     "gradient: TSP, fully_implicit(5)": Program(TSP, vm.fully_implicit(5), 11920, is_gradient=True),
 }

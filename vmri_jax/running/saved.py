@@ -101,11 +101,13 @@ class Saved(NamedTuple):
         # If the solved rows are kept, the implied rows are to blame.
         violated = module.where(solved > 0, int(Result.NOT_IMPLIED), int(Result.CONSTRAINT_VIOLATED))
         cause = module.where(module.isfinite(energy), violated, int(Result.NON_FINITE))
-        number, is_info = np.arange(num_nodes)[:, None], np.zeros(columns.width, bool)
-        is_info[columns.info] = True
+        number = np.arange(num_nodes)[:, None]
         lost = number >= module.where(breaks, node, after_step)[..., None, None]
         unreached = number > module.where(breaks, num_nodes, after_step)[..., None, None]
-        rows = module.where(lost & ~is_info, np.nan, module.where(unreached & is_info, 0.0, rows))
+        # kind by kind: a gradient that reads positions alone then computes only the observables that decide on failures
+        marks = [(unreached, 0.0) if part == columns.info else (lost, np.nan) for part in columns]
+        parts = [module.where(*mark, rows[..., part]) for mark, part in zip(marks, columns, strict=True)]
+        rows = module.concatenate(parts, axis=-1)
         failed_here = step + module.maximum(node * save_every - 1, 0)
         return Saved(rows, module.where(breaks, cause, result), module.where(breaks, failed_here, failed_at))
 
