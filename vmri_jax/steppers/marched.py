@@ -8,7 +8,7 @@ from jaxtyping import Array, Float, Int
 
 from vmri_jax.kernels import CONTRACTION
 from vmri_jax.schemes.equations import StepEquations, Unknowns
-from vmri_jax.steppers.accept import FLOOR_OF_NEWTON, Accepted, Weights, expected
+from vmri_jax.steppers.accept import FLOOR_OF_NEWTON, NO_WEIGHTS, Accepted, Weights, expected
 from vmri_jax.steppers.continuation import solve_in_parts, with_dependent_constraints
 from vmri_jax.steppers.march import (
     MarchEquations,
@@ -83,13 +83,15 @@ class Marched(StepSolver):
     newton: Solver
     sizes: tuple[int, int, int, int, int] | None = None
 
-    def init(self, equations: StepEquations, velocity) -> MarchMemory:
-        march = self._march(equations)
-        z, x = march.flat(equations.guess(velocity[0], velocity[1], jnp.zeros(march.n_g), jnp.zeros(march.n_gs)))
-        return MarchMemory(PolynomialPredictor.constant(z), x[0], march.no_matrices(), jnp.asarray(jnp.inf))
+    def init(self, equations: StepEquations) -> MarchMemory:
+        matrices = self._march(equations, NO_WEIGHTS).no_matrices()
+        slow, fast = len(matrices.slow), matrices.inverse.shape[-1]
+        return MarchMemory(PolynomialPredictor.empty(slow), jnp.zeros(fast), matrices, jnp.asarray(jnp.inf))
 
     def solve(self, equations: StepEquations, guess: Unknowns, memory: MarchMemory) -> tuple[Solution, MarchMemory]:
-        march = self._march(equations)
+        weights = Weights.of(equations)
+        march = self._march(equations, weights)
+        accepted = Accepted.of(equations, self.newton, weights).with_constraints(equations, weights)
         z, x = march.flat(guess)
         zero, infinite = jnp.zeros(()), jnp.asarray(jnp.inf)
         start = Progress(
@@ -105,7 +107,8 @@ class Marched(StepSolver):
         )
 
         def part(equations, guess, limit, is_first):
-            done = self._iterate(self._march(equations), guess, start, memory, limit, is_first)
+            of_part = self._march(equations, weights)
+            done = self._iterate(of_part, accepted, guess, start, memory, limit, is_first)
             return done, march.by_name(done.passed.z, done.passed.x), done.result, done.passes
 
         parts = solve_in_parts(equations, guess, start, part, self.newton.max_iterations, PLAIN_PASSES)
@@ -132,18 +135,23 @@ class Marched(StepSolver):
         matrices = only_if(renews, by_masses, last.matrices)
         return matrices, kept_pass(march, matrices, *start)
 
-    def _march(self, equations: StepEquations) -> MarchEquations:
+    def _march(self, equations: StepEquations, weights: Weights) -> MarchEquations:
         inverted = inverse_with_multipliers if self._has_multipliers else null_space.inverse_without_multipliers
-        return MarchEquations(equations, inverted, Weights.of(equations))
+        return MarchEquations(equations, inverted, weights)
 
     def _iterate(
-        self, march: MarchEquations, guess: Unknowns, start: Progress, memory: MarchMemory, limit, is_first
+        self,
+        march: MarchEquations,
+        accepted: Accepted,
+        guess: Unknowns,
+        start: Progress,
+        memory: MarchMemory,
+        limit,
+        is_first,
     ) -> Progress:
         """At most `limit` passes. The first attempt starts from the predicted slow unknowns, later attempts from the guess."""
-        accepted = Accepted.of(march.equations, self.newton, march.weights)
-        accepted = accepted.with_constraints(march.equations, march.weights)
         z, x = march.flat(guess)
-        z = jnp.where(is_first, memory.slow.next(march.num_slow), z)
+        z = jnp.where(is_first, memory.slow.next(march.num_slow, z), z)
         progress = start._replace(
             passed=start.passed._replace(z=z, x=x, dz=jnp.zeros_like(z), dx=jnp.zeros_like(x)),
             rate=jnp.where(is_first, memory.rate, jnp.inf),
@@ -169,7 +177,7 @@ class Marched(StepSolver):
 
         def step(last: Progress) -> Progress:
             # every interval of the very first pass starts from the corrected unknowns of the interval before
-            from_last = is_first & (last.passes == 0)
+            from_last = is_first & (last.passes == 0) & ~memory.slow.is_empty
             start = last.passed.z + last.passed.dz, last.passed.x + last.passed.dx, memory.fast, from_last
             # new matrices where the old ones contract too slowly; those of the masses once per attempt
             renews = ~(last.rate <= CONTRACTION) & (self.is_exact | (last.new_size == jnp.inf))
