@@ -35,7 +35,7 @@ class Part(NamedTuple):
     """An attempt at a part of the step.
 
     length, stride: length of the part relative to the step, and its excess over the longest part solved so far.
-    rates: unknowns of the longest solved part, divided by its length (multipliers: by the square of its length).
+    rates: unknowns of the longest solved part: increments divided by its length, multipliers lambda.
     solution: of the last attempt, any pytree.
     attempts: number of attempts so far.
     """
@@ -48,18 +48,18 @@ class Part(NamedTuple):
     iterations: Int[Array, ""]
     attempts: Int[Array, ""]
 
-    def after(self, solution, x: Unknowns, result, iterations, most) -> "Part":
+    def after(self, solution, rates: Unknowns, result, iterations, most) -> "Part":
         """The next attempt.
 
         Args:
-            solution, x, result, iterations: of this attempt, with its unknowns x.
+            solution, rates, result, iterations: of this attempt.
             most: iterations that were left to this attempt; if it used all of them, no attempt follows.
         """
         good, is_first = result <= Result.CONVERGED_AT_ROUNDOFF, self.attempts == 0
         solved = jnp.where(good, self.length, self.length - self.stride)
         # the second attempt is the whole step again: after the first failure the stride stays
         stride = jnp.where(good, 2.0, jnp.where(is_first, 1.0, 0.5)) * self.stride
-        rates = jax.tree.map(partial(jnp.where, good), stretched(x, 1 / self.length), self.rates)
+        rates = jax.tree.map(partial(jnp.where, good), rates, self.rates)
         goes_on = jnp.where(good, self.length < 1, (stride >= SHORTEST_PART) & (iterations < most))
         result = jnp.where(goes_on, RUNNING, result)
         length = jnp.minimum(solved + stride, 1.0)
@@ -86,13 +86,13 @@ def solve_in_parts(
         shorter = eqx.tree_at(lambda e: e.macro_dt, equations, part.length * equations.macro_dt)
         most = max_iterations - part.iterations
         limit = jnp.where(part.attempts < 2, jnp.minimum(most, plain_iterations), most)
-        solution, x, result, iterations = iterate(
-            shorter, stretched(part.rates, part.length), limit, part.attempts == 0
-        )
-        return part.after(solution, x, result, iterations, most)
+        guess = scaled(part.rates, part.length, shorter.multiplier_scales())
+        solution, x, result, iterations = iterate(shorter, guess, limit, part.attempts == 0)
+        return part.after(solution, rates_of(x, shorter, part.length), result, iterations, most)
 
     start = jnp.where(starts_finite(equations), RUNNING, Result.NON_FINITE)  # no attempt after a failed step
-    whole = Part(jnp.ones(()), jnp.ones(()), guess, solution, start, jnp.asarray(0), jnp.asarray(0))
+    rates = rates_of(guess, equations, 1.0)
+    whole = Part(jnp.ones(()), jnp.ones(()), rates, solution, start, jnp.asarray(0), jnp.asarray(0))
     return jax.lax.while_loop(lambda part: part.result == RUNNING, attempt, whole)
 
 
@@ -101,9 +101,16 @@ def starts_finite(equations: StepEquations):
     return jnp.isfinite(max_abs(equations.p_s) + max_abs(equations.p_f))
 
 
-def stretched(x: Unknowns, factor) -> Unknowns:
-    """The unknowns of a step that is `factor` times as long, to first order: increments times `factor`, multipliers times its square."""
-    multipliers = {"slow_multiplier": factor**2 * x.slow_multiplier, "multiplier": factor**2 * x.multiplier}
+def rates_of(x: Unknowns, equations: StepEquations, length) -> Unknowns:
+    """The unknowns of a part of the step, of this relative length, as `Part.rates`."""
+    scales = (1 / jnp.where(scale == 0, jnp.inf, scale) for scale in equations.multiplier_scales())
+    return scaled(x, 1 / length, scales)
+
+
+def scaled(x: Unknowns, factor, scales) -> Unknowns:
+    """Increments times a factor, multipliers times scales."""
+    scale, slow_scale = scales
+    multipliers = {"slow_multiplier": slow_scale * x.slow_multiplier, "multiplier": scale * x.multiplier}
     return Unknowns(slow=factor * x.slow, fast=factor * x.fast, **multipliers)
 
 

@@ -2,6 +2,7 @@
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -126,9 +127,13 @@ class Solved(Stepper):
         return end, info, memory
 
     def _solve(self, equations: StepEquations, memory: SolvedState) -> tuple[Solution, Any]:
-        """The solution, with straight motion at the velocities of the momenta after the kicks as the guess."""
-        phase = equations.q_s, equations.q_f, equations.p_s, equations.p_f
-        velocities, masses = velocity_and_masses(equations.system, *phase)
+        """The solution, from straight motion at velocities that nearly fulfil the hidden constraints."""
+        q_s, q_f, p_s, p_f = equations.q_s, equations.q_f, equations.p_s, equations.p_f
+        if self.system.is_constrained:  # the constraint force that the step before has left out, at its multipliers
+            impulse = equations.left_out(memory.multiplier, memory.slow_multiplier)
+            pull = jax.vjp(partial(equations.system.constraints, equations.t), q_s, q_f)[1]
+            p_s, p_f = jax.tree.map(jnp.subtract, (p_s, p_f), pull(impulse))
+        velocities, masses = velocity_and_masses(equations.system, q_s, q_f, p_s, p_f)
         guess = equations.guess(*velocities, memory.multiplier, memory.slow_multiplier)
         return self.solver.solve(replace(equations, masses=masses), guess, memory.solver)
 
