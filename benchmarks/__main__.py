@@ -12,7 +12,6 @@ from benchmarks import (
     against,
     batch,
     chains,
-    compilation,
     control,
     cost,
     dear,
@@ -25,10 +24,8 @@ from benchmarks import (
     instructions,
     kills,
     mechanisms,
-    orders,
     peers,
     random_models,
-    savings,
     scenes,
     tricks,
     tuned,
@@ -50,7 +47,7 @@ app.command()(gail2014)
 app.command()(refusals()(hard))
 
 
-COMPILES = ("chains", "mechanisms", "kills")
+COMPILES = ("chains", "mechanisms", "kills", "programs")
 """Commands that report seconds of compilation, or start processes: programs in the cache would be no measure of them."""
 MANY_CORES = ("gpu", "kills", "ensemble-kills")
 """Commands that keep to no core."""
@@ -91,7 +88,6 @@ for _name, _module in {
     "ensemble-kills": ensemble_kills,
     "floor": floor,
     "chains": chains,
-    "compile": compilation,
     "control": control,
     "errors": errors,
     "gpu": gpu,
@@ -99,10 +95,8 @@ for _name, _module in {
     "kills": kills,
     "mechanisms": mechanisms,
     "models": random_models,
-    "orders": orders,
     "peers": peers,
     "programs": instructions,
-    "savings": savings,
     "scenes": scenes,
     "tricks": tricks,
     "tuned": tuned,
@@ -134,9 +128,9 @@ def ensembles_command(
 
 @app.command("all")
 def all_command(full: Full = False, core: Core = None, out: Out = OUT) -> None:
-    """Floor, batch, compile and cost, one after the other."""
-    prepare(core)
-    for name, module in (("floor", floor), ("batch", batch), ("compile", compilation), ("cost", cost)):
+    """Floor, batch, programs and cost, one after the other."""
+    prepare(core, cache=False)
+    for name, module in (("floor", floor), ("batch", batch), ("programs", instructions), ("cost", cost)):
         _measure(name, module, full, out)
 
 

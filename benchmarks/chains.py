@@ -30,7 +30,6 @@ JOINT_FROM = 10
 """The same in joint coordinates."""
 LEVEL = [[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]]
 """The rotation that lays the long axis of a bar along x."""
-"""Seconds in which this process runs: others may share its core."""
 
 
 @dataclass(frozen=True)

@@ -1,10 +1,9 @@
-"""Estimated errors of runs over true ones, their shares over the limits of each grid, and runs of an accuracy."""
+"""Estimated errors of runs over true ones, and their shares over the limits of each grid."""
 
-import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import product
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,14 +14,15 @@ from benchmarks import programs
 from benchmarks.measure import Tell, silent
 from benchmarks.report import Report
 from vmri_jax.accuracy.companions import UncertifiedWarning
-from vmri_jax.accuracy.steps import AccuracyNotReached
 from vmri_jax.catalogue import find_problem
+from vmri_jax.running.timing import least_seconds
 from vmri_jax.schemes.composition import stage_scheme
 from vmri_jax.study import reference_solution
+from vmri_jax.study.reference_solution import joined
 
 COLUMNS = (
-    *("system", "scheme", "num_micro", "order", "steps", "asked", "true", "of reference", "estimate / true"),
-    *("slow share", "slow limit", "fast share", "fast limit", "time / run", "first call, s"),
+    *("system", "scheme", "num_micro", "order", "steps", "true", "of reference", "estimate / true"),
+    *("slow share", "slow limit", "fast share", "fast limit", "time / run"),
 )
 NODES = 10
 """Saved intervals of every run."""
@@ -31,12 +31,11 @@ MANY = 16
 FEW = 4
 """Micro steps from which on the slow share has a limit to compare with: single steps of the length of a micro step."""
 SCENES = Path(__file__).parent.parent / "notebooks" / "scenes"
-ACCURACIES = (1e-2, 1e-4, 1e-6, 1e-9)
 
 
 @dataclass(frozen=True)
 class Case:
-    """A run with an estimated error, or if `accuracy` is given one of that accuracy.
+    """A run with an estimated error.
 
     system: "FPU l=3", "TSP", "SAM", or the name of a scene of the gallery.
     t_end: in the units of the system.
@@ -47,7 +46,6 @@ class Case:
     label: str = ""
     scheme: vm.Scheme | vm.Composition | None = None
     num_steps: int = 0
-    accuracy: float = 0.0
 
     def problem(self) -> Any:
         """The system with its start."""
@@ -88,14 +86,10 @@ def sizes(name: str) -> list[Case]:
         ("engine", 0.02): {"fully implicit": (midpoint(5), 50), "explicit slow": (slow(5), 50)},
     }
     chosen = dict(list(table.items())[:2]) if name == "quick" else table
-    estimates = [
+    return [
         Case(system, t_end, label, scheme, num_steps)
         for (system, t_end), runs in chosen.items()
         for label, (scheme, num_steps) in runs.items()
-    ]
-    accuracies = ACCURACIES[1:2] if name == "quick" else ACCURACIES
-    return estimates + [
-        Case(system, t_end, accuracy=accuracy) for (system, t_end), accuracy in product(chosen, accuracies)
     ]
 
 
@@ -103,21 +97,16 @@ def run(cases: list[Case], name: str, tell: Tell = silent) -> Iterator[Report]:
     """Measure all of it, a report after each case."""
     rows = []
     for case in cases:
-        tell(f"{case.system}, {case.label or f'accuracy {case.accuracy:g}'}")
+        tell(f"{case.system}, {case.label}")
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UncertifiedWarning)
-            warnings.simplefilter("ignore", AccuracyNotReached)
-            rows.append(_of_accuracy(case) if case.accuracy else _of_estimate(case))
-        estimates = [row["estimate / true"] for row in rows if "asked" not in row]
-        misses = [row["true"] / row["asked"] for row in rows if "asked" in row]
-        notes = [
-            f"{sum(0.5 <= ratio <= 2 for ratio in estimates)} of {len(estimates)} estimates are between 0.5 and 2 of the true error.",
-            f"{sum(miss <= 1 for miss in misses)} of {len(misses)} runs keep the accuracy that is asked for.",
-        ]
+            rows.append(_row(case))
+        near = sum(0.5 <= row["estimate / true"] <= 2 for row in rows)
+        notes = [f"{near} of {len(rows)} estimates are between 0.5 and 2 of the true error."]
         yield Report("errors", name, rows, [], notes)
 
 
-def _of_estimate(case: Case) -> dict:
+def _row(case: Case) -> dict:
     """A run with its estimate, the true error, and the limits of its shares."""
     problem, scheme = case.problem(), case.scheme
     assert scheme is not None
@@ -142,34 +131,10 @@ def _of_estimate(case: Case) -> dict:
     row |= {"slow share": run.error.slow.max(), "fast share": run.error.fast.max(), "fast limit": without_fast}
     if num_micro >= FEW:
         row["slow limit"] = _difference(run, simulated(scheme.with_num_micro(1), num_micro))
-    alone, whole = (_seconds(lambda more=more: simulated(scheme, **more)) for more in ({}, {"error": True}))
+    alone, whole = least_seconds([partial(simulated, scheme), partial(simulated, scheme, error=True)], 4)
     return row | {"time / run": whole / alone}
-
-
-def _of_accuracy(case: Case) -> dict:
-    """A run of an accuracy with its true error, and the seconds of the first call."""
-    problem = case.problem()
-    start = time.perf_counter()
-    run = vm.simulate(problem, accuracy=case.accuracy, t_end=case.t_end, save=vm.Save(number=NODES))
-    seconds = time.perf_counter() - start
-    true = reference_solution(problem, case.t_end, num_saves=NODES).errors(run)[0]
-    chosen = {"scheme": run.settings.python, "steps": run.settings.num_steps, "order": run.settings.scheme.order}
-    estimate = {"estimate / true": run.error.largest / true, "first call, s": seconds}
-    return {"system": case.system, **chosen, "asked": case.accuracy, "true": true, **estimate}
 
 
 def _difference(a: vm.Trajectory, b: vm.Trajectory) -> float:
     """Largest difference of a position."""
-    return max(
-        float(np.abs(np.asarray(x) - np.asarray(y)).max(initial=0.0)) for x, y in ((a.q_s, b.q_s), (a.q_f, b.q_f))
-    )
-
-
-def _seconds(run: Callable[[], object]) -> float:
-    """Shortest of three calls; it has been called before."""
-    times = []
-    for _ in range(3):
-        start = time.perf_counter()
-        run()
-        times.append(time.perf_counter() - start)
-    return min(times)
+    return float(np.abs(joined(a)[0] - joined(b)[0]).max())

@@ -10,6 +10,7 @@ from benchmarks import programs
 from benchmarks.gail2014.cost import CostStudy
 from benchmarks.measure import Ratio
 from benchmarks.report import Claim
+from vmri_jax.scene.ledger import temporary_bytes
 
 MEMORY_FROM = 100
 """Fewest micro steps whose memory counts: with fewer of them, memory that does not depend on num_micro counts as well."""
@@ -26,7 +27,7 @@ def slopes(case: Any, study: CostStudy) -> tuple[dict[int, int], list[Claim]]:
     num_micro = np.array(list(samples))
     us = np.array(list(samples.values())) * num_micro[:, None]
     scheme = programs.SCHEMES[case.scheme]
-    size = {n: temporary_bytes(problem, scheme(n), case.micro_dt) for n in samples if n >= MEMORY_FROM}
+    size = {n: _bytes(problem, scheme(n), case.micro_dt) for n in samples if n >= MEMORY_FROM}
     what = f"{case.label}: slope of log {{}} against log num_micro up to {num_micro.max():g}"
     low, high = np.quantile([slope(num_micro, sample) for sample in us.T], (0.25, 0.75))
     seen = Ratio(slope(num_micro, np.median(us, axis=1)), float(low), float(high))
@@ -37,8 +38,7 @@ def slopes(case: Any, study: CostStudy) -> tuple[dict[int, int], list[Claim]]:
     return size, claims
 
 
-def temporary_bytes(problem: vm.Problem, scheme: vm.Scheme, micro_dt: float) -> int:
+def _bytes(problem: vm.Problem, scheme: vm.Scheme, micro_dt: float) -> int:
     """Temporary memory of one compiled macro step."""
-    step = jax.jit(vm.macro_step)
-    compiled = step.lower(problem.system, scheme, problem.state(), scheme.num_micro * micro_dt).compile()
-    return compiled.memory_analysis().temp_size_in_bytes  # pyright: ignore[reportOptionalMemberAccess]
+    step = jax.jit(vm.macro_step).lower(problem.system, scheme, problem.state(), scheme.num_micro * micro_dt)
+    return temporary_bytes(step.compile())

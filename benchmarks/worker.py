@@ -32,8 +32,6 @@ SPREAD = 0.01
 """Of the velocities in a batch."""
 COMPARED = 8
 """Macro steps after which two sides are compared: round-off has not grown by then."""
-COMPILED = "/jax/core/compile/backend_compile_duration"
-"""JAX's own name of that event."""
 CALLS = 20
 """Calls in a row whose mean is one sample of a short call."""
 
@@ -48,7 +46,7 @@ class Case:
         ``"kahan-li8 of fully_explicit 2"``.
     num_steps: macro steps; 0 to find how many take `seconds`.
     lanes: of a batch.
-    method: of `vmri_jax.Newton`.
+    method: matrix of `vmri_jax.Solver`.
     """
 
     kind: str
@@ -81,7 +79,6 @@ class Timed:
     num_steps: int
     end: np.ndarray
     result: str = ""
-    found: dict | None = None
 
     def sample(self) -> float:
         """Seconds."""
@@ -97,23 +94,14 @@ class Timed:
 
 def last_node(macro_dt: float, num_steps: int) -> dict:
     """Arguments of a run that saves its last node only."""
-    save = "save" if hasattr(vm, "Save") else "save_every"  # of a checkout from before December 2026
-    return {"macro_dt": macro_dt, "num_steps": num_steps, save: num_steps}
-
-
-def solver_of(matrix: str):
-    """The solver with this matrix; None, the default, for "auto"."""
-    if matrix == "auto" or hasattr(vm, "Solver"):
-        return None if matrix == "auto" else vm.Solver(matrix)
-    checkout: Any = vm  # one from before November 2026, where "exact" had another name
-    return checkout.solvers.named({"exact": "arrowhead"}[matrix])()
+    return {"macro_dt": macro_dt, "num_steps": num_steps, "save": num_steps}
 
 
 def simulator(case: Case):
     """``simulate(num_steps)`` by `vm.simulate`."""
     problem, scheme = case.problem(), case.made_scheme()
     state = problem.state()
-    solver = solver_of(case.method)
+    solver = vm.Solver(case.method)
 
     def simulate(num_steps: int) -> vm.Trajectory:
         try:
@@ -188,39 +176,6 @@ class First(Timed):
         self.keep(run, run)
 
 
-class Compile(Timed):
-    """Seconds of start, first call and later call; compilations over other steps, parameters and starts."""
-
-    def __init__(self, case: Case):
-        problem, scheme = case.problem(), case.made_scheme()
-        started, state = _seconds(problem.state), problem.state()
-
-        def call(macro_dt=case.macro_dt, num_steps=case.num_steps, of=problem.system, state=state):
-            return vm.simulate(of, scheme, state, **last_node(macro_dt, num_steps))
-
-        first, later = _seconds(call), _seconds(call)
-        moved = vm.State(state.t + 1.0, state.q_s, state.q_f, 1.01 * state.p_s, 1.01 * state.p_f)
-        other = problem.system.replace(params=_other_params(problem.system))
-        compiled = []
-        jax.monitoring.register_event_duration_secs_listener(
-            lambda event, duration_secs, **_: compiled.append(event) if event == COMPILED else None
-        )
-        call(num_steps=case.num_steps + 1)
-        call(macro_dt=1.1 * case.macro_dt)
-        call(of=other)
-        run = call(state=moved)
-        self.keep(run, run)
-        self.num_steps = case.num_steps
-        self.found = {"start": started, "first": first, "later": later, "compilations": 1 + len(compiled)}
-
-
-def _other_params(system) -> dict:
-    """Under constraints only another gravity, since a start depends on the lengths."""
-    if system.constraint is None:
-        return {key: 1.01 * value for key, value in system.params.items()}
-    return system.params | {"gravity": system.params["gravity"] + 1}
-
-
 class Gradient(Timed):
     """Reverse-mode derivative of the squared fast positions at the end with respect to the momenta of the start."""
 
@@ -266,7 +221,6 @@ KINDS = {
     "prepared": Prepared,
     "batch": Batch,
     "first": First,
-    "compile": Compile,
     "gradient": Gradient,
     "readme": Readme,
 }
@@ -316,7 +270,7 @@ def main() -> None:
     options = parser.parse_args()
     answers, sys.stdout = sys.stdout, sys.stderr
     if not options.as_imported:
-        (vm if hasattr(vm, "configure") else vm.runtime).configure(cache=None)  # pyright: ignore[reportAttributeAccessIssue]
+        vm.configure(cache=None)
     for name in options.plain:
         use_plain(name)
     timed = Timed()
@@ -328,7 +282,7 @@ def main() -> None:
                 jax.clear_caches()
                 timed = KINDS[question["case"]["kind"]](Case(**question["case"]))
                 end = np.ravel(timed.end).tolist()
-                answer: dict = {"num_steps": timed.num_steps, "end": end, "result": timed.result, "found": timed.found}
+                answer: dict = {"num_steps": timed.num_steps, "end": end, "result": timed.result}
                 answer["processor"] = time.process_time()
             else:
                 answer = {"seconds": timed.sample()}

@@ -7,7 +7,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import EngFormatter
 
-from benchmarks.savings import ratio_at
 from vmri_jax import plots
 from vmri_jax.plots.theme import legend_below, log_ticks
 
@@ -16,6 +15,16 @@ PANELS = ("64 molecules", "network", "spacecraft")
 TITLE = "Where micro steps pay: slow forces that are dear"
 GAIN_TITLE = "gain of micro steps; lines: the bound"
 COMPOSED = ("suzuki4", "kahan-li6")
+
+
+def ratio_at(single: tuple[np.ndarray, np.ndarray], error: float, ms: float) -> float | None:
+    """Time of single steps at this error, between those measured, over `ms`; None outside of them."""
+    if not len(single[0]):
+        return None
+    errors, times = (np.log(part[np.argsort(single[0])]) for part in single)
+    if not errors[0] <= np.log(error) <= errors[-1]:
+        return None
+    return float(np.exp(np.interp(np.log(error), errors, times)) / ms)
 
 
 def families(curves: Mapping[str, Any], target: float) -> dict[str, tuple[str, Any]]:
@@ -89,18 +98,6 @@ def draw_errors(curves: Mapping[str, Mapping[str, Any]], gains: Sequence[Any], t
             axes.xaxis.set_major_formatter(EngFormatter("s"))
         _gain_panel(panels[-1], gains, theme)
         legend_below(figure)
-    return figure
-
-
-def draw_gains(gains: Sequence[Any], theme: plots.Theme):
-    """The gain of micro steps against the price of the slow force, beside its bound.
-
-    Args:
-        gains: of all systems.
-        theme: colours.
-    """
-    with plots.new_figure(5.6, 4.0, TITLE, theme) as figure:
-        _gain_panel(figure.subplots(), gains, theme)
     return figure
 
 

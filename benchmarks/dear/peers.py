@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterator
 from importlib.util import find_spec
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -11,8 +10,8 @@ import numpy as np
 import vmri_jax as vm
 from benchmarks import c_loops
 from benchmarks.dear.systems import BOND, STIFFNESS, bonds
-from vmri_jax.mechanics.invariants import potential_energy
-from vmri_jax.mechanics.masses import ConstantMass
+from benchmarks.peers import autodiff
+from benchmarks.peers.cases import Case
 
 Runs = Iterator[tuple[int, Callable[[], np.ndarray]]]
 """Number of macro steps, or -log2 of the tolerance, and a function that gives the positions at the end."""
@@ -26,58 +25,18 @@ LARGEST_POWER = 43
 """Bound of the powers: tolerances stay above ``2^-43``, about 1e-13. Below, round-off of float64 lets errors fall no further."""
 STRIDE = 3
 """Step from one power to the next, so that each tolerance is an eighth of the one before; a larger step leaves a coarser staircase."""
-MAX_STEPS = 200_000
-"""Steps after which diffrax gives up; a larger number lengthens only runs that are too slow to be compared."""
-
-
-def can_run_dopri8(problem: vm.Problem) -> bool:
-    """Whether diffrax is installed and the system has constant masses, no constraints, and no forces besides potentials."""
-    system = problem.system
-    plain = isinstance(system.kinetic, ConstantMass) and system.force is None
-    return plain and not any(system.num_constraints(problem.q_s, problem.q_f)) and find_spec("diffrax") is not None
-
-
-def dopri8_runs(problem: vm.Problem, t_end: float) -> Iterator[tuple[int, Callable[[], np.ndarray]]]:
-    """Runs of Dopri8 with smaller and smaller tolerances ``2^-power``: the power, and a function that gives q at the end, slow first."""
-    import diffrax  # pyright: ignore[reportMissingImports]
-
-    system, n_s = problem.system, problem.q_s.size
-    mass: Any = system.kinetic
-    start = tuple(
-        jnp.concatenate([jnp.asarray(a), jnp.asarray(b)])
-        for a, b in ((problem.q_s, problem.q_f), (problem.v_s, problem.v_f))
-    )
-    gradient = jax.grad(lambda q: potential_energy(system, q[:n_s], q[n_s:]))
-
-    def acceleration(q):
-        force = -gradient(q)
-        return jnp.concatenate(mass.velocity(force[:n_s], force[n_s:]))
-
-    term: Any = diffrax.ODETerm(lambda t, y, args: (y[1], acceleration(y[0])))
-
-    @jax.jit
-    def solve(tolerance):
-        controller = diffrax.PIDController(rtol=tolerance, atol=tolerance)
-        solution = diffrax.diffeqsolve(
-            term,
-            diffrax.Dopri8(),
-            0.0,
-            t_end,
-            None,
-            start,
-            stepsize_controller=controller,
-            max_steps=MAX_STEPS,
-            throw=False,
-        )
-        return solution.ys[0][-1]  # pyright: ignore[reportOptionalSubscript]
-
-    for power in range(7, LARGEST_POWER, STRIDE):
-        yield power, lambda tolerance=2.0**-power: np.asarray(solve(tolerance))
 
 
 def diffrax(problem: vm.Problem, t_end: float, num_micro: int) -> Runs:
-    """Dopri8 with adaptive steps."""
-    return dopri8_runs(problem, t_end)
+    """Dopri8 with adaptive steps and tolerances ``2^-power``, equations by automatic differentiation of the same potentials."""
+    import diffrax  # pyright: ignore[reportMissingImports]
+
+    from benchmarks.peers.diffrax import solution
+
+    case = Case("", "", problem, t_end, problem.q_f)
+    solve, start = jax.jit(solution(case, diffrax.Dopri8(), autodiff)), (jnp.asarray(case.q), jnp.asarray(case.v))
+    for power in range(7, LARGEST_POWER, STRIDE):
+        yield power, lambda tolerance=2.0**-power: np.asarray(solve(start, tolerance))
 
 
 def openmm(problem: vm.Problem, t_end: float, num_micro: int) -> Runs:
@@ -169,7 +128,7 @@ def chosen(problem: vm.Problem) -> tuple[list[str], list[str]]:
     """Peers that can run a problem here, and notes on the others."""
     are_molecules = getattr(problem.system.fast_potential, "function", None) is bonds
     ready = {
-        "diffrax Dopri8": can_run_dopri8(problem),
+        "diffrax Dopri8": find_spec("diffrax") is not None,
         "OpenMM": find_spec("openmm") is not None,
         "heyoka": find_spec("heyoka") is not None,
         "C loop": c_loops.compiler() is not None,

@@ -27,7 +27,7 @@ class CostRow:
     """One program: its size and its times.
 
     label: of the system or the scheme, as passed to `cost_study`.
-    method: name of the curve.
+    method: of the curve.
     num_unknowns: unknowns of one macro step, ``r n_s + r n_gs + num_micro r (n_f + n_g)``, r the degree.
     num_steps: macro steps of the timed run.
     seconds_per_unit: computing time per unit of simulated time; the figures of the reference paper up to a constant.
@@ -103,14 +103,12 @@ class Curve:
     num_micro: numbers of micro steps per macro step.
     t_end: simulated time, rounded to whole macro steps: long enough (thousands of micro steps for small systems) that the start of a program
         takes a negligible part of the time.
-    name: of the curve, by default the method.
     """
 
     method: str
     problem: Problem
     num_micro: Sequence[int]
     t_end: float
-    name: str = ""
 
 
 def cost_study(
@@ -139,8 +137,7 @@ def cost_study(
     points = [(curve, n) for curve in curves for n in curve.num_micro]
     runs: list[tuple[Curve, Simulation, float, Trajectory]] = []
     for curve, n in points:
-        name = curve.name or curve.method
-        progress(f"{label} {name}, {n} micro steps: compiling".strip(), len(runs), len(points) + 1)
+        progress(f"{label} {curve.method}, {n} micro steps: compiling".strip(), len(runs), len(points) + 1)
         num_steps, elapsed = max(1, round(curve.t_end / (n * micro_dt))), stopwatch()
         length = {"macro_dt": n * micro_dt, "num_steps": num_steps, "save": num_steps}
         program = prepare(curve.problem, scheme(n), **length, solver=named(curve.method))
@@ -166,7 +163,7 @@ def _row(
     micro_steps = program.num_steps * scheme.num_micro
     return CostRow(
         label=label,
-        method=curve.name or curve.method,
+        method=curve.method,
         num_micro=scheme.num_micro,
         num_unknowns=scheme.degree * (state.q_s.size + n_gs + scheme.num_micro * (state.q_f.size + n_g)),
         num_steps=program.num_steps,

@@ -28,8 +28,6 @@ PEERS = {
     "OpenMM": "openmm",
     "Exudyn": "exudyn",
     "MuJoCo": "mujoco",
-    "JAX MD": "jax_md",
-    "JAX by hand": "jax_loops",
     "C by hand": "c",
 }
 """Modules of this package by the name of the integrator."""

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 import vmri_jax as vm
 from benchmarks import __main__ as command_line
-from benchmarks import batch, c_loops, chains, compilation, cost, floor, linear, programs, report, worker
+from benchmarks import batch, c_loops, chains, cost, floor, linear, programs, report, worker
 from benchmarks.cost import Case
 from benchmarks.measure import Ratio, interleaved, ratio, steps_for
 from benchmarks.report import Claim, Report
@@ -154,7 +154,6 @@ TINY = {
     ),
     "batch": (batch, batch.Size((batch.Case("FPU l=3", 1e-3, 0.6),), (2, 256), 2, 1e-3, 1, 5120)),
     "chains": (chains, chains.Size((2,), (2,), 1, (2,), ())),
-    "compile": (compilation, compilation.Size(("FPU l=3",), ("fully explicit",), (10,), 1)),
 }
 
 
@@ -232,18 +231,11 @@ def check_chains(found):
     assert row["joint, first s"] > 0
 
 
-def check_compile(found):
-    (row,) = found["rows"]
-    assert row["compilations"] == 1
-    assert 0 < row["later call, s"] < row["first call, s"] < row["process, s"]
-
-
 CHECKS = {
     "cost": check_cost,
     "floor": check_floor,
     "batch": check_batch,
     "chains": check_chains,
-    "compile": check_compile,
 }
 
 
@@ -291,7 +283,7 @@ def test_failed_runs_are_not_timed():
 
 @pytest.mark.parametrize("name", ["quick", "full"])
 def test_sizes(name):
-    for module in (cost, floor, batch, compilation):
+    for module in (cost, floor, batch):
         assert module.sizes(name).repeats >= 2
     assert timing.MIN_SECONDS >= 0.01
 
