@@ -17,7 +17,6 @@ from benchmarks import (
     dear,
     ensemble_kills,
     ensembles,
-    errors,
     floor,
     gpu,
     imports,
@@ -26,7 +25,6 @@ from benchmarks import (
     mechanisms,
     peers,
     random_models,
-    scenes,
     tricks,
     tuned,
 )
@@ -83,13 +81,13 @@ def _register(name: str, module) -> None:
 for _name, _module in {
     "adjoints": adjoints,
     "against": against,
+    "batch": batch,
     "cost": cost,
     "dear": dear,
     "ensemble-kills": ensemble_kills,
     "floor": floor,
     "chains": chains,
     "control": control,
-    "errors": errors,
     "gpu": gpu,
     "imports": imports,
     "kills": kills,
@@ -97,22 +95,10 @@ for _name, _module in {
     "models": random_models,
     "peers": peers,
     "programs": instructions,
-    "scenes": scenes,
     "tricks": tricks,
     "tuned": tuned,
 }.items():
     _register(_name, _module)
-
-
-@app.command("batch", help=batch.__doc__)
-def batch_command(
-    full: Full = False,
-    core: Core = None,
-    out: Out = OUT,
-    devices: Annotated[int, typer.Option(min=1, help="CPU devices to spread the batch over, each a core; 1 pins.")] = 1,
-) -> None:
-    prepare(core if devices == 1 else -1, devices=devices)
-    _measure("batch", batch, full, out, devices=devices)
 
 
 @app.command("ensembles", help=ensembles.__doc__)

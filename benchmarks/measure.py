@@ -107,7 +107,7 @@ def pin(core: int | None) -> int | None:
     return core
 
 
-def prepare(core: int | None = -1, cache: bool = True, devices: int = 1) -> None:
+def prepare(core: int | None = -1, cache: bool = True) -> None:
     """Before JAX starts: keep to one core, set the compiler's flags and its cache, switch 64-bit floats on."""
     pin(core)
-    configure(devices=devices if devices > 1 else None, cache=cache_folder() if cache else None)
+    configure(cache=cache_folder() if cache else None)

@@ -45,7 +45,6 @@ def families(curves: Mapping[str, Any], target: float) -> dict[str, tuple[str, A
         "three rates": [name for name in curves if name.startswith("three rates")],
         "one interval of degree 6": [name for name in curves if name.startswith("one interval")],
         "diffrax": [name for name in curves if name.startswith("diffrax")],
-        "heyoka": [name for name in curves if name.startswith("heyoka")],
         "OpenMM": [name for name in curves if name.startswith("OpenMM")],
         "C loop": [name for name in curves if name.startswith("C loop")],
     }
@@ -57,7 +56,7 @@ def families(curves: Mapping[str, Any], target: float) -> dict[str, tuple[str, A
 
 def _look(family: str, theme: plots.Theme) -> dict[str, Any]:
     """Micro steps in full colour, single steps of the same order beside them, other programs dashed."""
-    blue, orange, green, purple, gold, pale = theme.curves
+    blue, orange, green, purple, gold, _ = theme.curves
     looks = {
         "single steps": (orange, "-", "s", 1.8),
         "micro steps": (blue, "-", "o", 2.6),
@@ -66,7 +65,6 @@ def _look(family: str, theme: plots.Theme) -> dict[str, Any]:
         "three rates": (green, "-", "^", 2.0),
         "one interval of degree 6": (purple, "-", "P", 1.4),
         "diffrax": (gold, "--", "s", 1.4),
-        "heyoka": (pale, "--", "o", 1.4),
         "OpenMM": (theme.rod, "--", "D", 1.4),
         "C loop": (theme.ink, "--", "^", 1.4),
     }

@@ -17,10 +17,6 @@ Runs = Iterator[tuple[int, Callable[[], np.ndarray]]]
 """Number of macro steps, or -log2 of the tolerance, and a function that gives the positions at the end."""
 FIRST_STEPS, MOST_STEPS = 16, 2**20
 """Macro steps of the first and the longest run of programs with fixed steps."""
-HEYOKA_POWERS = (9, 50)
-"""Tolerances 2^-9 to 2^-49: each is compiled anew, half a minute for 16 atoms."""
-HEYOKA_ATOMS = 32
-"""Atoms up to which heyoka compiles all pairs of them; its expressions of 128 atoms have 8064 pairs and take minutes to compile."""
 LARGEST_POWER = 43
 """Bound of the powers: tolerances stay above ``2^-43``, about 1e-13. Below, round-off of float64 lets errors fall no further."""
 STRIDE = 3
@@ -69,40 +65,6 @@ def openmm(problem: vm.Problem, t_end: float, num_micro: int) -> Runs:
     return _doubled(run)
 
 
-def heyoka(problem: vm.Problem, t_end: float, num_micro: int) -> Runs:
-    """Taylor's method of adaptive step and order, compiled for the equations of the molecules."""
-    import heyoka as hy  # pyright: ignore[reportMissingImports]
-
-    n = problem.q_f.size
-    q, v = ([hy.expression(f"{name}{i}") for i in range(n)] for name in "qv")
-    pulls: list[list] = [[] for _ in range(n)]
-    for i in range(0, n, 3):
-        for j in range(i + 3, n, 3):
-            d = [q[j + a] - q[i + a] for a in range(3)]
-            square = hy.sum([x * x for x in d])
-            if i % 6 == 0 and j == i + 3:  # a bond
-                factor = STIFFNESS * (1.0 - BOND / hy.sqrt(square))
-            else:
-                cube = square**-3.0
-                factor = -24.0 * cube * (2.0 * cube - 1.0) / square
-            for a in range(3):
-                pulls[i + a].append(factor * d[a])
-                pulls[j + a].append(-factor * d[a])
-    system = list(zip([*q, *v], [*v, *map(hy.sum, pulls)], strict=True))
-    start = np.concatenate([problem.q_f, problem.v_f])
-
-    for power in range(HEYOKA_POWERS[0], HEYOKA_POWERS[1], 8):
-        taylor = hy.taylor_adaptive(system, start, tol=2.0**-power, compact_mode=True)
-
-        def run(taylor=taylor) -> np.ndarray:
-            taylor.time = 0.0
-            taylor.state[:] = start
-            taylor.propagate_until(t_end)
-            return taylor.state[:n].copy()
-
-        yield power, run
-
-
 def c_loop(problem: vm.Problem, t_end: float, num_micro: int) -> Runs:
     """The impulse method by hand."""
 
@@ -119,7 +81,7 @@ def _doubled(run: Callable[[int], np.ndarray]) -> Runs:
         num_steps *= 2
 
 
-PEERS = {"diffrax Dopri8": diffrax, "OpenMM": openmm, "heyoka": heyoka, "C loop": c_loop}
+PEERS = {"diffrax Dopri8": diffrax, "OpenMM": openmm, "C loop": c_loop}
 FIXED_STEPS = ("OpenMM", "C loop")
 """Peers with macro steps, of as many micro steps as our kicks need least time with."""
 
@@ -130,11 +92,8 @@ def chosen(problem: vm.Problem) -> tuple[list[str], list[str]]:
     ready = {
         "diffrax Dopri8": find_spec("diffrax") is not None,
         "OpenMM": find_spec("openmm") is not None,
-        "heyoka": find_spec("heyoka") is not None,
         "C loop": c_loops.compiler() is not None,
     }
     stated = ["diffrax Dopri8", *(("OpenMM", "C loop") if are_molecules else ())]
-    if are_molecules and problem.q_f.size <= 3 * HEYOKA_ATOMS:
-        stated.append("heyoka")
     missing = [f"{name} is not installed and left out." for name in stated if not ready[name]]
     return [name for name in stated if ready[name]], missing
