@@ -5,7 +5,6 @@ Questions and answers are lines of JSON on standard input and output; `benchmark
 """
 
 import argparse
-import ast
 import importlib
 import json
 import os
@@ -13,8 +12,6 @@ import runpy
 import sys
 import time
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
 if __name__ == "__main__":
     sys.path[0] = os.getcwd()
@@ -84,11 +81,11 @@ class Timed:
         """Seconds."""
         raise NotImplementedError
 
-    def keep(self, short, whole, node: int = -1) -> None:
-        """A node of the first run, by default its end, and the worst status of the second."""
+    def keep(self, short, whole) -> None:
+        """The end of the first run, and the worst status of the second."""
         nodes = short.states  # vectors, also where a run has dictionaries
         q = np.concatenate([np.asarray(nodes.q_s), np.asarray(nodes.q_f)], axis=-1)
-        self.end = q[..., node, :]
+        self.end = q[..., -1, :]
         self.result = vm.Result(int(np.max(np.asarray(whole.result)))).name
 
 
@@ -197,24 +194,6 @@ class Gradient(Timed):
         return _seconds(self.gradient, self.at)
 
 
-class Readme(Timed):
-    """The first program of README.md: its line with `vm.simulate` again."""
-
-    def __init__(self, case: Case):
-        text = Path("README.md").read_text(encoding="utf-8").split("```python\n")[1].split("```")[0]
-        lines = ast.parse(text).body
-        (last,) = (i for i, line in enumerate(lines) if "vm.simulate(" in ast.unparse(line))
-        self.names: dict[str, Any] = {}
-        exec(compile(ast.Module(lines[: last + 1], []), "README.md", "exec"), self.names)
-        self.line = compile(ast.Module(lines[last : last + 1], []), "README.md", "exec")
-        self.keep(self.names["run"], self.names["run"], node=COMPARED)
-        self.num_steps = len(self.names["run"].t) - 1
-
-    def sample(self) -> float:
-        """Of one call."""
-        return _seconds(exec, self.line, self.names)
-
-
 KINDS = {
     "single": Single,
     "call": Call,
@@ -222,7 +201,6 @@ KINDS = {
     "batch": Batch,
     "first": First,
     "gradient": Gradient,
-    "readme": Readme,
 }
 
 
@@ -265,12 +243,10 @@ def use_plain(name: str) -> None:
 def main() -> None:
     """Answer until there are no more questions."""
     parser = argparse.ArgumentParser()
-    parser.add_argument("--as-imported", action="store_true", help="leave the settings of JAX alone")
     parser.add_argument("--plain", action="append", default=[], help="a function of the kernels in its plain form")
     options = parser.parse_args()
     answers, sys.stdout = sys.stdout, sys.stderr
-    if not options.as_imported:
-        vm.configure(cache=None)
+    vm.configure(cache=None)
     for name in options.plain:
         use_plain(name)
     timed = Timed()

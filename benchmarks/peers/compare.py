@@ -3,13 +3,16 @@
 import importlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 
 import vmri_jax as vm
 from benchmarks.c_loops import NoCompiler
 from benchmarks.measure import Ratio, Tell, interleaved, quartiles, ratio, silent
-from benchmarks.peers import cases, figures
+from benchmarks.peers import autodiff, cases, figures
 from benchmarks.peers.cases import BATCH_LEVEL, LEVELS, Case, NotRepresentable
 from benchmarks.peers.ours import last_positions
 from benchmarks.peers.scan import Point, candidates, scan
@@ -22,15 +25,15 @@ PEERS = {
     OURS: "ours",
     "heyoka": "heyoka",
     "diffrax": "diffrax",
-    "diffrax, autodiff": "diffrax_autodiff",
+    "diffrax, autodiff": "diffrax",
     "scipy": "scipy",
-    "scipy, autodiff": "scipy_autodiff",
+    "scipy, autodiff": "scipy",
     "OpenMM": "openmm",
     "Exudyn": "exudyn",
     "MuJoCo": "mujoco",
     "C by hand": "c",
 }
-"""Modules of this package by the name of the integrator."""
+"""Modules of this package by the name of the integrator; "autodiff" says where equations come from, see `load`."""
 BATCHED = (OURS, "heyoka", "diffrax", "diffrax, autodiff")
 BATCH = 1024
 FINE_STEPS = 1000
@@ -80,9 +83,13 @@ def _chosen(names: Sequence[str], only: Sequence[str]) -> list[str]:
     return [name for name in names if not only or name in only or any(name.startswith(f"{x} ") for x in only)]
 
 
-def load(peer: str):
-    """The module of a peer, if its package is installed."""
-    return importlib.import_module(f"benchmarks.peers.{PEERS[peer]}")
+def load(peer: str) -> Any:
+    """The module of a peer, if its package is installed, with equations by automatic differentiation where its name says so."""
+    module = importlib.import_module(f"benchmarks.peers.{PEERS[peer]}")
+    if not peer.endswith("autodiff"):
+        return module
+    given = {name: getattr(module, name) for name in ("ladders", "batch_ladders") if hasattr(module, name)}
+    return SimpleNamespace(energy=autodiff.energy, **{k: partial(f, equations=autodiff) for k, f in given.items()})
 
 
 def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:

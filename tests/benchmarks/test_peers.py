@@ -28,7 +28,8 @@ def module(peer: str):
     """Of a peer; the test is skipped where it cannot run."""
     if peer == "C by hand" and c_loops.compiler() is None:
         pytest.skip("no C compiler (cc, gcc or clang) on the PATH")
-    return pytest.importorskip(f"benchmarks.peers.{compare.PEERS[peer]}")
+    pytest.importorskip(f"benchmarks.peers.{compare.PEERS[peer]}")
+    return compare.load(peer)
 
 
 def climb(ladder: Ladder, case: cases.Case) -> list[float]:
