@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 import vmri_jax as vm
-from benchmarks.linear import slope
+from benchmarks.cost import slope
 from benchmarks.measure import Ratio, Tell, silent
 from benchmarks.report import Claim, Report, growing
 from vmri_jax.mechanics import constraint_pattern

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -35,14 +35,8 @@ SPREAD, RATE = 0.2, 0.5
 """Standard deviations of coordinates and velocities at the start, rad, rad/s, m and m/s."""
 
 
-class Size(NamedTuple):
-    """The files to read, each with its package."""
-
-    files: tuple[tuple[str, Path], ...]
-
-
-def sizes(name: str, only: Sequence[str] = ()) -> Size:
-    """The files of the packages that are installed, or those `only` whose names begin like this.
+def sizes(name: str, only: Sequence[str] = ()) -> list[tuple[str, Path]]:
+    """Packages and files: of the packages that are installed, or those `only` whose names begin like this.
 
     Raises:
         FileNotFoundError: there are none.
@@ -55,8 +49,7 @@ def sizes(name: str, only: Sequence[str] = ()) -> Size:
     if not files:
         raise FileNotFoundError(f"neither {' nor '.join(FOLDERS)} is installed: {INSTALL}")
     beginnings = tuple(only) or (QUICK if name == "quick" else ("",))
-    files = [(package, file) for package, file in files if file.stem.startswith(beginnings)]
-    return Size(tuple(files))
+    return [(package, file) for package, file in files if file.stem.startswith(beginnings)]
 
 
 def _mujoco() -> Any:
@@ -159,10 +152,10 @@ def compare(file: Path) -> dict[str, Any]:
     return row
 
 
-def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
+def run(files: list[tuple[str, Path]], name: str, tell: Tell = silent) -> Iterator[Report]:
     """All files, a report after each."""
     rows: list[dict] = []
-    for package, file in size.files:
+    for package, file in files:
         tell(file.stem)
         rows.append({"file": f"{package}/{file.name}"} | compare(file))
         errors = [row["error"] for row in rows if "error" in row]

@@ -7,7 +7,7 @@ motion away from their defaults, and with flags and refused features drawn at ra
 from collections import Counter
 from collections.abc import Iterator
 from importlib import import_module
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -51,15 +51,9 @@ FLAGS = ("spring", "damper", "gravity", "actuation", "limit", "frictionloss", "c
 """Features that a flag may switch off."""
 
 
-class Size(NamedTuple):
-    """Seeds of the models."""
-
-    seeds: range
-
-
-def sizes(name: str) -> Size:
-    """ "quick" or "full"."""
-    return Size(range(300 if name == "full" else 12))
+def sizes(name: str) -> range:
+    """ "quick" or "full": seeds of the models."""
+    return range(300 if name == "full" else 12)
 
 
 def xml(seed: int) -> str:
@@ -184,10 +178,10 @@ def keyframe(mujoco: Any, seed: int, data: Any) -> Any:
     return mujoco.MjModel.from_xml_string(xml(seed).replace("</mujoco>", keys))
 
 
-def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
+def run(seeds: range, name: str, tell: Tell = silent) -> Iterator[Report]:
     """All models, one report."""
     rows = []
-    for seed in size.seeds:
+    for seed in seeds:
         tell(f"model {seed}")
         rows.append(compare(seed))
     read = [row["difference"] for row in rows if "difference" in row]

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import vmri_jax as vm
-from benchmarks.dear.figures import draw_errors, ratio_at
+from benchmarks.dear.figures import draw_errors, ratio_at, time_to
 from benchmarks.dear.peers import FIXED_STEPS, PEERS, chosen
 from benchmarks.dear.spacecraft import spacecraft
 from benchmarks.dear.systems import MIDDLE, molecules, teacher
@@ -273,9 +273,3 @@ def _prices(problem: vm.Problem) -> tuple[float, float]:
         jax.grad(lambda q, name=name: problem.system.all_potentials(jnp.zeros(0), q)[name]) for name in ("slow", "fast")
     )
     return seconds_each(slow, q, 100), seconds_each(fast, q, 1000)
-
-
-def time_to(error: float, steps: np.ndarray, errors: np.ndarray, ms: np.ndarray) -> float:
-    """Milliseconds at an error, between those measured; infinite outside of them."""
-    between = ratio_at((errors, ms), error, 1.0)
-    return np.inf if between is None else between

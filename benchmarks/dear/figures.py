@@ -27,15 +27,17 @@ def ratio_at(single: tuple[np.ndarray, np.ndarray], error: float, ms: float) -> 
     return float(np.exp(np.interp(np.log(error), errors, times)) / ms)
 
 
+def time_to(error: float, steps: np.ndarray, errors: np.ndarray, ms: np.ndarray) -> float:
+    """Milliseconds at an error, between those measured; infinite outside of them."""
+    between = ratio_at((errors, ms), error, 1.0)
+    return np.inf if between is None else between
+
+
 def families(curves: Mapping[str, Any], target: float) -> dict[str, tuple[str, Any]]:
     """The curves that are drawn, by family: single steps, and of all others the one that reaches the target first."""
 
     def best(names: Sequence[str]) -> str | None:
-        def milliseconds(name: str) -> float:
-            at_target = ratio_at(curves[name][1:], target, 1.0)
-            return np.inf if at_target is None else at_target
-
-        return min(names, key=milliseconds, default=None)
+        return min(names, key=lambda name: time_to(target, *curves[name]), default=None)
 
     groups = {
         "single steps": [name for name in curves if name == "kicks, N = 1"],

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 import vmri_jax as vm
 from benchmarks import __main__ as command_line
-from benchmarks import batch, c_loops, chains, cost, floor, linear, programs, report, worker
+from benchmarks import batch, c_loops, chains, cost, floor, programs, report, worker
 from benchmarks.cost import Case
 from benchmarks.measure import Ratio, interleaved, ratio, steps_for
 from benchmarks.report import Claim, Report
@@ -267,7 +267,7 @@ def test_starts_differ_and_keep_to_the_constraints(system):
 
 def test_slope():
     x = np.array([1.0, 10.0, 100.0])
-    assert linear.slope(x, 7 * x**1.5) == pytest.approx(1.5)
+    assert cost.slope(x, 7 * x**1.5) == pytest.approx(1.5)
 
 
 def test_failed_runs_are_not_timed():
