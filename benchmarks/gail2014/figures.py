@@ -21,6 +21,8 @@ SETTLED = 10
 """From about so many micro steps on, the structured solve should cost the same per micro step."""
 
 
+SAMPLE = 0.02
+"""Least seconds of a sample of a time. The medians of several short samples in turns bear a busy machine better than means of long ones."""
 NO_OVERHEAD = "compiled code has hardly any cost of a macro step that more micro steps could share"
 """Why a dense solve is cheapest with fewer micro steps here than in the paper."""
 LONG_STEPS = "longer macro steps take more passes of Newton's iteration, and newer matrices: in macro steps of one length the cost is {:.2f} times"
@@ -142,7 +144,7 @@ class CostPanel:
         settled = min(self.num_micro, key=lambda n: abs(n - SETTLED))
         methods = ("exact", *self.others)
         curves += [Curve(method, structured, self.num_micro, self.t_end, settled) for method in methods]
-        how = {"micro_dt": self.micro_dt, "repeats": self.repeats, "progress": progress}
+        how = {"micro_dt": self.micro_dt, "repeats": self.repeats, "min_seconds": SAMPLE, "progress": progress}
         return cost_study(self.title, self.scheme, curves, **how)
 
 

@@ -62,8 +62,8 @@ class Size:
     degree_num_micro: tuple[int, ...]
 
 
-FEW_ATOMS = (1, 4, 8, 12, 16, 20, 24, 32, 40, 60, 80, 100)
-FEW_SPRINGS = (1, 4, 8, 12, 16, 20, 40, 60, 100)
+ATOMS_NUM_MICRO = (1, 4, 8, 12, 16, 20, 24, 32, 40, 60, 80, 100)
+CHAIN_NUM_MICRO = (1, 4, 8, 12, 16, 20, 40, 60, 100)
 SIZES = {
     "quick": Size(
         fpu_steps=PAPER_STEPS[:-1],
@@ -74,19 +74,19 @@ SIZES = {
         chain_lengths=(30,),
         others=(),
         largest_dense=1000,
-        repeats=9,
+        repeats=7,
         degree_num_micro=(5,),
     ),
     "full": Size(
         fpu_steps=PAPER_STEPS,
         tsp_steps=PAPER_STEPS[1:],
         fpu=(PAPER_NUM_MICRO, PAPER_NUM_MICRO),
-        sam=(FEW_ATOMS, FEW_ATOMS),
-        chain=(FEW_SPRINGS, FEW_SPRINGS),
+        sam=(ATOMS_NUM_MICRO, ATOMS_NUM_MICRO),
+        chain=(CHAIN_NUM_MICRO, CHAIN_NUM_MICRO),
         chain_lengths=(10, 40, 70, 100, 150, 200),
         others=("null_space",),
         largest_dense=2500,
-        repeats=9,
+        repeats=7,
         degree_num_micro=(5, 10),
     ),
 }
@@ -104,7 +104,7 @@ def _cost_figures(size: Size) -> tuple[CostFigure, ...]:
     chain, atoms, scheme = systems.fermi_pasta_ulam, systems.simple_atomic_model, vm.fully_implicit
     small = (
         CostPanel("FPU, l = 3", chain, chain, scheme, 60, *size.fpu, 0.01, 5.0, 20.0, size.repeats),
-        CostPanel("SAM", atoms, atoms, scheme, 20, *size.sam, 0.001, 0.2, 1.0, size.repeats, size.others),
+        CostPanel("SAM", atoms, atoms, scheme, 20, *size.sam, 0.001, 0.12, 1.0, size.repeats, size.others),
     )
     chains = tuple(_chain_panel(size, name, length) for name in SCHEMES for length in size.chain_lengths)
     return (
