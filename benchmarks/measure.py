@@ -38,11 +38,6 @@ class Ratio:
     def __str__(self) -> str:
         return f"{self.value:.3g} ({self.low:.3g} to {self.high:.3g})"
 
-    @property
-    def inverse(self) -> "Ratio":
-        """The ratio of the second time to the first."""
-        return Ratio(1 / self.value, 1 / self.high, 1 / self.low)
-
 
 def ratio(above: Sequence[float], below: Sequence[float]) -> Ratio:
     """`above` over `below`, two lists of samples from one `interleaved`.

@@ -53,8 +53,3 @@ def program(problem: vm.Problem, scheme: vm.Scheme | vm.Composition, macro_dt, s
     start = problem.state()
     prepared = vm.prepare(problem.system, scheme, start, macro_dt=macro_dt, num_steps=1, solver=solver)
     return lambda num_steps, **other: prepared(num_steps=num_steps, **other, throw=False)
-
-
-def failed(trajectory: vm.Trajectory) -> bool:
-    """Whether any step, or any trajectory of a batch, failed."""
-    return bool(np.any(np.asarray(trajectory.failed_at) >= 0))

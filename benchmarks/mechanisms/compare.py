@@ -13,7 +13,7 @@ from benchmarks.mechanisms.ways import ways
 from benchmarks.peers import figures
 from benchmarks.peers.cases import NotRepresentable
 from benchmarks.peers.scan import Point, candidates, scan
-from benchmarks.report import Report
+from benchmarks.report import Report, note
 
 LEVELS = (1e-3, 1e-5)
 """Largest errors of the centres of bars at the end, over the size of the mechanism."""
@@ -97,19 +97,13 @@ def scanned(mechanism: Mechanism, title: str, size: Size, notes: list[str], tell
         try:
             ladder, centres = make()
         except ModuleNotFoundError as error:
-            _note(notes, f"{way} was left out: there is no {error.name}; pip install -e '.[peers]' installs it.")
+            note(notes, f"{way} was left out: there is no {error.name}; pip install -e '.[peers]' installs it.")
         except NotRepresentable as error:
-            _note(notes, f"{title}: {way.partition(' ')[0]} was left out: {error}.")
+            note(notes, f"{title}: {way.partition(' ')[0]} was left out: {error}.")
         else:
             judge = Judged(other if way.startswith(("scipy", "diffrax")) else end, mechanism.size, centres)
             found[way] = scan(way, [ladder], judge, size.seconds, size.levels)
     return found
-
-
-def _note(notes: list[str], text: str) -> None:
-    """Once."""
-    if text not in notes:
-        notes.append(text)
 
 
 def timed(mechanism: Mechanism, title: str, found: dict[str, list[Point]], size: Size) -> list[dict]:

@@ -17,7 +17,7 @@ from benchmarks.peers.cases import BATCH_LEVEL, LEVELS, Case, NotRepresentable
 from benchmarks.peers.ours import last_positions
 from benchmarks.peers.scan import Point, candidates, scan
 from benchmarks.peers.targets import target
-from benchmarks.report import Claim, Report, spread
+from benchmarks.report import Claim, Report, note, spread
 from benchmarks.worker import starts
 
 OURS = "vmri_jax"
@@ -137,9 +137,9 @@ def _one(case: Case, peers, levels, ladders_of, size: Size, report: Report, tell
             ladders = ladders_of(module, case)
             differs[peer] = None if is_batch else energy_difference(module, case)
         except ModuleNotFoundError as error:
-            _note(report, f"{peer} was left out: there is no {error.name}; pip install -e '.[peers]' installs it.")
+            note(report.notes, f"{peer} was left out: there is no {error.name}; pip install -e '.[peers]' installs it.")
         except (NotRepresentable, NoCompiler) as error:
-            _note(report, f"{title}: {peer} was left out: {error}.")
+            note(report.notes, f"{title}: {peer} was left out: {error}.")
         else:
             points[peer] = scan(peer, ladders, case, size.seconds, levels)
     tell(f"{title}, timing")
@@ -151,19 +151,13 @@ def _one(case: Case, peers, levels, ladders_of, size: Size, report: Report, tell
             row["trajectories/s"] = len(case.q_end) / (1e-3 * row["levels"][0]["ms"])
         report.rows.append(row)
         if missed := [level for level in levels if (peer, level) not in timed]:
-            _note(report, f"{title}: {peer} does not reach {_why(mine, missed)}.")
+            note(report.notes, f"{title}: {peer} does not reach {_why(mine, missed)}.")
         for level in levels:
             least = target(title, peer, level)
             if least is not None and (peer, level) in timed:
                 what = f"{title}, {level:.0e}: {peer} over ours"
                 report.claims.append(Claim(what, timed[peer, level].to_ours, at_least=least))
     return [p for mine in points.values() for p in mine]
-
-
-def _note(report: Report, text: str) -> None:
-    """Once."""
-    if text not in report.notes:
-        report.notes.append(text)
 
 
 @dataclass(frozen=True)
