@@ -103,8 +103,8 @@ def reference_figures(size: str = "quick") -> tuple[ConvergenceFigure | CostFigu
 def _cost_figures(size: Size) -> tuple[CostFigure, ...]:
     chain, atoms, scheme = systems.fermi_pasta_ulam, systems.simple_atomic_model, vm.fully_implicit
     small = (
-        CostPanel("FPU, l = 3", chain, chain, scheme, 60, *size.fpu, 0.01, 5.0, 20.0, size.repeats),
-        CostPanel("SAM", atoms, atoms, scheme, 20, *size.sam, 0.001, 0.12, 1.0, size.repeats, size.others),
+        CostPanel("FPU, l = 3", chain, chain, scheme, 60, *size.fpu, 0.01, 2.0, 20.0, size.repeats),
+        CostPanel("SAM", atoms, atoms, scheme, 20, *size.sam, 0.001, 0.08, 1.0, size.repeats, size.others),
     )
     chains = tuple(_chain_panel(size, name, length) for name in SCHEMES for length in size.chain_lengths)
     return (
@@ -138,7 +138,7 @@ def _chain_panel(size: Size, scheme: str, num_springs: int) -> CostPanel:
         dense_num_micro=feasible,
         num_micro=structured,
         micro_dt=0.01,
-        dense_t_end=0.5,
+        dense_t_end=0.2,
         t_end=10.0 if scheme == "fully explicit" else min(10.0, max(0.5, 4000 / num_springs**2)),  # solves cost l^3
         repeats=size.repeats,
     )

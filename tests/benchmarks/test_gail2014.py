@@ -115,6 +115,7 @@ def test_checks_compare_what_was_measured(made):
     assert [check.quantity for check in cost.checks] == [
         "FPU, dense: cost turns up again",
         "FPU, dense: cheapest number of micro steps",
+        "FPU, exact: cost at 2 micro steps over that at 2, in macro steps of one length",
         "FPU, exact: cost at 2 micro steps over that at 2",
     ]
 
@@ -122,9 +123,9 @@ def test_checks_compare_what_was_measured(made):
 @pytest.mark.parametrize(
     ("times", "agree", "surprise"),
     [
-        ((5.0, 1.0, 1.0, 1.4, 1.4), [False, True, True], [True, False, False]),
-        ((1.0, 5.0, 1.0, 2.0, 1.1), [True, False, False], [False, False, False]),
-        ((1.0, 5.0, 1.0, 2.0, 1.6), [True, False, False], [False, False, True]),
+        ((5.0, 1.0, 1.0, 1.4, 1.4), [False, True, True, True], [True, False, False, False]),
+        ((1.0, 5.0, 1.0, 2.0, 1.1), [True, False, True, False], [False, False, False, False]),
+        ((1.0, 5.0, 1.0, 2.0, 1.6), [True, False, False, False], [False, False, True, True]),
     ],
 )
 def test_a_difference_is_known_where_its_reason_holds(times, agree, surprise):
@@ -134,7 +135,7 @@ def test_a_difference_is_known_where_its_reason_holds(times, agree, surprise):
         for method, n, us in zip(("dense", "dense", "exact", "exact"), (1, 60, 10, 100), times, strict=False)
     ]
     checks = _cost_checks(tiny_cost().panels[0], CostStudy(tuple(rows)))
-    assert [check.kind for check in checks] == ["turn", "minimum", "structured"]
+    assert [check.kind for check in checks] == ["turn", "minimum", "structured", "longer"]
     assert [check.agrees for check in checks] == agree
     assert [check.surprises for check in checks] == surprise
     figure = FigureResult("cost", "", "", "", tuple(checks), 0.0)
