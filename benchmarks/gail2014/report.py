@@ -66,7 +66,7 @@ class Report:
             f"Orders: {agreeing['order']} as expected, of positions and of momenta.",
             f"Dense solve: {agreeing['turn']} curves of cost turn up again; cheapest numbers of micro steps: {'; '.join(minima) or 'none'}.",
             f"Structured solve: with the most micro steps a micro step costs at most {most['structured']:g} times as much as with about {SETTLED} "
-            f"in macro steps of one length, at most {most['longer']:g} times in the longer ones of one micro step.",
+            f"in macro steps of one length, at most {most['longer']:g} times in macro steps that grow with their number.",
             f"Different from what was expected: {surprising or 'nothing'}. Different for reasons that the page gives: {known or 'nothing'}.",
             f"Page: {self.path}",
         ]
