@@ -12,24 +12,19 @@ from benchmarks import (
     against,
     batch,
     chains,
-    compilation,
     control,
     cost,
     dear,
     ensemble_kills,
     ensembles,
-    errors,
     floor,
     gpu,
     imports,
     instructions,
     kills,
     mechanisms,
-    orders,
     peers,
     random_models,
-    savings,
-    scenes,
     tricks,
     tuned,
 )
@@ -50,7 +45,7 @@ app.command()(gail2014)
 app.command()(refusals()(hard))
 
 
-COMPILES = ("chains", "mechanisms", "kills")
+COMPILES = ("chains", "mechanisms", "kills", "programs")
 """Commands that report seconds of compilation, or start processes: programs in the cache would be no measure of them."""
 MANY_CORES = ("gpu", "kills", "ensemble-kills")
 """Commands that keep to no core."""
@@ -86,39 +81,24 @@ def _register(name: str, module) -> None:
 for _name, _module in {
     "adjoints": adjoints,
     "against": against,
+    "batch": batch,
     "cost": cost,
     "dear": dear,
     "ensemble-kills": ensemble_kills,
     "floor": floor,
     "chains": chains,
-    "compile": compilation,
     "control": control,
-    "errors": errors,
     "gpu": gpu,
     "imports": imports,
     "kills": kills,
     "mechanisms": mechanisms,
     "models": random_models,
-    "orders": orders,
     "peers": peers,
     "programs": instructions,
-    "savings": savings,
-    "scenes": scenes,
     "tricks": tricks,
     "tuned": tuned,
 }.items():
     _register(_name, _module)
-
-
-@app.command("batch", help=batch.__doc__)
-def batch_command(
-    full: Full = False,
-    core: Core = None,
-    out: Out = OUT,
-    devices: Annotated[int, typer.Option(min=1, help="CPU devices to spread the batch over, each a core; 1 pins.")] = 1,
-) -> None:
-    prepare(core if devices == 1 else -1, devices=devices)
-    _measure("batch", batch, full, out, devices=devices)
 
 
 @app.command("ensembles", help=ensembles.__doc__)
@@ -134,9 +114,9 @@ def ensembles_command(
 
 @app.command("all")
 def all_command(full: Full = False, core: Core = None, out: Out = OUT) -> None:
-    """Floor, batch, compile and cost, one after the other."""
-    prepare(core)
-    for name, module in (("floor", floor), ("batch", batch), ("compile", compilation), ("cost", cost)):
+    """Floor, batch, programs and cost, one after the other."""
+    prepare(core, cache=False)
+    for name, module in (("floor", floor), ("batch", batch), ("programs", instructions), ("cost", cost)):
         _measure(name, module, full, out)
 
 

@@ -128,26 +128,16 @@ def _diffrax(case: Case, problem: vm.Problem, calls: dict, tell: Tell) -> list[d
     """Its gradient with respect to the momenta at a tolerance of 1e-8, the equations by automatic differentiation of the same Lagrangian."""
     try:
         import diffrax  # pyright: ignore[reportMissingImports]
+
+        from benchmarks.peers.diffrax import solution
     except ImportError:
         return []
     tell(f"{case.name}, diffrax")
-    t_end = SHORT * case.macro_dt
-    peer = PeerCase(case.name, case.name, problem, t_end, np.zeros(0))
-    acceleration, q = autodiff.acceleration(peer), jnp.asarray(peer.q)
+    peer = PeerCase(case.name, case.name, problem, SHORT * case.macro_dt, np.zeros(0))
+    solve, q = solution(peer, diffrax.Dopri8(), autodiff), jnp.asarray(peer.q)
 
     def cost(v):
-        end = diffrax.diffeqsolve(
-            diffrax.ODETerm(lambda t, y, _: (y[1], acceleration(*y))),
-            diffrax.Dopri8(),
-            0.0,
-            t_end,
-            case.macro_dt / 10,
-            (q, v),
-            stepsize_controller=diffrax.PIDController(rtol=1e-8, atol=1e-8),
-            max_steps=100_000,
-        )
-        assert end.ys is not None
-        return jnp.sum(end.ys[0][-1] ** 2)
+        return jnp.sum(solve((q, v), 1e-8) ** 2)
 
     began = time.perf_counter()
     program = jax.jit(jax.grad(cost)).lower(jnp.asarray(peer.v)).compile()

@@ -18,8 +18,8 @@ TWO = ("fully_explicit 10", "explicit_slow 10", "fully_implicit 10")
 """Schemes of order 2 that the first results are measured with."""
 COMPOSED = ("kahan-li6 of fully_explicit 2", "kahan-li8 of fully_explicit 2")
 LANES = 256
-SINGLE, CALL, PREPARED, COLD, GRADIENT, README = 1.1, 250e-6, 25e-6, 4.0, 8.0, 1.2
-"""Targets: ratio of single runs; seconds of calls, of first results and gradients; README over configured."""
+SINGLE, CALL, PREPARED, COLD, GRADIENT = 1.1, 250e-6, 25e-6, 4.0, 8.0
+"""Targets: ratio of single runs; seconds of calls, of first results and gradients."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,6 @@ GROUPS = {
     "call": _calls("call", CALL) + _calls("prepared", PREPARED),
     "first": FIRST,
     "gradient": GRADIENTS,
-    "readme": [Entry(Case("readme", "README", "fully_implicit 10"))],
 }
 FRESH = ("first", "gradient")
 """Groups in which every sample is a new process."""
@@ -131,7 +130,7 @@ def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
     rows, claims = [], []
     notes = [", ".join(f"{side}: {about[side]['commit']}" for side in seats)]
     for group, entry, outcome in _outcomes(size, seats, tell):
-        rows += _rows(group, entry, outcome)
+        rows.append(_row(group, entry, outcome))
         claims += _claims(group, entry, outcome)
         notes += [f"{group}, {entry.label}: {side} was left out: {why}." for side, why in outcome.refused.items()]
         yield Report("against", name, rows, claims, notes, about=about)
@@ -146,12 +145,8 @@ def _outcomes(size: Size, seats: dict[str, Seat], tell: Tell) -> Iterator[tuple[
                 yield f"{group}, cold", entry, first_results(seats, entry.case, size.fresh)
         if group == "first":
             continue
-        warm = dict(seats)
-        if group == "readme":  # as printed, and after the settings have been made
-            warm = {side: replace(seat, options=("--as-imported", *seat.options)) for side, seat in seats.items()}
-            warm |= {f"{side}, configured": seat for side, seat in seats.items()}
         with ExitStack() as stack:
-            workers = {name: stack.enter_context(Worker(seat)) for name, seat in warm.items()}
+            workers = {name: stack.enter_context(Worker(seat)) for name, seat in seats.items()}
             for entry in entries:
                 tell(f"{group}, {entry.label}")
                 case = replace(entry.case, seconds=size.seconds)
@@ -159,25 +154,18 @@ def _outcomes(size: Size, seats: dict[str, Seat], tell: Tell) -> Iterator[tuple[
                 yield entry.case.kind, unbound, take_turns(workers, case, size.repeats)
 
 
-def _rows(group: str, entry: Entry, outcome: Outcome) -> list[dict]:
-    """One for the entry; of README's program a second one for the settings made first."""
-    pairs = [(BEFORE, AFTER)]
-    if group == "readme":
-        pairs += [(f"{BEFORE}, configured", f"{AFTER}, configured")]
-    rows = []
-    for before, after in pairs:
-        samples, made = outcome.samples, outcome.made.values()
-        row: dict = {"group": group, "case": entry.label + after.removeprefix(AFTER)}
-        for side, key in ((BEFORE, before), (AFTER, after)):
-            row[f"{side}, ms"] = 1e3 * float(np.median(samples[key])) if key in samples else None
-        if before in samples and after in samples:
-            found = ratio(samples[after], samples[before])
-            row |= {"after/before": found.value, "quartiles": f"{found.low:.3g} to {found.high:.3g}"}
-        row["steps"] = max((m["num_steps"] for m in made), default=None)
-        row["differs"] = outcome.difference(after, before)
-        row["result"] = ", ".join(sorted({m["result"] for m in made}))
-        rows.append(row)
-    return rows
+def _row(group: str, entry: Entry, outcome: Outcome) -> dict:
+    samples, made = outcome.samples, outcome.made.values()
+    row: dict = {"group": group, "case": entry.label}
+    for side in (BEFORE, AFTER):
+        row[f"{side}, ms"] = 1e3 * float(np.median(samples[side])) if side in samples else None
+    if {BEFORE, AFTER} <= set(samples):
+        found = ratio(samples[AFTER], samples[BEFORE])
+        row |= {"after/before": found.value, "quartiles": f"{found.low:.3g} to {found.high:.3g}"}
+    row["steps"] = max((m["num_steps"] for m in made), default=None)
+    row["differs"] = outcome.difference(AFTER, BEFORE)
+    row["result"] = ", ".join(sorted({m["result"] for m in made}))
+    return row
 
 
 def _claims(group: str, entry: Entry, outcome: Outcome) -> list[Claim]:
@@ -187,10 +175,4 @@ def _claims(group: str, entry: Entry, outcome: Outcome) -> list[Claim]:
         claims.append(Claim(f"{what} over before", ratio(samples[AFTER], samples[BEFORE]), at_most=entry.ratio))
     if entry.seconds is not None and AFTER in samples:
         claims.append(Claim(f"{what}, seconds", quartiles(samples[AFTER]), at_most=entry.seconds))
-    if group == "readme":
-        for side in (BEFORE, AFTER):
-            if {side, f"{side}, configured"} <= set(samples):
-                over_configured = ratio(samples[side], samples[f"{side}, configured"])
-                most = README if side == AFTER else None
-                claims.append(Claim(f"README of {side}, as printed over configured", over_configured, at_most=most))
     return claims

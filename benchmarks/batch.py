@@ -46,11 +46,10 @@ class Size:
     batches: tuple[int, ...]
     repeats: int
     seconds: float
-    devices: int = 1
     micro_steps: int = 200_000
 
 
-def sizes(name: str, devices: int = 1) -> Size:
+def sizes(name: str) -> Size:
     """ "quick" or "full"."""
     chosen = (
         Case("FPU l=3", 0.001, 0.6),
@@ -58,8 +57,8 @@ def sizes(name: str, devices: int = 1) -> Size:
         Case("SAM", 0.0002, 0.7, "SAM t=1"),
     )
     if name == "quick":
-        return Size(chosen, (1, 32, 256), 5, 0.05, devices)
-    return Size(chosen, (1, 4, 16, 64, 256, 1024), 15, 0.2, devices)
+        return Size(chosen, (1, 32, 256), 5, 0.05)
+    return Size(chosen, (1, 4, 16, 64, 256, 1024), 15, 0.2)
 
 
 def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
@@ -67,7 +66,7 @@ def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
     return growing("batch", name, (_measure(case, size, tell) for case in size.cases), c_loops.missing())
 
 
-def _program(problem: vm.Problem, case: Case, batch: int, devices: int) -> Callable:
+def _program(problem: vm.Problem, case: Case, batch: int) -> Callable:
     states = starts(problem, batch)
 
     def run(num_steps: int) -> vm.Trajectory:
@@ -78,7 +77,6 @@ def _program(problem: vm.Problem, case: Case, batch: int, devices: int) -> Calla
             macro_dt=NUM_MICRO * case.micro_dt,
             num_steps=num_steps,
             save=num_steps,
-            devices=devices if batch % devices == 0 else 1,
         )
 
     return run
@@ -99,7 +97,7 @@ def _all_sizes(case: Case, size: Size, tell: Tell) -> tuple[list[dict], list[Cla
     runs, work, results = {}, {}, {}
     for batch in size.batches:
         tell(f"{case.system}, batch {batch}")
-        simulate = _program(problem, case, batch, min(size.devices, batch))
+        simulate = _program(problem, case, batch)
         steps = _steps(simulate, batch, size)
         key = f"default {batch}"
         runs[key], work[key] = partial(simulate, steps), batch * steps * NUM_MICRO

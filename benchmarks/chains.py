@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 import vmri_jax as vm
-from benchmarks.linear import slope
+from benchmarks.cost import slope
 from benchmarks.measure import Ratio, Tell, silent
 from benchmarks.report import Claim, Report, growing
 from vmri_jax.mechanics import constraint_pattern
@@ -30,7 +30,6 @@ JOINT_FROM = 10
 """The same in joint coordinates."""
 LEVEL = [[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]]
 """The rotation that lays the long axis of a bar along x."""
-"""Seconds in which this process runs: others may share its core."""
 
 
 @dataclass(frozen=True)

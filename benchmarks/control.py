@@ -1,6 +1,5 @@
 """Optimal control: a satellite with booms turned from rest to rest, error of the cost against time, and one turned by wheels."""
 
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache, partial
@@ -13,6 +12,7 @@ from benchmarks.measure import Ratio, Tell, silent
 from benchmarks.report import Claim, Report
 from vmri_jax import plots
 from vmri_jax.control import Optimum
+from vmri_jax.running.timing import stopwatch
 from vmri_jax.scene import (
     Bending,
     Body,
@@ -186,8 +186,8 @@ def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
 
 def timed(call: Callable[[], Optimum]) -> tuple[Optimum, float]:
     """What it finds, and the seconds that it takes."""
-    start = time.perf_counter()
-    return call(), time.perf_counter() - start
+    elapsed = stopwatch()
+    return call(), elapsed()
 
 
 def _draw(curves: dict[tuple[str, int], np.ndarray]):

@@ -9,12 +9,14 @@ import jax
 import numpy as np
 from matplotlib.figure import Figure
 
-from benchmarks import linear, programs
+import vmri_jax as vm
+from benchmarks import programs
 from benchmarks.gail2014.cost import CostStudy, Curve, cost_study, plot_cost
 from benchmarks.gail2014.reference import unstructured
 from benchmarks.measure import Ratio, quartiles, ratio, silent
 from benchmarks.programs import SCHEMES
 from benchmarks.report import Claim, Report, spread
+from vmri_jax.scene.ledger import temporary_bytes
 
 TIME = "µs/micro step"
 COLUMNS = ("case", "method", "num_micro", "unknowns", "micro_dt", TIME, "to cheapest", "iterations", "result")
@@ -26,6 +28,9 @@ MACRO_STEPS, DENSE_MACRO_STEPS = 20, 3
 have the same length. With fewer steps the call counts."""
 LEAST_COMPARED = 10
 """Fewest micro steps with which the default solve is held against the dense one."""
+
+MEMORY_FROM = 100
+"""Fewest micro steps whose memory counts: with fewer of them, memory that does not depend on num_micro counts as well."""
 
 
 @dataclass(frozen=True)
@@ -190,10 +195,38 @@ def run(size: Size, name: str, tell=silent) -> Iterator[Report]:
         yield report()
     for case in size.linear:
         study = case.measure(size.repeats, size.seconds, tell)
-        bytes_of, more_claims = linear.slopes(case, study)
+        bytes_of, more_claims = slopes(case, study)
         rows += [row | {"bytes": bytes_of.get(row["num_micro"])} for row in case.rows(study)]
         claims += more_claims
         yield report()
+
+
+def slope(x, y) -> float:
+    """Least-squares slope of log y against log x."""
+    return float(np.polyfit(np.log(x), np.log(y), 1)[0])
+
+
+def slopes(case: Case, study: CostStudy) -> tuple[dict[int, int], list[Claim]]:
+    """Temporary bytes of the macro steps of a case by num_micro, and slopes of time and bytes in logarithms."""
+    samples, problem = study.samples("auto"), programs.problem(case.system)
+    num_micro = np.array(list(samples))
+    us = np.array(list(samples.values())) * num_micro[:, None]
+    scheme = programs.SCHEMES[case.scheme]
+    size = {n: _bytes(problem, scheme(n), case.micro_dt) for n in samples if n >= MEMORY_FROM}
+    what = f"{case.label}: slope of log {{}} against log num_micro up to {num_micro.max():g}"
+    low, high = np.quantile([slope(num_micro, sample) for sample in us.T], (0.25, 0.75))
+    seen = Ratio(slope(num_micro, np.median(us, axis=1)), float(low), float(high))
+    claims = [Claim(what.format("time"), seen, 1.1, 0.9)]
+    if len(size) > 1:
+        memory = slope(list(size), list(size.values()))
+        claims.append(Claim(what.format("memory"), Ratio(memory, memory, memory), 1.1))
+    return size, claims
+
+
+def _bytes(problem: vm.Problem, scheme: vm.Scheme, micro_dt: float) -> int:
+    """Temporary memory of one compiled macro step."""
+    step = jax.jit(vm.macro_step).lower(problem.system, scheme, problem.state(), scheme.num_micro * micro_dt)
+    return temporary_bytes(step.compile())
 
 
 def _notes(size: Size, rows: list[dict]) -> list[str]:

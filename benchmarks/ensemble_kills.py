@@ -5,7 +5,6 @@ import os
 import shutil
 import signal
 import threading
-import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -17,19 +16,18 @@ import numpy as np
 
 import vmri_jax as vm
 from benchmarks.ensembles import moved
+from benchmarks.kills import EARLY, chunks_of, kill_at_random
 from benchmarks.measure import Tell, silent
 from benchmarks.report import Report
 from vmri_jax.ensembles import Draws, Ensemble
 from vmri_jax.executors.executor import local_workers
-from vmri_jax.running.store.layout import committed
 
 COLUMNS = ("ensemble", "kills", "chunks before a resume", "calls", "identical")
 LANES, CHUNK = 30_000, 500
 PER_ENSEMBLE = 10
 """Workers that are killed during one ensemble."""
-EARLY = 5
-"""Every so many processes are killed at any time after their start, the others after their first chunk."""
-PATIENCE = 120.0
+EARLIEST, LATEST = 6.0, 1.0
+"""Most seconds to a kill: from the start of a process, and from its next chunk."""
 
 
 @dataclass(frozen=True)
@@ -121,30 +119,14 @@ def kill_processes(count: int, random, folder: Path, expected: dict[str, bytes],
             child = context.Process(target=_child, args=(str(out),))
             child.start()
             if done + kills >= count:
-                child.join(PATIENCE)
-            elif calls % EARLY == EARLY - 1:
-                child.join(random.uniform(0.0, 6.0))
-            else:
-                _wait_for_chunk(child, out, chunks[-1] if chunks else 0)
-                child.join(random.uniform(0.0, 1.0))
-            if child.exitcode is None:
-                child.kill()
                 child.join()
+            elif kill_at_random(child, out, random, EARLIEST if calls % EARLY == EARLY - 1 else None, LATEST):
                 kills += 1
-                chunks.append(len(committed(out)) if out.exists() else 0)
+                chunks.append(chunks_of(out))
             calls, code = calls + 1, child.exitcode
             tell(f"{done + kills} of {count} processes killed")
         done += kills
         yield _row("process killed", kills, chunks, calls, contents(out) == expected)
-
-
-def _wait_for_chunk(child, out: Path, known: int) -> None:
-    """Until there are more chunks, or the process has ended."""
-    end = time.monotonic() + PATIENCE
-    while child.is_alive() and time.monotonic() < end:
-        if out.exists() and len(committed(out)) > known:
-            return
-        time.sleep(0.01)
 
 
 def _row(what: str, kills: int, chunks: list[int], calls: int, same: bool) -> dict:

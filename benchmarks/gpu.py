@@ -1,6 +1,5 @@
 """Batches on a GPU: lanes per second, beside `simulate_batch` on this machine's CPU and diffrax on the card, and how far both devices are apart."""
 
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
@@ -17,6 +16,7 @@ from benchmarks.measure import Ratio, Tell, silent
 from benchmarks.programs import problem
 from benchmarks.report import Claim, Report, growing
 from benchmarks.worker import starts
+from vmri_jax.running.timing import least_seconds
 
 COLUMNS = ("system", "program", "device", "lanes", "lanes/s", "error", "apart")
 T_END = 1.0
@@ -120,17 +120,6 @@ def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
     return growing("gpu", name, (_measure(system, size, tell) for system in systems_of(size.systems)), notes)
 
 
-def seconds(run: Callable[[], Any], repeats: int) -> float:
-    """The least time of a run that is compiled already."""
-    jax.block_until_ready(run())
-    best = np.inf
-    for _ in range(repeats):
-        start = time.perf_counter()
-        jax.block_until_ready(run())
-        best = min(best, time.perf_counter() - start)
-    return best
-
-
 def _measure(system: System, size: Size, tell: Tell) -> tuple[list[dict], list[Claim]]:
     accelerator, cpu = devices()
     with jax.default_device(cpu):
@@ -145,7 +134,8 @@ def _measure(system: System, size: Size, tell: Tell) -> tuple[list[dict], list[C
 
     def row(program: str, device: Any, lanes: int, run: Callable[[], Any], **more) -> None:
         tell(f"{system.name}, {program}, {device.device_kind}, {lanes} lanes")
-        rate = lanes / seconds(run, size.repeats)
+        jax.block_until_ready(run())  # compiled
+        rate = lanes / least_seconds([run], size.repeats)[0]
         rows.append(
             {"system": system.name, "program": program, "device": device.device_kind, "lanes": lanes, "lanes/s": rate}
             | more

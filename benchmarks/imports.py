@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -35,14 +35,8 @@ SPREAD, RATE = 0.2, 0.5
 """Standard deviations of coordinates and velocities at the start, rad, rad/s, m and m/s."""
 
 
-class Size(NamedTuple):
-    """The files to read, each with its package."""
-
-    files: tuple[tuple[str, Path], ...]
-
-
-def sizes(name: str, only: Sequence[str] = ()) -> Size:
-    """The files of the packages that are installed, or those `only` whose names begin like this.
+def sizes(name: str, only: Sequence[str] = ()) -> list[tuple[str, Path]]:
+    """Packages and files: of the packages that are installed, or those `only` whose names begin like this.
 
     Raises:
         FileNotFoundError: there are none.
@@ -55,8 +49,7 @@ def sizes(name: str, only: Sequence[str] = ()) -> Size:
     if not files:
         raise FileNotFoundError(f"neither {' nor '.join(FOLDERS)} is installed: {INSTALL}")
     beginnings = tuple(only) or (QUICK if name == "quick" else ("",))
-    files = [(package, file) for package, file in files if file.stem.startswith(beginnings)]
-    return Size(tuple(files))
+    return [(package, file) for package, file in files if file.stem.startswith(beginnings)]
 
 
 def _mujoco() -> Any:
@@ -85,18 +78,26 @@ def their_centres(model: Any, qpos: np.ndarray, qvel: np.ndarray) -> dict[str, n
     return of_centres(model, data.xipos)
 
 
-def their_accelerations(model: Any, qpos: np.ndarray, qvel: np.ndarray) -> dict[str, np.ndarray]:
-    """Accelerations of the centres of mass at the start by MuJoCo, by the names that a scene gives to its bodies."""
-    mujoco = _mujoco()
-    data, accelerations = mujoco.MjData(model), np.zeros((model.nbody, 3))
-    data.qpos[:], data.qvel[:] = qpos, qvel
+def their_accelerations(model: Any, data: Any) -> dict[str, np.ndarray]:
+    """Accelerations of the centres of mass by MuJoCo at the state of its data, by the names that a scene gives to its bodies."""
+    mujoco, accelerations = _mujoco(), np.zeros((model.nbody, 3))
+    has_gravity = not model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_GRAVITY)
     mujoco.mj_forward(model, data)
     mujoco.mj_rnePostConstraint(model, data)
     for body in range(1, model.nbody):
         felt = np.zeros(6)  # rotation, translation; a body at rest feels -g
         mujoco.mj_objectAcceleration(model, data, mujoco.mjtObj.mjOBJ_BODY, body, felt, 0)
-        accelerations[body] = felt[3:] + model.opt.gravity
+        accelerations[body] = felt[3:] + has_gravity * model.opt.gravity
     return of_centres(model, accelerations)
+
+
+def apart(scene: Any, model: Any, data: Any) -> tuple[float, float]:
+    """Largest difference of the accelerations of a scene and of MuJoCo, and their size, the largest of MuJoCo."""
+    from vmri_jax.scene.body_motions import accelerations, state_of  # only now: scenes start JAX
+
+    ours, theirs = accelerations(scene, state_of(scene)), their_accelerations(model, data)
+    differences = (float(np.abs(ours[name][2][:3] - a).max()) for name, a in theirs.items())
+    return max(differences), max(float(np.abs(a).max()) for a in theirs.values())
 
 
 def of_centres(model: Any, values: np.ndarray) -> dict[str, np.ndarray]:
@@ -126,8 +127,7 @@ def moved(model: Any, data: Any, qpos: np.ndarray, qvel: np.ndarray) -> bool:
 
 def compare(file: Path) -> dict[str, Any]:
     """The row of one file."""
-    from vmri_jax.scene import Scene
-    from vmri_jax.scene.body_motions import accelerations, state_of  # only now: scenes start JAX
+    from vmri_jax.scene import Scene  # only now: scenes start JAX
 
     mujoco = _mujoco()
     model = mujoco.MjModel.from_xml_path(str(file))
@@ -139,10 +139,10 @@ def compare(file: Path) -> dict[str, Any]:
     begin = time.process_time()
     scene = Scene.from_mujoco(model, qpos=qpos, qvel=qvel, ignore=IGNORED)
     row: dict[str, Any] = {"scene": time.process_time() - begin, "coordinates": sum(x.size for x in scene.start[:2])}
-    ours, theirs = accelerations(scene, state_of(scene)), their_accelerations(model, qpos, qvel)
-    size = max(float(np.abs(a).max()) for a in theirs.values())
-    apart = max(float(np.abs(ours[name][2][:3] - a).max()) for name, a in theirs.items())
-    row |= {"bodies": len(theirs), "acceleration": apart / size}
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:] = qpos, qvel
+    difference, size = apart(scene, model, data)
+    row |= {"bodies": len(scene.bodies), "acceleration": difference / size}
     begin = time.process_time()
     scheme, steps = vm.compose(vm.fully_implicit(1), "suzuki4"), round(T_END / STEP)
     run = vm.simulate(scene, scheme, macro_dt=STEP, num_steps=steps, save=steps)
@@ -152,10 +152,10 @@ def compare(file: Path) -> dict[str, Any]:
     return row
 
 
-def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
+def run(files: list[tuple[str, Path]], name: str, tell: Tell = silent) -> Iterator[Report]:
     """All files, a report after each."""
     rows: list[dict] = []
-    for package, file in size.files:
+    for package, file in files:
         tell(file.stem)
         rows.append({"file": f"{package}/{file.name}"} | compare(file))
         errors = [row["error"] for row in rows if "error" in row]

@@ -13,9 +13,8 @@ import jax.numpy as jnp
 import vmri_jax as vm
 from benchmarks.chains import Coordinates
 from benchmarks.measure import Ratio, Tell, silent
-from benchmarks.programs import problem
+from benchmarks.programs import gallery_scene, problem
 from benchmarks.report import Claim, Report, growing
-from benchmarks.scenes import gallery_scene
 
 COLUMNS = ("program", "instructions", "to compile, s")
 STEPS = 100

@@ -68,17 +68,10 @@ def kill_often(size: Size, folder: Path, tell: Tell = silent) -> tuple[list[dict
     rows, runs = [], []
     while len(rows) < size.count:
         tell(f"kill {len(rows) + 1}")
-        before = _chunks(path)
+        before = chunks_of(path)
         child, begin = start(path), time.perf_counter()
-        if len(rows) % EARLY == 0:
-            child.join(random.uniform(0, to_first_chunk))
-        else:
-            _wait_for_chunk(child, path, before)
-            child.join(random.uniform(0, whole / 3))
-        if child.exitcode is None:
-            child.kill()
-            child.join(PATIENCE)
-            after = _chunks(path)
+        if kill_at_random(child, path, random, None if len(rows) % EARLY else to_first_chunk, whole / 3):
+            after = chunks_of(path)
             same = "yes" if after == 0 or _identical(vm.StoredTrajectory(path).load(), expected) else "no"
             row = {"kill": len(rows) + 1, "after, s": time.perf_counter() - begin, "chunks": after}
             rows.append(row | {"new": after - before, "moment": _moment(path, after), "identical": same})
@@ -96,7 +89,7 @@ def _timed(start, path: Path) -> tuple[float, float]:
     shutil.rmtree(path, ignore_errors=True)
     begin = time.perf_counter()
     child = start(path)
-    _wait_for_chunk(child, path, 0)
+    wait_for_chunk(child, path, 0)
     to_first_chunk = time.perf_counter() - begin
     child.join(PATIENCE)
     if child.exitcode != 0:
@@ -113,9 +106,39 @@ def _child(out: str, cache: str) -> None:
     vm.stream(problem.system, scheme, problem.state(), out=out, resume=True, **arguments)
 
 
-def _chunks(path: Path) -> int:
+def chunks_of(path: Path) -> int:
     """Committed chunks."""
     return len(committed(path)) if path.exists() else 0
+
+
+def wait_for_chunk(child, path: Path, known: int) -> None:
+    """Until there are more chunks, or the process has ended."""
+    deadline = time.monotonic() + PATIENCE
+    while child.is_alive() and time.monotonic() < deadline and chunks_of(path) <= known:
+        time.sleep(0.002)
+
+
+def kill_at_random(child, path: Path, random, early: float | None, late: float) -> bool:
+    """Kill a process that has just been started, if it is still running then.
+
+    Args:
+        child: the process.
+        path: the store that it writes.
+        random: generator of the moment.
+        early: most seconds from its start to the kill; None to wait for its next chunk.
+        late: most seconds from its next chunk to the kill.
+
+    Returns:
+        Whether it was killed.
+    """
+    if early is None:
+        wait_for_chunk(child, path, chunks_of(path))
+    child.join(random.uniform(0.0, late if early is None else early))
+    if child.exitcode is None:
+        child.kill()
+        child.join(PATIENCE)
+        return True
+    return False
 
 
 def _moment(path: Path, chunks: int) -> str:
@@ -124,13 +147,6 @@ def _moment(path: Path, chunks: int) -> str:
         return "before there was a store"
     torn = any(path.rglob("*.partial")) or any(path.glob(f"*/c.{chunks}*"))
     return "while writing" if torn else "starting or computing"
-
-
-def _wait_for_chunk(child, path: Path, known: int) -> None:
-    """Until there are more chunks, or the run has ended."""
-    deadline = time.monotonic() + PATIENCE
-    while child.is_alive() and time.monotonic() < deadline and _chunks(path) <= known:
-        time.sleep(0.002)
 
 
 def _complete(child, path: Path, expected: vm.Trajectory) -> bool:

@@ -38,11 +38,6 @@ class Ratio:
     def __str__(self) -> str:
         return f"{self.value:.3g} ({self.low:.3g} to {self.high:.3g})"
 
-    @property
-    def inverse(self) -> "Ratio":
-        """The ratio of the second time to the first."""
-        return Ratio(1 / self.value, 1 / self.high, 1 / self.low)
-
 
 def ratio(above: Sequence[float], below: Sequence[float]) -> Ratio:
     """`above` over `below`, two lists of samples from one `interleaved`.
@@ -107,7 +102,7 @@ def pin(core: int | None) -> int | None:
     return core
 
 
-def prepare(core: int | None = -1, cache: bool = True, devices: int = 1) -> None:
+def prepare(core: int | None = -1, cache: bool = True) -> None:
     """Before JAX starts: keep to one core, set the compiler's flags and its cache, switch 64-bit floats on."""
     pin(core)
-    configure(devices=devices if devices > 1 else None, cache=cache_folder() if cache else None)
+    configure(cache=cache_folder() if cache else None)

@@ -8,12 +8,15 @@ import numpy as np
 
 import vmri_jax as vm
 from benchmarks.worker import Case
+from vmri_jax.catalogue import imported
+from vmri_jax.scene import Scene
 
 SCHEMES: dict[str, Callable[[int], vm.Scheme]] = {
     "fully implicit": vm.fully_implicit,
     "explicit slow": vm.explicit_slow,
     "fully explicit": vm.fully_explicit,
 }
+GALLERY = Path(__file__).parents[1] / "notebooks" / "scenes"
 TRUTH = Path(__file__).parent.parent / "tests" / "data" / "ground_truth"
 FILES = {"FPU l=3": "fpu3", "FPU l=200": "fpu200", "TSP": "tsp", "SAM": "sam"}
 
@@ -21,6 +24,11 @@ FILES = {"FPU l=3": "fpu3", "FPU l=200": "fpu200", "TSP": "tsp", "SAM": "sam"}
 def problem(name: str) -> vm.Problem:
     """``"TSP"``, ``"SAM"``, or the chain with a number of springs, ``"FPU l=50"``."""
     return Case("", name).problem()
+
+
+def gallery_scene(name: str) -> Scene:
+    """The scene in a file of the gallery."""
+    return imported(f"{GALLERY / name}.py:scene")
 
 
 def ground_truth(system: str, t_end: str) -> Path:
@@ -45,8 +53,3 @@ def program(problem: vm.Problem, scheme: vm.Scheme | vm.Composition, macro_dt, s
     start = problem.state()
     prepared = vm.prepare(problem.system, scheme, start, macro_dt=macro_dt, num_steps=1, solver=solver)
     return lambda num_steps, **other: prepared(num_steps=num_steps, **other, throw=False)
-
-
-def failed(trajectory: vm.Trajectory) -> bool:
-    """Whether any step, or any trajectory of a batch, failed."""
-    return bool(np.any(np.asarray(trajectory.failed_at) >= 0))

@@ -7,11 +7,11 @@ motion away from their defaults, and with flags and refused features drawn at ra
 from collections import Counter
 from collections.abc import Iterator
 from importlib import import_module
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from benchmarks.imports import of_centres
+from benchmarks.imports import apart
 from benchmarks.measure import Tell, silent
 from benchmarks.report import Report
 
@@ -51,15 +51,9 @@ FLAGS = ("spring", "damper", "gravity", "actuation", "limit", "frictionloss", "c
 """Features that a flag may switch off."""
 
 
-class Size(NamedTuple):
-    """Seeds of the models."""
-
-    seeds: range
-
-
-def sizes(name: str) -> Size:
-    """ "quick" or "full"."""
-    return Size(range(300 if name == "full" else 12))
+def sizes(name: str) -> range:
+    """ "quick" or "full": seeds of the models."""
+    return range(300 if name == "full" else 12)
 
 
 def xml(seed: int) -> str:
@@ -158,8 +152,7 @@ def model_of(seed: int) -> tuple[Any, Any]:
 
 def compare(seed: int) -> dict[str, Any]:
     """The row of one model: the difference of accelerations relative to the largest one, or the features that are refused."""
-    from vmri_jax.scene import Scene
-    from vmri_jax.scene.body_motions import accelerations, state_of  # only now: scenes start JAX
+    from vmri_jax.scene import Scene  # only now: scenes start JAX
     from vmri_jax.scene.mujoco_model import Compiled
 
     mujoco: Any = import_module("mujoco")
@@ -173,18 +166,8 @@ def compare(seed: int) -> dict[str, Any]:
         if not refused or any(kind not in str(error) for kind in refused):
             raise
         return row | {"refused": ", ".join(refused)}
-    mujoco.mj_forward(model, data)
-    mujoco.mj_rnePostConstraint(model, data)
-    theirs = np.zeros((model.nbody, 3))
-    gravity = np.zeros(3) if model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_GRAVITY) else model.opt.gravity
-    for number in range(1, model.nbody):
-        felt = np.zeros(6)  # rotation, translation; a body at rest feels -g
-        mujoco.mj_objectAcceleration(model, data, mujoco.mjtObj.mjOBJ_BODY, number, felt, 0)
-        theirs[number] = felt[3:] + gravity
-    expected, ours = of_centres(model, theirs), accelerations(scene, state_of(scene))
-    size = max([1.0, *(float(np.abs(a).max()) for a in expected.values())])
-    apart = max(float(np.abs(ours[name][2][:3] - a).max()) for name, a in expected.items())
-    return row | {"difference": apart / size}
+    difference, size = apart(scene, model, data)
+    return row | {"difference": difference / max(1.0, size)}
 
 
 def keyframe(mujoco: Any, seed: int, data: Any) -> Any:
@@ -195,10 +178,10 @@ def keyframe(mujoco: Any, seed: int, data: Any) -> Any:
     return mujoco.MjModel.from_xml_string(xml(seed).replace("</mujoco>", keys))
 
 
-def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
+def run(seeds: range, name: str, tell: Tell = silent) -> Iterator[Report]:
     """All models, one report."""
     rows = []
-    for seed in size.seeds:
+    for seed in seeds:
         tell(f"model {seed}")
         rows.append(compare(seed))
     read = [row["difference"] for row in rows if "difference" in row]

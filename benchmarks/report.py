@@ -118,6 +118,12 @@ def growing(name: str, size: str, parts: Iterable[tuple[list[dict], list[Claim]]
         yield Report(name, size, rows, claims, list(notes))
 
 
+def note(notes: list[str], text: str) -> None:
+    """Add a note, once."""
+    if text not in notes:
+        notes.append(text)
+
+
 @contextmanager
 def progress(title: str) -> Iterator[Tell]:
     """Show what is being measured; yields the function that is told each part before it starts.

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 import vmri_jax as vm
-from benchmarks import errors
+from benchmarks import programs
 from benchmarks.dear.systems import molecules
 from benchmarks.measure import Tell, ratio, silent
 from benchmarks.report import Claim, Report
@@ -33,7 +33,7 @@ COLUMNS = (
     "seconds",
     "of search",
 )
-NODES = errors.NODES
+NODES = 10
 """Saved intervals, at whose ends errors are compared."""
 ERRORS = (1e-3, 1e-6)
 REPEATS = 5
@@ -63,18 +63,15 @@ def sizes(name: str, only: Sequence[str] = ()) -> list[Case]:
         only: systems; none for all.
     """
 
-    def of(system: str) -> Callable[[], Any]:
-        return errors.Case(system, 1.0).problem
-
     systems = {
-        "FPU l=3": (of("FPU l=3"), 2.0),
+        "FPU l=3": (partial(programs.problem, "FPU l=3"), 2.0),
         "2 molecules": (partial(molecules, 2), 0.3),
-        "FPU l=10": (of("FPU l=10"), 1.0),
-        "TSP": (of("TSP"), 1.0),
-        "SAM": (of("SAM"), 1.0),
-        "molecule": (of("molecule"), 1.0),
-        "upright_pendulum": (of("upright_pendulum"), 1.0),
-        "three_scales": (of("three_scales"), 1.0),
+        "FPU l=10": (partial(programs.problem, "FPU l=10"), 1.0),
+        "TSP": (partial(programs.problem, "TSP"), 1.0),
+        "SAM": (partial(programs.problem, "SAM"), 1.0),
+        "molecule": (partial(programs.gallery_scene, "molecule"), 1.0),
+        "upright_pendulum": (partial(programs.gallery_scene, "upright_pendulum"), 1.0),
+        "three_scales": (partial(programs.gallery_scene, "three_scales"), 1.0),
     }
     few = ("fully explicit", "fully explicit, suzuki4", "fully explicit, kahan-li6", "galerkin 4")
     menu = few if name == "quick" else None

@@ -5,7 +5,6 @@ Questions and answers are lines of JSON on standard input and output; `benchmark
 """
 
 import argparse
-import ast
 import importlib
 import json
 import os
@@ -13,8 +12,6 @@ import runpy
 import sys
 import time
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
 if __name__ == "__main__":
     sys.path[0] = os.getcwd()
@@ -32,8 +29,6 @@ SPREAD = 0.01
 """Of the velocities in a batch."""
 COMPARED = 8
 """Macro steps after which two sides are compared: round-off has not grown by then."""
-COMPILED = "/jax/core/compile/backend_compile_duration"
-"""JAX's own name of that event."""
 CALLS = 20
 """Calls in a row whose mean is one sample of a short call."""
 
@@ -48,7 +43,7 @@ class Case:
         ``"kahan-li8 of fully_explicit 2"``.
     num_steps: macro steps; 0 to find how many take `seconds`.
     lanes: of a batch.
-    method: of `vmri_jax.Newton`.
+    method: matrix of `vmri_jax.Solver`.
     """
 
     kind: str
@@ -81,39 +76,29 @@ class Timed:
     num_steps: int
     end: np.ndarray
     result: str = ""
-    found: dict | None = None
 
     def sample(self) -> float:
         """Seconds."""
         raise NotImplementedError
 
-    def keep(self, short, whole, node: int = -1) -> None:
-        """A node of the first run, by default its end, and the worst status of the second."""
+    def keep(self, short, whole) -> None:
+        """The end of the first run, and the worst status of the second."""
         nodes = short.states  # vectors, also where a run has dictionaries
         q = np.concatenate([np.asarray(nodes.q_s), np.asarray(nodes.q_f)], axis=-1)
-        self.end = q[..., node, :]
+        self.end = q[..., -1, :]
         self.result = vm.Result(int(np.max(np.asarray(whole.result)))).name
 
 
 def last_node(macro_dt: float, num_steps: int) -> dict:
     """Arguments of a run that saves its last node only."""
-    save = "save" if hasattr(vm, "Save") else "save_every"  # of a checkout from before December 2026
-    return {"macro_dt": macro_dt, "num_steps": num_steps, save: num_steps}
-
-
-def solver_of(matrix: str):
-    """The solver with this matrix; None, the default, for "auto"."""
-    if matrix == "auto" or hasattr(vm, "Solver"):
-        return None if matrix == "auto" else vm.Solver(matrix)
-    checkout: Any = vm  # one from before November 2026, where "exact" had another name
-    return checkout.solvers.named({"exact": "arrowhead"}[matrix])()
+    return {"macro_dt": macro_dt, "num_steps": num_steps, "save": num_steps}
 
 
 def simulator(case: Case):
     """``simulate(num_steps)`` by `vm.simulate`."""
     problem, scheme = case.problem(), case.made_scheme()
     state = problem.state()
-    solver = solver_of(case.method)
+    solver = vm.Solver(case.method)
 
     def simulate(num_steps: int) -> vm.Trajectory:
         try:
@@ -188,39 +173,6 @@ class First(Timed):
         self.keep(run, run)
 
 
-class Compile(Timed):
-    """Seconds of start, first call and later call; compilations over other steps, parameters and starts."""
-
-    def __init__(self, case: Case):
-        problem, scheme = case.problem(), case.made_scheme()
-        started, state = _seconds(problem.state), problem.state()
-
-        def call(macro_dt=case.macro_dt, num_steps=case.num_steps, of=problem.system, state=state):
-            return vm.simulate(of, scheme, state, **last_node(macro_dt, num_steps))
-
-        first, later = _seconds(call), _seconds(call)
-        moved = vm.State(state.t + 1.0, state.q_s, state.q_f, 1.01 * state.p_s, 1.01 * state.p_f)
-        other = problem.system.replace(params=_other_params(problem.system))
-        compiled = []
-        jax.monitoring.register_event_duration_secs_listener(
-            lambda event, duration_secs, **_: compiled.append(event) if event == COMPILED else None
-        )
-        call(num_steps=case.num_steps + 1)
-        call(macro_dt=1.1 * case.macro_dt)
-        call(of=other)
-        run = call(state=moved)
-        self.keep(run, run)
-        self.num_steps = case.num_steps
-        self.found = {"start": started, "first": first, "later": later, "compilations": 1 + len(compiled)}
-
-
-def _other_params(system) -> dict:
-    """Under constraints only another gravity, since a start depends on the lengths."""
-    if system.constraint is None:
-        return {key: 1.01 * value for key, value in system.params.items()}
-    return system.params | {"gravity": system.params["gravity"] + 1}
-
-
 class Gradient(Timed):
     """Reverse-mode derivative of the squared fast positions at the end with respect to the momenta of the start."""
 
@@ -242,33 +194,13 @@ class Gradient(Timed):
         return _seconds(self.gradient, self.at)
 
 
-class Readme(Timed):
-    """The first program of README.md: its line with `vm.simulate` again."""
-
-    def __init__(self, case: Case):
-        text = Path("README.md").read_text(encoding="utf-8").split("```python\n")[1].split("```")[0]
-        lines = ast.parse(text).body
-        (last,) = (i for i, line in enumerate(lines) if "vm.simulate(" in ast.unparse(line))
-        self.names: dict[str, Any] = {}
-        exec(compile(ast.Module(lines[: last + 1], []), "README.md", "exec"), self.names)
-        self.line = compile(ast.Module(lines[last : last + 1], []), "README.md", "exec")
-        self.keep(self.names["run"], self.names["run"], node=COMPARED)
-        self.num_steps = len(self.names["run"].t) - 1
-
-    def sample(self) -> float:
-        """Of one call."""
-        return _seconds(exec, self.line, self.names)
-
-
 KINDS = {
     "single": Single,
     "call": Call,
     "prepared": Prepared,
     "batch": Batch,
     "first": First,
-    "compile": Compile,
     "gradient": Gradient,
-    "readme": Readme,
 }
 
 
@@ -311,12 +243,10 @@ def use_plain(name: str) -> None:
 def main() -> None:
     """Answer until there are no more questions."""
     parser = argparse.ArgumentParser()
-    parser.add_argument("--as-imported", action="store_true", help="leave the settings of JAX alone")
     parser.add_argument("--plain", action="append", default=[], help="a function of the kernels in its plain form")
     options = parser.parse_args()
     answers, sys.stdout = sys.stdout, sys.stderr
-    if not options.as_imported:
-        (vm if hasattr(vm, "configure") else vm.runtime).configure(cache=None)  # pyright: ignore[reportAttributeAccessIssue]
+    vm.configure(cache=None)
     for name in options.plain:
         use_plain(name)
     timed = Timed()
@@ -328,7 +258,7 @@ def main() -> None:
                 jax.clear_caches()
                 timed = KINDS[question["case"]["kind"]](Case(**question["case"]))
                 end = np.ravel(timed.end).tolist()
-                answer: dict = {"num_steps": timed.num_steps, "end": end, "result": timed.result, "found": timed.found}
+                answer: dict = {"num_steps": timed.num_steps, "end": end, "result": timed.result}
                 answer["processor"] = time.process_time()
             else:
                 answer = {"seconds": timed.sample()}

@@ -10,13 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 
 import vmri_jax as vm
-from benchmarks.dear.figures import draw_errors, draw_gains
+from benchmarks.dear.figures import draw_errors, ratio_at, time_to
 from benchmarks.dear.peers import FIXED_STEPS, PEERS, chosen
 from benchmarks.dear.spacecraft import spacecraft
 from benchmarks.dear.systems import MIDDLE, molecules, teacher
 from benchmarks.measure import Ratio, Tell, silent
 from benchmarks.report import Claim, Report
-from benchmarks.savings import ratio_at
 from vmri_jax import plots
 from vmri_jax.running.simulation import Simulation
 from vmri_jax.running.timing import interleaved, seconds_each, stopwatch
@@ -144,7 +143,6 @@ def run(cases: list[Case], name: str, tell: Tell = silent) -> Iterator[Report]:
         figures = {}
         for suffix, theme in (("", plots.LIGHT), ("_dark", plots.DARK)):
             figures[f"dear{suffix}"] = partial(draw_errors, dict(curves), list(gains), TARGET, theme)
-            figures[f"dear_gain{suffix}"] = partial(draw_gains, list(gains), theme)
         about = {"gains": [vars(gain) for gain in gains]}
         yield Report("dear", name, list(rows), list(claims), list(notes), figures, about)
 
@@ -275,9 +273,3 @@ def _prices(problem: vm.Problem) -> tuple[float, float]:
         jax.grad(lambda q, name=name: problem.system.all_potentials(jnp.zeros(0), q)[name]) for name in ("slow", "fast")
     )
     return seconds_each(slow, q, 100), seconds_each(fast, q, 1000)
-
-
-def time_to(error: float, steps: np.ndarray, errors: np.ndarray, ms: np.ndarray) -> float:
-    """Milliseconds at an error, between those measured; infinite outside of them."""
-    between = ratio_at((errors, ms), error, 1.0)
-    return np.inf if between is None else between

@@ -7,7 +7,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import EngFormatter
 
-from benchmarks.savings import ratio_at
 from vmri_jax import plots
 from vmri_jax.plots.theme import legend_below, log_ticks
 
@@ -18,15 +17,27 @@ GAIN_TITLE = "gain of micro steps; lines: the bound"
 COMPOSED = ("suzuki4", "kahan-li6")
 
 
+def ratio_at(single: tuple[np.ndarray, np.ndarray], error: float, ms: float) -> float | None:
+    """Time of single steps at this error, between those measured, over `ms`; None outside of them."""
+    if not len(single[0]):
+        return None
+    errors, times = (np.log(part[np.argsort(single[0])]) for part in single)
+    if not errors[0] <= np.log(error) <= errors[-1]:
+        return None
+    return float(np.exp(np.interp(np.log(error), errors, times)) / ms)
+
+
+def time_to(error: float, steps: np.ndarray, errors: np.ndarray, ms: np.ndarray) -> float:
+    """Milliseconds at an error, between those measured; infinite outside of them."""
+    between = ratio_at((errors, ms), error, 1.0)
+    return np.inf if between is None else between
+
+
 def families(curves: Mapping[str, Any], target: float) -> dict[str, tuple[str, Any]]:
     """The curves that are drawn, by family: single steps, and of all others the one that reaches the target first."""
 
     def best(names: Sequence[str]) -> str | None:
-        def milliseconds(name: str) -> float:
-            at_target = ratio_at(curves[name][1:], target, 1.0)
-            return np.inf if at_target is None else at_target
-
-        return min(names, key=milliseconds, default=None)
+        return min(names, key=lambda name: time_to(target, *curves[name]), default=None)
 
     groups = {
         "single steps": [name for name in curves if name == "kicks, N = 1"],
@@ -36,7 +47,6 @@ def families(curves: Mapping[str, Any], target: float) -> dict[str, tuple[str, A
         "three rates": [name for name in curves if name.startswith("three rates")],
         "one interval of degree 6": [name for name in curves if name.startswith("one interval")],
         "diffrax": [name for name in curves if name.startswith("diffrax")],
-        "heyoka": [name for name in curves if name.startswith("heyoka")],
         "OpenMM": [name for name in curves if name.startswith("OpenMM")],
         "C loop": [name for name in curves if name.startswith("C loop")],
     }
@@ -48,7 +58,7 @@ def families(curves: Mapping[str, Any], target: float) -> dict[str, tuple[str, A
 
 def _look(family: str, theme: plots.Theme) -> dict[str, Any]:
     """Micro steps in full colour, single steps of the same order beside them, other programs dashed."""
-    blue, orange, green, purple, gold, pale = theme.curves
+    blue, orange, green, purple, gold, _ = theme.curves
     looks = {
         "single steps": (orange, "-", "s", 1.8),
         "micro steps": (blue, "-", "o", 2.6),
@@ -57,7 +67,6 @@ def _look(family: str, theme: plots.Theme) -> dict[str, Any]:
         "three rates": (green, "-", "^", 2.0),
         "one interval of degree 6": (purple, "-", "P", 1.4),
         "diffrax": (gold, "--", "s", 1.4),
-        "heyoka": (pale, "--", "o", 1.4),
         "OpenMM": (theme.rod, "--", "D", 1.4),
         "C loop": (theme.ink, "--", "^", 1.4),
     }
@@ -89,18 +98,6 @@ def draw_errors(curves: Mapping[str, Mapping[str, Any]], gains: Sequence[Any], t
             axes.xaxis.set_major_formatter(EngFormatter("s"))
         _gain_panel(panels[-1], gains, theme)
         legend_below(figure)
-    return figure
-
-
-def draw_gains(gains: Sequence[Any], theme: plots.Theme):
-    """The gain of micro steps against the price of the slow force, beside its bound.
-
-    Args:
-        gains: of all systems.
-        theme: colours.
-    """
-    with plots.new_figure(5.6, 4.0, TITLE, theme) as figure:
-        _gain_panel(figure.subplots(), gains, theme)
     return figure
 
 

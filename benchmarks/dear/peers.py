@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterator
 from importlib.util import find_spec
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -11,73 +10,29 @@ import numpy as np
 import vmri_jax as vm
 from benchmarks import c_loops
 from benchmarks.dear.systems import BOND, STIFFNESS, bonds
-from vmri_jax.mechanics.invariants import potential_energy
-from vmri_jax.mechanics.masses import ConstantMass
+from benchmarks.peers import autodiff
+from benchmarks.peers.cases import Case
 
 Runs = Iterator[tuple[int, Callable[[], np.ndarray]]]
 """Number of macro steps, or -log2 of the tolerance, and a function that gives the positions at the end."""
 FIRST_STEPS, MOST_STEPS = 16, 2**20
 """Macro steps of the first and the longest run of programs with fixed steps."""
-HEYOKA_POWERS = (9, 50)
-"""Tolerances 2^-9 to 2^-49: each is compiled anew, half a minute for 16 atoms."""
-HEYOKA_ATOMS = 32
-"""Atoms up to which heyoka compiles all pairs of them; its expressions of 128 atoms have 8064 pairs and take minutes to compile."""
 LARGEST_POWER = 43
 """Bound of the powers: tolerances stay above ``2^-43``, about 1e-13. Below, round-off of float64 lets errors fall no further."""
 STRIDE = 3
 """Step from one power to the next, so that each tolerance is an eighth of the one before; a larger step leaves a coarser staircase."""
-MAX_STEPS = 200_000
-"""Steps after which diffrax gives up; a larger number lengthens only runs that are too slow to be compared."""
-
-
-def can_run_dopri8(problem: vm.Problem) -> bool:
-    """Whether diffrax is installed and the system has constant masses, no constraints, and no forces besides potentials."""
-    system = problem.system
-    plain = isinstance(system.kinetic, ConstantMass) and system.force is None
-    return plain and not any(system.num_constraints(problem.q_s, problem.q_f)) and find_spec("diffrax") is not None
-
-
-def dopri8_runs(problem: vm.Problem, t_end: float) -> Iterator[tuple[int, Callable[[], np.ndarray]]]:
-    """Runs of Dopri8 with smaller and smaller tolerances ``2^-power``: the power, and a function that gives q at the end, slow first."""
-    import diffrax  # pyright: ignore[reportMissingImports]
-
-    system, n_s = problem.system, problem.q_s.size
-    mass: Any = system.kinetic
-    start = tuple(
-        jnp.concatenate([jnp.asarray(a), jnp.asarray(b)])
-        for a, b in ((problem.q_s, problem.q_f), (problem.v_s, problem.v_f))
-    )
-    gradient = jax.grad(lambda q: potential_energy(system, q[:n_s], q[n_s:]))
-
-    def acceleration(q):
-        force = -gradient(q)
-        return jnp.concatenate(mass.velocity(force[:n_s], force[n_s:]))
-
-    term: Any = diffrax.ODETerm(lambda t, y, args: (y[1], acceleration(y[0])))
-
-    @jax.jit
-    def solve(tolerance):
-        controller = diffrax.PIDController(rtol=tolerance, atol=tolerance)
-        solution = diffrax.diffeqsolve(
-            term,
-            diffrax.Dopri8(),
-            0.0,
-            t_end,
-            None,
-            start,
-            stepsize_controller=controller,
-            max_steps=MAX_STEPS,
-            throw=False,
-        )
-        return solution.ys[0][-1]  # pyright: ignore[reportOptionalSubscript]
-
-    for power in range(7, LARGEST_POWER, STRIDE):
-        yield power, lambda tolerance=2.0**-power: np.asarray(solve(tolerance))
 
 
 def diffrax(problem: vm.Problem, t_end: float, num_micro: int) -> Runs:
-    """Dopri8 with adaptive steps."""
-    return dopri8_runs(problem, t_end)
+    """Dopri8 with adaptive steps and tolerances ``2^-power``, equations by automatic differentiation of the same potentials."""
+    import diffrax  # pyright: ignore[reportMissingImports]
+
+    from benchmarks.peers.diffrax import solution
+
+    case = Case("", "", problem, t_end, problem.q_f)
+    solve, start = jax.jit(solution(case, diffrax.Dopri8(), autodiff)), (jnp.asarray(case.q), jnp.asarray(case.v))
+    for power in range(7, LARGEST_POWER, STRIDE):
+        yield power, lambda tolerance=2.0**-power: np.asarray(solve(start, tolerance))
 
 
 def openmm(problem: vm.Problem, t_end: float, num_micro: int) -> Runs:
@@ -110,40 +65,6 @@ def openmm(problem: vm.Problem, t_end: float, num_micro: int) -> Runs:
     return _doubled(run)
 
 
-def heyoka(problem: vm.Problem, t_end: float, num_micro: int) -> Runs:
-    """Taylor's method of adaptive step and order, compiled for the equations of the molecules."""
-    import heyoka as hy  # pyright: ignore[reportMissingImports]
-
-    n = problem.q_f.size
-    q, v = ([hy.expression(f"{name}{i}") for i in range(n)] for name in "qv")
-    pulls: list[list] = [[] for _ in range(n)]
-    for i in range(0, n, 3):
-        for j in range(i + 3, n, 3):
-            d = [q[j + a] - q[i + a] for a in range(3)]
-            square = hy.sum([x * x for x in d])
-            if i % 6 == 0 and j == i + 3:  # a bond
-                factor = STIFFNESS * (1.0 - BOND / hy.sqrt(square))
-            else:
-                cube = square**-3.0
-                factor = -24.0 * cube * (2.0 * cube - 1.0) / square
-            for a in range(3):
-                pulls[i + a].append(factor * d[a])
-                pulls[j + a].append(-factor * d[a])
-    system = list(zip([*q, *v], [*v, *map(hy.sum, pulls)], strict=True))
-    start = np.concatenate([problem.q_f, problem.v_f])
-
-    for power in range(HEYOKA_POWERS[0], HEYOKA_POWERS[1], 8):
-        taylor = hy.taylor_adaptive(system, start, tol=2.0**-power, compact_mode=True)
-
-        def run(taylor=taylor) -> np.ndarray:
-            taylor.time = 0.0
-            taylor.state[:] = start
-            taylor.propagate_until(t_end)
-            return taylor.state[:n].copy()
-
-        yield power, run
-
-
 def c_loop(problem: vm.Problem, t_end: float, num_micro: int) -> Runs:
     """The impulse method by hand."""
 
@@ -160,7 +81,7 @@ def _doubled(run: Callable[[int], np.ndarray]) -> Runs:
         num_steps *= 2
 
 
-PEERS = {"diffrax Dopri8": diffrax, "OpenMM": openmm, "heyoka": heyoka, "C loop": c_loop}
+PEERS = {"diffrax Dopri8": diffrax, "OpenMM": openmm, "C loop": c_loop}
 FIXED_STEPS = ("OpenMM", "C loop")
 """Peers with macro steps, of as many micro steps as our kicks need least time with."""
 
@@ -169,13 +90,10 @@ def chosen(problem: vm.Problem) -> tuple[list[str], list[str]]:
     """Peers that can run a problem here, and notes on the others."""
     are_molecules = getattr(problem.system.fast_potential, "function", None) is bonds
     ready = {
-        "diffrax Dopri8": can_run_dopri8(problem),
+        "diffrax Dopri8": find_spec("diffrax") is not None,
         "OpenMM": find_spec("openmm") is not None,
-        "heyoka": find_spec("heyoka") is not None,
         "C loop": c_loops.compiler() is not None,
     }
     stated = ["diffrax Dopri8", *(("OpenMM", "C loop") if are_molecules else ())]
-    if are_molecules and problem.q_f.size <= 3 * HEYOKA_ATOMS:
-        stated.append("heyoka")
     missing = [f"{name} is not installed and left out." for name in stated if not ready[name]]
     return [name for name in stated if ready[name]], missing

@@ -27,7 +27,7 @@ class CostRow:
     """One program: its size and its times.
 
     label: of the system or the scheme, as passed to `cost_study`.
-    method: name of the curve.
+    method: of the curve.
     num_unknowns: unknowns of one macro step, ``r n_s + r n_gs + num_micro r (n_f + n_g)``, r the degree.
     num_steps: macro steps of the timed run.
     seconds_per_unit: computing time per unit of simulated time; the figures of the reference paper up to a constant.
@@ -36,6 +36,7 @@ class CostRow:
     iterations: most Newton iterations of a step.
     solved_by: name of the `Method` that took the steps, which "auto" chooses, as in ``run.info.method``.
     result: name of the `Result` of the run.
+    us_in_short_step: microseconds per micro step in the macro step of `Curve.settled` micro steps; NaN where that was not timed.
     samples: microseconds per micro step, in turns with all other programs of the study; not in files.
     """
 
@@ -50,6 +51,7 @@ class CostRow:
     iterations: int
     solved_by: str
     result: str
+    us_in_short_step: float = float("nan")
     samples: tuple[float, ...] = ()
 
 
@@ -103,14 +105,15 @@ class Curve:
     num_micro: numbers of micro steps per macro step.
     t_end: simulated time, rounded to whole macro steps: long enough (thousands of micro steps for small systems) that the start of a program
         takes a negligible part of the time.
-    name: of the curve, by default the method.
+    settled: number of micro steps in whose macro step the runs with more of them are timed, too, by the same programs: what their cost is
+        without the length of their own macro steps. 0 for none.
     """
 
     method: str
     problem: Problem
     num_micro: Sequence[int]
     t_end: float
-    name: str = ""
+    settled: int = 0
 
 
 def cost_study(
@@ -139,17 +142,22 @@ def cost_study(
     points = [(curve, n) for curve in curves for n in curve.num_micro]
     runs: list[tuple[Curve, Simulation, float, Trajectory]] = []
     for curve, n in points:
-        name = curve.name or curve.method
-        progress(f"{label} {name}, {n} micro steps: compiling".strip(), len(runs), len(points) + 1)
+        progress(f"{label} {curve.method}, {n} micro steps: compiling".strip(), len(runs), len(points) + 1)
         num_steps, elapsed = max(1, round(curve.t_end / (n * micro_dt))), stopwatch()
         length = {"macro_dt": n * micro_dt, "num_steps": num_steps, "save": num_steps}
         program = prepare(curve.problem, scheme(n), **length, solver=named(curve.method))
         runs.append((curve, program, elapsed(), program(throw=False)))
     progress(f"{label} measuring times".strip(), len(points), len(points) + 1)
-    calls = {str(i): program.timed() for i, (_, program, _, run) in enumerate(runs) if run.success}
+    calls = {}
+    for i, (curve, program, _, run) in enumerate(runs):
+        if run.success:
+            calls[f"{i}"] = program.timed()
+            if 0 < curve.settled < program.scheme.num_micro:
+                calls[f"{i}, short steps"] = program.timed(macro_dt=curve.settled * micro_dt)
     seconds = interleaved(calls, repeats, min_seconds)
     progress("done", 1, 1)
-    return CostStudy(tuple(_row(label, *run, seconds.get(str(i), [np.nan])) for i, run in enumerate(runs)))
+    samples = [[seconds.get(f"{i}{end}", [np.nan]) for end in ("", ", short steps")] for i in range(len(runs))]
+    return CostStudy(tuple(_row(label, *run, *of_run) for run, of_run in zip(runs, samples, strict=True)))
 
 
 def _row(
@@ -159,6 +167,7 @@ def _row(
     first_call_seconds: float,
     trajectory: Trajectory,
     seconds: Sequence[float],
+    seconds_in_short_steps: Sequence[float],
 ) -> CostRow:
     """The row of a run with its samples of seconds."""
     scheme, state = program.scheme, program.state
@@ -166,7 +175,7 @@ def _row(
     micro_steps = program.num_steps * scheme.num_micro
     return CostRow(
         label=label,
-        method=curve.name or curve.method,
+        method=curve.method,
         num_micro=scheme.num_micro,
         num_unknowns=scheme.degree * (state.q_s.size + n_gs + scheme.num_micro * (state.q_f.size + n_g)),
         num_steps=program.num_steps,
@@ -176,6 +185,7 @@ def _row(
         iterations=int(np.max(trajectory.info.iterations)),
         solved_by=Method(int(np.max(trajectory.info.method))).name,
         result=Result(int(trajectory.result)).name,
+        us_in_short_step=1e6 * float(np.median(seconds_in_short_steps)) / micro_steps,
         samples=tuple(1e6 * s / micro_steps for s in seconds),
     )
 

@@ -5,12 +5,10 @@ integrators"; orders of higher degree from Ober-Bloebaum, Wenger, Gail, Leyendec
 schemes of the paper have order 1: they have alpha = 0 here.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 
 import vmri_jax as vm
-from benchmarks.gail2014 import minimal
 from benchmarks.gail2014.figures import ConvergenceFigure, CostFigure, CostPanel
 from vmri_jax import systems
 
@@ -18,8 +16,6 @@ PAPER_STEPS = (0.1, 0.05, 0.02, 0.01, 0.005, 0.002, 0.001, 0.0005, 0.0002, 0.000
 DEGREE_STEPS = (0.05, 0.025, 0.02, 0.0125, 0.01, 0.005, 0.002, 0.001)
 """Order 6 falls from the first errors to round-off within a decade of steps: more of them there."""
 PAPER_NUM_MICRO = (1, 4, *range(8, 101, 4))
-OTHERS = ("auto", "null_space")
-"""Solvers of constrained systems beside the exact one: what `vm.simulate` takes by itself, and that without multipliers."""
 PAPER_MINIMA = {  # cheapest num_micro by scheme: (smallest l, largest l, num_micro)
     "fully implicit": ((70, 80, 12), (90, 100, 8), (110, 200, 1)),
     "explicit slow": ((70, 110, 12), (120, 180, 8), (190, 200, 1)),
@@ -45,52 +41,52 @@ class Size:
     """How much is run.
 
     fpu_steps, tsp_steps: macro steps of the convergence figures.
-    fpu_num_micro, sam_num_micro: micro steps per macro step in Fig. 4.
-    chain_lengths, chain_num_micro: l by scheme, and micro steps per macro step, in Fig. 5.
-    least_structured: fewest micro steps of the structured solve; its cost is compared from `SETTLED` on.
+    fpu, sam, chain: micro steps per macro step, of the dense and of the structured solve, in Fig. 4 and 5; the structured cost is compared
+        from about `SETTLED` on.
+    chain_lengths: l in Fig. 5.
     others: solvers beside the dense and the structured one in Fig. 4.
     largest_dense: most unknowns for which the dense solve is run.
+    repeats: samples of each time, of whose medians claims are made.
     degree_num_micro: micro steps per macro step in the figures of degree 2 and 3.
     """
 
     fpu_steps: tuple[float, ...]
     tsp_steps: tuple[float, ...]
-    fpu_num_micro: tuple[int, ...]
-    sam_num_micro: tuple[int, ...]
-    chain_lengths: Mapping[str, tuple[int, ...]]
-    chain_num_micro: tuple[int, ...]
-    least_structured: int
+    fpu: tuple[tuple[int, ...], tuple[int, ...]]
+    sam: tuple[tuple[int, ...], tuple[int, ...]]
+    chain: tuple[tuple[int, ...], tuple[int, ...]]
+    chain_lengths: tuple[int, ...]
     others: tuple[str, ...]
     largest_dense: int
     repeats: int
     degree_num_micro: tuple[int, ...]
 
 
+ATOMS_NUM_MICRO = (1, 4, 8, 12, 16, 20, 24, 32, 40, 60, 80, 100)
+CHAIN_NUM_MICRO = (1, 4, 8, 12, 16, 20, 40, 60, 100)
 SIZES = {
     "quick": Size(
         fpu_steps=PAPER_STEPS[:-1],
         tsp_steps=PAPER_STEPS[1:-2],
-        fpu_num_micro=(1, 10, 60, 100),
-        sam_num_micro=(1, 10, 40),
-        chain_lengths=dict.fromkeys(SCHEMES, (30,)),
-        chain_num_micro=(1, 8, 20),
-        least_structured=8,
+        fpu=((1, 60, 100), (10, 100)),
+        sam=((1, 20, 40), (10, 40)),
+        chain=((1, 20), (8, 20)),
+        chain_lengths=(30,),
         others=(),
         largest_dense=1000,
-        repeats=5,
+        repeats=7,
         degree_num_micro=(5,),
     ),
     "full": Size(
         fpu_steps=PAPER_STEPS,
         tsp_steps=PAPER_STEPS[1:],
-        fpu_num_micro=PAPER_NUM_MICRO,
-        sam_num_micro=(1, 4, 8, 12, 16, 20, 24, 32, 40, 60, 80, 100),
-        chain_lengths=dict.fromkeys(SCHEMES, (10, 40, 70, 100, 150, 200)),
-        chain_num_micro=(1, 4, 8, 12, 16, 20, 40, 60, 100),
-        least_structured=1,
+        fpu=(PAPER_NUM_MICRO, PAPER_NUM_MICRO),
+        sam=(ATOMS_NUM_MICRO, ATOMS_NUM_MICRO),
+        chain=(CHAIN_NUM_MICRO, CHAIN_NUM_MICRO),
+        chain_lengths=(10, 40, 70, 100, 150, 200),
         others=("null_space",),
         largest_dense=2500,
-        repeats=5,
+        repeats=7,
         degree_num_micro=(5, 10),
     ),
 }
@@ -105,22 +101,12 @@ def reference_figures(size: str = "quick") -> tuple[ConvergenceFigure | CostFigu
 
 
 def _cost_figures(size: Size) -> tuple[CostFigure, ...]:
-    chain, atoms = systems.fermi_pasta_ulam, systems.simple_atomic_model
-    n, m = size.fpu_num_micro, size.sam_num_micro
-    of_chain, of_atoms = (tuple(k for k in counts if k >= size.least_structured) for counts in (n, m))
+    chain, atoms, scheme = systems.fermi_pasta_ulam, systems.simple_atomic_model, vm.fully_implicit
     small = (
-        CostPanel("FPU, l = 3", chain, chain, vm.fully_implicit, 60, n, of_chain, 0.01, 20.0, 20.0, size.repeats),
-        CostPanel("SAM", atoms, atoms, vm.fully_implicit, 20, m, of_atoms, 0.001, 0.2, 1.0, size.repeats, size.others),
+        CostPanel("FPU, l = 3", chain, chain, scheme, 60, *size.fpu, 0.01, 2.0, 20.0, size.repeats),
+        CostPanel("SAM", atoms, atoms, scheme, 20, *size.sam, 0.001, 0.08, 1.0, size.repeats, size.others),
     )
-    pendulum = systems.triple_spherical_pendulum
-    constrained = tuple(
-        CostPanel(name, make, make, vm.fully_implicit, None, (), m, 0.001, 1.0, 1.0, size.repeats, OTHERS, without)
-        for name, make, without in (
-            ("TSP", pendulum, minimal.triple_spherical_pendulum),
-            ("SAM", atoms, minimal.simple_atomic_model),
-        )
-    )
-    chains = tuple(_chain_panel(size, name, length) for name in SCHEMES for length in size.chain_lengths[name])
+    chains = tuple(_chain_panel(size, name, length) for name in SCHEMES for length in size.chain_lengths)
     return (
         CostFigure(
             "fig4",
@@ -128,12 +114,6 @@ def _cost_figures(size: Size) -> tuple[CostFigure, ...]:
             "FPU with l = 3 is cheapest at 60 micro steps per macro step (183 unknowns), the simple atomic model at 20 "
             "(307 unknowns); then the dense solve makes the curves turn up again.",
             small,
-        ),
-        CostFigure(
-            "fig4-minimal",
-            "Computing time with constraints and in minimal coordinates",
-            "the paper asks at its end whether a minimal set of variables saves more computing time.",
-            constrained,
         ),
         CostFigure(
             "fig5",
@@ -147,7 +127,8 @@ def _cost_figures(size: Size) -> tuple[CostFigure, ...]:
 
 def _chain_panel(size: Size, scheme: str, num_springs: int) -> CostPanel:
     chain = partial(systems.fermi_pasta_ulam, num_springs)
-    feasible = tuple(n for n in size.chain_num_micro if num_springs * (n + 1) <= size.largest_dense)
+    dense, structured = size.chain
+    feasible = tuple(n for n in dense if num_springs * (n + 1) <= size.largest_dense)
     return CostPanel(
         title=f"{scheme}, l = {num_springs}",
         dense=chain if scheme == "fully implicit" else lambda: unstructured(chain()),
@@ -155,9 +136,9 @@ def _chain_panel(size: Size, scheme: str, num_springs: int) -> CostPanel:
         scheme=SCHEMES[scheme],
         paper_minimum=paper_minimum(scheme, num_springs),
         dense_num_micro=feasible,
-        num_micro=tuple(n for n in size.chain_num_micro if n >= size.least_structured),
+        num_micro=structured,
         micro_dt=0.01,
-        dense_t_end=0.5,
+        dense_t_end=0.2,
         t_end=10.0 if scheme == "fully explicit" else min(10.0, max(0.5, 4000 / num_springs**2)),  # solves cost l^3
         repeats=size.repeats,
     )

@@ -2,10 +2,10 @@
 
 from dataclasses import replace
 
-from benchmarks.hard_cases import chains, constraints, encounters, large_steps, long_runs, resonance, scales
+from benchmarks.hard_cases import chains, encounters, large_steps, long_runs, resonance
 from vmri_jax.hard_cases import Case
 
-MODULES = (resonance, large_steps, constraints, chains, long_runs, encounters, scales)
+MODULES = (resonance, large_steps, chains, long_runs, encounters)
 
 
 def catalogue() -> tuple[Case, ...]:

@@ -1,4 +1,4 @@
-"""Pictures of the cases where one helps: unstable omega H, linkages at their singularity, three scales."""
+"""Pictures of the cases where one helps: linkages at their singularity, three scales."""
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -7,19 +7,6 @@ from vmri_jax import plots
 from vmri_jax.running.trajectory import Trajectory
 
 THEME = plots.LIGHT
-
-
-def draw_windows(windows_of: dict[str, list]) -> Figure:
-    """Unstable intervals of omega H / pi of the linear model, one line per num_micro."""
-    with plots.new_figure(7.2, 2.6, "", THEME) as figure:
-        axes = figure.subplots()
-        for k, (windows, color) in enumerate(zip(windows_of.values(), THEME.curves, strict=False)):
-            bars = [(start / np.pi, (stop - start) / np.pi) for start, stop, _ in windows]
-            axes.broken_barh(bars, (k - 0.35, 0.7), facecolor=color, edgecolor=color, linewidth=1.0)
-        axes.set(xlabel=r"$\omega H / \pi$", ylabel="num_micro", xlim=(0, 4), title="unstable steps")
-        axes.set_yticks(range(len(windows_of)), windows_of)
-        axes.grid(axis="y", visible=False)
-    return figure
 
 
 def draw_singular(linkage: Trajectory, chain: Trajectory) -> Figure:

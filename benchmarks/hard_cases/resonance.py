@@ -7,11 +7,10 @@ import numpy as np
 
 import vmri_jax as vm
 from benchmarks.hard_cases.case import hard_case
-from benchmarks.hard_cases.pictures import draw_windows
 from benchmarks.hard_cases.systems import cubic_chain, swapped_chain
 from vmri_jax.hard_cases import Outcome
 from vmri_jax.hard_cases.measures import energy, long_run, status
-from vmri_jax.stability import advise, linear_model, stability_map
+from vmri_jax.stability import advise, linear_model, plot_stability, stability_map
 
 FIRST_UNSTABLE = {2: 1.248, 3: 1.089, 5: 1.025, 10: 0.999, 20: 0.993}
 """omega H / pi by num_micro, of an independent prototype."""
@@ -43,7 +42,7 @@ def impulse_resonance(full: bool) -> Outcome:
         f"first unstable omega H / pi (num_micro): {words}; a step in the window is {advised(advice)}",
         not advice.ok and all(abs(first[n] - expected[n]) < 0.005 for n in expected),
         {f"first_unstable_{n}": value for n, value in first.items()} | {"warned": not advice.ok},
-        partial(draw_windows, {str(n): found.windows(n) for n in expected}),
+        partial(plot_stability, {"explicit slow": found}),
     )
 
 

@@ -10,18 +10,16 @@ from benchmarks.measure import Tell, interleaved, quartiles, silent
 from benchmarks.mechanisms.cases import CASES
 from benchmarks.mechanisms.plane import Mechanism
 from benchmarks.mechanisms.ways import ways
+from benchmarks.peers import figures
 from benchmarks.peers.cases import NotRepresentable
-from benchmarks.peers.scan import Point, candidates, front, scan
-from benchmarks.report import Report
-from vmri_jax import plots
-from vmri_jax.plots import legend_below
+from benchmarks.peers.scan import Point, candidates, scan
+from benchmarks.report import Report, note
 
 LEVELS = (1e-3, 1e-5)
 """Largest errors of the centres of bars at the end, over the size of the mechanism."""
 FINEST = 1e-8
 """The smallest error asked for in full runs."""
 COLUMNS = ("mechanism", "level", "way", "setting", "step, s", "error", "µs per s", "quartiles", "to best", "first, s")
-"""Seconds in which this process runs: others may share its core."""
 OURS = ("joint", "directors", "functions")
 """How the names of this toolkit's ways begin."""
 
@@ -99,19 +97,13 @@ def scanned(mechanism: Mechanism, title: str, size: Size, notes: list[str], tell
         try:
             ladder, centres = make()
         except ModuleNotFoundError as error:
-            _note(notes, f"{way} was left out: there is no {error.name}; pip install -e '.[peers]' installs it.")
+            note(notes, f"{way} was left out: there is no {error.name}; pip install -e '.[peers]' installs it.")
         except NotRepresentable as error:
-            _note(notes, f"{title}: {way.partition(' ')[0]} was left out: {error}.")
+            note(notes, f"{title}: {way.partition(' ')[0]} was left out: {error}.")
         else:
             judge = Judged(other if way.startswith(("scipy", "diffrax")) else end, mechanism.size, centres)
             found[way] = scan(way, [ladder], judge, size.seconds, size.levels)
     return found
-
-
-def _note(notes: list[str], text: str) -> None:
-    """Once."""
-    if text not in notes:
-        notes.append(text)
 
 
 def timed(mechanism: Mechanism, title: str, found: dict[str, list[Point]], size: Size) -> list[dict]:
@@ -144,21 +136,6 @@ def _step(point: Point, mechanism: Mechanism) -> float | None:
 
 def draw(found: dict[str, dict[str, list[Point]]]):
     """Error against time, a panel for each mechanism."""
-    columns = min(3, len(found))
-    rows = -(-len(found) // columns)
     names = list(dict.fromkeys(way for points in found.values() for way in points))
-    with plots.new_figure(0.8 + 3.2 * columns, 1.4 + 2.6 * rows, "Mechanisms: time to an error", plots.LIGHT) as figure:
-        for axes, (title, ways_of) in zip(plots.panel_grid(figure, len(found), columns), found.items(), strict=True):
-            for way, points in ways_of.items():
-                shown = [p for p in front(points) if p.settled < 1.0]
-                look = {
-                    "color": f"C{names.index(way) % 10}",
-                    "marker": plots.MARKERS[names.index(way) % len(plots.MARKERS)],
-                }
-                strong = {"linewidth": 2.0} if way.startswith(OURS) else {"linewidth": 0.9, "linestyle": "--"}
-                axes.loglog(
-                    [p.seconds for p in shown], [p.settled for p in shown], label=way, markersize=4, **look, **strong
-                )
-            axes.set(title=title, xlabel="processor time, s", ylabel="error / size")
-        legend_below(figure)
-    return figure
+    points = {title: [point for some in of_title.values() for point in some] for title, of_title in found.items()}
+    return figures.draw(points, names, "Mechanisms: time to an error", OURS)

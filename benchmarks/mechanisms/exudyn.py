@@ -10,12 +10,7 @@ from exudyn import itemInterface as items
 
 from benchmarks.mechanisms.plane import GROUND, Mechanism
 from benchmarks.peers.cases import NotRepresentable
-from benchmarks.peers.exudyn import DENSE, NEWTON, SPECTRAL_RADIUS
-
-SOLVERS = {
-    "trapezoidal index 2": exu.DynamicSolverType.TrapezoidalIndex2,
-    "generalized-alpha": exu.DynamicSolverType.GeneralizedAlpha,
-}
+from benchmarks.peers.exudyn import settings_of, solved
 
 
 def build(mechanism: Mechanism, solver: str, num_steps: int):
@@ -27,26 +22,11 @@ def build(mechanism: Mechanism, solver: str, num_steps: int):
     if mechanism.contact is not None:
         raise NotRepresentable("the cam is a potential of its own")
     mbs, nodes = _assemble(mechanism)
-    settings = exu.SimulationSettings()
-    stepping = settings.timeIntegration
-    stepping.endTime, stepping.numberOfSteps, stepping.verboseMode = mechanism.t_end, num_steps, 0
-    stepping.adaptiveStep = False
-    for name, value in NEWTON.items():
-        setattr(stepping.newton, name, value)
-    stepping.newton.useModifiedNewton = True
-    stepping.generalizedAlpha.spectralRadius = SPECTRAL_RADIUS
-    settings.solutionSettings.writeSolutionToFile = False
-    settings.solutionSettings.sensorsWritePeriod = mechanism.t_end
-    kinds = exu.LinearSolverType
-    settings.linearSolverType = kinds.EXUdense if 3 * len(mechanism.bars) <= DENSE else kinds.EigenSparse
-    settings.displayStatistics = settings.displayComputationTime = settings.displayGlobalTimers = False
-    return partial(_run, mbs, nodes, settings, SOLVERS[solver])
+    return partial(_run, mbs, nodes, settings_of(mechanism.t_end, num_steps, 3 * len(mechanism.bars)), solver)
 
 
-def _run(mbs, nodes, settings, solver) -> np.ndarray:
-    try:
-        mbs.SolveDynamic(settings, solverType=solver, storeSolver=False, showCausingItems=False)
-    except (ValueError, RuntimeError):  # the solver gave up
+def _run(mbs, nodes, settings, solver: str) -> np.ndarray:
+    if not solved(mbs, settings, solver):
         return np.full((len(nodes), 2), np.nan)
     return np.array([mbs.GetNodeOutput(node, exu.OutputVariableType.CoordinatesTotal)[:2] for node in nodes])
 

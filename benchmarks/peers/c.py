@@ -5,7 +5,9 @@ import numpy as np
 from benchmarks import c_loops
 from benchmarks.peers import equations
 from benchmarks.peers.cases import Case, Ladder, steps_ladder
-from benchmarks.peers.jax_loops import NUM_MICRO
+
+NUM_MICRO = (1, 4, 16)
+"""Micro steps per macro step of r-RESPA that are tried."""
 
 
 def ladders(case: Case) -> list[Ladder]:

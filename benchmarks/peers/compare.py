@@ -3,18 +3,21 @@
 import importlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 
 import vmri_jax as vm
 from benchmarks.c_loops import NoCompiler
 from benchmarks.measure import Ratio, Tell, interleaved, quartiles, ratio, silent
-from benchmarks.peers import cases, figures
+from benchmarks.peers import autodiff, cases, figures
 from benchmarks.peers.cases import BATCH_LEVEL, LEVELS, Case, NotRepresentable
 from benchmarks.peers.ours import last_positions
 from benchmarks.peers.scan import Point, candidates, scan
 from benchmarks.peers.targets import target
-from benchmarks.report import Claim, Report, spread
+from benchmarks.report import Claim, Report, note, spread
 from benchmarks.worker import starts
 
 OURS = "vmri_jax"
@@ -22,17 +25,15 @@ PEERS = {
     OURS: "ours",
     "heyoka": "heyoka",
     "diffrax": "diffrax",
-    "diffrax, autodiff": "diffrax_autodiff",
+    "diffrax, autodiff": "diffrax",
     "scipy": "scipy",
-    "scipy, autodiff": "scipy_autodiff",
+    "scipy, autodiff": "scipy",
     "OpenMM": "openmm",
     "Exudyn": "exudyn",
     "MuJoCo": "mujoco",
-    "JAX MD": "jax_md",
-    "JAX by hand": "jax_loops",
     "C by hand": "c",
 }
-"""Modules of this package by the name of the integrator."""
+"""Modules of this package by the name of the integrator; "autodiff" says where equations come from, see `load`."""
 BATCHED = (OURS, "heyoka", "diffrax", "diffrax, autodiff")
 BATCH = 1024
 FINE_STEPS = 1000
@@ -82,9 +83,13 @@ def _chosen(names: Sequence[str], only: Sequence[str]) -> list[str]:
     return [name for name in names if not only or name in only or any(name.startswith(f"{x} ") for x in only)]
 
 
-def load(peer: str):
-    """The module of a peer, if its package is installed."""
-    return importlib.import_module(f"benchmarks.peers.{PEERS[peer]}")
+def load(peer: str) -> Any:
+    """The module of a peer, if its package is installed, with equations by automatic differentiation where its name says so."""
+    module = importlib.import_module(f"benchmarks.peers.{PEERS[peer]}")
+    if not peer.endswith("autodiff"):
+        return module
+    given = {name: getattr(module, name) for name in ("ladders", "batch_ladders") if hasattr(module, name)}
+    return SimpleNamespace(energy=autodiff.energy, **{k: partial(f, equations=autodiff) for k, f in given.items()})
 
 
 def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
@@ -132,9 +137,9 @@ def _one(case: Case, peers, levels, ladders_of, size: Size, report: Report, tell
             ladders = ladders_of(module, case)
             differs[peer] = None if is_batch else energy_difference(module, case)
         except ModuleNotFoundError as error:
-            _note(report, f"{peer} was left out: there is no {error.name}; pip install -e '.[peers]' installs it.")
+            note(report.notes, f"{peer} was left out: there is no {error.name}; pip install -e '.[peers]' installs it.")
         except (NotRepresentable, NoCompiler) as error:
-            _note(report, f"{title}: {peer} was left out: {error}.")
+            note(report.notes, f"{title}: {peer} was left out: {error}.")
         else:
             points[peer] = scan(peer, ladders, case, size.seconds, levels)
     tell(f"{title}, timing")
@@ -146,19 +151,13 @@ def _one(case: Case, peers, levels, ladders_of, size: Size, report: Report, tell
             row["trajectories/s"] = len(case.q_end) / (1e-3 * row["levels"][0]["ms"])
         report.rows.append(row)
         if missed := [level for level in levels if (peer, level) not in timed]:
-            _note(report, f"{title}: {peer} does not reach {_why(mine, missed)}.")
+            note(report.notes, f"{title}: {peer} does not reach {_why(mine, missed)}.")
         for level in levels:
             least = target(title, peer, level)
             if least is not None and (peer, level) in timed:
                 what = f"{title}, {level:.0e}: {peer} over ours"
                 report.claims.append(Claim(what, timed[peer, level].to_ours, at_least=least))
     return [p for mine in points.values() for p in mine]
-
-
-def _note(report: Report, text: str) -> None:
-    """Once."""
-    if text not in report.notes:
-        report.notes.append(text)
 
 
 @dataclass(frozen=True)

@@ -30,14 +30,10 @@ def ladders(case: Case) -> list[Ladder]:
     def ladder(name: str) -> Ladder:
         def build(num_steps: int):
             mbs, nodes, _ = prepare(case)
-            settings = _settings(case, num_steps)
+            settings = settings_of(case.t_end, num_steps, case.q.size)
 
             def run():
-                try:
-                    mbs.SolveDynamic(settings, solverType=SOLVERS[name], storeSolver=False, showCausingItems=False)
-                except (ValueError, RuntimeError):  # the solver gave up
-                    return np.full(case.q.size, np.nan)
-                return positions(case, mbs, nodes)
+                return positions(case, mbs, nodes) if solved(mbs, settings, name) else np.full(case.q.size, np.nan)
 
             return run
 
@@ -73,18 +69,28 @@ def energy(case: Case) -> float:
     return float(kinetic + sum(potential(mbs) for potential in springs))
 
 
-def _settings(case: Case, num_steps: int):
+def solved(mbs, settings, name: str) -> bool:
+    """Whether the solver with this name got to the end."""
+    try:
+        mbs.SolveDynamic(settings, solverType=SOLVERS[name], storeSolver=False, showCausingItems=False)
+    except (ValueError, RuntimeError):  # the solver gave up
+        return False
+    return True
+
+
+def settings_of(t_end: float, num_steps: int, coordinates: int):
+    """Settings of a run of this length of a system with this number of coordinates."""
     settings = exu.SimulationSettings()
     time = settings.timeIntegration
-    time.endTime, time.numberOfSteps, time.verboseMode, time.adaptiveStep = case.t_end, num_steps, 0, False
+    time.endTime, time.numberOfSteps, time.verboseMode, time.adaptiveStep = t_end, num_steps, 0, False
     for name, value in NEWTON.items():
         setattr(time.newton, name, value)
     time.newton.useModifiedNewton = True
     time.generalizedAlpha.spectralRadius = SPECTRAL_RADIUS
     settings.solutionSettings.writeSolutionToFile = False
-    settings.solutionSettings.sensorsWritePeriod = case.t_end
+    settings.solutionSettings.sensorsWritePeriod = t_end
     kinds = exu.LinearSolverType
-    settings.linearSolverType = kinds.EXUdense if case.q.size <= DENSE else kinds.EigenSparse
+    settings.linearSolverType = kinds.EXUdense if coordinates <= DENSE else kinds.EigenSparse
     settings.displayStatistics = settings.displayComputationTime = False
     settings.displayGlobalTimers = False
     return settings

@@ -15,7 +15,7 @@ from vmri_jax.plots import legend_below
 FAMILIES = {"FPU": "Fermi-Pasta-Ulam chain", "TSP": "Triple spherical pendulum", "SAM": "Simple atomic model"}
 COLORS = (
     *("#0072b2", "#d55e00", "#009e73", "#66c9a9", "#a3508a", "#d3a5c5"),
-    *("#b98700", "#56a0d3", "#8a6d5a", "#d680a8", "#5f6b75", "#9aa5ae"),
+    *("#b98700", "#56a0d3", "#8a6d5a", "#5f6b75", "#d680a8", "#9aa5ae"),
 )
 SHOWN = (2e-10, 5e-2)
 """Errors between which a figure goes, or less where none is so small."""
@@ -35,20 +35,22 @@ def by_family(found: Mapping[str, Sequence[Point]], peers: Sequence[str]) -> dic
     return drawn
 
 
-def draw(found: Mapping[str, Sequence[Point]], peers: Sequence[str], title: str) -> Figure:
-    """One panel per case."""
+def draw(
+    found: Mapping[str, Sequence[Point]], peers: Sequence[str], title: str, ours: tuple[str, ...] = ("vmri_jax",)
+) -> Figure:
+    """One panel per case; peers whose names begin as `ours` are in front."""
     with plots.new_figure(max(7.2, 0.7 + 3.4 * len(found)), 4.7, title, plots.LIGHT) as figure:
         panels = figure.subplots(1, len(found), squeeze=False, sharey=True)[0]
         lowest = min((p.settled for points in found.values() for p in points), default=SHOWN[0])
         for axes, (name, points) in zip(panels, found.items(), strict=True):
-            _panel(axes, points, peers)
+            _panel(axes, points, peers, ours)
             axes.set(title=name, xlabel="time, s", ylim=(max(SHOWN[0], lowest / 3), SHOWN[1]))
         panels[0].set(ylabel=r"error $\max\,|q - q_{\mathrm{ref}}|$ at the end")
         legend_below(figure)
     return figure
 
 
-def _panel(axes: Axes, points: Sequence[Point], peers: Sequence[str]) -> None:
+def _panel(axes: Axes, points: Sequence[Point], peers: Sequence[str], ours: tuple[str, ...]) -> None:
     theme = plots.LIGHT
     for level in LEVELS:
         axes.axhline(level, color=theme.faint, linewidth=1.0, linestyle=(0, (4, 2)), zorder=0)
@@ -56,12 +58,11 @@ def _panel(axes: Axes, points: Sequence[Point], peers: Sequence[str]) -> None:
         shown = [p for p in front([p for p in points if p.peer == peer]) if p.settled < 1.0]
         if not shown:
             continue
-        ours = i == 0
         x, y = [p.seconds for p in shown], [max(p.settled, SHOWN[0] / 10) for p in shown]
-        look = {"color": COLORS[i], "marker": MARKERS[i], "label": peer}
+        look = {"color": COLORS[i % len(COLORS)], "marker": MARKERS[i % len(MARKERS)], "label": peer}
         strong = {"linewidth": 2.8, "markersize": 5.5, "zorder": 5}
         weak = {"linewidth": 1.1, "markersize": 3.6, "zorder": 3, "alpha": 0.9}
-        axes.loglog(x, y, **look, **(strong if ours else weak))
+        axes.loglog(x, y, **look, **(strong if peer.startswith(ours) else weak))
     left, right = axes.get_xlim()
     axes.xaxis.set_major_locator(LogLocator(subs=(1.0,) if right > 100 * left else (1.0, 3.0), numticks=12))
     axes.xaxis.set_major_formatter(LogFormatterSciNotation(labelOnlyBase=False, minor_thresholds=(9, 9)))

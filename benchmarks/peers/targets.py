@@ -17,7 +17,7 @@ class Target:
 
 RODS = ("TSP t=1", "TSP t=10", "SAM t=1", "SAM t=10")
 TARGETS = (
-    Target(("FPU l=3 t=1",), ("diffrax", "scipy", "OpenMM", "JAX MD"), LEVELS, 3.0),
+    Target(("FPU l=3 t=1",), ("diffrax", "scipy", "OpenMM"), LEVELS, 3.0),
     Target(("FPU l=3 t=1",), ("heyoka",), (2e-4,), 1 / 3),
     Target(("FPU l=3 t=1",), ("heyoka",), (1e-8,), 1 / 5),
     Target(("FPU l=3 t=100",), ("diffrax", "scipy"), (1e-2, 2e-4), 5.0),

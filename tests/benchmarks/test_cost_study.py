@@ -13,7 +13,7 @@ from tests.test_plots import is_drawn, names_below, y_data
 @pytest.fixture(scope="module")
 def study():
     chain = vm.systems.fermi_pasta_ulam(2)
-    curves = [Curve(method, chain, (1, 3), 2.0) for method in ("auto", "dense")]
+    curves = [Curve("auto", chain, (1, 3), 2.0, settled=1), Curve("dense", chain, (1, 3), 2.0)]
     return cost_study("chain", vm.explicit_slow, curves, micro_dt=0.01, repeats=3, min_seconds=0.02)
 
 
@@ -36,6 +36,7 @@ def test_times_are_per_simulated_unit_and_per_micro_step(study):
         assert 0.01 < row.us_per_micro_step < 1e4
         assert row.seconds_per_unit == pytest.approx(row.us_per_micro_step * 1e-6 / 0.01)
         assert row.first_call_seconds > 0
+        assert np.isfinite(row.us_in_short_step) == (row.method == "auto" and row.num_micro == 3)
 
 
 def test_curves_and_sums(study):

@@ -11,7 +11,7 @@ from scipy.special import lpmv
 
 import vmri_jax as vm
 from benchmarks import c_loops, dear
-from benchmarks.dear import compare, peers, spacecraft, systems
+from benchmarks.dear import compare, figures, peers, spacecraft, systems
 from vmri_jax.mechanics.invariants import potential_energy
 from vmri_jax.study.reference_solution import joined
 
@@ -31,6 +31,12 @@ def test_two_molecules(monkeypatch):
     assert gain["bound"] == pytest.approx(4 * (gain["price"] + 1) / (gain["price"] + 4)) or gain["num_micro"] == 1
     for draw in report.figures.values():
         draw()
+
+
+def test_gains_are_taken_at_the_same_error():
+    single = np.array([1e-2, 1e-4]), np.array([1.0, 100.0])
+    assert figures.ratio_at(single, 1e-3, 5.0) == pytest.approx(2.0)
+    assert figures.ratio_at(single, 1e-5, 5.0) is None
 
 
 def test_sizes():

@@ -1,9 +1,9 @@
-"""Benchmarks of ensembles and of savings: tiny ones run, figures are drawn."""
+"""Benchmarks of ensembles: tiny ones run, figures are drawn."""
 
 import numpy as np
 import pytest
 
-from benchmarks import ensemble_kills, ensembles, savings
+from benchmarks import ensemble_kills, ensembles
 
 xarray = pytest.importorskip("xarray")
 
@@ -23,13 +23,6 @@ def test_the_study_has_a_panel_for_each_scheme_and_number_of_micro_steps():
     figure = ensembles._draw_study(error.where(error < 1), ensembles.plots.LIGHT)
     assert [panel.get_title(loc="left") for panel in figure.axes[:2]] == ["num_micro = 1", "num_micro = 5"]
     assert len(figure.axes) == 5  # and the bar of colours
-
-
-def test_savings_are_taken_at_the_same_error():
-    single = np.array([1e-2, 1e-4]), np.array([1.0, 100.0])
-    assert savings.ratio_at(single, 1e-3, 5.0) == pytest.approx(2.0)
-    assert savings.ratio_at(single, 1e-5, 5.0) is None
-    assert len(savings._draw({"engine": {1: single, 5: single}}).axes) == 1
 
 
 @pytest.mark.full

@@ -4,22 +4,22 @@ import base64
 import csv
 import dataclasses
 import re
+from pathlib import Path
 
-import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 import vmri_jax as vm
 from benchmarks.__main__ import app
-from benchmarks.gail2014 import minimal, reference
+from benchmarks.gail2014 import reference
 from benchmarks.gail2014 import report as report_module
-from benchmarks.gail2014.figures import Check, ConvergenceFigure, CostFigure, CostPanel
+from benchmarks.gail2014.cost import CostRow, CostStudy
+from benchmarks.gail2014.figures import Check, ConvergenceFigure, CostFigure, CostPanel, _cost_checks
 from benchmarks.gail2014.reference import reference_figures
-from benchmarks.gail2014.report import choose_figures, reproduce
+from benchmarks.gail2014.report import FigureResult, Report, choose_figures, reproduce
 
 ALL = [
     "fig4",
-    "fig4-minimal",
     "fig5",
     "fig6",
     "fig7",
@@ -95,7 +95,7 @@ def test_the_full_study_marks_the_minima_of_the_paper():
 def test_choosing_figures():
     figures = reference_figures()
     assert [figure.name for figure in choose_figures(figures, ["fig9", "fig6"])] == ["fig6", "fig9"]
-    assert [figure.name for figure in choose_figures(figures, [])] == [name for name in ALL if name != "fig4-minimal"]
+    assert [figure.name for figure in choose_figures(figures, [])] == ALL
     with pytest.raises(ValueError, match=r"no figure 'fig11'; there are fig4, .*tsp-degree"):
         choose_figures(figures, ["fig11"])
 
@@ -115,8 +115,35 @@ def test_checks_compare_what_was_measured(made):
     assert [check.quantity for check in cost.checks] == [
         "FPU, dense: cost turns up again",
         "FPU, dense: cheapest number of micro steps",
+        "FPU, exact: cost at 2 micro steps over that at 2, in macro steps of one length",
         "FPU, exact: cost at 2 micro steps over that at 2",
     ]
+
+
+@pytest.mark.parametrize(
+    ("times", "agree", "surprise"),
+    [
+        ((5.0, 1.0, 1.0, 1.4, 1.4), [False, True, True, True], [True, False, False, False]),
+        ((1.0, 5.0, 1.0, 2.0, 1.1), [True, False, True, False], [False, False, False, False]),
+        ((1.0, 5.0, 1.0, 2.0, 1.6), [True, False, False, False], [False, False, True, True]),
+    ],
+)
+def test_a_difference_is_known_where_its_reason_holds(times, agree, surprise):
+    """Times of the dense solve with 1 and 60 micro steps, of the structured one with 10 and 100, and with 100 in short macro steps."""
+    rows = [
+        CostRow("FPU", method, n, 3, 10, 1.0, us, 1.0, 5, "EXACT", "CONVERGED", times[4])
+        for method, n, us in zip(("dense", "dense", "exact", "exact"), (1, 60, 10, 100), times, strict=False)
+    ]
+    checks = _cost_checks(tiny_cost().panels[0], CostStudy(tuple(rows)))
+    assert [check.kind for check in checks] == ["turn", "minimum", "structured", "longer"]
+    assert [check.agrees for check in checks] == agree
+    assert [check.surprises for check in checks] == surprise
+    figure = FigureResult("cost", "", "", "", tuple(checks), 0.0)
+    lines = Report(Path("report.html"), (figure,)).in_five_lines()
+    assert len(lines) == 5
+    expected = "; ".join(check.quantity for check in checks if check.surprises) or "nothing"
+    assert lines[3].startswith(f"Different from what was expected: {expected}.")
+    assert f"FPU: {60 if times[0] > times[1] else 1} (paper 60)" in lines[1]
 
 
 def test_what_was_seen_is_made_from_the_numbers(made):
@@ -179,7 +206,7 @@ def test_progress_runs_over_all_figures(made):
 def gail2014(tmp_path, monkeypatch):
     """Runs ``python -m benchmarks gail2014`` in an empty folder: (exit code, everything printed)."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("benchmarks.gail2014.command.prepare", lambda: None)
+    monkeypatch.setattr("benchmarks.gail2014.command.start", lambda size: None)
     (tmp_path / "a_file").write_text("")
 
     def run(*arguments):
@@ -208,7 +235,7 @@ def test_the_command_one_figure(gail2014, tmp_path, monkeypatch):
 def test_the_command_refuses_unknown_figures(gail2014, tmp_path):
     code, text = gail2014("--only", "fig11")
     assert code == 2
-    assert "no figure 'fig11'; there are fig4, fig4-minimal, fig5" in text
+    assert "no figure 'fig11'; there are fig4, fig5" in text
     assert not (tmp_path / "out").exists()
 
 
@@ -227,22 +254,3 @@ def test_the_command_keeps_the_other_figures(gail2014, tmp_path, monkeypatch):
     assert code == 1
     assert "fig6: RuntimeError: out of luck" in text
     assert "out of luck" in (tmp_path / "study" / "report.html").read_text()
-
-
-@pytest.mark.parametrize("name", ["triple_spherical_pendulum", "simple_atomic_model"])
-def test_minimal_coordinates_are_the_same_system(name):
-    """Positions, energy and momenta of the start; the coordinates keep the bonds wherever they are."""
-    full, small = getattr(vm.systems, name)(), getattr(minimal, name)()
-    positions = {"triple_spherical_pendulum": minimal.pendulum_positions, "simple_atomic_model": minimal.atom_positions}
-    x = positions[name](small.q_s, small.q_f, small.system.params)
-    start, other = full.state(), small.state()
-    np.testing.assert_allclose(np.concatenate(x), np.concatenate([start.q_s, start.q_f]), atol=1e-12)
-    energies = [
-        float(vm.diagnostics.energy(problem.system, s.q_s, s.q_f, s.p_s, s.p_f))
-        for problem, s in ((full, start), (small, other))
-    ]
-    assert energies[1] == pytest.approx(energies[0], rel=1e-10)
-    moved = positions[name](small.q_s + 0.1, small.q_f - 0.2, small.system.params)
-    assert np.abs(full.system.constraint(*moved, full.system.params)).max() < 1e-12
-    assert np.abs(full.system.slow_constraint(moved[0], full.system.params)).max() < 1e-12
-    assert small.q_s.size + small.q_f.size == full.q_s.size + full.q_f.size - sum(full.system.num_constraints(*x))

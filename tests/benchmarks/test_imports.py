@@ -1,6 +1,5 @@
 """The benchmark of model files, on two small ones."""
 
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -28,10 +27,10 @@ def test_files_of_installed_packages_move_as_in_mujoco(tmp_path, monkeypatch):
     (folder / "giant.xml").write_text(moves)
     known = {"gymnasium": SimpleNamespace(submodule_search_locations=[str(tmp_path)])}
     monkeypatch.setattr(imports, "find_spec", known.get)
-    size = imports.sizes("quick")
-    assert [Path(file).stem for _, file in size.files] == ["cartpole", "swimmer"]
-    assert [Path(file).stem for _, file in imports.sizes("full", ["giant"]).files] == ["giant"]
-    *_, report = imports.run(size, "quick")
+    files = imports.sizes("quick")
+    assert [file.stem for _, file in files] == ["cartpole", "swimmer"]
+    assert [file.stem for _, file in imports.sizes("full", ["giant"])] == ["giant"]
+    *_, report = imports.run(files, "quick")
     first, second = report.rows
     assert (first["file"], first["bodies"], first["coordinates"]) == ("gymnasium/cartpole.xml", 2, 2)
     assert first["error"] < 1e-8
