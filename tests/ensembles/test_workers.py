@@ -220,7 +220,7 @@ def test_workers_without_the_package(tmp_path, cache):
 
 def test_workers_of_another_version(tmp_path, monkeypatch):
     versions = known_versions() | {"vmri_jax": "0.0.1"}
-    with pytest.raises(NotAWorker, match=r"vmri_jax .* instead of 0\.0\.1.*give all workers the versions"):
+    with pytest.raises(NotAWorker, match=r"vmri_jax .* instead of 0\.0\.1.*give all workers the same versions"):
         in_worker(versions, b"")
 
 

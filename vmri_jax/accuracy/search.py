@@ -38,6 +38,7 @@ from vmri_jax.accuracy.trials import LEAST_TIME, Trial, seconds_of_steps
 from vmri_jax.mechanics.driving import events
 from vmri_jax.mechanics.linearisation import Linearisation, linearise
 from vmri_jax.mechanics.state import Movable, State, start_of
+from vmri_jax.refusals import Refused
 from vmri_jax.running.arguments import Steps
 from vmri_jax.running.progress import Progress, silent
 from vmri_jax.running.run_error import largest_of
@@ -109,7 +110,6 @@ class Search:
 
     system, start, length: of all runs.
     drives: events of the system in this time; all runs have steps that see them.
-    seen: called with each trial.
     seconds: measured seconds of a macro step by the Python expression of the scheme.
     """
 
@@ -122,11 +122,13 @@ class Search:
         num_saves: int | None = None,
         of: Callable | None = None,
         progress: Progress = silent,
-        seen: Callable[[Trial], None] = lambda trial: None,
     ):
         self.system, self.start = start_of("simulate", moving, state)
-        self.length, self.drives = float(t_end - self.start.t), events(self.system, self.start, t_end)
-        self.num_saves, self.progress, self.seen, self.num_trials = num_saves, progress, seen, 0
+        self.length = float(t_end - self.start.t)
+        if not 0 < self.length < np.inf:
+            raise Refused(f"t_end is {self.length:g} after the start; it must be later, by a finite time.")
+        self.drives = events(self.system, self.start, t_end)
+        self.num_saves, self.progress, self.num_trials = num_saves, progress, 0
         self.seconds: dict[str, float] = {}
         self._runs: dict[tuple[str, int], Simulation] = {}
         self._firsts: dict[tuple[str, int], Trial] = {}
@@ -219,12 +221,15 @@ class Search:
             certified = succeeded and bool(certified_nodes(trajectory, errors)[0].all())
             error = float(largest_of(errors).max()) if certified else np.inf
             trial = Trial(family, num_micro, run, trajectory, halved, errors, error)
-            self.seen(trial)
+            self.note(trial)
             # The seconds of the first trial include compiling, which later trials do not repeat.
             is_late = seconds > most and run.num_steps > FEWEST_STEPS
             if certified or is_late or 2 * run.num_steps > MOST_STEPS:
                 return trial
             num_steps, most = 2 * run.num_steps, min(most_seconds, MOST_TRIAL_SECONDS)
+
+    def note(self, trial: Trial) -> None:
+        """Called with each trial."""
 
     def accurate(self, trial: Trial, accuracy: float) -> Trial:
         """A trial of the same scheme with an error of at most the accuracy; the last trial if `MOST_REPEATS` of them

@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 from vmri_jax.accuracy.companions import check_function_of_run, with_error
-from vmri_jax.accuracy.steps import with_accuracy
+from vmri_jax.accuracy.steps import COMPARES, with_accuracy
 from vmri_jax.mechanics.checks import check_system
 from vmri_jax.mechanics.state import Movable, State
 from vmri_jax.refusals import Refused
@@ -92,15 +92,11 @@ def simulate(
             warnings.warn(type(concern)(f"simulate: {concern}"), stacklevel=2)
         return with_error(run, trajectory, of, error == "shares", trial=(best.halved, best.errors))
     if scheme is None:
-        raise Refused(
-            "simulate: scheme is None without an accuracy; give a scheme, or accuracy=1e-5 to have one chosen."
-        )
+        raise Refused("simulate: scheme is None without an accuracy; give one of them, e.g. accuracy=1e-5.")
     run = simulation(system, scheme, state, solver, steps)
     if not run.is_concrete:
         if error:
-            raise Refused(
-                "simulate: an error compares runs with numbers; call simulate outside of jax.jit, vmap and grad."
-            )
+            raise Refused(f"simulate: an error {COMPARES}")
         check_system(run.system, run.state.q_s, run.state.q_f)
         return run.traced()
     if state is not None:  # the start of a problem is checked when it is made
@@ -121,8 +117,8 @@ def _end(steps: Steps) -> float:
         refused.append(f"save={steps.save!r}")
     if refused:
         raise Refused(
-            f"simulate: got {' and '.join(refused)} with an accuracy, which chooses steps and saved nodes; leave them out, or the "
-            "accuracy. Of what is saved, Save(number=) is left to you."
+            f"simulate: got {' and '.join(refused)} with an accuracy, which chooses steps and saved nodes, but for "
+            "Save(number=); leave them out, or the accuracy."
         )
     if steps.t_end is None:
         raise Refused("simulate: an accuracy needs t_end, the time until which it is to be kept.")

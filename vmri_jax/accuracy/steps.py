@@ -28,6 +28,10 @@ ROUNDOFF = 100 * np.finfo(float).eps
 reachable accuracies."""
 
 
+COMPARES = "compares runs with numbers; call simulate outside of jax.jit, vmap and grad."
+"""End of the refusal of an error or an accuracy in a transformation."""
+
+
 class AccuracyNotReached(UserWarning):
     """The error of a run exceeds its accuracy, or is not certified."""
 
@@ -57,12 +61,8 @@ def with_accuracy(
     check_type("simulate: scheme", scheme, Scheme | Composition | None, a_scheme)
     opened_system, start = start_of("simulate", system, state)
     if not is_concrete((vars(start), opened_system.params, t_end)):
-        raise Refused(
-            "simulate: an accuracy compares runs with numbers; call simulate outside of jax.jit, vmap and grad."
-        )
+        raise Refused(f"simulate: an accuracy {COMPARES}")
     check_error("simulate: accuracy", accuracy, start)
-    if not t_end > start.t:
-        raise Refused(f"simulate: t_end is {float(t_end - start.t):g} after the start; it must be later.")
     search = Search(system, state, solver, t_end, num_saves, of, progress)
     best = reached("simulate: accuracy", search, usual_menu(search, scheme, accuracy), accuracy)[0]
     warn_of_events("simulate", search, best.run.scheme, stacklevel=4)
@@ -91,10 +91,9 @@ def check_extent(name: str, search: Search, accuracy: float) -> None:
     extent = search.extent()
     # Driven systems: positions at few saved nodes may hide the motion, and all trials see the events.
     if accuracy > extent and not search.drives.names:
+        until = f"until t = {float(search.start.t) + search.length:g}: any run is as accurate"
         raise Refused(
-            f"{name} is {accuracy:g}, and no position moves by more than {extent:.3g} until t = "
-            f"{float(search.start.t) + search.length:g}: any run is as accurate. Give a smaller one, in the unit of the "
-            "positions."
+            f"{name} is {accuracy:g}, and no position moves by more than {extent:.3g} {until}. Give a smaller one."
         )
 
 
@@ -134,10 +133,8 @@ def check_error(name: str, error: float, start: State | Problem) -> None:
     check_number(name, error)
     size, floor = round_off(start)
     if not error > floor:
-        raise Refused(
-            f"{name} is {error:g}; the largest position is {size:.3g}, so that round-off of float64 alone is about "
-            f"{floor:.0e}. Give a larger one, in the unit of the positions."
-        )
+        round_off_of = f"the largest position is {size:.3g}, so that round-off of float64 alone is about {floor:.0e}"
+        raise Refused(f"{name} is {error:g}; {round_off_of}. Give a larger one, in the unit of the positions.")
 
 
 def round_off(start: State | Problem) -> tuple[float, float]:

@@ -16,7 +16,7 @@ from vmri_jax.animation.html import write_html
 from vmri_jax.animation.motion import Motion, motion
 from vmri_jax.animation.vtk import write_vtk
 from vmri_jax.catalogue import SYSTEMS, find_problem
-from vmri_jax.cli.common import PICTURES, check_target_file, console
+from vmri_jax.cli.common import PICTURES, check_target, console
 from vmri_jax.running.progress import progress_shown
 from vmri_jax.running.store import StoredTrajectory
 from vmri_jax.running.trajectory import Trajectory
@@ -57,7 +57,7 @@ def animate(
     bar.
     """
     out = run.with_suffix(".html") if out is None else out
-    check_target_file("--out", out, (".html", *PICTURES, ".gif", ".pvd"))
+    check_target("--out", out, ".html", *PICTURES, ".gif", ".pvd")
     shown = _motion(run, system, drawing).between(start, end)
     if view is not None:
         shown = replace(shown, drawing=replace(shown.drawing, view=angles(view.split(","), "--view")))

@@ -17,7 +17,7 @@ from vmri_jax import plots
 from vmri_jax.accuracy.simulate import simulate as run_at_once
 from vmri_jax.catalogue import find_problem, find_scheme
 from vmri_jax.cli import options
-from vmri_jax.cli.common import PICTURES, check_target_file, console, print_failure, print_named
+from vmri_jax.cli.common import PICTURES, check_target, console, print_failure, print_named
 from vmri_jax.refusals import Refused
 from vmri_jax.running.arguments import Save, nothing_fast
 from vmri_jax.running.interrupts import Interrupted
@@ -89,7 +89,7 @@ def simulate(
     vmri simulate my_file.py:my_problem --scheme galerkin --degree 2 --macro-dt 0.05 --steps 400
     """
     streamed = _check_out(out, resume, overwrite)
-    check_target_file("--plot", plot, PICTURES)
+    check_target("--plot", plot, *PICTURES)
     problem = find_problem(system)
     _check_steps(steps, accuracy, t_end, streamed, error)
     of_scheme = {"--compose": compose, "--alpha": alpha, "--degree": degree, "--rule": rule}
@@ -208,7 +208,7 @@ def _check_out(out: Path | None, resume: bool, overwrite: bool) -> bool:
             f"{option} is for a run that is written while it goes; give --out with a file that ends in .zarr."
         )
     if out is not None and not (streamed and out.is_dir()):  # `stream` checks an existing store
-        check_target_file("--out", out, (".npz", ".zarr"))
+        check_target("--out", out, ".npz", ".zarr")
     return streamed
 
 

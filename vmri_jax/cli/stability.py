@@ -10,8 +10,7 @@ from rich.markup import escape
 from vmri_jax import plots
 from vmri_jax.catalogue import find_problem, find_scheme
 from vmri_jax.cli import options
-from vmri_jax.cli.common import PICTURES, check_target_file, console, print_written
-from vmri_jax.refusals import Refused
+from vmri_jax.cli.common import PICTURES, check_target, console, print_written
 from vmri_jax.running.printed import PrintedTable
 from vmri_jax.running.progress import Working
 from vmri_jax.stability import advise as advise_on
@@ -41,8 +40,6 @@ def advise(
     """
     problem = find_problem(system)
     chosen = find_scheme(scheme, num_micro, compose, alpha=alpha, degree=degree, rule=rule)
-    if macro_dt is None:
-        raise Refused("--macro-dt is missing; give the macro step that is to be judged.")
     with Working("judging this step and the steps around it"):
         advice = advise_on(problem, chosen, macro_dt=macro_dt)
     console.print(advice.table() if advice.findings else escape(advice.verdict))
@@ -75,7 +72,7 @@ def stability(
 
     vmri stability tsp --scheme fully-explicit --scheme mollified-impulse
     """
-    check_target_file("--out", out, PICTURES)
+    check_target("--out", out, *PICTURES)
     problem = linear_model() if system is None else find_problem(system)
     numbers, grid = num_micro or [2, 5, 10, 20], np.linspace(0.02, until, max(2, round(50 * until))) * np.pi
     chosen = {

@@ -5,20 +5,19 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 import typer
 from rich.markup import escape
 
 from vmri_jax import study
 from vmri_jax.catalogue import find_problem
 from vmri_jax.cli import options
-from vmri_jax.cli.common import check_target_file, check_target_folder, console, print_failure, print_written
+from vmri_jax.cli.common import check_target, console, print_failure, print_written
 from vmri_jax.running.interrupts import Interrupted
 from vmri_jax.running.progress import Progress, progress_shown
 from vmri_jax.steppers.results import SimulationError
 from vmri_jax.study.cost_report import PERIODS
 from vmri_jax.study.table import ResultTable
-from vmri_jax.study.tuning import NothingReached, check_target
+from vmri_jax.study.tuning import NothingReached
 
 
 def tune(
@@ -36,9 +35,8 @@ def tune(
 
     vmri tune my_file.py:my_problem --error 1e-3 --t-end 2
     """
-    check_target_file("--out", out, (".csv",))
+    check_target("--out", out, ".csv")
     problem = find_problem(system)
-    check_target(error, t_end, problem)
     try:
         with _search(out) as tell:
             choice = study.tune(problem, error, t_end, exhaustive=exhaustive, progress=tell)
@@ -72,9 +70,7 @@ def cost(
     vmri cost my_file.py:my_problem --t-end 5
     """
     problem = find_problem(system)
-    for target in error or [np.finfo(float).max]:
-        check_target(target, 1.0 if t_end is None else t_end, problem)
-    check_target_folder("--out", out)
+    check_target("--out", out)
     with _search(None) as tell:
         report = study.cost_report(problem, system, out, t_end=t_end, errors=error, progress=tell)
     console.print(report.table())

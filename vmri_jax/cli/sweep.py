@@ -16,7 +16,7 @@ from vmri_jax import plots
 from vmri_jax.animation.checks import check_keys
 from vmri_jax.catalogue import find_problem
 from vmri_jax.cli.columns import by_name
-from vmri_jax.cli.common import PICTURES, check_target_file, console, print_failure, print_named, print_written
+from vmri_jax.cli.common import PICTURES, check_target, console, print_failure, print_named, print_written
 from vmri_jax.ensembles import Axis, Draw, Draws, Ensemble, EnsembleError, Product, ensemble
 from vmri_jax.ensembles.quantities import drawn_by_default
 from vmri_jax.executors.executor import local_workers
@@ -52,7 +52,7 @@ def sweep(
 
     Finished runs stay if a worker or this program dies; --resume computes the others.
     """
-    check_target_file("--plot", plot, PICTURES)
+    check_target("--plot", plot, *PICTURES)
     if plot is not None:
         for package in ("xarray", "dask.array"):  # refuse a missing package now: the figure comes after all runs
             extra(package, "--plot", "ensemble")

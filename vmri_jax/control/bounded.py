@@ -59,10 +59,8 @@ def solve(stages: Stages, final: Final, limits: Limits) -> tuple[Solution, float
         slopes = [np.abs(part).max(initial=0.0) for part in (stages.gradient, final.s)]
         solution = _solved(stages, final, limits, RELAXATION_WEIGHT * max(1.0, *slopes))
     if solution is None:
-        raise Unsolved(
-            "minimize: PIQP solves neither the linear-quadratic problem of an iteration nor its relaxation. Look at "
-            "the sizes of cost, goal and limits: they should be of one order."
-        )
+        problem = "neither the linear-quadratic problem of an iteration nor its relaxation"
+        raise Unsolved(f"minimize: PIQP solves {problem}; cost, goal and limits should be of one order.")
     return solution
 
 

@@ -112,11 +112,8 @@ def minimize(
             nu, rho = change.nu, max(rho, 2 * steepest)
             point, record = line_search(setup, point._replace(gaps=stages.c, goal=final.g), change, rho)
             history.append(record)
-            tell(
-                f"cost {record['cost']:.6g}, goal {record['miss']:.1e}, steps {record['gap']:.1e}",
-                count,
-                max_iterations,
-            )
+            words = f"cost {record['cost']:.6g}, goal {record['miss']:.1e}, steps {record['gap']:.1e}"
+            tell(words, count, max_iterations)
             if max(record["update"], record["gap"]) <= tolerance or record["part"] == 0.0:
                 break
     last = history[-1]
@@ -130,19 +127,6 @@ def minimize(
     controls, times = np.asarray(point.u), setup.times(num_steps)
     if grid == "macro":
         controls, times = controls[:, 0], times[:, 0]
-    return Optimum(
-        controls,
-        times,
-        labels,
-        setup.bounds,
-        trajectory,
-        last["cost"],
-        np.asarray(nu),
-        last["miss"],
-        last["over"],
-        last["gap"],
-        len(history),
-        success,
-        driven,
-        history,
-    )
+    reached = {name: last[name] for name in ("cost", "miss", "over", "gap")} | {"multipliers": np.asarray(nu)}
+    ended = {"iterations": len(history), "success": success, "problem": driven, "history": history}
+    return Optimum(controls, times, labels, setup.bounds, trajectory, **reached, **ended)

@@ -107,9 +107,9 @@ def shadow_energy(system: Movable, scheme: Scheme | Composition, trajectory: Tra
     macro_dt = (t[-1] - t[0]) / (len(t) - 1)
     actions, miss, result = _actions(system, scheme, nodes, macro_dt)
     if int(result) > Result.CONVERGED_AT_ROUNDOFF or not float(miss) < LARGEST_MISS:
+        far = f"steps of {macro_dt:.6g} from the nodes of the trajectory miss the next ones by {float(miss):.1e} of a step"
         raise Refused(
-            f"shadow_energy: steps of {macro_dt:.6g} from the nodes of the trajectory miss the next ones by {float(miss):.1e} of "
-            "a step. It must be a run of this system and scheme with every macro node saved (save=1)."
+            f"shadow_energy: {far}. Give a run of this system and scheme with every macro node saved (save=1)."
         )
     q, p = (np.concatenate(pair, axis=1) for pair in ((nodes.q_s, nodes.q_f), (nodes.p_s, nodes.p_f)))
     energy = _energy(q, p, np.asarray(actions), macro_dt, k)
@@ -134,10 +134,8 @@ def _checked(system: Movable, scheme: Scheme | Composition, trajectory: Trajecto
         raise Refused("shadow_energy: the run failed; take its first part, trajectory[:n].")
     fewest = 2 * k + BLOCKS + 1
     if np.ndim(trajectory.t) != 1 or len(trajectory.t) < fewest:
-        raise Refused(
-            f"shadow_energy: the times have shape {np.shape(trajectory.t)}; with k = {k} one run of at least {fewest} nodes is "
-            "needed. Simulate longer, or take a smaller k."
-        )
+        expected = f"with k = {k} give one run of at least {fewest} nodes, or a smaller k"
+        raise Refused(f"shadow_energy: the times have shape {np.shape(trajectory.t)}; {expected}.")
     return system
 
 

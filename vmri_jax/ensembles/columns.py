@@ -61,16 +61,14 @@ def lane_function(
     """
     if vary is None and columns:
         name = columns[0]
+        known = near(name, (*STEPS, *SCHEMES))
         raise Refused(
-            f"ensemble: the column {name!r} is neither a step nor a scheme.{near(name, (*STEPS, *SCHEMES))} Give vary=, a "
-            f"function (problem, row) -> problem that puts row[{name!r}] into the problem of a run."
+            f"ensemble: the column {name!r} is neither a step nor a scheme.{known} Give vary=, which puts it into a problem."
         )
 
     def lane(row: Row) -> Lanes:
         changed = problem if vary is None else vary(problem, {name: row[name] for name in columns})
-        check_type(
-            "ensemble: vary(problem, row)", changed, Problem, "dataclasses.replace(problem, q_s=...), for example"
-        )
+        check_type("ensemble: vary(problem, row)", changed, Problem, "dataclasses.replace(problem, q_s=...)")
         _check_only_values_differ(problem, changed)
         if time_is_fixed and changed.t is not problem.t:
             raise Refused(
@@ -92,7 +90,7 @@ def _check_only_values_differ(problem: Problem, changed: Problem) -> None:
     before, after = ((entry.system.params, [getattr(entry, part) for part in START]) for entry in (problem, changed))
     same_shapes = jax.tree.map(np.shape, before) == jax.tree.map(np.shape, after)
     if not (same_system and same_shapes):
+        changes = "the system besides its params" if same_shapes else "the structure or shape of one of them"
         raise Refused(
-            "ensemble: vary(problem, row) may change the values of system.params, positions, velocities and t. It changes "
-            f"{'the system besides its params' if same_shapes else 'the structure or shape of one of them'}; such runs need an ensemble of their own."
+            f"ensemble: vary changes {changes}; it may change the values of system.params, positions, velocities and t."
         )

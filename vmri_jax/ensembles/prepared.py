@@ -39,10 +39,8 @@ def prepared(work: Work, design: Design, chunk: int | None = None) -> tuple[dict
     runs[0].check("ensemble: the start", constraints=False)
     over_nodes = [str(name) for name, quantity in zip(work.save, work.quantities, strict=True) if quantity.over_nodes]
     if over_nodes and work.num_saves == 1:
-        raise Refused(
-            f"ensemble: {', '.join(over_nodes)} looks at the saved nodes of a run, and only its end is saved; give num_saves, "
-            "for example 50."
-        )
+        looks = f"{', '.join(over_nodes)} looks at the saved nodes of a run"
+        raise Refused(f"ensemble: {looks}, and only its end is saved; give num_saves, for example 50.")
     runs.sort(key=_micro_steps, reverse=True)
     arrays = {
         "result": Kept(np.empty((), np.int32), (), "status of the run, see flag_meanings"),

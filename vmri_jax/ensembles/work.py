@@ -23,8 +23,8 @@ from vmri_jax.ensembles.columns import (
 )
 from vmri_jax.ensembles.design import Design, Rows, unique_rows
 from vmri_jax.ensembles.quantities import Quantity, Saved, of_lanes, quantity
-from vmri_jax.mechanics.checks import digest
-from vmri_jax.mechanics.names import near
+from vmri_jax.mechanics.checks import check_type, digest
+from vmri_jax.mechanics.names import unknown
 from vmri_jax.mechanics.state import Problem
 from vmri_jax.refusals import Refused
 from vmri_jax.running import arguments
@@ -90,12 +90,11 @@ class Work:
         for file, digest_at_start in self.sources.items():
             if not Path(file).is_file():
                 raise FileNotFoundError(
-                    f"{file} does not exist on this worker. Put it where all workers see it, or install it as a package and give "
-                    "my_package.my_module:name."
+                    f"{file} does not exist on this worker. Put it where all workers see it, or give my_package.my_module:name."
                 )
             if digest(Path(file).read_bytes()) != digest_at_start:
                 raise Refused(
-                    f"{file} differs from the file where the ensemble was started; give all workers the same file."
+                    f"{file} differs from the file where the ensemble was started; give workers the same file."
                 )
 
     def with_sources(self) -> "Work":
@@ -154,10 +153,7 @@ class Work:
         """The first run of a group, after a check of its arguments."""
         macro_dt, num_steps = float(np.ravel(group.macro_dt)[0]), group.num_steps
         if num_steps % self.num_saves:
-            raise Refused(
-                f"ensemble: {num_steps} macro steps are no multiple of num_saves = {self.num_saves}, so that the last saved node "
-                "would not be the end."
-            )
+            raise Refused(f"ensemble: {num_steps} macro steps are no multiple of num_saves = {self.num_saves}.")
         state = self.problem.state(self.project)
         steps = arguments.Steps(macro_dt, num_steps, save=Save(number=self.num_saves))
         return simulation(self.problem, group.scheme, state, self.solver, steps)
@@ -199,25 +195,19 @@ class Work:
     def _scheme(self, values: Mapping[str, Any]) -> Scheme | Composition:
         label = str(values.get("scheme", next(iter(self.schemes))))
         if label not in self.schemes:
-            raise Refused(
-                f"ensemble: there is no scheme {label!r}.{near(label, self.schemes)} There are {', '.join(self.schemes)}."
-            )
+            raise Refused(f"ensemble: {unknown('scheme', label, self.schemes)}")
         scheme = self.schemes[label]
         num_micro = _whole("num_micro", values["num_micro"]) if "num_micro" in values else self.num_micro
         if isinstance(scheme, Scheme | Composition):
             if num_micro is not None:
                 raise Refused(
-                    f"ensemble: the scheme {label!r} has its num_micro already; give a function of num_micro, for example "
-                    "vmri_jax.fully_implicit, or the name of a scheme."
+                    f"ensemble: the scheme {label!r} has its num_micro already; give the function, vm.fully_implicit, or its name."
                 )
             return scheme
         if num_micro is None:
-            raise Refused(
-                f"ensemble: num_micro is missing for the scheme {label!r}; give num_micro, or a column of this name."
-            )
+            raise Refused(f"ensemble: num_micro is missing for the scheme {label!r}, as argument or column.")
         made = find_scheme(scheme, num_micro) if isinstance(scheme, str) else scheme(num_micro)
-        if not isinstance(made, Scheme | Composition):
-            raise Refused(f"ensemble: the scheme {label!r} makes {type(made).__name__}; it must make a Scheme.")
+        check_type(f"ensemble: the value of the scheme {label!r}", made, Scheme | Composition, "a Scheme")
         return made
 
     def _steps(self, values: Mapping[str, Any]) -> tuple[Any, int]:
@@ -229,10 +219,8 @@ class Work:
         values_by_name |= {name: values[name] for name in STEPS if name in values}
         names = set(values_by_name)
         if len(names) != 2:
-            raise Refused(
-                f"ensemble: of the steps {', '.join(sorted(names)) or 'nothing'} is given; give two of t_end, "
-                "num_steps and macro_dt, as arguments or columns."
-            )
+            given = ", ".join(sorted(names)) or "nothing"
+            raise Refused(f"ensemble: got {given}; give two of t_end, num_steps and macro_dt, as arguments or columns.")
         if "num_steps" in values_by_name:
             values_by_name["num_steps"] = _whole("num_steps", values_by_name["num_steps"])
         start = float(self.problem.t)

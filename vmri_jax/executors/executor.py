@@ -10,6 +10,7 @@ from typing import Any
 
 from vmri_jax.executors.worker import NotAWorker, in_worker, known_versions, packed
 from vmri_jax.mechanics.arrays import whole_number
+from vmri_jax.mechanics.checks import check_type
 from vmri_jax.refusals import Refused
 from vmri_jax.running.export import extra
 from vmri_jax.running.interrupts import Interrupted, interrupts_noted
@@ -47,26 +48,18 @@ def executor_of(caller: str, executor: Any, processes: int | None = None) -> Ite
             executor = resources.enter_context(local_workers(whole_number(f"{caller}: processes", processes)))
         if executor is not None and hasattr(executor, "get_executor"):
             executor = executor.get_executor(retries=DASK_RETRIES, pure=False)
-        if not isinstance(executor, Executor | None):
-            raise Refused(
-                f"{caller}: executor is {type(executor).__name__}; give a dask.distributed.Client or a concurrent.futures.Executor, "
-                "or the number of processes on this machine."
-            )
-        if executor is not None:
-            _check_worker(caller, executor)
+        kinds = "a dask.distributed.Client or a concurrent.futures.Executor"
+        check_type(f"{caller}: executor", executor, Executor | None, kinds)
+        try:
+            # A function of Python's library: a worker of Dask that cannot import the function of a task ends, and the
+            # task never does.
+            if executor is not None:
+                executor.submit(version, "vmri_jax").result()
+        except PackageNotFoundError as error:
+            raise NotAWorker(
+                f"{caller}: a worker does not have vmri_jax; install the version of this process."
+            ) from error
         yield Here() if executor is None else executor
-
-
-def _check_worker(caller: str, tasks: Executor) -> None:
-    """Refuse workers without this package; asked by a function of Python's library, since a worker of Dask that cannot import
-    the function of a task ends, and the task never does."""
-    try:
-        tasks.submit(version, "vmri_jax").result()
-    except PackageNotFoundError as error:
-        raise NotAWorker(
-            f"{caller}: a worker does not have vmri_jax. Install it in the environment of the workers, the version of this "
-            "process."
-        ) from error
 
 
 @contextmanager

@@ -35,10 +35,9 @@ def packed(caller: str, task: Callable, *shared) -> bytes:
             raise pickle.PicklingError("it has functions of the running program")
     except (pickle.PicklingError, AttributeError, TypeError) as error:
         raise Refused(
-            f"{caller}: workers cannot import this system or scheme ({error}). Workers cannot find functions of the running program or of an "
-            "interactive session, nor lambdas and functions within functions. Put the "
-            "problem into a file and give its name, 'my_file.py:my_problem', or into a package that workers have, "
-            "'my_package.my_module:my_problem'."
+            f"{caller}: workers cannot import this system or scheme ({error}): functions of the running program or of an "
+            "interactive session, lambdas, and functions within functions. Put the problem into a file, "
+            "'my_file.py:my_problem', or into a package that workers have, 'my_package.my_module:my_problem'."
         ) from error
     return data
 
@@ -51,10 +50,8 @@ def in_worker(versions: dict[str, str], data: bytes, *plain):
     here = known_versions()
     differ = [f"{name} {here[name]} instead of {versions[name]}" for name in versions if here[name] != versions[name]]
     if differ:
-        raise NotAWorker(
-            f"the worker on {socket.gethostname()} has {', '.join(differ)}. Results would differ in their last digits: give all "
-            "workers the versions of the process that starts them."
-        )
+        worker = f"the worker on {socket.gethostname()} has {', '.join(differ)}"
+        raise NotAWorker(f"{worker}. Results would differ in their last digits: give all workers the same versions.")
     _prepare(os.getpid())
     task, shared = _unpacked(data)
     return task(*shared, *plain)
@@ -76,7 +73,6 @@ def _prepare(process: int) -> None:
         configure(cache=cache_folder() / "workers" / processor())
     except RuntimeError as error:
         raise NotAWorker(
-            f"process {process} on {socket.gethostname()} runs JAX already, without the settings of vmri_jax; perhaps it was forked. "
-            "Give an executor that starts new processes, ProcessPoolExecutor(n, "
-            "mp_context=multiprocessing.get_context('spawn')), and workers that do nothing else with JAX."
+            f"process {process} on {socket.gethostname()} runs JAX already, without the settings of vmri_jax; perhaps it "
+            "was forked. Give new processes, ProcessPoolExecutor(n, mp_context=multiprocessing.get_context('spawn'))."
         ) from error

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any, cast
+from typing import cast
 
 import jax
 import jax.numpy as jnp
@@ -103,8 +103,7 @@ def fit(
         tell("a run with the first parameters", 0, NUM_PHASES)
         run = prepare(first, scheme, macro_dt=macro_dt, num_steps=max(int(s.max()) for s in steps), solver=solver)
         run()
-        # A fallback is a branch of the compiled step; `jax.vmap` over searches and derivatives would compute both of
-        # its sides.
+        # A fallback is a branch of the compiled step: `jax.vmap` over searches would compute both of its sides.
         shooting = Shooting(model, unknowns, data, steps, scheme, solver or run.plan.first, float(macro_dt), segments)
         search = _Search(shooting, max_steps)
         u = np.zeros((starts, unknowns.size))
@@ -115,19 +114,18 @@ def fit(
 
 def _model(problem, parameters: Mapping) -> Callable[[Mapping], Problem]:
     if not parameters:
-        raise Refused(
-            "fit: parameters is empty; name the unknown parameters, e.g. {'stiffness': Unknown(3000.0, lower=0)}."
-        )
+        raise Refused("fit: parameters is empty; name the unknown ones, e.g. {'stiffness': Unknown(3000.0, lower=0)}.")
     if not isinstance(problem, Problem) and callable(problem) and not hasattr(problem, "problem"):
         return cast(Callable[[Mapping], Problem], problem)
     base = problem_of("fit", cast(Problem, problem))
-    params = base.system.params
-    known, structure = _by_name(params if isinstance(params, Mapping) else {})
+    params = base.system.params if isinstance(base.system.params, Mapping) else {}
+    numbers, structure = jax.tree.flatten_with_path(params, is_leaf=lambda value: not isinstance(value, Mapping))
+    known = {jax.tree_util.keystr(path, simple=True, separator="."): number for path, number in numbers}
     for name, unknown in parameters.items():
         if name not in known and name not in START:
+            places = f"system.params ({', '.join(known) or 'no dict'}) nor of {', '.join(START)}"
             raise Refused(
-                f"fit: parameters has {name!r}, which is none of system.params ({', '.join(known) or 'no dict'}) nor "
-                f"of {', '.join(START)}. Give a function from parameters to a Problem for anything else."
+                f"fit: parameters has {name!r}, which is none of {places}. Give a function that makes a Problem."
             )
         expected = np.shape(known[name] if name in known else getattr(base, name))
         start = unknown.start if isinstance(unknown, Unknown) else unknown
@@ -141,13 +139,6 @@ def _model(problem, parameters: Mapping) -> Callable[[Mapping], Problem]:
         return replace(base, system=system, **start)
 
     return model
-
-
-def _by_name(params: Mapping) -> tuple[dict[str, Any], Any]:
-    """The numbers in nested dictionaries by name, ``"bonds.stiffness"``, and the structure that makes the dictionaries
-    from them."""
-    numbers, structure = jax.tree.flatten_with_path(params, is_leaf=lambda value: not isinstance(value, Mapping))
-    return {jax.tree_util.keystr(path, simple=True, separator="."): number for path, number in numbers}, structure
 
 
 def _check(data: list, segments: int, starts: int, max_steps: int) -> None:
@@ -170,9 +161,7 @@ class _Search:
         self.size = shooting.unknowns.size
         self.count = len(shooting.values)
         if self.count < self.size:
-            raise Refused(
-                f"fit: {self.count} values for {self.size} unknown numbers; measure more, or fix some of them."
-            )
+            raise Refused(f"fit: {self.count} values for {self.size} unknown numbers; measure more, or fix some.")
         u_start = np.zeros(self.size)
         self.part_starts = shooting.starts(u_start)
         # The starts of the parts are scaled by the largest value of each coordinate along the first run.
@@ -232,11 +221,8 @@ class _Search:
         by_parameters = np.asarray(self.compiled_jacobian(*point)[0])
         dead = np.flatnonzero(~by_parameters.any(axis=0))
         if dead.size:
-            labels = self.shooting.unknowns.labels
-            raise Refused(
-                f"fit: no measured value depends on {', '.join(labels[i] for i in dead)} at the start of the search. "
-                "Leave this parameter out, or start elsewhere."
-            )
+            names = ", ".join(self.shooting.unknowns.labels[i] for i in dead)
+            raise Refused(f"fit: no measured value depends on {names}; leave this parameter out, or start elsewhere.")
 
     def result(self, u, tell: Progress) -> Fit:
         """The `Fit` of the best search; each row of u starts one."""

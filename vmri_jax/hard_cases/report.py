@@ -23,7 +23,7 @@ COLORS = {True: "green", False: "red", None: "dim"}
 """Colour of the verdict, by `Outcome.passed`."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Report(ResultTable):
     """Outcomes of cases, in order."""
 

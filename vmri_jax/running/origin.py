@@ -80,7 +80,7 @@ class Origin:
         """
         if self.simulated is None:
             raise Refused(
-                "this run does not know its system, since it was read from a file, or pickled with functions that Python cannot "
+                "this run does not know its system: it was read from a file, or pickled with functions that Python cannot "
                 "pickle. Give it: run.of(problem), with the Problem, Scene or System that was simulated."
             )
         return jax.tree.map(lambda leaf: leaf[(0,) * axes], self.simulated) if axes else self.simulated

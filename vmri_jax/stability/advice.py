@@ -6,10 +6,11 @@ from typing import Any
 
 import numpy as np
 
+from vmri_jax.mechanics.checks import check_type
 from vmri_jax.mechanics.linearisation import Linearisation, linearise
 from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.mechanics.terms import label
-from vmri_jax.refusals import Refused
+from vmri_jax.running.arguments import check_step_size
 from vmri_jax.running.origin import names_of
 from vmri_jax.schemes.composition import Composition, stage_lengths, stage_scheme
 from vmri_jax.schemes.scheme import Scheme
@@ -68,7 +69,7 @@ class Finding:
     number: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Advice(ResultTable):
     """Result of `advise`.
 
@@ -166,10 +167,8 @@ def advise(
     """
     names = names_of(system)
     system, state = start_of("advise", system, state)
-    if not isinstance(scheme, Scheme | Composition):
-        raise Refused(f"advise: scheme is {type(scheme).__name__}; give a Scheme, e.g. fully_implicit(num_micro=10).")
-    if not (np.ndim(macro_dt) == 0 and np.isfinite(macro_dt) and macro_dt > 0):
-        raise Refused(f"advise: macro_dt is {macro_dt}; it must be a positive number.")
+    check_type("advise: scheme", scheme, Scheme | Composition, "a Scheme, e.g. fully_implicit(num_micro=10)")
+    check_step_size(macro_dt, "advise")
     macro_dt, linear = float(macro_dt), linearise(system, state, names)
     period = drive_period(system, state, macro_dt)
     if period is None:

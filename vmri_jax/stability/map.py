@@ -39,7 +39,7 @@ def windows_text(windows: Sequence[Window]) -> str:
     return ", ".join(f"{w.start / np.pi:.4g} to {w.stop / np.pi:.4g}" for w in windows) or "nowhere"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class StabilityMap(ResultTable):
     """Largest multipliers of a macro step over a grid, and the windows of instability.
 
@@ -131,10 +131,7 @@ def stability_map(
     systems = system if isinstance(system, Mapping) else {"": system}
     schemes = scheme if isinstance(scheme, Mapping) else {"": scheme}
     if not schemes or not all(isinstance(s, Scheme | Composition) for s in schemes.values()):
-        raise Refused(
-            f"stability_map: scheme is {scheme!r}; give a Scheme or Composition, e.g. explicit_slow(10), or a dict of "
-            "them."
-        )
+        raise Refused(f"stability_map: scheme is {scheme!r}; give a Scheme, e.g. explicit_slow(10), or a dict of them.")
     if min(len(systems), len(schemes)) != 1:
         raise Refused(f"stability_map: {len(systems)} systems and {len(schemes)} schemes; give one of either.")
     axis, labels = ("system", systems) if isinstance(system, Mapping) and len(schemes) == 1 else ("scheme", schemes)
@@ -214,8 +211,6 @@ def _grid(omega_H) -> np.ndarray:
     grid = np.asarray(omega_H, dtype=float)
     if grid.ndim != 1 or grid.size < 2 or not (np.isfinite(grid).all() and grid[0] > 0 and (np.diff(grid) > 0).all()):
         values = f"{grid.flat[0]:g} to {grid.flat[-1]:g}" if grid.size else "none"
-        raise Refused(
-            f"stability_map: omega_H has shape {grid.shape} and values {values}; give two or more positive values, "
-            "increasing, e.g. numpy.linspace(0.05, 12, 240)."
-        )
+        expected = "give two or more positive values, increasing, e.g. numpy.linspace(0.05, 12, 240)"
+        raise Refused(f"stability_map: omega_H has shape {grid.shape} and values {values}; {expected}.")
     return grid

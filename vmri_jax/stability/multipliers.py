@@ -15,12 +15,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.diagnostics.linear import phase_step, phase_vector, state_of, with_slopes
-from vmri_jax.mechanics.arrays import QUICK, is_concrete, quickly_compiled, whole_number
+from vmri_jax.mechanics.arrays import QUICK, quickly_compiled, whole_number
 from vmri_jax.mechanics.invariants import all_constraints
 from vmri_jax.mechanics.linearisation import Linearisation, tangents
 from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.mechanics.system import System
 from vmri_jax.refusals import Refused
+from vmri_jax.running.arguments import check_step_size
 from vmri_jax.schemes.composition import Composition, stage_lengths, stage_scheme
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.results import Result
@@ -93,9 +94,7 @@ def multipliers(linear: Linearisation, scheme: Scheme | Composition, macro_dt) -
     """
     macro_dt, size = np.asarray(macro_dt, dtype=float), 2 * linear.shapes.shape[1]
     if not size:
-        raise Refused(
-            f"multipliers: the constraints leave none of the {len(linear.shapes)} coordinates free; nothing moves."
-        )
+        raise Refused(f"multipliers: the constraints leave none of the {len(linear.shapes)} coordinates free.")
     lanes = int(np.clip(LANES * 36 // size, 4, LANES))
     stages = np.outer(macro_dt, stage_lengths(scheme))
     padded = np.pad(stages.ravel(), (0, -stages.size % lanes), mode="edge").reshape(-1, lanes)
@@ -201,8 +200,7 @@ def monodromy(
     """
     system, state = start_of("monodromy", system, state)
     whole_number("monodromy: num_steps", num_steps)
-    if is_concrete(macro_dt) and not (np.ndim(macro_dt) == 0 and np.isfinite(macro_dt) and macro_dt > 0):
-        raise Refused(f"monodromy: macro_dt is {macro_dt}; it must be a positive number.")
+    check_step_size(macro_dt, "monodromy")
     start = State(*(jnp.asarray(a, dtype=float) for a in (state.t, state.q_s, state.q_f, state.p_s, state.p_f)))
     directions = tangents(np.asarray(_constraint_rows(system, start))).T
     z, images, steps, result = _followed(system, scheme, start, macro_dt, solver, num_steps, directions)

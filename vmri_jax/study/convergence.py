@@ -58,9 +58,8 @@ class Case:
     def row(self, name: str, scheme, num_steps: int, t_end: float, run: Trajectory) -> Row:
         """The row of a run of a scheme to `t_end`."""
         error_q, error_p = self.reference.errors(run)
-        numbers, system = (t_end / num_steps, num_steps), self.problem.system
-        measured = {"error_q": error_q, "error_p": error_p, "case": self.label}
-        return row_of(name, system, scheme, run, *numbers, self.energies, **measured)
+        known = {"error_q": error_q, "error_p": error_p, "case": self.label}
+        return row_of(name, self.problem.system, scheme, run, t_end / num_steps, num_steps, self.energies, **known)
 
 
 @dataclass(frozen=True)
@@ -90,7 +89,7 @@ def _order(fit: OrderFit) -> str:
     return f"{fit.order:.2f}" + (f" ± {fit.half_width:.2f}" if np.isfinite(fit.half_width) else "")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class ConvergenceStudy(RunTable):
     """Rows of a convergence study, sorted by scheme, then by case, then by macro step in the order of the call.
 
@@ -222,11 +221,10 @@ def convergence_study(
     steps = [_num_steps(t_end, dt, num_saves) for dt in macro_dt]
     if not steps:
         raise Refused("convergence_study: macro_dt is empty; give the macro steps to run.")
-    total = len(schemes) * len(steps) * (1 if params is None else len(params))
-    told = lambda message, *_: progress(message, 0, total)  # noqa: E731
-    cases = _cases(problem, params, reference, t_end, num_saves, told)
+    cases = _cases(problem, params, reference, t_end, num_saves, progress)
     labels = [(label, case, n) for label in schemes for case in cases for n in steps]
     arguments = [(case.problem, schemes[label], t_end, num_saves, solver, n) for label, case, n in labels]
+    total = len(labels)
 
     def tell(done: int, i: int) -> None:
         progress(f"{labels[i][0]}, H = {t_end / labels[i][2]:g}", done, total)
@@ -246,12 +244,9 @@ def convergence_study(
             progress("measuring times", total, total)
             timed = {str(i): _prepared(*arguments[i]).timed() for i, row in enumerate(rows) if not row.failed}
             samples = interleaved(timed, repeats)
-        study = replace(
-            study,
-            rows=tuple(
-                replace(row, seconds=float(np.median(samples.get(str(i), [np.nan])))) for i, row in enumerate(rows)
-            ),
-        )
+        seconds = [float(np.median(samples.get(str(i), [np.nan]))) for i in range(total)]
+        rows = [replace(row, seconds=each) for row, each in zip(rows, seconds, strict=True)]
+        study = replace(study, rows=tuple(rows))
     progress("done", total, total)
     return study
 
@@ -268,16 +263,14 @@ def _cases(problem: Problem, params, reference, t_end: float, num_saves: int, pr
     elif not isinstance(reference, Mapping) and len(problems) == 1:
         reference = dict.fromkeys(problems, reference)
     if not isinstance(reference, Mapping) or set(reference) != set(problems):
-        raise Refused(
-            f"convergence_study: params has the labels {list(problems)}, so reference must be a mapping with the same labels."
-        )
+        raise Refused(f"convergence_study: reference must be a mapping with the labels of params, {list(problems)}.")
     shape = (num_saves + 1, problem.q_s.size + problem.q_f.size)
     for label in problems:
-        q, p = reference[label].q, reference[label].p
-        if q.shape != shape or p.shape != shape:
+        shapes = reference[label].q.shape, reference[label].p.shape
+        if shapes != (shape, shape):
+            nodes = "num_saves + 1 nodes from the start to t_end, slow coordinates first"
             raise Refused(
-                f"convergence_study: reference has q of shape {q.shape} and p of shape {p.shape}; both "
-                f"must be {shape}: num_saves + 1 nodes from the start to t_end, slow coordinates first."
+                f"convergence_study: reference has q and p of shapes {shapes}; both must be {shape}: {nodes}."
             )
     return [Case(label, problem, reference[label]) for label, problem in problems.items()]
 
@@ -296,9 +289,6 @@ def _num_steps(t_end: float, macro_dt: float, num_saves: int) -> int:
     """The number of macro steps up to `t_end`."""
     num_steps = round(t_end / macro_dt) if macro_dt > 0 else 0
     if num_steps < 1 or abs(num_steps * macro_dt - t_end) > 1e-9 * t_end or num_steps % num_saves:
-        raise Refused(
-            f"convergence_study: macro_dt = {macro_dt:g} makes {t_end / macro_dt if macro_dt else float('inf'):.6g} steps "
-            f"up to t_end = {t_end:g}; it must make a multiple of num_saves = {num_saves} whole steps, so that every run "
-            "saves the same times."
-        )
+        steps = f"macro_dt = {macro_dt:g} makes {t_end / (macro_dt or np.nan):.6g} steps up to t_end = {t_end:g}"
+        raise Refused(f"convergence_study: {steps}; it must make a multiple of num_saves = {num_saves} whole steps.")
     return num_steps

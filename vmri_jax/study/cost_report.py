@@ -1,24 +1,27 @@
 """A page on the cost of accuracy for a system: what one search for a few errors has seen."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax import plots
 from vmri_jax.accuracy.families import Family
-from vmri_jax.accuracy.steps import check_extent, round_off
+from vmri_jax.accuracy.steps import check_error, check_extent, round_off
 from vmri_jax.mechanics.linearisation import linearise
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
+from vmri_jax.mechanics.terms import Term
 from vmri_jax.refusals import Refused
 from vmri_jax.running.files import make_writable_folder
 from vmri_jax.running.progress import part, shows_progress
+from vmri_jax.running.timing import seconds_each
 from vmri_jax.study.html import embedded, write_page
-from vmri_jax.study.prices import bound_of, prices
 from vmri_jax.study.row import Row, record
 from vmri_jax.study.table import Column, ResultTable, interruptible
 from vmri_jax.study.tuning import Tuning
@@ -45,7 +48,7 @@ def _of_setting(form: Callable[[Row], str]) -> Callable[[Answer], str]:
     return lambda answer: "" if answer.setting is None else form(answer.setting)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class CostReport(ResultTable):
     """The answers of a search for several errors, and the path of their page; its table has a line per answer.
 
@@ -148,17 +151,17 @@ def cost_report(
     problem, out = problem_of("cost_report", problem), Path(out)
     make_writable_folder(out)
     t_end = default_t_end(problem) if t_end is None else t_end
-    if errors is not None and (not errors or min(errors) <= 0):
-        raise Refused(f"cost_report: errors are {list(errors)}; give positive numbers, in the unit of the positions.")
+    for error in errors or ():
+        check_error("cost_report: each of errors", error, problem)
     tuning, answered = Tuning(problem, t_end, menu, progress=progress), []
     with interruptible(tuning.runs):  # around the drawing as well, so that Ctrl-C there keeps the runs, too
-        tuning.search.first_trials(tuning.menu[:1], np.inf)  # they tell how far the system moves
-        errors = sorted(_default_errors(tuning, problem, t_end) if errors is None else errors)
-        check_extent("cost_report: the largest of errors", tuning.search, errors[-1])
+        tuning.first_trials(tuning.menu[:1], np.inf)  # they tell how far the system moves
+        errors = sorted(errors or _default_errors(tuning, problem, t_end))
+        check_extent("cost_report: the largest of errors", tuning, errors[-1])
         try:
             # The smallest error first: families that are given up for it are hopeless for larger errors.
             for i, error in enumerate(errors):
-                tuning.search.progress = part(progress, i, len(errors))
+                tuning.progress = part(progress, i, len(errors))
                 tuning.look_for("cost_report: error", error)
                 answered.append(error)
         finally:
@@ -172,16 +175,43 @@ def cost_report(
     return report
 
 
+def prices(problem: Problem) -> dict[str | int, float]:
+    """Seconds of one evaluation of the gradient of each potential that the system has, by the name of the potential,
+    each timed in a compiled loop of its own."""
+    system, n_s = problem.system, problem.q_s.size
+
+    def gradient(term: Term) -> Callable:
+        return jax.grad(lambda q: term(system.params, q_s=q[:n_s], q_f=q[n_s:]))
+
+    q = jnp.concatenate([jnp.asarray(problem.q_s), jnp.asarray(problem.q_f)])
+    return {term.name: seconds_each(gradient(term), q) for term in system.of_kind("potential")}
+
+
+def seconds_of_gradients(price: Mapping[str | int, float], row: Row) -> float:
+    """Seconds of a run in its gradients: evaluations times `prices`."""
+    counts = {"V": row.slow_evaluations, "W": row.fast_evaluations, **row.evaluations}
+    return sum(seconds * counts.get(name, 0) for name, seconds in price.items())
+
+
+def bound_of(price: Mapping[str | int, float], rows: Sequence[Row]) -> tuple[tuple[float, float], ...]:
+    """Seconds and error of runs whose time is that of their gradients alone.
+
+    A gradient that is evaluated in a loop of its own may take longer than in the run, so that the time of the run
+    bounds it.
+    """
+    return tuple((min(seconds_of_gradients(price, row), row.seconds), row.error_q) for row in rows)
+
+
 def _default_errors(tuning: Tuning, problem: Problem, t_end: float) -> list[float]:
     """RELATIVE_ERRORS of a power of ten near how far the system moves, without errors that round-off hides."""
-    moved, least = tuning.search.extent(), round_off(problem)[1]
+    moved, least = tuning.extent(), round_off(problem)[1]
     motion = 10.0 ** math.floor(math.log10(moved)) if moved > 0 else 0.0
     errors = [motion * error for error in RELATIVE_ERRORS if motion * error > least]
     if not errors:
+        rest = f"until t_end = {t_end:g} positions move by {moved:.1e}, and errors below {least:.1e} are round-off"
         raise Refused(
-            f"cost_report: until t_end = {t_end:g} the positions are those of the start up to {moved:.1e}, and "
-            f"errors below {least:.1e} cannot be told from round-off: the system is at rest, or no run until then is "
-            "certified. Give a start that moves, another t_end, or the errors that you accept."
+            f"cost_report: {rest}: the system is at rest, or no run until then is certified. Give a start that moves, "
+            "another t_end, or the errors that you accept."
         )
     return errors
 

@@ -101,12 +101,8 @@ def row_of(
     energies: np.ndarray | None = None,
     **measured,
 ) -> Row:
-    """The row of a run, with its invariants and evaluations, and without a time.
-
-    Args:
-        energies: right energies at the saved nodes; None for the energy at the start.
-        measured: errors of the run, and further fields that are known.
-    """
+    """The row of a run, with its invariants and evaluations, without a time; `energies` are right energies at the saved
+    nodes, None for the energy at the start."""
     cost, passes = scheme.describe(), np.maximum(np.asarray(run.info.iterations), 1)
     method = Method(int(np.max(run.info.method)))
     solves = cost.constrained_solves if system.is_constrained else cost.solves

@@ -28,8 +28,9 @@ class Column:
 class ResultTable:
     """Rows that can be printed, written to a CSV file, and handed to pandas.
 
-    A subclass is a frozen dataclass with a field `rows`, whose items are dataclasses, and with the `columns` of the printed
-    table; a column that is empty in all rows is left out. Files hold every field of every row.
+    A subclass is a frozen dataclass without a ``__repr__`` of its own, with a field `rows`, whose items are
+    dataclasses, and with the `columns` of the printed table; a column that is empty in all rows is left out. Files hold
+    every field of every row.
     """
 
     rows: Any
@@ -58,10 +59,6 @@ class ResultTable:
 
     def __rich__(self) -> PrintedTable:
         return self.table()
-
-    def __init_subclass__(cls, **options):
-        super().__init_subclass__(**options)
-        cls.__repr__ = ResultTable.__repr__  # else `dataclass` writes one that prints every field of every row
 
     def __str__(self) -> str:
         return str(self.table())

@@ -24,7 +24,7 @@ def duration(seconds: float) -> str:
     return f"{seconds / 1e-6:.2g} µs"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class WorkPrecision(RunTable):
     """Runs by their errors and their work; its table is the Pareto front.
 
