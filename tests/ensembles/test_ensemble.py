@@ -271,7 +271,7 @@ def test_a_full_disk_keeps_the_chunks_before(tmp_path, monkeypatch):
     [
         ({"design": {"num_mirco": [1]}, "vary": None}, ValueError, r"the column 'num_mirco' is neither a step nor a"),
         ({"design": {"q_s": [1.0]}}, ValueError, r"q_s has shape \(\); it must be a vector"),
-        ({"design": {"omega": ["fast"]}}, ValueError, r"'omega' has labels; only the column 'scheme'"),
+        ({"design": {"omega": ["fast"]}}, ValueError, r"'omega' has labels; give numbers"),
         ({"design": {"scheme": ["leapfrog"]}}, ValueError, r"no scheme 'leapfrog'"),
         ({"design": {"num_micro": [2.5]}, "num_micro": None}, ValueError, r"num_micro is 2\.5; it must be a whole"),
         ({"design": {"macro_dt": [0.03]}, "macro_dt": None}, ValueError, r"no whole number"),

@@ -235,13 +235,9 @@ def check_function_of_run(of: Callable | None, run: Simulation) -> None:
         return
     value = of(resting(run))
     if np.asarray(value).dtype.kind not in "fiu":
-        raise Refused(
-            f"simulate: the function error returned {value!r} for a run; it must return a number or an array of numbers."
-        )
+        raise Refused(f"simulate: the function error returned {value!r} for a run; it must return numbers.")
     if not np.array_equal(value, of(resting(run)), equal_nan=True):
-        raise Refused(
-            "simulate: the function error returns other numbers for the same run; it must be pure, or differences of runs say nothing."
-        )
+        raise Refused("simulate: the function error returns other numbers for the same run; it must be pure.")
 
 
 def resting(run: Simulation) -> Trajectory:

@@ -93,7 +93,7 @@ def check_extent(name: str, search: Search, accuracy: float) -> None:
     if accuracy > extent and not search.drives.names:
         until = f"until t = {float(search.start.t) + search.length:g}: any run is as accurate"
         raise Refused(
-            f"{name} is {accuracy:g}, and no position moves by more than {extent:.3g} {until}. Give a smaller one."
+            f"{name} is {accuracy:g}, and no position moves by more than {extent:.3g} {until}; give a smaller one."
         )
 
 

@@ -204,9 +204,7 @@ def _check_out(out: Path | None, resume: bool, overwrite: bool) -> bool:
     streamed = out is not None and out.suffix.lower() == ".zarr"
     if (resume or overwrite) and not streamed:
         option = "--resume" if resume else "--overwrite"
-        raise Refused(
-            f"{option} is for a run that is written while it goes; give --out with a file that ends in .zarr."
-        )
+        raise Refused(f"{option} is for a run that is written while it goes; give --out run.zarr.")
     if out is not None and not (streamed and out.is_dir()):  # `stream` checks an existing store
         check_target("--out", out, ".npz", ".zarr")
     return streamed

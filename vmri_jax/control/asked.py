@@ -27,9 +27,7 @@ def actuation_of(problem, actuate, num_controls) -> tuple[Callable, tuple[str, .
     if actuate is None:
         if scene_actuation is None:
             effects = 'Controlled effects, e.g. Controlled("hub", "torque")'
-            raise Refused(
-                f"minimize: nothing is controlled; give a scene with {effects}, or actuate= and num_controls=."
-            )
+            raise Refused(f"minimize: nothing is controlled; give a scene with {effects}, or actuate and num_controls.")
         count = len(scene_actuation.labels)
         if num_controls not in (None, count):
             raise Refused(f"minimize: num_controls is {num_controls}; the scene has {count} controls.")
@@ -126,9 +124,7 @@ def started(setup: Transcription, start, num_steps: int, num_controls: int, grid
     if nodes is None:  # controls start from the motion that they make, without gaps
         nodes, _ = rolled(setup, u)
         if not np.isfinite(nodes).all():
-            raise Refused(
-                "minimize: the motion with the first controls fails; give another start, or a smaller macro_dt."
-            )
+            raise Refused("minimize: the motion with the first controls fails; give another start, or shorter steps.")
     return Point(nodes, u, np.zeros(0), np.zeros(0))
 
 

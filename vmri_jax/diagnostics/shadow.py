@@ -108,9 +108,7 @@ def shadow_energy(system: Movable, scheme: Scheme | Composition, trajectory: Tra
     actions, miss, result = _actions(system, scheme, nodes, macro_dt)
     if int(result) > Result.CONVERGED_AT_ROUNDOFF or not float(miss) < LARGEST_MISS:
         far = f"steps of {macro_dt:.6g} from the nodes of the trajectory miss the next ones by {float(miss):.1e} of a step"
-        raise Refused(
-            f"shadow_energy: {far}. Give a run of this system and scheme with every macro node saved (save=1)."
-        )
+        raise Refused(f"shadow_energy: {far}. Give a run of this system and scheme with every macro node saved.")
     q, p = (np.concatenate(pair, axis=1) for pair in ((nodes.q_s, nodes.q_f), (nodes.p_s, nodes.p_f)))
     energy = _energy(q, p, np.asarray(actions), macro_dt, k)
     inner = slice(k, len(t) - k)

@@ -38,9 +38,7 @@ def numbers_in(rows: Rows) -> Rows:
     columns = {name: rows[name] for name in columns_of_problems(list(rows))}
     for name, values in columns.items():
         if values.dtype.kind not in "if":
-            raise Refused(
-                f"ensemble: the column {name!r} has labels; only the column 'scheme' may have them. Give numbers."
-            )
+            raise Refused(f"ensemble: the column {name!r} has labels; give numbers. Only 'scheme' may have labels.")
     return columns
 
 
@@ -71,9 +69,7 @@ def lane_function(
         check_type("ensemble: vary(problem, row)", changed, Problem, "dataclasses.replace(problem, q_s=...)")
         _check_only_values_differ(problem, changed)
         if time_is_fixed and changed.t is not problem.t:
-            raise Refused(
-                "ensemble: vary changes t, so that t_end does not fix the number of steps; give num_steps and a step."
-            )
+            raise Refused("ensemble: vary changes t, so that t_end does not fix the number of steps; give num_steps.")
         is_same = changed.system.params is problem.system.params
         return None if is_same else changed.system.params, tuple(getattr(changed, part) for part in START)
 
@@ -91,6 +87,4 @@ def _check_only_values_differ(problem: Problem, changed: Problem) -> None:
     same_shapes = jax.tree.map(np.shape, before) == jax.tree.map(np.shape, after)
     if not (same_system and same_shapes):
         changes = "the system besides its params" if same_shapes else "the structure or shape of one of them"
-        raise Refused(
-            f"ensemble: vary changes {changes}; it may change the values of system.params, positions, velocities and t."
-        )
+        raise Refused(f"ensemble: vary changes {changes}; it may change values of system.params and of the start.")

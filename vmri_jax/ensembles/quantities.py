@@ -121,13 +121,9 @@ def quantity(saved: Saved) -> Quantity:
         )
     user_function, label = saved if callable(saved) else imported(saved), label_of(saved)
     if not callable(user_function):
-        raise Refused(
-            f"ensemble: save has {saved!r}, which is {type(user_function).__name__}; give a function of a trajectory."
-        )
+        raise Refused(f"ensemble: save has {saved!r}, {type(user_function).__name__}; give a function of a trajectory.")
     if not label.isidentifier():
-        raise Refused(
-            f"ensemble: save has {saved!r}, a function without a name for its array in the store; define it with def."
-        )
+        raise Refused(f"ensemble: save has {saved!r}, a function without a name for its array; define it with def.")
 
     def function(run: Trajectory) -> dict[str, Kept]:
         result = user_function(run)

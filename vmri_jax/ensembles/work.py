@@ -90,12 +90,10 @@ class Work:
         for file, digest_at_start in self.sources.items():
             if not Path(file).is_file():
                 raise FileNotFoundError(
-                    f"{file} does not exist on this worker. Put it where all workers see it, or give my_package.my_module:name."
+                    f"{file} does not exist on this worker; put it where all see it, or into a package."
                 )
             if digest(Path(file).read_bytes()) != digest_at_start:
-                raise Refused(
-                    f"{file} differs from the file where the ensemble was started; give workers the same file."
-                )
+                raise Refused(f"{file} differs from the file of the process that started the ensemble.")
 
     def with_sources(self) -> "Work":
         """This work with absolute paths of the user's files, and with digests of them."""
@@ -201,7 +199,7 @@ class Work:
         if isinstance(scheme, Scheme | Composition):
             if num_micro is not None:
                 raise Refused(
-                    f"ensemble: the scheme {label!r} has its num_micro already; give the function, vm.fully_implicit, or its name."
+                    f"ensemble: the scheme {label!r} has its num_micro already; give its function or its name."
                 )
             return scheme
         if num_micro is None:

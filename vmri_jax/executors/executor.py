@@ -56,9 +56,7 @@ def executor_of(caller: str, executor: Any, processes: int | None = None) -> Ite
             if executor is not None:
                 executor.submit(version, "vmri_jax").result()
         except PackageNotFoundError as error:
-            raise NotAWorker(
-                f"{caller}: a worker does not have vmri_jax; install the version of this process."
-            ) from error
+            raise NotAWorker(f"{caller}: a worker does not have vmri_jax; install it there.") from error
         yield Here() if executor is None else executor
 
 

@@ -124,9 +124,7 @@ def _model(problem, parameters: Mapping) -> Callable[[Mapping], Problem]:
     for name, unknown in parameters.items():
         if name not in known and name not in START:
             places = f"system.params ({', '.join(known) or 'no dict'}) nor of {', '.join(START)}"
-            raise Refused(
-                f"fit: parameters has {name!r}, which is none of {places}. Give a function that makes a Problem."
-            )
+            raise Refused(f"fit: parameters has {name!r}, which is none of {places}. A function may make the Problem.")
         expected = np.shape(known[name] if name in known else getattr(base, name))
         start = unknown.start if isinstance(unknown, Unknown) else unknown
         if np.shape(start) != expected:

@@ -55,9 +55,7 @@ class Measured:
         if self.sigma is not None:
             sigma = np.asarray(real_array("Measured: sigma", self.sigma))
             if not (np.isfinite(sigma).all() and np.all(sigma > 0)):
-                raise Refused(
-                    f"Measured: sigma is {self.sigma}; it must be positive. The fit estimates an unknown one."
-                )
+                raise Refused(f"Measured: sigma is {self.sigma}; it must be positive, or None if it is unknown.")
             k, m = values.shape
             # (m,) of as many times as quantities could be one for each time
             if sigma.shape not in ((), shape, (1, m), (k, 1)) and (sigma.shape != (m,) or k == m):

@@ -49,9 +49,7 @@ class Unknown:
             if value is not None:
                 value = np.asarray(real_array(f"Unknown: {name}", value))
                 if value.shape not in ((), start.shape):
-                    raise Refused(
-                        f"Unknown: {name} has shape {value.shape}; give a number, or {start.shape}, as start."
-                    )
+                    raise Refused(f"Unknown: {name} has shape {value.shape}; give a number, or {start.shape}.")
                 object.__setattr__(self, name, np.broadcast_to(value, start.shape))
         too_small = self.lower is not None and not np.all(self.lower < start)
         too_large = self.upper is not None and not np.all(start < self.upper)

@@ -269,9 +269,7 @@ def _cases(problem: Problem, params, reference, t_end: float, num_saves: int, pr
         shapes = reference[label].q.shape, reference[label].p.shape
         if shapes != (shape, shape):
             nodes = "num_saves + 1 nodes from the start to t_end, slow coordinates first"
-            raise Refused(
-                f"convergence_study: reference has q and p of shapes {shapes}; both must be {shape}: {nodes}."
-            )
+            raise Refused(f"convergence_study: reference has shapes {shapes}; both must be {shape}: {nodes}.")
     return [Case(label, problem, reference[label]) for label, problem in problems.items()]
 
 
