@@ -12,6 +12,7 @@ import numpy as np
 import typer
 from rich.console import Console
 from rich.markup import escape
+from typer import Option
 
 from vmri_jax import plots
 from vmri_jax.accuracy.simulate import simulate as run_at_once
@@ -40,41 +41,24 @@ draw."""
 
 def simulate(
     system: options.System,
-    steps: Annotated[int | None, typer.Option(help="Number of macro steps; not with --accuracy.")] = None,
+    steps: Annotated[int | None, Option(help="Number of macro steps; not with --accuracy.")] = None,
     macro_dt: options.MacroStep = None,
-    scheme: Annotated[
-        str | None,
-        typer.Option(
-            help="See [bold]vmri schemes[/bold]. [dim]fully-implicit; with --accuracy one that is chosen[/dim]"
-        ),
-    ] = None,
+    scheme: Annotated[str | None, Option(help="See vmri schemes. [dim]fully-implicit; or chosen[/dim]")] = None,
     num_micro: options.NumMicro = 10,
     alpha: options.Alpha = None,
     degree: options.Degree = None,
     rule: options.Rule = None,
     compose: options.Compose = None,
-    accuracy: Annotated[
-        float | None,
-        typer.Option(help="Largest error of a position; steps, and without --scheme the scheme, are chosen for it."),
-    ] = None,
-    t_end: Annotated[float | None, typer.Option(help="End of the run, with --accuracy.")] = None,
-    error: Annotated[bool, typer.Option("--error", help="Estimate the error of the positions.")] = False,
-    save_every: Annotated[
-        int | None, typer.Option(help=f"Macro steps between saved nodes. [dim]about {DEFAULT_SAVED_NODES} nodes[/dim]")
-    ] = None,
-    save_micro: Annotated[
-        bool,
-        typer.Option(
-            "--save-micro", help="Keep the fast motion within macro steps too, by default of every macro step."
-        ),
-    ] = False,
-    matrix: Annotated[str, typer.Option(help="auto, masses, modes, exact or null-space.")] = "auto",
-    out: Annotated[
-        Path | None, typer.Option(help="Write the trajectory here: .npz at the end, or .zarr during the run.")
-    ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with the run in --out, a .zarr.")] = False,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the run in --out, a .zarr.")] = False,
-    plot: Annotated[Path | None, typer.Option(help="Draw the run here: .png, .svg or .pdf.")] = None,
+    accuracy: Annotated[float | None, Option(help="Largest error of a position, for which steps are chosen.")] = None,
+    t_end: Annotated[float | None, Option(help="End of the run, with --accuracy.")] = None,
+    error: Annotated[bool, Option("--error", help="Estimate the error of the positions.")] = False,
+    save_every: Annotated[int | None, Option(help=f"Steps between nodes. [dim]for {DEFAULT_SAVED_NODES}[/dim]")] = None,
+    save_micro: Annotated[bool, Option("--save-micro", help="Keep the fast motion within macro steps too.")] = False,
+    matrix: Annotated[str, Option(help="auto, masses, modes, exact or null-space.")] = "auto",
+    out: Annotated[Path | None, Option(help="Write it here: .npz at the end, or .zarr during the run.")] = None,
+    resume: Annotated[bool, Option("--resume", help="Go on with the run in --out, a .zarr.")] = False,
+    overwrite: Annotated[bool, Option("--overwrite", help="Replace the run in --out, a .zarr.")] = False,
+    plot: Annotated[Path | None, Option(help="Draw the run here: .png, .svg or .pdf.")] = None,
 ) -> None:
     """Simulate a system, and report steps, energy, constraints and time.
 

@@ -6,6 +6,7 @@ from typing import Annotated
 import numpy as np
 import typer
 from rich.markup import escape
+from typer import Argument, Option
 
 from vmri_jax import plots
 from vmri_jax.catalogue import find_problem, find_scheme
@@ -48,21 +49,15 @@ def advise(
 
 
 def stability(
-    system: Annotated[
-        str | None, typer.Argument(help="A system at its start. [dim]one slow and one stiff spring, kappa = 25[/dim]")
-    ] = None,
-    scheme: Annotated[
-        list[str] | None, typer.Option(help="See [bold]vmri schemes[/bold]; may be repeated. [dim]explicit-slow[/dim]")
-    ] = None,
-    num_micro: Annotated[
-        list[int] | None, typer.Option(help="Micro steps per macro step; may be repeated. [dim]2 5 10 20[/dim]")
-    ] = None,
+    system: Annotated[str | None, Argument(help="A system at its start. [dim]a slow and a stiff spring[/dim]")] = None,
+    scheme: Annotated[list[str] | None, Option(help="May be repeated. [dim]explicit-slow[/dim]")] = None,
+    num_micro: Annotated[list[int] | None, Option(help="May be repeated. [dim]2 5 10 20[/dim]")] = None,
     alpha: options.Alpha = None,
     degree: options.Degree = None,
     rule: options.Rule = None,
     compose: options.Compose = None,
-    until: Annotated[float, typer.Option(help="Largest omega H, in units of pi.", min=0.1)] = 4.0,
-    out: Annotated[Path | None, typer.Option(help="Draw the map here: .png, .svg or .pdf.")] = None,
+    until: Annotated[float, Option(help="Largest omega H, in units of pi.", min=0.1)] = 4.0,
+    out: Annotated[Path | None, Option(help="Draw the map here: .png, .svg or .pdf.")] = None,
 ) -> None:
     """Find the stable macro steps of a scheme, in units of the fastest vibration.
 

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 from rich.markup import escape
+from typer import Option
 
 from vmri_jax import study
 from vmri_jax.catalogue import find_problem
@@ -22,10 +23,10 @@ from vmri_jax.study.tuning import NothingReached
 
 def tune(
     system: options.System,
-    error: Annotated[float, typer.Option(help="Largest accepted error of a position in the run, in its unit.")],
-    t_end: Annotated[float, typer.Option(help="Simulated time.")],
-    exhaustive: Annotated[bool, typer.Option("--exhaustive", help="Search without shortcuts.")] = False,
-    out: Annotated[Path | None, typer.Option(help="Write all runs of the search here, .csv.")] = None,
+    error: Annotated[float, Option(help="Largest accepted error of a position in the run, in its unit.")],
+    t_end: Annotated[float, Option(help="Simulated time.")],
+    exhaustive: Annotated[bool, Option("--exhaustive", help="Search without shortcuts.")] = False,
+    out: Annotated[Path | None, Option(help="Write all runs of the search here, .csv.")] = None,
 ) -> None:
     """Find the scheme, num_micro and macro step that reach an error in the least time on this machine.
 
@@ -53,13 +54,9 @@ def tune(
 
 def cost(
     system: options.System,
-    t_end: Annotated[
-        float | None, typer.Option(help=f"Simulated time. [dim]{PERIODS} periods of the fastest vibration[/dim]")
-    ] = None,
-    error: Annotated[
-        list[float] | None, typer.Option(help="Target error; may be repeated. [dim]1e-2 to 1e-8 of the motion[/dim]")
-    ] = None,
-    out: Annotated[Path, typer.Option(help="Folder for the page.")] = Path("out/cost"),
+    t_end: Annotated[float | None, Option(help=f"Simulated time. [dim]{PERIODS} fastest periods[/dim]")] = None,
+    error: Annotated[list[float] | None, Option(help="May be repeated. [dim]1e-2 to 1e-8 of the motion[/dim]")] = None,
+    out: Annotated[Path, Option(help="Folder for the page.")] = Path("out/cost"),
 ) -> None:
     """Write a page about the cost of accuracy: time over error, and the best scheme for each error.
 

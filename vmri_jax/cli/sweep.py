@@ -11,6 +11,7 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 from rich.markup import escape
+from typer import Argument, Option
 
 from vmri_jax import plots
 from vmri_jax.animation.checks import check_keys
@@ -31,22 +32,11 @@ SETTINGS = ("t_end", "num_steps", "macro_dt", "num_micro", "save", "num_saves", 
 
 
 def sweep(
-    file: Annotated[Path, typer.Argument(help="The sweep, a .toml; vmri new sweep.toml writes one.")] = Path(
-        "sweep.toml"
-    ),
-    workers: Annotated[
-        str | None,
-        typer.Option(
-            help="Number of workers on this machine, or the address of a scheduler of Dask, tcp://host:port. "
-            "[dim]this process[/dim]"
-        ),
-    ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Compute the missing runs of the store.")] = False,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the store.")] = False,
-    plot: Annotated[
-        Path | None,
-        typer.Option(help="Draw the last saved number of each run against the longest axes: .png, .svg or .pdf."),
-    ] = None,
+    file: Annotated[Path, Argument(help="A .toml, which vmri new sweep.toml writes.")] = Path("sweep.toml"),
+    workers: Annotated[str | None, Option(help="Number, or Dask tcp://host:port. [dim]this process[/dim]")] = None,
+    resume: Annotated[bool, Option("--resume", help="Compute the missing runs of the store.")] = False,
+    overwrite: Annotated[bool, Option("--overwrite", help="Replace the store.")] = False,
+    plot: Annotated[Path | None, Option(help="Draw the last saved number of each run: .png, .svg or .pdf.")] = None,
 ) -> None:
     """Run a sweep of parameters, starts, steps and schemes, on one core or on a cluster, into a store on disk.
 
