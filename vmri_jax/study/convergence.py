@@ -29,9 +29,8 @@ from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.solver import Solver
 from vmri_jax.study.reference_solution import ReferenceSolution, reference_solution
-from vmri_jax.study.row import Row, RunTable, row_of
+from vmri_jax.study.row import Row, RunTable, WorkPrecision, row_of
 from vmri_jax.study.table import Column, interruptible
-from vmri_jax.study.work import WorkPrecision
 
 MIN_ERROR_OVER_REFERENCE = 100.0
 """Least ratio of a fitted error to the error of the reference; at this ratio the reference changes the error of the scheme by 1 %; a larger

@@ -22,10 +22,9 @@ from vmri_jax.running.files import make_writable_folder
 from vmri_jax.running.progress import part, shows_progress
 from vmri_jax.running.timing import seconds_each
 from vmri_jax.study.html import embedded, write_page
-from vmri_jax.study.row import Row, record
+from vmri_jax.study.row import Row, WorkPrecision, duration, pareto_front, record
 from vmri_jax.study.table import Column, ResultTable, interruptible
 from vmri_jax.study.tuning import Tuning
-from vmri_jax.study.work import WorkPrecision, duration, pareto_front
 
 TEMPLATE = Path(__file__).parent / "cost.html.j2"
 PERIODS = 30

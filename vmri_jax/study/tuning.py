@@ -16,9 +16,8 @@ from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
 from vmri_jax.running.failures import simulation_error
 from vmri_jax.running.progress import Progress, shows_progress, silent
 from vmri_jax.steppers.solver import Solver
-from vmri_jax.study.row import Row, row_of
+from vmri_jax.study.row import Row, WorkPrecision, row_of
 from vmri_jax.study.table import interruptible
-from vmri_jax.study.work import WorkPrecision
 
 FINALISTS = 4
 """Families whose micro steps and steps are searched for, of those that promise the least time. A larger number searches
