@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from matplotlib.figure import Figure
 from rich.text import Text
 
 from vmri_jax import plots
@@ -19,8 +18,8 @@ from vmri_jax.running.printed import PrintedTable
 from vmri_jax.running.progress import ShowsProgress, progress_to
 from vmri_jax.study.table import Column, ResultTable, rich_table
 
-COLORS = {True: "green", False: "red", None: "dim"}
-"""Colour of the verdict, by `Outcome.passed`."""
+COLORS = {"pass": "green", "fail": "red", "does not apply": "dim"}
+"""Colour of a verdict."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -32,7 +31,7 @@ class Report(ResultTable):
         Column("case", lambda row: row.case.title),
         Column("criterion", lambda row: row.case.criterion),
         Column("measured", lambda row: row.measured),
-        Column("", lambda row: Text(row.verdict, COLORS[row.passed])),
+        Column("", lambda row: Text(row.verdict, COLORS[row.verdict])),
         Column("s", lambda row: f"{row.seconds:.1f}", right=True),
     )
     rows: tuple[Outcome, ...]
@@ -49,22 +48,14 @@ class Report(ResultTable):
 
     def records(self) -> list[dict[str, Any]]:
         """Case, verdict and measured values of every row."""
-        return [
-            {
-                **{name: getattr(row.case, name) for name in ("number", "title", "setup", "criterion")},
-                **{name: getattr(row, name) for name in ("measured", "verdict", "seconds")},
-                **row.values,
-            }
-            for row in self.rows
-        ]
+        case, outcome = ("number", "title", "setup", "criterion"), ("measured", "verdict", "seconds")
+        of_cases = [{name: getattr(row.case, name) for name in case} for row in self.rows]
+        measured = [{name: getattr(row, name) for name in outcome} | row.values for row in self.rows]
+        return [one | other for one, other in zip(of_cases, measured, strict=True)]
 
     def table(self) -> PrintedTable:
         """The rows, with lines between them, for the terminal."""
         return rich_table(self.columns, self.rows, ruled=True)
-
-    def pictures(self) -> dict[str, Figure]:
-        """Figures by the title of the case, for all cases with a picture."""
-        return {row.case.title: row.picture() for row in self.rows if row.picture is not None}
 
     def write(self, folder: str | Path) -> list[Path]:
         """Write cases.csv and the pictures into a folder, made if it does not exist; returns their paths."""
@@ -72,9 +63,10 @@ class Report(ResultTable):
         folder.mkdir(parents=True, exist_ok=True)
         paths = [folder / "cases.csv"]
         self.to_csv(paths[0])
-        for title, figure in self.pictures().items():
-            paths.append(folder / f"{title.lower().replace(' ', '_')}.png")
-            plots.save(figure, paths[-1])
+        for row in self.rows:
+            if row.picture is not None:
+                paths.append(folder / f"{row.case.title.lower().replace(' ', '_')}.png")
+                plots.save(row.picture(), paths[-1])
         return paths
 
 
