@@ -64,12 +64,9 @@ def families(
 
 
 def two_families(system: System, degrees_of_freedom: int, digits: float, most_single: int) -> list[Family]:
-    """The usual menu for an accuracy of a number of digits: kicks, and a single interval of high degree.
-
-    Kicks are composed to an order of about the number of digits; with masses that depend on the configuration the
-    midpoint rule takes their place. A single micro interval carries no rule on every k-th micro node, and is left out
-    for more than `most_single` degrees of freedom.
-    """
+    """The usual menu for an accuracy of a number of digits: kicks, composed to an order of about this number, or the
+    midpoint rule where masses depend on the configuration; and a single interval of high degree, which carries no rule
+    on every k-th micro node, for at most `most_single` degrees of freedom."""
     base = of_order_2(fully_explicit if isinstance(system.kinetic, ConstantMass) else fully_implicit)
     name = next((name for most, name in COMPOSED if digits <= most), None)
     kicks = base if name is None else base.composed(name)
@@ -112,10 +109,8 @@ def for_system(menu: Sequence[Family], system: System, has_two_rates: bool) -> l
 
 
 def by_promise(menu: Sequence[Family], digits: float) -> list[Family]:
-    """The menu, sorted: first the families whose order is near the number of digits of the accuracy.
-
-    Lower orders take many steps, and higher orders take long to compile.
-    """
+    """The menu, first the families whose order is near the number of digits of the accuracy: lower orders take many
+    steps, and higher orders long to compile."""
     return sorted(menu, key=lambda family: abs(np.log(family.make(family.first).order / max(digits, 2.0))))
 
 

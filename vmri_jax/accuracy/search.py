@@ -35,7 +35,8 @@ from vmri_jax.accuracy.companions import (
 )
 from vmri_jax.accuracy.families import Family, micro_steps_help, unit_of
 from vmri_jax.accuracy.trials import LEAST_TIME, Trial, seconds_of_steps
-from vmri_jax.mechanics.driving import events
+from vmri_jax.mechanics.arrays import is_concrete
+from vmri_jax.mechanics.driving import Events, events
 from vmri_jax.mechanics.linearisation import Linearisation, linearise
 from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.refusals import Refused
@@ -105,11 +106,14 @@ SHORTER_STEPS = (1.0, 0.98, 0.96, 0.93, 0.9, 0.86, 0.82, 0.78)
 """Macro steps that are tried in this order until one is not resonant, in units of the largest step for the accuracy."""
 
 
+COMPARES = "compares runs with numbers; call simulate outside of jax.jit, vmap and grad."
+"""End of the refusal of an error or an accuracy in a transformation."""
+
+
 class Search:
     """Trial runs of several schemes from the same start until `t_end`; arguments as of `vmri_jax.simulate`.
 
-    system, start, length: of all runs.
-    drives: events of the system in this time; all runs have steps that see them.
+    system, start, t_end, length: of all runs.
     seconds: measured seconds of a macro step by the Python expression of the scheme.
     """
 
@@ -124,10 +128,11 @@ class Search:
         progress: Progress = silent,
     ):
         self.system, self.start = start_of("simulate", moving, state)
-        self.length = float(t_end - self.start.t)
+        if not is_concrete((vars(self.start), self.system.params, t_end)):
+            raise Refused(f"simulate: an accuracy {COMPARES}")
+        self.t_end, self.length = float(t_end), float(t_end - self.start.t)
         if not 0 < self.length < np.inf:
             raise Refused(f"t_end is {self.length:g} after the start; it must be later, by a finite time.")
-        self.drives = events(self.system, self.start, t_end)
         self.num_saves, self.progress, self.num_trials = num_saves, progress, 0
         self.seconds: dict[str, float] = {}
         self._runs: dict[tuple[str, int], Simulation] = {}
@@ -145,6 +150,11 @@ class Search:
         self._make = make
 
     @cached_property
+    def drives(self) -> Events:
+        """The events of the system in this time; all runs have steps that see them."""
+        return events(self.system, self.start, self.t_end)
+
+    @cached_property
     def has_two_rates(self) -> bool:
         """Whether micro steps may save time."""
         return micro_steps_help(self.system, self.start)
@@ -152,11 +162,8 @@ class Search:
     def cheapest(
         self, menu: Sequence[Family], accuracy: float, finalists: int = 1, exhaustive: bool = False
     ) -> list[Trial]:
-        """Trials with steps for the accuracy, of the families that promise the least time; the most promising one
-        first.
-
-        An exhaustive search tries all of `NUM_MICRO` with every family, and every pair of them may be a finalist.
-        """
+        """Trials with steps for the accuracy, of the families that promise the least time, the most promising one
+        first; exhaustive ones of all families with all of `NUM_MICRO`."""
         if exhaustive:
             units = [(family, unit_of(self.system, family.make(family.first))) for family in menu]
             menu = [replace(family, first=unit * n) for family, unit in units for n in NUM_MICRO]
@@ -169,11 +176,8 @@ class Search:
         return [self.accurate(trial, accuracy) for trial in chosen]
 
     def first_trials(self, menu: Sequence[Family], accuracy: float) -> list[Trial]:
-        """A trial of each family, which the search makes once.
-
-        First without the fallback: steps that are too large for the motion fail with any method. The fallback is
-        compiled only if no scheme of the menu succeeds without it.
-        """
+        """A trial of each family, which the search makes once: without the fallback, since steps that are too large for
+        the motion fail with any method, and with it only if no scheme of the menu succeeds without it."""
         for falls_back in (False, True):
             limit = np.inf
             for family in menu:
@@ -199,12 +203,7 @@ class Search:
         most_seconds: float = np.inf,
     ) -> Trial:
         """The first trial with a certified error, of 1, 2, 4, ... times the macro steps; the last trial if the search
-        runs out of time or steps.
-
-        `falls_back` tells whether the fallback is tried where the first matrix fails, see `Simulation`. With an
-        accuracy the errors are also from a third companion where it is needed, see `estimated_errors`. Repeated trials
-        end after `most_seconds`.
-        """
+        runs out of steps, or of time, `most_seconds`. With an accuracy the errors are those of `estimated_errors`."""
         most = MOST_TRIAL_SECONDS
         while True:
             run = replace(self.run(family, num_micro, num_steps), may_fall_back=falls_back)
@@ -301,10 +300,7 @@ class Search:
         return Settings(run.scheme, trial.python, trial.family.options, *numbers, gain)
 
     def _with_best_num_micro(self, trial: Trial, error: float) -> Trial:
-        """A trial with the number of micro steps of the least time.
-
-        A single interval of high degree (above 1) stays single: it resolves the fast variables by its degree.
-        """
+        """A trial with the number of micro steps of the least time; an interval of high degree stays single."""
         can_choose = self.has_two_rates and stage_scheme(trial.run.scheme).degree == 1
         if not (can_choose and 0 < trial.error < np.inf):
             return trial

@@ -6,7 +6,8 @@ from dataclasses import replace
 from typing import Any
 
 from vmri_jax.accuracy.companions import check_function_of_run, with_error
-from vmri_jax.accuracy.steps import COMPARES, with_accuracy
+from vmri_jax.accuracy.search import COMPARES, Search
+from vmri_jax.accuracy.steps import with_accuracy
 from vmri_jax.mechanics.checks import check_system
 from vmri_jax.mechanics.state import Movable, State
 from vmri_jax.refusals import Refused
@@ -82,10 +83,12 @@ def simulate(
         raise Refused(f"simulate: error is {error!r}; it must be True or False, 'shares', or a function of a run.")
     steps = Steps(macro_dt, num_steps, t_end, save)
     if accuracy is not None:
-        length = {"t_end": _end(steps), "num_saves": Save.of(save).number}
+        length = _end(steps), Save.of(save).number
         with progress_to("simulate", Save.of(save).progress) as tell:
-            best, settings = with_accuracy(system, scheme, state, solver, accuracy, **length, of=of, progress=tell)
-        run, trajectory = best.run, replace(best.trajectory, origin=replace(best.run.origin, settings=settings))
+            search = Search(system, state, solver, *length, of, tell)
+            best = with_accuracy(search, scheme, accuracy)
+        origin = replace(best.run.origin, settings=search.settings(best))
+        run, trajectory = best.run, replace(best.trajectory, origin=origin)
         if int(trajectory.failed_at) >= 0:
             raise simulation_error(trajectory, run.macro_dt, run.save_every, run.scheme.num_micro)
         for concern in trajectory.concerns():

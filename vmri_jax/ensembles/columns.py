@@ -45,18 +45,8 @@ def numbers_in(rows: Rows) -> Rows:
 def lane_function(
     problem: Problem, vary: Vary | None, columns: Sequence[str], time_is_fixed: bool
 ) -> Callable[[Row], Lanes]:
-    """The function from a row to the parameters and the start of its run.
-
-    Args:
-        vary: None if there are no columns.
-        columns: names of the columns that change the problem, in their order in the design; JAX would sort them.
-        time_is_fixed: whether all runs must start at the time of the problem.
-
-    Raises:
-        ValueError: there are columns, and no function that takes them.
-        TypeError, ValueError: when the function of rows is called, `vary` returns no problem, or changes something else than
-            the values of parameters and of the start.
-    """
+    """The function from a row to the parameters and the start of its run; `columns` change the problem, in their order
+    in the design, which JAX would sort. With `time_is_fixed` runs must start at the time of the problem."""
     if vary is None and columns:
         name = columns[0]
         known = near(name, (*STEPS, *SCHEMES))

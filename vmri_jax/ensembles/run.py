@@ -236,12 +236,8 @@ def ensemble(
 
 @dataclass(frozen=True)
 class ChunkTask:
-    """The computation of a chunk: it writes the results to the store, commits them, and returns how many of the runs failed.
-
-    path: folder of the store.
-    chunks: the division of the runs.
-    work: the arguments that the runs share.
-    """
+    """The computation of a chunk: it writes the results to the store at `path`, commits them, and returns how many of
+    the runs failed."""
 
     path: Path
     chunks: Chunks

@@ -79,12 +79,8 @@ def submitter(caller: str, tasks: Executor, task: Callable, *shared) -> Callable
 def as_done(
     submit: Callable[[int], Future], numbers: Iterable[int], interrupted: Callable[[], bool] = lambda: False
 ) -> Iterator[tuple[int, Future]]:
-    """Submit tasks by their numbers, at most `MOST_UNDER_WAY` ahead, and yield each number with its future as the tasks end.
-
-    Args:
-        submit: starts one task. A task of this process has ended when `submit` returns, and is yielded before the next one starts.
-        interrupted: returns whether Ctrl-C was pressed, for a `KeyboardInterrupt`. Python loses one that is raised in the finaliser of a
-            future of Dask; therefore a handler notes Ctrl-C, and this function polls it.
+    """Submit tasks by their numbers, at most `MOST_UNDER_WAY` ahead, and yield each number with its future as the tasks
+    end. ``interrupted()`` is polled for Ctrl-C: Python loses a `KeyboardInterrupt` in the finaliser of a future of Dask.
     """
     waiting: dict[Future, int] = {}
     left = iter(numbers)
@@ -114,15 +110,8 @@ def mapped(
     executor: Any = None,
     report: Callable[[int, int], None] = lambda done, number: None,
 ) -> list:
-    """``[task(*call) for call in arguments]``, computed by an executor as in `ensemble`; the first error is raised.
-
-    Args:
-        task: a function that is defined in a module.
-        arguments: a tuple for each call, which pickle can send if workers compute.
-        report: ``report(done, number)``, the number of calls that are done when call `number` is submitted.
-
-    Raises:
-        Interrupted: Ctrl-C; carries the results up to then.
+    """``[task(*call) for call in arguments]``, computed by an executor as in `ensemble`; the first error is raised, and
+    at Ctrl-C an `Interrupted` with the results up to then. ``report(done, number)``: before call `number` is submitted.
     """
     calls = list(arguments)
     results: list = [None] * len(calls)

@@ -167,12 +167,8 @@ class _Search:
         self.scale = np.where(scale > 0, scale, scale.max() or 1.0)
 
     def residual(self, x, args):
-        """Misses of all values in standard deviations, and weighted gaps between the parts; `args` are the values and
-        the weight of gaps.
-
-        x is (u, z), search variables of the parameters, and starts of the parts after the first one in units of
-        `scale`.
-        """
+        """Misses of all values in standard deviations, and weighted gaps between the parts, at x = (u, z): search
+        variables, and starts of the parts in units of `scale`; `args` are the values and the weight of gaps."""
         (u, z), (values, weight) = x, args
         predicted, gaps = self.shooting.predict(u, z * self.scale)
         misses = (predicted - values) / self.shooting.sigma

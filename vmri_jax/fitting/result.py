@@ -207,11 +207,8 @@ class Bootstrap:
 
 
 def without_starts(by_parameters, by_starts):
-    """The Jacobian (m, p) with respect to the parameters, projected on the complement of the range of the Jacobian
-    (m, k) with respect to the starts.
-
-    Changes of the predictions that other starts make as well say nothing about the parameters.
-    """
+    """The Jacobian (m, p) with respect to the parameters, without changes that other starts make as well: projected on
+    the complement of the range of the Jacobian (m, k) with respect to the starts."""
     if not by_starts.size:
         return by_parameters
     q, sizes, _ = jnp.linalg.svd(by_starts, full_matrices=False)

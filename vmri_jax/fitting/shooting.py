@@ -120,11 +120,8 @@ class Shooting:
 
     @cached_property
     def _parts(self) -> Callable:
-        """``(u, starts of all parts) -> observed quantities at the nodes of all parts, ends of all parts``.
-
-        A part depends on its own start and on u alone. The custom derivative uses this: it takes 2 n + len(u) tangents
-        through each part, where JAX would carry the tangents of all starts through every part.
-        """
+        """``(u, starts of all parts) -> observed quantities at the nodes of all parts, their ends``; a derivative takes
+        2 n + len(u) tangents through each part, where JAX would take those of all starts through every part."""
 
         @jax.custom_jvp
         def parts(u, starts):

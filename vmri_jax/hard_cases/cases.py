@@ -188,11 +188,8 @@ class Resolved:
         )
 
     def _from_textbook(self, scheme: Scheme, macro_dt: float, steps: int) -> float:
-        """Largest difference of a run from the textbook, relative to the largest positions and momenta, less round-off.
-
-        A step divides the round-off of ``M (q_+ - q)`` by its micro step h, so that momenta have a round-off of
-        ``eps |M| |q| / h``.
-        """
+        """Largest difference of a run from the textbook, relative to the largest positions and momenta, less the
+        round-off ``eps |M| |q| / h`` of momenta, ``M (q_+ - q) / h``."""
         system, state = self.problem.system, self.problem.state()
         simulated = jax.jit(textbook.simulate, static_argnames="num_steps")
         oracle = simulated(system, scheme, state, macro_dt, num_steps=steps)

@@ -58,11 +58,8 @@ def derivatives(problem: Problem, scheme: Scheme, macro_dt: float) -> Outcome:
 
 
 def _terms(problem: Problem, scheme: Scheme, macro_dt: float) -> Iterator[tuple[str, Callable, np.ndarray]]:
-    """The functions of the system by name, each as a function of a vector, ``function(z) -> (m,)``, with (k, n) points
-    z.
-
-    The points are the start and nodes of a short run up to a failure.
-    """
+    """The functions of the system by name, as functions of a vector, ``function(z) -> (m,)``, with (k, n) points z: the
+    start and nodes of a short run."""
     system, n_s = problem.system, problem.q_s.size
     along = run(problem, scheme, macro_dt, 20, save=5)
     speeds = jax.jit(jax.vmap(lambda *z: jnp.concatenate(velocity(system, *z))))
@@ -107,11 +104,8 @@ def _differences(function: Callable, points: np.ndarray) -> tuple[float, float]:
 
 
 def _from_quotients(f: Callable, z, directions, derivatives, size: float):
-    """Relative difference of the derivatives (DIRECTIONS, ...) of f from its quotients of order 4, for the h with the
-    smallest one.
-
-    Less the round-off, which the size of the values divided by the size of the positions sets.
-    """
+    """Relative difference of the derivatives (DIRECTIONS, ...) of f from its quotients of order 4, less round-off, for
+    the h with the smallest one."""
 
     def quotient(h, d):
         near, far = (f(z + k * h * d) - f(z - k * h * d) for k in (1, 2))

@@ -144,11 +144,8 @@ def _moduli(run: SavedRun) -> dict[str, dict[str, np.ndarray]]:
 
 
 def position_panels(run: SavedRun) -> list[tuple[np.ndarray, list[str], str, np.ndarray | None]]:
-    """For slow and fast positions and angles of a run, if there are any: values (k, n), names, label of the axis, and
-    errors (k, n) or None.
-
-    Directors of rigid bodies are left out.
-    """
+    """For slow and fast positions and angles of a run, without directors of rigid bodies: values (k, n), names, label
+    of the axis, and errors (k, n) or None."""
     names, error, panels = run.names, run.error, []
     for part, pace, labels in (("s", "slow", names.slow_coordinates), ("f", "fast", names.fast_coordinates)):
         values = np.asarray(getattr(run.states, f"q_{part}"))

@@ -64,12 +64,7 @@ def clear_partial(path: Path) -> None:
 
 
 def check_place(path: Path) -> None:
-    """Refuse a path where no file can exist.
-
-    Raises:
-        FileNotFoundError: the folder above it does not exist.
-        IsADirectoryError: the path is a folder.
-    """
+    """Refuse a path where no file can exist: a FileNotFoundError without its folder, an IsADirectoryError of a folder."""
     if not path.parent.is_dir():
         raise FileNotFoundError(f"{path} cannot be written: the folder {path.parent} does not exist; make it first.")
     if os.path.isdir(path):  # False, where `Path.is_dir` raises: a name that is too long
@@ -80,10 +75,6 @@ def check_writable(path: Path) -> None:
     """Refuse a path where no file can be written, before long work: a file is made beside `path` and removed again.
 
     Permissions alone do not tell: only an attempt finds a read-only file system, or a name that is too long.
-
-    Raises:
-        FileNotFoundError, IsADirectoryError: as of `check_place`.
-        OSError: the folder or the file cannot be written.
     """
     check_place(path)
     path = path.resolve()
@@ -98,11 +89,7 @@ def check_writable(path: Path) -> None:
 
 
 def make_writable_folder(path: Path) -> None:
-    """Make a folder with all folders above it, and refuse a folder in which no file can be written.
-
-    Raises:
-        OSError: the folder cannot be made, or no file can be made in it.
-    """
+    """Make a folder with all folders above it, and refuse a folder in which no file can be written."""
     with explained(path, "Give another place."):
         path.mkdir(parents=True, exist_ok=True)
     check_writable(path / "attempt")

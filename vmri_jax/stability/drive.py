@@ -171,10 +171,7 @@ def growth_over_period(moving: Movable, linear: Linearisation) -> DrivenMotion |
 def driven_motion(
     system: System, scheme: Scheme | Composition, state: State, macro_dt: float, period: float
 ) -> DrivenMotion:
-    """The growth over a period of the drive, from steps of T/n, which are halved until two of them agree.
-
-    It is the mean over as many periods as a run with this macro step is followed.
-    """
+    """The mean growth over a period of the drive, from steps of T/n, which are halved until two of them agree."""
     n, micro, tried = max(1, int(np.ceil(period / macro_dt - 1e-6))), stage_scheme(scheme).num_micro, {}
     followed = period, periods_of_run(macro_dt, period)
     while True:

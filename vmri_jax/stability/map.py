@@ -173,13 +173,11 @@ def measure(
 def find_windows(
     label: Callable[[np.ndarray], Sequence], x: np.ndarray, labels: Sequence, resolution: float
 ) -> list[tuple[float, float]]:
-    """Unstable intervals of x between its first and last value.
+    """Unstable intervals of x between its first and last value; ``label(samples)`` has a label for each sample, None
+    for unstable, else any value to compare, and `labels` are those of x (k,).
 
     Between neighbouring samples with different labels lies an end of a window, or a whole window. All such brackets are
     divided at the same time, until they are shorter than `resolution`; shorter windows are left out.
-
-    ``label(samples)`` has a label for each sample, None for unstable, else any value to compare; `labels` are the
-    labels of x (k,).
     """
     edges = [x[0]] if labels[0] is None else []
     samples = zip(x, x[1:], labels, labels[1:], strict=False)

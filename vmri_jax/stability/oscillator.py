@@ -58,10 +58,8 @@ def linear_model(omega=50.0, kappa=25.0) -> Problem:
 
 
 def phase(scheme: Scheme, x: float) -> float:
-    """Phase by which a fast vibration turns in a micro step, ``x = omega h``; NaN where the step is unstable.
-
-    Needs the fast potential on every micro interval; else NaN.
-    """
+    """Phase by which a fast vibration turns in a micro step, ``x = omega h``; NaN where the step is unstable, or the
+    fast potential is not on every micro interval."""
     if not scheme.fast.is_local:
         return np.nan
     path = np.linspace(0.0, x, 2 + int(abs(x) / RESOLUTION))
