@@ -148,7 +148,7 @@ def estimated_errors(
     result = extrapolated(order, trajectory, halved)
     if not drives.names and np.abs(result).max(initial=0.0) > DOUBTED * accuracy:
         return result
-    # From a compared node to the next, `stride` saved nodes, there are `whole` macro steps of the run, `parts` of the companion.
+    # From a compared node to the next, `stride` saved nodes later: `whole` steps of the run, `parts` of the companion.
     strides = [s for s in range(1, run.num_saves + 1) if run.num_saves % s == 0]
     stride = next((s for s in strides if s * run.save_every >= FEWEST_DIVIDED), run.num_saves)
     whole = stride * run.save_every

@@ -312,10 +312,8 @@ def _progress(runs: Ensemble) -> str:
 def _schemes(scheme) -> dict[str, AnyScheme]:
     if not isinstance(scheme, Mapping):
         scheme = {scheme if isinstance(scheme, str) else "scheme": scheme}
-    if not scheme or not all(
-        isinstance(label, str) and (isinstance(entry, str | Scheme | Composition) or callable(entry))
-        for label, entry in scheme.items()
-    ):
+    known = (isinstance(entry, str | Scheme | Composition) or callable(entry) for entry in scheme.values())
+    if not scheme or not all(known) or not all(isinstance(label, str) for label in scheme):
         one = "a Scheme, the name of one, or a function that makes one for a num_micro"
         raise Refused(f"ensemble: scheme is {scheme!r}; give {one}, or several by label.")
     return dict(scheme)

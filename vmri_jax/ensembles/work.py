@@ -11,16 +11,8 @@ import numpy as np
 
 from vmri_jax.accuracy.batch import simulate_batch
 from vmri_jax.catalogue import find_problem, find_scheme
-from vmri_jax.ensembles.columns import (
-    SCHEMES,
-    STEPS,
-    Lanes,
-    Row,
-    Vary,
-    columns_of_problems,
-    lane_function,
-    numbers_in,
-)
+from vmri_jax.ensembles import columns
+from vmri_jax.ensembles.columns import SCHEMES, STEPS, Lanes, Row, Vary
 from vmri_jax.ensembles.design import Design, Rows, unique_rows
 from vmri_jax.ensembles.quantities import Quantity, Saved, of_lanes, quantity
 from vmri_jax.mechanics.checks import check_type, digest
@@ -116,7 +108,8 @@ class Work:
     @cached_property
     def lane(self) -> Callable[[Row], Lanes]:
         """The function from the numbers of a row to the parameters and the start of its run."""
-        return lane_function(self.problem, self.vary, columns_of_problems(self.columns), "t_end" in self.steps)
+        names = columns.columns_of_problems(self.columns)
+        return columns.lane_function(self.problem, self.vary, names, "t_end" in self.steps)
 
     @cached_property
     def lanes(self) -> Callable[[Rows, int], Lanes]:
@@ -172,21 +165,12 @@ class Work:
         filled = np.minimum(np.arange(max(count, width)), count - 1)
         rows = {name: values[filled] for name, values in rows.items()}
         macro_dt = group.macro_dt[filled] if np.ndim(group.macro_dt) else group.macro_dt
-        params, start = self.lanes(numbers_in(rows), len(filled))
+        params, start = self.lanes(columns.numbers_in(rows), len(filled))
         project = self.problem.project if self.project is None else self.project
         states = consistent_states(self.problem.system, params, start, project)
-        trajectory = simulate_batch(
-            self.problem,
-            group.scheme,
-            states,
-            macro_dt=macro_dt,
-            num_steps=group.num_steps,
-            save=Save(number=self.num_saves),
-            params=params,
-            solver=self.solver,
-            chunk=width,
-            warn=False,
-        )
+        steps = {"macro_dt": macro_dt, "num_steps": group.num_steps, "save": Save(number=self.num_saves)}
+        how = {"params": params, "solver": self.solver, "chunk": width, "warn": False}
+        trajectory = simulate_batch(self.problem, group.scheme, states, **steps, **how)
         kept = {name: np.asarray(getattr(trajectory, name)) for name in STATUS} | of_lanes(self.quantities, trajectory)
         return {name: np.asarray(value)[:count] for name, value in kept.items()}
 

@@ -80,8 +80,7 @@ def as_done(
     submit: Callable[[int], Future], numbers: Iterable[int], interrupted: Callable[[], bool] = lambda: False
 ) -> Iterator[tuple[int, Future]]:
     """Submit tasks by their numbers, at most `MOST_UNDER_WAY` ahead, and yield each number with its future as the tasks
-    end. ``interrupted()`` is polled for Ctrl-C: Python loses a `KeyboardInterrupt` in the finaliser of a future of Dask.
-    """
+    end. ``interrupted()`` is polled: Python loses a `KeyboardInterrupt` in the finaliser of a future of Dask."""
     waiting: dict[Future, int] = {}
     left = iter(numbers)
     try:

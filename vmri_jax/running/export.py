@@ -158,7 +158,7 @@ class Exports(Quantities):
 
 
 def extra(package: str, caller: str, name: str = "xarray"):
-    """An optional package that `caller` needs, and that the extra `name` of vmri_jax installs; ImportError without it."""
+    """An optional package that `caller` needs and the extra `name` of vmri_jax installs; ImportError without it."""
     try:
         return importlib.import_module(package)
     except ImportError as error:

@@ -64,7 +64,7 @@ def clear_partial(path: Path) -> None:
 
 
 def check_place(path: Path) -> None:
-    """Refuse a path where no file can exist: a FileNotFoundError without its folder, an IsADirectoryError of a folder."""
+    """Refuse a path where no file can be: FileNotFoundError without its folder, IsADirectoryError for a folder."""
     if not path.parent.is_dir():
         raise FileNotFoundError(f"{path} cannot be written: the folder {path.parent} does not exist; make it first.")
     if os.path.isdir(path):  # False, where `Path.is_dir` raises: a name that is too long
