@@ -177,9 +177,8 @@ def _print_stop(stopped: SimulationError | Interrupted, saved: list[str], stream
     print_failure("Interrupted", f"After {stopped.number} of {stopped.total} macro steps.{kept}")
     if streamed:
         again = [word for word in sys.argv[1:] if word not in ("--resume", "--overwrite")]
-        console.print(
-            f"Go on with it:\n[bold]{escape(shlex.join(['vmri', *again, '--resume']))}[/bold]", soft_wrap=True
-        )
+        command = escape(shlex.join(["vmri", *again, "--resume"]))
+        console.print(f"Go on with it:\n[bold]{command}[/bold]", soft_wrap=True)
     return 130
 
 
@@ -215,9 +214,8 @@ def _energy_balance(trajectory: Trajectory | StoredTrajectory) -> dict[str, str]
     uncertainty = sum(work.uncertainty for work in works)
     work = {"work of forces": forces, "work of moving constraints": constraints}
     words = {name: f"{value:.6g}" for name, value in work.items() if value != 0}
-    return words | {
-        "energy balance": f"{left:.1e} left at the end; the saved nodes resolve the work to {uncertainty:.1e}"
-    }
+    balance = f"{left:.1e} left at the end; the saved nodes resolve the work to {uncertainty:.1e}"
+    return words | {"energy balance": balance}
 
 
 def default_save_every(steps: int) -> int:

@@ -50,7 +50,5 @@ class Optimum:
     def __repr__(self) -> str:
         status = "converged" if self.success else "not converged: the best that was found"
         over = f", limits by {self.over:.1e}" if self.over > 0 else ""
-        return (
-            f"cost {self.cost:.8g} after {self.iterations} iterations, {status}; goal missed by {self.miss:.1e}{over}, "
-            f"steps by {self.gap:.1e}"
-        )
+        missed = f"goal missed by {self.miss:.1e}{over}, steps by {self.gap:.1e}"
+        return f"cost {self.cost:.8g} after {self.iterations} iterations, {status}; {missed}"

@@ -77,10 +77,8 @@ class ShadowEnergy:
 
     def __repr__(self) -> str:
         verdict = "it drifts" if self.drifts else "no drift is seen"
-        return (
-            f"shadow energy: band {self.band:.1e} (energy of the system: {self.energy_band:.1e}), "
-            f"drift {self.drift:.1e} +- {self.drift_error:.0e} per time: {verdict}"
-        )
+        drift = f"drift {self.drift:.1e} +- {self.drift_error:.0e} per time: {verdict}"
+        return f"shadow energy: band {self.band:.1e} (energy of the system: {self.energy_band:.1e}), {drift}"
 
 
 def shadow_energy(system: Movable, scheme: Scheme | Composition, trajectory: Trajectory, k: int = 5) -> ShadowEnergy:

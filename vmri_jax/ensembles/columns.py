@@ -70,9 +70,8 @@ def _check_only_values_differ(problem: Problem, changed: Problem) -> None:
     """Refuse a row whose run the program of the problem cannot compute: another system but for parameters, or arrays of other shapes."""
     leaves, structure = jax.tree.flatten(problem.system.replace(params=None))
     new_leaves, new_structure = jax.tree.flatten(changed.system.replace(params=None))
-    same_system = structure == new_structure and all(
-        a is b or (is_concrete(b) and np.array_equal(a, b)) for a, b in zip(leaves, new_leaves, strict=True)
-    )
+    are_equal = (a is b or (is_concrete(b) and np.array_equal(a, b)) for a, b in zip(leaves, new_leaves, strict=False))
+    same_system = structure == new_structure and all(are_equal)
     before, after = ((entry.system.params, [getattr(entry, part) for part in START]) for entry in (problem, changed))
     same_shapes = jax.tree.map(np.shape, before) == jax.tree.map(np.shape, after)
     if not (same_system and same_shapes):

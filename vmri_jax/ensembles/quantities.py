@@ -39,11 +39,9 @@ class Quantity(NamedTuple):
 
 
 def _end(run: Trajectory) -> dict[str, Kept]:
-    names = {"q": "positions", "p": "momenta"}
-    arrays = {name: getattr(run.states, name) for name in ("q_s", "q_f", "p_s", "p_f")}
-    return {
-        name: Kept(array[-1], DIMENSIONS[name][1:], f"{names[name[0]]} at the end") for name, array in arrays.items()
-    }
+    words = {"q": "positions at the end", "p": "momenta at the end"}
+    ends = {name: getattr(run.states, name)[-1] for name in ("q_s", "q_f", "p_s", "p_f")}
+    return {name: Kept(array, DIMENSIONS[name][1:], words[name[0]]) for name, array in ends.items()}
 
 
 def _nodes(run: Trajectory) -> dict[str, Kept]:
@@ -59,10 +57,8 @@ def _energy_error(run: Trajectory) -> dict[str, Kept]:
 
 def _energy_drift(run: Trajectory) -> dict[str, Kept]:
     t = run.t - jnp.mean(run.t)
-    slope = jnp.sum(t * run.energy) / jnp.sum(t * t)
-    return {
-        "energy_drift": Kept(slope * (run.t[-1] - run.t[0]), (), "change of a line fitted to the energy over the run")
-    }
+    drift = jnp.sum(t * run.energy) / jnp.sum(t * t) * (run.t[-1] - run.t[0])
+    return {"energy_drift": Kept(drift, (), "change of a line fitted to the energy over the run")}
 
 
 def _constraints(run: Trajectory) -> dict[str, Kept]:

@@ -60,10 +60,7 @@ ROUND_OFF = 4 * np.finfo(float).eps
 """Round-off of a position in a step, as a part of the largest position; a larger value hides differences of momenta."""
 OVERFLOWING_MOMENTUM = 1e160
 """A momentum whose square, and so its kinetic energy, overflows float64."""
-ENERGY_CRITERION = (
-    "the linear trend is at most half of the largest energy error, or flattens in a longer run, or the error is below "
-    "1e-9"
-)
+ENERGY_CRITERION = "the trend is at most half of the energy error, or flattens in a longer run, or error below 1e-9"
 EXPLICIT_CRITERION = "runs at omega h = 1; at 2.5 every NaN is reported as a failure"
 DERIVATIVE_CRITERION = "gradients and Hessians are those of the functions, to 1e-4"
 LANE_CRITERION = "the bad lane reports its failure, the others equal their single runs to 1e-12"
@@ -207,9 +204,7 @@ class Resolved:
         some lanes."""
         lanes, options = 64 if full else 16, {"macro_dt": self.macro_dt, "num_steps": 20, "save": 20}
         bad = lanes // 3
-        along = run(
-            self.problem, self.scheme, self.macro_dt, lanes - 1
-        )  # its nodes are consistent with all constraints
+        along = run(self.problem, self.scheme, self.macro_dt, lanes - 1)  # nodes are consistent with all constraints
         p_s, p_f = (jnp.asarray(p).at[bad].set(OVERFLOWING_MOMENTUM) for p in (along.p_s, along.p_f))
         states = State(along.t, along.q_s, along.q_f, p_s, p_f)
         batch = simulate_batch(self.problem.system, self.scheme, states, **options, warn=False)
@@ -266,9 +261,8 @@ def resolved(problem: Problem) -> Resolved:
     omega = float(max(linear.frequencies.max(initial=0.0), turning))
     if not omega > 0:
         now = motion(problem.system, state)
-        q, v, a = (
-            np.abs(np.append(*parts)) for parts in ((state.q_s, state.q_f), (now.v_s, now.v_f), (now.a_s, now.a_f))
-        )
+        pairs = (state.q_s, state.q_f), (now.v_s, now.v_f), (now.a_s, now.a_f)
+        q, v, a = (np.abs(np.append(*pair)) for pair in pairs)
         sizes = np.where(q > 0, q, q.max() or 1.0)
         omega = float(max((v / sizes).max(), np.sqrt(a / sizes).max())) or 1.0
     omega = max(omega, 2 * np.pi / (drive_period(problem.system, state, 1 / omega) or np.inf))
@@ -341,6 +335,4 @@ def _turns_one_way(problem: Problem) -> str:
     there, back = (float(system.kinetic_energy(problem.q_s, problem.q_f, v_s * x, v_f * x)) for x in (1, -1))
     if abs(there - back) <= 1e-12 * (abs(there) + abs(back)):
         return ""
-    return (
-        "its kinetic energy depends on the sign of velocities (as in a magnetic field): the way back is another motion"
-    )
+    return "its kinetic energy depends on the sign of velocities (magnetic fields): the way back is another motion"

@@ -149,9 +149,8 @@ def _plot_maps(values, failed, x: str, y: str, title: str, theme: Theme) -> Note
     with new_figure(1.2 + 2.6 * columns, 0.9 + 2.3 * rows, title, theme) as figure:
         grid = panel_grid(figure, len(panels), columns)
         for axes, (name, panel), mark in zip(grid, panels, marks, strict=True):
-            mesh = axes.pcolormesh(
-                values[x], values[y], panel.transpose(y, x), norm=norm, cmap="viridis", rasterized=True
-            )
+            colours = {"norm": norm, "cmap": "viridis", "rasterized": True}
+            mesh = axes.pcolormesh(values[x], values[y], panel.transpose(y, x), **colours)
             hidden = np.ma.masked_where(~mark.transpose(y, x).values, np.ones((values.sizes[y], values.sizes[x])))
             axes.pcolormesh(values[x], values[y], hidden, cmap=ListedColormap([theme.faint]), rasterized=True)
             axes.set_title(name)

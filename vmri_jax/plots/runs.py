@@ -128,9 +128,8 @@ def _moduli(run: SavedRun) -> dict[str, dict[str, np.ndarray]]:
             reactions = {kind: force}
             if body in names.rigid:
                 # (k, directors, 3): the first three entries are of the centre
-                pulls, directors = (
-                    np.asarray(a)[:, 3:].reshape(len(force), -1, 3) for a in (force, run.position(body))
-                )
+                both = (np.asarray(a)[:, 3:].reshape(len(force), -1, 3) for a in (force, run.position(body)))
+                pulls, directors = both
                 reactions = {"force": force[:, :3], "torque": np.cross(directors, pulls).sum(axis=1)}
             for unit, reaction in reactions.items():
                 curves, modulus = panels[unit], np.linalg.norm(reaction, axis=1)
@@ -181,10 +180,8 @@ def coordinates(axes: Axes, t, values, names: Sequence[str], theme: Theme, error
         label = names[i] if i in named else f"_{names[i]}"  # legends leave out labels with an underscore
         axes.plot(t, values[:, i], color=colors[i], linewidth=_thin(t), label=label)
         if error is not None:
-            half = np.abs(error[:, i])
-            axes.fill_between(
-                t, values[:, i] - half, values[:, i] + half, color=colors[i], alpha=BAND_OPACITY, linewidth=0
-            )
+            half, look = np.abs(error[:, i]), {"color": colors[i], "alpha": BAND_OPACITY, "linewidth": 0}
+            axes.fill_between(t, values[:, i] - half, values[:, i] + half, **look)
     if n:
         legend_beside(axes, f"{len(named)} of {n}" if n > MOST_NAMED else None, 9.0 if n <= len(theme.curves) else 6.5)
 
@@ -233,9 +230,8 @@ def _energy_balance(above: Axes, below: Axes, trajectory: SavedRun, theme: Theme
     below.axhspan(-work.uncertainty, work.uncertainty, color=theme.faint, label="not resolved\nby the nodes")
     below.set_ylabel("energy balance")
     if trajectory.micro is None:
-        below.set_title(
-            "schemes with kicks: terms of $H^2$, a drift among them, without Save(micro=True)", fontsize=7.5
-        )
+        terms = "schemes with kicks: terms of $H^2$, a drift among them, without Save(micro=True)"
+        below.set_title(terms, fontsize=7.5)
     legend_beside(below, size=7.5)
     _not_below_roundoff(below.yaxis, energy)
 

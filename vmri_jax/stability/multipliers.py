@@ -212,9 +212,8 @@ def monodromy(
 @quickly_compiled
 def _constraint_rows(system: System, state: State):
     """Derivatives (2 n_g + 2 n_gs, 2 n) of the constraints and the hidden constraints by z."""
-    return jax.jacfwd(lambda z: jnp.concatenate(all_constraints(system, state_of(z, state.t, state))))(
-        phase_vector(state)
-    )
+    rows = jax.jacfwd(lambda z: jnp.concatenate(all_constraints(system, state_of(z, state.t, state))))
+    return rows(phase_vector(state))
 
 
 @quickly_compiled

@@ -47,12 +47,8 @@ def linear_model(omega=50.0, kappa=25.0) -> Problem:
         omega: frequency of the fast variable alone.
         kappa: stiffness of the spring between the two.
     """
-    system = System(
-        ConstantMass([1.0], [1.0]),
-        soft_spring,
-        stiff_spring,
-        params={"omega": jnp.asarray(omega, dtype=float), "kappa": jnp.asarray(kappa, dtype=float)},
-    )
+    params = {"omega": jnp.asarray(omega, dtype=float), "kappa": jnp.asarray(kappa, dtype=float)}
+    system = System(ConstantMass([1.0], [1.0]), soft_spring, stiff_spring, params=params)
     one = jnp.ones(1)
     return Problem(system, one, one / omega, 0 * one, one)
 

@@ -88,12 +88,11 @@ class CostReport(ResultTable):
     @property
     def curves(self) -> WorkPrecision:
         """The Pareto fronts of the families, each with the name of the family as its scheme."""
-        by_family = {row.family: [] for row in self.runs.rows}
-        for row in self.runs.rows:
-            by_family[row.family].append(replace(row, scheme=row.family))
-        return WorkPrecision(
-            tuple(row for rows in by_family.values() for row in pareto_front(rows, "seconds", "error_q"))
-        )
+        fronts: list[Row] = []
+        for family in dict.fromkeys(row.family for row in self.runs.rows):
+            of_family = [replace(row, scheme=family) for row in self.runs.rows if row.family == family]
+            fronts += pareto_front(of_family, "seconds", "error_q")
+        return WorkPrecision(tuple(fronts))
 
     @property
     def reached(self) -> list[Row]:

@@ -61,10 +61,8 @@ class Tuning(Search):
         """The table of all runs so far, sorted by scheme and number of steps; seconds are those of the steps, NaN where
         they were not measured."""
         rows = sorted(self._rows.values(), key=attrgetter("scheme", "num_steps"))
-        seconds = (self.seconds.get(row.settings.python, np.nan) for row in rows)
-        return WorkPrecision(
-            tuple(replace(row, seconds=s * row.num_steps) for row, s in zip(rows, seconds, strict=True))
-        )
+        seconds = [self.seconds.get(row.settings.python, np.nan) * row.num_steps for row in rows]
+        return WorkPrecision(tuple(replace(row, seconds=s) for row, s in zip(rows, seconds, strict=True)))
 
 
 class NothingReached(ValueError):
@@ -101,10 +99,8 @@ class Recommendation(WorkPrecision):
     @property
     def caption(self) -> str:
         """The recommended setting."""
-        return (
-            f"For an error of {self.error:g} take the first: its .scheme, .macro_dt and .num_steps. "
-            f"All {len(self.rows)} runs are in .runs and .to_csv(path)."
-        )
+        first = f"For an error of {self.error:g} take the first: its .scheme, .macro_dt and .num_steps"
+        return f"{first}. All {len(self.rows)} runs are in .runs and .to_csv(path)."
 
     @property
     def scheme(self):

@@ -63,11 +63,6 @@ def fermi_pasta_ulam(num_springs: int = 3, omega: float = 50.0) -> Problem:
     if num_springs < 1:
         raise Refused(f"fermi_pasta_ulam: num_springs is {num_springs}; there must be at least 1.")
     ones, first = jnp.ones(num_springs), jnp.zeros(num_springs).at[0].set(1.0)
-    system = System(
-        kinetic=ConstantMass(ones, ones),
-        slow_potential=soft_springs,
-        fast_potential=stiff_springs,
-        params={"omega": jnp.asarray(omega)},
-    )
+    system = System(ConstantMass(ones, ones), soft_springs, stiff_springs, params={"omega": jnp.asarray(omega)})
     names = Names({"centres": num_springs}, {"elongations": num_springs}, numbered=("centres", "elongations"))
     return Problem(system, first, first / omega, first, first, names=names, drawing=drawing(num_springs))

@@ -60,18 +60,14 @@ def triple_spherical_pendulum(
     """
     m_1, m_2, m_3 = masses
     l_1, l_2, l_3 = lengths
+    params = {"masses": masses, "stiffness": stiffness, "lengths": lengths, "gravity": gravity}
     system = System(
         kinetic=ConstantMass(slow=jnp.full(3, m_1), fast=jnp.repeat(jnp.array([m_2, m_3]), 3)),
         slow_potential=weight,
         fast_potential=quartic_spring if quartic else spring,
         constraint=second_rod,
         slow_constraint=first_rod,
-        params={
-            "masses": jnp.asarray(masses),
-            "stiffness": jnp.asarray(stiffness),
-            "lengths": jnp.asarray(lengths),
-            "gravity": jnp.asarray(gravity),
-        },
+        params={name: jnp.asarray(value) for name, value in params.items()},
     )
     return Problem(
         system,
