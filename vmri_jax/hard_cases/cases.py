@@ -60,7 +60,10 @@ ROUND_OFF = 4 * np.finfo(float).eps
 """Round-off of a position in a step, as a part of the largest position; a larger value hides differences of momenta."""
 OVERFLOWING_MOMENTUM = 1e160
 """A momentum whose square, and so its kinetic energy, overflows float64."""
-ENERGY_CRITERION = "the trend is at most half of the energy error, or flattens in a longer run, or error below 1e-9"
+ENERGY_CRITERION = (
+    "the linear trend is at most half of the largest energy error, or flattens in a longer run, or the error is below "
+    "1e-9"
+)
 EXPLICIT_CRITERION = "runs at omega h = 1; at 2.5 every NaN is reported as a failure"
 DERIVATIVE_CRITERION = "gradients and Hessians are those of the functions, to 1e-4"
 LANE_CRITERION = "the bad lane reports its failure, the others equal their single runs to 1e-12"
