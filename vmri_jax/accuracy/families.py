@@ -98,8 +98,7 @@ def of_scheme(scheme: Scheme | Composition) -> Family:
 
 
 def for_system(menu: Sequence[Family], system: System, has_two_rates: bool) -> list[Family]:
-    """The families with a first num_micro that the rates of the potentials divide: the least one where micro steps save
-    no time."""
+    """The families with a first num_micro that the rates of the potentials divide, the least one without two rates."""
 
     def adapted(family: Family) -> Family:
         unit = unit_of(system, family.make(family.first))
@@ -115,12 +114,10 @@ def by_promise(menu: Sequence[Family], digits: float) -> list[Family]:
 
 
 def micro_steps_help(system: System, start: State) -> bool:
-    """Whether micro steps may save time: the system has fast coordinates, and slow coordinates or potentials for the
-    macro grid."""
+    """Whether micro steps may save time: there are fast coordinates, and slow ones or potentials for the macro grid."""
     return bool(start.q_f.size and (start.q_s.size or system.slow_potential is not None or system.potentials))
 
 
 def unit_of(system: System, scheme: Scheme | Composition) -> int:
-    """The number whose multiples are allowed as num_micro: the least common multiple of all k of rules on every k-th
-    micro node."""
+    """The number whose multiples are allowed as num_micro: least common multiple of k of rules on every k-th node."""
     return math.lcm(stage_scheme(scheme).unit, *(name for name, _ in system.potentials if isinstance(name, int)))

@@ -55,8 +55,7 @@ AIMED_PART = 0.5
 """Part of the accuracy for which steps are chosen. Trials predict errors of finer runs to about a factor of 2: with a
 larger part more runs miss the accuracy and are repeated, with a smaller part all runs take more steps."""
 MOST_SAVED = 1000
-"""Most saved intervals of a run with an accuracy whose user gives no number; a larger value takes more memory in long
-runs."""
+"""Most saved intervals of a run with an accuracy if the user gives no number; a larger value takes more memory."""
 FEWEST_STEPS = 16
 """Macro steps of the first trial of a scheme; a trial without a certified error is repeated with twice the steps. A
 larger value makes searches with large accuracies slower."""
@@ -66,8 +65,7 @@ MOST_GROWTH = 64
 """Most steps of a run over the steps of the run before. With a larger number a search whose accuracy is out of reach,
 as with jumps of forces, ends with fewer steps than it could take; with a smaller one it repeats runs more often."""
 MOST_REPEATS = 5
-"""Runs that may miss the accuracy before the search gives up; a larger value makes searches for an accuracy out of
-reach take longer."""
+"""Runs that may miss the accuracy before the search gives up; more lengthen searches for one out of reach."""
 MOST_TRIAL_SECONDS = 20.0
 """Seconds of a trial, compiling included, after which the search no longer halves the steps of an uncertified trial.
 With a larger value searches take longer where no error can be certified, as for chaotic motion."""
@@ -80,8 +78,7 @@ take for the accuracy, and where its run promises to take this many times as lon
 NUM_MICRO = (1, 2, 3, 5, 8, 12, 20, 30, 50)
 """Numbers of micro steps that an exhaustive search tries, in units of the rates of the potentials."""
 MOST_MICRO = 64
-"""Most micro steps chosen; more save little unless an evaluation of the slow force takes a hundred times as long as of
-the fast force."""
+"""Most micro steps chosen; more save little unless the slow force takes a hundred times as long as the fast one."""
 WORTH_COMPILING = 1.5
 """Time of a run over the time that a third number of micro steps promises, above which its program is compiled. A larger
 value misses savings; a smaller one compiles for seconds to save milliseconds."""
@@ -89,8 +86,7 @@ LEAST_SHARE = 1e-3
 """Least slow share of the error, as a part of the fast share: the number of micro steps stays finite where the slow
 share vanishes. A larger value allows fewer micro steps."""
 USUAL_TRIALS = 5
-"""Trial runs of a usual search, the total that a progress bar starts with; with a larger value the bar ends before it
-is full."""
+"""Trial runs of a usual search, the total that a bar starts with; with a larger value the bar ends early."""
 MOST_COORDINATES = 60
 """Most coordinates of a system for which a single interval of high degree is tried, and for which resonances are looked
 up. The matrices of both have a row for each coordinate: with 200 of them they take minutes, and schemes with kicks are
@@ -231,8 +227,7 @@ class Search:
         """Called with each trial."""
 
     def accurate(self, trial: Trial, accuracy: float) -> Trial:
-        """A trial of the same scheme with an error of at most the accuracy; the last trial if `MOST_REPEATS` of them
-        miss it."""
+        """A trial of the same scheme that keeps the accuracy; the last one if `MOST_REPEATS` of them miss it."""
         order = 1.0 if self.drives.jump else float(trial.run.order)
         for _ in range(MOST_REPEATS):
             before, run = trial, trial.run

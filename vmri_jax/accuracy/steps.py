@@ -1,5 +1,4 @@
-"""The doors of the search for an accuracy: checks of arguments, the usual menu, and warnings about runs that miss the
-accuracy."""
+"""The doors of the search for an accuracy: checks of arguments, the usual menu, warnings about runs that miss it."""
 
 import warnings
 
@@ -16,11 +15,9 @@ from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 
 MANY_STEPS = 100_000
-"""Macro steps that short events demand, above which a warning tells of them; a smaller value warns of runs that take
-less than a second."""
+"""Macro steps that short events demand, above which a warning tells of them; a smaller value warns of fast runs."""
 ROUNDOFF = 100 * np.finfo(float).eps
-"""Error below which an accuracy is refused as round-off, as a part of the largest position; a larger value refuses
-reachable accuracies."""
+"""Error refused as round-off, as a part of the largest position; a larger value refuses reachable accuracies."""
 
 
 class AccuracyNotReached(UserWarning):
@@ -48,8 +45,7 @@ def with_accuracy(search: Search, scheme: Scheme | Composition | None, accuracy:
 
 
 def reached(name: str, search: Search, menu: list[Family], accuracy: float, **how) -> list[Trial]:
-    """`Search.cheapest` of an accuracy, which is refused if no position moves as far; `name` begins the message, `how`
-    are further arguments."""
+    """`Search.cheapest` of an accuracy, which is refused if no position moves as far; `name` begins the message."""
     search.first_trials(menu, accuracy)
     check_extent(name, search, accuracy)
     return search.cheapest(menu, accuracy, **how)
@@ -67,8 +63,7 @@ def check_extent(name: str, search: Search, accuracy: float) -> None:
 
 
 def usual_menu(search: Search, scheme: Scheme | Composition | None, accuracy: float) -> list[Family]:
-    """The families for an accuracy: the user's scheme alone; without one, kicks and a single interval of high
-    degree."""
+    """The families for an accuracy: the user's scheme alone, or kicks and a single interval of high degree."""
     if scheme is not None:
         return [of_scheme(scheme)]
     size = search.start.q_s.size + search.start.q_f.size
@@ -77,8 +72,7 @@ def usual_menu(search: Search, scheme: Scheme | Composition | None, accuracy: fl
 
 
 def digits_of(search: Search, accuracy: float) -> float:
-    """The digits of an accuracy, relative to the largest position at the start, or to the largest speed times the
-    length; at least one."""
+    """The digits of an accuracy, at least one, relative to the largest position, or largest speed times length."""
     start = search.start
     q, v = (start.q_s, start.q_f), velocity(search.system, start.q_s, start.q_f, start.p_s, start.p_f)
     size, speed = (max(np.abs(np.asarray(a)).max(initial=0.0) for a in pair) for pair in (q, v))

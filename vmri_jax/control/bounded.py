@@ -65,8 +65,7 @@ def solve(stages: Stages, final: Final, limits: Limits) -> tuple[Solution, float
 
 
 def _solved(stages: Stages, final: Final, limits: Limits, weight: float | None) -> tuple[Solution, float] | None:
-    """The solution, and its largest multiplier, of the problem as it is or of its relaxation with this weight; None if
-    PIQP fails."""
+    """Solution and largest multiplier of the problem or its relaxation with this weight; None if PIQP fails."""
     piqp = export.extra("piqp", "minimize with bounds or limits of controls", "control")
     (count, n, m), c, e = stages.B.shape, limits.value.shape[1], len(final.g)
     num_slacks = 0 if weight is None else c

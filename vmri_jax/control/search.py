@@ -15,8 +15,7 @@ from vmri_jax.mechanics.arrays import Numbers
 SHORTEST_PART = 2.0**-10
 """Smallest part of an update that the line search tries, after ten halvings; a larger one gives up earlier."""
 SUFFICIENT_DECREASE = 1e-4
-"""Armijo's constant: the decrease of the merit has to be this part of the predicted one. A larger one refuses more
-updates."""
+"""Armijo's constant: the merit decreases by at least this part of the prediction; a larger one refuses more."""
 
 
 class Point(NamedTuple):

@@ -1,8 +1,7 @@
 """Discrete mechanics and optimal control: stages of a controlled motion, and their derivatives.
 
 A stage is a macro step of the scheme, ``z_{k+1} = Phi(z_k, u_k)`` with ``z = (q_s, q_f, p_s, p_f)``; its discrete
-forced equations are the constraints of the optimisation. Controls are constant over a macro interval, or over each
-micro interval.
+forced equations are the constraints of the optimisation. Controls are constant over macro or micro intervals.
 
 Source: S. Ober-Bloebaum, O. Junge, J. E. Marsden, Discrete mechanics and optimal control, ESAIM: COCV 17 (2011); S.
 Leyendecker, S. Ober-Bloebaum, J. E. Marsden, M. Ortiz, Optim. Control Appl. Meth. 31 (2010), with constraints; T.

@@ -236,8 +236,7 @@ def ensemble(
 
 @dataclass(frozen=True)
 class ChunkTask:
-    """The computation of a chunk: it writes the results to the store at `path`, commits them, and returns how many of
-    the runs failed."""
+    """The computation of a chunk: it writes and commits results to the store, and returns how many runs failed."""
 
     path: Path
     chunks: Chunks

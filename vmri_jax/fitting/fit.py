@@ -73,10 +73,8 @@ def fit(
         scheme, macro_dt, solver: as in `simulate`. The times of measurement must be macro nodes. Where the solver is
             not chosen, runs have no fallback.
         segments: parts of multiple shooting; more than one for long or chaotic motion.
-        starts: number of searches side by side, the first from the starts of `parameters`, the others from random ones
-            around them.
-        spread: standard deviation of the search variables of the random starts, about the relative change of a
-            parameter.
+        starts: number of searches side by side, the first from `parameters`, the others from random starts about them.
+        spread: standard deviation of the random starts, about the relative change of a parameter.
         max_steps: largest number of iterations of a search.
         seed: of the random starts.
 
@@ -194,8 +192,7 @@ class _Search:
         return u, z, misses, jnp.sum(iterations), good[-1], jnp.max(jnp.abs(gaps), initial=0.0)
 
     def jacobian(self, u, z, values):
-        """Jacobians of misses and gaps, the gaps with their last weight: by the parameters themselves, and by the
-        starts of the parts."""
+        """Jacobians of misses and gaps with their last weight, by the parameters and by the starts of the parts."""
 
         def joined(x):
             u, z = jnp.split(x, [self.size])
@@ -232,8 +229,7 @@ class _Search:
         return Fit.of(self.shooting, u, misses, jacobians, **end, again=partial(self.again, u, z))
 
     def again(self, u, z, values):
-        """Parameters (k, p) and covariances (k, p, p) of fits to other values (k, m); each search starts at the end u,
-        z of the first fit."""
+        """Parameters (k, p) and covariances (k, p, p) of fits to other values (k, m), which start at the end u, z."""
         unknowns = self.shooting.unknowns
 
         @jax.jit

@@ -23,16 +23,14 @@ STARTS_RANK_TOLERANCE = 1e-12
 """Smallest singular value, over the largest one, of a direction in the range of the Jacobian in the starts; below it a
 direction is round-off. A larger one leaves real effects of the starts to the parameters."""
 DOUBTED_PROBABILITY = 1e-6
-"""Probability of a chi^2 as large as that of the fit, below which the report doubts the fit. A larger one doubts good
-fits by chance."""
+"""Probability of a chi^2 as large as that of the fit, below which the fit is doubted; a larger one doubts good fits."""
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
     """Fitted parameters, their covariance, and the quality of the fit.
 
-    Further results are properties: `standard_errors`, `values`, `problem`, `doubts`, `probability`, and the method
-    `intervals`.
+    Further results: `standard_errors`, `values`, `problem`, `doubts`, `probability`, and the method `intervals`.
 
     Attributes:
         parameters: values by name.
@@ -113,8 +111,7 @@ class Fit:
 
     @property
     def probability(self) -> float:
-        """Probability of a sum of squares at least as large, if model and sigma are right; 1 where sigma is
-        estimated."""
+        """Probability of as large a sum of squares, if model and sigma are right; 1 where sigma is estimated."""
         if not self.shooting.knows_sigma:
             return 1.0
         return float(stats.chi2.sf(np.sum(self.residuals**2), max(self.freedom, 1)))

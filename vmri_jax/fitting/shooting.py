@@ -1,5 +1,4 @@
-"""Shooting: predictions of a model for all measurements, from the start of the motion or from the starts of parts of
-it.
+"""Shooting: predictions of a model for all measurements, from the start of the motion or of parts of it.
 
 With one part the start follows from the parameters. With several (*multiple shooting*) the start of each part is an
 unknown, and a condition of the search is that each part ends where the next one starts. Errors grow little within a
@@ -88,8 +87,7 @@ class Shooting:
         return _phase(problem, problem.state())
 
     def starts(self, u) -> np.ndarray:
-        """(segments - 1, 2 n) starts of the parts after the first one, along a single run with the search variables
-        u."""
+        """(segments - 1, 2 n) starts of the parts after the first one, along a single run with u."""
         if self.segments == 1:
             return np.zeros((0, self.start(u).size))
         problem = self.model(self.unknowns.at(u))
@@ -113,8 +111,7 @@ class Shooting:
 
     @cached_property
     def _places(self) -> list[tuple[np.ndarray, np.ndarray]]:
-        """For each set of measurements, the part that each of its times lies in, and the number of the saved node
-        there."""
+        """For each set of measurements, the part that each time lies in, and the number of the saved node there."""
         parts = [np.minimum(steps // self.length, self.segments - 1) for steps in self.steps]
         return [(k, (steps - k * self.length) // self.every) for k, steps in zip(parts, self.steps, strict=True)]
 

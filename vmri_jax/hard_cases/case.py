@@ -1,5 +1,4 @@
-"""A hard case: a set-up, a criterion, a function that measures it, and the picture of a long run: its energy error as a
-band."""
+"""A hard case: a set-up, a criterion, a function that measures it; and the picture of the energy of a long run."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field

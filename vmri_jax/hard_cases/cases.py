@@ -44,8 +44,7 @@ from vmri_jax.steppers.solver import Solver
 NUM_MICRO = 5
 """Micro steps per macro step of the cases."""
 PHASE = 0.2
-"""omega h of the fastest vibration, which resolves it; omega H = 1 is well below the first resonance. A larger value
-may meet resonances."""
+"""omega h of the fastest vibration; omega H = 1 is below the first resonance, which a larger value may meet."""
 LONGER_RUN = 8
 """Factor by which a run is lengthened if its energy has a trend. In the longer run the trend of a slow motion turns
 back or settles, and a drift goes on; a larger factor tells the two apart more safely and takes longer."""
@@ -71,8 +70,7 @@ LANE_CRITERION = "the bad lane reports its failure, the others equal their singl
 
 @dataclass(frozen=True)
 class Resolved:
-    """A problem with a scheme and a macro step that resolve its fastest vibration, of frequency omega; every public
-    method is a case."""
+    """A problem with a scheme and a step that resolve its fastest vibration, omega; every public method is a case."""
 
     problem: Problem
     scheme: Scheme
@@ -203,8 +201,7 @@ class Resolved:
         return max(difference(q, q_oracle) / largest_q, max(difference(p, p_oracle) - round_off, 0.0) / largest_p)
 
     def bad_lane(self, full: bool) -> Outcome:
-        """A batch whose lanes start at the nodes of a run, one of them with overflowing momenta, beside single runs of
-        some lanes."""
+        """A batch that starts at the nodes of a run, one of them with overflowing momenta, beside single runs."""
         lanes, options = 64 if full else 16, {"macro_dt": self.macro_dt, "num_steps": 20, "save": 20}
         bad = lanes // 3
         along = run(self.problem, self.scheme, self.macro_dt, lanes - 1)  # nodes are consistent with all constraints
@@ -331,8 +328,7 @@ def _has_no_limit(system: System) -> str:
 
 
 def _turns_one_way(problem: Problem) -> str:
-    """The reason why reversed momenta do not lead a closed system back to the start; empty if its kinetic energy is
-    even in the velocities."""
+    """The reason why reversed momenta do not lead back to the start; empty if the kinetic energy is even in them."""
     random, system = np.random.default_rng(0), problem.system
     v_s, v_f = (random.uniform(-1, 1, q.shape) for q in (problem.q_s, problem.q_f))
     there, back = (float(system.kinetic_energy(problem.q_s, problem.q_f, v_s * x, v_f * x)) for x in (1, -1))

@@ -53,8 +53,7 @@ def named_arrays(run: SavedRun) -> dict:
 
 
 def rows_of(run: SavedRun) -> dict[str, np.ndarray]:
-    """The arrays of a run or a batch by name, a row for each saved node; row k has the work of the solver since node
-    k - 1."""
+    """The arrays of a run or a batch by name, a row for each saved node; row k has the work since node k - 1."""
     arrays = {name: np.asarray(value) for name, value in named_arrays(run).items() if name in DIMENSIONS}
     axis = arrays["t"].ndim - 1
     for name, array in arrays.items():

@@ -10,8 +10,7 @@ from typing import IO
 
 @contextmanager
 def replaced(path: str | Path) -> Iterator[IO[bytes]]:
-    """A binary file to write to; if the block raises nothing it replaces `path` in one operation, after its bytes are
-    on disk."""
+    """A binary file to write to; without an error it replaces `path` in one operation, after its bytes are on disk."""
     path = Path(path).resolve()  # a link stays, its target is replaced
     check_place(path)
     if path.exists() and not path.is_file():  # a device is written to directly: it cannot be replaced

@@ -46,8 +46,7 @@ def statuses(result: np.ndarray, failed_at: np.ndarray) -> str:
 
 
 def energy_in_words(energy: np.ndarray, kept: bool | None) -> str:
-    """Energy (..., k) at the start and its change; of a batch the largest change in a run. `kept` is None if the system
-    is not known."""
+    """Energy (..., k) at the start and its change; of a batch the largest change. `kept` is None without a system."""
     start = energy[..., :1]
     change = np.abs(energy - start)
     largest = float(np.nanmax(change, initial=0.0))

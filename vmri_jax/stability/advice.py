@@ -40,11 +40,9 @@ LONGER_FOR_CAUSE = 0.01
 than each alone. A larger value may blame a limit that is not yet reached."""
 RADIANS_IN_PHASE = 0.2
 """Distance of the turn of a vibration in a macro step from a multiple of 2 pi, below which kicks of a constant force
-are said to be in phase: they make the vibration 10 times as large as kicks at odd multiples of pi do. A larger value
-warns of more steps."""
+are said to be in phase: then it is 10 times as large as at odd multiples of pi. A larger value warns of more steps."""
 LEAST_FORCE = 1e-6
-"""Smallest part of the constant slow force in a vibration for which its kicks are judged; a smaller value warns of
-round-off."""
+"""Smallest part of the constant slow force in a vibration that is judged; a smaller value warns of round-off."""
 MOST_SCANS = 5
 """Most scans, each over smaller steps than the previous one, until one of them contains a safe step."""
 
@@ -80,8 +78,7 @@ class Advice(ResultTable):
     scanned: least and largest macro step of all scans.
     safe_macro_dt: the stable step nearest to macro_dt without a near window, macro_dt itself if it is such a step; NaN
         if no scan has one. Of a periodic drive a part of the period.
-    fast_frequencies, slow_frequencies: (d,) frequencies of the fast and of the slow potential at the state, the largest
-        first.
+    fast_frequencies, slow_frequencies: (d,) frequencies of the fast and the slow potential, the largest first.
     about: the motions that are judged, in words.
     """
 

@@ -33,8 +33,8 @@ from vmri_jax.study.row import Row, RunTable, WorkPrecision, row_of
 from vmri_jax.study.table import Column, interruptible
 
 MIN_ERROR_OVER_REFERENCE = 100.0
-"""Least ratio of a fitted error to the error of the reference; at this ratio the reference changes the error of the scheme by 1 %; a larger
-ratio fits fewer runs."""
+"""Least ratio of a fitted error to the error of the reference; at it the
+reference changes the error of the scheme by 1 %; a larger ratio fits fewer runs."""
 
 
 @dataclass(frozen=True)
@@ -200,10 +200,8 @@ def convergence_study(
         macro_dt: macro steps H; each must divide `t_end` into a multiple of `num_saves` steps.
         t_end: time simulated.
         num_saves: nodes compared, equally spaced over `t_end`.
-        params: parameters of the system by label, if there are several sets; positions and velocities at the start are
-            those of `problem`.
-        reference: the solution that errors are measured against, by label of the parameters if there are several; by default
-            `reference_solution`.
+        params: parameters of the system by label, if there are several sets, with the start of `problem`.
+        reference: what errors are measured against, by label of several sets; by default `reference_solution`.
         solver: how implicit equations are solved.
         repeats: timed samples of every run; 0 for no times. The runs take turns on the clock of this process, so that a slow
             moment of the machine hits all of them; a row has the median.

@@ -35,8 +35,7 @@ RELATIVE_ERRORS = (1e-2, 1e-4, 1e-6, 1e-8)
 
 @dataclass(frozen=True)
 class Answer:
-    """The largest accepted error of the positions, and the run of the cheapest setting for it; None if no setting keeps
-    the error."""
+    """The largest accepted error of the positions, and the run of the cheapest setting; None if no setting keeps it."""
 
     error: float
     setting: Row | None
@@ -56,8 +55,7 @@ class CostReport(ResultTable):
     t_end: simulated time.
     errors: accepted errors of a position.
     runs: every run of the search.
-    bound: seconds and error of the runs of the Pareto front, if the time of a run were that of its gradients alone;
-        empty with constraints.
+    bound: seconds and error of the Pareto front, if runs took the time of their gradients; empty with constraints.
     """
 
     columns = (
@@ -136,14 +134,12 @@ def cost_report(
         name: of the system, for the title and the commands: a built-in one or ``my_file.py:my_problem``.
         out: folder, made if it does not exist.
         t_end: simulated time, by default `default_t_end`.
-        errors: largest accepted errors of a position, as of `tune`; by default `RELATIVE_ERRORS` times how far the
-            system moves.
+        errors: largest accepted errors of a position, as of `tune`; by default `RELATIVE_ERRORS` of the motion.
         menu: families to choose from, by default `families()`.
         progress: True for a bar, or a function (what, done, total) that is told about every run.
 
     Raises:
-        ValueError: errors that are not positive, or above the extent of the motion; no errors are passed, and the
-            system does not move.
+        ValueError: errors below round-off, or above the extent of the motion; no errors, and no motion.
         Interrupted: Ctrl-C; carries the runs of the search.
     """
     problem, out = problem_of("cost_report", problem), Path(out)
@@ -194,8 +190,7 @@ def seconds_of_gradients(price: Mapping[str | int, float], row: Row) -> float:
 def bound_of(price: Mapping[str | int, float], rows: Sequence[Row]) -> tuple[tuple[float, float], ...]:
     """Seconds and error of runs whose time is that of their gradients alone.
 
-    A gradient that is evaluated in a loop of its own may take longer than in the run, so that the time of the run
-    bounds it.
+    A gradient in a loop of its own may take longer than in the run, so that the time of the run bounds it.
     """
     return tuple((min(seconds_of_gradients(price, row), row.seconds), row.error_q) for row in rows)
 

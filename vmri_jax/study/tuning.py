@@ -20,8 +20,7 @@ from vmri_jax.study.row import Row, WorkPrecision, row_of
 from vmri_jax.study.table import interruptible
 
 FINALISTS = 4
-"""Families whose micro steps and steps are searched for, of those that promise the least time. A larger number searches
-longer."""
+"""Families whose micro steps and steps are searched for, of those that promise the least time; more take longer."""
 SETTINGS_PRINTED = 5
 """Number of settings, the recommended one included, that a recommendation and `vmri tune` print."""
 
@@ -58,8 +57,7 @@ class Tuning(Search):
         return self.runs()
 
     def runs(self) -> WorkPrecision:
-        """The table of all runs so far, sorted by scheme and number of steps; seconds are those of the steps, NaN where
-        they were not measured."""
+        """The table of all runs so far, sorted by scheme and number of steps, with the seconds of the steps."""
         rows = sorted(self._rows.values(), key=attrgetter("scheme", "num_steps"))
         seconds = [self.seconds.get(row.settings.python, np.nan) * row.num_steps for row in rows]
         return WorkPrecision(tuple(replace(row, seconds=s) for row, s in zip(rows, seconds, strict=True)))
@@ -141,8 +139,7 @@ def tune(
         error: largest accepted error of a position, in the unit of the positions.
         t_end: simulated time.
         menu: families to choose from, by default `families()`.
-        num_saves: saved intervals, equally spaced, at whose ends errors are compared; None for one per macro step, at
-            most 1000.
+        num_saves: equal intervals at whose ends errors are compared; None for one per macro step, at most 1000.
         solver: how implicit equations are solved.
         exhaustive: try every num_micro of every family, to check the staged search.
         progress: True for a bar, or a function (what, done, total) that is told about every trial run.
