@@ -42,8 +42,7 @@ def animate(
 ) -> None:
     """Show a run: a page to open in a browser, a strip of pictures, or a GIF.
 
-    The drawing is the one stored with the run, else the drawing of --system; without a drawing every coordinate is a
-    bar.
+    The drawing is the one stored with the run, else the drawing of --system; without one coordinates are bars.
     """
     out = run.with_suffix(".html") if out is None else out
     check_target("--out", out, ".html", *PICTURES, ".gif", ".pvd")

@@ -32,8 +32,7 @@ FAULT = "This is no error of your command, but of the program. Please report it,
 
 @contextmanager
 def refusals() -> Iterator[None]:
-    """Within this context refusals of the library are shown as panels, and other errors of their classes as faults of
-    the program."""
+    """Within this context refusals of the library are shown as panels, other errors of their classes as faults."""
     try:
         yield
     except Refused as error:
@@ -72,8 +71,7 @@ def print_named(texts: dict[str, str]) -> None:
 
 
 def check_target(option: str, path: Path | None, *endings: str) -> None:
-    """Refuse a file with another ending, or that cannot be written, before anything is computed; without endings make a
-    folder, or refuse it."""
+    """Refuse a file that cannot be written, or has another ending; without endings make a folder, or refuse it."""
     if path is None:
         return
     if endings and path.suffix.lower() not in endings:

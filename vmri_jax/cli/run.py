@@ -32,11 +32,9 @@ from vmri_jax.steppers.solver import Solver
 DEFAULT_SCHEME = "fully-implicit"
 """The scheme of a run without --scheme and --accuracy."""
 DEFAULT_SAVED_NODES = 1000
-"""Approximate number of saved nodes of a run without --save-every; more make larger files, and figures do not show
-them."""
+"""Approximate number of saved nodes of a run without --save-every; more make larger files."""
 MOST_READ_NODES = 10_000
-"""Largest number of nodes of a run in its summary and figure; more are not seen, and take longer to read and to
-draw."""
+"""Largest number of nodes of a run in its summary and figure; more are not seen, and take longer."""
 
 
 def simulate(
@@ -206,8 +204,7 @@ def _compile_clock() -> list[float]:
 
 
 def _energy_balance(trajectory: Trajectory | StoredTrajectory) -> dict[str, str]:
-    """Work of forces and of moving constraints, and the remainder of their balance, in words; a stored run is read
-    piece by piece."""
+    """Work of forces and of moving constraints, and the remainder of their balance; a stored run is read in pieces."""
     pieces = [trajectory] if isinstance(trajectory, Trajectory) else trajectory.chunks()
     works = [piece.work() for piece in pieces]
     forces, constraints, left = (sum(part[-1] for part in parts) for parts in zip(*(w[:3] for w in works), strict=True))

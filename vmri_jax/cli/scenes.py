@@ -27,8 +27,7 @@ def explain(
     macro_dt: options.MacroStep = None,
     measure: Annotated[bool, Option(help="Time a macro step, and the derivatives of every effect.")] = True,
 ) -> None:
-    """Show the grid of every body and effect of a scene, or function of a system, with the reason, its cost, and all
-    frequencies.
+    """Show the grid of every body and effect of a scene, or function of a system, why, its cost, and frequencies.
 
     The cost: unknowns, evaluations, and the time of one evaluation of the first derivatives at all nodes. Frequencies
     are of small vibrations about the start.

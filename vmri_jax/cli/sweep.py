@@ -75,8 +75,7 @@ def _drawn(save: list[str], problem: Problem) -> str:
     if not drawn:
         raise Refused(
             f"--plot draws one number per run or per saved node, and save = {json.dumps(save)} keeps neither. Add one "
-            f"to the file, e.g. save = {json.dumps([*save, 'energy_error'])}, or a function of your own that returns "
-            "one, my_file.py:function."
+            f"to the file, e.g. save = {json.dumps([*save, 'energy_error'])}, or a function of your own."
         )
     return drawn[-1]
 

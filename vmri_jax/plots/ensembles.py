@@ -55,15 +55,13 @@ def plot_ensemble(
 
     Args:
         data: from `vmri_jax.open_ensemble`, or a selection of it.
-        quantity: name of the result; if None the last result with a single number per run, else the last one with a
-            number per saved node.
+        quantity: name of the result; if None the last one with a single number per run, or per saved node.
         x, y: names of axes or columns; the two longest axes if both are None and the design has axes.
         title: title above the panels.
         theme: colours.
 
     Raises:
-        ValueError: an unknown name, a quantity with several numbers per run, no quantity to choose, or more panels than
-        can be drawn.
+        ValueError: an unknown name, a quantity with several numbers per run, no quantity to choose, or too many panels.
     """
     quantity = _quantity(data, quantity)
     values = data[quantity]

@@ -20,15 +20,13 @@ BAND_OPACITY = 0.25
 LEAST_SHOWN = 1e-9
 """Least reaction that is drawn, as a part of the largest one in its unit; a smaller value draws curves of round-off."""
 LEAST_SPAN = 1e-13
-"""Least span of an axis of energies, as a part of the largest value; a smaller one magnifies round-off to the height of
-the panel."""
+"""Least span of an axis of energies, as a part of the largest value; a smaller one magnifies round-off."""
 
 
 def plot_trajectory(trajectory: SavedRun, title: str = "", theme: Theme = LIGHT) -> NotebookFigure:
     """Slow and fast positions, energy and, where there are constraints, their residual, against time.
 
-    Rigid bodies are drawn by their centres of mass. Curves have the units of the system; angles of joints have a panel
-    of their own.
+    Rigid bodies are drawn by their centres of mass. Angles of joints have a panel of their own.
 
     A run with an estimated error has bands of this error about its positions, and a panel of the largest error and its
     shares.
@@ -119,8 +117,7 @@ UNITS = {"force": "N", "torque": "N m", "generalised force": "N, or N m for an a
 
 
 def _moduli(run: SavedRun) -> dict[str, dict[str, np.ndarray]]:
-    """For each unit, the largest modulus (k,) of the reaction on a body of each constraint by name; reactions that are
-    round-off are left out."""
+    """For each unit, the largest modulus (k,) of the reaction on a body of each constraint, without round-off."""
     names, panels = run.names, {unit: {} for unit in UNITS}
     for constraint, by_body in run.reaction_forces().items():
         for body, force in by_body.items():
@@ -160,16 +157,14 @@ def position_panels(run: SavedRun) -> list[tuple[np.ndarray, list[str], str, np.
 
 
 def limit_times(axes: Axes, t) -> None:
-    """Set the limits of a time axis to the first and the last node reached; leave the default limits if these are the
-    same node."""
+    """Set the limits of a time axis to the first and the last node reached; leave the limits at a single node."""
     reached = t[np.isfinite(t)]
     if reached.size and reached[0] < reached[-1]:
         axes.set_xlim(reached[0], reached[-1])
 
 
 def coordinates(axes: Axes, t, values, names: Sequence[str], theme: Theme, error=None) -> None:
-    """One curve for each coordinate, with a band of its error, and names beside the panel, at most `MOST_NAMED` of
-    them."""
+    """One curve for each coordinate, with a band of its error, and at most `MOST_NAMED` names beside the panel."""
     n = values.shape[1]
     colors: Any = theme.curves
     if n > len(theme.curves):
@@ -204,8 +199,7 @@ def _position_error(axes: Axes, t, error: Any, theme: Theme) -> None:
 
 
 def _energy_error(axes: Axes, trajectory: SavedRun, theme: Theme) -> None:
-    """Energy minus the energy at the start, divided by the latter unless it is zero; called a change if the system is
-    not known."""
+    """Energy minus the energy at the start, divided by the latter unless it is zero; a change without a system."""
     t, energy = np.asarray(trajectory.t), np.asarray(trajectory.energy)
     kind = "error" if trajectory.keeps_energy else "change"
     error, label = energy - energy[0], rf"energy {kind} $\Delta E$"

@@ -57,8 +57,7 @@ class Finding:
         or "motion".
     sentence: the result in words.
     number: its measure: growth per step of an error, relative distance of a window, ratio of frequencies, amplitude,
-        longest stage, micro steps in a period of the drive, growth rate of the motion (NaN if each period has another
-        one).
+        longest stage, micro steps in a period of the drive, growth rate of the motion (NaN if it changes).
     """
 
     severity: str
@@ -372,8 +371,7 @@ def _is_fast(linear: Linearisation, i) -> bool:
 
 
 def _turn(linear: Linearisation, scheme: Scheme | Composition, macro_dt: float, i) -> float:
-    """Angle by which vibration i turns in a macro step: the phase of the micro steps if W carries the vibration, else
-    ``omega H``."""
+    """Angle that vibration i turns in a macro step: the phase of the micro steps if W carries it, else ``omega H``."""
     exact = float(linear.frequencies[i] * macro_dt)
     if not _is_fast(linear, i):
         return exact

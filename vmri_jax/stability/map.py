@@ -19,8 +19,7 @@ from vmri_jax.study.table import Column, ResultTable
 POINTS_IN_WINDOW = np.linspace(0.0, 1.0, 9)
 """Points of a window at which its growth is measured, in widths from its start."""
 RESOLUTION = 1e-7
-"""Accuracy of the ends of windows, as a part of the range of omega H; narrower windows are left out. A larger value
-takes less time."""
+"""Accuracy of the ends of windows, as a part of the range of omega H; narrower windows are left out."""
 POINTS_PER_CALL = 64
 """Samples that all brackets together get in a call of `label`, the number that `multipliers` computes at a time for
 small systems; more samples divide brackets faster, and each costs an eigenvalue problem."""
@@ -118,8 +117,7 @@ def stability_map(
         scheme: a scheme or composition, or several by label, e.g. ``{n: explicit_slow(n) for n in (2, 3, 5)}``; each
             num_micro and structure is compiled once.
         omega_H: (n,) increasing positive values of omega times the macro step. A spacing of 0.1 or less finds narrow
-            windows; with a larger one a multiplier may pass several multipliers between two points, which hides
-            windows.
+            windows; with a larger one multipliers that pass several others hide windows.
         state: point of expansion of the small motions; None for the start of the problem.
         executor: executor that computes the rows, as of `vmri_jax.ensemble`; None for this process.
 
@@ -155,8 +153,7 @@ def stability_map(
 def measure(
     linear: Linearisation, scheme: Scheme | Composition, macro_dt, resolution: float = RESOLUTION
 ) -> tuple[np.ndarray, list[Window]]:
-    """Spectral radius (n,) at n increasing macro steps, and the unstable windows between the first and the last of
-    them."""
+    """Spectral radius (n,) at n increasing macro steps, and the unstable windows between the first and the last."""
 
     def label(macro_dt):
         return multipliers(linear, scheme, macro_dt).krein_signatures

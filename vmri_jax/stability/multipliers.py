@@ -1,5 +1,4 @@
-"""Multipliers of a macro step, the eigenvalues of its derivative, and their Krein signatures; the derivative of many
-steps.
+"""Multipliers of a macro step, eigenvalues of its derivative, and their Krein signatures; the derivative of a run.
 
 The multipliers of a symplectic map come in pairs (a, 1/a). They stay on the unit circle, and the motion stays bounded,
 until two multipliers of opposite Krein signature meet; multipliers of equal signature pass through each other (Krein,
@@ -32,11 +31,9 @@ TOLERANCE = 1e-6
 2e-8; a larger value overlooks slow growth."""
 LANES = 64
 """Step sizes that a compiled call computes side by side for up to 18 degrees of freedom; larger systems get fewer, at
-least 4, to limit memory. With more lanes a call for a single step size, which is padded to this number, takes
-longer."""
+least 4, to limit memory. With more a call for a single step size takes longer."""
 FREE_MOTION_ANGLE = 1e-5
-"""Angle in radians up to which a multiplier belongs to a free motion, which has no signature; a larger value leaves
-slow vibrations out."""
+"""Angle, rad, up to which a multiplier is of a free motion, without signature; more leaves out slow vibrations."""
 
 
 @dataclass(frozen=True)
@@ -126,8 +123,7 @@ def _step_matrices(system: System, scheme, rest: State, embed, read, macro_dt):
 
 @dataclass(frozen=True)
 class Monodromy:
-    """Derivative of the end of a trajectory with respect to its start, between the tangent spaces of the constraint
-    manifold at both.
+    """Derivative of the end of a trajectory by its start, between the tangent spaces of the constraint manifold.
 
     start, end: states.
     tangents: (k, 2 n) orthonormal tangent vectors (q_s, q_f, p_s, p_f) at the start, one per row; k = 2 (n_s + n_f -
@@ -144,8 +140,7 @@ class Monodromy:
     def matrix(self) -> np.ndarray:
         """M, (k, k) derivative in the coordinates of `tangents`.
 
-        It is meaningful only for a trajectory that closes, or ends near its start (small `closure`): then both ends
-        share a tangent space.
+        It has a meaning only where both ends share a tangent space: with a small `closure`.
         """
         return self.tangents @ self.images.T
 
@@ -185,8 +180,7 @@ def monodromy(
     num_steps: int,
     solver: Solver | None = None,
 ) -> Monodromy:
-    """Product of the step's derivatives along a trajectory, ``DPhi(z_(N-1)) ... DPhi(z_0)``, on the tangent space of
-    the constraint manifold.
+    """Product of the step's derivatives along a trajectory, ``DPhi(z_(N-1)) ... DPhi(z_0)``, on the tangent spaces.
 
     Args:
         system, scheme, macro_dt, solver: as in `macro_step`.

@@ -1,5 +1,4 @@
-"""Oscillators: a model of two, and the test equation ``q'' = -omega^2 q`` under a quadrature rule, the phase of a step
-and the limit of the rule.
+"""Oscillators: a model of two, and the test equation ``q'' = -omega^2 q`` under a quadrature rule: phase and limit.
 
 A step of length tau with a path of degree r has the discrete Lagrangian ``q^T S q / (2 tau)`` in the control points,
 ``S = D - x^2 B``, x = omega tau, with D and B the sums of the rules over ``l_i' l_j'`` and ``l_i l_j``. Eliminating the
@@ -22,8 +21,7 @@ from vmri_jax.schemes.quadrature import PlacedRule, Rule, midpoint
 from vmri_jax.schemes.scheme import Scheme
 
 RESOLUTION = 0.05
-"""Spacing of x along which the phase is unwrapped and limits are searched; with a larger value a narrow unstable
-interval is missed."""
+"""Spacing of x along which the phase is unwrapped and limits are searched; a larger one misses narrow intervals."""
 LARGEST_X = 30.0
 """Largest x searched for a limit; larger limits count as infinite."""
 

@@ -48,7 +48,7 @@ DRAWING = {
 def triple_spherical_pendulum(
     masses=(100.0, 1.0, 1.0), stiffness=5000.0, lengths=(10.0, 2.0, 3.0), gravity=9.81, quartic=False
 ) -> Problem:
-    """Triple spherical pendulum in R^3: q_1 slow, (q_2, q_3) fast; rod 1 starts along x, rod 2 along y, the spring along z.
+    """Triple spherical pendulum in R^3: q_1 slow, (q_2, q_3) fast; rods along x and y, spring along z.
 
     Args:
         masses: of the three bobs.
