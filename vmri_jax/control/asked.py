@@ -1,5 +1,4 @@
-"""Arguments of `minimize`: their checks, the `Transcription` that they make, and the point where the iteration
-starts."""
+"""Arguments of `minimize`: their checks, the `Transcription` that they make, and the first point."""
 
 from collections.abc import Callable, Mapping
 
@@ -107,8 +106,7 @@ def _bounds(bounds, num_controls: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def started(setup: Transcription, start, num_steps: int, num_controls: int, grid: str) -> Point:
-    """Nodes and controls of the first iteration, without their gaps and the miss of the goal; `start` as of
-    `minimize`."""
+    """Nodes and controls of the first iteration, without gaps and miss; `start` as of `minimize`."""
     nodes, shape = None, (num_steps, setup.parts, num_controls)
     if isinstance(start, Optimum):
         nodes, controls = _resampled(setup, start, num_steps)
@@ -129,8 +127,7 @@ def started(setup: Transcription, start, num_steps: int, num_controls: int, grid
 
 
 def _resampled(setup: Transcription, start: Optimum, num_steps: int):
-    """Nodes (N, n) and controls (N, parts, m) of an optimum, interpolated to the grid of another problem of the same
-    duration."""
+    """Nodes (N, n) and controls (N, parts, m) of an optimum, interpolated to another grid of the same duration."""
     run, m = start.trajectory, start.controls.shape[-1]
     old_nodes = np.asarray(phase_vector(run.states))
     duration, expected = float(run.t[-1] - run.t[0]), num_steps * setup.macro_dt

@@ -26,10 +26,8 @@ class Optimum:
         gap: largest distance between the end of a step and the next node, relative to the largest node.
         iterations: number of linear-quadratic problems that were solved.
         success: whether update, gap, miss and over are all below the tolerance.
-        problem: the problem with the forces of these controls: ``vm.simulate(optimum.problem, ...)`` runs it again, on
-            other grids too.
-        history: of every iteration cost, gap, miss, over, the largest update, and the part of the update that was
-            taken.
+        problem: the problem with the forces of these controls: ``vm.simulate(optimum.problem, ...)`` runs it again.
+        history: of every iteration cost, gap, miss, over, the largest update, and the part of it that was taken.
     """
 
     controls: Float[np.ndarray, "N ..."]

@@ -34,8 +34,7 @@ CONTROL = "vmri_jax.control"
 
 BORDER_WIDTH = 1e-6
 """Half the width of the border between two controls, relative to the duration of a control: within it a time counts as
-the border, so that round-off of a node's time does not choose a control. A larger one would mix controls at micro nodes
-beside the border."""
+the border, so that round-off of a node's time does not choose a control. A larger one mixes controls at micro nodes."""
 
 
 class Transcription(eqx.Module):
@@ -50,8 +49,7 @@ class Transcription(eqx.Module):
         goal: equations for the last state, ``goal(state) -> (e,)``.
         bounds: least and largest controls, (m,) each.
         parts: number of controls that follow each other in a macro interval: 1, or num_micro.
-        limits: ``limits(state, u) -> (c,)``, not above zero at the end of every macro interval, for each of its
-            controls; None for none.
+        limits: ``limits(state, u) -> (c,)``, not above zero at the end of macro intervals, for each control; or None.
     """
 
     system: System

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from vmri_jax.mechanics.arrays import whole_number
-from vmri_jax.mechanics.names import near
+from vmri_jax.mechanics.names import near, unknown
 from vmri_jax.refusals import Refused
 
 Rows = dict[str, np.ndarray]

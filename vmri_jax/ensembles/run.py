@@ -33,8 +33,7 @@ from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.solver import Solver
 
 FAILURES_TO_STOP = 10
-"""Number of failed chunks, before any chunk succeeds, at which the ensemble stops. A larger one spends more time on an error that all chunks
-have."""
+"""Number of failed chunks, before any chunk succeeds, at which the ensemble stops; a larger one takes longer."""
 NOTE_BYTES = 4
 """Bytes of the note of a chunk, the number of its runs that failed; fewer could not hold it."""
 

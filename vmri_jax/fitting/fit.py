@@ -29,8 +29,7 @@ START = ("q_s", "q_f", "v_s", "v_f")
 GAP_WEIGHTS = (1e-2, 1.0, 1e2, 1e4, 1e6)
 """Weights of the gaps between the parts of multiple shooting, for searches one after the other, each from the end of
 the one before. A gap as large as the motion counts like a miss of every value by this many standard deviations. A
-larger first weight makes the search as hard as one with a single run; a smaller last weight leaves gaps in the
-result."""
+larger first weight makes the search as hard as one with a single run; a smaller last one leaves gaps."""
 TOLERANCE = 1e-6
 """Absolute and relative change of the search variables at which a search ends. A larger one leaves errors of this size
 beside the standard errors of the parameters."""
@@ -68,8 +67,7 @@ def fit(
         problem: a problem whose ``system.params`` is a dict; `parameters` name its entries, or "q_s", "q_f", "v_s",
             "v_f" for the start. Or a function ``{name: value} -> Problem``, for everything else.
         data: one or several sets of measurements.
-        parameters: an `Unknown` for each name, or the number where its search starts. Names of nested params have dots,
-            "bonds.stiffness".
+        parameters: an `Unknown` for each name, or the number where its search starts. Nested names: "bonds.stiffness".
         scheme, macro_dt, solver: as in `simulate`. The times of measurement must be macro nodes. Where the solver is
             not chosen, runs have no fallback.
         segments: parts of multiple shooting; more than one for long or chaotic motion.

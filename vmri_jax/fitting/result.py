@@ -122,8 +122,7 @@ class Fit:
         return simulate(self.problem, self.shooting.scheme, **settings)
 
     def bootstrap(self, repeats: int, seed: int = 0) -> "Bootstrap":
-        """Fits to synthetic measurements: the predictions of this fit plus normal errors of its sigma. They show how
-        good the intervals are.
+        """Fits to synthetic measurements: its predictions plus normal errors of its sigma; they show how good they are.
 
         Args:
             repeats: number of synthetic sets of measurements.

@@ -2,8 +2,7 @@
 
 With one part the start follows from the parameters. With several (*multiple shooting*) the start of each part is an
 unknown, and a condition of the search is that each part ends where the next one starts. Errors grow little within a
-part, so that the search is well behaved where a single run would be chaotic, or many periods away from the
-measurements.
+part, so that the search is well behaved where a single run is chaotic, or many periods off.
 
 Source: H. G. Bock, Recent advances in parameter identification techniques for O.D.E., Birkhaeuser (1983).
 """

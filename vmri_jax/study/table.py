@@ -29,8 +29,7 @@ class ResultTable:
     """Rows that can be printed, written to a CSV file, and handed to pandas.
 
     A subclass is a frozen dataclass without a ``__repr__`` of its own, with a field `rows`, whose items are
-    dataclasses, and with the `columns` of the printed table; a column that is empty in all rows is left out. Files hold
-    every field of every row.
+    dataclasses, and with the `columns` of the printed table, but for empty ones. Files hold every field of every row.
     """
 
     rows: Any
