@@ -79,7 +79,7 @@ def test_pictures_are_drawn_where_a_case_has_one():
         return Outcome("", True, {}, partial(draw_energy, {"": long}))
 
     report = run_cases([Case(1, "energy for long", "", "", run), CASES[0]])
-    [(name, figure)] = [(row.case.title, row.picture()) for row in report.rows if row.picture]
+    [(name, figure)] = report.pictures().items()
     assert name == "energy for long"
     low, high = figure.axes[0].get_ylim()
     assert low < -0.9

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from matplotlib.figure import Figure
 from rich.text import Text
 
 from vmri_jax import plots
@@ -57,16 +58,19 @@ class Report(ResultTable):
         """The rows, with lines between them, for the terminal."""
         return rich_table(self.columns, self.rows, ruled=True)
 
+    def pictures(self) -> dict[str, Figure]:
+        """Figures by the title of the case, for all cases with a picture."""
+        return {row.case.title: row.picture() for row in self.rows if row.picture is not None}
+
     def write(self, folder: str | Path) -> list[Path]:
         """Write cases.csv and the pictures into a folder, made if it does not exist; returns their paths."""
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
         paths = [folder / "cases.csv"]
         self.to_csv(paths[0])
-        for row in self.rows:
-            if row.picture is not None:
-                paths.append(folder / f"{row.case.title.lower().replace(' ', '_')}.png")
-                plots.save(row.picture(), paths[-1])
+        for title, figure in self.pictures().items():
+            paths.append(folder / f"{title.lower().replace(' ', '_')}.png")
+            plots.save(figure, paths[-1])
         return paths
 
 
