@@ -1,6 +1,6 @@
 """Preparation of an ensemble: checks of all arguments, its chunks, the arrays of its store, and the record that identifies it."""
 
-from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +10,7 @@ import numpy as np
 from vmri_jax.accuracy.companions import resting
 from vmri_jax.ensembles.columns import Row, numbers_in
 from vmri_jax.ensembles.design import Axis, Chunks, Design, Draws, Product
-from vmri_jax.ensembles.quantities import Quantity, label_of, quantity, what_is_kept
+from vmri_jax.ensembles.quantities import OVER_NODES, Quantity, label_of, quantity, what_is_kept
 from vmri_jax.ensembles.work import Work, all_groups
 from vmri_jax.mechanics.arrays import whole_number
 from vmri_jax.mechanics.names import Names
@@ -37,7 +37,7 @@ def prepared(work: Work, design: Design, chunk: int | None = None) -> tuple[dict
     jax.eval_shape(work.lane, _first_row(design))
     runs = [work.simulation(group) for group in all_groups(work, design)]  # one of each group
     runs[0].check("ensemble: the start", constraints=False)
-    over_nodes = [str(name) for name, quantity in zip(work.save, work.quantities, strict=True) if quantity.over_nodes]
+    over_nodes = [name for name in OVER_NODES if name in work.save]
     if over_nodes and work.num_saves == 1:
         looks = f"{', '.join(over_nodes)} looks at the saved nodes of a run"
         raise Refused(f"ensemble: {looks}, and only its end is saved; give num_saves, for example 50.")
@@ -105,7 +105,8 @@ def _identity(work: Work, design: Design, run: Simulation) -> dict[str, str]:
     saved = [label_of(entry) if callable(entry) else Path(entry).name for entry in work.save]
     identity_record |= {"num_micro": str(work.num_micro), "save": ", ".join(saved)}
     for entry in filter(callable, work.save):
-        identity_record |= {f"operations of {label_of(entry)}": operations(_arrays_of(quantity(entry)), resting(run))}
+        values = partial(_values_of, quantity(entry))
+        identity_record |= {f"operations of {label_of(entry)}": operations(values, resting(run))}
     identity_record |= {"num_saves": str(work.num_saves), "project": str(work.project), "runs": str(len(design))}
     identity_record |= {f"file {Path(file).name}": digest for file, digest in work.sources.items()}
     if work.vary is not None:
@@ -114,9 +115,8 @@ def _identity(work: Work, design: Design, run: Simulation) -> dict[str, str]:
     return identity_record | _describe_design(design)
 
 
-def _arrays_of(quantity: Quantity) -> Callable[[Trajectory], dict[str, Any]]:
-    """The function from a run to the arrays of a quantity."""
-    return lambda run: {name: array.value for name, array in quantity.function(run).items()}
+def _values_of(quantity: Quantity, run: Trajectory) -> dict[str, Any]:
+    return {name: array.value for name, array in quantity(run).items()}
 
 
 def _describe_design(design: Design) -> dict[str, str]:
