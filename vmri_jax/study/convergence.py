@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import product
+from operator import attrgetter, itemgetter
 from typing import Any
 
 import jax
@@ -61,31 +62,20 @@ class Case:
         return row_of(name, self.problem.system, scheme, run, t_end / num_steps, num_steps, self.energies, **known)
 
 
-@dataclass(frozen=True)
-class SchemeSummary:
-    """One scheme with one set of parameters: its runs and observed orders of positions and momenta."""
-
-    runs: tuple[Row, ...]
-    fit_q: OrderFit
-    fit_p: OrderFit
-
-    def of_finest(self, name: str, form: str = ".1e") -> str:
-        """The text of an attribute of the run with the smallest step that did not fail."""
-        finest = min((row for row in self.runs if not row.failed), key=lambda row: row.macro_dt, default=None)
-        return "-" if finest is None else format(getattr(finest, name), form)
-
-    @property
-    def failures(self) -> str:
-        """The number of failed runs; empty if no run failed."""
-        failed = sum(row.failed for row in self.runs)
-        return f"{failed} of {len(self.runs)}" if failed else ""
-
-
 def _order(fit: OrderFit) -> str:
     """The text of an observed order with its uncertainty."""
     if not np.isfinite(fit.order):
         return "-"
     return f"{fit.order:.2f}" + (f" ± {fit.half_width:.2f}" if np.isfinite(fit.half_width) else "")
+
+
+OF_FINEST = {
+    "smallest H": ("macro_dt", "g"),
+    "error of q": ("error_q", ".1e"),
+    "error of p": ("error_p", ".1e"),
+    "energy": ("energy_error", ".1e"),
+}
+"""Columns about the run with the smallest step that did not fail: its attributes and their formats."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -98,15 +88,8 @@ class ConvergenceStudy(RunTable):
     """
 
     columns = (
-        Column("scheme", lambda summary: summary.runs[0].scheme),
-        Column("case", lambda summary: summary.runs[0].case),
-        Column("order of q", lambda summary: _order(summary.fit_q), right=True),
-        Column("order of p", lambda summary: _order(summary.fit_p), right=True),
-        Column("smallest H", lambda summary: summary.of_finest("macro_dt", "g"), right=True),
-        Column("error of q", lambda summary: summary.of_finest("error_q"), right=True),
-        Column("error of p", lambda summary: summary.of_finest("error_p"), right=True),
-        Column("energy", lambda summary: summary.of_finest("energy_error"), right=True),
-        Column("failed", lambda summary: summary.failures, right=True),
+        *(Column(name, itemgetter(name)) for name in ("scheme", "case")),
+        *(Column(name, itemgetter(name), right=True) for name in ("order of q", "order of p", *OF_FINEST, "failed")),
     )
     rows: tuple[Row, ...]
     references: Mapping[str, ReferenceSolution]
@@ -150,14 +133,19 @@ class ConvergenceStudy(RunTable):
         """Observed order: the slope of `fit`."""
         return self.fit(scheme, quantity, points, case).order
 
-    def shown(self) -> list[SchemeSummary]:
-        """Observed orders, and the errors at the smallest step that did not fail."""
-        summaries = []
+    def shown(self) -> list[dict[str, str]]:
+        """Observed orders, and the errors at the smallest step that did not fail, by column."""
+        lines = []
         for scheme, case in product(self.schemes, self.cases):
-            runs = tuple(row for row in self.rows if (row.scheme, row.case) == (scheme, case))
-            fits = (self.fit(scheme, quantity, case=case) for quantity in ("q", "p"))
-            summaries.append(SchemeSummary(runs, *fits))
-        return summaries
+            runs = [row for row in self.rows if (row.scheme, row.case) == (scheme, case)]
+            failed = sum(row.failed for row in runs)
+            finest = min((row for row in runs if not row.failed), key=attrgetter("macro_dt"), default=None)
+            orders = {f"order of {quantity}": _order(self.fit(scheme, quantity, case=case)) for quantity in ("q", "p")}
+            line = {"scheme": scheme, "case": case, "failed": f"{failed} of {len(runs)}" if failed else ""} | orders
+            for column, (name, form) in OF_FINEST.items():
+                line[column] = "-" if finest is None else format(getattr(finest, name), form)
+            lines.append(line)
+        return lines
 
     def work(self, case: str | None = None) -> WorkPrecision:
         """The runs of a case, the first one by default, by their errors and their work; times where the study has them."""
