@@ -50,7 +50,7 @@ def simulate(
     accuracy: Annotated[float | None, Option(help="Largest error of a position, for which steps are chosen.")] = None,
     t_end: Annotated[float | None, Option(help="End of the run, with --accuracy.")] = None,
     error: Annotated[bool, Option("--error", help="Estimate the error of the positions.")] = False,
-    save_every: Annotated[int | None, Option(help=f"Steps between nodes. [dim]for {DEFAULT_SAVED_NODES}[/dim]")] = None,
+    save_every: Annotated[int | None, Option(help=f"Steps per node. [dim]{DEFAULT_SAVED_NODES} nodes[/dim]")] = None,
     save_micro: Annotated[bool, Option("--save-micro", help="Keep the fast motion within macro steps too.")] = False,
     matrix: Annotated[str, Option(help="auto, masses, modes, exact or null-space.")] = "auto",
     out: Annotated[Path | None, Option(help="Write it here: .npz at the end, or .zarr during the run.")] = None,
