@@ -65,7 +65,7 @@ MOST_GROWTH = 64
 """Most steps of a run over the steps of the run before. With a larger number a search whose accuracy is out of reach,
 as with jumps of forces, ends with fewer steps than it could take; with a smaller one it repeats runs more often."""
 MOST_REPEATS = 5
-"""Runs that may miss the accuracy before the search gives up; more lengthen searches for one out of reach."""
+"""Runs that may miss the accuracy before a search ends; a larger value takes longer where it is out of reach."""
 MOST_TRIAL_SECONDS = 20.0
 """Seconds of a trial, compiling included, after which the search no longer halves the steps of an uncertified trial.
 With a larger value searches take longer where no error can be certified, as for chaotic motion."""

@@ -29,7 +29,7 @@ DISPLACEMENT = 1e-4
 """Largest random displacement of the points, as a part of the largest position: a function with a bend exactly at a
 point has no derivative there. A larger value leaves the states of the run."""
 WRONG = 1e-4
-"""Relative difference from which a derivative is wrong; right ones differ by at most 1e-7. More overlooks errors."""
+"""Relative difference from which a derivative is wrong; right ones differ by 1e-7. A larger value overlooks errors."""
 ROUND_OFF = 1e-14
 """Round-off of a difference of values, as a part of the value; a larger value hides errors of small derivatives."""
 

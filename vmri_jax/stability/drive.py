@@ -26,7 +26,7 @@ from vmri_jax.schemes.scheme import Scheme, fully_implicit
 from vmri_jax.stability.multipliers import monodromy
 
 SAMPLES = 1024
-"""Times at which the drive is compared with itself, one period later or earlier; fewer miss narrow pulses."""
+"""Times at which the drive is compared with itself, a period apart; with fewer of them narrow pulses are missed."""
 SPANS = 8.0 ** np.arange(-1, 5)
 """Lengths of the sampled intervals, in macro steps: periods of 1/500 to 2000 steps are seen; more take longer."""
 CANDIDATES = 8
@@ -37,9 +37,9 @@ periodic that change slowly."""
 STEPS_FOLLOWED = 64
 """Most macro steps that are followed where they are no part of the period: N steps are nearly m periods."""
 LEAST_GROWTH = 1e-4
-"""Growth per period that counts: round-off of thousands of steps is below. More overlooks slow growth."""
+"""Growth per period that counts: round-off of thousands of steps is below; a larger value overlooks growth."""
 LEAST_STEPS = 4
-"""Micro steps that a period of the drive needs at least; fewer pass over it, and more warns of right steps."""
+"""Least micro steps in a period of the drive: fewer pass over it. A larger value warns of right steps."""
 CONVERGED_STEPS, MOST_STEPS = 32, 20_000
 """Micro steps in a period from which halved steps confirm the growth, and macro steps at which halving ends."""
 

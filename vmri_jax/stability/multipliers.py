@@ -33,7 +33,7 @@ LANES = 64
 """Step sizes that a compiled call computes side by side for up to 18 degrees of freedom; larger systems get fewer, at
 least 4, to limit memory. With more a call for a single step size takes longer."""
 FREE_MOTION_ANGLE = 1e-5
-"""Angle, rad, up to which a multiplier is of a free motion, without signature; more leaves out slow vibrations."""
+"""Angle, rad, up to which a multiplier is of a free motion, which has no signature; a larger one drops slow ones."""
 
 
 @dataclass(frozen=True)
