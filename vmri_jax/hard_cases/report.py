@@ -15,9 +15,8 @@ from vmri_jax.hard_cases.cases import cases_for
 from vmri_jax.mechanics.state import HasProblem, Problem
 from vmri_jax.refusals import Refused
 from vmri_jax.running.interrupts import Interrupted
-from vmri_jax.running.printed import PrintedTable
 from vmri_jax.running.progress import ShowsProgress, progress_to
-from vmri_jax.study.table import Column, ResultTable, rich_table
+from vmri_jax.study.table import Column, ResultTable
 
 COLORS = {"pass": "green", "fail": "red", "does not apply": "dim"}
 """Colour of a verdict."""
@@ -35,6 +34,7 @@ class Report(ResultTable):
         Column("", lambda row: Text(row.verdict, COLORS[row.verdict])),
         Column("s", lambda row: f"{row.seconds:.1f}", right=True),
     )
+    ruled = True
     rows: tuple[Outcome, ...]
 
     @property
@@ -53,10 +53,6 @@ class Report(ResultTable):
         of_cases = [{name: getattr(row.case, name) for name in case} for row in self.rows]
         measured = [{name: getattr(row, name) for name in outcome} | row.values for row in self.rows]
         return [one | other for one, other in zip(of_cases, measured, strict=True)]
-
-    def table(self) -> PrintedTable:
-        """The rows, with lines between them, for the terminal."""
-        return rich_table(self.columns, self.rows, ruled=True)
 
     def pictures(self) -> dict[str, Figure]:
         """Figures by the title of the case, for all cases with a picture."""

@@ -212,24 +212,14 @@ def _default_errors(tuning: Tuning, problem: Problem, t_end: float) -> list[floa
 def _write(report: CostReport, problem: Problem) -> None:
     """The runs, the figures and the page of a report."""
     report.runs.to_csv(report.path.parent / "cost.csv")
+    rows = sum(problem.system.num_constraints(problem.q_s, problem.q_f))
+    sizes = {"slow variables": problem.q_s.size, "fast variables": problem.q_f.size, "constraints": rows}
+    title = f"{report.name}: what accuracy costs over a time of {report.t_end:g}"
     try:
-        _draw(report, problem)
+        for end, theme in (("", plots.LIGHT), ("_dark", plots.DARK)):
+            plots.save(report.figure(title, theme), report.path.parent / f"cost{end}.png", theme)
+        figure = embedded(partial(report.figure, ""))
+        write_page(report.path, TEMPLATE, report=report, sizes=sizes, duration=duration, figure=figure)
     except Exception as fault:
         fault.add_note(f"{report.path} could not be drawn or written; all runs are in cost.csv beside it.")
         raise
-
-
-def _draw(report: CostReport, problem: Problem) -> None:
-    """The figures and the page of a report."""
-    title = f"{report.name}: what accuracy costs over a time of {report.t_end:g}"
-    for end, theme in (("", plots.LIGHT), ("_dark", plots.DARK)):
-        plots.save(report.figure(title, theme), report.path.parent / f"cost{end}.png", theme)
-    n_g, n_gs = problem.system.num_constraints(problem.q_s, problem.q_f)
-    write_page(
-        report.path,
-        TEMPLATE,
-        report=report,
-        sizes={"slow variables": problem.q_s.size, "fast variables": problem.q_f.size, "constraints": n_g + n_gs},
-        duration=duration,
-        figure=embedded(partial(report.figure, "")),
-    )
