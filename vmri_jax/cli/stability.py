@@ -21,7 +21,7 @@ from vmri_jax.stability.map import windows_text
 
 def advise(
     system: options.System,
-    macro_dt: options.MacroStep = None,
+    macro_dt: Annotated[float, Option(help="Macro step H, of num_micro micro steps.")],
     scheme: options.Scheme = "fully-implicit",
     num_micro: options.NumMicro = 10,
     alpha: options.Alpha = None,

@@ -51,7 +51,7 @@ class Report(ResultTable):
         """Case, verdict and measured values of every row."""
         case, outcome = ("number", "title", "setup", "criterion"), ("measured", "verdict", "seconds")
         of_cases = [{name: getattr(row.case, name) for name in case} for row in self.rows]
-        measured = [{name: getattr(row, name) for name in outcome} | row.values for row in self.rows]
+        measured = [{name: getattr(row, name) for name in outcome} | dict(row.values) for row in self.rows]
         return [one | other for one, other in zip(of_cases, measured, strict=True)]
 
     def pictures(self) -> dict[str, Figure]:
