@@ -55,7 +55,7 @@ class CostRow:
     samples: tuple[float, ...] = ()
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class CostStudy(ResultTable):
     """Rows of one or several cost studies."""
 

@@ -193,7 +193,7 @@ def test_bad_input(message, options):
 
 def test_params_must_be_a_dict():
     system = vm.System(vm.ConstantMass([1.0], NONE), params=jnp.ones(2))
-    with pytest.raises(TypeError, match="need it to be a dict"):
+    with pytest.raises(TypeError, match="give a dict, or None"):
         minimize(
             vm.Problem(system, [0.0], NONE),
             effort,

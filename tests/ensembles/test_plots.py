@@ -88,7 +88,7 @@ def test_the_legend_of_one_panel_of_bands_is_inside_the_figure(grid):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("enrgy",), "there is no 'enrgy'"),
+        (("enrgy",), "there is no quantity 'enrgy'"),
         (("max_q_s",), r"several numbers per run; choose one, data\.isel\(slow=0\)"),
         (("energy_error", "omga"), "there is no axis or column 'omga'"),
     ],

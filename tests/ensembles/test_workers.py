@@ -22,7 +22,7 @@ import vmri_jax as vm
 from tests.ensembles import own
 from tests.ensembles.test_ensemble import OWN
 from vmri_jax.ensembles import EnsembleError
-from vmri_jax.executors.worker import NotAWorker, in_worker, known_versions
+from vmri_jax.executors.executor import NotAWorker, in_worker, package_versions
 
 distributed = pytest.importorskip("distributed")
 pytestmark = pytest.mark.filterwarnings("default")  # of Dask, about ports and slow loops
@@ -219,8 +219,8 @@ def test_workers_without_the_package(tmp_path, cache):
 
 
 def test_workers_of_another_version(tmp_path, monkeypatch):
-    versions = known_versions() | {"vmri_jax": "0.0.1"}
-    with pytest.raises(NotAWorker, match=r"vmri_jax .* instead of 0\.0\.1.*give all workers the versions"):
+    versions = package_versions() | {"vmri_jax": "0.0.1"}
+    with pytest.raises(NotAWorker, match=r"vmri_jax .* instead of 0\.0\.1.*give all workers the same versions"):
         in_worker(versions, b"")
 
 
@@ -228,7 +228,7 @@ def test_processes_that_run_jax_already():
     jnp.zeros(1)
     program = (
         "import jax.numpy as jnp\njnp.zeros(1)\n"
-        "from vmri_jax.executors.worker import in_worker, known_versions\nin_worker(known_versions(), b'')"
+        "from vmri_jax.executors.executor import in_worker, package_versions\nin_worker(package_versions(), b'')"
     )
     environment = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, env=environment)

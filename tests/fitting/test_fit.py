@@ -167,7 +167,7 @@ def test_numbers_of_a_scene_have_the_names_of_their_effects():
     assert found.parameters["bond.stiffness"] == pytest.approx(40.0, rel=1e-6)
     with pytest.raises(ValueError, match=r"'bond.length_', which is none of system.params \(bond.length"):
         vm.fit(scene, data, {"bond.length_": 1.0}, scheme=single, macro_dt=DT)
-    with pytest.raises(TypeError, match="start is a dictionary; name its numbers one by one"):
+    with pytest.raises(TypeError, match="start is a dict; name its numbers one by one"):
         Unknown({"stiffness": 1.0})
 
 

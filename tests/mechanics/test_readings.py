@@ -138,7 +138,7 @@ def test_params_of_effects_keep_their_order():
 
 
 def test_bounds_and_errors_of_fits():
-    with pytest.raises(ValueError, match=r"lower has shape \(3,\); give a number, or the shape of start, \(3, 3\)"):
+    with pytest.raises(ValueError, match=r"lower has shape \(3,\); give a number, or \(3, 3\)"):
         vm.fitting.Unknown(np.ones((3, 3)), lower=np.zeros(3))
     times = np.arange(3.0)
     with pytest.raises(ValueError, match=r"one for each quantity, \(1, 3\), one for each time, \(3, 1\)"):

@@ -93,7 +93,7 @@ def test_bad_input():
     model, scheme = linear_model(), fully_explicit(3)
     with pytest.raises(TypeError, match="stability_map: a System has no start; give a State"):
         stability_map(model.system, scheme, GRID)  # pyright: ignore[reportArgumentType]
-    with pytest.raises(TypeError, match="give a Scheme or Composition"):
+    with pytest.raises(TypeError, match="give a Scheme"):
         stability_map(model, {"a": 3}, GRID)  # pyright: ignore[reportArgumentType]
     for grid in ([1.0], [0.0, 1.0], [2.0, 1.0], [1.0, np.nan]):
         with pytest.raises(ValueError, match=r"omega_H has shape .* give two or more positive values"):

@@ -30,5 +30,5 @@ def test_cost_report(tmp_path):
     assert all(0 < seconds <= row for (seconds, _), row in zip(report.bound, front, strict=True))
     assert {"cost.html", "cost.png", "cost_dark.png", "cost.csv"} <= {path.name for path in tmp_path.iterdir()}
     assert default_t_end(PROBLEM) == pytest.approx(30 * 2 * np.pi / 20, rel=0.1)
-    with pytest.raises(ValueError, match="positive"):
+    with pytest.raises(ValueError, match="each of errors is -1"):
         cost_report(PROBLEM, "spring", tmp_path, t_end=1.0, errors=(-1.0,))

@@ -59,7 +59,7 @@ def test_cost_reports_keep_their_runs_while_the_page_is_drawn(monkeypatch, tmp_p
     def drawing(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(import_module("vmri_jax.study.cost_report"), "_draw", drawing)
+    monkeypatch.setattr(import_module("vmri_jax.study.cost_report"), "_write", drawing)
     menu = [replace(of_order_2(vm.fully_explicit), first=1)]
     with pytest.raises(vm.Interrupted) as caught:
         cost_report(one_coordinate(), "mass", tmp_path, t_end=T_END, errors=[1e-3], menu=menu)
@@ -69,5 +69,5 @@ def test_cost_reports_keep_their_runs_while_the_page_is_drawn(monkeypatch, tmp_p
 def test_a_cost_report_of_a_system_at_rest_says_so(tmp_path):
     """Its errors are parts of how far it moves; it came as "errors are []"."""
     at_rest = vm.Problem(vm.System(vm.ConstantMass([1.0], [])), [1.0], [])
-    with pytest.raises(ValueError, match=r"positions are those of the start up to 0\.0e\+00.*at rest"):
+    with pytest.raises(ValueError, match=r"positions move by 0\.0e\+00.*at rest"):
         cost_report(at_rest, "mass", tmp_path, t_end=1.0, menu=[of_order_2(vm.fully_explicit)])

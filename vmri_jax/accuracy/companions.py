@@ -78,19 +78,13 @@ def with_error(
     shares: bool = False,
     trial: tuple[Trajectory, np.ndarray] | None = None,
 ) -> Trajectory:
-    """The trajectory of a run without a failed step, with its `RunError`; warns if the error is not certified over the whole run.
-
-    A `trial` has the companion with half the macro step and the errors (k, n_s + n_f), if they have been computed. With `shares` the error has
-    its slow and its fast share.
-    """
+    """The trajectory of a run without a failed step, with its `RunError`; warns if the error is not certified over the
+    whole run. A `trial` has the companion with half the macro step and the errors (k, n_s + n_f), if they are known."""
     halved = companion(run, 2) if trial is None else trial[0]
     if int(halved.failed_at) >= 0:
         failed = float(halved.t[0]) + int(halved.failed_at) * float(run.macro_dt) / 2
-        warnings.warn(
-            f"simulate: the error is not known; the same run with half the macro step failed at t = {failed:.4g}.",
-            UncertifiedWarning,
-            stacklevel=3,
-        )
+        reason = f"the error is not known; the same run with half the macro step failed at t = {failed:.4g}."
+        warnings.warn(f"simulate: {reason}", UncertifiedWarning, stacklevel=3)
         return trajectory
     drives = events(run.system, run.state, float(trajectory.t[-1])) if trial is None else Events()
     total = estimated_errors(run, trajectory, halved, drives) if trial is None else trial[1]
@@ -101,11 +95,8 @@ def with_error(
     error = run_error(run, trajectory, halved, total, drives, refined, of)
     if not error.is_certified:
         unseen = first_unseen(run, drives)
-        reason = (
-            _stepped_over(run, drives, unseen)
-            if unseen <= trajectory.t[-1]
-            else _uncertified(error, trajectory, run, halved)
-        )
+        is_seen = unseen > trajectory.t[-1]
+        reason = _uncertified(error, trajectory, run, halved) if is_seen else _stepped_over(run, drives, unseen)
         warnings.warn(f"simulate: {reason}", UncertifiedWarning, stacklevel=3)
     return replace(trajectory, error=error)
 
@@ -119,10 +110,8 @@ def run_error(
     refined: Trajectory | None = None,
     of: Callable | None = None,
 ) -> RunError:
-    """The error of a run, NaN where it is not certified, from the estimated errors of the positions, `total` (k, n_s + n_f).
-
-    `halved` is the companion with half the macro step, `refined` the one with twice the micro steps; without it there are no shares.
-    """
+    """The error of a run, NaN where it is not certified, from the errors of the positions, `total` (k, n_s + n_f);
+    `halved` has half the macro step, `refined` twice the micro steps: without it there are no shares."""
     order = run.order
     fast = np.full_like(total, np.nan) if refined is None else extrapolated(order, trajectory, refined)
     certified, growth = certified_nodes(trajectory, total)
@@ -153,16 +142,13 @@ def estimated_errors(
     accuracy: float = 0.0,
     companion_of: Callable[[int, int], Trajectory] | None = None,
 ) -> np.ndarray:
-    """(k, n_s + n_f) errors of the positions, from the companion with half the macro step, and from further ones if the system is driven or its
-    errors are not believed: below `DOUBTED` of the accuracy. They are infinite if a further companion fails.
-
-    ``companion_of(parts, whole)`` makes the companions of a lane of a batch.
-    """
+    """(k, n_s + n_f) errors of the positions, from the companion with half the macro step, and from further ones if the
+    system is driven or its errors are below `DOUBTED` of the accuracy; infinite if a further companion fails."""
     order = 1 if drives.jump else run.order
     result = extrapolated(order, trajectory, halved)
     if not drives.names and np.abs(result).max(initial=0.0) > DOUBTED * accuracy:
         return result
-    # `whole` macro steps of the run are `parts` steps of the companion, from one compared node to the next, `stride` saved nodes later.
+    # From a compared node to the next, `stride` saved nodes later: `whole` steps of the run, `parts` of the companion.
     strides = [s for s in range(1, run.num_saves + 1) if run.num_saves % s == 0]
     stride = next((s for s in strides if s * run.save_every >= FEWEST_DIVIDED), run.num_saves)
     whole = stride * run.save_every
@@ -203,10 +189,8 @@ def first_unseen(run: Simulation, drives: Events) -> float:
 def _of_error(
     of: Callable, order: int, trajectory: Trajectory, halved: Trajectory, certified: np.ndarray
 ) -> np.ndarray:
-    """Error of a function of the run.
-
-    A function with a value for each node is NaN at nodes that are not certified; any other function is NaN unless all nodes are certified.
-    """
+    """Error of a function of the run: NaN at nodes that are not certified; of a function without a value for each node
+    NaN unless all nodes are certified."""
     error = ratio(order) * (np.asarray(of(trajectory)) - np.asarray(of(halved)))
     has_node_values = error.shape[:1] == certified.shape
     shown = certified.reshape(-1, *(1,) * (error.ndim - 1)) if has_node_values else certified.all()
@@ -235,13 +219,9 @@ def check_function_of_run(of: Callable | None, run: Simulation) -> None:
         return
     value = of(resting(run))
     if np.asarray(value).dtype.kind not in "fiu":
-        raise Refused(
-            f"simulate: the function error returned {value!r} for a run; it must return a number or an array of numbers."
-        )
+        raise Refused(f"simulate: the function error returned {value!r} for a run; it must return numbers.")
     if not np.array_equal(value, of(resting(run)), equal_nan=True):
-        raise Refused(
-            "simulate: the function error returns other numbers for the same run; it must be pure, or differences of runs say nothing."
-        )
+        raise Refused("simulate: the function error returns other numbers for the same run; it must be pure.")
 
 
 def resting(run: Simulation) -> Trajectory:
@@ -256,10 +236,8 @@ def resting(run: Simulation) -> Trajectory:
 
 
 def companion(run: Simulation, parts: int, whole: int = 1) -> Trajectory:
-    """The run with every `whole` macro steps divided into equal parts; it may fail.
-
-    Its saved nodes are the saved nodes of the run, or those that are multiples of `whole` steps, a multiple of `save_every`.
-    """
+    """The run with every `whole` macro steps divided into equal parts, at the nodes of the run or every `whole` steps;
+    it may fail."""
     return finer(run, parts, whole).in_pieces()
 
 
@@ -280,11 +258,8 @@ def positions(trajectory: Trajectory) -> np.ndarray:
 
 
 def _is_chaotic(error: RunError, trajectory: Trajectory, run: Simulation, halved: Trajectory) -> bool:
-    """Whether small differences grow like exp(L t) by the motion itself.
-
-    Steps that are too large let errors grow as well, so that two runs with smaller steps are compared: a half and a quarter of the macro step. Forces and
-    moving constraints may pump a regular motion; of such motions nothing is said.
-    """
+    """Whether small differences grow like exp(L t) by the motion itself, and not by large steps: between two runs with
+    a half and a quarter of the macro step. Driven motions, which may be pumped, are left out."""
     if not (float(error.growth) > CHAOTIC_GROWTH and trajectory.keeps_energy) or trajectory.concerns():
         return False
     quartered = companion(run, 4)

@@ -64,12 +64,9 @@ def families(
 
 
 def two_families(system: System, degrees_of_freedom: int, digits: float, most_single: int) -> list[Family]:
-    """The usual menu for an accuracy of a number of digits: kicks, and a single interval of high degree.
-
-    Kicks are composed to an order of about the number of digits; with masses that depend on the configuration the
-    midpoint rule takes their place. A single micro interval carries no rule on every k-th micro node, and is left out
-    for more than `most_single` degrees of freedom.
-    """
+    """The usual menu for an accuracy of a number of digits: kicks, composed to an order of about this number, or the
+    midpoint rule where masses depend on the configuration; and a single interval of high degree, which carries no rule
+    on every k-th micro node, for at most `most_single` degrees of freedom."""
     base = of_order_2(fully_explicit if isinstance(system.kinetic, ConstantMass) else fully_implicit)
     name = next((name for most, name in COMPOSED if digits <= most), None)
     kicks = base if name is None else base.composed(name)
@@ -101,8 +98,7 @@ def of_scheme(scheme: Scheme | Composition) -> Family:
 
 
 def for_system(menu: Sequence[Family], system: System, has_two_rates: bool) -> list[Family]:
-    """The families with a first num_micro that the rates of the potentials divide: the least one where micro steps save
-    no time."""
+    """The families with a first num_micro that the rates of the potentials divide, the least one without two rates."""
 
     def adapted(family: Family) -> Family:
         unit = unit_of(system, family.make(family.first))
@@ -112,20 +108,16 @@ def for_system(menu: Sequence[Family], system: System, has_two_rates: bool) -> l
 
 
 def by_promise(menu: Sequence[Family], digits: float) -> list[Family]:
-    """The menu, sorted: first the families whose order is near the number of digits of the accuracy.
-
-    Lower orders take many steps, and higher orders take long to compile.
-    """
+    """The menu, first the families whose order is near the number of digits of the accuracy: lower orders take many
+    steps, and higher orders long to compile."""
     return sorted(menu, key=lambda family: abs(np.log(family.make(family.first).order / max(digits, 2.0))))
 
 
 def micro_steps_help(system: System, start: State) -> bool:
-    """Whether micro steps may save time: the system has fast coordinates, and slow coordinates or potentials for the
-    macro grid."""
+    """Whether micro steps may save time: there are fast coordinates, and slow ones or potentials for the macro grid."""
     return bool(start.q_f.size and (start.q_s.size or system.slow_potential is not None or system.potentials))
 
 
 def unit_of(system: System, scheme: Scheme | Composition) -> int:
-    """The number whose multiples are allowed as num_micro: the least common multiple of all k of rules on every k-th
-    micro node."""
+    """The number whose multiples are allowed as num_micro: least common multiple of k of rules on every k-th node."""
     return math.lcm(stage_scheme(scheme).unit, *(name for name, _ in system.potentials if isinstance(name, int)))

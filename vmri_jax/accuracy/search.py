@@ -35,9 +35,11 @@ from vmri_jax.accuracy.companions import (
 )
 from vmri_jax.accuracy.families import Family, micro_steps_help, unit_of
 from vmri_jax.accuracy.trials import LEAST_TIME, Trial, seconds_of_steps
-from vmri_jax.mechanics.driving import events
+from vmri_jax.mechanics.arrays import is_concrete
+from vmri_jax.mechanics.driving import Events, events
 from vmri_jax.mechanics.linearisation import Linearisation, linearise
 from vmri_jax.mechanics.state import Movable, State, start_of
+from vmri_jax.refusals import Refused
 from vmri_jax.running.arguments import Steps
 from vmri_jax.running.progress import Progress, silent
 from vmri_jax.running.run_error import largest_of
@@ -53,8 +55,7 @@ AIMED_PART = 0.5
 """Part of the accuracy for which steps are chosen. Trials predict errors of finer runs to about a factor of 2: with a
 larger part more runs miss the accuracy and are repeated, with a smaller part all runs take more steps."""
 MOST_SAVED = 1000
-"""Most saved intervals of a run with an accuracy whose user gives no number; a larger value takes more memory in long
-runs."""
+"""Most saved intervals of a run with an accuracy if the user gives no number; a larger value takes more memory."""
 FEWEST_STEPS = 16
 """Macro steps of the first trial of a scheme; a trial without a certified error is repeated with twice the steps. A
 larger value makes searches with large accuracies slower."""
@@ -64,8 +65,7 @@ MOST_GROWTH = 64
 """Most steps of a run over the steps of the run before. With a larger number a search whose accuracy is out of reach,
 as with jumps of forces, ends with fewer steps than it could take; with a smaller one it repeats runs more often."""
 MOST_REPEATS = 5
-"""Runs that may miss the accuracy before the search gives up; a larger value makes searches for an accuracy out of
-reach take longer."""
+"""Runs that may miss the accuracy before a search ends; a larger value takes longer where it is out of reach."""
 MOST_TRIAL_SECONDS = 20.0
 """Seconds of a trial, compiling included, after which the search no longer halves the steps of an uncertified trial.
 With a larger value searches take longer where no error can be certified, as for chaotic motion."""
@@ -78,8 +78,7 @@ take for the accuracy, and where its run promises to take this many times as lon
 NUM_MICRO = (1, 2, 3, 5, 8, 12, 20, 30, 50)
 """Numbers of micro steps that an exhaustive search tries, in units of the rates of the potentials."""
 MOST_MICRO = 64
-"""Most micro steps chosen; more save little unless an evaluation of the slow force takes a hundred times as long as of
-the fast force."""
+"""Most micro steps chosen; more save little unless the slow force takes a hundred times as long as the fast one."""
 WORTH_COMPILING = 1.5
 """Time of a run over the time that a third number of micro steps promises, above which its program is compiled. A larger
 value misses savings; a smaller one compiles for seconds to save milliseconds."""
@@ -87,8 +86,7 @@ LEAST_SHARE = 1e-3
 """Least slow share of the error, as a part of the fast share: the number of micro steps stays finite where the slow
 share vanishes. A larger value allows fewer micro steps."""
 USUAL_TRIALS = 5
-"""Trial runs of a usual search, the total that a progress bar starts with; with a larger value the bar ends before it
-is full."""
+"""Trial runs of a usual search, the total that a bar starts with; with a larger value the bar ends early."""
 MOST_COORDINATES = 60
 """Most coordinates of a system for which a single interval of high degree is tried, and for which resonances are looked
 up. The matrices of both have a row for each coordinate: with 200 of them they take minutes, and schemes with kicks are
@@ -104,12 +102,14 @@ SHORTER_STEPS = (1.0, 0.98, 0.96, 0.93, 0.9, 0.86, 0.82, 0.78)
 """Macro steps that are tried in this order until one is not resonant, in units of the largest step for the accuracy."""
 
 
+COMPARES = "compares runs with numbers; call simulate outside of jax.jit, vmap and grad."
+"""End of the refusal of an error or an accuracy in a transformation."""
+
+
 class Search:
     """Trial runs of several schemes from the same start until `t_end`; arguments as of `vmri_jax.simulate`.
 
-    system, start, length: of all runs.
-    drives: events of the system in this time; all runs have steps that see them.
-    seen: called with each trial.
+    system, start, t_end, length: of all runs.
     seconds: measured seconds of a macro step by the Python expression of the scheme.
     """
 
@@ -122,11 +122,14 @@ class Search:
         num_saves: int | None = None,
         of: Callable | None = None,
         progress: Progress = silent,
-        seen: Callable[[Trial], None] = lambda trial: None,
     ):
         self.system, self.start = start_of("simulate", moving, state)
-        self.length, self.drives = float(t_end - self.start.t), events(self.system, self.start, t_end)
-        self.num_saves, self.progress, self.seen, self.num_trials = num_saves, progress, seen, 0
+        if not is_concrete((vars(self.start), self.system.params, t_end)):
+            raise Refused(f"simulate: an accuracy {COMPARES}")
+        self.t_end, self.length = float(t_end), float(t_end - self.start.t)
+        if not 0 < self.length < np.inf:
+            raise Refused(f"t_end is {self.length:g} after the start; it must be later, by a finite time.")
+        self.num_saves, self.progress, self.num_trials = num_saves, progress, 0
         self.seconds: dict[str, float] = {}
         self._runs: dict[tuple[str, int], Simulation] = {}
         self._firsts: dict[tuple[str, int], Trial] = {}
@@ -143,6 +146,11 @@ class Search:
         self._make = make
 
     @cached_property
+    def drives(self) -> Events:
+        """The events of the system in this time; all runs have steps that see them."""
+        return events(self.system, self.start, self.t_end)
+
+    @cached_property
     def has_two_rates(self) -> bool:
         """Whether micro steps may save time."""
         return micro_steps_help(self.system, self.start)
@@ -150,11 +158,8 @@ class Search:
     def cheapest(
         self, menu: Sequence[Family], accuracy: float, finalists: int = 1, exhaustive: bool = False
     ) -> list[Trial]:
-        """Trials with steps for the accuracy, of the families that promise the least time; the most promising one
-        first.
-
-        An exhaustive search tries all of `NUM_MICRO` with every family, and every pair of them may be a finalist.
-        """
+        """Trials with steps for the accuracy, of the families that promise the least time, the most promising one
+        first; exhaustive ones of all families with all of `NUM_MICRO`."""
         if exhaustive:
             units = [(family, unit_of(self.system, family.make(family.first))) for family in menu]
             menu = [replace(family, first=unit * n) for family, unit in units for n in NUM_MICRO]
@@ -167,11 +172,8 @@ class Search:
         return [self.accurate(trial, accuracy) for trial in chosen]
 
     def first_trials(self, menu: Sequence[Family], accuracy: float) -> list[Trial]:
-        """A trial of each family, which the search makes once.
-
-        First without the fallback: steps that are too large for the motion fail with any method. The fallback is
-        compiled only if no scheme of the menu succeeds without it.
-        """
+        """A trial of each family, which the search makes once: without the fallback, since steps that are too large for
+        the motion fail with any method, and with it only if no scheme of the menu succeeds without it."""
         for falls_back in (False, True):
             limit = np.inf
             for family in menu:
@@ -197,12 +199,7 @@ class Search:
         most_seconds: float = np.inf,
     ) -> Trial:
         """The first trial with a certified error, of 1, 2, 4, ... times the macro steps; the last trial if the search
-        runs out of time or steps.
-
-        `falls_back` tells whether the fallback is tried where the first matrix fails, see `Simulation`. With an
-        accuracy the errors are also from a third companion where it is needed, see `estimated_errors`. Repeated trials
-        end after `most_seconds`.
-        """
+        runs out of steps, or of time, `most_seconds`. With an accuracy the errors are those of `estimated_errors`."""
         most = MOST_TRIAL_SECONDS
         while True:
             run = replace(self.run(family, num_micro, num_steps), may_fall_back=falls_back)
@@ -219,16 +216,18 @@ class Search:
             certified = succeeded and bool(certified_nodes(trajectory, errors)[0].all())
             error = float(largest_of(errors).max()) if certified else np.inf
             trial = Trial(family, num_micro, run, trajectory, halved, errors, error)
-            self.seen(trial)
+            self.note(trial)
             # The seconds of the first trial include compiling, which later trials do not repeat.
             is_late = seconds > most and run.num_steps > FEWEST_STEPS
             if certified or is_late or 2 * run.num_steps > MOST_STEPS:
                 return trial
             num_steps, most = 2 * run.num_steps, min(most_seconds, MOST_TRIAL_SECONDS)
 
+    def note(self, trial: Trial) -> None:
+        """Called with each trial."""
+
     def accurate(self, trial: Trial, accuracy: float) -> Trial:
-        """A trial of the same scheme with an error of at most the accuracy; the last trial if `MOST_REPEATS` of them
-        miss it."""
+        """A trial of the same scheme that keeps the accuracy; the last one if `MOST_REPEATS` of them miss it."""
         order = 1.0 if self.drives.jump else float(trial.run.order)
         for _ in range(MOST_REPEATS):
             before, run = trial, trial.run
@@ -296,10 +295,7 @@ class Search:
         return Settings(run.scheme, trial.python, trial.family.options, *numbers, gain)
 
     def _with_best_num_micro(self, trial: Trial, error: float) -> Trial:
-        """A trial with the number of micro steps of the least time.
-
-        A single interval of high degree (above 1) stays single: it resolves the fast variables by its degree.
-        """
+        """A trial with the number of micro steps of the least time; an interval of high degree stays single."""
         can_choose = self.has_two_rates and stage_scheme(trial.run.scheme).degree == 1
         if not (can_choose and 0 < trial.error < np.inf):
             return trial

@@ -6,6 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 from vmri_jax.accuracy.companions import check_function_of_run, with_error
+from vmri_jax.accuracy.search import COMPARES, Search
 from vmri_jax.accuracy.steps import with_accuracy
 from vmri_jax.mechanics.checks import check_system
 from vmri_jax.mechanics.state import Movable, State
@@ -82,25 +83,23 @@ def simulate(
         raise Refused(f"simulate: error is {error!r}; it must be True or False, 'shares', or a function of a run.")
     steps = Steps(macro_dt, num_steps, t_end, save)
     if accuracy is not None:
-        length = {"t_end": _end(steps), "num_saves": Save.of(save).number}
+        length = _end(steps), Save.of(save).number
         with progress_to("simulate", Save.of(save).progress) as tell:
-            best, settings = with_accuracy(system, scheme, state, solver, accuracy, **length, of=of, progress=tell)
-        run, trajectory = best.run, replace(best.trajectory, origin=replace(best.run.origin, settings=settings))
+            search = Search(system, state, solver, *length, of, tell)
+            best = with_accuracy(search, scheme, accuracy)
+        origin = replace(best.run.origin, settings=search.settings(best))
+        run, trajectory = best.run, replace(best.trajectory, origin=origin)
         if int(trajectory.failed_at) >= 0:
             raise simulation_error(trajectory, run.macro_dt, run.save_every, run.scheme.num_micro)
         for concern in trajectory.concerns():
             warnings.warn(type(concern)(f"simulate: {concern}"), stacklevel=2)
         return with_error(run, trajectory, of, error == "shares", trial=(best.halved, best.errors))
     if scheme is None:
-        raise Refused(
-            "simulate: scheme is None without an accuracy; give a scheme, or accuracy=1e-5 to have one chosen."
-        )
+        raise Refused("simulate: scheme is None without an accuracy; give one of them, e.g. accuracy=1e-5.")
     run = simulation(system, scheme, state, solver, steps)
     if not run.is_concrete:
         if error:
-            raise Refused(
-                "simulate: an error compares runs with numbers; call simulate outside of jax.jit, vmap and grad."
-            )
+            raise Refused(f"simulate: an error {COMPARES}")
         check_system(run.system, run.state.q_s, run.state.q_f)
         return run.traced()
     if state is not None:  # the start of a problem is checked when it is made
@@ -121,8 +120,8 @@ def _end(steps: Steps) -> float:
         refused.append(f"save={steps.save!r}")
     if refused:
         raise Refused(
-            f"simulate: got {' and '.join(refused)} with an accuracy, which chooses steps and saved nodes; leave them out, or the "
-            "accuracy. Of what is saved, Save(number=) is left to you."
+            f"simulate: got {' and '.join(refused)} with an accuracy, which chooses steps and saved nodes, but for "
+            "Save(number=); leave them out, or the accuracy."
         )
     if steps.t_end is None:
         raise Refused("simulate: an accuracy needs t_end, the time until which it is to be kept.")

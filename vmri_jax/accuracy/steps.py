@@ -1,69 +1,35 @@
-"""The doors of the search for an accuracy: checks of arguments, the usual menu, and warnings about runs that miss the
-accuracy."""
+"""The doors of the search for an accuracy: checks of arguments, the usual menu, warnings about runs that miss it."""
 
 import warnings
-from collections.abc import Callable
 
 import numpy as np
 
 from vmri_jax.accuracy.companions import fewest_steps
 from vmri_jax.accuracy.families import Family, for_system, of_scheme, two_families
 from vmri_jax.accuracy.search import MOST_COORDINATES, Search, Trial
-from vmri_jax.mechanics.arrays import is_concrete
 from vmri_jax.mechanics.checks import check_number, check_type
 from vmri_jax.mechanics.invariants import velocity
-from vmri_jax.mechanics.state import Movable, Problem, State, start_of
+from vmri_jax.mechanics.state import Problem, State
 from vmri_jax.refusals import Refused
-from vmri_jax.running.progress import Progress, silent
-from vmri_jax.running.settings import Settings
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
-from vmri_jax.steppers.solver import Solver
 
 MANY_STEPS = 100_000
-"""Macro steps that short events demand, above which a warning tells of them; a smaller value warns of runs that take
-less than a second."""
+"""Macro steps that short events demand, above which a warning tells of them; a smaller value warns of fast runs."""
 ROUNDOFF = 100 * np.finfo(float).eps
-"""Error below which an accuracy is refused as round-off, as a part of the largest position; a larger value refuses
-reachable accuracies."""
+"""Error refused as round-off, as a part of the largest position; a larger value refuses reachable accuracies."""
 
 
 class AccuracyNotReached(UserWarning):
     """The error of a run exceeds its accuracy, or is not certified."""
 
 
-def with_accuracy(
-    system: Movable,
-    scheme: Scheme | Composition | None,
-    state: State | None,
-    solver: Solver | None,
-    accuracy: float,
-    *,
-    t_end: float,
-    num_saves: int | None,
-    of: Callable | None = None,
-    progress: Progress = silent,
-) -> tuple[Trial, Settings]:
-    """The trial whose largest estimated error of a position is at most `accuracy`, and its settings.
-
-    Warns with `AccuracyNotReached` if no trial is as accurate. Arguments are as of `vmri_jax.simulate`.
-
-    Raises:
-        TypeError: scheme is not a scheme.
-        ValueError: an accuracy below round-off, or above the extent of the motion; arguments that `vmri_jax.simulate`
-            refuses.
-    """
+def with_accuracy(search: Search, scheme: Scheme | Composition | None, accuracy: float) -> Trial:
+    """The trial whose largest estimated error of a position is at most `accuracy`, with a scheme of the user or with
+    one of the usual menu; warns with `AccuracyNotReached` if no trial is as accurate."""
     a_scheme = "a Scheme, e.g. fully_implicit(num_micro=10), or None"
     check_type("simulate: scheme", scheme, Scheme | Composition | None, a_scheme)
-    opened_system, start = start_of("simulate", system, state)
-    if not is_concrete((vars(start), opened_system.params, t_end)):
-        raise Refused(
-            "simulate: an accuracy compares runs with numbers; call simulate outside of jax.jit, vmap and grad."
-        )
-    check_error("simulate: accuracy", accuracy, start)
-    if not t_end > start.t:
-        raise Refused(f"simulate: t_end is {float(t_end - start.t):g} after the start; it must be later.")
-    search = Search(system, state, solver, t_end, num_saves, of, progress)
+    check_error("simulate: accuracy", accuracy, search.start)
     best = reached("simulate: accuracy", search, usual_menu(search, scheme, accuracy), accuracy)[0]
     warn_of_events("simulate", search, best.run.scheme, stacklevel=4)
     if not best.error <= accuracy:
@@ -75,12 +41,11 @@ def with_accuracy(
             AccuracyNotReached,
             stacklevel=3,
         )
-    return best, search.settings(best)
+    return best
 
 
 def reached(name: str, search: Search, menu: list[Family], accuracy: float, **how) -> list[Trial]:
-    """`Search.cheapest` of an accuracy, which is refused if no position moves as far; `name` begins the message, `how`
-    are further arguments."""
+    """`Search.cheapest` of an accuracy, which is refused if no position moves as far; `name` begins the message."""
     search.first_trials(menu, accuracy)
     check_extent(name, search, accuracy)
     return search.cheapest(menu, accuracy, **how)
@@ -91,16 +56,14 @@ def check_extent(name: str, search: Search, accuracy: float) -> None:
     extent = search.extent()
     # Driven systems: positions at few saved nodes may hide the motion, and all trials see the events.
     if accuracy > extent and not search.drives.names:
+        until = f"until t = {search.t_end:g}: any run is as accurate"
         raise Refused(
-            f"{name} is {accuracy:g}, and no position moves by more than {extent:.3g} until t = "
-            f"{float(search.start.t) + search.length:g}: any run is as accurate. Give a smaller one, in the unit of the "
-            "positions."
+            f"{name} is {accuracy:g}, and no position moves by more than {extent:.3g} {until}; give a smaller one."
         )
 
 
 def usual_menu(search: Search, scheme: Scheme | Composition | None, accuracy: float) -> list[Family]:
-    """The families for an accuracy: the user's scheme alone; without one, kicks and a single interval of high
-    degree."""
+    """The families for an accuracy: the user's scheme alone, or kicks and a single interval of high degree."""
     if scheme is not None:
         return [of_scheme(scheme)]
     size = search.start.q_s.size + search.start.q_f.size
@@ -109,8 +72,7 @@ def usual_menu(search: Search, scheme: Scheme | Composition | None, accuracy: fl
 
 
 def digits_of(search: Search, accuracy: float) -> float:
-    """The digits of an accuracy, relative to the largest position at the start, or to the largest speed times the
-    length; at least one."""
+    """The digits of an accuracy, at least one, relative to the largest position, or largest speed times length."""
     start = search.start
     q, v = (start.q_s, start.q_f), velocity(search.system, start.q_s, start.q_f, start.p_s, start.p_f)
     size, speed = (max(np.abs(np.asarray(a)).max(initial=0.0) for a in pair) for pair in (q, v))
@@ -124,7 +86,7 @@ def warn_of_events(caller: str, search: Search, scheme: Scheme | Composition, st
         warnings.warn(
             f"{caller}: {' and '.join(drives.names)} of the system changes and changes back within "
             f"{drives.shortest:.2g}, so that the run takes at least {fewest} macro steps until "
-            f"t = {float(search.start.t) + search.length:g}; a run in parts, with its steps for each part, takes fewer.",
+            f"t = {search.t_end:g}; a run in parts, with its steps for each part, takes fewer.",
             stacklevel=stacklevel,
         )
 
@@ -134,10 +96,8 @@ def check_error(name: str, error: float, start: State | Problem) -> None:
     check_number(name, error)
     size, floor = round_off(start)
     if not error > floor:
-        raise Refused(
-            f"{name} is {error:g}; the largest position is {size:.3g}, so that round-off of float64 alone is about "
-            f"{floor:.0e}. Give a larger one, in the unit of the positions."
-        )
+        round_off_of = f"the largest position is {size:.3g}, so that round-off of float64 alone is about {floor:.0e}"
+        raise Refused(f"{name} is {error:g}; {round_off_of}. Give a larger one, in the unit of the positions.")
 
 
 def round_off(start: State | Problem) -> tuple[float, float]:

@@ -11,14 +11,13 @@ from vmri_jax.running.trajectory import Trajectory
 
 LEAST_TIME = 0.02
 """Least seconds a and b N in ``a + b N``, as a part of the seconds of a macro step, and of the steps of a run, as a
-part of its seconds, since the noise of the clock may make them zero. A larger value pulls the number of micro steps
-towards the present one."""
+part of its seconds, since the noise of the clock may make them zero. A larger value changes the number of
+micro steps less."""
 FEWEST_SAMPLES = 4
 """Least samples of the seconds of a run, of which the least counts. With fewer of them other programs on the machine
 distort the prices of the steps."""
 MOST_SAMPLES = 24
-"""Most samples, for short runs, whose time is mostly the time of the call; with fewer of them the noise of the call hides
-the time of the steps."""
+"""Most samples, of short runs, whose time is mostly the call; with fewer its noise hides the time of the steps."""
 SAMPLED_SECONDS = 0.1
 """Seconds of all samples, unless their number ends them; a larger value makes searches longer and prices surer."""
 TIMED_SECONDS = 0.02

@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-import typer
 from rich.markup import escape
+from typer import Argument, Option
 
 from vmri_jax import plots
 from vmri_jax.animation.bars import bars
@@ -16,7 +16,7 @@ from vmri_jax.animation.html import write_html
 from vmri_jax.animation.motion import Motion, motion
 from vmri_jax.animation.vtk import write_vtk
 from vmri_jax.catalogue import SYSTEMS, find_problem
-from vmri_jax.cli.common import PICTURES, check_target_file, console
+from vmri_jax.cli.common import PICTURES, check_target, console
 from vmri_jax.running.progress import progress_shown
 from vmri_jax.running.store import StoredTrajectory
 from vmri_jax.running.trajectory import Trajectory
@@ -28,36 +28,24 @@ MOST_STORE_NODES = 100_000
 
 
 def animate(
-    run: Annotated[Path, typer.Argument(help="A saved trajectory, run.npz or run.zarr.")],
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            help="Write it here: .html, a strip .png/.svg/.pdf, .gif, or .pvd for ParaView. [dim]run.html[/dim]"
-        ),
-    ] = None,
-    system: Annotated[
-        str | None, typer.Option(help="System of the run: fpu, tsp, sam, or my_file.py:my_problem.")
-    ] = None,
-    drawing: Annotated[
-        Path | None, typer.Option(help="Drawing in a .json file, in place of the one in the run.", exists=True)
-    ] = None,
-    title: Annotated[str | None, typer.Option(help="Over the picture. [dim]name of the system or file[/dim]")] = None,
-    start: Annotated[float | None, typer.Option("--from", help="Start at this time.")] = None,
-    end: Annotated[float | None, typer.Option("--to", help="Stop at this time.")] = None,
-    view: Annotated[
-        str | None, typer.Option(help="Look from this azimuth and elevation in degrees, e.g. -90,90 from above.")
-    ] = None,
-    frames: Annotated[int, typer.Option(min=1, max=60, help="Pictures in a strip.")] = 5,
-    seconds: Annotated[float, typer.Option(min=0.1, max=60, help="How long a GIF takes.")] = 6.0,
-    dark: Annotated[bool, typer.Option("--dark", help="Dark colours; a page has both.")] = False,
+    run: Annotated[Path, Argument(help="A saved trajectory, run.npz or run.zarr.")],
+    out: Annotated[Path | None, Option(help=".html, a strip .png/.svg/.pdf, .gif or .pvd. [dim]run.html[/dim]")] = None,
+    system: Annotated[str | None, Option(help="System of the run: fpu, tsp, sam, or my_file.py:my_problem.")] = None,
+    drawing: Annotated[Path | None, Option(help="A .json in place of the drawing in the run.", exists=True)] = None,
+    title: Annotated[str | None, Option(help="Over the picture. [dim]name of the system or file[/dim]")] = None,
+    start: Annotated[float | None, Option("--from", help="Start at this time.")] = None,
+    end: Annotated[float | None, Option("--to", help="Stop at this time.")] = None,
+    view: Annotated[str | None, Option(help="Azimuth and elevation in degrees, e.g. -90,90 from above.")] = None,
+    frames: Annotated[int, Option(min=1, max=60, help="Pictures in a strip.")] = 5,
+    seconds: Annotated[float, Option(min=0.1, max=60, help="How long a GIF takes.")] = 6.0,
+    dark: Annotated[bool, Option("--dark", help="Dark colours; a page has both.")] = False,
 ) -> None:
     """Show a run: a page to open in a browser, a strip of pictures, or a GIF.
 
-    The drawing is the one stored with the run, else the drawing of --system; without a drawing every coordinate is a
-    bar.
+    The drawing is the one stored with the run, else the drawing of --system; without one coordinates are bars.
     """
     out = run.with_suffix(".html") if out is None else out
-    check_target_file("--out", out, (".html", *PICTURES, ".gif", ".pvd"))
+    check_target("--out", out, ".html", *PICTURES, ".gif", ".pvd")
     shown = _motion(run, system, drawing).between(start, end)
     if view is not None:
         shown = replace(shown, drawing=replace(shown.drawing, view=angles(view.split(","), "--view")))
@@ -78,7 +66,7 @@ def _motion(run: Path, system: str | None, drawing: Path | None) -> Motion:
 
 
 def _load(run: Path) -> tuple[Trajectory, str | dict]:
-    """A saved run, every k-th node of a long store, and the drawing stored with the run, empty if it has none."""
+    """A saved run, every k-th node of a long store, and the drawing in it, empty if it has none."""
     if run.suffix.lower() == ".zarr":
         stored = StoredTrajectory(run)
         return stored[:: -(-len(stored) // MOST_STORE_NODES)], stored.attributes.get("drawing", "")

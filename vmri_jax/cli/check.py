@@ -8,7 +8,7 @@ import typer
 
 from vmri_jax.catalogue import find_problem
 from vmri_jax.cli import options
-from vmri_jax.cli.common import check_target_folder, console, print_failure
+from vmri_jax.cli.common import check_target, console, print_failure
 from vmri_jax.hard_cases import Case, cases_for, run_cases
 from vmri_jax.running.interrupts import Interrupted
 from vmri_jax.running.progress import progress_shown
@@ -23,7 +23,7 @@ def check(system: options.System, case: Numbers = None, full: Full = False, out:
 
     Steps are chosen from its frequencies. Cases that do not apply say why. Ends with code 1 if a criterion is not met.
     """
-    check_target_folder("--out", out)
+    check_target("--out", out)
     cases = cases_for(find_problem(system))
     run_and_show(cases, case or (), full, out)
 

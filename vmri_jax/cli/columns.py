@@ -24,8 +24,7 @@ Place = tuple[int, tuple[int, ...]]
 
 @dataclass(frozen=True)
 class ByName:
-    """A function ``(problem, row) -> problem`` that puts the value of each column in its place, and that pickle can
-    send."""
+    """A function ``(problem, row) -> problem`` that puts each value in its place, and that pickle can send."""
 
     places: dict[str, Place]
 

@@ -32,8 +32,7 @@ FAULT = "This is no error of your command, but of the program. Please report it,
 
 @contextmanager
 def refusals() -> Iterator[None]:
-    """Within this context refusals of the library are shown as panels, and other errors of their classes as faults of
-    the program."""
+    """Within this context refusals of the library are shown as panels, other errors of their classes as faults."""
     try:
         yield
     except Refused as error:
@@ -71,25 +70,13 @@ def print_named(texts: dict[str, str]) -> None:
     console.print(table)
 
 
-def check_target_file(option: str, path: Path | None, endings: tuple[str, ...]) -> None:
-    """Refuse a file that has another ending, no folder, or cannot be written, before anything is computed."""
+def check_target(option: str, path: Path | None, *endings: str) -> None:
+    """Refuse a file that cannot be written, or has another ending; without endings make a folder, or refuse it."""
     if path is None:
         return
-    if path.suffix.lower() not in endings:
+    if endings and path.suffix.lower() not in endings:
         raise Refused(f"{option} {path}: the file must end in {' or '.join(endings)}.")
-    if not path.resolve().parent.is_dir():
-        raise Refused(f"{option} {path}: the folder {path.parent} does not exist; make it first.")
     try:
-        check_writable(path)
+        (check_writable if endings else make_writable_folder)(path)
     except OSError as error:
-        raise Refused(f"{option} {path} cannot be written ({error.strerror or error}); give another file.") from error
-
-
-def check_target_folder(option: str, path: Path | None) -> None:
-    """Make the folder for results, or refuse it, before anything is computed."""
-    if path is None:
-        return
-    try:
-        make_writable_folder(path)
-    except OSError as error:
-        raise Refused(f"{option} {path}: {error.strerror or error}; give a folder that can be written.") from error
+        raise Refused(f"{option} {error.strerror or error}") from error

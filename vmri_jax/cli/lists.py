@@ -16,9 +16,8 @@ def systems() -> None:
         problem = make()
         names, rows = problem.names, sum(problem.system.num_constraints(problem.q_s, problem.q_f))
         parts = coordinates(names.slow_coordinates), coordinates(names.fast_coordinates)
-        table.add_row(
-            f"[bold]{name}[/bold]", _first_sentence(make), *parts, f"{rows}", parameters(problem.system.params)
-        )
+        numbers = f"{rows}", parameters(problem.system.params)
+        table.add_row(f"[bold]{name}[/bold]", _first_sentence(make), *parts, *numbers)
     console.print(table)
     console.print("\nYour own: [bold]vmri simulate my_file.py:my_problem[/bold], a vmri_jax.Problem in that file.")
 

@@ -4,20 +4,18 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Annotated
 
-import typer
 from rich.markup import escape
+from typer import Argument, Option
 
-from vmri_jax.cli.common import check_target_file, console
+from vmri_jax.cli.common import check_target, console
 
 
 def new(
-    file: Annotated[Path, typer.Argument(help="Where to write it: a .py, or a .toml for a sweep.")] = Path(
-        "my_system.py"
-    ),
-    scene: Annotated[bool, typer.Option("--scene", help="Bodies and effects instead of functions.")] = False,
+    file: Annotated[Path, Argument(help="Where to write it: a .py, or a .toml for a sweep.")] = Path("my_system.py"),
+    scene: Annotated[bool, Option("--scene", help="Bodies and effects instead of functions.")] = False,
 ) -> None:
     """Write a commented program that runs, to change into your own system or scene, or the file of a sweep."""
-    check_target_file("FILE", file, (".py", ".toml"))
+    check_target("FILE", file, ".py", ".toml")
     if file.exists():
         raise FileExistsError(f"{file} exists already; give another name.")
     if file.suffix.lower() == ".toml":

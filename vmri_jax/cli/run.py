@@ -12,12 +12,13 @@ import numpy as np
 import typer
 from rich.console import Console
 from rich.markup import escape
+from typer import Option
 
 from vmri_jax import plots
 from vmri_jax.accuracy.simulate import simulate as run_at_once
 from vmri_jax.catalogue import find_problem, find_scheme
 from vmri_jax.cli import options
-from vmri_jax.cli.common import PICTURES, check_target_file, console, print_failure, print_named
+from vmri_jax.cli.common import PICTURES, check_target, console, print_failure, print_named
 from vmri_jax.refusals import Refused
 from vmri_jax.running.arguments import Save, nothing_fast
 from vmri_jax.running.interrupts import Interrupted
@@ -31,50 +32,31 @@ from vmri_jax.steppers.solver import Solver
 DEFAULT_SCHEME = "fully-implicit"
 """The scheme of a run without --scheme and --accuracy."""
 DEFAULT_SAVED_NODES = 1000
-"""Approximate number of saved nodes of a run without --save-every; more make larger files, and figures do not show
-them."""
+"""Approximate number of saved nodes of a run without --save-every; more make larger files."""
 MOST_READ_NODES = 10_000
-"""Largest number of nodes of a run in its summary and figure; more are not seen, and take longer to read and to
-draw."""
+"""Largest number of nodes of a run in its summary and figure; more are not seen, and take longer."""
 
 
 def simulate(
     system: options.System,
-    steps: Annotated[int | None, typer.Option(help="Number of macro steps; not with --accuracy.")] = None,
+    steps: Annotated[int | None, Option(help="Number of macro steps; not with --accuracy.")] = None,
     macro_dt: options.MacroStep = None,
-    scheme: Annotated[
-        str | None,
-        typer.Option(
-            help="See [bold]vmri schemes[/bold]. [dim]fully-implicit; with --accuracy one that is chosen[/dim]"
-        ),
-    ] = None,
+    scheme: Annotated[str | None, Option(help="See vmri schemes. [dim]fully-implicit; or chosen[/dim]")] = None,
     num_micro: options.NumMicro = 10,
     alpha: options.Alpha = None,
     degree: options.Degree = None,
     rule: options.Rule = None,
     compose: options.Compose = None,
-    accuracy: Annotated[
-        float | None,
-        typer.Option(help="Largest error of a position; steps, and without --scheme the scheme, are chosen for it."),
-    ] = None,
-    t_end: Annotated[float | None, typer.Option(help="End of the run, with --accuracy.")] = None,
-    error: Annotated[bool, typer.Option("--error", help="Estimate the error of the positions.")] = False,
-    save_every: Annotated[
-        int | None, typer.Option(help=f"Macro steps between saved nodes. [dim]about {DEFAULT_SAVED_NODES} nodes[/dim]")
-    ] = None,
-    save_micro: Annotated[
-        bool,
-        typer.Option(
-            "--save-micro", help="Keep the fast motion within macro steps too, by default of every macro step."
-        ),
-    ] = False,
-    matrix: Annotated[str, typer.Option(help="auto, masses, modes, exact or null-space.")] = "auto",
-    out: Annotated[
-        Path | None, typer.Option(help="Write the trajectory here: .npz at the end, or .zarr during the run.")
-    ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with the run in --out, a .zarr.")] = False,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the run in --out, a .zarr.")] = False,
-    plot: Annotated[Path | None, typer.Option(help="Draw the run here: .png, .svg or .pdf.")] = None,
+    accuracy: Annotated[float | None, Option(help="Largest error of a position, for which steps are chosen.")] = None,
+    t_end: Annotated[float | None, Option(help="End of the run, with --accuracy.")] = None,
+    error: Annotated[bool, Option("--error", help="Estimate the error of the positions.")] = False,
+    save_every: Annotated[int | None, Option(help=f"Steps per node. [dim]{DEFAULT_SAVED_NODES} nodes[/dim]")] = None,
+    save_micro: Annotated[bool, Option("--save-micro", help="Keep the fast motion within macro steps too.")] = False,
+    matrix: Annotated[str, Option(help="auto, masses, modes, exact or null-space.")] = "auto",
+    out: Annotated[Path | None, Option(help="Write it here: .npz at the end, or .zarr during the run.")] = None,
+    resume: Annotated[bool, Option("--resume", help="Go on with the run in --out, a .zarr.")] = False,
+    overwrite: Annotated[bool, Option("--overwrite", help="Replace the run in --out, a .zarr.")] = False,
+    plot: Annotated[Path | None, Option(help="Draw the run here: .png, .svg or .pdf.")] = None,
 ) -> None:
     """Simulate a system, and report steps, energy, constraints and time.
 
@@ -89,7 +71,7 @@ def simulate(
     vmri simulate my_file.py:my_problem --scheme galerkin --degree 2 --macro-dt 0.05 --steps 400
     """
     streamed = _check_out(out, resume, overwrite)
-    check_target_file("--plot", plot, PICTURES)
+    check_target("--plot", plot, *PICTURES)
     problem = find_problem(system)
     _check_steps(steps, accuracy, t_end, streamed, error)
     of_scheme = {"--compose": compose, "--alpha": alpha, "--degree": degree, "--rule": rule}
@@ -193,9 +175,8 @@ def _print_stop(stopped: SimulationError | Interrupted, saved: list[str], stream
     print_failure("Interrupted", f"After {stopped.number} of {stopped.total} macro steps.{kept}")
     if streamed:
         again = [word for word in sys.argv[1:] if word not in ("--resume", "--overwrite")]
-        console.print(
-            f"Go on with it:\n[bold]{escape(shlex.join(['vmri', *again, '--resume']))}[/bold]", soft_wrap=True
-        )
+        command = escape(shlex.join(["vmri", *again, "--resume"]))
+        console.print(f"Go on with it:\n[bold]{command}[/bold]", soft_wrap=True)
     return 130
 
 
@@ -204,11 +185,9 @@ def _check_out(out: Path | None, resume: bool, overwrite: bool) -> bool:
     streamed = out is not None and out.suffix.lower() == ".zarr"
     if (resume or overwrite) and not streamed:
         option = "--resume" if resume else "--overwrite"
-        raise Refused(
-            f"{option} is for a run that is written while it goes; give --out with a file that ends in .zarr."
-        )
+        raise Refused(f"{option} is for a run that is written while it goes; give --out run.zarr.")
     if out is not None and not (streamed and out.is_dir()):  # `stream` checks an existing store
-        check_target_file("--out", out, (".npz", ".zarr"))
+        check_target("--out", out, ".npz", ".zarr")
     return streamed
 
 
@@ -225,17 +204,15 @@ def _compile_clock() -> list[float]:
 
 
 def _energy_balance(trajectory: Trajectory | StoredTrajectory) -> dict[str, str]:
-    """Work of forces and of moving constraints, and the remainder of their balance, in words; a stored run is read
-    piece by piece."""
+    """Work of forces and of moving constraints, and the remainder of their balance; a stored run is read in pieces."""
     pieces = [trajectory] if isinstance(trajectory, Trajectory) else trajectory.chunks()
     works = [piece.work() for piece in pieces]
     forces, constraints, left = (sum(part[-1] for part in parts) for parts in zip(*(w[:3] for w in works), strict=True))
     uncertainty = sum(work.uncertainty for work in works)
     work = {"work of forces": forces, "work of moving constraints": constraints}
     words = {name: f"{value:.6g}" for name, value in work.items() if value != 0}
-    return words | {
-        "energy balance": f"{left:.1e} left at the end; the saved nodes resolve the work to {uncertainty:.1e}"
-    }
+    balance = f"{left:.1e} left at the end; the saved nodes resolve the work to {uncertainty:.1e}"
+    return words | {"energy balance": balance}
 
 
 def default_save_every(steps: int) -> int:

@@ -2,8 +2,8 @@
 
 from typing import Annotated
 
-import typer
 from rich.markup import escape
+from typer import Option
 
 from vmri_jax.catalogue import find_scene_or_problem, find_scheme
 from vmri_jax.cli import options
@@ -24,13 +24,10 @@ def explain(
     degree: options.Degree = None,
     rule: options.Rule = None,
     compose: options.Compose = None,
-    macro_dt: Annotated[
-        float | None, typer.Option(help="Macro step that is timed. [dim]from the fastest vibration[/dim]")
-    ] = None,
-    measure: Annotated[bool, typer.Option(help="Time a macro step, and the derivatives of every effect.")] = True,
+    macro_dt: options.MacroStep = None,
+    measure: Annotated[bool, Option(help="Time a macro step, and the derivatives of every effect.")] = True,
 ) -> None:
-    """Show the grid of every body and effect of a scene, or function of a system, with the reason, its cost, and all
-    frequencies.
+    """Show the grid of every body and effect of a scene, or function of a system, why, its cost, and frequencies.
 
     The cost: unknowns, evaluations, and the time of one evaluation of the first derivatives at all nodes. Frequencies
     are of small vibrations about the start.

@@ -6,12 +6,12 @@ from typing import Annotated
 import numpy as np
 import typer
 from rich.markup import escape
+from typer import Argument, Option
 
 from vmri_jax import plots
 from vmri_jax.catalogue import find_problem, find_scheme
 from vmri_jax.cli import options
-from vmri_jax.cli.common import PICTURES, check_target_file, console, print_written
-from vmri_jax.refusals import Refused
+from vmri_jax.cli.common import PICTURES, check_target, console, print_written
 from vmri_jax.running.printed import PrintedTable
 from vmri_jax.running.progress import Working
 from vmri_jax.stability import advise as advise_on
@@ -21,7 +21,7 @@ from vmri_jax.stability.map import windows_text
 
 def advise(
     system: options.System,
-    macro_dt: options.MacroStep = None,
+    macro_dt: Annotated[float, Option(help="Macro step H, of num_micro micro steps.")],
     scheme: options.Scheme = "fully-implicit",
     num_micro: options.NumMicro = 10,
     alpha: options.Alpha = None,
@@ -41,8 +41,6 @@ def advise(
     """
     problem = find_problem(system)
     chosen = find_scheme(scheme, num_micro, compose, alpha=alpha, degree=degree, rule=rule)
-    if macro_dt is None:
-        raise Refused("--macro-dt is missing; give the macro step that is to be judged.")
     with Working("judging this step and the steps around it"):
         advice = advise_on(problem, chosen, macro_dt=macro_dt)
     console.print(advice.table() if advice.findings else escape(advice.verdict))
@@ -51,21 +49,15 @@ def advise(
 
 
 def stability(
-    system: Annotated[
-        str | None, typer.Argument(help="A system at its start. [dim]one slow and one stiff spring, kappa = 25[/dim]")
-    ] = None,
-    scheme: Annotated[
-        list[str] | None, typer.Option(help="See [bold]vmri schemes[/bold]; may be repeated. [dim]explicit-slow[/dim]")
-    ] = None,
-    num_micro: Annotated[
-        list[int] | None, typer.Option(help="Micro steps per macro step; may be repeated. [dim]2 5 10 20[/dim]")
-    ] = None,
+    system: Annotated[str | None, Argument(help="A system at its start. [dim]a slow and a stiff spring[/dim]")] = None,
+    scheme: Annotated[list[str] | None, Option(help="May be repeated. [dim]explicit-slow[/dim]")] = None,
+    num_micro: Annotated[list[int] | None, Option(help="May be repeated. [dim]2 5 10 20[/dim]")] = None,
     alpha: options.Alpha = None,
     degree: options.Degree = None,
     rule: options.Rule = None,
     compose: options.Compose = None,
-    until: Annotated[float, typer.Option(help="Largest omega H, in units of pi.", min=0.1)] = 4.0,
-    out: Annotated[Path | None, typer.Option(help="Draw the map here: .png, .svg or .pdf.")] = None,
+    until: Annotated[float, Option(help="Largest omega H, in units of pi.", min=0.1)] = 4.0,
+    out: Annotated[Path | None, Option(help="Draw the map here: .png, .svg or .pdf.")] = None,
 ) -> None:
     """Find the stable macro steps of a scheme, in units of the fastest vibration.
 
@@ -75,7 +67,7 @@ def stability(
 
     vmri stability tsp --scheme fully-explicit --scheme mollified-impulse
     """
-    check_target_file("--out", out, PICTURES)
+    check_target("--out", out, *PICTURES)
     problem = linear_model() if system is None else find_problem(system)
     numbers, grid = num_micro or [2, 5, 10, 20], np.linspace(0.02, until, max(2, round(50 * until))) * np.pi
     chosen = {

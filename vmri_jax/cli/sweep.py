@@ -11,12 +11,13 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 from rich.markup import escape
+from typer import Argument, Option
 
 from vmri_jax import plots
 from vmri_jax.animation.checks import check_keys
 from vmri_jax.catalogue import find_problem
 from vmri_jax.cli.columns import by_name
-from vmri_jax.cli.common import PICTURES, check_target_file, console, print_failure, print_named, print_written
+from vmri_jax.cli.common import PICTURES, check_target, console, print_failure, print_named, print_written
 from vmri_jax.ensembles import Axis, Draw, Draws, Ensemble, EnsembleError, Product, ensemble
 from vmri_jax.ensembles.quantities import drawn_by_default
 from vmri_jax.executors.executor import local_workers
@@ -31,28 +32,17 @@ SETTINGS = ("t_end", "num_steps", "macro_dt", "num_micro", "save", "num_saves", 
 
 
 def sweep(
-    file: Annotated[Path, typer.Argument(help="The sweep, a .toml; vmri new sweep.toml writes one.")] = Path(
-        "sweep.toml"
-    ),
-    workers: Annotated[
-        str | None,
-        typer.Option(
-            help="Number of workers on this machine, or the address of a scheduler of Dask, tcp://host:port. "
-            "[dim]this process[/dim]"
-        ),
-    ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Compute the missing runs of the store.")] = False,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the store.")] = False,
-    plot: Annotated[
-        Path | None,
-        typer.Option(help="Draw the last saved number of each run against the longest axes: .png, .svg or .pdf."),
-    ] = None,
+    file: Annotated[Path, Argument(help="A .toml, which vmri new sweep.toml writes.")] = Path("sweep.toml"),
+    workers: Annotated[str | None, Option(help="Number, or Dask tcp://host:port. [dim]this process[/dim]")] = None,
+    resume: Annotated[bool, Option("--resume", help="Compute the missing runs of the store.")] = False,
+    overwrite: Annotated[bool, Option("--overwrite", help="Replace the store.")] = False,
+    plot: Annotated[Path | None, Option(help="Draw the last saved number of each run: .png, .svg or .pdf.")] = None,
 ) -> None:
     """Run a sweep of parameters, starts, steps and schemes, on one core or on a cluster, into a store on disk.
 
     Finished runs stay if a worker or this program dies; --resume computes the others.
     """
-    check_target_file("--plot", plot, PICTURES)
+    check_target("--plot", plot, *PICTURES)
     if plot is not None:
         for package in ("xarray", "dask.array"):  # refuse a missing package now: the figure comes after all runs
             extra(package, "--plot", "ensemble")
@@ -85,8 +75,7 @@ def _drawn(save: list[str], problem: Problem) -> str:
     if not drawn:
         raise Refused(
             f"--plot draws one number per run or per saved node, and save = {json.dumps(save)} keeps neither. Add one "
-            f"to the file, e.g. save = {json.dumps([*save, 'energy_error'])}, or a function of your own that returns "
-            "one, my_file.py:function."
+            f"to the file, e.g. save = {json.dumps([*save, 'energy_error'])}, or a function of your own."
         )
     return drawn[-1]
 

@@ -1,5 +1,4 @@
-"""Arguments of `minimize`: their checks, the `Transcription` that they make, and the point where the iteration
-starts."""
+"""Arguments of `minimize`: their checks, the `Transcription` that they make, and the first point."""
 
 from collections.abc import Callable, Mapping
 
@@ -12,6 +11,7 @@ from vmri_jax.control.search import Point, rolled
 from vmri_jax.control.transcription import Transcription
 from vmri_jax.diagnostics.linear import phase_vector
 from vmri_jax.mechanics.arrays import real_array, whole_number
+from vmri_jax.mechanics.checks import check_type
 from vmri_jax.mechanics.functions import traced_once
 from vmri_jax.mechanics.order import order_of
 from vmri_jax.mechanics.state import start_of
@@ -25,15 +25,11 @@ def actuation_of(problem, actuate, num_controls) -> tuple[Callable, tuple[str, .
     scene_actuation = getattr(problem, "actuation", None)
     if actuate is None:
         if scene_actuation is None:
-            raise Refused(
-                'minimize: nothing is controlled; give a scene with Controlled effects, e.g. Controlled("hub", '
-                '"torque"), or actuate= '
-                "and num_controls=."
-            )
-        if num_controls not in (None, len(scene_actuation.labels)):
-            raise Refused(
-                f"minimize: num_controls is {num_controls}; the scene has {len(scene_actuation.labels)} controls."
-            )
+            effects = 'Controlled effects, e.g. Controlled("hub", "torque")'
+            raise Refused(f"minimize: nothing is controlled; give a scene with {effects}, or actuate and num_controls.")
+        count = len(scene_actuation.labels)
+        if num_controls not in (None, count):
+            raise Refused(f"minimize: num_controls is {num_controls}; the scene has {count} controls.")
         return scene_actuation, scene_actuation.labels
     if scene_actuation is not None:
         raise Refused("minimize: actuate is given, and the scene has Controlled effects; leave one of them out.")
@@ -53,23 +49,16 @@ def transcribed(
         raise Refused(f"minimize: grid is {grid!r}; it must be 'macro' or 'micro'.")
     system, state = start_of("minimize", problem, None)
     params = {} if system.params is None else system.params
-    if not isinstance(params, Mapping):
-        raise Refused(
-            f"minimize: system.params is {type(params).__name__}; the controls need it to be a dict, or None."
-        )
+    check_type("minimize: system.params", params, Mapping, "a dict, or None")
     prepare(problem, scheme, macro_dt=macro_dt, num_steps=1, solver=solver)  # makes the checks of a run
-    # A fallback is a branch of the compiled step. `jax.vmap` over all steps would compute both of its sides for every
-    # step.
+    # A fallback is a branch of the compiled step: `jax.vmap` over all steps would compute both of its sides.
     solver = solver or plan(system, scheme, state).first
     u = np.zeros(num_controls)
     actuate = traced_once(actuate, order_of(params))
     forces = jax.eval_shape(lambda: actuate(state.q_s, state.q_f, u, params))
     expected = (state.q_s.shape, state.q_f.shape)
     if not isinstance(forces, tuple) or tuple(getattr(f, "shape", None) for f in forces) != expected:
-        raise Refused(
-            f"minimize: actuate returns {forces}; it must return forces on the slow and on the fast variables, of "
-            f"shapes {expected[0]} and {expected[1]}."
-        )
+        raise Refused(f"minimize: actuate returns {forces}; it must return slow and fast forces of shapes {expected}.")
     for name, function in aims.items():
         arguments = (state, u) if name in ("cost", "limits") else (state,)
         shape = jax.eval_shape(lambda f=function, g=arguments: f(*g)).shape
@@ -117,8 +106,7 @@ def _bounds(bounds, num_controls: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def started(setup: Transcription, start, num_steps: int, num_controls: int, grid: str) -> Point:
-    """Nodes and controls of the first iteration, without their gaps and the miss of the goal; `start` as of
-    `minimize`."""
+    """Nodes and controls of the first iteration, without gaps and miss; `start` as of `minimize`."""
     nodes, shape = None, (num_steps, setup.parts, num_controls)
     if isinstance(start, Optimum):
         nodes, controls = _resampled(setup, start, num_steps)
@@ -131,21 +119,15 @@ def started(setup: Transcription, start, num_steps: int, num_controls: int, grid
             raise Refused(f"minimize: start has shape {controls.shape}; the controls have {expected}.")
         controls = controls.reshape(shape)
     u = jnp.asarray(np.clip(controls, *setup.bounds))
-    # Given controls start from the motion that they make, without gaps; the nodes of an optimum are interpolated, with
-    # gaps.
-    if nodes is None:
+    if nodes is None:  # controls start from the motion that they make, without gaps
         nodes, _ = rolled(setup, u)
         if not np.isfinite(nodes).all():
-            raise Refused(
-                "minimize: the motion with the first controls fails; give other controls, start=..., or a smaller "
-                "macro_dt."
-            )
+            raise Refused("minimize: the motion with the first controls fails; give another start, or shorter steps.")
     return Point(nodes, u, np.zeros(0), np.zeros(0))
 
 
 def _resampled(setup: Transcription, start: Optimum, num_steps: int):
-    """Nodes (N, n) and controls (N, parts, m) of an optimum, interpolated to the grid of another problem of the same
-    duration."""
+    """Nodes (N, n) and controls (N, parts, m) of an optimum, interpolated to another grid of the same duration."""
     run, m = start.trajectory, start.controls.shape[-1]
     old_nodes = np.asarray(phase_vector(run.states))
     duration, expected = float(run.t[-1] - run.t[0]), num_steps * setup.macro_dt
@@ -154,9 +136,7 @@ def _resampled(setup: Transcription, start: Optimum, num_steps: int):
             f"minimize: start is an Optimum of duration {duration:g}; num_steps macro steps last {expected:g}."
         )
     if m != len(setup.bounds[0]) or old_nodes.shape[1] != setup.z_start.size:
-        raise Refused(
-            "minimize: start is an Optimum of another system or other controls; give an Optimum of this problem."
-        )
+        raise Refused("minimize: start is an Optimum of another system or other controls; give one of this problem.")
     t = float(setup.start.t) + setup.macro_dt * np.arange(1, num_steps + 1)
     nodes = np.stack([np.interp(t, np.asarray(run.t), column) for column in old_nodes.T], axis=1)
     # A control is constant over its interval: both grids are compared at the middles of the intervals.

@@ -5,11 +5,9 @@
     lower <= u_k + du_k <= upper        C_k dz_{k+1} + D_k du_k + l_k <= 0
 
 If the goal and the inequalities have no common solution, slack variables take up the violation of the goal and of the
-limits, and their sum enters the cost with a large weight. Unknowns are ordered by stages, so that the solver's matrices
-are banded.
+limits, and their sum enters the cost with a large weight. Unknowns are ordered by stages: matrices are banded.
 
-Source: R. Schwan, Y. Jiang, D. Kuhn, C. N. Jones, PIQP: a proximal interior-point quadratic programming solver, CDC
-(2023);
+Source: R. Schwan, Y. Jiang, D. Kuhn, C. N. Jones, PIQP: a proximal interior-point QP solver, CDC (2023);
 relaxation: R. Fletcher, Practical methods of optimization, Wiley (1987), section 14.4.
 """
 
@@ -26,8 +24,7 @@ from vmri_jax.running import export
 
 RELAXATION_WEIGHT = 1e4
 """Cost of one unit of slack, relative to the largest slope of the cost. It has to exceed the multipliers of goal and
-limits, else the solution violates goals and limits that it could fulfil; a larger cost makes the problem
-ill-conditioned."""
+limits, else the solution violates goals and limits that it could fulfil; a larger cost spoils the condition."""
 TOLERANCE = 1e-10
 """Absolute and relative tolerance of PIQP, two decades below the default tolerance of `minimize`; with a larger one the
 updates of the last iterations would be errors of PIQP."""
@@ -59,16 +56,13 @@ def solve(stages: Stages, final: Final, limits: Limits) -> tuple[Solution, float
         slopes = [np.abs(part).max(initial=0.0) for part in (stages.gradient, final.s)]
         solution = _solved(stages, final, limits, RELAXATION_WEIGHT * max(1.0, *slopes))
     if solution is None:
-        raise Unsolved(
-            "minimize: PIQP solves neither the linear-quadratic problem of an iteration nor its relaxation. Look at "
-            "the sizes of cost, goal and limits: they should be of one order."
-        )
+        problem = "neither the linear-quadratic problem of an iteration nor its relaxation"
+        raise Unsolved(f"minimize: PIQP solves {problem}; cost, goal and limits should be of one order.")
     return solution
 
 
 def _solved(stages: Stages, final: Final, limits: Limits, weight: float | None) -> tuple[Solution, float] | None:
-    """The solution, and its largest multiplier, of the problem as it is or of its relaxation with this weight; None if
-    PIQP fails."""
+    """Solution and largest multiplier of the problem or its relaxation with this weight; None if PIQP fails."""
     piqp = export.extra("piqp", "minimize with bounds or limits of controls", "control")
     (count, n, m), c, e = stages.B.shape, limits.value.shape[1], len(final.g)
     num_slacks = 0 if weight is None else c

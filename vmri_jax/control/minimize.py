@@ -55,16 +55,13 @@ def minimize(
     Sequential quadratic programming with the nodes among the unknowns: all steps are linearised side by side, and the
     linear-quadratic problem is solved by a Riccati sweep (`vmri_jax.control.riccati`), or by the interior-point method
     of PIQP where there are bounds or limits (extra ``control``), so that time grows with the number of steps.
-    Costs enter with their second derivatives, without negative curvature; steps and limits with their first
-    derivatives.
+    Costs enter with their second derivatives, without negative curvature; steps and limits with first ones.
 
     Args:
-        problem: system and start, a scene with `vmri_jax.scene.Controlled` effects or a problem; its ``system.params``
-            is a dict or None.
+        problem: system and start, a scene with `vmri_jax.scene.Controlled` effects or a problem with a dict of params.
         cost: C, cost per time, ``cost(state, u) -> ()``, with a positive second derivative in u.
         scheme, macro_dt, num_steps, solver: as in `simulate`. Forces act on the grid of the scheme for forces.
-        actuate: generalised forces of the controls, ``actuate(q_s, q_f, u, params) -> (f_s, f_f)``; None for
-            a scene, which has its own.
+        actuate: generalised forces of the controls, ``actuate(q_s, q_f, u, params) -> (f_s, f_f)``; None for a scene.
         num_controls: m, length of u; a scene knows its number.
         final_cost: cost of the last state, ``final_cost(state) -> ()``.
         goal: equations for the last state, ``goal(state) -> (e,)``, zero where the goal is reached.
@@ -76,8 +73,7 @@ def minimize(
         tolerance: largest update, gap, miss of the goal and violation of a limit of a converged optimum; updates and
             gaps are relative to the largest node and the largest control.
         max_iterations: largest number of linear-quadratic problems that are solved.
-        progress: show cost and misses of each iteration as a bar; without it, a search of more than two seconds prints
-            a line now and then.
+        progress: show cost and misses of each iteration as a bar; without it a long search prints lines.
 
     Returns:
         The `Optimum`. If the iteration does not converge, its last point, with ``success`` false.
@@ -112,11 +108,8 @@ def minimize(
             nu, rho = change.nu, max(rho, 2 * steepest)
             point, record = line_search(setup, point._replace(gaps=stages.c, goal=final.g), change, rho)
             history.append(record)
-            tell(
-                f"cost {record['cost']:.6g}, goal {record['miss']:.1e}, steps {record['gap']:.1e}",
-                count,
-                max_iterations,
-            )
+            words = f"cost {record['cost']:.6g}, goal {record['miss']:.1e}, steps {record['gap']:.1e}"
+            tell(words, count, max_iterations)
             if max(record["update"], record["gap"]) <= tolerance or record["part"] == 0.0:
                 break
     last = history[-1]
@@ -130,19 +123,6 @@ def minimize(
     controls, times = np.asarray(point.u), setup.times(num_steps)
     if grid == "macro":
         controls, times = controls[:, 0], times[:, 0]
-    return Optimum(
-        controls,
-        times,
-        labels,
-        setup.bounds,
-        trajectory,
-        last["cost"],
-        np.asarray(nu),
-        last["miss"],
-        last["over"],
-        last["gap"],
-        len(history),
-        success,
-        driven,
-        history,
-    )
+    reached = {name: last[name] for name in ("cost", "miss", "over", "gap")} | {"multipliers": np.asarray(nu)}
+    ended = {"iterations": len(history), "success": success, "problem": driven, "history": history}
+    return Optimum(controls, times, labels, setup.bounds, trajectory, **reached, **ended)

@@ -26,10 +26,8 @@ class Optimum:
         gap: largest distance between the end of a step and the next node, relative to the largest node.
         iterations: number of linear-quadratic problems that were solved.
         success: whether update, gap, miss and over are all below the tolerance.
-        problem: the problem with the forces of these controls: ``vm.simulate(optimum.problem, ...)`` runs it again, on
-            other grids too.
-        history: of every iteration cost, gap, miss, over, the largest update, and the part of the update that was
-            taken.
+        problem: the problem with the forces of these controls: ``vm.simulate(optimum.problem, ...)`` runs it again.
+        history: of every iteration cost, gap, miss, over, the largest update, and the part of it that was taken.
     """
 
     controls: Float[np.ndarray, "N ..."]
@@ -50,7 +48,5 @@ class Optimum:
     def __repr__(self) -> str:
         status = "converged" if self.success else "not converged: the best that was found"
         over = f", limits by {self.over:.1e}" if self.over > 0 else ""
-        return (
-            f"cost {self.cost:.8g} after {self.iterations} iterations, {status}; goal missed by {self.miss:.1e}{over}, "
-            f"steps by {self.gap:.1e}"
-        )
+        missed = f"goal missed by {self.miss:.1e}{over}, steps by {self.gap:.1e}"
+        return f"cost {self.cost:.8g} after {self.iterations} iterations, {status}; {missed}"

@@ -15,8 +15,7 @@ from vmri_jax.mechanics.arrays import Numbers
 SHORTEST_PART = 2.0**-10
 """Smallest part of an update that the line search tries, after ten halvings; a larger one gives up earlier."""
 SUFFICIENT_DECREASE = 1e-4
-"""Armijo's constant: the decrease of the merit has to be this part of the predicted one. A larger one refuses more
-updates."""
+"""Armijo's constant: the merit decreases by at least this part of the prediction; a larger one refuses more."""
 
 
 class Point(NamedTuple):
@@ -62,10 +61,8 @@ def line_search(setup: Transcription, point: Point, change: riccati.Solution, rh
     """The first point along an update with a sufficient decrease of the merit, and its entry in the history.
 
     The merit is ``cost + rho (sum |gaps| + sum |goal| + sum max(limits, 0))``. The update is halved until one of two
-    trials is
-    accepted: nodes and controls updated alike, which unstable motions need; and the motion of the updated controls,
-        which has
-    no gaps and suits bodies that turn far. The point stays, and ``part`` is 0, if no part of the update is accepted.
+    trials is accepted: nodes and controls updated alike, which unstable motions need; and the motion of the updated
+    controls, without gaps, which suits bodies that turn far. The point stays, ``part`` 0, if no part is accepted.
     """
     dz, du = change.dz, jnp.reshape(change.du, point.u.shape)
     cost, violation, size_z, size_u, _ = measured(setup, point)

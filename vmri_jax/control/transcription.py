@@ -1,8 +1,7 @@
 """Discrete mechanics and optimal control: stages of a controlled motion, and their derivatives.
 
 A stage is a macro step of the scheme, ``z_{k+1} = Phi(z_k, u_k)`` with ``z = (q_s, q_f, p_s, p_f)``; its discrete
-forced equations are the constraints of the optimisation. Controls are constant over a macro interval, or over each
-micro interval.
+forced equations are the constraints of the optimisation. Controls are constant over macro or micro intervals.
 
 Source: S. Ober-Bloebaum, O. Junge, J. E. Marsden, Discrete mechanics and optimal control, ESAIM: COCV 17 (2011); S.
 Leyendecker, S. Ober-Bloebaum, J. E. Marsden, M. Ortiz, Optim. Control Appl. Meth. 31 (2010), with constraints; T.
@@ -35,8 +34,7 @@ CONTROL = "vmri_jax.control"
 
 BORDER_WIDTH = 1e-6
 """Half the width of the border between two controls, relative to the duration of a control: within it a time counts as
-the border, so that round-off of a node's time does not choose a control. A larger one would mix controls at micro nodes
-beside the border."""
+the border, so that round-off of a node's time does not choose a control. A larger one mixes controls at micro nodes."""
 
 
 class Transcription(eqx.Module):
@@ -51,8 +49,7 @@ class Transcription(eqx.Module):
         goal: equations for the last state, ``goal(state) -> (e,)``.
         bounds: least and largest controls, (m,) each.
         parts: number of controls that follow each other in a macro interval: 1, or num_micro.
-        limits: ``limits(state, u) -> (c,)``, not above zero at the end of every macro interval, for each of its
-            controls; None for none.
+        limits: ``limits(state, u) -> (c,)``, not above zero at the end of macro intervals, for each control; or None.
     """
 
     system: System

@@ -38,10 +38,7 @@ def phase_step(system: System, scheme: Scheme | Composition, like: State, t, z, 
 
 
 def with_slopes(function: Callable, x, directions):
-    """``function(x) -> (y, more)`` with its derivative along k directions: y, more and ``dy/dx d`` (k, m) for directions d (k, n).
-
-    The derivative of steps: of a run it is the product of these, ``DPhi(z_(N-1)) ... DPhi(z_0) d``.
-    """
+    """``function(x) -> (y, more)`` with its derivative along k directions d (k, n): y, more and ``dy/dx d`` (k, m)."""
 
     def along(direction):
         y, slope, more = jax.jvp(function, (x,), (direction,), has_aux=True)

@@ -77,10 +77,8 @@ class ShadowEnergy:
 
     def __repr__(self) -> str:
         verdict = "it drifts" if self.drifts else "no drift is seen"
-        return (
-            f"shadow energy: band {self.band:.1e} (energy of the system: {self.energy_band:.1e}), "
-            f"drift {self.drift:.1e} +- {self.drift_error:.0e} per time: {verdict}"
-        )
+        drift = f"drift {self.drift:.1e} +- {self.drift_error:.0e} per time: {verdict}"
+        return f"shadow energy: band {self.band:.1e} (energy of the system: {self.energy_band:.1e}), {drift}"
 
 
 def shadow_energy(system: Movable, scheme: Scheme | Composition, trajectory: Trajectory, k: int = 5) -> ShadowEnergy:
@@ -107,10 +105,8 @@ def shadow_energy(system: Movable, scheme: Scheme | Composition, trajectory: Tra
     macro_dt = (t[-1] - t[0]) / (len(t) - 1)
     actions, miss, result = _actions(system, scheme, nodes, macro_dt)
     if int(result) > Result.CONVERGED_AT_ROUNDOFF or not float(miss) < LARGEST_MISS:
-        raise Refused(
-            f"shadow_energy: steps of {macro_dt:.6g} from the nodes of the trajectory miss the next ones by {float(miss):.1e} of "
-            "a step. It must be a run of this system and scheme with every macro node saved (save=1)."
-        )
+        far = f"steps of {macro_dt:.6g} from the nodes of the trajectory miss the next ones by {float(miss):.1e} of a step"
+        raise Refused(f"shadow_energy: {far}. Give a run of this system and scheme with every macro node saved.")
     q, p = (np.concatenate(pair, axis=1) for pair in ((nodes.q_s, nodes.q_f), (nodes.p_s, nodes.p_f)))
     energy = _energy(q, p, np.asarray(actions), macro_dt, k)
     inner = slice(k, len(t) - k)
@@ -134,10 +130,8 @@ def _checked(system: Movable, scheme: Scheme | Composition, trajectory: Trajecto
         raise Refused("shadow_energy: the run failed; take its first part, trajectory[:n].")
     fewest = 2 * k + BLOCKS + 1
     if np.ndim(trajectory.t) != 1 or len(trajectory.t) < fewest:
-        raise Refused(
-            f"shadow_energy: the times have shape {np.shape(trajectory.t)}; with k = {k} one run of at least {fewest} nodes is "
-            "needed. Simulate longer, or take a smaller k."
-        )
+        expected = f"with k = {k} give one run of at least {fewest} nodes, or a smaller k"
+        raise Refused(f"shadow_energy: the times have shape {np.shape(trajectory.t)}; {expected}.")
     return system
 
 

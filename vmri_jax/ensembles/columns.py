@@ -38,44 +38,28 @@ def numbers_in(rows: Rows) -> Rows:
     columns = {name: rows[name] for name in columns_of_problems(list(rows))}
     for name, values in columns.items():
         if values.dtype.kind not in "if":
-            raise Refused(
-                f"ensemble: the column {name!r} has labels; only the column 'scheme' may have them. Give numbers."
-            )
+            raise Refused(f"ensemble: the column {name!r} has labels; give numbers. Only 'scheme' may have labels.")
     return columns
 
 
 def lane_function(
     problem: Problem, vary: Vary | None, columns: Sequence[str], time_is_fixed: bool
 ) -> Callable[[Row], Lanes]:
-    """The function from a row to the parameters and the start of its run.
-
-    Args:
-        vary: None if there are no columns.
-        columns: names of the columns that change the problem, in their order in the design; JAX would sort them.
-        time_is_fixed: whether all runs must start at the time of the problem.
-
-    Raises:
-        ValueError: there are columns, and no function that takes them.
-        TypeError, ValueError: when the function of rows is called, `vary` returns no problem, or changes something else than
-            the values of parameters and of the start.
-    """
+    """The function from a row to the parameters and the start of its run; `columns` change the problem, in their order
+    in the design, which JAX would sort. With `time_is_fixed` runs must start at the time of the problem."""
     if vary is None and columns:
         name = columns[0]
+        known = near(name, (*STEPS, *SCHEMES))
         raise Refused(
-            f"ensemble: the column {name!r} is neither a step nor a scheme.{near(name, (*STEPS, *SCHEMES))} Give vary=, a "
-            f"function (problem, row) -> problem that puts row[{name!r}] into the problem of a run."
+            f"ensemble: the column {name!r} is neither a step nor a scheme.{known} Give vary=, which puts it into a problem."
         )
 
     def lane(row: Row) -> Lanes:
         changed = problem if vary is None else vary(problem, {name: row[name] for name in columns})
-        check_type(
-            "ensemble: vary(problem, row)", changed, Problem, "dataclasses.replace(problem, q_s=...), for example"
-        )
+        check_type("ensemble: vary(problem, row)", changed, Problem, "dataclasses.replace(problem, q_s=...)")
         _check_only_values_differ(problem, changed)
         if time_is_fixed and changed.t is not problem.t:
-            raise Refused(
-                "ensemble: vary changes t, so that t_end does not fix the number of steps; give num_steps and a step."
-            )
+            raise Refused("ensemble: vary changes t, so that t_end does not fix the number of steps; give num_steps.")
         is_same = changed.system.params is problem.system.params
         return None if is_same else changed.system.params, tuple(getattr(changed, part) for part in START)
 
@@ -86,13 +70,10 @@ def _check_only_values_differ(problem: Problem, changed: Problem) -> None:
     """Refuse a row whose run the program of the problem cannot compute: another system but for parameters, or arrays of other shapes."""
     leaves, structure = jax.tree.flatten(problem.system.replace(params=None))
     new_leaves, new_structure = jax.tree.flatten(changed.system.replace(params=None))
-    same_system = structure == new_structure and all(
-        a is b or (is_concrete(b) and np.array_equal(a, b)) for a, b in zip(leaves, new_leaves, strict=True)
-    )
+    are_equal = (a is b or (is_concrete(b) and np.array_equal(a, b)) for a, b in zip(leaves, new_leaves, strict=False))
+    same_system = structure == new_structure and all(are_equal)
     before, after = ((entry.system.params, [getattr(entry, part) for part in START]) for entry in (problem, changed))
     same_shapes = jax.tree.map(np.shape, before) == jax.tree.map(np.shape, after)
     if not (same_system and same_shapes):
-        raise Refused(
-            "ensemble: vary(problem, row) may change the values of system.params, positions, velocities and t. It changes "
-            f"{'the system besides its params' if same_shapes else 'the structure or shape of one of them'}; such runs need an ensemble of their own."
-        )
+        changes = "the system besides its params" if same_shapes else "the structure or shape of one of them"
+        raise Refused(f"ensemble: vary changes {changes}; it may change values of system.params and of the start.")

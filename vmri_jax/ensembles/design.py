@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from vmri_jax.mechanics.arrays import whole_number
-from vmri_jax.mechanics.names import near
+from vmri_jax.mechanics.names import near, unknown
 from vmri_jax.refusals import Refused
 
 Rows = dict[str, np.ndarray]
@@ -69,8 +69,7 @@ class Draw:
         if not isinstance(distribution, stats.rv_continuous):
             known = [*ALIASES, *(n for n, d in vars(stats).items() if isinstance(d, stats.rv_continuous))]
             raise Refused(
-                f"Draws: there is no distribution {self.name!r}.{near(self.name, known)} Give uniform, loguniform, normal, or "
-                "another continuous distribution of scipy.stats."
+                f"Draws: there is no continuous distribution {self.name!r} in scipy.stats.{near(self.name, known)}"
             )
         arguments = self.arguments
         try:
@@ -81,10 +80,8 @@ class Draw:
         except (TypeError, ValueError) as error:
             raise Refused(f"Draws: {self.name} with the arguments {self.arguments}: {error}.") from None
         if not np.isfinite(values).all():
-            raise Refused(
-                f"Draws: {self.name} with the arguments {self.arguments} gives no numbers; uniform and loguniform take the "
-                "lowest and the highest value, normal the mean and the standard deviation."
-            )
+            takes = "uniform and loguniform take the lowest and the highest value, normal mean and standard deviation"
+            raise Refused(f"Draws: {self.name} with the arguments {self.arguments} gives no numbers; {takes}.")
         return values
 
 
@@ -105,9 +102,7 @@ class Product:
         for name, axis in axes.items():
             values = axis.values
             if values.ndim != 1 or not values.size:
-                raise Refused(
-                    f"Product: the axis {name!r} has values of shape {values.shape}; give a list of one or more."
-                )
+                raise Refused(f"Product: the axis {name!r} has values of shape {values.shape}; give a list of numbers.")
             if len(np.unique(values)) < values.size:
                 raise Refused(f"Product: the axis {name!r} has a value more than once: {values.tolist()}.")
         object.__setattr__(self, "axes", axes)
@@ -150,12 +145,10 @@ class Table:
         columns = _axes("the column", self.columns)
         lengths = {name: axis.values.shape[:1] for name, axis in columns.items()}
         if len(set(lengths.values())) != 1 or () in lengths.values() or (0,) in lengths.values():
-            lengths_text = ", ".join(
-                f"{name} {shape[0] if shape else 'a single value'}" for name, shape in lengths.items()
-            )
+            texts = [f"{name} {shape[0] if shape else 'a single value'}" for name, shape in lengths.items()]
             raise Refused(
-                f"Table: columns must have one value for each run, but their lengths are: {lengths_text or 'no columns'}. For all "
-                "combinations of values take Product."
+                f"Table: columns must have one value for each run, but their lengths are: {', '.join(texts) or 'none'}. "
+                "For all combinations of values take Product."
             )
         object.__setattr__(self, "columns", columns)
 
@@ -197,13 +190,10 @@ class Draws:
         whole_number("Draws: count", self.count)
         whole_number("Draws: seed", self.seed, least=0)
         if self.method not in list(MOST_POINTS):
-            raise Refused(
-                f"Draws: method is {self.method!r}.{near(str(self.method), MOST_POINTS)} Give one of {', '.join(MOST_POINTS)}."
-            )
-        if self.count > MOST_POINTS[self.method]:
-            raise Refused(
-                f"Draws: count is {self.count}, more than the {MOST_POINTS[self.method]} of the method {self.method}; take method='random'."
-            )
+            raise Refused(f"Draws: {unknown('method', str(self.method), MOST_POINTS)}")
+        most = MOST_POINTS[self.method]
+        if self.count > most:
+            raise Refused(f"Draws: count is {self.count}, more than {most} of {self.method}; take method='random'.")
         if not self.columns:
             raise Refused("Draws: there are no columns; give at least one, e.g. {'omega': ('uniform', 10, 50)}.")
         columns = {name: _draw(name, draw) for name, draw in self.columns.items()}
@@ -222,16 +212,13 @@ class Draws:
     def combinations(self, names: Sequence[str]) -> Rows:
         """No rows. Drawn values are all different, and each would need a program of its own, so that names are refused."""
         if names:
-            raise Refused(
-                f"Draws: {', '.join(names)} cannot be drawn: each value needs a program of its own. Give the runs as a Table."
-            )
+            raise Refused(f"Draws: {', '.join(names)} cannot be drawn: each value needs a program. Give a Table.")
         return {}
 
     def described(self) -> dict[str, dict]:
         """The columns as plain data, for the store."""
-        return {
-            name: {**_words(draw), "distribution": [draw.name, *draw.arguments]} for name, draw in self.columns.items()
-        }
+        distributions = {name: [draw.name, *draw.arguments] for name, draw in self.columns.items()}
+        return {name: {**_words(draw), "distribution": distributions[name]} for name, draw in self.columns.items()}
 
     def _points(self, first: int, last: int) -> np.ndarray:
         """(last - first, number of columns) numbers between 0 and 1."""
@@ -295,10 +282,7 @@ def _draw(name: str, entry) -> Draw:
     if isinstance(entry, Draw):
         return entry
     if not (isinstance(entry, Sequence) and len(entry) and isinstance(entry[0], str)) or isinstance(entry, str):
-        raise Refused(
-            f"Draws: the column {name!r} is {entry!r}; give the name of a distribution and its arguments, "
-            "('uniform', 10, 50) or ('normal', 0, 0.1)."
-        )
+        raise Refused(f"Draws: the column {name!r} is {entry!r}; give a distribution, e.g. ('uniform', 10, 50).")
     return Draw(entry[0], tuple(float(x) for x in entry[1:]))
 
 

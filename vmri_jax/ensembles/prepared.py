@@ -1,6 +1,6 @@
 """Preparation of an ensemble: checks of all arguments, its chunks, the arrays of its store, and the record that identifies it."""
 
-from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +10,7 @@ import numpy as np
 from vmri_jax.accuracy.companions import resting
 from vmri_jax.ensembles.columns import Row, numbers_in
 from vmri_jax.ensembles.design import Axis, Chunks, Design, Draws, Product
-from vmri_jax.ensembles.quantities import Quantity, label_of, quantity, what_is_kept
+from vmri_jax.ensembles.quantities import OVER_NODES, Quantity, label_of, quantity, what_is_kept
 from vmri_jax.ensembles.work import Work, all_groups
 from vmri_jax.mechanics.arrays import whole_number
 from vmri_jax.mechanics.names import Names
@@ -37,13 +37,11 @@ def prepared(work: Work, design: Design, chunk: int | None = None) -> tuple[dict
     jax.eval_shape(work.lane, _first_row(design))
     runs = [work.simulation(group) for group in all_groups(work, design)]  # one of each group
     runs[0].check("ensemble: the start", constraints=False)
-    over_nodes = [str(name) for name, quantity in zip(work.save, work.quantities, strict=True) if quantity.over_nodes]
+    over_nodes = [name for name in OVER_NODES if name in work.save]
     if over_nodes and work.num_saves == 1:
-        raise Refused(
-            f"ensemble: {', '.join(over_nodes)} looks at the saved nodes of a run, and only its end is saved; give num_saves, "
-            "for example 50."
-        )
-    runs.sort(key=_micro_steps, reverse=True)
+        looks = f"{', '.join(over_nodes)} looks at the saved nodes of a run"
+        raise Refused(f"ensemble: {looks}, and only its end is saved; give num_saves, for example 50.")
+    runs.sort(key=lambda run: run.num_steps * run.scheme.num_micro, reverse=True)
     arrays = {
         "result": Kept(np.empty((), np.int32), (), "status of the run, see flag_meanings"),
         "failed_at": Kept(np.empty((), np.int32), (), "macro step that failed, -1 if none did"),
@@ -57,10 +55,6 @@ def _first_row(design: Design) -> Row:
     return {name: values[0] for name, values in numbers_in(design.rows(0, 1)).items()}
 
 
-def _micro_steps(run: Simulation) -> int:
-    return run.num_steps * run.scheme.num_micro
-
-
 def _chunks(runs: list[Simulation], lanes: int, arrays: dict[str, Kept], chunk: int | None) -> Chunks:
     """Chunks of about `CHUNK_SECONDS`, of a power of two times `width` runs; `width` runs are computed side by side."""
     run = runs[0]
@@ -71,7 +65,8 @@ def _chunks(runs: list[Simulation], lanes: int, arrays: dict[str, Kept], chunk: 
         return Chunks(lanes, size, min(width, size))
     kind = "implicit" if run.system.is_constrained or run.plan.has_fallback else "explicit"
     size_q = run.state.q_s.size + run.state.q_f.size
-    seconds = 1e-9 * MICRO_STEP_NANOSECONDS[kind] * _micro_steps(run) * run.scheme.degree**2 * size_q
+    micro_steps = run.num_steps * run.scheme.num_micro
+    seconds = 1e-9 * MICRO_STEP_NANOSECONDS[kind] * micro_steps * run.scheme.degree**2 * size_q
     array_bytes = sum(kept.value.dtype.itemsize * int(np.prod(kept.value.shape)) for kept in arrays.values())
     bytes_of_run = array_bytes + 8 * (2 * size_q + 8) * (run.num_saves + 1)
     most_lanes = min(rows_per_chunk(lanes, seconds, bytes_of_run, MOST_CHUNKS), lanes / FEWEST_CHUNKS)
@@ -101,30 +96,27 @@ def attributes_of(work: Work, design: Design, run: Simulation, chunks: Chunks) -
 
 def _identity(work: Work, design: Design, run: Simulation) -> dict[str, str]:
     """In words and digests, by name, everything that the results depend on."""
-    schemes = {}
+    about_run = identity(run, run.state).items()
+    identity_record = {name: text for name, text in about_run if not name.startswith(("scheme", "macro_dt"))}
     for label, scheme in work.schemes.items():
         name = scheme if isinstance(scheme, str) else getattr(scheme, "__qualname__", None)
-        schemes |= {f"scheme {label}": name} if name else describe(f"scheme {label}", scheme)
-    identity_record = {
-        name: text for name, text in identity(run, run.state).items() if not name.startswith(("scheme", "macro_dt"))
-    }
-    identity_record |= schemes | {name: str(value) for name, value in work.steps.items()}
+        identity_record |= {f"scheme {label}": name} if name else describe(f"scheme {label}", scheme)
+    identity_record |= {name: str(value) for name, value in work.steps.items()}
     saved = [label_of(entry) if callable(entry) else Path(entry).name for entry in work.save]
     identity_record |= {"num_micro": str(work.num_micro), "save": ", ".join(saved)}
     for entry in filter(callable, work.save):
-        identity_record |= {f"operations of {label_of(entry)}": operations(_arrays_of(quantity(entry)), resting(run))}
+        values = partial(_values_of, quantity(entry))
+        identity_record |= {f"operations of {label_of(entry)}": operations(values, resting(run))}
     identity_record |= {"num_saves": str(work.num_saves), "project": str(work.project), "runs": str(len(design))}
     identity_record |= {f"file {Path(file).name}": digest for file, digest in work.sources.items()}
     if work.vary is not None:
-        identity_record |= describe("vary", work.vary) | {
-            "operations of vary": operations(work.lane, _first_row(design))
-        }
+        identity_record |= describe("vary", work.vary)
+        identity_record |= {"operations of vary": operations(work.lane, _first_row(design))}
     return identity_record | _describe_design(design)
 
 
-def _arrays_of(quantity: Quantity) -> Callable[[Trajectory], dict[str, Any]]:
-    """The function from a run to the arrays of a quantity."""
-    return lambda run: {name: array.value for name, array in quantity.function(run).items()}
+def _values_of(quantity: Quantity, run: Trajectory) -> dict[str, Any]:
+    return {name: array.value for name, array in quantity(run).items()}
 
 
 def _describe_design(design: Design) -> dict[str, str]:
@@ -133,7 +125,6 @@ def _describe_design(design: Design) -> dict[str, str]:
     if isinstance(design, Draws):
         texts |= {"method": design.method, "seed": str(design.seed)}
     for name, column in (design.axes if isinstance(design, Product) else design.columns).items():
-        texts |= describe(
-            f"column {name}", column.values if isinstance(column, Axis) else (column.name, *column.arguments)
-        )
+        values = column.values if isinstance(column, Axis) else (column.name, *column.arguments)
+        texts |= describe(f"column {name}", values)
     return texts

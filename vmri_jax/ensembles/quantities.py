@@ -1,7 +1,7 @@
 """Quantities of a run that the store keeps: arrays by name, which a worker computes from the saved nodes of the run."""
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -27,23 +27,14 @@ Saved = str | Callable[[Trajectory], Any]
 """An entry of the argument ``save`` of `vmri_jax.ensemble`."""
 
 
-class Quantity(NamedTuple):
-    """A quantity that users choose by name.
-
-    function: ``function(trajectory)`` of a single run returns arrays by name.
-    over_nodes: whether the quantity needs more saved nodes than the end.
-    """
-
-    function: Callable[[Trajectory], dict[str, Kept]]
-    over_nodes: bool
+Quantity = Callable[[Trajectory], dict[str, Kept]]
+"""A function of a single run that returns arrays by name."""
 
 
 def _end(run: Trajectory) -> dict[str, Kept]:
-    names = {"q": "positions", "p": "momenta"}
-    arrays = {name: getattr(run.states, name) for name in ("q_s", "q_f", "p_s", "p_f")}
-    return {
-        name: Kept(array[-1], DIMENSIONS[name][1:], f"{names[name[0]]} at the end") for name, array in arrays.items()
-    }
+    words = {"q": "positions at the end", "p": "momenta at the end"}
+    ends = {name: getattr(run.states, name)[-1] for name in ("q_s", "q_f", "p_s", "p_f")}
+    return {name: Kept(array, DIMENSIONS[name][1:], words[name[0]]) for name, array in ends.items()}
 
 
 def _nodes(run: Trajectory) -> dict[str, Kept]:
@@ -59,10 +50,8 @@ def _energy_error(run: Trajectory) -> dict[str, Kept]:
 
 def _energy_drift(run: Trajectory) -> dict[str, Kept]:
     t = run.t - jnp.mean(run.t)
-    slope = jnp.sum(t * run.energy) / jnp.sum(t * t)
-    return {
-        "energy_drift": Kept(slope * (run.t[-1] - run.t[0]), (), "change of a line fitted to the energy over the run")
-    }
+    drift = jnp.sum(t * run.energy) / jnp.sum(t * t) * (run.t[-1] - run.t[0])
+    return {"energy_drift": Kept(drift, (), "change of a line fitted to the energy over the run")}
 
 
 def _constraints(run: Trajectory) -> dict[str, Kept]:
@@ -92,15 +81,17 @@ def _quantiles(run: Trajectory) -> dict[str, Kept]:
 
 
 QUANTITIES = {
-    "end": Quantity(_end, False),
-    "nodes": Quantity(_nodes, False),
-    "energy_error": Quantity(_energy_error, True),
-    "energy_drift": Quantity(_energy_drift, True),
-    "constraint_residual": Quantity(_constraints, True),
-    "iterations": Quantity(_iterations, False),
-    "extremes": Quantity(_extremes, True),
-    "quantiles": Quantity(_quantiles, True),
+    "end": _end,
+    "nodes": _nodes,
+    "energy_error": _energy_error,
+    "energy_drift": _energy_drift,
+    "constraint_residual": _constraints,
+    "iterations": _iterations,
+    "extremes": _extremes,
+    "quantiles": _quantiles,
 }
+OVER_NODES = ("energy_error", "energy_drift", "constraint_residual", "extremes", "quantiles")
+"""Quantities that need more saved nodes than the end."""
 
 
 def quantity(saved: Saved) -> Quantity:
@@ -121,13 +112,9 @@ def quantity(saved: Saved) -> Quantity:
         )
     user_function, label = saved if callable(saved) else imported(saved), label_of(saved)
     if not callable(user_function):
-        raise Refused(
-            f"ensemble: save has {saved!r}, which is {type(user_function).__name__}; give a function of a trajectory."
-        )
+        raise Refused(f"ensemble: save has {saved!r}, {type(user_function).__name__}; give a function of a trajectory.")
     if not label.isidentifier():
-        raise Refused(
-            f"ensemble: save has {saved!r}, a function without a name for its array in the store; define it with def."
-        )
+        raise Refused(f"ensemble: save has {saved!r}, a function without a name for its array; define it with def.")
 
     def function(run: Trajectory) -> dict[str, Kept]:
         result = user_function(run)
@@ -137,7 +124,7 @@ def quantity(saved: Saved) -> Quantity:
         axes = {key: tuple(f"{key}_{i}" for i in range(array.ndim)) for key, array in arrays.items()}
         return {key: Kept(array, axes[key], description) for key, array in arrays.items()}
 
-    return Quantity(function, False)
+    return function
 
 
 def label_of(saved: Saved) -> str:
@@ -149,7 +136,7 @@ def kept(quantities: Sequence[Quantity], run: Trajectory) -> dict[str, Kept]:
     """All arrays that the store keeps of a run."""
     arrays: dict[str, Kept] = {}
     for item in quantities:
-        part = item.function(run)
+        part = item(run)
         both = sorted(set(arrays) & set(part))
         if both:
             raise Refused(f"ensemble: save has two arrays called {', '.join(both)}; give one of them another name.")
@@ -178,13 +165,10 @@ def drawn_by_default(names: Sequence[str], problem: Problem) -> list[str]:
 
 def of_lanes(quantities: Sequence[Quantity], run: Trajectory) -> dict[str, Any]:
     """The arrays that the store keeps of a batch, a row for each run, by a program that JAX keeps for these quantities."""
-    return _of_lanes([TracedOnce(item.function) for item in quantities], run)
+    return _of_lanes(list(map(TracedOnce, quantities)), run)
 
 
 @jax.jit
 def _of_lanes(functions: list[TracedOnce], run: Trajectory) -> dict[str, Any]:
-    def of_lane(run: Trajectory):
-        quantities = [Quantity(function.function, False) for function in functions]
-        return {name: array.value for name, array in kept(quantities, run).items()}
-
-    return jax.vmap(of_lane)(run)
+    quantities = [function.function for function in functions]
+    return jax.vmap(lambda run: {name: array.value for name, array in kept(quantities, run).items()})(run)

@@ -45,9 +45,8 @@ def open_ensemble(path: str | os.PathLike) -> "xarray.Dataset":
         data = _on_axes(data, columns_record, xarray)
     else:
         columns = _drawn(attributes) if attributes["design"]["kind"] == "Draws" else _table(path)
-        data = data.assign_coords(
-            {name: ((LANE, *(f"{name}_{i}" for i in range(array.ndim - 1))), array) for name, array in columns.items()}
-        )
+        axes = {name: (LANE, *(f"{name}_{i}" for i in range(array.ndim - 1))) for name, array in columns.items()}
+        data = data.assign_coords({name: (axes[name], array) for name, array in columns.items()})
     for name, column in columns_record.items():
         data[name].attrs |= {key: column[key] for key in ("units", "description") if key in column}
     labels = {"slow": attributes["slow"], "fast": attributes["fast"], "quantile": list(LEVELS)}
@@ -66,19 +65,16 @@ def _without_missing(data, path: Path, attributes: dict[str, Any], xarray):
     if is_committed.all():
         return data
     in_store = xarray.DataArray(np.repeat(is_committed, chunk)[:lanes], dims=LANE)
-    return xarray.Dataset(
-        {name: array.where(in_store, FILL.get(array.dtype.kind, 0)) for name, array in data.items()}, attrs=data.attrs
-    )
+    arrays = {name: array.where(in_store, FILL.get(array.dtype.kind, 0)) for name, array in data.items()}
+    return xarray.Dataset(arrays, attrs=data.attrs)
 
 
 def _on_axes(data, columns_record: dict[str, dict], xarray):
     """The data with a dimension for each axis of the product in place of the lanes."""
     axes = {name: axis["values"] for name, axis in columns_record.items()}
     shape = tuple(map(len, axes.values()))
-    arrays = {}
-    for name, array in data.items():
-        values = array.data.reshape((*shape, *array.shape[1:]))
-        arrays[name] = xarray.DataArray(values, dims=(*axes, *array.dims[1:]), attrs=array.attrs)
+    values = {name: array.data.reshape((*shape, *array.shape[1:])) for name, array in data.items()}
+    arrays = {name: ((*axes, *array.dims[1:]), values[name], array.attrs) for name, array in data.items()}
     return xarray.Dataset(arrays, coords=axes)
 
 

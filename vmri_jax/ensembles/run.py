@@ -18,9 +18,9 @@ from vmri_jax.ensembles.prepared import attributes_of, prepared
 from vmri_jax.ensembles.quantities import Saved
 from vmri_jax.ensembles.reading import LANE, open_ensemble
 from vmri_jax.ensembles.work import AnyScheme, Work
-from vmri_jax.executors.executor import as_done, executor_of, submitter
-from vmri_jax.executors.worker import NotAWorker
+from vmri_jax.executors.executor import NotAWorker, as_done, executor_of, submitter
 from vmri_jax.mechanics.arrays import require_x64, whole_number
+from vmri_jax.mechanics.checks import check_type
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
 from vmri_jax.refusals import Refused
 from vmri_jax.running.files import explained
@@ -33,8 +33,7 @@ from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.solver import Solver
 
 FAILURES_TO_STOP = 10
-"""Number of failed chunks, before any chunk succeeds, at which the ensemble stops. A larger one spends more time on an error that all chunks
-have."""
+"""Number of failed chunks, before any chunk succeeds, at which the ensemble stops; a larger one takes longer."""
 NOTE_BYTES = 4
 """Bytes of the note of a chunk, the number of its runs that failed; fewer could not hold it."""
 
@@ -194,9 +193,7 @@ def ensemble(
     schemes, design = _schemes(scheme), _design(design)
     if len(schemes) > 1 and "scheme" not in design.described():
         if not isinstance(design, Product):
-            raise Refused(
-                "ensemble: there are several schemes, but the design has no column 'scheme' that chooses one for each run."
-            )
+            raise Refused("ensemble: there are several schemes; give a column 'scheme' that chooses one for each run.")
         design = Product({"scheme": list(schemes), **design.axes})
     steps = {"t_end": t_end, "num_steps": num_steps, "macro_dt": macro_dt}
     work = Work(
@@ -237,12 +234,7 @@ def ensemble(
 
 @dataclass(frozen=True)
 class ChunkTask:
-    """The computation of a chunk: it writes the results to the store, commits them, and returns how many of the runs failed.
-
-    path: folder of the store.
-    chunks: the division of the runs.
-    work: the arguments that the runs share.
-    """
+    """The computation of a chunk: it writes and commits results to the store, and returns how many runs failed."""
 
     path: Path
     chunks: Chunks
@@ -288,10 +280,9 @@ def _compute(runs: Ensemble, submit: Callable[[int], Future], tell: Progress, in
         again = f"go on with resume=True, {runs.path}"
         raise Interrupted(runs, len(runs.done), runs.chunks.count, "chunks", again) from None
     except (BrokenExecutor, CancelledError) as gone:
-        raise RuntimeError(
-            f"ensemble: the workers, or their scheduler, are gone. {len(layout.committed(runs.path))} of {runs.chunks.count} "
-            f"chunks are in {runs.path}; go on with resume=True."
-        ) from gone
+        kept = f"{len(layout.committed(runs.path))} of {runs.chunks.count} chunks are in {runs.path}"
+        reason = "ensemble: the workers, or their scheduler, are gone"
+        raise RuntimeError(f"{reason}. {kept}; go on with resume=True.") from gone
 
 
 def _raise_if_full(error: Exception, runs: Ensemble) -> None:
@@ -318,23 +309,16 @@ def _progress(runs: Ensemble) -> str:
 def _schemes(scheme) -> dict[str, AnyScheme]:
     if not isinstance(scheme, Mapping):
         scheme = {scheme if isinstance(scheme, str) else "scheme": scheme}
-    if not scheme or not all(
-        isinstance(label, str) and (isinstance(entry, str | Scheme | Composition) or callable(entry))
-        for label, entry in scheme.items()
-    ):
-        raise Refused(
-            f"ensemble: scheme is {scheme!r}; give a Scheme, the name of one, a function that makes one for a num_micro, or several "
-            "by label."
-        )
+    known = (isinstance(entry, str | Scheme | Composition) or callable(entry) for entry in scheme.values())
+    if not scheme or not all(known) or not all(isinstance(label, str) for label in scheme):
+        one = "a Scheme, the name of one, or a function that makes one for a num_micro"
+        raise Refused(f"ensemble: scheme is {scheme!r}; give {one}, or several by label.")
     return dict(scheme)
 
 
 def _design(design) -> Design:
     if isinstance(design, Mapping):
         return Product(design)
-    if not isinstance(design, Product | Table | Draws):
-        raise Refused(
-            f"ensemble: design is {type(design).__name__}; give a Product, Table or Draws of vmri_jax.ensembles, or a mapping of axes, "
-            "{'omega': [10, 50]}."
-        )
+    designs = "a Product, Table or Draws of vmri_jax.ensembles, or a mapping of axes, {'omega': [10, 50]}"
+    check_type("ensemble: design", design, Product | Table | Draws, designs)
     return design

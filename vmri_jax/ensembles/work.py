@@ -11,20 +11,12 @@ import numpy as np
 
 from vmri_jax.accuracy.batch import simulate_batch
 from vmri_jax.catalogue import find_problem, find_scheme
-from vmri_jax.ensembles.columns import (
-    SCHEMES,
-    STEPS,
-    Lanes,
-    Row,
-    Vary,
-    columns_of_problems,
-    lane_function,
-    numbers_in,
-)
+from vmri_jax.ensembles import columns
+from vmri_jax.ensembles.columns import SCHEMES, STEPS, Lanes, Row, Vary
 from vmri_jax.ensembles.design import Design, Rows, unique_rows
 from vmri_jax.ensembles.quantities import Quantity, Saved, of_lanes, quantity
-from vmri_jax.mechanics.checks import digest
-from vmri_jax.mechanics.names import near
+from vmri_jax.mechanics.checks import check_type, digest
+from vmri_jax.mechanics.names import unknown
 from vmri_jax.mechanics.state import Problem
 from vmri_jax.refusals import Refused
 from vmri_jax.running import arguments
@@ -90,13 +82,10 @@ class Work:
         for file, digest_at_start in self.sources.items():
             if not Path(file).is_file():
                 raise FileNotFoundError(
-                    f"{file} does not exist on this worker. Put it where all workers see it, or install it as a package and give "
-                    "my_package.my_module:name."
+                    f"{file} does not exist on this worker; put it where all see it, or into a package."
                 )
             if digest(Path(file).read_bytes()) != digest_at_start:
-                raise Refused(
-                    f"{file} differs from the file where the ensemble was started; give all workers the same file."
-                )
+                raise Refused(f"{file} differs from the file of the process that started the ensemble.")
 
     def with_sources(self) -> "Work":
         """This work with absolute paths of the user's files, and with digests of them."""
@@ -119,7 +108,8 @@ class Work:
     @cached_property
     def lane(self) -> Callable[[Row], Lanes]:
         """The function from the numbers of a row to the parameters and the start of its run."""
-        return lane_function(self.problem, self.vary, columns_of_problems(self.columns), "t_end" in self.steps)
+        names = columns.columns_of_problems(self.columns)
+        return columns.lane_function(self.problem, self.vary, names, "t_end" in self.steps)
 
     @cached_property
     def lanes(self) -> Callable[[Rows, int], Lanes]:
@@ -154,10 +144,7 @@ class Work:
         """The first run of a group, after a check of its arguments."""
         macro_dt, num_steps = float(np.ravel(group.macro_dt)[0]), group.num_steps
         if num_steps % self.num_saves:
-            raise Refused(
-                f"ensemble: {num_steps} macro steps are no multiple of num_saves = {self.num_saves}, so that the last saved node "
-                "would not be the end."
-            )
+            raise Refused(f"ensemble: {num_steps} macro steps are no multiple of num_saves = {self.num_saves}.")
         state = self.problem.state(self.project)
         steps = arguments.Steps(macro_dt, num_steps, save=Save(number=self.num_saves))
         return simulation(self.problem, group.scheme, state, self.solver, steps)
@@ -178,46 +165,31 @@ class Work:
         filled = np.minimum(np.arange(max(count, width)), count - 1)
         rows = {name: values[filled] for name, values in rows.items()}
         macro_dt = group.macro_dt[filled] if np.ndim(group.macro_dt) else group.macro_dt
-        params, start = self.lanes(numbers_in(rows), len(filled))
+        params, start = self.lanes(columns.numbers_in(rows), len(filled))
         project = self.problem.project if self.project is None else self.project
         states = consistent_states(self.problem.system, params, start, project)
-        trajectory = simulate_batch(
-            self.problem,
-            group.scheme,
-            states,
-            macro_dt=macro_dt,
-            num_steps=group.num_steps,
-            save=Save(number=self.num_saves),
-            params=params,
-            solver=self.solver,
-            chunk=width,
-            warn=False,
-        )
+        steps = {"macro_dt": macro_dt, "num_steps": group.num_steps, "save": Save(number=self.num_saves)}
+        how = {"params": params, "solver": self.solver, "chunk": width, "warn": False}
+        trajectory = simulate_batch(self.problem, group.scheme, states, **steps, **how)
         kept = {name: np.asarray(getattr(trajectory, name)) for name in STATUS} | of_lanes(self.quantities, trajectory)
         return {name: np.asarray(value)[:count] for name, value in kept.items()}
 
     def _scheme(self, values: Mapping[str, Any]) -> Scheme | Composition:
         label = str(values.get("scheme", next(iter(self.schemes))))
         if label not in self.schemes:
-            raise Refused(
-                f"ensemble: there is no scheme {label!r}.{near(label, self.schemes)} There are {', '.join(self.schemes)}."
-            )
+            raise Refused(f"ensemble: {unknown('scheme', label, self.schemes)}")
         scheme = self.schemes[label]
         num_micro = _whole("num_micro", values["num_micro"]) if "num_micro" in values else self.num_micro
         if isinstance(scheme, Scheme | Composition):
             if num_micro is not None:
                 raise Refused(
-                    f"ensemble: the scheme {label!r} has its num_micro already; give a function of num_micro, for example "
-                    "vmri_jax.fully_implicit, or the name of a scheme."
+                    f"ensemble: the scheme {label!r} has its num_micro already; give its function or its name."
                 )
             return scheme
         if num_micro is None:
-            raise Refused(
-                f"ensemble: num_micro is missing for the scheme {label!r}; give num_micro, or a column of this name."
-            )
+            raise Refused(f"ensemble: num_micro is missing for the scheme {label!r}, as argument or column.")
         made = find_scheme(scheme, num_micro) if isinstance(scheme, str) else scheme(num_micro)
-        if not isinstance(made, Scheme | Composition):
-            raise Refused(f"ensemble: the scheme {label!r} makes {type(made).__name__}; it must make a Scheme.")
+        check_type(f"ensemble: the value of the scheme {label!r}", made, Scheme | Composition, "a Scheme")
         return made
 
     def _steps(self, values: Mapping[str, Any]) -> tuple[Any, int]:
@@ -229,10 +201,8 @@ class Work:
         values_by_name |= {name: values[name] for name in STEPS if name in values}
         names = set(values_by_name)
         if len(names) != 2:
-            raise Refused(
-                f"ensemble: of the steps {', '.join(sorted(names)) or 'nothing'} is given; give two of t_end, "
-                "num_steps and macro_dt, as arguments or columns."
-            )
+            given = ", ".join(sorted(names)) or "nothing"
+            raise Refused(f"ensemble: got {given}; give two of t_end, num_steps and macro_dt, as arguments or columns.")
         if "num_steps" in values_by_name:
             values_by_name["num_steps"] = _whole("num_steps", values_by_name["num_steps"])
         start = float(self.problem.t)

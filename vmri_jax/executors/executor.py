@@ -1,18 +1,26 @@
-"""Executors of tasks: this process, workers on this machine, or an executor that the user gives."""
+"""Executors of tasks: this process, workers on this machine, or an executor that the user gives.
 
+A worker gets bytes and unpacks them after it has set up JAX: to unpack an array of JAX starts JAX, with default settings.
+"""
+
+import os
+import pickle
+import socket
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from contextlib import ExitStack, contextmanager
-from functools import partial
+from functools import lru_cache, partial
 from importlib.metadata import PackageNotFoundError, version
 from itertools import islice
 from typing import Any
 
-from vmri_jax.executors.worker import NotAWorker, in_worker, known_versions, packed
+from vmri_jax.configure import cache_folder, configure, processor
 from vmri_jax.mechanics.arrays import whole_number
+from vmri_jax.mechanics.checks import check_type
 from vmri_jax.refusals import Refused
 from vmri_jax.running.export import extra
 from vmri_jax.running.interrupts import Interrupted, interrupts_noted
+from vmri_jax.running.store.identity import package_versions
 
 DASK_RETRIES = 2
 """Number of times that Dask repeats a task that raised an error; a larger one delays the report of an error that is no accident. A
@@ -23,6 +31,61 @@ with a larger number ensembles of large systems need more of it, with a smaller 
 POLL_SECONDS = 1.0
 """Seconds between two looks at the workers and at all futures: `wait` does not return for futures that Dask cancels when its scheduler
 ends. With a larger value the program notices later that the scheduler is gone."""
+
+
+class NotAWorker(RuntimeError):
+    """A process cannot be a worker: it has other versions of packages, or JAX runs in it with other settings."""
+
+
+def packed(caller: str, task: Callable, *shared) -> bytes:
+    """A function and its first arguments as bytes that another process can read; refuses functions that workers cannot import."""
+    try:
+        data = pickle.dumps((task, shared))
+        if b"__main__" in data:
+            raise pickle.PicklingError("it has functions of the running program")
+    except (pickle.PicklingError, AttributeError, TypeError) as error:
+        raise Refused(
+            f"{caller}: workers cannot import this system or scheme ({error}): functions of the running program or of an "
+            "interactive session, lambdas, and functions within functions. Put the problem into a file, "
+            "'my_file.py:my_problem', or into a package that workers have, 'my_package.my_module:my_problem'."
+        ) from error
+    return data
+
+
+def in_worker(versions: dict[str, str], data: bytes, *plain):
+    """Set up JAX in this process and return ``task(*shared, *plain)`` for the task that `packed` has packed.
+
+    Refuses a process with other `versions` than the one that started the work, or one where JAX has started with other settings.
+    """
+    here = package_versions()
+    differ = [f"{name} {here[name]} instead of {versions[name]}" for name in versions if here[name] != versions[name]]
+    if differ:
+        worker = f"the worker on {socket.gethostname()} has {', '.join(differ)}"
+        raise NotAWorker(f"{worker}. Results would differ in their last digits: give all workers the same versions.")
+    _prepare(os.getpid())
+    task, shared = _unpacked(data)
+    return task(*shared, *plain)
+
+
+@lru_cache(maxsize=4)
+def _unpacked(data: bytes) -> tuple[Callable, tuple]:
+    return pickle.loads(data)
+
+
+@lru_cache(maxsize=1)
+def _prepare(process: int) -> None:
+    """One thread, 64-bit floats, fast loops, and compiled programs on disk in a folder for this kind of processor.
+
+    `process` is the number of this process; a forked process has another one, and prepares itself again.
+    """
+    os.environ.setdefault("PJRT_NPROC", "1")
+    try:
+        configure(cache=cache_folder() / "workers" / processor())
+    except RuntimeError as error:
+        raise NotAWorker(
+            f"process {process} on {socket.gethostname()} runs JAX already, without the settings of vmri_jax; perhaps it "
+            "was forked. Give new processes, ProcessPoolExecutor(n, mp_context=multiprocessing.get_context('spawn'))."
+        ) from error
 
 
 class Here(Executor):
@@ -47,26 +110,16 @@ def executor_of(caller: str, executor: Any, processes: int | None = None) -> Ite
             executor = resources.enter_context(local_workers(whole_number(f"{caller}: processes", processes)))
         if executor is not None and hasattr(executor, "get_executor"):
             executor = executor.get_executor(retries=DASK_RETRIES, pure=False)
-        if not isinstance(executor, Executor | None):
-            raise Refused(
-                f"{caller}: executor is {type(executor).__name__}; give a dask.distributed.Client or a concurrent.futures.Executor, "
-                "or the number of processes on this machine."
-            )
-        if executor is not None:
-            _check_worker(caller, executor)
+        kinds = "a dask.distributed.Client or a concurrent.futures.Executor"
+        check_type(f"{caller}: executor", executor, Executor | None, kinds)
+        try:
+            # A function of Python's library: a worker of Dask that cannot import the function of a task ends, and the
+            # task never does.
+            if executor is not None:
+                executor.submit(version, "vmri_jax").result()
+        except PackageNotFoundError as error:
+            raise NotAWorker(f"{caller}: a worker does not have vmri_jax; install it there.") from error
         yield Here() if executor is None else executor
-
-
-def _check_worker(caller: str, tasks: Executor) -> None:
-    """Refuse workers without this package; asked by a function of Python's library, since a worker of Dask that cannot import
-    the function of a task ends, and the task never does."""
-    try:
-        tasks.submit(version, "vmri_jax").result()
-    except PackageNotFoundError as error:
-        raise NotAWorker(
-            f"{caller}: a worker does not have vmri_jax. Install it in the environment of the workers, the version of this "
-            "process."
-        ) from error
 
 
 @contextmanager
@@ -82,19 +135,14 @@ def submitter(caller: str, tasks: Executor, task: Callable, *shared) -> Callable
     """The function of further arguments that has an executor compute ``task(*shared, *further)``, see `packed`."""
     if isinstance(tasks, Here):
         return partial(tasks.submit, task, *shared)
-    return partial(tasks.submit, in_worker, known_versions(), packed(caller, task, *shared))
+    return partial(tasks.submit, in_worker, package_versions(), packed(caller, task, *shared))
 
 
 def as_done(
     submit: Callable[[int], Future], numbers: Iterable[int], interrupted: Callable[[], bool] = lambda: False
 ) -> Iterator[tuple[int, Future]]:
-    """Submit tasks by their numbers, at most `MOST_UNDER_WAY` ahead, and yield each number with its future as the tasks end.
-
-    Args:
-        submit: starts one task. A task of this process has ended when `submit` returns, and is yielded before the next one starts.
-        interrupted: returns whether Ctrl-C was pressed, for a `KeyboardInterrupt`. Python loses one that is raised in the finaliser of a
-            future of Dask; therefore a handler notes Ctrl-C, and this function polls it.
-    """
+    """Submit tasks by their numbers, at most `MOST_UNDER_WAY` ahead, and yield each number with its future as the tasks
+    end. ``interrupted()`` is polled: Python loses a `KeyboardInterrupt` in the finaliser of a future of Dask."""
     waiting: dict[Future, int] = {}
     left = iter(numbers)
     try:
@@ -123,15 +171,8 @@ def mapped(
     executor: Any = None,
     report: Callable[[int, int], None] = lambda done, number: None,
 ) -> list:
-    """``[task(*call) for call in arguments]``, computed by an executor as in `ensemble`; the first error is raised.
-
-    Args:
-        task: a function that is defined in a module.
-        arguments: a tuple for each call, which pickle can send if workers compute.
-        report: ``report(done, number)``, the number of calls that are done when call `number` is submitted.
-
-    Raises:
-        Interrupted: Ctrl-C; carries the results up to then.
+    """``[task(*call) for call in arguments]``, computed by an executor as in `ensemble`; the first error is raised, and
+    at Ctrl-C an `Interrupted` with the results up to then. ``report(done, number)``: before call `number` is submitted.
     """
     calls = list(arguments)
     results: list = [None] * len(calls)

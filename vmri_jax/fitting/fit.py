@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any, cast
+from typing import cast
 
 import jax
 import jax.numpy as jnp
@@ -29,8 +29,7 @@ START = ("q_s", "q_f", "v_s", "v_f")
 GAP_WEIGHTS = (1e-2, 1.0, 1e2, 1e4, 1e6)
 """Weights of the gaps between the parts of multiple shooting, for searches one after the other, each from the end of
 the one before. A gap as large as the motion counts like a miss of every value by this many standard deviations. A
-larger first weight makes the search as hard as one with a single run; a smaller last weight leaves gaps in the
-result."""
+larger first weight makes the search as hard as one with a single run; a smaller last one leaves gaps."""
 TOLERANCE = 1e-6
 """Absolute and relative change of the search variables at which a search ends. A larger one leaves errors of this size
 beside the standard errors of the parameters."""
@@ -68,15 +67,12 @@ def fit(
         problem: a problem whose ``system.params`` is a dict; `parameters` name its entries, or "q_s", "q_f", "v_s",
             "v_f" for the start. Or a function ``{name: value} -> Problem``, for everything else.
         data: one or several sets of measurements.
-        parameters: an `Unknown` for each name, or the number where its search starts. Names of nested params have dots,
-            "bonds.stiffness".
+        parameters: an `Unknown` for each name, or the number where its search starts. Nested names: "bonds.stiffness".
         scheme, macro_dt, solver: as in `simulate`. The times of measurement must be macro nodes. Where the solver is
             not chosen, runs have no fallback.
         segments: parts of multiple shooting; more than one for long or chaotic motion.
-        starts: number of searches side by side, the first from the starts of `parameters`, the others from random ones
-            around them.
-        spread: standard deviation of the search variables of the random starts, about the relative change of a
-            parameter.
+        starts: number of searches side by side, the first from `parameters`, the others from random starts about them.
+        spread: standard deviation of the random starts, about the relative change of a parameter.
         max_steps: largest number of iterations of a search.
         seed: of the random starts.
 
@@ -103,8 +99,7 @@ def fit(
         tell("a run with the first parameters", 0, NUM_PHASES)
         run = prepare(first, scheme, macro_dt=macro_dt, num_steps=max(int(s.max()) for s in steps), solver=solver)
         run()
-        # A fallback is a branch of the compiled step; `jax.vmap` over searches and derivatives would compute both of
-        # its sides.
+        # A fallback is a branch of the compiled step: `jax.vmap` over searches would compute both of its sides.
         shooting = Shooting(model, unknowns, data, steps, scheme, solver or run.plan.first, float(macro_dt), segments)
         search = _Search(shooting, max_steps)
         u = np.zeros((starts, unknowns.size))
@@ -115,20 +110,17 @@ def fit(
 
 def _model(problem, parameters: Mapping) -> Callable[[Mapping], Problem]:
     if not parameters:
-        raise Refused(
-            "fit: parameters is empty; name the unknown parameters, e.g. {'stiffness': Unknown(3000.0, lower=0)}."
-        )
+        raise Refused("fit: parameters is empty; name the unknown ones, e.g. {'stiffness': Unknown(3000.0, lower=0)}.")
     if not isinstance(problem, Problem) and callable(problem) and not hasattr(problem, "problem"):
         return cast(Callable[[Mapping], Problem], problem)
     base = problem_of("fit", cast(Problem, problem))
-    params = base.system.params
-    known, structure = _by_name(params if isinstance(params, Mapping) else {})
+    params = base.system.params if isinstance(base.system.params, Mapping) else {}
+    numbers, structure = jax.tree.flatten_with_path(params, is_leaf=lambda value: not isinstance(value, Mapping))
+    known = {jax.tree_util.keystr(path, simple=True, separator="."): number for path, number in numbers}
     for name, unknown in parameters.items():
         if name not in known and name not in START:
-            raise Refused(
-                f"fit: parameters has {name!r}, which is none of system.params ({', '.join(known) or 'no dict'}) nor "
-                f"of {', '.join(START)}. Give a function from parameters to a Problem for anything else."
-            )
+            places = f"system.params ({', '.join(known) or 'no dict'}) nor of {', '.join(START)}"
+            raise Refused(f"fit: parameters has {name!r}, which is none of {places}. A function may make the Problem.")
         expected = np.shape(known[name] if name in known else getattr(base, name))
         start = unknown.start if isinstance(unknown, Unknown) else unknown
         if np.shape(start) != expected:
@@ -141,13 +133,6 @@ def _model(problem, parameters: Mapping) -> Callable[[Mapping], Problem]:
         return replace(base, system=system, **start)
 
     return model
-
-
-def _by_name(params: Mapping) -> tuple[dict[str, Any], Any]:
-    """The numbers in nested dictionaries by name, ``"bonds.stiffness"``, and the structure that makes the dictionaries
-    from them."""
-    numbers, structure = jax.tree.flatten_with_path(params, is_leaf=lambda value: not isinstance(value, Mapping))
-    return {jax.tree_util.keystr(path, simple=True, separator="."): number for path, number in numbers}, structure
 
 
 def _check(data: list, segments: int, starts: int, max_steps: int) -> None:
@@ -170,9 +155,7 @@ class _Search:
         self.size = shooting.unknowns.size
         self.count = len(shooting.values)
         if self.count < self.size:
-            raise Refused(
-                f"fit: {self.count} values for {self.size} unknown numbers; measure more, or fix some of them."
-            )
+            raise Refused(f"fit: {self.count} values for {self.size} unknown numbers; measure more, or fix some.")
         u_start = np.zeros(self.size)
         self.part_starts = shooting.starts(u_start)
         # The starts of the parts are scaled by the largest value of each coordinate along the first run.
@@ -180,12 +163,8 @@ class _Search:
         self.scale = np.where(scale > 0, scale, scale.max() or 1.0)
 
     def residual(self, x, args):
-        """Misses of all values in standard deviations, and weighted gaps between the parts; `args` are the values and
-        the weight of gaps.
-
-        x is (u, z), search variables of the parameters, and starts of the parts after the first one in units of
-        `scale`.
-        """
+        """Misses of all values in standard deviations, and weighted gaps between the parts, at x = (u, z): search
+        variables, and starts of the parts in units of `scale`; `args` are the values and the weight of gaps."""
         (u, z), (values, weight) = x, args
         predicted, gaps = self.shooting.predict(u, z * self.scale)
         misses = (predicted - values) / self.shooting.sigma
@@ -211,8 +190,7 @@ class _Search:
         return u, z, misses, jnp.sum(iterations), good[-1], jnp.max(jnp.abs(gaps), initial=0.0)
 
     def jacobian(self, u, z, values):
-        """Jacobians of misses and gaps, the gaps with their last weight: by the parameters themselves, and by the
-        starts of the parts."""
+        """Jacobians of misses and gaps with their last weight, by the parameters and by the starts of the parts."""
 
         def joined(x):
             u, z = jnp.split(x, [self.size])
@@ -232,11 +210,8 @@ class _Search:
         by_parameters = np.asarray(self.compiled_jacobian(*point)[0])
         dead = np.flatnonzero(~by_parameters.any(axis=0))
         if dead.size:
-            labels = self.shooting.unknowns.labels
-            raise Refused(
-                f"fit: no measured value depends on {', '.join(labels[i] for i in dead)} at the start of the search. "
-                "Leave this parameter out, or start elsewhere."
-            )
+            names = ", ".join(self.shooting.unknowns.labels[i] for i in dead)
+            raise Refused(f"fit: no measured value depends on {names}; leave this parameter out, or start elsewhere.")
 
     def result(self, u, tell: Progress) -> Fit:
         """The `Fit` of the best search; each row of u starts one."""
@@ -252,8 +227,7 @@ class _Search:
         return Fit.of(self.shooting, u, misses, jacobians, **end, again=partial(self.again, u, z))
 
     def again(self, u, z, values):
-        """Parameters (k, p) and covariances (k, p, p) of fits to other values (k, m); each search starts at the end u,
-        z of the first fit."""
+        """Parameters (k, p) and covariances (k, p, p) of fits to other values (k, m), which start at the end u, z."""
         unknowns = self.shooting.unknowns
 
         @jax.jit

@@ -48,26 +48,19 @@ class Measured:
         t = np.asarray(real_array("Measured: t", self.t, ndim=1))
         values = np.asarray(real_array("Measured: values", self.values))
         if values.ndim not in (1, 2) or len(values) != len(t) or not len(t):
-            raise Refused(
-                f"Measured: values have shape {values.shape} for times of shape {t.shape}; give one row for each time."
-            )
+            raise Refused(f"Measured: values have shape {values.shape}, t has {t.shape}; give one row for each time.")
         shape, values = values.shape, values.reshape(len(t), -1)
         if not np.isfinite(t).all() or not np.isfinite(values).any():
             raise Refused("Measured: t must be finite, and at least one value must be a number.")
         if self.sigma is not None:
             sigma = np.asarray(real_array("Measured: sigma", self.sigma))
             if not (np.isfinite(sigma).all() and np.all(sigma > 0)):
-                raise Refused(
-                    f"Measured: sigma is {self.sigma}; it must be positive. Leave an unknown sigma out: the fit "
-                    "estimates it."
-                )
+                raise Refused(f"Measured: sigma is {self.sigma}; it must be positive, or None if it is unknown.")
             k, m = values.shape
             # (m,) of as many times as quantities could be one for each time
             if sigma.shape not in ((), shape, (1, m), (k, 1)) and (sigma.shape != (m,) or k == m):
-                raise Refused(
-                    f"Measured: sigma has shape {sigma.shape}; values have {shape}. Give a number, one for each "
-                    f"quantity, {(1, m)}, one for each time, {(k, 1)}, or one for each value."
-                )
+                shapes = f"one for each quantity, {(1, m)}, one for each time, {(k, 1)}, or one for each value"
+                raise Refused(f"Measured: sigma has shape {sigma.shape}; values have {shape}. Give a number, {shapes}.")
             sigma = sigma.reshape(k, m) if sigma.shape == shape else np.broadcast_to(sigma, (k, m))
             object.__setattr__(self, "sigma", sigma)
         object.__setattr__(self, "t", t)
@@ -83,12 +76,11 @@ class Measured:
         steps = np.rint(exact).astype(int)
         off = np.flatnonzero(np.abs(exact - steps) > NODE_TOLERANCE)
         if off.size:
-            t = self.t[off[0]]
+            before, after = (t_start + (int(exact[off[0]]) + i) * macro_dt for i in (0, 1))
+            between = f"the time {self.t[off[0]]:g} lies between its nodes {before:g} and {after:g}"
             raise Refused(
-                f"fit: macro_dt is {macro_dt:g}, and the time {t:g} lies between its nodes "
-                f"{t_start + int(exact[off[0]]) * macro_dt:g} and {t_start + (int(exact[off[0]]) + 1) * macro_dt:g}. "
-                "Values are not interpolated: take a step that divides the times, or interpolate the measurements to "
-                "the nodes."
+                f"fit: macro_dt is {macro_dt:g}, and {between}. Values are not interpolated: take a step that divides "
+                "the times, or interpolate the measurements to the nodes."
             )
         if steps.min() < 0:
             raise Refused(f"fit: the time {self.t.min():g} lies before the start of the problem, {t_start:g}.")

@@ -23,16 +23,14 @@ STARTS_RANK_TOLERANCE = 1e-12
 """Smallest singular value, over the largest one, of a direction in the range of the Jacobian in the starts; below it a
 direction is round-off. A larger one leaves real effects of the starts to the parameters."""
 DOUBTED_PROBABILITY = 1e-6
-"""Probability of a chi^2 as large as that of the fit, below which the report doubts the fit. A larger one doubts good
-fits by chance."""
+"""Probability of a chi^2 as large as that of the fit, below which the fit is doubted; a larger one doubts good fits."""
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
     """Fitted parameters, their covariance, and the quality of the fit.
 
-    Further results are properties: `standard_errors`, `values`, `problem`, `doubts`, `probability`, and the method
-    `intervals`.
+    Further results: `standard_errors`, `values`, `problem`, `doubts`, `probability`, and the method `intervals`.
 
     Attributes:
         parameters: values by name.
@@ -108,15 +106,12 @@ class Fit:
             raise Refused(f"intervals: level is {level}; it must lie between 0 and 1, e.g. 0.95.")
         tail = (1 + level) / 2
         q = stats.norm.ppf(tail) if self.shooting.knows_sigma else stats.t.ppf(tail, max(self.freedom, 1))
-        return {
-            label: (float(x - q * s), float(x + q * s))
-            for (label, s), x in zip(self.standard_errors.items(), self.values, strict=True)
-        }
+        pairs = zip(self.values, self.standard_errors.values(), strict=True)
+        return dict(zip(self.labels, ((float(x - q * s), float(x + q * s)) for x, s in pairs), strict=True))
 
     @property
     def probability(self) -> float:
-        """Probability of a sum of squares at least as large, if model and sigma are right; 1 where sigma is
-        estimated."""
+        """Probability of as large a sum of squares, if model and sigma are right; 1 where sigma is estimated."""
         if not self.shooting.knows_sigma:
             return 1.0
         return float(stats.chi2.sf(np.sum(self.residuals**2), max(self.freedom, 1)))
@@ -127,8 +122,7 @@ class Fit:
         return simulate(self.problem, self.shooting.scheme, **settings)
 
     def bootstrap(self, repeats: int, seed: int = 0) -> "Bootstrap":
-        """Fits to synthetic measurements: the predictions of this fit plus normal errors of its sigma. They show how
-        good the intervals are.
+        """Fits to synthetic measurements: its predictions plus normal errors of its sigma; they show how good they are.
 
         Args:
             repeats: number of synthetic sets of measurements.
@@ -146,19 +140,14 @@ class Fit:
         """Reasons to doubt the fit, in sentences; its intervals say little then, and are not printed."""
         sentences = []
         if not self.success:
-            sentences.append(
-                "The search did not end by its tolerance: raise max_steps, start closer, fit a shorter time first, or "
-                "cut the motion into segments."
-            )
+            remedies = "raise max_steps, start closer, fit a shorter time first, or cut the motion into segments"
+            sentences.append(f"The search did not end by its tolerance: {remedies}.")
         if self.probability < DOUBTED_PROBABILITY:
             remedies = [] if len(self.squares) > 1 else ["starts=8"]
             remedies += [] if self.shooting.segments > 1 else ["segments=10, which cuts the motion into parts"]
-            other_cause = (
-                f"the search may have ended beside the best parameters (try {' or '.join(remedies)}), or "
-                if remedies
-                else ""
-            )
-            sentences.append(f"Sigma does not explain the misses: {other_cause}the model or sigma is not right.")
+            beside = f"the search may have ended beside the best parameters (try {' or '.join(remedies)}), or "
+            cause = f"{beside if remedies else ''}the model or sigma is not right"
+            sentences.append(f"Sigma does not explain the misses: {cause}.")
         return sentences
 
     def __repr__(self) -> str:
@@ -168,15 +157,10 @@ class Fit:
             known = zip(self.standard_errors.values(), self.intervals().values(), strict=True)
             intervals = [f" +- {s:.2g}   95 %: {low:.6g} .. {high:.6g}" for s, (low, high) in known]
             lines = [line + interval for line, interval in zip(lines, intervals, strict=True)]
-        sigma_words = (
-            f"chance of worse {self.probability:.2g}"
-            if self.shooting.knows_sigma
-            else f"sigma estimated: {self.sigma:.3g}"
-        )
+        chance, estimate = f"chance of worse {self.probability:.2g}", f"sigma estimated: {self.sigma:.3g}"
+        quality = f"{self.freedom} degrees of freedom ({chance if self.shooting.knows_sigma else estimate})"
         squares = float(np.sum(self.residuals**2))
-        lines.append(
-            f"chi^2 {squares:.4g} for {self.freedom} degrees of freedom ({sigma_words}), {self.iterations} iterations"
-        )
+        lines.append(f"chi^2 {squares:.4g} for {quality}, {self.iterations} iterations")
         lines += self.doubts
         if self.shooting.segments > 1:
             lines.append(f"{self.shooting.segments} segments, largest gap {self.gap:.1e} of the motion")
@@ -207,11 +191,8 @@ class Bootstrap:
 
 
 def without_starts(by_parameters, by_starts):
-    """The Jacobian (m, p) with respect to the parameters, projected on the complement of the range of the Jacobian
-    (m, k) with respect to the starts.
-
-    Changes of the predictions that other starts make as well say nothing about the parameters.
-    """
+    """The Jacobian (m, p) with respect to the parameters, without changes that other starts make as well: projected on
+    the complement of the range of the Jacobian (m, k) with respect to the starts."""
     if not by_starts.size:
         return by_parameters
     q, sizes, _ = jnp.linalg.svd(by_starts, full_matrices=False)

@@ -1,10 +1,8 @@
-"""Shooting: predictions of a model for all measurements, from the start of the motion or from the starts of parts of
-it.
+"""Shooting: predictions of a model for all measurements, from the start of the motion or of parts of it.
 
 With one part the start follows from the parameters. With several (*multiple shooting*) the start of each part is an
 unknown, and a condition of the search is that each part ends where the next one starts. Errors grow little within a
-part, so that the search is well behaved where a single run would be chaotic, or many periods away from the
-measurements.
+part, so that the search is well behaved where a single run is chaotic, or many periods off.
 
 Source: H. G. Bock, Recent advances in parameter identification techniques for O.D.E., Birkhaeuser (1983).
 """
@@ -88,8 +86,7 @@ class Shooting:
         return _phase(problem, problem.state())
 
     def starts(self, u) -> np.ndarray:
-        """(segments - 1, 2 n) starts of the parts after the first one, along a single run with the search variables
-        u."""
+        """(segments - 1, 2 n) starts of the parts after the first one, along a single run with u."""
         if self.segments == 1:
             return np.zeros((0, self.start(u).size))
         problem = self.model(self.unknowns.at(u))
@@ -113,18 +110,14 @@ class Shooting:
 
     @cached_property
     def _places(self) -> list[tuple[np.ndarray, np.ndarray]]:
-        """For each set of measurements, the part that each of its times lies in, and the number of the saved node
-        there."""
+        """For each set of measurements, the part that each time lies in, and the number of the saved node there."""
         parts = [np.minimum(steps // self.length, self.segments - 1) for steps in self.steps]
         return [(k, (steps - k * self.length) // self.every) for k, steps in zip(parts, self.steps, strict=True)]
 
     @cached_property
     def _parts(self) -> Callable:
-        """``(u, starts of all parts) -> observed quantities at the nodes of all parts, ends of all parts``.
-
-        A part depends on its own start and on u alone. The custom derivative uses this: it takes 2 n + len(u) tangents
-        through each part, where JAX would carry the tangents of all starts through every part.
-        """
+        """``(u, starts of all parts) -> observed quantities at the nodes of all parts, their ends``; a derivative takes
+        2 n + len(u) tangents through each part, where JAX would take those of all starts through every part."""
 
         @jax.custom_jvp
         def parts(u, starts):

@@ -39,9 +39,7 @@ class Unknown:
 
     def __post_init__(self):
         if isinstance(self.start, Mapping):
-            raise Refused(
-                'Unknown: start is a dictionary; name its numbers one by one, {"bonds.stiffness": Unknown(...)}.'
-            )
+            raise Refused('Unknown: start is a dict; name its numbers one by one, {"bonds.stiffness": Unknown(...)}.')
         start = np.asarray(real_array("Unknown: start", self.start))
         object.__setattr__(self, "start", start)
         if not np.isfinite(start).all():
@@ -51,9 +49,7 @@ class Unknown:
             if value is not None:
                 value = np.asarray(real_array(f"Unknown: {name}", value))
                 if value.shape not in ((), start.shape):
-                    raise Refused(
-                        f"Unknown: {name} has shape {value.shape}; give a number, or the shape of start, {start.shape}."
-                    )
+                    raise Refused(f"Unknown: {name} has shape {value.shape}; give a number, or {start.shape}.")
                 object.__setattr__(self, name, np.broadcast_to(value, start.shape))
         too_small = self.lower is not None and not np.all(self.lower < start)
         too_large = self.upper is not None and not np.all(start < self.upper)

@@ -1,9 +1,8 @@
-"""A hard case: a set-up, a criterion, a function that measures it, and the picture of a long run: its energy error as a
-band."""
+"""A hard case: a set-up, a criterion, a function that measures it; and the picture of the energy of a long run."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -27,7 +26,6 @@ class Outcome:
         case, seconds: the case and the time that it took, which `run_cases` notes.
     """
 
-    VERDICTS: ClassVar = {True: "pass", False: "fail", None: "does not apply"}
     measured: str
     passed: bool | np.bool | None
     values: Mapping[str, Any] = field(default_factory=dict)
@@ -42,7 +40,7 @@ class Outcome:
     @property
     def verdict(self) -> str:
         """Whether the criterion is met, or the case does not apply."""
-        return self.VERDICTS[self.passed]
+        return "does not apply" if self.passed is None else "pass" if self.passed else "fail"
 
 
 @dataclass(frozen=True)

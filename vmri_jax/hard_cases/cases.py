@@ -44,8 +44,7 @@ from vmri_jax.steppers.solver import Solver
 NUM_MICRO = 5
 """Micro steps per macro step of the cases."""
 PHASE = 0.2
-"""omega h of the fastest vibration, which resolves it; omega H = 1 is well below the first resonance. A larger value
-may meet resonances."""
+"""omega h of the fastest vibration; omega H = 1 is below the first resonance, which a larger value may meet."""
 LONGER_RUN = 8
 """Factor by which a run is lengthened if its energy has a trend. In the longer run the trend of a slow motion turns
 back or settles, and a drift goes on; a larger factor tells the two apart more safely and takes longer."""
@@ -71,8 +70,7 @@ LANE_CRITERION = "the bad lane reports its failure, the others equal their singl
 
 @dataclass(frozen=True)
 class Resolved:
-    """A problem with a scheme and a macro step that resolve its fastest vibration, of frequency omega; every public
-    method is a case."""
+    """A problem with a scheme and a step that resolve its fastest vibration, omega; every public method is a case."""
 
     problem: Problem
     scheme: Scheme
@@ -195,11 +193,8 @@ class Resolved:
         )
 
     def _from_textbook(self, scheme: Scheme, macro_dt: float, steps: int) -> float:
-        """Largest difference of a run from the textbook, relative to the largest positions and momenta, less round-off.
-
-        A step divides the round-off of ``M (q_+ - q)`` by its micro step h, so that momenta have a round-off of
-        ``eps |M| |q| / h``.
-        """
+        """Largest difference of a run from the textbook, relative to the largest positions and momenta, less the
+        round-off ``eps |M| |q| / h`` of momenta, ``M (q_+ - q) / h``."""
         system, state = self.problem.system, self.problem.state()
         simulated = jax.jit(textbook.simulate, static_argnames="num_steps")
         oracle = simulated(system, scheme, state, macro_dt, num_steps=steps)
@@ -213,13 +208,10 @@ class Resolved:
         return max(difference(q, q_oracle) / largest_q, max(difference(p, p_oracle) - round_off, 0.0) / largest_p)
 
     def bad_lane(self, full: bool) -> Outcome:
-        """A batch whose lanes start at the nodes of a run, one of them with overflowing momenta, beside single runs of
-        some lanes."""
+        """A batch that starts at the nodes of a run, one of them with overflowing momenta, beside single runs."""
         lanes, options = 64 if full else 16, {"macro_dt": self.macro_dt, "num_steps": 20, "save": 20}
         bad = lanes // 3
-        along = run(
-            self.problem, self.scheme, self.macro_dt, lanes - 1
-        )  # its nodes are consistent with all constraints
+        along = run(self.problem, self.scheme, self.macro_dt, lanes - 1)  # nodes are consistent with all constraints
         p_s, p_f = (jnp.asarray(p).at[bad].set(OVERFLOWING_MOMENTUM) for p in (along.p_s, along.p_f))
         states = State(along.t, along.q_s, along.q_f, p_s, p_f)
         batch = simulate_batch(self.problem.system, self.scheme, states, **options, warn=False)
@@ -276,9 +268,8 @@ def resolved(problem: Problem) -> Resolved:
     omega = float(max(linear.frequencies.max(initial=0.0), turning))
     if not omega > 0:
         now = motion(problem.system, state)
-        q, v, a = (
-            np.abs(np.append(*parts)) for parts in ((state.q_s, state.q_f), (now.v_s, now.v_f), (now.a_s, now.a_f))
-        )
+        pairs = (state.q_s, state.q_f), (now.v_s, now.v_f), (now.a_s, now.a_f)
+        q, v, a = (np.abs(np.append(*pair)) for pair in pairs)
         sizes = np.where(q > 0, q, q.max() or 1.0)
         omega = float(max((v / sizes).max(), np.sqrt(a / sizes).max())) or 1.0
     omega = max(omega, 2 * np.pi / (drive_period(problem.system, state, 1 / omega) or np.inf))
@@ -344,13 +335,10 @@ def _has_no_limit(system: System) -> str:
 
 
 def _turns_one_way(problem: Problem) -> str:
-    """The reason why reversed momenta do not lead a closed system back to the start; empty if its kinetic energy is
-    even in the velocities."""
+    """The reason why reversed momenta do not lead back to the start; empty if the kinetic energy is even in them."""
     random, system = np.random.default_rng(0), problem.system
     v_s, v_f = (random.uniform(-1, 1, q.shape) for q in (problem.q_s, problem.q_f))
     there, back = (float(system.kinetic_energy(problem.q_s, problem.q_f, v_s * x, v_f * x)) for x in (1, -1))
     if abs(there - back) <= 1e-12 * (abs(there) + abs(back)):
         return ""
-    return (
-        "its kinetic energy depends on the sign of velocities (as in a magnetic field): the way back is another motion"
-    )
+    return "its kinetic energy depends on the sign of velocities (magnetic fields): the way back is another motion"

@@ -5,7 +5,7 @@ With s(z) a function of positions (and velocities), or a weighted sum of its com
     grad s(z) . d = (8 (s(z + h d) - s(z - h d)) - (s(z + 2 h d) - s(z - 2 h d))) / (12 h) + O(h^4)
 
 must hold for at least one h: higher derivatives spoil a large h, round-off a small one. The second derivative of a
-potential is compared with differences of the gradient in the same way, and must be symmetric.
+potential is compared with differences of the gradient in the same way; then it is symmetric, too.
 """
 
 from collections.abc import Callable, Iterator
@@ -29,8 +29,7 @@ DISPLACEMENT = 1e-4
 """Largest random displacement of the points, as a part of the largest position: a function with a bend exactly at a
 point has no derivative there. A larger value leaves the states of the run."""
 WRONG = 1e-4
-"""Relative difference from which a derivative is wrong; right derivatives differ by at most 1e-7. A larger value
-overlooks small errors."""
+"""Relative difference from which a derivative is wrong; right ones differ by 1e-7. A larger value overlooks errors."""
 ROUND_OFF = 1e-14
 """Round-off of a difference of values, as a part of the value; a larger value hides errors of small derivatives."""
 
@@ -39,11 +38,10 @@ def derivatives(problem: Problem, scheme: Scheme, macro_dt: float) -> Outcome:
     """The largest relative difference of derivatives, and the functions whose derivatives are wrong."""
     worst = {}
     for name, function, points in _terms(problem, scheme, macro_dt):
-        first, second, asymmetry = _differences(function, points)
+        first, second = _differences(function, points)
         worst[f"the gradient of {name} from differences of its values"] = first
         if "potential" in name:
             worst[f"the second derivative of {name} from differences of its gradient"] = second
-            worst[f"the second derivative of {name} from its transpose"] = asymmetry
     wrong = {comparison: difference for comparison, difference in worst.items() if not difference < WRONG}
     largest = max(worst.values(), default=0.0)
     if not wrong:
@@ -59,11 +57,8 @@ def derivatives(problem: Problem, scheme: Scheme, macro_dt: float) -> Outcome:
 
 
 def _terms(problem: Problem, scheme: Scheme, macro_dt: float) -> Iterator[tuple[str, Callable, np.ndarray]]:
-    """The functions of the system by name, each as a function of a vector, ``function(z) -> (m,)``, with (k, n) points
-    z.
-
-    The points are the start and nodes of a short run up to a failure.
-    """
+    """The functions of the system by name, as functions of a vector, ``function(z) -> (m,)``, with (k, n) points z: the
+    start and nodes of a short run."""
     system, n_s = problem.system, problem.q_s.size
     along = run(problem, scheme, macro_dt, 20, save=5)
     speeds = jax.jit(jax.vmap(lambda *z: jnp.concatenate(velocity(system, *z))))
@@ -81,16 +76,15 @@ def _terms(problem: Problem, scheme: Scheme, macro_dt: float) -> Iterator[tuple[
         yield "the constraints", lambda q: system.constraints(t, q[:n_s], q[n_s:]), points[:, :n]
 
 
-def _differences(function: Callable, points: np.ndarray) -> tuple[float, float, float]:
-    """Largest relative differences over all points: of the gradient and of the second derivative from differences, and
-    of the second derivative from its transpose."""
+def _differences(function: Callable, points: np.ndarray) -> tuple[float, float]:
+    """Largest relative differences over all points, of the gradient and of the second derivative from differences."""
     random = np.random.default_rng(0)
     size = float(np.abs(points).max(initial=0.0)) or 1.0
     points = points + DISPLACEMENT * size * random.uniform(-1, 1, points.shape)
     directions = random.uniform(-1, 1, (DIRECTIONS, points.shape[1]))
 
     if not points.shape[1]:
-        return 0.0, 0.0, 0.0
+        return 0.0, 0.0
 
     def value(z):
         values = function(z)
@@ -102,21 +96,15 @@ def _differences(function: Callable, points: np.ndarray) -> tuple[float, float, 
         d, gradient = jnp.asarray(directions), jax.grad(value)
         gradients, second_derivatives = jax.lax.map(lambda x: jax.jvp(gradient, (z,), (x,)), d)  # grad s and s'' d
         first = _from_quotients(value, z, d, jnp.sum(gradients * d, axis=1), size)
-        second = _from_quotients(gradient, z, d, second_derivatives, size)
-        bilinear = second_derivatives @ d.T  # d_i . s'' d_j
-        scale = jnp.abs(bilinear).max() + ROUND_OFF * jnp.abs(gradient(z)).max() / size
-        return first, second, jnp.abs(bilinear - bilinear.T).max() / jnp.where(scale > 0, scale, 1.0)
+        return first, _from_quotients(gradient, z, d, second_derivatives, size)
 
-    first, second, asymmetry = (float(np.max(np.asarray(x))) for x in compared(jnp.asarray(points)))
-    return first, second, asymmetry
+    first, second = (float(np.max(np.asarray(x))) for x in compared(jnp.asarray(points)))
+    return first, second
 
 
 def _from_quotients(f: Callable, z, directions, derivatives, size: float):
-    """Relative difference of the derivatives (DIRECTIONS, ...) of f from its quotients of order 4, for the h with the
-    smallest one.
-
-    Less the round-off, which the size of the values divided by the size of the positions sets.
-    """
+    """Relative difference of the derivatives (DIRECTIONS, ...) of f from its quotients of order 4, less round-off, for
+    the h with the smallest one."""
 
     def quotient(h, d):
         near, far = (f(z + k * h * d) - f(z - k * h * d) for k in (1, 2))

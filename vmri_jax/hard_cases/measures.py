@@ -59,14 +59,12 @@ class Energy:
 
     @property
     def drifts(self) -> bool:
-        """Whether the linear trend is more than half of the band: chaotic motion alone moves the mean by a tenth or
-        two."""
+        """Whether the linear trend is more than half of the band: chaotic motion moves the mean by a tenth or two."""
         return not self.share <= 0.5
 
 
 def energy(trajectory: Trajectory, num_steps: int, scale: float = 1.0) -> Energy:
-    """Band and drift of the energy over a run of `num_steps` steps, in units of `scale`; infinite where the run
-    failed."""
+    """Band and drift of the energy over a run of `num_steps` steps, in units of `scale`; infinite if it failed."""
     e = (np.asarray(trajectory.energy) - float(trajectory.energy[0])) / scale
     if not np.isfinite(e).all():
         return Energy(np.inf, np.inf, np.inf)
@@ -85,8 +83,7 @@ def energy_scale(problem: Problem, trajectory: Trajectory) -> float:
 
 
 def drift_meter(problem: Problem, scheme, macro_dt, num_steps: int) -> ShadowEnergy | None:
-    """The shadow energy of the first steps; None where there is none: forces, constraints that depend on time, a run
-    that failed."""
+    """The shadow energy of the first steps; None with forces, moving constraints, or a run that failed."""
     try:
         return diagnostics.shadow_energy(problem, scheme, run(problem, scheme, macro_dt, num_steps))
     except Refused:

@@ -15,15 +15,14 @@ from vmri_jax.hard_cases.cases import cases_for
 from vmri_jax.mechanics.state import HasProblem, Problem
 from vmri_jax.refusals import Refused
 from vmri_jax.running.interrupts import Interrupted
-from vmri_jax.running.printed import PrintedTable
 from vmri_jax.running.progress import ShowsProgress, progress_to
-from vmri_jax.study.table import Column, ResultTable, rich_table
+from vmri_jax.study.table import Column, ResultTable
 
-COLORS = {True: "green", False: "red", None: "dim"}
-"""Colour of the verdict, by `Outcome.passed`."""
+COLORS = {"pass": "green", "fail": "red", "does not apply": "dim"}
+"""Colour of a verdict."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Report(ResultTable):
     """Outcomes of cases, in order."""
 
@@ -32,9 +31,10 @@ class Report(ResultTable):
         Column("case", lambda row: row.case.title),
         Column("criterion", lambda row: row.case.criterion),
         Column("measured", lambda row: row.measured),
-        Column("", lambda row: Text(row.verdict, COLORS[row.passed])),
+        Column("", lambda row: Text(row.verdict, COLORS[row.verdict])),
         Column("s", lambda row: f"{row.seconds:.1f}", right=True),
     )
+    ruled = True
     rows: tuple[Outcome, ...]
 
     @property
@@ -49,18 +49,10 @@ class Report(ResultTable):
 
     def records(self) -> list[dict[str, Any]]:
         """Case, verdict and measured values of every row."""
-        return [
-            {
-                **{name: getattr(row.case, name) for name in ("number", "title", "setup", "criterion")},
-                **{name: getattr(row, name) for name in ("measured", "verdict", "seconds")},
-                **row.values,
-            }
-            for row in self.rows
-        ]
-
-    def table(self) -> PrintedTable:
-        """The rows, with lines between them, for the terminal."""
-        return rich_table(self.columns, self.rows, ruled=True)
+        case, outcome = ("number", "title", "setup", "criterion"), ("measured", "verdict", "seconds")
+        of_cases = [{name: getattr(row.case, name) for name in case} for row in self.rows]
+        measured = [{name: getattr(row, name) for name in outcome} | dict(row.values) for row in self.rows]
+        return [one | other for one, other in zip(of_cases, measured, strict=True)]
 
     def pictures(self) -> dict[str, Figure]:
         """Figures by the title of the case, for all cases with a picture."""

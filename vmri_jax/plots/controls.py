@@ -39,11 +39,8 @@ def plot_control(optimum: Any, *, title: str = "", theme: Theme = LIGHT) -> Note
             if np.any(values > 0):
                 numbers = 1 + np.arange(len(values))
                 below.semilogy(numbers, np.maximum(values, ROUNDOFF_FLOOR), ".-", color=color, label=MEANING[name])
-        below.set(
-            xlabel="iteration",
-            ylabel="remaining error",
-            xticks=1 + np.arange(0, len(optimum.history), 1 + len(optimum.history) // 12),
-        )
+        count = len(optimum.history)
+        below.set(xlabel="iteration", ylabel="remaining error", xticks=1 + np.arange(0, count, 1 + count // 12))
         legend_beside(below)
         figure.align_ylabels()
     return figure

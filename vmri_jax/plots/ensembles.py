@@ -7,6 +7,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap, LogNorm, Normalize
 
+from vmri_jax.mechanics.names import unknown
 from vmri_jax.plots.theme import (
     LIGHT,
     NotebookFigure,
@@ -54,15 +55,13 @@ def plot_ensemble(
 
     Args:
         data: from `vmri_jax.open_ensemble`, or a selection of it.
-        quantity: name of the result; if None the last result with a single number per run, else the last one with a
-            number per saved node.
+        quantity: name of the result; if None the last one with a single number per run, or per saved node.
         x, y: names of axes or columns; the two longest axes if both are None and the design has axes.
         title: title above the panels.
         theme: colours.
 
     Raises:
-        ValueError: an unknown name, a quantity with several numbers per run, no quantity to choose, or more panels than
-        can be drawn.
+        ValueError: an unknown name, a quantity with several numbers per run, no quantity to choose, or too many panels.
     """
     quantity = _quantity(data, quantity)
     values = data[quantity]
@@ -70,15 +69,11 @@ def plot_ensemble(
         return _plot_bands(data, values.where(~_failed(data, values)), title, theme)
     several = [name for name in values.dims if name in COORDINATES]
     if several:
-        raise Refused(
-            f"plot_ensemble: {quantity} has several numbers per run; choose one, "
-            f"data.isel({several[0]}=0) or data.sel({several[0]}={data[several[0]].values[0]!r})."
-        )
+        one = f"data.isel({several[0]}=0) or data.sel({several[0]}={data[several[0]].values[0]!r})"
+        raise Refused(f"plot_ensemble: {quantity} has several numbers per run; choose one, {one}.")
     for name in (x, y):
         if name is not None and name not in data.coords:
-            raise Refused(
-                f"plot_ensemble: there is no axis or column {name!r}; there are {', '.join(map(str, data.coords))}."
-            )
+            raise Refused(f"plot_ensemble: {unknown('axis or column', name, map(str, data.coords))}")
     axes = sorted((str(d) for d in values.dims if d != "lane"), key=lambda d: -values.sizes[d])
     if x is None and y is None and "lane" not in values.dims:
         numbers = [name for name in axes if values[name].dtype.kind in "if" and values.sizes[name] > 1]
@@ -101,7 +96,7 @@ def _quantity(data: "xarray.Dataset", name: str | None) -> str:
     """The name of the quantity to draw, see `plot_ensemble`."""
     if name is not None:
         if name not in data:
-            raise Refused(f"plot_ensemble: there is no {name!r}; there are {', '.join(map(str, data.data_vars))}.")
+            raise Refused(f"plot_ensemble: {unknown('quantity', name, map(str, data.data_vars))}")
         return name
     arrays = {str(n): set(map(str, array.dims)) & set(COORDINATES) for n, array in data.data_vars.items()}
     arrays = {n: several for n, several in arrays.items() if n not in (*STATUS, "node_t")}
@@ -109,10 +104,10 @@ def _quantity(data: "xarray.Dataset", name: str | None) -> str:
         names = [n for n, dimensions in arrays.items() if dimensions == several]
         if names:
             return names[-1]
+    kept = ", ".join(arrays) or "none besides the status, which is drawn as 'result'"
     raise Refused(
-        "plot_ensemble: no quantity is one number per run; there are "
-        f"{', '.join(arrays) or 'none besides the status'}. Save one, save=('end', 'energy_error'), or choose one "
-        "number of a quantity: plot_ensemble(data.isel(slow=0), 'q_s'). The status of the runs is drawn as 'result'."
+        f"plot_ensemble: no quantity is one number per run; there are {kept}. Save one, save=('end', 'energy_error'), "
+        "or choose one number of a quantity: plot_ensemble(data.isel(slow=0), 'q_s')."
     )
 
 
@@ -126,10 +121,8 @@ def _panels(values, drawn: Sequence[str]) -> list[tuple[str, Any]]:
     panel_axes = [d for d in values.dims if d not in drawn]
     count = int(np.prod([values.sizes[d] for d in panel_axes], dtype=int))
     if count > MOST_PANELS:
-        raise Refused(
-            f"plot_ensemble: besides {', '.join(drawn)} there are {', '.join(map(str, panel_axes))} with {count} "
-            f"combinations of values; select some, data.sel({panel_axes[-1]}=...)."
-        )
+        others = f"{', '.join(map(str, panel_axes))} with {count} combinations of values"
+        raise Refused(f"plot_ensemble: besides {', '.join(drawn)} there are {others}; data.sel() selects some.")
     panels = []
     for numbers in np.ndindex(*(values.sizes[d] for d in panel_axes)):
         indices = dict(zip(panel_axes, numbers, strict=True))
@@ -154,9 +147,8 @@ def _plot_maps(values, failed, x: str, y: str, title: str, theme: Theme) -> Note
     with new_figure(1.2 + 2.6 * columns, 0.9 + 2.3 * rows, title, theme) as figure:
         grid = panel_grid(figure, len(panels), columns)
         for axes, (name, panel), mark in zip(grid, panels, marks, strict=True):
-            mesh = axes.pcolormesh(
-                values[x], values[y], panel.transpose(y, x), norm=norm, cmap="viridis", rasterized=True
-            )
+            colours = {"norm": norm, "cmap": "viridis", "rasterized": True}
+            mesh = axes.pcolormesh(values[x], values[y], panel.transpose(y, x), **colours)
             hidden = np.ma.masked_where(~mark.transpose(y, x).values, np.ones((values.sizes[y], values.sizes[x])))
             axes.pcolormesh(values[x], values[y], hidden, cmap=ListedColormap([theme.faint]), rasterized=True)
             axes.set_title(name)
@@ -228,10 +220,10 @@ def _plot_bands(data, values, title: str, theme: Theme) -> NotebookFigure:
     runs = [d for d in values.dims if d not in COORDINATES]
     has_coordinates = any(d in COORDINATES and d != "node" for d in values.dims)
     time = data.node_t.mean(runs, skipna=True).values if "node_t" in data else np.arange(values.sizes["node"])
-    values = values.chunk(dict.fromkeys(runs, -1)) if runs else values
-    bands = (
-        values.quantile(BANDS, dim=runs, skipna=True).compute() if runs else values.expand_dims(quantile=5).compute()
-    )
+    if runs:
+        bands = values.chunk(dict.fromkeys(runs, -1)).quantile(BANDS, dim=runs, skipna=True).compute()
+    else:
+        bands = values.expand_dims(quantile=len(BANDS)).compute()
     panels = _panels(bands, ("quantile", "node"))
     columns = min(3, len(panels))
     with new_figure(0.8 + 3.0 * columns, 0.8 + 2.2 * -(-len(panels) // columns), title, theme) as figure:

@@ -20,15 +20,13 @@ BAND_OPACITY = 0.25
 LEAST_SHOWN = 1e-9
 """Least reaction that is drawn, as a part of the largest one in its unit; a smaller value draws curves of round-off."""
 LEAST_SPAN = 1e-13
-"""Least span of an axis of energies, as a part of the largest value; a smaller one magnifies round-off to the height of
-the panel."""
+"""Least span of an axis of energies, as a part of the largest value; a smaller one magnifies round-off."""
 
 
 def plot_trajectory(trajectory: SavedRun, title: str = "", theme: Theme = LIGHT) -> NotebookFigure:
     """Slow and fast positions, energy and, where there are constraints, their residual, against time.
 
-    Rigid bodies are drawn by their centres of mass. Curves have the units of the system; angles of joints have a panel
-    of their own.
+    Rigid bodies are drawn by their centres of mass. Angles of joints have a panel of their own.
 
     A run with an estimated error has bands of this error about its positions, and a panel of the largest error and its
     shares.
@@ -119,8 +117,7 @@ UNITS = {"force": "N", "torque": "N m", "generalised force": "N, or N m for an a
 
 
 def _moduli(run: SavedRun) -> dict[str, dict[str, np.ndarray]]:
-    """For each unit, the largest modulus (k,) of the reaction on a body of each constraint by name; reactions that are
-    round-off are left out."""
+    """For each unit, the largest modulus (k,) of the reaction on a body of each constraint, without round-off."""
     names, panels = run.names, {unit: {} for unit in UNITS}
     for constraint, by_body in run.reaction_forces().items():
         for body, force in by_body.items():
@@ -128,9 +125,8 @@ def _moduli(run: SavedRun) -> dict[str, dict[str, np.ndarray]]:
             reactions = {kind: force}
             if body in names.rigid:
                 # (k, directors, 3): the first three entries are of the centre
-                pulls, directors = (
-                    np.asarray(a)[:, 3:].reshape(len(force), -1, 3) for a in (force, run.position(body))
-                )
+                both = (np.asarray(a)[:, 3:].reshape(len(force), -1, 3) for a in (force, run.position(body)))
+                pulls, directors = both
                 reactions = {"force": force[:, :3], "torque": np.cross(directors, pulls).sum(axis=1)}
             for unit, reaction in reactions.items():
                 curves, modulus = panels[unit], np.linalg.norm(reaction, axis=1)
@@ -144,11 +140,8 @@ def _moduli(run: SavedRun) -> dict[str, dict[str, np.ndarray]]:
 
 
 def position_panels(run: SavedRun) -> list[tuple[np.ndarray, list[str], str, np.ndarray | None]]:
-    """For slow and fast positions and angles of a run, if there are any: values (k, n), names, label of the axis, and
-    errors (k, n) or None.
-
-    Directors of rigid bodies are left out.
-    """
+    """For slow and fast positions and angles of a run, without directors of rigid bodies: values (k, n), names, label
+    of the axis, and errors (k, n) or None."""
     names, error, panels = run.names, run.error, []
     for part, pace, labels in (("s", "slow", names.slow_coordinates), ("f", "fast", names.fast_coordinates)):
         values = np.asarray(getattr(run.states, f"q_{part}"))
@@ -164,16 +157,14 @@ def position_panels(run: SavedRun) -> list[tuple[np.ndarray, list[str], str, np.
 
 
 def limit_times(axes: Axes, t) -> None:
-    """Set the limits of a time axis to the first and the last node reached; leave the default limits if these are the
-    same node."""
+    """Set the limits of a time axis to the first and the last node reached; leave the limits at a single node."""
     reached = t[np.isfinite(t)]
     if reached.size and reached[0] < reached[-1]:
         axes.set_xlim(reached[0], reached[-1])
 
 
 def coordinates(axes: Axes, t, values, names: Sequence[str], theme: Theme, error=None) -> None:
-    """One curve for each coordinate, with a band of its error, and names beside the panel, at most `MOST_NAMED` of
-    them."""
+    """One curve for each coordinate, with a band of its error, and at most `MOST_NAMED` names beside the panel."""
     n = values.shape[1]
     colors: Any = theme.curves
     if n > len(theme.curves):
@@ -184,10 +175,8 @@ def coordinates(axes: Axes, t, values, names: Sequence[str], theme: Theme, error
         label = names[i] if i in named else f"_{names[i]}"  # legends leave out labels with an underscore
         axes.plot(t, values[:, i], color=colors[i], linewidth=_thin(t), label=label)
         if error is not None:
-            half = np.abs(error[:, i])
-            axes.fill_between(
-                t, values[:, i] - half, values[:, i] + half, color=colors[i], alpha=BAND_OPACITY, linewidth=0
-            )
+            half, look = np.abs(error[:, i]), {"color": colors[i], "alpha": BAND_OPACITY, "linewidth": 0}
+            axes.fill_between(t, values[:, i] - half, values[:, i] + half, **look)
     if n:
         legend_beside(axes, f"{len(named)} of {n}" if n > MOST_NAMED else None, 9.0 if n <= len(theme.curves) else 6.5)
 
@@ -210,8 +199,7 @@ def _position_error(axes: Axes, t, error: Any, theme: Theme) -> None:
 
 
 def _energy_error(axes: Axes, trajectory: SavedRun, theme: Theme) -> None:
-    """Energy minus the energy at the start, divided by the latter unless it is zero; called a change if the system is
-    not known."""
+    """Energy minus the energy at the start, divided by the latter unless it is zero; a change without a system."""
     t, energy = np.asarray(trajectory.t), np.asarray(trajectory.energy)
     kind = "error" if trajectory.keeps_energy else "change"
     error, label = energy - energy[0], rf"energy {kind} $\Delta E$"
@@ -236,9 +224,8 @@ def _energy_balance(above: Axes, below: Axes, trajectory: SavedRun, theme: Theme
     below.axhspan(-work.uncertainty, work.uncertainty, color=theme.faint, label="not resolved\nby the nodes")
     below.set_ylabel("energy balance")
     if trajectory.micro is None:
-        below.set_title(
-            "schemes with kicks: terms of $H^2$, a drift among them, without Save(micro=True)", fontsize=7.5
-        )
+        terms = "schemes with kicks: terms of $H^2$, a drift among them, without Save(micro=True)"
+        below.set_title(terms, fontsize=7.5)
     legend_beside(below, size=7.5)
     _not_below_roundoff(below.yaxis, energy)
 

@@ -38,9 +38,8 @@ def plot_convergence(study: Any, orders: Sequence[int] = (), title: str = "", th
             steps = []
             for i, scheme in enumerate(study.schemes):
                 macro_dt, errors = study.errors(scheme, quantity)
-                axes.loglog(
-                    macro_dt, positive(errors), label=f"{scheme}   {_orders(study, scheme)}", **curve_look(i, theme)
-                )
+                label = f"{scheme}   {_orders(study, scheme)}"
+                axes.loglog(macro_dt, positive(errors), label=label, **curve_look(i, theme))
                 steps += list(macro_dt)
             for order in orders:
                 _guide_triangle(axes, study, quantity, order, theme)
@@ -137,6 +136,5 @@ def _guide_triangle(axes: Axes, study: Any, quantity: str, order: int, theme: Th
     left, top = right / 2, top / 2.5
     bottom = top / 2**order
     axes.fill([left, right, right], [bottom, bottom, top], facecolor=theme.faint, edgecolor="none", zorder=1)
-    axes.annotate(
-        f"{order}", (right, (bottom * top) ** 0.5), (4, 0), textcoords="offset points", va="center", fontsize=8.5
-    )
+    beside: dict[str, Any] = {"textcoords": "offset points", "va": "center", "fontsize": 8.5}
+    axes.annotate(f"{order}", (right, (bottom * top) ** 0.5), (4, 0), **beside)

@@ -36,8 +36,7 @@ MARKERS = ("o", "s", "^", "D", "v", "P")
 LINES = ("-", "--", ":", "-.", (0, (7, 1.5, 1, 1.5, 1, 1.5)))
 """Styles of lines: the style changes after each pass through the colours, so that 30 curves differ."""
 ROUNDOFF_FLOOR = 1e-17
-"""Value at which a logarithmic axis of residuals draws zeros, below the round-off of numbers of order one; a smaller
-value stretches the axis."""
+"""Value at which a logarithmic axis of residuals draws zeros, below round-off; a smaller one stretches the axis."""
 DPI = 150
 """Dots per inch of a figure saved by its method `savefig` outside of `style`; a larger value makes larger files."""
 

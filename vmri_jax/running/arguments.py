@@ -148,13 +148,13 @@ def steps_until(t_end, t, macro_dt) -> int:
     return whole
 
 
-def check_step_size(macro_dt) -> None:
+def check_step_size(macro_dt, caller: str = "simulate") -> None:
     """Refuse a missing step size, or one that is not positive."""
     if macro_dt is None:
-        raise Refused("simulate: macro_dt is missing; give the macro step H, num_micro times the micro step.")
-    size = real_array("simulate: macro_dt", macro_dt, 0)
+        raise Refused(f"{caller}: macro_dt is missing; give the macro step H, num_micro times the micro step.")
+    size = real_array(f"{caller}: macro_dt", macro_dt, 0)
     if is_concrete(size) and not 0 < np.asarray(size) < np.inf:  # of NumPy: in a program JAX would trace the comparison
-        raise Refused(f"simulate: macro_dt is {macro_dt}; it must be a positive number.")
+        raise Refused(f"{caller}: macro_dt is {macro_dt}; it must be a positive number.")
 
 
 @lru_cache(maxsize=256)

@@ -53,11 +53,7 @@ def named_arrays(run: SavedRun) -> dict:
 
 
 def rows_of(run: SavedRun) -> dict[str, np.ndarray]:
-    """The arrays of a run with a row for each saved node; row k has the work of the solver from node k - 1 to node k.
-
-    Args:
-        run: one run, or a batch.
-    """
+    """The arrays of a run or a batch by name, a row for each saved node; row k has the work since node k - 1."""
     arrays = {name: np.asarray(value) for name, value in named_arrays(run).items() if name in DIMENSIONS}
     axis = arrays["t"].ndim - 1
     for name, array in arrays.items():
@@ -161,16 +157,7 @@ class Exports(Quantities):
 
 
 def extra(package: str, caller: str, name: str = "xarray"):
-    """An optional package.
-
-    Args:
-        package: to import.
-        caller: the function that needs it, for the message.
-        name: the extra of vmri_jax that installs it.
-
-    Raises:
-        ImportError: it is not installed.
-    """
+    """An optional package that `caller` needs and the extra `name` of vmri_jax installs; ImportError without it."""
     try:
         return importlib.import_module(package)
     except ImportError as error:

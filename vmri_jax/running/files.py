@@ -10,7 +10,7 @@ from typing import IO
 
 @contextmanager
 def replaced(path: str | Path) -> Iterator[IO[bytes]]:
-    """A binary file to write to; if the block raises nothing it replaces `path` in one operation, after its bytes are on disk."""
+    """A binary file to write to; without an error it replaces `path` in one operation, after its bytes are on disk."""
     path = Path(path).resolve()  # a link stays, its target is replaced
     check_place(path)
     if path.exists() and not path.is_file():  # a device is written to directly: it cannot be replaced
@@ -63,15 +63,10 @@ def clear_partial(path: Path) -> None:
 
 
 def check_place(path: Path) -> None:
-    """Refuse a path where no file can exist.
-
-    Raises:
-        FileNotFoundError: the folder above it does not exist.
-        IsADirectoryError: the path is a folder.
-    """
+    """Refuse a path where no file can be: FileNotFoundError without its folder, IsADirectoryError for a folder."""
     if not path.parent.is_dir():
         raise FileNotFoundError(f"{path} cannot be written: the folder {path.parent} does not exist; make it first.")
-    if path.is_dir():
+    if os.path.isdir(path):  # False, where `Path.is_dir` raises: a name that is too long
         raise IsADirectoryError(f"{path} is a folder; give the name of a file.")
 
 
@@ -79,16 +74,12 @@ def check_writable(path: Path) -> None:
     """Refuse a path where no file can be written, before long work: a file is made beside `path` and removed again.
 
     Permissions alone do not tell: only an attempt finds a read-only file system, or a name that is too long.
-
-    Raises:
-        FileNotFoundError, IsADirectoryError: as of `check_place`.
-        OSError: the folder or the file cannot be written.
     """
-    path = path.resolve()
     check_place(path)
-    if path.exists() and not os.access(path, os.W_OK):
+    path = path.resolve()
+    if os.path.exists(path) and not os.access(path, os.W_OK):
         raise PermissionError(f"{path} cannot be written: there is a file that may not be changed; give another name.")
-    if path.exists() and not path.is_file():  # a device: written to directly, without a file beside it
+    if os.path.exists(path) and not path.is_file():  # a device: written to directly, without a file beside it
         return
     attempt = path.with_name(f".{path.name}.{os.getpid()}.partial")
     with explained(path, "Give another place."):
@@ -97,17 +88,9 @@ def check_writable(path: Path) -> None:
 
 
 def make_writable_folder(path: Path) -> None:
-    """Make a folder with all folders above it, and refuse a folder in which no file can be written.
-
-    Raises:
-        OSError: the folder cannot be made, or no file can be made in it.
-    """
-    try:
+    """Make a folder with all folders above it, and refuse a folder in which no file can be written."""
+    with explained(path, "Give another place."):
         path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OSError(
-            error.errno, f"the folder {path} cannot be made: {error.strerror}. Give another place."
-        ) from error
     check_writable(path / "attempt")
 
 

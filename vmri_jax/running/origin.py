@@ -70,17 +70,10 @@ class Origin:
         return self.simulated is not None
 
     def system(self, axes: int = 0) -> System:
-        """The system with the parameters of the run; of a batch with the parameters of its first lane.
-
-        Args:
-            axes: number of axes of lanes.
-
-        Raises:
-            ValueError: the run does not know its system.
-        """
+        """The system with the parameters of the run, which has a number of axes of lanes: of its first lane."""
         if self.simulated is None:
             raise Refused(
-                "this run does not know its system, since it was read from a file, or pickled with functions that Python cannot "
+                "this run does not know its system: it was read from a file, or pickled with functions that Python cannot "
                 "pickle. Give it: run.of(problem), with the Problem, Scene or System that was simulated."
             )
         return jax.tree.map(lambda leaf: leaf[(0,) * axes], self.simulated) if axes else self.simulated
@@ -90,11 +83,7 @@ class Origin:
         return vectors if self.names is None else self.names.shaped(part, vectors)
 
     def check(self, n_s: int, n_f: int) -> None:
-        """Refuse a system whose numbers of coordinates differ from the run.
-
-        Raises:
-            ValueError: with the numbers of the run.
-        """
+        """Refuse a system whose numbers of coordinates differ from the run."""
         try:
             check_system(self.system(), np.zeros(n_s), np.zeros(n_f))
         except ValueError as error:
@@ -122,14 +111,8 @@ def names_of(moving: Any) -> Names | None:
 def at_nodes(function, origin: Origin, nodes, *static):
     """``function(system, node, *static)`` at every node; of concrete numbers by one program for runs of all lengths.
 
-    Args:
-        function: a function at module level, so that it is compiled once for each system structure.
-        origin: the origin of the run.
-        nodes: a `State` or tuple whose first array is the times, (k,) or in a batch (lanes, k).
-        static: further arguments, the same at all nodes.
-
-    Raises:
-        ValueError: the system is not known.
+    The function is at module level, so that it is compiled once for each system structure; `nodes` are a `State` or a
+    tuple whose first array is the times, (k,) or in a batch (lanes, k).
     """
     arrays, structure = jax.tree.flatten(origin.system())  # raises if the system is not known
     arrays, shape = of_one_type(arrays), np.shape(jax.tree.leaves(nodes)[0])

@@ -151,15 +151,7 @@ def progress_shown() -> Iterator[Progress]:
 
 
 def progress_to(name: str, progress: ShowsProgress) -> AbstractContextManager[Progress]:
-    """Context that yields the `Progress` for the argument `progress` of a function.
-
-    Args:
-        name: name of the function, for its lines and messages.
-        progress: True for a bar, False for occasional lines, or a `Progress`.
-
-    Raises:
-        TypeError: neither True nor False nor a function.
-    """
+    """Context that yields the `Progress` for the argument `progress` of the function of this name."""
     check_progress(name, progress)
     if callable(progress):
         return nullcontext(progress)

@@ -208,11 +208,8 @@ class Quantities(ABC):
         rows = {name: tuple(rows) for name, rows in names.rows.items() if constraint in (None, name)}
         if not rows:
             hint = " Joints that carry bodies have no rows; scene.by_directors(run) gives the run that has."
-            missing = (
-                "the system has no constraints."
-                if constraint is None
-                else unknown("constraint", constraint, names.rows)
-            )
+            known = "" if constraint is None else unknown("constraint", constraint, names.rows)
+            missing = known or "the system has no constraints."
             raise Refused(f"reaction_forces: {missing}{hint if names.carried else ''}")
         forces, touched = at_nodes(reaction_forces, run.origin, _states(run, micro), tuple(rows.values()))
         first = {"s": 0, "f": run.states.q_s.shape[-1]}
@@ -233,10 +230,8 @@ class Quantities(ABC):
         Raises:
             ValueError: the run does not know its system, or it is a batch.
         """
-        from scipy.integrate import (  # here: its import takes a fifth of a second
-            cumulative_simpson,
-            cumulative_trapezoid,
-        )
+        # here: its import takes a fifth of a second
+        from scipy.integrate import cumulative_simpson, cumulative_trapezoid
 
         run = _concrete("work", self.whole())
         if np.ndim(run.t) != 1:
@@ -266,21 +261,13 @@ class Quantities(ABC):
         return concerns(table, t, run.origin.system(t.ndim - 1), np.mean(np.diff(t), axis=-1), 1)
 
     def plot(self, title: str = ""):
-        """Positions, energy and constraints against time, a matplotlib `Figure`; more in `vmri_jax.plots`.
-
-        Args:
-            title: title above the panels.
-        """
+        """Positions, energy and constraints against time, a matplotlib `Figure` with a title; more in `vmri_jax.plots`."""
         from vmri_jax.plots import plot_trajectory  # here: its import takes half a second
 
         return plot_trajectory(self.whole(), title)
 
     def plot_forces(self, title: str = ""):
-        """Reaction forces of all constraints against time, a matplotlib `Figure`; see `vmri_jax.plots.plot_forces`.
-
-        Args:
-            title: title above the panels.
-        """
+        """Reaction forces of all constraints against time, a `Figure` with a title, see `vmri_jax.plots.plot_forces`."""
         from vmri_jax.plots import plot_forces
 
         return plot_forces(self.whole(), title)

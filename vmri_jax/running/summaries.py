@@ -11,11 +11,7 @@ from vmri_jax.steppers.results import Result
 
 
 def summary_of(run: SavedRun) -> tuple[str, dict[str, str]]:
-    """Title and lines of the summary of a run, or of a batch of runs.
-
-    Args:
-        run: a run of concrete values, not tracers.
-    """
+    """Title and lines of the summary of a run, or of a batch of runs, of concrete values."""
     t, energy, residual = (np.asarray(a) for a in (run.t, run.energy, run.constraint_residual))
     lanes = t.shape[:-1]
     batch = f" of a batch of {' x '.join(map(str, lanes))} runs" if lanes else ""
@@ -50,12 +46,7 @@ def statuses(result: np.ndarray, failed_at: np.ndarray) -> str:
 
 
 def energy_in_words(energy: np.ndarray, kept: bool | None) -> str:
-    """Energy at the start and its change; of a batch the largest change in a run.
-
-    Args:
-        energy: (k,), in a batch (..., k); NaN after a failure.
-        kept: whether the system keeps its energy; None if the system is not known.
-    """
+    """Energy (..., k) at the start and its change; of a batch the largest change. `kept` is None without a system."""
     start = energy[..., :1]
     change = np.abs(energy - start)
     largest = float(np.nanmax(change, initial=0.0))

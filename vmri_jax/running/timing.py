@@ -75,13 +75,7 @@ def least_seconds(runs: Sequence[Callable[[], object]], samples: int) -> list[fl
 
 
 def seconds_each(function: Callable, q, count: int = 2000) -> float:
-    """Seconds per evaluation in a compiled loop in which every evaluation depends on the previous one.
-
-    Args:
-        function: ``function(q)``, shaped like q.
-        q: point of evaluation.
-        count: evaluations in the loop.
-    """
+    """Seconds per evaluation of ``function(q)``, shaped like q, in a compiled loop, each from the previous one."""
 
     @jax.jit
     def loop(q, zero):  # an argument, since XLA would remove the function behind a constant zero

@@ -6,10 +6,11 @@ from typing import Any
 
 import numpy as np
 
+from vmri_jax.mechanics.checks import check_type
 from vmri_jax.mechanics.linearisation import Linearisation, linearise
 from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.mechanics.terms import label
-from vmri_jax.refusals import Refused
+from vmri_jax.running.arguments import check_step_size
 from vmri_jax.running.origin import names_of
 from vmri_jax.schemes.composition import Composition, stage_lengths, stage_scheme
 from vmri_jax.schemes.scheme import Scheme
@@ -39,11 +40,9 @@ LONGER_FOR_CAUSE = 0.01
 than each alone. A larger value may blame a limit that is not yet reached."""
 RADIANS_IN_PHASE = 0.2
 """Distance of the turn of a vibration in a macro step from a multiple of 2 pi, below which kicks of a constant force
-are said to be in phase: they make the vibration 10 times as large as kicks at odd multiples of pi do. A larger value
-warns of more steps."""
+are said to be in phase: then it is 10 times as large as at odd multiples of pi. A larger value warns of more steps."""
 LEAST_FORCE = 1e-6
-"""Smallest part of the constant slow force in a vibration for which its kicks are judged; a smaller value warns of
-round-off."""
+"""Smallest part of the constant slow force in a vibration that is judged; a smaller value warns of round-off."""
 MOST_SCANS = 5
 """Most scans, each over smaller steps than the previous one, until one of them contains a safe step."""
 
@@ -58,8 +57,7 @@ class Finding:
         or "motion".
     sentence: the result in words.
     number: its measure: growth per step of an error, relative distance of a window, ratio of frequencies, amplitude,
-        longest stage, micro steps in a period of the drive, growth rate of the motion (NaN if each period has another
-        one).
+        longest stage, micro steps in a period of the drive, growth rate of the motion (NaN if it changes).
     """
 
     severity: str
@@ -68,7 +66,7 @@ class Finding:
     number: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Advice(ResultTable):
     """Result of `advise`.
 
@@ -79,8 +77,7 @@ class Advice(ResultTable):
     scanned: least and largest macro step of all scans.
     safe_macro_dt: the stable step nearest to macro_dt without a near window, macro_dt itself if it is such a step; NaN
         if no scan has one. Of a periodic drive a part of the period.
-    fast_frequencies, slow_frequencies: (d,) frequencies of the fast and of the slow potential at the state, the largest
-        first.
+    fast_frequencies, slow_frequencies: (d,) frequencies of the fast and the slow potential, the largest first.
     about: the motions that are judged, in words.
     """
 
@@ -166,10 +163,8 @@ def advise(
     """
     names = names_of(system)
     system, state = start_of("advise", system, state)
-    if not isinstance(scheme, Scheme | Composition):
-        raise Refused(f"advise: scheme is {type(scheme).__name__}; give a Scheme, e.g. fully_implicit(num_micro=10).")
-    if not (np.ndim(macro_dt) == 0 and np.isfinite(macro_dt) and macro_dt > 0):
-        raise Refused(f"advise: macro_dt is {macro_dt}; it must be a positive number.")
+    check_type("advise: scheme", scheme, Scheme | Composition, "a Scheme, e.g. fully_implicit(num_micro=10)")
+    check_step_size(macro_dt, "advise")
     macro_dt, linear = float(macro_dt), linearise(system, state, names)
     period = drive_period(system, state, macro_dt)
     if period is None:
@@ -376,8 +371,7 @@ def _is_fast(linear: Linearisation, i) -> bool:
 
 
 def _turn(linear: Linearisation, scheme: Scheme | Composition, macro_dt: float, i) -> float:
-    """Angle by which vibration i turns in a macro step: the phase of the micro steps if W carries the vibration, else
-    ``omega H``."""
+    """Angle that vibration i turns in a macro step: the phase of the micro steps if W carries it, else ``omega H``."""
     exact = float(linear.frequencies[i] * macro_dt)
     if not _is_fast(linear, i):
         return exact

@@ -26,28 +26,22 @@ from vmri_jax.schemes.scheme import Scheme, fully_implicit
 from vmri_jax.stability.multipliers import monodromy
 
 SAMPLES = 1024
-"""Times at which the drive is compared with itself, one period later or earlier; with fewer of them narrow pulses are
-missed."""
+"""Times at which the drive is compared with itself, a period apart; with fewer of them narrow pulses are missed."""
 SPANS = 8.0 ** np.arange(-1, 5)
-"""Lengths of the sampled intervals, in macro steps: periods of 1/500 to 2000 macro steps are seen. Longer ones take
-longer to measure."""
+"""Lengths of the sampled intervals, in macro steps: periods of 1/500 to 2000 steps are seen; more take longer."""
 CANDIDATES = 8
 """Lags that are tried as the period in an interval; more of them find drives with many harmonics."""
 SAME = 1e-7
 """Difference of the drive from itself a period later, as a part of its amplitude. A larger value takes drives for
 periodic that change slowly."""
 STEPS_FOLLOWED = 64
-"""Macro steps that are followed at most where they are no part of the period, so that N steps are nearly m periods;
-more steps come nearer."""
+"""Most macro steps that are followed where they are no part of the period: N steps are nearly m periods."""
 LEAST_GROWTH = 1e-4
-"""Growth per period that counts: round-off of the product of thousands of steps is below. A larger value overlooks slow
-growth."""
+"""Growth per period that counts: round-off of thousands of steps is below; a larger value overlooks growth."""
 LEAST_STEPS = 4
-"""Micro steps that a period of the drive needs at least; with fewer of them steps pass over it. A larger value warns of
-steps that are right."""
+"""Least micro steps in a period of the drive: fewer pass over it. A larger value warns of right steps."""
 CONVERGED_STEPS, MOST_STEPS = 32, 20_000
-"""Micro steps in a period from which halved steps confirm the growth of the motion, and macro steps at which halving
-ends; more take longer."""
+"""Micro steps in a period from which halved steps confirm the growth, and macro steps at which halving ends."""
 
 
 @dataclass(frozen=True)
@@ -66,8 +60,7 @@ class DrivenMotion:
     steps: tuple[float, ...]
 
     def agrees(self, growth: float) -> bool:
-        """Whether disturbances of a run with this growth per period grow if those of the motion do, and about as
-        fast."""
+        """Whether disturbances of a run with this growth per period grow about as fast as those of the motion."""
         return self.growth / 3 <= growth <= 3 * self.growth
 
     def __str__(self) -> str:
@@ -82,8 +75,7 @@ def in_words(growth: float) -> str:
 
 
 def drive_period(system: System, state: State, scale: float) -> float | None:
-    """The smallest period of all terms that depend on time and of their derivatives, with positions and velocities of
-    the state.
+    """The smallest period of all terms that depend on time and of their derivatives, at a state.
 
     Periods of 1/500 to 2000 times `scale`, such as the macro step, are seen. None if nothing depends on time, or no
     period is seen, as for pulses, chirps, and drives with jumps.
@@ -110,8 +102,7 @@ def drive_period(system: System, state: State, scale: float) -> float | None:
 
 
 def _signal(system: System, state: State, times: np.ndarray) -> Callable[[np.ndarray], tuple]:
-    """One function of times (k,) for all terms, each in units of its amplitude at the given times, and its rate of
-    change, (k,) both."""
+    """One function of times (k,) for all terms, each in units of its amplitude, and its rate of change, (k,) both."""
     values = np.nan_to_num(_drive(system, state, times)[0], posinf=0.0, neginf=0.0)
     amplitude = np.ptp(values, axis=0)
     moves = amplitude > 1e-9 * np.abs(values).max(axis=0)
@@ -122,8 +113,7 @@ def _signal(system: System, state: State, times: np.ndarray) -> Callable[[np.nda
 
 @quickly_compiled
 def _drive(system: System, state: State, times):
-    """Forces and constraints at k times with their derivative along one direction of (q, v), and the rates of change of
-    both, (k, m) each."""
+    """Forces and constraints at k times with a derivative along one direction of (q, v), and their rates, (k, m)."""
     z = jnp.concatenate([state.q_s, state.q_f, *velocity(system, state.q_s, state.q_f, state.p_s, state.p_f)])
     direction = jnp.cos(2.0 + jnp.arange(z.size))
 
@@ -138,8 +128,7 @@ def _drive(system: System, state: State, times):
 
 
 def periods_of_run(macro_dt: float, period: float) -> int:
-    """The number m of periods of the drive after which a run is compared with the motion: nearly a whole number of
-    macro steps."""
+    """The number m of periods after which a run is compared with the motion: nearly a whole number of steps."""
     return Fraction(period / macro_dt).limit_denominator(max(1, int(STEPS_FOLLOWED * macro_dt / period))).denominator
 
 
@@ -160,8 +149,7 @@ def growth_of_run(system: System, scheme, state: State, macro_dt: float, period:
 
 
 def growth_over_period(moving: Movable, linear: Linearisation) -> DrivenMotion | None:
-    """The growth of disturbances of a motion over a period of the drive, from `fully_implicit` steps; None if no period
-    is seen."""
+    """The growth of disturbances over a period of the drive, from `fully_implicit` steps; None without a period."""
     system, state = start_of("growth_over_period", moving, linear.state)
     step = 1 / max(np.abs(linear.rates).max(initial=0.0), 1e-300)
     period = drive_period(system, state, step)
@@ -171,10 +159,7 @@ def growth_over_period(moving: Movable, linear: Linearisation) -> DrivenMotion |
 def driven_motion(
     system: System, scheme: Scheme | Composition, state: State, macro_dt: float, period: float
 ) -> DrivenMotion:
-    """The growth over a period of the drive, from steps of T/n, which are halved until two of them agree.
-
-    It is the mean over as many periods as a run with this macro step is followed.
-    """
+    """The mean growth over a period of the drive, from steps of T/n, which are halved until two of them agree."""
     n, micro, tried = max(1, int(np.ceil(period / macro_dt - 1e-6))), stage_scheme(scheme).num_micro, {}
     followed = period, periods_of_run(macro_dt, period)
     while True:

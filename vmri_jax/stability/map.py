@@ -19,8 +19,7 @@ from vmri_jax.study.table import Column, ResultTable
 POINTS_IN_WINDOW = np.linspace(0.0, 1.0, 9)
 """Points of a window at which its growth is measured, in widths from its start."""
 RESOLUTION = 1e-7
-"""Accuracy of the ends of windows, as a part of the range of omega H; narrower windows are left out. A larger value
-takes less time."""
+"""Accuracy of the ends of windows, as a part of the range of omega H; narrower windows are left out."""
 POINTS_PER_CALL = 64
 """Samples that all brackets together get in a call of `label`, the number that `multipliers` computes at a time for
 small systems; more samples divide brackets faster, and each costs an eigenvalue problem."""
@@ -39,7 +38,7 @@ def windows_text(windows: Sequence[Window]) -> str:
     return ", ".join(f"{w.start / np.pi:.4g} to {w.stop / np.pi:.4g}" for w in windows) or "nowhere"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class StabilityMap(ResultTable):
     """Largest multipliers of a macro step over a grid, and the windows of instability.
 
@@ -118,8 +117,7 @@ def stability_map(
         scheme: a scheme or composition, or several by label, e.g. ``{n: explicit_slow(n) for n in (2, 3, 5)}``; each
             num_micro and structure is compiled once.
         omega_H: (n,) increasing positive values of omega times the macro step. A spacing of 0.1 or less finds narrow
-            windows; with a larger one a multiplier may pass several multipliers between two points, which hides
-            windows.
+            windows; with a larger one multipliers that pass several others hide windows.
         state: point of expansion of the small motions; None for the start of the problem.
         executor: executor that computes the rows, as of `vmri_jax.ensemble`; None for this process.
 
@@ -131,10 +129,7 @@ def stability_map(
     systems = system if isinstance(system, Mapping) else {"": system}
     schemes = scheme if isinstance(scheme, Mapping) else {"": scheme}
     if not schemes or not all(isinstance(s, Scheme | Composition) for s in schemes.values()):
-        raise Refused(
-            f"stability_map: scheme is {scheme!r}; give a Scheme or Composition, e.g. explicit_slow(10), or a dict of "
-            "them."
-        )
+        raise Refused(f"stability_map: scheme is {scheme!r}; give a Scheme, e.g. explicit_slow(10), or a dict of them.")
     if min(len(systems), len(schemes)) != 1:
         raise Refused(f"stability_map: {len(systems)} systems and {len(schemes)} schemes; give one of either.")
     axis, labels = ("system", systems) if isinstance(system, Mapping) and len(schemes) == 1 else ("scheme", schemes)
@@ -158,8 +153,7 @@ def stability_map(
 def measure(
     linear: Linearisation, scheme: Scheme | Composition, macro_dt, resolution: float = RESOLUTION
 ) -> tuple[np.ndarray, list[Window]]:
-    """Spectral radius (n,) at n increasing macro steps, and the unstable windows between the first and the last of
-    them."""
+    """Spectral radius (n,) at n increasing macro steps, and the unstable windows between the first and the last."""
 
     def label(macro_dt):
         return multipliers(linear, scheme, macro_dt).krein_signatures
@@ -176,13 +170,11 @@ def measure(
 def find_windows(
     label: Callable[[np.ndarray], Sequence], x: np.ndarray, labels: Sequence, resolution: float
 ) -> list[tuple[float, float]]:
-    """Unstable intervals of x between its first and last value.
+    """Unstable intervals of x between its first and last value; ``label(samples)`` has a label for each sample, None
+    for unstable, else any value to compare, and `labels` are those of x (k,).
 
     Between neighbouring samples with different labels lies an end of a window, or a whole window. All such brackets are
     divided at the same time, until they are shorter than `resolution`; shorter windows are left out.
-
-    ``label(samples)`` has a label for each sample, None for unstable, else any value to compare; `labels` are the
-    labels of x (k,).
     """
     edges = [x[0]] if labels[0] is None else []
     samples = zip(x, x[1:], labels, labels[1:], strict=False)
@@ -214,8 +206,6 @@ def _grid(omega_H) -> np.ndarray:
     grid = np.asarray(omega_H, dtype=float)
     if grid.ndim != 1 or grid.size < 2 or not (np.isfinite(grid).all() and grid[0] > 0 and (np.diff(grid) > 0).all()):
         values = f"{grid.flat[0]:g} to {grid.flat[-1]:g}" if grid.size else "none"
-        raise Refused(
-            f"stability_map: omega_H has shape {grid.shape} and values {values}; give two or more positive values, "
-            "increasing, e.g. numpy.linspace(0.05, 12, 240)."
-        )
+        expected = "give two or more positive values, increasing, e.g. numpy.linspace(0.05, 12, 240)"
+        raise Refused(f"stability_map: omega_H has shape {grid.shape} and values {values}; {expected}.")
     return grid

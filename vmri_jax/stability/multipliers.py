@@ -1,5 +1,4 @@
-"""Multipliers of a macro step, the eigenvalues of its derivative, and their Krein signatures; the derivative of many
-steps.
+"""Multipliers of a macro step, eigenvalues of its derivative, and their Krein signatures; the derivative of a run.
 
 The multipliers of a symplectic map come in pairs (a, 1/a). They stay on the unit circle, and the motion stays bounded,
 until two multipliers of opposite Krein signature meet; multipliers of equal signature pass through each other (Krein,
@@ -15,12 +14,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.diagnostics.linear import phase_step, phase_vector, state_of, with_slopes
-from vmri_jax.mechanics.arrays import QUICK, is_concrete, quickly_compiled, whole_number
+from vmri_jax.mechanics.arrays import QUICK, quickly_compiled, whole_number
 from vmri_jax.mechanics.invariants import all_constraints
 from vmri_jax.mechanics.linearisation import Linearisation, tangents
 from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.mechanics.system import System
 from vmri_jax.refusals import Refused
+from vmri_jax.running.arguments import check_step_size
 from vmri_jax.schemes.composition import Composition, stage_lengths, stage_scheme
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.results import Result
@@ -31,11 +31,9 @@ TOLERANCE = 1e-6
 2e-8; a larger value overlooks slow growth."""
 LANES = 64
 """Step sizes that a compiled call computes side by side for up to 18 degrees of freedom; larger systems get fewer, at
-least 4, to limit memory. With more lanes a call for a single step size, which is padded to this number, takes
-longer."""
+least 4, to limit memory. With more a call for a single step size takes longer."""
 FREE_MOTION_ANGLE = 1e-5
-"""Angle in radians up to which a multiplier belongs to a free motion, which has no signature; a larger value leaves
-slow vibrations out."""
+"""Angle, rad, up to which a multiplier is of a free motion, which has no signature; a larger one drops slow ones."""
 
 
 @dataclass(frozen=True)
@@ -93,9 +91,7 @@ def multipliers(linear: Linearisation, scheme: Scheme | Composition, macro_dt) -
     """
     macro_dt, size = np.asarray(macro_dt, dtype=float), 2 * linear.shapes.shape[1]
     if not size:
-        raise Refused(
-            f"multipliers: the constraints leave none of the {len(linear.shapes)} coordinates free; nothing moves."
-        )
+        raise Refused(f"multipliers: the constraints leave none of the {len(linear.shapes)} coordinates free.")
     lanes = int(np.clip(LANES * 36 // size, 4, LANES))
     stages = np.outer(macro_dt, stage_lengths(scheme))
     padded = np.pad(stages.ravel(), (0, -stages.size % lanes), mode="edge").reshape(-1, lanes)
@@ -127,8 +123,7 @@ def _step_matrices(system: System, scheme, rest: State, embed, read, macro_dt):
 
 @dataclass(frozen=True)
 class Monodromy:
-    """Derivative of the end of a trajectory with respect to its start, between the tangent spaces of the constraint
-    manifold at both.
+    """Derivative of the end of a trajectory by its start, between the tangent spaces of the constraint manifold.
 
     start, end: states.
     tangents: (k, 2 n) orthonormal tangent vectors (q_s, q_f, p_s, p_f) at the start, one per row; k = 2 (n_s + n_f -
@@ -145,8 +140,7 @@ class Monodromy:
     def matrix(self) -> np.ndarray:
         """M, (k, k) derivative in the coordinates of `tangents`.
 
-        It is meaningful only for a trajectory that closes, or ends near its start (small `closure`): then both ends
-        share a tangent space.
+        It has a meaning only where both ends share a tangent space: with a small `closure`.
         """
         return self.tangents @ self.images.T
 
@@ -186,8 +180,7 @@ def monodromy(
     num_steps: int,
     solver: Solver | None = None,
 ) -> Monodromy:
-    """Product of the step's derivatives along a trajectory, ``DPhi(z_(N-1)) ... DPhi(z_0)``, on the tangent space of
-    the constraint manifold.
+    """Product of the step's derivatives along a trajectory, ``DPhi(z_(N-1)) ... DPhi(z_0)``, on the tangent spaces.
 
     Args:
         system, scheme, macro_dt, solver: as in `macro_step`.
@@ -201,8 +194,7 @@ def monodromy(
     """
     system, state = start_of("monodromy", system, state)
     whole_number("monodromy: num_steps", num_steps)
-    if is_concrete(macro_dt) and not (np.ndim(macro_dt) == 0 and np.isfinite(macro_dt) and macro_dt > 0):
-        raise Refused(f"monodromy: macro_dt is {macro_dt}; it must be a positive number.")
+    check_step_size(macro_dt, "monodromy")
     start = State(*(jnp.asarray(a, dtype=float) for a in (state.t, state.q_s, state.q_f, state.p_s, state.p_f)))
     directions = tangents(np.asarray(_constraint_rows(system, start))).T
     z, images, steps, result = _followed(system, scheme, start, macro_dt, solver, num_steps, directions)
@@ -214,9 +206,8 @@ def monodromy(
 @quickly_compiled
 def _constraint_rows(system: System, state: State):
     """Derivatives (2 n_g + 2 n_gs, 2 n) of the constraints and the hidden constraints by z."""
-    return jax.jacfwd(lambda z: jnp.concatenate(all_constraints(system, state_of(z, state.t, state))))(
-        phase_vector(state)
-    )
+    rows = jax.jacfwd(lambda z: jnp.concatenate(all_constraints(system, state_of(z, state.t, state))))
+    return rows(phase_vector(state))
 
 
 @quickly_compiled

@@ -1,5 +1,4 @@
-"""Oscillators: a model of two, and the test equation ``q'' = -omega^2 q`` under a quadrature rule, the phase of a step
-and the limit of the rule.
+"""Oscillators: a model of two, and the test equation ``q'' = -omega^2 q`` under a quadrature rule: phase and limit.
 
 A step of length tau with a path of degree r has the discrete Lagrangian ``q^T S q / (2 tau)`` in the control points,
 ``S = D - x^2 B``, x = omega tau, with D and B the sums of the rules over ``l_i' l_j'`` and ``l_i l_j``. Eliminating the
@@ -22,8 +21,7 @@ from vmri_jax.schemes.quadrature import PlacedRule, Rule, midpoint
 from vmri_jax.schemes.scheme import Scheme
 
 RESOLUTION = 0.05
-"""Spacing of x along which the phase is unwrapped and limits are searched; with a larger value a narrow unstable
-interval is missed."""
+"""Spacing of x along which the phase is unwrapped and limits are searched; a larger one misses narrow intervals."""
 LARGEST_X = 30.0
 """Largest x searched for a limit; larger limits count as infinite."""
 
@@ -47,21 +45,15 @@ def linear_model(omega=50.0, kappa=25.0) -> Problem:
         omega: frequency of the fast variable alone.
         kappa: stiffness of the spring between the two.
     """
-    system = System(
-        ConstantMass([1.0], [1.0]),
-        soft_spring,
-        stiff_spring,
-        params={"omega": jnp.asarray(omega, dtype=float), "kappa": jnp.asarray(kappa, dtype=float)},
-    )
+    params = {"omega": jnp.asarray(omega, dtype=float), "kappa": jnp.asarray(kappa, dtype=float)}
+    system = System(ConstantMass([1.0], [1.0]), soft_spring, stiff_spring, params=params)
     one = jnp.ones(1)
     return Problem(system, one, one / omega, 0 * one, one)
 
 
 def phase(scheme: Scheme, x: float) -> float:
-    """Phase by which a fast vibration turns in a micro step, ``x = omega h``; NaN where the step is unstable.
-
-    Needs the fast potential on every micro interval; else NaN.
-    """
+    """Phase by which a fast vibration turns in a micro step, ``x = omega h``; NaN where the step is unstable, or the
+    fast potential is not on every micro interval."""
     if not scheme.fast.is_local:
         return np.nan
     path = np.linspace(0.0, x, 2 + int(abs(x) / RESOLUTION))

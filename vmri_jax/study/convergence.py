@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import product
+from operator import attrgetter, itemgetter
 from typing import Any
 
 import jax
@@ -29,13 +30,12 @@ from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.solver import Solver
 from vmri_jax.study.reference_solution import ReferenceSolution, reference_solution
-from vmri_jax.study.row import Row, RunTable, row_of
+from vmri_jax.study.row import Row, RunTable, WorkPrecision, row_of
 from vmri_jax.study.table import Column, interruptible
-from vmri_jax.study.work import WorkPrecision
 
 MIN_ERROR_OVER_REFERENCE = 100.0
-"""Least ratio of a fitted error to the error of the reference; at this ratio the reference changes the error of the scheme by 1 %; a larger
-ratio fits fewer runs."""
+"""Least ratio of a fitted error to the error of the reference; at it the
+reference changes the error of the scheme by 1 %; a larger ratio fits fewer runs."""
 
 
 @dataclass(frozen=True)
@@ -58,29 +58,8 @@ class Case:
     def row(self, name: str, scheme, num_steps: int, t_end: float, run: Trajectory) -> Row:
         """The row of a run of a scheme to `t_end`."""
         error_q, error_p = self.reference.errors(run)
-        numbers, system = (t_end / num_steps, num_steps), self.problem.system
-        measured = {"error_q": error_q, "error_p": error_p, "case": self.label}
-        return row_of(name, system, scheme, run, *numbers, self.energies, **measured)
-
-
-@dataclass(frozen=True)
-class SchemeSummary:
-    """One scheme with one set of parameters: its runs and observed orders of positions and momenta."""
-
-    runs: tuple[Row, ...]
-    fit_q: OrderFit
-    fit_p: OrderFit
-
-    def of_finest(self, name: str, form: str = ".1e") -> str:
-        """The text of an attribute of the run with the smallest step that did not fail."""
-        finest = min((row for row in self.runs if not row.failed), key=lambda row: row.macro_dt, default=None)
-        return "-" if finest is None else format(getattr(finest, name), form)
-
-    @property
-    def failures(self) -> str:
-        """The number of failed runs; empty if no run failed."""
-        failed = sum(row.failed for row in self.runs)
-        return f"{failed} of {len(self.runs)}" if failed else ""
+        known = {"error_q": error_q, "error_p": error_p, "case": self.label}
+        return row_of(name, self.problem.system, scheme, run, t_end / num_steps, num_steps, self.energies, **known)
 
 
 def _order(fit: OrderFit) -> str:
@@ -90,7 +69,16 @@ def _order(fit: OrderFit) -> str:
     return f"{fit.order:.2f}" + (f" ± {fit.half_width:.2f}" if np.isfinite(fit.half_width) else "")
 
 
-@dataclass(frozen=True)
+OF_FINEST = {
+    "smallest H": ("macro_dt", "g"),
+    "error of q": ("error_q", ".1e"),
+    "error of p": ("error_p", ".1e"),
+    "energy": ("energy_error", ".1e"),
+}
+"""Columns about the run with the smallest step that did not fail: its attributes and their formats."""
+
+
+@dataclass(frozen=True, repr=False)
 class ConvergenceStudy(RunTable):
     """Rows of a convergence study, sorted by scheme, then by case, then by macro step in the order of the call.
 
@@ -100,15 +88,8 @@ class ConvergenceStudy(RunTable):
     """
 
     columns = (
-        Column("scheme", lambda summary: summary.runs[0].scheme),
-        Column("case", lambda summary: summary.runs[0].case),
-        Column("order of q", lambda summary: _order(summary.fit_q), right=True),
-        Column("order of p", lambda summary: _order(summary.fit_p), right=True),
-        Column("smallest H", lambda summary: summary.of_finest("macro_dt", "g"), right=True),
-        Column("error of q", lambda summary: summary.of_finest("error_q"), right=True),
-        Column("error of p", lambda summary: summary.of_finest("error_p"), right=True),
-        Column("energy", lambda summary: summary.of_finest("energy_error"), right=True),
-        Column("failed", lambda summary: summary.failures, right=True),
+        *(Column(name, itemgetter(name)) for name in ("scheme", "case")),
+        *(Column(name, itemgetter(name), right=True) for name in ("order of q", "order of p", *OF_FINEST, "failed")),
     )
     rows: tuple[Row, ...]
     references: Mapping[str, ReferenceSolution]
@@ -152,14 +133,19 @@ class ConvergenceStudy(RunTable):
         """Observed order: the slope of `fit`."""
         return self.fit(scheme, quantity, points, case).order
 
-    def shown(self) -> list[SchemeSummary]:
-        """Observed orders, and the errors at the smallest step that did not fail."""
-        summaries = []
+    def shown(self) -> list[dict[str, str]]:
+        """Observed orders, and the errors at the smallest step that did not fail, by column."""
+        lines = []
         for scheme, case in product(self.schemes, self.cases):
-            runs = tuple(row for row in self.rows if (row.scheme, row.case) == (scheme, case))
-            fits = (self.fit(scheme, quantity, case=case) for quantity in ("q", "p"))
-            summaries.append(SchemeSummary(runs, *fits))
-        return summaries
+            runs = [row for row in self.rows if (row.scheme, row.case) == (scheme, case)]
+            failed = sum(row.failed for row in runs)
+            finest = min((row for row in runs if not row.failed), key=attrgetter("macro_dt"), default=None)
+            orders = {f"order of {quantity}": _order(self.fit(scheme, quantity, case=case)) for quantity in ("q", "p")}
+            line = {"scheme": scheme, "case": case, "failed": f"{failed} of {len(runs)}" if failed else ""} | orders
+            for column, (name, form) in OF_FINEST.items():
+                line[column] = "-" if finest is None else format(getattr(finest, name), form)
+            lines.append(line)
+        return lines
 
     def work(self, case: str | None = None) -> WorkPrecision:
         """The runs of a case, the first one by default, by their errors and their work; times where the study has them."""
@@ -202,10 +188,8 @@ def convergence_study(
         macro_dt: macro steps H; each must divide `t_end` into a multiple of `num_saves` steps.
         t_end: time simulated.
         num_saves: nodes compared, equally spaced over `t_end`.
-        params: parameters of the system by label, if there are several sets; positions and velocities at the start are
-            those of `problem`.
-        reference: the solution that errors are measured against, by label of the parameters if there are several; by default
-            `reference_solution`.
+        params: parameters of the system by label, if there are several sets, with the start of `problem`.
+        reference: what errors are measured against, by label of several sets; by default `reference_solution`.
         solver: how implicit equations are solved.
         repeats: timed samples of every run; 0 for no times. The runs take turns on the clock of this process, so that a slow
             moment of the machine hits all of them; a row has the median.
@@ -222,11 +206,10 @@ def convergence_study(
     steps = [_num_steps(t_end, dt, num_saves) for dt in macro_dt]
     if not steps:
         raise Refused("convergence_study: macro_dt is empty; give the macro steps to run.")
-    total = len(schemes) * len(steps) * (1 if params is None else len(params))
-    told = lambda message, *_: progress(message, 0, total)  # noqa: E731
-    cases = _cases(problem, params, reference, t_end, num_saves, told)
+    cases = _cases(problem, params, reference, t_end, num_saves, progress)
     labels = [(label, case, n) for label in schemes for case in cases for n in steps]
     arguments = [(case.problem, schemes[label], t_end, num_saves, solver, n) for label, case, n in labels]
+    total = len(labels)
 
     def tell(done: int, i: int) -> None:
         progress(f"{labels[i][0]}, H = {t_end / labels[i][2]:g}", done, total)
@@ -246,12 +229,9 @@ def convergence_study(
             progress("measuring times", total, total)
             timed = {str(i): _prepared(*arguments[i]).timed() for i, row in enumerate(rows) if not row.failed}
             samples = interleaved(timed, repeats)
-        study = replace(
-            study,
-            rows=tuple(
-                replace(row, seconds=float(np.median(samples.get(str(i), [np.nan])))) for i, row in enumerate(rows)
-            ),
-        )
+        seconds = [float(np.median(samples.get(str(i), [np.nan]))) for i in range(total)]
+        rows = [replace(row, seconds=each) for row, each in zip(rows, seconds, strict=True)]
+        study = replace(study, rows=tuple(rows))
     progress("done", total, total)
     return study
 
@@ -268,17 +248,13 @@ def _cases(problem: Problem, params, reference, t_end: float, num_saves: int, pr
     elif not isinstance(reference, Mapping) and len(problems) == 1:
         reference = dict.fromkeys(problems, reference)
     if not isinstance(reference, Mapping) or set(reference) != set(problems):
-        raise Refused(
-            f"convergence_study: params has the labels {list(problems)}, so reference must be a mapping with the same labels."
-        )
+        raise Refused(f"convergence_study: reference must be a mapping with the labels of params, {list(problems)}.")
     shape = (num_saves + 1, problem.q_s.size + problem.q_f.size)
     for label in problems:
-        q, p = reference[label].q, reference[label].p
-        if q.shape != shape or p.shape != shape:
-            raise Refused(
-                f"convergence_study: reference has q of shape {q.shape} and p of shape {p.shape}; both "
-                f"must be {shape}: num_saves + 1 nodes from the start to t_end, slow coordinates first."
-            )
+        shapes = reference[label].q.shape, reference[label].p.shape
+        if shapes != (shape, shape):
+            nodes = "num_saves + 1 nodes from the start to t_end, slow coordinates first"
+            raise Refused(f"convergence_study: reference has shapes {shapes}; both must be {shape}: {nodes}.")
     return [Case(label, problem, reference[label]) for label, problem in problems.items()]
 
 
@@ -296,9 +272,6 @@ def _num_steps(t_end: float, macro_dt: float, num_saves: int) -> int:
     """The number of macro steps up to `t_end`."""
     num_steps = round(t_end / macro_dt) if macro_dt > 0 else 0
     if num_steps < 1 or abs(num_steps * macro_dt - t_end) > 1e-9 * t_end or num_steps % num_saves:
-        raise Refused(
-            f"convergence_study: macro_dt = {macro_dt:g} makes {t_end / macro_dt if macro_dt else float('inf'):.6g} steps "
-            f"up to t_end = {t_end:g}; it must make a multiple of num_saves = {num_saves} whole steps, so that every run "
-            "saves the same times."
-        )
+        steps = f"macro_dt = {macro_dt:g} makes {t_end / (macro_dt or np.nan):.6g} steps up to t_end = {t_end:g}"
+        raise Refused(f"convergence_study: {steps}; it must make a multiple of num_saves = {num_saves} whole steps.")
     return num_steps

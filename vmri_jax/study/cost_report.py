@@ -1,28 +1,30 @@
 """A page on the cost of accuracy for a system: what one search for a few errors has seen."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax import plots
 from vmri_jax.accuracy.families import Family
-from vmri_jax.accuracy.steps import check_extent, round_off
+from vmri_jax.accuracy.steps import check_error, check_extent, round_off
 from vmri_jax.mechanics.linearisation import linearise
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
+from vmri_jax.mechanics.terms import Term
 from vmri_jax.refusals import Refused
 from vmri_jax.running.files import make_writable_folder
 from vmri_jax.running.progress import part, shows_progress
+from vmri_jax.running.timing import seconds_each
 from vmri_jax.study.html import embedded, write_page
-from vmri_jax.study.prices import bound_of, prices
-from vmri_jax.study.row import Row, record
+from vmri_jax.study.row import Row, WorkPrecision, duration, pareto_front, record
 from vmri_jax.study.table import Column, ResultTable, interruptible
 from vmri_jax.study.tuning import Tuning
-from vmri_jax.study.work import WorkPrecision, duration, pareto_front
 
 TEMPLATE = Path(__file__).parent / "cost.html.j2"
 PERIODS = 30
@@ -33,8 +35,7 @@ RELATIVE_ERRORS = (1e-2, 1e-4, 1e-6, 1e-8)
 
 @dataclass(frozen=True)
 class Answer:
-    """The largest accepted error of the positions, and the run of the cheapest setting for it; None if no setting keeps
-    the error."""
+    """The largest accepted error of the positions, and the run of the cheapest setting; None if no setting keeps it."""
 
     error: float
     setting: Row | None
@@ -45,7 +46,7 @@ def _of_setting(form: Callable[[Row], str]) -> Callable[[Answer], str]:
     return lambda answer: "" if answer.setting is None else form(answer.setting)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class CostReport(ResultTable):
     """The answers of a search for several errors, and the path of their page; its table has a line per answer.
 
@@ -54,8 +55,7 @@ class CostReport(ResultTable):
     t_end: simulated time.
     errors: accepted errors of a position.
     runs: every run of the search.
-    bound: seconds and error of the runs of the Pareto front, if the time of a run were that of its gradients alone;
-        empty with constraints.
+    bound: seconds and error of the Pareto front, if runs took the time of their gradients; empty with constraints.
     """
 
     columns = (
@@ -86,12 +86,11 @@ class CostReport(ResultTable):
     @property
     def curves(self) -> WorkPrecision:
         """The Pareto fronts of the families, each with the name of the family as its scheme."""
-        by_family = {row.family: [] for row in self.runs.rows}
-        for row in self.runs.rows:
-            by_family[row.family].append(replace(row, scheme=row.family))
-        return WorkPrecision(
-            tuple(row for rows in by_family.values() for row in pareto_front(rows, "seconds", "error_q"))
-        )
+        fronts: list[Row] = []
+        for family in dict.fromkeys(row.family for row in self.runs.rows):
+            of_family = [replace(row, scheme=family) for row in self.runs.rows if row.family == family]
+            fronts += pareto_front(of_family, "seconds", "error_q")
+        return WorkPrecision(tuple(fronts))
 
     @property
     def reached(self) -> list[Row]:
@@ -135,30 +134,28 @@ def cost_report(
         name: of the system, for the title and the commands: a built-in one or ``my_file.py:my_problem``.
         out: folder, made if it does not exist.
         t_end: simulated time, by default `default_t_end`.
-        errors: largest accepted errors of a position, as of `tune`; by default `RELATIVE_ERRORS` times how far the
-            system moves.
+        errors: largest accepted errors of a position, as of `tune`; by default `RELATIVE_ERRORS` of the motion.
         menu: families to choose from, by default `families()`.
         progress: True for a bar, or a function (what, done, total) that is told about every run.
 
     Raises:
-        ValueError: errors that are not positive, or above the extent of the motion; no errors are passed, and the
-            system does not move.
+        ValueError: errors below round-off, or above the extent of the motion; no errors, and no motion.
         Interrupted: Ctrl-C; carries the runs of the search.
     """
     problem, out = problem_of("cost_report", problem), Path(out)
     make_writable_folder(out)
     t_end = default_t_end(problem) if t_end is None else t_end
-    if errors is not None and (not errors or min(errors) <= 0):
-        raise Refused(f"cost_report: errors are {list(errors)}; give positive numbers, in the unit of the positions.")
+    for error in errors or ():
+        check_error("cost_report: each of errors", error, problem)
     tuning, answered = Tuning(problem, t_end, menu, progress=progress), []
     with interruptible(tuning.runs):  # around the drawing as well, so that Ctrl-C there keeps the runs, too
-        tuning.search.first_trials(tuning.menu[:1], np.inf)  # they tell how far the system moves
-        errors = sorted(_default_errors(tuning, problem, t_end) if errors is None else errors)
-        check_extent("cost_report: the largest of errors", tuning.search, errors[-1])
+        tuning.first_trials(tuning.menu[:1], np.inf)  # they tell how far the system moves
+        errors = sorted(errors or _default_errors(tuning, problem, t_end))
+        check_extent("cost_report: the largest of errors", tuning, errors[-1])
         try:
             # The smallest error first: families that are given up for it are hopeless for larger errors.
             for i, error in enumerate(errors):
-                tuning.search.progress = part(progress, i, len(errors))
+                tuning.progress = part(progress, i, len(errors))
                 tuning.look_for("cost_report: error", error)
                 answered.append(error)
         finally:
@@ -172,16 +169,42 @@ def cost_report(
     return report
 
 
+def prices(problem: Problem) -> dict[str | int, float]:
+    """Seconds of one evaluation of the gradient of each potential that the system has, by the name of the potential,
+    each timed in a compiled loop of its own."""
+    system, n_s = problem.system, problem.q_s.size
+
+    def gradient(term: Term) -> Callable:
+        return jax.grad(lambda q: term(system.params, q_s=q[:n_s], q_f=q[n_s:]))
+
+    q = jnp.concatenate([jnp.asarray(problem.q_s), jnp.asarray(problem.q_f)])
+    return {term.name: seconds_each(gradient(term), q) for term in system.of_kind("potential")}
+
+
+def seconds_of_gradients(price: Mapping[str | int, float], row: Row) -> float:
+    """Seconds of a run in its gradients: evaluations times `prices`."""
+    counts = {"V": row.slow_evaluations, "W": row.fast_evaluations, **row.evaluations}
+    return sum(seconds * counts.get(name, 0) for name, seconds in price.items())
+
+
+def bound_of(price: Mapping[str | int, float], rows: Sequence[Row]) -> tuple[tuple[float, float], ...]:
+    """Seconds and error of runs whose time is that of their gradients alone.
+
+    A gradient in a loop of its own may take longer than in the run, so that the time of the run bounds it.
+    """
+    return tuple((min(seconds_of_gradients(price, row), row.seconds), row.error_q) for row in rows)
+
+
 def _default_errors(tuning: Tuning, problem: Problem, t_end: float) -> list[float]:
     """RELATIVE_ERRORS of a power of ten near how far the system moves, without errors that round-off hides."""
-    moved, least = tuning.search.extent(), round_off(problem)[1]
+    moved, least = tuning.extent(), round_off(problem)[1]
     motion = 10.0 ** math.floor(math.log10(moved)) if moved > 0 else 0.0
     errors = [motion * error for error in RELATIVE_ERRORS if motion * error > least]
     if not errors:
+        rest = f"until t_end = {t_end:g} positions move by {moved:.1e}, and errors below {least:.1e} are round-off"
         raise Refused(
-            f"cost_report: until t_end = {t_end:g} the positions are those of the start up to {moved:.1e}, and "
-            f"errors below {least:.1e} cannot be told from round-off: the system is at rest, or no run until then is "
-            "certified. Give a start that moves, another t_end, or the errors that you accept."
+            f"cost_report: {rest}: the system is at rest, or no run until then is certified. Give a start that moves, "
+            "another t_end, or the errors that you accept."
         )
     return errors
 
@@ -189,24 +212,14 @@ def _default_errors(tuning: Tuning, problem: Problem, t_end: float) -> list[floa
 def _write(report: CostReport, problem: Problem) -> None:
     """The runs, the figures and the page of a report."""
     report.runs.to_csv(report.path.parent / "cost.csv")
+    rows = sum(problem.system.num_constraints(problem.q_s, problem.q_f))
+    sizes = {"slow variables": problem.q_s.size, "fast variables": problem.q_f.size, "constraints": rows}
+    title = f"{report.name}: what accuracy costs over a time of {report.t_end:g}"
     try:
-        _draw(report, problem)
+        for end, theme in (("", plots.LIGHT), ("_dark", plots.DARK)):
+            plots.save(report.figure(title, theme), report.path.parent / f"cost{end}.png", theme)
+        figure = embedded(partial(report.figure, ""))
+        write_page(report.path, TEMPLATE, report=report, sizes=sizes, duration=duration, figure=figure)
     except Exception as fault:
         fault.add_note(f"{report.path} could not be drawn or written; all runs are in cost.csv beside it.")
         raise
-
-
-def _draw(report: CostReport, problem: Problem) -> None:
-    """The figures and the page of a report."""
-    title = f"{report.name}: what accuracy costs over a time of {report.t_end:g}"
-    for end, theme in (("", plots.LIGHT), ("_dark", plots.DARK)):
-        plots.save(report.figure(title, theme), report.path.parent / f"cost{end}.png", theme)
-    n_g, n_gs = problem.system.num_constraints(problem.q_s, problem.q_f)
-    write_page(
-        report.path,
-        TEMPLATE,
-        report=report,
-        sizes={"slow variables": problem.q_s.size, "fast variables": problem.q_f.size, "constraints": n_g + n_gs},
-        duration=duration,
-        figure=embedded(partial(report.figure, "")),
-    )

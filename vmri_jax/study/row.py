@@ -1,11 +1,13 @@
-"""The row of a run in a study: its errors, invariants, evaluations and time."""
+"""Runs of a study: a row with errors, invariants, evaluations and time, their table, and the Pareto front of all runs."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
 
+from vmri_jax import plots
 from vmri_jax.mechanics.system import System
 from vmri_jax.mechanics.terms import label
 from vmri_jax.running.settings import Settings
@@ -13,7 +15,8 @@ from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes.composition import Composition, stage_scheme
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.results import Method, Result
-from vmri_jax.study.table import ResultTable
+from vmri_jax.study.reference_solution import ReferenceSolution
+from vmri_jax.study.table import Column, ResultTable
 
 
 @dataclass(frozen=True)
@@ -101,12 +104,8 @@ def row_of(
     energies: np.ndarray | None = None,
     **measured,
 ) -> Row:
-    """The row of a run, with its invariants and evaluations, and without a time.
-
-    Args:
-        energies: right energies at the saved nodes; None for the energy at the start.
-        measured: errors of the run, and further fields that are known.
-    """
+    """The row of a run, with its invariants and evaluations, without a time; `energies` are right energies at the saved
+    nodes, None for the energy at the start."""
     cost, passes = scheme.describe(), np.maximum(np.asarray(run.info.iterations), 1)
     method = Method(int(np.max(run.info.method)))
     solves = cost.constrained_solves if system.is_constrained else cost.solves
@@ -133,3 +132,74 @@ def row_of(
         degree=cost.degree,
         **measured,
     )
+
+
+def duration(seconds: float) -> str:
+    """A time with its unit: 12 µs, 3.4 ms, 1.2 s; empty for NaN."""
+    if np.isnan(seconds):
+        return ""
+    for unit, size in (("s", 1.0), ("ms", 1e-3), ("µs", 1e-6)):
+        if seconds >= size:
+            return f"{seconds / size:.3g} {unit}"
+    return f"{seconds / 1e-6:.2g} µs"
+
+
+@dataclass(frozen=True, repr=False)
+class WorkPrecision(RunTable):
+    """Runs by their errors and their work; its table is the Pareto front.
+
+    reference: the solution that errors are measured against; None for a search, whose errors are estimated by companion runs.
+    """
+
+    columns = (
+        Column("scheme", lambda row: row.scheme),
+        Column("H", lambda row: f"{row.macro_dt:.4g}", right=True),
+        Column("steps", lambda row: f"{row.num_steps:,}", right=True),
+        Column("error of q", lambda row: f"{row.error_q:.1e}", right=True),
+        Column("time", lambda row: duration(row.seconds), right=True),
+        Column("grad V", lambda row: f"{row.slow_evaluations:,}", right=True),
+        Column("grad W", lambda row: f"{row.fast_evaluations:,}", right=True),
+        Column("further gradients", lambda row: ", ".join(f"{label(k)} {n:,}" for k, n in row.evaluations.items())),
+        Column("solves", lambda row: f"{row.solves:,}", right=True),
+    )
+    rows: tuple[Row, ...]
+    reference: ReferenceSolution | None = None
+
+    @property
+    def known_to(self) -> float:
+        """Error of the positions of the reference; 0 without one."""
+        return 0.0 if self.reference is None else self.reference.error_q
+
+    def curve(self, scheme: str) -> list[Row]:
+        """The runs of a scheme that did not fail, the coarsest first."""
+        return [row for row in self.rows if row.scheme == scheme and not row.failed]
+
+    def pareto(self, work: str = "seconds") -> list[Row]:
+        """The runs that no other one beats both in error and in work, the cheapest first.
+
+        Args:
+            work: "seconds", "slow_evaluations", "fast_evaluations" or "solves".
+        """
+        return pareto_front(self.rows, work, "error_q")
+
+    def keeping(self, error: float) -> list[Row]:
+        """The runs that keep an error of the positions and whose time is known, the fastest first."""
+        kept = [row for row in self.rows if row.error_q <= error and np.isfinite(row.seconds)]
+        return sorted(kept, key=attrgetter("seconds"))
+
+    def shown(self) -> list[Row]:
+        """The Pareto front, by numbers of steps where no run has a time."""
+        return self.pareto() or self.pareto("num_steps")
+
+    def plot(self, title: str = "", work: str = "seconds"):
+        """Error against work, see `vmri_jax.plots.plot_work_precision`."""
+        return plots.plot_work_precision(self, title, work)
+
+
+def pareto_front(items: Sequence[Any], work: str, error: str) -> list[Any]:
+    """The items that no other item beats both in the attribute `work` and in the attribute `error`, the cheapest first."""
+    front, finite = [], [item for item in items if np.isfinite([getattr(item, error), getattr(item, work)]).all()]
+    for item in sorted(finite, key=attrgetter(work, error)):
+        if not front or getattr(item, error) < getattr(front[-1], error):
+            front.append(item)
+    return front

@@ -28,12 +28,14 @@ class Column:
 class ResultTable:
     """Rows that can be printed, written to a CSV file, and handed to pandas.
 
-    A subclass is a frozen dataclass with a field `rows`, whose items are dataclasses, and with the `columns` of the printed
-    table; a column that is empty in all rows is left out. Files hold every field of every row.
+    A subclass is a frozen dataclass without a ``__repr__`` of its own, with a field `rows`, whose items are
+    dataclasses, and with the `columns` of the printed table, but for empty ones. Files hold every field of every row.
     """
 
     rows: Any
     columns: ClassVar[tuple[Column, ...]]
+    ruled: ClassVar[bool] = False
+    """Whether the printed table has lines between its rows."""
 
     @property
     def caption(self) -> str:
@@ -53,15 +55,20 @@ class ResultTable:
         return extra("pandas", "to_pandas").DataFrame(self.records())
 
     def table(self) -> PrintedTable:
-        """A table for the terminal and for notebooks."""
-        return rich_table(self.columns, self.shown(), self.caption)
+        """A table for the terminal and for notebooks, of the columns that are not empty in all lines."""
+        cells = [[column.text(row) for column in self.columns] for row in self.shown()]
+        kept = [i for i in range(len(self.columns)) if not cells or any(str(line[i]) for line in cells)]
+        look = {"show_lines": True, "box": HEAVY_HEAD, "pad_edge": True} if self.ruled else {}
+        table = PrintedTable(header_style="bold", caption=self.caption or None, **look)
+        for i in kept:
+            table.add_column(self.columns[i].name, justify="right" if self.columns[i].right else "left")
+        for line in cells:
+            shown = [line[i] for i in kept]
+            table.add_row(*(escape(cell) if isinstance(cell, str) else cell for cell in shown))
+        return table
 
     def __rich__(self) -> PrintedTable:
         return self.table()
-
-    def __init_subclass__(cls, **options):
-        super().__init_subclass__(**options)
-        cls.__repr__ = ResultTable.__repr__  # else `dataclass` writes one that prints every field of every row
 
     def __str__(self) -> str:
         return str(self.table())
@@ -91,17 +98,3 @@ def interruptible(rows: Callable[[], ResultTable]) -> Iterator[None]:
     except KeyboardInterrupt:
         done = rows()
         raise Interrupted(done, len(done.rows), None, "runs") from None
-
-
-def rich_table(columns: Sequence[Column], rows: Sequence[Any], caption: str = "", ruled: bool = False) -> PrintedTable:
-    """The columns that are not empty in all rows, with lines between the rows if `ruled`."""
-    cells = [[column.text(row) for column in columns] for row in rows]
-    kept = [i for i in range(len(columns)) if not cells or any(str(line[i]) for line in cells)]
-    look = {"show_lines": True, "box": HEAVY_HEAD, "pad_edge": True} if ruled else {}
-    table = PrintedTable(header_style="bold", caption=caption or None, **look)
-    for i in kept:
-        table.add_column(columns[i].name, justify="right" if columns[i].right else "left")
-    for line in cells:
-        shown = [line[i] for i in kept]
-        table.add_row(*(escape(cell) if isinstance(cell, str) else cell for cell in shown))
-    return table

@@ -13,23 +13,20 @@ from vmri_jax.accuracy.search import Search
 from vmri_jax.accuracy.steps import check_error, digits_of, reached, warn_of_events
 from vmri_jax.accuracy.trials import Trial
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
-from vmri_jax.refusals import Refused
 from vmri_jax.running.failures import simulation_error
 from vmri_jax.running.progress import Progress, shows_progress, silent
 from vmri_jax.steppers.solver import Solver
-from vmri_jax.study.row import Row, row_of
+from vmri_jax.study.row import Row, WorkPrecision, row_of
 from vmri_jax.study.table import interruptible
-from vmri_jax.study.work import WorkPrecision
 
 FINALISTS = 4
-"""Families whose micro steps and steps are searched for, of those that promise the least time. A larger number searches
-longer."""
+"""Families whose micro steps and steps are searched for, of those that promise the least time; more take longer."""
 SETTINGS_PRINTED = 5
 """Number of settings, the recommended one included, that a recommendation and `vmri tune` print."""
 
 
-class Tuning:
-    """A search over a menu for the errors of a problem, and a row for each of its runs; arguments as of `tune`."""
+class Tuning(Search):
+    """A search over a menu, with a row for each of its runs; arguments as of `tune`."""
 
     def __init__(
         self,
@@ -40,33 +37,30 @@ class Tuning:
         solver: Solver | None = None,
         progress: Progress = silent,
     ):
-        self.search = Search(problem, None, solver, problem.t + t_end, num_saves, None, progress, self._add)
-        whole = families() if menu is None else menu
-        self.menu = for_system(whole, self.search.system, self.search.has_two_rates)
+        super().__init__(problem, None, solver, problem.t + t_end, num_saves, None, progress)
+        self.menu = for_system(families() if menu is None else menu, self.system, self.has_two_rates)
         self._rows: dict[tuple[str, int], Row] = {}
 
-    def _add(self, trial: Trial) -> None:
+    def note(self, trial: Trial) -> None:
         """Add the row of a trial; a failed or uncertified run has an error of NaN."""
         run, error = trial.run, trial.error if np.isfinite(trial.error) else np.nan
         label, numbers = trial.family.label(trial.num_micro), (float(run.macro_dt), run.num_steps)
-        measured = {"error_q": error, "settings": self.search.settings(trial), "family": trial.family.name}
+        measured = {"error_q": error, "settings": self.settings(trial), "family": trial.family.name}
         row = row_of(label, run.system, run.scheme, trial.trajectory, *numbers, **measured)
         self._rows[trial.python, run.num_steps] = row
 
     def look_for(self, name: str, error: float, exhaustive: bool = False) -> WorkPrecision:
         """Search for an error, and return the table of all runs so far; `name` begins messages."""
-        menu = by_promise(self.menu, digits_of(self.search, error))
-        finals = reached(name, self.search, menu, error, finalists=FINALISTS, exhaustive=exhaustive)
-        self.search.measure([trial for trial in finals if np.isfinite(trial.error)])
+        menu = by_promise(self.menu, digits_of(self, error))
+        finals = reached(name, self, menu, error, finalists=FINALISTS, exhaustive=exhaustive)
+        self.measure([trial for trial in finals if np.isfinite(trial.error)])
         return self.runs()
 
     def runs(self) -> WorkPrecision:
-        """The table of all runs so far, sorted by scheme and number of steps; seconds are those of the steps, NaN where
-        they were not measured."""
+        """The table of all runs so far, sorted by scheme and number of steps, with the seconds of the steps."""
         rows = sorted(self._rows.values(), key=attrgetter("scheme", "num_steps"))
-        seconds = self.search.seconds
-        timed = (replace(row, seconds=seconds.get(row.settings.python, np.nan) * row.num_steps) for row in rows)
-        return WorkPrecision(tuple(timed))
+        seconds = [self.seconds.get(row.settings.python, np.nan) * row.num_steps for row in rows]
+        return WorkPrecision(tuple(replace(row, seconds=s) for row, s in zip(rows, seconds, strict=True)))
 
 
 class NothingReached(ValueError):
@@ -77,7 +71,7 @@ class NothingReached(ValueError):
         super().__init__(message)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Recommendation(WorkPrecision):
     """The cheapest setting for an error, and all runs of the search that led to it; prints as a table of the best few settings.
 
@@ -103,10 +97,8 @@ class Recommendation(WorkPrecision):
     @property
     def caption(self) -> str:
         """The recommended setting."""
-        return (
-            f"For an error of {self.error:g} take the first: its .scheme, .macro_dt and .num_steps. "
-            f"All {len(self.rows)} runs are in .runs and .to_csv(path)."
-        )
+        first = f"For an error of {self.error:g} take the first: its .scheme, .macro_dt and .num_steps"
+        return f"{first}. All {len(self.rows)} runs are in .runs and .to_csv(path)."
 
     @property
     def scheme(self):
@@ -122,13 +114,6 @@ class Recommendation(WorkPrecision):
     def num_steps(self) -> int:
         """Macro steps up to t_end."""
         return self.setting.num_steps
-
-
-def check_target(error: float, t_end: float, problem: Problem) -> None:
-    """Refuse errors and times that no run can meet."""
-    if not (np.isfinite(t_end) and t_end > 0):
-        raise Refused(f"tune: t_end is {t_end}; it must be a positive number.")
-    check_error("tune: error", error, problem)
 
 
 @shows_progress
@@ -154,8 +139,7 @@ def tune(
         error: largest accepted error of a position, in the unit of the positions.
         t_end: simulated time.
         menu: families to choose from, by default `families()`.
-        num_saves: saved intervals, equally spaced, at whose ends errors are compared; None for one per macro step, at
-            most 1000.
+        num_saves: equal intervals at whose ends errors are compared; None for one per macro step, at most 1000.
         solver: how implicit equations are solved.
         exhaustive: try every num_micro of every family, to check the staged search.
         progress: True for a bar, or a function (what, done, total) that is told about every trial run.
@@ -170,20 +154,20 @@ def tune(
         UserWarning: events of forces demand many steps.
     """
     problem = problem_of("tune", problem)
-    check_target(error, t_end, problem)
+    check_error("tune: error", error, problem)
     tuning = Tuning(problem, t_end, menu, num_saves, solver, progress)
     with interruptible(tuning.runs):
         choice = Recommendation(tuning.look_for("tune: error", error, exhaustive).rows, error=error)
         if not choice.keeping(error):
             raise _nothing(tuning, error)
     progress("done", 1, 1)
-    warn_of_events("tune", tuning.search, choice.scheme, stacklevel=4)
+    warn_of_events("tune", tuning, choice.scheme, stacklevel=4)
     return choice
 
 
 def _nothing(tuning: Tuning, error: float) -> Exception:
     """The reason why no setting keeps the error: all runs failed, or none is as accurate."""
-    runs, trial = tuning.runs(), tuning.search.first_trials(tuning.menu, error)[0]
+    runs, trial = tuning.runs(), tuning.first_trials(tuning.menu, error)[0]
     if all(row.result not in ("CONVERGED", "CONVERGED_AT_ROUNDOFF") for row in runs.rows):
         return simulation_error(trial.trajectory, trial.run.macro_dt, trial.run.save_every, trial.run.scheme.num_micro)
     best = min(runs.rows, key=lambda row: np.nan_to_num(row.error_q, nan=np.inf))

@@ -4,6 +4,5 @@ from typing import Any
 
 
 def point(name: str, part: str, number: int, radius: float) -> dict[str, Any]:
-    """The entry of a body whose coordinates are three of q_s ("s") or q_f ("f"), the point of this number among
-    them."""
+    """The entry of a body whose coordinates are the point of this number of q_s ("s") or q_f ("f")."""
     return {"name": name, "coordinates": [[part, 3 * number + axis] for axis in range(3)], "radius": radius}

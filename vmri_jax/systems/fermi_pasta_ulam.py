@@ -16,8 +16,7 @@ from vmri_jax.mechanics.system import ConstantMass, System
 from vmri_jax.refusals import Refused
 
 MAGNIFICATION = 10.0
-"""Drawn over real elongation of the stiff springs, which stretch by a few percent. With 1 the stretching could not be
-seen."""
+"""Drawn over real elongation of the stiff springs, which stretch by a few percent: with 1 they seem rigid."""
 
 
 def soft_springs(q_s, q_f, params):
@@ -33,8 +32,7 @@ def stiff_springs(q_f, params):
 
 
 def drawing(num_springs: int) -> dict[str, Any]:
-    """The chain between two walls: masses displaced by ``(s_i - f_i) / sqrt 2`` and ``(s_i + f_i) / sqrt 2`` from their
-    places at rest."""
+    """The chain between two walls: masses displaced by ``(s_i - f_i) / sqrt 2`` and ``(s_i + f_i) / sqrt 2``."""
     bodies, w, look = [], 1 / math.sqrt(2), {"radius": 0.3, "color": "#8a97a1"}
     for i in range(num_springs):
         for sign, place in ((-1.0, 4.5 * i + 3.0), (1.0, 4.5 * i + 4.5)):
@@ -63,11 +61,6 @@ def fermi_pasta_ulam(num_springs: int = 3, omega: float = 50.0) -> Problem:
     if num_springs < 1:
         raise Refused(f"fermi_pasta_ulam: num_springs is {num_springs}; there must be at least 1.")
     ones, first = jnp.ones(num_springs), jnp.zeros(num_springs).at[0].set(1.0)
-    system = System(
-        kinetic=ConstantMass(ones, ones),
-        slow_potential=soft_springs,
-        fast_potential=stiff_springs,
-        params={"omega": jnp.asarray(omega)},
-    )
+    system = System(ConstantMass(ones, ones), soft_springs, stiff_springs, params={"omega": jnp.asarray(omega)})
     names = Names({"centres": num_springs}, {"elongations": num_springs}, numbered=("centres", "elongations"))
     return Problem(system, first, first / omega, first, first, names=names, drawing=drawing(num_springs))

@@ -79,18 +79,14 @@ def simple_atomic_model(
             [radius, 0.0, top - length],
         ]
     )
+    params = {"masses": masses, "stiffness": stiffness, "length": length, "gravity": gravity}
     system = System(
         kinetic=ConstantMass(jnp.repeat(jnp.asarray(masses[:2]), 3), jnp.repeat(jnp.asarray(masses[2:]), 3)),
         slow_potential=slow_forces,
         fast_potential=stiff_springs,
         constraint=bonds,
         slow_constraint=slow_bond,
-        params={
-            "masses": jnp.asarray(masses),
-            "stiffness": jnp.asarray(stiffness),
-            "length": jnp.asarray(length),
-            "gravity": jnp.asarray(gravity),
-        },
+        params={name: jnp.asarray(value) for name, value in params.items()},
     )
     v_s = np.array([[0.0, 0.5, 0.0], [0.3, 0.2, 0.1]])
     v_f = np.array([[0.0, 0.4, 0.2], [-0.5, 0.2, 0.3], [0.2, -0.6, 0.4], [0.7, 0.1, 0.2]])

@@ -48,8 +48,7 @@ DRAWING = {
 def triple_spherical_pendulum(
     masses=(100.0, 1.0, 1.0), stiffness=5000.0, lengths=(10.0, 2.0, 3.0), gravity=9.81, quartic=False
 ) -> Problem:
-    """Triple spherical pendulum in R^3: q_1 slow, (q_2, q_3) fast; started with rod 1 along x, rod 2 along y and the
-    spring along z.
+    """Triple spherical pendulum in R^3: q_1 slow, (q_2, q_3) fast; rods along x and y, spring along z.
 
     Args:
         masses: of the three bobs.
@@ -60,18 +59,14 @@ def triple_spherical_pendulum(
     """
     m_1, m_2, m_3 = masses
     l_1, l_2, l_3 = lengths
+    params = {"masses": masses, "stiffness": stiffness, "lengths": lengths, "gravity": gravity}
     system = System(
         kinetic=ConstantMass(slow=jnp.full(3, m_1), fast=jnp.repeat(jnp.array([m_2, m_3]), 3)),
         slow_potential=weight,
         fast_potential=quartic_spring if quartic else spring,
         constraint=second_rod,
         slow_constraint=first_rod,
-        params={
-            "masses": jnp.asarray(masses),
-            "stiffness": jnp.asarray(stiffness),
-            "lengths": jnp.asarray(lengths),
-            "gravity": jnp.asarray(gravity),
-        },
+        params={name: jnp.asarray(value) for name, value in params.items()},
     )
     return Problem(
         system,

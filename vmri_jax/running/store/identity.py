@@ -32,11 +32,15 @@ def identity(simulation: Simulation, start: State) -> dict[str, str]:
     return texts | {f"operations of {name}": text for name, text in _operations(simulation.system, start).items()}
 
 
+def package_versions() -> dict[str, str]:
+    """Versions of the packages on which the last digits of a run depend."""
+    return {name: version(name) for name in ("vmri_jax", "jax", "jaxlib")}
+
+
 def environment() -> dict[str, str]:
     """Versions, machine and compiler flags, on which the last digits of a run depend."""
-    versions = {name: version(name) for name in ("vmri_jax", "jax", "jaxlib")}
     flags = os.environ.get("XLA_FLAGS", "")
-    return versions | {"machine": f"{platform.system()} {platform.machine()}", "XLA_FLAGS": flags}
+    return package_versions() | {"machine": f"{platform.system()} {platform.machine()}", "XLA_FLAGS": flags}
 
 
 def check_same(path: Path, attributes: dict, stored: dict, chunk: int | None, complete: bool) -> None:
