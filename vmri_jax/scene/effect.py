@@ -54,6 +54,10 @@ class Effect(Bindable):
             (on every k-th micro node), or "auto" (the scene decides by stiffness). A potential with the rate "fast" or k makes its bodies fast, except bodies
             with the pace "slow": the positions of these slow bodies are then solved for by iteration over the macro step. Of a kinetic effect "slow",
             "fast" or "auto"; here the rate decides only whether its bodies are fast, since all kinetic effects are on the micro grid.
+
+    Raises:
+        TypeError, ValueError: arguments other than the docstring of the class says; of the scene, see `check`: wrong shapes or signs,
+            unknown names, points at one place where a line between them is needed, constraints that the start violates.
     """
 
     kind: ClassVar[Kind]

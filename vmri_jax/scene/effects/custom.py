@@ -37,10 +37,6 @@ class CustomEffect(Effect):
             runs have derivatives with respect to them.
         name: the name of the function by default.
         drawn_as: "link" or "spring", drawn between each of the bodies and the next; None draws nothing.
-
-    Raises:
-        TypeError: a function that cannot be called, or that takes other arguments.
-        ValueError: another drawing; (of the scene) one of a single body, or of blocks of general coordinates.
     """
 
     function: Callable  # pyright: ignore[reportIncompatibleVariableOverride]
