@@ -39,10 +39,8 @@ class Joint(Effect):
     Args:
         between: names (a, b), or a list of such pairs. A name may come with a point that is fixed in the body,
             ``(("hub", [1, 0, 0]), ("arm", [-1, 0, 0]))``: the body is joined there, and both points must coincide at the start.
+            Along the axes of a joint both bodies need directors.
         at: (3,) m, the point of the joint in space at the start; or a point for each pair, (n, 3). It takes the place of points in `between`.
-
-    Raises:
-        ValueError: (of the scene) no point, or points that do not coincide; an axis along which a body has no director.
     """
 
     between: Any = names(2)
@@ -80,12 +78,12 @@ class Joint(Effect):
 
     @cached_property
     def frames(self) -> dict[str, Any]:
-        """Points and triads of all pairs as components along the directors of each body: "point_a", "point_b", "frame_a", "frame_b"."""
-        return {name: stacked(values) for name, values in self._frames().items()}
+        """Points and triads as components along the directors of each body: "point_a", "point_b", "frame_a", "frame_b"."""
+        return {name: stacked([*values]) for name, values in self._components.items()}
 
     def _factors(self) -> dict[str, Any]:
         """The numbers of the rows of all pairs, see `products`."""
-        frames = {name: library(values).stack(values) for name, values in self._frames().items()}
+        frames = self._components
         xp, count = library(frames), len(self.elements)
         named, zero = [name for side in zip(*self.rows, strict=True) for name in side], np.zeros((count, FRAME))
         offsets, halves = np.stack([AXES.get(name, np.zeros(3)) for name in named]), []
@@ -145,7 +143,7 @@ class Joint(Effect):
             self.require(coincide, f"the distance of the points of {a}-{b}", f"{float(distance):.6g}", expected)
 
     def drawn_points(self):
-        points = {role: np.atleast_2d(self.frames[f"point_{role}"]) for role in "ab"}
+        points = {role: self._components[f"point_{role}"] for role in "ab"}
         return {
             f"{self.name} {'-'.join(element)} in {name}": (name, points[role][i])
             for i, element in enumerate(self.elements)
@@ -181,8 +179,9 @@ class Joint(Effect):
             joining.append((points[0], points[-1]))
         return joining
 
-    def _frames(self) -> dict[str, list]:
-        """Points and triads of every pair as components along the directors of each body: "point_a", "frame_a", "point_b", "frame_b"."""
+    @cached_property
+    def _components(self) -> dict[str, Any]:
+        """`frames` with an axis for the pairs."""
         points, triads = self.joining_points, self.triads
         components: dict[str, list] = {}
         for i, element in enumerate(self.elements):
@@ -201,7 +200,7 @@ class Joint(Effect):
                     except ValueError as error:
                         raise Refused(f"{self.name}: {error}") from None
                     components.setdefault(f"frame_{role}", []).append(library(rows).stack(rows))
-        return components
+        return {name: library(values).stack(values) for name, values in components.items()}
 
 
 @effect_class
