@@ -5,7 +5,7 @@ import json
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from itertools import chain
 from typing import Any
 
@@ -129,17 +129,21 @@ class Drawing:
 
         return tuple(map(np.asarray, jax.jit(jax.vmap(bodies_and_rates))(q_s, q_f, v_s, v_f)))
 
+    @cached_property
+    def numbers(self) -> dict[str, int]:
+        """Numbers of the bodies by name."""
+        return {body.name: i for i, body in enumerate(self.bodies)}
+
     def corners(self, points: np.ndarray) -> list[np.ndarray]:
         """Corners (..., n, 3) of each solid.
 
         Args:
             points: (..., n_bodies, 3) positions of the bodies.
         """
-        index = {body.name: i for i, body in enumerate(self.bodies)}
         solids = []
         for solid in self.solids:
             # x_0 + sum_i c_i (x_i - x_0)
-            centre, *ends = (points[..., index[name], :] for name in solid.points)
+            centre, *ends = (points[..., self.numbers[name], :] for name in solid.points)
             axes = np.stack([end - centre for end in ends], axis=-2)
             solids.append(centre[..., None, :] + np.array(solid.corners) @ axes)
         return solids

@@ -115,13 +115,12 @@ def layout(motion: Motion) -> Layout:
 
 
 def _connections(drawing: Drawing) -> list[Connection]:
-    index = {body.name: i for i, body in enumerate(drawing.bodies)}
     points = drawing.place([joint.point or () for joint in drawing.joints])
     connections = []
     for joint, point in zip(drawing.joints, points, strict=True):
-        body, other = index[joint.bodies[0]], None
+        body, other = drawing.numbers[joint.bodies[0]], None
         if joint.point is None:
-            other, point = index[joint.bodies[1]], None
+            other, point = drawing.numbers[joint.bodies[1]], None
         connections.append(Connection(joint.kind, body, other, point, drawing.pace(joint), turns=0))
     return connections
 

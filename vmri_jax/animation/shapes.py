@@ -74,7 +74,7 @@ class Stage:
         self._draw_around(pen, points)
         past = self.motion.at(self._trail_times(max(float(self.motion.t[0]), time - trail), time))
         drawing, colors = self.motion.drawing, self._colors
-        bodies, index = drawing.bodies, {body.name: i for i, body in enumerate(drawing.bodies)}
+        bodies = drawing.bodies
         balls = [i for i, body in enumerate(bodies) if body.shown == "ball"]
         for i in balls:
             pen.trail(past[:, i], colors[i], self.sizes.radii[i])
@@ -83,7 +83,7 @@ class Stage:
             pen.ball(points[i], self.sizes.radii[i], colors[i])
         for solid, corners in zip(drawing.solids, drawing.corners(points), strict=True):
             for face in solid.faces:
-                pen.face(corners[list(face)], solid.color or colors[index[solid.points[0]]])
+                pen.face(corners[list(face)], solid.color or colors[drawing.numbers[solid.points[0]]])
         if names:
             named = [i for i, body in enumerate(bodies) if body.shown]
             pen.names(points[named], self.sizes.radii[named], [bodies[i].name for i in named])

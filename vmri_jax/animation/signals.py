@@ -88,12 +88,11 @@ def _coordinates(motion: Motion) -> list[Signal]:
 def _lengths(motion: Motion) -> list[Signal]:
     """Signals of the lengths of all springs."""
     drawing, signals = motion.drawing, []
-    index = {body.name: i for i, body in enumerate(drawing.bodies)}
     for joint in drawing.joints:
         if joint.kind != "spring":
             continue
-        end = index[joint.bodies[-1]] if joint.point is None else drawing.place([joint.point])[0]
-        of = _distance(index[joint.bodies[0]], end)
+        end = drawing.numbers[joint.bodies[-1]] if joint.point is None else drawing.place([joint.point])[0]
+        of = _distance(drawing.numbers[joint.bodies[0]], end)
         signals += _signal(motion, f"length of spring {' to '.join(joint.bodies)}", drawing.pace(joint), of)
     return signals
 

@@ -57,8 +57,7 @@ def write_vtk(motion: Motion, path: str | Path) -> None:
 def _cells(drawing: Drawing) -> tuple[list, dict]:
     """Cells for meshio, and the data of each block of cells. Points are the bodies, fixed ends of joints, corners of
     solids, in this order."""
-    index = {body.name: i for i, body in enumerate(drawing.bodies)}
-    next_point = len(drawing.bodies)
+    index, next_point = drawing.numbers, len(drawing.bodies)
     cells_by_type: dict[str, list[tuple[list[int], str, bool]]] = {}
     for body in drawing.bodies:
         if body.shown == "ball":

@@ -174,11 +174,8 @@ def _advice(sorting: Sorting, rows: ConstraintRows, micro: list[int]) -> str:
     jacobian = rows.by_masses[micro]
     _, dependent = rank_of(jacobian[:, rows.num_slow :])
     involved = jacobian[dependent]
-    touched = {
-        name
-        for name, place in sorting.layout.coordinates.items()
-        if place.part == "s" and involved[:, place.start : place.start + place.size].any()
-    }
+    numbers = sorting.layout.numbers
+    touched = {name for name in sorting.layout.coordinates if name not in fast and involved[:, numbers[name]].any()}
     make_fast = f"make {' or '.join(sorted(touched))} fast too" if touched else "make more of their bodies fast"
     return (
         f"they touch fast bodies and are held on the micro grid, where only {', '.join(fast)} can move; leave one out, or {make_fast}, "

@@ -17,8 +17,7 @@ from vmri_jax.mechanics.names import Names
 from vmri_jax.scene.body import LARGEST_POINT, label_of
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.effects.freedoms import ANGLES
-from vmri_jax.scene.functions import MicroConstraint
-from vmri_jax.scene.layout import join
+from vmri_jax.scene.functions import function_of
 from vmri_jax.scene.rates import positions
 from vmri_jax.scene.sorting import HOMES, Home, Placed, Sorting
 from vmri_jax.scene.terms import EffectTerm, Role
@@ -143,18 +142,16 @@ class ConstraintRows:
     @classmethod
     def of(cls, sorting: Sorting) -> "ConstraintRows | None":
         """The rows of all constraints of a scene; None if it has none, or if their numbers are traced."""
-        bodies, layout, to_bodies = sorting.bodies, sorting.layout, sorting.to_bodies
+        layout, to_bodies = sorting.layout, sorting.to_bodies
         constraints = [part for part in sorting.placed if part.home in HOMES]
         if not constraints or not is_concrete(
             (sorting.positions, sorting.joints, [part.effect.parameters for part in constraints])
         ):
             return None
-        start = np.concatenate(sorting.positions)
+        start, of_bodies = sorting.positions, sorting.of_bodies("masses")
         _, jacobian = to_bodies(start)
         # the diagonal of J^T M J with J = dQ/dq
-        of_bodies = join(bodies, layout, "s", "masses"), join(bodies, layout, "f", "masses")
-        is_known = is_concrete(of_bodies)
-        masses = np.concatenate(of_bodies) @ (jacobian * jacobian) if is_known else np.ones_like(start)
+        masses = of_bodies @ (jacobian * jacobian) if is_concrete(of_bodies) else np.ones_like(start)
         terms = tuple(
             (term, part.effect.is_analytic) for part in constraints for term in part.effect.terms(part.elements, layout)
         )
@@ -166,7 +163,7 @@ class ConstraintRows:
         """Values g (k,) and Jacobian dg/dq (k, n) at a time and at positions (n,)."""
         q_bodies, by_coordinates = self.to_bodies(q)
         n_s, others = self.num_slow_of_bodies, [term for term, is_analytic in self.terms if not is_analytic]
-        functions = [TracedOnce(MicroConstraint((term,))) for term in others]
+        functions = [TracedOnce(function_of("constraint", (term,))) for term in others]
         arguments = self.params, float(t), q_bodies[:n_s], q_bodies[n_s:]
         of_others = iter(jax.device_get(_compiled_derivatives(functions, *arguments)) if others else ())
         parts = [
@@ -229,16 +226,15 @@ def _scales(sorting: Sorting) -> np.ndarray:
     points, layout = positions(sorting.bodies), sorting.layout
     # largest distance from the mean along an axis; of bodies at one place their largest coordinate, or 1 at the origin
     extent = float(np.abs(points - points.mean(axis=0)).max() or np.abs(points).max() or 1.0)
-    scales = {place: np.full(1, 1.0 if key[2] in ANGLES else extent) for key, place in layout.freedoms.items()}
-    for name, body in sorting.bodies.items():
-        if name in layout.coordinates and layout.coordinates[name] not in scales:
-            q = np.asarray(body.coordinates)
-            of_points = np.where(np.arange(q.size) < LARGEST_POINT, extent, 1.0)
-            of_block = np.full(q.size, np.abs(q).max() or 1.0)
-            scales[layout.coordinates[name]] = of_block if body.block else of_points
-    return np.concatenate(
-        [scales[place] for place in sorted(scales, key=lambda place: (place.part == "f", place.start))]
-    )
+    numbers, scales = layout.numbers, np.zeros(sum(layout.sizes))
+    for name in layout.coordinates.keys() & sorting.bodies.keys():
+        body = sorting.bodies[name]
+        largest = np.abs(np.asarray(body.coordinates)).max() or 1.0
+        of_points = np.where(np.arange(body.size) < LARGEST_POINT, extent, 1.0)
+        scales[numbers[name]] = largest if body.block else of_points
+    for key in layout.freedoms:
+        scales[numbers[key]] = 1.0 if key[2] in ANGLES else extent
+    return scales
 
 
 def names_of(sorting: Sorting) -> Names:

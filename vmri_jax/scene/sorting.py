@@ -38,12 +38,11 @@ from scipy.sparse import eye_array
 from vmri_jax.mechanics.arrays import is_concrete, library, quickly_compiled
 from vmri_jax.mechanics.kinematics import Kinematics
 from vmri_jax.refusals import Refused
-from vmri_jax.scene.body import GROUND, Bodies
+from vmri_jax.scene.body import GROUND, Bodies, joined
 from vmri_jax.scene.effect import Effect
-from vmri_jax.scene.joint_constants import joint_constants
-from vmri_jax.scene.layout import DecidedPace, Layout, join
+from vmri_jax.scene.layout import DecidedPace, Layout
 from vmri_jax.scene.rates import SEPARATION, Rates, border, measure
-from vmri_jax.scene.trees import Branch, make_layout, with_weight
+from vmri_jax.scene.trees import Branch, joint_constants, make_layout, with_weight
 
 NAMED = 3
 """Most bodies that a reason names; with more the table of reasons is too wide."""
@@ -101,40 +100,40 @@ class Sorting:
         """(q_s, q_f, v_s, v_f) at the start."""
         return self.start_and_violation[0]
 
-    @property
-    def positions(self) -> tuple[jax.Array, jax.Array]:
-        """(q_s, q_f) at the start."""
-        return self._with_joint_starts(*self.assembled, 0)
+    @cached_property
+    def positions(self) -> Any:
+        """(n,) q = (q_s, q_f) at the start."""
+        return self._with_joint_starts(self.assembled, 0)
 
     @property
-    def assembled(self) -> tuple[Any, Any]:
-        """(q_s, q_f) at the positions of the bodies as the user gave them, where freedoms of joints are zero."""
-        slow, fast = self._of_bodies("coordinates")
-        n_s, n_f = self.layout.sizes
-        return slow[:n_s], fast[:n_f]
+    def assembled(self) -> Any:
+        """(n,) q = (q_s, q_f) at the positions of the bodies as the user gave them, where freedoms of joints are zero."""
+        q, (n_s, n_f), first_fast = self.of_bodies("coordinates"), self.layout.sizes, self.layout.ends[0]
+        return q if self.layout.kinematics is None else joined([q[:n_s], q[first_fast : first_fast + n_f]])
 
-    def _with_joint_starts(self, slow, fast, order: Literal[0, 1]) -> tuple[Any, Any]:
-        """Coordinates (order 0) or velocities (order 1), slow and fast, with the values or rates in `joint_starts` put in."""
+    def _with_joint_starts(self, q: Any, order: Literal[0, 1]) -> Any:
+        """Coordinates (order 0) or velocities (order 1) with the values or rates in `joint_starts` put in."""
+        numbers = self.layout.numbers
         for key, value_and_rate in self.joint_starts.items():
-            part, start, _ = self.layout.freedoms[key]
-            vector, number = (slow, fast)[part == "f"], value_and_rate[order]
-            pieces = vector[:start], library(number).reshape(number, (1,)), vector[start + 1 :]
-            changed = library(pieces).concatenate(pieces)
-            slow, fast = (changed, fast) if part == "s" else (slow, changed)
-        return slow, fast
+            (i,), number = numbers[key], value_and_rate[order]
+            q = joined([q[:i], library(number).reshape(number, (1,)), q[i + 1 :]])
+        return q
 
     @cached_property
     def start_and_violation(self) -> tuple[tuple, Any]:
         """`start`, and the part of the velocities of bodies that their joints do not allow, relative to all, by masses."""
-        if self.layout.kinematics is None:
-            return (*self._of_bodies("coordinates"), *self._of_bodies("rates")), 0.0
-        q, n_s = library(self.assembled).concatenate(self.assembled), self.layout.sizes[0]
-        rates, masses = (library(parts).concatenate(parts) for parts in map(self._of_bodies, ("rates", "masses")))
-        v, violation = _nearest_rates(self.to_bodies(q)[1], rates, masses)
-        return (*self.positions, *self._with_joint_starts(v[:n_s], v[n_s:], 1)), violation
+        q, v, violation, n_s = self.positions, self.of_bodies("rates"), 0.0, self.layout.sizes[0]
+        if self.layout.kinematics is not None:
+            v, violation = _nearest_rates(self.to_bodies(self.assembled)[1], v, self.of_bodies("masses"))
+            v = self._with_joint_starts(v, 1)
+        return (q[:n_s], q[n_s:], v[:n_s], v[n_s:]), violation
 
-    def _of_bodies(self, quantity: Literal["coordinates", "rates", "masses"]) -> tuple[jax.Array, jax.Array]:
-        return join(self.bodies, self.layout, "s", quantity), join(self.bodies, self.layout, "f", quantity)
+    def of_bodies(self, quantity: Literal["coordinates", "rates", "masses"]) -> Any:
+        """A quantity of all bodies in the order of (Q_s, Q_f), with zeros for the freedoms of joints."""
+        layout = self.layout
+        pieces = {place: getattr(self.bodies[name], quantity) for name, place in layout.bodies.items()}
+        pieces |= {place: np.zeros(1) for place in layout.freedoms.values()}
+        return joined([pieces[place] for place in sorted(pieces, key=lambda place: (place.part == "f", place.start))])
 
     def to_bodies(self, q: Any) -> tuple[Any, Any]:
         """Q = (Q_s, Q_f) of q = (q_s, q_f), each one vector, and the Jacobian dQ/dq."""

@@ -83,15 +83,10 @@ def with_rates(
             f"{(errors * lengths).max():.3g}. Give fewer rates: the rate of a joint follows from those of others, or the joint cannot move here."
         )
     # the velocities of bodies belong to their positions as the user gave them, where joint coordinates are zero
-    body_rates = sorting.to_bodies(np.concatenate(sorting.assembled))[1] @ v
+    body_rates = sorting.to_bodies(sorting.assembled)[1] @ v
     moved = [body.with_rates(body_rates[columns[name]]) for name, body in sorting.bodies.items()]
-    return moved, {key: (np.asarray(q[i]), v[i]) for key, i in _freedom_numbers(sorting).items()}
-
-
-def _freedom_numbers(sorting: Sorting) -> dict[Key, int]:
-    """Numbers of the joint coordinates in q = (q_s, q_f)."""
-    n_s = sorting.layout.sizes[0]
-    return {key: place.start + (n_s if place.part == "f" else 0) for key, place in sorting.layout.freedoms.items()}
+    numbers = sorting.layout.numbers
+    return moved, {key: (np.asarray(q[i]), v[i]) for key in sorting.layout.freedoms for i in numbers[key]}
 
 
 def joint_starts(sorting: Sorting, effects: Sequence[Effect], starts: Mapping[str, Any]) -> dict[Key, tuple[Any, Any]]:
@@ -123,7 +118,8 @@ def with_closed_loops(sorting: Sorting, starts: dict[Key, tuple[Any, Any]]) -> d
     rows = ConstraintRows.of(sorting)
     if rows is None or not is_concrete((sorting.start, starts)):
         return starts
-    columns = _freedom_numbers(sorting)
+    all_numbers = sorting.layout.numbers
+    columns = {key: int(all_numbers[key][0]) for key in sorting.layout.freedoms}
     held, free = [columns[key] for key in starts], [columns[key] for key in columns if key not in starts]
     q, v = (np.concatenate(parts) for parts in (sorting.start[:2], sorting.start[2:]))
     numbers = _of_joints_alone(sorting, rows)
@@ -159,11 +155,10 @@ def steps_of(keys: Iterable[Key], changes: Iterable[float]) -> int:
 
 def _of_joints_alone(sorting: Sorting, rows: ConstraintRows) -> np.ndarray:
     """Numbers of the rows that depend on joint coordinates alone: no motion of a body with directors or of a point changes them."""
-    n_s, changes = sorting.layout.sizes[0], np.zeros(len(rows.rows), bool)
-    for name, place in sorting.layout.coordinates.items():
+    changes = np.zeros(len(rows.rows), bool)
+    for name, numbers in sorting.layout.numbers.items():
         if name in sorting.bodies:
-            first = place.start + (n_s if place.part == "f" else 0)
-            by_motions = rows.jacobian[:, first : first + place.size] @ sorting.bodies[name].motions
+            by_motions = rows.jacobian[:, numbers] @ sorting.bodies[name].motions
             changes |= np.linalg.norm(by_motions, axis=1) > RANK * np.linalg.norm(rows.jacobian, axis=1)
     return np.flatnonzero(~changes)
 
