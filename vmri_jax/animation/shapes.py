@@ -73,8 +73,8 @@ class Stage:
         points = self.motion.at([time])[0]
         self._draw_around(pen, points)
         past = self.motion.at(self._trail_times(max(float(self.motion.t[0]), time - trail), time))
-        drawing, colors = self.motion.drawing, self._colors
-        bodies = drawing.bodies
+        drawing, bodies = self.motion.drawing, self.motion.drawing.bodies
+        colors = [body.color or self.paces[body.pace] for body in bodies]
         balls = [i for i, body in enumerate(bodies) if body.shown == "ball"]
         for i in balls:
             pen.trail(past[:, i], colors[i], self.sizes.radii[i])
@@ -96,10 +96,6 @@ class Stage:
     def paces(self) -> dict[str, str]:
         """Colours of slow and of fast parts."""
         return {"slow": self.theme.curves[0], "fast": self.theme.curves[1]}
-
-    @property
-    def _colors(self) -> list[str]:
-        return [body.color or self.paces[body.pace] for body in self.motion.drawing.bodies]
 
     def _trail_times(self, start: float, end: float) -> np.ndarray:
         """Times of the points of a trail, two for each node: with fewer points fast motion would be a zigzag."""
@@ -236,7 +232,7 @@ class _Pen:
                 corner = places[i] + [left, shift]
                 box = corner + np.array([[0.0, 0.0], [width, 1.2 * letter]])
                 inside = edge[0] < box[0, 0] and box[1, 0] < edge[1]
-                if inside and not any(_overlap(box, other) for other in taken):
+                if inside and not any(np.all(box[0] < other[1]) and np.all(other[0] < box[1]) for other in taken):
                     taken.append(box)
                     x, y = corner.tolist()
                     ink = self.theme.ink
@@ -283,8 +279,3 @@ class _Pen:
         if len(corners):
             path = Path.make_compound_path_from_polys(self.camera.project(np.array(corners))[0])
             self.axes.add_patch(PathPatch(path, facecolor=color, linewidth=0, alpha=alpha, zorder=zorder))
-
-
-def _overlap(a: np.ndarray, b: np.ndarray) -> bool:
-    """Whether two boxes overlap, each given by its lower left and upper right corner."""
-    return bool(np.all(a[0] < b[1]) and np.all(b[0] < a[1]))

@@ -6,7 +6,7 @@ smooth surface there. The dropped rows follow from the kept rows, that is are im
 around the start. The check evaluates them at the ends of random motions along the surface.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -15,13 +15,12 @@ from scipy.linalg import qr
 
 from vmri_jax.mechanics.constraints import RANK, rank_of
 from vmri_jax.refusals import Refused
+from vmri_jax.scene.body import listed
 from vmri_jax.scene.effects.joint_base import Joint
 from vmri_jax.scene.rigid import Rigidity
 from vmri_jax.scene.rows import ConstraintRows
 from vmri_jax.scene.sorting import HOMES, Sorting
 
-NAMED = 8
-"""Most rows that a message names; with more it is hard to read."""
 MOTIONS = 3
 """Number of random motions on which dropped rows are evaluated: on a single motion a row may by chance change little. More take longer."""
 NEARBY = 0.1
@@ -145,27 +144,23 @@ def _joined_twice(sorting: Sorting) -> str:
     twice = [
         f"{' and '.join(sorted(pair))} by {' and '.join(names)}" for pair, names in labels.items() if len(names) > 1
     ]
-    return f"joints join the same bodies: {_listed(twice)}; " if twice else ""
+    return f"joints join the same bodies: {listed(twice)}; " if twice else ""
 
 
 def _in_words(rows: ConstraintRows, opening: Opening) -> str:
     """That dropped rows do not vanish where the others do, and advice."""
     names = [rows.rows[i].name for i in opening.rows]
-    errors = _listed([f"{name} by {value:.1e}" for name, value in zip(names, opening.values, strict=True)])
+    errors = listed([f"{name} by {value:.1e}" for name, value in zip(names, opening.values, strict=True)])
     if not opening.motion:
         return (
-            f"{_listed(names)} contradicts the other constraints. Where they hold, its violation relative to its size is not zero: {errors}. "
+            f"{listed(names)} contradicts the other constraints. Where they hold, its violation relative to its size is not zero: {errors}. "
             "Correct its numbers, or leave it out"
         )
     return (
-        f"{_listed(names)} depends on the other constraints at the start alone. Nearby, where coordinates have moved by some "
+        f"{listed(names)} depends on the other constraints at the start alone. Nearby, where coordinates have moved by some "
         f"{opening.motion:.1g} of the extent of the scene and the other constraints hold, its violation relative to its size is not zero: "
         f"{errors}. {BEND}"
     )
-
-
-def _listed(names: Sequence[str]) -> str:
-    return ", ".join(names[:NAMED]) + (f" and {len(names) - NAMED} more" if len(names) > NAMED else "")
 
 
 def _advice(sorting: Sorting, rows: ConstraintRows, micro: list[int]) -> str:
@@ -194,6 +189,6 @@ def _refuse(rows: ConstraintRows, numbers: list[int], first: int, advice: Callab
     named = [name for name in all_named if not name.startswith(Rigidity.default_name + " ")] or all_named
     among = "among " if len(named) < len(involved) else ""
     raise Refused(
-        f"Scene: over-constrained at the start: {_listed(named)} are {among}{len(involved)} constraints of "
+        f"Scene: over-constrained at the start: {listed(named)} are {among}{len(involved)} constraints of "
         f"rank {rank_of(jacobian[involved])[0]}; {advice()}."
     )

@@ -38,7 +38,7 @@ from scipy.sparse import eye_array
 from vmri_jax.mechanics.arrays import is_concrete, library, quickly_compiled
 from vmri_jax.mechanics.kinematics import Kinematics
 from vmri_jax.refusals import Refused
-from vmri_jax.scene.body import GROUND, Bodies, joined
+from vmri_jax.scene.body import GROUND, Bodies, joined, listed
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.layout import DecidedPace, Layout
 from vmri_jax.scene.rates import SEPARATION, Rates, border, measure
@@ -55,13 +55,6 @@ Home = (
 
 HOMES: tuple[Home, ...] = ("slow_constraint", "constraint")
 """The arguments of `System` that hold constraints, in the order of the grids macro, micro."""
-
-
-class Reason(NamedTuple):
-    """Why an element has its home. A text about bodies has two braces ``{}``, for their names and for "is" or "are"."""
-
-    text: str
-    bodies: tuple[str, ...] = ()
 
 
 class Placed(NamedTuple):
@@ -226,13 +219,13 @@ def sort(bodies: Bodies, effects: Sequence[Effect], branches: Sequence[Branch] =
     paces = _paces(bodies, energies, measured, limit, owned)
     placed = []
     for effect in effects:
-        homes: dict[Home, dict[int, Reason]] = {}
+        homes: dict[Home, dict[int, tuple[str, tuple[str, ...]]]] = {}
         for i, (names, _) in enumerate(owned[effect.name]):
             if (effect.name, i) in carrying:
                 continue  # a joint that carries a body has coordinates instead of constraint rows
             slow = tuple(name for name in names if paces[name].value == "slow")
             home, reason = _home(effect, i, slow, len(names), measured, limit)
-            homes.setdefault(home, {})[i] = reason
+            homes.setdefault(home, {})[i] = reason, slow
         placed += [Placed(effect, tuple(reasons), home, _summary(reasons.values())) for home, reasons in homes.items()]
     layout, ordered = make_layout(bodies, paces, branches)
     if not any(layout.sizes):
@@ -303,41 +296,43 @@ def _stiff(effect: Effect, i: int, measured, limit) -> str:
     return f"{measured[effect.name].frequency[i]:.3g} rad/s, above {limit:.3g}"
 
 
-def _home(effect: Effect, i: int, slow: tuple[str, ...], size: int, measured, limit) -> tuple[Home, Reason]:
-    """The home of element i, see the table of this module, and why; it touches `size` bodies, the slow ones `slow`."""
+def _home(effect: Effect, i: int, slow: tuple[str, ...], size: int, measured, limit) -> tuple[Home, str]:
+    """The home of element i, see the table of this module, and why; it touches `size` bodies, the slow ones `slow`.
+
+    In a reason two braces ``{}`` stand for the names of the slow bodies, and for "is" or "are".
+    """
     if effect.kind == "kinetic":
-        return "kinetic", Reason("depends on velocities")
+        return "kinetic", "depends on velocities"
     if effect.kind == "force":
-        return "force", Reason("not derived from a potential")
+        return "force", "not derived from a potential"
     if effect.kind == "control":
-        return "control", Reason("set by an optimisation, zero in a run")
+        return "control", "set by an optimisation, zero in a run"
     if effect.kind == "constraint" and len(slow) == size:
-        return "slow_constraint", Reason("between slow bodies")
+        return "slow_constraint", "between slow bodies"
     if effect.kind == "constraint":
-        return "constraint", Reason("touches a fast body")
+        return "constraint", "touches a fast body"
     if isinstance(effect.rate, int):
-        return effect.rate, Reason("as given")
+        return effect.rate, "as given"
     if slow and effect.rate == "fast":
-        return "fast", Reason("as given, and touches {}, which {} slow", slow)
+        return "fast", "as given, and touches {}, which {} slow"
     if slow:
-        return "slow_potential", Reason("touches {}, which {} slow", slow)
+        return "slow_potential", "touches {}, which {} slow"
     if effect.rate != "auto":
-        return ("fast_potential" if effect.rate == "fast" else "slow_potential"), Reason("as given")
+        return ("fast_potential" if effect.rate == "fast" else "slow_potential"), "as given"
     level = f"{limit:.3g} rad/s" if limit else "zero: no border between slow and fast"
     if measured[effect.name].frequency[i] > (limit or 0.0):
-        return "fast_potential", Reason(f"between fast bodies and stiff, above {level}")
-    return "slow_potential", Reason(f"between fast bodies but soft, {'below' if limit else 'at'} {level}")
+        return "fast_potential", f"between fast bodies and stiff, above {level}"
+    return "slow_potential", f"between fast bodies but soft, {'below' if limit else 'at'} {level}"
 
 
-def _summary(reasons: Iterable[Reason]) -> str:
-    """The distinct reasons of the elements of an effect, each with all its bodies; of several reasons each with its number of elements."""
+def _summary(reasons: Iterable[tuple[str, tuple[str, ...]]]) -> str:
+    """The distinct reasons of the elements of an effect, each with all its slow bodies; of several reasons each with its number of elements."""
     bodies_by_text: dict[str, list[tuple[str, ...]]] = {}
-    for reason in reasons:
-        bodies_by_text.setdefault(reason.text, []).append(reason.bodies)
+    for text, slow in reasons:
+        bodies_by_text.setdefault(text, []).append(slow)
     parts = []
     for text, bodies in bodies_by_text.items():
         names = tuple(dict.fromkeys(chain(*bodies)))
-        listed = ", ".join(names[:NAMED]) + (f" and {len(names) - NAMED} more" if len(names) > NAMED else "")
         count = f" ({len(bodies)})" if len(bodies_by_text) > 1 else ""
-        parts.append(text.format(listed, "is" if len(names) == 1 else "are") + count)
+        parts.append(text.format(listed(names, NAMED), "is" if len(names) == 1 else "are") + count)
     return "; ".join(parts)

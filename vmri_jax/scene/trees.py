@@ -70,11 +70,6 @@ class Branch(NamedTuple):
         return list(zip(self.joint.moves, self.keys, strict=True))[:: 1 if self.forward else -1]
 
     @property
-    def sign(self) -> float:
-        """1 if a positive value of a freedom moves the child along its axis, -1 if against it."""
-        return 1.0 if self.forward else -1.0
-
-    @property
     def points(self) -> tuple[Any, Any]:
         """The point of the joint in space, as the parent has it and as the child has it, (3,) at the start."""
         a, b = self.joint.joining_points[self.element]
@@ -217,7 +212,8 @@ def _kinematics(branches: Sequence[Branch], places, freedoms, sizes) -> tuple[Ki
         if branch.child in fast or branch.child in carriers:
             carriers.add(branch.parent)
     ordered = sorted(branches, key=lambda branch: 2 if branch.child in fast else branch.child in carriers)
-    firsts = dict(zip((branch.child for branch in ordered), _firsts(ordered), strict=True))
+    ends = np.cumsum([len(branch.joint.moves) for branch in ordered]).tolist()
+    firsts = {branch.child: end - len(branch.joint.moves) for branch, end in zip(ordered, ends, strict=True)}
     numbers = {name: i for i, name in enumerate(dict.fromkeys(b.parent for b in branches if b.parent in places))}
     numbers[GROUND] = -1
     links, lasts = {}, {}
@@ -230,11 +226,6 @@ def _kinematics(branches: Sequence[Branch], places, freedoms, sizes) -> tuple[Ki
     carried = (Carried("f" if b.child in fast else "s", numbers[b.child], lasts[b.child]) for b in ordered)
     roots = tuple(places[name] for name in numbers if name in places)
     return Kinematics(roots, tuple(links[i] for i in range(len(links))), tuple(carried), sizes), tuple(ordered)
-
-
-def _firsts(branches: Sequence[Branch]) -> list[int]:
-    """The number of the first link of each branch."""
-    return [0, *np.cumsum([len(branch.joint.moves) for branch in branches])[:-1].tolist()]
 
 
 def joint_constants(bodies: Bodies, branches: Sequence[Branch]) -> dict[str, Any]:
@@ -250,7 +241,8 @@ def joint_constants(bodies: Bodies, branches: Sequence[Branch]) -> dict[str, Any
         zeros.append(library(place, axes).concatenate([place[None], axes]) @ directors.T)
         point = (branch.points[1] + shift - centre) @ directors.T
         for move, _ in branch.moves:
-            axis = branch.sign * branch.joint.triads[branch.element][move.axis] @ directors.T
+            # a positive value of a freedom moves body b of the joint along its axis
+            axis = (1.0 if branch.forward else -1.0) * branch.joint.triads[branch.element][move.axis] @ directors.T
             pitch = branch.joint.pitch_of(branch.element) / (2 * np.pi)
             turns.append((move.kind != "slide") * _turn(axis, point))
             slides.append({"turn": 0.0, "slide": 1.0, "screw": pitch}[move.kind] * axis)
