@@ -33,6 +33,30 @@ KEYS = (
 
 
 @dataclass(frozen=True)
+class Connection:
+    """A link or spring from a body, by its number, to another body or, if `other` is None, to a fixed point (3,).
+
+    turns: of a drawn spring, which `vmri_jax.animation.layout` chooses.
+    """
+
+    kind: str
+    body: int
+    other: int | None
+    point: np.ndarray | None
+    pace: str
+    turns: int = 0
+
+    def ends(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The two points (..., 3) that it joins, from the positions (..., n_bodies, 3) of the bodies."""
+        end = points[..., self.other, :] if self.point is None else self.point
+        return points[..., self.body, :], end
+
+    def length(self, points: np.ndarray) -> np.ndarray:
+        """(...) distance of its ends."""
+        return np.linalg.norm(np.subtract(*self.ends(points)), axis=-1)
+
+
+@dataclass(frozen=True)
 class Drawing:
     """The picture of a system: bodies, solids, blocks of general coordinates, joints between bodies, fixed planes and
     spheres.
@@ -133,6 +157,16 @@ class Drawing:
     def numbers(self) -> dict[str, int]:
         """Numbers of the bodies by name."""
         return {body.name: i for i, body in enumerate(self.bodies)}
+
+    @property
+    def connections(self) -> list[Connection]:
+        """The joints, with numbers of bodies and points in coordinates of the picture."""
+        points, connections = self.place([joint.point or () for joint in self.joints]), []
+        for joint, point in zip(self.joints, points, strict=True):
+            body, *other = (self.numbers[name] for name in joint.bodies)
+            end = (other[0], None) if joint.point is None else (None, point)
+            connections.append(Connection(joint.kind, body, *end, self.pace(joint)))
+        return connections
 
     def corners(self, points: np.ndarray) -> list[np.ndarray]:
         """Corners (..., n, 3) of each solid.

@@ -7,8 +7,9 @@ import jinja2
 import numpy as np
 
 from vmri_jax import plots
+from vmri_jax.animation.drawing import Connection
 from vmri_jax.animation.geometry import JOINT_END, LAMP, helix
-from vmri_jax.animation.layout import Connection, Ground, Layout, layout, nice
+from vmri_jax.animation.layout import Ground, Layout, layout, nice
 from vmri_jax.animation.motion import Motion
 from vmri_jax.running.files import check_place
 

@@ -102,10 +102,6 @@ class Stage:
         nodes = int(np.sum((self.motion.t >= start) & (self.motion.t <= end)))
         return np.linspace(start, end, int(np.clip(2 * nodes, *TRAIL_POINTS)))
 
-    def _ends(self, points: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-        """The two points that each connection joins."""
-        return [(points[c.body], points[c.other] if c.point is None else c.point) for c in self.sizes.connections]
-
     def _draw_around(self, pen: "_Pen", points: np.ndarray) -> None:
         """Draw the planes with the shadows on them, and fixed spheres."""
         sizes, drawing = self.sizes, self.motion.drawing
@@ -115,7 +111,7 @@ class Stage:
         for ground in sizes.grounds:
             pen.ground(ground)
             if ground.bears:
-                pen.shadows(ground, centers, radii, self._ends(points), sizes.rod)
+                pen.shadows(ground, centers, radii, [c.ends(points) for c in sizes.connections], sizes.rod)
                 for solid, corners in zip(drawing.solids, drawing.corners(points), strict=True):
                     pen.shadow(ground, [corners[list(face)] for face in solid.faces])
         for center, radius in zip(sizes.spheres, sizes.sphere_radii, strict=True):
@@ -123,7 +119,8 @@ class Stage:
 
     def _draw_joints(self, pen: "_Pen", points: np.ndarray) -> None:
         sizes = self.sizes
-        for c, (a, b) in zip(sizes.connections, self._ends(points), strict=True):
+        for c in sizes.connections:
+            a, b = c.ends(points)
             reach = (sizes.radii[c.body], 0.0 if c.other is None else sizes.radii[c.other])
             ends = joint(a, b, reach)
             if ends is not None and c.kind == "link":

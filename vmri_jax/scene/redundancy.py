@@ -62,7 +62,7 @@ def check_constraints(sorting: Sorting) -> None:
     macro, micro = (rows.numbers(home) for home in HOMES)
     _refuse(rows, macro + micro, 0, lambda: _cure(sorting))
     if micro:
-        _refuse(rows, micro, rows.num_slow, lambda: _advice(sorting, rows, micro))
+        _refuse(rows, micro, sorting.layout.sizes[0], lambda: _advice(rows, micro))
 
 
 def without_redundant(sorting: Sorting) -> Sorting:
@@ -163,14 +163,13 @@ def _in_words(rows: ConstraintRows, opening: Opening) -> str:
     )
 
 
-def _advice(sorting: Sorting, rows: ConstraintRows, micro: list[int]) -> str:
+def _advice(rows: ConstraintRows, micro: list[int]) -> str:
     """Advice about constraints on the micro grid that the fast bodies cannot satisfy."""
-    fast = [name for name, place in sorting.layout.coordinates.items() if place.part == "f"]
-    jacobian = rows.by_masses[micro]
-    _, dependent = rank_of(jacobian[:, rows.num_slow :])
-    involved = jacobian[dependent]
-    numbers = sorting.layout.numbers
-    touched = {name for name in sorting.layout.coordinates if name not in fast and involved[:, numbers[name]].any()}
+    layout, jacobian = rows.sorting.layout, rows.by_masses[micro]
+    fast = [name for name, place in layout.coordinates.items() if place.part == "f"]
+    _, dependent = rank_of(jacobian[:, layout.sizes[0] :])
+    involved, numbers = jacobian[dependent], layout.numbers
+    touched = {name for name in layout.coordinates if name not in fast and involved[:, numbers[name]].any()}
     make_fast = f"make {' or '.join(sorted(touched))} fast too" if touched else "make more of their bodies fast"
     return (
         f"they touch fast bodies and are held on the micro grid, where only {', '.join(fast)} can move; leave one out, or {make_fast}, "
