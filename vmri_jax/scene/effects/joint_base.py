@@ -79,7 +79,7 @@ class Joint(Effect):
     @cached_property
     def frames(self) -> dict[str, Any]:
         """Points and triads as components along the directors of each body: "point_a", "point_b", "frame_a", "frame_b"."""
-        return {name: stacked([*values]) for name, values in self._components.items()}
+        return {name: values if len(self.elements) > 1 else values[0] for name, values in self._components.items()}
 
     def _factors(self) -> dict[str, Any]:
         """The numbers of the rows of all pairs, see `products`."""
