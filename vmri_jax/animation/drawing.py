@@ -203,10 +203,14 @@ class Drawing:
         points += [vector for body in self.bodies for vector in (body.forms, body.offset)] + [self.up or ()]
         return max((len(point) for point in points), default=1)
 
-    def frame(self) -> np.ndarray:
-        """(3, dimension) matrix from coordinates of the bodies to coordinates of the picture, where z points
-        upwards."""
-        return frame(self.up, self.dimension)
+    def frame(self, dimension: int | None = None) -> np.ndarray:
+        """(3, dimension) matrix of orthonormal columns from coordinates of the bodies to coordinates of the picture, where
+        z points upwards; `dimension` of the drawing by default."""
+        dimension = dimension or self.dimension
+        if self.up is None:
+            return np.array([[1.0], [0.0], [0.0]]) if dimension == 1 else _upright(np.eye(dimension)[-1])
+        padded = np.pad(self.up, (0, dimension - len(self.up)))
+        return _upright(padded / np.linalg.norm(padded))
 
     def place(self, points: Sequence[tuple[float, ...]]) -> np.ndarray:
         """(n, 3) points in coordinates of the picture.
@@ -236,15 +240,6 @@ class Drawing:
                     check_index(body.name, part, index, n_s, n_f)
                     matrix[i, axis, first[part] + index] += weight
         return self.place([body.offset for body in self.bodies]), np.einsum("ad,idq->iaq", self.frame(), matrix)
-
-
-def frame(up: tuple[float, ...] | None, dimension: int) -> np.ndarray:
-    """(3, dimension) matrix of orthonormal columns from coordinates of the bodies to coordinates of the picture, see
-    `Drawing.up`."""
-    if up is None:
-        return np.array([[1.0], [0.0], [0.0]]) if dimension == 1 else _upright(np.eye(dimension)[-1])
-    padded = np.pad(up, (0, dimension - len(up)))
-    return _upright(padded / np.linalg.norm(padded))
 
 
 def check_index(name: str, part: str, index: int, n_s: int, n_f: int) -> None:
