@@ -57,12 +57,6 @@ class Branch(NamedTuple):
         """The freedoms of the joint as keys of `Layout.freedoms`."""
         return [(self.joint.name, self.element, freedom) for freedom in self.joint.freedoms]
 
-    def labels(self) -> list[str]:
-        """Names of the coordinates of the joint."""
-        name = self.joint.label(self.element)
-        freedoms = self.joint.freedoms
-        return [name] if len(freedoms) == 1 else [f"{name} {freedom}" for freedom in freedoms]
-
     @property
     def moves(self) -> list[tuple[Move, Key]]:
         """The motions of the joint, each with the key of its freedom, in the order from the parent to the child."""
@@ -186,9 +180,9 @@ def make_layout(
             coordinates[name] = places[name] = Place(part, ends[part], body.size)
             ends[part] += body.size
             continue
-        for freedom, label in zip(branch.joint.freedoms, branch.labels(), strict=True):
-            place = Place(part, ends[part], 1)
-            coordinates[label] = freedoms[branch.joint.name, branch.element, freedom] = place
+        for key in branch.keys:
+            label = branch.joint.label(branch.element) + (f" {key[2]}" if len(branch.keys) > 1 else "")
+            coordinates[label] = freedoms[key] = Place(part, ends[part], 1)
             ends[part] += 1
     if not branches:
         return Layout(places, coordinates), ()
