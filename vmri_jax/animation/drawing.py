@@ -204,8 +204,8 @@ class Drawing:
         return max((len(point) for point in points), default=1)
 
     def frame(self, dimension: int | None = None) -> np.ndarray:
-        """(3, dimension) matrix of orthonormal columns from coordinates of the bodies to coordinates of the picture, see
-        `up`; in the dimension of the drawing by default."""
+        """(3, dimension) matrix of orthonormal columns from coordinates of the bodies to coordinates of the picture,
+        see `up`; in the dimension of the drawing by default."""
         dimension = dimension or self.dimension
         if self.up is None:
             return np.array([[1.0], [0.0], [0.0]]) if dimension == 1 else _upright(np.eye(dimension)[-1])
