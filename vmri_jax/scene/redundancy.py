@@ -8,7 +8,6 @@ around the start. The check evaluates them at the ends of random motions along t
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import qr
@@ -40,25 +39,13 @@ BEND = "Bend bodies that lie in line or flat at the start by a little, leave oth
 """Advice for rows that depend on others at the start alone."""
 
 
-class Opening(NamedTuple):
-    """Numbers of dropped rows that do not vanish where the kept rows do, and their largest values over their sizes.
-
-    motion: its length relative to the scales of coordinates; 0 if these rows are violated at the start itself.
-    """
-
-    rows: list[int]
-    values: list[float]
-    motion: float
-
-
 def check_constraints(sorting: Sorting) -> None:
     """Refuse redundant constraints, dropped rows that do not follow from the others, and constraints that the fast bodies cannot satisfy."""
     rows = ConstraintRows.of(sorting)
     if rows is None:
         return
-    opening = find_opening(rows)
-    if opening is not None:
-        raise Refused(f'Scene: redundant="drop" would change the motion: {_in_words(rows, opening)}.')
+    if opening := _opening_in_words(rows):
+        raise Refused(f'Scene: redundant="drop" would change the motion: {opening}.')
     macro, micro = (rows.numbers(home) for home in HOMES)
     _refuse(rows, macro + micro, 0, lambda: _cure(sorting))
     if micro:
@@ -90,22 +77,23 @@ def without_redundant(sorting: Sorting) -> Sorting:
     return replace(sorting, placed=tuple(placed))
 
 
-def find_opening(rows: ConstraintRows) -> Opening | None:
-    """The dropped rows that do not follow from the kept rows g_k, with their values; None if all follow.
+def find_opening(rows: ConstraintRows) -> tuple[dict[int, float], float]:
+    """The dropped rows that do not follow from the kept rows g_k: their largest values over their sizes by number, {} if all follow; and the
+    length of the motion to them relative to the scales of coordinates, 0 if they are violated at the start itself.
 
     In coordinates over their scales, motions z along the surface solve ``dg_k(q_0) z = 0``. Newton's iteration leads from
     ``q_0 + s z`` back onto ``g_k = 0``, where the dropped rows are evaluated.
     """
     kept, dropped = rows.numbers(), [i for i, row in enumerate(rows.rows) if not row.kept]
     if not dropped:
-        return None
+        return {}, 0.0
     unit = (rows.jacobian * rows.scales / rows.sizes[:, None])[kept]
     basis, triangle = np.linalg.qr(unit.T)
     step = NEARBY * float(np.linalg.svd(triangle, compute_uv=False).min(initial=1.0))
     everywhere = np.arange(rows.start.size)
     q, values, is_reached = rows.onto(kept, rows.start, everywhere)
     if not is_reached:
-        return None  # positions far off the constraints: the initial state refuses them with a message of its own
+        return {}, 0.0  # positions far off the constraints: the initial state refuses them with a message of its own
     worst, length = np.abs(values[dropped]), 0.0
     if worst.max() <= FOLLOWS:
         random, timed = np.random.default_rng(0), any(row.effect.timed for row in rows.rows)
@@ -119,18 +107,15 @@ def find_opening(rows: ConstraintRows) -> Opening | None:
                     worst, length = np.maximum(worst, np.abs(values[dropped])), max(length, step)
                     break
                 step /= SHORTENING
-    opened = np.flatnonzero(worst > FOLLOWS)
-    if not opened.size:
-        return None
-    return Opening([dropped[i] for i in opened], worst[opened].tolist(), length)
+    return {i: value for i, value in zip(dropped, worst.tolist(), strict=True) if value > FOLLOWS}, length
 
 
 def _cure(sorting: Sorting) -> str:
     """Advice about rows that depend on others: to leave one out, unless this would change the motion."""
     rows = ConstraintRows.of(without_redundant(sorting))
-    if rows is None or (opening := find_opening(rows)) is None:
+    if rows is None or not (opening := _opening_in_words(rows)):
         return f'{_joined_twice(sorting)}leave one of them out, or let the scene choose, redundant="drop"'
-    return f"leaving one out would change the motion: {_in_words(rows, opening)}"
+    return f"leaving one out would change the motion: {opening}"
 
 
 def _joined_twice(sorting: Sorting) -> str:
@@ -147,18 +132,21 @@ def _joined_twice(sorting: Sorting) -> str:
     return f"joints join the same bodies: {listed(twice)}; " if twice else ""
 
 
-def _in_words(rows: ConstraintRows, opening: Opening) -> str:
-    """That dropped rows do not vanish where the others do, and advice."""
-    names = [rows.rows[i].name for i in opening.rows]
-    errors = listed([f"{name} by {value:.1e}" for name, value in zip(names, opening.values, strict=True)])
-    if not opening.motion:
+def _opening_in_words(rows: ConstraintRows) -> str:
+    """That dropped rows do not vanish where the others do, and advice; "" if all follow."""
+    values, motion = find_opening(rows)
+    if not values:
+        return ""
+    names = [rows.rows[i].name for i in values]
+    errors = listed([f"{rows.rows[i].name} by {value:.1e}" for i, value in values.items()])
+    if not motion:
         return (
             f"{listed(names)} contradicts the other constraints. Where they hold, its violation relative to its size is not zero: {errors}. "
             "Correct its numbers, or leave it out"
         )
     return (
         f"{listed(names)} depends on the other constraints at the start alone. Nearby, where coordinates have moved by some "
-        f"{opening.motion:.1g} of the extent of the scene and the other constraints hold, its violation relative to its size is not zero: "
+        f"{motion:.1g} of the extent of the scene and the other constraints hold, its violation relative to its size is not zero: "
         f"{errors}. {BEND}"
     )
 

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.mechanics.arrays import is_concrete, real_array
+from vmri_jax.mechanics.arrays import is_concrete
 from vmri_jax.mechanics.constraints import RANK
 from vmri_jax.mechanics.projection import legendre
 from vmri_jax.mechanics.system import System
@@ -16,7 +16,7 @@ from vmri_jax.refusals import Refused
 from vmri_jax.scene.body import AnyBody, moving
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.effects.freedoms import ANGLES
-from vmri_jax.scene.effects.joint_base import Joint, freedom_of, joint_named
+from vmri_jax.scene.effects.joint_base import Joint, for_pairs, freedom_of, joint_named
 from vmri_jax.scene.layout import Key
 from vmri_jax.scene.rows import ConstraintRows
 from vmri_jax.scene.sorting import Sorting
@@ -59,7 +59,7 @@ def with_rates(
     values = [-np.asarray(jax.jacfwd(constraints)(t, q))]
     for joint, freedom, number in _by_freedom("Scene.with_rates", effects, rates):
         pairs = joint.elements
-        numbers = _for_pairs(f"Scene.with_rates: the rate of {joint.name}", number, len(pairs), "one number")
+        numbers = for_pairs(f"Scene.with_rates: the rate of {joint.name}", number, len(pairs), "one number")
         gradient = jax.jacfwd(
             lambda q, joint=joint, freedom=freedom, pairs=pairs: joint.values(
                 freedom, range(len(pairs)), {name: q[columns[name]] for name in moving(chain(*pairs))}
@@ -96,7 +96,7 @@ def joint_starts(sorting: Sorting, effects: Sequence[Effect], starts: Mapping[st
         name, count = joint.name, len(joint.elements)
         value, rate = start if isinstance(start, tuple) else (start, 0.0)
         about = f"Scene.with_joints: the start of {name}"
-        numbers = [_for_pairs(about, number, count, "one number, or a pair (value, rate)") for number in (value, rate)]
+        numbers = [for_pairs(about, number, count, "one number, or a pair (value, rate)") for number in (value, rate)]
         for i in range(count):
             key = name, i, freedom
             if key not in sorting.layout.freedoms:
@@ -175,14 +175,3 @@ def _by_freedom(method: str, effects: Sequence[Effect], numbers: Mapping[str, An
             except ValueError as error:
                 raise Refused(f'{method}: {error} Give a dictionary, {{"turn": ..., "slide": ...}}.') from None
             yield joint, known, of_freedom
-
-
-def _for_pairs(about: str, numbers: Any, count: int, form: str):
-    """Finite numbers, () or (count,) for the pairs of a joint; `form` is the form of a single one, for messages."""
-    values = real_array(about, numbers)
-    if values.shape not in ((), (count,)):
-        for_pairs = f", or one for each pair, ({count},)" if count > 1 else ""
-        raise Refused(f"{about} has shape {values.shape}; give {form}{for_pairs}.")
-    if is_concrete(values) and not np.isfinite(values).all():
-        raise Refused(f"{about} is {values}; it must be finite.")
-    return values

@@ -278,8 +278,16 @@ def _triad(axis):
 
 def _vectors(argument: str, numbers, count: int):
     """(count, 3) vectors from a single vector (3,), or from a vector for each pair; `argument` begins messages."""
-    vectors = real_array(argument, numbers)
-    if vectors.shape not in ((3,), (count, 3)):
-        for_pairs = f", or one for each pair, ({count}, 3)" if count > 1 else ""
-        raise Refused(f"{argument} has shape {vectors.shape}; give (3,){for_pairs}.")
+    vectors = for_pairs(argument, numbers, count, "(3,)", (3,))
     return library(vectors).broadcast_to(vectors, (count, 3))
+
+
+def for_pairs(about: str, numbers: Any, count: int, form: str, shape: tuple[int, ...] = ()) -> Any:
+    """Finite numbers of a shape, or (count, *shape) for the pairs of a joint; `form` is the form of a single one, for messages."""
+    values = real_array(about, numbers)
+    if values.shape not in (shape, (count, *shape)):
+        for_each = f", or one for each pair, {(count, *shape)}" if count > 1 else ""
+        raise Refused(f"{about} has shape {values.shape}; give {form}{for_each}.")
+    if is_concrete(values) and not np.isfinite(values).all():
+        raise Refused(f"{about} is {values}; it must be finite.")
+    return values
