@@ -206,15 +206,7 @@ def sort(bodies: Bodies, effects: Sequence[Effect], branches: Sequence[Branch] =
     energies = [effect for effect in effects if effect.kind in ("potential", "kinetic")]
     owned = {effect.name: _owners(effect, branches) for effect in effects}
     measured = _measure(with_weight(bodies, branches), energies, owned)
-    declared = {
-        rate: [measured[effect.name].rate for effect in energies if effect.rate == rate and effect.name in measured]
-        for rate in ("slow", "fast")
-    }
-    limit = border(
-        [rates.rate for rates in measured.values()],
-        max((rates.max() for rates in declared["slow"]), default=0.0),
-        min((rates.min() for rates in declared["fast"]), default=np.inf),
-    )
+    limit = border(measured, energies)
     carrying = {(branch.joint.name, branch.element) for branch in branches}
     paces = _paces(bodies, energies, measured, limit, owned)
     placed = []
