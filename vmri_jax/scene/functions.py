@@ -3,6 +3,7 @@
 All classes here are compared by value: scenes of the same structure give equal functions, which JAX compiles only once.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import chain
 from typing import Any
@@ -40,7 +41,7 @@ class _OfTerms:
     kinematics: Kinematics | None = None
     rows: Entries | None = None
 
-    def by_name(self, arguments):
+    def by_name(self, arguments) -> tuple[Any, ...]:
         """(t, q_s, q_f, v_s, v_f, params) of the arguments of a call, with None for those that the function does not take."""
         *arguments, params = arguments
         names = KINDS[self.field].arguments
@@ -128,7 +129,7 @@ class Actuation(_OfTerms):
         return self.forces_on(q_s, q_f, params, forces)
 
 
-FUNCTIONS = {
+FUNCTIONS: dict[str, Any] = {
     "kinetic": KineticEnergy,
     "potential": PotentialEnergy,
     "constraint": ConstraintValues,
@@ -138,6 +139,6 @@ FUNCTIONS = {
 """For each kind of a function of `System`, the class that makes it of its terms."""
 
 
-def function_of(field: str, *of_terms) -> _OfTerms:
+def function_of(field: str, *of_terms) -> Callable:
     """The function that is an argument of `System`, of terms, kinematics and rows."""
     return FUNCTIONS[KINDS[field].kind](field, *of_terms)

@@ -241,11 +241,11 @@ class Compiled:
         meet &= group[:, None] != group  # bodies that are welded together do not move against each other
         return np.argwhere(np.triu(meet))
 
-    def _turning_joints(self, field: str) -> list[int]:
+    def _turning_joints(self, field: str) -> list:
         """Ball and free joints with an entry of a field of velocities that is not zero."""
         return [j for j in self.model.dof_jntid[np.flatnonzero(getattr(self.model, field))] if self.turning[j]]
 
-    def _sprung(self) -> list[int]:
+    def _sprung(self) -> list:
         """Ball and free joints with a spring or a damper, in their order."""
         sprung = (
             [] if self.off("SPRING") else np.flatnonzero(self.turning & (np.asarray(self.model.jnt_stiffness) != 0))

@@ -155,10 +155,10 @@ def steps_of(keys: Iterable[Key], changes: Iterable[float]) -> int:
 
 def _of_joints_alone(sorting: Sorting, rows: ConstraintRows) -> np.ndarray:
     """Numbers of the rows that depend on joint coordinates alone: no motion of a body with directors or of a point changes them."""
-    changes = np.zeros(len(rows.rows), bool)
-    for name, numbers in sorting.layout.numbers.items():
+    changes, numbers = np.zeros(len(rows.rows), bool), sorting.layout.numbers
+    for name in sorting.layout.coordinates:
         if name in sorting.bodies:
-            by_motions = rows.jacobian[:, numbers] @ sorting.bodies[name].motions
+            by_motions = rows.jacobian[:, numbers[name]] @ sorting.bodies[name].motions
             changes |= np.linalg.norm(by_motions, axis=1) > RANK * np.linalg.norm(rows.jacobian, axis=1)
     return np.flatnonzero(~changes)
 
