@@ -44,9 +44,8 @@ class _OfTerms:
     def by_name(self, arguments) -> tuple[Any, ...]:
         """(t, q_s, q_f, v_s, v_f, params) of the arguments of a call, with None for those that the function does not take."""
         *arguments, params = arguments
-        names = KINDS[self.field].arguments
-        is_timed = len(arguments) > len(names)
-        values = dict(zip(("t", *names) if is_timed else names, arguments, strict=True))
+        names = ("t", *KINDS[self.field].arguments)[-len(arguments) :]  # rows that depend on time get t first
+        values = dict(zip(names, arguments, strict=True))
         return *map(values.get, ("t", "q_s", "q_f", "v_s", "v_f")), params
 
     def bodies(self, q_s, q_f, params) -> tuple[Any, Any]:
