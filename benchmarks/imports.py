@@ -126,8 +126,8 @@ def moved(model: Any, data: Any, qpos: np.ndarray, qvel: np.ndarray) -> bool:
 
 def compare(file: Path) -> dict[str, Any]:
     """The row of one file."""
-    from benchmarks.body_motions import accelerations, state_of  # only now: scenes start JAX
     from vmri_jax.scene import Scene
+    from vmri_jax.scene.body_motions import accelerations, state_of  # only now: scenes start JAX
 
     mujoco = _mujoco()
     model = mujoco.MjModel.from_xml_path(str(file))

@@ -1,7 +1,5 @@
 """The programs that are timed: the built-in systems under the schemes of the reference study."""
 
-import re
-from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -17,10 +15,6 @@ SCHEMES: dict[str, Callable[[int], vm.Scheme]] = {
     "fully explicit": vm.fully_explicit,
 }
 TRUTH = Path(__file__).parent.parent / "tests" / "data" / "ground_truth"
-NO_OPERATION = {"parameter", "constant", "tuple", "get-tuple-element", "bitcast"}
-"""Names of instructions in a compiled program that compute nothing."""
-INSTRUCTION = re.compile(r"^\s*(?:ROOT )?%?[\w.-]+ = (?:\(.*?\)|\S+) ([a-z][a-z0-9-]*)\(", re.MULTILINE)
-"""A line of XLA's text of a program, with the name of the instruction as its group."""
 FILES = {"FPU l=3": "fpu3", "FPU l=200": "fpu200", "TSP": "tsp", "SAM": "sam"}
 
 
@@ -56,13 +50,3 @@ def program(problem: vm.Problem, scheme: vm.Scheme | vm.Composition, macro_dt, s
 def failed(trajectory: vm.Trajectory) -> bool:
     """Whether any step, or any trajectory of a batch, failed."""
     return bool(np.any(np.asarray(trajectory.failed_at) >= 0))
-
-
-def operations(compiled) -> Counter:
-    """Number of instructions of each name in a compiled program, with the instructions inside its fusions and loops."""
-    return Counter(name for name in INSTRUCTION.findall(compiled.as_text()) if name not in NO_OPERATION)
-
-
-def temporary_bytes(compiled) -> int:
-    """Temporary memory of a compiled program, bytes."""
-    return compiled.memory_analysis().temp_size_in_bytes

@@ -158,8 +158,8 @@ def model_of(seed: int) -> tuple[Any, Any]:
 
 def compare(seed: int) -> dict[str, Any]:
     """The row of one model: the difference of accelerations relative to the largest one, or the features that are refused."""
-    from benchmarks.body_motions import accelerations, state_of  # only now: scenes start JAX
     from vmri_jax.scene import Scene
+    from vmri_jax.scene.body_motions import accelerations, state_of  # only now: scenes start JAX
     from vmri_jax.scene.mujoco_model import Compiled
 
     mujoco: Any = import_module("mujoco")

@@ -7,9 +7,9 @@ from pathlib import Path
 from benchmarks import programs
 from benchmarks.measure import Tell, interleaved, quartiles, ratio, silent
 from benchmarks.report import Claim, Report
-from vmri_jax import prepare
 from vmri_jax.catalogue import imported
 from vmri_jax.scene import Scene
+from vmri_jax.scene.ledger import operations, prepare_steps, temporary_bytes
 
 COLUMNS = ("system", "scheme", "program", "µs/micro step", "quartiles", "operations", "bytes")
 GALLERY = Path(__file__).parents[1] / "notebooks" / "scenes"
@@ -51,9 +51,9 @@ def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
         for scheme in size.schemes:
             tell(f"{system}, {scheme}")
             problems = {"scene": scene.problem(), "by hand": programs.problem(system)}
-            made, macro_dt, n = programs.SCHEMES[scheme](size.num_micro), size.num_micro * size.micro_dt, size.num_steps
+            made, macro_dt = programs.SCHEMES[scheme](size.num_micro), size.num_micro * size.micro_dt
             prepared = {
-                key: prepare(problem.system, made, problem.state(), macro_dt=macro_dt, num_steps=n, save=n)
+                key: prepare_steps(problem.system, made, problem.state(), macro_dt, num_steps=size.num_steps)
                 for key, problem in problems.items()
             }
             timed = {key: run.timed() for key, run in prepared.items()}
@@ -61,11 +61,8 @@ def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
             for key, run in prepared.items():
                 program, us = run.compiled(), quartiles(seconds[key], 1e6 / size.num_steps / size.num_micro)
                 row = {"system": system, "scheme": scheme, "program": key, "µs/micro step": us.value}
-                row |= {
-                    "quartiles": f"{us.low:.3g} to {us.high:.3g}",
-                    "operations": sum(programs.operations(program).values()),
-                }
-                rows.append(row | {"bytes": programs.temporary_bytes(program)})
+                row |= {"quartiles": f"{us.low:.3g} to {us.high:.3g}", "operations": sum(operations(program).values())}
+                rows.append(row | {"bytes": temporary_bytes(program)})
             label = f"{system}, {scheme}: scene over by hand"
             claims.append(Claim(label, ratio(seconds["scene"], seconds["by hand"]), MOST))
             yield Report("scenes", name, rows, claims, [])

@@ -4,12 +4,12 @@ import jax
 import numpy as np
 import pytest
 
-from benchmarks.programs import operations, temporary_bytes
 from tests.scene.effect_scenes import BASE, EFFECTS, RIGID, RIGID_EFFECTS, base_by_hand, scene_with
 from tests.scene.mechanics import values
 from vmri_jax import fully_explicit, plan
 from vmri_jax import scene as sc
 from vmri_jax.mechanics import invariants
+from vmri_jax.scene.ledger import operations, temporary_bytes
 
 
 def test_every_effect_is_in_the_list():

@@ -1,5 +1,7 @@
 """The ledger of a scene or of a system of functions: grid, unknowns, evaluations and computing time of every body and effect."""
 
+import re
+from collections import Counter
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,6 +20,7 @@ from vmri_jax.mechanics.terms import KINDS, Term
 from vmri_jax.refusals import Refused
 from vmri_jax.running.prepare import prepare
 from vmri_jax.running.printed import PrintedTable
+from vmri_jax.running.simulation import Simulation
 from vmri_jax.running.timing import interleaved, seconds_each
 from vmri_jax.scene.assembly import build
 from vmri_jax.scene.sorting import Sorting
@@ -191,8 +194,7 @@ def _macro_step(system: System, scheme, state: State, macro_dt: float | None, fr
     """Microseconds of a macro step, by default of micro steps 0.1 / w, w the largest frequency or `frequency`."""
     if macro_dt is None:
         macro_dt = scheme.num_micro * 0.1 / (float(linearise(system, state).frequencies.max(initial=0.0)) or frequency)
-    run = prepare(system, scheme, state, macro_dt=macro_dt, num_steps=STEPS, save=STEPS)
-    seconds = interleaved({"": run.timed()}, 5)[""]
+    seconds = interleaved({"": prepare_steps(system, scheme, state, macro_dt).timed()}, 5)[""]
     return 1e6 * float(np.median(seconds)) / STEPS
 
 
@@ -214,3 +216,24 @@ def _first_derivatives(system: System, n_s: int, v_s, v_f):
         return total
 
     return derivatives
+
+
+def prepare_steps(system: System, scheme: Scheme | Composition, state, macro_dt, num_steps: int = STEPS) -> Simulation:
+    """A simulation, see `vmri_jax.prepare`, that saves the end alone; `operations` and `temporary_bytes` take its ``.compiled()``."""
+    return prepare(system, scheme, state, macro_dt=macro_dt, num_steps=num_steps, save=num_steps)
+
+
+NO_OPERATION = {"parameter", "constant", "tuple", "get-tuple-element", "bitcast"}
+"""Names of instructions in a compiled program that compute nothing."""
+INSTRUCTION = re.compile(r"^\s*(?:ROOT )?%?[\w.-]+ = (?:\(.*?\)|\S+) ([a-z][a-z0-9-]*)\(", re.MULTILINE)
+"""A line of XLA's text of a program, with the name of the instruction as its group."""
+
+
+def operations(compiled) -> Counter:
+    """Number of instructions of each name in a compiled program, with the instructions inside its fusions and loops."""
+    return Counter(name for name in INSTRUCTION.findall(compiled.as_text()) if name not in NO_OPERATION)
+
+
+def temporary_bytes(compiled) -> int:
+    """Temporary memory of a compiled program, bytes."""
+    return compiled.memory_analysis().temp_size_in_bytes
