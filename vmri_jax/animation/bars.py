@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from vmri_jax.animation.drawing import Drawing, check_index, frame
+from vmri_jax.animation.drawing import Drawing, check_index
 from vmri_jax.animation.parts import Body, Joint
 from vmri_jax.running.trajectory import Trajectory
 
@@ -49,7 +49,7 @@ def with_bars(drawing: Drawing, q_s: np.ndarray, q_f: np.ndarray) -> Drawing:
             check_index(block.name, part, i, q_s.shape[1], q_f.shape[1])
     corner, height = _room(drawing, q_s, q_f)
     unit = height / max(2.0, 0.22 * sum(len(block.coordinates) for block in drawing.blocks))
-    axes = frame(drawing.up, max(2, drawing.dimension))
+    axes = drawing.frame(max(2, drawing.dimension))
     bodies, posts, scales, x = [], [], [], 0.0
     for block in drawing.blocks:
         largest = max(float(np.abs(values[part][:, i]).max()) for part, i in block.coordinates)

@@ -5,7 +5,7 @@ import json
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from itertools import chain
 from typing import Any
 
@@ -30,6 +30,30 @@ KEYS = (
     *("bodies", "solids", "blocks", "links", "springs", "anchors", "planes", "spheres"),
     *("up", "view", "caption", "kinematics"),
 )
+
+
+@dataclass(frozen=True)
+class Connection:
+    """A link or spring from a body, by its number, to another body or, if `other` is None, to a fixed point (3,).
+
+    turns: of a drawn spring, which `vmri_jax.animation.layout` chooses.
+    """
+
+    kind: str
+    body: int
+    other: int | None
+    point: np.ndarray | None
+    pace: str
+    turns: int = 0
+
+    def ends(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The two points (..., 3) that it joins, from the positions (..., n_bodies, 3) of the bodies."""
+        end = points[..., self.other, :] if self.point is None else self.point
+        return points[..., self.body, :], end
+
+    def length(self, points: np.ndarray) -> np.ndarray:
+        """(...) distance of its ends."""
+        return np.linalg.norm(np.subtract(*self.ends(points)), axis=-1)
 
 
 @dataclass(frozen=True)
@@ -129,17 +153,31 @@ class Drawing:
 
         return tuple(map(np.asarray, jax.jit(jax.vmap(bodies_and_rates))(q_s, q_f, v_s, v_f)))
 
+    @cached_property
+    def numbers(self) -> dict[str, int]:
+        """Numbers of the bodies by name."""
+        return {body.name: i for i, body in enumerate(self.bodies)}
+
+    @property
+    def connections(self) -> list[Connection]:
+        """The joints, with numbers of bodies and points in coordinates of the picture."""
+        points, connections = self.place([joint.point or () for joint in self.joints]), []
+        for joint, point in zip(self.joints, points, strict=True):
+            body, *other = (self.numbers[name] for name in joint.bodies)
+            end = (other[0], None) if joint.point is None else (None, point)
+            connections.append(Connection(joint.kind, body, *end, self.pace(joint)))
+        return connections
+
     def corners(self, points: np.ndarray) -> list[np.ndarray]:
         """Corners (..., n, 3) of each solid.
 
         Args:
             points: (..., n_bodies, 3) positions of the bodies.
         """
-        index = {body.name: i for i, body in enumerate(self.bodies)}
         solids = []
         for solid in self.solids:
             # x_0 + sum_i c_i (x_i - x_0)
-            centre, *ends = (points[..., index[name], :] for name in solid.points)
+            centre, *ends = (points[..., self.numbers[name], :] for name in solid.points)
             axes = np.stack([end - centre for end in ends], axis=-2)
             solids.append(centre[..., None, :] + np.array(solid.corners) @ axes)
         return solids
@@ -165,10 +203,14 @@ class Drawing:
         points += [vector for body in self.bodies for vector in (body.forms, body.offset)] + [self.up or ()]
         return max((len(point) for point in points), default=1)
 
-    def frame(self) -> np.ndarray:
-        """(3, dimension) matrix from coordinates of the bodies to coordinates of the picture, where z points
-        upwards."""
-        return frame(self.up, self.dimension)
+    def frame(self, dimension: int | None = None) -> np.ndarray:
+        """(3, dimension) matrix of orthonormal columns from coordinates of the bodies to coordinates of the picture,
+        see `up`; in the dimension of the drawing by default."""
+        dimension = dimension or self.dimension
+        if self.up is None:
+            return np.array([[1.0], [0.0], [0.0]]) if dimension == 1 else _upright(np.eye(dimension)[-1])
+        padded = np.pad(self.up, (0, dimension - len(self.up)))
+        return _upright(padded / np.linalg.norm(padded))
 
     def place(self, points: Sequence[tuple[float, ...]]) -> np.ndarray:
         """(n, 3) points in coordinates of the picture.
@@ -198,15 +240,6 @@ class Drawing:
                     check_index(body.name, part, index, n_s, n_f)
                     matrix[i, axis, first[part] + index] += weight
         return self.place([body.offset for body in self.bodies]), np.einsum("ad,idq->iaq", self.frame(), matrix)
-
-
-def frame(up: tuple[float, ...] | None, dimension: int) -> np.ndarray:
-    """(3, dimension) matrix of orthonormal columns from coordinates of the bodies to coordinates of the picture, see
-    `Drawing.up`."""
-    if up is None:
-        return np.array([[1.0], [0.0], [0.0]]) if dimension == 1 else _upright(np.eye(dimension)[-1])
-    padded = np.pad(up, (0, dimension - len(up)))
-    return _upright(padded / np.linalg.norm(padded))
 
 
 def check_index(name: str, part: str, index: int, n_s: int, n_f: int) -> None:

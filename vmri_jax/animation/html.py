@@ -7,8 +7,9 @@ import jinja2
 import numpy as np
 
 from vmri_jax import plots
+from vmri_jax.animation.drawing import Connection
 from vmri_jax.animation.geometry import JOINT_END, LAMP, helix
-from vmri_jax.animation.layout import Connection, Ground, Layout, layout, nice
+from vmri_jax.animation.layout import Ground, Layout, layout, nice
 from vmri_jax.animation.motion import Motion
 from vmri_jax.running.files import check_place
 
@@ -65,7 +66,6 @@ def _data(motion: Motion, sizes: Layout) -> dict:
     many = len(sizes.connections) > 20  # fewer points then: the script draws every helix in every picture
     constrained = bool(np.nanmax(motion.residual, initial=0.0) > 0)
     title = f"{motion.energy_names[0]} {'ΔE / |E₀|' if motion.relative else 'ΔE'}"
-    index = {body.name: i for i, body in enumerate(drawing.bodies)}
     return {
         "t": _packed(t, np.float64),
         "points": _packed(motion.points),
@@ -78,7 +78,9 @@ def _data(motion: Motion, sizes: Layout) -> dict:
             {"name": body.name, "pace": body.pace, "color": body.color, "radius": float(radius), "shown": body.shown}
             for body, radius in zip(drawing.bodies, sizes.radii, strict=True)
         ],
-        "solids": [vars(solid) | {"points": [index[name] for name in solid.points]} for solid in drawing.solids],
+        "solids": [
+            vars(solid) | {"points": [drawing.numbers[name] for name in solid.points]} for solid in drawing.solids
+        ],
         "connections": [_plain(connection) for connection in sizes.connections],
         "planes": [_plain(ground) | {"grid": _packed(ground.grid), "bears": ground.bears} for ground in sizes.grounds],
         "spheres": [

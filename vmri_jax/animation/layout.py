@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from vmri_jax.animation.drawing import Drawing
+from vmri_jax.animation.drawing import Connection, Drawing
 from vmri_jax.animation.geometry import grid
 from vmri_jax.animation.motion import Motion
 
@@ -42,18 +42,6 @@ class Ground:
 
 
 @dataclass(frozen=True)
-class Connection:
-    """A link or spring from a body, by its number, to another body or, if `other` is None, to a fixed point (3,)."""
-
-    kind: str
-    body: int
-    other: int | None
-    point: np.ndarray | None
-    pace: str
-    turns: int
-
-
-@dataclass(frozen=True)
 class Layout:
     """Sizes in the unit of the coordinates, positions in coordinates of the picture, and the first view.
 
@@ -80,7 +68,7 @@ class Layout:
 def layout(motion: Motion) -> Layout:
     """Sizes for a picture: balls do not touch their neighbours, coils are thinner than the shortest spring is long."""
     drawing, points = motion.drawing, motion.thinned(500).points
-    connections = _connections(drawing)
+    connections = drawing.connections
     fixed = np.array([c.point for c in connections if c.point is not None]).reshape(-1, 3)
     spheres = drawing.place([sphere.center for sphere in drawing.spheres])
     sphere_radii = np.array([sphere.radius for sphere in drawing.spheres])
@@ -88,7 +76,7 @@ def layout(motion: Motion) -> Layout:
     corners = [corner.reshape(-1, 3) for corner in drawing.corners(points)]
     box = np.concatenate([points.reshape(-1, 3), *corners, fixed, spheres - reach, spheres + reach])
     size = float(np.linalg.norm(np.ptp(box, axis=0))) or 1.0
-    lengths = [_median_length(connection, points) or size for connection in connections]
+    lengths = [float(np.median(connection.length(points))) or size for connection in connections]
     small = min(0.02 * size, 0.3 * min(lengths, default=size))
     balls = [body.shown == "ball" for body in drawing.bodies]
     radii = np.where(balls, [body.radius or small for body in drawing.bodies], HIDDEN_RADIUS * small)
@@ -112,23 +100,6 @@ def layout(motion: Motion) -> Layout:
         azimuth=math.radians(azimuth),
         elevation=math.radians(elevation),
     )
-
-
-def _connections(drawing: Drawing) -> list[Connection]:
-    index = {body.name: i for i, body in enumerate(drawing.bodies)}
-    points = drawing.place([joint.point or () for joint in drawing.joints])
-    connections = []
-    for joint, point in zip(drawing.joints, points, strict=True):
-        body, other = index[joint.bodies[0]], None
-        if joint.point is None:
-            other, point = index[joint.bodies[1]], None
-        connections.append(Connection(joint.kind, body, other, point, drawing.pace(joint), turns=0))
-    return connections
-
-
-def _median_length(connection: Connection, points: np.ndarray) -> float:
-    end = connection.point if connection.other is None else points[:, connection.other]
-    return float(np.median(np.linalg.norm(points[:, connection.body] - end, axis=-1)))
 
 
 def _grounds(drawing: Drawing, box: np.ndarray, radius: float, size: float) -> list[Ground]:

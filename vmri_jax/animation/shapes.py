@@ -73,8 +73,8 @@ class Stage:
         points = self.motion.at([time])[0]
         self._draw_around(pen, points)
         past = self.motion.at(self._trail_times(max(float(self.motion.t[0]), time - trail), time))
-        drawing, colors = self.motion.drawing, self._colors
-        bodies, index = drawing.bodies, {body.name: i for i, body in enumerate(drawing.bodies)}
+        drawing, bodies = self.motion.drawing, self.motion.drawing.bodies
+        colors = [body.color or self.paces[body.pace] for body in bodies]
         balls = [i for i, body in enumerate(bodies) if body.shown == "ball"]
         for i in balls:
             pen.trail(past[:, i], colors[i], self.sizes.radii[i])
@@ -83,7 +83,7 @@ class Stage:
             pen.ball(points[i], self.sizes.radii[i], colors[i])
         for solid, corners in zip(drawing.solids, drawing.corners(points), strict=True):
             for face in solid.faces:
-                pen.face(corners[list(face)], solid.color or colors[index[solid.points[0]]])
+                pen.face(corners[list(face)], solid.color or colors[drawing.numbers[solid.points[0]]])
         if names:
             named = [i for i, body in enumerate(bodies) if body.shown]
             pen.names(points[named], self.sizes.radii[named], [bodies[i].name for i in named])
@@ -97,18 +97,10 @@ class Stage:
         """Colours of slow and of fast parts."""
         return {"slow": self.theme.curves[0], "fast": self.theme.curves[1]}
 
-    @property
-    def _colors(self) -> list[str]:
-        return [body.color or self.paces[body.pace] for body in self.motion.drawing.bodies]
-
     def _trail_times(self, start: float, end: float) -> np.ndarray:
         """Times of the points of a trail, two for each node: with fewer points fast motion would be a zigzag."""
         nodes = int(np.sum((self.motion.t >= start) & (self.motion.t <= end)))
         return np.linspace(start, end, int(np.clip(2 * nodes, *TRAIL_POINTS)))
-
-    def _ends(self, points: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-        """The two points that each connection joins."""
-        return [(points[c.body], points[c.other] if c.point is None else c.point) for c in self.sizes.connections]
 
     def _draw_around(self, pen: "_Pen", points: np.ndarray) -> None:
         """Draw the planes with the shadows on them, and fixed spheres."""
@@ -119,7 +111,7 @@ class Stage:
         for ground in sizes.grounds:
             pen.ground(ground)
             if ground.bears:
-                pen.shadows(ground, centers, radii, self._ends(points), sizes.rod)
+                pen.shadows(ground, centers, radii, [c.ends(points) for c in sizes.connections], sizes.rod)
                 for solid, corners in zip(drawing.solids, drawing.corners(points), strict=True):
                     pen.shadow(ground, [corners[list(face)] for face in solid.faces])
         for center, radius in zip(sizes.spheres, sizes.sphere_radii, strict=True):
@@ -127,7 +119,8 @@ class Stage:
 
     def _draw_joints(self, pen: "_Pen", points: np.ndarray) -> None:
         sizes = self.sizes
-        for c, (a, b) in zip(sizes.connections, self._ends(points), strict=True):
+        for c in sizes.connections:
+            a, b = c.ends(points)
             reach = (sizes.radii[c.body], 0.0 if c.other is None else sizes.radii[c.other])
             ends = joint(a, b, reach)
             if ends is not None and c.kind == "link":
@@ -236,7 +229,7 @@ class _Pen:
                 corner = places[i] + [left, shift]
                 box = corner + np.array([[0.0, 0.0], [width, 1.2 * letter]])
                 inside = edge[0] < box[0, 0] and box[1, 0] < edge[1]
-                if inside and not any(_overlap(box, other) for other in taken):
+                if inside and not any(np.all(box[0] < other[1]) and np.all(other[0] < box[1]) for other in taken):
                     taken.append(box)
                     x, y = corner.tolist()
                     ink = self.theme.ink
@@ -283,8 +276,3 @@ class _Pen:
         if len(corners):
             path = Path.make_compound_path_from_polys(self.camera.project(np.array(corners))[0])
             self.axes.add_patch(PathPatch(path, facecolor=color, linewidth=0, alpha=alpha, zorder=zorder))
-
-
-def _overlap(a: np.ndarray, b: np.ndarray) -> bool:
-    """Whether two boxes overlap, each given by its lower left and upper right corner."""
-    return bool(np.all(a[0] < b[1]) and np.all(b[0] < a[1]))

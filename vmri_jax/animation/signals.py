@@ -88,18 +88,11 @@ def _coordinates(motion: Motion) -> list[Signal]:
 def _lengths(motion: Motion) -> list[Signal]:
     """Signals of the lengths of all springs."""
     drawing, signals = motion.drawing, []
-    index = {body.name: i for i, body in enumerate(drawing.bodies)}
-    for joint in drawing.joints:
-        if joint.kind != "spring":
-            continue
-        end = index[joint.bodies[-1]] if joint.point is None else drawing.place([joint.point])[0]
-        of = _distance(index[joint.bodies[0]], end)
-        signals += _signal(motion, f"length of spring {' to '.join(joint.bodies)}", drawing.pace(joint), of)
+    for joint, connection in zip(drawing.joints, drawing.connections, strict=True):
+        if joint.kind == "spring":
+            label = f"length of spring {' to '.join(joint.bodies)}"
+            signals += _signal(motion, label, connection.pace, connection.length)
     return signals
-
-
-def _distance(body: int, end: int | np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-    return lambda points: np.linalg.norm(points[:, body] - (points[:, end] if isinstance(end, int) else end), axis=1)
 
 
 def _signal(motion: Motion, label: str, pace: str, of: Callable[[np.ndarray], np.ndarray]) -> list[Signal]:

@@ -57,17 +57,15 @@ def write_vtk(motion: Motion, path: str | Path) -> None:
 def _cells(drawing: Drawing) -> tuple[list, dict]:
     """Cells for meshio, and the data of each block of cells. Points are the bodies, fixed ends of joints, corners of
     solids, in this order."""
-    index = {body.name: i for i, body in enumerate(drawing.bodies)}
-    next_point = len(drawing.bodies)
+    index, next_point = drawing.numbers, len(drawing.bodies)
     cells_by_type: dict[str, list[tuple[list[int], str, bool]]] = {}
     for body in drawing.bodies:
         if body.shown == "ball":
             cells_by_type.setdefault("vertex", []).append(([index[body.name]], "body", body.pace == "fast"))
-    for joint in drawing.joints:
-        ends = [index[name] for name in joint.bodies]
-        if joint.point is not None:
-            ends, next_point = [*ends, next_point], next_point + 1
-        cells_by_type.setdefault("line", []).append((ends, joint.kind, drawing.pace(joint) == "fast"))
+    for line in drawing.connections:
+        end = next_point if line.other is None else line.other
+        next_point += line.other is None
+        cells_by_type.setdefault("line", []).append(([line.body, end], line.kind, line.pace == "fast"))
     for solid in drawing.solids:
         fast = drawing.bodies[index[solid.points[0]]].pace == "fast"
         for face in solid.faces:

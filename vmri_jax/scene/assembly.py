@@ -8,9 +8,10 @@ import numpy as np
 from vmri_jax.mechanics.kinematics import JOINTS, MASS, Kinematics
 from vmri_jax.mechanics.rows import Entries
 from vmri_jax.mechanics.system import ConstantMass, Rheonomic, System
+from vmri_jax.mechanics.terms import KINDS
 from vmri_jax.scene.declare import arrays
-from vmri_jax.scene.functions import FUNCTIONS, IMPLIED, Actuation
-from vmri_jax.scene.layout import Layout, join
+from vmri_jax.scene.functions import IMPLIED, Actuation, function_of
+from vmri_jax.scene.layout import Layout
 from vmri_jax.scene.rows import rows_of
 from vmri_jax.scene.sorting import HOMES, Placed, Sorting
 from vmri_jax.scene.terms import joined
@@ -18,36 +19,31 @@ from vmri_jax.scene.terms import joined
 
 def build(sorting: Sorting, placed: Sequence[Placed]) -> System:
     """The system of the bodies and of some or all effects; a function without effects is None."""
-    bodies, layout = sorting.bodies, sorting.layout
+    layout = sorting.layout
     terms: dict[Any, list] = {}
     for part in placed:
         for home in (part.home, "implied") if part.dropped else (part.home,):
             terms.setdefault(home, []).extend(part.effect.terms(part.elements, layout))
-    # the values of constraints keep the order of `rows_of`
-    in_order: tuple[Any, ...] = (*HOMES, "implied")
-    terms = {home: [*joined(of_home, home in in_order)] for home, of_home in terms.items()}
-    taken = _taken(placed) if "implied" in terms else {}
+    terms = {home: of_home for home, of_home in terms.items() if of_home and home != "control"}
     # with joint coordinates the masses depend on positions, so that T is a function even without kinetic effects
     if layout.kinematics is not None:
         terms.setdefault("kinetic", [])
     if "kinetic" in terms and layout.sizes[0]:
         terms["slow_kinetic"] = []
-    functions: dict[str, Any] = {
-        home: FUNCTIONS[home](tuple(terms[home]), _kinematics(home, terms[home], layout), taken.get(home))
-        for home in FUNCTIONS
-        if terms.get(home) or ("kinetic" in home and home in terms)
-    }
-    rates = [home for home in terms if home == "fast" or isinstance(home, int)]  # potentials with a rate of their own
-    if rates:
-        functions["potentials"] = {
-            rate: FUNCTIONS["slow_potential"](tuple(terms[rate]), _kinematics("potentials", terms[rate], layout))
-            for rate in rates
-        }
-    for home in in_order:
-        if any(term.timed for term in terms.get(home, ())):
-            functions[home] = Rheonomic(functions[home])
+    taken = _taken(placed) if "implied" in terms else {}
+    functions: dict[str, Any] = {"potentials": {}}
+    for home, of_home in terms.items():
+        is_rows = home in (*HOMES, "implied")  # whose values keep the order of `rows_of`
+        of_home = joined(of_home, in_order=is_rows)
+        field = home if home in KINDS else "potentials"  # a potential with a rate of its own
+        function = function_of(field, of_home, _kinematics(home, of_home, layout), taken.get(home))
+        if field == "potentials":
+            functions[field][home] = function
+        else:
+            functions[home] = Rheonomic(function) if is_rows and any(term.timed for term in of_home) else function
     params: dict[str, Any] = {part.effect.name: arrays(part.effect.parameters) for part in placed}
-    slow, fast = (join(bodies, layout, part, "masses") for part in ("s", "f"))
+    masses, num_slow = sorting.of_bodies("masses"), layout.ends[0]
+    slow, fast = masses[:num_slow], masses[num_slow:]
     if "kinetic" in functions:
         params[MASS] = {"slow": slow, "fast": fast}
     if layout.kinematics is not None:
@@ -71,7 +67,7 @@ def actuation(sorting: Sorting) -> Actuation | None:
     controls = [part for part in sorting.placed if part.home == "control"]
     terms = tuple(part.effect.terms(part.elements, layout)[0] for part in controls)
     names = tuple(part.effect.components() for part in controls)
-    return Actuation(terms, _kinematics("control", terms, layout), names=names) if controls else None
+    return Actuation("control", terms, _kinematics("control", terms, layout), names=names) if controls else None
 
 
 def _kinematics(home: str, terms: Sequence, layout: Layout) -> Kinematics | None:

@@ -19,8 +19,6 @@ from vmri_jax.scene.declare import effect_class, lasting
 from vmri_jax.scene.returned import check_function
 
 Kind = Literal["kinetic", "potential", "constraint", "force", "control"]
-DRAWN = {"link": "links", "spring": "springs"}
-"""For each symbol that an effect may draw between two bodies, the list of the drawing that holds it."""
 START = 1e-9
 """Largest violation of a constraint at the start, relative to the value that it keeps. A larger one would start runs off the constraints;
 a smaller one would refuse lengths that are written with ten digits."""
@@ -54,6 +52,10 @@ class Effect(Bindable):
             (on every k-th micro node), or "auto" (the scene decides by stiffness). A potential with the rate "fast" or k makes its bodies fast, except bodies
             with the pace "slow": the positions of these slow bodies are then solved for by iteration over the macro step. Of a kinetic effect "slow",
             "fast" or "auto"; here the rate decides only whether its bodies are fast, since all kinetic effects are on the micro grid.
+
+    Raises:
+        TypeError, ValueError: arguments other than the docstring of the class says; of the scene, see `check`: wrong shapes or signs,
+            unknown names, points at one place where a line between them is needed, constraints that the start violates.
     """
 
     kind: ClassVar[Kind]
@@ -194,7 +196,7 @@ class Effect(Bindable):
             {"body": label_of(body), "point": end_of(self.by_name, ground).position.tolist(), "kind": self.drawn_as}
             for body, ground in to_ground
         ]
-        return {DRAWN[self.drawn_as]: between, "anchors": anchors}
+        return {f"{self.drawn_as}s": between, "anchors": anchors}
 
     def require(self, condition: Any, quantity: str, value: Any, expected: str) -> None:
         """Raise ValueError, "{quantity} is {value}; {expected}.", unless a condition is true everywhere, or traced."""

@@ -3,6 +3,7 @@
 All classes here are compared by value: scenes of the same structure give equal functions, which JAX compiles only once.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import chain
 from typing import Any
@@ -13,6 +14,7 @@ import numpy as np
 
 from vmri_jax.mechanics.kinematics import JOINTS, MASS, Kinematics
 from vmri_jax.mechanics.rows import Entries
+from vmri_jax.mechanics.terms import KINDS
 from vmri_jax.scene.terms import concatenated, total, totals
 
 IMPLIED = "implied"
@@ -27,20 +29,24 @@ RESERVED = {
 
 @dataclass(frozen=True)
 class _OfTerms:
-    """A function of a `System`, made of terms of the coordinates Q of bodies; compared by class, terms and kinematics.
+    """A function of a `System`, made of terms of the coordinates Q of bodies; compared by class and fields.
 
-    The kinematics are the map from the coordinates q of the scene to Q; None if Q = q. Of the rows of a constraint `rows` are taken; None for all.
+    field: the argument of `System`, see `vmri_jax.mechanics.terms.KINDS`.
+    kinematics: the map from the coordinates q of the scene to Q; None if Q = q.
+    rows: of a constraint, those that are taken; None for all.
     """
 
+    field: str
     terms: tuple[Any, ...]
     kinematics: Kinematics | None = None
     rows: Entries | None = None
 
-    def values(self, q_s, q_f, params, *t):
-        """The values of the rows of constraints, one term after the other."""
-        bodies = self.bodies(q_s, q_f, params)
-        values = concatenated([term.value(*bodies, params, *t) for term in self.terms])
-        return values if self.rows is None else self.rows.take(values)
+    def by_name(self, arguments) -> tuple[Any, ...]:
+        """(t, q_s, q_f, v_s, v_f, params) of the arguments of a call, with None for those that the function does not take."""
+        *arguments, params = arguments
+        names = ("t", *KINDS[self.field].arguments)[-len(arguments) :]  # rows that depend on time get t first
+        values = dict(zip(names, arguments, strict=True))
+        return *map(values.get, ("t", "q_s", "q_f", "v_s", "v_f")), params
 
     def bodies(self, q_s, q_f, params) -> tuple[Any, Any]:
         """(Q_s, Q_f) of q_s and q_f; one of these may be None if the terms do not depend on it, and zeros take its place."""
@@ -62,65 +68,41 @@ class _OfTerms:
         return jax.vjp(lambda q_s, q_f: self.bodies(q_s, q_f, params), q_s, q_f)[1](forces)
 
 
-class SlowPotential(_OfTerms):
-    """``V(q_s, q_f, params)``, the sum of its terms."""
+class PotentialEnergy(_OfTerms):
+    """V, W or V_i, the sum of its terms."""
 
-    def __call__(self, q_s, q_f, params):
+    def __call__(self, *arguments):
+        _, q_s, q_f, *_, params = self.by_name(arguments)
         bodies = self.bodies(q_s, q_f, params)
         return total([term.value(*bodies, params) for term in self.terms])
 
 
-class FastPotential(_OfTerms):
-    """``W(q_f, params)``, the sum of its terms."""
-
-    def __call__(self, q_f, params):
-        bodies = self.bodies(None, q_f, params)
-        return total([term.value(*bodies, params) for term in self.terms])
-
-
-class MicroConstraint(_OfTerms):
-    """``g(q_s, q_f, params)``, or ``g(t, q_s, q_f, params)``: the values of its terms one after the other."""
+class ConstraintValues(_OfTerms):
+    """g or g_s, the values of its terms one after the other; g_i, the values of the dropped rows over their sizes."""
 
     def __call__(self, *arguments):
-        *t, q_s, q_f, params = arguments
-        return self.values(q_s, q_f, params, *t)
-
-
-class MacroConstraint(_OfTerms):
-    """``g_s(q_s, params)``, or ``g_s(t, q_s, params)``: the values of its terms one after the other."""
-
-    def __call__(self, *arguments):
-        *t, q_s, params = arguments
-        return self.values(q_s, None, params, *t)
-
-
-class ImpliedRows(MicroConstraint):
-    """``g_i(q_s, q_f, params)``, or ``g_i(t, q_s, q_f, params)``: the values of the dropped rows over their sizes."""
-
-    def __call__(self, *arguments):
-        return super().__call__(*arguments) / arguments[-1][IMPLIED]
+        t, q_s, q_f, *_, params = self.by_name(arguments)
+        bodies = self.bodies(q_s, q_f, params)
+        values = concatenated([term.value(*bodies, params, t) for term in self.terms])
+        values = values if self.rows is None else self.rows.take(values)
+        return values / params[IMPLIED] if self.field == "implied" else values
 
 
 class KineticEnergy(_OfTerms):
-    """``T = sum m V_f^2 / 2`` of the velocities V_f of bodies that depend on fast coordinates, plus the velocity-dependent terms."""
+    """``T = sum m V_f^2 / 2`` of bodies that depend on fast coordinates, plus the velocity-dependent terms; ``T_s = sum m V_s^2 / 2`` of all others."""
 
-    def __call__(self, q_s, q_f, v_s, v_f, params):
+    def __call__(self, *arguments):
+        _, q_s, q_f, v_s, v_f, params = self.by_name(arguments)
+        part, number = ("slow", 0) if self.field == "slow_kinetic" else ("fast", 1)
+        if q_f is None:
+            q_f = v_f = jnp.zeros(0 if self.kinematics is None else self.kinematics.sizes[1])
         bodies, rates = self.motions(q_s, q_f, v_s, v_f, params)
-        of_bodies = jnp.sum(params[MASS]["fast"] * rates[1] ** 2) / 2
+        of_bodies = jnp.sum(params[MASS][part] * rates[number] ** 2) / 2
         return total([of_bodies, *(term.kinetic(*bodies, *rates, params) for term in self.terms)])
 
 
-class SlowKineticEnergy(_OfTerms):
-    """``T_s = sum m V_s^2 / 2`` of the velocities V_s of bodies that depend on slow coordinates alone."""
-
-    def __call__(self, q_s, v_s, params):
-        none = jnp.zeros(0 if self.kinematics is None else self.kinematics.sizes[1])
-        (rates, _) = self.motions(q_s, none, v_s, none, params)[1]
-        return jnp.sum(params[MASS]["slow"] * rates**2) / 2
-
-
 class TotalForce(_OfTerms):
-    """``F(t, q_s, q_f, v_s, v_f, params)``, the sum of its terms."""
+    """F, the sum of its terms."""
 
     def __call__(self, t, q_s, q_f, v_s, v_f, params):
         bodies, rates = self.motions(q_s, q_f, v_s, v_f, params)
@@ -146,14 +128,16 @@ class Actuation(_OfTerms):
         return self.forces_on(q_s, q_f, params, forces)
 
 
-FUNCTIONS = {
+FUNCTIONS: dict[str, Any] = {
     "kinetic": KineticEnergy,
-    "slow_kinetic": SlowKineticEnergy,
-    "slow_potential": SlowPotential,
-    "fast_potential": FastPotential,
-    "constraint": MicroConstraint,
-    "slow_constraint": MacroConstraint,
+    "potential": PotentialEnergy,
+    "constraint": ConstraintValues,
+    "implied": ConstraintValues,
     "force": TotalForce,
-    "implied": ImpliedRows,
 }
-"""For each argument of `System`, the class that makes a function of its terms."""
+"""For each kind of a function of `System`, the class that makes it of its terms."""
+
+
+def function_of(field: str, *of_terms) -> Callable:
+    """The function that is an argument of `System`, of terms, kinematics and rows."""
+    return FUNCTIONS[KINDS[field].kind](field, *of_terms)

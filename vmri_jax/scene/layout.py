@@ -1,14 +1,13 @@
 """Where the coordinates of bodies and joints lie in q_s and q_f."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from vmri_jax.mechanics.arrays import library
 from vmri_jax.mechanics.kinematics import Kinematics
-from vmri_jax.mechanics.rows import Part, Place
-from vmri_jax.scene.body import Bodies
+from vmri_jax.mechanics.rows import Place
 
 Key = tuple[str, int, str]
 """Name of a joint, number of its pair of bodies, and name of a freedom of the joint."""
@@ -54,15 +53,15 @@ class Layout:
     @property
     def columns(self) -> dict[str | Key, np.ndarray]:
         """Numbers of the coordinates of every body, and of every freedom of a joint, in (Q_s, Q_f), taken as one vector."""
-        first, places = {"s": 0, "f": self.ends[0]}, {**self.bodies, **self.freedoms}
-        return {name: first[part] + start + np.arange(size) for name, (part, start, size) in places.items()}
+        return _numbers({**self.bodies, **self.freedoms}, self.ends[0])
+
+    @property
+    def numbers(self) -> dict[str | Key, np.ndarray]:
+        """Numbers of the coordinates of every name and freedom in (q_s, q_f), taken as one vector."""
+        return _numbers({**self.coordinates, **self.freedoms}, self.sizes[0])
 
 
-def join(bodies: Bodies, layout: Layout, part: Part, quantity: Literal["coordinates", "rates", "masses"]) -> Any:
-    """A vector of the length of Q_s or Q_f with a quantity of all bodies at their places, and zeros for freedoms of joints."""
-    pieces = {
-        place.start: getattr(bodies[name], quantity) for name, place in layout.bodies.items() if place.part == part
+def _numbers(places: Mapping[Any, Place], num_slow: int) -> dict[Any, np.ndarray]:
+    return {
+        name: start + (num_slow if part == "f" else 0) + np.arange(size) for name, (part, start, size) in places.items()
     }
-    pieces |= {place.start: np.zeros(1) for place in layout.freedoms.values() if place.part == part}
-    ordered = [pieces[start] for start in sorted(pieces)]
-    return library(ordered).concatenate(ordered) if ordered else np.zeros(0)

@@ -1,6 +1,6 @@
 """A compiled model of MuJoCo: names of its elements, its flags, and the features that no scene expresses."""
 
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -9,7 +9,7 @@ import numpy as np
 
 from vmri_jax.mechanics.names import unknown
 from vmri_jax.refusals import Refused
-from vmri_jax.scene.body import GROUND
+from vmri_jax.scene.body import GROUND, listed
 from vmri_jax.scene.mujoco_fields import CONSTRAINTS, PASSIVE, REFUSED, Refusal
 
 SOFTEST_TIME = 0.02
@@ -23,8 +23,6 @@ ELEMENTS = {"jnt": "joint", "dof": "joint", "body": "body", "tendon": "tendon", 
 STATES_ASKED = (0.1, 1.0)
 """Standard deviations, in m, rad, m/s and rad/s, of random changes of the start at which MuJoCo is asked for the forces of actuators: a force
 that is zero at the start, as of a servo at its target, is not zero there. More states take longer."""
-NAMED = 8
-"""Most elements that a message names; with more it is hard to read."""
 
 
 @dataclass(frozen=True)
@@ -137,19 +135,27 @@ class Compiled:
 
     def beyond(self) -> Iterator[tuple[str, str]]:
         """The features of the model that a scene does not express: the name in `REFUSED`, and the elements that have the feature."""
-        looks: dict[str, Callable[[], str]] = {
-            "actuators": self._actuators,
-            "contact": self._contact,
-            "armature of ball and free joints": self._turning_armature,
-            "springs and dampers of ball and free joints": self._turning_springs,
-            "couplings": self._couplings,
-            "soft equalities": self._soft_equalities,
-            "sleep": self._sleep,
-            "several joints of one body": self._several_joints,
-            "compensation of gravity by actuators": self._actuated_compensation,
+        model = self.model
+        kept = [i for i in self.equalities if self.closes(i) or self.ties(i)]
+        # bodies with several joints, if one of these is a ball joint or the scene has directors alone
+        several = np.flatnonzero(np.asarray(model.body_jntnum) > 1)
+        if self.coordinates != "directors":
+            several = [b for b in several if np.any(self.turning[self.joints_of(int(b))])]
+        is_sleeping = int(model.opt.enableflags) & int(self.mujoco.mjtEnableBit.mjENBL_SLEEP)
+        compensation = "compensation of gravity by actuators"
+        parts = {
+            "actuators": self._actuators(),
+            "contact": self._contact(),
+            "armature of ball and free joints": self._listed("joint", self._turning_joints("dof_armature")),
+            "springs and dampers of ball and free joints": self._listed("joint", self._sprung()),
+            "couplings": self._listed("equality", [i for i in self.equalities if i not in kept]),
+            "soft equalities": self._listed("equality", [i for i in kept if self._is_soft(i)]),
+            "sleep": "the flag sleep" if is_sleeping else "",
+            "several joints of one body": self._listed("body", several),
+            compensation: self._acting(REFUSED[compensation]) if self.compensated else "",
         }
         for kind, refusal in REFUSED.items():
-            part = looks[kind]() if kind in looks else self._acting(refusal)
+            part = parts[kind] if kind in parts else self._acting(refusal)
             if part:
                 yield kind, part
 
@@ -171,9 +177,7 @@ class Compiled:
 
     def _listed(self, kind: str, rows) -> str:
         """ "joint a, joint b, ..." without repetitions."""
-        names = list(dict.fromkeys(f"{kind} {getattr(self.model, kind)(int(i)).name or int(i)}" for i in rows))
-        unnamed = [f"and {len(names) - NAMED} more"] if len(names) > NAMED else []
-        return ", ".join(names[:NAMED] + unnamed)
+        return listed(list(dict.fromkeys(f"{kind} {getattr(self.model, kind)(int(i)).name or int(i)}" for i in rows)))
 
     def _actuators(self) -> str:
         """Actuators with a force, joints with a force of actuators (a range without zero), and all actuators with armature or damping."""
@@ -237,45 +241,21 @@ class Compiled:
         meet &= group[:, None] != group  # bodies that are welded together do not move against each other
         return np.argwhere(np.triu(meet))
 
-    def _turning_springs(self) -> str:
-        """Ball and free joints with a spring or a damper."""
-        model = self.model
-        sprung = np.zeros(model.njnt, dtype=bool) if self.off("SPRING") else np.asarray(model.jnt_stiffness) != 0
-        damped = [] if self.off("DAMPER") else model.dof_jntid[np.flatnonzero(model.dof_damping)]
-        sprung[np.asarray(damped, dtype=int)] = True
-        return self._listed("joint", np.flatnonzero(self.turning & sprung))
+    def _turning_joints(self, field: str) -> list:
+        """Ball and free joints with an entry of a field of velocities that is not zero."""
+        return [j for j in self.model.dof_jntid[np.flatnonzero(getattr(self.model, field))] if self.turning[j]]
 
-    def _turning_armature(self) -> str:
-        """Ball and free joints with armature."""
-        rows = self.model.dof_jntid[np.flatnonzero(self.model.dof_armature)]
-        return self._listed("joint", [j for j in rows if self.turning[j]])
+    def _sprung(self) -> list:
+        """Ball and free joints with a spring or a damper, in their order."""
+        sprung = (
+            [] if self.off("SPRING") else np.flatnonzero(self.turning & (np.asarray(self.model.jnt_stiffness) != 0))
+        )
+        return sorted({*sprung, *([] if self.off("DAMPER") else self._turning_joints("dof_damping"))})
 
-    def _couplings(self) -> str:
-        """Equalities that neither close a loop nor couple hinges and slides."""
-        return self._listed("equality", [i for i in self.equalities if not (self.closes(i) or self.ties(i))])
-
-    def _soft_equalities(self) -> str:
-        """Equalities that are softer than by default, or whose solref has negative numbers, which define a spring."""
-        model = self.model
-        kept = np.array([i for i in self.equalities if self.closes(i) or self.ties(i)], dtype=int)
-        time, impedance = model.eq_solref[kept, 0], model.eq_solimp[kept, :2].min(axis=1)
-        is_stiff = (time > 0) & (time <= SOFTEST_TIME) & (impedance >= SOFTEST_IMPEDANCE)
-        return self._listed("equality", kept[~is_stiff])
-
-    def _sleep(self) -> str:
-        is_on = int(self.model.opt.enableflags) & int(self.mujoco.mjtEnableBit.mjENBL_SLEEP)
-        return "the flag sleep" if is_on else ""
-
-    def _several_joints(self) -> str:
-        """Bodies with several joints, if one of them is a ball joint or the scene has directors alone."""
-        several = np.flatnonzero(np.asarray(self.model.body_jntnum) > 1)
-        if self.coordinates != "directors":
-            several = [b for b in several if np.any(self.turning[self.joints_of(int(b))])]
-        return self._listed("body", several)
-
-    def _actuated_compensation(self) -> str:
-        """Joints whose actuators compensate gravity, if a body has gravcomp."""
-        return self._acting(REFUSED["compensation of gravity by actuators"]) if self.compensated else ""
+    def _is_soft(self, i: int) -> bool:
+        """Whether an equality is softer than by default, or has a solref with negative numbers, which define a spring."""
+        time, impedance = self.model.eq_solref[i, 0], self.model.eq_solimp[i, :2].min()
+        return not (0 < time <= SOFTEST_TIME and impedance >= SOFTEST_IMPEDANCE)
 
 
 def _rows(values: Any) -> np.ndarray:

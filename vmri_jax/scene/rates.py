@@ -76,12 +76,17 @@ def measure(bodies: Bodies, effects: Sequence[Effect]) -> dict[str, Rates]:
     return {effect.name: _rates(effect, elements[effect.name], mass, size or 1.0) for effect in effects}
 
 
-def border(rates: Sequence[np.ndarray], slow: float = 0.0, fast: float = np.inf) -> float | None:
+def border(measured: Mapping[str, Rates], effects: Sequence[Effect]) -> float | None:
     """The border between slow and fast: the middle of the widest gap between rates, rad/s; None if no gap is wide enough.
 
-    It is above `slow`, the largest rate that is declared slow, and below `fast`, the smallest one declared fast.
+    It is above the largest rate of the effects that are declared slow, and below the smallest one of those declared fast.
     """
-    ordered = np.sort([rate for of_effect in rates for rate in of_effect if rate > 0])
+    of_slow, of_fast = (
+        [measured[effect.name].rate for effect in effects if effect.rate == rate and effect.name in measured]
+        for rate in ("slow", "fast")
+    )
+    slow, fast = max(map(np.max, of_slow), default=0.0), min(map(np.min, of_fast), default=np.inf)
+    ordered = np.sort([rate for rates in measured.values() for rate in rates.rate if rate > 0])
     if not ordered.size:
         return None
     ordered = np.maximum(ordered, min(ordered[-1], fast) / SPAN)

@@ -6,22 +6,20 @@ smooth surface there. The dropped rows follow from the kept rows, that is are im
 around the start. The check evaluates them at the ends of random motions along the surface.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import qr
 
 from vmri_jax.mechanics.constraints import RANK, rank_of
 from vmri_jax.refusals import Refused
+from vmri_jax.scene.body import listed
 from vmri_jax.scene.effects.joint_base import Joint
 from vmri_jax.scene.rigid import Rigidity
 from vmri_jax.scene.rows import ConstraintRows
 from vmri_jax.scene.sorting import HOMES, Sorting
 
-NAMED = 8
-"""Most rows that a message names; with more it is hard to read."""
 MOTIONS = 3
 """Number of random motions on which dropped rows are evaluated: on a single motion a row may by chance change little. More take longer."""
 NEARBY = 0.1
@@ -41,29 +39,17 @@ BEND = "Bend bodies that lie in line or flat at the start by a little, leave oth
 """Advice for rows that depend on others at the start alone."""
 
 
-class Opening(NamedTuple):
-    """Numbers of dropped rows that do not vanish where the kept rows do, and their largest values over their sizes.
-
-    motion: its length relative to the scales of coordinates; 0 if these rows are violated at the start itself.
-    """
-
-    rows: list[int]
-    values: list[float]
-    motion: float
-
-
 def check_constraints(sorting: Sorting) -> None:
     """Refuse redundant constraints, dropped rows that do not follow from the others, and constraints that the fast bodies cannot satisfy."""
     rows = ConstraintRows.of(sorting)
     if rows is None:
         return
-    opening = find_opening(rows)
-    if opening is not None:
-        raise Refused(f'Scene: redundant="drop" would change the motion: {_in_words(rows, opening)}.')
+    if opening := _opening_in_words(rows):
+        raise Refused(f'Scene: redundant="drop" would change the motion: {opening}.')
     macro, micro = (rows.numbers(home) for home in HOMES)
     _refuse(rows, macro + micro, 0, lambda: _cure(sorting))
     if micro:
-        _refuse(rows, micro, rows.num_slow, lambda: _advice(sorting, rows, micro))
+        _refuse(rows, micro, sorting.layout.sizes[0], lambda: _advice(rows, micro))
 
 
 def without_redundant(sorting: Sorting) -> Sorting:
@@ -91,22 +77,23 @@ def without_redundant(sorting: Sorting) -> Sorting:
     return replace(sorting, placed=tuple(placed))
 
 
-def find_opening(rows: ConstraintRows) -> Opening | None:
-    """The dropped rows that do not follow from the kept rows g_k, with their values; None if all follow.
+def find_opening(rows: ConstraintRows) -> tuple[dict[int, float], float]:
+    """The dropped rows that do not follow from the kept rows g_k: their largest values over their sizes by number, {} if all follow; and the
+    length of the motion to them relative to the scales of coordinates, 0 if they are violated at the start itself.
 
     In coordinates over their scales, motions z along the surface solve ``dg_k(q_0) z = 0``. Newton's iteration leads from
     ``q_0 + s z`` back onto ``g_k = 0``, where the dropped rows are evaluated.
     """
     kept, dropped = rows.numbers(), [i for i, row in enumerate(rows.rows) if not row.kept]
     if not dropped:
-        return None
+        return {}, 0.0
     unit = (rows.jacobian * rows.scales / rows.sizes[:, None])[kept]
     basis, triangle = np.linalg.qr(unit.T)
     step = NEARBY * float(np.linalg.svd(triangle, compute_uv=False).min(initial=1.0))
     everywhere = np.arange(rows.start.size)
     q, values, is_reached = rows.onto(kept, rows.start, everywhere)
     if not is_reached:
-        return None  # positions far off the constraints: the initial state refuses them with a message of its own
+        return {}, 0.0  # positions far off the constraints: the initial state refuses them with a message of its own
     worst, length = np.abs(values[dropped]), 0.0
     if worst.max() <= FOLLOWS:
         random, timed = np.random.default_rng(0), any(row.effect.timed for row in rows.rows)
@@ -120,18 +107,15 @@ def find_opening(rows: ConstraintRows) -> Opening | None:
                     worst, length = np.maximum(worst, np.abs(values[dropped])), max(length, step)
                     break
                 step /= SHORTENING
-    opened = np.flatnonzero(worst > FOLLOWS)
-    if not opened.size:
-        return None
-    return Opening([dropped[i] for i in opened], worst[opened].tolist(), length)
+    return {i: value for i, value in zip(dropped, worst.tolist(), strict=True) if value > FOLLOWS}, length
 
 
 def _cure(sorting: Sorting) -> str:
     """Advice about rows that depend on others: to leave one out, unless this would change the motion."""
     rows = ConstraintRows.of(without_redundant(sorting))
-    if rows is None or (opening := find_opening(rows)) is None:
+    if rows is None or not (opening := _opening_in_words(rows)):
         return f'{_joined_twice(sorting)}leave one of them out, or let the scene choose, redundant="drop"'
-    return f"leaving one out would change the motion: {_in_words(rows, opening)}"
+    return f"leaving one out would change the motion: {opening}"
 
 
 def _joined_twice(sorting: Sorting) -> str:
@@ -145,40 +129,35 @@ def _joined_twice(sorting: Sorting) -> str:
     twice = [
         f"{' and '.join(sorted(pair))} by {' and '.join(names)}" for pair, names in labels.items() if len(names) > 1
     ]
-    return f"joints join the same bodies: {_listed(twice)}; " if twice else ""
+    return f"joints join the same bodies: {listed(twice)}; " if twice else ""
 
 
-def _in_words(rows: ConstraintRows, opening: Opening) -> str:
-    """That dropped rows do not vanish where the others do, and advice."""
-    names = [rows.rows[i].name for i in opening.rows]
-    errors = _listed([f"{name} by {value:.1e}" for name, value in zip(names, opening.values, strict=True)])
-    if not opening.motion:
+def _opening_in_words(rows: ConstraintRows) -> str:
+    """That dropped rows do not vanish where the others do, and advice; "" if all follow."""
+    values, motion = find_opening(rows)
+    if not values:
+        return ""
+    names = [rows.rows[i].name for i in values]
+    errors = listed([f"{rows.rows[i].name} by {value:.1e}" for i, value in values.items()])
+    if not motion:
         return (
-            f"{_listed(names)} contradicts the other constraints. Where they hold, its violation relative to its size is not zero: {errors}. "
+            f"{listed(names)} contradicts the other constraints. Where they hold, its violation relative to its size is not zero: {errors}. "
             "Correct its numbers, or leave it out"
         )
     return (
-        f"{_listed(names)} depends on the other constraints at the start alone. Nearby, where coordinates have moved by some "
-        f"{opening.motion:.1g} of the extent of the scene and the other constraints hold, its violation relative to its size is not zero: "
+        f"{listed(names)} depends on the other constraints at the start alone. Nearby, where coordinates have moved by some "
+        f"{motion:.1g} of the extent of the scene and the other constraints hold, its violation relative to its size is not zero: "
         f"{errors}. {BEND}"
     )
 
 
-def _listed(names: Sequence[str]) -> str:
-    return ", ".join(names[:NAMED]) + (f" and {len(names) - NAMED} more" if len(names) > NAMED else "")
-
-
-def _advice(sorting: Sorting, rows: ConstraintRows, micro: list[int]) -> str:
+def _advice(rows: ConstraintRows, micro: list[int]) -> str:
     """Advice about constraints on the micro grid that the fast bodies cannot satisfy."""
-    fast = [name for name, place in sorting.layout.coordinates.items() if place.part == "f"]
-    jacobian = rows.by_masses[micro]
-    _, dependent = rank_of(jacobian[:, rows.num_slow :])
-    involved = jacobian[dependent]
-    touched = {
-        name
-        for name, place in sorting.layout.coordinates.items()
-        if place.part == "s" and involved[:, place.start : place.start + place.size].any()
-    }
+    layout, jacobian = rows.sorting.layout, rows.by_masses[micro]
+    fast = [name for name, place in layout.coordinates.items() if place.part == "f"]
+    _, dependent = rank_of(jacobian[:, layout.sizes[0] :])
+    involved, numbers = jacobian[dependent], layout.numbers
+    touched = {name for name in layout.coordinates if name not in fast and involved[:, numbers[name]].any()}
     make_fast = f"make {' or '.join(sorted(touched))} fast too" if touched else "make more of their bodies fast"
     return (
         f"they touch fast bodies and are held on the micro grid, where only {', '.join(fast)} can move; leave one out, or {make_fast}, "
@@ -197,6 +176,6 @@ def _refuse(rows: ConstraintRows, numbers: list[int], first: int, advice: Callab
     named = [name for name in all_named if not name.startswith(Rigidity.default_name + " ")] or all_named
     among = "among " if len(named) < len(involved) else ""
     raise Refused(
-        f"Scene: over-constrained at the start: {_listed(named)} are {among}{len(involved)} constraints of "
+        f"Scene: over-constrained at the start: {listed(named)} are {among}{len(involved)} constraints of "
         f"rank {rank_of(jacobian[involved])[0]}; {advice()}."
     )

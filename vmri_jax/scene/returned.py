@@ -1,6 +1,5 @@
 """Checks of the function of an effect before the scene is sorted, so that messages name the effect: its value, and constraints at the start."""
 
-from functools import partial
 from typing import Any
 
 import jax
@@ -23,10 +22,7 @@ def check_function(effect: Any, moved: bool) -> None:
 
     The function gets each group of equal elements, as the terms of the system do.
     """
-    function = effect.function
-    while isinstance(function, partial):
-        function = function.func
-    if effect.kind == "control" or getattr(function, "__module__", "").startswith(LIBRARY):
+    if effect.kind == "control" or getattr(effect.function, "__module__", "").startswith(LIBRARY):
         return
     for group in effect.by_size():
         q = jax.device_put(effect.positions(group))

@@ -1,7 +1,7 @@
 """The rows of a scene's constraints: names, also of coordinates, values and Jacobian at any positions."""
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -17,8 +17,7 @@ from vmri_jax.mechanics.names import Names
 from vmri_jax.scene.body import LARGEST_POINT, label_of
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.effects.freedoms import ANGLES
-from vmri_jax.scene.functions import MicroConstraint
-from vmri_jax.scene.layout import join
+from vmri_jax.scene.functions import function_of
 from vmri_jax.scene.rates import positions
 from vmri_jax.scene.sorting import HOMES, Home, Placed, Sorting
 from vmri_jax.scene.terms import EffectTerm, Role
@@ -121,52 +120,43 @@ def _compiled_derivatives(functions: Sequence[TracedOnce], params, t, q_s, q_f):
 
 @dataclass(frozen=True)
 class ConstraintRows:
-    """The k rows of all constraints, in the order of `Sorting.placed`, over the n coordinates, slow ones first.
+    """The k rows of all constraints of a scene, in the order of `Sorting.placed`, over its n coordinates, slow ones first."""
 
-    terms, params: of the rows, and whether the functions are analytic, see `Effect.is_analytic`.
-    masses: (n,) of the coordinates; 1 for traced masses, since they only weigh the choice of the rows to drop.
-    scales: (n,) change of each coordinate in a large motion: the extent of the scene for positions, 1 for
-        directors of rigid bodies and angles of joints, and for general coordinates their largest value, or 1 if all are zero.
-    to_bodies: (Q_s, Q_f) as one vector at q, and its Jacobian dQ/dq; Q_s has the length `num_slow_of_bodies`.
-    """
-
-    rows: tuple[Row, ...]
-    terms: tuple[tuple[EffectTerm, bool], ...]
-    params: dict[str, Any]
-    start: np.ndarray
-    masses: np.ndarray
-    scales: np.ndarray
-    num_slow: int
-    num_slow_of_bodies: int
-    to_bodies: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+    sorting: Sorting
 
     @classmethod
     def of(cls, sorting: Sorting) -> "ConstraintRows | None":
-        """The rows of all constraints of a scene; None if it has none, or if their numbers are traced."""
-        bodies, layout, to_bodies = sorting.bodies, sorting.layout, sorting.to_bodies
-        constraints = [part for part in sorting.placed if part.home in HOMES]
-        if not constraints or not is_concrete(
-            (sorting.positions, sorting.joints, [part.effect.parameters for part in constraints])
-        ):
-            return None
-        start = np.concatenate(sorting.positions)
-        _, jacobian = to_bodies(start)
-        # the diagonal of J^T M J with J = dQ/dq
-        of_bodies = join(bodies, layout, "s", "masses"), join(bodies, layout, "f", "masses")
-        is_known = is_concrete(of_bodies)
-        masses = np.concatenate(of_bodies) @ (jacobian * jacobian) if is_known else np.ones_like(start)
-        terms = tuple(
-            (term, part.effect.is_analytic) for part in constraints for term in part.effect.terms(part.elements, layout)
-        )
-        params = {part.effect.name: part.effect.parameters for part in constraints}
-        sizes, rows = (layout.sizes[0], layout.ends[0]), tuple(rows_of(sorting.placed))
-        return cls(rows, terms, params, start, masses, _scales(sorting), *sizes, to_bodies)
+        """The rows of a scene; None if it has none, or if their numbers are traced."""
+        rows = cls(sorting)
+        return rows if rows.params and is_concrete((rows.start, sorting.joints, rows.params)) else None
+
+    @property
+    def start(self) -> np.ndarray:
+        """(n,) positions at the start."""
+        return self.sorting.positions
+
+    @cached_property
+    def rows(self) -> list[Row]:
+        """The names and origins of the rows."""
+        return rows_of(self.sorting.placed)
+
+    @cached_property
+    def params(self) -> dict[str, Any]:
+        """The parameters of the constraints."""
+        return {part.effect.name: part.effect.parameters for part in self.sorting.placed if part.home in HOMES}
+
+    @cached_property
+    def terms(self) -> list[tuple[EffectTerm, bool]]:
+        """The terms of the rows, and whether their functions are analytic, see `Effect.is_analytic`."""
+        layout, constraints = self.sorting.layout, (part for part in self.sorting.placed if part.home in HOMES)
+        terms = ((part.effect, part.effect.terms(part.elements, layout)) for part in constraints)
+        return [(term, effect.is_analytic) for effect, of_effect in terms for term in of_effect]
 
     def evaluate(self, t: float, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Values g (k,) and Jacobian dg/dq (k, n) at a time and at positions (n,)."""
-        q_bodies, by_coordinates = self.to_bodies(q)
-        n_s, others = self.num_slow_of_bodies, [term for term, is_analytic in self.terms if not is_analytic]
-        functions = [TracedOnce(MicroConstraint((term,))) for term in others]
+        q_bodies, by_coordinates = self.sorting.to_bodies(q)
+        n_s, others = self.sorting.layout.ends[0], [term for term, is_analytic in self.terms if not is_analytic]
+        functions = [TracedOnce(function_of("constraint", (term,))) for term in others]
         arguments = self.params, float(t), q_bodies[:n_s], q_bodies[n_s:]
         of_others = iter(jax.device_get(_compiled_derivatives(functions, *arguments)) if others else ())
         parts = [
@@ -210,8 +200,33 @@ class ConstraintRows:
 
     @cached_property
     def by_masses(self) -> np.ndarray:
-        """`jacobian` with the columns over the square roots of masses, so that the entries of a row have one unit."""
-        return self.jacobian / np.sqrt(np.where(self.masses > 0, self.masses, 1.0))
+        """`jacobian` with the columns over the square roots of masses, so that the entries of a row have one unit.
+
+        The masses of coordinates are the diagonal of J^T M J with J = dQ/dq; 1 if masses are traced, since they only weigh the choice of
+        the rows to drop.
+        """
+        of_bodies, masses = self.sorting.of_bodies("masses"), np.ones(1)
+        if is_concrete(of_bodies):
+            jacobian = self.sorting.to_bodies(self.start)[1]
+            masses = of_bodies @ (jacobian * jacobian)
+        return self.jacobian / np.sqrt(np.where(masses > 0, masses, 1.0))
+
+    @cached_property
+    def scales(self) -> np.ndarray:
+        """(n,) change of each coordinate in a large motion: the extent of the scene for positions, 1 for directors of rigid bodies and angles
+        of joints, and for general coordinates their largest value, or 1 if all are zero."""
+        sorting, layout, points = self.sorting, self.sorting.layout, positions(self.sorting.bodies)
+        # largest distance from the mean along an axis; of bodies at one place their largest coordinate, or 1 at the origin
+        extent = float(np.abs(points - points.mean(axis=0)).max() or np.abs(points).max() or 1.0)
+        numbers, scales = layout.numbers, np.zeros(self.start.size)
+        for name in layout.coordinates.keys() & sorting.bodies.keys():
+            body = sorting.bodies[name]
+            largest = np.abs(np.asarray(body.coordinates)).max() or 1.0
+            of_points = np.where(np.arange(body.size) < LARGEST_POINT, extent, 1.0)
+            scales[numbers[name]] = largest if body.block else of_points
+        for key in layout.freedoms:
+            scales[numbers[key]] = 1.0 if key[2] in ANGLES else extent
+        return scales
 
     @cached_property
     def sizes(self) -> np.ndarray:
@@ -222,23 +237,6 @@ class ConstraintRows:
     def numbers(self, home: Home | None = None) -> list[int]:
         """Numbers of the kept rows, all or only the rows with a certain home."""
         return [i for i, row in enumerate(self.rows) if row.kept and home in (None, row.home)]
-
-
-def _scales(sorting: Sorting) -> np.ndarray:
-    """(n,) change of each coordinate in a large motion, see `ConstraintRows`."""
-    points, layout = positions(sorting.bodies), sorting.layout
-    # largest distance from the mean along an axis; of bodies at one place their largest coordinate, or 1 at the origin
-    extent = float(np.abs(points - points.mean(axis=0)).max() or np.abs(points).max() or 1.0)
-    scales = {place: np.full(1, 1.0 if key[2] in ANGLES else extent) for key, place in layout.freedoms.items()}
-    for name, body in sorting.bodies.items():
-        if name in layout.coordinates and layout.coordinates[name] not in scales:
-            q = np.asarray(body.coordinates)
-            of_points = np.where(np.arange(q.size) < LARGEST_POINT, extent, 1.0)
-            of_block = np.full(q.size, np.abs(q).max() or 1.0)
-            scales[layout.coordinates[name]] = of_block if body.block else of_points
-    return np.concatenate(
-        [scales[place] for place in sorted(scales, key=lambda place: (place.part == "f", place.start))]
-    )
 
 
 def names_of(sorting: Sorting) -> Names:

@@ -38,12 +38,11 @@ from scipy.sparse import eye_array
 from vmri_jax.mechanics.arrays import is_concrete, library, quickly_compiled
 from vmri_jax.mechanics.kinematics import Kinematics
 from vmri_jax.refusals import Refused
-from vmri_jax.scene.body import GROUND, Bodies
+from vmri_jax.scene.body import GROUND, Bodies, joined, listed
 from vmri_jax.scene.effect import Effect
-from vmri_jax.scene.joint_constants import joint_constants
-from vmri_jax.scene.layout import DecidedPace, Layout, join
+from vmri_jax.scene.layout import DecidedPace, Layout
 from vmri_jax.scene.rates import SEPARATION, Rates, border, measure
-from vmri_jax.scene.trees import Branch, make_layout, with_weight
+from vmri_jax.scene.trees import Branch, joint_constants, make_layout, with_weight
 
 NAMED = 3
 """Most bodies that a reason names; with more the table of reasons is too wide."""
@@ -56,13 +55,6 @@ Home = (
 
 HOMES: tuple[Home, ...] = ("slow_constraint", "constraint")
 """The arguments of `System` that hold constraints, in the order of the grids macro, micro."""
-
-
-class Reason(NamedTuple):
-    """Why an element has its home. A text about bodies has two braces ``{}``, for their names and for "is" or "are"."""
-
-    text: str
-    bodies: tuple[str, ...] = ()
 
 
 class Placed(NamedTuple):
@@ -101,40 +93,40 @@ class Sorting:
         """(q_s, q_f, v_s, v_f) at the start."""
         return self.start_and_violation[0]
 
-    @property
-    def positions(self) -> tuple[jax.Array, jax.Array]:
-        """(q_s, q_f) at the start."""
-        return self._with_joint_starts(*self.assembled, 0)
+    @cached_property
+    def positions(self) -> Any:
+        """(n,) q = (q_s, q_f) at the start."""
+        return self._with_joint_starts(self.assembled, 0)
 
     @property
-    def assembled(self) -> tuple[Any, Any]:
-        """(q_s, q_f) at the positions of the bodies as the user gave them, where freedoms of joints are zero."""
-        slow, fast = self._of_bodies("coordinates")
-        n_s, n_f = self.layout.sizes
-        return slow[:n_s], fast[:n_f]
+    def assembled(self) -> Any:
+        """(n,) q = (q_s, q_f) at the positions of the bodies as the user gave them, where freedoms of joints are zero."""
+        q, (n_s, n_f), first_fast = self.of_bodies("coordinates"), self.layout.sizes, self.layout.ends[0]
+        return q if self.layout.kinematics is None else joined([q[:n_s], q[first_fast : first_fast + n_f]])
 
-    def _with_joint_starts(self, slow, fast, order: Literal[0, 1]) -> tuple[Any, Any]:
-        """Coordinates (order 0) or velocities (order 1), slow and fast, with the values or rates in `joint_starts` put in."""
+    def _with_joint_starts(self, q: Any, order: Literal[0, 1]) -> Any:
+        """Coordinates (order 0) or velocities (order 1) with the values or rates in `joint_starts` put in."""
+        numbers = self.layout.numbers
         for key, value_and_rate in self.joint_starts.items():
-            part, start, _ = self.layout.freedoms[key]
-            vector, number = (slow, fast)[part == "f"], value_and_rate[order]
-            pieces = vector[:start], library(number).reshape(number, (1,)), vector[start + 1 :]
-            changed = library(pieces).concatenate(pieces)
-            slow, fast = (changed, fast) if part == "s" else (slow, changed)
-        return slow, fast
+            (i,), number = numbers[key], value_and_rate[order]
+            q = joined([q[:i], library(number).reshape(number, (1,)), q[i + 1 :]])
+        return q
 
     @cached_property
     def start_and_violation(self) -> tuple[tuple, Any]:
         """`start`, and the part of the velocities of bodies that their joints do not allow, relative to all, by masses."""
-        if self.layout.kinematics is None:
-            return (*self._of_bodies("coordinates"), *self._of_bodies("rates")), 0.0
-        q, n_s = library(self.assembled).concatenate(self.assembled), self.layout.sizes[0]
-        rates, masses = (library(parts).concatenate(parts) for parts in map(self._of_bodies, ("rates", "masses")))
-        v, violation = _nearest_rates(self.to_bodies(q)[1], rates, masses)
-        return (*self.positions, *self._with_joint_starts(v[:n_s], v[n_s:], 1)), violation
+        q, v, violation, n_s = self.positions, self.of_bodies("rates"), 0.0, self.layout.sizes[0]
+        if self.layout.kinematics is not None:
+            v, violation = _nearest_rates(self.to_bodies(self.assembled)[1], v, self.of_bodies("masses"))
+            v = self._with_joint_starts(v, 1)
+        return (q[:n_s], q[n_s:], v[:n_s], v[n_s:]), violation
 
-    def _of_bodies(self, quantity: Literal["coordinates", "rates", "masses"]) -> tuple[jax.Array, jax.Array]:
-        return join(self.bodies, self.layout, "s", quantity), join(self.bodies, self.layout, "f", quantity)
+    def of_bodies(self, quantity: Literal["coordinates", "rates", "masses"]) -> Any:
+        """A quantity of all bodies in the order of (Q_s, Q_f), with zeros for the freedoms of joints."""
+        layout = self.layout
+        pieces = {place: getattr(self.bodies[name], quantity) for name, place in layout.bodies.items()}
+        pieces |= {place: np.zeros(1) for place in layout.freedoms.values()}
+        return joined([pieces[place] for place in sorted(pieces, key=lambda place: (place.part == "f", place.start))])
 
     def to_bodies(self, q: Any) -> tuple[Any, Any]:
         """Q = (Q_s, Q_f) of q = (q_s, q_f), each one vector, and the Jacobian dQ/dq."""
@@ -214,26 +206,18 @@ def sort(bodies: Bodies, effects: Sequence[Effect], branches: Sequence[Branch] =
     energies = [effect for effect in effects if effect.kind in ("potential", "kinetic")]
     owned = {effect.name: _owners(effect, branches) for effect in effects}
     measured = _measure(with_weight(bodies, branches), energies, owned)
-    declared = {
-        rate: [measured[effect.name].rate for effect in energies if effect.rate == rate and effect.name in measured]
-        for rate in ("slow", "fast")
-    }
-    limit = border(
-        [rates.rate for rates in measured.values()],
-        max((rates.max() for rates in declared["slow"]), default=0.0),
-        min((rates.min() for rates in declared["fast"]), default=np.inf),
-    )
+    limit = border(measured, energies)
     carrying = {(branch.joint.name, branch.element) for branch in branches}
     paces = _paces(bodies, energies, measured, limit, owned)
     placed = []
     for effect in effects:
-        homes: dict[Home, dict[int, Reason]] = {}
+        homes: dict[Home, dict[int, tuple[str, tuple[str, ...]]]] = {}
         for i, (names, _) in enumerate(owned[effect.name]):
             if (effect.name, i) in carrying:
                 continue  # a joint that carries a body has coordinates instead of constraint rows
             slow = tuple(name for name in names if paces[name].value == "slow")
             home, reason = _home(effect, i, slow, len(names), measured, limit)
-            homes.setdefault(home, {})[i] = reason
+            homes.setdefault(home, {})[i] = reason, slow
         placed += [Placed(effect, tuple(reasons), home, _summary(reasons.values())) for home, reasons in homes.items()]
     layout, ordered = make_layout(bodies, paces, branches)
     if not any(layout.sizes):
@@ -304,41 +288,43 @@ def _stiff(effect: Effect, i: int, measured, limit) -> str:
     return f"{measured[effect.name].frequency[i]:.3g} rad/s, above {limit:.3g}"
 
 
-def _home(effect: Effect, i: int, slow: tuple[str, ...], size: int, measured, limit) -> tuple[Home, Reason]:
-    """The home of element i, see the table of this module, and why; it touches `size` bodies, the slow ones `slow`."""
+def _home(effect: Effect, i: int, slow: tuple[str, ...], size: int, measured, limit) -> tuple[Home, str]:
+    """The home of element i, see the table of this module, and why; it touches `size` bodies, the slow ones `slow`.
+
+    In a reason two braces ``{}`` stand for the names of the slow bodies, and for "is" or "are".
+    """
     if effect.kind == "kinetic":
-        return "kinetic", Reason("depends on velocities")
+        return "kinetic", "depends on velocities"
     if effect.kind == "force":
-        return "force", Reason("not derived from a potential")
+        return "force", "not derived from a potential"
     if effect.kind == "control":
-        return "control", Reason("set by an optimisation, zero in a run")
+        return "control", "set by an optimisation, zero in a run"
     if effect.kind == "constraint" and len(slow) == size:
-        return "slow_constraint", Reason("between slow bodies")
+        return "slow_constraint", "between slow bodies"
     if effect.kind == "constraint":
-        return "constraint", Reason("touches a fast body")
+        return "constraint", "touches a fast body"
     if isinstance(effect.rate, int):
-        return effect.rate, Reason("as given")
+        return effect.rate, "as given"
     if slow and effect.rate == "fast":
-        return "fast", Reason("as given, and touches {}, which {} slow", slow)
+        return "fast", "as given, and touches {}, which {} slow"
     if slow:
-        return "slow_potential", Reason("touches {}, which {} slow", slow)
+        return "slow_potential", "touches {}, which {} slow"
     if effect.rate != "auto":
-        return ("fast_potential" if effect.rate == "fast" else "slow_potential"), Reason("as given")
+        return ("fast_potential" if effect.rate == "fast" else "slow_potential"), "as given"
     level = f"{limit:.3g} rad/s" if limit else "zero: no border between slow and fast"
     if measured[effect.name].frequency[i] > (limit or 0.0):
-        return "fast_potential", Reason(f"between fast bodies and stiff, above {level}")
-    return "slow_potential", Reason(f"between fast bodies but soft, {'below' if limit else 'at'} {level}")
+        return "fast_potential", f"between fast bodies and stiff, above {level}"
+    return "slow_potential", f"between fast bodies but soft, {'below' if limit else 'at'} {level}"
 
 
-def _summary(reasons: Iterable[Reason]) -> str:
-    """The distinct reasons of the elements of an effect, each with all its bodies; of several reasons each with its number of elements."""
+def _summary(reasons: Iterable[tuple[str, tuple[str, ...]]]) -> str:
+    """The distinct reasons of the elements of an effect, each with all its slow bodies; of several reasons each with its number of elements."""
     bodies_by_text: dict[str, list[tuple[str, ...]]] = {}
-    for reason in reasons:
-        bodies_by_text.setdefault(reason.text, []).append(reason.bodies)
+    for text, slow in reasons:
+        bodies_by_text.setdefault(text, []).append(slow)
     parts = []
     for text, bodies in bodies_by_text.items():
         names = tuple(dict.fromkeys(chain(*bodies)))
-        listed = ", ".join(names[:NAMED]) + (f" and {len(names) - NAMED} more" if len(names) > NAMED else "")
         count = f" ({len(bodies)})" if len(bodies_by_text) > 1 else ""
-        parts.append(text.format(listed, "is" if len(names) == 1 else "are") + count)
+        parts.append(text.format(listed(names, NAMED), "is" if len(names) == 1 else "are") + count)
     return "; ".join(parts)

@@ -16,11 +16,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from vmri_jax.mechanics.arrays import is_concrete
+from vmri_jax.mechanics.arrays import is_concrete, library
 from vmri_jax.mechanics.kinematics import Carried, Kinematics, Link, Move
 from vmri_jax.mechanics.rows import Part, Place
 from vmri_jax.refusals import Refused
-from vmri_jax.scene.body import GROUND, Bodies, Frame
+from vmri_jax.scene.body import GROUND, Bodies, Frame, body_of
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.effects.freedoms import ANGLES
 from vmri_jax.scene.effects.joint_base import Joint, OfFreedoms
@@ -57,22 +57,11 @@ class Branch(NamedTuple):
         """The freedoms of the joint as keys of `Layout.freedoms`."""
         return [(self.joint.name, self.element, freedom) for freedom in self.joint.freedoms]
 
-    def labels(self) -> list[str]:
-        """Names of the coordinates of the joint."""
-        name = self.joint.label(self.element)
-        freedoms = self.joint.freedoms
-        return [name] if len(freedoms) == 1 else [f"{name} {freedom}" for freedom in freedoms]
-
     @property
     def moves(self) -> list[tuple[Move, Key]]:
         """The motions of the joint, each with the key of its freedom, in the order from the parent to the child."""
         # the moves are defined from body a to body b of the joint; a child that is body a undoes them, the last one first
         return list(zip(self.joint.moves, self.keys, strict=True))[:: 1 if self.forward else -1]
-
-    @property
-    def sign(self) -> float:
-        """1 if a positive value of a freedom moves the child along its axis, -1 if against it."""
-        return 1.0 if self.forward else -1.0
 
     @property
     def points(self) -> tuple[Any, Any]:
@@ -191,9 +180,9 @@ def make_layout(
             coordinates[name] = places[name] = Place(part, ends[part], body.size)
             ends[part] += body.size
             continue
-        for freedom, label in zip(branch.joint.freedoms, branch.labels(), strict=True):
-            place = Place(part, ends[part], 1)
-            coordinates[label] = freedoms[branch.joint.name, branch.element, freedom] = place
+        for key in branch.keys:
+            label = branch.joint.label(branch.element) + (f" {key[2]}" if len(branch.keys) > 1 else "")
+            coordinates[label] = freedoms[key] = Place(part, ends[part], 1)
             ends[part] += 1
     if not branches:
         return Layout(places, coordinates), ()
@@ -217,7 +206,8 @@ def _kinematics(branches: Sequence[Branch], places, freedoms, sizes) -> tuple[Ki
         if branch.child in fast or branch.child in carriers:
             carriers.add(branch.parent)
     ordered = sorted(branches, key=lambda branch: 2 if branch.child in fast else branch.child in carriers)
-    firsts = dict(zip((branch.child for branch in ordered), _firsts(ordered), strict=True))
+    ends = np.cumsum([len(branch.joint.moves) for branch in ordered]).tolist()
+    firsts = {branch.child: end - len(branch.joint.moves) for branch, end in zip(ordered, ends, strict=True)}
     numbers = {name: i for i, name in enumerate(dict.fromkeys(b.parent for b in branches if b.parent in places))}
     numbers[GROUND] = -1
     links, lasts = {}, {}
@@ -232,6 +222,49 @@ def _kinematics(branches: Sequence[Branch], places, freedoms, sizes) -> tuple[Ki
     return Kinematics(roots, tuple(links[i] for i in range(len(links))), tuple(carried), sizes), tuple(ordered)
 
 
-def _firsts(branches: Sequence[Branch]) -> list[int]:
-    """The number of the first link of each branch."""
-    return [0, *np.cumsum([len(branch.joint.moves) for branch in branches])[:-1].tolist()]
+def joint_constants(bodies: Bodies, branches: Sequence[Branch]) -> dict[str, Any]:
+    """The constants "turn", "slide" and "zero" of the branches, see `Kinematics` with its letters, in the axes of their roots."""
+    on_joints = {branch.child: branch for branch in branches}
+    zeros, turns, slides = [], [], []
+    for branch in branches:
+        root, shift = _root(branch, on_joints)
+        centre, directors = _frame(bodies, root)
+        origin, axes = _frame(bodies, branch.child)
+        # a vector y in space has the components y D^T along the directors of the root, the rows of D
+        place = origin + shift - centre
+        zeros.append(library(place, axes).concatenate([place[None], axes]) @ directors.T)
+        point = (branch.points[1] + shift - centre) @ directors.T
+        for move, _ in branch.moves:
+            # a positive value of a freedom moves body b of the joint along its axis
+            axis = (1.0 if branch.forward else -1.0) * branch.joint.triads[branch.element][move.axis] @ directors.T
+            pitch = branch.joint.pitch_of(branch.element) / (2 * np.pi)
+            turns.append((move.kind != "slide") * _turn(axis, point))
+            slides.append({"turn": 0.0, "slide": 1.0, "screw": pitch}[move.kind] * axis)
+    xp = library(zeros, turns, slides)
+    of_links = {"turn": xp.reshape(xp.asarray(turns), (-1, 4, 3)), "slide": xp.reshape(xp.asarray(slides), (-1, 3))}
+    return of_links | {"zero": xp.stack(zeros)}
+
+
+def _root(branch: Branch | None, on_joints: Mapping[str, Branch]) -> tuple[str, Any]:
+    """The root of a child, and the displacement of the child from its place as the user gave it to its place at x = 0.
+
+    There both points of each joint coincide. As the user gave them they differ by round-off, or by the numbers that a
+    derivative varies.
+    """
+    shift, name = np.zeros(3), ""
+    while branch is not None:
+        (of_parent, of_child), name = branch.points, branch.parent
+        shift, branch = shift + of_parent - of_child, on_joints.get(name)
+    return name, shift
+
+
+def _frame(bodies: Bodies, name: str) -> tuple[Any, Any]:
+    """Centre (3,) and directors (3, 3) of a body as the user gave them."""
+    rows = body_of(bodies, name).coordinates.reshape(4, 3)  # pyright: ignore[reportAttributeAccessIssue]
+    return rows[0], rows[1:]
+
+
+def _turn(axis, point):
+    """(4, 3) the twist T of a turn about an axis through a point: the velocity ``axis x (y - point)`` of a point y."""
+    xp = library(axis, point)
+    return xp.cross(axis, xp.concatenate([-point[None], xp.eye(3)]))

@@ -93,10 +93,10 @@ def at_start(sorting: Sorting, joint: Joint, pair: int, freedom: str) -> Any:
 
     From there turns are counted along the straight line to the start in joint coordinates.
     """
-    starts, begin = sorting.joint_starts, np.concatenate(sorting.assembled) if is_concrete(sorting.positions) else None
+    starts, begin = sorting.joint_starts, sorting.assembled if is_concrete(sorting.positions) else None
     if not starts or begin is None:
         return 0.0
-    way = np.concatenate(sorting.positions) - begin
+    way = sorting.positions - begin
     names, columns, angles = moving(joint.elements[pair]), sorting.layout.columns, []
     for fraction in np.linspace(0.0, 1.0, 1 + steps_of(starts, (value for value, _ in starts.values()))):
         bodies = sorting.to_bodies(begin + fraction * way)[0]

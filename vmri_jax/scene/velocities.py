@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.mechanics.arrays import is_concrete, real_array
+from vmri_jax.mechanics.arrays import is_concrete
 from vmri_jax.mechanics.constraints import RANK
 from vmri_jax.mechanics.projection import legendre
 from vmri_jax.mechanics.system import System
@@ -16,7 +16,7 @@ from vmri_jax.refusals import Refused
 from vmri_jax.scene.body import AnyBody, moving
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.effects.freedoms import ANGLES
-from vmri_jax.scene.effects.joint_base import Joint, freedom_of, joint_named
+from vmri_jax.scene.effects.joint_base import Joint, for_pairs, freedom_of, joint_named
 from vmri_jax.scene.layout import Key
 from vmri_jax.scene.rows import ConstraintRows
 from vmri_jax.scene.sorting import Sorting
@@ -59,7 +59,7 @@ def with_rates(
     values = [-np.asarray(jax.jacfwd(constraints)(t, q))]
     for joint, freedom, number in _by_freedom("Scene.with_rates", effects, rates):
         pairs = joint.elements
-        numbers = _for_pairs(f"Scene.with_rates: the rate of {joint.name}", number, len(pairs), "one number")
+        numbers = for_pairs(f"Scene.with_rates: the rate of {joint.name}", number, len(pairs), "one number")
         gradient = jax.jacfwd(
             lambda q, joint=joint, freedom=freedom, pairs=pairs: joint.values(
                 freedom, range(len(pairs)), {name: q[columns[name]] for name in moving(chain(*pairs))}
@@ -83,15 +83,10 @@ def with_rates(
             f"{(errors * lengths).max():.3g}. Give fewer rates: the rate of a joint follows from those of others, or the joint cannot move here."
         )
     # the velocities of bodies belong to their positions as the user gave them, where joint coordinates are zero
-    body_rates = sorting.to_bodies(np.concatenate(sorting.assembled))[1] @ v
+    body_rates = sorting.to_bodies(sorting.assembled)[1] @ v
     moved = [body.with_rates(body_rates[columns[name]]) for name, body in sorting.bodies.items()]
-    return moved, {key: (np.asarray(q[i]), v[i]) for key, i in _freedom_numbers(sorting).items()}
-
-
-def _freedom_numbers(sorting: Sorting) -> dict[Key, int]:
-    """Numbers of the joint coordinates in q = (q_s, q_f)."""
-    n_s = sorting.layout.sizes[0]
-    return {key: place.start + (n_s if place.part == "f" else 0) for key, place in sorting.layout.freedoms.items()}
+    numbers = sorting.layout.numbers
+    return moved, {key: (np.asarray(q[i]), v[i]) for key in sorting.layout.freedoms for i in numbers[key]}
 
 
 def joint_starts(sorting: Sorting, effects: Sequence[Effect], starts: Mapping[str, Any]) -> dict[Key, tuple[Any, Any]]:
@@ -101,7 +96,7 @@ def joint_starts(sorting: Sorting, effects: Sequence[Effect], starts: Mapping[st
         name, count = joint.name, len(joint.elements)
         value, rate = start if isinstance(start, tuple) else (start, 0.0)
         about = f"Scene.with_joints: the start of {name}"
-        numbers = [_for_pairs(about, number, count, "one number, or a pair (value, rate)") for number in (value, rate)]
+        numbers = [for_pairs(about, number, count, "one number, or a pair (value, rate)") for number in (value, rate)]
         for i in range(count):
             key = name, i, freedom
             if key not in sorting.layout.freedoms:
@@ -123,7 +118,8 @@ def with_closed_loops(sorting: Sorting, starts: dict[Key, tuple[Any, Any]]) -> d
     rows = ConstraintRows.of(sorting)
     if rows is None or not is_concrete((sorting.start, starts)):
         return starts
-    columns = _freedom_numbers(sorting)
+    all_numbers = sorting.layout.numbers
+    columns = {key: int(all_numbers[key][0]) for key in sorting.layout.freedoms}
     held, free = [columns[key] for key in starts], [columns[key] for key in columns if key not in starts]
     q, v = (np.concatenate(parts) for parts in (sorting.start[:2], sorting.start[2:]))
     numbers = _of_joints_alone(sorting, rows)
@@ -159,11 +155,10 @@ def steps_of(keys: Iterable[Key], changes: Iterable[float]) -> int:
 
 def _of_joints_alone(sorting: Sorting, rows: ConstraintRows) -> np.ndarray:
     """Numbers of the rows that depend on joint coordinates alone: no motion of a body with directors or of a point changes them."""
-    n_s, changes = sorting.layout.sizes[0], np.zeros(len(rows.rows), bool)
-    for name, place in sorting.layout.coordinates.items():
+    changes, numbers = np.zeros(len(rows.rows), bool), sorting.layout.numbers
+    for name in sorting.layout.coordinates:
         if name in sorting.bodies:
-            first = place.start + (n_s if place.part == "f" else 0)
-            by_motions = rows.jacobian[:, first : first + place.size] @ sorting.bodies[name].motions
+            by_motions = rows.jacobian[:, numbers[name]] @ sorting.bodies[name].motions
             changes |= np.linalg.norm(by_motions, axis=1) > RANK * np.linalg.norm(rows.jacobian, axis=1)
     return np.flatnonzero(~changes)
 
@@ -180,14 +175,3 @@ def _by_freedom(method: str, effects: Sequence[Effect], numbers: Mapping[str, An
             except ValueError as error:
                 raise Refused(f'{method}: {error} Give a dictionary, {{"turn": ..., "slide": ...}}.') from None
             yield joint, known, of_freedom
-
-
-def _for_pairs(about: str, numbers: Any, count: int, form: str):
-    """Finite numbers, () or (count,) for the pairs of a joint; `form` is the form of a single one, for messages."""
-    values = real_array(about, numbers)
-    if values.shape not in ((), (count,)):
-        for_pairs = f", or one for each pair, ({count},)" if count > 1 else ""
-        raise Refused(f"{about} has shape {values.shape}; give {form}{for_pairs}.")
-    if is_concrete(values) and not np.isfinite(values).all():
-        raise Refused(f"{about} is {values}; it must be finite.")
-    return values

@@ -39,11 +39,8 @@ class Angle(_AmongPoints):
     Args:
         between: names (a, b, c), or a list of such.
         stiffness: k, N m, positive; one number, or one for each angle.
-        angle: theta_0, rad, between 0 and pi; likewise. The angle at the positions in `bodies` by default.
-
-    Raises:
-        ValueError: (of the scene) a stiffness that is not positive; a rest angle that is not between 0 and pi, where this
-            energy is not smooth (take `Bending` for pi); points that coincide.
+        angle: theta_0, rad, between 0 and pi, where the energy is smooth (take `Bending` for pi); likewise. The angle at the positions in
+            `bodies` by default.
     """
 
     between: Any = names(3)
@@ -73,9 +70,6 @@ class Bending(_AmongPoints):
     Args:
         between: names (a, b, c), or a list of such.
         stiffness: k, N m, positive; one number, or one for each.
-
-    Raises:
-        ValueError: (of the scene) a stiffness that is not positive, points that coincide.
     """
 
     between: Any = names(3)
@@ -95,14 +89,10 @@ class Torsion(_AmongPoints):
     phi is 0 if a and d are on the same side of b-c (cis), and pi if they are on opposite sides (trans).
 
     Args:
-        between: names (a, b, c, d) of points in space, or a list of such.
+        between: names (a, b, c, d) of points in space that are not on a line, or a list of such.
         stiffness: k, N m; one number, or one for each. Negative ones make phi_0 a maximum, as in the OPLS series.
         angle: phi_0, rad, of a minimum; likewise.
-        multiplicity: m, number of minima in a turn; likewise.
-
-    Raises:
-        ValueError: (of the scene) a multiplicity that is not a positive integer, points
-            that coincide or lie on a line.
+        multiplicity: m, a positive integer, the number of minima in a turn; likewise.
     """
 
     between: Any = names(4)

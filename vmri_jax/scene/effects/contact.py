@@ -49,14 +49,11 @@ class PlaneContact(_Contact):
 
     Args:
         point: p, (d,), in the plane.
-        normal: n, (d,), towards the free side; scaled to length one.
+        normal: n, (d,), not zero, towards the free side; scaled to length one.
         stiffness: k, N/m, positive; one number, or one for each body.
         smoothing: s, m, positive: decay length of the force outside of contact.
         radius: r, m, of the bodies; one number, or one for each.
         bodies: names; all bodies of the scene by default.
-
-    Raises:
-        ValueError: (of the scene) numbers that are not positive, a normal that is zero, vectors of another dimension.
     """
 
     _: KW_ONLY
@@ -93,12 +90,9 @@ class SphereContact(_Contact):
     ``gap = |q - c| - R - r``.
 
     Args:
-        center: c, (d,).
+        center: c, (d,); no body may start at it.
         sphere_radius: R, m, positive.
         stiffness, smoothing, radius, bodies: as of `PlaneContact`.
-
-    Raises:
-        ValueError: (of the scene) numbers that are not positive, a center of another dimension, a body that starts at it.
     """
 
     _: KW_ONLY

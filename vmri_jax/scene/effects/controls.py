@@ -4,7 +4,6 @@ from collections.abc import Callable
 from dataclasses import KW_ONLY
 from typing import Any, Literal
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -14,7 +13,6 @@ from vmri_jax.refusals import Refused
 from vmri_jax.scene.body import Attachment, body_of, entry, is_entry, label_of
 from vmri_jax.scene.declare import effect_class, names, vector
 from vmri_jax.scene.effect import Effect
-from vmri_jax.scene.effects.freedoms import FREEDOMS
 from vmri_jax.scene.effects.joint_base import Joint
 from vmri_jax.scene.effects.joint_effects import InJoint
 from vmri_jax.scene.terms import Applied, split
@@ -51,10 +49,6 @@ class Controlled(Effect):
         load: "force" or "torque"; a torque acts on a rigid body or in a joint.
         along: (d,) the direction of a single control, of any length; by default there is a control for each axis.
         axes: "space", or "body" for the principal axes of inertia of the rigid body, its directors.
-
-    Raises:
-        ValueError: (of the scene) no body of this name, a torque on a body that is not rigid, a joint without this freedom, a vector of
-            another dimension.
     """
 
     body: Any = names()
@@ -131,19 +125,12 @@ class Controlled(Effect):
         return tuple(f"{self.name}{axis}" for axis in axes)
 
 
-def control_along(law, freedom: str, q, u, params):
-    """``u dx/dq`` along a freedom x of a joint; no law takes part."""
-    x, pull = jax.vjp(lambda q: FREEDOMS[freedom](q, params), q)
-    return pull(u.reshape(x.shape))[0]
-
-
 @effect_class
 class ControlledJoint(InJoint):
     """The force or torque of `Controlled` in a joint."""
 
     kind = "control"
     counts_turns = False
-    along = staticmethod(control_along)
 
     def check_bodies(self):
         super().check_bodies()

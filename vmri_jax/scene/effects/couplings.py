@@ -115,15 +115,10 @@ class JointCoupling(_Coupling):
         JointCoupling(["camshaft", "valve"], cam, {"stroke": 0.01})
 
     Args:
-        joints: names of joints of the scene, each with a single pair of bodies; ``(name, freedom)`` for a joint with several freedoms.
+        joints: names of 1 to 16 joints of the scene, each with a single pair of bodies; ``(name, freedom)`` for a joint with several freedoms.
         law: ``g(x, params) -> ()`` or (k,) with the freedoms x (n,) in the order of `joints`, rad and m from the given position; zero at x = 0.
         params: numbers, arrays or trees of them that the law gets. They may change without a new compilation, and runs have derivatives
             with respect to them.
-
-    Raises:
-        TypeError: a law that is no function of (x, params).
-        ValueError: no joints, or more than 16; (of the scene) no joint of this name, a joint with several pairs of bodies, a joint
-            without this freedom; a law that returns no vector, or that is not zero at the start.
     """
 
     law: Callable  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -160,9 +155,6 @@ class Gear(_Coupling):
     Args:
         joints: as of `JointCoupling`.
         ratios: (n,) r, not zero, in the order of `joints`.
-
-    Raises:
-        ValueError: as of `JointCoupling`; another number of ratios than joints, or a ratio of zero.
     """
 
     ratios: Any

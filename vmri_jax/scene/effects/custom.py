@@ -15,7 +15,7 @@ from vmri_jax.mechanics.functions import NO_TIME, NO_VELOCITY, check_arguments
 from vmri_jax.refusals import Refused
 from vmri_jax.scene.body import end_of, entry, is_entry
 from vmri_jax.scene.declare import effect_class, real_tree
-from vmri_jax.scene.effect import DRAWN, Effect
+from vmri_jax.scene.effect import Effect
 
 ARGUMENTS = {"potential": "q, params", "constraint": "q, params", "kinetic": "q, v, params", "force": "t, q, v, params"}
 """Arguments of the functions by kind; a constraint with timed=True takes t first."""
@@ -37,10 +37,6 @@ class CustomEffect(Effect):
             runs have derivatives with respect to them.
         name: the name of the function by default.
         drawn_as: "link" or "spring", drawn between each of the bodies and the next; None draws nothing.
-
-    Raises:
-        TypeError: a function that cannot be called, or that takes other arguments.
-        ValueError: another drawing; (of the scene) one of a single body, or of blocks of general coordinates.
     """
 
     function: Callable  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -60,7 +56,7 @@ class CustomEffect(Effect):
         arguments = f"t, {ARGUMENTS[self.kind]}" if self.timed else ARGUMENTS[self.kind]
         check_arguments(f"{type(self).__name__}: function", self.function, arguments, instead)
         super().__post_init__()
-        if self.drawn_as not in (None, *DRAWN):
+        if self.drawn_as not in (None, "link", "spring"):
             raise Refused(f"{self.name}: drawn_as is {self.drawn_as!r}; it must be 'link', 'spring' or None.")
 
     def _elements(self):

@@ -26,9 +26,6 @@ class LinearDamping(Effect):
     Args:
         coefficient: c, N s/m, positive; one number, or one for each body.
         bodies: names; all bodies of the scene by default.
-
-    Raises:
-        ValueError: (of the scene) a coefficient that is not positive.
     """
 
     coefficient: Any = positive()
@@ -50,9 +47,6 @@ class QuadraticDrag(Effect):
     Args:
         coefficient: c, kg/m, positive: density times drag coefficient times area, over 2; one number, or one for each body.
         bodies: names; all bodies of the scene by default.
-
-    Raises:
-        ValueError: (of the scene) a coefficient that is not positive.
     """
 
     coefficient: Any = positive()
@@ -74,9 +68,6 @@ class Dashpot(BetweenPoints):
     Args:
         between: names of two bodies, or a list of such pairs.
         coefficient: c, N s/m, positive; one number, or one for each.
-
-    Raises:
-        ValueError: (of the scene) a coefficient that is not positive, ends at one point at the start.
     """
 
     coefficient: Any = positive()
@@ -104,11 +95,8 @@ class RayleighDamping(Effect):
 
     Args:
         mass: alpha, 1/s, positive; None for zero.
-        stiffness: beta, s, positive; None for zero.
+        stiffness: beta, s, positive; None for zero if there is a mass.
         of: names of the potentials in K; all potentials of the scene by default.
-
-    Raises:
-        ValueError: (of the scene) neither alpha nor beta, numbers that are not positive, a name in `of` that is no potential.
     """
 
     mass: Any = array(default=None, sign="positive")

@@ -22,9 +22,6 @@ class ConstantForce(Effect):
     Args:
         bodies: a name, or a list of names.
         force: f, N, (d,); or one for each body, (n, d).
-
-    Raises:
-        ValueError: (of the scene) a force of another dimension than its body.
     """
 
     bodies: Any = names()
@@ -47,9 +44,6 @@ class HarmonicDrive(Effect):
         amplitude: f, N, (d,); or one for each body, (n, d).
         frequency: w, rad/s, positive; one number, or one for each.
         phase: phi, rad; likewise.
-
-    Raises:
-        ValueError: (of the scene) a frequency that is not positive, an amplitude of another dimension than its body.
     """
 
     bodies: Any = names()
@@ -117,9 +111,6 @@ class FollowerForce(BetweenPoints):
     Args:
         between: names (a, b), or a list of such pairs.
         force: f, N; positive pushes b away from a; one number, or one for each.
-
-    Raises:
-        ValueError: (of the scene) ends at one point at the start.
     """
 
     force: Any = number()

@@ -17,10 +17,7 @@ class Gravity(Effect):
 
     Args:
         acceleration: g, (d,) m/s^2; a number g is that acceleration downwards, along the last axis: (0, ..., -g).
-        bodies: names; all bodies of the scene by default.
-
-    Raises:
-        ValueError: (of the scene) an acceleration of another dimension than a body, a body with several masses.
+        bodies: names of bodies with one mass each; all bodies of the scene by default.
     """
 
     acceleration: Any = common(default=9.81, may_be_number=True)
@@ -52,9 +49,6 @@ class MagneticField(Effect):
         field: B, T, (3,); for bodies in the plane a number, the component out of it.
         charge: Q, C; one number, or one for each body.
         bodies: names; all bodies of the scene by default.
-
-    Raises:
-        ValueError: (of the scene) a field that does not fit the dimension of the bodies.
     """
 
     field: Any = array()

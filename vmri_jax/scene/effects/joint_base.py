@@ -39,10 +39,8 @@ class Joint(Effect):
     Args:
         between: names (a, b), or a list of such pairs. A name may come with a point that is fixed in the body,
             ``(("hub", [1, 0, 0]), ("arm", [-1, 0, 0]))``: the body is joined there, and both points must coincide at the start.
+            Along the axes of a joint both bodies need directors.
         at: (3,) m, the point of the joint in space at the start; or a point for each pair, (n, 3). It takes the place of points in `between`.
-
-    Raises:
-        ValueError: (of the scene) no point, or points that do not coincide; an axis along which a body has no director.
     """
 
     between: Any = names(2)
@@ -80,12 +78,12 @@ class Joint(Effect):
 
     @cached_property
     def frames(self) -> dict[str, Any]:
-        """Points and triads of all pairs as components along the directors of each body: "point_a", "point_b", "frame_a", "frame_b"."""
-        return {name: stacked(values) for name, values in self._frames().items()}
+        """Points and triads as components along the directors of each body: "point_a", "point_b", "frame_a", "frame_b"."""
+        return {name: values if len(self.elements) > 1 else values[0] for name, values in self._components.items()}
 
     def _factors(self) -> dict[str, Any]:
         """The numbers of the rows of all pairs, see `products`."""
-        frames = {name: library(values).stack(values) for name, values in self._frames().items()}
+        frames = self._components
         xp, count = library(frames), len(self.elements)
         named, zero = [name for side in zip(*self.rows, strict=True) for name in side], np.zeros((count, FRAME))
         offsets, halves = np.stack([AXES.get(name, np.zeros(3)) for name in named]), []
@@ -145,7 +143,7 @@ class Joint(Effect):
             self.require(coincide, f"the distance of the points of {a}-{b}", f"{float(distance):.6g}", expected)
 
     def drawn_points(self):
-        points = {role: np.atleast_2d(self.frames[f"point_{role}"]) for role in "ab"}
+        points = {role: self._components[f"point_{role}"] for role in "ab"}
         return {
             f"{self.name} {'-'.join(element)} in {name}": (name, points[role][i])
             for i, element in enumerate(self.elements)
@@ -181,8 +179,9 @@ class Joint(Effect):
             joining.append((points[0], points[-1]))
         return joining
 
-    def _frames(self) -> dict[str, list]:
-        """Points and triads of every pair as components along the directors of each body: "point_a", "frame_a", "point_b", "frame_b"."""
+    @cached_property
+    def _components(self) -> dict[str, Any]:
+        """`frames` with an axis for the pairs."""
         points, triads = self.joining_points, self.triads
         components: dict[str, list] = {}
         for i, element in enumerate(self.elements):
@@ -201,7 +200,7 @@ class Joint(Effect):
                     except ValueError as error:
                         raise Refused(f"{self.name}: {error}") from None
                     components.setdefault(f"frame_{role}", []).append(library(rows).stack(rows))
-        return components
+        return {name: library(values).stack(values) for name, values in components.items()}
 
 
 @effect_class
@@ -279,8 +278,16 @@ def _triad(axis):
 
 def _vectors(argument: str, numbers, count: int):
     """(count, 3) vectors from a single vector (3,), or from a vector for each pair; `argument` begins messages."""
-    vectors = real_array(argument, numbers)
-    if vectors.shape not in ((3,), (count, 3)):
-        for_pairs = f", or one for each pair, ({count}, 3)" if count > 1 else ""
-        raise Refused(f"{argument} has shape {vectors.shape}; give (3,){for_pairs}.")
+    vectors = for_pairs(argument, numbers, count, "(3,)", (3,))
     return library(vectors).broadcast_to(vectors, (count, 3))
+
+
+def for_pairs(about: str, numbers: Any, count: int, form: str, shape: tuple[int, ...] = ()) -> Any:
+    """Finite numbers of a shape, or (count, *shape) for the pairs of a joint; `form` is the form of a single one, for messages."""
+    values = real_array(about, numbers)
+    if values.shape not in (shape, (count, *shape)):
+        for_each = f", or one for each pair, {(count, *shape)}" if count > 1 else ""
+        raise Refused(f"{about} has shape {values.shape}; give {form}{for_each}.")
+    if is_concrete(values) and not np.isfinite(values).all():
+        raise Refused(f"{about} is {values}; it must be finite.")
+    return values

@@ -48,6 +48,22 @@ def prescribed_motion(law, freedom: str, t, q, params):
     return sine * xp.cos(a) - cosine * xp.sin(a)
 
 
+def control_along(law, freedom: str, q, u, params):
+    """``u dx/dq``; no law takes part."""
+    x, pull = jax.vjp(lambda q: FREEDOMS[freedom](q, params), q)
+    return pull(u.reshape(x.shape))[0]
+
+
+ALONG: dict[str, Callable] = {
+    "potential": energy_of,
+    "kinetic": energy_of_rate,
+    "force": force_along,
+    "constraint": prescribed_motion,
+    "control": control_along,
+}
+"""For each kind of an effect, the function that makes of a law and the name in `FREEDOMS` of a freedom a function of coordinates."""
+
+
 @effect_class
 class InJoint(OfFreedoms):
     """Base class of effects along the freedom x of a joint: the angle or displacement of b against a from the given position.
@@ -56,9 +72,6 @@ class InJoint(OfFreedoms):
         joint: name of a joint in the scene with an angle or a displacement. Angles count their turns where they are coordinates, see
             `Scene`; of directors an effect takes them up to 5/6 of half a turn, where a run ends.
         of: name of the freedom, if the joint has several; "auto" for the only freedom.
-
-    Raises:
-        ValueError: (of the scene) no joint of this name, or a joint without this freedom.
     """
 
     joint: Any
@@ -66,9 +79,7 @@ class InJoint(OfFreedoms):
 
     derived = Joint.derived
     law: ClassVar[Any] = None
-    """Energy, force or path as a function of x."""
-    along: ClassVar[Any]
-    """The function ``(law, freedom, ...)`` that makes of the law a function of coordinates; the freedom x by its name in `FREEDOMS`."""
+    """The energy of x or of x', the force at (t, x, x'), or the path: the first argument of the function in `ALONG`."""
 
     def resolved(self, effects):
         """A copy with the joint itself instead of its name."""
@@ -81,7 +92,7 @@ class InJoint(OfFreedoms):
 
     @property
     def function(self):
-        return Applied(self.along, (self.law, self.by_directors(self.freedom)))
+        return Applied(ALONG[self.kind], (self.law, self.by_directors(self.freedom)))
 
     def _elements(self):
         return self.joint.elements
@@ -97,7 +108,7 @@ class InJoint(OfFreedoms):
         if not carrying:
             return terms
         role = Role(Rows.of([layout.freedoms[keys[i]] for i in carrying]), len(carrying), 1)
-        return (*terms, self._term(Applied(self.along, (self.law, COORDINATE)), [role], carrying))
+        return (*terms, self._term(Applied(ALONG[self.kind], (self.law, COORDINATE)), [role], carrying))
 
     def _parameters(self):
         return super()._parameters() | self.joint.frames
@@ -123,7 +134,6 @@ class JointSpring(InJoint):
     kind = "potential"
     marks = ("neutral",)
     default_name = "joint_springs"
-    along = staticmethod(energy_of)
 
     @staticmethod
     def law(x, params):
@@ -138,12 +148,9 @@ class JointLimit(InJoint):
 
     Args:
         joint, of: as of `InJoint`.
-        lower, upper: rad or m, from the given position; one number, or one for each pair of the joint.
+        lower, upper: rad or m, from the given position, lower below upper; one number, or one for each pair of the joint.
         stiffness: k, N m/rad or N/m, positive; likewise.
         smoothing: s, rad or m, positive: the distance from the limit at which the force sets in.
-
-    Raises:
-        ValueError: (of the scene) lower above upper.
     """
 
     lower: Any = number()
@@ -155,7 +162,6 @@ class JointLimit(InJoint):
     kind = "potential"
     marks = ("lower", "upper")
     default_name = "joint_limits"
-    along = staticmethod(energy_of)
 
     @staticmethod
     def law(x, params):
@@ -184,7 +190,6 @@ class JointDamper(InJoint):
     kind = "force"
     counts_turns = False
     default_name = "joint_dampers"
-    along = staticmethod(force_along)
 
     @staticmethod
     def law(t, x, rate, params):
@@ -206,7 +211,6 @@ class RotorInertia(InJoint):
     kind = "kinetic"
     counts_turns = False
     default_name = "rotors"
-    along = staticmethod(energy_of_rate)
 
     @staticmethod
     def law(rate, params):
@@ -234,7 +238,6 @@ class JointDrive(InJoint):
     kind = "force"
     counts_turns = False
     default_name = "joint_drive"
-    along = staticmethod(force_along)
 
     @property
     def law(self):
@@ -251,9 +254,6 @@ class JointMotion(InJoint):
         joint, of: as of `InJoint`.
         path: a, ``path(t, params) -> ()``, rad or m from the given position, zero at t = 0.
         params: of `path`. They may change without a new compilation, and runs have derivatives with respect to them.
-
-    Raises:
-        ValueError: (of the scene) a path that does not start at zero.
     """
 
     path: Callable = of_time()
@@ -263,7 +263,6 @@ class JointMotion(InJoint):
     is_analytic = True
     counts_turns = False
     default_name = "joint_motion"
-    along = staticmethod(prescribed_motion)
     timed = True
 
     @property

@@ -71,9 +71,6 @@ class Universal(AboutAxis):
         between, at: as of `Joint`.
         axis: (3,) the axis n that is fixed in a, in space at the start; or an axis for each pair, (n, 3).
         second: (3,) the axis e that is fixed in b, perpendicular to `axis` at the start; or an axis for each pair, (n, 3).
-
-    Raises:
-        ValueError: (of the scene) axes that are not perpendicular.
     """
 
     second: Any = (1.0, 0.0, 0.0)
@@ -137,9 +134,6 @@ class Screw(AboutAxis):
         between, at, axis: as of `Revolute`.
         pitch: how far b moves along the axis per turn, m, not zero, negative for a left-handed screw; one number, or a number for each
             pair. A millimetre by default.
-
-    Raises:
-        ValueError: (of the scene) a pitch of zero.
     """
 
     pitch: Any = number(default=1e-3)

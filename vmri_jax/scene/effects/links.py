@@ -32,11 +32,8 @@ class RigidLink(_Rigid, BetweenPoints):
 
     Args:
         between: names of two bodies, or a list of such pairs.
-        length: l, positive; one number, or one for each link. The distance at the positions in `bodies` by default.
-
-    Raises:
-        ValueError: (of the scene) ends at one point at the start, a length that is not positive or not the distance at
-            the start (unless the scene projects), links that together are redundant.
+        length: l, positive; one number, or one for each link. The distance at the positions in `bodies` by default, and no other one unless
+            the scene projects.
     """
 
     default_name = "links"
@@ -52,11 +49,7 @@ class Anchor(_Rigid, ToFixedPoint):
     Args:
         bodies: a name, or a list of names.
         point: a, (d,); or one for each body, (n, d).
-        length: l, positive; one number, or one for each. The distance at the positions in `bodies` by default.
-
-    Raises:
-        TypeError: a function as point.
-        ValueError: (of the scene) bodies that start at the point, a length that is not positive or not the distance at the start.
+        length: l, positive, as of `RigidLink`.
     """
 
     default_name = "anchors"
@@ -70,12 +63,8 @@ class MovingPivot(_Rigid, ToPath):
     Args:
         bodies: a name, or a list of names.
         path: ``path(t, params) -> (d,)``, the point.
-        length: l, positive; one number, or one for each. The distance at the start, t = 0, by default.
+        length: l, positive, as of `RigidLink`; the distance at t = 0.
         params: of `path`.
-
-    Raises:
-        TypeError: (of the scene) a path that is no function.
-        ValueError: (of the scene) bodies that start at the point, a length that is not positive or not the distance at the start.
     """
 
     default_name = "moving_pivots"
@@ -88,12 +77,8 @@ class Guide(ToPath):
 
     Args:
         bodies: a name.
-        path: a, ``path(t, params) -> (d,)``.
+        path: a, ``path(t, params) -> (d,)``, which starts at the body.
         params: of `path`.
-
-    Raises:
-        TypeError: (of the scene) a path that is no function.
-        ValueError: (of the scene) a body that does not start at a(0).
     """
 
     kind = "constraint"

@@ -23,10 +23,7 @@ class NBodyGravity(Effect):
     Args:
         constant: G, in the units of the scene: 6.674e-11 N m^2/kg^2 in SI units.
         between: names of bodies, every pair of which attracts; or a list of pairs. All bodies by default.
-        softening: s, a length; zero for points.
-
-    Raises:
-        ValueError: (of the scene) bodies that start at one point without a softening.
+        softening: s, a length; zero for points, which must not start at one place.
     """
 
     constant: Any = array(default=6.674e-11)
@@ -103,13 +100,10 @@ class Coulomb(_Nonbonded):
     """Coulomb's law between charges, ``V = C sum_{a<b} Q_a Q_b / |q_b - q_a|``.
 
     Args:
-        charges: Q by name of the body, a dictionary.
+        charges: Q by name of the body, a dictionary with all bodies of `between`.
         constant: C, in the units of the scene: 8.99e9 N m^2/C^2 in SI units.
         between: a list of pairs; all pairs of the charges by default.
         exclude: pairs without this force, see `within_bonds`.
-
-    Raises:
-        ValueError: (of the scene) a pair without a charge, bodies that start at one point.
     """
 
     charges: Any
@@ -154,9 +148,6 @@ class LennardJones(_Nonbonded):
         distance: s, m, positive; likewise.
         between: names of bodies, every pair of which interacts; or a list of pairs. All bodies by default, bonded ones too.
         exclude: pairs without this force, see `within_bonds`.
-
-    Raises:
-        ValueError: (of the scene) numbers that are not positive, bodies that start at one point.
     """
 
     depth: Any = positive()

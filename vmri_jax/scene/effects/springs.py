@@ -21,9 +21,6 @@ class Spring(BetweenPoints):
         between: names of two bodies, or a list of such pairs.
         stiffness: k, N/m, positive; one number, or one for each spring.
         length: l, at rest, positive; likewise. The distance at the positions in `bodies` by default.
-
-    Raises:
-        ValueError: (of the scene) numbers that are not positive, ends at one point at the start.
     """
 
     stiffness: Any = positive()
@@ -46,11 +43,8 @@ class NonlinearSpring(BetweenPoints):
 
     Args:
         between: names of two bodies, or a list of such pairs.
-        coefficients: (k_1, k_2, ...), N/m^j, the same for all springs.
+        coefficients: (k_1, k_2, ...), N/m^j, at least one, the same for all springs.
         length: l, at rest, positive; one number, or one for each spring. The distance at the positions in `bodies` by default.
-
-    Raises:
-        ValueError: (of the scene) no coefficients, a length that is not positive, ends at one point at the start.
     """
 
     coefficients: Any = array()
@@ -83,10 +77,6 @@ class SpringAnchor(ToFixedPoint):
         point: a, (d,); or one for each body, (n, d).
         stiffness: k, N/m, positive; one number, or one for each.
         length: l, at rest, positive; likewise; None for a spring that is relaxed at the point itself.
-
-    Raises:
-        TypeError: a function as point.
-        ValueError: (of the scene) numbers that are not positive, bodies that start at the point of a spring with a length.
     """
 
     stiffness: Any = positive()
@@ -116,10 +106,6 @@ class MovingAnchor(ToPath):
         path: ``path(t, params) -> (d,)``, the point.
         stiffness: k, N/m, positive; one number, or one for each body.
         params: of `path`.
-
-    Raises:
-        TypeError: (of the scene) a path that is no function.
-        ValueError: (of the scene) a stiffness that is not positive.
     """
 
     stiffness: Any = positive()
