@@ -90,6 +90,7 @@ def test_names_that_do_not_exist(swing):
 def test_work_accounts_for_the_energy():
     problem = pendulum(constraint=vm.Rheonomic(swinging_rod), force=drag)
     run = vm.simulate(problem, vm.fully_implicit(4), macro_dt=0.01, num_steps=300)
+    assert run.constraint_residual.max() < 1e-11
     work = run.work()
     assert np.abs(work.forces).max() > 0.5
     assert np.abs(work.constraints).max() > 0.5

@@ -171,7 +171,7 @@ def test_lanes_and_runs_that_are_asked_afterwards():
 def test_scenes_say_it():
     """A stiff spring beyond stability; for all other causes scenes are systems."""
     body = Body("b", 1.0, [0.1, 0.0], pace="fast")
-    scene = Scene([body], [SpringAnchor("b", [0.0, 0.0], 1e4, length=0.0)])
+    scene = Scene([body], [SpringAnchor("b", [0.0, 0.0], 1e4)])
     with pytest.warns(vm.LostEnergyWarning, match="the computed motion is wrong"):
         vm.simulate(scene, EXPLICIT, macro_dt=0.0205, num_steps=10)
 

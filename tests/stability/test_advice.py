@@ -151,7 +151,7 @@ def test_kicks_of_a_weight_that_meet_its_spring_in_phase(turn, warned):
 
     masses = vm.ConstantMass(jnp.zeros(0), jnp.ones(1))
     system = vm.System(masses, weight, spring, params={"k": jnp.asarray((turn / macro_dt) ** 2)})
-    problem, scheme = vm.Problem(system, [], [0.0]), vm.explicit_slow(200)
+    problem, scheme = vm.Problem(system, [], [0.0]), vm.fully_explicit(200)
     findings = [f for f in vm.advise(problem, scheme, macro_dt=macro_dt).findings if f.kind == "kicks in phase"]
     assert bool(findings) == warned
     if findings:

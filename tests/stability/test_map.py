@@ -20,9 +20,12 @@ GRID = np.linspace(0.05, 4 * np.pi, 126)
 CASE_3 = 57 * 0.1  # omega H at omega h = 0.1
 
 
-@pytest.mark.parametrize("num_micro", [(2, 10), pytest.param((2, 3, 5, 10, 20), marks=pytest.mark.full)])
+@pytest.mark.parametrize("num_micro", [(2,), pytest.param((2, 3, 5, 10, 20), marks=pytest.mark.full)])
 def test_first_impulse_resonances(num_micro):
-    """omega 50, kappa 25: first unstable omega H / pi as measured with an independent code, within 0.005."""
+    """omega 50, kappa 25: first unstable omega H / pi as measured with an independent code, within 0.005.
+
+    `tests/steppers/test_mollified.py` has the first resonance of ten micro steps, by the derivative of the step itself.
+    """
     expected = {n: {2: 1.248, 3: 1.089, 5: 1.025, 10: 0.999, 20: 0.993}[n] for n in num_micro}
     found = stability_map(linear_model(), {n: explicit_slow(n) for n in expected}, GRID)
     first = {n: found.first_unstable(n) / np.pi for n in expected}
