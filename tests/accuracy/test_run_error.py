@@ -10,6 +10,7 @@ from scipy.integrate import solve_ivp
 
 import vmri_jax as vm
 from tests.small_systems import NONE, SYSTEMS, no_constraint
+from vmri_jax.accuracy import search
 from vmri_jax.accuracy.companions import UncertifiedWarning
 from vmri_jax.study import reference_solution
 
@@ -149,6 +150,14 @@ def test_chaotic_motion_is_not_certified():
     assert f"until t = {until:.4g}" in run.error.in_words()
     assert np.isnan(run.error.of)
     assert "no error is certified" in repr(run[-3:].error)
+
+
+def test_chaotic_motion_misses_the_accuracy(monkeypatch):
+    monkeypatch.setattr(search, "MOST_TRIAL_SECONDS", 0.0)
+    monkeypatch.setattr(search, "FEWEST_STEPS", 1024)
+    with pytest.warns(vm.AccuracyNotReached, match="no error is certified"), pytest.warns(match="chaotic"):
+        run = vm.simulate(double_pendulum(), vm.galerkin(1, 3), accuracy=1e-3, t_end=40.0)
+    assert run.error.largest == np.inf
 
 
 def test_steps_that_do_not_see_the_motion_are_not_certified():
