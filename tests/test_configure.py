@@ -8,7 +8,6 @@ import pytest
 
 from vmri_jax.configure import FAST_LOOPS
 
-
 FORKING = """
 import os, sys
 import jax, vmri_jax
