@@ -9,7 +9,7 @@ import pytest
 
 import vmri_jax as vm
 from tests.user_systems import two_oscillators
-from vmri_jax.executors import worker
+from vmri_jax.executors.executor import in_worker
 from vmri_jax.stability import stability_map
 from vmri_jax.study import convergence_study
 
@@ -27,7 +27,7 @@ class Travelling(Executor):
 @pytest.fixture(autouse=True)
 def set_up(monkeypatch):
     """This process has its settings already."""
-    monkeypatch.setattr(worker, "_prepare", lambda process: None)
+    monkeypatch.setattr(f"{in_worker.__module__}._prepare", lambda process: None)
 
 
 def test_convergence_study():
