@@ -13,7 +13,7 @@ by many digits.
 Source: R. D. Skeel, D. J. Hardy, Practical construction of modified Hamiltonians, SIAM J. Sci. Comput. 23 (2001).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import factorial
 
 import jax
@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Float
 
 from vmri_jax.mechanics.arrays import whole_number
-from vmri_jax.mechanics.invariants import velocity
+from vmri_jax.mechanics.invariants import velocity_and_masses
 from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.mechanics.system import System
 from vmri_jax.refusals import Refused
@@ -175,10 +175,10 @@ def _stage(system: System, scheme: Scheme, state: State, macro_dt):
     start = with_kicks(state, start=1.0)
     equations = StepEquations.of(system, scheme, start, macro_dt)
     n_g, n_gs = system.num_constraints(state.q_s, state.q_f)
-    v_s, v_f = velocity(system, start.q_s, start.q_f, start.p_s, start.p_f)
-    guess = equations.guess(v_s, v_f, jnp.zeros(n_g), jnp.zeros(n_gs))
+    velocities, masses = velocity_and_masses(system, start.q_s, start.q_f, start.p_s, start.p_f)
+    guess = equations.guess(*velocities, jnp.zeros(n_g), jnp.zeros(n_gs))
     solver = Marched(Solver("exact"))
-    solution, _ = solver.solve(equations, guess, solver.init(equations, (v_s, v_f)))
+    solution, _ = solver.solve(replace(equations, masses=masses), guess, solver.init(equations))
     q_s, (q_f, p_s, p_f) = state.q_s + solution.x.slow[-1], solution.end
     end = with_kicks(State(state.t + macro_dt, q_s, q_f, p_s, p_f), end=1.0)
     return end, terms(equations.path(solution.x)), solution.status.result

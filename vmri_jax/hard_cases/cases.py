@@ -27,7 +27,7 @@ from vmri_jax.hard_cases.measures import (
     run,
     status,
 )
-from vmri_jax.mechanics.constraints import rows_at
+from vmri_jax.mechanics.constraints import rows_at, weights_at
 from vmri_jax.mechanics.linearisation import linearise
 from vmri_jax.mechanics.motion import motion
 from vmri_jax.mechanics.projection import legendre
@@ -100,7 +100,14 @@ class Resolved:
         trajectory = long_run(self.problem, self.scheme, self.macro_dt, steps)
         position, velocity = constraints(trajectory)
         nodes = trajectory.states
-        rows = jax.jit(jax.vmap(partial(rows_at, self.problem.system)))(nodes.t, nodes.q_s, nodes.q_f)
+        system = self.problem.system
+
+        @jax.jit
+        @jax.vmap
+        def rows_of(t, q_s, q_f):
+            return rows_at(system, t, q_s, q_f, weights_at(system, q_s, q_f))
+
+        rows = rows_of(nodes.t, nodes.q_s, nodes.q_f)
         part = float(np.max(np.abs(rows.values) / rows.sizes))
         return Outcome(
             f"{steps:.0e} steps: {status(trajectory)}, |g| {position:.1e}, |G v| {velocity:.1e}",

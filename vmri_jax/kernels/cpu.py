@@ -39,8 +39,6 @@ COLLOCATES = True
 """Whether `Collocation` solves a single interval of high degree, for all variables at once."""
 DRIFTS = True
 """Whether `Rattle` solves a drift along constraints, for its multipliers alone."""
-DEFERS_PROJECTION = True
-"""Whether runs with drifts project the momenta onto the hidden constraints only at saved nodes."""
 
 
 def matmul(a, b):

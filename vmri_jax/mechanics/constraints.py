@@ -19,11 +19,12 @@ import numpy as np
 from jaxtyping import Float
 from scipy.linalg import block_diag
 
+from vmri_jax.kernels import max_abs
 from vmri_jax.mechanics.arrays import Numbers, is_concrete, library, quickly_compiled
 from vmri_jax.mechanics.by_name import constraint_sizes
 from vmri_jax.mechanics.functions import Rheonomic
 from vmri_jax.mechanics.masses import correlation
-from vmri_jax.mechanics.projection import mass_and_momentum, mass_diagonal, time_rates
+from vmri_jax.mechanics.projection import mass_and_momentum, time_rates
 from vmri_jax.mechanics.system import System
 from vmri_jax.mechanics.terms_of_rows import sizes_of_terms
 from vmri_jax.refusals import Refused
@@ -109,25 +110,37 @@ class Rows(NamedTuple):
     def of(cls, function, q, weights: Any = 1.0) -> "Rows":
         """The rows (k,) of a function of q (n,)."""
         direction = np.random.default_rng(0).normal(size=q.size) / weights
-        gradients, bends = (a / weights for a in jax.jvp(jax.jacrev(function), (q,), (direction,)))
+
+        def gradients_and_values(q):
+            values, pull = jax.vjp(function, q)
+            return jax.vmap(pull)(jnp.eye(values.size))[0], values
+
+        gradients, bends, values = jax.jvp(gradients_and_values, (q,), (direction,), has_aux=True)
+        gradients, bends = gradients / weights, bends / weights
         terms, reach = sizes_of_terms(function, q), jnp.sum(jnp.abs(gradients), axis=1) * jnp.max(jnp.abs(weights * q))
         # |hess g e| of a random direction e for the norm of the Hessian
         squared, bend = jnp.sum(gradients**2, axis=1), jnp.linalg.norm(bends, axis=1)
         radius = jnp.where(bend > 0, squared / jnp.where(bend > 0, bend, 1.0), 0.0)
-        return cls(function(q), jnp.maximum(terms, jnp.minimum(radius, reach)), terms + reach, gradients)
+        return cls(values, jnp.maximum(terms, jnp.minimum(radius, reach)), terms + reach, gradients)
 
 
-def rows_at(system: System, t, q_s, q_f, weights=None) -> Rows:
-    """The `Rows` of a system; the weights w of coordinates are those of the masses by default."""
+def rows_at(system: System, t, q_s, q_f, weights) -> Rows:
+    """The `Rows` of a system, for weights w (n,) of the coordinates."""
     n_s = q_s.shape[0]
+    return Rows.of(lambda q: _values(system, t, q[:n_s], q[n_s:]), jnp.concatenate([q_s, q_f]), weights)
 
-    def rows(q):
-        configuration = t, q[:n_s], q[n_s:]
-        return jnp.concatenate([system.constraints(*configuration), system.g_implied(*configuration)])
 
-    if weights is None:
-        weights = weights_of(jnp.concatenate(mass_diagonal(system, q_s, q_f)))
-    return Rows.of(rows, jnp.concatenate([q_s, q_f]), weights)
+def _values(system: System, *configuration):
+    """(k,) values of all rows."""
+    return jnp.concatenate([system.constraints(*configuration), system.g_implied(*configuration)])
+
+
+def residual_of(rows: Rows, system: System, state, weighted_velocity):
+    """Largest ``|g|`` and largest ``|G v + dg/dt|``, shape (2,), from the rows at a state, and w v (n,) with their weights."""
+    rates, t = rows.gradients @ weighted_velocity, state.t
+    if system.is_rheonomic or isinstance(system.implied, Rheonomic):
+        rates += jax.jvp(lambda t: _values(system, t, state.q_s, state.q_f), (t,), (jnp.ones_like(t),))[1]
+    return jnp.stack([max_abs(rows.values), max_abs(rates)])
 
 
 def weights_of(masses):
@@ -136,17 +149,24 @@ def weights_of(masses):
     return xp.sqrt(xp.where(masses > 0, masses, 1.0))
 
 
-def are_kept(system: System, state, tolerance):
+def weights_at(system: System, q_s, q_f):
+    """(n,) the weights w at positions."""
+    if system.has_constant_mass:
+        return weights_of(jnp.concatenate(system.kinetic.diagonal))
+    masses, _ = mass_and_momentum(system, q_s, q_f, jnp.zeros_like(q_s), jnp.zeros_like(q_f))
+    return weights_of(jnp.diagonal(masses))
+
+
+def are_kept(rows: Rows, solved: int, tolerance):
     """Whether a state of a run keeps the rows that are solved for, and the implied ones.
 
     Args:
-        state: a `State`.
+        rows: at the state.
+        solved: number of rows that are solved for.
         tolerance: of the solver.
     """
-    rows = rows_at(system, state.t, state.q_s, state.q_f)
     tolerance = jnp.maximum(CONSTRAINT_TOLERANCE, CONSTRAINT_OVER_TOLERANCE * tolerance)
     kept = jnp.abs(rows.values) <= rows.allowed(tolerance)
-    solved = sum(system.num_constraints(state.q_s, state.q_f))
     return jnp.all(kept[:solved]), jnp.all(kept[solved:])
 
 

@@ -1,4 +1,4 @@
-"""Quantities that a trajectory conserves: energy, momentum maps, constraints."""
+"""Quantities that a trajectory conserves: energy, momentum maps, constraints; and velocities."""
 
 from functools import reduce
 from operator import add
@@ -6,7 +6,8 @@ from operator import add
 import jax
 import jax.numpy as jnp
 
-from vmri_jax.kernels import max_abs
+from vmri_jax.kernels import solve
+from vmri_jax.mechanics.constraints import residual_of, rows_at
 from vmri_jax.mechanics.projection import project_momentum
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.structure import has_constant_hessian
@@ -55,7 +56,7 @@ def oscillatory_energies(omega, q_f, p_f):
     return (p_f**2 + omega**2 * q_f**2) / 2
 
 
-def constraint_residual(system: System, state: State, velocities=None):
+def constraint_residual(system: System, state, velocities=None):
     """Largest ``|g|`` (position level) and largest ``|G v + dg/dt|`` (velocity level), shape (2,).
 
     Args:
@@ -63,13 +64,9 @@ def constraint_residual(system: System, state: State, velocities=None):
         state: time, positions and momenta.
         velocities: (v_s, v_f) of the momenta if they are known.
     """
-    configuration = state.t, state.q_s, state.q_f
     velocities = velocities or velocity(system, state.q_s, state.q_f, state.p_s, state.p_f)
-    levels = all_constraints(system, state, velocities)
-    if system.implied is not None:
-        implied = system.g_implied(*configuration), system.implied_rates(*configuration, *velocities)
-        levels = [jnp.concatenate(rows) for rows in zip(levels, implied, strict=True)]
-    return jax.vmap(max_abs)(jnp.stack(levels))
+    rows = rows_at(system, state.t, state.q_s, state.q_f, weights=1.0)
+    return residual_of(rows, system, state, jnp.concatenate(velocities))
 
 
 def all_constraints(system: System, state: State, velocities=None):
@@ -105,8 +102,7 @@ def velocity_and_masses(system: System, q_s, q_f, p_s, p_f):
     gradient, times_masses = jax.linearize(jax.grad(kinetic), v)
     masses = jax.vmap(times_masses)(jnp.eye(p.size))
     if is_quadratic:
-        # p = M v + dT/dv(0); a library's solver: it is one instruction, and large matrices are not unrolled
-        v = jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(masses), True), p - gradient)
+        v = solve(masses, (p - gradient)[:, None])[:, 0]  # p = M v + dT/dv(0)
     return (v[:n_s], v[n_s:]), masses
 
 

@@ -76,6 +76,11 @@ class ConstantMass(eqx.Module):
         """``M_f`` as an operator."""
         return _operator(self.fast)
 
+    @property
+    def diagonal(self):
+        """The diagonals (n_s,) of M_s and (n_f,) of M_f."""
+        return tuple(mass if mass.ndim == 1 else jnp.diagonal(mass) for mass in (self.slow, self.fast))
+
     def __call__(self, q_s, q_f, v_s, v_f, params):
         p_s, p_f = self.momentum(v_s, v_f)
         return (jnp.sum(v_s * p_s) + jnp.sum(v_f * p_f)) / 2

@@ -37,23 +37,6 @@ def mass_and_momentum(system: System, q_s, q_f, v_s, v_f):
     return jax.vmap(times_mass)(jnp.eye(p.size)), p
 
 
-def mass_diagonal(system: System, q_s, q_f):
-    """Diagonal of the mass matrix at rest, in fewer operations than the matrix: (n_s,) and (n_f,)."""
-    if system.has_constant_mass:
-        masses = system.kinetic.slow, system.kinetic.fast
-        return tuple(mass if mass.ndim == 1 else jnp.diagonal(mass) for mass in masses)
-    n_s, n = q_s.shape[0], q_s.shape[0] + q_f.shape[0]
-
-    def second(direction):
-        def kinetic(step):
-            v = step * direction
-            return system.kinetic_energy(q_s, q_f, v[:n_s], v[n_s:])
-
-        return jax.jvp(lambda step: jax.jvp(kinetic, (step,), (1.0,))[1], (0.0,), (1.0,))[1]
-
-    return tuple(jnp.split(jax.vmap(second)(jnp.eye(n)), [n_s]))
-
-
 def project_momentum(system: System, state, guess=None, sparsity: Sparsity | None = None):
     """Momenta projected onto the hidden constraints, ``p <- p - G^T mu`` with ``G v + dg/dt = 0``, and their velocities.
 

@@ -244,24 +244,14 @@ class System(eqx.Module):
 
     def constraint_rates(self, t, q_s, q_f, v_s, v_f):
         """Rates of all constraint values, ``G v + dg/dt``, shape (n_g + n_gs,)."""
-        return _rates(self.constraints, self.is_rheonomic, (t, q_s, q_f), (v_s, v_f))
-
-    def implied_rates(self, t, q_s, q_f, v_s, v_f):
-        """Rates of the values of `implied`, shape (n_i,)."""
-        return _rates(self.g_implied, isinstance(self.implied, Rheonomic), (t, q_s, q_f), (v_s, v_f))
+        if self.is_rheonomic:
+            return jax.jvp(self.constraints, (t, q_s, q_f), (jnp.ones_like(t), v_s, v_f))[1]
+        return jax.jvp(partial(self.constraints, t), (q_s, q_f), (v_s, v_f))[1]
 
     def num_constraints(self, q_s, q_f) -> tuple[int, int]:
         """``(n_g, n_gs)`` for configurations of these shapes."""
         t = jnp.zeros(())
         return jax.eval_shape(self.g, t, q_s, q_f).shape[0], jax.eval_shape(self.g_slow, t, q_s).shape[0]
-
-
-def _rates(values, is_rheonomic: bool, configuration, velocities):
-    """The rate of ``values(t, q_s, q_f)``, with its derivative with respect to time if it depends on time."""
-    t, *positions = configuration
-    if is_rheonomic:
-        return jax.jvp(values, configuration, (jnp.ones_like(t), *velocities))[1]
-    return jax.jvp(partial(values, t), tuple(positions), velocities)[1]
 
 
 def _checked(name: str, function, order: Order | None):

@@ -102,7 +102,8 @@ class Engine:
             is_later = number > 0  # turn 0 saves the start, so that the code for nodes is compiled once
             moved, info, micro = interval(cursor, jnp.where(is_later, save_every, 0))
             cursor = jax.tree.map(lambda a, b: a if a is b else jnp.where(is_later, a, b), moved, cursor)
-            row = _row(cursor.state, info, micro)
+            saved = jax.tree.map(partial(jnp.where, is_later), stepper.project(cursor.state), cursor.state)
+            row = _row(saved, info, micro)
             return number + 1, cursor, jax.lax.dynamic_update_slice(rows, row[None], (number, 0))
 
         begin = jax.tree.map(jnp.asarray, begin._replace(memory=memory))
@@ -137,7 +138,7 @@ class Engine:
 
             def save(cursor: Cursor, _):
                 cursor, info, micro = interval(cursor, save_every)
-                return cursor, _row(cursor.state, info, micro)
+                return cursor, _row(stepper.project(cursor.state), info, micro)
 
             cursor = Cursor.at_start(run.state, stepper.init(run.state, run.macro_dt))
             cursor, rows = loops.scan(save, jax.tree.map(jnp.asarray, cursor), self.num_saves)
@@ -217,11 +218,7 @@ def _interval(stepper: Plan, run, repeat: Callable):
         return Cursor(state, memory, cursor.step + 1, result, failed_at), worst, micro
 
     def interval(cursor: Cursor, count):
-        cursor, info, micro = repeat(count, step, (cursor, *_nothing(run)))
-        if stepper.defers_projection:  # between saved nodes a projection would not change the motion
-            state, memory = stepper.project(cursor.state, cursor.memory)
-            cursor = cursor._replace(state=state, memory=memory)
-        return cursor, info, micro
+        return repeat(count, step, (cursor, *_nothing(run)))
 
     return interval
 

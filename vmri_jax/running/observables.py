@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Float
 
 from vmri_jax.mechanics.arrays import Numbers
-from vmri_jax.mechanics.constraints import are_kept
-from vmri_jax.mechanics.invariants import constraint_residual, energy_parts, velocity_and_masses
+from vmri_jax.mechanics.constraints import are_kept, residual_of, rows_at, weights_of
+from vmri_jax.mechanics.invariants import energy_parts, velocity_and_masses
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
 
@@ -94,16 +94,18 @@ def observables(system: System, state: State, tolerance: Any = 0.0):
     phase = state.q_s, state.q_f, state.p_s, state.p_f
     velocities, masses = velocity_and_masses(system, *phase)
     parts = list(energy_parts(system, *phase, velocities).values())
-    position, rate = constraint_residual(system, state, velocities)
+    q, v = jnp.concatenate([state.q_s, state.q_f]), jnp.concatenate(velocities)
     if masses is None:
-        kinetic, volume = parts[0], 0.0
+        kinetic, volume, diagonal = parts[0], 0.0, jnp.concatenate(system.kinetic.diagonal)
         rounding = system.kinetic_energy(state.q_s, state.q_f, state.q_s, state.q_f)
     else:
-        q, v = jnp.concatenate([state.q_s, state.q_f]), jnp.concatenate(velocities)
-        kinetic = v @ masses @ v / 2
+        kinetic, diagonal = v @ masses @ v / 2, jnp.diagonal(masses)
         rounding, volume = q @ masses @ q / 2, 2 * jnp.sum(jnp.log(jnp.diagonal(jnp.linalg.cholesky(masses))))
-    terms, kept = sum(map(jnp.abs, parts)), are_kept(system, state, tolerance)
-    values = sum(parts), position, rate, *kept, kinetic, terms, rounding, volume
+    weights = weights_of(diagonal)
+    rows = rows_at(system, state.t, state.q_s, state.q_f, weights)
+    residual = residual_of(rows, system, state, weights * v)
+    kept = are_kept(rows, sum(system.num_constraints(state.q_s, state.q_f)), tolerance)
+    values = sum(parts), *residual, *kept, kinetic, sum(map(jnp.abs, parts)), rounding, volume
     return jnp.stack([jnp.asarray(value, dtype=float) for value in values])
 
 

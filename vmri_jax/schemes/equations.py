@@ -16,7 +16,7 @@ The momentum equations are multiplied by the micro step h, and the multipliers a
 ``k_ij M_s / num_micro`` and the constraint Jacobian for every step size, up to ``h^2`` times the curvature of potentials, with
 ``k_ij = sum_n w_n l_i'(c_n) l_j'(c_n)`` of the rule of T. The w_j are weights on the macro interval: with
 n = num_micro, the weight of the constraint rule over n, summed over both intervals at nodes where two intervals meet
-(`multiplier_scales`).
+(`StepEquations.multiplier_scales`).
 """
 
 from typing import NamedTuple
@@ -28,11 +28,16 @@ import numpy as np
 from jaxtyping import Float
 
 from vmri_jax.mechanics.arrays import Number, Numbers
+from vmri_jax.mechanics.masses import ConstantMass
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
 from vmri_jax.schemes.discrete_lagrangian import Sum, lagrangian
 from vmri_jax.schemes.path import Nodes, Path, control_nodes, lagrange_basis, velocity_nodes
 from vmri_jax.schemes.scheme import Scheme
+
+LEAST_SUM = 0.2
+"""Smallest length of a step and the step before together, relative to the step, with which multipliers at their common node count. If a forward and a
+backward step of a composition nearly cancel, they are round-off. A larger value loses predictions of multipliers, a smaller one amplifies round-off."""
 
 
 class Unknowns(NamedTuple):
@@ -57,6 +62,9 @@ class StepEquations(eqx.Module):
 
     Arguments of the methods: x, the `Unknowns`; `path`, which is varied; `held`, the same path as a constant, along which forces are
     evaluated.
+
+    before: length of the step before, whose momenta are off the hidden constraints; 0 for momenta on them.
+    masses: mass matrix ``d2T/dv2`` (n, n) at the start of the step, of a kinetic energy that is a function; solvers need it.
     """
 
     system: System
@@ -67,11 +75,13 @@ class StepEquations(eqx.Module):
     p_s: Float[Numbers, "n_s"]
     p_f: Float[Numbers, "n_f"]
     macro_dt: Number
+    before: Number = 0.0
+    masses: Float[Numbers, "n n"] | None = None
 
     @classmethod
-    def of(cls, system: System, scheme: Scheme, state: State, macro_dt) -> "StepEquations":
-        """The equations of a step from a state."""
-        return cls(system, scheme, state.t, state.q_s, state.q_f, state.p_s, state.p_f, macro_dt)
+    def of(cls, system: System, scheme: Scheme, state: State, macro_dt, before: Number = 0.0) -> "StepEquations":
+        """The equations of a step from a state, without `masses`."""
+        return cls(system, scheme, state.t, state.q_s, state.q_f, state.p_s, state.p_f, macro_dt, before)
 
     @property
     def micro_dt(self):
@@ -82,6 +92,12 @@ class StepEquations(eqx.Module):
     def force_nodes(self) -> Nodes:
         """Where forces are evaluated."""
         return velocity_nodes(self.scheme.force, self.scheme.num_micro, self.scheme.degree)
+
+    def mass_diagonal(self):
+        """Diagonals (n_s,) and (n_f,) of the constant masses, or of `masses`."""
+        if isinstance(self.system.kinetic, ConstantMass):
+            return self.system.kinetic.diagonal
+        return tuple(jnp.split(jnp.diagonal(self.masses), [self.q_s.size]))
 
     def path(self, x: Unknowns) -> Path:
         """The path of the unknowns."""
@@ -155,7 +171,7 @@ class StepEquations(eqx.Module):
     def guess(self, v_s, v_f, multiplier, slow_multiplier) -> Unknowns:
         """Straight motion at these velocities, with these (physical) multipliers at all nodes."""
         n, c = self.scheme.num_micro, control_nodes(self.scheme.degree)[1:, None]
-        scale, slow_scale = multiplier_scales(self.scheme, self.macro_dt)
+        scale, slow_scale = self.multiplier_scales()
         return Unknowns(
             slow=c * (self.macro_dt * v_s),
             slow_multiplier=slow_scale * slow_multiplier,
@@ -163,33 +179,41 @@ class StepEquations(eqx.Module):
             multiplier=scale * multiplier,
         )
 
+    def multiplier_scales(self):
+        """The factors of the multipliers in the unknowns: ``mu / lambda`` (num_micro, r, 1) of g, and (r, 1) of g_s.
+
+        With the weights w_0..w_r of the constraint rule on its unit interval, and H_before, the factors of g are
+
+            h^2 (w_0 + (H_before / H) w_r)  at the start of the step    h^2 (w_0 + w_r)  where micro intervals meet    h^2 w_j  inside
+
+        and, with the weights of the slow constraint rule, those of g_s are ``H^2 (w_0 + (H_before / H) w_r)`` at S_0 and ``H^2 w_i`` at S_i:
+        the constraint force that the step before has left out at the common node belongs to this step.
+        """
+        scheme, macro_dt = self.scheme, self.macro_dt
+        w, w_slow = (jnp.asarray(placed.rule.weights) for placed in (scheme.constraint, scheme.slow_constraint))
+        starts, first = np.eye(1, w.size - 1), np.eye(scheme.num_micro, 1)
+        shared = w[:-1] + (1 + first * (self.before / macro_dt - 1)) * starts * w[-1]
+        slow_shared = w_slow[:-1] + self.before / macro_dt * np.eye(1, w_slow.size - 1)[0] * w_slow[-1]
+        return self.micro_dt**2 * shared[..., None], macro_dt**2 * slow_shared[:, None]
+
+    def multipliers(self, x: Unknowns, multiplier, slow_multiplier):
+        """The multipliers lambda (num_micro, r, n_g) and (r, n_gs) of the unknowns; those of the step before, where both steps cancel.
+
+        Args:
+            x: unknowns.
+            multiplier, slow_multiplier: (n_g,) and (n_gs,) multipliers of the step before.
+        """
+        cancels = jnp.abs(self.macro_dt + self.before) < LEAST_SUM * jnp.abs(self.macro_dt)
+        scaled, last = (x.multiplier, x.slow_multiplier), (multiplier, slow_multiplier)
+        return tuple(
+            jnp.where(cancels, before, mu / jnp.where(cancels, 1.0, scale))
+            for mu, scale, before in zip(scaled, self.multiplier_scales(), last, strict=True)
+        )
+
 
 def sum_before(increments):
     """Running sum of increments over the intervals before each one."""
     return jnp.concatenate([jnp.zeros_like(increments[:1]), jnp.cumsum(increments[:-1], axis=0)])
-
-
-def multiplier_scales(scheme: Scheme, macro_dt, before: Number = 0.0):
-    """The factors of the multipliers in the unknowns: ``mu / lambda`` (num_micro, r, 1) of g, and (r, 1) of g_s.
-
-    With the weights w_0..w_r of the constraint rule on its unit interval, and H_before, the factors of g are
-
-        h^2 (w_0 + (H_before / H) w_r)  at the start of the step      h^2 (w_0 + w_r)  where micro intervals meet      h^2 w_j  inside
-
-    and, with the weights of the slow constraint rule, the factors of g_s are ``H^2 (w_0 + (H_before / H) w_r)`` at S_0 and ``H^2 w_i`` at S_i.
-
-    Args:
-        scheme: its constraint rules.
-        macro_dt: length H of the step.
-        before: H_before, length of the step before if its end momenta were not projected, else 0. Without a projection, the multipliers at
-            the common node carry the constraint forces of both steps.
-    """
-    n, h = scheme.num_micro, macro_dt / scheme.num_micro
-    w, w_slow = (jnp.asarray(placed.rule.weights) for placed in (scheme.constraint, scheme.slow_constraint))
-    starts, first = np.eye(1, w.size - 1), np.eye(n, 1)
-    shared = w[:-1] + (1 + first * (before / macro_dt - 1)) * starts * w[-1]
-    slow_shared = w_slow[:-1] + before / macro_dt * np.eye(1, w_slow.size - 1)[0] * w_slow[-1]
-    return h**2 * shared[..., None], macro_dt**2 * slow_shared[:, None]
 
 
 def slow_basis_at_control_nodes(num_micro: int, degree: int) -> np.ndarray:

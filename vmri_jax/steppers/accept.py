@@ -25,7 +25,6 @@ from jaxtyping import Array, Float
 
 from vmri_jax.kernels import max_abs
 from vmri_jax.mechanics.arrays import Number
-from vmri_jax.mechanics.projection import mass_diagonal
 from vmri_jax.schemes.equations import StepEquations
 
 ROUNDOFF = 4.0
@@ -61,9 +60,9 @@ class Weights(NamedTuple):
     @classmethod
     def of(cls, equations: StepEquations) -> "Weights":
         """The weights at the start of a step."""
-        if equations.system.has_constant_mass:
+        if equations.masses is None:
             return NO_WEIGHTS
-        return cls(*map(jnp.sqrt, mass_diagonal(equations.system, equations.q_s, equations.q_f)))
+        return cls(*map(jnp.sqrt, equations.mass_diagonal()))
 
     def of_momenta(self) -> "Weights":
         """The weights of momenta and of the rows of momentum equations."""

@@ -52,9 +52,5 @@ class Composed(Stepper):
         along = map(jnp.concatenate, (infos.q_f_micro, infos.multiplier, infos.slow_multiplier))
         return state, StepInfo(*worst, *along), ComposedState(last, stage_memories)
 
-    def project(self, state: State, memory: ComposedState) -> tuple[State, ComposedState]:
-        state, last = self.stage.project(state, memory.last)
-        return state, memory._replace(last=last)
-
     def describe(self) -> list[str]:
         return [f"composition of {len(self.coefficients)} stages, each:", *indented(self.stage.describe())]

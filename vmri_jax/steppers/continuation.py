@@ -20,7 +20,6 @@ from jaxtyping import Array, Float, Int
 
 from vmri_jax.kernels import max_abs
 from vmri_jax.mechanics.constraints import is_rank_deficient
-from vmri_jax.mechanics.projection import mass_diagonal
 from vmri_jax.schemes.equations import StepEquations, Unknowns
 from vmri_jax.steppers.results import RUNNING, Result
 from vmri_jax.steppers.stepper import StepStatus
@@ -120,7 +119,7 @@ def with_dependent_constraints(equations: StepEquations, status: StepStatus) -> 
             *jax.jacrev(system.g, argnums=(1, 2))(equations.t, q_s, q_f),
             jax.jacrev(system.g_slow, 1)(equations.t, q_s),
         )
-        m_s, m_f = mass_diagonal(system, q_s, q_f)
+        m_s, m_f = equations.mass_diagonal()
         g_s, g_f, g_slow = (g / jnp.sqrt(m) for g, m in zip(jacobians, (m_s, m_f, m_s), strict=True))
         return is_rank_deficient(g_f, g_s, RANK) | is_rank_deficient(g_slow, tolerance=RANK)
 

@@ -1,40 +1,27 @@
-"""Whole steps from a user's stepper: a projection where it has none, and checks of shapes."""
+"""Whole steps from a user's stepper, and checks of shapes."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
 import numpy as np
 
 from vmri_jax.mechanics.checks import check_type
-from vmri_jax.mechanics.projection import project_momentum
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
 from vmri_jax.refusals import Refused
 from vmri_jax.schemes.discrete_lagrangian import lagrangian
 from vmri_jax.schemes.scheme import Scheme
-from vmri_jax.steppers.kicked import Kicked, KickedState
+from vmri_jax.steppers.kicked import Kicked
 from vmri_jax.steppers.solved import Solved
 from vmri_jax.steppers.stepper import Stepper
-
-
-@dataclass(frozen=True, kw_only=True)
-class Projecting(Kicked):
-    """Kicks around a stepper without a method `project`, with the projection of momenta onto the hidden constraints added."""
-
-    system: System
-
-    def project(self, state: State, memory: KickedState) -> tuple[State, KickedState]:
-        p_s, p_f, _, _ = project_momentum(self.system, state)
-        return State(state.t, state.q_s, state.q_f, p_s, p_f), memory
 
 
 def whole_step(made: Any, system: System, scheme: Scheme, average: Callable | None) -> Kicked:
     """The stepper of a run, made of a user's stepper.
 
     A `Solved` stepper solves the equations between the kicks, so that the kicks of the scheme are added before and after; any other stepper
-    takes the whole step. With constraints every step ends with a projection of the momenta onto the hidden constraints.
+    takes the whole step.
 
     Args:
         made: value of ``Solver.stepper``.
@@ -50,16 +37,7 @@ def whole_step(made: Any, system: System, scheme: Scheme, average: Callable | No
         made = Kicked(lagrangian(system, scheme).kicks, made, average)
     if type(made) is not Kicked:  # a subclass may have an `advance` of its own
         made = Kicked((), made)
-    if system.is_constrained and not _projects(made.inner):
-        made = Projecting(made.kicks, made.inner, made.average, system=system)
-    return replace(made, projects=system.is_constrained)
-
-
-def _projects(stepper: Stepper) -> bool:
-    """Whether a stepper projects momenta itself: by a method `project` of its class, or of the stepper between its kicks."""
-    if type(stepper).project is Kicked.project:
-        return _projects(stepper.inner)  # pyright: ignore[reportAttributeAccessIssue]
-    return type(stepper).project is not Stepper.project
+    return made
 
 
 def check_shapes(stepper: Stepper, system: System, scheme: Scheme, state: State) -> None:

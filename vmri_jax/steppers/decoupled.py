@@ -45,12 +45,6 @@ class Decoupled(Stepper):
         info = StepInfo(*status, info.q_f_micro, info.multiplier, slow_info.multiplier[0])
         return end, info, DecoupledState(slow_memory, fast_memory)
 
-    def project(self, state: State, memory: DecoupledState) -> tuple[State, DecoupledState]:
-        slow, fast = apart(state)
-        slow, slow_memory = self.slow.project(slow, memory.slow)
-        fast, fast_memory = self.fast.project(fast, memory.fast)
-        return State(state.t, state.q_s, state.q_f, slow.p_f, fast.p_f), DecoupledState(slow_memory, fast_memory)
-
     def continued(self, memory: DecoupledState, last: DecoupledState, state: State, macro_dt) -> DecoupledState:
         slow, fast = apart(state)
         return DecoupledState(

@@ -35,13 +35,11 @@ class Kicked(Stepper):
     kicks: the terms with nodes at the ends of the interval; may be empty.
     inner: the stepper between the kicks.
     average: the filter of mollified kicks, ``average(macro_dt)(q_s, q_f) -> q_f``; None without mollified kicks.
-    projects: whether every step ends with a projection of the momenta onto the hidden constraints.
     """
 
     kicks: tuple[TermOnNodes, ...]
     inner: Stepper
     average: Callable | None = None
-    projects: bool = False
 
     def init(self, state: State, macro_dt) -> KickedState:
         return KickedState(self._gradients(state, macro_dt), self.inner.init(state, macro_dt))
@@ -57,8 +55,6 @@ class Kicked(Stepper):
         gradients = self._gradients(state, macro_dt)
         memory = KickedState(gradients, inner)
         state = kicked(state, self.kicks, gradients, macro_dt, end=1.0)
-        if self.projects:
-            state, memory = self.project(state, memory)
         return state, info, memory
 
     def advance_many(
@@ -95,10 +91,6 @@ class Kicked(Stepper):
         q_f, multiplier = _all_steps(q_f, last.q_f_micro), _all_steps(multiplier, last.multiplier)
         return state, StepInfo(*status, q_f, multiplier, last.slow_multiplier), memory
 
-    def project(self, state: State, memory: KickedState) -> tuple[State, KickedState]:
-        state, inner = self.inner.project(state, memory.inner)
-        return state, memory._replace(inner=inner)
-
     def continued(self, memory: KickedState, last: KickedState, state: State, macro_dt) -> KickedState:
         gradients = last.gradients if self.average is None else self._gradients(state, macro_dt)
         return KickedState(gradients, self.inner.continued(memory.inner, last.inner, state, macro_dt))
@@ -118,16 +110,15 @@ class Kicked(Stepper):
         return tuple(map(gradient, self.kicks))
 
     def describe(self) -> list[str]:
-        projected = ["momenta projected onto the hidden constraints"] if self.projects else []
         if not self.kicks:
-            return [*self.inner.describe(), *projected]
+            return self.inner.describe()
         places: dict[str, list[str]] = {"both ends": [], "the start": [], "the end": []}
         for term in self.kicks:
             at_start, at_end = (w is not None and not (is_concrete(w) and w == 0) for w in (term.start, term.end))
             places["both ends" if at_start and at_end else "the start" if at_start else "the end"].append(term.name)
         averaged = ", at averaged fast positions" if self.average is not None else ""
         kicks = [f"kicks of {', '.join(names)} at {place}{averaged}" for place, names in places.items() if names]
-        return [*kicks, *indented(self.inner.describe()), *projected]
+        return [*kicks, *indented(self.inner.describe())]
 
 
 @dataclass(frozen=True)
@@ -145,9 +136,6 @@ class Repeated(Stepper):
 
     def advance(self, state: State, memory: KickedState, macro_dt) -> tuple[State, StepInfo, KickedState]:
         return self.inner.advance_with_matrices(state, memory, macro_dt / self.count, self.count)
-
-    def project(self, state: State, memory: KickedState) -> tuple[State, KickedState]:
-        return self.inner.project(state, memory)
 
     def continued(self, memory: KickedState, last: KickedState, state: State, macro_dt) -> KickedState:
         return self.inner.continued(memory, last, state, macro_dt / self.count)

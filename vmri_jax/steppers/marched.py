@@ -8,7 +8,7 @@ from jaxtyping import Array, Float, Int
 
 from vmri_jax.kernels import CONTRACTION
 from vmri_jax.schemes.equations import StepEquations, Unknowns
-from vmri_jax.steppers.accept import FLOOR_OF_NEWTON, Accepted, Weights, expected
+from vmri_jax.steppers.accept import FLOOR_OF_NEWTON, NO_WEIGHTS, Accepted, Weights, expected
 from vmri_jax.steppers.continuation import solve_in_parts, with_dependent_constraints
 from vmri_jax.steppers.march import (
     MarchEquations,
@@ -36,7 +36,7 @@ class MarchMemory(NamedTuple):
     slow: predictor of the slow unknowns z.
     fast: unknowns of the last micro interval.
     matrices: the last ones.
-    rate: ratio of the last two corrections with these matrices; infinite if there are none.
+    rate: ratio of the last two corrections with these matrices, of the masses the largest ratio; infinite if there are none.
     """
 
     slow: PolynomialPredictor
@@ -77,19 +77,21 @@ class Marched(StepSolver):
     newton: settings; its matrix is "exact", "masses", or "null_space", which is exact and eliminates without multipliers.
     sizes: (n_s, n_gs, n_f, n_g) and the degree r, for `describe` of the null space method.
 
-    Of the masses there are new matrices at the first pass of a step, if the old ones contract too slowly, and in later passes of exact ones, too.
+    There are new matrices where the old ones contract too slowly: exact ones in every pass, those of the masses before the first pass of an attempt.
     """
 
     newton: Solver
     sizes: tuple[int, int, int, int, int] | None = None
 
-    def init(self, equations: StepEquations, velocity) -> MarchMemory:
-        march = self._march(equations)
-        z, x = march.flat(equations.guess(velocity[0], velocity[1], jnp.zeros(march.n_g), jnp.zeros(march.n_gs)))
-        return MarchMemory(PolynomialPredictor.constant(z), x[0], march.no_matrices(), jnp.asarray(jnp.inf))
+    def init(self, equations: StepEquations) -> MarchMemory:
+        matrices = self._march(equations, NO_WEIGHTS).no_matrices()
+        slow, fast = len(matrices.slow), matrices.inverse.shape[-1]
+        return MarchMemory(PolynomialPredictor.empty(slow), jnp.zeros(fast), matrices, jnp.asarray(jnp.inf))
 
     def solve(self, equations: StepEquations, guess: Unknowns, memory: MarchMemory) -> tuple[Solution, MarchMemory]:
-        march = self._march(equations)
+        weights = Weights.of(equations)
+        march = self._march(equations, weights)
+        accepted = Accepted.of(equations, self.newton, weights).with_constraints(equations, weights)
         z, x = march.flat(guess)
         zero, infinite = jnp.zeros(()), jnp.asarray(jnp.inf)
         start = Progress(
@@ -105,7 +107,8 @@ class Marched(StepSolver):
         )
 
         def part(equations, guess, limit, is_first):
-            done = self._iterate(self._march(equations), guess, start, memory, limit, is_first)
+            of_part = self._march(equations, weights)
+            done = self._iterate(of_part, accepted, guess, start, memory, limit, is_first)
             return done, march.by_name(done.passed.z, done.passed.x), done.result, done.passes
 
         parts = solve_in_parts(equations, guess, start, part, self.newton.max_iterations, PLAIN_PASSES)
@@ -122,28 +125,41 @@ class Marched(StepSolver):
 
     def _pass(self, march: MarchEquations, renews, last: Progress, start) -> tuple[Matrices, Passed]:
         """A pass from `start`, the unknowns as in `linearised_pass`, with new matrices if `renews`, else with the last ones."""
+        if not self.is_exact:
+            return last.matrices, kept_pass(march, last.matrices, *start)
+        matrices, now = only_if(renews, lambda _: linearised_pass(march, *start)[:2], (last.matrices, last.passed))
+        return matrices, only_if(~renews, lambda _: kept_pass(march, matrices, *start), now)
+
+    def _prepared(self, march: MarchEquations, progress: Progress, last, from_last) -> Progress:
+        """The start of an attempt, with new matrices of the masses: outside of the loop of passes, which XLA compiles as a whole."""
         if self.is_exact:
-            matrices, now = only_if(renews, lambda _: linearised_pass(march, *start)[:2], (last.matrices, last.passed))
-            return matrices, only_if(~renews, lambda _: kept_pass(march, matrices, *start), now)
+            return progress
+        z, x = progress.passed.z, progress.passed.x
+        renews = ~(progress.rate <= CONTRACTION)
 
         def by_masses(_):
-            return linearised_pass(march.by_masses(*start[:2]), *start, corrects=False)[0]
+            return linearised_pass(march.by_masses(z, x), z, x, last, from_last, corrects=False)[0]
 
-        matrices = only_if(renews, by_masses, last.matrices)
-        return matrices, kept_pass(march, matrices, *start)
+        matrices = only_if(renews, by_masses, progress.matrices)
+        return progress._replace(matrices=matrices, rate=jnp.where(renews, 0.0, progress.rate))
 
-    def _march(self, equations: StepEquations) -> MarchEquations:
+    def _march(self, equations: StepEquations, weights: Weights) -> MarchEquations:
         inverted = inverse_with_multipliers if self._has_multipliers else null_space.inverse_without_multipliers
-        return MarchEquations(equations, inverted, Weights.of(equations))
+        return MarchEquations(equations, inverted, weights)
 
     def _iterate(
-        self, march: MarchEquations, guess: Unknowns, start: Progress, memory: MarchMemory, limit, is_first
+        self,
+        march: MarchEquations,
+        accepted: Accepted,
+        guess: Unknowns,
+        start: Progress,
+        memory: MarchMemory,
+        limit,
+        is_first,
     ) -> Progress:
         """At most `limit` passes. The first attempt starts from the predicted slow unknowns, later attempts from the guess."""
-        accepted = Accepted.of(march.equations, self.newton, march.weights)
-        accepted = accepted.with_constraints(march.equations, march.weights)
         z, x = march.flat(guess)
-        z = jnp.where(is_first, memory.slow.next(march.num_slow), z)
+        z = jnp.where(is_first, memory.slow.next(march.num_slow, z), z)
         progress = start._replace(
             passed=start.passed._replace(z=z, x=x, dz=jnp.zeros_like(z), dx=jnp.zeros_like(x)),
             rate=jnp.where(is_first, memory.rate, jnp.inf),
@@ -169,21 +185,23 @@ class Marched(StepSolver):
 
         def step(last: Progress) -> Progress:
             # every interval of the very first pass starts from the corrected unknowns of the interval before
-            from_last = is_first & (last.passes == 0)
+            from_last = is_first & (last.passes == 0) & ~memory.slow.is_empty
             start = last.passed.z + last.passed.dz, last.passed.x + last.passed.dx, memory.fast, from_last
-            # new matrices where the old ones contract too slowly; those of the masses once per attempt
-            renews = ~(last.rate <= CONTRACTION) & (self.is_exact | (last.new_size == jnp.inf))
+            renews = ~(last.rate <= CONTRACTION) & self.is_exact
             matrices, now = self._pass(march, renews, last, start)
             after = judged(now, last)
-            at_floor = renews & self.is_exact & accepted.at_floor(after.size, last.size, FLOOR_OF_NEWTON)
+            at_floor = renews & accepted.at_floor(after.size, last.size, FLOOR_OF_NEWTON)
             result = jnp.where(at_floor & (after.result == RUNNING), Result.CONVERGED_AT_ROUNDOFF, after.result)
-            kept_rate = jnp.where(last.passes > 0, after.size / last.size, last.rate)
-            curvature = jnp.maximum(last.curvature, jnp.where(renews, 0.0, kept_rate / last.new_size))
-            rate = jnp.where(renews, curvature * after.size, kept_rate)  # kappa |d_new|
+            ratio = jnp.where(last.passes > 0, after.size / last.size, last.rate)
+            curvature = jnp.maximum(last.curvature, jnp.where(renews, 0.0, ratio / last.new_size))
+            if self.is_exact:
+                rate = jnp.where(renews, curvature * after.size, ratio)  # kappa |d_new|
+            else:  # without the last pass of a step, which ends in round-off
+                rate = jnp.where(after.result == RUNNING, jnp.maximum(ratio, last.rate), last.rate)
             new_size = jnp.where(renews, after.size, last.new_size)
             return after._replace(matrices=matrices, rate=rate, curvature=curvature, new_size=new_size, result=result)
 
-        return iterated(step, progress)
+        return iterated(step, self._prepared(march, progress, memory.fast, is_first & ~memory.slow.is_empty))
 
     def _solution(self, march: MarchEquations, done: Progress, result, passes) -> Solution:
         equations, passed = march.equations, done.passed

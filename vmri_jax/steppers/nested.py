@@ -24,8 +24,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from vmri_jax.kernels import LINEARISES_FORCES, max_abs
-from vmri_jax.schemes.equations import StepEquations, Unknowns, multiplier_scales
-from vmri_jax.schemes.path import control_nodes
+from vmri_jax.schemes.equations import StepEquations, Unknowns
 from vmri_jax.steppers.accept import Accepted, expected
 from vmri_jax.steppers.interval import Interval, Matrix, constant_mass
 from vmri_jax.steppers.micro_intervals import FastUnknowns, MicroSweep, SweepTotals
@@ -96,11 +95,10 @@ class Nested(StepSolver):
     newton: Solver
     interval: Interval
 
-    def init(self, equations: StepEquations, velocity) -> NestedState:
+    def init(self, equations: StepEquations) -> NestedState:
         r, (n_g, n_gs) = equations.scheme.degree, equations.system.num_constraints(equations.q_s, equations.q_f)
         matrix = self.interval.matrix if self.interval.is_constant else self.interval.no_matrix
-        increments = control_nodes(r)[1:, None] * (equations.macro_dt * velocity[0])
-        slow = PolynomialPredictor.constant(jnp.concatenate([increments.reshape(-1), jnp.zeros(r * n_gs)]))
+        slow = PolynomialPredictor.empty(r * (equations.q_s.size + n_gs))
         # with these numbers the first step renews the matrix
         fewest, last = jnp.asarray(0), jnp.asarray(2 * EXTRA_PASSES)
         return NestedState(matrix(equations), slow, jnp.zeros((r, n_g)), jnp.ones(()), fewest, last)
@@ -121,11 +119,10 @@ class Nested(StepSolver):
         )
 
     def solve(self, equations: StepEquations, guess: Unknowns, memory: NestedState) -> tuple[Solution, NestedState]:
-        scheme, newton = equations.scheme, self.newton
-        scale, _ = multiplier_scales(scheme, equations.macro_dt)
+        scale, _ = equations.multiplier_scales()
         sweep = MicroSweep(equations, self.interval.is_explicit, memory.matrix, scale, self.interval.sparsity)
-        passes = _Passes(equations, memory, sweep, newton)
-        done = iterated(passes.next, passes.first())
+        passes = _Passes(equations, memory, sweep, self.newton)
+        done = iterated(passes.next, passes.first(guess))
 
         x = Unknowns(done.slow, done.slow_multiplier, done.fast.increments, done.fast.multiplier)
         per_h = 1 / equations.micro_dt
@@ -134,8 +131,8 @@ class Nested(StepSolver):
 
         learned = NestedState(
             memory.matrix,
-            memory.slow.add(_joined(done), done.slow.size),
-            (done.fast.multiplier / scale)[-1],
+            memory.slow.add(_flat(done.slow, done.slow_multiplier), done.slow.size),
+            equations.multipliers(x, memory.multiplier[-1], x.slow_multiplier[-1])[0][-1],
             done.slow_model_error,
             jnp.minimum(memory.fewest_passes, done.passes),
             done.passes,
@@ -167,9 +164,9 @@ class _Passes:
         self.mass = constant_mass(equations.system)
         self.r, self.n_s = equations.scheme.degree, equations.q_s.size
 
-    def first(self) -> Pass:
+    def first(self, guess: Unknowns) -> Pass:
         """The first pass, from the predicted slow unknowns."""
-        z = self.memory.slow.next(self.r * self.n_s)
+        z = self.memory.slow.next(self.r * self.n_s, _flat(guess.slow, guess.slow_multiplier))
         fast, totals = self.sweep.first_pass(self._apart(z)[0], self.memory.multiplier)
         inertia = self.slow_equations.constraint_inertia(jax.tree.map(lambda a: a[0], fast.schur_inverse))
         return self._judged(
@@ -196,7 +193,7 @@ class _Passes:
         return now._replace(slow_model_error=max_abs(missing) / (max_abs(update) + jnp.finfo(float).tiny))
 
     def _moved_by(self, d, last: Pass) -> Pass:
-        z = _joined(last) + d
+        z = _flat(last.slow, last.slow_multiplier) + d
         fast, totals = self.sweep.next_pass(self._apart(z)[0], last.fast)
         still_moves = expected(totals.moved, last.totals.moved)
         return self._judged(
@@ -243,6 +240,6 @@ class _Passes:
         return z[:size].reshape(self.r, self.n_s), z[size:].reshape(self.r, -1)
 
 
-def _joined(last: Pass):
-    """The slow unknowns z of a pass: slow increments, then slow multipliers."""
-    return jnp.concatenate([last.slow.reshape(-1), last.slow_multiplier.reshape(-1)])
+def _flat(slow, slow_multiplier):
+    """The slow unknowns z: slow increments, then slow multipliers."""
+    return jnp.concatenate([slow.reshape(-1), slow_multiplier.reshape(-1)])

@@ -22,9 +22,10 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from vmri_jax.kernels import COLLOCATES, DEFERS_PROJECTION, DRIFTS
+from vmri_jax.kernels import COLLOCATES, DRIFTS
 from vmri_jax.kernels.band import Sparsity
 from vmri_jax.mechanics.constraint_pattern import all_rows
+from vmri_jax.mechanics.projection import project_momentum
 from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.mechanics.structure import depends_on
 from vmri_jax.mechanics.system import System
@@ -70,15 +71,14 @@ class Plan:
     Attributes:
         system, scheme, solver: arguments of `plan`.
         stepper: the tree of steppers.
-        defers_projection: if True, steps do not project the momenta onto the hidden constraints, and a run calls `project` where it saves
-            momenta; else every step ends with a projection.
+        sparsity: of ``G M^-1 G^T`` with all constraints, for `project`.
     """
 
     system: System
     scheme: Scheme | Composition
     solver: Solver
     stepper: Stepper
-    defers_projection: bool
+    sparsity: Sparsity
 
     def init(self, state: State, macro_dt):
         """The memory of the first step."""
@@ -88,9 +88,16 @@ class Plan:
         """One macro step."""
         return self.stepper.step(state, memory, macro_dt)
 
-    def project(self, state: State, memory) -> tuple[State, Any]:
-        """Project the momenta onto the hidden constraints, ``G v + dg/dt = 0``."""
-        return self.stepper.project(state, memory)
+    def project(self, state: State) -> State:
+        """The state with its momenta projected onto the hidden constraints, ``G v + dg/dt = 0``.
+
+        A step depends on the momentum through ``h p - G_0^T mu`` alone. A projection ``p - G_0^T nu`` at its start changes mu, and not the motion:
+        only momenta that are saved are projected.
+        """
+        if not self.system.is_constrained:
+            return state
+        p_s, p_f, _, _ = project_momentum(self.system, state, sparsity=self.sparsity)
+        return State(state.t, state.q_s, state.q_f, p_s, p_f)
 
     @property
     def has_fallback(self) -> bool:
@@ -143,37 +150,25 @@ def plan(
         ValueError: a matrix that the system or the scheme does not allow; a scheme that the system does not allow.
     """
     system, state = start_of("plan", system, state)
-    solver, stage, defers = solver or Solver(), stage_scheme(scheme), False
+    solver, stage = solver or Solver(), stage_scheme(scheme)
     custom = None if solver.stepper is None else solver.stepper.called(system, stage)
     if solver.stepper is None or isinstance(custom, StepSolver):
-        kicked = _whole_step(system, stage, _Choice(solver, reverse_only), state.q_s, state.q_f)
-        defers = _defers_projection(kicked)
-        stepper: Stepper = replace(kicked, projects=not defers and system.is_constrained)
+        stepper: Stepper = _whole_step(system, stage, _Choice(solver, reverse_only), state.q_s, state.q_f)
     else:
         stepper = whole_step(custom, system, stage, _average(system, stage, _Choice(Solver(), reverse_only)))
     if solver.stepper is not None:
         check_shapes(stepper, system, stage, state)
     if isinstance(scheme, Composition):
         stepper = Composed(scheme.coefficients, stepper)
-    return Plan(system, scheme, solver, stepper, defers)
+    return Plan(system, scheme, solver, stepper, all_rows(system, state.q_s, state.q_f))
 
 
-def _defers_projection(stepper: Stepper) -> bool:
-    """Whether steps may leave out the projection of the momenta.
-
-    A drift (RATTLE) depends on the momentum through ``h p - G_0^T mu`` alone. A projection ``p - G_0^T nu`` at the start changes mu, and
-    not the motion. So only momenta that are saved need it.
-    """
-    solvers = _solvers(stepper, constrained=True)
-    return DEFERS_PROJECTION and bool(solvers) and all(isinstance(solver, Rattle) for solver in solvers)
-
-
-def _solvers(stepper: Stepper, constrained: bool = False) -> list[StepSolver]:
-    """The solvers of a tree of steppers, all of them or only those of constrained systems."""
+def _solvers(stepper: Stepper) -> list[StepSolver]:
+    """The solvers of a tree of steppers."""
     if isinstance(stepper, Solved):
-        return [stepper.solver] if stepper.system.is_constrained or not constrained else []
+        return [stepper.solver]
     inner = [getattr(stepper, name) for name in ("stage", "inner", "slow", "fast") if hasattr(stepper, name)]
-    return [solver for part in inner for solver in _solvers(part, constrained)]
+    return [solver for part in inner for solver in _solvers(part)]
 
 
 def _whole_step(system: System, scheme: Scheme, choice: _Choice, q_s, q_f) -> Kicked:
@@ -191,36 +186,35 @@ def _whole_step(system: System, scheme: Scheme, choice: _Choice, q_s, q_f) -> Ki
 
 
 def _between_kicks(system: System, scheme: Scheme, choice: _Choice, q_s, q_f) -> Stepper:
-    solver = choice.solver
-    can_be_nested, rows = _can_be_nested(system, scheme), all_rows(system, q_s, q_f)
+    solver, can_be_nested = choice.solver, _can_be_nested(system, scheme)
     _check_matrix(solver.matrix, system, scheme, can_be_nested)
     if _is_drift(system, scheme) and not system.is_constrained:
         return FreeFlight(system)
     if solver.stepper is not None:
         custom = solver.stepper.called(system, scheme)
-        return Solved(system, scheme, custom, rows, choice.reverse_only)
+        return Solved(system, scheme, custom, choice.reverse_only)
     if not can_be_nested or solver.matrix in ("exact", "null_space"):
         n_g, n_gs = system.num_constraints(q_s, q_f)
         first = "exact" if system.has_constant_mass else "masses"
         chosen = replace(solver, matrix=first) if solver.matrix == "auto" else solver
         marched = Marched(chosen, (q_s.size, n_gs, q_f.size, n_g, scheme.degree))
-        return Solved(system, scheme, marched, rows, choice.reverse_only)
+        return Solved(system, scheme, marched, choice.reverse_only)
     interval = Interval.of(system, scheme, q_s, q_f)
     if _is_linear(system, scheme, interval, q_s):
         return Linear(system, scheme, interval)
-    approximate = _approximate(system, scheme, solver, interval, rows, q_f.size or q_s.size)
-    return Solved(system, scheme, approximate, rows, choice.reverse_only)
+    approximate = _approximate(system, scheme, solver, interval, q_s, q_f)
+    return Solved(system, scheme, approximate, choice.reverse_only)
 
 
-def _approximate(
-    system: System, scheme: Scheme, solver: Solver, interval: Interval, rows: Sparsity, size: int
-) -> StepSolver:
-    """The matrix "masses" or "modes", or the first one of "auto", for constant masses; `size` is the number of variables of an interval."""
-    small = size <= SMALL  # Nested keeps a larger matrix over many steps, Collocation does not
+def _approximate(system: System, scheme: Scheme, solver: Solver, interval: Interval, q_s, q_f) -> StepSolver:
+    """The matrix "masses" or "modes", or the first one of "auto", for constant masses."""
+    small = (q_f.size or q_s.size) <= SMALL  # Nested keeps a larger matrix over many steps, Collocation does not
     chosen = COLLOCATES and small and not interval.is_diagonal and _has_modes(system, scheme)
     if solver.matrix == "modes" or (solver.matrix == "auto" and chosen):
         return Collocation(solver)
-    return Rattle(solver, rows) if DRIFTS and _is_drift(system, scheme) else Nested(solver, interval)
+    if DRIFTS and _is_drift(system, scheme):
+        return Rattle(solver, all_rows(system, q_s, q_f))
+    return Nested(solver, interval)
 
 
 def _check_matrix(matrix: str, system: System, scheme: Scheme, can_be_nested: bool) -> None:

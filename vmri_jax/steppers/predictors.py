@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from vmri_jax.kernels import SLOW_ORDER, matmul
 
@@ -19,31 +19,35 @@ class PolynomialPredictor(NamedTuple):
     The polynomial of degree k through the last k + 1 values extrapolates to ``x_(n+1) = d_0 + ... + d_k``; d_(k+1) is the error of this
     prediction for x_n. Few or rough steps need a low order, smooth motion a high one.
 
+    is_empty: whether there is no step yet; the values are then zero.
     misses: largest prediction error of every order so far, with a weight that decreases by `FADING` per step.
     """
 
+    is_empty: Bool[Array, ""]
     differences: Float[Array, "SLOW_ORDER+2 n"]
     misses: Float[Array, "SLOW_ORDER+1"]
 
     @classmethod
-    def constant(cls, x) -> "PolynomialPredictor":
-        """The predictor of a constant past x."""
-        return cls(jnp.zeros((SLOW_ORDER + 2, x.size)).at[0].set(x), jnp.zeros(SLOW_ORDER + 1))
+    def empty(cls, size: int) -> "PolynomialPredictor":
+        """The predictor of `size` unknowns before the first step."""
+        return cls(jnp.asarray(True), jnp.zeros((SLOW_ORDER + 2, size)), jnp.zeros(SLOW_ORDER + 1))
 
-    def next(self, measured: int):
-        """The predicted values, by the lowest order with the least error in the first `measured` entries."""
+    def next(self, measured: int, guess):
+        """The predicted values, by the lowest order with the least error in the first `measured` entries; the guess before the first step."""
         missed, orders = self._missed(measured), jnp.arange(SLOW_ORDER + 1)
         best = jnp.min(jnp.where(missed <= jnp.min(missed), orders, SLOW_ORDER))
         taken = jnp.arange(SLOW_ORDER + 2) <= best
-        return jnp.sum(jnp.where(taken[:, None], self.differences, 0.0), axis=0)
+        return jnp.where(self.is_empty, guess, jnp.sum(jnp.where(taken[:, None], self.differences, 0.0), axis=0))
 
     def add(self, x, measured: int) -> "PolynomialPredictor":
-        """The predictor after one more step with the values x."""
+        """The predictor after one more step with the values x; before the first step they count as constant."""
         # d_(j+1) = x_n - (d_0 + ... + d_j)(x_(n-1))
         sums = matmul(np.tri(SLOW_ORDER + 1), self.differences[:-1])
-        differences = jnp.concatenate([x[None], x - sums])
+        differences = jnp.concatenate([x[None], jnp.where(self.is_empty, 0.0, x - sums)])
         missed = self._missed(measured)
-        return PolynomialPredictor(differences, jnp.where(jnp.isfinite(missed), FADING * missed, 0.0))
+        return PolynomialPredictor(
+            jnp.asarray(False), differences, jnp.where(jnp.isfinite(missed), FADING * missed, 0.0)
+        )
 
     def _missed(self, measured: int):
         """(SLOW_ORDER + 1,) weighted errors of every order, infinite after a failed step."""

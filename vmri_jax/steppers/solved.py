@@ -1,7 +1,7 @@
 """A step that solves its equations by iteration: initial guess, solver, derivative of the solution."""
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import jax
@@ -9,15 +9,13 @@ import jax.numpy as jnp
 from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Float
 
-from vmri_jax.kernels.band import Sparsity
-from vmri_jax.mechanics.arrays import Numbers
-from vmri_jax.mechanics.projection import project_momentum
+from vmri_jax.mechanics.arrays import Number, Numbers
+from vmri_jax.mechanics.invariants import velocity_and_masses
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
-from vmri_jax.schemes.equations import StepEquations, Unknowns, multiplier_scales
+from vmri_jax.schemes.equations import StepEquations, Unknowns
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.accept import NO_WEIGHTS, Weights
-from vmri_jax.steppers.interval import constant_mass
 from vmri_jax.steppers.newton.implicit import differentiable, differentiable_reverse_only
 from vmri_jax.steppers.stepper import StepInfo, Stepper, StepStatus
 
@@ -37,7 +35,7 @@ class Solution(NamedTuple):
 class StepSolver(ABC):
     """Solves the equations of a step.
 
-    First ``memory = init(equations, velocity)``, then ``solution, memory = solve(equations, guess, memory)`` for every step.
+    First ``memory = init(equations)``, then ``solution, memory = solve(equations, guess, memory)`` for every step.
     """
 
     @property
@@ -45,13 +43,8 @@ class StepSolver(ABC):
         """Whether its matrices are exact, so that no other ones may solve what it does not solve."""
         return False
 
-    def init(self, equations: StepEquations, velocity) -> Any:
-        """The memory of the first step.
-
-        Args:
-            equations: of the first step.
-            velocity: (v_s, v_f) at the start of the run.
-        """
+    def init(self, equations: StepEquations) -> Any:
+        """The memory of the first step."""
         return ()
 
     def renew(self, equations: StepEquations, memory) -> Any:
@@ -72,10 +65,6 @@ class StepSolver(ABC):
         """The memory of a stage of a composition, see `Stepper.continued`."""
         return memory
 
-    def projected(self, memory) -> Any:
-        """The memory after a projection of the momenta."""
-        return memory
-
     @abstractmethod
     def describe(self) -> list[str]:
         """In words, one line each."""
@@ -84,15 +73,14 @@ class StepSolver(ABC):
 class SolvedState(NamedTuple):
     """Memory from which the next iteration starts.
 
-    velocity: (v_s, v_f) of the guess. Used only if masses are not constant (else the guess takes ``M^-1 p``): the mean velocities
-        ``(q_s(H) - q_s(0)) / H`` and ``(q_f(H) - q_f(H - h)) / h`` of the last step, or the velocities of the projected momenta.
     multiplier, slow_multiplier: Lagrange multipliers of the step before, at its last control node with multipliers.
+    last_dt: length of the step before, 0 before the first step.
     solver: memory of the solver.
     """
 
-    velocity: tuple[Float[Numbers, "n_s"], Float[Numbers, "n_f"]]
     multiplier: Float[Array, "n_g"]
     slow_multiplier: Float[Array, "n_gs"]
+    last_dt: Number
     solver: Any
 
 
@@ -103,24 +91,18 @@ class Solved(Stepper):
     Derivatives follow from the implicit function theorem, ``dx = -(dR/dx)^-1 (dR/de) de`` with the data e of the equations: iterations are
     never differentiated.
 
-    sparsity: of ``G M^-1 G^T`` with all constraints.
     reverse_only: allows one derivative in reverse mode only, in half the time.
     """
 
     system: System
     scheme: Scheme
     solver: StepSolver
-    sparsity: Sparsity
     reverse_only: bool = False
 
     def init(self, state: State, macro_dt) -> SolvedState:
-        if self.system.has_constant_mass:
-            velocity = constant_mass(self.system).velocity(state.p_s, state.p_f)
-        else:
-            velocity = project_momentum(self.system, state)[2:]
-        n_g, n_gs = self.system.num_constraints(state.q_s, state.q_f)
-        solver = self.solver.init(StepEquations.of(self.system, self.scheme, state, macro_dt), velocity)
-        return SolvedState(velocity, jnp.zeros(n_g), jnp.zeros(n_gs), solver)
+        multipliers = map(jnp.zeros, self.system.num_constraints(state.q_s, state.q_f))
+        solver = self.solver.init(StepEquations.of(self.system, self.scheme, state, macro_dt))
+        return SolvedState(*multipliers, jnp.zeros(()), solver)
 
     def renew(self, state: State, memory: SolvedState, macro_dt) -> SolvedState:
         return memory._replace(
@@ -128,31 +110,26 @@ class Solved(Stepper):
         )
 
     def advance(self, state: State, memory: SolvedState, macro_dt) -> tuple[State, StepInfo, SolvedState]:
-        equations = StepEquations.of(self.system, self.scheme, state, macro_dt)
-        v_s, v_f = memory.velocity
-        if self.system.has_constant_mass:
-            v_s, v_f = constant_mass(self.system).velocity(state.p_s, state.p_f)  # momenta after the kicks
-        guess = equations.guess(v_s, v_f, memory.multiplier, memory.slow_multiplier)
+        equations = StepEquations.of(self.system, self.scheme, state, macro_dt, memory.last_dt)
         # no derivative enters the iteration; `derivative` attaches the one of the root
-        solution, solver = self.solver.solve(*jax.lax.stop_gradient((equations, guess, memory.solver)))
+        solution, solver = self._solve(*jax.lax.stop_gradient((equations, memory)))
         root, status = checkpoint_name(((solution.x, solution.end), solution.status), ROOT)
         derivative = differentiable_reverse_only if self.reverse_only else differentiable
         x, (q_f, p_s, p_f) = derivative(equations, *root)
 
-        scale, slow_scale = multiplier_scales(self.scheme, macro_dt)
-        lambdas = x.multiplier / scale, x.slow_multiplier / slow_scale
+        lambdas = equations.multipliers(x, memory.multiplier, memory.slow_multiplier)
         q_f_micro = jnp.concatenate([equations.path(x).fast_start[1:], q_f[None]])
         info = StepInfo(*StepStatus(*status), q_f_micro, *lambdas)
         end = State(state.t + macro_dt, state.q_s + x.slow[-1], q_f, p_s, p_f)
-        velocity = memory.velocity
-        if not self.system.has_constant_mass:  # mean velocities of the last intervals: guess of the next step
-            velocity = jax.lax.stop_gradient((x.slow[-1] / macro_dt, x.fast[-1, -1] / equations.micro_dt))
-        return end, info, SolvedState(velocity, lambdas[0][-1, -1], lambdas[1][-1], solver)
+        last_dt = jnp.asarray(macro_dt, dtype=float)
+        return end, info, SolvedState(lambdas[0][-1, -1], lambdas[1][-1], last_dt, solver)
 
-    def project(self, state: State, memory: SolvedState) -> tuple[State, SolvedState]:
-        p_s, p_f, v_s, v_f = project_momentum(self.system, state, memory.velocity, self.sparsity)
-        memory = memory._replace(velocity=(v_s, v_f), solver=self.solver.projected(memory.solver))
-        return State(state.t, state.q_s, state.q_f, p_s, p_f), memory
+    def _solve(self, equations: StepEquations, memory: SolvedState) -> tuple[Solution, Any]:
+        """The solution, with straight motion at the velocities of the momenta after the kicks as the guess."""
+        phase = equations.q_s, equations.q_f, equations.p_s, equations.p_f
+        velocities, masses = velocity_and_masses(self.system, *phase)
+        guess = equations.guess(*velocities, memory.multiplier, memory.slow_multiplier)
+        return self.solver.solve(replace(equations, masses=masses), guess, memory.solver)
 
     def continued(self, memory: SolvedState, last: SolvedState, state: State, macro_dt) -> SolvedState:
         return last._replace(solver=self.solver.continued(memory.solver, last.solver))

@@ -87,10 +87,6 @@ class Stepper(ABC):
         has_result = finite | (info.result > Result.CONVERGED_AT_ROUNDOFF)  # a solver that failed has said why
         return state, replace(info, result=jnp.where(has_result, info.result, Result.NON_FINITE)), memory
 
-    def project(self, state: State, memory) -> tuple[State, Any]:
-        """The state with momenta on the hidden constraints ``G v + dg/dt = 0``; by default unchanged; a run then adds a projection."""
-        return state, memory
-
     def continued(self, memory, last, state: State, macro_dt) -> Any:
         """The memory of a stage of a composition; by default `init`, as if the stage were a first step.
 
