@@ -26,8 +26,8 @@ def printed():
     """What a program prints, also as errors and warnings, in a process whose JAX has no settings."""
     environment = {k: v for k, v in os.environ.items() if not k.startswith(("JAX_", "XLA_"))}
     command = [sys.executable, "-W", "ignore::DeprecationWarning", "-c", FORKING]
-    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
-    with subprocess.Popen(command, text=True, env=environment, **pipes) as mother:
+    pipe, joined = subprocess.PIPE, subprocess.STDOUT
+    with subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=joined, text=True, env=environment) as mother:
         programs, answers = mother.stdin, mother.stdout
         assert programs
         assert answers

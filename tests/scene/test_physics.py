@@ -30,10 +30,11 @@ def wave(t, params):
 
 SCENE = Scene(
     [
-        Body(name, 1.0, 1.0, pace=pace)
-        for name, pace in zip(
-            ("damped", "driven", "pulled", "falling", "bouncing"), ("fast", "slow", "fast", "slow", "fast"), strict=True
-        )
+        Body("damped", 1.0, 1.0, pace="fast"),
+        Body("driven", 1.0, 1.0, pace="slow"),
+        Body("pulled", 1.0, 1.0, pace="fast"),
+        Body("falling", 1.0, 1.0, pace="slow"),
+        Body("bouncing", 1.0, 1.0, pace="fast"),
     ],
     [
         SpringAnchor(["damped", "driven"], 0.0, STIFFNESS),
