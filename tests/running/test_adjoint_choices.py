@@ -20,7 +20,7 @@ def test_lanes_of_gradients():
 
 @pytest.mark.parametrize(("second", "compiled"), [(jax.jacfwd, False), (jax.jacrev, True)])
 def test_second_derivatives_are_refused(second, compiled):
-    cost, at = simple_cost("checkpoint", "kicks")
+    cost, at = simple_cost("checkpoint")
     gradient = jax.grad(cost)
     with pytest.raises(TypeError, match="stored"):
         second(jax.jit(gradient) if compiled else gradient)(at)
@@ -36,11 +36,9 @@ def test_stored_steps_have_second_derivatives():
 
 def test_what_auto_chooses(monkeypatch):
     """Values with the derivatives that `checkpoint` refuses tell which adjoint has been taken."""
-    cost, at = simple_cost("auto", "kicks")
+    cost, at = simple_cost("auto")
     monkeypatch.setattr(simulation, "LONGEST_STORED_RUN", 5)
-    np.testing.assert_allclose(
-        jax.jit(jax.grad(cost))(at), simple_gradient("stored", "kicks")(at), rtol=1e-11, atol=1e-12
-    )
+    np.testing.assert_allclose(jax.jit(jax.grad(cost))(at), simple_gradient("stored")(at), rtol=1e-11, atol=1e-12)
     with pytest.raises(TypeError, match="stored"):
         jax.jacfwd(jax.grad(cost))(at)
 
