@@ -27,6 +27,11 @@ def solve(a, b):
     return jnp.linalg.solve(a, b)
 
 
+def solve_masses(m, p):
+    """The v with ``m v = p`` for a mass matrix (n, n) and p (n,)."""
+    return jnp.linalg.solve(m, p)
+
+
 def inverse(a):
     """The inverses of a (..., n, n), real or complex."""
     return jnp.linalg.inv(a)

@@ -1,12 +1,12 @@
 """Quantities that a trajectory conserves: energy, momentum maps, constraints; and velocities."""
 
-from functools import reduce
+from functools import partial, reduce
 from operator import add
 
 import jax
 import jax.numpy as jnp
 
-from vmri_jax.kernels import solve
+from vmri_jax.kernels import solve_masses
 from vmri_jax.mechanics.constraints import residual_of, rows_at
 from vmri_jax.mechanics.projection import project_momentum
 from vmri_jax.mechanics.state import State
@@ -102,7 +102,9 @@ def velocity_and_masses(system: System, q_s, q_f, p_s, p_f):
     gradient, times_masses = jax.linearize(jax.grad(kinetic), v)
     masses = jax.vmap(times_masses)(jnp.eye(p.size))
     if is_quadratic:
-        v = solve(masses, (p - gradient)[:, None])[:, 0]  # p = M v + dT/dv(0)
+        # p = M v + dT/dv(0); the derivative is one more solve, without that of the elimination
+        solve = partial(solve_masses, masses)
+        v = jax.lax.custom_linear_solve(masses.dot, p - gradient, lambda _, b: solve(b), symmetric=True)
     return (v[:n_s], v[n_s:]), masses
 
 

@@ -122,12 +122,13 @@ class Solved(Stepper):
         info = StepInfo(*StepStatus(*status), q_f_micro, *lambdas)
         end = State(state.t + macro_dt, state.q_s + x.slow[-1], q_f, p_s, p_f)
         last_dt = jnp.asarray(macro_dt, dtype=float)
-        return end, info, SolvedState(lambdas[0][-1, -1], lambdas[1][-1], last_dt, solver)
+        memory = SolvedState(lambdas[0][-1, -1], lambdas[1][-1], last_dt, solver)
+        return end, info, memory
 
     def _solve(self, equations: StepEquations, memory: SolvedState) -> tuple[Solution, Any]:
         """The solution, with straight motion at the velocities of the momenta after the kicks as the guess."""
         phase = equations.q_s, equations.q_f, equations.p_s, equations.p_f
-        velocities, masses = velocity_and_masses(self.system, *phase)
+        velocities, masses = velocity_and_masses(equations.system, *phase)
         guess = equations.guess(*velocities, memory.multiplier, memory.slow_multiplier)
         return self.solver.solve(replace(equations, masses=masses), guess, memory.solver)
 
