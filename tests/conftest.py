@@ -18,9 +18,10 @@ settings.load_profile("repeatable")
 
 MANY_MAPS = 20_000
 """Memory maps of a process from which on compiled programs are forgotten; Linux allows 65 530."""
-MUCH_MEMORY = 1.1e9
-"""Bytes of a process from which on compiled programs are forgotten after a test. A larger value saves the compiling of the few programs
-that tests share; two workers with 1.5 GiB each fit into a small machine."""
+MUCH_MEMORY = 1.0e9
+"""Bytes of a process from which on compiled programs are forgotten after a file; the tests of a file share programs, files few."""
+MOST_MEMORY = 1.25e9
+"""Bytes of a process from which on programs are forgotten after any test; two workers with 1.5 GiB each fit into a small machine."""
 GROWTH = 2e8
 """Fewest bytes that tests add between two times when programs are forgotten: else a process that stays large would forget after every test."""
 LONGEST = ("textbook", "verification", "steppers", "pages")
@@ -95,21 +96,22 @@ def pytest_collection_modifyitems(config, items):
                 item.add_marker(pytest.mark.skip(reason="takes long; run with --full"))
 
 
-@pytest.fixture(scope="session")
-def left():
-    """Bytes that were left when programs were forgotten last, in a list of one."""
-    return [0.0]
+LEFT = pytest.StashKey[float]()
+"""Bytes that were left when programs were forgotten last."""
 
 
-@pytest.fixture(autouse=True)
-def few_programs(left):
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_teardown(item, nextitem):
     """Compiled programs go when they hold too many memory maps or too much memory; until then tests share them."""
-    yield
-    maps, process = Path("/proc/self/maps"), psutil.Process()
+    result = yield
+    maps, process, stash = Path("/proc/self/maps"), psutil.Process(), item.config.stash
     many_maps = maps.exists() and maps.read_bytes().count(b"\n") > MANY_MAPS
-    if many_maps or process.memory_info().rss > max(MUCH_MEMORY, left[0] + GROWTH):
+    ends_file = nextitem is None or nextitem.path != item.path
+    most = max(MUCH_MEMORY if ends_file else MOST_MEMORY, stash.get(LEFT, 0.0) + GROWTH)
+    if many_maps or process.memory_info().rss > most:
         forget_programs()
-        left[0] = process.memory_info().rss
+        stash[LEFT] = process.memory_info().rss
+    return result
 
 
 @pytest.fixture(scope="session", autouse=True)

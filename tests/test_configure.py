@@ -8,16 +8,44 @@ import pytest
 
 from vmri_jax.configure import FAST_LOOPS
 
+FORKING = """
+import os, sys
+import jax, vmri_jax
+for line in sys.stdin:
+    if not (child := os.fork()):
+        exec(eval(line), {})
+        sys.stdout.flush()
+        os._exit(0)
+    print("ended", os.waitpid(child, 0)[1], flush=True)
+"""
+"""Forks a process for each program that it reads: JAX, which is imported once, has no settings and has not started in any of them."""
 
-def printed(program: str) -> str:
+
+@pytest.fixture(scope="module")
+def printed():
     """What a program prints, also as errors and warnings, in a process whose JAX has no settings."""
     environment = {k: v for k, v in os.environ.items() if not k.startswith(("JAX_", "XLA_"))}
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, env=environment, check=False)
-    assert done.returncode == 0, done.stderr
-    return done.stdout + done.stderr
+    command = [sys.executable, "-W", "ignore::DeprecationWarning", "-c", FORKING]
+    pipe, joined = subprocess.PIPE, subprocess.STDOUT
+    with subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=joined, text=True, env=environment) as mother:
+        programs, answers = mother.stdin, mother.stdout
+        assert programs
+        assert answers
+
+        def output(program: str) -> str:
+            print(repr(program), file=programs, flush=True)
+            text = ""
+            while not (line := answers.readline()).startswith("ended"):
+                assert line, text
+                text += line
+            assert line == "ended 0\n", text
+            return text
+
+        yield output
+        programs.close()
 
 
-def test_configure_before_jax_starts():
+def test_configure_before_jax_starts(printed):
     program = """
 import os, jax, vmri_jax as vm
 from vmri_jax.configure import warn_if_slow
@@ -42,7 +70,7 @@ except RuntimeError as error:
     ("arguments", "folder"),
     [("", "/tmp/somewhere/vmri_jax"), ("cache=False", "None"), ("cache='/tmp/mine'", "/tmp/mine")],
 )
-def test_programs_are_kept_on_disk(arguments, folder):
+def test_programs_are_kept_on_disk(printed, arguments, folder):
     program = f"""
 import os, jax
 os.environ["XDG_CACHE_HOME"] = "/tmp/somewhere"
@@ -53,7 +81,7 @@ print(jax.config.jax_compilation_cache_dir)
     assert printed(program).split() == [folder]
 
 
-def test_a_folder_that_jax_has_already_is_kept():
+def test_a_folder_that_jax_has_already_is_kept(printed):
     program = """
 import jax, vmri_jax as vm
 jax.config.update("jax_compilation_cache_dir", "/tmp/mine")
@@ -63,7 +91,7 @@ print(jax.config.jax_compilation_cache_dir)
     assert printed(program).split() == ["/tmp/mine"]
 
 
-def test_import_and_questions_change_nothing():
+def test_import_and_questions_change_nothing(printed):
     program = """
 import os, jax, vmri_jax as vm
 assert "XLA_FLAGS" not in os.environ and not jax.config.jax_enable_x64
@@ -77,7 +105,7 @@ except RuntimeError as error:
     assert printed(program).splitlines() == ["1", "True -1 False"]
 
 
-def test_one_warning_with_the_line_to_add():
+def test_one_warning_with_the_line_to_add(printed):
     program = """
 import warnings
 import jax
@@ -92,8 +120,7 @@ print(len(caught), caught[0].category is NotConfiguredWarning, "vm.configure()" 
     assert printed(program).split() == ["1", "True", "True"]
 
 
-def test_the_import_leaves_figures_and_studies_for_later():
+def test_the_import_leaves_figures_and_studies_for_later(printed):
     """matplotlib and the rooms that draw take half a second; runs do not need them."""
     program = "import sys, vmri_jax; print([name for name in ('matplotlib', 'vmri_jax.study') if name in sys.modules])"
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
+    assert printed(program).strip() == "[]"

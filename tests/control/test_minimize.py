@@ -11,8 +11,14 @@ from tests.user_systems import cart
 from vmri_jax.control import minimize
 
 NONE = np.zeros(0)
-POINT = vm.Problem(vm.System(vm.ConstantMass([1.0], NONE)), [0.0], NONE)
-"""On a straight line, moved by a force."""
+
+
+def point_of(strength: float) -> vm.Problem:
+    """A point on a straight line, moved by a force of this strength."""
+    return vm.Problem(vm.System(vm.ConstantMass([1.0], NONE), params={"strength": strength}), [0.0], NONE)
+
+
+POINT = point_of(1.0)
 MARCH = vm.Solver("masses")
 """Without the exact solve behind it, which takes long to compile."""
 STIFFNESS = np.array([4.0, 9.0])
@@ -31,16 +37,21 @@ def at_rest_at_one(state):
     return jnp.concatenate([state.q_s - 1.0, state.q_f - 1.0, state.p_s, state.p_f])
 
 
-def point(steps: int):
+def pull(q_s, q_f, u, params):
+    return params["strength"] * u, 0 * q_f
+
+
+def point(steps: int, strength: float = 1.0, **options):
     return minimize(
-        POINT,
+        point_of(strength),
         effort,
-        actuate=push,
+        actuate=pull,
         num_controls=1,
         goal=at_rest_at_one,
         scheme=vm.fully_explicit(1),
         macro_dt=1 / steps,
         num_steps=steps,
+        **options,
     )
 
 
@@ -140,22 +151,8 @@ def gravity(q_s, q_f, params):
     return 9.81 * q_f[1]
 
 
-def idle(q_s, q_f, u, params):
-    return 0 * u, 0 * q_f
-
-
 def test_a_goal_out_of_reach_is_said():
-    optimum = minimize(
-        POINT,
-        effort,
-        actuate=idle,
-        num_controls=1,
-        goal=at_rest_at_one,
-        scheme=vm.fully_explicit(1),
-        macro_dt=0.1,
-        num_steps=10,
-        max_iterations=3,
-    )
+    optimum = point(10, strength=0.0, max_iterations=3)
     assert not optimum.success
     assert optimum.miss == pytest.approx(1.0)
     assert "not converged: the best that was found; goal missed by 1.0e+00" in str(optimum)

@@ -26,6 +26,14 @@ def few(out, **changes) -> Ensemble:
     return vm.ensemble(**arguments | {"num_micro": 3, **STEPS} | changes, out=out)
 
 
+@pytest.fixture(scope="module")
+def stored(tmp_path_factory):
+    """A store that no test changes."""
+    out = tmp_path_factory.mktemp("stored") / "runs.zarr"
+    few(out)
+    return out
+
+
 def chain(omega: float, num_springs: int = 3) -> vm.Problem:
     """The chain that starts as the one of omega = 50 does."""
     problem = vm.systems.fermi_pasta_ulam(num_springs)
@@ -218,10 +226,9 @@ def test_resume_starts_what_is_not_there(tmp_path):
         ({"chunk": 1}, r"chunk: 1 here, 2 in the store"),
     ],
 )
-def test_another_ensemble_is_not_gone_on_with(tmp_path, changes, message):
-    few(tmp_path / "runs.zarr")
+def test_another_ensemble_is_not_gone_on_with(stored, changes, message):
     with pytest.raises(ValueError, match=r"holds another ensemble .*" + message):
-        few(tmp_path / "runs.zarr", **changes, resume=True)
+        few(stored, **changes, resume=True)
 
 
 def test_what_is_in_the_way(tmp_path):

@@ -10,6 +10,7 @@ import threading
 import time
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
+from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -21,8 +22,11 @@ import pytest
 import vmri_jax as vm
 from tests.ensembles import own
 from tests.ensembles.test_ensemble import OWN
+from tests.user_systems import two_oscillators
 from vmri_jax.ensembles import EnsembleError
 from vmri_jax.executors.executor import NotAWorker, in_worker, package_versions
+from vmri_jax.stability import stability_map
+from vmri_jax.study import convergence_study
 
 distributed = pytest.importorskip("distributed")
 pytestmark = pytest.mark.filterwarnings("default")  # of Dask, about ports and slow loops
@@ -113,6 +117,16 @@ def test_a_function_of_rows_travels(tmp_path, client):
     }
     here = sweep(tmp_path / "one.zarr", **arguments)
     assert contents(here.path) == contents(sweep(tmp_path / "two.zarr", **arguments, executor=client).path)
+
+
+def test_studies_travel(client):
+    """With the cluster as an executor; `tests/study/test_executor.py` says more about their results."""
+    problem, schemes = two_oscillators(), {n: vm.fully_explicit(n) for n in (2, 5)}
+    study = partial(convergence_study, problem, schemes, [0.02, 0.01], 0.2, num_saves=2)
+    assert study().to_pandas().equals(study(executor=client).to_pandas())
+    here, there = (stability_map(problem, schemes, np.linspace(1.5, 6.0, 12), executor=e) for e in (None, client))
+    assert np.allclose(here.radius, there.radius, rtol=0, atol=1e-12)
+    assert here.rows == there.rows
 
 
 def test_a_worker_that_is_killed(tmp_path, client, here_slowly):

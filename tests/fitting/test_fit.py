@@ -160,6 +160,7 @@ def test_a_parameter_that_nothing_depends_on_is_refused():
 def test_numbers_of_a_scene_have_the_names_of_their_effects():
     bodies = [vm.scene.Body("a", 1.0, [0.0]), vm.scene.Body("b", 1.0, [1.2])]
     scene = vm.scene.Scene(bodies, [vm.scene.Spring(("a", "b"), 40.0, 1.0, name="bond")])
+    assert not scene.problem().q_f.size
     single = vm.fully_explicit(1)
     run = vm.simulate(scene, single, macro_dt=DT, num_steps=20)
     data = Measured(run.t, run.states.q_s, sigma=1e-6, observe=lambda state: state.q_s)
@@ -181,12 +182,11 @@ def spring(q_s, q_f, params):
     return params["stiffness"] * (q_s @ q_s + q_f @ q_f) / 2
 
 
-@pytest.mark.parametrize("slow", [True, False], ids=["slow alone", "fast alone"])
-def test_systems_with_one_kind_of_variables_are_fitted(slow):
-    q, none = np.ones(1), np.zeros(0)
-    mass, start = (vm.ConstantMass(q, none), (q, none)) if slow else (vm.ConstantMass(none, q), (none, q))
-    problem = vm.Problem(vm.System(mass, spring, params={"stiffness": np.array(8.0)}), *start)
+def test_systems_without_slow_variables_are_fitted():
+    """Those without fast variables are in the test of a scene."""
+    system = vm.System(vm.ConstantMass([], [1.0]), spring, params={"stiffness": np.array(8.0)})
+    problem = vm.Problem(system, [], [1.0])
     run = vm.simulate(problem, vm.fully_explicit(1), macro_dt=0.05, num_steps=6)
-    data = Measured(run.t, run.q_s if slow else run.q_f, sigma=1e-3, observe=lambda s: s.q_s if slow else s.q_f)
+    data = Measured(run.t, run.q_f, sigma=1e-3, observe=lambda s: s.q_f)
     found = vm.fit(problem, data, {"stiffness": Unknown(7.0, lower=0)}, scheme=vm.fully_explicit(1), macro_dt=0.05)
     assert found.parameters["stiffness"] == pytest.approx(8.0, abs=1e-9)  # measured: 1e-13

@@ -77,7 +77,8 @@ def test_gradients_through_length_mass_and_stiffness():
     @jax.value_and_grad
     def reach(numbers):
         problem = swing(dict(zip(("length", "mass", "stiffness"), numbers, strict=True)) | {"damping": 0.15})
-        run = vm.simulate(problem.system, scheme, problem.state(), macro_dt=0.02, num_steps=20, save=20)
+        steps = {"macro_dt": 0.02, "num_steps": 20, "save": 20}
+        run = vm.simulate(problem.system, scheme, problem.state(), **steps, solver=vm.Solver("masses"))
         return run.q_s[-1, 0]
 
     numbers = jnp.array([1.0, 0.7, 3.0])

@@ -7,7 +7,10 @@ from rich.console import Console
 
 import vmri_jax as vm
 from vmri_jax import Names, Problem, State, System, compose, explicit_slow, fully_explicit, fully_implicit
-from vmri_jax.stability import advise, linear_model
+from vmri_jax.diagnostics import linearise
+from vmri_jax.stability import advise, linear_model, stability_map
+from vmri_jax.stability.advice import _kicks_in_phase
+from vmri_jax.stability.multipliers import TOLERANCE
 from vmri_jax.systems.fermi_pasta_ulam import soft_springs
 
 
@@ -37,7 +40,7 @@ def test_impulse_resonance_of_the_chain(fpu):
 
 
 def test_combination_resonance():
-    """Linear model, kappa 25, omega h = 0.1, num_micro 57, fully implicit."""
+    """Linear model, kappa 25, omega h = 0.1, num_micro 57, fully implicit: in advice and in a map; `test_linear` has the derivative of a step itself."""
     problem = linear_model()
     advice = advise(problem, fully_implicit(57), macro_dt=0.114)
     assert kinds(advice) == ["combination resonance"]
@@ -45,6 +48,14 @@ def test_combination_resonance():
     assert "frequencies 50.25 and 4.975" in str(advice)
     assert advice.safe_macro_dt == pytest.approx(0.114, rel=0.01)
     assert any(a < 0.114 < b for a, b, _ in advice.windows)
+    x = 57 * 0.1  # omega H
+    mapped = stability_map(problem, fully_implicit(57), [x - 0.02, x, x + 0.02])
+    growth = mapped.radius[0] - 1
+    assert growth[1] == pytest.approx(8.4e-4, abs=2e-5)
+    assert max(growth[0], growth[2]) <= TOLERANCE
+    [(start, stop, peak)] = mapped.windows()
+    assert peak == pytest.approx(8.44e-4, rel=0.02)
+    assert start < x < stop < start + 0.01
 
 
 @pytest.mark.parametrize(("x", "severity"), [(1.6, None), (1.98, "warning"), (2.1, "error")])
@@ -151,10 +162,10 @@ def test_kicks_of_a_weight_that_meet_its_spring_in_phase(turn, warned):
 
     masses = vm.ConstantMass(jnp.zeros(0), jnp.ones(1))
     system = vm.System(masses, weight, spring, params={"k": jnp.asarray((turn / macro_dt) ** 2)})
-    problem, scheme = vm.Problem(system, [], [0.0]), vm.explicit_slow(200)
+    problem, scheme = vm.Problem(system, [], [0.0]), vm.fully_explicit(200)
     findings = [f for f in vm.advise(problem, scheme, macro_dt=macro_dt).findings if f.kind == "kicks in phase"]
     assert bool(findings) == warned
     if findings:
         run = vm.simulate(problem, scheme, macro_dt=macro_dt, num_steps=2000)
         assert findings[0].number == pytest.approx(float(jnp.abs(run.q_f).max()) / 2, rel=0.02)
-    assert not vm.advise(problem, vm.fully_implicit(200), macro_dt=macro_dt).findings
+    assert not list(_kicks_in_phase(linearise(problem), vm.fully_implicit(200), macro_dt))

@@ -15,22 +15,21 @@ from vmri_jax import (
     fully_explicit,
     fully_implicit,
     initial_state,
-    macro_step,
+    textbook,
 )
 from vmri_jax.diagnostics import linearise
 from vmri_jax.mechanics.arrays import QUICK
 from vmri_jax.stability import advise, linear_model, multipliers
-from vmri_jax.steppers.solver import Solver
 
 
 def step_matrix(system, scheme, state, macro_dt, motions):
-    """Derivative of the system's own step, in the coordinates of the small motions."""
+    """Derivative of the step of the textbook, in the coordinates of the small motions."""
     n_s, n = state.q_s.size, state.q_s.size + state.q_f.size
     z = jnp.concatenate([state.q_s, state.q_f, state.p_s, state.p_f])
 
     def step(coordinates):
         start = State(state.t, *jnp.split(z + motions.embed @ coordinates, (n_s, n, n + n_s)))
-        end = macro_step(system, scheme, start, macro_dt, Solver("exact"))[0]
+        end = textbook.step(system, scheme, start, macro_dt)
         return motions.read @ jnp.concatenate([end.q_s, end.q_f, end.p_s, end.p_f])
 
     return np.asarray(jax.jit(jax.jacfwd(step), compiler_options=QUICK)(jnp.zeros(motions.embed.shape[1])))

@@ -10,36 +10,26 @@ from vmri_jax import (
     compose,
     explicit_slow,
     fully_explicit,
-    fully_implicit,
     galerkin,
 )
 from vmri_jax.stability import linear_model, plot_stability, stability_map
 from vmri_jax.stability.multipliers import TOLERANCE
 
 GRID = np.linspace(0.05, 4 * np.pi, 126)
-CASE_3 = 57 * 0.1  # omega H at omega h = 0.1
 
 
-@pytest.mark.parametrize("num_micro", [(2, 10), pytest.param((2, 3, 5, 10, 20), marks=pytest.mark.full)])
+@pytest.mark.parametrize("num_micro", [(2,), pytest.param((2, 3, 5, 10, 20), marks=pytest.mark.full)])
 def test_first_impulse_resonances(num_micro):
-    """omega 50, kappa 25: first unstable omega H / pi as measured with an independent code, within 0.005."""
+    """omega 50, kappa 25: first unstable omega H / pi as measured with an independent code, within 0.005.
+
+    `tests/steppers/test_mollified.py` has the first resonance of ten micro steps, by the derivative of the step itself.
+    """
     expected = {n: {2: 1.248, 3: 1.089, 5: 1.025, 10: 0.999, 20: 0.993}[n] for n in num_micro}
     found = stability_map(linear_model(), {n: explicit_slow(n) for n in expected}, GRID)
     first = {n: found.first_unstable(n) / np.pi for n in expected}
     assert first == pytest.approx(expected, abs=0.005)  # 1.2476, 1.0878, 1.0227, 0.9978, 0.9918
     assert found.omega == 50.0
     assert found.macro_dt[-1] == pytest.approx(4 * np.pi / 50)
-
-
-def test_combination_resonance_of_the_fully_implicit_scheme():
-    """Growth of 8.4e-4 per step at omega h = 0.1, num_micro 57; `test_linear` has the derivative of the step itself."""
-    found = stability_map(linear_model(), fully_implicit(57), [CASE_3 - 0.02, CASE_3, CASE_3 + 0.02])
-    growth = found.radius[0] - 1
-    assert growth[1] == pytest.approx(8.4e-4, abs=2e-5)
-    assert max(growth[0], growth[2]) <= TOLERANCE
-    [(start, stop, peak)] = found.windows()
-    assert peak == pytest.approx(8.44e-4, rel=0.02)
-    assert start < CASE_3 < stop < start + 0.01
 
 
 def test_windows_narrower_than_the_grid():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import vmri_jax as vm
-from tests.support import largest_difference, step_matrix
+from tests.support import ground_truth, largest_difference, step_matrix
 from tests.user_systems import cart, double_pendulum, two_oscillators
 from vmri_jax.schemes.quadrature import gradient_corrected, midpoint, trapezoidal
 
@@ -60,7 +60,7 @@ def test_in_coordinates_that_move_along_it_is_of_order_four(fpu):
 
     params, t_end, errors = fpu.system.params, 0.5, []
     q, v = jnp.concatenate([fpu.q_s, fpu.q_f]), jnp.concatenate([fpu.v_s, fpu.v_f])
-    fine = vm.simulate(fpu.system, vm.galerkin(1, 4), fpu.state(), macro_dt=t_end / 200, num_steps=200, save=200)
+    exact = ground_truth("fpu3_t1")["q"][50]  # of 100 intervals up to time 1
     for steps in (80, 160):
         h = t_end / steps
         x, w = q + h**2 / 12 * force(q), v - h**2 / 12 * jax.jvp(force, (q,), (v,))[1]
@@ -68,17 +68,16 @@ def test_in_coordinates_that_move_along_it_is_of_order_four(fpu):
         run = vm.simulate(fpu.system, vm.takahashi_imada(1), start, macro_dt=h, num_steps=steps, save=steps)
         x = jnp.concatenate([run.q_s[-1], run.q_f[-1]])
         x = x - h**2 / 12 * force(x)
-        errors.append(largest_difference(x, jnp.concatenate([fine.q_s[-1], fine.q_f[-1]])))
+        errors.append(largest_difference(x, exact))
     assert np.log2(errors[0] / errors[1]) == pytest.approx(4, abs=0.25)
 
 
 def test_composed_it_is_of_order_four(fpu):
-    state, fine = fpu.state(), vm.galerkin(1, 4)
-    exact = vm.simulate(fpu.system, fine, state, macro_dt=0.5 / 200, num_steps=200, save=200)
+    state, exact = fpu.state(), ground_truth("fpu3_t1")["q"][50]
     scheme, errors = vm.compose(vm.takahashi_imada(2), "suzuki4"), []
     for steps in (40, 80):
         run = vm.simulate(fpu.system, scheme, state, macro_dt=0.5 / steps, num_steps=steps, save=steps)
-        errors.append(largest_difference(run.q_s[-1], exact.q_s[-1]))
+        errors.append(largest_difference(run.q_s[-1], exact[:3]))
     assert np.log2(errors[0] / errors[1]) == pytest.approx(4, abs=0.3)
 
 
@@ -102,11 +101,11 @@ def test_with_constraints_every_method_makes_the_same_step():
 
 def test_with_constraints_vibrations_keep_their_phase(tsp):
     """Errors after 16 periods of the spring: several times smaller with as many steps."""
-    fine = vm.simulate(tsp.system, vm.galerkin(1, 8, "lobatto"), tsp.state(), macro_dt=0.02, num_steps=50, save=50)
+    exact = ground_truth("tsp_t1")["q"][-1, 3:]
 
     def error(scheme):
         run = vm.simulate(tsp.system, scheme, tsp.state(), macro_dt=1 / 200, num_steps=200, save=200)
-        return largest_difference(run.q_f[-1], fine.q_f[-1])
+        return largest_difference(run.q_f[-1], exact)
 
     assert error(vm.takahashi_imada(1)) < 0.1 * error(vm.fully_explicit(1))
 

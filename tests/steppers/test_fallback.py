@@ -22,9 +22,11 @@ from vmri_jax import (
     macro,
     micro,
     plan,
+    prepare,
     quadrature,
     simulate,
 )
+from vmri_jax.running import progress
 from vmri_jax.steppers.solver import Solver
 
 
@@ -115,6 +117,18 @@ def test_a_run_that_fails_late_is_made_again_with_exact_matrices(tsp):
     assert run.success
     assert np.all(run.info.method == Method.EXACT)
     assert largest_difference(run.q_f, exact.q_f) == 0.0
+
+
+def test_a_prepared_run_says_that_the_fallback_takes_over(tsp, capsys, monkeypatch):
+    monkeypatch.setattr(progress, "SECONDS_BETWEEN_LINES", 0.0)
+    solver = Solver(max_iterations=40)
+    run = prepare(tsp, fully_implicit(10), macro_dt=0.2, num_steps=20, save=5, solver=solver)
+    trajectory = run()
+    assert trajectory.success
+    line = "a step was not solved: computing its part of the run again with exact matrices"
+    assert line in capsys.readouterr().err
+    assert np.any(np.asarray(trajectory.info.method) == Method.EXACT)
+    run.timed()()
 
 
 @pytest.mark.skipif(os.environ.get("VMRI_KERNELS") == "plain", reason="the plain kernels are library calls")

@@ -1,5 +1,7 @@
-"""Studies on workers give what they give here."""
+"""Studies on executors give what they give here; `tests/ensembles/test_workers.py` has the same studies on a cluster."""
 
+import pickle
+from concurrent.futures import Executor, Future
 from functools import partial
 
 import numpy as np
@@ -7,32 +9,39 @@ import pytest
 
 import vmri_jax as vm
 from tests.user_systems import two_oscillators
+from vmri_jax.executors.executor import in_worker
 from vmri_jax.stability import stability_map
 from vmri_jax.study import convergence_study
 
-distributed = pytest.importorskip("distributed")
-pytestmark = pytest.mark.filterwarnings("default")  # of Dask, about ports and slow loops
+
+class Travelling(Executor):
+    """Tasks and results travel as bytes, as to a worker and back, but the worker is this process: programs are compiled once."""
+
+    def submit(self, fn, /, *args, **kwargs) -> Future:
+        fn, args, kwargs = pickle.loads(pickle.dumps((fn, args, kwargs)))
+        future: Future = Future()
+        future.set_result(pickle.loads(pickle.dumps(fn(*args, **kwargs))))
+        return future
 
 
-@pytest.fixture(scope="module")
-def client():
-    cluster = distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0")
-    with cluster, distributed.Client(cluster) as client:
-        yield client
+@pytest.fixture(autouse=True)
+def set_up(monkeypatch):
+    """This process has its settings already."""
+    monkeypatch.setattr(f"{in_worker.__module__}._prepare", lambda process: None)
 
 
-def test_convergence_study(client):
+def test_convergence_study():
     schemes = {"implicit": vm.fully_implicit(2), "explicit": vm.explicit_slow(2)}
     study = partial(convergence_study, two_oscillators(), schemes, [0.02, 0.01], 0.2, num_saves=2)
-    assert study().to_pandas().equals(study(executor=client).to_pandas())
-    assert all(row.seconds > 0 for row in study(executor=client, repeats=1).rows)
+    assert study().to_pandas().equals(study(executor=Travelling()).to_pandas())
+    assert all(row.seconds > 0 for row in study(executor=Travelling(), repeats=1).rows)
 
 
-def test_stability_map(client):
-    schemes = {n: vm.explicit_slow(n) for n in (2, 5)}
+def test_stability_map():
+    schemes = {n: vm.fully_explicit(n) for n in (2, 5)}
     grid = np.linspace(0.5, 2.0, 12) * np.pi
-    problem = two_oscillators()
-    here, there = (stability_map(problem, schemes, grid, executor=executor) for executor in (None, client))
+    here, there = (stability_map(two_oscillators(), schemes, grid, executor=e) for e in (None, Travelling()))
     assert np.allclose(here.radius, there.radius, rtol=0, atol=1e-12)
     assert here.rows == there.rows
-    assert len(here.windows(5)) == len(there.windows(5))
+    assert here.unstable == there.unstable
+    assert here.unstable[0]

@@ -21,7 +21,9 @@ STRUCTURES = {
     ),
     "march that moves": (
         Method.MASSES,
-        rs.Structure(2, 1, 1, **SPRINGS, constraint="rod", moving=True, scheme="gauss", num_micro=2, degree=2),
+        rs.Structure(
+            2, 1, 1, **SPRINGS, constraint="rod", moving=True, force="drag", scheme="gauss", num_micro=2, degree=2
+        ),
     ),
     "march without constraints": (
         Method.MASSES,
