@@ -79,9 +79,9 @@ def solve(a, b):
 
 
 def solve_masses(m, p):
-    """The v with ``m v = p`` for a mass matrix (n, n) and p (n,)."""
-    if p.size <= FEW:
-        return solve(m, p[:, None])[:, 0]
+    """The v with ``m v = p`` for a mass matrix (n, n) and p (n,) or (n, k)."""
+    if len(p) <= FEW:
+        return solve(m, p.reshape(len(p), -1)).reshape(p.shape)
     return jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(m), True), p)
 
 

@@ -28,7 +28,7 @@ def solve(a, b):
 
 
 def solve_masses(m, p):
-    """The v with ``m v = p`` for a mass matrix (n, n) and p (n,)."""
+    """The v with ``m v = p`` for a mass matrix (n, n) and p (n,) or (n, k)."""
     return jnp.linalg.solve(m, p)
 
 

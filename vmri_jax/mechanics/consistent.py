@@ -107,7 +107,7 @@ class At(NamedTuple):
 def _momenta(system, t, q_s, q_f, v_s, v_f):
     """p = dT/dv, and p and v after the projection onto the hidden constraints."""
     momenta = legendre(system, q_s, q_f, v_s, v_f)
-    p_s, p_f, *velocities = project_momentum(system, At(t, q_s, q_f, *momenta), (v_s, v_f))
+    p_s, p_f, *velocities, _ = project_momentum(system, At(t, q_s, q_f, *momenta), (v_s, v_f))
     return tuple(jnp.concatenate(a) for a in (momenta, (p_s, p_f), velocities))
 
 

@@ -1,16 +1,13 @@
 """Quantities that a trajectory conserves: energy, momentum maps, constraints; and velocities."""
 
-from functools import partial, reduce
+from functools import reduce
 from operator import add
 
-import jax
 import jax.numpy as jnp
 
-from vmri_jax.kernels import solve_masses
 from vmri_jax.mechanics.constraints import residual_of, rows_at
 from vmri_jax.mechanics.projection import project_momentum
 from vmri_jax.mechanics.state import State
-from vmri_jax.mechanics.structure import has_constant_hessian
 from vmri_jax.mechanics.system import System
 
 
@@ -84,28 +81,14 @@ def velocity(system: System, q_s, q_f, p_s, p_f):
         q_s, q_f: (n_s,) and (n_f,) positions, for masses that depend on them.
         p_s, p_f: (n_s,) and (n_f,) momenta.
     """
-    free = system.only(lambda term: term.kind not in ("constraint", "implied"))
-    return project_momentum(free, State(jnp.zeros(()), q_s, q_f, p_s, p_f))[2:]
+    return velocity_and_masses(system, q_s, q_f, p_s, p_f)[0]
 
 
 def velocity_and_masses(system: System, q_s, q_f, p_s, p_f):
     """`velocity`, and the mass matrix ``d^2 T / dv^2`` (n, n); None for constant masses."""
-    if system.has_constant_mass:
-        return velocity(system, q_s, q_f, p_s, p_f), None
-    n_s, p = q_s.size, jnp.concatenate([p_s, p_f])
-
-    def kinetic(v):
-        return system.kinetic_energy(q_s, q_f, v[:n_s], v[n_s:])
-
-    is_quadratic = has_constant_hessian(kinetic, p)
-    v = jnp.zeros_like(p) if is_quadratic else jnp.concatenate(velocity(system, q_s, q_f, p_s, p_f))
-    gradient, times_masses = jax.linearize(jax.grad(kinetic), v)
-    masses = jax.vmap(times_masses)(jnp.eye(p.size))
-    if is_quadratic:
-        # p = M v + dT/dv(0); the derivative is one more solve, without that of the elimination
-        solve = partial(solve_masses, masses)
-        v = jax.lax.custom_linear_solve(masses.dot, p - gradient, lambda _, b: solve(b), symmetric=True)
-    return (v[:n_s], v[n_s:]), masses
+    free = system.only(lambda term: term.kind not in ("constraint", "implied"))
+    _, _, *velocities, masses = project_momentum(free, State(jnp.zeros(()), q_s, q_f, p_s, p_f))
+    return tuple(velocities), masses
 
 
 def momentum_map(generator, q_s, q_f, p_s, p_f):

@@ -41,7 +41,8 @@ def project_momentum(system: System, state, guess=None, sparsity: Sparsity | Non
     """Momenta projected onto the hidden constraints, ``p <- p - G^T mu`` with ``G v + dg/dt = 0``, and their velocities.
 
     The velocity v of the projected momentum, ``p - G^T mu = dT/dv``, minimises ``T(v) - p . v`` over all v with ``G v + dg/dt = 0``. If T is
-    quadratic in v, that takes one linear solve. Else it takes Newton's iteration with a line search, and T must be convex in v.
+    quadratic in v with the masses M, that takes one linear solve, ``G M^-1 G^T mu = G v + dg/dt`` with the velocity v of p. Else it takes Newton's
+    iteration with a line search, and T must be convex in v.
 
     Args:
         system: with its kinetic energy and constraints.
@@ -50,15 +51,15 @@ def project_momentum(system: System, state, guess=None, sparsity: Sparsity | Non
         sparsity: of ``G M^-1 G^T``, for constant masses; by default the matrix is full.
 
     Returns:
-        (p_s, p_f, v_s, v_f); NaN where Newton's iteration does not converge.
+        (p_s, p_f, v_s, v_f, masses), the last one the mass matrix ``d2T/dv2`` (n, n), None for constant masses; NaN where Newton's iteration does
+        not converge.
     """
     if system.has_constant_mass:
-        return _by_one_solve(system, state, sparsity)
-    return _by_newton(system, state, guess)
+        return *_with_constant_masses(system, state, sparsity), None
+    return _with_masses(system, state, guess)
 
 
-def _by_one_solve(system: System, state, sparsity: Sparsity | None):
-    """``G M^-1 G^T mu = G M^-1 p + dg/dt``."""
+def _with_constant_masses(system: System, state, sparsity: Sparsity | None):
     t, q_s, q_f, p_s, p_f = state.t, state.q_s, state.q_f, state.p_s, state.p_f
     velocity = system.kinetic.velocity
     constraints = partial(system.constraints, t)
@@ -78,16 +79,38 @@ def _by_one_solve(system: System, state, sparsity: Sparsity | None):
     return p_s, p_f, *velocity(p_s, p_f)
 
 
-def _by_newton(system: System, state, guess):
-    t, q_s, q_f, n_s = state.t, state.q_s, state.q_f, state.q_s.shape[0]
-    jacobian = jnp.concatenate(jax.jacrev(system.constraints, argnums=(1, 2))(t, q_s, q_f), axis=1)  # (n_g + n_gs, n)
-    rates = time_rates(system, t, q_s, q_f)
+def _with_masses(system: System, state, guess):
+    t, q_s, q_f, n_s = state.t, state.q_s, state.q_f, state.q_s.size
     p = jnp.concatenate([state.p_s, state.p_f])
-    guess = jnp.zeros_like(p) if guess is None else jnp.concatenate(guess)
-    v, impulse = _velocity_and_impulse(system, q_s, q_f, (jacobian, rates), p, guess)
+
+    def kinetic(v):
+        return system.kinetic_energy(q_s, q_f, v[:n_s], v[n_s:])
+
+    jacobian = jnp.concatenate(jax.jacrev(system.constraints, argnums=(1, 2))(t, q_s, q_f), axis=1)  # (n_g + n_gs, n)
+    constraints = jacobian, time_rates(system, t, q_s, q_f)
+    is_quadratic, v = has_constant_hessian(kinetic, p), jnp.zeros_like(p)
+    if not is_quadratic:
+        guess = v if guess is None else jnp.concatenate(guess)
+        v, impulse = _velocity_and_impulse(system, q_s, q_f, constraints, p, guess)
+    gradient, times_masses = jax.linearize(jax.grad(kinetic), v)
+    masses = jax.vmap(times_masses)(jnp.eye(p.size))
+    if is_quadratic:
+        v, impulse = _by_one_solve(masses, p - gradient, *constraints)  # p = M v + dT/dv(0)
     if jacobian.shape[0]:
         p = p - impulse
-    return p[:n_s], p[n_s:], v[:n_s], v[n_s:]
+    return p[:n_s], p[n_s:], v[:n_s], v[n_s:], masses
+
+
+def _by_one_solve(masses, p, jacobian, rates):
+    """The velocity ``v - M^-1 G^T mu``, with ``M v = p`` and ``G M^-1 G^T mu = G v + dg/dt``, and ``G^T mu``."""
+    solve = partial(kernels.solve_masses, masses)
+    # the derivative is one more solve, without that of the elimination
+    v = jax.lax.custom_linear_solve(masses.dot, p, lambda _, b: solve(b), symmetric=True)
+    if not jacobian.shape[0]:
+        return v, jnp.zeros_like(p)
+    columns = solve(jacobian.T)
+    mu = Full(len(rates)).solve((jacobian @ columns).T, jacobian @ v + rates)
+    return v - columns @ mu, jacobian.T @ mu
 
 
 def time_rates(system: System, t, q_s, q_f):
@@ -127,8 +150,6 @@ def _velocity_and_impulse(system: System, q_s, q_f, constraints, p, guess):
         return jnp.where(stop, v, v + fractions[jnp.argmax(better)] * d), k + 1, stop
 
     data = (system, q_s, q_f, *constraints, p)
-    if has_constant_hessian(lambda v: kinetic(system, q_s, q_f, v), guess):
-        return direction(data, jnp.zeros_like(p))[:2]  # T is quadratic in v: Newton's first step is the solution
     constants, guess = jax.lax.stop_gradient((data, guess))
     fractions = jnp.append(0.5 ** jnp.arange(12.0), 0.0)
     start = (guess, 0, jnp.asarray(False))

@@ -196,13 +196,6 @@ class StepEquations(eqx.Module):
         slow_shared = w_slow[:-1] + self.before / macro_dt * np.eye(1, w_slow.size - 1)[0] * w_slow[-1]
         return self.micro_dt**2 * shared[..., None], macro_dt**2 * slow_shared[:, None]
 
-    def left_out(self, multiplier, slow_multiplier):
-        """The impulse (n_g + n_gs,) of the constraints at the start that the step before has left out: ``h_before w_r lambda`` and
-        ``H_before w_r nu`` for multipliers lambda and nu."""
-        w, w_slow = (placed.rule.weights[-1] for placed in (self.scheme.constraint, self.scheme.slow_constraint))
-        parts = [w / self.scheme.num_micro * multiplier, w_slow * slow_multiplier]
-        return self.before * jnp.concatenate(parts)
-
     def multipliers(self, x: Unknowns, multiplier, slow_multiplier):
         """The multipliers lambda (num_micro, r, n_g) and (r, n_gs) of the unknowns; those of the step before, where both steps cancel.
 

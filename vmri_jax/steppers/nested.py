@@ -25,6 +25,7 @@ from jaxtyping import Array, Float, Int
 
 from vmri_jax.kernels import LINEARISES_FORCES, max_abs
 from vmri_jax.schemes.equations import StepEquations, Unknowns
+from vmri_jax.schemes.path import control_nodes
 from vmri_jax.steppers.accept import Accepted, expected
 from vmri_jax.steppers.interval import Interval, Matrix, constant_mass
 from vmri_jax.steppers.micro_intervals import FastUnknowns, MicroSweep, SweepTotals
@@ -122,7 +123,7 @@ class Nested(StepSolver):
         scale, _ = equations.multiplier_scales()
         sweep = MicroSweep(equations, self.interval.is_explicit, memory.matrix, scale, self.interval.sparsity)
         passes = _Passes(equations, memory, sweep, self.newton)
-        done = iterated(passes.next, passes.first(guess))
+        done = iterated(passes.next, passes.first())
 
         x = Unknowns(done.slow, done.slow_multiplier, done.fast.increments, done.fast.multiplier)
         per_h = 1 / equations.micro_dt
@@ -163,10 +164,13 @@ class _Passes:
         self.accepted = Accepted.of(equations, newton)
         self.mass = constant_mass(equations.system)
         self.r, self.n_s = equations.scheme.degree, equations.q_s.size
+        self.num_multipliers = equations.system.num_constraints(equations.q_s, equations.q_f)[1]
 
-    def first(self, guess: Unknowns) -> Pass:
-        """The first pass, from the predicted slow unknowns."""
-        z = self.memory.slow.next(self.r * self.n_s, _flat(guess.slow, guess.slow_multiplier))
+    def first(self) -> Pass:
+        """The first pass, from the predicted slow unknowns; in the first step, whose momenta are on the hidden constraints, from straight motion."""
+        increment = self.equations.macro_dt * self.mass.slow_mass.inverse().times(self.equations.p_s)
+        straight = (control_nodes(self.r)[1:, None] * increment).reshape(-1)
+        z = self.memory.slow.next(self.r * self.n_s, jnp.pad(straight, (0, self.r * self.num_multipliers)))
         fast, totals = self.sweep.first_pass(self._apart(z)[0], self.memory.multiplier)
         inertia = self.slow_equations.constraint_inertia(jax.tree.map(lambda a: a[0], fast.schur_inverse))
         return self._judged(

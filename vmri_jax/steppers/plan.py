@@ -96,7 +96,7 @@ class Plan:
         """
         if not self.system.is_constrained:
             return state
-        p_s, p_f, _, _ = project_momentum(self.system, state, sparsity=self.sparsity)
+        p_s, p_f, *_ = project_momentum(self.system, state, sparsity=self.sparsity)
         return State(state.t, state.q_s, state.q_f, p_s, p_f)
 
     @property
@@ -186,35 +186,35 @@ def _whole_step(system: System, scheme: Scheme, choice: _Choice, q_s, q_f) -> Ki
 
 
 def _between_kicks(system: System, scheme: Scheme, choice: _Choice, q_s, q_f) -> Stepper:
-    solver, can_be_nested = choice.solver, _can_be_nested(system, scheme)
+    solver, can_be_nested, rows = choice.solver, _can_be_nested(system, scheme), all_rows(system, q_s, q_f)
     _check_matrix(solver.matrix, system, scheme, can_be_nested)
     if _is_drift(system, scheme) and not system.is_constrained:
         return FreeFlight(system)
     if solver.stepper is not None:
         custom = solver.stepper.called(system, scheme)
-        return Solved(system, scheme, custom, choice.reverse_only)
+        return Solved(system, scheme, custom, rows, choice.reverse_only)
     if not can_be_nested or solver.matrix in ("exact", "null_space"):
         n_g, n_gs = system.num_constraints(q_s, q_f)
         first = "exact" if system.has_constant_mass else "masses"
         chosen = replace(solver, matrix=first) if solver.matrix == "auto" else solver
         marched = Marched(chosen, (q_s.size, n_gs, q_f.size, n_g, scheme.degree))
-        return Solved(system, scheme, marched, choice.reverse_only)
+        return Solved(system, scheme, marched, rows, choice.reverse_only)
     interval = Interval.of(system, scheme, q_s, q_f)
     if _is_linear(system, scheme, interval, q_s):
         return Linear(system, scheme, interval)
-    approximate = _approximate(system, scheme, solver, interval, q_s, q_f)
-    return Solved(system, scheme, approximate, choice.reverse_only)
+    approximate = _approximate(system, scheme, solver, interval, rows, q_f.size or q_s.size)
+    return Solved(system, scheme, approximate, rows, choice.reverse_only)
 
 
-def _approximate(system: System, scheme: Scheme, solver: Solver, interval: Interval, q_s, q_f) -> StepSolver:
-    """The matrix "masses" or "modes", or the first one of "auto", for constant masses."""
-    small = (q_f.size or q_s.size) <= SMALL  # Nested keeps a larger matrix over many steps, Collocation does not
+def _approximate(
+    system: System, scheme: Scheme, solver: Solver, interval: Interval, rows: Sparsity, size: int
+) -> StepSolver:
+    """The matrix "masses" or "modes", or the first one of "auto", for constant masses; `size` is the number of variables of an interval."""
+    small = size <= SMALL  # Nested keeps a larger matrix over many steps, Collocation does not
     chosen = COLLOCATES and small and not interval.is_diagonal and _has_modes(system, scheme)
     if solver.matrix == "modes" or (solver.matrix == "auto" and chosen):
         return Collocation(solver)
-    if DRIFTS and _is_drift(system, scheme):
-        return Rattle(solver, all_rows(system, q_s, q_f))
-    return Nested(solver, interval)
+    return Rattle(solver, rows) if DRIFTS and _is_drift(system, scheme) else Nested(solver, interval)
 
 
 def _check_matrix(matrix: str, system: System, scheme: Scheme, can_be_nested: bool) -> None:

@@ -2,7 +2,6 @@
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -10,8 +9,9 @@ import jax.numpy as jnp
 from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Float
 
+from vmri_jax.kernels.band import Sparsity
 from vmri_jax.mechanics.arrays import Number, Numbers
-from vmri_jax.mechanics.invariants import velocity_and_masses
+from vmri_jax.mechanics.projection import project_momentum
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
 from vmri_jax.schemes.equations import StepEquations, Unknowns
@@ -92,12 +92,14 @@ class Solved(Stepper):
     Derivatives follow from the implicit function theorem, ``dx = -(dR/dx)^-1 (dR/de) de`` with the data e of the equations: iterations are
     never differentiated.
 
+    sparsity: of ``G M^-1 G^T`` with all constraints.
     reverse_only: allows one derivative in reverse mode only, in half the time.
     """
 
     system: System
     scheme: Scheme
     solver: StepSolver
+    sparsity: Sparsity
     reverse_only: bool = False
 
     def init(self, state: State, macro_dt) -> SolvedState:
@@ -127,13 +129,9 @@ class Solved(Stepper):
         return end, info, memory
 
     def _solve(self, equations: StepEquations, memory: SolvedState) -> tuple[Solution, Any]:
-        """The solution, from straight motion at velocities that nearly fulfil the hidden constraints."""
-        q_s, q_f, p_s, p_f = equations.q_s, equations.q_f, equations.p_s, equations.p_f
-        if self.system.is_constrained:  # the constraint force that the step before has left out, at its multipliers
-            impulse = equations.left_out(memory.multiplier, memory.slow_multiplier)
-            pull = jax.vjp(partial(equations.system.constraints, equations.t), q_s, q_f)[1]
-            p_s, p_f = jax.tree.map(jnp.subtract, (p_s, p_f), pull(impulse))
-        velocities, masses = velocity_and_masses(equations.system, q_s, q_f, p_s, p_f)
+        """The solution, with straight motion at the velocities of the projected momenta as the guess."""
+        state = State(equations.t, equations.q_s, equations.q_f, equations.p_s, equations.p_f)
+        _, _, *velocities, masses = project_momentum(equations.system, state, sparsity=self.sparsity)
         guess = equations.guess(*velocities, memory.multiplier, memory.slow_multiplier)
         return self.solver.solve(replace(equations, masses=masses), guess, memory.solver)
 
