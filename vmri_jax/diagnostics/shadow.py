@@ -169,8 +169,8 @@ def _stage(system: System, scheme: Scheme, state: State, macro_dt):
     start = with_kicks(state, start=1.0)
     equations = StepEquations.of(system, scheme, start, macro_dt)
     n_g, n_gs = system.num_constraints(state.q_s, state.q_f)
-    velocities, masses = velocity_and_masses(system, start.q_s, start.q_f, start.p_s, start.p_f)
-    guess = equations.guess(*velocities, jnp.zeros(n_g), jnp.zeros(n_gs))
+    (v_s, v_f), masses = velocity_and_masses(system, start.q_s, start.q_f, start.p_s, start.p_f)
+    guess = equations.guess(v_s, v_f, jnp.zeros(n_g), jnp.zeros(n_gs))
     solver = Marched(Solver("exact"))
     solution, _ = solver.solve(replace(equations, masses=masses), guess, solver.init(equations))
     q_s, (q_f, p_s, p_f) = state.q_s + solution.x.slow[-1], solution.end

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.linalg import block_diag
 
-from vmri_jax.kernels import max_abs
+from vmri_jax.kernels import matvec, max_abs
 from vmri_jax.mechanics.arrays import Numbers, is_concrete, library, quickly_compiled
 from vmri_jax.mechanics.by_name import constraint_sizes
 from vmri_jax.mechanics.functions import Rheonomic
@@ -137,7 +137,7 @@ def _values(system: System, *configuration):
 
 def residual_of(rows: Rows, system: System, state, weighted_velocity):
     """Largest ``|g|`` and largest ``|G v + dg/dt|``, shape (2,), from the rows at a state, and w v (n,) with their weights."""
-    rates, t = rows.gradients @ weighted_velocity, state.t
+    rates, t = matvec(rows.gradients, weighted_velocity), state.t
     if system.is_rheonomic or isinstance(system.implied, Rheonomic):
         rates += jax.jvp(lambda t: _values(system, t, state.q_s, state.q_f), (t,), (jnp.ones_like(t),))[1]
     return jnp.stack([max_abs(rows.values), max_abs(rates)])

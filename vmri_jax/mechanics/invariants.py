@@ -87,8 +87,8 @@ def velocity(system: System, q_s, q_f, p_s, p_f):
 def velocity_and_masses(system: System, q_s, q_f, p_s, p_f):
     """`velocity`, and the mass matrix ``d^2 T / dv^2`` (n, n); None for constant masses."""
     free = system.only(lambda term: term.kind not in ("constraint", "implied"))
-    _, _, *velocities, masses = project_momentum(free, State(jnp.zeros(()), q_s, q_f, p_s, p_f))
-    return tuple(velocities), masses
+    _, _, v_s, v_f, masses = project_momentum(free, State(jnp.zeros(()), q_s, q_f, p_s, p_f))
+    return (v_s, v_f), masses
 
 
 def momentum_map(generator, q_s, q_f, p_s, p_f):

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from vmri_jax import kernels
+from vmri_jax.kernels import matmul, matvec
 from vmri_jax.kernels.band import Full, Sparsity
 from vmri_jax.kernels.saddle import saddle
 from vmri_jax.mechanics.structure import has_constant_hessian
@@ -105,12 +106,12 @@ def _by_one_solve(masses, p, jacobian, rates):
     """The velocity ``v - M^-1 G^T mu``, with ``M v = p`` and ``G M^-1 G^T mu = G v + dg/dt``, and ``G^T mu``."""
     solve = partial(kernels.solve_masses, masses)
     # the derivative is one more solve, without that of the elimination
-    v = jax.lax.custom_linear_solve(masses.dot, p, lambda _, b: solve(b), symmetric=True)
+    v = jax.lax.custom_linear_solve(partial(matvec, masses), p, lambda _, b: solve(b), symmetric=True)
     if not jacobian.shape[0]:
         return v, jnp.zeros_like(p)
     columns = solve(jacobian.T)
-    mu = Full(len(rates)).solve((jacobian @ columns).T, jacobian @ v + rates)
-    return v - columns @ mu, jacobian.T @ mu
+    mu = Full(len(rates)).solve(matmul(jacobian, columns).T, matvec(jacobian, v) + rates)
+    return v - matvec(columns, mu), matvec(jacobian.T, mu)
 
 
 def time_rates(system: System, t, q_s, q_f):

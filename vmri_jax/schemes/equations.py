@@ -97,6 +97,7 @@ class StepEquations(eqx.Module):
         """Diagonals (n_s,) and (n_f,) of the constant masses, or of `masses`."""
         if isinstance(self.system.kinetic, ConstantMass):
             return self.system.kinetic.diagonal
+        assert self.masses is not None
         return tuple(jnp.split(jnp.diagonal(self.masses), [self.q_s.size]))
 
     def path(self, x: Unknowns) -> Path:

@@ -103,9 +103,9 @@ class Solved(Stepper):
     reverse_only: bool = False
 
     def init(self, state: State, macro_dt) -> SolvedState:
-        multipliers = map(jnp.zeros, self.system.num_constraints(state.q_s, state.q_f))
+        n_g, n_gs = self.system.num_constraints(state.q_s, state.q_f)
         solver = self.solver.init(StepEquations.of(self.system, self.scheme, state, macro_dt))
-        return SolvedState(*multipliers, jnp.zeros(()), solver)
+        return SolvedState(jnp.zeros(n_g), jnp.zeros(n_gs), jnp.zeros(()), solver)
 
     def renew(self, state: State, memory: SolvedState, macro_dt) -> SolvedState:
         return memory._replace(
@@ -131,8 +131,8 @@ class Solved(Stepper):
     def _solve(self, equations: StepEquations, memory: SolvedState) -> tuple[Solution, Any]:
         """The solution, with straight motion at the velocities of the projected momenta as the guess."""
         state = State(equations.t, equations.q_s, equations.q_f, equations.p_s, equations.p_f)
-        _, _, *velocities, masses = project_momentum(equations.system, state, sparsity=self.sparsity)
-        guess = equations.guess(*velocities, memory.multiplier, memory.slow_multiplier)
+        _, _, v_s, v_f, masses = project_momentum(equations.system, state, sparsity=self.sparsity)
+        guess = equations.guess(v_s, v_f, memory.multiplier, memory.slow_multiplier)
         return self.solver.solve(replace(equations, masses=masses), guess, memory.solver)
 
     def continued(self, memory: SolvedState, last: SolvedState, state: State, macro_dt) -> SolvedState:
