@@ -135,7 +135,7 @@ def test_table_and_bad_input(fpu):
     with pytest.raises(TypeError, match="scheme is int"):
         advise(fpu, 3, macro_dt=0.1)  # pyright: ignore[reportArgumentType]
     for macro_dt in (0.0, np.nan, [0.1]):
-        with pytest.raises(ValueError, match="macro_dt is"):
+        with pytest.raises(ValueError, match="macro_dt"):
             advise(fpu, fully_explicit(1), macro_dt=macro_dt)  # pyright: ignore[reportArgumentType]
 
 

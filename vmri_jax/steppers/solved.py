@@ -2,6 +2,7 @@
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -11,6 +12,7 @@ from jaxtyping import Array, Float
 
 from vmri_jax.kernels.band import Sparsity
 from vmri_jax.mechanics.arrays import Number, Numbers
+from vmri_jax.mechanics.invariants import velocity_and_masses
 from vmri_jax.mechanics.projection import project_momentum
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
@@ -76,12 +78,14 @@ class SolvedState(NamedTuple):
 
     multiplier, slow_multiplier: Lagrange multipliers of the step before, at its last control node with multipliers.
     last_dt: length of the step before, 0 before the first step.
+    velocity: mean velocities (v_s, v_f) of the last intervals, ``(q_s(H) - q_s(0)) / H`` and ``(q_f(H) - q_f(H - h)) / h``; () for constant masses.
     solver: memory of the solver.
     """
 
     multiplier: Float[Array, "n_g"]
     slow_multiplier: Float[Array, "n_gs"]
     last_dt: Number
+    velocity: tuple
     solver: Any
 
 
@@ -105,7 +109,8 @@ class Solved(Stepper):
     def init(self, state: State, macro_dt) -> SolvedState:
         n_g, n_gs = self.system.num_constraints(state.q_s, state.q_f)
         solver = self.solver.init(StepEquations.of(self.system, self.scheme, state, macro_dt))
-        return SolvedState(jnp.zeros(n_g), jnp.zeros(n_gs), jnp.zeros(()), solver)
+        at_rest = () if self.system.has_constant_mass else (jnp.zeros_like(state.q_s), jnp.zeros_like(state.q_f))
+        return SolvedState(jnp.zeros(n_g), jnp.zeros(n_gs), jnp.zeros(()), at_rest, solver)
 
     def renew(self, state: State, memory: SolvedState, macro_dt) -> SolvedState:
         return memory._replace(
@@ -125,13 +130,22 @@ class Solved(Stepper):
         info = StepInfo(*StepStatus(*status), q_f_micro, *lambdas)
         end = State(state.t + macro_dt, state.q_s + x.slow[-1], q_f, p_s, p_f)
         last_dt = jnp.asarray(macro_dt, dtype=float)
-        memory = SolvedState(lambdas[0][-1, -1], lambdas[1][-1], last_dt, solver)
+        velocity = jax.lax.stop_gradient((x.slow[-1] / macro_dt, x.fast[-1, -1] / equations.micro_dt))
+        velocity = () if self.system.has_constant_mass else velocity
+        memory = SolvedState(lambdas[0][-1, -1], lambdas[1][-1], last_dt, velocity, solver)
         return end, info, memory
 
     def _solve(self, equations: StepEquations, memory: SolvedState) -> tuple[Solution, Any]:
-        """The solution, with straight motion at the velocities of the projected momenta as the guess."""
-        state = State(equations.t, equations.q_s, equations.q_f, equations.p_s, equations.p_f)
-        _, _, v_s, v_f, masses = project_momentum(equations.system, state, sparsity=self.sparsity)
+        """The solution, from straight motion: at the velocities of the projected momenta for constant masses; else, since near poles of angles a
+        velocity ``M^-1 p`` says little about the next step, at the mean velocities of the last intervals."""
+        system, phase = equations.system, (equations.q_s, equations.q_f, equations.p_s, equations.p_f)
+        if system.has_constant_mass:
+            state = State(equations.t, *phase)
+            _, _, v_s, v_f, masses = project_momentum(system, state, sparsity=self.sparsity)
+        else:
+            velocities, masses = velocity_and_masses(system, *phase)
+            is_first = equations.before == 0
+            v_s, v_f = jax.tree.map(partial(jnp.where, is_first), velocities, memory.velocity)
         guess = equations.guess(v_s, v_f, memory.multiplier, memory.slow_multiplier)
         return self.solver.solve(replace(equations, masses=masses), guess, memory.solver)
 
