@@ -59,7 +59,7 @@ def test_legendre_transform_of_a_kinetic_function():
     coupling = m_2 * l_1 * l_2 * jnp.cos(q_s - q_f)
     assert largest_difference(state.p_s, (m_1 + m_2) * l_1**2 * v_s + coupling * v_f) < 1e-14
     assert largest_difference(state.p_f, m_2 * l_2**2 * v_f + coupling * v_s) < 1e-14
-    back = project_momentum(problem.system, state)[2:4]
+    _, _, *back, _ = project_momentum(problem.system, state)
     assert largest_difference(jnp.concatenate(back), jnp.concatenate([v_s, v_f])) < 1e-12
 
 
