@@ -27,9 +27,8 @@ def start(size: str) -> None:
     if size == "quick":
         os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {QUICK_FLAGS}".strip()
         jax.config.update("jax_disable_most_optimizations", True)
-        jax.config.update(
-            "jax_traceback_in_locations_limit", 0
-        )  # no places in Python's code in programs that nobody reads
+        # no places in Python's code in programs that nobody reads
+        jax.config.update("jax_traceback_in_locations_limit", 0)
         gc.set_threshold(OBJECTS_UNTIL_COLLECTION, 20, 20)
     prepare()
 

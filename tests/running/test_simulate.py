@@ -316,12 +316,20 @@ def test_lengths_of_runs_share_a_program(fpu, request):
         np.testing.assert_array_equal(run.q_f, longest.q_f[: num_steps + 1])
 
 
-def test_pieces_of_a_run_make_the_whole(fpu, monkeypatch):
+def test_pieces_of_a_run_make_the_whole(fpu, tsp, monkeypatch):
     """Short pieces: the same nodes, to the last bit, micro nodes too; and after a failure in one of them NaN to the end."""
     whole = simulate(fpu, fully_implicit(2), macro_dt=0.05, num_steps=36, save=vm.Save(2, micro=True))
     monkeypatch.setattr("vmri_jax.running.saved.NUMBERS_PER_PIECE", 100)
     pieces = simulate(fpu, fully_implicit(2), macro_dt=0.05, num_steps=36, save=vm.Save(2, micro=True))
     jax.tree.map(np.testing.assert_array_equal, whole, pieces)
+
+    # each piece starts with the saved node at which the one before ends, momenta on the hidden constraints
+    constrained = vm.prepare(tsp, fully_explicit(2), macro_dt=0.02, num_steps=8, save=2)
+    first, checkpoint = constrained.advance(constrained.start(), 2)
+    second, _ = constrained.advance(checkpoint, 2)
+    np.testing.assert_array_equal(second.rows[0, constrained.columns.p_f], first.rows[-1, constrained.columns.p_f])
+    np.testing.assert_array_equal(second.table[0], first.table[-1])
+    assert second.table[:, 2].max() < 1e-11
 
     steep = fpu.system.replace(fast_potential=lambda q_f, params: jnp.log(1.2 - q_f[0]) - 1e2 * q_f[0])
     failed = until_failure(steep, fully_explicit(1), fpu.state(), macro_dt=0.01, num_steps=60)

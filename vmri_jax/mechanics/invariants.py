@@ -53,7 +53,7 @@ def oscillatory_energies(omega, q_f, p_f):
     return (p_f**2 + omega**2 * q_f**2) / 2
 
 
-def constraint_residual(system: System, state, velocities=None):
+def constraint_residual(system: System, state: State, velocities=None):
     """Largest ``|g|`` (position level) and largest ``|G v + dg/dt|`` (velocity level), shape (2,).
 
     Args:

@@ -93,8 +93,7 @@ def _with_masses(system: System, state, guess):
     if not is_quadratic:
         guess = v if guess is None else jnp.concatenate(guess)
         v, impulse = _velocity_and_impulse(system, q_s, q_f, constraints, p, guess)
-    gradient, times_masses = jax.linearize(jax.grad(kinetic), v)
-    masses = jax.vmap(times_masses)(jnp.eye(p.size))
+    masses, gradient = mass_and_momentum(system, q_s, q_f, v[:n_s], v[n_s:])
     if is_quadratic:
         v, impulse = _by_one_solve(masses, p - gradient, *constraints)  # p = M v + dT/dv(0)
     if jacobian.shape[0]:

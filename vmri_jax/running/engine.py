@@ -102,8 +102,11 @@ class Engine:
             is_later = number > 0  # turn 0 saves the start, so that the code for nodes is compiled once
             moved, info, micro = interval(cursor, jnp.where(is_later, save_every, 0))
             cursor = jax.tree.map(lambda a, b: a if a is b else jnp.where(is_later, a, b), moved, cursor)
-            saved = jax.tree.map(partial(jnp.where, is_later), stepper.project(cursor.state), cursor.state)
-            row = _row(saved, info, micro)
+            has_moved = (
+                cursor.step > 0
+            )  # the start of a run is saved as it came; a later piece starts with momenta of a step
+            state = jax.tree.map(partial(jnp.where, has_moved), stepper.project(cursor.state), cursor.state)
+            row = _row(state, info, micro)
             return number + 1, cursor, jax.lax.dynamic_update_slice(rows, row[None], (number, 0))
 
         begin = jax.tree.map(jnp.asarray, begin._replace(memory=memory))

@@ -158,7 +158,7 @@ class Marched(StepSolver):
         is_first,
     ) -> Progress:
         """At most `limit` passes. The first attempt starts from the predicted slow unknowns, later attempts from the guess."""
-        z, x = march.flat(guess)
+        (z, x), is_predicted = march.flat(guess), is_first & ~memory.slow.is_empty
         z = jnp.where(is_first, memory.slow.next(march.num_slow, z), z)
         progress = start._replace(
             passed=start.passed._replace(z=z, x=x, dz=jnp.zeros_like(z), dx=jnp.zeros_like(x)),
@@ -185,7 +185,7 @@ class Marched(StepSolver):
 
         def step(last: Progress) -> Progress:
             # every interval of the very first pass starts from the corrected unknowns of the interval before
-            from_last = is_first & (last.passes == 0) & ~memory.slow.is_empty
+            from_last = is_predicted & (last.passes == 0)
             start = last.passed.z + last.passed.dz, last.passed.x + last.passed.dx, memory.fast, from_last
             renews = ~(last.rate <= CONTRACTION) & self.is_exact
             matrices, now = self._pass(march, renews, last, start)
@@ -201,7 +201,7 @@ class Marched(StepSolver):
             new_size = jnp.where(renews, after.size, last.new_size)
             return after._replace(matrices=matrices, rate=rate, curvature=curvature, new_size=new_size, result=result)
 
-        return iterated(step, self._prepared(march, progress, memory.fast, is_first & ~memory.slow.is_empty))
+        return iterated(step, self._prepared(march, progress, memory.fast, is_predicted))
 
     def _solution(self, march: MarchEquations, done: Progress, result, passes) -> Solution:
         equations, passed = march.equations, done.passed
