@@ -1,11 +1,8 @@
 """`python -m benchmarks gail2014`: the reference study, figure by figure."""
 
-import gc
-import os
 from pathlib import Path
 from typing import Annotated
 
-import jax
 import typer
 from rich.markup import escape
 
@@ -14,23 +11,6 @@ from benchmarks.gail2014.report import FigureResult, choose_figures, reproduce
 from benchmarks.measure import prepare
 from vmri_jax.cli.common import BadInput, console, print_failure
 from vmri_jax.running.progress import progress_shown
-
-QUICK_FLAGS = "--xla_cpu_parallel_codegen_split_count=1 --xla_disable_hlo_passes=dot-library-rewriter,while-loop-invariant-code-motion,simplify-while-loops"
-"""Options of XLA for programs that compile for seconds and run for milliseconds: one module, not copies of its parts, and no passes over loops that
-only make them faster."""
-OBJECTS_UNTIL_COLLECTION = 50_000
-"""Objects that Python makes between collections of garbage, 700 by default. Tracing makes many that live; a larger value keeps garbage for longer."""
-
-
-def start(size: str) -> None:
-    """The settings of JAX. The quick study compiles without optimisations, in a third of the time; orders and shapes of curves stay."""
-    if size == "quick":
-        os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {QUICK_FLAGS}".strip()
-        jax.config.update("jax_disable_most_optimizations", True)
-        # no places in Python's code in programs that nobody reads
-        jax.config.update("jax_traceback_in_locations_limit", 0)
-        gc.set_threshold(OBJECTS_UNTIL_COLLECTION, 20, 20)
-    prepare()
 
 
 def gail2014(
@@ -41,8 +21,8 @@ def gail2014(
     out: Annotated[Path, typer.Option(help="Folder for figures, tables and the report.")] = Path("out"),
 ) -> None:
     """Run the reference study of Gail et al. (2014): figures, tables and out/report.html."""
+    prepare()
     size = "full" if full else "quick"
-    start(size)
     try:
         choose_figures(reference_figures(size), only or [])
         out.mkdir(parents=True, exist_ok=True)

@@ -1,10 +1,12 @@
 """Kinds of figures of a study: what is run, what is expected, and how it is judged and drawn."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import reduce
 from operator import add
 
+import jax
 import numpy as np
 from matplotlib.figure import Figure
 
@@ -27,6 +29,17 @@ NO_OVERHEAD = "compiled code has hardly any cost of a macro step that more micro
 """Why a dense solve is cheapest with fewer micro steps here than in the paper."""
 LONG_STEPS = "longer macro steps take more passes of Newton's iteration, and newer matrices: in macro steps of one length the cost is {:.2f} times"
 """Why the cost of a structured solve grows, where it does not in macro steps of one length."""
+
+
+@contextmanager
+def compiled_quickly() -> Iterator[None]:
+    """Within this context programs are compiled without most optimisations, in half the time: for errors, not for times."""
+    before = jax.config.read("jax_disable_most_optimizations")
+    jax.config.update("jax_disable_most_optimizations", True)
+    try:
+        yield
+    finally:
+        jax.config.update("jax_disable_most_optimizations", before)
 
 
 @dataclass(frozen=True)
@@ -87,9 +100,11 @@ class ConvergenceFigure:
         problem = self.problem()
         if self.problem not in references:
             progress("reference solution", 0, 1)
-            references[self.problem] = reference_solution(problem, self.t_end)
+            with compiled_quickly():
+                references[self.problem] = reference_solution(problem, self.t_end)
         how = {"reference": references[self.problem], "progress": progress}
-        study = convergence_study(problem, self.schemes, self.macro_dt, self.t_end, **how)
+        with compiled_quickly():
+            study = convergence_study(problem, self.schemes, self.macro_dt, self.t_end, **how)
         orders = sorted(set(self.orders.values()))
         return Findings(
             seen=self._seen(study),
