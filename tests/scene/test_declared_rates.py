@@ -30,7 +30,7 @@ def homes(scene: Scene) -> dict:
 
 
 def test_a_potential_at_every_fourth_micro_node():
-    """The steps of such systems are those of the textbook in `tests/verification/test_rates.py`."""
+    """`tests/verification/test_rates.py` compares the steps of such systems with the textbook."""
     assert homes(CHAIN) == {"gravity": "slow_potential", "bonds": "fast_potential", "bends": 4}
     assert {pace.value for pace in CHAIN.sorting.paces.values()} == {"fast"}
     rows = {row.name: row for row in CHAIN.explain(vm.fully_explicit(12), measure=False).rows}

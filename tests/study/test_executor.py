@@ -1,4 +1,4 @@
-"""Studies on executors give what they give here; `tests/ensembles/test_workers.py` has the same studies on a cluster."""
+"""Studies on executors and in this process have the same results; `tests/ensembles/test_workers.py` has a cluster."""
 
 import pickle
 from concurrent.futures import Executor, Future

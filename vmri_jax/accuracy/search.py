@@ -199,7 +199,7 @@ class Search:
         most_seconds: float = np.inf,
     ) -> Trial:
         """The first trial with a certified error, of 1, 2, 4, ... times the macro steps; the last trial if the search
-        runs out of steps, or of time, `most_seconds`. With an accuracy the errors are those of `estimated_errors`."""
+        runs out of steps, or of time, `most_seconds`. With an accuracy `estimated_errors` gives the errors."""
         most = MOST_TRIAL_SECONDS
         while True:
             run = replace(self.run(family, num_micro, num_steps), may_fall_back=falls_back)

@@ -104,7 +104,7 @@ def _with_masses(system: System, state, guess):
 def _by_one_solve(masses, p, jacobian, rates):
     """The velocity ``v - M^-1 G^T mu``, with ``M v = p`` and ``G M^-1 G^T mu = G v + dg/dt``, and ``G^T mu``."""
     solve = partial(kernels.solve_masses, masses)
-    # the derivative is one more solve, without that of the elimination
+    # the derivative is one more solve: JAX does not differentiate the elimination
     v = jax.lax.custom_linear_solve(partial(matvec, masses), p, lambda _, b: solve(b), symmetric=True)
     if not jacobian.shape[0]:
         return v, jnp.zeros_like(p)

@@ -33,7 +33,8 @@ LANES = 64
 """Step sizes that a compiled call computes side by side for up to 18 degrees of freedom; larger systems get fewer, at
 least 4, to limit memory. With more a call for a single step size takes longer."""
 PASSES_AT_REST = 5
-"""Exact passes of the step at rest, whose equations are linear: two bring the multipliers to round-off. More take longer where round-off goes on."""
+"""Exact passes of the step at rest, whose equations are linear: two bring the multipliers to round-off. More take longer
+where round-off goes on."""
 FREE_MOTION_ANGLE = 1e-5
 """Angle, rad, up to which a multiplier is of a free motion, which has no signature; a larger one drops slow ones."""
 
@@ -116,8 +117,8 @@ def _step_matrices(system: System, scheme, rest: State, embed, read, macro_dt):
     """(k, 2 d, 2 d) derivatives of the macro step at rest, for k lengths of the step."""
 
     def matrix(macro_dt):
-        # The status does not count: corrections of a step at rest are round-off, and are compared with no motion. With all iterations spent on the
-        # whole step no part of it is taken for the step.
+        # The status does not count: corrections of a step at rest are round-off, and are compared with no motion. With
+        # all iterations spent on the whole step no part of it is taken for the step.
         solver = Solver("exact", max_iterations=PASSES_AT_REST)
         step = partial(phase_step, system, scheme, rest, rest.t, macro_dt=macro_dt, solver=solver)
         return read @ with_slopes(step, phase_vector(rest), embed.T)[2].T
