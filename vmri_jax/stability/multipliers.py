@@ -33,8 +33,8 @@ LANES = 64
 """Step sizes that a compiled call computes side by side for up to 18 degrees of freedom; larger systems get fewer, at
 least 4, to limit memory. With more a call for a single step size takes longer."""
 PASSES_AT_REST = 5
-"""Exact passes of the step at rest, whose equations are linear: two bring the multipliers to round-off. More take longer
-where round-off goes on."""
+"""Exact passes of the step at rest, whose equations are linear: two bring the multipliers to round-off. More take
+longer where round-off goes on."""
 FREE_MOTION_ANGLE = 1e-5
 """Angle, rad, up to which a multiplier is of a free motion, which has no signature; a larger one drops slow ones."""
 
