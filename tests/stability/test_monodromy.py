@@ -1,5 +1,7 @@
 """Monodromy: powers of the step where it is linear, tangent spaces where there are constraints."""
 
+from dataclasses import replace
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -26,6 +28,17 @@ def test_powers_of_a_linear_step():
     assert often.symplectic_defect < 1e-13
     assert often.stretch[0] >= np.abs(often.multipliers[0])
     assert float(often.end.t) == pytest.approx(40 * macro_dt)
+
+
+def drag(t, q_s, q_f, v_s, v_f, params):
+    return -0.1 * v_s, -0.1 * v_f
+
+
+def test_a_dissipative_step_is_not_symplectic():
+    problem = linear_model()
+    damped = replace(problem, system=problem.system.replace(force=drag))
+    found = monodromy(damped, fully_explicit(1), macro_dt=0.02, num_steps=1, solver=MARCH)
+    assert found.symplectic_defect > 1e-4  # 2e-3 without the force: 1e-16
 
 
 @pytest.fixture(scope="module")

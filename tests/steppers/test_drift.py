@@ -68,7 +68,6 @@ def test_a_composition_solves_the_equations_of_its_stages():
 @pytest.mark.parametrize(
     ("name", "scheme", "matrix"),
     [
-        ("sam", SUZUKI, "masses"),
         ("tsp", compose(fully_explicit(1), [1.0, -1.0, 1.0]), "masses"),
         ("general", fully_explicit(1), "masses"),
         ("tsp", fully_implicit(2), "masses"),

@@ -120,9 +120,9 @@ def test_a_run_that_fails_late_is_made_again_with_exact_matrices(tsp):
 
 
 def test_a_prepared_run_says_that_the_fallback_takes_over(tsp, capsys, monkeypatch):
+    """The programs are those of the run above."""
     monkeypatch.setattr(progress, "SECONDS_BETWEEN_LINES", 0.0)
-    solver = Solver(max_iterations=40)
-    run = prepare(tsp, fully_implicit(10), macro_dt=0.2, num_steps=20, save=5, solver=solver)
+    run = prepare(tsp, fully_implicit(10), macro_dt=0.2, num_steps=20, solver=Solver(max_iterations=40))
     trajectory = run()
     assert trajectory.success
     line = "a step was not solved: computing its part of the run again with exact matrices"
@@ -144,16 +144,21 @@ def test_no_library_call_in_a_compiled_run(tsp):
     assert " dot(" not in text
 
 
+def rod_by_squares(q_s, params):
+    distance = q_s - jnp.stack([0.0, 0.0, params["height"] + 5.0])
+    return (distance @ distance / 10 - 2.5)[None]
+
+
+def rod_by_norm(q_s, params):
+    return (jnp.linalg.norm(q_s - jnp.stack([0.0, 0.0, params["height"] + 5.0])) - 5.0)[None]
+
+
 @pytest.mark.parametrize("height", [0.0, 1.0])
-@pytest.mark.parametrize("form", ["squares", "norm"])
-def test_round_off_of_a_constraint_counts_by_its_own_length(height, form):
+@pytest.mark.parametrize("rod", [rod_by_squares, rod_by_norm])
+def test_round_off_of_a_constraint_counts_by_its_own_length(height, rod):
     """A slow bob near the origin on a rod of 5 m: the constraint has the round-off of 5 m, the positions have none."""
-
-    def rod(q_s, params):
-        distance = q_s - jnp.array([0.0, 0.0, height + 5.0])
-        return jnp.array([distance @ distance / 10 - 2.5 if form == "squares" else jnp.linalg.norm(distance) - 5.0])
-
-    system = vm.System(vm.ConstantMass(jnp.ones(3), jnp.zeros(0)), slow_constraint=rod)
+    masses = vm.ConstantMass(jnp.ones(3), jnp.zeros(0))
+    system = vm.System(masses, slow_constraint=rod, params={"height": height})
     problem = vm.Problem(system, [0.0, 0.0, height], [], [0.01, 0.0, 0.0], [])
     for solver in (vm.Solver(), vm.Solver("exact")):
         run = vm.simulate(problem, vm.fully_implicit(1), macro_dt=0.0025, num_steps=100, solver=solver)

@@ -6,7 +6,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from benchmarks.gail2014.dense import dense
 from tests.stability.systems import swinging
 from tests.support import compiled_step, largest_difference
 from tests.user_systems import FULL_MASS, two_oscillators
@@ -68,7 +67,6 @@ def test_few_passes_where_the_slow_motion_is_smooth(tsp):
     for scheme, micro_dt, num_steps, passes in (
         (fully_explicit(10), 2e-4, 500, 2.4),  # measured 2.2
         (fully_implicit(10), 2e-4, 1000, 2.7),  # measured 2.5
-        (explicit_slow(10), 2e-4, 1000, 2.7),
     ):
         run = simulate(tsp.system, scheme, tsp.state(), macro_dt=10 * micro_dt, num_steps=num_steps)
         assert run.info.iterations.mean() < passes
@@ -97,7 +95,7 @@ def link(q_s, q_f, params):
     return jnp.stack([jnp.sum((q_f[:2] - q_s) ** 2) - 2.0])
 
 
-@pytest.mark.parametrize("scheme", [fully_explicit(1), fully_explicit(5), explicit_slow(5)])
+@pytest.mark.parametrize("scheme", [fully_explicit(1), explicit_slow(5)])
 def test_a_heavy_slow_body_at_rest_at_the_origin(scheme):
     """It has neither position nor motion to be relative to: round-off of the hook on its rope is all there is."""
 
@@ -161,5 +159,4 @@ def test_momenta_have_their_full_precision(tsp):
         return simulate(tsp, fully_explicit(1), macro_dt=0.002, num_steps=300, save=100, solver=solver)[-1]
 
     drift = end(Solver())
-    for solver in (Solver("exact"), dense()):
-        assert ends_differ(end(solver), drift) < 1e-13
+    assert ends_differ(end(Solver("exact")), drift) < 1e-13
