@@ -56,20 +56,19 @@ def point(steps: int, strength: float = 1.0, **options):
 
 
 def test_a_double_integrator():
-    """u = 6 - 12 t, J = 6, multipliers (-12, 6); order 2, and one iteration, since the problem is linear."""
-    found = {steps: point(steps) for steps in (10, 20)}
-    for steps, optimum in found.items():
-        assert optimum.success
-        assert optimum.iterations <= 2
-        assert optimum.miss < 1e-12
-        assert optimum.trajectory.success
-        assert optimum.trajectory.q_s[-1, 0] == pytest.approx(1.0, abs=1e-12)
-        middle = optimum.t + 0.5 / steps
-        assert np.abs(optimum.controls[:, 0] - (6 - 12 * middle)).max() < 6.0 / steps**2
-        np.testing.assert_allclose(optimum.multipliers, [-12, 6], rtol=1.5 / steps**2)
-    errors = [found[steps].cost - 6 for steps in found]
-    assert np.log2(errors[0] / errors[1]) == pytest.approx(2.0, abs=0.1)
-    assert "converged" in str(found[10])
+    """u = 6 - 12 t, J = 6, multipliers (-12, 6), and one iteration, since the problem is linear; `test_bounded` has the order."""
+    steps = 10
+    optimum = point(steps)
+    assert optimum.success
+    assert optimum.iterations <= 2
+    assert optimum.miss < 1e-12
+    assert optimum.trajectory.success
+    assert optimum.trajectory.q_s[-1, 0] == pytest.approx(1.0, abs=1e-12)
+    middle = optimum.t + 0.5 / steps
+    assert np.abs(optimum.controls[:, 0] - (6 - 12 * middle)).max() < 6.0 / steps**2
+    np.testing.assert_allclose(optimum.multipliers, [-12, 6], rtol=1.5 / steps**2)
+    assert 0 < optimum.cost - 6 < 10 / steps**2
+    assert "converged" in str(optimum)
 
 
 def springs(q_s, q_f, params):

@@ -13,7 +13,7 @@ from vmri_jax.mechanics.motion import motion, powers, reaction_forces
 def test_a_pendulum_by_the_formula():
     system = System(ConstantMass(np.zeros(0), MASS * np.ones(2)), fast_potential=hanging_weight, constraint=own_rod)
     state = initial_state(system, [], LENGTH * np.array([0.6, -0.8]), [], np.array([0.8, 0.6]))
-    found = motion(system, state)
+    found = jax.jit(motion)(system, state)
     tension = MASS * (1.0 + GRAVITY * 0.8 * LENGTH) / LENGTH**2  # m (v^2 - g y) / L^2
     assert float(found.multipliers[0]) == pytest.approx(tension, rel=1e-13)
     (pull,), touched = reaction_forces(system, state, [[0]])
@@ -29,7 +29,7 @@ def test_accelerations_are_those_of_runs():
     h = 1e-3
     run = simulate(system, galerkin(1, 2), state, macro_dt=h, num_steps=2)
     middle = State(*(a[1] for a in (run.t, run.q_s, run.q_f, run.p_s, run.p_f)))
-    found = motion(system, middle)
+    found = jax.jit(motion)(system, middle)
     for q, a in ((run.q_s, found.a_s), (run.q_f, found.a_f)):
         assert np.allclose(
             (q[2] - 2 * q[1] + q[0]) / h**2, a, rtol=1e-4, atol=1e-4
@@ -43,7 +43,7 @@ def test_powers_are_the_rate_of_energy():
     state = initial_state(system, [], [LENGTH, 0.0], [], [0.0, 1.0], project=True)
     run = simulate(system, fully_implicit(1), state, macro_dt=1e-3, num_steps=1000)
     states = State(run.t, run.q_s, run.q_f, run.p_s, run.p_f)
-    rates = np.asarray(jax.vmap(lambda s: powers(system, s))(states))
+    rates = np.asarray(jax.jit(jax.vmap(powers, (None, 0)))(system, states))
     work = 1e-3 * (np.cumsum(rates, axis=0) - (rates + rates[0]) / 2)
     change = run.energy - run.energy[0]
     assert np.abs(change).max() > 1.0

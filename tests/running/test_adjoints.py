@@ -1,4 +1,4 @@
-"""Adjoints of runs against each other: the same derivatives, less memory, and what they refuse."""
+"""Adjoints of runs against each other: the same derivatives, less memory, lanes, second derivatives, what they refuse, and which one auto takes."""
 
 from functools import cache
 
@@ -10,7 +10,7 @@ import pytest
 import vmri_jax as vm
 from tests.support import PROBLEMS
 from tests.user_systems import LENGTH, cart, own_rod
-from vmri_jax.running import engine, loops
+from vmri_jax.running import engine, loops, simulation
 
 
 def heavy(q_f, params):
@@ -25,7 +25,7 @@ PENDULUM = vm.Problem(
     [],
     [0.0, 0.5],
 )
-SIMPLE = {"kicks": vm.fully_explicit(2), "solved": vm.fully_implicit(2)}
+SIMPLE = {"kicks": vm.fully_explicit(2), "solved": vm.fully_implicit(1)}
 LONG = ("fpu", "kicks", "tsp", "cart", "composed")
 CASES = {  # problem, scheme, macro_dt, steps
     "fpu": (PROBLEMS["fpu"], vm.fully_implicit(4), 0.02, 40),
@@ -142,3 +142,43 @@ def test_where_masses_fail_exact_matrices_are_differentiated():
     assert max(run.info.method) == vm.Method.EXACT
     for a, b in zip(*map(jax.tree.leaves, found.values()), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-6)
+
+
+# --- lanes, second derivatives, the choice of auto --------------------------------------------------------------------
+def test_lanes_of_gradients():
+    steps = "kicks"
+    cost, at = simple_cost("checkpoint", steps)
+    starts = jnp.stack([at, 1.1 * at])
+    lanes = jax.jit(jax.vmap(jax.grad(cost)))(starts)
+    np.testing.assert_allclose(lanes[1], simple_gradient("stored", steps)(starts[1]), rtol=1e-11, atol=1e-12)
+
+
+@pytest.mark.parametrize(("second", "compiled"), [(jax.jacfwd, False), (jax.jacrev, True)])
+def test_second_derivatives_are_refused(second, compiled):
+    cost, at = simple_cost("checkpoint")
+    gradient = jax.grad(cost)
+    with pytest.raises(TypeError, match="stored"):
+        second(jax.jit(gradient) if compiled else gradient)(at)
+
+
+def test_stored_steps_have_second_derivatives():
+    """Reverse over reverse; `tests/verification/test_gradients.py` takes forward over reverse."""
+    gradient, at = simple_gradient("stored"), simple_cost("stored")[1]
+    h = 1e-5
+    expected = jnp.stack([(gradient(at + h * e) - gradient(at - h * e)) / (2 * h) for e in jnp.eye(at.size)])
+    np.testing.assert_allclose(jax.jit(jax.jacrev(gradient))(at), expected, rtol=1e-6, atol=1e-8)
+
+
+def test_what_auto_chooses(monkeypatch):
+    """Values with the derivatives that `checkpoint` refuses tell which adjoint has been taken."""
+    cost, at = simple_cost("auto")
+    monkeypatch.setattr(simulation, "LONGEST_STORED_RUN", 5)
+    np.testing.assert_allclose(jax.jit(jax.grad(cost))(at), simple_gradient("stored")(at), rtol=1e-11, atol=1e-12)
+    with pytest.raises(TypeError, match="stored"):
+        jax.jacfwd(jax.grad(cost))(at)
+
+
+@pytest.mark.parametrize("name", ["reversible", "forward"])
+def test_adjoints_that_do_not_exist(name):
+    with pytest.raises(ValueError, match=f"adjoint is '{name}'; it must be one of 'auto', 'stored', 'checkpoint'"):
+        vm.Save(adjoint=name)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import vmri_jax as vm
+from tests.user_systems import cart
 from vmri_jax.schemes.discrete_lagrangian import lagrangian
 from vmri_jax.steppers.kicked import Kicked
 from vmri_jax.steppers.marched import Marched
@@ -77,7 +78,7 @@ def by_march(system, scheme):
 
 def without_projection(system, scheme):
     """A whole step that ends with the momenta of the discrete Legendre transform."""
-    whole = vm.plan(system, scheme, vm.systems.triple_spherical_pendulum().state(), vm.Solver("exact")).stepper
+    whole = vm.plan(system, scheme, cart().state(), vm.Solver("exact")).stepper
     return WithoutProjection(whole.inner)  # pyright: ignore[reportAttributeAccessIssue]
 
 
@@ -97,7 +98,7 @@ class WithoutProjection(Stepper):
 
 def test_a_solver_gets_the_kicks_and_the_projection():
     """A user's solver solves the equations between the kicks; momenta end on the hidden constraints."""
-    pendulum, scheme = vm.systems.triple_spherical_pendulum(), vm.explicit_slow(2)
+    pendulum, scheme = cart(), vm.explicit_slow(2)
     ours = vm.simulate(pendulum, scheme, solver=vm.Solver(stepper=by_march), **STEPS)
     theirs = vm.simulate(pendulum, scheme, solver=vm.Solver("exact"), **STEPS)
     np.testing.assert_allclose(ours.states.p_f, theirs.states.p_f, rtol=1e-13)
@@ -105,7 +106,7 @@ def test_a_solver_gets_the_kicks_and_the_projection():
 
 
 def test_momenta_of_a_whole_step_are_projected():
-    pendulum, scheme = vm.systems.triple_spherical_pendulum(), vm.fully_implicit(2)
+    pendulum, scheme = cart(), vm.fully_implicit(2)
     ours = vm.simulate(pendulum, scheme, solver=vm.Solver(stepper=without_projection), **STEPS)
     theirs = vm.simulate(pendulum, scheme, solver=vm.Solver("exact"), **STEPS)
     assert ours.constraint_residual.max() < 1e-12
@@ -127,7 +128,7 @@ def test_bad_input(fpu):
 
 def test_a_subclass_of_kicked_keeps_its_methods_with_constraints():
     """Its `advance` is called, and the momenta are projected where they are saved."""
-    pendulum, scheme, calls = vm.systems.triple_spherical_pendulum(), vm.fully_implicit(2), []
+    pendulum, scheme, calls = cart(), vm.fully_implicit(2), []
 
     class Counted(Kicked):
         def advance(self, state, memory, macro_dt):

@@ -51,7 +51,7 @@ def test_order(problem, reference, name):
 @pytest.mark.parametrize("name", ["fully implicit", "gauss 2"])
 def test_energy_band_without_drift(problem, name):
     pieces = [run_of(problem, name, 2000, 0.02)]
-    for _ in range(4):
+    for _ in range(2):
         pieces.append(run_of(problem, name, 2000, 0.02, pieces[-1].final_state))
     run = joined(pieces)
     energy = np.asarray(run.energy) / abs(float(run.energy[0]))

@@ -75,7 +75,7 @@ def test_order_with_a_force(case, scheme, steps):
 
 
 def test_damping_takes_energy_at_its_rate():
-    run = simulate(problem_with("damping"), fully_implicit(4), macro_dt=0.05, num_steps=200)
+    run = simulate(problem_with("damping"), fully_implicit(4), macro_dt=0.05, num_steps=200, save=10)
     energy = np.asarray(run.energy)
     assert energy[-1] / energy[0] == pytest.approx(np.exp(-2 * DAMPING * 10), rel=0.2)
     assert (np.diff(energy) < 0).all()

@@ -74,7 +74,7 @@ def test_explicit_micro_steps_are_the_impulse_method(fpu, num_micro, alpha):
     check(fpu, fully_explicit(num_micro, alpha), step)
 
 
-@pytest.mark.parametrize(("springs", "num_micro"), [(3, 4), (200, 1), (200, 2), (200, 5), (200, 6)])
+@pytest.mark.parametrize(("springs", "num_micro"), [(3, 4), (200, 1), (200, 5), (200, 6)])
 def test_implicit_micro_steps_of_linear_springs(springs, num_micro):
     """Kick by V, num_micro steps of the midpoint rule for W, kick by V: also where the chain is long."""
     problem = systems.fermi_pasta_ulam(springs)
