@@ -18,7 +18,7 @@ def test_a_function_of_rows_makes_the_problems(tmp_path):
     data = runs.open()
     assert data.speed.values.tolist() == [0.5, 2.0, 1.0]
     problem = chain(20.0)
-    run = vm.simulate(replace(problem, v_s=0.5 * problem.v_s), vm.explicit_slow(3), macro_dt=0.02, num_steps=10)
+    run = vm.simulate(replace(problem, v_s=0.5 * problem.v_s), vm.fully_explicit(3), macro_dt=0.02, num_steps=10)
     assert np.allclose(data.q_f[0], run.q_f[-1], rtol=0, atol=1e-14)
 
 
@@ -26,9 +26,9 @@ def test_a_function_of_rows_with_dictionaries(tmp_path):
     vary = lambda problem, row: replace(problem, q_f={"hook": problem.q_f[:2], "load": jnp.stack([row["x"], -1.2])})  # noqa: E731
     arguments = {"macro_dt": 0.02, "num_steps": 10}
     runs = vm.ensemble(
-        own.hung, vm.explicit_slow(3), {"x": [0.7, 1.0]}, vary=vary, out=tmp_path / "r.zarr", **arguments
+        own.hung, vm.fully_explicit(3), {"x": [0.7, 1.0]}, vary=vary, out=tmp_path / "r.zarr", **arguments
     )
-    run = vm.simulate(own.hung, vm.explicit_slow(3), **arguments)
+    run = vm.simulate(own.hung, vm.fully_explicit(3), **arguments)
     assert np.allclose(runs.open().q_f.sel(x=1.0), run.states.q_f[-1], rtol=0, atol=1e-14)
 
 

@@ -22,7 +22,7 @@ STEPS = {"t_end": 0.2, "macro_dt": 0.02}
 
 
 def few(out, **changes) -> Ensemble:
-    arguments = {"system": "fpu", "scheme": "explicit-slow", "design": {"omega": [20.0, 50.0]}, "vary": own.put}
+    arguments = {"system": "fpu", "scheme": "fully-explicit", "design": {"omega": [20.0, 50.0]}, "vary": own.put}
     return vm.ensemble(**arguments | {"num_micro": 3, **STEPS} | changes, out=out)
 
 
@@ -41,7 +41,7 @@ def chain(omega: float, num_springs: int = 3) -> vm.Problem:
 
 
 def test_runs_are_those_of_simulate(tmp_path):
-    schemes = {"explicit": vm.explicit_slow, "implicit": vm.fully_implicit}
+    schemes = {"explicit": vm.fully_explicit, "implicit": vm.fully_implicit}
     axes = {"num_micro": [1, 4], "num_steps": [8, 16], "omega": [20.0, 50.0], "v_s[0]": [0.1, 0.3]}
     save = ("end", "nodes", *(name for name in QUANTITIES if name not in ("end", "nodes")))
     how = {"vary": own.put, "t_end": 0.2, "save": save, "num_saves": 4}
@@ -80,7 +80,7 @@ def test_positions_as_dictionaries(tmp_path, system, function):
     runs = few(tmp_path / "runs.zarr", system=system, design=design, save=save, num_saves=5)
     one = runs.open().sel(k=50.0).load()
     stiff = replace(own.hung, system=own.hung.system.replace(params={"k": np.asarray(50.0)}))
-    run = vm.simulate(stiff, vm.explicit_slow(3), macro_dt=0.02, num_steps=10, save=2)
+    run = vm.simulate(stiff, vm.fully_explicit(3), macro_dt=0.02, num_steps=10, save=2)
     assert np.allclose(one.q_f, run.states.q_f[-1], rtol=0, atol=1e-13)
     assert np.allclose(one.max_q_f, run.states.q_f.max(axis=0), rtol=0, atol=1e-13)
     assert np.allclose(one["load"], run.q_f["load"][-1], rtol=0, atol=1e-13)
@@ -95,7 +95,7 @@ def test_steps_of_their_own_in_a_table_in_any_order(tmp_path):
     for i in range(5):
         steps = columns["num_steps"][i]
         problem = chain(columns["omega"][i])
-        run = vm.simulate(problem, vm.explicit_slow(3), macro_dt=0.2 / steps, num_steps=steps, save=steps)
+        run = vm.simulate(problem, vm.fully_explicit(3), macro_dt=0.2 / steps, num_steps=steps, save=steps)
         assert np.allclose(data.q_f[i], run.q_f[-1], rtol=0, atol=1e-13)
 
 
@@ -104,7 +104,7 @@ def test_steps_of_each_lane(tmp_path):
     data = few(tmp_path / "lanes.zarr", design=design, macro_dt=None, t_end=None, num_steps=10).open()
     problem = vm.systems.fermi_pasta_ulam()
     problem = replace(problem, q_f=design.columns["q_f"].values[2])
-    run = vm.simulate(problem, vm.explicit_slow(3), macro_dt=0.013, num_steps=10, save=10)
+    run = vm.simulate(problem, vm.fully_explicit(3), macro_dt=0.013, num_steps=10, save=10)
     assert np.allclose(data.p_s[2], run.p_s[-1], rtol=0, atol=1e-13)
 
 
@@ -126,7 +126,7 @@ def test_own_quantities_systems_and_units(tmp_path):
     data = runs.open()
     assert data.omega.attrs == {"units": "rad/s", "description": "frequency of the stiff springs"}
     assert data.reach.attrs["description"] == "Largest elongation of the first stiff spring."
-    run = vm.simulate(chain(30.0, 2), vm.explicit_slow(3), macro_dt=0.02, num_steps=10, save=2)
+    run = vm.simulate(chain(30.0, 2), vm.fully_explicit(3), macro_dt=0.02, num_steps=10, save=2)
     assert data.reach.sel(omega=30.0) == pytest.approx(float(np.abs(run.q_f[:, 0]).max()), abs=1e-14)
     again = few(tmp_path / "module.zarr", system="tests.ensembles.own:slow_chain", design={"omega": [30.0]}, save="end")
     assert np.allclose(again.open().q_f[0], data.q_f[1], rtol=0, atol=1e-13)
@@ -135,7 +135,6 @@ def test_own_quantities_systems_and_units(tmp_path):
 def test_failed_runs_have_a_status_and_others_do_not_notice(tmp_path):
     runs = few(
         tmp_path / "failed.zarr",
-        scheme="fully-explicit",
         design={"omega": [20.0, 1e9]},
         t_end=2.0,
         save=("end", "energy_error"),
@@ -291,7 +290,7 @@ def test_a_full_disk_keeps_the_chunks_before(tmp_path, monkeypatch):
         ),
         ({"design": {"t": [0.0, 1.0]}}, ValueError, r"vary changes t, so that t_end does not fix the number of steps"),
         ({"t_end": None}, ValueError, r"got macro_dt; give two of"),
-        ({"num_micro": None}, ValueError, r"num_micro is missing for the scheme 'explicit-slow'"),
+        ({"num_micro": None}, ValueError, r"num_micro is missing for the scheme 'fully-explicit'"),
         ({"scheme": vm.fully_implicit(2)}, ValueError, r"has its num_micro already"),
         ({"scheme": 3}, TypeError, r"scheme is .*3.*; give a Scheme"),
         ({"scheme": {}}, TypeError, r"give a Scheme"),
@@ -314,7 +313,7 @@ def test_bad_input_is_refused_before_anything_is_written(tmp_path, changes, erro
 
 
 def test_several_schemes_need_a_column_in_a_table(tmp_path):
-    schemes = {"a": vm.explicit_slow(2), "b": vm.fully_implicit(2)}
+    schemes = {"a": vm.fully_explicit(2), "b": vm.fully_implicit(2)}
     with pytest.raises(ValueError, match="give a column 'scheme'"):
         few(tmp_path / "runs.zarr", scheme=schemes, num_micro=None, design=Table({"omega": [1.0]}))
     design = Table({"omega": [20.0, 20.0], "scheme": ["b", "a"]})

@@ -27,7 +27,7 @@ def cloud(tmp_path_factory):
     design = Draws(50, {"omega": ("uniform", 20, 60), "v_s[0]": ("normal", 0, 0.1)})
     out = tmp_path_factory.mktemp("cloud") / "runs.zarr"
     how = {"vary": put, "t_end": 1.0, "macro_dt": 0.05, "save": "energy_error", "num_saves": 5}
-    return vm.ensemble("fpu", "explicit-slow", design, num_micro=2, **how, out=out).open()
+    return vm.ensemble("fpu", "fully-explicit", design, num_micro=2, **how, out=out).open()
 
 
 def test_the_status_is_drawn_only_if_it_is_asked_for(grid):

@@ -1,4 +1,4 @@
-"""The search for the cheapest setting: what it promises, what it refuses, what it keeps when it fails."""
+"""The search for the cheapest setting: what it promises, what it refuses, what it keeps when it fails; and the page of cost."""
 
 import dataclasses
 from itertools import pairwise
@@ -13,7 +13,8 @@ from tests.study.test_convergence import PROBLEM
 from vmri_jax.accuracy import search
 from vmri_jax.accuracy.families import by_promise
 from vmri_jax.running.interrupts import Interrupted
-from vmri_jax.study import families, reference_solution, tune
+from vmri_jax.study import cost_report, families, reference_solution, tune
+from vmri_jax.study.cost_report import default_t_end
 from vmri_jax.study.tuning import NothingReached
 
 SHORT_MENU = [family for family in families() if family.name in ("fully explicit", "fully explicit, suzuki4")]
@@ -120,3 +121,26 @@ def test_ctrl_c_keeps_the_runs(monkeypatch):
     with pytest.raises(Interrupted, match="interrupted after") as caught:
         tune(PROBLEM, 1e-3, 1.0, menu=SHORT_MENU)
     assert len(caught.value.done.rows) >= 2
+
+
+def test_cost_report(tmp_path):
+    report = cost_report(PROBLEM, "spring", tmp_path, t_end=1.0, errors=(1e-5, 1e-3), menu=SHORT_MENU)
+    text = report.path.read_text()
+    assert [answer.error for answer in report.rows] == [1e-3, 1e-5]
+    assert "What accuracy costs" in text
+    printed = " ".join(str(report).split())  # whatever the width of the terminal
+    assert "Runs to t = 1, with the largest errors of the positions on the way." in printed
+    large, small = report.reached
+    assert small.settings.command("spring") in text.replace("&#34;", '"')
+    assert small.error_q <= 1e-5
+    assert large.error_q <= 1e-3
+    assert large.seconds <= small.seconds
+    assert set(report.curves.schemes) == {family.name for family in SHORT_MENU}
+    for scheme in report.curves.schemes:  # a curve falls
+        assert all(a.error_q > b.error_q for a, b in pairwise(report.curves.curve(scheme)))
+    front = [row.seconds for row in report.curves.pareto()]
+    assert all(0 < seconds <= row for (seconds, _), row in zip(report.bound, front, strict=True))
+    assert {"cost.html", "cost.png", "cost_dark.png", "cost.csv"} <= {path.name for path in tmp_path.iterdir()}
+    assert default_t_end(PROBLEM) == pytest.approx(30 * 2 * np.pi / 20, rel=0.1)
+    with pytest.raises(ValueError, match="each of errors is -1"):
+        cost_report(PROBLEM, "spring", tmp_path, t_end=1.0, errors=(-1.0,))
