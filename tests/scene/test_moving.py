@@ -49,7 +49,7 @@ def motion_of(system, q_s, v_s):
     bob = by_hand.LENGTH * out + [x, 0.0], by_hand.LENGTH * SPIN * along + [rate, 0.0]
     start = q_s(x), bob[0], v_s(rate), bob[1]
     held = system.constraints(TIME, *start[:2]), system.constraint_rates(TIME, *start)
-    state = State(jnp.asarray(TIME), *start[:2], *legendre(system, *start))
+    state = State(jnp.asarray(TIME), *start[:2], *jax.jit(legendre)(system, *start))
     return held, jax.jit(motion)(system, state)
 
 
