@@ -22,7 +22,6 @@ from tests.support import (
     node,
     states_near,
 )
-from tests.verification.schemes import SCHEMES
 from vmri_jax import (
     Problem,
     Scheme,
@@ -38,6 +37,16 @@ from vmri_jax import (
     simulate,
 )
 from vmri_jax.diagnostics import fit_order, momentum_map, rotation_about, translation_along
+
+SCHEMES = {
+    f"{kind} alpha {alpha}": make(5, alpha)
+    for kind, make in (("explicit slow", explicit_slow), ("fully explicit", fully_explicit))
+    for alpha in (0.0, 1.0, 0.5)
+}
+SCHEMES["fully implicit"] = fully_implicit(5)
+SCHEMES |= {f"{rule} {degree}": galerkin(2, degree, rule) for rule in ("gauss", "lobatto") for degree in (1, 2, 3)}
+"""The schemes whose flow is verified."""
+
 
 # --- orders and errors -----------------------------------------------------------------------------------------------
 TRUTH = {"fpu": "fpu3_t1", "tsp": "tsp_t1"}
