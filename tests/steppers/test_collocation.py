@@ -124,7 +124,6 @@ COMPOSED = compose(galerkin(1, 2, "lobatto"), [0.5, -0.3, 0.8])
     ("name", "scheme", "macro_dt", "passes"),
     [
         ("tsp", galerkin(1, 3), 0.02, 9),
-        ("tsp", galerkin(1, 4, "lobatto"), 0.02, 9),
         pytest.param("sam", galerkin(1, 2), 0.01, 9, marks=pytest.mark.full),
         ("general", galerkin(1, 3), 0.1, 15),
         pytest.param("general", COMPOSED, 0.1, 15, marks=pytest.mark.full),

@@ -21,7 +21,7 @@ def frequency_errors(scheme: vm.Scheme, macro_dt: float) -> np.ndarray:
     return np.abs(np.sort(phases[phases > 0]) / macro_dt - exact)
 
 
-@pytest.mark.parametrize("num_micro", [1, 2, 5])
+@pytest.mark.parametrize("num_micro", [1, 5])
 def test_frequencies_are_of_order_four(num_micro):
     coarse, fine = (frequency_errors(vm.takahashi_imada(num_micro), macro_dt) for macro_dt in (0.01, 0.005))
     assert np.log2(coarse / fine) == pytest.approx(4, abs=0.2)

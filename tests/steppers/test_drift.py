@@ -44,8 +44,11 @@ SUZUKI = compose(fully_explicit(1), "suzuki4")
 
 @pytest.mark.parametrize(
     ("name", "scheme"),
-    [(name, fully_explicit(1)) for name in ("tsp", "sam")]
-    + [("general", SUZUKI), pytest.param("sam", SUZUKI, marks=pytest.mark.full)],
+    [
+        ("tsp", fully_explicit(1)),
+        ("general", SUZUKI),
+        *(pytest.param("sam", scheme, marks=pytest.mark.full) for scheme in (fully_explicit(1), SUZUKI)),
+    ],
 )
 def test_errors_are_within_the_tolerance(name, scheme, request):
     system, start = started(name, request)

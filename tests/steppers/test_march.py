@@ -40,7 +40,6 @@ def positions(run):
     [
         ("fpu", galerkin(4, 2), 0.1, 6),  # measured 5.1
         ("fpu", explicit_slow(4), 0.04, 2),
-        ("tsp", galerkin(3, 2, "lobatto"), 0.006, 5.5),  # measured 4.8
         ("tsp", galerkin(2, 3), 0.006, 5.5),  # measured 4.8
         ("tsp", fully_explicit(5), 0.02, 4.2),  # measured 3.8
         ("pendulum", explicit_slow(5), 0.01, 6.5),  # measured 5.9
