@@ -13,11 +13,11 @@ def _equations(system, scheme, slow, fast, t, macro_dt):
     """Derivatives of ``L_d`` and the work of forces by all control points, and constraints at them with their Jacobian."""
 
     def action(path):
-        free = textbook.discrete_lagrangian(system, scheme, *path, macro_dt)
+        free = textbook.discrete_lagrangian(system, scheme, path[0], path[1], macro_dt)
         return free + textbook.virtual_work(system, scheme, path, (slow, fast), t, macro_dt)
 
     def constraints(path):
-        rows = textbook.constraints(system, scheme, *path, t, macro_dt)
+        rows = textbook.constraints(system, scheme, path[0], path[1], t, macro_dt)
         return jnp.concatenate([jnp.ravel(values) for values in rows])
 
     path = slow, fast
