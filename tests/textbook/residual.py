@@ -25,7 +25,7 @@ def _equations(system, scheme, slow, fast, t, macro_dt):
 
 
 def residual(system, scheme, run: Trajectory, macro_dt) -> float:
-    """Largest part, over the largest momentum, of the slots that no constraint forces balance; or largest constraint, if it is larger.
+    """Largest part, over the largest momentum, of the slots that no constraint forces balance; or largest constraint or rate of one, if it is larger.
 
     With ``d = (p + D_first A, D_inner A, D_last A - p+)`` without multipliers, a step solves ``d = C^T lambda`` for some lambda, where
     C is the Jacobian of all constraints by the control points.
@@ -38,7 +38,7 @@ def residual(system, scheme, run: Trajectory, macro_dt) -> float:
     """
     assert scheme.degree == 1
     q_s, q_f, p_s, p_f = (np.asarray(getattr(run, name)) for name in NAMES)
-    worst, largest = 0.0, np.abs(np.hstack([p_s, p_f])).max()
+    worst, largest = float(np.max(run.constraint_residual)), np.abs(np.hstack([p_s, p_f])).max()
     for k, inner in enumerate(np.asarray(run.q_f_micro)):
         (d_slow, d_fast), values, jacobian = _equations(
             system, scheme, q_s[k : k + 2], np.vstack([q_f[k], inner]), run.t[k], macro_dt

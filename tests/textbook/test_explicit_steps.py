@@ -2,9 +2,13 @@
 
 from random import Random
 
+import numpy as np
 import pytest
 
-from tests.textbook.agreement import SPRINGS, assert_agrees
+import vmri_jax as vm
+from benchmarks.gail2014.dense import named
+from tests.textbook.agreement import BOUND, SPRINGS, STEPS, assert_agrees
+from tests.textbook.residual import residual
 from tests.verification import random_systems as rs
 from vmri_jax import Method, textbook
 
@@ -42,6 +46,18 @@ STRUCTURES = {
 def test_steppers_solve_the_equations_of_the_textbook(name):
     method, structure = STRUCTURES[name]
     assert_agrees(name, structure, method)
+
+
+def test_the_residual_sees_a_millionth():
+    structure = STRUCTURES["explicit"][1]
+    draw = rs.tame_draw(Random("explicit 0"), structure)
+    system, scheme = rs.problem(structure, draw).system, rs.scheme(structure, draw)
+    start, save = rs.problem(structure, draw).state(), vm.Save(micro=True)
+    run = vm.simulate(system, scheme, start, macro_dt=draw.macro_dt, num_steps=STEPS, save=save, solver=named("auto"))
+    assert residual(system, scheme, run, draw.macro_dt) < BOUND
+    moved = np.array(run.p_f)
+    moved[2] *= 1 + 1e-6
+    assert residual(system, scheme, run.with_arrays(p_f=moved), draw.macro_dt) > 1e-8
 
 
 def test_textbook_leaves_mollified_kicks_out():
