@@ -7,6 +7,7 @@ The plan chooses the cheapest stepper that the rules and the system allow, from 
 * *decoupled*: where no term but kicks couples slow and fast variables, the slow variables make one step over the macro interval and the
   fast variables num_micro steps over the micro intervals; each part is planned like a whole system. Potentials on every k-th micro
   node kick between groups of k fast steps (*repeated*);
+* *joined*: on one micro interval slow and fast unknowns are of one kind, so that all variables count as fast;
 * *free flight*: only kinetic energy of constant masses is left;
 * *linear*: only fast variables with linear equations are left;
 * else an iteration, by the matrix of `Solver`: masses and constraints, for the multipliers of a drift alone (*Rattle*) or for the micro
@@ -37,7 +38,7 @@ from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.collocation import Collocation
 from vmri_jax.steppers.composed import Composed
 from vmri_jax.steppers.custom import check_shapes, whole_step
-from vmri_jax.steppers.decoupled import Decoupled
+from vmri_jax.steppers.decoupled import Decoupled, Joined
 from vmri_jax.steppers.direct import FreeFlight, Linear
 from vmri_jax.steppers.interval import SMALL, Interval, implicit_terms
 from vmri_jax.steppers.kicked import Kicked, Repeated, average_over_fast_motion
@@ -47,7 +48,7 @@ from vmri_jax.steppers.rattle import Rattle
 from vmri_jax.steppers.solved import Solved, StepSolver
 from vmri_jax.steppers.solver import Solver
 from vmri_jax.steppers.stepper import StepInfo, Stepper, indented
-from vmri_jax.steppers.subsystems import fast_part, frozen_slow, slow_part
+from vmri_jax.steppers.subsystems import fast_part, frozen_slow, joined, slow_part
 
 Parts = tuple[list[Placed], dict[int, list[Placed]]]
 """Potentials of the slow variables, on the macro grid, and of the fast variables, by the number k of micro intervals that a copy of their rule
@@ -193,6 +194,11 @@ def _between_kicks(system: System, scheme: Scheme, choice: _Choice, q_s, q_f) ->
     if solver.stepper is not None:
         custom = solver.stepper.called(system, scheme)
         return Solved(system, scheme, custom, rows, choice.reverse_only)
+    if scheme.num_micro == 1 and q_s.size:
+        n_g, _ = system.num_constraints(q_s, q_f)
+        q = jnp.concatenate([q_s, q_f])
+        inner = _between_kicks(*joined(system, scheme, q_s.size), choice, jnp.zeros(0), q)
+        return Joined(inner, q_s.size, n_g)
     if not can_be_nested or solver.matrix in ("exact", "null_space"):
         n_g, n_gs = system.num_constraints(q_s, q_f)
         first = "exact" if system.has_constant_mass else "masses"
@@ -202,14 +208,14 @@ def _between_kicks(system: System, scheme: Scheme, choice: _Choice, q_s, q_f) ->
     interval = Interval.of(system, scheme, q_s, q_f)
     if _is_linear(system, scheme, interval, q_s):
         return Linear(system, scheme, interval)
-    approximate = _approximate(system, scheme, solver, interval, rows, q_f.size or q_s.size)
+    approximate = _approximate(system, scheme, solver, interval, rows, q_f.size)
     return Solved(system, scheme, approximate, rows, choice.reverse_only)
 
 
 def _approximate(
     system: System, scheme: Scheme, solver: Solver, interval: Interval, rows: Sparsity, size: int
 ) -> StepSolver:
-    """The matrix "masses" or "modes", or the first one of "auto", for constant masses; `size` is the number of variables of an interval."""
+    """The matrix "masses" or "modes", or the first one of "auto", for constant masses; `size` is the number of fast variables."""
     small = size <= SMALL  # Nested keeps a larger matrix over many steps, Collocation does not
     chosen = COLLOCATES and small and not interval.is_diagonal and _has_modes(system, scheme)
     if solver.matrix == "modes" or (solver.matrix == "auto" and chosen):
