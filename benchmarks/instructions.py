@@ -84,6 +84,7 @@ PROGRAMS: dict[str, Program] = {
     "FPU, fully_implicit(5)": Program(FPU, vm.fully_implicit(5), 3090),
     "FPU, fully_implicit(5), exact matrices": Program(FPU, vm.fully_implicit(5), 3470, "exact"),
     "TSP, fully_explicit(5)": Program(TSP, vm.fully_explicit(5), 3920),
+    "TSP, fully_implicit(1)": Program(TSP, vm.fully_implicit(1), 3300),
     "TSP, fully_implicit(5)": Program(TSP, vm.fully_implicit(5), 4610),
     "TSP, fully_implicit(5), exact matrices": Program(TSP, vm.fully_implicit(5), 5230, "exact"),
     "SAM, fully_implicit(5)": Program(SAM, vm.fully_implicit(5), 6470),

@@ -194,11 +194,9 @@ def _between_kicks(system: System, scheme: Scheme, choice: _Choice, q_s, q_f) ->
     if solver.stepper is not None:
         custom = solver.stepper.called(system, scheme)
         return Solved(system, scheme, custom, rows, choice.reverse_only)
-    if scheme.num_micro == 1 and q_s.size:
-        n_g, _ = system.num_constraints(q_s, q_f)
-        q = jnp.concatenate([q_s, q_f])
-        inner = _between_kicks(*joined(system, scheme, q_s.size), choice, jnp.zeros(0), q)
-        return Joined(inner, q_s.size, n_g)
+    if q_s.size and _joins(system, scheme, solver, q_s.size, q_f.size):
+        (n_g, _), q = system.num_constraints(q_s, q_f), jnp.concatenate([q_s, q_f])
+        return Joined(_between_kicks(*joined(system, scheme, q_s.size), choice, jnp.zeros(0), q), q_s.size, n_g)
     if not can_be_nested or solver.matrix in ("exact", "null_space"):
         n_g, n_gs = system.num_constraints(q_s, q_f)
         first = "exact" if system.has_constant_mass else "masses"
@@ -210,6 +208,16 @@ def _between_kicks(system: System, scheme: Scheme, choice: _Choice, q_s, q_f) ->
         return Linear(system, scheme, interval)
     approximate = _approximate(system, scheme, solver, interval, rows, q_f.size)
     return Solved(system, scheme, approximate, rows, choice.reverse_only)
+
+
+def _joins(system: System, scheme: Scheme, solver: Solver, n_s: int, n_f: int) -> bool:
+    """Whether slow and fast variables are unknowns of one kind: on one micro interval, where the nested iteration does not keep to smaller matrices.
+
+    Of many variables it keeps a matrix of the fast ones alone, and it solves for slow variables alone by their masses.
+    """
+    nested = _can_be_nested(system, scheme) and solver.matrix in ("auto", "masses") and not _is_drift(system, scheme)
+    is_small = n_s + n_f <= SMALL and (n_f > 0 or _has_modes(system, scheme))
+    return scheme.num_micro == 1 and (is_small or not nested)
 
 
 def _approximate(
