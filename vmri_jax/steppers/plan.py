@@ -26,7 +26,6 @@ import jax.numpy as jnp
 from vmri_jax.kernels import COLLOCATES, DRIFTS
 from vmri_jax.kernels.band import Sparsity
 from vmri_jax.mechanics.constraint_pattern import all_rows
-from vmri_jax.mechanics.projection import project_momentum
 from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.mechanics.structure import depends_on
 from vmri_jax.mechanics.system import System
@@ -72,14 +71,12 @@ class Plan:
     Attributes:
         system, scheme, solver: arguments of `plan`.
         stepper: the tree of steppers.
-        sparsity: of ``G M^-1 G^T`` with all constraints, for `project`.
     """
 
     system: System
     scheme: Scheme | Composition
     solver: Solver
     stepper: Stepper
-    sparsity: Sparsity
 
     def init(self, state: State, macro_dt):
         """The memory of the first step."""
@@ -88,17 +85,6 @@ class Plan:
     def step(self, state: State, memory, macro_dt) -> tuple[State, StepInfo, Any]:
         """One macro step."""
         return self.stepper.step(state, memory, macro_dt)
-
-    def project(self, state: State) -> State:
-        """The state with its momenta projected onto the hidden constraints, ``G v + dg/dt = 0``.
-
-        A step depends on the momentum through ``h p - G_0^T mu`` alone. A projection ``p - G_0^T nu`` at its start changes mu, and not the motion:
-        only momenta that are saved are projected.
-        """
-        if not self.system.is_constrained:
-            return state
-        p_s, p_f, *_ = project_momentum(self.system, state, sparsity=self.sparsity)
-        return State(state.t, state.q_s, state.q_f, p_s, p_f)
 
     @property
     def has_fallback(self) -> bool:
@@ -161,7 +147,7 @@ def plan(
         check_shapes(stepper, system, stage, state)
     if isinstance(scheme, Composition):
         stepper = Composed(scheme.coefficients, stepper)
-    return Plan(system, scheme, solver, stepper, all_rows(system, state.q_s, state.q_f))
+    return Plan(system, scheme, solver, stepper)
 
 
 def _solvers(stepper: Stepper) -> list[StepSolver]:
