@@ -116,7 +116,8 @@ def joined(system: System, scheme: Scheme, num_slow: int) -> tuple[System, Schem
         num_slow: number of slow variables.
     """
     inside = [(term, rule) for term, rule in placed_potentials(system, scheme) if not rule.only_ends]
-    functions, potentials = {}, {}
+    functions: dict[Any, Any] = {}
+    potentials: dict[Any, Any] = {}
     for term in [*(term for term, _ in inside), *system.of_kind("force")]:
         place, name = (potentials, term.name) if term.field == "potentials" else (functions, term.field)
         place[name] = OfJoined((term,), term.arguments, num_slow)
