@@ -129,7 +129,7 @@ def joined(system: System, scheme: Scheme, num_slow: int) -> tuple[System, Schem
         kinetic = OfJoined(system.of_kind("kinetic"), KINDS["kinetic"].arguments, num_slow)
     together = System(kinetic, **functions, params=system.params, potentials=potentials)
 
-    rules: dict[str, Any] = {"slow": scheme.kinetic, "fast": scheme.kinetic, "potentials": {}}
+    rules: dict[Any, Any] = {"slow": scheme.kinetic, "fast": scheme.kinetic, "potentials": {}}
     for term, rule in inside:
         place, name = (rules["potentials"], term.name) if term.field == "potentials" else (rules, RATE_OF[term.name])
         place[name] = micro(rule.rule)
