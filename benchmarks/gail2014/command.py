@@ -9,7 +9,7 @@ from rich.markup import escape
 from benchmarks.gail2014.reference import reference_figures
 from benchmarks.gail2014.report import FigureResult, choose_figures, reproduce
 from benchmarks.measure import prepare
-from vmri_jax.cli.common import BadInput, console, print_failure
+from vmri_jax.cli.common import check_target, console, print_failure
 from vmri_jax.running.progress import progress_shown
 
 
@@ -23,13 +23,8 @@ def gail2014(
     """Run the reference study of Gail et al. (2014): figures, tables and out/report.html."""
     prepare()
     size = "full" if full else "quick"
-    try:
-        choose_figures(reference_figures(size), only or [])
-        out.mkdir(parents=True, exist_ok=True)
-    except ValueError as error:
-        raise BadInput(str(error)) from error
-    except OSError as error:
-        raise BadInput(f"--out {out}: {error.strerror}; give a folder that can be written.") from error
+    choose_figures(reference_figures(size), only or [])
+    check_target("--out", out)
     with progress_shown() as show:
         report = reproduce(out, size, only or [], show, _figure_done)
     console.print("\n" + escape("\n".join(report.in_five_lines())), soft_wrap=True)

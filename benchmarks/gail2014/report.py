@@ -11,6 +11,7 @@ from pathlib import Path
 from benchmarks.gail2014.figures import SETTLED, Check, ConvergenceFigure, CostFigure
 from benchmarks.gail2014.reference import reference_figures
 from vmri_jax import plots
+from vmri_jax.refusals import Refused
 from vmri_jax.running.progress import Progress, part, silent
 from vmri_jax.study.html import embedded, write_page
 
@@ -104,7 +105,7 @@ def choose_figures(
     names = [figure.name for figure in figures]
     unknown = [name for name in only if name not in names]
     if unknown:
-        raise ValueError(f"reproduce: no figure {', '.join(map(repr, unknown))}; there are {', '.join(names)}.")
+        raise Refused(f"reproduce: no figure {', '.join(map(repr, unknown))}; there are {', '.join(names)}.")
     return [figure for figure in figures if figure.name in (only or names)]
 
 

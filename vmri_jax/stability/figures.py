@@ -33,7 +33,7 @@ def plot_stability(maps: Mapping[str, StabilityMap], title: str = "", theme: The
     colors = ScalarMappable(LogNorm(*GROWTHS_SHOWN, clip=True), shades)
     size = max(5.2, 0.9 + 2.9 * columns), 0.9 + height * math.ceil(len(maps) / columns)
     with new_figure(*size, title, theme) as figure:
-        panels = panel_grid(figure, len(maps), columns)
+        panels = panel_grid(figure, len(maps), columns, r"$\omega H / \pi$")
         for axes, (name, stability) in zip(panels, maps.items(), strict=True):
             over_numbers = stability.axis == "system" and all(isinstance(row, float) for row in stability.rows)
             y = np.array(stability.rows, dtype=float) if over_numbers else np.arange(len(stability.rows))
@@ -48,8 +48,6 @@ def plot_stability(maps: Mapping[str, StabilityMap], title: str = "", theme: The
                 axes.grid(axis="y", visible=False)
             if all(isinstance(row, int) for row in stability.rows):
                 axes.set(ylabel="micro steps per macro step")
-        for axes in panels[-columns:]:
-            axes.set(xlabel=r"$\omega H / \pi$")
         figure.colorbar(colors, ax=panels.tolist(), label="growth per macro step\n(blank: stable)", aspect=30, pad=0.01)
     return figure
 
