@@ -26,7 +26,7 @@ from benchmarks import (
     tricks,
     tuned,
 )
-from benchmarks.gail2014.command import gail2014
+from benchmarks.gail2014.report import gail2014
 from benchmarks.hard_cases import hard
 from benchmarks.measure import prepare
 from benchmarks.report import console

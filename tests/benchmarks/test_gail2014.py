@@ -206,7 +206,7 @@ def test_progress_runs_over_all_figures(made):
 def gail2014(tmp_path, monkeypatch):
     """Runs ``python -m benchmarks gail2014`` in an empty folder: (exit code, everything printed)."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("benchmarks.gail2014.command.prepare", lambda: None)
+    monkeypatch.setattr("benchmarks.gail2014.report.prepare", lambda: None)
     (tmp_path / "a_file").write_text("")
 
     def run(*arguments):
