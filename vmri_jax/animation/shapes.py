@@ -27,6 +27,8 @@ TRAIL_POINTS = (160, 2000)
 SHADOW = "#000000"
 NAME_SIZE = 7.5
 """Font size of the names of bodies, in points."""
+Place = tuple[float, float, float, float]
+"""Left, bottom, width and height of a panel, in parts of the figure."""
 
 
 @dataclass(frozen=True)
@@ -50,22 +52,9 @@ class Stage:
         aspect = float(np.clip((high[0] - low[0]) / (high[1] - low[1]), 0.5, 8.0))
         return cls(motion, sizes, start.fitted(sizes.hull, radius, aspect), aspect, theme)
 
-    def draw(
-        self,
-        figure: Figure,
-        place: tuple[float, float, float, float],
-        time: float,
-        trail: float,
-        *,
-        names: bool = False,
-    ) -> None:
-        """Draw one moment in a figure in the style of the theme.
-
-        Args:
-            place: left, bottom, width and height of the panel, in parts of the figure.
-            trail: duration of the trail behind each body.
-            names: whether to write names beside bodies where there is room.
-        """
+    def draw(self, figure: Figure, place: Place, time: float, trail: float, *, names: bool = False) -> None:
+        """Draw one moment, with trails of this duration, in a figure in the style of the theme; with `names` beside
+        bodies where there is room."""
         figure.set_layout_engine("none")
         axes = figure.add_axes(place)
         axes.set_axis_off()

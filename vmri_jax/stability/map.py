@@ -1,4 +1,4 @@
-"""Stability maps and their figures: the stable macro steps of a scheme, over ``omega H`` and over schemes or systems."""
+"""Stability maps and figures: the stable macro steps of a scheme, over ``omega H`` and over schemes or systems."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
