@@ -198,16 +198,17 @@ class Bindable(ABC):
         terms = []
         for group in self.by_size(select):
             roles = zip(POINTS, zip(*(self.attached[i] for i in group), strict=True), strict=False)
-            terms.append(self._term(self.function, [self._role(*role, layout.bodies) for role in roles], group))
+            terms.append(self._term([self._role(*role, layout.bodies) for role in roles], group))
         return tuple(terms)
 
-    def _term(self, function: Any, roles: Iterable[Role], group: Sequence[int]) -> EffectTerm:
-        """A function of some elements as a term."""
+    def _term(self, roles: Iterable[Role], group: Sequence[int], through: Any = None) -> EffectTerm:
+        """Some elements as a term."""
         select = None if len(group) == len(self.elements) else tuple(group)
         split, sources = self.split_of(self.parameters), (Source(self.name, len(group), select),)
+        function = self.function
         # A function of the user may be right for a single element alone; no parameter may be common to all elements.
         is_joined = is_of_package(function) and len(split) == len(self.parameters)
-        return EffectTerm(sources, function, tuple(roles), split, self.timed, is_joined)
+        return EffectTerm(sources, function, tuple(roles), split, self.timed, is_joined, through)
 
     def _role(self, parameter: str, names: Sequence[str], places: Mapping[str, Place]) -> Role:
         """The map from q_s and q_f to the coordinates of the bodies of a role, all of the same kind, or to points in them, which are a parameter."""

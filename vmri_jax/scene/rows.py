@@ -87,7 +87,7 @@ def _derivatives(
     x = q[columns] + (steps if columns.ndim == 1 else steps[:, None])
     parts = np.split(x, np.cumsum([of_role.shape[-1] for of_role in of_roles])[:-1], axis=-1)
     params = term.params_of(params)
-    points = tuple(role.of_bodies(x, params) for role, x in zip(term.roles, parts, strict=True))
+    points = term.of_roles([role.of_bodies(x, params) for role, x in zip(term.roles, parts, strict=True)], params)
     values = np.asarray(term.function(*((np.asarray(t),) if term.timed else ()), points, params))
     columns = np.atleast_2d(columns)
     values = values.reshape(*columns.shape[::-1], -1)  # of each step, element, and row of the element

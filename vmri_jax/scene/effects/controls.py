@@ -132,8 +132,12 @@ class ControlledJoint(InJoint):
     kind = "control"
     counts_turns = False
 
+    @staticmethod
+    def function(q, u, params):
+        (x,) = q
+        return (u.reshape(x.shape),)
+
     def check_bodies(self):
-        super().check_bodies()
         count = len(self.elements)
         self.require(count == 1, f"the number of pairs of {self.joint.name}", count, "give each pair its own joint")
 

@@ -4,7 +4,7 @@ For the letters see `vmri_jax.scene.effects.joints`.
 """
 
 from abc import abstractmethod
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
 from typing import Any, ClassVar
 
@@ -14,15 +14,16 @@ import numpy as np
 from vmri_jax.mechanics.arrays import is_concrete, library, real_array
 from vmri_jax.mechanics.kinematics import Move
 from vmri_jax.mechanics.names import unknown
+from vmri_jax.mechanics.rows import Rows
 from vmri_jax.refusals import Refused
 from vmri_jax.scene.body import GROUND, GROUND_COORDINATES, Attachment, body_of, label_of
 from vmri_jax.scene.declare import effect_class, names, stacked
 from vmri_jax.scene.effect import START, Effect
-from vmri_jax.scene.effects.freedoms import FREEDOMS, IN_REACH, Freedom
-from vmri_jax.scene.layout import Key
+from vmri_jax.scene.effects.freedoms import COORDINATE, FREEDOMS, IN_REACH, Freedom, freedoms_of
+from vmri_jax.scene.layout import Key, Layout
 from vmri_jax.scene.products import FRAME, products
 from vmri_jax.scene.rigid import RigidBody
-from vmri_jax.scene.terms import Applied
+from vmri_jax.scene.terms import Applied, EffectTerm, Role
 
 GAP = (("D", "x"), ("D", "y"), ("D", "z"))
 """Rows that keep the points of both bodies at one place: the components of D along the axes of space."""
@@ -248,7 +249,7 @@ def freedom_of(joint: Joint, of: str, about: str = "") -> Freedom:
 
 @effect_class
 class OfFreedoms(Effect):
-    """Base class of effects that are functions of freedoms of joints alone."""
+    """Base class of effects whose functions get freedoms of joints, () each or (n,) of n elements, as q, and their rates as v."""
 
     whole = True
     same_size = False
@@ -264,6 +265,35 @@ class OfFreedoms(Effect):
     def by_directors(self, freedom: Freedom) -> str:
         """The name in `FREEDOMS` of a freedom that is no coordinate of the scene."""
         return IN_REACH.get(freedom, freedom) if self.counts_turns else freedom
+
+    def positions(self, group):
+        """The freedoms at the positions in `bodies`, which are zero."""
+        return tuple(np.zeros(len(group)) if len(group) > 1 else np.zeros(()) for _ in self.freedoms_of(group[0]))
+
+    def terms(self, select, layout):
+        groups: dict[Any, list[int]] = {}
+        for number, group in enumerate(self.by_size(select)):
+            for i in group:
+                free = tuple(key in layout.freedoms for key in self.freedoms_of(i))
+                # elements whose freedoms are all coordinates are one term, whatever their bodies are
+                groups.setdefault((free, None if all(free) else number), []).append(i)
+        return tuple(self._along(free, group, layout) for (free, _), group in groups.items())
+
+    def _along(self, free: Sequence[bool], group: Sequence[int], layout: Layout) -> EffectTerm:
+        """Some elements as a term; `free` says which of their freedoms are coordinates."""
+        roles, freedoms = [], []
+        for j, is_coordinate in enumerate(free):
+            keys = [self.freedoms_of(i)[j] for i in group]
+            freedoms.append(COORDINATE if is_coordinate else self.by_directors(keys[0][2]))
+            if is_coordinate:
+                roles.append(Role(Rows.of([layout.freedoms[key] for key in keys]), len(group), 1))
+                continue
+            for role in (2 * j, 2 * j + 1):
+                roles.append(self._role("", [self.elements[i][role] for i in group], layout.bodies))
+        return self._term(roles, group, Applied(freedoms_of, (tuple(freedoms),)))
+
+    def check_bodies(self):
+        """Nothing: the joints check their bodies themselves."""
 
 
 def _triad(axis):
