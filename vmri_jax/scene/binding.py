@@ -6,12 +6,10 @@ from dataclasses import field, fields, replace
 from functools import cached_property
 from typing import Any, ClassVar, Literal, Self
 
-import numpy as np
-
 from vmri_jax.mechanics.arrays import library
 from vmri_jax.mechanics.rows import Place, Rows
 from vmri_jax.refusals import Refused
-from vmri_jax.scene.body import GROUND, Attachment, Bodies, Point, body_of, end_of, label_of, moving
+from vmri_jax.scene.body import GROUND, Attachment, Bodies, Point, body_of, end_of, label_of, moving, weights_of
 from vmri_jax.scene.declare import Elements, Parameter, effect_class, real_tree, stacked
 from vmri_jax.scene.layout import Key, Layout
 from vmri_jax.scene.terms import EffectTerm, Role, Source, choose, is_of_package
@@ -134,11 +132,8 @@ class Bindable(ABC):
         """For each role with points fixed in rigid bodies, the components X of these points along the directors; zeros for whole bodies."""
         points = {}
         for parameter, role in zip(POINTS, zip(*self.elements, strict=True), strict=False):
-            offsets = [getattr(name, "offset", None) for name in role]
-            if any(offset is not None for offset in offsets):
-                bodies = [body_of(self.by_name, name) for name in role]
-                ends = zip(bodies, offsets, strict=True)
-                points[parameter] = stacked([np.zeros(3) if x is None else body.weights(x) for body, x in ends])
+            if any(isinstance(name, Attachment) for name in role):
+                points[parameter] = stacked([weights_of(self.by_name, name) for name in role])
         return points
 
     def at_start(self, params: Mapping[str, Any]):

@@ -6,10 +6,9 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.mechanics.arrays import is_concrete, real_array
+from vmri_jax.mechanics.arrays import is_concrete, library, real_array
 from vmri_jax.refusals import Refused
 
 Pace = Literal["slow", "fast", "auto"]
@@ -139,10 +138,12 @@ class AnyBody(ABC):
         if self.pace not in ("slow", "fast", "auto"):
             raise Refused(f"{kind} {self.name}: pace is {self.pace!r}; it must be 'slow', 'fast' or 'auto'.")
 
-    def _numbers(self, name: str, argument):
+    def _numbers(self, name: str, argument, shape: tuple[int, ...] | None = None):
         """An argument as an array of float64; of NumPy unless it is traced, so that the precision does not depend on JAX's mode."""
         about = f"{type(self).__name__} {self.name}: {name}"
         numbers = real_array(about, argument)
+        if shape not in (None, numbers.shape):
+            raise Refused(f"{about} has shape {numbers.shape}; give {shape}.")
         if not is_concrete(numbers):
             return numbers
         if not np.isfinite(numbers).all():
@@ -276,10 +277,7 @@ class Frame(AnyBody):
 
     def __post_init__(self):
         self._check_names()
-        position = self._numbers("position", self.position)
-        if position.shape != (3,):
-            raise Refused(f"Frame {self.name}: position has shape {position.shape}; give (3,).")
-        object.__setattr__(self, "position", position)
+        object.__setattr__(self, "position", self._numbers("position", self.position, (3,)))
 
     @property
     def coordinates(self):
@@ -308,6 +306,12 @@ def end_of(bodies: Bodies, name: str, whole: bool = False) -> Point:
     return body.point(offset)
 
 
+def weights_of(bodies: Bodies, name: str) -> Any:
+    """(3,) components of the point in a body that a name stands for, see `AnyBody.weights`; zeros for the body itself."""
+    offset = getattr(name, "offset", None)
+    return np.zeros(3) if offset is None else body_of(bodies, name).weights(offset)
+
+
 def joined(vectors):
     """Vectors one after the other in one array; of NumPy unless an entry is traced."""
-    return np.concatenate(vectors) if is_concrete(vectors) else jnp.concatenate(vectors)
+    return library(vectors).concatenate(vectors)

@@ -94,10 +94,8 @@ class RigidBody(AnyBody):
         moments, axes = self._principal(tensor)
         fields = {"mass": mass, "shape": shape, "moments": moments, "axes": axes}
         for name in ("position", "velocity", "spin"):
-            value = np.zeros(3) if getattr(self, name) is None else self._numbers(name, getattr(self, name))
-            if value.shape != (3,):
-                raise Refused(f"RigidBody {self.name}: {name} has shape {value.shape}; give (3,).")
-            fields[name] = value
+            value = getattr(self, name)
+            fields[name] = np.zeros(3) if value is None else self._numbers(name, value, (3,))
         fields["rotation"] = self._matrix()
         for name, value in fields.items():
             object.__setattr__(self, name, value)
@@ -304,9 +302,7 @@ def matrix_of(rotation):
 
 def _cross_matrix(u):
     """The matrix of ``x -> u x x``."""
-    zero = u[0] * 0
-    rows = [[zero, -u[2], u[1]], [u[2], zero, -u[0]], [-u[1], u[0], zero]]
-    return np.array(rows) if is_concrete(u) else jnp.array(rows)
+    return library(u).cross(np.eye(3), u)
 
 
 def rotation(q):

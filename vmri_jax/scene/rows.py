@@ -17,7 +17,7 @@ from vmri_jax.mechanics.names import Names
 from vmri_jax.scene.body import LARGEST_POINT, label_of
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.effects.freedoms import ANGLES
-from vmri_jax.scene.functions import function_of
+from vmri_jax.scene.functions import ConstraintValues
 from vmri_jax.scene.rates import positions
 from vmri_jax.scene.sorting import HOMES, Home, Placed, Sorting
 from vmri_jax.scene.terms import EffectTerm, Role
@@ -101,8 +101,7 @@ def _columns(role: Role, num_slow: int) -> np.ndarray:
     """Numbers in (Q_s, Q_f) of the coordinates of a role, (n, c), or (c,) of a single element; none for the ground."""
     if role.rows is None:
         return np.zeros((0,) if role.count == 1 else (role.count, 0), int)
-    starts = np.array([place.start + (num_slow if place.part == "f" else 0) for place in role.rows.places])
-    columns = starts[:, None] + np.arange(role.rows.size)
+    columns = np.stack([place.numbers(num_slow)[: role.rows.size] for place in role.rows.places])
     return columns[0] if role.rows.single else columns
 
 
@@ -156,7 +155,7 @@ class ConstraintRows:
         """Values g (k,) and Jacobian dg/dq (k, n) at a time and at positions (n,)."""
         q_bodies, by_coordinates = self.sorting.to_bodies(q)
         n_s, others = self.sorting.layout.ends[0], [term for term, is_analytic in self.terms if not is_analytic]
-        functions = [TracedOnce(function_of("constraint", (term,))) for term in others]
+        functions = [TracedOnce(ConstraintValues("constraint", (term,))) for term in others]
         arguments = self.params, float(t), q_bodies[:n_s], q_bodies[n_s:]
         of_others = iter(jax.device_get(_compiled_derivatives(functions, *arguments)) if others else ())
         parts = [

@@ -6,7 +6,7 @@ All classes here are compared by value: scenes of the same structure give equal 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
-from itertools import chain, groupby
+from itertools import chain
 from operator import add
 from typing import Any, NamedTuple
 
@@ -214,17 +214,16 @@ def _rows(numbers, count: int):
 
 def joined(terms: Iterable[Any], in_order: bool = False) -> tuple[Any, ...]:
     """The terms, with one term in place of several of one kind; if `in_order`, of neighbours alone, so that the elements keep their order."""
-    numbers: dict[Any, int] = {}
-    keyed = [(numbers.setdefault(_kind(term), len(numbers)), term) for term in terms]
-    groups = groupby(keyed if in_order else sorted(keyed, key=lambda pair: pair[0]), key=lambda pair: pair[0])
-    return tuple(_as_one([term for _, term in group]) for _, group in groups)
-
-
-def _kind(term) -> Any:
-    """Equal for terms of several effects that can be one term."""
-    if not getattr(term, "is_joined", False):
-        return id(term)
-    return term.function, term.through, tuple(role.kind for role in term.roles), term.split, term.timed
+    groups: dict[Any, list] = {}
+    last, run = None, 0
+    for term in terms:
+        kind: Any = id(term)
+        if getattr(term, "is_joined", False):
+            kind = term.function, term.through, tuple(role.kind for role in term.roles), term.split, term.timed
+        run += in_order and kind != last
+        groups.setdefault((run, kind), []).append(term)
+        last = kind
+    return tuple(map(_as_one, groups.values()))
 
 
 def _as_one(terms: Sequence[Any]) -> Any:
@@ -252,8 +251,3 @@ def total(values: Sequence):
 def totals(pairs: Sequence):
     """Sum of pairs (slow, fast): the pair of the sums."""
     return tuple(total(parts) for parts in zip(*pairs, strict=True))
-
-
-def concatenated(values: Sequence):
-    """One vector of arrays of any shape."""
-    return jnp.concatenate([jnp.ravel(value) for value in values])

@@ -75,8 +75,6 @@ class Bending(_AmongPoints):
     between: Any = names(3)
     stiffness: Any = positive()
 
-    default_name = "bending"
-
     @staticmethod
     def function(q, params):
         return jnp.sum(params["stiffness"] * (1 + cosine(q)))
@@ -100,7 +98,6 @@ class Torsion(_AmongPoints):
     angle: Any = number(default=0.0)
     multiplicity: Any = positive(default=1)
 
-    default_name = "torsion"
     dimensions = (3,)
 
     @staticmethod

@@ -5,12 +5,11 @@ from dataclasses import KW_ONLY
 from typing import Any, Literal
 
 import jax.numpy as jnp
-import numpy as np
 
 from vmri_jax.mechanics.arrays import real_array
 from vmri_jax.mechanics.names import AXES
 from vmri_jax.refusals import Refused
-from vmri_jax.scene.body import Attachment, body_of, entry, is_entry, label_of
+from vmri_jax.scene.body import Attachment, body_of, entry, is_entry, label_of, weights_of
 from vmri_jax.scene.declare import effect_class, names, vector
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.effects.joint_base import Joint
@@ -94,7 +93,7 @@ class Controlled(Effect):
         if self.along is not None:
             params["along"] = self.declared["along"].array(f"{self.name}: along", self.along, [body.point()])
         if body.rigid:
-            params["point"] = body.weights(name.offset if isinstance(name, Attachment) else np.zeros(3))
+            params["point"] = weights_of(self.by_name, name)
         return params
 
     def check_bodies(self):

@@ -80,7 +80,6 @@ class Drive(Effect):
     params: Any = field(default_factory=dict)
 
     kind = "force"
-    default_name = "drive"
 
     @property
     def function(self):

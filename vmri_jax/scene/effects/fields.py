@@ -24,7 +24,6 @@ class Gravity(Effect):
     bodies: Any = names(default=None)
 
     kind = "potential"
-    default_name = "gravity"
     masses = ("mass",)
 
     @staticmethod

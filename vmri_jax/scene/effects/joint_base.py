@@ -56,10 +56,8 @@ class Joint(Effect):
     """Pairs of vectors whose scalar products are the rows: of the gap D, both triads, and the axes x, y, z of space."""
     carries: ClassVar[bool] = False
     """Whether the joint can carry a body, whose position is then a function of the freedoms: these must be coordinates without a singularity."""
-    moves: ClassVar[tuple[Move, ...]] = ()
-    """The motions of the triad of b against the triad of a, one for each freedom, applied one after the other."""
-    freedoms: ClassVar[tuple[Freedom, ...]] = ()
-    """Names of the freedoms, in the order of `moves`."""
+    freedoms: ClassVar[dict[Freedom, Move]] = {}
+    """For each freedom the motion of the triad of b against the triad of a; the motions are applied one after the other."""
 
     def _elements(self):
         return tuple(tuple(map(str, element)) for element in super()._elements())
@@ -80,7 +78,7 @@ class Joint(Effect):
     @cached_property
     def frames(self) -> dict[str, Any]:
         """Points and triads as components along the directors of each body: "point_a", "point_b", "frame_a", "frame_b"."""
-        return {name: values if len(self.elements) > 1 else values[0] for name, values in self._components.items()}
+        return {name: stacked([*values]) for name, values in self._components.items()}
 
     def _factors(self) -> dict[str, Any]:
         """The numbers of the rows of all pairs, see `products`."""
@@ -103,10 +101,6 @@ class Joint(Effect):
     def label(self, i: int) -> str:
         """The name of the joint, followed by the names of both bodies of the i-th pair if the joint has several pairs."""
         return self.name if len(self.elements) == 1 else f"{self.name} {'-'.join(self.elements[i])}"
-
-    def pitch_of(self, i: int):
-        """How far b moves along the axis per turn of the i-th pair, m; zero unless the joint is a screw."""
-        return np.zeros(())
 
     def values(self, freedom: str, pairs: Iterable[int], coordinates: Mapping[str, Any]):
         """A freedom of some pairs, (pairs, ...) rad or m, by the coordinates (..., n) of bodies by name; an angle is between -pi and pi."""

@@ -21,7 +21,7 @@ Source: P. Betsch, S. Leyendecker, Int. J. Numer. Meth. Engng 67 (2006).
 """
 
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -47,8 +47,6 @@ class Spherical(Joint):
         between, at: as of `Joint`. A body that is a point mass is joined at its position.
     """
 
-    default_name = "spherical"
-
 
 @effect_class
 class Revolute(AboutAxis):
@@ -58,9 +56,7 @@ class Revolute(AboutAxis):
         between, at, axis: as of `Joint`, and the axis in space at the start.
     """
 
-    default_name = "revolute"
-    moves = (Move("turn", N),)
-    freedoms = ("turn",)
+    freedoms: ClassVar = {"turn": Move("turn", N)}
 
 
 @effect_class
@@ -75,9 +71,7 @@ class Universal(AboutAxis):
 
     second: Any = (1.0, 0.0, 0.0)
 
-    default_name = "universal"
-    moves = (Move("turn", N), Move("turn", M))
-    freedoms = ("turn", "tilt")
+    freedoms: ClassVar = {"turn": Move("turn", N), "tilt": Move("turn", M)}
     rows = (*GAP, ("n", "e"))
 
     @cached_property
@@ -96,7 +90,6 @@ class Fixed(AboutAxis):
         between, at: as of `Joint`.
     """
 
-    default_name = "fixed"
     rows = (*GAP, *PARALLEL, UNTURNED)
 
 
@@ -108,9 +101,7 @@ class Cylindrical(AboutAxis):
         between, at, axis: as of `Revolute`.
     """
 
-    default_name = "cylindrical"
-    moves = (Move("turn", N), Move("slide", N))
-    freedoms = ("turn", "slide")
+    freedoms: ClassVar = {"turn": Move("turn", N), "slide": Move("slide", N)}
     rows = (*ACROSS, *PARALLEL)
 
 
@@ -138,19 +129,13 @@ class Screw(AboutAxis):
 
     pitch: Any = number(default=1e-3)
 
-    default_name = "screw"
-    moves = (Move("screw", N),)
-    freedoms = ("turn",)
+    freedoms: ClassVar = {"turn": Move("screw", N)}
     rows = Cylindrical.rows
 
     def check_parameters(self):
         super().check_parameters()
         pitch = self.parameters["pitch"]
         self.require(pitch != 0, "pitch", pitch, "it must not be zero; take Revolute if b does not move along the axis")
-
-    def pitch_of(self, i):
-        pitch = self.parameters["pitch"]
-        return pitch[i] if pitch.ndim else pitch
 
     @property
     def function(self):
@@ -175,9 +160,7 @@ class Planar(AboutAxis):
         axis: (3,) the normal n of the plane in space at the start; or a normal for each pair, (n, 3).
     """
 
-    default_name = "planar"
-    moves = (Move("slide", M), Move("slide", M_PRIME), Move("turn", N))
-    freedoms = ("along", "across", "turn")
+    freedoms: ClassVar = {"along": Move("slide", M), "across": Move("slide", M_PRIME), "turn": Move("turn", N)}
     rows = (("n", "D"), *PARALLEL)
 
 
@@ -189,7 +172,5 @@ class Prismatic(AboutAxis):
         between, at, axis: as of `Revolute`.
     """
 
-    default_name = "prismatic"
-    moves = (Move("slide", N),)
-    freedoms = ("slide",)
+    freedoms: ClassVar = {"slide": Move("slide", N)}
     rows = (*ACROSS, *PARALLEL, UNTURNED)

@@ -110,7 +110,6 @@ class Coulomb(_Nonbonded):
     constant: Any = array(default=8.9875517862e9)
     between: Any = names(2, pairs=True, default=None)
 
-    default_name = "coulomb"
     derived = ("charge_a", "charge_b")
 
     def __post_init__(self):
