@@ -2,7 +2,6 @@
 
 from vmri_jax.scene.body import Body, Frame
 from vmri_jax.scene.effect import Effect
-from vmri_jax.scene.effects.angles import Angle, Bending, Torsion
 from vmri_jax.scene.effects.contact import PlaneContact, SphereContact
 from vmri_jax.scene.effects.controls import Controlled
 from vmri_jax.scene.effects.couplings import Gear, JointCoupling
@@ -18,17 +17,8 @@ from vmri_jax.scene.effects.joint_effects import (
     JointSpring,
     RotorInertia,
 )
-from vmri_jax.scene.effects.joints import (
-    Cylindrical,
-    Fixed,
-    Planar,
-    Prismatic,
-    Revolute,
-    Screw,
-    Spherical,
-    Universal,
-)
-from vmri_jax.scene.effects.pairs import Coulomb, LennardJones, NBodyGravity, within_bonds
+from vmri_jax.scene.effects.joints import Cylindrical, Fixed, Planar, Prismatic, Revolute, Screw, Spherical, Universal
+from vmri_jax.scene.effects.potentials import Angle, Bending, Coulomb, LennardJones, NBodyGravity, Torsion, within_bonds
 from vmri_jax.scene.effects.springs import (
     Anchor,
     Guide,

@@ -12,7 +12,7 @@ from vmri_jax.refusals import Refused
 from vmri_jax.scene.body import GROUND, Attachment, Bodies, Point, body_of, end_of, label_of, moving, weights_of
 from vmri_jax.scene.declare import Elements, Parameter, effect_class, real_tree, stacked
 from vmri_jax.scene.layout import Key, Layout
-from vmri_jax.scene.terms import EffectTerm, Role, Source, choose, is_of_package
+from vmri_jax.scene.terms import Applied, EffectTerm, Role, Source, choose, is_of_package
 
 MOST_ROLES = 32
 """Most bodies of an element: the two bodies of each of sixteen joints that one equation couples. More are refused."""
@@ -70,6 +70,12 @@ class Bindable(ABC):
     def by_name(self) -> Bodies:
         """All bodies of the scene by name."""
         return vars(self)["_by_name"]
+
+    @property
+    def called(self) -> Any:
+        """The function that terms call; the functions of time of the user are its first arguments, see `of_time`."""
+        of_time = tuple(getattr(self, f.name) for f in fields(self) if "of_time" in f.metadata)
+        return Applied(self.function, of_time) if of_time else self.function
 
     @cached_property
     def elements(self) -> Elements:
@@ -200,7 +206,7 @@ class Bindable(ABC):
         """Some elements as a term."""
         select = None if len(group) == len(self.elements) else tuple(group)
         split, sources = self.split_of(self.parameters), (Source(self.name, len(group), select),)
-        function = self.function
+        function = self.called
         # A function of the user may be right for a single element alone; no parameter may be common to all elements.
         is_joined = is_of_package(function) and len(split) == len(self.parameters)
         return EffectTerm(sources, function, tuple(roles), split, self.timed, is_joined, through)

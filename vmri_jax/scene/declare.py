@@ -143,7 +143,7 @@ def array(*, default: Any = MISSING, sign: Sign = "") -> Any:
 
 
 def of_time() -> Any:
-    """A function of the user, ``f(t, params)``; the function of the effect gets `params` by the name of this field."""
+    """A function of the user, ``f(t, params)``: the first argument of the function of the effect, which gets `params` by the name of this field."""
     return field(metadata={"of_time": True})
 
 

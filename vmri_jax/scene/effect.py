@@ -174,10 +174,6 @@ class Effect(Bindable):
                 fits = value > 0 if parameter.sign == "positive" else value >= 0
                 self.require(fits, name, value, f"it must be {parameter.sign}")
 
-    def components(self) -> tuple[str, ...]:
-        """Names of the controls of this effect; () unless its kind is "control"."""
-        return ()
-
     def curvature(self):
         """Largest second derivative of the energy of each element, () or (n,), if the start does not show it (contacts that are open); else None."""
         return None
@@ -252,10 +248,10 @@ def check_function(effect: Any, moved: bool) -> None:
         t, v = jax.device_put(((np.zeros(()),), tuple(np.zeros(x.shape) for x in q)))
         before = {"force": (*t, q, v), "kinetic": (q, v)}.get(effect.kind, (*t, q) if effect.timed else (q,))
         arguments = *before, arrays(effect.params_of(group))
-        value = shape_of(f"{effect.name}: function", effect.function, *arguments)
+        value = shape_of(f"{effect.name}: function", effect.called, *arguments)
         _check_value(effect, value, [x.shape for x in q], len(group))
         if effect.kind == "constraint" and not moved and is_concrete(arguments):
-            rows = _rows(effect.function, *arguments)
+            rows = _rows(effect.called, *arguments)
             if np.any(np.abs(rows.values) > rows.allowed(KEPT_AT_START)):
                 raise Refused(
                     f"{effect.name}: the positions at the start violate this constraint by {np.abs(rows.values).max():.3g}; move the "

@@ -148,9 +148,7 @@ class _Reader(Compiled):
                 continue
             yield (Revolute if kind == kinds.mjJNT_HINGE else Prismatic)(between, anchor, axis, name=name)
             dof, place = model.jnt_dofadr[j], model.jnt_qposadr[j]
-            stiffness, damping, rotor = (
-                float(x) for x in (model.jnt_stiffness[j], model.dof_damping[dof], model.dof_armature[dof])
-            )
+            stiffness, damping, rotor = model.jnt_stiffness[j], model.dof_damping[dof], model.dof_armature[dof]
             is_nonlinear = np.any(model.jnt_stiffnesspoly[j]) or model.jnt_springyield[j]
             if stiffness and not is_nonlinear and not self.off("SPRING"):
                 relaxed = float(model.qpos_spring[place] - self.data.qpos[place])

@@ -64,7 +64,7 @@ def rows_of(placed: Sequence[Placed]) -> list[Row]:
         for group in effect.by_size(part.elements) if part.home in HOMES else ():
             # all elements of a group have as many rows
             t, one = (np.zeros(()),) if effect.timed else (), group[:1]
-            size = jax.eval_shape(effect.function, *t, effect.positions(one), effect.params_of(one)).size
+            size = jax.eval_shape(effect.called, *t, effect.positions(one), effect.params_of(one)).size
             for element in group:
                 named = f"{effect.name} {'-'.join(map(label_of, effect.elements[element]))}"
                 label = effect.name if len(effect.elements) == 1 else named

@@ -181,8 +181,7 @@ def make_layout(
             ends[part] += body.size
             continue
         for key in branch.moves:
-            label = branch.joint.label(branch.element) + (f" {key[2]}" if len(branch.moves) > 1 else "")
-            coordinates[label] = freedoms[key] = Place(part, ends[part], 1)
+            coordinates[branch.joint.label(branch.element, key[2])] = freedoms[key] = Place(part, ends[part], 1)
             ends[part] += 1
     if not branches:
         return Layout(places, coordinates), ()

@@ -48,14 +48,14 @@ def with_rates(
     constraints = configuration(system, np.zeros(()), *start[:2])
     rows, values = [constraints.jacobian], [-constraints.rates]
     for joint, freedom, number in _by_freedom("Scene.with_rates", effects, rates):
-        pairs = joint.elements
-        numbers = for_pairs(f"Scene.with_rates: the rate of {joint.name}", number, len(pairs), "one number")
-        gradient = jax.jacfwd(
-            lambda q, joint=joint, freedom=freedom, pairs=pairs: joint.values(
-                freedom, range(len(pairs)), {name: q[columns[name]] for name in moving(chain(*pairs))}
-            )
-        )
-        rows.append(np.asarray(gradient(jnp.asarray(bodies))) @ of_bodies)
+        pairs, about = range(len(joint.elements)), f"Scene.with_rates: the rate of {joint.name}"
+        numbers = for_pairs(about, number, len(pairs), "one number")
+
+        def freedoms(q, joint=joint, freedom=freedom, pairs=pairs):
+            coordinates = {name: q[columns[name]] for name in moving(chain(*joint.elements))}
+            return jnp.stack([joint.value(freedom, i, coordinates) for i in pairs])
+
+        rows.append(np.asarray(jax.jacfwd(freedoms)(jnp.asarray(bodies))) @ of_bodies)
         values.append(np.broadcast_to(numbers, (len(pairs),)))
     c, b = np.concatenate(rows), np.concatenate(values)
     root = np.linalg.cholesky(known_mass_and_momentum(system, *start)[0])  # M = R R^T

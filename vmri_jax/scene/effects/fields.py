@@ -13,7 +13,6 @@ from vmri_jax.scene.body import end_of
 from vmri_jax.scene.declare import array, common, effect_class, names, number, of_time, positive, real_tree, vector
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.effects.points import BetweenPoints
-from vmri_jax.scene.terms import Applied
 
 
 @effect_class
@@ -129,12 +128,6 @@ class HarmonicDrive(Effect):
         return (params["amplitude"] * jnp.cos(params["frequency"] * t + params["phase"])[..., None],)
 
 
-def same_on_all(history, t, q, v, params):
-    """``F = f(t)``, the same on all bodies."""
-    (q,) = q
-    return (jnp.broadcast_to(history(t, params), q.shape),)
-
-
 @effect_class
 class Drive(Effect):
     """A force ``F = f(t)`` on bodies, any function of time.
@@ -151,9 +144,9 @@ class Drive(Effect):
 
     kind = "force"
 
-    @property
-    def function(self):
-        return Applied(same_on_all, (self.history,))
+    @staticmethod
+    def function(history, t, q, v, params):
+        return (history(t, params),)
 
     def _parameters(self):
         params = real_tree(f"{self.name}: params", self.params)

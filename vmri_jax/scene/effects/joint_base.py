@@ -6,6 +6,7 @@ For the letters see `vmri_jax.scene.effects.joints`.
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
+from itertools import chain
 from typing import Any, ClassVar
 
 import jax.numpy as jnp
@@ -98,18 +99,15 @@ class Joint(Effect):
         factors = xp.concatenate(halves, axis=-1)
         return {"factors": stacked([*factors]), "offsets": stacked([*offsets])}
 
-    def label(self, i: int) -> str:
-        """The name of the joint, followed by the names of both bodies of the i-th pair if the joint has several pairs."""
-        return self.name if len(self.elements) == 1 else f"{self.name} {'-'.join(self.elements[i])}"
+    def label(self, i: int, freedom: str = "") -> str:
+        """The name of the joint, followed by the names of both bodies of the i-th pair if there are several, and by the freedom likewise."""
+        pair = "" if len(self.elements) == 1 else f" {'-'.join(self.elements[i])}"
+        return f"{self.name}{pair}" + (f" {freedom}" if freedom and len(self.freedoms) > 1 else "")
 
-    def values(self, freedom: str, pairs: Iterable[int], coordinates: Mapping[str, Any]):
-        """A freedom of some pairs, (pairs, ...) rad or m, by the coordinates (..., n) of bodies by name; an angle is between -pi and pi."""
-        values = []
-        for i in pairs:
-            ends = (GROUND_COORDINATES if name == GROUND else coordinates[name] for name in self.elements[i])
-            params = self.params_of((i,), self.parameters | self.frames)
-            values.append(FREEDOMS[freedom](tuple(map(jnp.asarray, ends)), params))
-        return jnp.stack(values)
+    def value(self, freedom: str, i: int, coordinates: Mapping[str, Any]):
+        """A freedom of the i-th pair, (...) rad or m, by the coordinates (..., n) of bodies by name; an angle is between -pi and pi."""
+        ends = (GROUND_COORDINATES if name == GROUND else coordinates[name] for name in self.elements[i])
+        return FREEDOMS[freedom](tuple(map(jnp.asarray, ends)), self.params_of((i,), self.parameters | self.frames))
 
     @cached_property
     def triads(self) -> Any:
@@ -118,13 +116,12 @@ class Joint(Effect):
 
     def check_bodies(self):
         super().check_bodies()
-        for element in self.elements:
-            for name in element:
-                body = body_of(self.by_name, name)
-                if not body.rigid and (body.block or body.size != 3):
-                    raise Refused(
-                        f"{self.name}: {name} has {body.size} coordinates; joints are between rigid bodies and points in space."
-                    )
+        for name in chain(*self.elements):
+            body = body_of(self.by_name, name)
+            if not body.rigid and (body.block or body.size != 3):
+                raise Refused(
+                    f"{self.name}: {name} has {body.size} coordinates; joints are between rigid bodies and points in space."
+                )
 
     def check_parameters(self):
         super().check_parameters()

@@ -14,7 +14,6 @@ from vmri_jax.scene.effects.contact import penalty
 from vmri_jax.scene.effects.freedoms import ANGLES, SINES, Freedom
 from vmri_jax.scene.effects.joint_base import Joint, OfFreedoms, freedom_of, joint_named
 from vmri_jax.scene.effects.springs import elastic_energy
-from vmri_jax.scene.terms import Applied
 
 
 @effect_class
@@ -154,11 +153,6 @@ class RotorInertia(InJoint):
         return jnp.sum(params["inertia"] * rate**2) / 2
 
 
-def driven(history, t, q, v, params):
-    """``f(t)``."""
-    return (history(t, params["history"]),)
-
-
 @effect_class
 class JointDrive(InJoint):
     """A torque about the axis of a joint, or a force along it, as a function of time; b gets it and a its opposite.
@@ -176,18 +170,9 @@ class JointDrive(InJoint):
     counts_turns = False
     default_name = "joint_drive"
 
-    @property
-    def function(self):
-        return Applied(driven, (self.history,))
-
-
-def prescribed(path, t, q, params):
-    """``x - a(t)``; by the sine and cosine of an angle x ``sin x cos a - cos x sin a``, which is homogeneous in the directors."""
-    (x,), a = q, path(t, params["path"])
-    if not isinstance(x, tuple):
-        return x - a
-    (sine, cosine), xp = x, library(a)
-    return sine * xp.cos(a) - cosine * xp.sin(a)
+    @staticmethod
+    def function(history, t, q, v, params):
+        return (history(t, params["history"]),)
 
 
 @effect_class
@@ -211,9 +196,14 @@ class JointMotion(InJoint):
     default_name = "joint_motion"
     timed = True
 
-    @property
-    def function(self):
-        return Applied(prescribed, (self.path,))
+    @staticmethod
+    def function(path, t, q, params):
+        (x,), a = q, path(t, params["path"])
+        if not isinstance(x, tuple):
+            return x - a
+        # homogeneous in the directors, unlike the angle itself
+        (sine, cosine), xp = x, library(a)
+        return sine * xp.cos(a) - cosine * xp.sin(a)
 
     def by_directors(self, freedom):
         return SINES.get(freedom, freedom)

@@ -16,7 +16,6 @@ from vmri_jax.refusals import Refused
 from vmri_jax.scene.body import end_of, label_of
 from vmri_jax.scene.declare import effect_class, names, of_time, real_tree, vector
 from vmri_jax.scene.effect import Effect
-from vmri_jax.scene.terms import Applied
 
 
 def distance(q, params=None):
@@ -96,12 +95,6 @@ class ToFixedPoint(ToPoint):
         return {"anchors": anchors}
 
 
-def along_path(law, path, t, q, *arguments):
-    """``law(q - a(t), params)``, as a function of time."""
-    (q,), params = q, arguments[-1]
-    return law(q - path(t, params["path"]), params)
-
-
 @effect_class
 class ToPath(ToPoint):
     """Between each body and a point that moves along a path."""
@@ -112,9 +105,10 @@ class ToPath(ToPoint):
     dimensions = (1, 2, 3)
     timed = True
 
-    @property
-    def function(self):
-        return Applied(along_path, (self.law, self.path))
+    @classmethod
+    def function(cls, path, t, q, *arguments):
+        (q,), params = q, arguments[-1]
+        return cls.law(q - path(t, params["path"]), params)
 
     def point_at_start(self, params):
         return self.path(np.zeros(()), real_tree(f"{self.name}: params", self.params))
