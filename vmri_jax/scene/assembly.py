@@ -64,7 +64,7 @@ def _taken(placed: Sequence[Placed]) -> dict[Any, Entries]:
 def actuation(sorting: Sorting) -> Actuation | None:
     """The forces of the controls of a scene, None if it has no controls."""
     layout = sorting.layout
-    controls = [part for part in sorting.placed if part.home == "control"]
+    controls: list[Any] = [part for part in sorting.placed if part.home == "control"]
     terms = tuple(part.effect.terms(part.elements, layout)[0] for part in controls)
     names = tuple(part.effect.components() for part in controls)
     return Actuation("control", terms, _kinematics("control", terms, layout), names=names) if controls else None

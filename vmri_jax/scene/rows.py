@@ -15,6 +15,7 @@ from vmri_jax.mechanics.constraints import RANK
 from vmri_jax.mechanics.functions import TracedOnce
 from vmri_jax.mechanics.names import Names
 from vmri_jax.scene.body import LARGEST_POINT, label_of
+from vmri_jax.scene.declare import stacked
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.effects.freedoms import ANGLES
 from vmri_jax.scene.functions import ConstraintValues
@@ -97,12 +98,11 @@ def _derivatives(
     return np.real(values[0]).ravel(), jacobian
 
 
-def _columns(role: Role, num_slow: int) -> np.ndarray:
+def _columns(role: Role, num_slow: int) -> Any:
     """Numbers in (Q_s, Q_f) of the coordinates of a role, (n, c), or (c,) of a single element; none for the ground."""
     if role.rows is None:
-        return np.zeros((0,) if role.count == 1 else (role.count, 0), int)
-    columns = np.stack([place.numbers(num_slow)[: role.rows.size] for place in role.rows.places])
-    return columns[0] if role.rows.single else columns
+        return stacked([np.zeros(0, int)] * role.count)
+    return stacked([place.numbers(num_slow)[: role.rows.size] for place in role.rows.places])
 
 
 @quickly_compiled
