@@ -1,7 +1,7 @@
 """Effects: each adds a function of positions, velocities and time of some bodies to the Lagrangian, the constraints or the forces."""
 
 from collections.abc import Sequence
-from dataclasses import Field, fields
+from dataclasses import fields
 from inspect import getattr_static, isfunction
 from itertools import chain, pairwise
 from typing import Any, ClassVar, Literal, get_args
@@ -20,7 +20,7 @@ from vmri_jax.mechanics.names import unknown
 from vmri_jax.refusals import Refused
 from vmri_jax.scene.binding import MOST_ROLES, Bindable
 from vmri_jax.scene.body import GROUND, Attachment, end_of, label_of, moving, weights_of
-from vmri_jax.scene.declare import arrays, effect_class, lasting
+from vmri_jax.scene.declare import arrays, lasting
 
 Kind = Literal["kinetic", "potential", "constraint", "force", "control"]
 START = 1e-9
@@ -31,7 +31,6 @@ LIBRARY = "vmri_jax."
 """Beginning of the names of modules whose functions are not checked: the tests of the package do that."""
 
 
-@effect_class
 class Effect(Bindable):
     """Base class of effects: a function, the bodies that it depends on, and its parameters.
 
@@ -80,11 +79,9 @@ class Effect(Bindable):
         """A new effect, of a class that is complete.
 
         Raises:
-            TypeError: the class has no decorator, no `kind`, no field with names of bodies, or a `function` that would get the effect itself.
+            TypeError: the class has no `kind`, no field with names of bodies, or a `function` that would get the effect itself.
         """
         about = f"the class of effects {cls.__name__}"
-        if any(isinstance(value, Field) for value in vars(cls).values()):  # the decorator replaces them
-            raise Refused(f"{about} has no decorator; write @effect_class of vmri_jax.scene.declare above it.")
         if getattr(cls, "kind", None) not in get_args(Kind):
             raise Refused(f"{about} has no kind; write kind = one of {', '.join(map(repr, get_args(Kind)))} in it.")
         if cls._elements is Effect._elements and not any("names" in f.metadata for f in fields(cls)):

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from vmri_jax.mechanics.arrays import is_concrete, library
 from vmri_jax.refusals import Refused
 from vmri_jax.scene.body import AnyBody, Pace, Point, joined
-from vmri_jax.scene.declare import effect_class, names
+from vmri_jax.scene.declare import names
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.products import FRAME, products
 from vmri_jax.scene.shapes import Ball, Rod, Shape, box_of
@@ -259,7 +259,6 @@ class RigidBody(AnyBody):
         return Point(self.name, self.position + self.rotation @ offset)
 
 
-@effect_class
 class Rigidity(Effect):
     """The constraints of rigid bodies by directors, ``g = (d_i . d_j - delta_ij) / (1 + delta_ij)``; every scene adds this effect itself.
 

@@ -10,7 +10,7 @@ from vmri_jax.mechanics.arrays import real_array
 from vmri_jax.mechanics.names import AXES
 from vmri_jax.refusals import Refused
 from vmri_jax.scene.body import Attachment, body_of, entry, is_entry, label_of, weights_of
-from vmri_jax.scene.declare import effect_class, names, vector
+from vmri_jax.scene.declare import names, vector
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.effects.joint_base import Joint
 from vmri_jax.scene.effects.joint_effects import InJoint
@@ -36,7 +36,6 @@ def load_on(load: Load, axes: Literal["space", "body"], q, u, params):
     return (jnp.concatenate([u, (params["point"][: len(d), None] * u).ravel()]),)
 
 
-@effect_class
 class Controlled(Effect):
     """A force or a torque that `vmri_jax.control.minimize` sets; in a run it is zero and takes no time.
 
@@ -124,7 +123,6 @@ class Controlled(Effect):
         return tuple(f"{self.name}{axis}" for axis in axes)
 
 
-@effect_class
 class ControlledJoint(InJoint):
     """The force or torque of `Controlled` in a joint."""
 

@@ -13,7 +13,7 @@ from vmri_jax.mechanics.checks import describe, shape_of
 from vmri_jax.mechanics.functions import NO_VELOCITY, check_arguments
 from vmri_jax.refusals import Refused
 from vmri_jax.scene.binding import MOST_ROLES
-from vmri_jax.scene.declare import effect_class, real_tree
+from vmri_jax.scene.declare import real_tree
 from vmri_jax.scene.effect import START
 from vmri_jax.scene.effects.joint_base import OfFreedoms, freedom_of, joint_named
 from vmri_jax.scene.terms import Applied
@@ -24,7 +24,6 @@ def equation(law, q, params):
     return law(jnp.stack(q), params["law"])
 
 
-@effect_class
 class _Coupling(OfFreedoms):
     """An equation between freedoms of joints, see `JointCoupling`."""
 
@@ -83,7 +82,6 @@ class _Coupling(OfFreedoms):
         self.require(violation < START, "the equation", violation, expected)
 
 
-@effect_class
 class JointCoupling(_Coupling):
     """An equation between the freedoms x of joints, ``g(x, params) = 0``.
 
@@ -125,7 +123,6 @@ def weighted_sum(x, params):
     return (params["ratios"] * x).sum()
 
 
-@effect_class
 class Gear(_Coupling):
     """Joints whose freedoms move in fixed ratios, ``sum_i r_i x_i = 0``.
 

@@ -10,12 +10,11 @@ import numpy as np
 from vmri_jax.mechanics.checks import shape_of
 from vmri_jax.refusals import Refused
 from vmri_jax.scene.body import end_of
-from vmri_jax.scene.declare import array, common, effect_class, names, number, of_time, positive, real_tree, vector
+from vmri_jax.scene.declare import array, common, names, number, of_time, positive, real_tree, vector
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.effects.points import BetweenPoints
 
 
-@effect_class
 class Gravity(Effect):
     """Uniform gravity, ``V = -sum_i m_i g . q_i``.
 
@@ -42,7 +41,6 @@ class Gravity(Effect):
         return {"up": up.tolist()} if up.ndim and up.any() else {}
 
 
-@effect_class
 class MagneticField(Effect):
     """Charges in a uniform magnetic field: ``L = sum Q v . A(q)``, ``A = B x q / 2``, hence the force ``Q v x B``.
 
@@ -84,7 +82,6 @@ class MagneticField(Effect):
                 )
 
 
-@effect_class
 class ConstantForce(Effect):
     """A constant force f on bodies.
 
@@ -104,7 +101,6 @@ class ConstantForce(Effect):
         return (params["force"],)
 
 
-@effect_class
 class HarmonicDrive(Effect):
     """A harmonic force ``F = f cos(w t + phi)`` on bodies.
 
@@ -128,7 +124,6 @@ class HarmonicDrive(Effect):
         return (params["amplitude"] * jnp.cos(params["frequency"] * t + params["phase"])[..., None],)
 
 
-@effect_class
 class Drive(Effect):
     """A force ``F = f(t)`` on bodies, any function of time.
 
@@ -166,7 +161,6 @@ class Drive(Effect):
                 )
 
 
-@effect_class
 class FollowerForce(BetweenPoints):
     """A force on b that turns with the line from a to b: ``F = f (q_b - q_a) / |q_b - q_a|``, a jet at the end of a rod.
 

@@ -13,12 +13,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.mechanics.arrays import is_concrete, library, real_array
-from vmri_jax.mechanics.kinematics import Move
+from vmri_jax.mechanics.kinematics import UNMOVED, Move
 from vmri_jax.mechanics.names import unknown
 from vmri_jax.mechanics.rows import Rows
 from vmri_jax.refusals import Refused
 from vmri_jax.scene.body import GROUND, GROUND_COORDINATES, Attachment, body_of, label_of
-from vmri_jax.scene.declare import effect_class, names, stacked
+from vmri_jax.scene.declare import names, stacked
 from vmri_jax.scene.effect import START, Effect
 from vmri_jax.scene.effects.freedoms import COORDINATE, FREEDOMS, IN_REACH, Freedom, freedoms_of
 from vmri_jax.scene.layout import Key, Layout
@@ -34,7 +34,6 @@ AXES = dict(zip("xyz", np.eye(3), strict=True))
 """The axes of space, which a row may have as one of its two vectors."""
 
 
-@effect_class
 class Joint(Effect):
     """Base class of joints between two bodies, or between a body and the ground.
 
@@ -94,7 +93,7 @@ class Joint(Effect):
                 vectors[name] = xp.concatenate([np.zeros((count, 1)), frames[f"frame_{role}"][:, i]], axis=-1)
             half = xp.stack([vectors.get(name, zero) for name in named], axis=1)
             is_ground = np.array([pair["ab".index(role)] == GROUND for pair in self.elements])[:, None, None]
-            offsets = offsets + is_ground * (half @ GROUND_COORDINATES.reshape(FRAME, 3))
+            offsets = offsets + is_ground * (half @ UNMOVED)
             halves.append(~is_ground * half)
         factors = xp.concatenate(halves, axis=-1)
         return {"factors": stacked([*factors]), "offsets": stacked([*offsets])}
@@ -195,7 +194,6 @@ class Joint(Effect):
         return {name: library(values).stack(values) for name, values in components.items()}
 
 
-@effect_class
 class AboutAxis(Joint):
     """Joints with an axis: (3,) its direction in space at the start, of any length; or a direction for each of k pairs, (k, 3)."""
 
@@ -238,7 +236,6 @@ def freedom_of(joint: Joint, of: str, about: str = "") -> Freedom:
     raise Refused(f"{about}of is {of!r}; {joint.name} leaves {free} free.")
 
 
-@effect_class
 class OfFreedoms(Effect):
     """Base class of effects whose functions get freedoms of joints, () each or (n,) of n elements, as q, and their rates as v."""
 
@@ -253,13 +250,13 @@ class OfFreedoms(Effect):
     @abstractmethod
     def freedoms_of(self, i: int) -> tuple[Key, ...]: ...
 
-    def by_directors(self, freedom: Freedom) -> str:
+    def by_directors(self, freedom: str) -> str:
         """The name in `FREEDOMS` of a freedom that is no coordinate of the scene."""
         return IN_REACH.get(freedom, freedom) if self.counts_turns else freedom
 
     def positions(self, group):
         """The freedoms at the positions in `bodies`, which are zero."""
-        return tuple(np.zeros(len(group)) if len(group) > 1 else np.zeros(()) for _ in self.freedoms_of(group[0]))
+        return tuple(stacked([0.0] * len(group)) for _ in self.freedoms_of(group[0]))
 
     def terms(self, select, layout):
         groups: dict[Any, list[int]] = {}

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.mechanics.arrays import library
-from vmri_jax.scene.declare import effect_class, number, of_time, positive
+from vmri_jax.scene.declare import number, of_time, positive
 from vmri_jax.scene.effect import START
 from vmri_jax.scene.effects.contact import penalty
 from vmri_jax.scene.effects.freedoms import ANGLES, SINES, Freedom
@@ -16,7 +16,6 @@ from vmri_jax.scene.effects.joint_base import Joint, OfFreedoms, freedom_of, joi
 from vmri_jax.scene.effects.springs import elastic_energy
 
 
-@effect_class
 class InJoint(OfFreedoms):
     """Base class of effects along the freedom x of a joint: the angle or displacement of b against a from the given position.
 
@@ -50,7 +49,6 @@ class InJoint(OfFreedoms):
         return super()._parameters() | self.joint.frames
 
 
-@effect_class
 class JointSpring(InJoint):
     """Springs in joints, ``V = sum k/2 (x - x_0)^2``.
 
@@ -73,7 +71,6 @@ class JointSpring(InJoint):
         return elastic_energy(params["stiffness"], x - params["neutral"])
 
 
-@effect_class
 class JointLimit(InJoint):
     """Stops of a joint by a smooth penalty: ``V = sum k/2 (d_-^2 + d_+^2)``.
 
@@ -110,7 +107,6 @@ class JointLimit(InJoint):
         self.require(params["lower"] < params["upper"], "lower", params["lower"], "it must be below upper")
 
 
-@effect_class
 class JointDamper(InJoint):
     """Dampers in joints, against the rate of the freedom: ``f = -c x'``.
 
@@ -131,7 +127,6 @@ class JointDamper(InJoint):
         return (-params["coefficient"] * rate,)
 
 
-@effect_class
 class RotorInertia(InJoint):
     """Inertia that moves with a joint alone, such as the rotor of its motor: ``T = J x'^2 / 2``; MuJoCo's armature.
 
@@ -153,7 +148,6 @@ class RotorInertia(InJoint):
         return jnp.sum(params["inertia"] * rate**2) / 2
 
 
-@effect_class
 class JointDrive(InJoint):
     """A torque about the axis of a joint, or a force along it, as a function of time; b gets it and a its opposite.
 
@@ -175,7 +169,6 @@ class JointDrive(InJoint):
         return (history(t, params["history"]),)
 
 
-@effect_class
 class JointMotion(InJoint):
     """A prescribed angle or displacement of a joint, ``x = a(t)``.
 

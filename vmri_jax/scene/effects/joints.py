@@ -27,7 +27,7 @@ import numpy as np
 
 from vmri_jax.mechanics.arrays import library
 from vmri_jax.mechanics.kinematics import Move
-from vmri_jax.scene.declare import effect_class, number
+from vmri_jax.scene.declare import number
 from vmri_jax.scene.effect import START
 from vmri_jax.scene.effects.freedoms import M_PRIME, M, N, slide, turn_by_sine
 from vmri_jax.scene.effects.joint_base import GAP, PARALLEL, AboutAxis, Joint
@@ -39,7 +39,6 @@ UNTURNED = ("m", "e'")
 """Row that keeps b from turning about the axis n."""
 
 
-@effect_class
 class Spherical(Joint):
     """Ball joints: both bodies share a point; three rows, ``D = 0``.
 
@@ -48,7 +47,6 @@ class Spherical(Joint):
     """
 
 
-@effect_class
 class Revolute(AboutAxis):
     """Hinges: b turns about an axis that is fixed in both bodies; five rows, ``D = 0, n . e = n . e' = 0``.
 
@@ -59,7 +57,6 @@ class Revolute(AboutAxis):
     freedoms: ClassVar = {"turn": Move("turn", N)}
 
 
-@effect_class
 class Universal(AboutAxis):
     """Cardan joints: an axis n of a and an axis e of b stay perpendicular; four rows, ``D = 0, n . e = 0``.
 
@@ -82,7 +79,6 @@ class Universal(AboutAxis):
         return [xp.stack([m, xp.cross(n, m), n]) for n, m in zip(first, second, strict=True)]
 
 
-@effect_class
 class Fixed(AboutAxis):
     """Two bodies that move as one; six rows, ``D = 0, n . e = n . e' = m . e' = 0``.
 
@@ -93,7 +89,6 @@ class Fixed(AboutAxis):
     rows = (*GAP, *PARALLEL, UNTURNED)
 
 
-@effect_class
 class Cylindrical(AboutAxis):
     """b slides along an axis and turns about it; four rows, ``m . D = m' . D = 0, n . e = n . e' = 0``.
 
@@ -115,7 +110,6 @@ def screwed(q, params):
     return xp.concatenate([products(len(Cylindrical.rows), q, params), difference[..., None]], axis=-1)
 
 
-@effect_class
 class Screw(AboutAxis):
     """Nuts on bolts: b moves along the axis as it turns; five rows, the four of `Cylindrical` and ``m' . e cos a = m . e sin a``.
 
@@ -149,7 +143,6 @@ class Screw(AboutAxis):
         return super()._parameters() | self.frames
 
 
-@effect_class
 class Planar(AboutAxis):
     """b moves in the plane of m and m' and turns about n; three rows, ``n . D = 0, n . e = n . e' = 0``.
 
@@ -164,7 +157,6 @@ class Planar(AboutAxis):
     rows = (("n", "D"), *PARALLEL)
 
 
-@effect_class
 class Prismatic(AboutAxis):
     """Slides: b moves along an axis and does not turn; five rows, the four of `Cylindrical` and ``m . e' = 0``.
 

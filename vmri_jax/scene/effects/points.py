@@ -14,7 +14,7 @@ import numpy as np
 from vmri_jax.mechanics.arrays import library
 from vmri_jax.refusals import Refused
 from vmri_jax.scene.body import end_of, label_of
-from vmri_jax.scene.declare import effect_class, names, of_time, real_tree, vector
+from vmri_jax.scene.declare import names, of_time, real_tree, vector
 from vmri_jax.scene.effect import Effect
 
 
@@ -24,7 +24,6 @@ def distance(q, params=None):
     return library(q).linalg.norm(b - a, axis=-1)
 
 
-@effect_class
 class BetweenPoints(Effect):
     """Between the two points of each pair, which do not start at the same place; ``x = q_b - q_a``."""
 
@@ -41,7 +40,6 @@ class BetweenPoints(Effect):
         return cls.law(b - a, params)
 
 
-@effect_class
 class ToPoint(Effect):
     """Between each body and a point p, which `point` or `path` of a derived class gives; ``x = q - p``."""
 
@@ -67,7 +65,6 @@ class ToPoint(Effect):
         self.require(distance > 0, "the distance of a body from its point", distance, expected)
 
 
-@effect_class
 class ToFixedPoint(ToPoint):
     """Between each body and a fixed point."""
 
@@ -95,7 +92,6 @@ class ToFixedPoint(ToPoint):
         return {"anchors": anchors}
 
 
-@effect_class
 class ToPath(ToPoint):
     """Between each body and a point that moves along a path."""
 

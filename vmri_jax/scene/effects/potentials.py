@@ -12,13 +12,12 @@ from vmri_jax.mechanics.checks import check_type
 from vmri_jax.mechanics.names import unknown
 from vmri_jax.refusals import Refused
 from vmri_jax.scene.body import end_of
-from vmri_jax.scene.declare import array, effect_class, names, number, positive, real_tree, stacked
+from vmri_jax.scene.declare import array, names, number, positive, real_tree, stacked
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.effects.points import distance
 from vmri_jax.scene.effects.springs import elastic_energy
 
 
-@effect_class
 class NBodyGravity(Effect):
     """Newton's gravity between bodies, ``V = -G sum_{a<b} m_a m_b / sqrt(|q_a - q_b|^2 + s^2)``.
 
@@ -47,7 +46,6 @@ class NBodyGravity(Effect):
         return not (is_concrete(self.softening) and np.all(np.asarray(self.softening) > 0))
 
 
-@effect_class
 class _Nonbonded(Effect):
     """Base class of potentials between pairs of points, without the pairs in `exclude`."""
 
@@ -97,7 +95,6 @@ def within_bonds(bonds: Iterable[tuple[str, str]], number: int = 3) -> list[tupl
     return sorted(pairs)
 
 
-@effect_class
 class Coulomb(_Nonbonded):
     """Coulomb's law between charges, ``V = C sum_{a<b} Q_a Q_b / |q_b - q_a|``.
 
@@ -140,7 +137,6 @@ class Coulomb(_Nonbonded):
         return super()._parameters() | of_roles
 
 
-@effect_class
 class LennardJones(_Nonbonded):
     """Lennard-Jones forces, ``V = 4 eps sum_{a<b} ((s/r)^12 - (s/r)^6)``; the minimum -eps is at ``r = 2^(1/6) s``.
 
@@ -184,7 +180,6 @@ def angle_between(q, params=None):
     return library(q).arccos(cosine(q))
 
 
-@effect_class
 class Angle(_AmongPoints):
     """Angles with a rest value, ``V = sum k/2 (theta - theta_0)^2``, theta at b between a and c.
 
@@ -213,7 +208,6 @@ class Angle(_AmongPoints):
         self.require((angle > 1e-3) & (angle < np.pi - 1e-3), "angle", angle, expected)
 
 
-@effect_class
 class Bending(_AmongPoints):
     """Resistance to bending of a straight line of points, ``V = sum k (1 + cos theta)``, theta at b between a and c.
 
@@ -232,7 +226,6 @@ class Bending(_AmongPoints):
         return jnp.sum(params["stiffness"] * (1 + cosine(q)))
 
 
-@effect_class
 class Torsion(_AmongPoints):
     """Torsion about the middle one of three bonds, ``V = sum k (1 - cos(m (phi - phi_0)))``, phi the dihedral angle.
 

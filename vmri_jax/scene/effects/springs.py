@@ -5,7 +5,7 @@ from typing import Any
 import jax.numpy as jnp
 
 from vmri_jax.mechanics.arrays import library
-from vmri_jax.scene.declare import array, effect_class, positive
+from vmri_jax.scene.declare import array, positive
 from vmri_jax.scene.effect import START, Effect
 from vmri_jax.scene.effects.points import BetweenPoints, ToFixedPoint, ToPath
 
@@ -15,7 +15,6 @@ def elastic_energy(stiffness, elongation):
     return jnp.sum(stiffness / 2 * elongation**2)
 
 
-@effect_class
 class Spring(BetweenPoints):
     """Linear springs, ``V = sum k/2 (|q_b - q_a| - l)^2``.
 
@@ -37,7 +36,6 @@ class Spring(BetweenPoints):
         return elastic_energy(params["stiffness"], jnp.linalg.norm(line, axis=-1) - params["length"])
 
 
-@effect_class
 class NonlinearSpring(BetweenPoints):
     """Springs whose force is a polynomial of the elongation ``e = |q_b - q_a| - l``: ``k_1 e + k_2 e^2 + k_3 e^3 + ...``
 
@@ -70,7 +68,6 @@ class NonlinearSpring(BetweenPoints):
         self.require(is_vector, "coefficients", repr(self.coefficients), "give (k_1, k_2, ...), at least one number")
 
 
-@effect_class
 class SpringAnchor(ToFixedPoint):
     """Springs to fixed points, ``V = sum k/2 (|q - a| - l)^2``; without a length the well ``sum k/2 |q - a|^2``.
 
@@ -99,7 +96,6 @@ class SpringAnchor(ToFixedPoint):
         return self.length is not None
 
 
-@effect_class
 class MovingAnchor(ToPath):
     """Springs to a moving point, ``F = k (a(t) - q)``: a force and not a potential, because it depends on time.
 
@@ -120,7 +116,6 @@ class MovingAnchor(ToPath):
         return (-params["stiffness"][..., None] * line,)
 
 
-@effect_class
 class _Rigid(Effect):
     """``g = (|x|^2 - l^2) / 2``, smooth also at x = 0."""
 
@@ -136,7 +131,6 @@ class _Rigid(Effect):
         return ((line**2).sum(axis=-1) - params["length"] ** 2) / 2
 
 
-@effect_class
 class RigidLink(_Rigid, BetweenPoints):
     """Massless rigid links, ``g = (|q_b - q_a|^2 - l^2) / 2 = 0``.
 
@@ -152,7 +146,6 @@ class RigidLink(_Rigid, BetweenPoints):
     drawn_as = "link"
 
 
-@effect_class
 class Anchor(_Rigid, ToFixedPoint):
     """Rigid links to fixed points, ``g = (|q - a|^2 - l^2) / 2 = 0``: a pendulum's rod.
 
@@ -168,7 +161,6 @@ class Anchor(_Rigid, ToFixedPoint):
     drawn_as = "link"
 
 
-@effect_class
 class MovingPivot(_Rigid, ToPath):
     """Rigid links to a moving point, ``g = (|q - a(t)|^2 - l^2) / 2 = 0``: a pendulum on a pivot that is moved.
 
@@ -183,7 +175,6 @@ class MovingPivot(_Rigid, ToPath):
     advice = "move one of them, or take Guide"
 
 
-@effect_class
 class Guide(ToPath):
     """A body with a prescribed motion, ``g = q - a(t) = 0``. Minus the multiplier is the force (N) that moves the body along a(t); it does work.
 
