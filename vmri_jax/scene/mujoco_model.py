@@ -224,11 +224,9 @@ class Compiled:
         model = self.model
         kept = [i for i in self.equalities if self.closes(i) or self.ties(i)]
         # bodies with several joints, if one of these is a ball joint or the scene has directors alone
-        several = [
-            b
-            for b in np.flatnonzero(np.asarray(model.body_jntnum) > 1)
-            if self.coordinates == "directors" or np.any(self.turning[self.joints_of(int(b))])
-        ]
+        several = np.flatnonzero(np.asarray(model.body_jntnum) > 1)
+        if self.coordinates != "directors":
+            several = [b for b in several if np.any(self.turning[self.joints_of(int(b))])]
         is_sleeping = int(model.opt.enableflags) & int(self.mujoco.mjtEnableBit.mjENBL_SLEEP)
         compensation = "compensation of gravity by actuators"
         parts = {

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from vmri_jax.mechanics.arrays import is_concrete, library
 from vmri_jax.refusals import Refused
-from vmri_jax.scene.body import AnyBody, Pace, Point, joined
+from vmri_jax.scene.body import AnyBody, Pace, joined
 from vmri_jax.scene.declare import names
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.products import FRAME, products
@@ -168,11 +168,6 @@ class RigidBody(AnyBody):
         return (self.rotation @ self.axes).T
 
     @property
-    def coordinates(self):
-        """(n,) centre of mass and directors."""
-        return joined([self.position, *(self.directors[i] for i in self.wide)])
-
-    @property
     def rates(self):
         """(n,) velocity of the centre of mass, ``d_i' = spin x d_i``."""
         turned = library(self.spin, self.directors).cross(self.spin, self.directors)
@@ -248,15 +243,6 @@ class RigidBody(AnyBody):
         """(3,) components X of a point ``phi + sum_i X_i d_i``, first those along the directors that the body has, then zeros."""
         components = self.components(offset)
         return joined([components[np.array(self.wide)], np.zeros(3 - len(self.wide))])
-
-    def point(self, offset: Any = None) -> Point:
-        """The centre of mass, or a point fixed in the body, at the start."""
-        if offset is None:
-            return Point(self.name, self.position, self.mass)
-        if offset.shape != (3,):
-            raise Refused(f"the point in {self.name} has shape {offset.shape}; give (3,), in the axes of the body.")
-        self.components(offset)  # refuses a point outside a plate or a rod
-        return Point(self.name, self.position + self.rotation @ offset)
 
 
 class Rigidity(Effect):

@@ -129,8 +129,8 @@ def _root_rank(name: str, bodies: Bodies) -> tuple:
     if name == GROUND:
         return (False,)
     body = bodies[name]
-    mass: Any = getattr(body, "mass", 0.0)
-    return True, body.pace != "slow", -len(body.wide), -float(mass) if is_concrete(mass) else 0.0
+    mass = float(body.mass or 0.0) if is_concrete(body.mass) else 0.0
+    return True, body.pace != "slow", -len(body.wide), -mass
 
 
 def check_frames(bodies: Bodies, branches: Sequence[Branch]) -> None:
