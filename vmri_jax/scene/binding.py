@@ -2,27 +2,15 @@
 
 from abc import ABC
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import field, fields, replace
 from functools import cached_property
-from typing import Any, ClassVar, Literal, Self, dataclass_transform
+from typing import Any, ClassVar, Literal, Self
 
 from vmri_jax.mechanics.arrays import library
 from vmri_jax.mechanics.rows import Place, Rows
 from vmri_jax.refusals import Refused
 from vmri_jax.scene.body import GROUND, Attachment, Bodies, Point, body_of, end_of, label_of, moving, weights_of
-from vmri_jax.scene.declare import (
-    Elements,
-    Parameter,
-    array,
-    common,
-    names,
-    number,
-    of_time,
-    positive,
-    real_tree,
-    stacked,
-    vector,
-)
+from vmri_jax.scene.declare import Declared, Elements, Parameter, real_tree, stacked
 from vmri_jax.scene.layout import Key, Layout
 from vmri_jax.scene.terms import Applied, EffectTerm, Role, Source, choose, is_of_package
 
@@ -34,20 +22,11 @@ ALONE = "alone"
 """Name of the term of a single element, the same for all effects, so that equal functions share a compiled program."""
 
 
-@dataclass_transform(
-    frozen_default=True,
-    eq_default=False,
-    field_specifiers=(names, number, positive, vector, common, array, of_time, field),
-)
-@dataclass(frozen=True, eq=False)
-class Bindable(ABC):
+class Bindable(Declared, ABC):
     """An effect with the bodies of its scene; see `vmri_jax.scene.effect.Effect` for the attributes of its class.
 
-    What depends on bodies is known of bound effects alone, see `bound`. Every subclass is a frozen dataclass.
+    What depends on bodies is known of bound effects alone, see `bound`.
     """
-
-    def __init_subclass__(cls):
-        dataclass(frozen=True, eq=False)(cls)
 
     function: ClassVar[Any]
     rest: ClassVar[Any] = None

@@ -11,7 +11,7 @@
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import MISSING, dataclass, field
 from itertools import combinations
-from typing import Any, Literal
+from typing import Any, Literal, dataclass_transform
 
 import jax
 import numpy as np
@@ -143,6 +143,18 @@ def array(*, default: Any = MISSING, sign: Sign = "") -> Any:
 def of_time() -> Any:
     """A function of the user, ``f(t, params)``: the first argument of the function of the effect, which gets `params` by the name of this field."""
     return field(metadata={"of_time": True})
+
+
+@dataclass_transform(
+    frozen_default=True,
+    eq_default=False,
+    field_specifiers=(names, number, positive, vector, common, array, of_time, field),
+)
+class Declared:
+    """Base class of frozen dataclasses: subclasses declare their fields by the functions above, and need no decorator."""
+
+    def __init_subclass__(cls):
+        dataclass(frozen=True, eq=False)(cls)
 
 
 def stacked(values: Sequence[Any]):
