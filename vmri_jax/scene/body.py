@@ -252,8 +252,8 @@ class Body(AnyBody):
 class Ground(AnyBody):
     """The body that does not move, with the axes of space."""
 
-    name, block, rigid = GROUND, False, True
-    position, rotation, coordinates = np.zeros(3), np.eye(3), GROUND_COORDINATES
+    name, block, rigid, wide = GROUND, False, True, (0, 1, 2)
+    position, rotation, directors = np.zeros(3), np.eye(3), np.eye(3)
 
     def point(self, offset: Any = None) -> Point:
         """A point in space that does not move."""
