@@ -12,6 +12,7 @@ mechanical systems, part II: multibody dynamics, Int. J. Numer. Meth. Engng 67 (
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -272,14 +273,15 @@ def matrix_of(rotation):
     """(3, 3) matrix of a rotation, which is such a matrix, a quaternion (w, x, y, z) or a rotation vector (3,)."""
     if rotation.shape == (3, 3):
         return rotation
-    xp = library(rotation)
     if rotation.shape == (4,):
         # R = 1 + 2 w U + 2 U^2 with the matrix U of x -> u x x, u the vector part
         w, u = rotation[0], _cross_matrix(rotation[1:])
-        return xp.eye(3) + 2 * w * u + 2 * u @ u
+        return library(rotation).eye(3) + 2 * w * u + 2 * u @ u
+    if is_concrete(rotation):
+        return Rotation.from_rotvec(np.array(rotation)).as_matrix()
     # Rodrigues: R = 1 + (sin a / a) U + (1 - cos a) / a^2 U^2, with (1 - cos a) / a^2 = (sin(a/2) / (a/2))^2 / 2
-    angle, u = xp.sqrt(xp.sum(rotation**2)), _cross_matrix(rotation)
-    return xp.eye(3) + xp.sinc(angle / np.pi) * u + xp.sinc(angle / (2 * np.pi)) ** 2 / 2 * u @ u
+    angle, u = jnp.sqrt(jnp.sum(rotation**2)), _cross_matrix(rotation)
+    return jnp.eye(3) + jnp.sinc(angle / np.pi) * u + jnp.sinc(angle / (2 * np.pi)) ** 2 / 2 * u @ u
 
 
 def _cross_matrix(u):
