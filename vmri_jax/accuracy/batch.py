@@ -77,6 +77,7 @@ def simulate_batch(
     saved = lanes()
     plain = saved.trajectory(lanes.runs)
     trajectory = with_origin(plain, plain.origin, error=_errors(lanes, plain) if error else None)
+    lanes.runs.tell_of_start("simulate_batch", plain.states)
     lanes.runs.warn("simulate_batch", saved.table, plain.states.t)
     for kind, message in ((FailedLanesWarning, _failures(trajectory)), (UncertifiedWarning, _uncertified(trajectory))):
         if warn and message:
