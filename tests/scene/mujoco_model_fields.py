@@ -6,7 +6,7 @@ A field has its name in Python, ``jnt_stiffness``, ``opt.density``, ``vis.map.fo
 Source: the comments in MuJoCo's mjmodel.h, and its documentation, "XML reference".
 """
 
-from vmri_jax.scene.mujoco_fields import REFUSED
+from vmri_jax.scene.mujoco_model import REFUSED
 
 READ = {
     "bodies, their masses, and which are welded together": """nbody body_mass body_inertia body_ipos body_iquat body_pos body_quat

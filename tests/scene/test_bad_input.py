@@ -33,7 +33,7 @@ from vmri_jax.scene import (
     SpringAnchor,
     Torsion,
 )
-from vmri_jax.scene.declare import effect_class, names
+from vmri_jax.scene.declare import names
 
 
 def still(t, params):
@@ -272,7 +272,6 @@ def test_functions_that_return_something_else(effect, message):
 def test_functions_of_classes_are_named_where_they_return_wrong_values():
     """A force that is no tuple has the right number of rows between two bodies in the plane, and would be taken apart by coordinates."""
 
-    @effect_class
     class Tether(Effect):
         pair: Any = names(2)
         kind = "force"
@@ -281,7 +280,6 @@ def test_functions_of_classes_are_named_where_they_return_wrong_values():
         def function(t, q, v, params):
             return v[1] - v[0]
 
-    @effect_class
     class Attraction(Effect):
         pairs: Any = names(2)
         kind = "potential"
@@ -290,7 +288,6 @@ def test_functions_of_classes_are_named_where_they_return_wrong_values():
         def function(q, params):
             return jnp.sum((q[0] - q[1]) ** 2, axis=-1)
 
-    @effect_class
     class Rail(Effect):
         body: Any = names()
         kind = "constraint"

@@ -8,7 +8,7 @@ import pytest
 
 from vmri_jax import fully_implicit, simulate
 from vmri_jax.scene import Body, Effect, Scene
-from vmri_jax.scene.declare import array, common, effect_class, names, number, positive, vector
+from vmri_jax.scene.declare import array, common, names, number, positive, vector
 
 
 def turned(q, params=None):
@@ -17,7 +17,6 @@ def turned(q, params=None):
     return jnp.arctan2(q[..., 1], q[..., 0])
 
 
-@effect_class
 class TorsionSpring(Effect):
     """A spring that turns pointers in the plane back to an angle, ``V = sum k/2 (phi - phi_0)^2``."""
 
@@ -67,7 +66,6 @@ def test_declarations_are_checked(bodies, effect, message):
         Scene(bodies, [effect])
 
 
-@effect_class
 class Everything(Effect):
     """One field of each kind."""
 
@@ -86,7 +84,6 @@ class Everything(Effect):
         return jnp.zeros(())
 
 
-@effect_class
 class Wind(Effect):
     """A vector for all bodies."""
 
@@ -129,15 +126,14 @@ def test_incomplete_classes_of_effects_say_what_they_lack():
         "__annotations__": {"pairs": Any},
     }
     classes = {
-        "has no decorator; write @effect_class": type("Bare", (Effect,), dict(body)),
-        "has no kind; write kind = one of 'kinetic'": effect_class(type("Kindless", (Effect,), {**body, "kind": None})),
-        "has no field with names of bodies": effect_class(
-            type("Alone", (Effect,), {name: body[name] for name in ("kind", "function")})
+        "has no kind; write kind = one of 'kinetic'": type("Kindless", (Effect,), {**body, "kind": None}),
+        "has no field with names of bodies": type(
+            "Alone", (Effect,), {name: body[name] for name in ("kind", "function")}
         ),
-        "function without @staticmethod": effect_class(type("Bound", (Effect,), {**body, "function": function})),
+        "function without @staticmethod": type("Bound", (Effect,), {**body, "function": function}),
     }
     for message, cls in classes.items():
         with pytest.raises(TypeError, match=f"the class of effects {cls.__name__} .*{message}"):
             cls(("a", "b"))
-    magnets: Any = effect_class(type("Magnets", (Effect,), dict(body)))
+    magnets: Any = type("Magnets", (Effect,), dict(body))
     assert magnets(("a", "b")).name == "magnets"

@@ -43,14 +43,14 @@ def test_joints_in_a_row_are_one_joint_of_several_freedoms():
         (Planar(("ground", "plate"), [0, 0, 0], axis=axis, name="joint"), [Prismatic, Prismatic, Revolute]),
     ]
     for whole, kinds in cases:
-        axes = whole.bound({PLATE.name: PLATE}).triads[0][[move.axis for move in whole.moves]]
+        axes = whole.bound({PLATE.name: PLATE}).triads[0][[move.axis for move in whole.freedoms.values()]]
         frames = [Frame(f"frame {i}", [0.1 * i, 0.2, 0.3]) for i in range(len(kinds) - 1)]
         names = ["ground", *(frame.name for frame in frames), "plate"]
         row = [
             kind(pair, [0, 0, 0], axis=along, name=f"joint {i}")
             for i, (kind, pair, along) in enumerate(zip(kinds, pairwise(names), axes, strict=True))
         ]
-        first, last = whole.freedoms[0], whole.freedoms[-1]
+        first, *_, last = whole.freedoms
         one = scene_of([], [whole, JointSpring("joint", 3.0, 0.1, of=first), JointDamper("joint", 0.2, of=last)])
         other = scene_of(frames, [*row, JointSpring("joint 0", 3.0, 0.1), JointDamper(row[-1].name, 0.2)])
         for numbers in np.random.default_rng(0).normal(size=(3, len(kinds), 2)) / 2:

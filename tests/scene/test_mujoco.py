@@ -13,8 +13,7 @@ from tests.scene.mujoco_model_fields import IDLE, READ, REFUSED_FIELDS
 from vmri_jax.scene import Fixed, Scene, Spherical
 from vmri_jax.scene.body_motions import accelerations as motions
 from vmri_jax.scene.body_motions import state_of
-from vmri_jax.scene.mujoco_fields import REFUSED
-from vmri_jax.scene.mujoco_model import Compiled
+from vmri_jax.scene.mujoco_model import REFUSED, Compiled
 
 mujoco = pytest.importorskip("mujoco")
 

@@ -26,7 +26,7 @@ from vmri_jax.scene import (
     SpringAnchor,
     assembly,
 )
-from vmri_jax.scene.declare import effect_class, names, positive
+from vmri_jax.scene.declare import names, positive
 from vmri_jax.scene.effect import Effect
 
 N = 4
@@ -134,7 +134,6 @@ def test_a_number_in_a_list_is_the_number_of_a_single_element():
     assert energy([4.0], [9.0]) == energy(4.0, [9.0]) == energy(4.0, 9.0) == (4.0 + 9.0) / 2
 
 
-@effect_class
 class Quartic(Effect):
     """A potential of one body, written for one element."""
 

@@ -1,4 +1,4 @@
-"""Coordinates of some bodies in q_s and q_f, taken out and put back without a gather."""
+"""Coordinates of some bodies in q_s and q_f, taken out without a gather."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,6 +17,10 @@ class Place(NamedTuple):
     part: Part
     start: int
     size: int
+
+    def numbers(self, num_slow: int) -> np.ndarray:
+        """(size,) numbers of the coordinates in (q_s, q_f), taken as one vector whose first `num_slow` entries are q_s."""
+        return self.start + (num_slow if self.part == "f" else 0) + np.arange(self.size)
 
 
 class Run(NamedTuple):
@@ -135,23 +139,3 @@ class Rows:
                 whole = q[start : start + self.stride * count].reshape(count, self.stride)
                 pieces.append(whole[:, : self.size].reshape(-1))
         return jnp.concatenate(pieces).reshape(-1, self.size)
-
-    def put(self, rows, n_s: int, n_f: int):
-        """The transpose of `take`.
-
-        Args:
-            rows: one row for each place, or one row for all places.
-            n_s, n_f: lengths of q_s and q_f.
-
-        Returns:
-            Vectors (n_s,), (n_f,) with the rows added at their places.
-        """
-        rows, first = jnp.broadcast_to(rows, (sum(run.count for run in self.runs), self.size)), 0
-        sums, beyond = {"s": jnp.zeros(n_s), "f": jnp.zeros(n_f)}, self.stride - self.size
-        for part, start, count, same in self.runs:
-            piece = rows[first : first + count]
-            piece = jnp.sum(piece, axis=0) if same else jnp.pad(piece, ((0, 0), (0, beyond))).reshape(-1)
-            after = sums[part].shape[0] - start - piece.shape[0]
-            sums[part] += jnp.pad(piece, (start, after))
-            first += count
-        return tuple(sums.values())

@@ -2,14 +2,12 @@
 
 from vmri_jax.scene.body import Body, Frame
 from vmri_jax.scene.effect import Effect
-from vmri_jax.scene.effects.angles import Angle, Bending, Torsion
 from vmri_jax.scene.effects.contact import PlaneContact, SphereContact
 from vmri_jax.scene.effects.controls import Controlled
 from vmri_jax.scene.effects.couplings import Gear, JointCoupling
 from vmri_jax.scene.effects.custom import Constraint, CustomEffect, Force, Kinetic, Potential
 from vmri_jax.scene.effects.damping import Dashpot, LinearDamping, QuadraticDrag, RayleighDamping
-from vmri_jax.scene.effects.drives import ConstantForce, Drive, FollowerForce, HarmonicDrive
-from vmri_jax.scene.effects.fields import Gravity, MagneticField
+from vmri_jax.scene.effects.fields import ConstantForce, Drive, FollowerForce, Gravity, HarmonicDrive, MagneticField
 from vmri_jax.scene.effects.joint_base import Joint
 from vmri_jax.scene.effects.joint_effects import (
     JointDamper,
@@ -19,19 +17,18 @@ from vmri_jax.scene.effects.joint_effects import (
     JointSpring,
     RotorInertia,
 )
-from vmri_jax.scene.effects.joints import (
-    Cylindrical,
-    Fixed,
-    Planar,
-    Prismatic,
-    Revolute,
-    Screw,
-    Spherical,
-    Universal,
+from vmri_jax.scene.effects.joints import Cylindrical, Fixed, Planar, Prismatic, Revolute, Screw, Spherical, Universal
+from vmri_jax.scene.effects.potentials import Angle, Bending, Coulomb, LennardJones, NBodyGravity, Torsion, within_bonds
+from vmri_jax.scene.effects.springs import (
+    Anchor,
+    Guide,
+    MovingAnchor,
+    MovingPivot,
+    NonlinearSpring,
+    RigidLink,
+    Spring,
+    SpringAnchor,
 )
-from vmri_jax.scene.effects.links import Anchor, Guide, MovingPivot, RigidLink
-from vmri_jax.scene.effects.pairs import Coulomb, LennardJones, NBodyGravity, within_bonds
-from vmri_jax.scene.effects.springs import MovingAnchor, NonlinearSpring, Spring, SpringAnchor
 from vmri_jax.scene.rigid import RigidBody, angular_momentum, angular_velocity, quaternion, rotation
 from vmri_jax.scene.scene import Scene
 from vmri_jax.scene.shapes import Ball, Box, Cylinder, Rod

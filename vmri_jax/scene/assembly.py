@@ -10,7 +10,7 @@ from vmri_jax.mechanics.rows import Entries
 from vmri_jax.mechanics.system import ConstantMass, Rheonomic, System
 from vmri_jax.mechanics.terms import KINDS
 from vmri_jax.scene.declare import arrays
-from vmri_jax.scene.functions import IMPLIED, Actuation, function_of
+from vmri_jax.scene.functions import FUNCTIONS, IMPLIED, Actuation
 from vmri_jax.scene.layout import Layout
 from vmri_jax.scene.rows import rows_of
 from vmri_jax.scene.sorting import HOMES, Placed, Sorting
@@ -36,7 +36,7 @@ def build(sorting: Sorting, placed: Sequence[Placed]) -> System:
         is_rows = home in (*HOMES, "implied")  # whose values keep the order of `rows_of`
         of_home = joined(of_home, in_order=is_rows)
         field = home if home in KINDS else "potentials"  # a potential with a rate of its own
-        function = function_of(field, of_home, _kinematics(home, of_home, layout), taken.get(home))
+        function = FUNCTIONS[KINDS[field].kind](field, of_home, _kinematics(home, of_home, layout), taken.get(home))
         if field == "potentials":
             functions[field][home] = function
         else:
@@ -64,7 +64,7 @@ def _taken(placed: Sequence[Placed]) -> dict[Any, Entries]:
 def actuation(sorting: Sorting) -> Actuation | None:
     """The forces of the controls of a scene, None if it has no controls."""
     layout = sorting.layout
-    controls = [part for part in sorting.placed if part.home == "control"]
+    controls: list[Any] = [part for part in sorting.placed if part.home == "control"]
     terms = tuple(part.effect.terms(part.elements, layout)[0] for part in controls)
     names = tuple(part.effect.components() for part in controls)
     return Actuation("control", terms, _kinematics("control", terms, layout), names=names) if controls else None

@@ -6,15 +6,13 @@ from dataclasses import field, fields, replace
 from functools import cached_property
 from typing import Any, ClassVar, Literal, Self
 
-import numpy as np
-
 from vmri_jax.mechanics.arrays import library
 from vmri_jax.mechanics.rows import Place, Rows
 from vmri_jax.refusals import Refused
-from vmri_jax.scene.body import GROUND, Attachment, Bodies, Point, body_of, end_of, label_of, moving
-from vmri_jax.scene.declare import Elements, Parameter, effect_class, real_tree, stacked
+from vmri_jax.scene.body import GROUND, Attachment, Bodies, Point, body_of, end_of, label_of, moving, weights_of
+from vmri_jax.scene.declare import Declared, Elements, Parameter, real_tree, stacked
 from vmri_jax.scene.layout import Key, Layout
-from vmri_jax.scene.terms import EffectTerm, Role, Source, choose, is_of_package
+from vmri_jax.scene.terms import Applied, EffectTerm, Role, Source, choose, is_of_package
 
 MOST_ROLES = 32
 """Most bodies of an element: the two bodies of each of sixteen joints that one equation couples. More are refused."""
@@ -24,8 +22,7 @@ ALONE = "alone"
 """Name of the term of a single element, the same for all effects, so that equal functions share a compiled program."""
 
 
-@effect_class
-class Bindable(ABC):
+class Bindable(Declared, ABC):
     """An effect with the bodies of its scene; see `vmri_jax.scene.effect.Effect` for the attributes of its class.
 
     What depends on bodies is known of bound effects alone, see `bound`.
@@ -72,6 +69,12 @@ class Bindable(ABC):
     def by_name(self) -> Bodies:
         """All bodies of the scene by name."""
         return vars(self)["_by_name"]
+
+    @property
+    def called(self) -> Any:
+        """The function that terms call; the functions of time of the user are its first arguments, see `of_time`."""
+        of_time = tuple(getattr(self, f.name) for f in fields(self) if "of_time" in f.metadata)
+        return Applied(self.function, of_time) if of_time else self.function
 
     @cached_property
     def elements(self) -> Elements:
@@ -134,11 +137,8 @@ class Bindable(ABC):
         """For each role with points fixed in rigid bodies, the components X of these points along the directors; zeros for whole bodies."""
         points = {}
         for parameter, role in zip(POINTS, zip(*self.elements, strict=True), strict=False):
-            offsets = [getattr(name, "offset", None) for name in role]
-            if any(offset is not None for offset in offsets):
-                bodies = [body_of(self.by_name, name) for name in role]
-                ends = zip(bodies, offsets, strict=True)
-                points[parameter] = stacked([np.zeros(3) if x is None else body.weights(x) for body, x in ends])
+            if any(isinstance(name, Attachment) for name in role):
+                points[parameter] = stacked([weights_of(self.by_name, name) for name in role])
         return points
 
     def at_start(self, params: Mapping[str, Any]):
@@ -198,16 +198,17 @@ class Bindable(ABC):
         terms = []
         for group in self.by_size(select):
             roles = zip(POINTS, zip(*(self.attached[i] for i in group), strict=True), strict=False)
-            terms.append(self._term(self.function, [self._role(*role, layout.bodies) for role in roles], group))
+            terms.append(self._term([self._role(*role, layout.bodies) for role in roles], group))
         return tuple(terms)
 
-    def _term(self, function: Any, roles: Iterable[Role], group: Sequence[int]) -> EffectTerm:
-        """A function of some elements as a term."""
+    def _term(self, roles: Iterable[Role], group: Sequence[int], through: Any = None) -> EffectTerm:
+        """Some elements as a term."""
         select = None if len(group) == len(self.elements) else tuple(group)
         split, sources = self.split_of(self.parameters), (Source(self.name, len(group), select),)
+        function = self.called
         # A function of the user may be right for a single element alone; no parameter may be common to all elements.
         is_joined = is_of_package(function) and len(split) == len(self.parameters)
-        return EffectTerm(sources, function, tuple(roles), split, self.timed, is_joined)
+        return EffectTerm(sources, function, tuple(roles), split, self.timed, is_joined, through)
 
     def _role(self, parameter: str, names: Sequence[str], places: Mapping[str, Place]) -> Role:
         """The map from q_s and q_f to the coordinates of the bodies of a role, all of the same kind, or to points in them, which are a parameter."""

@@ -1,15 +1,14 @@
 """Bodies: points of a scene, blocks of general coordinates, frames, the ground, and the points of a body that effects act on."""
 
-from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.mechanics.arrays import is_concrete, real_array
+from vmri_jax.mechanics.arrays import is_concrete, library, real_array
+from vmri_jax.mechanics.kinematics import UNMOVED
 from vmri_jax.refusals import Refused
 
 Pace = Literal["slow", "fast", "auto"]
@@ -17,7 +16,7 @@ LARGEST_POINT = 3
 """Most coordinates of a point; a body with more is a block of general coordinates."""
 GROUND = "ground"
 """Name in effects of the body that does not move."""
-GROUND_COORDINATES = np.concatenate([np.zeros(3), np.eye(3).ravel()])
+GROUND_COORDINATES = UNMOVED.ravel()
 """The twelve coordinates (phi, d_1, d_2, d_3) of the ground as a rigid body."""
 
 
@@ -81,12 +80,14 @@ class Point(NamedTuple):
         return self.position.shape[0]
 
 
-class AnyBody(ABC):
+class AnyBody:
     """Base class of bodies.
 
     Attributes:
         name, pace: see `Body`.
-        coordinates, rates: (n,) q and v at the start.
+        mass: kg; None of a body without mass.
+        directors: (3, 3) principal axes in space at the start, one per row.
+        rates: (n,) v at the start.
         masses: (n,) m of the kinetic energy ``sum_i m_i v_i^2 / 2``.
         block: whether it has general coordinates, not the position of a point.
         rigid: whether its coordinates are a centre and directors.
@@ -96,8 +97,9 @@ class AnyBody(ABC):
 
     name: str
     pace: Pace
+    mass: Any
     position: Any
-    coordinates: Any
+    directors: Any
     rates: Any
     masses: Any
     radius: float | None
@@ -105,6 +107,11 @@ class AnyBody(ABC):
     rigid: bool = False
     rotation: Any = None
     wide: tuple[int, ...] = ()
+
+    @property
+    def coordinates(self) -> Any:
+        """(n,) centre of mass and directors."""
+        return joined([self.position, *(self.directors[i] for i in self.wide)])
 
     @property
     def size(self) -> int:
@@ -120,9 +127,14 @@ class AnyBody(ABC):
         """(3,) components X along the directors of a point ``phi + sum_i X_i d_i`` fixed in the body, see `point`."""
         return joined([offset, np.zeros(3 - offset.shape[0])])
 
-    @abstractmethod
     def point(self, offset: Any = None) -> Point:
         """The centre of the body, or the point at `offset` (3,) m from it in the axes of the body, at the start."""
+        if offset is None:
+            return Point(self.name, self.position, self.mass, self.block)
+        if offset.shape != (3,):
+            raise Refused(f"the point in {self.name} has shape {offset.shape}; give (3,), in the axes of the body.")
+        self.weights(offset)  # refuses a point outside a plate or a rod
+        return Point(self.name, self.position + self.rotation @ offset)
 
     def with_rates(self, rates: np.ndarray) -> "AnyBody":
         """The same body with other rates (n,) of its coordinates at the start; a body without mass has none."""
@@ -139,10 +151,12 @@ class AnyBody(ABC):
         if self.pace not in ("slow", "fast", "auto"):
             raise Refused(f"{kind} {self.name}: pace is {self.pace!r}; it must be 'slow', 'fast' or 'auto'.")
 
-    def _numbers(self, name: str, argument):
+    def _numbers(self, name: str, argument, shape: tuple[int, ...] | None = None):
         """An argument as an array of float64; of NumPy unless it is traced, so that the precision does not depend on JAX's mode."""
         about = f"{type(self).__name__} {self.name}: {name}"
         numbers = real_array(about, argument)
+        if shape not in (None, numbers.shape):
+            raise Refused(f"{about} has shape {numbers.shape}; give {shape}.")
         if not is_concrete(numbers):
             return numbers
         if not np.isfinite(numbers).all():
@@ -229,7 +243,7 @@ class Body(AnyBody):
         """The position of the body at the start; an offset, as if the body were rigid, is refused."""
         if offset is not None:
             raise Refused(f"{self.name} is no rigid body, so that no point is fixed in it; give its name alone.")
-        return Point(self.name, self.position, self.mass, self.block)
+        return super().point()
 
     def with_rates(self, rates: np.ndarray) -> "Body":
         return replace(self, velocity=rates)
@@ -238,8 +252,8 @@ class Body(AnyBody):
 class Ground(AnyBody):
     """The body that does not move, with the axes of space."""
 
-    name, block, rigid = GROUND, False, True
-    position, rotation, coordinates = np.zeros(3), np.eye(3), GROUND_COORDINATES
+    name, block, rigid, wide = GROUND, False, True, (0, 1, 2)
+    position, rotation, directors = np.zeros(3), np.eye(3), np.eye(3)
 
     def point(self, offset: Any = None) -> Point:
         """A point in space that does not move."""
@@ -272,23 +286,11 @@ class Frame(AnyBody):
     pace: Pace = "auto"
 
     rigid, block, radius, wide = True, False, None, (0, 1, 2)
-    rotation, rates, masses = np.eye(3), np.zeros(12), np.zeros(12)
+    mass, rotation, directors, rates, masses = None, np.eye(3), np.eye(3), np.zeros(12), np.zeros(12)
 
     def __post_init__(self):
         self._check_names()
-        position = self._numbers("position", self.position)
-        if position.shape != (3,):
-            raise Refused(f"Frame {self.name}: position has shape {position.shape}; give (3,).")
-        object.__setattr__(self, "position", position)
-
-    @property
-    def coordinates(self):
-        """(12,) origin and axes."""
-        return joined([self.position, np.eye(3).ravel()])
-
-    def point(self, offset: Any = None) -> Point:
-        """The origin of the frame, or a point fixed in it, at the start."""
-        return Point(self.name, self.position if offset is None else self.position + offset)
+        object.__setattr__(self, "position", self._numbers("position", self.position, (3,)))
 
 
 Bodies = Mapping[str, AnyBody]
@@ -308,6 +310,12 @@ def end_of(bodies: Bodies, name: str, whole: bool = False) -> Point:
     return body.point(offset)
 
 
+def weights_of(bodies: Bodies, name: str) -> Any:
+    """(3,) components of the point in a body that a name stands for, see `AnyBody.weights`; zeros for the body itself."""
+    offset = getattr(name, "offset", None)
+    return np.zeros(3) if offset is None else body_of(bodies, name).weights(offset)
+
+
 def joined(vectors):
     """Vectors one after the other in one array; of NumPy unless an entry is traced."""
-    return np.concatenate(vectors) if is_concrete(vectors) else jnp.concatenate(vectors)
+    return library(vectors).concatenate(vectors)

@@ -1,6 +1,5 @@
 """Declarations of the fields of an effect: the bodies that it depends on, and the parameters of its function.
 
-    @effect_class
     class Spring(Effect):
         between: Any = names(2)
         stiffness: Any = positive()
@@ -12,7 +11,7 @@
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import MISSING, dataclass, field
 from itertools import combinations
-from typing import Any, Literal, TypeVar, dataclass_transform
+from typing import Any, Literal, dataclass_transform
 
 import jax
 import numpy as np
@@ -24,7 +23,6 @@ from vmri_jax.scene.body import Bodies, Frame, Point, entry, is_entry
 
 Elements = tuple[tuple[str, ...], ...]
 Sign = Literal["", "positive", "at least zero"]
-Class = TypeVar("Class")
 
 
 @dataclass(frozen=True)
@@ -143,7 +141,7 @@ def array(*, default: Any = MISSING, sign: Sign = "") -> Any:
 
 
 def of_time() -> Any:
-    """A function of the user, ``f(t, params)``; the function of the effect gets `params` by the name of this field."""
+    """A function of the user, ``f(t, params)``: the first argument of the function of the effect, which gets `params` by the name of this field."""
     return field(metadata={"of_time": True})
 
 
@@ -152,9 +150,11 @@ def of_time() -> Any:
     eq_default=False,
     field_specifiers=(names, number, positive, vector, common, array, of_time, field),
 )
-def effect_class(cls: type[Class]) -> type[Class]:
-    """Decorator: a frozen dataclass whose fields may be declared by `names`, `positive` and the other functions of this module."""
-    return dataclass(frozen=True, eq=False)(cls)
+class Declared:
+    """Base class of frozen dataclasses: subclasses declare their fields by the functions above, and need no decorator."""
+
+    def __init_subclass__(cls):
+        dataclass(frozen=True, eq=False)(cls)
 
 
 def stacked(values: Sequence[Any]):

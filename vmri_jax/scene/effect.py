@@ -1,30 +1,36 @@
 """Effects: each adds a function of positions, velocities and time of some bodies to the Lagrangian, the constraints or the forces."""
 
 from collections.abc import Sequence
-from dataclasses import Field, fields
+from dataclasses import fields
 from inspect import getattr_static, isfunction
 from itertools import chain, pairwise
 from typing import Any, ClassVar, Literal, get_args
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 
 from vmri_jax.mechanics.arrays import is_concrete, library
+from vmri_jax.mechanics.checks import describe, shape_of
+from vmri_jax.mechanics.constraints import START as KEPT_AT_START
+from vmri_jax.mechanics.constraints import Rows
 from vmri_jax.mechanics.functions import check_arguments
 from vmri_jax.mechanics.names import unknown
 from vmri_jax.refusals import Refused
 from vmri_jax.scene.binding import MOST_ROLES, Bindable
-from vmri_jax.scene.body import GROUND, Attachment, end_of, label_of, moving
-from vmri_jax.scene.declare import effect_class, lasting
-from vmri_jax.scene.returned import check_function
+from vmri_jax.scene.body import GROUND, Attachment, end_of, label_of, moving, weights_of
+from vmri_jax.scene.declare import arrays, lasting
 
 Kind = Literal["kinetic", "potential", "constraint", "force", "control"]
 START = 1e-9
 """Largest violation of a constraint at the start, relative to the value that it keeps. A larger one would start runs off the constraints;
 a smaller one would refuse lengths that are written with ten digits."""
 
+LIBRARY = "vmri_jax."
+"""Beginning of the names of modules whose functions are not checked: the tests of the package do that."""
 
-@effect_class
+
 class Effect(Bindable):
     """Base class of effects: a function, the bodies that it depends on, and its parameters.
 
@@ -73,11 +79,9 @@ class Effect(Bindable):
         """A new effect, of a class that is complete.
 
         Raises:
-            TypeError: the class has no decorator, no `kind`, no field with names of bodies, or a `function` that would get the effect itself.
+            TypeError: the class has no `kind`, no field with names of bodies, or a `function` that would get the effect itself.
         """
         about = f"the class of effects {cls.__name__}"
-        if any(isinstance(value, Field) for value in vars(cls).values()):  # the decorator replaces them
-            raise Refused(f"{about} has no decorator; write @effect_class of vmri_jax.scene.declare above it.")
         if getattr(cls, "kind", None) not in get_args(Kind):
             raise Refused(f"{about} has no kind; write kind = one of {', '.join(map(repr, get_args(Kind)))} in it.")
         if cls._elements is Effect._elements and not any("names" in f.metadata for f in fields(cls)):
@@ -167,10 +171,6 @@ class Effect(Bindable):
                 fits = value > 0 if parameter.sign == "positive" else value >= 0
                 self.require(fits, name, value, f"it must be {parameter.sign}")
 
-    def components(self) -> tuple[str, ...]:
-        """Names of the controls of this effect; () unless its kind is "control"."""
-        return ()
-
     def curvature(self):
         """Largest second derivative of the energy of each element, () or (n,), if the start does not show it (contacts that are open); else None."""
         return None
@@ -180,7 +180,7 @@ class Effect(Bindable):
         if self.drawn_as is None:
             return {}
         return {
-            name.label: (str(name), self.by_name[name].weights(name.offset))
+            name.label: (str(name), weights_of(self.by_name, name))
             for name in chain(*self.elements)
             if isinstance(name, Attachment) and name != GROUND
         }
@@ -231,3 +231,50 @@ class Effect(Bindable):
                     f"it starts as {measured:.12g}; give this value, move a body, or let the scene do so, project=True"
                 )
                 self.require(agrees, f"{name} of {'-'.join(map(label_of, element))}", f"{kept:g}", expected)
+
+
+def check_function(effect: Any, moved: bool) -> None:
+    """Refuse a function of the user with a wrong value, and a constraint that the start violates unless `moved`.
+
+    The function gets each group of equal elements, as the terms of the system do.
+    """
+    if effect.kind == "control" or getattr(effect.function, "__module__", "").startswith(LIBRARY):
+        return
+    for group in effect.by_size():
+        q = jax.device_put(effect.positions(group))
+        t, v = jax.device_put(((np.zeros(()),), tuple(np.zeros(x.shape) for x in q)))
+        before = {"force": (*t, q, v), "kinetic": (q, v)}.get(effect.kind, (*t, q) if effect.timed else (q,))
+        arguments = *before, arrays(effect.params_of(group))
+        value = shape_of(f"{effect.name}: function", effect.called, *arguments)
+        _check_value(effect, value, [x.shape for x in q], len(group))
+        if effect.kind == "constraint" and not moved and is_concrete(arguments):
+            rows = _rows(effect.called, *arguments)
+            if np.any(np.abs(rows.values) > rows.allowed(KEPT_AT_START)):
+                raise Refused(
+                    f"{effect.name}: the positions at the start violate this constraint by {np.abs(rows.values).max():.3g}; move the "
+                    "bodies, or let the scene do so, Scene(..., project=True)."
+                )
+
+
+def _rows(constraint, *arguments) -> Rows:
+    """The `Rows` of a constraint of positions, its last argument but one."""
+    *before, q, params = arguments
+    flat, by_role = ravel_pytree(q)
+    return Rows.of(lambda flat: jnp.ravel(constraint(*before, by_role(flat), params)), flat)
+
+
+def _check_value(effect: Any, value: Any, sizes: list[tuple[int, ...]], count: int) -> None:
+    """Refuse a value of a function of `count` elements, as shapes, whose roles have the shapes `sizes`."""
+    shape = getattr(value, "shape", None)
+    if effect.kind == "force":
+        fits = isinstance(value, tuple | list) and [getattr(x, "shape", None) for x in value] == sizes
+        expected = (
+            f"a tuple with a force for each body, of shapes {', '.join(map(str, sizes))}: (force,) of a single body"
+        )
+    elif effect.kind == "constraint":
+        fits = shape is not None and (len(shape) < 2 or count > 1)
+        expected = "a vector (k,) of values that are kept zero, or one value ()"
+    else:
+        fits, expected = shape == (), "an energy, a scalar of shape (), the sum over all elements"
+    if not fits:
+        raise Refused(f"{effect.name}: function returns {describe(value)}; it must return {expected}.")

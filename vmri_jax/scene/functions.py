@@ -3,7 +3,6 @@
 All classes here are compared by value: scenes of the same structure give equal functions, which JAX compiles only once.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import chain
 from typing import Any
@@ -16,7 +15,7 @@ from vmri_jax.kernels import matmul
 from vmri_jax.mechanics.kinematics import JOINTS, MASS, Kinematics
 from vmri_jax.mechanics.rows import Entries
 from vmri_jax.mechanics.terms import KINDS
-from vmri_jax.scene.terms import concatenated, total, totals
+from vmri_jax.scene.terms import total, totals
 
 IMPLIED = "implied"
 """Key of params that holds the sizes of the dropped rows."""
@@ -84,7 +83,7 @@ class ConstraintValues(_OfTerms):
     def __call__(self, *arguments):
         t, q_s, q_f, *_, params = self.by_name(arguments)
         bodies = self.bodies(q_s, q_f, params)
-        values = concatenated([term.value(*bodies, params, t) for term in self.terms])
+        values = jnp.concatenate([jnp.ravel(term.value(*bodies, params, t)) for term in self.terms])
         values = values if self.rows is None else self.rows.take(values)
         return values / params[IMPLIED] if self.field == "implied" else values
 
@@ -154,8 +153,3 @@ FUNCTIONS: dict[str, Any] = {
     "force": TotalForce,
 }
 """For each kind of a function of `System`, the class that makes it of its terms."""
-
-
-def function_of(field: str, *of_terms) -> Callable:
-    """The function that is an argument of `System`, of terms, kinematics and rows."""
-    return FUNCTIONS[KINDS[field].kind](field, *of_terms)

@@ -1,8 +1,8 @@
 """Where the coordinates of bodies and joints lie in q_s and q_f."""
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -40,28 +40,26 @@ class Layout:
     @property
     def sizes(self) -> tuple[int, int]:
         """(n_s, n_f)."""
-        n_s, n_f = (sum(place.size for place in self.coordinates.values() if place.part == part) for part in ("s", "f"))
-        return n_s, n_f
+        return _ends([*self.coordinates.values()])
 
     @property
     def ends(self) -> tuple[int, int]:
         """Lengths of Q_s and Q_f."""
-        places = [*self.coordinates.values(), *self.bodies.values()]
-        slow, fast = (max((p.start + p.size for p in places if p.part == part), default=0) for part in ("s", "f"))
-        return slow, fast
+        return _ends([*self.coordinates.values(), *self.bodies.values()])
 
     @property
     def columns(self) -> dict[str | Key, np.ndarray]:
         """Numbers of the coordinates of every body, and of every freedom of a joint, in (Q_s, Q_f), taken as one vector."""
-        return _numbers({**self.bodies, **self.freedoms}, self.ends[0])
+        num_slow, places = self.ends[0], {**self.bodies, **self.freedoms}
+        return {name: place.numbers(num_slow) for name, place in places.items()}
 
     @property
     def numbers(self) -> dict[str | Key, np.ndarray]:
         """Numbers of the coordinates of every name and freedom in (q_s, q_f), taken as one vector."""
-        return _numbers({**self.coordinates, **self.freedoms}, self.sizes[0])
+        num_slow, places = self.sizes[0], {**self.coordinates, **self.freedoms}
+        return {name: place.numbers(num_slow) for name, place in places.items()}
 
 
-def _numbers(places: Mapping[Any, Place], num_slow: int) -> dict[Any, np.ndarray]:
-    return {
-        name: start + (num_slow if part == "f" else 0) + np.arange(size) for name, (part, start, size) in places.items()
-    }
+def _ends(places: Sequence[Place]) -> tuple[int, int]:
+    slow, fast = (max((p.start + p.size for p in places if p.part == part), default=0) for part in ("s", "f"))
+    return slow, fast

@@ -13,10 +13,10 @@ from vmri_jax.mechanics import invariants
 from vmri_jax.mechanics.linearisation import linearise
 from vmri_jax.mechanics.masses import ConstantMass
 from vmri_jax.mechanics.names import Names
-from vmri_jax.mechanics.state import Problem, State, initial_state
+from vmri_jax.mechanics.state import Problem, initial_state
 from vmri_jax.mechanics.surroundings import name_of
 from vmri_jax.mechanics.system import System
-from vmri_jax.mechanics.terms import KINDS, Term
+from vmri_jax.mechanics.terms import KINDS
 from vmri_jax.refusals import Refused
 from vmri_jax.running.prepare import prepare
 from vmri_jax.running.printed import PrintedTable
@@ -103,30 +103,15 @@ def ledger(sorting: Sorting, scheme: Scheme | Composition, macro_dt: float | Non
     """The ledger of a scene, see `Scene.explain`."""
     if not isinstance(scheme, Scheme | Composition):
         raise Refused(f"Scene.explain: scheme is {scheme!r}; give a Scheme, e.g. fully_implicit(num_micro=10).")
-    stage, stages, intervals = _intervals(scheme)
-    rows = []
     sizes = {name: place.size for name, place in sorting.layout.bodies.items()}
     sizes |= {branch.child: len(branch.joint.freedoms) for branch in sorting.branches}
-    for name, pace in sorting.paces.items():
-        grid = "micro" if pace.value == "fast" else "macro"
-        unknowns = intervals[grid] * sizes[name]
-        rows.append(LedgerRow(name, "body", grid, f"{pace.value}: {pace.reason}", unknowns, 0, 0))
-    step_time, times = _measure(sorting, scheme, macro_dt) if measure else (None, [None] * len(sorting.placed))
-    for part, nanoseconds in zip(sorting.placed, times, strict=True):
-        symbol, kind = _term(part.home)
-        rule = stage.rule_of(symbol)
-        multipliers = intervals[rule.grid] * sum(build(sorting, [part]).num_constraints(*sorting.start[:2]))
-        count = 0 if part.home == "control" else stages * rule.evaluations(stage.num_micro)
-        microseconds = None if nanoseconds is None else nanoseconds * count / 1e3
-        rows.append(LedgerRow(part.effect.name, kind, rule.grid, part.reason, 0, multipliers, count, microseconds))
-    return Ledger(tuple(rows), step_time)
-
-
-def _intervals(scheme: Scheme | Composition) -> tuple[Scheme, int, dict[str, int]]:
-    """The scheme of a stage, the number of stages, and the number of unknown nodes in a macro step on each grid."""
-    stage = stage_scheme(scheme)
-    stages = scheme.num_stages if isinstance(scheme, Composition) else 1
-    return stage, stages, {"macro": stages * stage.degree, "micro": stages * stage.degree * stage.num_micro}
+    bodies = [(name, sizes[name], pace.value, pace.reason) for name, pace in sorting.paces.items()]
+    functions = [
+        (part.effect.name, *_term(part.home), part.reason, build(sorting, [part]), part.home != "control")
+        for part in sorting.placed
+    ]
+    system = build(sorting, sorting.placed)
+    return _ledger(bodies, functions, system, sorting.start, scheme, macro_dt, measure)
 
 
 def _term(home: Any) -> tuple[Any, str]:
@@ -142,58 +127,62 @@ def ledger_of_functions(
 ) -> Ledger:
     """The ledger of a system of functions: its coordinates by name, and each of its functions; see `Scene.explain`."""
     system, state = problem.system, problem.state()
-    stage, stages, intervals = _intervals(scheme)
     names = (problem.names or Names()).of_coordinates(state.q_s.size, state.q_f.size)
-    rows = []
-    for name, (part, _, size) in names.bodies.items():
-        pace, grid = ("fast", "micro") if part == "f" else ("slow", "macro")
-        rows.append(LedgerRow(name, "body", grid, f"{pace}: it is in q_{part}", intervals[grid] * size, 0, 0))
-
+    bodies = [
+        (name, size, "fast" if part == "f" else "slow", f"it is in q_{part}")
+        for name, (part, _, size) in names.bodies.items()
+    ]
+    masses = ConstantMass(np.ones(state.q_s.size), np.ones(state.q_f.size))
+    functions = []
     for term in system.terms:
         # T_s is a part of the row of T; masses cost nothing, and steps do not solve for implied rows
         if term.kind == "implied" or term.name == "T_s" or isinstance(term.function, ConstantMass):
             continue
-        rule, alone = stage.rule_of(term.name), _alone(system, term, state)
-        multipliers = intervals[rule.grid] * sum(alone.num_constraints(state.q_s, state.q_f))
-        count, microseconds = stages * rule.evaluations(stage.num_micro), None
+        alone = {other.name: other.function for other in system.terms if other.kind == term.kind == "kinetic"}
+        alone = {"T": masses} | alone | {term.name: term.function}
+        kind, system_alone = (
+            f"{KINDS[term.field].in_words} {term.label}",
+            system.mapped(lambda t, f=alone: f.get(t.name)),
+        )
+        functions.append((name_of(term.function), term.name, kind, "", system_alone, True))
+    start = state.q_s, state.q_f, problem.v_s, problem.v_f
+    return _ledger(bodies, functions, system, start, scheme, macro_dt, measure)
+
+
+def _ledger(bodies, functions, system: System, start, scheme, macro_dt: float | None, measure: bool) -> Ledger:
+    """The ledger of a system.
+
+    Args:
+        bodies: (name, number of coordinates, pace, reason for it).
+        functions: (name, key of its rule, name of its kind, reason for its grid, the system with this function alone, whether steps evaluate it).
+        start: (q_s, q_f, v_s, v_f), where the functions are measured.
+    """
+    stage, stages = stage_scheme(scheme), scheme.num_stages if isinstance(scheme, Composition) else 1
+    nodes = {"macro": stages * stage.degree, "micro": stages * stage.degree * stage.num_micro}  # with unknowns
+    rows = []
+    for name, size, pace, reason in bodies:
+        grid = "micro" if pace == "fast" else "macro"
+        rows.append(LedgerRow(name, "body", grid, f"{pace}: {reason}", nodes[grid] * size, 0, 0))
+    q = jnp.concatenate(start[:2])
+    for name, key, kind, reason, alone, is_evaluated in functions:
+        rule = stage.rule_of(key)
+        reason = reason or f"the rule of the scheme for it: {rule.in_words()}"
+        multipliers = nodes[rule.grid] * sum(alone.num_constraints(*start[:2]))
+        count, microseconds = is_evaluated * stages * rule.evaluations(stage.num_micro), None
         if measure:
-            derivatives = _first_derivatives(alone, state.q_s.size, problem.v_s, problem.v_f)
-            microseconds = 1e6 * seconds_each(derivatives, jnp.concatenate([state.q_s, state.q_f])) * count
-        kind = f"{KINDS[term.field].in_words} {term.label}"
-        why = f"the rule of the scheme for it: {rule.in_words()}"
-        rows.append(LedgerRow(name_of(term.function), kind, rule.grid, why, 0, multipliers, count, microseconds))
-    return Ledger(tuple(rows), _macro_step(system, scheme, state, macro_dt, DEFAULT_FREQUENCY) if measure else None)
+            microseconds = 1e6 * count * seconds_each(_first_derivatives(alone, start[0].size, *start[2:]), q)
+        rows.append(LedgerRow(name, kind, rule.grid, reason, 0, multipliers, count, microseconds))
+    return Ledger(tuple(rows), _macro_step(system, scheme, start, macro_dt) if measure else None)
 
 
-def _alone(system: System, term: Term, state: State) -> System:
-    """The system with one term alone, and with unit masses unless this is the kinetic energy."""
-    masses = ConstantMass(np.ones(state.q_s.size), np.ones(state.q_f.size))
-
-    def function(other: Term):
-        if other.name == term.name or other.kind == term.kind == "kinetic":
-            return other.function
-        return masses if other.name == "T" else None
-
-    return system.mapped(function)
-
-
-def _measure(sorting: Sorting, scheme, macro_dt) -> tuple[float, list[float]]:
-    """Microseconds of a macro step, and nanoseconds of an evaluation of the first derivatives of every effect."""
-    system = build(sorting, sorting.placed)
-    state = initial_state(system, *sorting.start, project=True)
-    q_s, q_f, v_s, v_f = sorting.start
-    largest_q, largest_v = (max(np.abs(x).max(initial=0.0) for x in pair) for pair in ((q_s, q_f), (v_s, v_f)))
-    turning = float(largest_v / max(largest_q, 1e-300))  # rad/s; of a spinning body roughly its angular velocity
-    step = _macro_step(system, scheme, state, macro_dt, turning or DEFAULT_FREQUENCY)
-    of_effects = [_first_derivatives(build(sorting, [part]), q_s.size, v_s, v_f) for part in sorting.placed]
-    q = jnp.concatenate([q_s, q_f])
-    return step, [1e9 * seconds_each(derivatives, q) for derivatives in of_effects]
-
-
-def _macro_step(system: System, scheme, state: State, macro_dt: float | None, frequency: float) -> float:
-    """Microseconds of a macro step, by default of micro steps 0.1 / w, w the largest frequency or `frequency`."""
+def _macro_step(system: System, scheme, start, macro_dt: float | None) -> float:
+    """Microseconds of a macro step, by default of micro steps 0.1 / w, w the largest frequency."""
+    state = initial_state(system, *start, project=True)
     if macro_dt is None:
-        macro_dt = scheme.num_micro * 0.1 / (float(linearise(system, state).frequencies.max(initial=0.0)) or frequency)
+        largest_q, largest_v = (max(np.abs(x).max(initial=0.0) for x in pair) for pair in (start[:2], start[2:]))
+        turning = float(largest_v / max(largest_q, 1e-300))  # rad/s; of a spinning body roughly its angular velocity
+        frequency = float(linearise(system, state).frequencies.max(initial=0.0)) or turning or DEFAULT_FREQUENCY
+        macro_dt = scheme.num_micro * 0.1 / frequency
     seconds = interleaved({"": prepare_steps(system, scheme, state, macro_dt).timed()}, 5)[""]
     return 1e6 * float(np.median(seconds)) / STEPS
 

@@ -10,7 +10,7 @@
 | equalities joint, tendon (fixed) | `JointCoupling` |
 | gravity, gravcomp | `Gravity`, `Potential` |
 
-MuJoCo's equalities are soft; here they are constraints, satisfied to round-off. The parts of a model that the reader refuses are in `mujoco_fields`.
+MuJoCo's equalities are soft; here they are constraints, satisfied to round-off. The parts of a model that the reader refuses are in `mujoco_model`.
 """
 
 from collections.abc import Collection, Iterator
@@ -31,15 +31,14 @@ from vmri_jax.scene.effects.joint_base import Joint
 from vmri_jax.scene.effects.joint_effects import JointDamper, JointLimit, JointSpring, RotorInertia
 from vmri_jax.scene.effects.joints import Fixed, Prismatic, Revolute, Spherical
 from vmri_jax.scene.mujoco_equalities import close, couplings, loops
-from vmri_jax.scene.mujoco_fields import CONSTRAINTS
-from vmri_jax.scene.mujoco_model import Compiled
+from vmri_jax.scene.mujoco_model import CONSTRAINTS, Compiled
 from vmri_jax.scene.rigid import RigidBody
 
 SMOOTHING = 1e-3
 """Smoothing of a limit as a spring, relative to the range of the joint. With a larger value the force sets in visibly before the limit;
 a smaller value needs smaller steps there."""
 OLDEST_VERSION = 4
-"""First major version of MuJoCo with the fields of `mujoco_fields`; older versions have other flags."""
+"""First major version of MuJoCo with the fields of `mujoco_model`; older versions have other flags."""
 
 
 def bodies_and_effects(
@@ -149,9 +148,7 @@ class _Reader(Compiled):
                 continue
             yield (Revolute if kind == kinds.mjJNT_HINGE else Prismatic)(between, anchor, axis, name=name)
             dof, place = model.jnt_dofadr[j], model.jnt_qposadr[j]
-            stiffness, damping, rotor = (
-                float(x) for x in (model.jnt_stiffness[j], model.dof_damping[dof], model.dof_armature[dof])
-            )
+            stiffness, damping, rotor = model.jnt_stiffness[j], model.dof_damping[dof], model.dof_armature[dof]
             is_nonlinear = np.any(model.jnt_stiffnesspoly[j]) or model.jnt_springyield[j]
             if stiffness and not is_nonlinear and not self.off("SPRING"):
                 relaxed = float(model.qpos_spring[place] - self.data.qpos[place])

@@ -166,12 +166,10 @@ def couplings(compiled: Compiled) -> Iterator[JointCoupling]:
         ratios = np.array([[side.get(j, 0.0) for j in joints] for side in sides])
         places = model.jnt_qposadr[joints]
         coefficients = np.where(np.any(ratios[1]), model.eq_data[i, :5], [model.eq_data[i, 0], 0, 0, 0, 0])
-        params = {
-            "ratios": ratios,
-            "offsets": ratios
-            @ (compiled.data.qpos[places] - model.qpos0[places]),  # a scene counts coordinates from the start
-            "coefficients": coefficients,
-        }
+        offsets = ratios @ (
+            compiled.data.qpos[places] - model.qpos0[places]
+        )  # a scene counts coordinates from the start
+        params = {"ratios": ratios, "offsets": offsets, "coefficients": coefficients}
         name = compiled.name("equality", i)
         violation = abs(float(polynomial(jnp.zeros(len(joints)), params)))
         if violation > WIDEST_GAP:

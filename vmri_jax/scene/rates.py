@@ -50,7 +50,6 @@ class Linearised(NamedTuple):
 
     columns: indices of these velocities among the velocities of all bodies.
     force, stiffness, gyroscopic, mass: force on the bodies at rest, K, G, and d2L/dv2, a part of the mass matrix.
-    translation, turning: matrices from these velocities to the rates of positions and to the rates of directors.
     """
 
     columns: np.ndarray
@@ -58,8 +57,6 @@ class Linearised(NamedTuple):
     stiffness: np.ndarray
     gyroscopic: np.ndarray
     mass: np.ndarray
-    translation: np.ndarray
-    turning: np.ndarray
 
 
 def measure(bodies: Bodies, effects: Sequence[Effect]) -> dict[str, Rates]:
@@ -68,12 +65,17 @@ def measure(bodies: Bodies, effects: Sequence[Effect]) -> dict[str, Rates]:
     columns = dict(zip(bodies, np.split(np.arange(sum(sizes)), np.cumsum(sizes)[:-1]), strict=True))
     # M = A^T diag(m) A with the motions A of each body, plus d2L/dv2 of kinetic effects
     mass = np.asarray(block_diag(*(body.motions.T @ (body.masses[:, None] * body.motions) for body in bodies.values())))
-    elements = {effect.name: _linearise(effect, bodies, columns) for effect in effects}
+    elements = {
+        effect.name: [_linearise(effect, i, bodies, columns) for i in range(len(effect.elements))] for effect in effects
+    }
     for element in chain(*elements.values()):
         mass[np.ix_(element.columns, element.columns)] += element.mass
+    # the first three coordinates of a rigid body are its centre, all others directors
+    centres = [(body.motions, 3 if body.rigid else body.size) for body in bodies.values()]
+    motions = block_diag(*(m[:k] for m, k in centres)), block_diag(*(m[k:] for m, k in centres))
     points = positions(bodies)
     size = max(float(np.ptp(points, axis=0).max(initial=0.0)), float(np.abs(points).max()))
-    return {effect.name: _rates(effect, elements[effect.name], mass, size or 1.0) for effect in effects}
+    return {effect.name: _rates(effect, elements[effect.name], mass, motions, size or 1.0) for effect in effects}
 
 
 def border(measured: Mapping[str, Rates], effects: Sequence[Effect]) -> float | None:
@@ -96,12 +98,13 @@ def border(measured: Mapping[str, Rates], effects: Sequence[Effect]) -> float | 
     return float(middle) if widest >= SEPARATION or (declared and widest > 1) else None
 
 
-def _rates(effect: Effect, elements: Sequence[Linearised], mass: np.ndarray, size: float) -> Rates:
-    """Frequencies and rates of the elements of an effect, with the mass matrix of all bodies and the size L of the scene."""
+def _rates(effect: Effect, elements: Sequence[Linearised], mass: np.ndarray, motions: Sequence, size: float) -> Rates:
+    """Of the elements of an effect; `motions` are matrices from all velocities to rates of positions, and to rates of directors."""
     declared = effect.curvature()
     curvatures = np.broadcast_to(-np.inf if declared is None else declared, len(elements))
     frequency, rate = np.zeros(len(elements)), np.zeros(len(elements))
     for i, (names, element) in enumerate(zip(effect.elements, elements, strict=True)):
+        translation, turning = (np.asarray(part)[:, element.columns] for part in motions)
         element_mass = mass[np.ix_(element.columns, element.columns)]
         if not np.linalg.eigvalsh(element_mass).min() > 0:
             raise Refused(
@@ -112,12 +115,12 @@ def _rates(effect: Effect, elements: Sequence[Linearised], mass: np.ndarray, siz
         # w^2: the largest eigenvalue of N^T K N, or the declared curvature k times the largest eigenvalue of A M^-1 A^T, where A v are the rates of
         # positions: k / m for a body of mass m
         matrix = N.T @ (element.stiffness + element.stiffness.T) @ N / 2
-        largest = max(np.linalg.eigvalsh(matrix).max(), curvatures[i] * np.linalg.norm(element.translation @ N, 2) ** 2)
+        largest = max(np.linalg.eigvalsh(matrix).max(), curvatures[i] * np.linalg.norm(translation @ N, 2) ** 2)
         if largest > ROUND_OFF * np.abs(matrix).max(initial=0.0):
             frequency[i] = np.sqrt(largest)
         frequency[i] = max(frequency[i], np.linalg.norm(N.T @ element.gyroscopic @ N, 2))
         acceleration = N @ (N.T @ element.force)
-        a, alpha = (np.abs(part @ acceleration).max(initial=0.0) for part in (element.translation, element.turning))
+        a, alpha = (np.abs(part @ acceleration).max(initial=0.0) for part in (translation, turning))
         rate[i] = max(frequency[i], np.sqrt(a / size), np.sqrt(alpha))
     # elements between the same bodies are terms of a series, as of a torsion: they get the rate of the fastest
     same_bodies: dict[frozenset, list[int]] = {}
@@ -128,31 +131,21 @@ def _rates(effect: Effect, elements: Sequence[Linearised], mass: np.ndarray, siz
     return Rates(frequency, rate)
 
 
-def _linearise(effect: Effect, bodies: Bodies, columns: Mapping[str, np.ndarray]) -> list[Linearised]:
-    """The elements of an effect at the start; `columns` of each body, see `Linearised`."""
-    linearised = []
-    for i, element in enumerate(map(moving, effect.elements)):
-        term, element_params = effect.element_term(i)
-        q = np.concatenate([bodies[name].coordinates for name in element])
-        v = np.concatenate([bodies[name].rates for name in element])
-        is_kinetic = effect.kind == "kinetic"
-        function = TracedOnce(term.kinetic if is_kinetic else term.value)
-        force, *matrices = map(np.asarray, _derivatives(function, is_kinetic, q, v, element_params))
-        each = [bodies[name].motions for name in element]
-        motions = block_diag(*each)
-        force, (stiffness, gyroscopic, mass) = motions.T @ force, [motions.T @ matrix @ motions for matrix in matrices]
-        if not all(np.isfinite(part).all() for part in (force, stiffness, gyroscopic, mass)):
-            raise Refused(
-                f"{effect.name}: its energy between {', '.join(map(label_of, effect.elements[i]))} has no finite derivatives at the "
-                "start; move these bodies, or smooth the energy."
-            )
-        # the first three coordinates of a rigid body are its centre, all others directors
-        centres = [(m, 3 if bodies[name].rigid else bodies[name].size) for m, name in zip(each, element, strict=True)]
-        translation = np.asarray(block_diag(*(m[:k] for m, k in centres)))
-        turning = np.asarray(block_diag(*(m[k:] for m, k in centres)))
-        joined_columns = np.concatenate([columns[name] for name in element])
-        linearised.append(Linearised(joined_columns, force, stiffness, gyroscopic, mass, translation, turning))
-    return linearised
+def _linearise(effect: Effect, i: int, bodies: Bodies, columns: Mapping[str, np.ndarray]) -> Linearised:
+    """Element i of an effect at the start; `columns` of each body, see `Linearised`."""
+    names, (term, params) = moving(effect.elements[i]), effect.element_term(i)
+    q, v = (np.concatenate([getattr(bodies[name], of) for name in names]) for of in ("coordinates", "rates"))
+    is_kinetic = effect.kind == "kinetic"
+    function = TracedOnce(term.kinetic if is_kinetic else term.value)
+    force, *matrices = map(np.asarray, _derivatives(function, is_kinetic, q, v, params))
+    motions = block_diag(*(bodies[name].motions for name in names))
+    parts = [motions.T @ force, *(motions.T @ matrix @ motions for matrix in matrices)]
+    if not all(np.isfinite(part).all() for part in parts):
+        raise Refused(
+            f"{effect.name}: its energy between {', '.join(map(label_of, effect.elements[i]))} has no finite derivatives at the "
+            "start; move these bodies, or smooth the energy."
+        )
+    return Linearised(np.concatenate([columns[name] for name in names]), *parts)
 
 
 @partial(quickly_compiled, static_argnames="kinetic")

@@ -18,8 +18,8 @@ from scipy.spatial.transform import Rotation
 
 from vmri_jax.mechanics.arrays import is_concrete, library
 from vmri_jax.refusals import Refused
-from vmri_jax.scene.body import AnyBody, Pace, Point, joined
-from vmri_jax.scene.declare import effect_class, names
+from vmri_jax.scene.body import AnyBody, Pace, joined
+from vmri_jax.scene.declare import names
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.products import FRAME, products
 from vmri_jax.scene.shapes import Ball, Rod, Shape, box_of
@@ -94,10 +94,8 @@ class RigidBody(AnyBody):
         moments, axes = self._principal(tensor)
         fields = {"mass": mass, "shape": shape, "moments": moments, "axes": axes}
         for name in ("position", "velocity", "spin"):
-            value = np.zeros(3) if getattr(self, name) is None else self._numbers(name, getattr(self, name))
-            if value.shape != (3,):
-                raise Refused(f"RigidBody {self.name}: {name} has shape {value.shape}; give (3,).")
-            fields[name] = value
+            value = getattr(self, name)
+            fields[name] = np.zeros(3) if value is None else self._numbers(name, value, (3,))
         fields["rotation"] = self._matrix()
         for name, value in fields.items():
             object.__setattr__(self, name, value)
@@ -169,11 +167,6 @@ class RigidBody(AnyBody):
     def directors(self):
         """(3, 3) principal axes in space at the start, one per row."""
         return (self.rotation @ self.axes).T
-
-    @property
-    def coordinates(self):
-        """(n,) centre of mass and directors."""
-        return joined([self.position, *(self.directors[i] for i in self.wide)])
 
     @property
     def rates(self):
@@ -252,17 +245,7 @@ class RigidBody(AnyBody):
         components = self.components(offset)
         return joined([components[np.array(self.wide)], np.zeros(3 - len(self.wide))])
 
-    def point(self, offset: Any = None) -> Point:
-        """The centre of mass, or a point fixed in the body, at the start."""
-        if offset is None:
-            return Point(self.name, self.position, self.mass)
-        if offset.shape != (3,):
-            raise Refused(f"the point in {self.name} has shape {offset.shape}; give (3,), in the axes of the body.")
-        self.components(offset)  # refuses a point outside a plate or a rod
-        return Point(self.name, self.position + self.rotation @ offset)
 
-
-@effect_class
 class Rigidity(Effect):
     """The constraints of rigid bodies by directors, ``g = (d_i . d_j - delta_ij) / (1 + delta_ij)``; every scene adds this effect itself.
 
@@ -293,20 +276,17 @@ def matrix_of(rotation):
     if rotation.shape == (4,):
         # R = 1 + 2 w U + 2 U^2 with the matrix U of x -> u x x, u the vector part
         w, u = rotation[0], _cross_matrix(rotation[1:])
-        return jnp.eye(3) + 2 * w * u + 2 * u @ u
+        return library(rotation).eye(3) + 2 * w * u + 2 * u @ u
     if is_concrete(rotation):
         return Rotation.from_rotvec(np.array(rotation)).as_matrix()
     # Rodrigues: R = 1 + (sin a / a) U + (1 - cos a) / a^2 U^2, with (1 - cos a) / a^2 = (sin(a/2) / (a/2))^2 / 2
-    angle = jnp.sqrt(jnp.sum(rotation**2))
-    u = _cross_matrix(rotation)
+    angle, u = jnp.sqrt(jnp.sum(rotation**2)), _cross_matrix(rotation)
     return jnp.eye(3) + jnp.sinc(angle / np.pi) * u + jnp.sinc(angle / (2 * np.pi)) ** 2 / 2 * u @ u
 
 
 def _cross_matrix(u):
     """The matrix of ``x -> u x x``."""
-    zero = u[0] * 0
-    rows = [[zero, -u[2], u[1]], [u[2], zero, -u[0]], [-u[1], u[0], zero]]
-    return np.array(rows) if is_concrete(u) else jnp.array(rows)
+    return library(u).cross(np.eye(3), u)
 
 
 def rotation(q):

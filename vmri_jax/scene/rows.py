@@ -15,9 +15,10 @@ from vmri_jax.mechanics.constraints import RANK
 from vmri_jax.mechanics.functions import TracedOnce
 from vmri_jax.mechanics.names import Names
 from vmri_jax.scene.body import LARGEST_POINT, label_of
+from vmri_jax.scene.declare import stacked
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.effects.freedoms import ANGLES
-from vmri_jax.scene.functions import function_of
+from vmri_jax.scene.functions import ConstraintValues
 from vmri_jax.scene.rates import positions
 from vmri_jax.scene.sorting import HOMES, Home, Placed, Sorting
 from vmri_jax.scene.terms import EffectTerm, Role
@@ -64,7 +65,7 @@ def rows_of(placed: Sequence[Placed]) -> list[Row]:
         for group in effect.by_size(part.elements) if part.home in HOMES else ():
             # all elements of a group have as many rows
             t, one = (np.zeros(()),) if effect.timed else (), group[:1]
-            size = jax.eval_shape(effect.function, *t, effect.positions(one), effect.params_of(one)).size
+            size = jax.eval_shape(effect.called, *t, effect.positions(one), effect.params_of(one)).size
             for element in group:
                 named = f"{effect.name} {'-'.join(map(label_of, effect.elements[element]))}"
                 label = effect.name if len(effect.elements) == 1 else named
@@ -87,7 +88,7 @@ def _derivatives(
     x = q[columns] + (steps if columns.ndim == 1 else steps[:, None])
     parts = np.split(x, np.cumsum([of_role.shape[-1] for of_role in of_roles])[:-1], axis=-1)
     params = term.params_of(params)
-    points = tuple(role.of_bodies(x, params) for role, x in zip(term.roles, parts, strict=True))
+    points = term.of_roles([role.of_bodies(x, params) for role, x in zip(term.roles, parts, strict=True)], params)
     values = np.asarray(term.function(*((np.asarray(t),) if term.timed else ()), points, params))
     columns = np.atleast_2d(columns)
     values = values.reshape(*columns.shape[::-1], -1)  # of each step, element, and row of the element
@@ -97,13 +98,11 @@ def _derivatives(
     return np.real(values[0]).ravel(), jacobian
 
 
-def _columns(role: Role, num_slow: int) -> np.ndarray:
+def _columns(role: Role, num_slow: int) -> Any:
     """Numbers in (Q_s, Q_f) of the coordinates of a role, (n, c), or (c,) of a single element; none for the ground."""
     if role.rows is None:
-        return np.zeros((0,) if role.count == 1 else (role.count, 0), int)
-    starts = np.array([place.start + (num_slow if place.part == "f" else 0) for place in role.rows.places])
-    columns = starts[:, None] + np.arange(role.rows.size)
-    return columns[0] if role.rows.single else columns
+        return stacked([np.zeros(0, int)] * role.count)
+    return stacked([place.numbers(num_slow)[: role.rows.size] for place in role.rows.places])
 
 
 @quickly_compiled
@@ -156,7 +155,7 @@ class ConstraintRows:
         """Values g (k,) and Jacobian dg/dq (k, n) at a time and at positions (n,)."""
         q_bodies, by_coordinates = self.sorting.to_bodies(q)
         n_s, others = self.sorting.layout.ends[0], [term for term, is_analytic in self.terms if not is_analytic]
-        functions = [TracedOnce(function_of("constraint", (term,))) for term in others]
+        functions = [TracedOnce(ConstraintValues("constraint", (term,))) for term in others]
         arguments = self.params, float(t), q_bodies[:n_s], q_bodies[n_s:]
         of_others = iter(jax.device_get(_compiled_derivatives(functions, *arguments)) if others else ())
         parts = [

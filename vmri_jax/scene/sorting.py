@@ -56,6 +56,13 @@ Home = (
 HOMES: tuple[Home, ...] = ("slow_constraint", "constraint")
 """The arguments of `System` that hold constraints, in the order of the grids macro, micro."""
 
+ELSEWHERE: dict[str, tuple[Home, str]] = {
+    "kinetic": ("kinetic", "depends on velocities"),
+    "force": ("force", "not derived from a potential"),
+    "control": ("control", "set by an optimisation, zero in a run"),
+}
+"""Home of all elements of other kinds than potentials and constraints, and why."""
+
 
 class Placed(NamedTuple):
     """Some elements of an effect, by their indices, with a common home, and the reason for it.
@@ -293,16 +300,12 @@ def _home(effect: Effect, i: int, slow: tuple[str, ...], size: int, measured, li
 
     In a reason two braces ``{}`` stand for the names of the slow bodies, and for "is" or "are".
     """
-    if effect.kind == "kinetic":
-        return "kinetic", "depends on velocities"
-    if effect.kind == "force":
-        return "force", "not derived from a potential"
-    if effect.kind == "control":
-        return "control", "set by an optimisation, zero in a run"
-    if effect.kind == "constraint" and len(slow) == size:
-        return "slow_constraint", "between slow bodies"
+    if effect.kind in ELSEWHERE:
+        return ELSEWHERE[effect.kind]
     if effect.kind == "constraint":
-        return "constraint", "touches a fast body"
+        return (
+            ("slow_constraint", "between slow bodies") if len(slow) == size else ("constraint", "touches a fast body")
+        )
     if isinstance(effect.rate, int):
         return effect.rate, "as given"
     if slow and effect.rate == "fast":

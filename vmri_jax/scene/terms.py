@@ -6,7 +6,7 @@ All classes here are compared by value: scenes of the same structure give equal 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
-from itertools import chain, groupby
+from itertools import chain
 from operator import add
 from typing import Any, NamedTuple
 
@@ -85,28 +85,11 @@ class Role:
 
     def of_bodies(self, q, params):
         """Coordinates or points, from the coordinates of the bodies, which the ground does not need."""
-        if self.rows is None:
-            return params[self.point][..., : self.size] if self.point else self._shaped(GROUND_COORDINATES)
-        return place(q, params[self.point]) if self.point else q
-
-    def velocities(self, v_s, v_f, params):
-        """(d,) or (n, d) velocities."""
-        return self._shaped(np.zeros(self.size)) if self.rows is None else self.positions(v_s, v_f, params)
-
-    def put(self, force, params, n_s: int, n_f: int):
-        """Forces on all slow and on all fast coordinates; no coordinate feels a force on the ground."""
-        if self.rows is None:
-            return jnp.zeros(n_s), jnp.zeros(n_f)
+        if self.rows is not None:
+            return place(q, params[self.point]) if self.point else q
         if self.point:
-            # the transpose of the map of positions: F on the centre, X_i F on the director d_i
-            components = params[self.point][..., : self.rows.stride // 3 - 1, None]
-            force = jnp.broadcast_to(force, (*jnp.broadcast_shapes(force.shape[:-1], components.shape[:-2]), 3))
-            triples = jnp.concatenate([force[..., None, :], components * force[..., None, :]], axis=-2)
-            force = triples.reshape(*triples.shape[:-2], -1)
-        return self.rows.put(force, n_s, n_f)
-
-    def _shaped(self, vector):
-        return vector if self.count == 1 else np.broadcast_to(vector, (self.count, self.size))
+            return params[self.point][..., : self.size]
+        return GROUND_COORDINATES if self.count == 1 else np.broadcast_to(GROUND_COORDINATES, (self.count, self.size))
 
 
 class Source(NamedTuple):
@@ -130,6 +113,7 @@ class EffectTerm:
     split: names of the parameters that have an entry for each element.
     timed: whether the first argument of the function is the time.
     is_joined: whether the terms of several effects with this function are one term, see `joined`.
+    through: ``through(q, params)``, the argument q of the function by the coordinates of each role; None if it is these coordinates.
     """
 
     sources: tuple[Source, ...]
@@ -138,6 +122,7 @@ class EffectTerm:
     split: tuple[str, ...] = ()
     timed: bool = False
     is_joined: bool = False
+    through: Callable | None = None
 
     def params_of(self, params):
         """The params of the function: the parameters of the effects for their elements, one after the other."""
@@ -157,37 +142,40 @@ class EffectTerm:
     def value(self, q_s, q_f, params, t=None):
         """Energy or constraint values."""
         params = self.params_of(params)
-        return self.function(*((t,) if self.timed else ()), self._positions(q_s, q_f, params), params)
+        return self.function(*((t,) if self.timed else ()), self._map(params)(q_s, q_f), params)
 
     def kinetic(self, q_s, q_f, v_s, v_f, params):
         """Velocity-dependent energy."""
         params = self.params_of(params)
-        return self.function(self._positions(q_s, q_f, params), self._velocities(v_s, v_f, params), params)
+        return self.function(*jax.jvp(self._map(params), (q_s, q_f), (v_s, v_f)), params)
 
     def forces(self, t, q_s, q_f, v_s, v_f, params):
         """Force on all slow and on all fast coordinates."""
         params = self.params_of(params)
-        forces = self.function(t, self._positions(q_s, q_f, params), self._velocities(v_s, v_f, params), params)
-        return self._put(forces, params, q_s.shape[0], q_f.shape[0])
+        q, v = jax.jvp(self._map(params), (q_s, q_f), (v_s, v_f))
+        return self._put(self.function(t, q, v, params), params, q_s, q_f)
 
     def controlled(self, q_s, q_f, u, params):
         """Force of the controls u on all slow and on all fast coordinates."""
         params = self.params_of(params)
-        forces = self.function(self._positions(q_s, q_f, params), u, params)
-        return self._put(forces, params, q_s.shape[0], q_f.shape[0])
+        return self._put(self.function(self._map(params)(q_s, q_f), u, params), params, q_s, q_f)
+
+    def of_roles(self, coordinates: Iterable[Any], params) -> tuple[Any, ...]:
+        """The argument q of the function, by the coordinates of each role."""
+        return tuple(coordinates) if self.through is None else self.through(coordinates, params)
+
+    def _map(self, params) -> Callable:
+        """The map from (q_s, q_f) to the argument q of the function."""
+        return lambda q_s, q_f: self.of_roles((role.positions(q_s, q_f, params) for role in self.roles), params)
+
+    def _put(self, forces, params, q_s, q_f):
+        """Forces F on the argument q of the function, as forces ``(dq/dq_s)^T F`` and ``(dq/dq_f)^T F``."""
+        q, pull = jax.vjp(self._map(params), q_s, q_f)
+        return pull(tuple(jnp.broadcast_to(jnp.asarray(f, float), x.shape) for f, x in zip(forces, q, strict=True)))
 
     def within(self, sizes: tuple[int, int]) -> bool:
         """Whether the term depends only on the coordinates of the scene, the first n_s of Q_s and the first n_f of Q_f."""
         return all(role.rows is None or role.rows.within(sizes) for role in self.roles)
-
-    def _put(self, forces, params, n_s: int, n_f: int):
-        return totals([role.put(force, params, n_s, n_f) for role, force in zip(self.roles, forces, strict=True)])
-
-    def _positions(self, q_s, q_f, params):
-        return tuple(role.positions(q_s, q_f, params) for role in self.roles)
-
-    def _velocities(self, v_s, v_f, params):
-        return tuple(role.velocities(v_s, v_f, params) for role in self.roles)
 
 
 @dataclass(frozen=True)
@@ -226,17 +214,16 @@ def _rows(numbers, count: int):
 
 def joined(terms: Iterable[Any], in_order: bool = False) -> tuple[Any, ...]:
     """The terms, with one term in place of several of one kind; if `in_order`, of neighbours alone, so that the elements keep their order."""
-    numbers: dict[Any, int] = {}
-    keyed = [(numbers.setdefault(_kind(term), len(numbers)), term) for term in terms]
-    groups = groupby(keyed if in_order else sorted(keyed, key=lambda pair: pair[0]), key=lambda pair: pair[0])
-    return tuple(_as_one([term for _, term in group]) for _, group in groups)
-
-
-def _kind(term) -> Any:
-    """Equal for terms of several effects that can be one term."""
-    if not getattr(term, "is_joined", False):
-        return id(term)
-    return term.function, tuple(role.kind for role in term.roles), term.split, term.timed
+    groups: dict[Any, list] = {}
+    last, run = None, 0
+    for term in terms:
+        kind: Any = id(term)
+        if getattr(term, "is_joined", False):
+            kind = term.function, term.through, tuple(role.kind for role in term.roles), term.split, term.timed
+        run += in_order and kind != last
+        groups.setdefault((run, kind), []).append(term)
+        last = kind
+    return tuple(map(_as_one, groups.values()))
 
 
 def _as_one(terms: Sequence[Any]) -> Any:
@@ -264,8 +251,3 @@ def total(values: Sequence):
 def totals(pairs: Sequence):
     """Sum of pairs (slow, fast): the pair of the sums."""
     return tuple(total(parts) for parts in zip(*pairs, strict=True))
-
-
-def concatenated(values: Sequence):
-    """One vector of arrays of any shape."""
-    return jnp.concatenate([jnp.ravel(value) for value in values])

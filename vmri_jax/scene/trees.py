@@ -53,15 +53,15 @@ class Branch(NamedTuple):
     forward: bool
 
     @property
-    def keys(self) -> list[Key]:
-        """The freedoms of the joint as keys of `Layout.freedoms`."""
-        return [(self.joint.name, self.element, freedom) for freedom in self.joint.freedoms]
+    def moves(self) -> dict[Key, Move]:
+        """The motions of the joint by the keys of `Layout.freedoms`."""
+        return {(self.joint.name, self.element, freedom): move for freedom, move in self.joint.freedoms.items()}
 
     @property
-    def moves(self) -> list[tuple[Move, Key]]:
-        """The motions of the joint, each with the key of its freedom, in the order from the parent to the child."""
+    def way(self) -> list[tuple[Key, Move]]:
+        """The motions in the order from the parent to the child."""
         # the moves are defined from body a to body b of the joint; a child that is body a undoes them, the last one first
-        return list(zip(self.joint.moves, self.keys, strict=True))[:: 1 if self.forward else -1]
+        return list(self.moves.items())[:: 1 if self.forward else -1]
 
     @property
     def points(self) -> tuple[Any, Any]:
@@ -106,7 +106,7 @@ def _offers(bodies: Bodies, effects: Sequence[Effect], ranks: Mapping) -> dict[s
     for joint in (effect for effect in effects if isinstance(effect, Joint) and effect.carries):
         for i, (a, b) in enumerate(joint.elements):
             if a != b and all(name == GROUND or (name in bodies and bodies[name].rigid) for name in (a, b)):
-                order = ranks.get((joint.name, i), UNUSED), len(joint.moves)
+                order = ranks.get((joint.name, i), UNUSED), len(joint.freedoms)
                 names = joint.name, *sorted((a, b)), next(number)
                 by_parent[a].append((order, names, Branch(b, a, joint, i, True)))
                 by_parent[b].append((order, names, Branch(a, b, joint, i, False)))
@@ -129,8 +129,8 @@ def _root_rank(name: str, bodies: Bodies) -> tuple:
     if name == GROUND:
         return (False,)
     body = bodies[name]
-    mass: Any = getattr(body, "mass", 0.0)
-    return True, body.pace != "slow", -len(body.wide), -float(mass) if is_concrete(mass) else 0.0
+    mass = float(body.mass or 0.0) if is_concrete(body.mass) else 0.0
+    return True, body.pace != "slow", -len(body.wide), -mass
 
 
 def check_frames(bodies: Bodies, branches: Sequence[Branch]) -> None:
@@ -180,9 +180,8 @@ def make_layout(
             coordinates[name] = places[name] = Place(part, ends[part], body.size)
             ends[part] += body.size
             continue
-        for key in branch.keys:
-            label = branch.joint.label(branch.element) + (f" {key[2]}" if len(branch.keys) > 1 else "")
-            coordinates[label] = freedoms[key] = Place(part, ends[part], 1)
+        for key in branch.moves:
+            coordinates[branch.joint.label(branch.element, key[2])] = freedoms[key] = Place(part, ends[part], 1)
             ends[part] += 1
     if not branches:
         return Layout(places, coordinates), ()
@@ -199,22 +198,22 @@ def _kinematics(branches: Sequence[Branch], places, freedoms, sizes) -> tuple[Ki
     """
     fast = {name for name, place in places.items() if place.part == "f"}  # bodies that depend on fast coordinates
     for branch in branches:
-        if branch.parent in fast or any(freedoms[key].part == "f" for key in branch.keys):
+        if branch.parent in fast or any(freedoms[key].part == "f" for key in branch.moves):
             fast.add(branch.child)
     carriers: set[str] = set()  # the bodies that carry, at any depth, fast ones
     for branch in reversed(branches):
         if branch.child in fast or branch.child in carriers:
             carriers.add(branch.parent)
     ordered = sorted(branches, key=lambda branch: 2 if branch.child in fast else branch.child in carriers)
-    ends = np.cumsum([len(branch.joint.moves) for branch in ordered]).tolist()
-    firsts = {branch.child: end - len(branch.joint.moves) for branch, end in zip(ordered, ends, strict=True)}
+    ends = np.cumsum([len(branch.moves) for branch in ordered]).tolist()
+    firsts = {branch.child: end - len(branch.moves) for branch, end in zip(ordered, ends, strict=True)}
     numbers = {name: i for i, name in enumerate(dict.fromkeys(b.parent for b in branches if b.parent in places))}
     numbers[GROUND] = -1
     links, lasts = {}, {}
     for branch in branches:
         numbers[branch.child] = numbers[branch.parent]
         last = lasts.get(branch.parent, -1)
-        for number, (_, key) in enumerate(branch.moves, firsts[branch.child]):
+        for number, (key, _) in enumerate(branch.way, firsts[branch.child]):
             links[number], last = Link(freedoms[key], last), number
         lasts[branch.child] = last
     carried = (Carried("f" if b.child in fast else "s", numbers[b.child], lasts[b.child]) for b in ordered)
@@ -234,10 +233,13 @@ def joint_constants(bodies: Bodies, branches: Sequence[Branch]) -> dict[str, Any
         place = origin + shift - centre
         zeros.append(library(place, axes).concatenate([place[None], axes]) @ directors.T)
         point = (branch.points[1] + shift - centre) @ directors.T
-        for move, _ in branch.moves:
+        pitches = branch.joint.parameters.get(
+            "pitch", np.zeros(())
+        )  # of a screw: how far b moves along the axis per turn, m
+        pitch = (pitches[branch.element] if pitches.ndim else pitches) / (2 * np.pi)
+        for _, move in branch.way:
             # a positive value of a freedom moves body b of the joint along its axis
             axis = (1.0 if branch.forward else -1.0) * branch.joint.triads[branch.element][move.axis] @ directors.T
-            pitch = branch.joint.pitch_of(branch.element) / (2 * np.pi)
             turns.append((move.kind != "slide") * _turn(axis, point))
             slides.append({"turn": 0.0, "slide": 1.0, "screw": pitch}[move.kind] * axis)
     xp = library(zeros, turns, slides)

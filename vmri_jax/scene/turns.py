@@ -5,6 +5,7 @@ The directors of two bodies give the sine and the cosine of the angle between th
 """
 
 from collections.abc import Iterator
+from functools import partial
 from typing import Any
 
 import jax
@@ -23,14 +24,9 @@ def along_run(sorting: Sorting, joint: Joint, run: Any, of: str, pair: int) -> n
     """The freedom of a joint along a run, (k,) rad or m, whole turns included; see `Scene.joint_motion`."""
     freedom, elements = freedom_of(joint, of), joint.elements
     pair = range(len(elements))[pair]  # raises IndexError
-    place = sorting.layout.freedoms.get((joint.name, pair, freedom))
-    label = next((name for name, other in sorting.layout.coordinates.items() if other == place), "")
-    if label in run.names.bodies:
+    if (label := joint.label(pair, freedom)) in run.names.bodies:
         return np.asarray(run.position(label))[..., 0]
-
-    def value(coordinates):
-        return joint.values(freedom, [pair], coordinates)[0]
-
+    value = partial(joint.value, freedom, pair)
     q = {name: run.position(name) for name in moving(elements[pair])}
     if freedom not in ANGLES:
         return np.asarray(value(q))
@@ -101,5 +97,5 @@ def at_start(sorting: Sorting, joint: Joint, pair: int, freedom: str) -> Any:
     for fraction in np.linspace(0.0, 1.0, 1 + steps_of(starts, (value for value, _ in starts.values()))):
         bodies = sorting.to_bodies(begin + fraction * way)[0]
         coordinates = {name: bodies[columns[name]] for name in names}
-        angles.append(joint.values(freedom, [pair], coordinates)[0])
+        angles.append(joint.value(freedom, pair, coordinates))
     return float(np.unwrap(angles)[-1])

@@ -9,8 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.mechanics.arrays import is_concrete
-from vmri_jax.mechanics.constraints import RANK
-from vmri_jax.mechanics.projection import legendre
+from vmri_jax.mechanics.constraints import RANK, configuration, known_mass_and_momentum
 from vmri_jax.mechanics.system import System
 from vmri_jax.refusals import Refused
 from vmri_jax.scene.body import AnyBody, moving
@@ -42,33 +41,24 @@ def with_rates(
         raise Refused(
             "Scene.with_rates: jax.jit, grad or vmap traces numbers of the scene or rates; call with_rates outside of these."
         )
-    q_s, q_f, v_s, v_f = sorting.start
-    q, v, n_s = jnp.concatenate([q_s, q_f]), np.concatenate([v_s, v_f]), q_s.size
-    columns = sorting.layout.columns
-    bodies, of_bodies = sorting.to_bodies(np.asarray(q))
-
-    def constraints(t, q):
-        return system.constraints(t, q[:n_s], q[n_s:])
-
-    def momentum(v):
-        return jnp.concatenate(legendre(system, q_s, q_f, v[:n_s], v[n_s:]))
-
+    start, columns = tuple(map(np.asarray, sorting.start)), sorting.layout.columns
+    q, v = np.concatenate(start[:2]), np.concatenate(start[2:])
+    bodies, of_bodies = sorting.to_bodies(q)
     # rows dg/dq v = -dg/dt of the constraints, then dx/dq v = x' of the freedoms x whose rates the user gives
-    t = jnp.zeros(())
-    rows = [np.asarray(jax.jacfwd(constraints, 1)(t, q))]
-    values = [-np.asarray(jax.jacfwd(constraints)(t, q))]
+    constraints = configuration(system, np.zeros(()), *start[:2])
+    rows, values = [constraints.jacobian], [-constraints.rates]
     for joint, freedom, number in _by_freedom("Scene.with_rates", effects, rates):
-        pairs = joint.elements
-        numbers = for_pairs(f"Scene.with_rates: the rate of {joint.name}", number, len(pairs), "one number")
-        gradient = jax.jacfwd(
-            lambda q, joint=joint, freedom=freedom, pairs=pairs: joint.values(
-                freedom, range(len(pairs)), {name: q[columns[name]] for name in moving(chain(*pairs))}
-            )
-        )
-        rows.append(np.asarray(gradient(jnp.asarray(bodies))) @ of_bodies)
+        pairs, about = range(len(joint.elements)), f"Scene.with_rates: the rate of {joint.name}"
+        numbers = for_pairs(about, number, len(pairs), "one number")
+
+        def freedoms(q, joint=joint, freedom=freedom, pairs=pairs):
+            coordinates = {name: q[columns[name]] for name in moving(chain(*joint.elements))}
+            return jnp.stack([joint.value(freedom, i, coordinates) for i in pairs])
+
+        rows.append(np.asarray(jax.jacfwd(freedoms)(jnp.asarray(bodies))) @ of_bodies)
         values.append(np.broadcast_to(numbers, (len(pairs),)))
     c, b = np.concatenate(rows), np.concatenate(values)
-    root = np.linalg.cholesky(np.asarray(jax.jacfwd(momentum)(jnp.asarray(v))))  # M = R R^T
+    root = np.linalg.cholesky(known_mass_and_momentum(system, *start)[0])  # M = R R^T
     # rows of C R^-T and b in units of their lengths: all have the unit of R^T v, whose squared length is twice the kinetic energy
     c_by_root = np.linalg.solve(root, c.T).T
     lengths = np.linalg.norm(c_by_root, axis=1)
@@ -86,7 +76,7 @@ def with_rates(
     body_rates = sorting.to_bodies(sorting.assembled)[1] @ v
     moved = [body.with_rates(body_rates[columns[name]]) for name, body in sorting.bodies.items()]
     numbers = sorting.layout.numbers
-    return moved, {key: (np.asarray(q[i]), v[i]) for key in sorting.layout.freedoms for i in numbers[key]}
+    return moved, {key: (q[i], v[i]) for key in sorting.layout.freedoms for i in numbers[key]}
 
 
 def joint_starts(sorting: Sorting, effects: Sequence[Effect], starts: Mapping[str, Any]) -> dict[Key, tuple[Any, Any]]:

@@ -9,7 +9,7 @@ import numpy as np
 
 from vmri_jax.mechanics.arrays import library, real_array
 from vmri_jax.scene.body import end_of
-from vmri_jax.scene.declare import array, common, effect_class, names, number, positive
+from vmri_jax.scene.declare import array, common, names, number, positive
 from vmri_jax.scene.effect import Effect
 
 
@@ -19,7 +19,6 @@ def penalty(gap, params):
     return jnp.sum(params["stiffness"] / 2 * depth**2)
 
 
-@effect_class
 class _Contact(Effect):
     """Base class of contacts: stiffness, smoothing, and radius of the bodies."""
 
@@ -41,7 +40,6 @@ class _Contact(Effect):
         return {"radii": [[name, r] for (name,), r in zip(elements, radii, strict=True) if r > 0]}
 
 
-@effect_class
 class PlaneContact(_Contact):
     """Contact with the side of a plane that its normal points to: ``V = k/2 sum d^2``, ``d = s log(1 + exp(-gap / s))``.
 
@@ -83,7 +81,6 @@ class PlaneContact(_Contact):
         return super().drawing() | {"planes": [plane]}
 
 
-@effect_class
 class SphereContact(_Contact):
     """Contact with the outside of a fixed sphere: ``V = k/2 sum d^2``, ``d = s log(1 + exp(-gap / s))``.
 

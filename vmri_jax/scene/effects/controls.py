@@ -5,13 +5,12 @@ from dataclasses import KW_ONLY
 from typing import Any, Literal
 
 import jax.numpy as jnp
-import numpy as np
 
 from vmri_jax.mechanics.arrays import real_array
 from vmri_jax.mechanics.names import AXES
 from vmri_jax.refusals import Refused
-from vmri_jax.scene.body import Attachment, body_of, entry, is_entry, label_of
-from vmri_jax.scene.declare import effect_class, names, vector
+from vmri_jax.scene.body import Attachment, body_of, entry, is_entry, label_of, weights_of
+from vmri_jax.scene.declare import names, vector
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.effects.joint_base import Joint
 from vmri_jax.scene.effects.joint_effects import InJoint
@@ -37,7 +36,6 @@ def load_on(load: Load, axes: Literal["space", "body"], q, u, params):
     return (jnp.concatenate([u, (params["point"][: len(d), None] * u).ravel()]),)
 
 
-@effect_class
 class Controlled(Effect):
     """A force or a torque that `vmri_jax.control.minimize` sets; in a run it is zero and takes no time.
 
@@ -94,7 +92,7 @@ class Controlled(Effect):
         if self.along is not None:
             params["along"] = self.declared["along"].array(f"{self.name}: along", self.along, [body.point()])
         if body.rigid:
-            params["point"] = body.weights(name.offset if isinstance(name, Attachment) else np.zeros(3))
+            params["point"] = weights_of(self.by_name, name)
         return params
 
     def check_bodies(self):
@@ -125,15 +123,18 @@ class Controlled(Effect):
         return tuple(f"{self.name}{axis}" for axis in axes)
 
 
-@effect_class
 class ControlledJoint(InJoint):
     """The force or torque of `Controlled` in a joint."""
 
     kind = "control"
     counts_turns = False
 
+    @staticmethod
+    def function(q, u, params):
+        (x,) = q
+        return (u.reshape(x.shape),)
+
     def check_bodies(self):
-        super().check_bodies()
         count = len(self.elements)
         self.require(count == 1, f"the number of pairs of {self.joint.name}", count, "give each pair its own joint")
 

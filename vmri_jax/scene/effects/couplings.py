@@ -3,7 +3,6 @@
 from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import field, replace
-from itertools import islice
 from typing import Any, ClassVar
 
 import jax.numpy as jnp
@@ -12,26 +11,19 @@ import numpy as np
 from vmri_jax.mechanics.arrays import real_array
 from vmri_jax.mechanics.checks import describe, shape_of
 from vmri_jax.mechanics.functions import NO_VELOCITY, check_arguments
-from vmri_jax.mechanics.rows import Rows
 from vmri_jax.refusals import Refused
 from vmri_jax.scene.binding import MOST_ROLES
-from vmri_jax.scene.declare import effect_class, real_tree
+from vmri_jax.scene.declare import real_tree
 from vmri_jax.scene.effect import START
-from vmri_jax.scene.effects.freedoms import COORDINATE, FREEDOMS
 from vmri_jax.scene.effects.joint_base import OfFreedoms, freedom_of, joint_named
-from vmri_jax.scene.terms import Applied, Role
+from vmri_jax.scene.terms import Applied
 
 
-def equation(law, freedoms: tuple[str, ...], q, params):
-    """``g(x, params)`` with the freedoms x, by their names in `FREEDOMS`, of coordinates or of both bodies of each joint."""
-    x, roles = [], iter(q)
-    for freedom, of_joint in zip(freedoms, params["joints"], strict=True):
-        ends = islice(roles, 1 if freedom == COORDINATE else 2)
-        x.append(FREEDOMS[freedom](tuple(ends), of_joint))
-    return law(jnp.stack(x), params["law"])
+def equation(law, q, params):
+    """``g(x, params)`` of the freedoms x."""
+    return law(jnp.stack(q), params["law"])
 
 
-@effect_class
 class _Coupling(OfFreedoms):
     """An equation between freedoms of joints, see `JointCoupling`."""
 
@@ -71,24 +63,10 @@ class _Coupling(OfFreedoms):
 
     @property
     def function(self):
-        return Applied(equation, (self.law, tuple(self.by_directors(freedom) for _, freedom in self.joints)))
+        return Applied(equation, (self.law,))
 
     def _parameters(self):
         return {"law": self.numbers(), "joints": tuple(joint.frames for joint, _ in self.joints)}
-
-    def terms(self, select, layout):
-        roles, freedoms = [], []
-        for (joint, freedom), key in zip(self.joints, self.freedoms_of(0), strict=True):
-            is_coordinate = key in layout.freedoms
-            freedoms.append(COORDINATE if is_coordinate else self.by_directors(freedom))
-            if is_coordinate:
-                roles.append(Role(Rows.of([layout.freedoms[key]]), 1, 1))
-            else:
-                roles += [self._role("", (name,), layout.bodies) for name in joint.elements[0]]
-        return (self._term(Applied(equation, (self.law, tuple(freedoms))), roles, (0,)),)
-
-    def check_bodies(self):
-        """Nothing: the joints check their bodies themselves."""
 
     def check_parameters(self):
         super().check_parameters()
@@ -104,7 +82,6 @@ class _Coupling(OfFreedoms):
         self.require(violation < START, "the equation", violation, expected)
 
 
-@effect_class
 class JointCoupling(_Coupling):
     """An equation between the freedoms x of joints, ``g(x, params) = 0``.
 
@@ -146,7 +123,6 @@ def weighted_sum(x, params):
     return (params["ratios"] * x).sum()
 
 
-@effect_class
 class Gear(_Coupling):
     """Joints whose freedoms move in fixed ratios, ``sum_i r_i x_i = 0``.
 

@@ -14,7 +14,7 @@ from typing import Any, Literal
 from vmri_jax.mechanics.functions import NO_TIME, NO_VELOCITY, check_arguments
 from vmri_jax.refusals import Refused
 from vmri_jax.scene.body import end_of, entry, is_entry
-from vmri_jax.scene.declare import effect_class, real_tree
+from vmri_jax.scene.declare import real_tree
 from vmri_jax.scene.effect import Effect
 
 ARGUMENTS = {"potential": "q, params", "constraint": "q, params", "kinetic": "q, v, params", "force": "t, q, v, params"}
@@ -25,7 +25,6 @@ _INSTEAD = {
 }
 
 
-@effect_class
 class CustomEffect(Effect):
     """An effect with a single element, whose function the user gives.
 
@@ -96,7 +95,6 @@ class Potential(CustomEffect):
     kind = "potential"
 
 
-@effect_class
 class Constraint(CustomEffect):
     """A custom holonomic constraint, ``function(q, params) -> (k,)``, kept zero.
 

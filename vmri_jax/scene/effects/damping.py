@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from vmri_jax.mechanics.names import unknown
 from vmri_jax.refusals import Refused
-from vmri_jax.scene.declare import array, effect_class, names, positive
+from vmri_jax.scene.declare import array, names, positive
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.effects.points import BetweenPoints
 from vmri_jax.scene.terms import TangentDamping, joined
@@ -19,7 +19,6 @@ def norm(v):
     return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
 
 
-@effect_class
 class LinearDamping(Effect):
     """Damping of points and of the centres of rigid bodies against the ground, ``F = -c v``; rotations are not damped.
 
@@ -40,7 +39,6 @@ class LinearDamping(Effect):
         return (-params["coefficient"][..., None] * v,)
 
 
-@effect_class
 class QuadraticDrag(Effect):
     """Drag of a resting fluid, ``F = -c |v| v``.
 
@@ -61,7 +59,6 @@ class QuadraticDrag(Effect):
         return (-(params["coefficient"] * norm(v))[..., None] * v,)
 
 
-@effect_class
 class Dashpot(BetweenPoints):
     """Dampers between points, against the change of their distance: ``F_b = -c ((v_b - v_a) . n) n = -F_a``, n from a to b.
 
@@ -84,7 +81,6 @@ class Dashpot(BetweenPoints):
         return -force, force
 
 
-@effect_class
 class RayleighDamping(Effect):
     """Rayleigh damping of the whole scene, ``F = -(alpha M + beta K(q)) v``, K the Hessian of potentials.
 

@@ -3,6 +3,8 @@
 For the letters see `vmri_jax.scene.effects.joints`.
 """
 
+from collections.abc import Iterable, Mapping
+from itertools import islice
 from typing import Any, Literal
 
 import jax.numpy as jnp
@@ -79,7 +81,17 @@ def within_reach(angle):
 
 IN_REACH = {freedom: f"{freedom} within reach" for freedom in ANGLES}
 """For each angle, the name in `FREEDOMS` of the same angle `within_reach`."""
-FREEDOMS |= {
+SINES = {freedom: f"sine and cosine of {freedom}" for freedom in ANGLES}
+"""For each angle, the name in `FREEDOMS` of its function in `ANGLES`."""
+FREEDOMS |= {SINES[freedom]: function for freedom, function in ANGLES.items()} | {
     name: lambda q, params, angle=FREEDOMS[freedom]: within_reach(angle(q, params))
     for freedom, name in IN_REACH.items()
 }
+
+
+def freedoms_of(names: tuple[str, ...], q: Iterable[Any], params: Mapping[str, Any]) -> tuple[Any, ...]:
+    """The freedoms with these names in `FREEDOMS`, by the coordinate of each or by the coordinates of both bodies of its joint."""
+    roles, frames = iter(q), params.get("joints", (params,))
+    sizes = (1 if name == COORDINATE else 2 for name in names)
+    of_each = zip(names, sizes, frames, strict=True)
+    return tuple(FREEDOMS[name](tuple(islice(roles, size)), of_joint) for name, size, of_joint in of_each)

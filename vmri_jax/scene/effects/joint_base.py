@@ -4,25 +4,27 @@ For the letters see `vmri_jax.scene.effects.joints`.
 """
 
 from abc import abstractmethod
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
+from itertools import chain
 from typing import Any, ClassVar
 
 import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.mechanics.arrays import is_concrete, library, real_array
-from vmri_jax.mechanics.kinematics import Move
+from vmri_jax.mechanics.kinematics import UNMOVED, Move
 from vmri_jax.mechanics.names import unknown
+from vmri_jax.mechanics.rows import Rows
 from vmri_jax.refusals import Refused
 from vmri_jax.scene.body import GROUND, GROUND_COORDINATES, Attachment, body_of, label_of
-from vmri_jax.scene.declare import effect_class, names, stacked
+from vmri_jax.scene.declare import names, stacked
 from vmri_jax.scene.effect import START, Effect
-from vmri_jax.scene.effects.freedoms import FREEDOMS, IN_REACH, Freedom
-from vmri_jax.scene.layout import Key
+from vmri_jax.scene.effects.freedoms import COORDINATE, FREEDOMS, IN_REACH, Freedom, freedoms_of
+from vmri_jax.scene.layout import Key, Layout
 from vmri_jax.scene.products import FRAME, products
 from vmri_jax.scene.rigid import RigidBody
-from vmri_jax.scene.terms import Applied
+from vmri_jax.scene.terms import Applied, EffectTerm, Role
 
 GAP = (("D", "x"), ("D", "y"), ("D", "z"))
 """Rows that keep the points of both bodies at one place: the components of D along the axes of space."""
@@ -32,7 +34,6 @@ AXES = dict(zip("xyz", np.eye(3), strict=True))
 """The axes of space, which a row may have as one of its two vectors."""
 
 
-@effect_class
 class Joint(Effect):
     """Base class of joints between two bodies, or between a body and the ground.
 
@@ -55,10 +56,8 @@ class Joint(Effect):
     """Pairs of vectors whose scalar products are the rows: of the gap D, both triads, and the axes x, y, z of space."""
     carries: ClassVar[bool] = False
     """Whether the joint can carry a body, whose position is then a function of the freedoms: these must be coordinates without a singularity."""
-    moves: ClassVar[tuple[Move, ...]] = ()
-    """The motions of the triad of b against the triad of a, one for each freedom, applied one after the other."""
-    freedoms: ClassVar[tuple[Freedom, ...]] = ()
-    """Names of the freedoms, in the order of `moves`."""
+    freedoms: ClassVar[dict[Freedom, Move]] = {}
+    """For each freedom the motion of the triad of b against the triad of a; the motions are applied one after the other."""
 
     def _elements(self):
         return tuple(tuple(map(str, element)) for element in super()._elements())
@@ -79,7 +78,7 @@ class Joint(Effect):
     @cached_property
     def frames(self) -> dict[str, Any]:
         """Points and triads as components along the directors of each body: "point_a", "point_b", "frame_a", "frame_b"."""
-        return {name: values if len(self.elements) > 1 else values[0] for name, values in self._components.items()}
+        return {name: stacked([*values]) for name, values in self._components.items()}
 
     def _factors(self) -> dict[str, Any]:
         """The numbers of the rows of all pairs, see `products`."""
@@ -94,27 +93,20 @@ class Joint(Effect):
                 vectors[name] = xp.concatenate([np.zeros((count, 1)), frames[f"frame_{role}"][:, i]], axis=-1)
             half = xp.stack([vectors.get(name, zero) for name in named], axis=1)
             is_ground = np.array([pair["ab".index(role)] == GROUND for pair in self.elements])[:, None, None]
-            offsets = offsets + is_ground * (half @ GROUND_COORDINATES.reshape(FRAME, 3))
+            offsets = offsets + is_ground * (half @ UNMOVED)
             halves.append(~is_ground * half)
         factors = xp.concatenate(halves, axis=-1)
         return {"factors": stacked([*factors]), "offsets": stacked([*offsets])}
 
-    def label(self, i: int) -> str:
-        """The name of the joint, followed by the names of both bodies of the i-th pair if the joint has several pairs."""
-        return self.name if len(self.elements) == 1 else f"{self.name} {'-'.join(self.elements[i])}"
+    def label(self, i: int, freedom: str = "") -> str:
+        """The name of the joint, followed by the names of both bodies of the i-th pair if there are several, and by the freedom likewise."""
+        pair = "" if len(self.elements) == 1 else f" {'-'.join(self.elements[i])}"
+        return f"{self.name}{pair}" + (f" {freedom}" if freedom and len(self.freedoms) > 1 else "")
 
-    def pitch_of(self, i: int):
-        """How far b moves along the axis per turn of the i-th pair, m; zero unless the joint is a screw."""
-        return np.zeros(())
-
-    def values(self, freedom: str, pairs: Iterable[int], coordinates: Mapping[str, Any]):
-        """A freedom of some pairs, (pairs, ...) rad or m, by the coordinates (..., n) of bodies by name; an angle is between -pi and pi."""
-        values = []
-        for i in pairs:
-            ends = (GROUND_COORDINATES if name == GROUND else coordinates[name] for name in self.elements[i])
-            params = self.params_of((i,), self.parameters | self.frames)
-            values.append(FREEDOMS[freedom](tuple(map(jnp.asarray, ends)), params))
-        return jnp.stack(values)
+    def value(self, freedom: str, i: int, coordinates: Mapping[str, Any]):
+        """A freedom of the i-th pair, (...) rad or m, by the coordinates (..., n) of bodies by name; an angle is between -pi and pi."""
+        ends = (GROUND_COORDINATES if name == GROUND else coordinates[name] for name in self.elements[i])
+        return FREEDOMS[freedom](tuple(map(jnp.asarray, ends)), self.params_of((i,), self.parameters | self.frames))
 
     @cached_property
     def triads(self) -> Any:
@@ -123,13 +115,12 @@ class Joint(Effect):
 
     def check_bodies(self):
         super().check_bodies()
-        for element in self.elements:
-            for name in element:
-                body = body_of(self.by_name, name)
-                if not body.rigid and (body.block or body.size != 3):
-                    raise Refused(
-                        f"{self.name}: {name} has {body.size} coordinates; joints are between rigid bodies and points in space."
-                    )
+        for name in chain(*self.elements):
+            body = body_of(self.by_name, name)
+            if not body.rigid and (body.block or body.size != 3):
+                raise Refused(
+                    f"{self.name}: {name} has {body.size} coordinates; joints are between rigid bodies and points in space."
+                )
 
     def check_parameters(self):
         super().check_parameters()
@@ -203,7 +194,6 @@ class Joint(Effect):
         return {name: library(values).stack(values) for name, values in components.items()}
 
 
-@effect_class
 class AboutAxis(Joint):
     """Joints with an axis: (3,) its direction in space at the start, of any length; or a direction for each of k pairs, (k, 3)."""
 
@@ -246,9 +236,8 @@ def freedom_of(joint: Joint, of: str, about: str = "") -> Freedom:
     raise Refused(f"{about}of is {of!r}; {joint.name} leaves {free} free.")
 
 
-@effect_class
 class OfFreedoms(Effect):
-    """Base class of effects that are functions of freedoms of joints alone."""
+    """Base class of effects whose functions get freedoms of joints, () each or (n,) of n elements, as q, and their rates as v."""
 
     whole = True
     same_size = False
@@ -261,9 +250,38 @@ class OfFreedoms(Effect):
     @abstractmethod
     def freedoms_of(self, i: int) -> tuple[Key, ...]: ...
 
-    def by_directors(self, freedom: Freedom) -> str:
+    def by_directors(self, freedom: str) -> str:
         """The name in `FREEDOMS` of a freedom that is no coordinate of the scene."""
         return IN_REACH.get(freedom, freedom) if self.counts_turns else freedom
+
+    def positions(self, group):
+        """The freedoms at the positions in `bodies`, which are zero."""
+        return tuple(stacked([0.0] * len(group)) for _ in self.freedoms_of(group[0]))
+
+    def terms(self, select, layout):
+        groups: dict[Any, list[int]] = {}
+        for number, group in enumerate(self.by_size(select)):
+            for i in group:
+                free = tuple(key in layout.freedoms for key in self.freedoms_of(i))
+                # elements whose freedoms are all coordinates are one term, whatever their bodies are
+                groups.setdefault((free, None if all(free) else number), []).append(i)
+        return tuple(self._along(free, group, layout) for (free, _), group in groups.items())
+
+    def _along(self, free: Sequence[bool], group: Sequence[int], layout: Layout) -> EffectTerm:
+        """Some elements as a term; `free` says which of their freedoms are coordinates."""
+        roles, freedoms = [], []
+        for j, is_coordinate in enumerate(free):
+            keys = [self.freedoms_of(i)[j] for i in group]
+            freedoms.append(COORDINATE if is_coordinate else self.by_directors(keys[0][2]))
+            if is_coordinate:
+                roles.append(Role(Rows.of([layout.freedoms[key] for key in keys]), len(group), 1))
+                continue
+            for role in (2 * j, 2 * j + 1):
+                roles.append(self._role("", [self.elements[i][role] for i in group], layout.bodies))
+        return self._term(roles, group, Applied(freedoms_of, (tuple(freedoms),)))
+
+    def check_bodies(self):
+        """Nothing: the joints check their bodies themselves."""
 
 
 def _triad(axis):

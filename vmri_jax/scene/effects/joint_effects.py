@@ -2,69 +2,20 @@
 
 from collections.abc import Callable
 from dataclasses import KW_ONLY, field, replace
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.mechanics.arrays import library
-from vmri_jax.mechanics.rows import Rows
-from vmri_jax.scene.declare import effect_class, number, of_time, positive
+from vmri_jax.scene.declare import number, of_time, positive
 from vmri_jax.scene.effect import START
 from vmri_jax.scene.effects.contact import penalty
-from vmri_jax.scene.effects.freedoms import ANGLES, COORDINATE, FREEDOMS, Freedom
+from vmri_jax.scene.effects.freedoms import ANGLES, SINES, Freedom
 from vmri_jax.scene.effects.joint_base import Joint, OfFreedoms, freedom_of, joint_named
 from vmri_jax.scene.effects.springs import elastic_energy
-from vmri_jax.scene.terms import Applied, Role
 
 
-def energy_of(law, freedom: str, q, params):
-    """``law(x, params)``."""
-    return law(FREEDOMS[freedom](q, params), params)
-
-
-def energy_of_rate(law, freedom: str, q, v, params):
-    """``law(x', params)``."""
-    return law(jax.jvp(lambda q: FREEDOMS[freedom](q, params), (q,), (v,))[1], params)
-
-
-def force_along(law, freedom: str, t, q, v, params):
-    """``F = f dx/dq`` with ``f = law(t, x, x', params)``: b gets f, a torque about a hinge, and a its opposite."""
-
-    def value(q):
-        return FREEDOMS[freedom](q, params)
-
-    x, rate = jax.jvp(value, (q,), (v,))
-    return jax.vjp(value, q)[1](jnp.broadcast_to(law(t, x, rate, params), x.shape))[0]
-
-
-def prescribed_motion(law, freedom: str, t, q, params):
-    """``x - a(t)`` with the law a; for an angle x ``sin x cos a - cos x sin a``, which is homogeneous in the directors."""
-    a = law(t, params["path"])
-    if freedom not in ANGLES:
-        return FREEDOMS[freedom](q, params) - a
-    (sine, cosine), xp = ANGLES[freedom](q, params), library(a)
-    return sine * xp.cos(a) - cosine * xp.sin(a)
-
-
-def control_along(law, freedom: str, q, u, params):
-    """``u dx/dq``; no law takes part."""
-    x, pull = jax.vjp(lambda q: FREEDOMS[freedom](q, params), q)
-    return pull(u.reshape(x.shape))[0]
-
-
-ALONG: dict[str, Callable] = {
-    "potential": energy_of,
-    "kinetic": energy_of_rate,
-    "force": force_along,
-    "constraint": prescribed_motion,
-    "control": control_along,
-}
-"""For each kind of an effect, the function that makes of a law and the name in `FREEDOMS` of a freedom a function of coordinates."""
-
-
-@effect_class
 class InJoint(OfFreedoms):
     """Base class of effects along the freedom x of a joint: the angle or displacement of b against a from the given position.
 
@@ -78,8 +29,6 @@ class InJoint(OfFreedoms):
     of: Freedom | Literal["auto"] = field(default="auto", kw_only=True)
 
     derived = Joint.derived
-    law: ClassVar[Any] = None
-    """The energy of x or of x', the force at (t, x, x'), or the path: the first argument of the function in `ALONG`."""
 
     def resolved(self, effects):
         """A copy with the joint itself instead of its name."""
@@ -90,35 +39,16 @@ class InJoint(OfFreedoms):
         """Name of the freedom that the effect acts on."""
         return freedom_of(self.joint, self.of, f"{self.name}: ")
 
-    @property
-    def function(self):
-        return Applied(ALONG[self.kind], (self.law, self.by_directors(self.freedom)))
-
     def _elements(self):
         return self.joint.elements
 
     def freedoms_of(self, i):
         return ((self.joint.name, i, self.freedom),)
 
-    def terms(self, select, layout):
-        # pairs that carry a body have x as a coordinate; those that close loops have x as a function of the coordinates of both bodies
-        keys = {i: self.freedoms_of(i)[0] for i in select}
-        carrying = [i for i in select if keys[i] in layout.freedoms]
-        terms = super().terms([i for i in select if i not in carrying], layout)
-        if not carrying:
-            return terms
-        role = Role(Rows.of([layout.freedoms[keys[i]] for i in carrying]), len(carrying), 1)
-        return (*terms, self._term(Applied(ALONG[self.kind], (self.law, COORDINATE)), [role], carrying))
-
     def _parameters(self):
         return super()._parameters() | self.joint.frames
 
-    def check_bodies(self):
-        """Refuse a joint without this freedom; the joint checks its bodies itself."""
-        _ = self.freedom
 
-
-@effect_class
 class JointSpring(InJoint):
     """Springs in joints, ``V = sum k/2 (x - x_0)^2``.
 
@@ -136,11 +66,11 @@ class JointSpring(InJoint):
     default_name = "joint_springs"
 
     @staticmethod
-    def law(x, params):
+    def function(q, params):
+        (x,) = q
         return elastic_energy(params["stiffness"], x - params["neutral"])
 
 
-@effect_class
 class JointLimit(InJoint):
     """Stops of a joint by a smooth penalty: ``V = sum k/2 (d_-^2 + d_+^2)``.
 
@@ -164,7 +94,8 @@ class JointLimit(InJoint):
     default_name = "joint_limits"
 
     @staticmethod
-    def law(x, params):
+    def function(q, params):
+        (x,) = q
         return penalty(x - params["lower"], params) + penalty(params["upper"] - x, params)
 
     def curvature(self):
@@ -176,7 +107,6 @@ class JointLimit(InJoint):
         self.require(params["lower"] < params["upper"], "lower", params["lower"], "it must be below upper")
 
 
-@effect_class
 class JointDamper(InJoint):
     """Dampers in joints, against the rate of the freedom: ``f = -c x'``.
 
@@ -192,11 +122,11 @@ class JointDamper(InJoint):
     default_name = "joint_dampers"
 
     @staticmethod
-    def law(t, x, rate, params):
-        return -params["coefficient"] * rate
+    def function(t, q, v, params):
+        (rate,) = v
+        return (-params["coefficient"] * rate,)
 
 
-@effect_class
 class RotorInertia(InJoint):
     """Inertia that moves with a joint alone, such as the rotor of its motor: ``T = J x'^2 / 2``; MuJoCo's armature.
 
@@ -213,16 +143,11 @@ class RotorInertia(InJoint):
     default_name = "rotors"
 
     @staticmethod
-    def law(rate, params):
+    def function(q, v, params):
+        (rate,) = v
         return jnp.sum(params["inertia"] * rate**2) / 2
 
 
-def of_history(history, t, x, rate, params):
-    """``f(t)``."""
-    return history(t, params["history"])
-
-
-@effect_class
 class JointDrive(InJoint):
     """A torque about the axis of a joint, or a force along it, as a function of time; b gets it and a its opposite.
 
@@ -239,12 +164,11 @@ class JointDrive(InJoint):
     counts_turns = False
     default_name = "joint_drive"
 
-    @property
-    def law(self):
-        return Applied(of_history, (self.history,))
+    @staticmethod
+    def function(history, t, q, v, params):
+        return (history(t, params["history"]),)
 
 
-@effect_class
 class JointMotion(InJoint):
     """A prescribed angle or displacement of a joint, ``x = a(t)``.
 
@@ -265,9 +189,17 @@ class JointMotion(InJoint):
     default_name = "joint_motion"
     timed = True
 
-    @property
-    def law(self):
-        return self.path
+    @staticmethod
+    def function(path, t, q, params):
+        (x,), a = q, path(t, params["path"])
+        if not isinstance(x, tuple):
+            return x - a
+        # homogeneous in the directors, unlike the angle itself
+        (sine, cosine), xp = x, library(a)
+        return sine * xp.cos(a) - cosine * xp.sin(a)
+
+    def by_directors(self, freedom):
+        return SINES.get(freedom, freedom)
 
     def check_parameters(self):
         super().check_parameters()

@@ -21,13 +21,13 @@ Source: P. Betsch, S. Leyendecker, Int. J. Numer. Meth. Engng 67 (2006).
 """
 
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
 from vmri_jax.mechanics.arrays import library
 from vmri_jax.mechanics.kinematics import Move
-from vmri_jax.scene.declare import effect_class, number
+from vmri_jax.scene.declare import number
 from vmri_jax.scene.effect import START
 from vmri_jax.scene.effects.freedoms import M_PRIME, M, N, slide, turn_by_sine
 from vmri_jax.scene.effects.joint_base import GAP, PARALLEL, AboutAxis, Joint
@@ -39,7 +39,6 @@ UNTURNED = ("m", "e'")
 """Row that keeps b from turning about the axis n."""
 
 
-@effect_class
 class Spherical(Joint):
     """Ball joints: both bodies share a point; three rows, ``D = 0``.
 
@@ -47,10 +46,7 @@ class Spherical(Joint):
         between, at: as of `Joint`. A body that is a point mass is joined at its position.
     """
 
-    default_name = "spherical"
 
-
-@effect_class
 class Revolute(AboutAxis):
     """Hinges: b turns about an axis that is fixed in both bodies; five rows, ``D = 0, n . e = n . e' = 0``.
 
@@ -58,12 +54,9 @@ class Revolute(AboutAxis):
         between, at, axis: as of `Joint`, and the axis in space at the start.
     """
 
-    default_name = "revolute"
-    moves = (Move("turn", N),)
-    freedoms = ("turn",)
+    freedoms: ClassVar = {"turn": Move("turn", N)}
 
 
-@effect_class
 class Universal(AboutAxis):
     """Cardan joints: an axis n of a and an axis e of b stay perpendicular; four rows, ``D = 0, n . e = 0``.
 
@@ -75,9 +68,7 @@ class Universal(AboutAxis):
 
     second: Any = (1.0, 0.0, 0.0)
 
-    default_name = "universal"
-    moves = (Move("turn", N), Move("turn", M))
-    freedoms = ("turn", "tilt")
+    freedoms: ClassVar = {"turn": Move("turn", N), "tilt": Move("turn", M)}
     rows = (*GAP, ("n", "e"))
 
     @cached_property
@@ -88,7 +79,6 @@ class Universal(AboutAxis):
         return [xp.stack([m, xp.cross(n, m), n]) for n, m in zip(first, second, strict=True)]
 
 
-@effect_class
 class Fixed(AboutAxis):
     """Two bodies that move as one; six rows, ``D = 0, n . e = n . e' = m . e' = 0``.
 
@@ -96,11 +86,9 @@ class Fixed(AboutAxis):
         between, at: as of `Joint`.
     """
 
-    default_name = "fixed"
     rows = (*GAP, *PARALLEL, UNTURNED)
 
 
-@effect_class
 class Cylindrical(AboutAxis):
     """b slides along an axis and turns about it; four rows, ``m . D = m' . D = 0, n . e = n . e' = 0``.
 
@@ -108,9 +96,7 @@ class Cylindrical(AboutAxis):
         between, at, axis: as of `Revolute`.
     """
 
-    default_name = "cylindrical"
-    moves = (Move("turn", N), Move("slide", N))
-    freedoms = ("turn", "slide")
+    freedoms: ClassVar = {"turn": Move("turn", N), "slide": Move("slide", N)}
     rows = (*ACROSS, *PARALLEL)
 
 
@@ -124,7 +110,6 @@ def screwed(q, params):
     return xp.concatenate([products(len(Cylindrical.rows), q, params), difference[..., None]], axis=-1)
 
 
-@effect_class
 class Screw(AboutAxis):
     """Nuts on bolts: b moves along the axis as it turns; five rows, the four of `Cylindrical` and ``m' . e cos a = m . e sin a``.
 
@@ -138,19 +123,13 @@ class Screw(AboutAxis):
 
     pitch: Any = number(default=1e-3)
 
-    default_name = "screw"
-    moves = (Move("screw", N),)
-    freedoms = ("turn",)
+    freedoms: ClassVar = {"turn": Move("screw", N)}
     rows = Cylindrical.rows
 
     def check_parameters(self):
         super().check_parameters()
         pitch = self.parameters["pitch"]
         self.require(pitch != 0, "pitch", pitch, "it must not be zero; take Revolute if b does not move along the axis")
-
-    def pitch_of(self, i):
-        pitch = self.parameters["pitch"]
-        return pitch[i] if pitch.ndim else pitch
 
     @property
     def function(self):
@@ -164,7 +143,6 @@ class Screw(AboutAxis):
         return super()._parameters() | self.frames
 
 
-@effect_class
 class Planar(AboutAxis):
     """b moves in the plane of m and m' and turns about n; three rows, ``n . D = 0, n . e = n . e' = 0``.
 
@@ -175,13 +153,10 @@ class Planar(AboutAxis):
         axis: (3,) the normal n of the plane in space at the start; or a normal for each pair, (n, 3).
     """
 
-    default_name = "planar"
-    moves = (Move("slide", M), Move("slide", M_PRIME), Move("turn", N))
-    freedoms = ("along", "across", "turn")
+    freedoms: ClassVar = {"along": Move("slide", M), "across": Move("slide", M_PRIME), "turn": Move("turn", N)}
     rows = (("n", "D"), *PARALLEL)
 
 
-@effect_class
 class Prismatic(AboutAxis):
     """Slides: b moves along an axis and does not turn; five rows, the four of `Cylindrical` and ``m . e' = 0``.
 
@@ -189,7 +164,5 @@ class Prismatic(AboutAxis):
         between, at, axis: as of `Revolute`.
     """
 
-    default_name = "prismatic"
-    moves = (Move("slide", N),)
-    freedoms = ("slide",)
+    freedoms: ClassVar = {"slide": Move("slide", N)}
     rows = (*ACROSS, *PARALLEL, UNTURNED)

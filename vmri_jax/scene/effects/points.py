@@ -14,9 +14,8 @@ import numpy as np
 from vmri_jax.mechanics.arrays import library
 from vmri_jax.refusals import Refused
 from vmri_jax.scene.body import end_of, label_of
-from vmri_jax.scene.declare import effect_class, names, of_time, real_tree, vector
+from vmri_jax.scene.declare import names, of_time, real_tree, vector
 from vmri_jax.scene.effect import Effect
-from vmri_jax.scene.terms import Applied
 
 
 def distance(q, params=None):
@@ -25,7 +24,6 @@ def distance(q, params=None):
     return library(q).linalg.norm(b - a, axis=-1)
 
 
-@effect_class
 class BetweenPoints(Effect):
     """Between the two points of each pair, which do not start at the same place; ``x = q_b - q_a``."""
 
@@ -42,7 +40,6 @@ class BetweenPoints(Effect):
         return cls.law(b - a, params)
 
 
-@effect_class
 class ToPoint(Effect):
     """Between each body and a point p, which `point` or `path` of a derived class gives; ``x = q - p``."""
 
@@ -68,7 +65,6 @@ class ToPoint(Effect):
         self.require(distance > 0, "the distance of a body from its point", distance, expected)
 
 
-@effect_class
 class ToFixedPoint(ToPoint):
     """Between each body and a fixed point."""
 
@@ -96,13 +92,6 @@ class ToFixedPoint(ToPoint):
         return {"anchors": anchors}
 
 
-def along_path(law, path, t, q, *arguments):
-    """``law(q - a(t), params)``, as a function of time."""
-    (q,), params = q, arguments[-1]
-    return law(q - path(t, params["path"]), params)
-
-
-@effect_class
 class ToPath(ToPoint):
     """Between each body and a point that moves along a path."""
 
@@ -112,9 +101,10 @@ class ToPath(ToPoint):
     dimensions = (1, 2, 3)
     timed = True
 
-    @property
-    def function(self):
-        return Applied(along_path, (self.law, self.path))
+    @classmethod
+    def function(cls, path, t, q, *arguments):
+        (q,), params = q, arguments[-1]
+        return cls.law(q - path(t, params["path"]), params)
 
     def point_at_start(self, params):
         return self.path(np.zeros(()), real_tree(f"{self.name}: params", self.params))

@@ -1,4 +1,4 @@
-"""Forces between all pairs of points: Newton's gravity, Coulomb, Lennard-Jones."""
+"""Potentials between several points: Newton's gravity, Coulomb, Lennard-Jones, angles, bending, torsion."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import field
@@ -7,16 +7,17 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.mechanics.arrays import is_concrete
+from vmri_jax.mechanics.arrays import is_concrete, library
 from vmri_jax.mechanics.checks import check_type
 from vmri_jax.mechanics.names import unknown
 from vmri_jax.refusals import Refused
-from vmri_jax.scene.declare import array, effect_class, names, number, positive, real_tree, stacked
+from vmri_jax.scene.body import end_of
+from vmri_jax.scene.declare import array, names, number, positive, real_tree, stacked
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.effects.points import distance
+from vmri_jax.scene.effects.springs import elastic_energy
 
 
-@effect_class
 class NBodyGravity(Effect):
     """Newton's gravity between bodies, ``V = -G sum_{a<b} m_a m_b / sqrt(|q_a - q_b|^2 + s^2)``.
 
@@ -45,7 +46,6 @@ class NBodyGravity(Effect):
         return not (is_concrete(self.softening) and np.all(np.asarray(self.softening) > 0))
 
 
-@effect_class
 class _Nonbonded(Effect):
     """Base class of potentials between pairs of points, without the pairs in `exclude`."""
 
@@ -95,7 +95,6 @@ def within_bonds(bonds: Iterable[tuple[str, str]], number: int = 3) -> list[tupl
     return sorted(pairs)
 
 
-@effect_class
 class Coulomb(_Nonbonded):
     """Coulomb's law between charges, ``V = C sum_{a<b} Q_a Q_b / |q_b - q_a|``.
 
@@ -110,7 +109,6 @@ class Coulomb(_Nonbonded):
     constant: Any = array(default=8.9875517862e9)
     between: Any = names(2, pairs=True, default=None)
 
-    default_name = "coulomb"
     derived = ("charge_a", "charge_b")
 
     def __post_init__(self):
@@ -139,7 +137,6 @@ class Coulomb(_Nonbonded):
         return super()._parameters() | of_roles
 
 
-@effect_class
 class LennardJones(_Nonbonded):
     """Lennard-Jones forces, ``V = 4 eps sum_{a<b} ((s/r)^12 - (s/r)^6)``; the minimum -eps is at ``r = 2^(1/6) s``.
 
@@ -161,3 +158,116 @@ class LennardJones(_Nonbonded):
         a, b = q
         sixth = (params["distance"] ** 2 / jnp.sum((b - a) ** 2, axis=-1)) ** 3
         return jnp.sum(4 * params["depth"] * (sixth**2 - sixth))
+
+
+class _AmongPoints(Effect):
+    """Base class of the potentials here: between different points in the plane or in space."""
+
+    kind = "potential"
+    dimensions = (2, 3)
+    apart = True
+
+
+def cosine(q):
+    """Cosine of the angle at b between a and c."""
+    a, b, c = q
+    u, w = a - b, c - b
+    return (u * w).sum(axis=-1) / library(q).sqrt((u**2).sum(axis=-1) * (w**2).sum(axis=-1))
+
+
+def angle_between(q, params=None):
+    """Angle at b between a and c, rad."""
+    return library(q).arccos(cosine(q))
+
+
+class Angle(_AmongPoints):
+    """Angles with a rest value, ``V = sum k/2 (theta - theta_0)^2``, theta at b between a and c.
+
+    Args:
+        between: names (a, b, c), or a list of such.
+        stiffness: k, N m, positive; one number, or one for each angle.
+        angle: theta_0, rad, between 0 and pi, where the energy is smooth (take `Bending` for pi); likewise. The angle at the positions in
+            `bodies` by default.
+    """
+
+    between: Any = names(3)
+    stiffness: Any = positive()
+    angle: Any = number(default=None, measured=True)
+
+    default_name = "angles"
+    rest = staticmethod(angle_between)
+
+    @staticmethod
+    def function(q, params):
+        return elastic_energy(params["stiffness"], angle_between(q) - params["angle"])
+
+    def check_parameters(self):
+        super().check_parameters()
+        angle = self.parameters["angle"]
+        expected = "it must lie between 0 and pi, where the energy is smooth; for pi take Bending"
+        self.require((angle > 1e-3) & (angle < np.pi - 1e-3), "angle", angle, expected)
+
+
+class Bending(_AmongPoints):
+    """Resistance to bending of a straight line of points, ``V = sum k (1 + cos theta)``, theta at b between a and c.
+
+    ``k/2 (pi - theta)^2`` near the straight line, and smooth there.
+
+    Args:
+        between: names (a, b, c), or a list of such.
+        stiffness: k, N m, positive; one number, or one for each.
+    """
+
+    between: Any = names(3)
+    stiffness: Any = positive()
+
+    @staticmethod
+    def function(q, params):
+        return jnp.sum(params["stiffness"] * (1 + cosine(q)))
+
+
+class Torsion(_AmongPoints):
+    """Torsion about the middle one of three bonds, ``V = sum k (1 - cos(m (phi - phi_0)))``, phi the dihedral angle.
+
+    phi is 0 if a and d are on the same side of b-c (cis), and pi if they are on opposite sides (trans).
+
+    Args:
+        between: names (a, b, c, d) of points in space that are not on a line, or a list of such.
+        stiffness: k, N m; one number, or one for each. Negative ones make phi_0 a maximum, as in the OPLS series.
+        angle: phi_0, rad, of a minimum; likewise.
+        multiplicity: m, a positive integer, the number of minima in a turn; likewise.
+    """
+
+    between: Any = names(4)
+    stiffness: Any = number()
+    angle: Any = number(default=0.0)
+    multiplicity: Any = positive(default=1)
+
+    dimensions = (3,)
+
+    @staticmethod
+    def function(q, params):
+        a, b, c, d = q
+        # with b_1 = b - a, b_2 = c - b, b_3 = d - c: tan phi = |b_2| b_1 . (b_2 x b_3) / ((b_1 x b_2) . (b_2 x b_3))
+        first, axis, last = b - a, c - b, d - c
+        left, right = jnp.cross(first, axis), jnp.cross(axis, last)
+        sine = jnp.linalg.norm(axis, axis=-1) * jnp.sum(first * right, axis=-1)
+        phi = jnp.arctan2(sine, jnp.sum(left * right, axis=-1))
+        return jnp.sum(params["stiffness"] * (1 - jnp.cos(params["multiplicity"] * (phi - params["angle"]))))
+
+    def check_parameters(self):
+        super().check_parameters()
+        multiplicity = self.parameters["multiplicity"]
+        self.require(
+            multiplicity == library(multiplicity).round(multiplicity),
+            "multiplicity",
+            multiplicity,
+            "it must be an integer",
+        )
+        expected = "they must not start on a line, where there is no dihedral angle"
+        for element in self.elements:
+            for corner in (element[:3], element[1:]):
+                a, b, c = (end_of(self.by_name, name).position for name in corner)
+                xp = library(a, b, c)
+                area, size = xp.linalg.norm(xp.cross(b - a, c - b)), xp.linalg.norm(b - a) * xp.linalg.norm(c - b)
+                self.require(area > 1e-9 * size, f"the area between {', '.join(corner)}", area, expected)
