@@ -19,7 +19,7 @@ of two families, `vmri_jax.tune` compares the best of many.
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -209,10 +209,10 @@ class Search:
             elapsed = stopwatch()
             trajectory, halved = run.in_pieces(), companion(run, 2)
             seconds, succeeded = elapsed(), max(int(trajectory.failed_at), int(halved.failed_at)) < 0
-            if succeeded and accuracy is not None:
-                errors = estimated_errors(run, trajectory, halved, self.drives, accuracy)
-            else:
+            if accuracy is None:
                 errors = extrapolated(run.order, trajectory, halved)
+            else:
+                errors = estimated_errors(run, trajectory, halved, self.drives, partial(companion, run), accuracy)
             certified = succeeded and bool(certified_nodes(trajectory, errors)[0].all())
             error = float(largest_of(errors).max()) if certified else np.inf
             trial = Trial(family, num_micro, run, trajectory, halved, errors, error)

@@ -18,8 +18,6 @@ from vmri_jax.steppers.solver import Solver
 WHOLE_NUMBER_TOLERANCE = 1e-9
 """Relative distance from a whole number up to which ``(t_end - t) / macro_dt`` counts as one. The end of a run misses t_end by at most this
 part of its length; a larger value lets runs end visibly beside t_end."""
-
-
 ADJOINTS = ("auto", "stored", "checkpoint")
 
 
@@ -117,12 +115,7 @@ def check_run(system, scheme, state, solver, steps: Steps) -> tuple[int, int]:
 
 
 def nothing_fast(scheme: Scheme | Composition, num_fast: int) -> str:
-    """Advice where a scene without fast bodies takes several micro steps; empty for any other scene.
-
-    Args:
-        scheme: its micro steps count; of a composition the micro steps of a stage.
-        num_fast: number of fast coordinates, or of fast bodies.
-    """
+    """Advice where a scene without fast coordinates or bodies takes several micro steps; empty for any other scene."""
     if num_fast or stage_scheme(scheme).num_micro == 1:
         return ""
     return (

@@ -159,12 +159,8 @@ def shared(value, lanes: int) -> np.ndarray:
 
 @eqx.filter_jit
 def consistent_states(system: System, params, start: tuple, project: bool, starts_differ: bool = True) -> State:
-    """Consistent states of all lanes, from starts (t, q_s, q_f, v_s, v_f) and parameters.
-
-    Args:
-        params: of all lanes; None for the parameters of the system.
-        starts_differ: whether the arrays of the start have an axis of lanes.
-    """
+    """Consistent states of all lanes, from parameters, None for those of the system, and a start (t, q_s, q_f, v_s, v_f)
+    for each of them, or for all, without an axis of lanes."""
 
     def of_lane(lane_params, lane_start):
         t, q_s, q_f, v_s, v_f = lane_start
@@ -175,11 +171,7 @@ def consistent_states(system: System, params, start: tuple, project: bool, start
 
 
 def _named(values, known: Collection[str], path: tuple[str, ...] = ()) -> Iterator[tuple[str, Any]]:
-    """Name and value of each parameter in a part of the parameters, nested or with dots in its names.
-
-    Raises:
-        ValueError: a name that is not known, with the known ones.
-    """
+    """Name and value of each parameter in a part of the parameters, nested or with dots in its names."""
     name = ".".join(path)
     if name in known:
         yield name, np.asarray(values)
@@ -192,14 +184,9 @@ def _named(values, known: Collection[str], path: tuple[str, ...] = ()) -> Iterat
 
 
 def _with_lanes(all_params, params, start: State, macro_dt) -> tuple[Any, State, np.ndarray]:
-    """Parameters, starts and macro steps of all lanes, with the lanes as their first axis.
+    """Parameters (of the system, some replaced by the user's), starts and macro steps, the lanes as their first axis.
 
-    Args:
-        all_params: of the system.
-        params: of the user, some of them with an axis of lanes.
-
-    Raises:
-        ValueError: arrays of other shapes, axes of different lengths, or no axis of lanes at all.
+    Refuses arrays of other shapes, axes of different lengths, and arguments without any axis of lanes.
     """
     leaves, structure = jax.tree_util.tree_flatten_with_path(all_params)
     values = {jax.tree_util.keystr(path, simple=True, separator="."): value for path, value in leaves}

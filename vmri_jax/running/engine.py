@@ -63,9 +63,8 @@ class Engine:
 
     A run is flattened once: to flatten a system at every call would take longer than a short run.
 
-    Attributes:
-        structure: structure of the pytree of a run, without its length and names.
-        num_saves: saved intervals that fit into the arrays of a run.
+    structure: of the pytree of a run, without its length and names.
+    num_saves: saved intervals that fit into the arrays of a run.
     """
 
     structure: Any
@@ -79,12 +78,11 @@ class Engine:
     def steps(self, leaves: list, save_every, saves=None, cursor: Cursor | None = None, is_first: Any = True):
         """The first `saves` saved intervals: an array of `Saved` rows, and the cursor after them.
 
-        Args:
-            saves: None for all intervals, failed or not: the end of the loop then depends on no lane of a batch, and `jax.vmap` need not select
-                between old and new values in every lane.
-            cursor: None for the start of the run. In place of a cursor the program then returns (2,) result and failed step, since each array
-                costs some microseconds.
-            is_first: whether the memory of a first step replaces the memory of the cursor.
+        `saves` None: all intervals, failed or not. The end of the loop then depends on no lane of a batch, and
+        `jax.vmap` need not select between old and new values in every lane.
+        `cursor` None: the start of the run. In place of a cursor the program then returns (2,) result and failed step,
+        since each array costs some microseconds.
+        `is_first`: whether the memory of a first step replaces the memory of the cursor.
         """
         run: Any = jax.tree.unflatten(self.structure, leaves)
         stepper, begin = run.stepper(), cursor or Cursor.at_start(run.state)
@@ -102,9 +100,8 @@ class Engine:
             is_later = number > 0  # turn 0 saves the start, so that the code for nodes is compiled once
             moved, info, micro = interval(cursor, jnp.where(is_later, save_every, 0))
             cursor = jax.tree.map(lambda a, b: a if a is b else jnp.where(is_later, a, b), moved, cursor)
-            has_moved = (
-                cursor.step > 0
-            )  # the start of a run is saved as it came; a later piece starts with momenta of a step
+            # The start of a run is saved as it came; a later piece starts with the momenta of a step.
+            has_moved = cursor.step > 0
             state = jax.tree.map(partial(jnp.where, has_moved), stepper.project(cursor.state), cursor.state)
             row = _row(state, info, micro)
             return number + 1, cursor, jax.lax.dynamic_update_slice(rows, row[None], (number, 0))
@@ -227,14 +224,9 @@ def _interval(stepper: Plan, run, repeat: Callable):
 
 
 def unsolved(result, method):
-    """Whether steps failed that exact matrices may solve.
+    """Whether steps failed that exact matrices may solve, from their worst `Result` and largest `Method`.
 
-    They cannot help explicit and linear equations, the methods up to `Method.LINEAR`, nor steps that were solved but violate implied
-    constraints, `Result.NOT_IMPLIED`.
-
-    Args:
-        result: worst `Result` of the steps, of one run or (lanes,).
-        method: largest `Method` of the steps.
+    They cannot help explicit and linear equations, nor steps that were solved but violate implied constraints.
     """
     return (result > Result.CONVERGED_AT_ROUNDOFF) & (result != Result.NOT_IMPLIED) & (method > Method.LINEAR)
 
@@ -243,12 +235,7 @@ def solved_again(first: Callable, exact: Callable, failed: Callable, arguments: 
     """``first(arguments)``, or ``exact(arguments)`` where that has failed, in one program, to be transformed.
 
     The derivative is the derivative of `exact`, with its value: to differentiate both would compile two programs. Values of the two differ by
-    the tolerance of the solver.
-
-    Args:
-        first, exact: the run with the first matrix and with exact matrices, functions of one pytree of arrays.
-        failed: whether a value of `first` is to be computed again.
-        arguments: of both.
+    the tolerance of the solver. ``failed(value)`` says whether a value of `first` is computed again.
     """
 
     @jax.custom_jvp

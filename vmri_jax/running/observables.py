@@ -119,12 +119,7 @@ def concerns(table: np.ndarray, t, system: System, macro_dt, save_every: int) ->
     *Singular coordinates*: the mass matrix changes by a factor between two nodes, and the energy changes beside them. Forces change the energy, too:
     where they do, only steps that are all saved tell.
 
-    Args:
-        table: the `Observables` (..., k, 9).
-        t: (..., k) times.
-        system: the system, of which only the structure counts.
-        macro_dt: macro step H, or one for each lane.
-        save_every: macro steps from one saved node to the next.
+    `table` has the `Observables` (..., k, 9) at the times t (..., k); of the system only the structure counts.
     """
     energy, kinetic = table[..., 0], table[..., Observables._fields.index("kinetic")]
     if not np.any(np.ptp(energy, axis=-1) > min(CHANGE_AT_POLE, REPORTED_CHANGE) * kinetic.max(axis=-1)):

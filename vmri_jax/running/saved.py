@@ -83,10 +83,7 @@ class Saved(NamedTuple):
         its pole); a lane of a batch started off its constraints; the rows of ``system.implied``, redundant constraints that the solver leaves
         out, are violated; or a stepper of the user leaves the constraints. The last step before the first such node counts as the failed one.
 
-        Args:
-            columns: of the rows, in which there may be anything after a failed step.
-            save_every: macro steps from one saved node to the next.
-            step: macro steps before the first node.
+        Rows after a failed step may have any numbers. There are `step` macro steps before the first node.
         """
         rows, result, failed_at = self
         module, now = library(self), Observables.of(self.table)
@@ -134,17 +131,8 @@ def joined(pieces: list[Saved]) -> Saved:
 
 
 def check_memory(caller: str, run: Any, lanes: int = 1, num_saves: int | None = None) -> None:
-    """Refuse a run whose trajectory would not fit into the free memory.
-
-    Args:
-        caller: the function that was called, for the message.
-        run: the `Simulation` of one lane.
-        lanes: runs whose trajectories are kept together.
-        num_saves: saved intervals; None for those of the run.
-
-    Raises:
-        ValueError: the trajectory is larger than the free memory.
-    """
+    """Refuse runs side by side, with `num_saves` intervals each, None for those of `run`, that would not fit into the
+    free memory; `caller` begins the message."""
     nodes = 1 + (num_saves or run.num_saves)
     needed = BYTES_PER_NUMBER * run.columns.width * nodes * lanes
     if needed < UNCHECKED_BYTES:

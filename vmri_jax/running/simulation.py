@@ -54,8 +54,7 @@ STEPPING = "stepping"
 class Checkpoint(NamedTuple):
     """A run between two steps: everything that its next steps depend on, to the last bit.
 
-    cursor: state, memory of the stepper such as the start of Newton's next iteration, steps done, and status so far. The memory is None where the
-        stepper has none of earlier steps.
+    cursor: state, memory of the stepper, None where it has none of earlier steps, steps done, and status so far.
     fell_back: whether the fallback has replaced the first matrix.
     """
 
@@ -64,7 +63,7 @@ class Checkpoint(NamedTuple):
 
 
 MOTION = ("macro_dt", "state", "solver", "scheme", "system")
-"""The fields of a `Simulation` with the numbers and functions that its motion follows from."""
+"""The fields of a `Simulation` that its motion follows from."""
 LENGTH = ("num_steps", "save_every", "save", "names", "may_fall_back")
 """All other fields."""
 

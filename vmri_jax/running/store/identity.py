@@ -46,11 +46,8 @@ def environment() -> dict[str, str]:
 def check_same(path: Path, attributes: dict, stored: dict, chunk: int | None, complete: bool) -> None:
     """Refuse to go on with the store of another run; warn if its environment was another one, unless it is complete.
 
+    `attributes` are of the store that the user wants, `stored` of the store on disk; `chunk` is the user's, or None.
     Operations are compared only if both were made with the same version of JAX: another version prints them differently.
-
-    Args:
-        attributes, stored: of the store that the user wants, and of the store on disk, with "identity", "made_with" and "chunk".
-        chunk: size of a chunk that the user wants, or None.
     """
     kind, here, there = stored["kind"], attributes["identity"], stored["identity"]
     now, then = attributes["made_with"], stored["made_with"]

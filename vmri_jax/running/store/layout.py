@@ -63,12 +63,7 @@ class Kept(NamedTuple):
 
 
 def rows_per_chunk(rows: int, seconds: float, size: int, most_chunks: int) -> float:
-    """Rows of a chunk that takes about `CHUNK_SECONDS`, longer where there would be more than `most_chunks`.
-
-    Args:
-        rows: of the store.
-        seconds, size: time to compute a row, and its bytes.
-    """
+    """Rows of a chunk, from seconds and bytes of a row: `CHUNK_SECONDS`, more where `most_chunks` do not suffice."""
     return min(max(CHUNK_SECONDS / seconds, rows / most_chunks), MOST_CHUNK_BYTES / size)
 
 
@@ -96,10 +91,8 @@ def writing(
 ) -> Iterator[None]:
     """Context in which this process alone may write to a store, which is made if there is none, or one to overwrite.
 
-    Args:
-        attributes: of a new store, among them "kind", "rows" and "chunk".
-        arrays: by name, the first axis of each, the rows, left out.
-        design: name of the `dimension` of the rows, and `table`, columns by name.
+    A new store gets these attributes, "kind", "rows" and "chunk" among them, and these arrays, each without its first
+    axis, the rows; `design` has the name of this `dimension` and a `table` of columns.
     """
     if overwrite or not path.exists():
         with explained(path, "Give another place."):
@@ -194,11 +187,7 @@ def change_attributes(path: Path, **changes) -> None:
 
 
 def read_attributes(path: Path, kind: str) -> dict[str, Any]:
-    """Attributes of the store of a kind, "run" or "ensemble".
-
-    Raises:
-        FileNotFoundError, ValueError: there is no such store at the path, or one of another format.
-    """
+    """Attributes of the store of a kind, "run" or "ensemble"; refuses another store, and another format."""
     if not path.exists():
         raise FileNotFoundError(f"{path} does not exist; give the folder of a stored {kind}.")
     try:

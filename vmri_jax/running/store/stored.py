@@ -22,7 +22,7 @@ from vmri_jax.running.simulation import Checkpoint, Simulation
 from vmri_jax.running.store import layout
 from vmri_jax.running.store.layout import chunk_file, read_attributes
 from vmri_jax.running.summaries import named_coordinates
-from vmri_jax.running.trajectory import Trajectory, part_of, with_origin
+from vmri_jax.running.trajectory import Trajectory, part_of
 from vmri_jax.steppers.results import Result
 
 
@@ -175,8 +175,7 @@ class StoredTrajectory(Exports):
         return self[number : number + 1][0]
 
     def _part(self, first: int, last: int, stride: int) -> Trajectory:
-        nodes, has_micro = (first, last, stride), self.attributes["save_micro"]
-        return with_origin(part_of(self._rows, int(self.result), self.failed_at, nodes, has_micro), self.origin)
+        return part_of(self, self._rows, (first, last, stride), self.attributes["save_micro"])
 
     def chunks(self):
         """The trajectory in pieces of a chunk each; a piece starts with the last node of the previous piece."""
@@ -184,7 +183,7 @@ class StoredTrajectory(Exports):
             yield self[first : first + self.chunk + 1]
 
     def _rows(self, name: str, rows: slice) -> np.ndarray:
-        """Committed rows of an array, see `part_of`; a ValueError if one of their files is missing or damaged."""
+        """Committed rows of an array, see `part_of`; refuses missing and damaged files."""
         import zarr
 
         shift = name not in NODES  # the first row of arrays of intervals is blank
