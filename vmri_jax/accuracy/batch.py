@@ -12,12 +12,12 @@ from vmri_jax.mechanics.checks import check_flags
 from vmri_jax.mechanics.driving import Events, driven, events
 from vmri_jax.mechanics.state import Movable, State
 from vmri_jax.running.arguments import Save, Steps
-from vmri_jax.running.batch import Batch, batch
+from vmri_jax.running.batch import Batch, batch, shared
+from vmri_jax.running.origin import is_repeated
 from vmri_jax.running.progress import Working
 from vmri_jax.running.run_error import RunError
 from vmri_jax.running.trajectory import Trajectory
-from vmri_jax.schemes.composition import Composition
-from vmri_jax.schemes.scheme import Scheme
+from vmri_jax.schemes.composition import SchemeLike
 from vmri_jax.steppers.results import Result
 from vmri_jax.steppers.solver import Solver
 
@@ -28,7 +28,7 @@ class FailedLanesWarning(UserWarning):
 
 def simulate_batch(
     system: Movable,
-    scheme: Scheme | Composition,
+    scheme: SchemeLike,
     states: State | None = None,
     *,
     macro_dt=None,
@@ -91,8 +91,10 @@ def _errors(lanes: Batch, plain: Trajectory) -> RunError:
 
     @cache
     def companions(parts: int, whole: int = 1) -> Trajectory:
-        finer_lanes = lanes.with_steps(finer(lanes.run, parts, whole))
-        return finer_lanes().trajectory(finer_lanes.runs)
+        runs = finer(lanes.runs, parts, whole)
+        if is_repeated(lanes.runs.macro_dt):  # a step of all lanes stays one array
+            runs = replace(runs, macro_dt=shared(runs.macro_dt[0], len(lanes)))
+        return replace(lanes, runs=runs)().trajectory(runs)
 
     def error(i: int) -> RunError:
         run, coarse = lanes.lane(i), plain.lane(i)

@@ -41,8 +41,7 @@ from vmri_jax.running.run_error import RunError, largest_of
 from vmri_jax.running.saved import Saved
 from vmri_jax.running.simulation import Simulation
 from vmri_jax.running.trajectory import Trajectory
-from vmri_jax.schemes.composition import Composition, stage_lengths, stage_scheme
-from vmri_jax.schemes.scheme import Scheme
+from vmri_jax.schemes.composition import SchemeLike, stage_lengths, stage_scheme
 from vmri_jax.steppers.results import Result
 
 LARGEST_CERTIFIED = 0.1
@@ -169,14 +168,14 @@ def estimated_errors(
     return result
 
 
-def node_distance(scheme: Scheme | Composition, drives: Events) -> float:
+def node_distance(scheme: SchemeLike, drives: Events) -> float:
     """Largest distance in time of the nodes at which a scheme sees the terms that depend on time, in units of the macro step."""
     stage = stage_scheme(scheme)
     longest = float(np.abs(stage_lengths(scheme)).max())
     return longest * max(getattr(stage, name).largest_gap(stage.num_micro) for name in drives.names)
 
 
-def fewest_steps(scheme: Scheme | Composition, drives: Events, length: float) -> int:
+def fewest_steps(scheme: SchemeLike, drives: Events, length: float) -> int:
     """Fewest macro steps in a time with `NODES_OF_EVENT` nodes in the shortest event."""
     if not drives.names:
         return 1

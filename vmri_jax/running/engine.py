@@ -61,10 +61,8 @@ class Cursor(NamedTuple):
 class Engine:
     """Compiled runs of all systems and schemes of one structure, as functions of the leaves of a `Simulation` and of numbers of steps.
 
-    A run is flattened once: to flatten a system at every call would take longer than a short run.
-
-    structure: of the pytree of a run, without its length and names.
-    num_saves: saved intervals that fit into the arrays of a run.
+    A run is flattened once: to flatten a system at every call would take longer than a short run. `structure` is the
+    structure of a run without its length and names, whose arrays have room for `num_saves` saved intervals.
     """
 
     structure: Any
@@ -159,10 +157,6 @@ class Engine:
 
         return jax.jit(observed)  # else JAX would compile the operations of a gradient outside of jit one by one
 
-    def blank_memory(self, leaves: list):
-        """Zeros in the shapes of the memory of the stepper, for a first piece."""
-        return _blank_memory(self, tuple((a.shape, a.dtype) for a in leaves))
-
 
 engine = lru_cache(maxsize=32)(Engine)
 """``engine(structure, num_saves)``: the `Engine` with these attributes, made once. The 33rd structure displaces the one used
@@ -170,7 +164,9 @@ least recently, which compiles again when it is needed: each program takes memor
 
 
 @lru_cache(maxsize=256)
-def _blank_memory(engine: Engine, shapes: tuple):
+def blank_memory(engine: Engine, shapes: tuple):
+    """Zeros in the shapes of the memory of the stepper, from the shapes and types of the leaves of a run."""
+
     def first_memory(leaves):
         run = jax.tree.unflatten(engine.structure, leaves)
         return run.stepper().init(run.state, run.macro_dt)
@@ -193,7 +189,7 @@ def _row(state: State, info: RunInfo, micro) -> Float[Numbers, "numbers"]:
 
 def _nothing(run) -> tuple[RunInfo, Any]:
     """The work of the solver, and the micro nodes, before the first step."""
-    num_micro = run.scheme.num_micro if run.save_micro else 0
+    num_micro = run.scheme.num_micro if run.save.micro else 0
     return RunInfo(np.asarray(0), np.asarray(0), np.zeros(())), jnp.zeros((num_micro, run.state.q_f.shape[0]))
 
 
@@ -214,7 +210,7 @@ def _interval(stepper: Plan, run, repeat: Callable):
         state = State(t_start + (cursor.step + 1) * macro_dt, state.q_s, state.q_f, p_s, p_f)
         result = jnp.where(alive, jnp.maximum(cursor.result, info.result), cursor.result)
         failed_at = jnp.where(alive & ~ok, cursor.step, cursor.failed_at)
-        micro = jnp.where(ok, info.q_f_micro, jnp.nan) if run.save_micro else micro
+        micro = jnp.where(ok, info.q_f_micro, jnp.nan) if run.save.micro else micro
         return Cursor(state, memory, cursor.step + 1, result, failed_at), worst, micro
 
     def interval(cursor: Cursor, count):

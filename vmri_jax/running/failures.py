@@ -25,10 +25,8 @@ computes steps from positions that have already exploded."""
 
 
 class Motion(NamedTuple):
-    """How far a body, or a coordinate without a body, moves in a step.
+    """How far a body, or a coordinate without a body, moves in a step, in a micro step if it is fast (`micro`).
 
-    name: of the body or coordinate.
-    micro: whether it is fast, so that the motion in a micro step counts.
     amount: radians for a turn; for a move the distance as a part of the extent of all positions.
     turns: whether this is the turn of a rigid body; else it is a move.
     """

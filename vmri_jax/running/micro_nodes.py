@@ -43,7 +43,7 @@ def why_not(t, t_micro) -> str:
 
 
 def with_micro_nodes(nodes: Nodes, t_micro, q_f_micro) -> Nodes:
-    """All nodes of a run for which `why_not` is empty, from finite macro nodes and micro nodes (k - 1, num_micro, ...)."""
+    """All nodes of a run for which `why_not` is empty, from macro nodes, finite ones, and micro nodes."""
     from scipy.interpolate import CubicHermiteSpline, CubicSpline  # here: its import takes a fifth of a second
 
     t_micro, q_f_micro = np.asarray(t_micro, dtype=float), np.asarray(q_f_micro, dtype=float)

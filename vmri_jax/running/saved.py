@@ -61,11 +61,7 @@ class Columns(NamedTuple):
 
 
 class Saved(NamedTuple):
-    """Nodes of a run and its status, of JAX or of NumPy, in a batch with an axis of lanes.
-
-    rows: a row for each node, see `Columns`.
-    result, failed_at: of a `Trajectory`.
-    """
+    """Nodes of a run, a row of `Columns` for each, and its status, of JAX or NumPy; in a batch with lanes."""
 
     rows: Float[Numbers, "k width"]
     result: Int[Numbers, ""]
@@ -115,7 +111,7 @@ class Saved(NamedTuple):
         t = t_start[..., None] + (step + np.arange(rows.shape[-2]) * run.save_every) * macro_dt[..., None]
         states, first = columns.states(rows, t), columns.info.start
         method, iterations, residual = (rows[..., 1:, first + i] for i in range(len(RunInfo._fields)))
-        if run.save_micro:  # micro node i lies H (1 - c_i) before the end of its macro step
+        if run.save.micro:  # micro node i lies H (1 - c_i) before the end of its macro step
             before_end = macro_dt[..., None, None] * (1 - run.scheme.micro_times)
             shape = *residual.shape, before_end.shape[-1], states.q_f.shape[-1]
             micro = MicroNodes(t[..., 1:, None] - before_end, rows[..., 1:, columns.micro].reshape(shape))
@@ -139,8 +135,6 @@ def check_memory(caller: str, run: Any, lanes: int = 1, num_saves: int | None = 
         return
     free = psutil.virtual_memory().available
     if needed > free:
-        raise Refused(
-            f"{caller}: {nodes} saved nodes{f' of {lanes} runs' if lanes > 1 else ''} would take {needed / 1e9:.3g} GB, and "
-            f"{free / 1e9:.3g} GB of memory are free. Save fewer of them (save=...), or write them to disk as they come "
-            "(vmri_jax.stream)."
-        )
+        kept = f"{nodes} saved nodes{f' of {lanes} runs' if lanes > 1 else ''} would take {needed / 1e9:.3g} GB"
+        advice = "Save fewer of them (save=...), or write them to disk as they come (vmri_jax.stream)"
+        raise Refused(f"{caller}: {kept}, and {free / 1e9:.3g} GB of memory are free. {advice}.")

@@ -12,6 +12,7 @@ schedulers; a larger value makes measurements take longer."""
 LEAST_SECONDS = 1e-7
 """Seconds of a call that is too short for the clock, or only waits; a smaller value repeats calls that wait for minutes."""
 
+
 def interleaved(
     runs: Mapping[str, Callable[[], object]],
     repeats: int,

@@ -247,15 +247,11 @@ class Trajectory(Exports):
             with path.open("rb") as file, np.load(file, allow_pickle=False) as data:
                 arrays = {name: data[name] for name in data.files if name not in NOT_READ}
         except Exception as error:
-            raise Refused(
-                f"{path} cannot be read as a .npz file ({error}); it is damaged or something else."
-            ) from error
+            raise Refused(f"{path} cannot be read as a .npz file ({error}); it may be damaged.") from error
         known = str(arrays.pop("format", ""))
         if known != FORMAT:
             other = f" It has the format {known!r}, this version of vmri_jax reads {FORMAT!r}." if known else ""
-            raise Refused(
-                f"{path} is a .npz file but not a trajectory saved by Trajectory.save of this version.{other}"
-            )
+            raise Refused(f"{path} is a .npz file but no trajectory of Trajectory.save of this version.{other}")
         texts = [arrays.pop(name, None) for name in ("names", "settings")]
         needed = {*NODES, *INFO, *STATUS}
         missing = needed - set(arrays)
@@ -264,9 +260,7 @@ class Trajectory(Exports):
         try:
             origin = Origin.from_file(*(None if text is None else json.loads(str(text)) for text in texts))
         except (KeyError, TypeError, ValueError) as error:
-            raise Refused(
-                f"{path} is a damaged trajectory: its names or settings cannot be read ({error!r})."
-            ) from error
+            raise Refused(f"{path} is a damaged trajectory: no names or settings can be read ({error!r}).") from error
         return from_named_arrays(arrays, origin)
 
 
@@ -278,11 +272,13 @@ def status(result) -> Any:
 
 def from_named_arrays(arrays: dict, origin: Origin = UNKNOWN) -> Trajectory:
     """The inverse of `named_arrays`; arrays of micro nodes and of the error may be absent."""
-    states, info = (kind(*map(arrays.get, names)) for kind, names in ((State, NODES[:5]), (RunInfo, INFO)))
+    states, info = State(*map(arrays.get, NODES[:5])), RunInfo(*map(arrays.get, INFO))
     fields = {name: arrays[name] for name in NODES[5:]} | {"result": status(arrays["result"])}
     micro = MicroNodes(*map(arrays.get, MICRO)) if MICRO[0] in arrays else None
     error: Any = RunError(*map(arrays.get, ERROR)) if ERROR[0] in arrays else None
-    return Trajectory(states, info=info, failed_at=arrays["failed_at"], micro=micro, error=error, origin=origin, **fields)
+    return Trajectory(
+        states, info=info, failed_at=arrays["failed_at"], micro=micro, error=error, origin=origin, **fields
+    )
 
 
 def part_of(run: SavedRun, rows: Callable[[str, slice], np.ndarray], nodes: tuple, has_micro: bool) -> Trajectory:

@@ -50,12 +50,7 @@ MOST_CHUNK_BYTES = 2**26
 
 
 class Kept(NamedTuple):
-    """An array of a store, in one row.
-
-    value: an array, or its shape and type.
-    dimensions: names of its axes.
-    description: of its meaning.
-    """
+    """A row of an array of a store, or its shape and type; the names of its axes, and a description of its meaning."""
 
     value: Any
     dimensions: tuple[str, ...] = ()
@@ -79,10 +74,8 @@ def check_place(caller: str, path: Path, kind: str, resume: bool, overwrite: boo
     stored = read_attributes(path, kind)
     if not (resume or overwrite):
         count = -(-stored["rows"] // stored["chunk"])
-        raise FileExistsError(
-            f"{path} is a stored {kind}, {len(committed(path))} of {count} chunks done. Go on with it (resume=True), replace it "
-            "(overwrite=True), or give another name."
-        )
+        advice = "Go on with it (resume=True), replace it (overwrite=True), or give another name"
+        raise FileExistsError(f"{path} is a stored {kind}, {len(committed(path))} of {count} chunks done. {advice}.")
 
 
 @contextmanager
@@ -197,10 +190,8 @@ def read_attributes(path: Path, kind: str) -> dict[str, Any]:
         raise Refused(f"{path} is not a stored {kind} ({type(error).__name__}: {error}).") from error
     if known != FORMAT:
         version = attributes.get("made_with", {}).get("vmri_jax", "of another format")
-        raise Refused(
-            f"{path} has the format {known!r}, and this version of vmri_jax reads {FORMAT!r}; read it with the version that "
-            f"wrote it, vmri_jax {version}, or compute it again."
-        )
+        formats = f"the format {known!r}, and this version of vmri_jax reads {FORMAT!r}"
+        raise Refused(f"{path} has {formats}; read it with vmri_jax {version}, or compute it again.")
     if attributes["kind"] != kind:
         raise Refused(f"{path} is not a stored {kind} but a stored {attributes['kind']}.")
     return attributes

@@ -27,12 +27,7 @@ from vmri_jax.steppers.results import Result
 
 
 class Record(NamedTuple):
-    """A `Checkpoint` in a store: a run as far as its chunks are committed.
-
-    saved: number of committed saved intervals.
-    result, failed_at, step, fell_back: of these intervals, as in `Cursor` and `Checkpoint`.
-    leaves: state and memory of the cursor.
-    """
+    """A `Checkpoint` after the committed saved intervals: their number, its counts, leaves of its state and memory."""
 
     saved: int = 0
     result: int = int(Result.CONVERGED)
@@ -73,7 +68,8 @@ class Record(NamedTuple):
         """The checkpoint of the run; a ValueError if the arrays do not fit the memory of its stepper."""
         if not self.leaves:
             return run.start()
-        expected, structure = jax.tree.flatten((run.state, run.blank_memory(self.fell_back)))
+        memory = (run.exact if self.fell_back else run).blank_memory
+        expected, structure = jax.tree.flatten((run.state, memory))
         if [(leaf.shape, leaf.dtype) for leaf in self.leaves] != [(leaf.shape, leaf.dtype) for leaf in expected]:
             raise Refused("the checkpoint was made by a version of vmri_jax whose steps remember something else")
         state, memory = jax.tree.unflatten(structure, map(jnp.asarray, self.leaves))
@@ -108,10 +104,8 @@ class StoredTrajectory(Exports):
     def __init__(self, path):
         self.path = Path(path)
         if self.path.is_file():
-            raise Refused(
-                f"{path} is not a stored run but a file; a run written by Trajectory.save is read by "
-                f"Trajectory.load({str(path)!r})."
-            )
+            advice = f"a run written by Trajectory.save is read by Trajectory.load({str(path)!r})"
+            raise Refused(f"{path} is not a stored run but a file; {advice}.")
         self.attributes: dict[str, Any] = read_attributes(self.path, "run")
         self.num_steps: int = self.attributes["num_steps"]
         self.save_every: int = self.attributes["save_every"]
