@@ -84,11 +84,12 @@ PROGRAMS: dict[str, Program] = {
     "FPU, fully_implicit(5)": Program(FPU, vm.fully_implicit(5), 3090),
     "FPU, fully_implicit(5), exact matrices": Program(FPU, vm.fully_implicit(5), 3470, "exact"),
     "TSP, fully_explicit(5)": Program(TSP, vm.fully_explicit(5), 3920),
+    "TSP, fully_implicit(1)": Program(TSP, vm.fully_implicit(1), 3300),
     "TSP, fully_implicit(5)": Program(TSP, vm.fully_implicit(5), 4610),
     "TSP, fully_implicit(5), exact matrices": Program(TSP, vm.fully_implicit(5), 5230, "exact"),
     "SAM, fully_implicit(5)": Program(SAM, vm.fully_implicit(5), 6470),
     "SAM, fully_implicit(5), exact matrices": Program(SAM, vm.fully_implicit(5), 7020, "exact"),
-    "satellite in joint coordinates, fully_explicit(5)": Program(SATELLITE, vm.fully_explicit(5), 11600),
+    "satellite in joint coordinates, fully_explicit(5)": Program(SATELLITE, vm.fully_explicit(5), 10100),
     "squeezer by directors, fully_implicit(1)": Program(SQUEEZER, vm.fully_implicit(1), 4970),
     "engine by directors, explicit_slow(5)": Program(ENGINE, vm.explicit_slow(5), 10040),
     "gradient: double pendulum, fully_implicit(1)": Program(

@@ -83,6 +83,14 @@ CAUSES = {  # problem, scheme, macro step, steps, outcome
 }
 
 
+class PushedStart(vm.Problem):
+    """A start whose momenta are off the hidden constraints."""
+
+    def state(self, project=None):
+        state = super().state(project)
+        return replace(state, p_f=state.p_f + np.array([0.5, 0.0]))
+
+
 # --- roads -----------------------------------------------------------------------------------------------------------
 def by_simulate(moving, scheme, steps, out):
     return vm.simulate(moving, scheme, **steps).result
@@ -155,6 +163,14 @@ def test_every_road_says_it(road, cause, tmp_path):
         assert (int(result) <= 1, kinds) == (True, [expected] if expected else [])
     if expected is vm.SingularCoordinatesWarning:
         assert "the coordinates are singular near t = 0.53" in str(given[0].message)
+
+
+@pytest.mark.parametrize("road", [by_simulate, by_prepare, by_stream, by_batch])
+def test_every_road_says_that_the_momenta_of_the_start_are_projected(road, tmp_path):
+    moving = problem(of_masses(1.0, 1.0), None, [0.0, 0.0], [0.0, 1.0], constraint=line)
+    pushed = PushedStart(moving.system, moving.q_s, moving.q_f, moving.v_s, moving.v_f)
+    with pytest.warns(UserWarning, match="off the hidden constraints, by 0.5 where the largest of them is 1;"):
+        road(pushed, EXPLICIT, {"macro_dt": 0.01, "num_steps": 40}, tmp_path / "run.zarr")
 
 
 @pytest.mark.filterwarnings("ignore::vmri_jax.SingularCoordinatesWarning")

@@ -19,6 +19,12 @@ STRUCTURES = {
             2, 1, 1, "bent", **SPRINGS, constraint="rod", moving=True, slow_constraint="norm", force="drag", num_micro=2
         ),
     ),
+    "kinetic function and all else, joined": (
+        Method.MASSES,
+        rs.Structure(
+            2, 1, 1, "bent", **SPRINGS, constraint="rod", moving=True, slow_constraint="norm", force="drag", num_micro=1
+        ),
+    ),
     "null space": (
         Method.NULL_SPACE,
         rs.Structure(

@@ -79,6 +79,7 @@ def simulate_batch(
     trajectory = plain = saved.trajectory(lanes.runs)
     if error:
         trajectory = replace(plain, error=_errors(lanes, plain))
+    lanes.runs.tell_of_start("simulate_batch", plain.states)
     lanes.runs.warn("simulate_batch", saved.table, plain.states.t)
     for kind, message in ((FailedLanesWarning, _failures(trajectory)), (UncertifiedWarning, _uncertified(trajectory))):
         if warn and message:

@@ -9,6 +9,7 @@ from vmri_jax import kernels
 from vmri_jax.kernels import matmul, matvec
 from vmri_jax.kernels.band import Full, Sparsity
 from vmri_jax.kernels.saddle import saddle
+from vmri_jax.mechanics.constraint_pattern import all_rows
 from vmri_jax.mechanics.structure import has_constant_hessian
 from vmri_jax.mechanics.system import System
 
@@ -49,7 +50,7 @@ def project_momentum(system: System, state, guess=None, sparsity: Sparsity | Non
         system: with its kinetic energy and constraints.
         state: a `State`: time, positions and momenta.
         guess: velocities (v_s, v_f) from which Newton's iteration starts, by default zero.
-        sparsity: of ``G M^-1 G^T``, for constant masses; by default the matrix is full.
+        sparsity: of ``G M^-1 G^T``, for constant masses; found if it is None.
 
     Returns:
         (p_s, p_f, v_s, v_f, masses), the last one the mass matrix ``d2T/dv2`` (n, n), None for constant masses; NaN where Newton's iteration does
@@ -67,7 +68,7 @@ def _with_constant_masses(system: System, state, sparsity: Sparsity | None):
     g, pull = jax.vjp(constraints, q_s, q_f)
     if g.size:
         push = jax.linearize(constraints, q_s, q_f)[1]
-        sparsity = sparsity or Full(g.size)
+        sparsity = sparsity or all_rows(system, q_s, q_f)
         # G M^-1 times G^T seeds and p: one map for all, since each use of `push` is compiled anew
         impulses = zip(jax.vmap(pull)(sparsity.seeds), (p_s, p_f), strict=True)
         pushed = jax.vmap(lambda *p: push(*velocity(*p)))(*(jnp.concatenate([a, p[None]]) for a, p in impulses))

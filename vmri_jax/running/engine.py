@@ -29,7 +29,7 @@ from jaxtyping import Float, Int
 from vmri_jax.mechanics.arrays import Numbers, options_of_runs
 from vmri_jax.mechanics.state import State
 from vmri_jax.running.loops import MOST_STORED_STEPS, Adjoint, plain
-from vmri_jax.running.observables import observables
+from vmri_jax.running.observables import observed
 from vmri_jax.running.saved import Saved
 from vmri_jax.running.trajectory import RunInfo
 from vmri_jax.steppers.plan import Plan
@@ -98,10 +98,7 @@ class Engine:
             is_later = number > 0  # turn 0 saves the start, so that the code for nodes is compiled once
             moved, info, micro = interval(cursor, jnp.where(is_later, save_every, 0))
             cursor = jax.tree.map(lambda a, b: a if a is b else jnp.where(is_later, a, b), moved, cursor)
-            # The start of a run is saved as it came; a later piece starts with the momenta of a step.
-            has_moved = cursor.step > 0
-            state = jax.tree.map(partial(jnp.where, has_moved), stepper.project(cursor.state), cursor.state)
-            row = _row(state, info, micro)
+            row = _row(cursor.state, info, micro)
             return number + 1, cursor, jax.lax.dynamic_update_slice(rows, row[None], (number, 0))
 
         begin = jax.tree.map(jnp.asarray, begin._replace(memory=memory))
@@ -111,14 +108,18 @@ class Engine:
         return rows, jnp.stack([end.result, end.failed_at]) if cursor is None else end
 
     def _observed(self, run, rows, step, save_every, saves):
-        """The rows with their `Observables`, of blocks of `NODES_AT_ONCE` nodes side by side, up to the node `saves`."""
-        size, start = min(NODES_AT_ONCE, self.num_saves + 1), run.columns.observables.start
+        """The rows as they are saved, of blocks of `NODES_AT_ONCE` nodes side by side, up to the node `saves`."""
+        size = min(NODES_AT_ONCE, self.num_saves + 1)
 
         def block(i, rows):
             first = jnp.minimum(i * size, self.num_saves + 1 - size)
-            number = jnp.minimum(first + jnp.arange(size), saves)  # beyond the last node there may be no state
-            table = _observables(run, rows[number], step + number * save_every)
-            return jax.lax.dynamic_update_slice(rows, table, (first, start))
+            number = first + jnp.arange(size)
+            existing = jnp.minimum(number, saves)  # beyond the last node there may be no state
+            new = _as_saved(run, rows[existing], step + existing * save_every)
+            # the last block may overlap the block before, whose nodes are projected already
+            is_new = (number >= i * size) & (number <= saves)
+            old = jax.lax.dynamic_slice(rows, (first, 0), new.shape)
+            return jax.lax.dynamic_update_slice(rows, jnp.where(is_new[:, None], new, old), (first, 0))
 
         return jax.lax.fori_loop(0, saves // size + 1, block, rows)
 
@@ -136,7 +137,7 @@ class Engine:
 
             def save(cursor: Cursor, _):
                 cursor, info, micro = interval(cursor, save_every)
-                return cursor, _row(stepper.project(cursor.state), info, micro)
+                return cursor, _row(cursor.state, info, micro)
 
             cursor = Cursor.at_start(run.state, stepper.init(run.state, run.macro_dt))
             cursor, rows = loops.scan(save, jax.tree.map(jnp.asarray, cursor), self.num_saves)
@@ -147,12 +148,11 @@ class Engine:
 
     @cached_property
     def observed(self):
-        """``observed(leaves, saved, save_every)``: the nodes of `differentiable` with their observables and failures."""
+        """``observed(leaves, saved, save_every)``: the nodes of `differentiable` as they are saved, with failures."""
 
         def observed(leaves: list, saved: Saved, save_every) -> Saved:
             run: Any = jax.tree.unflatten(self.structure, leaves)
-            table = _observables(run, saved.rows, jnp.arange(self.num_saves + 1) * save_every)
-            rows = jnp.concatenate([saved.rows, table], axis=1)
+            rows = _as_saved(run, saved.rows, jnp.arange(self.num_saves + 1) * save_every)
             return saved._replace(rows=rows).marked(run.columns, save_every)
 
         return jax.jit(observed)  # else JAX would compile the operations of a gradient outside of jit one by one
@@ -175,10 +175,17 @@ def blank_memory(engine: Engine, shapes: tuple):
     return jax.device_put(jax.tree.map(lambda a: np.zeros(a.shape, a.dtype), blank))
 
 
-def _observables(run, rows, steps) -> Float[Numbers, "k 9"]:
-    """The `Observables` of nodes after these numbers of macro steps."""
-    states = run.columns.states(rows, run.state.t + steps * run.macro_dt)
-    return jax.vmap(lambda state: observables(run.system, state, run.solver.tolerance))(states)
+def _as_saved(run, rows, steps) -> Float[Numbers, "k width"]:
+    """The rows of nodes after these numbers of macro steps, with projected momenta, and with their `Observables`."""
+    columns = run.columns
+
+    def node(row, step):
+        state = columns.states(row, run.state.t + step * run.macro_dt)
+        state, table = observed(run.system, state, run.solver.tolerance)
+        positions, info = row[: columns.p_s.start], row[columns.info.start : columns.observables.start]
+        return jnp.concatenate([positions, state.p_s, state.p_f, info, table])
+
+    return jax.vmap(node)(rows, steps)
 
 
 def _row(state: State, info: RunInfo, micro) -> Float[Numbers, "numbers"]:

@@ -1,16 +1,16 @@
 """A single macro step, without a run."""
 
+from dataclasses import replace
 from functools import partial
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 
 from vmri_jax.mechanics.checks import check_type
-from vmri_jax.mechanics.constraints import are_kept, rows_at, weights_at
 from vmri_jax.mechanics.state import A_SYSTEM, State
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.engine import solved_again, unsolved
+from vmri_jax.running.observables import Observables, observed
 from vmri_jax.schemes.composition import SchemeLike
 from vmri_jax.steppers.plan import plan
 from vmri_jax.steppers.results import Result
@@ -58,10 +58,7 @@ def _step(arguments, exact: bool = False):
     system, scheme, state, macro_dt, solver = arguments
     planned = plan(system, scheme, state, solver.exact() if exact else solver)
     state, info, _ = planned.step(state, planned.init(state, macro_dt), macro_dt)
-    if system.is_constrained:  # rows that contradict each other leave increments that converge
-        configuration = state.t, state.q_s, state.q_f
-        rows = rows_at(system, *configuration, weights_at(system, *configuration[1:]))
-        kept, _ = are_kept(rows, sum(system.num_constraints(*configuration[1:])), solver.tolerance)
-        fails = (info.result <= Result.CONVERGED_AT_ROUNDOFF) & ~kept
-        info = eqx.tree_at(lambda info: info.result, info, jnp.where(fails, Result.CONSTRAINT_VIOLATED, info.result))
-    return planned.project(state), info
+    state, now = observed(system, state, solver.tolerance)
+    # rows that contradict each other leave increments that converge
+    fails = (info.result <= Result.CONVERGED_AT_ROUNDOFF) & (Observables.of(now).solved == 0)
+    return state, replace(info, result=jnp.where(fails, Result.CONSTRAINT_VIOLATED, info.result))

@@ -13,7 +13,8 @@ from jaxtyping import Float
 
 from vmri_jax.mechanics.arrays import Numbers
 from vmri_jax.mechanics.constraints import are_kept, residual_of, rows_at, weights_of
-from vmri_jax.mechanics.invariants import energy_parts, velocity_and_masses
+from vmri_jax.mechanics.invariants import energy_parts
+from vmri_jax.mechanics.projection import project_momentum
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
 
@@ -85,24 +86,33 @@ class Observables(NamedTuple):
         return np.array([[self.energy[0], *(column.max() for column in self[1:-1]), self.volume[-1]]])
 
 
-def observables(system: System, state: State, tolerance: Any = 0.0):
-    """The `Observables` of a state, as an array (9,), for a tolerance of the solver."""
-    phase = state.q_s, state.q_f, state.p_s, state.p_f
-    velocities, masses = velocity_and_masses(system, *phase)
+def observed(system: System, state: State, tolerance: Any = 0.0) -> tuple[State, Any]:
+    """A state as it is saved, with momenta projected onto the hidden constraints, ``G v + dg/dt = 0``, and its `Observables` as an array (9,).
+
+    A step depends on the momentum through ``h p - G_0^T mu`` alone. A projection ``p - G_0^T nu`` at its start changes mu, and not the motion: only
+    momenta that are saved are projected. `tolerance` is of the solver.
+    """
+    p_s, p_f, *velocities, masses = project_momentum(system, state)
+    phase, v = (state.q_s, state.q_f, p_s, p_f), jnp.concatenate(velocities)
     parts = list(energy_parts(system, *phase, velocities).values())
-    q, v = jnp.concatenate([state.q_s, state.q_f]), jnp.concatenate(velocities)
     if masses is None:
         kinetic, volume, diagonal = parts[0], 0.0, jnp.concatenate(system.kinetic.diagonal)
         rounding = system.kinetic_energy(state.q_s, state.q_f, state.q_s, state.q_f)
     else:
-        kinetic, diagonal = v @ masses @ v / 2, jnp.diagonal(masses)
-        rounding, volume = q @ masses @ q / 2, 2 * jnp.sum(jnp.log(jnp.diagonal(jnp.linalg.cholesky(masses))))
+        q, diagonal = jnp.concatenate([state.q_s, state.q_f]), jnp.diagonal(masses)
+        kinetic, rounding = v @ masses @ v / 2, q @ masses @ q / 2
+        volume = 2 * jnp.sum(jnp.log(jnp.diagonal(jnp.linalg.cholesky(masses))))
     weights = weights_of(diagonal)
     rows = rows_at(system, state.t, state.q_s, state.q_f, weights)
     residual = residual_of(rows, system, state, weights * v)
     kept = are_kept(rows, sum(system.num_constraints(state.q_s, state.q_f)), tolerance)
     values = sum(parts), *residual, *kept, kinetic, sum(map(jnp.abs, parts)), rounding, volume
-    return jnp.stack([jnp.asarray(value, dtype=float) for value in values])
+    return State(state.t, *phase), jnp.stack([jnp.asarray(value, dtype=float) for value in values])
+
+
+def observables(system: System, state: State):
+    """The `Observables` of a saved state, as an array (9,)."""
+    return observed(system, state)[1]
 
 
 def concerns(table: np.ndarray, t, system: System, macro_dt, save_every: int) -> list[LostEnergyWarning]:

@@ -25,7 +25,7 @@ from vmri_jax.configure import warn_if_slow
 from vmri_jax.mechanics.arrays import Known, is_concrete, of_one_type
 from vmri_jax.mechanics.checks import check_arrays, check_params
 from vmri_jax.mechanics.names import Names
-from vmri_jax.mechanics.state import Movable, State, opened, start_of
+from vmri_jax.mechanics.state import REPORTED_VIOLATION, Movable, State, opened, start_of
 from vmri_jax.mechanics.summary import numbers, summary
 from vmri_jax.mechanics.system import System
 from vmri_jax.refusals import Refused
@@ -115,6 +115,7 @@ class Simulation:
         trajectory = saved.trajectory(run)
         if throw and saved.failed_at >= 0:
             raise simulation_error(trajectory, run.macro_dt, run.save_every, run.scheme.num_micro)
+        run.tell_of_start("run", trajectory.states)
         run.warn("run", saved.table, trajectory.states.t)
         return trajectory
 
@@ -181,6 +182,19 @@ class Simulation:
             run = partial(solved_again, run, steps(self.exact), failed)
         saved = run(self.leaves)
         return self.engine.observed(self.leaves, saved, self.save_every).trajectory(self)
+
+    def tell_of_start(self, caller: str, saved: State, stacklevel: int = 3) -> None:
+        """Warn about momenta of the start that are off the hidden constraints: the run takes their projection, the first node of the saved states."""
+        if not self.system.is_constrained:
+            return
+        given, taken = (np.concatenate([a.p_s, a.p_f], axis=-1) for a in (self.state, saved))
+        change, size = (np.max(np.abs(p), initial=0.0) for p in (taken[..., 0, :] - given, given))
+        if change > REPORTED_VIOLATION * size:
+            warnings.warn(
+                f"{caller}: the momenta of the start are off the hidden constraints, by {change:.3g} where the largest of them is {size:.3g}; the run "
+                "starts with their projection. Make the start by initial_state(...).",
+                stacklevel=stacklevel,
+            )
 
     def warn(self, caller: str, table, t, stacklevel: int = 3) -> bool:
         """Give the warnings about the motion of a run, or of runs with an axis of lanes, see `concerns`; returns whether there are any."""
@@ -331,6 +345,7 @@ class Simulation:
         saved = joined(pieces)
         trajectory = saved.trajectory(self)
         if caller:
+            self.tell_of_start(caller, trajectory.states, stacklevel=4)
             self.warn(caller, saved.table, trajectory.states.t, stacklevel=4)
         return trajectory
 

@@ -60,7 +60,8 @@ class Scheme(eqx.Module):
         kinetic, slow, fast, force: placed rules (``macro(...)`` or ``micro(...)``) of T, V, W and the forces;
             `kinetic` must be placed with micro, `force` defaults to the rule of `kinetic`.
         constraint: where g holds: micro(rule) whose nodes are the control nodes; default micro(lobatto(degree + 1)).
-        slow_constraint: where g_s holds: macro(rule) on the same nodes; default macro(lobatto(degree + 1)).
+        slow_constraint: where g_s holds: macro(rule) on the same nodes; default macro(lobatto(degree + 1)). With one micro interval the weights
+            of `constraint` count for both.
         potentials: placed rules of `System.potentials` by name (a string or a whole number), see `with_potentials`.
 
     Raises:

@@ -1,7 +1,6 @@
-"""One interval with a path of degree r > 1: all variables at once, by simplified Newton steps in modes of time.
+"""One interval of fast variables with a path of degree r > 1, by simplified Newton steps in modes of time.
 
-With the Hessian of the potentials in the fast variables and the Jacobian of the constraints taken at one point, in the middle of
-the step, the Newton matrix is
+With the Hessian of the potentials and the Jacobian of the constraints taken at one point, in the middle of the step, the Newton matrix is
 
     [A (x) M - h^2 B (x) W'',  -1 (x) G^T;  1 (x) G,  0]        (x): Kronecker product
 
@@ -40,71 +39,56 @@ from vmri_jax.steppers.solver import Solver, iterated, only_if
 from vmri_jax.steppers.time_modes import TimeModes, product, times_i
 
 
-class JoinedEquations:
-    """The equations of the step in the joined variables q = (q_s, q_f), with the nodes as the last axis.
+class IntervalEquations:
+    """The equations of the step, with the nodes as the last axis.
 
-    num_curved: the Hessian W'' has the last num_curved variables: the fast ones, or all variables if none is fast.
     directions, along: L (d, n), the combinations of variables along which the potentials are curved, and its pseudo-inverse (n, d).
     """
 
     def __init__(self, equations: StepEquations):
-        self.system, self.h = equations.system, equations.macro_dt
-        self.n_s, self.r = equations.q_s.size, equations.scheme.degree
-        self.q = jnp.concatenate([equations.q_s, equations.q_f])
-        self.p = jnp.concatenate([equations.p_s, equations.p_f])
+        self.system, self.h, self.r = equations.system, equations.macro_dt, equations.scheme.degree
+        self.q_s, self.q, self.p = equations.q_s, equations.q_f, equations.p_f
         self.times = equations.t + self.h * control_nodes(self.r)
         terms = lagrangian(self.system, equations.scheme)
         self.form = terms.kinetic.fast_form[1:]
         self.potentials = [term for term in terms.potentials.terms if term.inside.groups]
-        kinetic = constant_mass(self.system)
-        self.masses = kinetic.slow_mass, kinetic.fast_mass
-        self.inverse_masses = kinetic.slow_mass.inverse(), kinetic.fast_mass.inverse()
-        self.num_curved = equations.q_f.size or self.q.size
-        directions = curved_directions(partial(self.potential_of_curved, self.q), self.q[-self.num_curved :])
-        self.directions = np.pad(directions, ((0, 0), (self.q.size - self.num_curved, 0)))
+        self.mass = constant_mass(self.system).fast_mass
+        self.inverse_mass = self.mass.inverse()
+        self.directions = curved_directions(self.potential, self.q)
         self.along = np.linalg.pinv(self.directions)
         self.at_start = self.jacobian(self.times[0], self.q)
 
     def constraints(self, t, q):
-        """All constraints (n_c,) at one point."""
-        return self.system.constraints(t, q[: self.n_s], q[self.n_s :])
+        """All constraints (n_g,) at one point."""
+        return self.system.g(t, self.q_s, q)
 
     def jacobian(self, t, q):
-        """The Jacobian G (n_c, n) of the constraints."""
+        """The Jacobian G (n_g, n) of the constraints."""
         return jax.jacrev(self.constraints, argnums=1)(t, q)
 
     def times_mass(self, x):
         """``M x`` for (n, m)."""
-        parts = zip(self.masses, (x[: self.n_s], x[self.n_s :]), strict=True)
-        return jnp.concatenate([mass.times(part.T).T for mass, part in parts])
+        return self.mass.times(x.T).T
 
     def over_mass(self, x):
         """``M^-1 x`` for (n, m)."""
-        parts = zip(self.inverse_masses, (x[: self.n_s], x[self.n_s :]), strict=True)
-        return jnp.concatenate([inverse.times(part.T).T for inverse, part in parts])
+        return self.inverse_mass.times(x.T).T
 
-    def by_name(self, term: TermOnNodes, q) -> tuple:
-        """The arguments of a term, out of joined variables (n, ...)."""
-        parts = {"q_s": q[: self.n_s], "q_f": q[self.n_s :]}
-        return tuple(parts[name] for name in term.arguments)
+    def of_term(self, term: TermOnNodes, q):
+        """A term of the Lagrangian at one point, with its sign."""
+        return term.sign * term.integrand(*({"q_s": self.q_s, "q_f": q}[name] for name in term.arguments))
 
     def potential(self, q):
         """All potentials at one point."""
-        return sum((-term.sign * term.integrand(*self.by_name(term, q)) for term in self.potentials), jnp.zeros(()))
-
-    def potential_of_curved(self, q, curved):
-        """`potential` with the last `num_curved` variables as an argument of their own."""
-        return self.potential(jnp.concatenate([q[: -self.num_curved], curved]))
+        return -sum((self.of_term(term, q) for term in self.potentials), jnp.zeros(()))
 
     def curvature(self, q):
-        """(n, d) the product of W'' with `along`, zero in the rows of the other variables."""
-        curved, gradient = q[-self.num_curved :], jax.grad(partial(self.potential_of_curved, q))
-        changes = self.along.T[:, -self.num_curved :]
-        columns = jax.vmap(lambda change: jax.jvp(gradient, (curved,), (change,))[1], out_axes=1)(changes)
-        return jnp.pad(columns, ((self.q.size - self.num_curved, 0), (0, 0)))
+        """(n, d) the product of W'' with `along`."""
+        gradient = jax.grad(self.potential)
+        return jax.vmap(lambda change: jax.jvp(gradient, (q,), (change,))[1], out_axes=1)(self.along.T)
 
     def forces(self, x, mu) -> "Forces":
-        """Forces of potentials and constraints for the increments x (n, r) and multipliers mu (n_c, r)."""
+        """Forces of potentials and constraints for the increments x (n, r) and multipliers mu (n_g, r)."""
         q = self.q[:, None] + x  # at the nodes 1..r
 
         def at_node(t_q_mu):
@@ -120,7 +104,7 @@ class JoinedEquations:
         for term in self.potentials:
             theta = np.concatenate([term.inside.theta(group) for group in term.inside.groups])
             basis, weights = lagrange_basis(self.r, theta), self.h**2 * term.inside.weights
-            gradient = jax.grad(lambda q, term=term: term.sign * term.integrand(*self.by_name(term, q)))
+            gradient = jax.grad(partial(self.of_term, term))
             before, k = int(np.argmax(basis[0, 1:])), len(theta)
             consecutive = np.eye(self.r + 1)[before + 1 : before + 1 + k]
             if np.array_equal(basis, consecutive):  # quadrature nodes are control nodes: no interpolation
@@ -152,7 +136,7 @@ class Forces(NamedTuple):
 
     inside: Float[Array, "n r"]
     last: Float[Array, "n"]
-    g: Float[Array, "n_c r"]
+    g: Float[Array, "n_g r"]
 
 
 class Saddles(NamedTuple):
@@ -177,20 +161,20 @@ class Saddles(NamedTuple):
 
     modes: TimeModes
     gamma: Float[np.ndarray, "2 k"]
-    push: Float[Array, "d+n_c n"]
-    pull: Float[Array, "n d+n_c"]
+    push: Float[Array, "d+n_g n"]
+    pull: Float[Array, "n d+n_g"]
     bend: Float[Array, "d d"]
     denominator: Float[Array, "d d k"]
-    push_bend: Float[Array, "n_c d"]
-    pull_bend: list[Float[Array, "d n_c k"]]
-    schur: list[Float[Array, "n_c n_c k"]]
+    push_bend: Float[Array, "n_g d"]
+    pull_bend: list[Float[Array, "d n_g k"]]
+    schur: list[Float[Array, "n_g n_g k"]]
 
     @classmethod
-    def at(cls, joined: JoinedEquations, modes: TimeModes, t, q) -> "Saddles":
+    def at(cls, interval: IntervalEquations, modes: TimeModes, t, q) -> "Saddles":
         """The saddles with Hessian and Jacobian at one point."""
-        along, jacobian = joined.directions, joined.jacobian(t, q)
-        bend, pull = joined.over_mass(joined.h**2 * joined.curvature(q)), joined.over_mass(jacobian.T)
-        k, d, n_c = modes.gamma.shape[1], len(along), len(jacobian)
+        along, jacobian = interval.directions, interval.jacobian(t, q)
+        bend, pull = interval.over_mass(interval.h**2 * interval.curvature(q)), interval.over_mass(jacobian.T)
+        k, d, n_g = modes.gamma.shape[1], len(along), len(jacobian)
         re, im = modes.gamma[:, :, None, None]  # modes are the first axis until the end
 
         def of_parts(z):
@@ -203,8 +187,8 @@ class Saddles(NamedTuple):
         # (1 - gamma L Q)^-1 L M^-1 G^T = |1 - gamma L Q|^-2 (1 - conj(gamma) L Q) L M^-1 G^T, by real and imaginary part
         pulled = matmul(along, pull)
         columns = jnp.concatenate([pulled, matmul(bent, pulled)], axis=1)
-        products = (matmul(denominator.reshape(k * d, d), columns)).reshape(k, d, 2 * n_c)
-        real, imaginary = products[..., :n_c] - re * products[..., n_c:], im * products[..., n_c:]
+        products = (matmul(denominator.reshape(k * d, d), columns)).reshape(k, d, 2 * n_g)
+        real, imaginary = products[..., :n_g] - re * products[..., n_g:], im * products[..., n_g:]
 
         # G M^-1 G^T + gamma G Q (real + i imaginary)
         push_bend = matmul(jacobian, bend)
@@ -218,7 +202,7 @@ class Saddles(NamedTuple):
         )
 
     def solve(self, y, g):
-        """x (n, r) and mu (n_c, r) with ``M x - h^2 W'' x (A^-1 B)^T - G^T mu A^-T = M y`` and ``G x = g``."""
+        """x (n, r) and mu (n_g, r) with ``M x - h^2 W'' x (A^-1 B)^T - G^T mu A^-T = M y`` and ``G x = g``."""
         d = len(self.bend)
         pushed = matmul(self.push, y)
         pushed = matmul(jnp.concatenate([pushed[:d], g - pushed[d:]]), self.modes.of_values)
@@ -242,11 +226,11 @@ class Saddles(NamedTuple):
 
 
 class Increments(NamedTuple):
-    """Increments x, multipliers mu, largest last corrections (slow, fast), number of corrections, and `Result` or RUNNING."""
+    """Increments x, multipliers mu, largest last correction, number of corrections, and `Result` or RUNNING."""
 
     x: Float[Array, "n r"]
-    mu: Float[Array, "n_c r"]
-    moved: tuple[Float[Array, ""], ...]
+    mu: Float[Array, "n_g r"]
+    moved: Float[Array, ""]
     iterations: Int[Array, ""]
     result: Int[Array, ""]
 
@@ -270,51 +254,37 @@ class Collocation(StepSolver):
     newton: Solver
 
     def solve(self, equations: StepEquations, guess: Unknowns, memory: tuple) -> tuple[Solution, tuple]:
-        newton = self.newton
-        joined, modes = JoinedEquations(equations), TimeModes.of(equations.scheme)
-        n_s, (n_g, _) = joined.n_s, equations.system.num_constraints(equations.q_s, equations.q_f)
-        x = jnp.concatenate([guess.slow, guess.fast[0]], axis=1).T
-        mu = jnp.concatenate([guess.multiplier[0], guess.slow_multiplier], axis=1).T
-        saddles = Saddles.at(joined, modes, equations.t + joined.h / 2, joined.q + x[:, -1] / 2)
+        newton, interval, modes = self.newton, IntervalEquations(equations), TimeModes.of(equations.scheme)
+        x, mu = guess.fast[0].T, guess.multiplier[0].T
+        saddles = Saddles.at(interval, modes, equations.t + interval.h / 2, interval.q + x[:, -1] / 2)
         accepted = Accepted.of(equations, newton)
-
-        def slow_and_fast(x):
-            return max_abs(x[:n_s]), max_abs(x[n_s:])
 
         def corrected(last: Increments, forces: Forces) -> Increments:
             # residual R = M x A^T + forces, times (A x M)^-1: x + M^-1 forces A^-T
-            moves = matmul(joined.over_mass(forces.inside), modes.of_rows)
+            moves = matmul(interval.over_mass(forces.inside), modes.of_rows)
             residual = last.x + moves
             dx, dmu = saddles.solve(-residual, -forces.g)
-            x, mu, moved, iterations = last.x + dx, last.mu + dmu, slow_and_fast(dx), last.iterations + 1
-            next_moves = tuple(map(expected, moved, last.moved))
-            result = newton.status(accepted.ratio(next_moves, slow_and_fast(x), iterations), iterations)
+            x, mu, moved, iterations = last.x + dx, last.mu + dmu, max_abs(dx), last.iterations + 1
+            ratio = accepted.ratio((0.0, expected(moved, last.moved)), (0.0, max_abs(x)), iterations)
+            result = newton.status(ratio, iterations)
             return Increments(x, mu, moved, iterations, result)
 
         def step(iterate: Evaluated) -> Evaluated:
             """Forces of the last iterate, then a correction unless it has converged: one place for the forces compiles them once."""
             last = iterate.last
-            forces = joined.forces(last.x, last.mu)
+            forces = interval.forces(last.x, last.mu)
             return Evaluated(
                 only_if(last.result == RUNNING, lambda last: corrected(last, forces), last), forces, last.result
             )
 
-        running, none = jnp.asarray(RUNNING), Forces(jnp.zeros_like(x), jnp.zeros_like(joined.q), jnp.zeros_like(mu))
-        start = Increments(x, mu, (jnp.zeros(()),) * 2, jnp.asarray(0), running)
+        running, none = jnp.asarray(RUNNING), Forces(jnp.zeros_like(x), jnp.zeros_like(interval.q), jnp.zeros_like(mu))
+        start = Increments(x, mu, jnp.zeros(()), jnp.asarray(0), running)
         last, forces, _ = iterated(step, Evaluated(start, none, running))
 
-        p, rows = joined.momentum(last.x, forces), joined.residual(last.x, forces)
-        x, mu = last.x.T, last.mu.T
-        unknowns = Unknowns(x[:, :n_s], mu[:, n_g:], x[None, :, n_s:], mu[None, :, :n_g])
-        end = equations.q_f + x[-1, n_s:], p[:n_s], p[n_s:]
-        status = status_of(
-            equations,
-            last.result,
-            Method.MODES,
-            last.iterations,
-            rows=max_abs(rows),
-            end=end,
-        )
+        p, rows = interval.momentum(last.x, forces), interval.residual(last.x, forces)
+        unknowns = guess._replace(fast=last.x.T[None], multiplier=last.mu.T[None])
+        end = interval.q + last.x[:, -1], equations.p_s, p
+        status = status_of(equations, last.result, Method.MODES, last.iterations, rows=max_abs(rows), end=end)
         return Solution(unknowns, end, status), memory
 
     def describe(self) -> list[str]:

@@ -1,6 +1,10 @@
-"""Slow equations that do not depend on the fast unknowns: the slow variables make one step, then the fast variables several shorter ones."""
+"""Slow and fast variables apart, or joined.
 
-from dataclasses import dataclass
+*Decoupled*: slow equations that do not depend on the fast unknowns; the slow variables make one step, then the fast variables several shorter
+ones. *Joined*: on one micro interval slow and fast unknowns are of one kind.
+"""
+
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -59,6 +63,47 @@ class Decoupled(Stepper):
             f"fast variables, {steps_in_words(self.num_fast, self.fast)}:",
             *indented(self.fast.describe()),
         ]
+
+
+@dataclass(frozen=True)
+class Joined(Stepper):
+    """All variables as fast ones of a `System` of its own, the slow variables and the constraints g first.
+
+    num_slow: number of slow variables.
+    num_constraints: number of rows of g, before those of g_s.
+    """
+
+    inner: Stepper
+    num_slow: int
+    num_constraints: int
+
+    def init(self, state: State, macro_dt) -> Any:
+        return self.inner.init(together(state), macro_dt)
+
+    def renew(self, state: State, memory, macro_dt) -> Any:
+        return self.inner.renew(together(state), memory, macro_dt)
+
+    def advance(self, state: State, memory, macro_dt) -> tuple[State, StepInfo, Any]:
+        end, info, memory = self.inner.advance(together(state), memory, macro_dt)
+        n_s, (q_s, q_f), (p_s, p_f) = self.num_slow, *(jnp.split(a, [self.num_slow]) for a in (end.q_f, end.p_f))
+        multiplier, slow_multiplier = jnp.split(info.multiplier, [self.num_constraints], axis=-1)
+        info = replace(
+            info, q_f_micro=info.q_f_micro[:, n_s:], multiplier=multiplier, slow_multiplier=slow_multiplier[0]
+        )
+        return State(end.t, q_s, q_f, p_s, p_f), info, memory
+
+    def continued(self, memory, last, state: State, macro_dt) -> Any:
+        return self.inner.continued(memory, last, together(state), macro_dt)
+
+    def describe(self) -> list[str]:
+        return self.inner.describe()
+
+
+def together(state: State) -> State:
+    """The slow and then the fast variables as a state in which all variables count as fast."""
+    none = jnp.zeros(0)
+    q, p = jnp.concatenate([state.q_s, state.q_f]), jnp.concatenate([state.p_s, state.p_f])
+    return State(state.t, none, q, none, p)
 
 
 def apart(state: State) -> tuple[State, State]:

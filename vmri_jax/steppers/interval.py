@@ -38,7 +38,7 @@ from vmri_jax.schemes.path import Path, control_nodes, lagrange_basis
 from vmri_jax.schemes.quadrature import micro, midpoint
 from vmri_jax.schemes.scheme import Scheme
 
-SMALL = 16
+SMALL = 24
 """Most fast variables for which an interval of high degree is solved with one full matrix. For more variables, matrices per coordinate, or
 matrices that are kept over many steps, are cheaper."""
 PATHS = 3

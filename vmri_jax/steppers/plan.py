@@ -7,6 +7,7 @@ The plan chooses the cheapest stepper that the rules and the system allow, from 
 * *decoupled*: where no term but kicks couples slow and fast variables, the slow variables make one step over the macro interval and the
   fast variables num_micro steps over the micro intervals; each part is planned like a whole system. Potentials on every k-th micro
   node kick between groups of k fast steps (*repeated*);
+* *joined*: on one micro interval slow and fast unknowns are of one kind, so that all variables count as fast;
 * *free flight*: only kinetic energy of constant masses is left;
 * *linear*: only fast variables with linear equations are left;
 * else an iteration, by the matrix of `Solver`: masses and constraints, for the multipliers of a drift alone (*Rattle*) or for the micro
@@ -25,7 +26,6 @@ import jax.numpy as jnp
 from vmri_jax.kernels import COLLOCATES, DRIFTS
 from vmri_jax.kernels.band import Sparsity
 from vmri_jax.mechanics.constraint_pattern import all_rows
-from vmri_jax.mechanics.projection import project_momentum
 from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.mechanics.structure import depends_on
 from vmri_jax.mechanics.system import System
@@ -37,7 +37,7 @@ from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.collocation import Collocation
 from vmri_jax.steppers.composed import Composed
 from vmri_jax.steppers.custom import check_shapes, whole_step
-from vmri_jax.steppers.decoupled import Decoupled
+from vmri_jax.steppers.decoupled import Decoupled, Joined
 from vmri_jax.steppers.direct import FreeFlight, Linear
 from vmri_jax.steppers.interval import SMALL, Interval, implicit_terms
 from vmri_jax.steppers.kicked import Kicked, Repeated, average_over_fast_motion
@@ -47,7 +47,7 @@ from vmri_jax.steppers.rattle import Rattle
 from vmri_jax.steppers.solved import Solved, StepSolver
 from vmri_jax.steppers.solver import Solver
 from vmri_jax.steppers.stepper import StepInfo, Stepper, indented
-from vmri_jax.steppers.subsystems import fast_part, frozen_slow, slow_part
+from vmri_jax.steppers.subsystems import fast_part, frozen_slow, joined, slow_part
 
 Parts = tuple[list[Placed], dict[int, list[Placed]]]
 """Potentials of the slow variables, on the macro grid, and of the fast variables, by the number k of micro intervals that a copy of their rule
@@ -71,14 +71,12 @@ class Plan:
     Attributes:
         system, scheme, solver: arguments of `plan`.
         stepper: the tree of steppers.
-        sparsity: of ``G M^-1 G^T`` with all constraints, for `project`.
     """
 
     system: System
     scheme: Scheme | Composition
     solver: Solver
     stepper: Stepper
-    sparsity: Sparsity
 
     def init(self, state: State, macro_dt):
         """The memory of the first step."""
@@ -87,17 +85,6 @@ class Plan:
     def step(self, state: State, memory, macro_dt) -> tuple[State, StepInfo, Any]:
         """One macro step."""
         return self.stepper.step(state, memory, macro_dt)
-
-    def project(self, state: State) -> State:
-        """The state with its momenta projected onto the hidden constraints, ``G v + dg/dt = 0``.
-
-        A step depends on the momentum through ``h p - G_0^T mu`` alone. A projection ``p - G_0^T nu`` at its start changes mu, and not the motion:
-        only momenta that are saved are projected.
-        """
-        if not self.system.is_constrained:
-            return state
-        p_s, p_f, *_ = project_momentum(self.system, state, sparsity=self.sparsity)
-        return State(state.t, state.q_s, state.q_f, p_s, p_f)
 
     @property
     def has_fallback(self) -> bool:
@@ -160,7 +147,7 @@ def plan(
         check_shapes(stepper, system, stage, state)
     if isinstance(scheme, Composition):
         stepper = Composed(scheme.coefficients, stepper)
-    return Plan(system, scheme, solver, stepper, all_rows(system, state.q_s, state.q_f))
+    return Plan(system, scheme, solver, stepper)
 
 
 def _solvers(stepper: Stepper) -> list[StepSolver]:
@@ -193,6 +180,9 @@ def _between_kicks(system: System, scheme: Scheme, choice: _Choice, q_s, q_f) ->
     if solver.stepper is not None:
         custom = solver.stepper.called(system, scheme)
         return Solved(system, scheme, custom, rows, choice.reverse_only)
+    if q_s.size and _joins(system, scheme, solver, q_s.size, q_f.size):
+        (n_g, _), q = system.num_constraints(q_s, q_f), jnp.concatenate([q_s, q_f])
+        return Joined(_between_kicks(*joined(system, scheme, q_s.size), choice, jnp.zeros(0), q), q_s.size, n_g)
     if not can_be_nested or solver.matrix in ("exact", "null_space"):
         n_g, n_gs = system.num_constraints(q_s, q_f)
         first = "exact" if system.has_constant_mass else "masses"
@@ -202,14 +192,24 @@ def _between_kicks(system: System, scheme: Scheme, choice: _Choice, q_s, q_f) ->
     interval = Interval.of(system, scheme, q_s, q_f)
     if _is_linear(system, scheme, interval, q_s):
         return Linear(system, scheme, interval)
-    approximate = _approximate(system, scheme, solver, interval, rows, q_f.size or q_s.size)
+    approximate = _approximate(system, scheme, solver, interval, rows, q_f.size)
     return Solved(system, scheme, approximate, rows, choice.reverse_only)
+
+
+def _joins(system: System, scheme: Scheme, solver: Solver, n_s: int, n_f: int) -> bool:
+    """Whether slow and fast variables are unknowns of one kind: on one micro interval, where the nested iteration does not keep to smaller matrices.
+
+    Of many variables it keeps a matrix of the fast ones alone, and it solves for slow variables alone by their masses.
+    """
+    nested = _can_be_nested(system, scheme) and solver.matrix in ("auto", "masses") and not _is_drift(system, scheme)
+    is_small = n_s + n_f <= SMALL and (n_f > 0 or _has_modes(system, scheme))
+    return scheme.num_micro == 1 and (is_small or not nested)
 
 
 def _approximate(
     system: System, scheme: Scheme, solver: Solver, interval: Interval, rows: Sparsity, size: int
 ) -> StepSolver:
-    """The matrix "masses" or "modes", or the first one of "auto", for constant masses; `size` is the number of variables of an interval."""
+    """The matrix "masses" or "modes", or the first one of "auto", for constant masses; `size` is the number of fast variables."""
     small = size <= SMALL  # Nested keeps a larger matrix over many steps, Collocation does not
     chosen = COLLOCATES and small and not interval.is_diagonal and _has_modes(system, scheme)
     if solver.matrix == "modes" or (solver.matrix == "auto" and chosen):

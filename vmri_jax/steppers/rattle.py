@@ -1,4 +1,4 @@
-"""RATTLE: a step with kinetic energy of constant masses and constraints alone.
+"""RATTLE: a step of fast variables with kinetic energy of constant masses and constraints alone.
 
 The increments are explicit functions of the multipliers mu, which are the only unknowns:
 
@@ -26,18 +26,18 @@ from vmri_jax.steppers.results import Method
 from vmri_jax.steppers.solved import Solution, StepSolver, status_of
 from vmri_jax.steppers.solver import Solver, iterated
 
-RattleState: TypeAlias = Float[Array, "2 n_g+n_gs"]
-"""Multipliers lambda of all constraints in the last two steps, the last step first."""
+RattleState: TypeAlias = Float[Array, "2 n_g"]
+"""Multipliers lambda in the last two steps, the last step first."""
 
 
 class Correction(NamedTuple):
-    """Increments x of all variables, scaled multipliers mu, constraint values ``g(q + x)``, and the next corrections -dx and dmu."""
+    """Increments x, scaled multipliers mu, constraint values ``g(q + x)``, and the next corrections -dx and dmu."""
 
-    x: Float[Array, "n_s+n_f"]
-    mu: Float[Array, "n_g+n_gs"]
-    g: Float[Array, "n_g+n_gs"]
-    dx: Float[Array, "n_s+n_f"]
-    dmu: Float[Array, "n_g+n_gs"]
+    x: Float[Array, "n_f"]
+    mu: Float[Array, "n_g"]
+    g: Float[Array, "n_g"]
+    dx: Float[Array, "n_f"]
+    dmu: Float[Array, "n_g"]
     iterations: Int[Array, ""]
     result: Int[Array, ""]
 
@@ -46,43 +46,34 @@ class Correction(NamedTuple):
 class Rattle(StepSolver):
     """Corrects the multipliers until the next correction would change no increment (`Accepted`).
 
-    sparsity: of ``G M^-1 G^T`` with all constraints.
+    sparsity: of ``G M^-1 G^T``.
     """
 
     newton: Solver
     sparsity: Sparsity
 
     def init(self, equations: StepEquations) -> RattleState:
-        return jnp.zeros((2, sum(equations.system.num_constraints(equations.q_s, equations.q_f))))
+        return jnp.zeros((2, equations.system.num_constraints(equations.q_s, equations.q_f)[0]))
 
     def solve(self, equations: StepEquations, guess: Unknowns, memory: RattleState) -> tuple[Solution, RattleState]:
-        system, h, newton = equations.system, equations.macro_dt, self.newton
-        q, n_s = jnp.concatenate([equations.q_s, equations.q_f]), equations.q_s.size
-        kinetic = constant_mass(system)
-        velocity_s, velocity_f = kinetic.slow_mass.inverse().times, kinetic.fast_mass.inverse().times
+        system, h, q, newton = equations.system, equations.macro_dt, equations.q_f, self.newton
+        move_by = constant_mass(system).fast_mass.inverse().times  # M^-1
 
         def constraints(t, q):
-            return system.constraints(t, q[:n_s], q[n_s:])
-
-        # M^-1 forces
-        def moves(forces):
-            return jnp.concatenate([velocity_s(forces[..., :n_s]), velocity_f(forces[..., n_s:])], axis=-1)
+            return system.g(t, equations.q_s, q)
 
         seeds = self.sparsity.seeds
         pull = jax.vjp(partial(constraints, equations.t), q)[1]
         forces = jax.vmap(lambda seed: pull(seed)[0])(seeds)
-        columns = moves(forces)
+        columns = move_by(forces)
         # mu -> G_0^T mu and mu -> M^-1 G_0^T mu. A full pattern has all rows of G_0 at hand; else one product by reverse mode is cheaper.
         if isinstance(self.sparsity, Full):
             force, move = partial(weighted_sum, increments=forces), partial(weighted_sum, increments=columns)
         else:
-            force, move = (lambda mu: pull(mu)[0]), (lambda mu: moves(pull(mu)[0]))
-        straight = h * velocity_s(equations.p_s), h * velocity_f(equations.p_f)
-        counts = n_g, _ = system.num_constraints(equations.q_s, equations.q_f)
-        scales = equations.multiplier_scales()
-        scale = jnp.concatenate([jnp.broadcast_to(a.reshape(-1), n) for a, n in zip(scales, counts, strict=True)])
+            force, move = (lambda mu: pull(mu)[0]), (lambda mu: move_by(pull(mu)[0]))
+        scale = equations.multiplier_scales()[0].reshape(())
         mu = scale * (2 * memory[0] - memory[1])
-        x = jnp.concatenate(straight) - move(mu)  # M^-1 (h p - G_0^T mu)
+        x = h * move_by(equations.p_f) - move(mu)  # M^-1 (h p - G_0^T mu)
         g, push = jax.linearize(lambda x: constraints(equations.t + h, q + x), x)
         schur = self.sparsity.inverse(jax.vmap(push)(columns))  # (G_1 M^-1 G_0^T)^-1
         accepted = Accepted.of(equations, newton)
@@ -90,8 +81,7 @@ class Rattle(StepSolver):
         def judged(x, mu, g, iterations) -> Correction:
             dmu = schur.times(g)
             dx = move(dmu)
-            changes, motions = ((max_abs(a[:n_s]), max_abs(a[n_s:])) for a in (dx, x))
-            ratio = accepted.ratio(changes, motions, iterations)
+            ratio = accepted.ratio((0.0, max_abs(dx)), (0.0, max_abs(x)), iterations)
             return Correction(x, mu, g, dx, dmu, jnp.asarray(iterations), newton.status(ratio, iterations))
 
         def corrected(last: Correction) -> Correction:
@@ -102,20 +92,13 @@ class Rattle(StepSolver):
         first = corrected(judged(x, mu, g, 0))
         done = iterated(corrected, first)
 
-        impulse = force(done.mu) / h  # p+ = p - G_0^T mu / h
-        end = equations.q_f + done.x[n_s:], equations.p_s - impulse[:n_s], equations.p_f - impulse[n_s:]
-        status = status_of(
-            equations,
-            done.result,
-            Method.MASSES,
-            done.iterations,
-            rows=max_abs(force(done.dmu)),
-            end=end,
-        )
-        x, mu = done.x[None], done.mu[None]
-        unknowns = Unknowns(x[:, :n_s], mu[:, n_g:], x[None, :, n_s:], mu[None, :, :n_g])
-        multipliers = equations.multipliers(unknowns, memory[0, :n_g], memory[0, n_g:])
-        last = jnp.concatenate([a.reshape(-1) for a in multipliers])
+        # p+ = p - G_0^T mu / h
+        end = q + done.x, equations.p_s, equations.p_f - force(done.mu) / h
+        rows = max_abs(force(done.dmu))
+        status = status_of(equations, done.result, Method.MASSES, done.iterations, rows=rows, end=end)
+        none = jnp.zeros((1, 0))
+        unknowns = Unknowns(none, none, done.x[None, None], done.mu[None, None])
+        last = equations.multipliers(unknowns, memory[0], jnp.zeros(0))[0].reshape(-1)
         return Solution(unknowns, end, status), jnp.stack([last, memory[0]])
 
     def continued(self, memory: RattleState, last: RattleState) -> RattleState:

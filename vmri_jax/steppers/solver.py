@@ -8,7 +8,7 @@
 | "null_space" | as "exact", in coordinates of the free motions: no multipliers among the unknowns |
 
 "masses" needs a kinetic energy that is a function, or every term in single micro intervals, or as kicks at the macro nodes or at every k-th micro
-node; "modes" needs constant masses and no forces. "auto" takes the first matrix that the structure allows: "modes" with at most 16 fast variables,
+node; "modes" needs constant masses and no forces. "auto" takes the first matrix that the structure allows: "modes" with at most 24 variables in an interval,
 unless W is a sum over single coordinates, else "masses", else "exact". What "auto" does not solve is solved again with "exact": the step
 (`macro_step`), the whole run (`prepare`), the lane (batches), or the piece that failed and all pieces after it (`simulate`, `stream`); see
 `vmri_jax.running.engine`. ``print(vm.plan(problem, scheme))`` says beforehand which matrix a step takes, ``StepInfo.method`` and

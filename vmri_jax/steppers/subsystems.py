@@ -1,8 +1,8 @@
-"""Decoupled parts of a system: the slow and the fast variables as systems of their own, in which all variables count as fast.
+"""Decoupled parts of a system, and all of its variables joined: systems in which all variables count as fast, on a single interval.
 
-Each part moves on a single interval; slow variables are stored as q_f.
+Slow variables of a part are stored as q_f, joined ones as ``(q_s, q_f)`` in q_f.
 
-The functions of the parts are dataclasses. They compare by value, so that JAX traces equal ones once.
+The functions of these systems are dataclasses. They compare by value, so that JAX traces equal ones once.
 """
 
 from collections.abc import Sequence
@@ -10,12 +10,13 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import jax.numpy as jnp
+from jax.scipy.linalg import block_diag
 
 from vmri_jax.mechanics.functions import Rheonomic
 from vmri_jax.mechanics.masses import ConstantMass
-from vmri_jax.mechanics.system import System
-from vmri_jax.mechanics.terms import Term
-from vmri_jax.schemes.discrete_lagrangian import Placed
+from vmri_jax.mechanics.system import RATE_OF, System
+from vmri_jax.mechanics.terms import KINDS, POSITIONS, Term
+from vmri_jax.schemes.discrete_lagrangian import Placed, placed_potentials
 from vmri_jax.schemes.quadrature import micro, midpoint
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.interval import constant_mass
@@ -81,6 +82,67 @@ def _part(
     fast = drift if main is None else replace(main.rule, grid="micro", every=1)
     rules = {name: micro(part.rule.rule) for name, part in further.items()}
     return alone, Scheme(1, kinetic=drift, slow=drift, fast=fast, potentials=rules)
+
+
+@dataclass(frozen=True)
+class OfJoined:
+    """The sum of energies, the joined rows of constraints, or the forces, as a function of joined variables.
+
+    terms: of one kind.
+    arguments: names of its arguments without params; q_f and v_f are the joined variables, q_s and v_s have size 0.
+    """
+
+    terms: tuple[Term, ...]
+    arguments: tuple[str, ...]
+    num_slow: int
+
+    def __call__(self, *arguments):
+        *values, params = arguments
+        values = dict(zip(self.arguments, values, strict=True))
+        for slow, fast in (("q_s", "q_f"), ("v_s", "v_f")):
+            if fast in values:
+                values[slow], values[fast] = values[fast][: self.num_slow], values[fast][self.num_slow :]
+        first, *others = (term(params, **values) for term in self.terms)
+        if self.terms[0].kind == "force":
+            return jnp.zeros(0), jnp.concatenate(first)
+        return jnp.concatenate([first, *others]) if self.terms[0].kind == "constraint" else sum(others, first)
+
+
+def joined(system: System, scheme: Scheme, num_slow: int) -> tuple[System, Scheme]:
+    """All variables as fast ones, and the scheme of their step on one micro interval, without potentials that only kick.
+
+    Args:
+        system, scheme: the whole ones.
+        num_slow: number of slow variables.
+    """
+    inside = [(term, rule) for term, rule in placed_potentials(system, scheme) if not rule.only_ends]
+    functions: dict[Any, Any] = {}
+    potentials: dict[Any, Any] = {}
+    for term in [*(term for term, _ in inside), *system.of_kind("force")]:
+        place, name = (potentials, term.name) if term.field == "potentials" else (functions, term.field)
+        place[name] = OfJoined((term,), term.arguments, num_slow)
+    if system.is_constrained:
+        functions["constraint"] = Rheonomic(OfJoined(system.of_kind("constraint"), ("t", *POSITIONS), num_slow))
+    if system.has_constant_mass:
+        kinetic = ConstantMass(jnp.zeros(0), _joined_masses(constant_mass(system)))
+    else:
+        kinetic = OfJoined(system.of_kind("kinetic"), KINDS["kinetic"].arguments, num_slow)
+    together = System(kinetic, **functions, params=system.params, potentials=potentials)
+
+    rules: dict[Any, Any] = {"slow": scheme.kinetic, "fast": scheme.kinetic, "potentials": {}}
+    for term, rule in inside:
+        place, name = (rules["potentials"], term.name) if term.field == "potentials" else (rules, RATE_OF[term.name])
+        place[name] = micro(rule.rule)
+    rules |= {"kinetic": scheme.kinetic, "constraint": scheme.constraint, "force": micro(scheme.force.rule)}
+    return together, Scheme(1, scheme.degree, **rules)
+
+
+def _joined_masses(kinetic: ConstantMass):
+    """The masses of the slow and then of the fast variables, as one diagonal or one matrix."""
+    masses = kinetic.slow, kinetic.fast
+    if all(mass.ndim == 1 for mass in masses):
+        return jnp.concatenate(masses)
+    return block_diag(*(mass if mass.ndim == 2 else jnp.diag(mass) for mass in masses))
 
 
 @dataclass(frozen=True)

@@ -139,6 +139,8 @@ def _continue(stored: StoredTrajectory, run: Simulation, tell: Progress) -> Iter
         tell("simulating", record.saved, rows)
         saved, checkpoint = run.advance(checkpoint, size)
         piece, table = saved.trajectory(run, record.step), np.concatenate([before, saved.table])
+        if not record.saved:
+            run.tell_of_start("stream", piece.states, stacklevel=4)
         has_warned = has_warned or run.warn("stream", table, np.append(run.state.t, piece.states.t), stacklevel=4)
         before = Observables.of(table).so_far()
         first = record.saved + 1 if record.saved else 0  # the first chunk has the start
