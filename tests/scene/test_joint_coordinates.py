@@ -16,6 +16,7 @@ from tests.scene.random_trees import random_scene
 from vmri_jax.animation.drawing import Drawing
 from vmri_jax.animation.motion import motion as motion_of
 from vmri_jax.mechanics.names import Names
+from vmri_jax.mechanics.projection import closed_masses
 from vmri_jax.scene import (
     Ball,
     Box,
@@ -44,6 +45,21 @@ def test_random_trees_have_the_mechanics_of_directors(seed):
     """Their equations of motion are solved in `test_joint_rings`."""
     scene, _ = random_scene(seed)
     assert_mechanics_as_by_directors(scene)
+
+
+@pytest.mark.parametrize("seed", DRAWN[:2])
+def test_the_mass_matrix_of_trees_in_closed_form(seed):
+    problem = random_scene(seed)[0].problem()
+    random = np.random.default_rng(seed)
+    q_s, q_f = (q + 0.3 * random.normal(size=q.shape) for q in (problem.q_s, problem.q_f))
+
+    def kinetic(v):
+        return problem.system.kinetic_energy(q_s, q_f, v[: q_s.size], v[q_s.size :])
+
+    masses, expected = jax.jit(
+        lambda: (closed_masses(problem.system, q_s, q_f), jax.hessian(kinetic)(jnp.zeros(q_s.size + q_f.size)))
+    )()
+    np.testing.assert_allclose(masses, expected, rtol=0, atol=1e-14 * np.abs(expected).max())
 
 
 SPIN = np.array([0.05, 0.02, 0.2])

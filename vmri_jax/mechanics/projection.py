@@ -11,6 +11,7 @@ from vmri_jax.kernels.band import Full, Sparsity
 from vmri_jax.kernels.saddle import saddle
 from vmri_jax.mechanics.constraint_pattern import all_rows
 from vmri_jax.mechanics.structure import has_constant_hessian
+from vmri_jax.mechanics.surroundings import innermost
 from vmri_jax.mechanics.system import System
 
 MAX_ITERATIONS = 50
@@ -33,10 +34,28 @@ def legendre(system: System, q_s, q_f, v_s, v_f):
 
 def mass_and_momentum(system: System, q_s, q_f, v_s, v_f):
     """Mass matrix ``d2T/dv2`` (n, n) and momentum ``dT/dv`` (n,)."""
-    n_s = v_s.size
+    n_s, masses = v_s.size, closed_masses(system, q_s, q_f)
+    if masses is not None:
+        return masses, matvec(masses, jnp.append(v_s, v_f))
     momentum = jax.grad(lambda v: system.kinetic_energy(q_s, q_f, v[:n_s], v[n_s:]))
     p, times_mass = jax.linearize(momentum, jnp.append(v_s, v_f))
     return jax.vmap(times_mass)(jnp.eye(p.size)), p
+
+
+def closed_masses(system: System, q_s, q_f):
+    """The mass matrix (n, n) by the closed forms of the kinetic energies T: a function T with ``T = v^T M v / 2`` may have a method
+    ``masses(q_s, q_f, params) -> M``, of T_s ``masses(q_s, params)``. None if one of them has no closed form.
+    """
+    total, size = 0.0, q_s.size + q_f.size
+    for term in system.of_kind("kinetic"):
+        masses = getattr(innermost(term.function), "masses", None)
+        of_term = masses and masses(
+            *(q for q, name in ((q_s, "q_s"), (q_f, "q_f")) if name in term.arguments), system.params
+        )
+        if of_term is None:
+            return None
+        total += jnp.pad(of_term, (0, size - len(of_term)))
+    return total
 
 
 def project_momentum(system: System, state, guess=None, sparsity: Sparsity | None = None):
@@ -90,7 +109,8 @@ def _with_masses(system: System, state, guess):
 
     jacobian = jnp.concatenate(jax.jacrev(system.constraints, argnums=(1, 2))(t, q_s, q_f), axis=1)  # (n_g + n_gs, n)
     constraints = jacobian, time_rates(system, t, q_s, q_f)
-    is_quadratic, v = has_constant_hessian(kinetic, p), jnp.zeros_like(p)
+    is_quadratic = closed_masses(system, q_s, q_f) is not None or has_constant_hessian(kinetic, p)
+    v = jnp.zeros_like(p)
     if not is_quadratic:
         guess = v if guess is None else jnp.concatenate(guess)
         v, impulse = _velocity_and_impulse(system, q_s, q_f, constraints, p, guess)

@@ -6,6 +6,7 @@ from itertools import pairwise
 from typing import Literal, NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 
 Part = Literal["s", "f"]
 
@@ -49,6 +50,12 @@ class Entries:
     def count(self) -> int:
         """Number of the entries."""
         return sum(stop - start for start, stop in self.runs)
+
+    @property
+    def marked(self) -> np.ndarray:
+        """(n,) whether an entry is one of them."""
+        runs = (range(*run) for run in self.runs)
+        return np.isin(np.arange(self.size), [i for run in runs for i in run])
 
     def take(self, vectors):
         """(..., count) the entries of vectors (..., n)."""

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from vmri_jax.kernels import matmul
 from vmri_jax.mechanics.kinematics import JOINTS, MASS, Kinematics
 from vmri_jax.mechanics.rows import Entries
 from vmri_jax.mechanics.terms import KINDS
@@ -99,6 +100,23 @@ class KineticEnergy(_OfTerms):
         bodies, rates = self.motions(q_s, q_f, v_s, v_f, params)
         of_bodies = jnp.sum(params[MASS][part] * rates[number] ** 2) / 2
         return total([of_bodies, *(term.kinetic(*bodies, *rates, params) for term in self.terms)])
+
+    def masses(self, q_s, *q_f_and_params):
+        """The mass matrix ``J^T m J`` of `__call__` in closed form, J = dQ/dq; None with velocity-dependent terms."""
+        if self.terms or self.kinematics is None:
+            return None
+        *q_f, params = q_f_and_params
+        part, number = ("fast", 1) if q_f else ("slow", 0)
+
+        def bodies(q):
+            """The coordinates Q_f, or Q_s, of coordinates q."""
+            return (
+                self.bodies(*jnp.split(q, [q_s.size]), params)[number] if q_f else self.bodies(q, None, params)[number]
+            )
+
+        q = jnp.concatenate([q_s, *q_f])
+        rates = jax.vmap(jax.linearize(bodies, q)[1])(jnp.eye(q.size))
+        return matmul(rates * params[MASS][part], rates.T)
 
 
 class TotalForce(_OfTerms):

@@ -188,14 +188,31 @@ class Intervals:
         n, r = equations.scheme.num_micro, equations.scheme.degree
         self._slow_basis = slow_basis_at_control_nodes(n, r)[..., 1:]  # at the control nodes, by slow increments
 
-    def by_masses(self, v_s, v_f) -> "Intervals":
-        """The equations with ``v^T M v / 2`` in place of kinetic energies T that are functions, ``M = d2T/dv2`` at these velocities and at the start of
-        the step: their derivatives contain none of T.
+    def by_masses(self) -> "Intervals":
+        """The equations with ``v^T M v / 2`` in place of kinetic energies T that are functions, with the masses M at the start of the step: their
+        derivatives contain none of T.
+
+        The intervals have the masses of the variables that they see, and the slow equations all others.
         """
-        values = {"q_s": self.equations.q_s, "q_f": self.equations.q_f, "v_s": v_s, "v_f": v_f}
+        masses, n_s = self.equations.masses, self.equations.q_s.size
+        assert masses is not None
+        is_seen = self.seen.marked
+        of_slow = jnp.where(is_seen[:, None] & is_seen, 0.0, masses[:n_s, :n_s])
+
+        def with_masses(term: TermOnNodes) -> TermOnNodes:
+            if "v_s" not in term.arguments:
+                return term
+            number, matrix = (2, masses) if "v_f" in term.arguments else (1, of_slow)
+
+            def energy(*arguments):
+                v = jnp.concatenate(arguments[-number:])
+                return v @ matvec(matrix, v) / 2
+
+            return replace(term, integrand=energy)
+
         by_masses = copy(self)
-        by_masses._terms = [(_by_masses(term, values), nodes) for term, nodes in self._terms]
-        by_masses._slow_terms = [_by_masses(term, values) for term in self._slow_terms]
+        by_masses._terms = [(with_masses(term), nodes) for term, nodes in self._terms]
+        by_masses._slow_terms = [with_masses(term) for term in self._slow_terms]
         return by_masses
 
     def _seen(self) -> Entries:
@@ -313,24 +330,6 @@ class Intervals:
         rows = jnp.concatenate([(equations.micro_dt * equations.p_s + start - d.sum(0))[None], d[:-1]]) - impulses
         p_s = equations.p_s + (start - impulses.sum(0)) / equations.micro_dt
         return (rows, jax.vmap(equations.system.g_slow)(times[1:], nodes[1:])), p_s
-
-
-def _by_masses(term: TermOnNodes, values: dict) -> TermOnNodes:
-    """The term, or for a kinetic energy ``v^T M v / 2`` with ``M = d2T/dv2`` at these values."""
-    names = [name for name in term.arguments if name.startswith("v")]
-    if not names:
-        return term
-    positions = [values[name] for name in term.arguments if name not in names]
-    ends = np.cumsum([values[name].size for name in names])[:-1]
-    v = jnp.concatenate([values[name] for name in names])
-    times_mass = jax.linearize(jax.grad(lambda v: term.integrand(*positions, *jnp.split(v, ends))), v)[1]
-    mass = jax.vmap(times_mass)(jnp.eye(v.size))
-
-    def energy(*arguments):
-        v = jnp.concatenate(arguments[-len(names) :])
-        return v @ matvec(mass, v) / 2
-
-    return replace(term, integrand=energy)
 
 
 def _where_there_are_nodes(nodes: IntervalNodes, m, function, *paths):

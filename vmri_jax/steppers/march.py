@@ -88,12 +88,10 @@ class MarchEquations:
         self.n_v = self.intervals.seen.count  # the slow variables that intervals see
         self.num_fast, self.num_slow, self.num_seen = self.r * self.n_f, self.r * self.n_s, self.r * self.n_v
 
-    def by_masses(self, z, x) -> "MarchEquations":
-        """The equations with the quadratic form of the masses in place of a kinetic energy that is a function, with the mean velocities of z and x."""
-        slow, fast = z[self.num_slow - self.n_s : self.num_slow], self.last_increment(x[0])
-        v_s, v_f = slow / self.equations.macro_dt, fast / self.equations.micro_dt
+    def by_masses(self) -> "MarchEquations":
+        """The equations with the quadratic form of the masses in place of a kinetic energy that is a function."""
         march = copy(self)
-        march.intervals = self.intervals.by_masses(v_s, v_f)
+        march.intervals = self.intervals.by_masses()
         return march
 
     def flat(self, x: Unknowns):

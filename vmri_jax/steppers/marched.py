@@ -138,7 +138,7 @@ class Marched(StepSolver):
         renews = ~(progress.rate <= CONTRACTION)
 
         def by_masses(_):
-            return linearised_pass(march.by_masses(z, x), z, x, last, from_last, corrects=False)[0]
+            return linearised_pass(march.by_masses(), z, x, last, from_last, corrects=False)[0]
 
         matrices = only_if(renews, by_masses, progress.matrices)
         return progress._replace(matrices=matrices, rate=jnp.where(renews, 0.0, progress.rate))
