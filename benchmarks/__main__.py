@@ -10,12 +10,10 @@ import typer
 from benchmarks import (
     adjoints,
     against,
-    batch,
     chains,
     control,
     cost,
     dear,
-    ensemble_kills,
     ensembles,
     floor,
     gpu,
@@ -28,11 +26,12 @@ from benchmarks import (
     tricks,
     tuned,
 )
-from benchmarks.gail2014.command import gail2014
-from benchmarks.hard_cases.command import hard
+from benchmarks.gail2014.report import gail2014
+from benchmarks.hard_cases import hard
 from benchmarks.measure import prepare
-from benchmarks.report import console, progress
+from benchmarks.report import console
 from vmri_jax.cli.common import refusals
+from vmri_jax.running.progress import progress_shown
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help=__doc__, pretty_exceptions_show_locals=False)
 
@@ -41,13 +40,13 @@ Core = Annotated[int | None, typer.Option(help="Core to keep to; by default the 
 Out = Annotated[Path, typer.Option(help="Folder for the JSON files and the figures.")]
 OUT = Path("out/benchmarks")
 
-app.command()(gail2014)
+app.command()(refusals()(gail2014))
 app.command()(refusals()(hard))
 
 
 COMPILES = ("chains", "mechanisms", "kills", "programs")
 """Commands that report seconds of compilation, or start processes: programs in the cache would be no measure of them."""
-MANY_CORES = ("gpu", "kills", "ensemble-kills")
+MANY_CORES = ("ensembles", "gpu", "kills")
 """Commands that keep to no core."""
 
 HELP = {
@@ -81,10 +80,9 @@ def _register(name: str, module) -> None:
 for _name, _module in {
     "adjoints": adjoints,
     "against": against,
-    "batch": batch,
     "cost": cost,
     "dear": dear,
-    "ensemble-kills": ensemble_kills,
+    "ensembles": ensembles,
     "floor": floor,
     "chains": chains,
     "control": control,
@@ -101,36 +99,25 @@ for _name, _module in {
     _register(_name, _module)
 
 
-@app.command("ensembles", help=ensembles.__doc__)
-def ensembles_command(
-    only: Annotated[list[str] | None, typer.Option(help=f"Of {', '.join(ensembles.PARTS)}; may be repeated.")] = None,
-    full: Full = False,
-    out: Out = OUT,
-) -> None:
-    prepare()
-    for name in only or ensembles.PARTS:
-        _measure(f"ensembles, {name}", ensembles.part(name), full, out)
-
-
 @app.command("all")
 def all_command(full: Full = False, core: Core = None, out: Out = OUT) -> None:
-    """Floor, batch, programs and cost, one after the other."""
+    """Floor, programs and cost, one after the other."""
     prepare(core, cache=False)
-    for name, module in (("floor", floor), ("batch", batch), ("programs", instructions), ("cost", cost)):
+    for name, module in (("floor", floor), ("programs", instructions), ("cost", cost)):
         _measure(name, module, full, out)
 
 
 def _measure(title: str, module, full: bool, out: Path, **options) -> None:
     """Measure, print and write: after each case what is known by then, so that nothing is lost."""
-    name, report, path = "full" if full else "quick", None, None
+    name, reports = "full" if full else "quick", {}
     size = module.sizes(name, **options)
     try:
-        with progress(title) as tell:
-            for report in module.run(size, name, tell):
-                path = report.write(out)
+        with progress_shown() as show:
+            for report in module.run(size, name, lambda part: show(f"{title}: {part}", 0, 1)):
+                reports[report.write(out)] = report
     finally:
-        if report is not None:
-            report.show(module.COLUMNS)
+        for path, report in reports.items():
+            report.show()
             console.print(f"written to {path}\n")
 
 

@@ -1,4 +1,4 @@
-"""Gradients of runs: time over that of a run, memory, compile time and agreement of all adjoints, and of diffrax if it is there."""
+"""Gradients of runs: time over that of a run, memory, compile time and agreement of all adjoints."""
 
 import time
 from collections.abc import Callable, Iterator
@@ -9,12 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 
 import vmri_jax as vm
-from benchmarks.measure import Ratio, Tell, interleaved, quartiles, silent
-from benchmarks.peers import autodiff
-from benchmarks.peers.cases import Case as PeerCase
+from benchmarks.measure import Ratio, Tell, exactly, interleaved, quartiles, silent
 from benchmarks.report import Claim, Report
 
-COLUMNS = ("system", "gradient", "steps", "compile s", "over a run", "MB", "apart")
 ADJOINTS = ("stored", "checkpoint")
 FACTOR, AGREEMENT, GROWTH = 4.0, 1e-10, 4.0
 """Targets: time over that of a run, differences of gradients, memory of checkpoints over a thousand times as many steps."""
@@ -53,22 +50,20 @@ def sizes(name: str) -> Size:
 
 def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
     """A report after each system."""
-    rows, claims, notes = [], [], []
+    report = Report("adjoints", name)
     for case in size.cases:
-        found, ratios = measured(case, size.repeats, tell)
-        rows += found
+        rows, ratios = measured(case, size.repeats, tell)
+        report.rows.extend(rows)
         for adjoint in ADJOINTS:
-            claims.append(Claim(f"{case.name}: {adjoint} over a run", ratios[adjoint], at_most=FACTOR))
-            apart = max(row.get("apart", 0.0) for row in found if row["gradient"] == adjoint)
-            claims.append(
-                Claim(f"{case.name}: {adjoint} apart from stored", Ratio(apart, apart, apart), at_most=AGREEMENT)
-            )
-        memory = {(row["gradient"], row["steps"]): row["MB"] for row in found}
-        growth = memory["checkpoint", LONG] / memory["checkpoint", SHORT]
-        name_of_growth = f"{case.name}: memory of checkpoint, {LONG} over {SHORT} steps"
-        claims.append(Claim(name_of_growth, Ratio(growth, growth, growth), at_most=GROWTH))
-        notes.append(f"{case.name}: a run takes {found[0]['run us']:.1f} microseconds a step.")
-        yield Report("adjoints", name, list(rows), list(claims), list(notes))
+            report.claims.append(Claim(f"{case.name}: {adjoint} over a run", ratios[adjoint], at_most=FACTOR))
+            apart = exactly(max(row.get("apart", 0.0) for row in rows if row["gradient"] == adjoint))
+            report.claims.append(Claim(f"{case.name}: {adjoint} apart from stored", apart, at_most=AGREEMENT))
+        memory = {(row["gradient"], row["steps"]): row["MB"] for row in rows}
+        growth = exactly(memory["checkpoint", LONG] / memory["checkpoint", SHORT])
+        words = f"{case.name}: memory of checkpoint, {LONG} over {SHORT} steps"
+        report.claims.append(Claim(words, growth, at_most=GROWTH))
+        report.note(f"{case.name}: a run takes {rows[0]['run us']:.1f} microseconds a step.")
+        yield report
 
 
 def measured(case: Case, repeats: int, tell: Tell) -> tuple[list[dict], dict[str, Ratio]]:
@@ -109,7 +104,6 @@ def measured(case: Case, repeats: int, tell: Tell) -> tuple[list[dict], dict[str
         if adjoint == "checkpoint":
             program, seconds = gradient(adjoint, LONG)
             rows.append(_row(case, adjoint, LONG, seconds, program))
-    rows += _diffrax(case, problem, calls, tell)
     samples = interleaved(calls, repeats)
     run, ratios = np.array(samples["run"]), {}
     for row in rows:
@@ -122,25 +116,3 @@ def measured(case: Case, repeats: int, tell: Tell) -> tuple[list[dict], dict[str
 def _row(case: Case, gradient: str, steps: int, seconds: float, program) -> dict:
     memory = program.memory_analysis().temp_size_in_bytes / 1e6
     return {"system": case.name, "gradient": gradient, "steps": steps, "compile s": seconds, "MB": memory}
-
-
-def _diffrax(case: Case, problem: vm.Problem, calls: dict, tell: Tell) -> list[dict]:
-    """Its gradient with respect to the momenta at a tolerance of 1e-8, the equations by automatic differentiation of the same Lagrangian."""
-    try:
-        import diffrax  # pyright: ignore[reportMissingImports]
-
-        from benchmarks.peers.diffrax import solution
-    except ImportError:
-        return []
-    tell(f"{case.name}, diffrax")
-    peer = PeerCase(case.name, case.name, problem, SHORT * case.macro_dt, np.zeros(0))
-    solve, q = solution(peer, diffrax.Dopri8(), autodiff), jnp.asarray(peer.q)
-
-    def cost(v):
-        return jnp.sum(solve((q, v), 1e-8) ** 2)
-
-    began = time.perf_counter()
-    program = jax.jit(jax.grad(cost)).lower(jnp.asarray(peer.v)).compile()
-    seconds = time.perf_counter() - began
-    calls["diffrax"] = lambda: jax.block_until_ready(program(jnp.asarray(peer.v)))
-    return [_row(case, "diffrax", SHORT, seconds, program)]

@@ -9,18 +9,14 @@ import numpy as np
 
 import vmri_jax as vm
 from benchmarks.cost import slope
-from benchmarks.measure import Ratio, Tell, silent
-from benchmarks.report import Claim, Report, growing
+from benchmarks.measure import Tell, exactly, silent
+from benchmarks.report import Claim, Report
 from vmri_jax.mechanics import constraint_pattern
 from vmri_jax.running.engine import engine
 from vmri_jax.running.timing import seconds_per_call, stopwatch
 from vmri_jax.scene import Box, Gravity, JointSpring, Revolute, RigidBody, Scene
 
 Coordinates = Literal["joint", "directors"]
-COLUMNS = (
-    *("shape", "bodies", "rows", "band, us", "full, us", "joint, us", "band, us a body"),
-    *("directors, first s", "joint, first s", "directors over joint"),
-)
 SHORT, LONG = 50, 250
 """Steps of two runs; what a call costs besides its steps is in both."""
 MACRO_DT = 1e-3
@@ -118,8 +114,8 @@ def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
     """Measure all of it, a report after each number of bodies."""
     band: dict[int, float] = {}
     joint: dict[str, dict[int, float]] = {shape: {} for shape in SHAPES}
-
-    def measured(shape: str, number: int) -> tuple[list[dict], list[Claim]]:
+    report = Report("chains", name)
+    for shape, number in [*(("chain", n) for n in size.bodies), *(("star", n) for n in size.stars)]:
         tell(f"{shape}, {number} bodies")
         is_chain = shape == "chain"
         rows = 11 * number + 6 * (not is_chain)  # five of each hinge, six of each body: those of the hub on top
@@ -142,10 +138,9 @@ def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
             row |= {"joint, us": found.us, "directors over joint": by_directors.us / found.us}
         if is_chain:
             band[number] = row["band, us"]
-        return [row], _slopes(shape, number, band if is_chain else {}, joint[shape], size)
-
-    parts = [*(("chain", n) for n in size.bodies), *(("star", n) for n in size.stars)]
-    return growing("chains", name, (measured(*part) for part in parts))
+        report.rows.append(row)
+        report.claims.extend(_slopes(shape, number, band if is_chain else {}, joint[shape], size))
+        yield report
 
 
 def _slopes(shape: str, number: int, band: dict[int, float], joint: dict[int, float], size: Size) -> list[Claim]:
@@ -158,5 +153,5 @@ def _slopes(shape: str, number: int, band: dict[int, float], joint: dict[int, fl
         if len(many) > 1:
             found = slope(np.array(many), np.array([us[n] for n in many]))
             words = f"{shape}{what}: slope of log time against log bodies, {many[0]} to {many[-1]}"
-            claims.append(Claim(words, Ratio(found, found, found), most))
+            claims.append(Claim(words, exactly(found), most))
     return claims

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import vmri_jax as vm
-from benchmarks.measure import Ratio, Tell, silent
+from benchmarks.measure import Tell, exactly, silent
 from benchmarks.report import Claim, Report
 from vmri_jax import plots
 from vmri_jax.control import Optimum
@@ -27,7 +27,6 @@ from vmri_jax.scene import (
     angular_momentum,
 )
 
-COLUMNS = ("case", "num_micro", "steps", "J", "error", "s", "first s")
 HUB = Box((1.0, 1.0, 1.0))
 ANGLE, DURATION = 0.6, 6.0
 """rad, s: how far the hub turns, and in which time."""
@@ -154,34 +153,32 @@ def sizes(name: str) -> Size:
 
 def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
     """A report after each scheme, and one of the wheels."""
-    rows, claims, notes, curves = [], [], [], {}
+    curves: dict[tuple[str, int], np.ndarray] = {}
+    report = Report("control", name, figures={"slew": partial(_draw, curves)})
     tell("the exact cost")
     fine, half = (slew(1, steps).cost for steps in (size.fine, size.fine // 2))
     exact = fine + (fine - half) / 3  # of order 2
+    report.note(f"J of the slew: {exact:.6f}, from single steps, {size.fine // 2} and {size.fine}.")
     for (scheme, num_micro), counts in size.slews.items():
         found = []
         for steps in counts:
             tell(f"slew, {scheme}, num_micro = {num_micro}, {steps} steps")
-            first, again = (timed(partial(slew, num_micro, steps, SCHEMES[scheme])) for _ in range(2))
-            error = abs(again[0].cost - exact) / exact
-            found.append((error, again[1]))
-            numbers = [f"slew, {scheme}", num_micro, steps, again[0].cost, error, again[1], first[1]]
-            rows.append(dict(zip(COLUMNS, numbers, strict=True)))
+            (_, first), (again, seconds) = (timed(partial(slew, num_micro, steps, SCHEMES[scheme])) for _ in range(2))
+            found.append((abs(again.cost - exact) / exact, seconds))
+            row = {"case": f"slew, {scheme}", "num_micro": num_micro, "steps": steps, "J": again.cost}
+            report.rows.append(row | {"error": found[-1][0], "s": seconds, "first s": first})
         curves[scheme, num_micro] = np.array(found).T
-        yield Report("control", name, list(rows), list(claims), list(notes), {"slew": partial(_draw, dict(curves))})
-    notes.append(f"J of the slew: {exact:.6f}, from single steps, {size.fine // 2} and {size.fine}.")
-    figures: dict[str, Callable] = {"slew": partial(_draw, dict(curves))}
+        yield report
     if size.wheels is not None:
         tell("wheels")
         found, seconds = timed(partial(reorientation, size.wheels))
-        lost = momentum_lost(found)
-        rows.append(
-            dict(zip(COLUMNS, ["wheels", 1, size.wheels, found.cost, found.miss, seconds, seconds], strict=True))
-        )
-        claims.append(Claim("wheels: total angular momentum over that of the hub", Ratio(lost, lost, lost), MOMENTUM))
-        notes.append(f"wheels: {found}")
-        figures["wheels"] = partial(plots.plot_control, found, title="A hub turned by its wheels")
-    yield Report("control", name, list(rows), list(claims), list(notes), figures)
+        row = {"case": "wheels", "num_micro": 1, "steps": size.wheels, "J": found.cost}
+        report.rows.append(row | {"error": found.miss, "s": seconds, "first s": seconds})
+        lost = exactly(momentum_lost(found))
+        report.claims.append(Claim("wheels: total angular momentum over that of the hub", lost, MOMENTUM))
+        report.note(f"wheels: {found}")
+        report.figures["wheels"] = partial(plots.plot_control, found, title="A hub turned by its wheels")
+        yield report
 
 
 def timed(call: Callable[[], Optimum]) -> tuple[Optimum, float]:

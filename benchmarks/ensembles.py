@@ -1,10 +1,8 @@
-"""Ensembles: lanes per second and worker, what a task costs, a million runs, and what large ensembles would take."""
+"""Ensembles: lanes per second and worker, what a task costs, a million runs, and a study of a hundred thousand."""
 
 import shutil
-import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -17,8 +15,8 @@ import numpy as np
 import psutil
 
 import vmri_jax as vm
-from benchmarks.measure import Ratio, Tell, ratio, silent
-from benchmarks.report import Claim, Part, Report
+from benchmarks.measure import Tell, exactly, ratio, silent
+from benchmarks.report import Claim, Report
 from vmri_jax import plots
 from vmri_jax.ensembles import Axis, Draws, Ensemble, Product
 from vmri_jax.ensembles.prepared import prepared
@@ -26,33 +24,27 @@ from vmri_jax.ensembles.work import Work
 from vmri_jax.executors.executor import as_done, executor_of, local_workers, submitter
 from vmri_jax.running.store.layout import committed
 
-PARTS = ("speed", "paper", "million", "study")
-COLUMNS = {
-    "speed": ("what", "lanes", "lanes a second", "low", "high"),
-    "paper": ("lanes", "workers", "chunk", "tasks", "hours", "GB", "files", "limit"),
-    "million": ("lanes", "chunks", "seconds", "lanes a second", "MB on disk", "RSS MB at a third", "RSS MB at the end"),
-    "study": ("scheme", "num_micro", "lanes", "failed", "accurate"),
-}
 START = {"omega": ("uniform", 20.0, 80.0), "v_s": ("normal", 0.0, 0.1), "v_f": ("normal", 0.0, 0.1)}
 """Frequency of the stiff springs, and velocities of the first slow and of the first fast coordinate."""
 RUN: dict[str, Any] = {"t_end": 1.0, "macro_dt": 0.01}
 SCHEME = vm.fully_implicit(10)
-SLEEPERS = 16
-"""Workers of the run whose work is sleeping."""
-NAP = 0.5
-EMPTY = 2000
-"""Tasks without work, which show what a task costs."""
+CHUNK = 4096
+"""Runs in a chunk whose tasks are priced."""
+MANY, EMPTY = 16, 2000
+"""Workers, and tasks without work, which show what a task costs."""
 
 
 @dataclass(frozen=True)
 class Size:
     """How much is run.
 
+    parts: names of `PARTS`.
     chunks: of the ensembles that are timed; repeats: how often.
     million: runs of the large one.
     omega, steps: points of the axes of the study.
     """
 
+    parts: Sequence[str]
     chunks: int
     repeats: int
     million: int
@@ -67,20 +59,17 @@ def moved(problem: vm.Problem, row) -> vm.Problem:
     return replace(problem, system=system, **firsts)
 
 
-def sizes(name: str) -> Size:
-    """ "quick" or "full"."""
-    return Size(8, 3, 100_000, 60, 8) if name == "quick" else Size(16, 5, 1_000_000, 340, 24)
+def sizes(name: str, only: Sequence[str] = ()) -> Size:
+    """ "quick" or "full"; `only` some of `PARTS`."""
+    parts = tuple(only) or tuple(PARTS)
+    return Size(parts, 8, 3, 100_000, 60, 8) if name == "quick" else Size(parts, 16, 5, 1_000_000, 340, 24)
 
 
-def part(name: str) -> Part:
-    """What `python -m benchmarks` asks of one of `PARTS`."""
-    measured = {"speed": speed, "paper": paper, "million": million, "study": study}[name]
-
-    def run(size: Size, how: str, tell: Tell = silent) -> Iterator[Report]:
+def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
+    """A report of each part."""
+    for part in size.parts:
         with TemporaryDirectory() as folder:
-            yield measured(size, how, Path(folder), tell)
-
-    return Part(COLUMNS[name], run, sizes)
+            yield PARTS[part](size, name, Path(folder), tell)
 
 
 def _sweep(out: Path, lanes: int, **how) -> Ensemble:
@@ -137,68 +126,33 @@ def _batch(first: int, last: int):
     return make(v_s, v_f), {"omega": rows["omega"]}
 
 
-# --- large ensembles on paper, and by sleeping -----------------------------------------------------------------------
-def paper(size: Size, name: str, folder: Path, tell: Tell) -> Report:
-    """What a task costs, measured; what large ensembles take, by that; and the same for sleeping workers, measured."""
-    tell("lanes a second")
-    _sweep(folder / "runs.zarr", 2**14, chunk=4096)
-    runs = _sweep(folder / "runs.zarr", 2**15, chunk=4096)
+# --- what tasks and stores cost --------------------------------------------------------------------------------------
+def tasks(size: Size, name: str, folder: Path, tell: Tell) -> Report:
+    """Runs a second and worker, bytes and files of a run, and what a task costs: handing it over, the first one, to see whether it is done."""
+    tell("runs a second")
+    _sweep(folder / "runs.zarr", 2**14, chunk=CHUNK)
+    runs = _sweep(folder / "runs.zarr", 2**15, chunk=CHUNK)
     files = [file for file in runs.path.rglob("*") if file.is_file()]
-    per_lane = sum(file.stat().st_size for file in files) / len(runs)
-    per_chunk = sum("/c." in str(file) or file.name.isdecimal() for file in files) / runs.chunks.count
-    listing = _listing(runs.path)
+    begin = time.perf_counter()
+    listing = len(committed(runs.path)) / (time.perf_counter() - begin)
     with local_workers(1) as client:
         tell("compiling in a worker")
-        first = _sweep(folder / "runs.zarr", 4096, chunk=4096, executor=client)
-        again = _sweep(folder / "runs.zarr", 4096, chunk=4096, executor=client)
-        compiling = first.seconds - again.seconds
-    with local_workers(2) as client:
-        _sleep(client, 8, 0.0)
-        handing_over = _sleep(client, EMPTY, 0.0) / EMPTY
-    tell(f"{SLEEPERS} workers")
-    with local_workers(SLEEPERS) as client:
-        _sleep(client, 4 * SLEEPERS, 0.0)  # all have imported the package
-        empty = _sleep(client, EMPTY, 0.0) / EMPTY
-        tasks = 40 * SLEEPERS
-        slept = _sleep(client, tasks, NAP)
-    predicted = max(tasks * (NAP + empty) / SLEEPERS, tasks * empty)
-    rate = runs.runs_per_second
+        first, again = (_sweep(folder / "runs.zarr", CHUNK, chunk=CHUNK, executor=client).seconds for _ in range(2))
     rows = []
-    for lanes in (10**6, 10**9):
-        for workers in (1, 16, 1000):
-            chunk = _picked(lanes)
-            count = -(-lanes // chunk)
-            computing, handing = lanes / rate / workers, count * handing_over
-            rows.append(
-                {
-                    "lanes": f"{lanes:.0e}",
-                    "workers": workers,
-                    "chunk": chunk,
-                    "tasks": count,
-                    "hours": (compiling + max(computing, handing)) / 3600,
-                    "GB": lanes * per_lane / 1e9,
-                    "files": round(count * per_chunk),
-                    "limit": "workers" if computing > handing else "scheduler",
-                }
-            )
-    seconds = 4096 / rate
+    for workers in (2, MANY):
+        tell(f"{workers} workers")
+        with local_workers(workers) as client:
+            _do_nothing(client, 4 * workers)  # all have imported the package
+            handing_over = _do_nothing(client, EMPTY) / EMPTY
+        row = {"workers": workers, "ms a task": 1e3 * handing_over, "runs a second and worker": runs.runs_per_second}
+        row["workers that chunks are enough for"] = CHUNK / runs.runs_per_second / handing_over
+        rows.append(row)
+    of_chunks = sum("/c." in str(file) or file.name.isdecimal() for file in files)
     notes = [
-        f"{rate:,.0f} runs a second and worker ({seconds:.2f} s a chunk of 4096); {per_lane:.0f} bytes and {per_chunk / 4096:.4f} "
-        f"files a run; a worker's first chunk takes {compiling:.1f} s longer.",
-        f"A task without work takes {1e3 * handing_over:.2f} ms of this process, the scheduler and 2 workers, all on this machine "
-        f"({1e3 * empty:.2f} ms with {SLEEPERS} workers on it): with chunks of {seconds:.2f} s they are enough for "
-        f"{seconds / handing_over:,.0f} workers. To see which of 1e6 chunks are done takes {1e6 * listing:.0f} s.",
+        f"{sum(file.stat().st_size for file in files) / len(runs):.0f} bytes and {of_chunks / len(runs):.4f} files a run in chunks of {CHUNK}; "
+        f"a worker's first chunk takes {first - again:.1f} s longer; {listing:,.0f} chunks a second are seen to be done."
     ]
-    seen = Ratio(slept / predicted, slept / predicted, slept / predicted)
-    claims = [Claim(f"{tasks} tasks of {NAP} s on {SLEEPERS} workers, over the prediction", seen, at_most=1.1)]
-    return Report("ensembles_paper", name, rows, claims, notes)
-
-
-def _listing(path: Path) -> float:
-    """Seconds per chunk to see which are done."""
-    begin = time.perf_counter()
-    count = len(committed(path))
-    return (time.perf_counter() - begin) / count
+    return Report("ensembles_tasks", name, rows, [], notes)
 
 
 def _picked(lanes: int) -> int:
@@ -208,10 +162,10 @@ def _picked(lanes: int) -> int:
     return chunks.size
 
 
-def _sleep(client, count: int, seconds: float) -> float:
-    """Time that so many tasks take that do nothing but sleep."""
-    with executor_of("sleep", client) as tasks:
-        submit = submitter("sleep", tasks, time.sleep, seconds)
+def _do_nothing(client, count: int) -> float:
+    """Seconds that so many tasks take that do nothing."""
+    with executor_of("ensembles", client) as workers:
+        submit = submitter("ensembles", workers, time.sleep, 0.0)
         begin = time.perf_counter()
         for _, future in as_done(lambda _: submit(), range(count)):
             future.result()
@@ -222,56 +176,37 @@ def _sleep(client, count: int, seconds: float) -> float:
 def million(size: Size, name: str, folder: Path, tell: Tell) -> Report:
     """Many runs through the store in this process, with the memory it takes, and read back without loading them."""
     tell(f"{size.million:,} runs")
-    out = folder / "million.zarr"
-    with _memory() as seen:
-        design = Draws(size.million, START)
-        runs = vm.ensemble("fpu", "fully-explicit", design, vary=moved, num_micro=10, **RUN, out=out)
-    after = psutil.Process().memory_info().rss / 1e6
-    data = runs.open()
-    mean = float(data.q_s.mean())
-    read = psutil.Process().memory_info().rss / 1e6
-    t, rss = np.array(seen).T
-    third, end = (float(np.interp(part * t[-1], t, rss)) for part in (1 / 3, 1.0))
-    bytes_there = sum(file.stat().st_size for file in out.rglob("*") if file.is_file())
+    out, memory = folder / "million.zarr", []
+
+    def watch(what: str, done: int, total: int) -> None:
+        memory.append((done / total, _memory()))
+
+    design = Draws(size.million, START)
+    how = {"vary": moved, "num_micro": 10, **RUN, "out": out, "progress": watch}
+    runs = vm.ensemble("fpu", "fully-explicit", design, **how)
+    after = _memory()
+    mean = float(runs.open().q_s.mean())
+    parts, mb = np.array(memory).T
+    third, end = (float(np.interp(part, parts, mb)) for part in (1 / 3, 1.0))
     row = {
         "lanes": len(runs),
         "chunks": runs.chunks.count,
         "seconds": runs.seconds,
         "lanes a second": runs.runs_per_second,
-        "MB on disk": bytes_there / 1e6,
+        "MB on disk": sum(file.stat().st_size for file in out.rglob("*") if file.is_file()) / 1e6,
         "RSS MB at a third": third,
         "RSS MB at the end": end,
     }
-    notes = [f"mean of all q_s, read chunk by chunk: {mean:.6f}; memory {after:.0f} MB before, {read:.0f} MB after."]
-    claims = [
-        Claim("memory at the end over that at a third", Ratio(end / third, end / third, end / third), at_most=1.02)
+    notes = [
+        f"mean of all q_s, read chunk by chunk: {mean:.6f}; memory {after:.0f} MB before, {_memory():.0f} MB after."
     ]
-    figure = partial(_draw_memory, t, rss, len(runs))
-    return Report("ensembles_million", name, [row], claims, notes, {"ensembles_million": figure})
+    claims = [Claim("memory at the end over that at a third", exactly(end / third), at_most=1.02)]
+    return Report("ensembles_million", name, [row], claims, notes)
 
 
-@contextmanager
-def _memory() -> Iterator[list[tuple[float, float]]]:
-    """Meanwhile, times and the memory of this process in MB."""
-    process, seen, end, begin = psutil.Process(), [], threading.Event(), time.perf_counter()
-
-    def watch() -> None:
-        while not end.wait(0.1):
-            seen.append((time.perf_counter() - begin, process.memory_info().rss / 1e6))
-
-    thread = threading.Thread(target=watch, daemon=True)
-    thread.start()
-    yield seen
-    end.set()
-    thread.join()
-
-
-def _draw_memory(t: np.ndarray, rss: np.ndarray, lanes: int):
-    with plots.new_figure(6.0, 2.8, f"{lanes:,} runs: memory", plots.LIGHT) as figure:
-        axes = figure.subplots()
-        axes.plot(t, rss)
-        axes.set(xlabel="seconds", ylabel="MB", ylim=(0, None))
-    return figure
+def _memory() -> float:
+    """Of this process, MB."""
+    return psutil.Process().memory_info().rss / 1e6
 
 
 # --- the study of the paper, over omega, H and num_micro --------------------------------------------------------------
@@ -350,3 +285,11 @@ def _draw_study(error, theme: plots.Theme):
         bar = figure.colorbar(mesh, ax=grid, pad=0.01, label=about)
         bar.outline.set_visible(False)
     return figure
+
+
+PARTS: dict[str, Callable[[Size, str, Path, Tell], Report]] = {
+    "speed": speed,
+    "tasks": tasks,
+    "million": million,
+    "study": study,
+}

@@ -12,13 +12,12 @@ import numpy as np
 
 import vmri_jax as vm
 from benchmarks.instructions import double_pendulum
-from benchmarks.measure import Ratio, Tell, silent
+from benchmarks.measure import Tell, exactly, silent
 from benchmarks.programs import problem
-from benchmarks.report import Claim, Report, growing
+from benchmarks.report import Claim, Report
 from benchmarks.worker import starts
 from vmri_jax.running.timing import least_seconds
 
-COLUMNS = ("system", "program", "device", "lanes", "lanes/s", "error", "apart")
 T_END = 1.0
 COMPARED = 256
 """Lanes whose ends are compared between devices and with a reference."""
@@ -114,13 +113,15 @@ def devices() -> tuple[Any, Any]:
 def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
     """Measure all of it, a report after each system."""
     accelerator, _ = devices()
-    notes = [f"accelerator: {accelerator.device_kind}"]
+    report = Report("gpu", name, notes=[f"accelerator: {accelerator.device_kind}"])
     if accelerator.platform == "cpu":
-        notes.append("JAX sees no accelerator here: the rows of the device are of the CPU")
-    return growing("gpu", name, (_measure(system, size, tell) for system in systems_of(size.systems)), notes)
+        report.note("JAX sees no accelerator here: the rows of the device are of the CPU")
+    for system in systems_of(size.systems):
+        _measure(system, size, report, tell)
+        yield report
 
 
-def _measure(system: System, size: Size, tell: Tell) -> tuple[list[dict], list[Claim]]:
+def _measure(system: System, size: Size, report: Report, tell: Tell) -> None:
     accelerator, cpu = devices()
     with jax.default_device(cpu):
         few = starts(system.problem, max(COMPARED, min(size.lanes)))
@@ -130,16 +131,13 @@ def _measure(system: System, size: Size, tell: Tell) -> tuple[list[dict], list[C
     ends, gradients = jax.jit(jax.vmap(system.end)), jax.jit(jax.vmap(system.gradient))
     here = ends(jax.device_put(compared, cpu))
     error = float(jnp.max(jnp.abs(here - reference)))
-    rows = []
 
     def row(program: str, device: Any, lanes: int, run: Callable[[], Any], **more) -> None:
         tell(f"{system.name}, {program}, {device.device_kind}, {lanes} lanes")
         jax.block_until_ready(run())  # compiled
         rate = lanes / least_seconds([run], size.repeats)[0]
-        rows.append(
-            {"system": system.name, "program": program, "device": device.device_kind, "lanes": lanes, "lanes/s": rate}
-            | more
-        )
+        row = {"system": system.name, "program": program, "device": device.device_kind, "lanes": lanes}
+        report.rows.append(row | {"lanes/s": rate} | more)
 
     there = np.asarray(ends(jax.device_put(compared, accelerator)))
     apart = float(np.max(np.abs(there - np.asarray(here))) / np.max(np.abs(here)))
@@ -155,7 +153,7 @@ def _measure(system: System, size: Size, tell: Tell) -> tuple[list[dict], list[C
         row("simulate_batch", cpu, lanes, lambda: batch().q_f, error=error)
     for lanes, run, peer_error in _diffrax(system, few, size.lanes, reference, error, accelerator):
         row("diffrax Dopri8", accelerator, lanes, run, error=peer_error)
-    return rows, [Claim(f"{system.name}: CPU and device apart", Ratio(apart, apart, apart), APART)]
+    report.claims.append(Claim(f"{system.name}: CPU and device apart", exactly(apart), APART))
 
 
 def _repeated(states: vm.State, lanes: int) -> vm.State:

@@ -18,7 +18,6 @@ import vmri_jax as vm
 from benchmarks.measure import Tell, silent
 from benchmarks.report import Report
 
-COLUMNS = ("file", "bodies", "coordinates", "scene", "acceleration", "first run", "error", "not read")
 FOLDERS = {"gymnasium": "envs/mujoco/assets", "dm_control": "suite"}
 """Where packages have models that stand for themselves."""
 INSTALL = "pip install --no-deps gymnasium==1.4.0 dm_control==1.0.50"

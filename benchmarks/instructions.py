@@ -12,11 +12,10 @@ import jax.numpy as jnp
 
 import vmri_jax as vm
 from benchmarks.chains import Coordinates
-from benchmarks.measure import Ratio, Tell, silent
+from benchmarks.measure import Tell, exactly, silent
 from benchmarks.programs import gallery_scene, problem
-from benchmarks.report import Claim, Report, growing
+from benchmarks.report import Claim, Report
 
-COLUMNS = ("program", "instructions", "to compile, s")
 STEPS = 100
 """Macro steps of a program. The size of a program does not depend on this number."""
 MICRO_DT = 2e-4
@@ -51,13 +50,8 @@ class Program:
 
     def compiled(self) -> jax.stages.Compiled:
         """The program."""
-        problem, macro_dt = self.problem(), MICRO_DT * self.scheme.num_micro
-        options = {
-            "macro_dt": macro_dt,
-            "num_steps": STEPS,
-            "save": STEPS,
-            "solver": vm.Solver(self.matrix),
-        }
+        problem, steps = self.problem(), {"macro_dt": MICRO_DT * self.scheme.num_micro, "num_steps": STEPS}
+        options = {**steps, "save": STEPS, "solver": vm.Solver(self.matrix)}
         if not self.is_gradient:
             return vm.prepare(problem, self.scheme, **options).compiled()
 
@@ -112,15 +106,19 @@ def sizes(name: str) -> list[str]:
 
 def run(size: list[str], name: str, tell: Tell = silent) -> Iterator[Report]:
     """Compile them one after the other, a report after each."""
-    return growing("programs", name, (measured(name, tell) for name in size))
+    report = Report("programs", name)
+    for program in size:
+        tell(program)
+        row, claim = measured(program)
+        report.rows.append(row)
+        report.claims.append(claim)
+        yield report
 
 
-def measured(name: str, tell: Tell = silent) -> tuple[list[dict], list[Claim]]:
+def measured(name: str) -> tuple[dict, Claim]:
     """The row of a program, and its instructions over those that were written down."""
-    tell(name)
     program = PROGRAMS[name]
     start = time.process_time()
     count = instructions(program.compiled())
     row = {"program": name, "instructions": count, "to compile, s": time.process_time() - start}
-    part = count / program.most
-    return [row], [Claim(f"{name}: instructions over those written down", Ratio(part, part, part), 1.1)]
+    return row, Claim(f"{name}: instructions over those written down", exactly(count / program.most), 1.1)

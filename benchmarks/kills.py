@@ -1,109 +1,149 @@
-"""A streaming run killed at random moments: resumed it is the same to the last bit."""
+"""A streaming run, and an ensemble or its workers, killed at random moments: resumed they are the same to the last bit."""
 
 import multiprocessing
+import os
 import shutil
+import signal
+import threading
 import time
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 
 import vmri_jax as vm
+from benchmarks.ensembles import moved
 from benchmarks.measure import Tell, silent
 from benchmarks.report import Report
+from vmri_jax.ensembles import Draws, Ensemble
+from vmri_jax.executors.executor import local_workers
 from vmri_jax.running.export import STATUS, named_arrays
 from vmri_jax.running.store.layout import committed
 
-COLUMNS = ("kill", "after, s", "chunks", "new", "moment", "identical")
 CHUNKS, PER_CHUNK = 40, 5
+"""Of the streaming run."""
+LANES, CHUNK = 30_000, 500
+"""Runs of the ensemble, and of each of its chunks."""
+PER_ENSEMBLE = 10
+"""Workers that are killed during one ensemble."""
 EARLY = 5
-"""Every so many kills come at any time after the start of the process, the others after its first chunk."""
+"""Every so many kills come at any time after the start of the process, the others after its next chunk."""
+FROM_START, FROM_CHUNK = 6.0, 0.5
+"""Most seconds to a kill: from the start of a process, and from its next chunk."""
 PATIENCE = 300.0
+"""Seconds to wait for a chunk, and for the end of a process that was killed."""
+
+
+@dataclass(frozen=True)
+class Kind:
+    """Processes that are killed.
+
+    start: how Python starts them; "forkserver" from a process that has imported everything.
+    target: ``target(path)`` in a process of its own, starts a store or goes on with it.
+    same: ``same(whole, path, complete)``, whether a store has all of one that nobody disturbed, before the end its beginning.
+    """
+
+    name: str
+    start: str
+    target: Callable[[Path], None]
+    same: Callable[[Path, Path, bool], bool]
+
+    def process(self, path: Path):
+        """A process that has just been started."""
+        context: Any = multiprocessing.get_context(self.start)
+        if self.start == "forkserver":
+            context.set_forkserver_preload(["benchmarks.kills"])
+        child = context.Process(target=self.target, args=(path,))
+        child.start()
+        return child
+
+    def finish(self, child) -> None:
+        """Wait for the end of a process."""
+        child.join()
+        if child.exitcode != 0:
+            raise RuntimeError(f"kills: a process that nobody killed ended with exit code {child.exitcode}.")
+
+    def killed(self, child, path: Path, random, *, early: bool) -> bool:
+        """Kill a process that has just been started, if it is still running then; whether it was killed."""
+        if not early:
+            known, deadline = chunks_of(path), time.monotonic() + PATIENCE
+            while child.is_alive() and time.monotonic() < deadline and chunks_of(path) <= known:
+                time.sleep(0.002)
+        child.join(random.uniform(0.0, FROM_START if early else FROM_CHUNK))
+        if child.exitcode is None:
+            child.kill()
+            child.join(PATIENCE)
+            return True
+        return False
 
 
 @dataclass(frozen=True)
 class Size:
-    """Kills, and the seed of their moments."""
+    """Kills of streaming runs, of workers and of whole ensembles; the seed of their moments."""
 
-    count: int
+    runs: int
+    workers: int
+    ensembles: int
     seed: int = 0
 
 
-def sizes(name: str, count: int = 100) -> Size:
+def sizes(name: str, runs: int = 100, workers: int = 50, ensembles: int = 20) -> Size:
     """So many kills, whatever the name."""
-    return Size(count)
+    return Size(runs, workers, ensembles)
 
 
 def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
-    """Kill, look at what is there, resume, kill ..., each completed run compared with one that nobody killed."""
-    with TemporaryDirectory() as folder:
-        rows, runs = kill_often(size, Path(folder), tell)
-    identical = sum(row["identical"] == "yes" for row in rows)
-    moments = {row["moment"] for row in rows}
-    counts = ", ".join(f"{sum(row['moment'] == m for row in rows)} {m}" for m in sorted(moments))
-    notes = [
-        f"{len(rows)} kills ({counts}), each resumed: {identical} times everything on disk identical to the uninterrupted run.",
-        f"{sum(runs)} of {len(runs)} completed runs identical in every array.",
-    ]
-    yield Report("kills", name, rows, [], notes)
+    """A row for each run or ensemble that came to its end."""
+    report, random, moments = Report("kills", name), np.random.default_rng(size.seed), Counter()
+    with TemporaryDirectory() as place:
+        parts = (
+            kill_processes(RUNS, size.runs, random, Path(place), tell, moments),
+            kill_workers(size.workers, random, Path(place), tell),
+            kill_processes(ENSEMBLES, size.ensembles, random, Path(place), tell, moments),
+        )
+        for row in chain(*parts):
+            report.rows.append(row)
+            yield report
+    report.note(f"processes were killed {', '.join(f'{count} times {word}' for word, count in moments.items())}")
+    same = sum(row["identical"] == "yes" for row in report.rows)
+    report.note(f"{sum(row['kills'] for row in report.rows)} kills; {same} of {len(report.rows)} identical.")
+    yield report
 
 
-def kill_often(size: Size, folder: Path, tell: Tell = silent) -> tuple[list[dict], list[bool]]:
-    """One row per kill; and whether the completed runs are identical to the uninterrupted one."""
-    context = multiprocessing.get_context("forkserver")  # children start from a process that has imported everything
-    context.set_forkserver_preload(["benchmarks.kills"])
-    random = np.random.default_rng(size.seed)
-    first, path = folder / "uninterrupted.zarr", folder / "run.zarr"
-
-    def start(out: Path):
-        child = context.Process(target=_child, args=(str(out), str(folder / "cache")), daemon=True)
-        child.start()
-        return child
-
-    to_first_chunk, whole = [_timed(start, first) for _ in range(2)][1]  # the second one finds the programs compiled
-    expected = vm.StoredTrajectory(first).load()
-
-    rows, runs = [], []
-    while len(rows) < size.count:
-        tell(f"kill {len(rows) + 1}")
-        before = chunks_of(path)
-        child, begin = start(path), time.perf_counter()
-        if kill_at_random(child, path, random, None if len(rows) % EARLY else to_first_chunk, whole / 3):
-            after = chunks_of(path)
-            same = "yes" if after == 0 or _identical(vm.StoredTrajectory(path).load(), expected) else "no"
-            row = {"kill": len(rows) + 1, "after, s": time.perf_counter() - begin, "chunks": after}
-            rows.append(row | {"new": after - before, "moment": _moment(path, after), "identical": same})
-        else:
-            runs.append(_complete(child, path, expected))
-            shutil.rmtree(path)
-    child = start(path)
-    child.join(PATIENCE)
-    runs.append(_complete(child, path, expected))
-    return rows, runs
+def kill_processes(kind: Kind, count: int, random, folder: Path, tell: Tell, moments: Counter[str]) -> Iterator[dict]:
+    """Processes are killed and started again until their store is complete, and further ones until `count` were killed."""
+    done, whole, out = 0, folder / f"whole {kind.name}.zarr", folder / f"{kind.name}.zarr"
+    if count:
+        kind.finish(kind.process(whole))
+    while done < count:
+        chunks, calls, same, complete = [], 0, True, False
+        shutil.rmtree(out, ignore_errors=True)
+        while not complete:
+            child, calls, wanted = kind.process(out), calls + 1, done + len(chunks) < count
+            if wanted and kind.killed(child, out, random, early=calls % EARLY == 0):
+                chunks.append(chunks_of(out))
+                moments[_moment(out)] += 1
+            else:
+                kind.finish(child)
+                complete = True
+            same = same and kind.same(whole, out, complete)
+            tell(f"{kind.name}: {done + len(chunks)} of {count} processes killed")
+        done += len(chunks)
+        yield _row(kind.name, len(chunks), chunks, calls, same and chunks_of(out) == chunks_of(whole))
 
 
-def _timed(start, path: Path) -> tuple[float, float]:
-    """Seconds of a run to its first chunk, and from there to its end."""
-    shutil.rmtree(path, ignore_errors=True)
-    begin = time.perf_counter()
-    child = start(path)
-    wait_for_chunk(child, path, 0)
-    to_first_chunk = time.perf_counter() - begin
-    child.join(PATIENCE)
-    if child.exitcode != 0:
-        raise RuntimeError(f"kills: the uninterrupted run ended with exit code {child.exitcode}.")
-    return to_first_chunk, time.perf_counter() - begin - to_first_chunk
-
-
-def _child(out: str, cache: str) -> None:
-    """Start the run, or go on with it."""
-    vm.configure(cache=cache)
-    problem = vm.systems.fermi_pasta_ulam()
-    scheme, steps = vm.fully_implicit(3), CHUNKS * PER_CHUNK * 2
-    arguments = {"macro_dt": 0.01, "num_steps": steps, "save": vm.Save(2, micro=True), "chunk": PER_CHUNK}
-    vm.stream(problem.system, scheme, problem.state(), out=out, resume=True, **arguments)
+def _moment(path: Path) -> str:
+    """What the process was at; files beyond the completed chunks are what it was writing."""
+    if not path.exists():
+        return "before there was a store"
+    torn = any(path.rglob("*.partial")) or any(path.glob(f"*/c.{chunks_of(path)}*"))
+    return "while writing" if torn else "starting or computing"
 
 
 def chunks_of(path: Path) -> int:
@@ -111,53 +151,89 @@ def chunks_of(path: Path) -> int:
     return len(committed(path)) if path.exists() else 0
 
 
-def wait_for_chunk(child, path: Path, known: int) -> None:
-    """Until there are more chunks, or the process has ended."""
-    deadline = time.monotonic() + PATIENCE
-    while child.is_alive() and time.monotonic() < deadline and chunks_of(path) <= known:
-        time.sleep(0.002)
+def _row(kind: str, kills: int, chunks: list[int], calls: int, same: bool) -> dict:
+    row = {"killed": kind, "kills": kills, "chunks before a resume": ", ".join(map(str, chunks)) or "-"}
+    return row | {"calls": calls, "identical": "yes" if same else "no"}
 
 
-def kill_at_random(child, path: Path, random, early: float | None, late: float) -> bool:
-    """Kill a process that has just been started, if it is still running then.
-
-    Args:
-        child: the process.
-        path: the store that it writes.
-        random: generator of the moment.
-        early: most seconds from its start to the kill; None to wait for its next chunk.
-        late: most seconds from its next chunk to the kill.
-
-    Returns:
-        Whether it was killed.
-    """
-    if early is None:
-        wait_for_chunk(child, path, chunks_of(path))
-    child.join(random.uniform(0.0, late if early is None else early))
-    if child.exitcode is None:
-        child.kill()
-        child.join(PATIENCE)
-        return True
-    return False
+# --- a streaming run -------------------------------------------------------------------------------------------------
+def streaming(out: Path) -> None:
+    """Start the run, or go on with it; programs are compiled once for all processes."""
+    vm.configure(cache=out.parent / "cache")
+    problem = vm.systems.fermi_pasta_ulam()
+    scheme, steps = vm.fully_implicit(3), CHUNKS * PER_CHUNK * 2
+    arguments = {"macro_dt": 0.01, "num_steps": steps, "save": vm.Save(2, micro=True), "chunk": PER_CHUNK}
+    vm.stream(problem.system, scheme, problem.state(), out=out, resume=True, **arguments)
 
 
-def _moment(path: Path, chunks: int) -> str:
-    """What the process was at; files beyond the completed chunks are what it was writing."""
-    if not path.exists():
-        return "before there was a store"
-    torn = any(path.rglob("*.partial")) or any(path.glob(f"*/c.{chunks}*"))
-    return "while writing" if torn else "starting or computing"
-
-
-def _complete(child, path: Path, expected: vm.Trajectory) -> bool:
-    """Whether the child ended well, and wrote the expected run."""
-    stored = vm.StoredTrajectory(path)
-    whole = child.exitcode == 0 and stored.complete and len(stored) == len(expected.t)
-    return whole and _identical(stored.load(), expected)
-
-
-def _identical(part: vm.Trajectory, expected: vm.Trajectory) -> bool:
-    """Whether every array is the beginning of the expected one, bit by bit."""
-    begun, whole = named_arrays(part), named_arrays(expected)
-    pairs = [(np.asarray(begun[name]), np.asarray(whole[name])) for name in begun if name not in STATUS]
+def _begins(whole: Path, path: Path, complete: bool) -> bool:
+    """Whether every array of a store is the beginning of the same array of the whole one, bit by bit."""
+    if not chunks_of(path):
+        return not complete
+    begun, expected = (named_arrays(vm.StoredTrajectory(store).load()) for store in (path, whole))
+    pairs = [(np.asarray(begun[name]), np.asarray(expected[name])) for name in begun if name not in STATUS]
     return all(a.tobytes() == b[: len(a)].tobytes() for a, b in pairs)
+
+
+RUNS = Kind("streaming run", "forkserver", streaming, _begins)
+
+
+# --- an ensemble -----------------------------------------------------------------------------------------------------
+def ensemble(out: Path, **how) -> Ensemble:
+    """The one that is disturbed."""
+    design = Draws(LANES, {"omega": ("uniform", 20.0, 80.0), "v_s": ("normal", 0.0, 0.1)}, seed=1)
+    steps = {"num_micro": 5, "t_end": 2.0, "macro_dt": 0.02}
+    return vm.ensemble("fpu", "fully-implicit", design, vary=moved, **steps, out=out, chunk=CHUNK, **how)
+
+
+def by_two_workers(out: Path) -> None:
+    """Start the ensemble, or go on with it."""
+    vm.configure()
+    ensemble(out, processes=2, resume=True)
+
+
+def _same_files(whole: Path, path: Path, complete: bool) -> bool:
+    """Whether a complete store has the same files as the whole one."""
+    contents = ({str(f.relative_to(p)): f.read_bytes() for f in p.rglob("*") if f.is_file()} for p in (whole, path))
+    return not complete or next(contents) == next(contents)
+
+
+ENSEMBLES = Kind("ensemble", "spawn", by_two_workers, _same_files)
+
+
+def kill_workers(count: int, random, folder: Path, tell: Tell) -> Iterator[dict]:
+    """Ensembles of two workers, of which one is killed again and again."""
+    done, whole, out = 0, folder / "whole.zarr", folder / "workers.zarr"
+    if count:
+        ensemble(whole)
+    while done < count:
+        kills, calls, chunks, complete = 0, 0, [], False
+        shutil.rmtree(out, ignore_errors=True)
+        while not complete:
+            wanted = min(PER_ENSEMBLE - kills, count - done - kills)
+            with local_workers(2) as client, _killing(client.cluster.workers, wanted, random) as seen:
+                found = ensemble(out, executor=client, resume=True, throw=False)
+            kills, calls, complete = kills + len(seen), calls + 1, found.complete
+            chunks.append(len(found.done))
+            tell(f"{done + kills} of {count} workers killed")
+        done += kills
+        yield _row("workers of an ensemble", kills, chunks[:-1], calls, _same_files(whole, out, complete))
+
+
+@contextmanager
+def _killing(nannies: Mapping[Any, Any], wanted: int, random) -> Iterator[list[int]]:
+    """Meanwhile, so many of these workers are killed at random moments; yields the list of those that were."""
+    stop, seen = threading.Event(), []
+
+    def kill() -> None:
+        while len(seen) < wanted and not stop.wait(random.uniform(0.05, 1.5)):
+            pids = [nanny.pid for nanny in nannies.values() if nanny.pid is not None]
+            if pids:
+                seen.append(int(random.choice(pids)))
+                os.kill(seen[-1], signal.SIGKILL)
+
+    killer = threading.Thread(target=kill, daemon=True)
+    killer.start()
+    yield seen
+    stop.set()
+    killer.join()

@@ -16,6 +16,7 @@ from vmri_jax.study.html import processor
 __all__ = [
     "Ratio",
     "Tell",
+    "exactly",
     "interleaved",
     "machine",
     "pin",
@@ -44,6 +45,11 @@ class Ratio:
 
     def __str__(self) -> str:
         return f"{self.value:.3g} ({self.low:.3g} to {self.high:.3g})"
+
+
+def exactly(value: float) -> Ratio:
+    """A ratio that was measured once."""
+    return Ratio(value, value, value)
 
 
 def ratio(above: Sequence[float], below: Sequence[float]) -> Ratio:

@@ -42,12 +42,6 @@ def masses(problem: vm.Problem) -> np.ndarray:
     return np.concatenate([kinetic.slow, kinetic.fast])
 
 
-def unknowns(problem: vm.Problem, num_micro: int) -> int:
-    """Unknowns of one macro step of degree 1, all of them solved for at once."""
-    n_g, n_gs = problem.system.num_constraints(problem.q_s, problem.q_f)
-    return problem.q_s.size + n_gs + num_micro * (problem.q_f.size + n_g)
-
-
 def program(problem: vm.Problem, scheme: vm.Scheme | vm.Composition, macro_dt, solver: vm.Solver | None = None):
     """``run(num_steps)``, a prepared run that saves the last node only, NaN if it fails."""
     start = problem.state()

@@ -15,7 +15,6 @@ from benchmarks.imports import apart
 from benchmarks.measure import Tell, silent
 from benchmarks.report import Report
 
-COLUMNS = ("model", "bodies", "coordinates", "difference", "refused")
 CHANCE = 0.12
 """Probability of each feature that a scene does not express, of each flag and of each actuator that acts."""
 LARGEST_DIFFERENCE = 1e-8

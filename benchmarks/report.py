@@ -2,10 +2,7 @@
 
 import json
 import math
-import sys
-import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,10 +10,9 @@ from typing import Any
 from matplotlib.figure import Figure
 from rich.markup import escape
 
-from benchmarks.measure import Ratio, Tell, machine
+from benchmarks.measure import Ratio, machine
 from vmri_jax import plots
 from vmri_jax.running.printed import OutputConsole, PrintedTable
-from vmri_jax.running.progress import SECONDS_BETWEEN_LINES
 
 console = OutputConsole()
 
@@ -50,13 +46,13 @@ class Claim:
 
 @dataclass(frozen=True)
 class Report:
-    """All that one benchmark found; figures are functions that draw, by file name, about is what else belongs into the file."""
+    """All that one benchmark has measured by now; figures are functions that draw, by file name, about is what else belongs into the file."""
 
     name: str
     size: str
-    rows: list[dict]
-    claims: list[Claim]
-    notes: list[str]
+    rows: list[dict] = field(default_factory=list)
+    claims: list[Claim] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
     figures: dict[str, Callable[[], Figure]] = field(default_factory=dict)
     about: dict = field(default_factory=dict)
 
@@ -75,10 +71,15 @@ class Report:
             plots.save(figure, out / f"{name}.png")
         return path
 
-    def show(self, columns: Sequence[str]) -> None:
-        """Print the rows (these columns of them), the claims and the notes."""
+    def note(self, text: str) -> None:
+        """Add a note, once."""
+        if text not in self.notes:
+            self.notes.append(text)
+
+    def show(self) -> None:
+        """Print the numbers and words of the rows, the claims and the notes."""
         console.print(f"{self.name}, {self.size}", style="bold")
-        for head, *body in self._tables(columns):
+        for head, *body in self._tables():
             table = PrintedTable(*head)
             for row in body:
                 table.add_row(*map(escape, row))
@@ -86,64 +87,19 @@ class Report:
         for note in self.notes:
             console.print(escape(note), style="dim")
 
-    def _tables(self, columns: Sequence[str]) -> Iterator[list[Sequence[str]]]:
-        """Rows and claims as text, the heads first; those that are empty are left out."""
-        if self.rows:
+    def _tables(self) -> Iterator[list[Sequence[str]]]:
+        """Rows and claims as text, the heads first; those that are empty are left out, and so are lists in rows."""
+        columns = list(dict.fromkeys(k for row in self.rows for k, x in row.items() if not isinstance(x, list)))
+        if columns:
             yield [columns, *([_cell(row.get(name)) for name in columns] for row in self.rows)]
         if self.claims:
             claims = [(c.what, str(c.seen), c.target, c.verdict) for c in self.claims]
             yield [("ratio", "seen (quartiles)", "target", "holds"), *claims]
 
 
-@dataclass(frozen=True)
-class Part:
-    """One table of a benchmark that has several, with the names that `python -m benchmarks` asks for."""
-
-    COLUMNS: tuple[str, ...]
-    run: Callable[..., Iterator[Report]]
-    sizes: Callable[[str], Any]
-
-
 def spread(what: str, seen: Ratio) -> dict:
     """Columns of a row: a median by its name, and its quartiles."""
     return {what: seen.value, "low": seen.low, "high": seen.high}
-
-
-def growing(name: str, size: str, parts: Iterable[tuple[list[dict], list[Claim]]], notes: Sequence[str] = ()):
-    """A report after each part, which has rows and claims, of all parts by then."""
-    rows, claims = [], []
-    for more_rows, more_claims in parts:
-        rows += more_rows
-        claims += more_claims
-        yield Report(name, size, rows, claims, list(notes))
-
-
-def note(notes: list[str], text: str) -> None:
-    """Add a note, once."""
-    if text not in notes:
-        notes.append(text)
-
-
-@contextmanager
-def progress(title: str) -> Iterator[Tell]:
-    """Show what is being measured; yields the function that is told each part before it starts.
-
-    In a terminal it is one line that changes; in a pipe or a file lines on the error stream, the first one at once.
-    """
-    if console.is_terminal:
-        with console.status(title) as status:
-            yield lambda at: status.update(f"{title}: {at}")
-        return
-    begin, last = time.monotonic(), -math.inf
-
-    def tell(part: str) -> None:
-        nonlocal last
-        now = time.monotonic()
-        if now - last >= SECONDS_BETWEEN_LINES:
-            last = now
-            print(f"{now - begin:5.0f} s  {title}: {part}", file=sys.stderr, flush=True)
-
-    yield tell
 
 
 def _cell(value) -> str:

@@ -37,7 +37,7 @@ CASES += [
     Case("single", "satellite", "fully_implicit 5", 0.02),  # its kinetic energy is a function
 ]
 BATCH = ", batch"
-COLUMNS = ("trick", *SCHEMES, "satellite", *(f"{system}{BATCH}" for system in SCHEMES), "most", "keep")
+SYSTEMS = (*SCHEMES, "satellite", *(f"{system}{BATCH}" for system in SCHEMES))
 
 
 @dataclass(frozen=True)
@@ -76,25 +76,28 @@ def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
     seats = {TUNED: tuned, ALL_PLAIN: Seat(environment={"VMRI_KERNELS": "plain"})}
     seats |= {trick: replace(tuned, options=("--plain", trick)) for trick in size.tricks}
     found: dict[str, dict[Case, Ratio]] = {seat: {} for seat in seats if seat != TUNED}
-    notes = [f"commit {tuned.commit}; time without the trick over time with it, the median of samples taken in turns"]
+    report = Report("tricks", name)
+    report.note(
+        f"commit {tuned.commit}; time without the trick over time with it, the median of samples taken in turns"
+    )
     with ExitStack() as stack:
         workers = {seat: stack.enter_context(Worker(of)) for seat, of in seats.items()}
         for case in size.cases:
-            head = f"{case.system}, {case.scheme}" + (f", {case.lanes} lanes" if case.lanes > 1 else "")
-            head += f", {case.method}" if case.method != "auto" else ""
-            tell(head)
+            tell(case.label)
             outcome = take_turns(workers, replace(case, seconds=size.seconds), size.repeats)
-            notes += [f"{head}: {seat} was left out: {why}." for seat, why in outcome.refused.items()]
+            for seat, why in outcome.refused.items():
+                report.note(f"{case.label}: {seat} was left out: {why}.")
             for seat, samples in outcome.samples.items():
                 if seat != TUNED:
                     found[seat][case] = ratio(samples, outcome.samples[TUNED])
-            yield Report("tricks", name, [_row(seat, ratios) for seat, ratios in found.items()], [], notes)
+            report.rows[:] = [_row(seat, ratios) for seat, ratios in found.items()]
+            yield report
 
 
 def _row(trick: str, ratios: dict[Case, Ratio]) -> dict:
     """The most that a trick buys on each system; by its lower quartile it stays or goes."""
     row: dict = {"trick": trick}
-    for column in COLUMNS[1:-2]:
+    for column in SYSTEMS:
         of_column = [found.value for case, found in ratios.items() if _column(case) == column]
         row[column] = max(of_column, default=None)
     row["most"] = max((found.value for found in ratios.values()), default=None)

@@ -11,7 +11,7 @@ import numpy as np
 import vmri_jax as vm
 from benchmarks import programs
 from benchmarks.dear.systems import molecules
-from benchmarks.measure import Tell, ratio, silent
+from benchmarks.measure import Tell, quartiles, ratio, silent
 from benchmarks.report import Claim, Report
 from vmri_jax.accuracy.companions import UncertifiedWarning
 from vmri_jax.accuracy.steps import AccuracyNotReached
@@ -20,19 +20,6 @@ from vmri_jax.running.timing import interleaved, stopwatch
 from vmri_jax.study import families, reference_solution, tune
 from vmri_jax.study.tuning import NothingReached
 
-COLUMNS = (
-    "system",
-    "error",
-    "by accuracy",
-    "its error",
-    "ms",
-    "by search",
-    "error there",
-    "ms there",
-    "ratio",
-    "seconds",
-    "of search",
-)
 NODES = 10
 """Saved intervals, at whose ends errors are compared."""
 ERRORS = (1e-3, 1e-6)
@@ -86,24 +73,18 @@ def sizes(name: str, only: Sequence[str] = ()) -> list[Case]:
 
 def run(cases: list[Case], name: str, tell: Tell = silent) -> Iterator[Report]:
     """A report after each case."""
-    rows, notes = [], []
+    report = Report("tuned", name)
     for case in cases:
         tell(f"{case.system}, {case.error:g}")
         try:
-            rows.append(_row(case))
+            report.rows.append(_row(case))
         except (NothingReached, ValueError) as refused:
-            notes.append(f"{case.system}, {case.error:g}: {refused}")
-        ratios = [row["ratio"] for row in rows]
-        claims = []
+            report.note(f"{case.system}, {case.error:g}: {refused}")
+        ratios = [row["ratio"] for row in report.rows]
         if ratios:
-            claims.append(
-                Claim(
-                    "time of an accuracy over the search, median of all",
-                    ratio(ratios, [1.0] * len(ratios)),
-                    at_most=AT_MOST,
-                )
-            )
-        yield Report("tuned", name, list(rows), claims, list(notes))
+            words = "time of an accuracy over the search, median of all"
+            report.claims[:] = [Claim(words, quartiles(ratios), at_most=AT_MOST)]
+        yield report
 
 
 def _row(case: Case) -> dict:

@@ -11,7 +11,9 @@ import os
 import runpy
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 if __name__ == "__main__":
     sys.path[0] = os.getcwd()
@@ -55,6 +57,12 @@ class Case:
     lanes: int = 1
     method: str = "auto"
 
+    @property
+    def label(self) -> str:
+        """In tables."""
+        lanes = f", {self.lanes} lanes" if self.lanes > 1 else ""
+        return f"{self.system}, {self.scheme}{lanes}{'' if self.method == 'auto' else f', {self.method}'}"
+
     def problem(self):
         """System and start."""
         if self.system in SCENES:
@@ -70,23 +78,20 @@ class Case:
         return vm.compose(scheme, composition) if composition else scheme
 
 
-class Timed:
-    """A run that takes turns with others; `end` is what a short call computes, `result` the status of a call."""
+class Timed(NamedTuple):
+    """What takes turns with others: its number of steps, the end of a short run, ``sample()`` in seconds, the worst status of a run."""
 
     num_steps: int
     end: np.ndarray
+    sample: Callable[[], float]
     result: str = ""
 
-    def sample(self) -> float:
-        """Seconds."""
-        raise NotImplementedError
 
-    def keep(self, short, whole) -> None:
-        """The end of the first run, and the worst status of the second."""
-        nodes = short.states  # vectors, also where a run has dictionaries
-        q = np.concatenate([np.asarray(nodes.q_s), np.asarray(nodes.q_f)], axis=-1)
-        self.end = q[..., -1, :]
-        self.result = vm.Result(int(np.max(np.asarray(whole.result)))).name
+def timed(short: vm.Trajectory, whole: vm.Trajectory, num_steps: int, sample: Callable[[], float]) -> Timed:
+    """The end of a short run and the status of a whole one."""
+    nodes = short.states  # vectors, also where a run has dictionaries
+    q = np.concatenate([np.asarray(nodes.q_s), np.asarray(nodes.q_f)], axis=-1)
+    return Timed(num_steps, q[..., -1, :], sample, vm.Result(int(np.max(np.asarray(whole.result)))).name)
 
 
 def last_node(macro_dt: float, num_steps: int) -> dict:
@@ -109,98 +114,71 @@ def simulator(case: Case):
     return simulate
 
 
-class Single(Timed):
+def prepared(case: Case):
+    """The same by `vm.prepare`."""
+    problem = case.problem()
+    run = vm.prepare(problem.system, case.made_scheme(), problem.state(), macro_dt=case.macro_dt, num_steps=1)
+    return lambda num_steps: run(num_steps=num_steps, throw=False)
+
+
+def single(case: Case) -> Timed:
     """`vm.simulate`: seconds of the steps, what a call of one step takes at least being subtracted."""
-
-    simulator = staticmethod(simulator)
-
-    def __init__(self, case: Case):
-        self.simulate = self.simulator(case)
-        self.num_steps = case.num_steps or _steps_for(self.simulate, case.seconds)
-        self.keep(self.simulate(COMPARED), self.simulate(self.num_steps))
-        self.call = min(_seconds(self.simulate, 1) for _ in range(CALLS))
-
-    def sample(self) -> float:
-        """Of `num_steps - 1` steps."""
-        return _seconds(self.simulate, self.num_steps) - self.call
+    simulate = simulator(case)
+    n = case.num_steps or _steps_for(simulate, case.seconds)
+    call = min(_seconds(simulate, 1) for _ in range(CALLS))
+    return timed(simulate(COMPARED), simulate(n), n, lambda: _seconds(simulate, n) - call)
 
 
-class Call(Single):
-    """What a call of `vm.simulate` takes besides its steps."""
+def call(simulate: Callable, case: Case) -> Timed:
+    """What a call takes besides its steps: a call of one step, less a step."""
+    n = case.num_steps or _steps_for(simulate, case.seconds)
 
-    def sample(self) -> float:
-        """A call of one step, less a step."""
-        one = np.mean([_seconds(self.simulate, 1) for _ in range(CALLS)])
-        return float(one - (_seconds(self.simulate, self.num_steps) - one) / (self.num_steps - 1))
+    def sample() -> float:
+        one = np.mean([_seconds(simulate, 1) for _ in range(CALLS)])
+        return float(one - (_seconds(simulate, n) - one) / (n - 1))
 
-
-class Prepared(Call):
-    """What a call of a prepared run takes besides its steps."""
-
-    @staticmethod
-    def simulator(case: Case):
-        """The same by `vm.prepare`."""
-        problem = case.problem()
-        run = vm.prepare(problem.system, case.made_scheme(), problem.state(), macro_dt=case.macro_dt, num_steps=1)
-        return lambda num_steps: run(num_steps=num_steps, throw=False)
+    return timed(simulate(COMPARED), simulate(n), n, sample)
 
 
-class Batch(Timed):
+def batch(case: Case) -> Timed:
     """`vm.simulate_batch`: seconds of a call."""
+    problem, scheme = case.problem(), case.made_scheme()
+    states = starts(problem, case.lanes)
 
-    def __init__(self, case: Case):
-        problem, scheme = case.problem(), case.made_scheme()
-        states = starts(problem, case.lanes)
+    def simulate(num_steps: int):
+        return vm.simulate_batch(problem.system, scheme, states, **last_node(case.macro_dt, num_steps))
 
-        def simulate(num_steps: int):
-            return vm.simulate_batch(problem.system, scheme, states, **last_node(case.macro_dt, num_steps))
-
-        self.simulate = simulate
-        self.num_steps = case.num_steps or _steps_for(simulate, case.seconds, first=COMPARED, factor=16)
-        self.keep(simulate(COMPARED), simulate(self.num_steps))
-
-    def sample(self) -> float:
-        """Of one call."""
-        return _seconds(self.simulate, self.num_steps)
+    n = case.num_steps or _steps_for(simulate, case.seconds, first=COMPARED, factor=16)
+    return timed(simulate(COMPARED), simulate(n), n, lambda: _seconds(simulate, n))
 
 
-class First(Timed):
-    """The first result of a process."""
-
-    def __init__(self, case: Case):
-        self.num_steps = case.num_steps
-        run = simulator(case)(case.num_steps)
-        self.keep(run, run)
+def first(case: Case) -> Timed:
+    """The first result of a process, whose time is the time of the process."""
+    run = simulator(case)(case.num_steps)
+    return timed(run, run, case.num_steps, lambda: np.nan)
 
 
-class Gradient(Timed):
+def gradient(case: Case) -> Timed:
     """Reverse-mode derivative of the squared fast positions at the end with respect to the momenta of the start."""
+    problem, scheme = case.problem(), case.made_scheme()
+    state, steps = problem.state(), last_node(case.macro_dt, case.num_steps)
 
-    def __init__(self, case: Case):
-        problem, scheme = case.problem(), case.made_scheme()
-        state, steps = problem.state(), last_node(case.macro_dt, case.num_steps)
+    @jax.jit
+    @jax.grad
+    def slope(p_f):
+        start = vm.State(state.t, state.q_s, state.q_f, state.p_s, p_f)
+        return jnp.sum(vm.simulate(problem.system, scheme, start, **steps).q_f[-1] ** 2)
 
-        @jax.jit
-        @jax.grad
-        def gradient(p_f):
-            start = vm.State(state.t, state.q_s, state.q_f, state.p_s, p_f)
-            return jnp.sum(vm.simulate(problem.system, scheme, start, **steps).q_f[-1] ** 2)
-
-        self.gradient, self.at, self.num_steps = gradient, state.p_f, case.num_steps
-        self.end = np.asarray(gradient(state.p_f))
-
-    def sample(self) -> float:
-        """Of one call."""
-        return _seconds(self.gradient, self.at)
+    return Timed(case.num_steps, np.asarray(slope(state.p_f)), lambda: _seconds(slope, state.p_f))
 
 
-KINDS = {
-    "single": Single,
-    "call": Call,
-    "prepared": Prepared,
-    "batch": Batch,
-    "first": First,
-    "gradient": Gradient,
+KINDS: dict[str, Callable[[Case], Timed]] = {
+    "single": single,
+    "call": lambda case: call(simulator(case), case),
+    "prepared": lambda case: call(prepared(case), case),
+    "batch": batch,
+    "first": first,
+    "gradient": gradient,
 }
 
 
@@ -249,19 +227,20 @@ def main() -> None:
     vm.configure(cache=None)
     for name in options.plain:
         use_plain(name)
-    timed = Timed()
+    made: Timed | None = None
     for line in sys.stdin:
         question = json.loads(line)
         try:
             if question["do"] == "make":
-                timed = Timed()  # nothing of the last one stays
+                made = None  # nothing of the last one stays
                 jax.clear_caches()
-                timed = KINDS[question["case"]["kind"]](Case(**question["case"]))
-                end = np.ravel(timed.end).tolist()
-                answer: dict = {"num_steps": timed.num_steps, "end": end, "result": timed.result}
+                made = KINDS[question["case"]["kind"]](Case(**question["case"]))
+                end = np.ravel(made.end).tolist()
+                answer: dict = {"num_steps": made.num_steps, "end": end, "result": made.result}
                 answer["processor"] = time.process_time()
             else:
-                answer = {"seconds": timed.sample()}
+                assert made is not None
+                answer = {"seconds": made.sample()}
         except Exception as error:  # the other side goes on
             answer = {"error": f"{type(error).__name__}: {error}"}
         print(json.dumps(answer), file=answers, flush=True)

@@ -9,6 +9,6 @@ The bound: if single steps are as long as micro steps of the same error, N of th
 ``v + N w``.
 """
 
-from benchmarks.dear.compare import COLUMNS, run, sizes
+from benchmarks.dear.compare import run, sizes
 
-__all__ = ["COLUMNS", "run", "sizes"]
+__all__ = ["run", "sizes"]

@@ -10,26 +10,27 @@ import jax.numpy as jnp
 import numpy as np
 
 import vmri_jax as vm
-from benchmarks.dear.figures import draw_errors, ratio_at, time_to
+from benchmarks.dear.figures import bound, draw_errors, ratio_at, time_to
 from benchmarks.dear.peers import FIXED_STEPS, PEERS, chosen
 from benchmarks.dear.spacecraft import spacecraft
 from benchmarks.dear.systems import MIDDLE, molecules, teacher
-from benchmarks.measure import Ratio, Tell, silent
+from benchmarks.measure import Tell, exactly, interleaved, silent
+from benchmarks.peers.cases import Ladder, doubled_steps
+from benchmarks.peers.scan import Climb, Point
 from benchmarks.report import Claim, Report
 from vmri_jax import plots
 from vmri_jax.running.simulation import Simulation
-from vmri_jax.running.timing import interleaved, seconds_each, stopwatch
+from vmri_jax.running.timing import seconds_each
 from vmri_jax.study.reference_solution import joined
 
-COLUMNS = ("system", "scheme", "H", "error", "ms", "gain", "bound")
 TARGET = 1e-5
 """Error of the positions at the end at which times are compared."""
-RATIO = 2.0
-"""From one number of macro steps to the next."""
+COUNTS = 30
+"""Numbers of macro steps, each twice the one before, that are tried at most."""
 SLOWEST, SLOWEST_PEER = 60.0, 10.0
 """Seconds of a run of ours and of another program after which a ladder ends."""
 LONG = 5.0
-"""Seconds of a run above which the run that tells its error is the sample of its time; a smaller value lets compilation count."""
+"""Seconds of a run above which it is not timed again, in turn with the others; a larger value makes the benchmark take longer."""
 LINE = "kicks, N = 1"
 """The scheme whose time the gain of every other one is measured by."""
 
@@ -97,11 +98,7 @@ def _cases(name: str) -> list[Case]:
 
 
 Curve = tuple[np.ndarray, np.ndarray, np.ndarray]
-"""Numbers of macro steps, errors and milliseconds."""
-
-
-Rungs = Iterator[tuple[int, Callable[[], np.ndarray], Callable[[], object]]]
-"""Numbers of macro steps, functions that give the positions at the end, and runs for the clock."""
+"""Numbers of macro steps or tolerances, errors and milliseconds."""
 
 
 @dataclass(frozen=True)
@@ -122,29 +119,28 @@ class Gain:
 
 def run(cases: list[Case], name: str, tell: Tell = silent) -> Iterator[Report]:
     """A report after each system."""
-    rows, claims, notes, curves, gains = [], [], [], {}, []
+    curves, gains = {}, []
+    report = Report("dear", name, about={"gains": []})
+    for suffix, theme in (("", plots.LIGHT), ("_dark", plots.DARK)):
+        report.figures[f"dear{suffix}"] = partial(draw_errors, curves, gains, TARGET, theme)
     for case in cases:
         problem = case.problem()
         slow, fast = _prices(problem)
+        price = slow / fast
         peers, missing = chosen(problem) if case.peers else ([], [])
         of_case = measured(case, problem, peers, tell)
-        rows += [
-            _row(case, of_case, scheme, i, slow / fast) for scheme in of_case for i in range(len(of_case[scheme][0]))
-        ]
+        for scheme, (steps, *_) in of_case.items():
+            report.rows.extend(_row(case, of_case, scheme, i, price) for i in range(len(steps)))
         to_target = {scheme: time_to(TARGET, *curve) for scheme, curve in of_case.items()}
-        claims += _claims(case, to_target, peers)
-        gains += _gain(case, to_target, slow / fast)
+        report.claims.extend(_claims(case, to_target, peers))
+        gains += _gain(case, to_target, price)
+        report.about["gains"] = [vars(gain) for gain in gains]
         if case.composed:
             curves[case.title] = of_case
-        notes.append(
-            f"{case.title}: a gradient of V takes {1e6 * slow:.3g} µs, {slow / fast:.3g} times as long as one of W."
-        )
-        notes += [note for note in missing if note not in notes]
-        figures = {}
-        for suffix, theme in (("", plots.LIGHT), ("_dark", plots.DARK)):
-            figures[f"dear{suffix}"] = partial(draw_errors, dict(curves), list(gains), TARGET, theme)
-        about = {"gains": [vars(gain) for gain in gains]}
-        yield Report("dear", name, list(rows), list(claims), list(notes), figures, about)
+        taken = f"{1e6 * slow:.3g} µs, {price:.3g} times as long as one of W"
+        for note in (f"{case.title}: a gradient of V takes {taken}.", *missing):
+            report.note(note)
+        yield report
 
 
 def _row(case: Case, curves: dict[str, Curve], scheme: str, i: int, price: float) -> dict:
@@ -155,11 +151,6 @@ def _row(case: Case, curves: dict[str, Curve], scheme: str, i: int, price: float
     row = {"system": case.title, "scheme": scheme, "H": case.t_end / steps if has_steps else None, "error": errors}
     kicks = scheme.startswith("kicks, N = ")
     return row | {"ms": ms, "gain": gain, "bound": bound(int(scheme.split()[-1]), price) if kicks else None}
-
-
-def bound(num_micro: int, price: float) -> float:
-    """``N (v + w) / (v + N w)`` for a price v / w."""
-    return num_micro * (price + 1) / (price + num_micro)
 
 
 def _claims(case: Case, to_target: dict[str, float], peers: list[str]) -> list[Claim]:
@@ -181,8 +172,7 @@ def _claims(case: Case, to_target: dict[str, float], peers: list[str]) -> list[C
 
 def _claim(name: str, ms: float, best: float) -> Claim:
     """Times to the target, one over the other."""
-    ratio = ms / best if np.isfinite(best) else np.nan
-    return Claim(f"{name} at {TARGET:g}", Ratio(ratio, ratio, ratio))
+    return Claim(f"{name} at {TARGET:g}", exactly(ms / best if np.isfinite(best) else np.nan))
 
 
 def _gain(case: Case, to_target: dict[str, float], price: float) -> list[Gain]:
@@ -199,45 +189,50 @@ def measured(case: Case, problem: vm.Problem, peers: Iterable[str], tell: Tell) 
     tell(f"{case.title}, fine steps")
     length = {"macro_dt": case.t_end / case.fine, "num_steps": case.fine, "save": case.fine}
     exact, _ = joined(vm.simulate(problem, vm.compose(vm.fully_explicit(10), "kahan-li8"), **length))
-    runs: dict[str, Callable[[], object]] = {}
-    errors: dict[str, dict[int, float]] = {}
-    samples: dict[str, list[float]] = {}
+    points: dict[str, dict[float, Point]] = {}
+    clocks: dict[str, Callable[[], object]] = {}
 
-    def climb(scheme: str, rungs: Rungs, slowest: float = SLOWEST) -> None:
-        """Runs of more and more steps, within the errors that are looked at."""
-        errors[scheme] = {}
-        for n, positions, timed in rungs:
-            tell(f"{case.title}, {scheme}, {n}")
-            elapsed = stopwatch()
-            error = float(np.abs(positions() - exact[-1]).max())
-            seconds = elapsed()
-            if error <= case.errors[0]:
-                errors[scheme][n] = error
-                if seconds > LONG:
-                    samples[f"{scheme}: {n}"] = [seconds]
-                else:
-                    runs[f"{scheme}: {n}"] = timed
-            if error < case.errors[1] or seconds > slowest:
-                return
+    def climb(scheme: str, ladder: Ladder, slowest: float, timed: Callable = lambda point, _: point.run) -> None:
+        """Runs of more and more steps, within the errors that are looked at; `timed` of them for the clock."""
+        rungs = Climb(scheme, ladder, lambda end: float(np.abs(end - exact[-1]).max()))
+        for setting in ladder.settings:
+            tell(f"{case.title}, {scheme}, {setting:g}")
+            point = rungs.add(setting)
+            if point.error < case.errors[1] or point.seconds > slowest:
+                break
+        points[scheme] = {setting: point for setting, point in rungs.rungs.items() if point.error <= case.errors[0]}
+        short = {setting: point for setting, point in points[scheme].items() if point.seconds <= LONG}
+        clocks.update({f"{scheme}: {setting}": timed(point, setting) for setting, point in short.items()})
 
     for scheme, (of_scheme, integrator) in schemes(case, problem).items():
+        run = vm.prepare(of_scheme, integrator, macro_dt=case.t_end, num_steps=1)
         first = max(1, case.first // 16) if isinstance(integrator, vm.Composition) else case.first
-        climb(scheme, _rungs(vm.prepare(of_scheme, integrator, macro_dt=case.t_end, num_steps=1), first))
+        ladder = doubled_steps(scheme, first, COUNTS, partial(_end, run))
+        climb(scheme, ladder, SLOWEST, lambda _, n, run=run: run.timed(**_steps(run, n)))
     fastest = max(case.num_micro)
     for peer in peers:
         name = f"{peer}, N = {fastest}" if peer in FIXED_STEPS else peer
-        rungs = PEERS[peer](problem, case.t_end, fastest)
-        climb(name, ((n, positions, positions) for n, positions in rungs), SLOWEST_PEER)
+        climb(name, PEERS[peer](problem, case.t_end, fastest), SLOWEST_PEER)
     tell(f"{case.title}, measuring times")
-    seconds = samples | interleaved(runs, case.repeats)
+    seconds = interleaved(clocks, case.repeats)
     return {
         scheme: (
             np.array(list(ladder)),
-            np.array(list(ladder.values())),
-            np.array([1e3 * np.median(seconds[f"{scheme}: {n}"]) for n in ladder]),
+            np.array([point.error for point in ladder.values()]),
+            np.array([1e3 * np.median(seconds.get(f"{scheme}: {n}", point.seconds)) for n, point in ladder.items()]),
         )
-        for scheme, ladder in errors.items()
+        for scheme, ladder in points.items()
     }
+
+
+def _steps(run: Simulation, num_steps: int) -> dict[str, Any]:
+    """Arguments of a run of this number of steps, as long as the prepared one of one step."""
+    return {"macro_dt": run.macro_dt / num_steps, "num_steps": num_steps}
+
+
+def _end(run: Simulation, num_steps: int) -> Callable[[], np.ndarray]:
+    """The positions at the end of a run of this number of steps."""
+    return lambda: joined(run(**_steps(run, num_steps), throw=False))[0][-1]
 
 
 def schemes(case: Case, problem: vm.Problem) -> dict[str, tuple[vm.Problem, Any]]:
@@ -255,15 +250,6 @@ def schemes(case: Case, problem: vm.Problem) -> dict[str, tuple[vm.Problem, Any]
         scheme = vm.fully_explicit(n).with_potentials(**placed)
         found[f"three rates, N = {n} and {n // case.every}"] = case.problem(three_rates=True), scheme
     return found
-
-
-def _rungs(run: Simulation, first: int) -> Rungs:
-    """Numbers of macro steps over the length of a run of one step, the positions at the end, and a run for the clock."""
-    n = first
-    while True:
-        length = {"macro_dt": run.macro_dt / n, "num_steps": n}
-        yield n, lambda length=length: joined(run(**length, throw=False))[0][-1], run.timed(**length)
-        n = round(n * RATIO)
 
 
 def _prices(problem: vm.Problem) -> tuple[float, float]:

@@ -1,6 +1,6 @@
 """Figures of the benchmark: error against time, and the gain of micro steps against the price of the slow force."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -33,44 +33,46 @@ def time_to(error: float, steps: np.ndarray, errors: np.ndarray, ms: np.ndarray)
     return np.inf if between is None else between
 
 
+def bound(num_micro: int, price):
+    """``N (v + w) / (v + N w)`` for a price v / w."""
+    return num_micro * (price + 1) / (price + num_micro)
+
+
+FAMILIES: dict[str, tuple[Callable[[str], bool], int | str, str, str, float]] = {
+    "single steps": (lambda name: name == "kicks, N = 1", 1, "-", "s", 1.8),
+    "micro steps": (lambda name: name.startswith("kicks, N = ") and name != "kicks, N = 1", 0, "-", "o", 2.6),
+    "order 4 or 6, single steps": (lambda name: name in {f"{c}, N = 1" for c in COMPOSED}, 1, ":", "D", 1.4),
+    "order 4 or 6, micro steps": (
+        lambda name: name.startswith(COMPOSED) and not name.endswith("N = 1"),
+        0,
+        ":",
+        "v",
+        1.4,
+    ),
+    "three rates": (lambda name: name.startswith("three rates"), 2, "-", "^", 2.0),
+    "one interval of degree 6": (lambda name: name.startswith("one interval"), 3, "-", "P", 1.4),
+    "diffrax": (lambda name: name.startswith("diffrax"), 4, "--", "s", 1.4),
+    "OpenMM": (lambda name: name.startswith("OpenMM"), "rod", "--", "D", 1.4),
+    "C loop": (lambda name: name.startswith("C loop"), "ink", "--", "^", 1.4),
+}
+"""Of each family: its schemes, the colour of the theme, line, marker and width. Micro steps are in full colour, single steps of the same order
+beside them, other programs dashed."""
+
+
 def families(curves: Mapping[str, Any], target: float) -> dict[str, tuple[str, Any]]:
     """The curves that are drawn, by family: single steps, and of all others the one that reaches the target first."""
-
-    def best(names: Sequence[str]) -> str | None:
-        return min(names, key=lambda name: time_to(target, *curves[name]), default=None)
-
-    groups = {
-        "single steps": [name for name in curves if name == "kicks, N = 1"],
-        "micro steps": [name for name in curves if name.startswith("kicks, N = ") and name != "kicks, N = 1"],
-        "order 4 or 6, single steps": [name for name in curves if name in {f"{c}, N = 1" for c in COMPOSED}],
-        "order 4 or 6, micro steps": [n for n in curves if n.startswith(COMPOSED) and not n.endswith("N = 1")],
-        "three rates": [name for name in curves if name.startswith("three rates")],
-        "one interval of degree 6": [name for name in curves if name.startswith("one interval")],
-        "diffrax": [name for name in curves if name.startswith("diffrax")],
-        "OpenMM": [name for name in curves if name.startswith("OpenMM")],
-        "C loop": [name for name in curves if name.startswith("C loop")],
-    }
-    chosen = {family: best(names) for family, names in groups.items()}
-    return {
-        family: (name, curves[name]) for family, name in chosen.items() if name is not None and len(curves[name][0])
-    }
+    chosen = {}
+    for family, (has, *_) in FAMILIES.items():
+        names = [name for name in curves if has(name)]
+        best = min(names, key=lambda name: time_to(target, *curves[name]), default=None)
+        if best is not None and len(curves[best][0]):
+            chosen[family] = best, curves[best]
+    return chosen
 
 
 def _look(family: str, theme: plots.Theme) -> dict[str, Any]:
-    """Micro steps in full colour, single steps of the same order beside them, other programs dashed."""
-    blue, orange, green, purple, gold, _ = theme.curves
-    looks = {
-        "single steps": (orange, "-", "s", 1.8),
-        "micro steps": (blue, "-", "o", 2.6),
-        "order 4 or 6, single steps": (orange, ":", "D", 1.4),
-        "order 4 or 6, micro steps": (blue, ":", "v", 1.4),
-        "three rates": (green, "-", "^", 2.0),
-        "one interval of degree 6": (purple, "-", "P", 1.4),
-        "diffrax": (gold, "--", "s", 1.4),
-        "OpenMM": (theme.rod, "--", "D", 1.4),
-        "C loop": (theme.ink, "--", "^", 1.4),
-    }
-    color, line, marker, width = looks[family]
+    _, color, line, marker, width = FAMILIES[family]
+    color = getattr(theme, color) if isinstance(color, str) else theme.curves[color]
     face = {"markerfacecolor": theme.paper, "markersize": 4.5}
     return {"color": color, "linestyle": line, "marker": marker, "linewidth": width, **face}
 
@@ -107,7 +109,7 @@ def _gain_panel(axes: Axes, gains: Sequence[Any], theme: plots.Theme) -> None:
     axes.set(xscale="log", yscale="log")
     prices = np.geomspace(1.0, 2.0 * max([gain.price for gain in gains], default=10.0), 100)
     for num_micro in sorted({gain.num_micro for gain in gains}):
-        bounds = num_micro * (prices + 1) / (prices + num_micro)
+        bounds = bound(num_micro, prices)
         axes.plot(prices, bounds, color=theme.rod, linewidth=1.0, linestyle="-")
         axes.annotate(
             f"N = {num_micro}", (prices[-1], bounds[-1]), (-2, 2), textcoords="offset points", ha="right", fontsize=8

@@ -1,71 +1,48 @@
-"""Other programs on the same problems: what each can state, and its runs from coarse to fine."""
+"""Other programs on the same problems: what each can state, and its ladder of settings."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from importlib.util import find_spec
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 import vmri_jax as vm
 from benchmarks import c_loops
 from benchmarks.dear.systems import BOND, STIFFNESS, bonds
 from benchmarks.peers import autodiff
-from benchmarks.peers.cases import Case
+from benchmarks.peers.cases import Case, Ladder, doubled_steps
 
-Runs = Iterator[tuple[int, Callable[[], np.ndarray]]]
-"""Number of macro steps, or -log2 of the tolerance, and a function that gives the positions at the end."""
-FIRST_STEPS, MOST_STEPS = 16, 2**20
-"""Macro steps of the first and the longest run of programs with fixed steps."""
-LARGEST_POWER = 43
-"""Bound of the powers: tolerances stay above ``2^-43``, about 1e-13. Below, round-off of float64 lets errors fall no further."""
-STRIDE = 3
-"""Step from one power to the next, so that each tolerance is an eighth of the one before; a larger step leaves a coarser staircase."""
+FIRST_STEPS, COUNTS = 16, 17
+"""Macro steps of the first run of programs with fixed steps, and numbers of runs: up to 2^20 steps."""
 
 
-def diffrax(problem: vm.Problem, t_end: float, num_micro: int) -> Runs:
-    """Dopri8 with adaptive steps and tolerances ``2^-power``, equations by automatic differentiation of the same potentials."""
-    import diffrax  # pyright: ignore[reportMissingImports]
+def diffrax(problem: vm.Problem, t_end: float, num_micro: int) -> Ladder:
+    """Dopri8 with adaptive steps, equations by automatic differentiation of the same potentials."""
+    from benchmarks.peers import diffrax
 
-    from benchmarks.peers.diffrax import solution
-
-    case = Case("", "", problem, t_end, problem.q_f)
-    solve, start = jax.jit(solution(case, diffrax.Dopri8(), autodiff)), (jnp.asarray(case.q), jnp.asarray(case.v))
-    for power in range(7, LARGEST_POWER, STRIDE):
-        yield power, lambda tolerance=2.0**-power: np.asarray(solve(start, tolerance))
+    return diffrax.ladders(Case("", "", problem, t_end, problem.q_f), autodiff)[0]
 
 
-def openmm(problem: vm.Problem, t_end: float, num_micro: int) -> Runs:
+def openmm(problem: vm.Problem, t_end: float, num_micro: int) -> Ladder:
     """Its r-RESPA integrator in doubles on the Reference platform: all pairs at macro nodes, bonds at micro nodes."""
     import openmm as mm  # pyright: ignore[reportMissingImports]
 
-    n = problem.q_f.size // 3
+    from benchmarks.peers.openmm import FAST, SLOW, add_forces, context_of, end_of
+
     system, stiff, soft = mm.System(), mm.HarmonicBondForce(), mm.NonbondedForce()
     soft.setNonbondedMethod(mm.NonbondedForce.NoCutoff)
-    for _ in range(n):
+    for i in range(problem.q_f.size // 3):
         system.addParticle(1.0)
         soft.addParticle(0.0, 1.0, 1.0)  # charge, diameter, depth
-    for i in range(0, n, 2):
-        stiff.addBond(i, i + 1, BOND, STIFFNESS)
-        soft.addException(i, i + 1, 0.0, 1.0, 0.0)
-    for group, force in enumerate((soft, stiff)):
-        force.setForceGroup(group)
-        system.addForce(force)
-    integrator = mm.MTSIntegrator(1e-3, [(0, 1), (1, num_micro)])
-    context = mm.Context(system, integrator, mm.Platform.getPlatformByName("Reference"))
+        if i % 2:
+            stiff.addBond(i - 1, i, BOND, STIFFNESS)
+            soft.addException(i - 1, i, 0.0, 1.0, 0.0)
+    add_forces(system, {soft: SLOW, stiff: FAST})
+    context = context_of(system, num_micro)
     x, v = (np.asarray(a, dtype=float).reshape(-1, 3) for a in (problem.q_f, problem.v_f))
-
-    def run(num_steps: int) -> np.ndarray:
-        integrator.setStepSize(t_end / num_steps)
-        context.setPositions(x)
-        context.setVelocities(v)
-        integrator.step(num_steps)
-        return np.asarray(context.getState(positions=True).getPositions(asNumpy=True)._value).reshape(-1)
-
-    return _doubled(run)
+    return _doubled(lambda num_steps: end_of(context, x, v, t_end, num_steps).reshape(-1))
 
 
-def c_loop(problem: vm.Problem, t_end: float, num_micro: int) -> Runs:
+def c_loop(problem: vm.Problem, t_end: float, num_micro: int) -> Ladder:
     """The impulse method by hand."""
 
     def run(num_steps: int) -> np.ndarray:
@@ -74,11 +51,8 @@ def c_loop(problem: vm.Problem, t_end: float, num_micro: int) -> Runs:
     return _doubled(run)
 
 
-def _doubled(run: Callable[[int], np.ndarray]) -> Runs:
-    num_steps = FIRST_STEPS
-    while num_steps <= MOST_STEPS:
-        yield num_steps, lambda n=num_steps: run(n)
-        num_steps *= 2
+def _doubled(run: Callable[[int], np.ndarray]) -> Ladder:
+    return doubled_steps("", FIRST_STEPS, COUNTS, lambda num_steps: lambda: run(num_steps))
 
 
 PEERS = {"diffrax Dopri8": diffrax, "OpenMM": openmm, "C loop": c_loop}

@@ -17,9 +17,10 @@ from vmri_jax.running.progress import Progress, silent
 from vmri_jax.running.simulation import Simulation
 from vmri_jax.running.timing import interleaved, stopwatch
 from vmri_jax.running.trajectory import Trajectory
+from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.results import Method, Result
-from vmri_jax.study.table import Column, ResultTable
+from vmri_jax.study.table import ResultTable
 
 
 @dataclass(frozen=True)
@@ -59,17 +60,7 @@ class CostRow:
 class CostStudy(ResultTable):
     """Rows of one or several cost studies."""
 
-    columns = (
-        Column("what", lambda row: row.label),
-        Column("method", lambda row: row.method),
-        Column("solved by", lambda row: row.solved_by),
-        Column("num_micro", lambda row: f"{row.num_micro}", right=True),
-        Column("unknowns", lambda row: f"{row.num_unknowns:,}", right=True),
-        Column("µs per micro step", lambda row: f"{row.us_per_micro_step:.3g}", right=True),
-        Column("first call, s", lambda row: f"{row.first_call_seconds:.2g}", right=True),
-        Column("iterations", lambda row: f"{row.iterations}", right=True),
-        Column("result", lambda row: row.result),
-    )
+    columns = ()  # files alone hold them
     rows: tuple[CostRow, ...]
 
     @property
@@ -170,14 +161,13 @@ def _row(
     seconds_in_short_steps: Sequence[float],
 ) -> CostRow:
     """The row of a run with its samples of seconds."""
-    scheme, state = program.scheme, program.state
-    n_g, n_gs = program.system.num_constraints(state.q_s, state.q_f)
+    scheme = program.scheme
     micro_steps = program.num_steps * scheme.num_micro
     return CostRow(
         label=label,
         method=curve.method,
         num_micro=scheme.num_micro,
-        num_unknowns=scheme.degree * (state.q_s.size + n_gs + scheme.num_micro * (state.q_f.size + n_g)),
+        num_unknowns=unknowns(curve.problem, scheme),
         num_steps=program.num_steps,
         seconds_per_unit=float(np.median(seconds)) / (program.num_steps * float(program.macro_dt)),
         us_per_micro_step=1e6 * float(np.median(seconds)) / micro_steps,
@@ -188,6 +178,12 @@ def _row(
         us_in_short_step=1e6 * float(np.median(seconds_in_short_steps)) / micro_steps,
         samples=tuple(1e6 * s / micro_steps for s in seconds),
     )
+
+
+def unknowns(problem: Problem, scheme: Scheme | Composition) -> int:
+    """Unknowns of one macro step, all of them solved for at once."""
+    n_g, n_gs = problem.system.num_constraints(problem.q_s, problem.q_f)
+    return scheme.degree * (problem.q_s.size + n_gs + scheme.num_micro * (problem.q_f.size + n_g))
 
 
 def plot_cost(
@@ -207,14 +203,10 @@ def plot_cost(
     columns = 2 if len(studies) == 4 else min(3, len(studies))
     height = 0.6 + 2.7 * math.ceil(len(studies) / columns)
     with plots.new_figure(max(5.2, 0.6 + 3.0 * columns), height, title, theme) as figure:
-        grid = plots.panel_grid(figure, len(studies), columns)
+        grid = plots.panel_grid(figure, len(studies), columns, "micro steps per macro step", "µs per micro step")
         for axes, (name, study) in zip(grid, studies.items(), strict=True):
             _cost_panel(axes, study, (paper_minima or {}).get(name), theme)
             axes.set(title=name)
-        for axes in grid[-columns:]:
-            axes.set(xlabel="micro steps per macro step")
-        for axes in grid[::columns]:
-            axes.set(ylabel="µs per micro step")
         plots.legend_below(figure)
     return figure
 

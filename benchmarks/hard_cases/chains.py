@@ -1,12 +1,9 @@
 """A constraint that hardly sees the fast variables, linkages through singular configurations, a chain that hardly stretches."""
 
-from functools import partial
-
 import numpy as np
 
 import vmri_jax as vm
-from benchmarks.hard_cases.case import hard_case, iterations
-from benchmarks.hard_cases.pictures import draw_singular
+from benchmarks.hard_cases import hard_case, iterations
 from benchmarks.hard_cases.systems import four_bar, link_chain, nearly_slow_constraint, stiff_chain
 from vmri_jax.hard_cases import Outcome
 from vmri_jax.hard_cases.measures import constraints, energy, refusal, run, status
@@ -63,7 +60,6 @@ def singular_configuration(full: bool) -> Outcome:
         f"{failed + '; ' if failed else ''}constraint {worst:.0e}; energy error, in brackets generic: {sizes}",
         not failed and worst < 1e-10 and bounded,
         {"constraint": worst, **{f"energy_{name}": here for name, (here, _) in band.items()}},
-        partial(draw_singular, met["turning"], met["chain"]),
     )
 
 

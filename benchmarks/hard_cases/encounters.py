@@ -7,8 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import vmri_jax as vm
-from benchmarks.hard_cases.case import hard_case
-from benchmarks.hard_cases.pictures import draw_oscillatory_energies
+from benchmarks.hard_cases import hard_case
 from benchmarks.hard_cases.systems import bouncing_ball, three_scales, two_body
 from vmri_jax.hard_cases import Outcome
 from vmri_jax.hard_cases.measures import energy, long_run, run, status
@@ -115,5 +114,4 @@ def three_time_scales(full: bool) -> Outcome:
         f"I_3 stays below {third:.0e}",
         coarse.success and at_end[:2].max() < 0.05 and third < 0.05,
         {"I_1": at_end[0], "I_2": at_end[1], "I_3": third},
-        partial(draw_oscillatory_energies, np.asarray(coarse.t), *actions),
     )

@@ -1,17 +1,13 @@
-"""Explicit limit, large and tiny steps, mass ratios, very many micro steps."""
-
-from functools import partial
+"""Explicit limit, large steps, mass ratios."""
 
 import numpy as np
 
 import vmri_jax as vm
 from benchmarks.gail2014.dense import dense
-from benchmarks.hard_cases.case import hard_case, iterations
-from vmri_jax.accuracy.companions import positions
+from benchmarks.hard_cases import hard_case, iterations
 from vmri_jax.diagnostics import step_condition
 from vmri_jax.hard_cases import Outcome
-from vmri_jax.hard_cases.measures import constraints, difference, energy, run, status
-from vmri_jax.running.timing import interleaved
+from vmri_jax.hard_cases.measures import energy, run, status
 
 EXACT = vm.Solver("exact")
 """Exact matrices, which a pass may take over from those before it: they have to converge."""
@@ -109,49 +105,4 @@ def mass_ratios(full: bool) -> Outcome:
         f"at most {worst:.0f} iterations ({values['iterations_1e+06']:.0f} at 1e6), scaled condition {condition:.0f}",
         worst <= 5 and condition < 100,
         values,
-    )
-
-
-@hard_case("tiny steps")
-def tiny_steps(full: bool) -> Outcome:
-    """triple pendulum, H from 0.1 to 1e-6
-
-    scaled condition flat, round-off floor stated
-    """
-    problem = vm.systems.triple_spherical_pendulum()
-    state, steps = problem.state(), 10.0 ** -np.arange(1.0, 7.0)
-    conditions = np.array([step_condition(problem.system, PENDULUM, state, macro_dt=h) for h in steps])
-    floor = _pendulum_run(problem, 1e-6, 10_000 if full else 1_000)
-    error = energy(floor, 1, float(floor.energy[0])).band
-    flat = conditions[1:].max() / conditions[1:].min()  # H = 0.1 is no small step
-    return Outcome(
-        f"scaled condition {conditions.min():.0f} to {conditions.max():.0f} for H = 0.1 to 1e-6; at H = 1e-6 {status(floor)}, "
-        f"constraint {constraints(floor)[0]:.0e}, relative energy error {error:.0e} (round-off)",
-        flat < 1.1 and conditions.max() < 100 and floor.success and constraints(floor)[0] < 1e-13,
-        {f"condition_{h:.0e}": c for h, c in zip(steps, conditions, strict=True)} | {"energy_floor": error},
-    )
-
-
-@hard_case("very many micro steps")
-def many_micro_steps(full: bool) -> Outcome:
-    """FPU chain, H = 0.1, num_micro 200 to 5000
-
-    time linear (slope 1 within 0.15), equal to the dense solve to 1e-11
-    """
-    problem, macro_dt, micro = vm.systems.fermi_pasta_ulam(), 0.1, (200, 1000, 5000)
-
-    def end(num_micro, steps, solver=None):  # one saved node: one program for each num_micro
-        scheme = vm.fully_implicit(num_micro)
-        return positions(run(problem, scheme, macro_dt, steps, save=steps, solver=solver))[-1]
-
-    steps = {n: (20 if full else 5) * micro[-1] // n for n in micro}  # as many micro steps for each
-    runs = {f"{n}": partial(end, n, steps[n]) for n in micro}
-    seconds = interleaved(runs, 40 if full else 20, min_seconds=0.0)
-    best = {n: min(seconds[f"{n}"]) / steps[n] for n in micro}
-    slope = np.polyfit(np.log(micro), np.log(list(best.values())), 1)[0]
-    apart = difference(end(micro[0], 3), end(micro[0], 3, dense()))
-    return Outcome(
-        f"time over num_micro {micro[0]} to {micro[-1]}: slope {slope:.2f}; from the dense solve at 200: {apart:.0e}",
-        abs(slope - 1) <= 0.15 and apart < 1e-11,
-        {"slope": slope, "from_dense": apart, **{f"seconds_{n}": s for n, s in best.items()}},
     )

@@ -6,7 +6,7 @@ from functools import partial
 import numpy as np
 
 import vmri_jax as vm
-from benchmarks.hard_cases.case import hard_case
+from benchmarks.hard_cases import hard_case
 from benchmarks.hard_cases.systems import cubic_chain, swapped_chain
 from vmri_jax.hard_cases import Outcome
 from vmri_jax.hard_cases.measures import energy, long_run, status

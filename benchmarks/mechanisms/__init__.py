@@ -1,5 +1,5 @@
 """Mechanisms by directors, in joint coordinates and by other integrators, at equal error."""
 
-from benchmarks.mechanisms.compare import COLUMNS, run, sizes
+from benchmarks.mechanisms.compare import run, sizes
 
-__all__ = ["COLUMNS", "run", "sizes"]
+__all__ = ["run", "sizes"]

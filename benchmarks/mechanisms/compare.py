@@ -1,6 +1,6 @@
 """Mechanisms by directors, in joint coordinates and by other integrators: the time to reach an error."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -13,13 +13,12 @@ from benchmarks.mechanisms.ways import ways
 from benchmarks.peers import figures
 from benchmarks.peers.cases import NotRepresentable
 from benchmarks.peers.scan import Point, candidates, scan
-from benchmarks.report import Report, note
+from benchmarks.report import Report
 
 LEVELS = (1e-3, 1e-5)
 """Largest errors of the centres of bars at the end, over the size of the mechanism."""
 FINEST = 1e-8
 """The smallest error asked for in full runs."""
-COLUMNS = ("mechanism", "level", "way", "setting", "step, s", "error", "µs per s", "quartiles", "to best", "first, s")
 OURS = ("joint", "directors", "functions")
 """How the names of this toolkit's ways begin."""
 
@@ -51,44 +50,24 @@ def sizes(name: str, only: Sequence[str] = (), way: Sequence[str] = ()) -> Size:
     return Size(tuple(chosen), (1, 5, 10, 50), (10,), (*LEVELS, FINEST), 2.0, 5, tuple(way))
 
 
-@dataclass(frozen=True)
-class Judged:
-    """What errors of one way are measured against.
-
-    q_end: (bars, 2) centres at the end.
-    centres: of what a run returns.
-    """
-
-    q_end: np.ndarray
-    size: float
-    centres: Callable
-
-    def error(self, q) -> float:
-        """The largest distance of a coordinate over the size; infinite for a run that failed."""
-        if isinstance(q, np.ndarray) and not np.all(np.isfinite(q)):
-            return np.inf
-        error = float(np.abs(self.centres(q) - self.q_end).max()) / self.size
-        return error if np.isfinite(error) else np.inf
-
-
 def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
     """A report after each mechanism."""
-    rows, notes = [], []
     found: dict[str, dict[str, list[Point]]] = {}
+    report = Report("mechanisms", name, figures={"mechanisms": partial(draw, found)})
     for title in size.mechanisms:
         mechanism = CASES[title]()
-        found[title] = scanned(mechanism, title, size, notes, tell)
+        found[title] = scanned(mechanism, title, size, report, tell)
         tell(f"{title}, timing")
-        rows += timed(mechanism, title, found[title], size)
-        yield Report("mechanisms", name, list(rows), [], list(notes), {"mechanisms": partial(draw, dict(found))})
+        report.rows.extend(timed(mechanism, title, found[title], size))
+        yield report
 
 
-def scanned(mechanism: Mechanism, title: str, size: Size, notes: list[str], tell: Tell) -> dict[str, list[Point]]:
+def scanned(mechanism: Mechanism, title: str, size: Size, report: Report, tell: Tell) -> dict[str, list[Point]]:
     """The runs of every way; ours, MuJoCo and Exudyn against DOP853, scipy and diffrax against Adams' methods."""
     tell(f"{title}, reference")
     end, other = mechanism.end("DOP853"), mechanism.end("LSODA")
     apart = float(np.abs(end - other).max()) / mechanism.size
-    notes.append(f"{title}: the two references differ by {apart:.0e}.")
+    report.note(f"{title}: the two references differ by {apart:.0e}.")
     found = {}
     for way, make in ways(mechanism, size.num_micro, size.by_directors).items():
         if size.ways and not way.startswith(size.ways):
@@ -97,13 +76,19 @@ def scanned(mechanism: Mechanism, title: str, size: Size, notes: list[str], tell
         try:
             ladder, centres = make()
         except ModuleNotFoundError as error:
-            note(notes, f"{way} was left out: there is no {error.name}; pip install -e '.[peers]' installs it.")
+            report.note(f"{way} was left out: there is no {error.name}; pip install -e '.[peers]' installs it.")
         except NotRepresentable as error:
-            note(notes, f"{title}: {way.partition(' ')[0]} was left out: {error}.")
+            report.note(f"{title}: {way.partition(' ')[0]} was left out: {error}.")
         else:
-            judge = Judged(other if way.startswith(("scipy", "diffrax")) else end, mechanism.size, centres)
-            found[way] = scan(way, [ladder], judge, size.seconds, size.levels)
+            judge = other if way.startswith(("scipy", "diffrax")) else end
+            error_of = partial(_error, mechanism, centres, judge)
+            found[way] = scan(way, [ladder], error_of, size.seconds, size.levels)
     return found
+
+
+def _error(mechanism: Mechanism, centres, judge: np.ndarray, end) -> float:
+    """The largest distance of a coordinate over the size; `centres` are of what a run returns."""
+    return float(np.abs(centres(end) - judge).max()) / mechanism.size
 
 
 def timed(mechanism: Mechanism, title: str, found: dict[str, list[Point]], size: Size) -> list[dict]:

@@ -8,7 +8,7 @@ and with loops c(q) = 0 that the coordinates leave, their multipliers beside a.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -94,8 +94,6 @@ class Mechanism:
     loops: Callable | None = None
     gravity: float = 0.0
     torque: float = 0.0
-    is_chain: bool = field(default=False, init=False)
-    """Not that of Fermi, Pasta and Ulam: integrators of `benchmarks.peers` ask."""
 
     # --- in the coordinates chosen by hand ----------------------------------------------------------------------------
     @property

@@ -13,10 +13,10 @@ import vmri_jax as vm
 from benchmarks.chains import Coordinates
 from benchmarks.mechanisms.plane import Mechanism
 from benchmarks.mechanisms.scenes import functions, scene
-from benchmarks.peers.cases import Ladder
+from benchmarks.peers.cases import Ladder, doubled_steps
 
-DOUBLINGS = 14
-"""Of a number of steps, at most."""
+COUNTS = 14
+"""Numbers of steps, each twice the one before, that are tried at most."""
 BY_HAND = SimpleNamespace(acceleration=lambda mechanism: mechanism.acceleration)
 """Equations as integrators of `benchmarks.peers` take them."""
 DEGREE = 2
@@ -53,11 +53,6 @@ def ways(mechanism: Mechanism, num_micro: tuple[int, ...], by_directors: tuple[i
     return found
 
 
-def doubled(name: str, first: int, build: Callable[[int], Callable[[], Any]]) -> Ladder:
-    """Numbers of steps, each twice the one before."""
-    return Ladder(name, "steps", [first * 2**k for k in range(DOUBLINGS)], build)
-
-
 def of_scene(mechanism: Mechanism, coordinates: Coordinates, scheme: vm.Scheme) -> Way:
     """The scene, macro steps; fewer at the coarsest with micro steps, since the macro step may be longer."""
 
@@ -88,14 +83,14 @@ def _ours(mechanism: Mechanism, made: Callable, scheme: vm.Scheme, first: int) -
     def build(num_steps: int):
         return partial(prepared(), num_steps=num_steps, macro_dt=mechanism.t_end / num_steps, throw=False)
 
-    return doubled("ours", first, build)
+    return doubled_steps("ours", first, COUNTS, build)
 
 
 def of_module(mechanism: Mechanism, module: str, name: str) -> Way:
     """MuJoCo and Exudyn: numbers of steps."""
     build = importlib.import_module(f"benchmarks.mechanisms.{module}").build
     build(mechanism, name, 1)  # says at once what it cannot state
-    return doubled(name, 2 * mechanism.steps, partial(build, mechanism, name)), np.asarray
+    return doubled_steps(name, 2 * mechanism.steps, COUNTS, partial(build, mechanism, name)), np.asarray
 
 
 def of_peer(mechanism: Mechanism, module: str, number: int) -> Way:

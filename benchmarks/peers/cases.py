@@ -13,8 +13,6 @@ from benchmarks.peers.mechanics import Particles
 
 LEVELS = (1e-2, 2e-4, 2e-6, 1e-8)
 """Largest errors ``max |q - q_ref|`` at the end that are asked for."""
-BATCH_LEVEL = 2e-4
-"""The same for batches, of the worst lane."""
 NAMES = ("FPU l=3 t=1", "FPU l=3 t=100", "FPU l=200 t=1", "TSP t=1", "TSP t=10", "SAM t=1", "SAM t=10")
 
 
@@ -74,9 +72,8 @@ class Case:
         return Particles.of(self.problem)
 
     def error(self, q) -> float:
-        """``max |q - q_end|``; infinite for a run that failed."""
-        error = float(np.max(np.abs(np.asarray(q) - self.q_end)))
-        return error if np.isfinite(error) else np.inf
+        """``max |q - q_end|``, no number for a run that failed."""
+        return float(np.max(np.abs(np.asarray(q) - self.q_end)))
 
 
 def case(name: str) -> Case:
@@ -115,6 +112,11 @@ class Ladder:
 def steps_ladder(case: Case, method: str, build: Callable[[int], Callable[[], Any]], first: float = 4.0) -> Ladder:
     """From `first` steps per unit of time up to 1e7."""
     return Ladder(method, "steps", step_counts(first * case.t_end, 1e7 * case.t_end), build)
+
+
+def doubled_steps(method: str, first: int, count: int, build: Callable[[int], Callable[[], Any]]) -> Ladder:
+    """`count` numbers of steps, each twice the one before."""
+    return Ladder(method, "steps", [first * 2**k for k in range(count)], build)
 
 
 def tolerances(first: float, last: float) -> list[float]:

@@ -2,23 +2,19 @@
 
 import importlib
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 
-import vmri_jax as vm
 from benchmarks.c_loops import NoCompiler
-from benchmarks.measure import Ratio, Tell, interleaved, quartiles, ratio, silent
+from benchmarks.measure import Ratio, Tell, exactly, interleaved, quartiles, ratio, silent
 from benchmarks.peers import autodiff, cases, figures
-from benchmarks.peers.cases import BATCH_LEVEL, LEVELS, Case, NotRepresentable
-from benchmarks.peers.ours import last_positions
+from benchmarks.peers.cases import LEVELS, Case, NotRepresentable
 from benchmarks.peers.scan import Point, candidates, scan
-from benchmarks.peers.targets import target
-from benchmarks.report import Claim, Report, note, spread
-from benchmarks.worker import starts
+from benchmarks.report import Claim, Report, spread
 
 OURS = "vmri_jax"
 PEERS = {
@@ -34,53 +30,52 @@ PEERS = {
     "C by hand": "c",
 }
 """Modules of this package by the name of the integrator; "autodiff" says where equations come from, see `load`."""
-BATCHED = (OURS, "heyoka", "diffrax", "diffrax, autodiff")
-BATCH = 1024
-FINE_STEPS = 1000
-"""Of the reference of a batch, whose error is then 1e-7, far below the level that is asked for."""
-BATCH_CASES = ("FPU l=3 t=1", "TSP t=1")
+OF_RODS = ("Exudyn", "MuJoCo")
+"""Multibody codes, which run points on rods and not the chain."""
+RODS = ("TSP t=1", "TSP t=10", "SAM t=1", "SAM t=10")
+TARGETS = (
+    (("FPU l=3 t=1",), ("diffrax", "scipy", "OpenMM"), LEVELS, 3.0),
+    (("FPU l=3 t=1",), ("heyoka",), (2e-4,), 1 / 3),
+    (("FPU l=3 t=1",), ("heyoka",), (1e-8,), 1 / 5),
+    (("FPU l=3 t=100",), ("diffrax", "scipy"), (1e-2, 2e-4), 5.0),
+    (("FPU l=200 t=1",), ("heyoka",), (1e-2, 2e-4), 8.0),
+    (("FPU l=200 t=1",), ("heyoka",), (2e-6,), 1.0),
+    (RODS, ("OpenMM", "Exudyn", "MuJoCo", "diffrax", "scipy"), LEVELS, 1.0),
+    (RODS, ("heyoka",), LEVELS, 1 / 5),
+)
+"""Some peers in some cases at some levels, and the least time over ours; below 1 it bounds how far we may be behind."""
 SLOW = 0.2
 """Runs longer than this many seconds are timed among themselves and with ours, with fewer samples."""
-TIMES = tuple(f"{level:.0e}" for level in LEVELS)
-COLUMNS = ("case", "peer", *TIMES, "trajectories/s", "best error", "energy differs", "build, s")
 
 
 @dataclass(frozen=True)
 class Size:
     """How much is run.
 
-    cases, batches: problems, single runs and batches of `BATCH`.
+    cases: names of problems.
     peers: names from `PEERS`; ours is always among them.
     seconds: the longest run of a ladder.
     repeats, slow_repeats: samples of fast and of slow runs.
     """
 
     cases: tuple[str, ...]
-    batches: tuple[str, ...]
     peers: tuple[str, ...]
     seconds: float
     repeats: int
     slow_repeats: int
-    batch: int = BATCH
 
 
 def sizes(name: str, only: Sequence[str] = (), peers: Sequence[str] = ()) -> Size:
     """ "quick" or "full"; `only` these cases, e.g. "TSP t=1" or "TSP", and `peers`."""
-    chosen = _chosen(cases.NAMES, only)
-    batches = _chosen([f"{case}, batch" for case in BATCH_CASES], only)
-    if not chosen and not batches:
+    chosen = [case for case in cases.NAMES if not only or case in only or case.startswith(tuple(f"{x} " for x in only))]
+    if not chosen:
         raise ValueError(f"peers: there is no case {' or '.join(only)}; there are {', '.join(cases.NAMES)}.")
     known = {peer.partition(",")[0] for peer in PEERS}
     if unknown := [peer for peer in peers if peer not in known]:
         raise ValueError(f"peers: there is no {', '.join(unknown)}; there are {', '.join(sorted(known))}.")
     named = tuple(peer for peer in PEERS if not peers or peer.partition(",")[0] in (OURS, *peers))
     seconds, repeats, slow = (1.0, 7, 2) if name == "quick" else (30.0, 15, 3)
-    return Size(tuple(chosen), tuple(batches), named, seconds, repeats, slow)
-
-
-def _chosen(names: Sequence[str], only: Sequence[str]) -> list[str]:
-    """Those asked for: by the whole name, else by its beginning."""
-    return [name for name in names if not only or name in only or any(name.startswith(f"{x} ") for x in only)]
+    return Size(tuple(chosen), named, seconds, repeats, slow)
 
 
 def load(peer: str) -> Any:
@@ -88,36 +83,24 @@ def load(peer: str) -> Any:
     module = importlib.import_module(f"benchmarks.peers.{PEERS[peer]}")
     if not peer.endswith("autodiff"):
         return module
-    given = {name: getattr(module, name) for name in ("ladders", "batch_ladders") if hasattr(module, name)}
-    return SimpleNamespace(energy=autodiff.energy, **{k: partial(f, equations=autodiff) for k, f in given.items()})
+    return SimpleNamespace(energy=autodiff.energy, ladders=partial(module.ladders, equations=autodiff))
 
 
 def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
     """Scan and time all of it, a report after each case."""
-    report = Report("peers", name, [], [], [])
+    report = Report("peers", name)
     found: dict[str, list[Point]] = {}
-
-    def add(case: Case, peers: Sequence[str], levels: Sequence[float], ladders_of) -> Report:
-        found[case.name] = _one(case, peers, levels, ladders_of, size, report, tell)
-        return replace(report, figures=figures.by_family(found, tuple(PEERS)))
-
     for title in size.cases:
-        yield add(cases.case(title), size.peers, LEVELS, lambda module, case: module.ladders(case))
-    for title in size.batches:
-        case, lanes = batch_case(title.removesuffix(", batch"), size.batch)
-        peers = [peer for peer in size.peers if peer in BATCHED]
-        yield add(case, peers, (BATCH_LEVEL,), lambda module, case, lanes=lanes: module.batch_ladders(case, *lanes))
+        found[title] = _one(cases.case(title), size, report, tell)
+        report.figures.update(figures.by_family(found, tuple(PEERS)))
+        yield report
 
 
-def batch_case(name: str, lanes: int) -> tuple[Case, tuple]:
-    """A case with `lanes` starts, and these: ``(states, q, v)``; the reference is a Gauss scheme of order 4."""
-    case = cases.case(name)
-    states = starts(case.problem, lanes)
-    steps = {"macro_dt": case.t_end / FINE_STEPS, "num_steps": FINE_STEPS, "save": FINE_STEPS}
-    end = vm.simulate_batch(case.problem.system, vm.galerkin(1, 2, "gauss"), states, **steps)
-    q = np.concatenate([states.q_s, states.q_f], axis=1)
-    v = np.concatenate([states.p_s, states.p_f], axis=1) / case.masses
-    return replace(case, name=f"{name}, batch", q_end=last_positions(end)), (states, q, v)
+def target(case: str, peer: str, level: float) -> float | None:
+    """The least ratio aimed at, None where there is none."""
+    return next(
+        (least for cases, peers, levels, least in TARGETS if case in cases and peer in peers and level in levels), None
+    )
 
 
 def energy_difference(module, case: Case) -> float:
@@ -125,34 +108,30 @@ def energy_difference(module, case: Case) -> float:
     return abs(module.energy(case) - case.energy) / abs(case.energy)
 
 
-def _one(case: Case, peers, levels, ladders_of, size: Size, report: Report, tell: Tell) -> list[Point]:
+def _one(case: Case, size: Size, report: Report, tell: Tell) -> list[Point]:
     """Adds rows, claims and notes of one case to the report; returns all points."""
-    title, is_batch = case.name, case.q_end.ndim == 2
+    title = case.name
     points: dict[str, list[Point]] = {}
-    differs: dict[str, float | None] = {}
-    for peer in peers:
+    differs: dict[str, float] = {}
+    for peer in [peer for peer in size.peers if not (case.is_chain and peer in OF_RODS)]:
         tell(f"{title}, {peer}")
         try:
             module = load(peer)
-            ladders = ladders_of(module, case)
-            differs[peer] = None if is_batch else energy_difference(module, case)
+            ladders = module.ladders(case)
+            differs[peer] = energy_difference(module, case)
         except ModuleNotFoundError as error:
-            note(report.notes, f"{peer} was left out: there is no {error.name}; pip install -e '.[peers]' installs it.")
+            report.note(f"{peer} was left out: there is no {error.name}; pip install -e '.[peers]' installs it.")
         except (NotRepresentable, NoCompiler) as error:
-            note(report.notes, f"{title}: {peer} was left out: {error}.")
+            report.note(f"{title}: {peer} was left out: {error}.")
         else:
-            points[peer] = scan(peer, ladders, case, size.seconds, levels)
+            points[peer] = scan(peer, ladders, case.error, size.seconds)
     tell(f"{title}, timing")
-    timed = _time(points, levels, size)
+    timed = _time(points, size)
     for peer, mine in points.items():
-        row = _row(title, peer, mine, levels, timed)
-        row["energy differs"] = differs[peer]
-        if is_batch and row["levels"]:
-            row["trajectories/s"] = len(case.q_end) / (1e-3 * row["levels"][0]["ms"])
-        report.rows.append(row)
-        if missed := [level for level in levels if (peer, level) not in timed]:
-            note(report.notes, f"{title}: {peer} does not reach {_why(mine, missed)}.")
-        for level in levels:
+        report.rows.append(_row(title, peer, mine, timed) | {"energy differs": differs[peer]})
+        if missed := [level for level in LEVELS if (peer, level) not in timed]:
+            report.note(f"{title}: {peer} does not reach {_why(mine, missed)}.")
+        for level in LEVELS:
             least = target(title, peer, level)
             if least is not None and (peer, level) in timed:
                 what = f"{title}, {level:.0e}: {peer} over ours"
@@ -169,9 +148,9 @@ class Timed:
     to_ours: Ratio
 
 
-def _time(points: Mapping[str, Sequence[Point]], levels, size: Size) -> dict[tuple[str, float], Timed]:
+def _time(points: Mapping[str, Sequence[Point]], size: Size) -> dict[tuple[str, float], Timed]:
     """Times of all candidates in turn: the fast ones together, the slow ones together, each with ours."""
-    chosen = {(peer, level): candidates(mine, level) for peer, mine in points.items() for level in levels}
+    chosen = {(peer, level): candidates(mine, level) for peer, mine in points.items() for level in LEVELS}
     fastest = {key: some[0].seconds for key, some in chosen.items() if some}
     found: dict[tuple[str, float], Timed] = {}
     for slow, repeats in ((False, size.repeats), (True, size.slow_repeats)):
@@ -191,15 +170,15 @@ def _time(points: Mapping[str, Sequence[Point]], levels, size: Size) -> dict[tup
         for key in keys:
             point, samples = best(key)
             mine = (OURS, key[1])
-            to_ours = ratio(samples, best(mine)[1]) if mine in fastest else Ratio(0.0, 0.0, 0.0)
+            to_ours = ratio(samples, best(mine)[1]) if mine in fastest else exactly(0.0)
             found[key] = Timed(point, samples, to_ours)
     return found
 
 
-def _row(title, peer, points: Sequence[Point], levels, timed) -> dict:
+def _row(title, peer, points: Sequence[Point], timed) -> dict:
     row: dict = {"case": title, "peer": peer}
     details = []
-    for level in levels:
+    for level in LEVELS:
         key = f"{level:.0e}"
         if (peer, level) not in timed:
             row[key] = "not reached"
@@ -211,8 +190,7 @@ def _row(title, peer, points: Sequence[Point], levels, timed) -> dict:
         details.append(detail | {"to ours": at.to_ours.value, "build, s": at.point.build + at.point.compile})
     row["best error"] = min((p.settled for p in points), default=np.inf)
     row["build, s"] = max((d["build, s"] for d in details), default=None)
-    scanned = [{"setting": p.label, "error": p.error, "seconds": p.seconds} for p in points]
-    return row | {"levels": details, "scan": scanned}
+    return row | {"levels": details}
 
 
 def _why(points: Sequence[Point], missed: Sequence[float]) -> str:

@@ -23,15 +23,12 @@ MARKERS = ("o", "s", "^", "2", "D", "1", "v", "P", "X", "<", ">", "*")
 
 
 def by_family(found: Mapping[str, Sequence[Point]], peers: Sequence[str]) -> dict[str, Callable[[], Figure]]:
-    """By file name, functions that draw; batches have a figure of their own."""
-    batches = {title: points for title, points in found.items() if title.endswith("batch")}
+    """By file name, functions that draw."""
     drawn: dict[str, Callable[[], Figure]] = {}
     for family, words in FAMILIES.items():
-        own = {title: found[title] for title in found if title.startswith(family) and title not in batches}
+        own = {title: found[title] for title in found if title.startswith(family)}
         if own:
             drawn[f"peers_{family.lower()}"] = partial(draw, own, peers, f"{words}: time to an error")
-    if batches:
-        drawn["peers_batch"] = partial(draw, batches, peers, "Batches of starts: time to an error of the worst lane")
     return drawn
 
 

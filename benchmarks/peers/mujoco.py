@@ -5,7 +5,7 @@ import mujoco
 import numpy as np
 
 from benchmarks.peers.cases import Case, Ladder, steps_ladder
-from benchmarks.peers.mechanics import Particles, from_masses, to_masses
+from benchmarks.peers.mechanics import Particles
 
 INERTIA = 1e-10
 """Of every mass about itself: MuJoCo knows no points. It moves no digit that is compared."""
@@ -55,17 +55,15 @@ def without_contacts():
 def prepare(case: Case):
     """Model, data and joint velocities at the start, where all joint positions are zero."""
     spec = without_contacts()
-    (_chain if case.is_chain else _particles)(case, spec)
+    _particles(case, spec)
     model = spec.compile()
     data = mujoco.MjData(model)
-    data.qvel[:] = to_masses(case.v) if case.is_chain else _velocities(case)
+    data.qvel[:] = _velocities(case)
     return model, data, data.qvel.copy()
 
 
 def positions(case: Case, data) -> np.ndarray:
     """Of the case, slow ones first."""
-    if case.is_chain:
-        return from_masses(data.xipos[1:, 0])
     order = np.argsort(_order(case.particles))
     return data.xipos[1:][order].reshape(-1)
 
@@ -76,31 +74,6 @@ def energy(case: Case) -> float:
     model.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_ENERGY
     mujoco.mj_forward(model, data)
     return float(data.energy.sum())
-
-
-def _chain(case: Case, spec) -> None:
-    """Its masses on sliders, joined by tendons of linear and cubic force, ``(omega^2 / 2) d`` and ``4 d^3``."""
-    spec.option.gravity = np.zeros(3)
-    x = to_masses(case.q)
-    for i, place in enumerate(x):
-        body = _body(spec.worldbody, AXES[0] * place)
-        body.add_joint(name=f"{i}", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=AXES[0], ref=place)
-    linear, cubic = [case.omega**2 / 2, 0.0, 0.0], [0.0, 0.0, 4.0]
-    last = len(x) - 1
-    for i in range(last):
-        _tendon(spec, {i + 1: 1.0, i: -1.0}, cubic if i % 2 else linear)
-    for i in (0, last):
-        _tendon(spec, {i: 1.0}, cubic)
-
-
-def _body(parent, place, mass: float = 1.0, centre=(0.0, 0.0, 0.0)):
-    return parent.add_body(pos=place, mass=mass, ipos=centre, inertia=[INERTIA] * 3, explicitinertial=True)
-
-
-def _tendon(spec, joints: dict[int, float], stiffness) -> None:
-    tendon = spec.add_tendon(stiffness=stiffness, springlength=[0.0, 0.0])
-    for i, coefficient in joints.items():
-        tendon.wrap_joint(f"{i}", coefficient)
 
 
 def _particles(case: Case, spec) -> None:
@@ -114,7 +87,9 @@ def _particles(case: Case, spec) -> None:
         parent = parents.get(i, -1)
         hinged = i in parents
         frames[i] = (q[parent] if parent >= 0 else np.zeros(3)) if hinged else q[i]
-        bodies[i] = _body(bodies[parent], frames[i] - frames[parent], p.masses[i], q[i] - frames[i])
+        place = {"pos": frames[i] - frames[parent], "ipos": q[i] - frames[i]}
+        point = {"mass": p.masses[i], "inertia": [INERTIA] * 3, "explicitinertial": True}
+        bodies[i] = bodies[parent].add_body(**place, **point)
         if hinged:
             bodies[i].add_joint(type=mujoco.mjtJoint.mjJNT_BALL)
         else:

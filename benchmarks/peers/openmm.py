@@ -22,19 +22,7 @@ def ladders(case: Case) -> list[Ladder]:
     def ladder(num_micro: int) -> Ladder:
         def build(num_steps: int):
             context, x, v = prepare(case, num_micro)
-            integrator = context.getIntegrator()
-            integrator.setStepSize(case.t_end / num_steps)
-
-            def run():
-                context.setPositions(x)
-                context.setVelocities(v)
-                try:
-                    integrator.step(num_steps)
-                except mm.OpenMMException:  # a step too large
-                    return np.full(case.q.size, np.nan)
-                return positions(case, context)
-
-            return run
+            return lambda: positions(case, end_of(context, x, v, case.t_end, num_steps))
 
         return steps_ladder(case, f"MTS {num_micro}", build)
 
@@ -44,17 +32,34 @@ def ladders(case: Case) -> list[Ladder]:
 def prepare(case: Case, num_micro: int):
     """Context, positions and velocities at the start, in nm, ps and kJ/mol."""
     system, x, v = _chain(case) if case.is_chain else _particles(case)
-    integrator = mm.MTSIntegrator(1e-3, [(SLOW, 1), (FAST, num_micro)])
-    integrator.setConstraintTolerance(TOLERANCE)
-    context = mm.Context(system, integrator, mm.Platform.getPlatformByName("Reference"))
+    context = context_of(system, num_micro)
     context.setPositions(x)
     context.setVelocities(v)
     return context, x, v
 
 
-def positions(case: Case, context) -> np.ndarray:
+def context_of(system, num_micro: int):
+    """A context that integrates a system with forces of two groups, `SLOW` and `FAST`."""
+    integrator = mm.MTSIntegrator(1e-3, [(SLOW, 1), (FAST, num_micro)])
+    integrator.setConstraintTolerance(TOLERANCE)
+    return mm.Context(system, integrator, mm.Platform.getPlatformByName("Reference"))
+
+
+def end_of(context, x, v, t_end: float, num_steps: int) -> np.ndarray:
+    """Places (particles, 3) of the particles after a run from x and v, NaN where a step is too large."""
+    context.setPositions(x)
+    context.setVelocities(v)
+    integrator = context.getIntegrator()
+    integrator.setStepSize(t_end / num_steps)
+    try:
+        integrator.step(num_steps)
+    except mm.OpenMMException:
+        return np.full(np.shape(x), np.nan)
+    return np.asarray(context.getState(positions=True).getPositions(asNumpy=True)._value)
+
+
+def positions(case: Case, x: np.ndarray) -> np.ndarray:
     """Of the case, slow ones first."""
-    x = np.asarray(context.getState(positions=True).getPositions(asNumpy=True)._value)
     return from_masses(x[:, 0]) if case.is_chain else x[: len(case.particles.masses)].reshape(-1)
 
 
@@ -79,7 +84,7 @@ def _chain(case: Case):
         soft.addBond(i, i + 1)
     walls.addParticle(0)
     walls.addParticle(n - 1)
-    _add(system, {stiff: FAST, soft: SLOW, walls: SLOW})
+    add_forces(system, {stiff: FAST, soft: SLOW, walls: SLOW})
     return system, x, v
 
 
@@ -98,12 +103,13 @@ def _particles(case: Case):
         (stiff if min(i, j) >= fast else soft).addBond(i, j, length, k)
     for i, j, length in p.rods:
         system.addConstraint(n if i < 0 else i, j, length)
-    _add(system, {stiff: FAST, soft: SLOW, weight: SLOW})
+    add_forces(system, {stiff: FAST, soft: SLOW, weight: SLOW})
     x, v = (np.vstack([a.reshape(-1, 3), np.zeros(3)]) for a in (case.q, case.v))
     return system, x, v
 
 
-def _add(system, groups) -> None:
+def add_forces(system, groups) -> None:
+    """Forces with their groups."""
     for force, group in groups.items():
         force.setForceGroup(group)
         system.addForce(force)

@@ -37,18 +37,8 @@ def schemes(case: Case) -> dict[str, vm.Scheme | vm.Composition]:
     }
     if not case.is_chain:
         found |= {f"Lobatto {degree}": vm.galerkin(1, degree, "lobatto") for degree in LOBATTO}
-    return found | {f"explicit {n}": explicit(n) for n in EXPLICIT} | corrected()
-
-
-def corrected() -> dict[str, vm.Scheme]:
-    """Explicit schemes whose frequencies of harmonic vibrations are of order 4."""
-    return {f"Takahashi-Imada {n}": vm.takahashi_imada(n) for n in CORRECTED}
-
-
-def batch_schemes() -> dict[str, vm.Scheme | vm.Composition]:
-    """The same for batches and moderate errors."""
-    composed = {f"explicit {n}, suzuki4": vm.compose(vm.fully_explicit(n), "suzuki4") for n in (1, 2, 4)}
-    return corrected() | composed | {f"explicit {n}": vm.fully_explicit(n) for n in (4, 8)}
+    found |= {f"explicit {n}": explicit(n) for n in EXPLICIT}
+    return found | {f"Takahashi-Imada {n}": vm.takahashi_imada(n) for n in CORRECTED}
 
 
 def loose(case: Case, scheme: vm.Scheme | vm.Composition) -> tuple[float, ...]:
@@ -74,43 +64,18 @@ def ladders(case: Case) -> list[Ladder]:
 
         return Ladder(name, "steps", step_counts(max(2, 2 * case.t_end), 1e6 * case.t_end), build)
 
-    return [ladder(*found) for found in _with_tolerances(case, schemes(case))]
+    found = []
+    for name, scheme in schemes(case).items():
+        found.append(ladder(name, scheme, TOLERANCE))
+        found += [ladder(f"{name}, tolerance {tol:.1e}", scheme, tol) for tol in loose(case, scheme)]
+    return found
 
 
 def last_positions(run: vm.Trajectory) -> np.ndarray:
-    """At the end, slow ones first; of all lanes of a batch."""
-    return np.concatenate([np.asarray(run.q_s)[..., -1, :], np.asarray(run.q_f)[..., -1, :]], axis=-1)
-
-
-def _with_tolerances(case: Case, schemes) -> list[tuple[str, vm.Scheme | vm.Composition, float]]:
-    """Name, scheme and tolerance: to round-off, and the looser ones."""
-    found = []
-    for name, scheme in schemes.items():
-        found.append((name, scheme, TOLERANCE))
-        found += [(f"{name}, tolerance {tol:.1e}", scheme, tol) for tol in loose(case, scheme)]
-    return found
+    """At the end, slow ones first."""
+    return np.concatenate([run.q_s[-1], run.q_f[-1]])
 
 
 def energy(case: Case) -> float:
     """Of the start."""
     return case.energy
-
-
-def batch_ladders(case: Case, states: vm.State, q, v, schemes=None) -> list[Ladder]:
-    """`vm.simulate_batch` with these schemes, a dictionary like `batch_schemes`."""
-    del q, v  # known from the states
-
-    def ladder(name: str, scheme, tolerance: float) -> Ladder:
-        solver = first_solver(case.problem, scheme, tolerance)
-
-        def build(num_steps: int):
-            steps = {"macro_dt": case.t_end / num_steps, "num_steps": num_steps, "save": num_steps}
-
-            def run():
-                return last_positions(vm.simulate_batch(case.problem.system, scheme, states, **steps, solver=solver))
-
-            return run
-
-        return Ladder(name, "steps", step_counts(2 * case.t_end, 4000 * case.t_end), build)
-
-    return [ladder(*found) for found in _with_tolerances(case, schemes or batch_schemes())]

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any
 
 import jax
 import numpy as np
@@ -22,13 +22,8 @@ ENOUGH = 0.01
 """Seconds that the calls for a rough time take together, at least."""
 
 
-class Judged(Protocol):
-    """What errors are measured against: the right end, and the error of what a run returns."""
-
-    @property
-    def q_end(self) -> np.ndarray: ...
-
-    def error(self, q) -> float: ...
+Error = Callable[[Any], float]
+"""The error of the end of a run; infinite or no number for a run that failed."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +47,7 @@ class Point:
 def scan(
     peer: str,
     ladders: Sequence[Ladder],
-    case: Judged,
+    error: Error,
     seconds: float,
     levels: Sequence[float] = LEVELS,
 ) -> list[Point]:
@@ -62,7 +57,7 @@ def scan(
     """
     climbed: list[Climb] = []
     for ladder in ladders:
-        climb = Climb(peer, ladder, case)
+        climb = Climb(peer, ladder, error)
         enough = min((p.seconds for c in climbed for p in c.points() if p.settled <= min(levels)), default=np.inf)
         for setting in ladder.settings:
             rung = climb.add(setting)
@@ -80,15 +75,28 @@ def scan(
 class Climb:
     """The settings of a ladder that were run, from coarse to fine."""
 
-    def __init__(self, peer: str, ladder: Ladder, case: Judged):
-        self.peer, self.ladder, self.case = peer, ladder, case
+    def __init__(self, peer: str, ladder: Ladder, error: Error):
+        self.peer, self.ladder, self.error = peer, ladder, error
         self.rungs: dict[float, Point] = {}
 
     def add(self, setting) -> Point:
         """Run one more."""
-        compiled = next((p.compile for p in self.rungs.values()), None)
-        self.rungs[setting] = _try(self.peer, self.ladder, setting, self.case, compiled)
-        return self.rungs[setting]
+        elapsed = stopwatch()
+        run = self.ladder.build(setting)
+        built, elapsed = elapsed(), stopwatch()
+        try:
+            end = jax.block_until_ready(run())
+        except (RuntimeError, ArithmeticError):  # an integrator that gives up, where others return NaN
+            end = None
+        first, error, seconds = elapsed(), np.nan if end is None else self.error(end), 0.0
+        compiled = next((point.compile for point in self.rungs.values()), None)
+        if np.isfinite(error):
+            seconds = _rough(run, None if compiled is None else first)
+        compiled = max(0.0, first - seconds) if compiled is None else compiled
+        error = error if np.isfinite(error) else np.inf
+        point = Point(self.peer, self.ladder.label(setting), error, error, seconds, built, compiled, run)
+        self.rungs[setting] = point
+        return point
 
     @property
     def settings(self) -> list[float]:
@@ -131,25 +139,6 @@ def front(points: Sequence[Point]) -> list[Point]:
             best = p.settled
             kept.append(p)
     return kept
-
-
-def _try(peer: str, ladder: Ladder, setting, case: Judged, compiled: float | None) -> Point:
-    """One setting; `compiled` is what compiling took before, None if this is the first call."""
-    elapsed = stopwatch()
-    run = ladder.build(setting)
-    built, elapsed = elapsed(), stopwatch()
-    try:
-        q = jax.block_until_ready(run())
-    except (RuntimeError, ArithmeticError):  # an integrator that gives up, where others return NaN
-        q = np.full(case.q_end.shape, np.nan)
-    first = elapsed()
-    error = case.error(q)
-    seconds = 0.0
-    if np.isfinite(error):
-        seconds = _rough(run, None if compiled is None else first)
-    if compiled is None:
-        compiled = max(0.0, first - seconds)
-    return Point(peer, ladder.label(setting), error, error, seconds, built, compiled, run)
 
 
 def _rough(run: Callable[[], Any], first: float | None) -> float:

@@ -13,7 +13,6 @@ from tests.animation.support import PENDULUM, swinging
 from vmri_jax import plots
 from vmri_jax.animation import Drawing, motion, plot_strip, write_gif
 from vmri_jax.animation.camera import FILLED_PART, Camera
-from vmri_jax.animation.frames import rows_of
 from vmri_jax.animation.layout import layout, nice
 from vmri_jax.animation.shapes import Stage
 
@@ -79,13 +78,6 @@ def test_a_strip_has_its_moments(pendulum):
     assert labels == ["$t = 0.00$", "$t = 2.00$", "$t = 4.00$"]
     with pytest.raises(ValueError, match=r"times is .*give at least one"):
         plot_strip(pendulum, [])
-
-
-@pytest.mark.parametrize(
-    ("count", "columns", "rows"), [(4, 3, [2, 2]), (5, 3, [3, 2]), (7, 6, [4, 3]), (3, 1, [1] * 3)]
-)
-def test_rows_of_a_strip_leave_no_hole(count, columns, rows):
-    assert rows_of(count, columns) == rows
 
 
 def test_pictures_of_a_strip_fill_its_width():

@@ -103,7 +103,7 @@ def test_the_script_draws_the_shapes_that_pictures_have(pendulum, tmp_path):
     data, sizes = data_of(page_of(pendulum, tmp_path / "run.html")), layout(pendulum)
     np.testing.assert_allclose(unpacked(data["planes"][0]["grid"]).reshape(-1, 7), sizes.grounds[0].grid, atol=1e-6)
     a, b, reach = np.array([0.0, 1.0, 2.0]), np.array([2.0, -1.0, 0.5]), (0.2, 0.1)
-    [turns] = {connection.turns for connection in sizes.connections if connection.kind == "spring"}
+    [turns] = {line["turns"] for line in data["connections"] if line["kind"] == "spring"}
     arguments = f"painter, {a.tolist()}, {b.tolist()}, {reach[0]}, {reach[1]}"
     program = (
         "".join((SCRIPTS / name).read_text() for name in ("camera.js", "shapes.js"))

@@ -3,18 +3,17 @@
 import numpy as np
 import pytest
 
-from benchmarks import ensemble_kills, ensembles
+from benchmarks import ensembles
 
 xarray = pytest.importorskip("xarray")
 
 
 def test_many_runs(tmp_path):
-    report = ensembles.million(ensembles.Size(1, 1, 2000, 2, 2), "quick", tmp_path, lambda _: None)
+    report = ensembles.million(ensembles.Size((), 1, 1, 2000, 2, 2), "quick", tmp_path, lambda _: None)
     (row,) = report.rows
     assert row["lanes"] == 2000
     assert row["MB on disk"] == pytest.approx(0.22, abs=0.05)  # 104 bytes a run, and metadata
-    assert set(row) == set(ensembles.COLUMNS["million"])
-    assert len(report.figures["ensembles_million"]().axes) == 1
+    assert 0 < row["RSS MB at a third"] < 2 * row["RSS MB at the end"]
 
 
 def test_the_study_has_a_panel_for_each_scheme_and_number_of_micro_steps():
@@ -27,13 +26,5 @@ def test_the_study_has_a_panel_for_each_scheme_and_number_of_micro_steps():
 
 @pytest.mark.full
 def test_speed(tmp_path):
-    report = ensembles.speed(ensembles.Size(1, 1, 0, 0, 0), "quick", tmp_path, lambda _: None)
+    report = ensembles.speed(ensembles.Size((), 1, 1, 0, 0, 0), "quick", tmp_path, lambda _: None)
     assert [row["what"] for row in report.rows] == ["simulate_batch", "this process", "1 worker", "2 workers"]
-
-
-@pytest.mark.full
-@pytest.mark.filterwarnings("default")
-def test_kills():
-    (report,) = ensemble_kills.run(ensemble_kills.Size(2, 2), "quick")
-    assert [row["identical"] for row in report.rows] == ["yes", "yes"]
-    assert sum(row["kills"] for row in report.rows) == 4

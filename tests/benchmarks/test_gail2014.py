@@ -206,7 +206,7 @@ def test_progress_runs_over_all_figures(made):
 def gail2014(tmp_path, monkeypatch):
     """Runs ``python -m benchmarks gail2014`` in an empty folder: (exit code, everything printed)."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("benchmarks.gail2014.command.prepare", lambda: None)
+    monkeypatch.setattr("benchmarks.gail2014.report.prepare", lambda: None)
     (tmp_path / "a_file").write_text("")
 
     def run(*arguments):
@@ -242,7 +242,7 @@ def test_the_command_refuses_unknown_figures(gail2014, tmp_path):
 def test_the_command_refuses_a_file_as_its_folder(gail2014):
     code, text = gail2014("--only", "fig6", "--out", "a_file")
     assert code == 2
-    assert "--out a_file: File exists" in text
+    assert "--out a_file cannot be written: File exists" in text
 
 
 def test_the_command_keeps_the_other_figures(gail2014, tmp_path, monkeypatch):

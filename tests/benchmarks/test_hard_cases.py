@@ -16,7 +16,6 @@ MEASURED = {
     ("large macro step", "iterations"): 6,
     ("large constrained step", "iterations"): 4,
     ("mass ratios 1e4 to 1e8", "iterations_1e+06"): 3,
-    ("energy for long", "band"): 4.4e-4,
 }
 
 
@@ -32,7 +31,7 @@ def test_criterion_is_met(case):
 @pytest.fixture
 def prepared(monkeypatch):
     """JAX runs already in this process."""
-    monkeypatch.setattr("benchmarks.hard_cases.command.prepare", lambda: None)
+    monkeypatch.setattr("benchmarks.hard_cases.prepare", lambda: None)
 
 
 @pytest.mark.usefixtures("prepared")
@@ -44,7 +43,7 @@ def test_the_command_refuses_an_unknown_case():
 
 @pytest.mark.usefixtures("prepared")
 def test_the_command_runs_a_case_and_writes_files(tmp_path):
-    result = CliRunner().invoke(app, ["hard", "--case", "10", "--out", str(tmp_path / "out")])
+    result = CliRunner().invoke(app, ["hard", "--case", "9", "--out", str(tmp_path / "out")])
     assert result.exit_code == 0, result.output
     assert "1 of 1 criteria met" in result.output
     assert len((tmp_path / "out" / "cases.csv").read_text().splitlines()) == 2

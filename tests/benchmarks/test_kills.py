@@ -1,11 +1,24 @@
-"""kill -9 at random moments of a streaming run; `python -m benchmarks kills` does it a hundred times."""
+"""kill -9 at random moments of runs, ensembles and their workers; `python -m benchmarks kills` does it 170 times."""
+
+import pytest
 
 from benchmarks import kills
 
 
-def test_killed_runs_resume_to_the_last_bit(tmp_path):
-    rows, runs = kills.kill_often(kills.Size(count=3), tmp_path)
-    assert [row["identical"] for row in rows] == ["yes"] * 3
-    assert max(row["chunks"] for row in rows) > 0
-    assert runs
-    assert all(runs)
+def killed(**counts):
+    *_, report = kills.run(kills.Size(**{"runs": 0, "workers": 0, "ensembles": 0} | counts), "quick")
+    assert {row["identical"] for row in report.rows} == {"yes"}
+    assert sum(row["kills"] for row in report.rows) == sum(counts.values())
+    return report
+
+
+def test_killed_runs_resume_to_the_last_bit():
+    report = killed(runs=3)
+    assert any(character in "123456789" for row in report.rows for character in row["chunks before a resume"])
+
+
+@pytest.mark.full
+@pytest.mark.filterwarnings("default")
+def test_killed_ensembles_resume_to_the_last_bit():
+    report = killed(workers=2, ensembles=2)
+    assert [row["killed"] for row in report.rows] == ["workers of an ensemble", "ensemble"]

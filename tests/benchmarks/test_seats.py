@@ -64,9 +64,8 @@ def test_turns():
 def test_every_group_of_a_comparison():
     """With itself, one case of each kind."""
     size = against.sizes("quick", ROOT, only=["single", "gradient"])
-    entries = [replace(against.GROUPS["single"][0], case=SHORT)]
-    gradient = replace(against.GRADIENTS[0].case, system="FPU l=3", scheme="fully_explicit 2", num_steps=2)
-    groups = {"single": entries, "gradient": [replace(against.GRADIENTS[0], case=gradient)]}
+    gradient = replace(against.GROUPS["gradient"][0], system="FPU l=3", scheme="fully_explicit 2", num_steps=2)
+    groups = {"single": [SHORT], "gradient": [gradient]}
     *_, report = against.run(replace(size, groups=groups, repeats=2, fresh=1, seconds=1e-3), "quick")
     assert [row["group"] for row in report.rows] == ["single", "gradient, cold", "gradient"]
     assert all(row["differs"] == 0 for row in report.rows)
@@ -83,8 +82,7 @@ def test_sizes_of_a_comparison(tmp_path):
 
 
 def test_every_case_names_a_scheme_and_a_system():
-    cases = [entry.case for entries in against.GROUPS.values() for entry in entries] + tricks.CASES
-    for case in cases:
+    for case in [*(case for cases in against.GROUPS.values() for case in cases), *tricks.CASES]:
         assert case.made_scheme().num_micro >= 1
         assert case.problem().q_s.size
 

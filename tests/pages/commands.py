@@ -24,8 +24,8 @@ FILES = {"crane.py": "docs/nutshell.md", "my_scene.py": "docs/how_to/scenes.md"}
 """Files that commands name, each the first program of a page."""
 CODES = {"vmri advise fpu": 1}
 """Exit codes other than 0: a step that is advised against."""
-SMALLER = {"python -m benchmarks hard": "--case 10", "python -m tests.fuzz": "--count 1 --out fuzz"}
-"""Options that make minutes to seconds: one case of 28, one system of 2000."""
+SMALLER = {"python -m benchmarks hard": "--case 9", "python -m tests.fuzz": "--count 1 --out fuzz"}
+"""Options that make minutes to seconds: one case of 19, one system of 2000."""
 NOT_RUN = {
     "make": "a command of CI, or one of hours; only the target is looked up",
     ".ci/run": "CI itself",

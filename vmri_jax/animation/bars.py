@@ -33,13 +33,10 @@ def bars(trajectory: Trajectory) -> dict:
 
 
 def with_bars(drawing: Drawing, q_s: np.ndarray, q_f: np.ndarray) -> Drawing:
-    """The drawing with a body for each coordinate of its blocks, to the right of all other bodies.
+    """The drawing with a body for each coordinate of its blocks, right of all others; q (k, n) along the run.
 
     Each block has a scale, 1, 2 or 5 times a power of ten, with which its largest coordinate in the run just fits the
     height of the bars; the caption tells the scales.
-
-    Args:
-        q_s, q_f: (k, n_s) and (k, n_f) positions along the run.
     """
     if not drawing.blocks:
         return drawing

@@ -12,9 +12,14 @@ from typing import Any
 import jax
 import numpy as np
 
-from vmri_jax.animation.checks import angles, check_keys, direction, entries, numbers, positive
 from vmri_jax.animation.parts import KINDS, PACES, Block, Body, Joint, Plane, Solid, Sphere
 from vmri_jax.animation.plain_data import (
+    angles,
+    check_keys,
+    direction,
+    entries,
+    numbers,
+    positive,
     read_anchor,
     read_block,
     read_body,
@@ -30,30 +35,6 @@ KEYS = (
     *("bodies", "solids", "blocks", "links", "springs", "anchors", "planes", "spheres"),
     *("up", "view", "caption", "kinematics"),
 )
-
-
-@dataclass(frozen=True)
-class Connection:
-    """A link or spring from a body, by its number, to another body or, if `other` is None, to a fixed point (3,).
-
-    turns: of a drawn spring, which `vmri_jax.animation.layout` chooses.
-    """
-
-    kind: str
-    body: int
-    other: int | None
-    point: np.ndarray | None
-    pace: str
-    turns: int = 0
-
-    def ends(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The two points (..., 3) that it joins, from the positions (..., n_bodies, 3) of the bodies."""
-        end = points[..., self.other, :] if self.point is None else self.point
-        return points[..., self.body, :], end
-
-    def length(self, points: np.ndarray) -> np.ndarray:
-        """(...) distance of its ends."""
-        return np.linalg.norm(np.subtract(*self.ends(points)), axis=-1)
 
 
 @dataclass(frozen=True)
@@ -137,12 +118,7 @@ class Drawing:
         )
 
     def extended(self, q_s, q_f, v_s, v_f) -> tuple[np.ndarray, ...]:
-        """Coordinates of the bodies and their rates, slow and fast, (k, n) each.
-
-        Args:
-            q_s, q_f: (k, n_s), (k, n_f) coordinates of a run.
-            v_s, v_f: their rates.
-        """
+        """Coordinates of the bodies and their rates, slow and fast, (k, n) each, for coordinates and rates of a run."""
         if self.carried is None:
             return q_s, q_f, v_s, v_f
         kinematics, joints = self.carried
@@ -158,22 +134,17 @@ class Drawing:
         """Numbers of the bodies by name."""
         return {body.name: i for i, body in enumerate(self.bodies)}
 
-    @property
-    def connections(self) -> list[Connection]:
-        """The joints, with numbers of bodies and points in coordinates of the picture."""
-        points, connections = self.place([joint.point or () for joint in self.joints]), []
-        for joint, point in zip(self.joints, points, strict=True):
-            body, *other = (self.numbers[name] for name in joint.bodies)
-            end = (other[0], None) if joint.point is None else (None, point)
-            connections.append(Connection(joint.kind, body, *end, self.pace(joint)))
-        return connections
+    def ends(self, joint: Joint, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The two points (..., 3) that a joint joins, from the positions (..., n_bodies, 3) of the bodies."""
+        body, *other = (points[..., self.numbers[name], :] for name in joint.bodies)
+        return body, self.place([joint.point])[0] if joint.point is not None else other[0]
+
+    def length(self, joint: Joint, points: np.ndarray) -> np.ndarray:
+        """(...) distance of the ends of a joint."""
+        return np.linalg.norm(np.subtract(*self.ends(joint, points)), axis=-1)
 
     def corners(self, points: np.ndarray) -> list[np.ndarray]:
-        """Corners (..., n, 3) of each solid.
-
-        Args:
-            points: (..., n_bodies, 3) positions of the bodies.
-        """
+        """Corners (..., n, 3) of each solid, from the positions (..., n_bodies, 3) of the bodies."""
         solids = []
         for solid in self.solids:
             # x_0 + sum_i c_i (x_i - x_0)
@@ -213,21 +184,14 @@ class Drawing:
         return _upright(padded / np.linalg.norm(padded))
 
     def place(self, points: Sequence[tuple[float, ...]]) -> np.ndarray:
-        """(n, 3) points in coordinates of the picture.
-
-        Args:
-            points: points or directions in coordinates of the bodies; missing coordinates are zero.
-        """
+        """(n, 3) points or directions in coordinates of the picture; missing coordinates of the given ones are zero."""
         d = self.dimension
         padded = np.array([np.pad(point, (0, d - len(point))) for point in points]).reshape(-1, d)
         return padded @ self.frame().T
 
     def maps(self, n_s: int, n_f: int) -> tuple[np.ndarray, np.ndarray]:
         """Offset (n, 3) and matrix (n, 3, n_s + n_f) of the positions of the bodies in the picture,
-        ``offset + matrix @ q``.
-
-        Args:
-            n_s, n_f: numbers of slow and of fast coordinates that `extended` returns.
+        ``offset + matrix @ q`` with n_s slow and n_f fast coordinates, as of `extended`.
 
         Raises:
             ValueError: a body uses a coordinate that q does not have.

@@ -49,7 +49,8 @@ def plot_strip(
         raise Refused(f"plot_strip: times is {times!r}; give at least one moment.")
     stage = Stage.of(motion, theme)
     aspect = stage.aspect
-    sizes = rows_of(len(moments), MOST_COLUMNS if aspect < 1.3 else 3 if aspect < 3.5 else 1)
+    most = MOST_COLUMNS if aspect < 1.3 else 3 if aspect < 3.5 else 1
+    sizes = [len(row) for row in np.array_split(moments, -(-len(moments) // most))]  # the longer rows first
     rows, columns = len(sizes), max(sizes)
     trail = 0.5 * (motion.t[-1] - motion.t[0]) / max(len(moments), 4)
     panels = curves.panels_of(motion)
@@ -68,12 +69,6 @@ def plot_strip(
         curves.draw(figure, motion, panels, moments, theme)
         _write_head(figure, title, stage)
     return figure
-
-
-def rows_of(count: int, columns: int) -> list[int]:
-    """The number of pictures in each row, at most `columns` and as equal as possible, the longer rows first."""
-    rows = -(-count // columns)
-    return [count // rows + (row < count % rows) for row in range(rows)]
 
 
 def _write_head(figure: Figure, title: str, stage: Stage) -> None:

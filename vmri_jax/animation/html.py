@@ -7,10 +7,11 @@ import jinja2
 import numpy as np
 
 from vmri_jax import plots
-from vmri_jax.animation.drawing import Connection
+from vmri_jax.animation.drawing import Drawing
 from vmri_jax.animation.geometry import JOINT_END, LAMP, helix
 from vmri_jax.animation.layout import Ground, Layout, layout, nice
 from vmri_jax.animation.motion import Motion
+from vmri_jax.animation.parts import Joint
 from vmri_jax.running.files import check_place
 
 MOST_COORDINATES = 600_000
@@ -34,8 +35,8 @@ def write_html(motion: Motion, path: str | Path, title: str = "") -> None:
     """
     every = -(-motion.points.size // MOST_COORDINATES)
     drawing, sizes = motion.drawing, layout(motion)
-    springs = [connection for connection in sizes.connections if connection.kind == "spring"]
-    uncoloured = [body for body in drawing.bodies if body.color is None and body.shown]
+    coloured = {drawing.pace(joint) for joint in drawing.joints if joint.kind == "spring"}
+    coloured |= {body.pace for body in drawing.bodies if body.color is None and body.shown}
     data = _data(motion.thinned(-(-len(motion.t) // every)), sizes)
     if every > 1:
         ending = {2: "nd", 3: "rd"}.get(every, "th")
@@ -45,7 +46,7 @@ def write_html(motion: Motion, path: str | Path, title: str = "") -> None:
     text = environment.get_template("page.html.j2").render(
         title=title or "Motion",
         description=_description(motion),
-        paces=sorted({thing.pace for thing in (*springs, *uncoloured)}, reverse=True),
+        paces=sorted(coloured, reverse=True),
         constrained=data["residual"] is not None,
         data=data,
         light=plots.LIGHT,
@@ -62,8 +63,9 @@ def _data(motion: Motion, sizes: Layout) -> dict:
     speed = (
         1.0 if 0.15 * PLAY_SECONDS <= duration <= 3 * PLAY_SECONDS or duration == 0 else nice(duration / PLAY_SECONDS)
     )
-    turns = {connection.turns for connection in sizes.connections if connection.kind == "spring"}
-    many = len(sizes.connections) > 20  # fewer points then: the script draws every helix in every picture
+    lines = [_line(drawing, *line) for line in zip(drawing.joints, sizes.turns, strict=True)]
+    turns = {line["turns"] for line in lines if line["kind"] == "spring"}
+    many = len(lines) > 20  # fewer points then: the script draws every helix in every picture
     constrained = bool(np.nanmax(motion.residual, initial=0.0) > 0)
     title = f"{motion.energy_names[0]} {'ΔE / |E₀|' if motion.relative else 'ΔE'}"
     return {
@@ -81,7 +83,7 @@ def _data(motion: Motion, sizes: Layout) -> dict:
         "solids": [
             vars(solid) | {"points": [drawing.numbers[name] for name in solid.points]} for solid in drawing.solids
         ],
-        "connections": [_plain(connection) for connection in sizes.connections],
+        "connections": lines,
         "planes": [_plain(ground) | {"grid": _packed(ground.grid), "bears": ground.bears} for ground in sizes.grounds],
         "spheres": [
             {"center": c.tolist(), "radius": float(r)} for c, r in zip(sizes.spheres, sizes.sphere_radii, strict=True)
@@ -106,9 +108,17 @@ def _data(motion: Motion, sizes: Layout) -> dict:
     }
 
 
-def _plain(record: Connection | Ground) -> dict:
-    """The fields of a record by name, arrays as lists."""
-    return {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in vars(record).items()}
+def _line(drawing: Drawing, joint: Joint, turns: int) -> dict:
+    """A link or spring from a body, by its number, to another body, or to a fixed point in the picture."""
+    body, *other = (drawing.numbers[name] for name in joint.bodies)
+    point = None if joint.point is None else drawing.place([joint.point])[0].tolist()
+    line = {"kind": joint.kind, "body": body, "other": next(iter(other), None), "point": point}
+    return line | {"pace": drawing.pace(joint), "turns": turns}
+
+
+def _plain(ground: Ground) -> dict:
+    """The fields of a ground by name, arrays as lists."""
+    return {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in vars(ground).items()}
 
 
 def _packed(array: np.ndarray, dtype: type = np.float32) -> str:

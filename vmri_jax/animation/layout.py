@@ -1,11 +1,11 @@
 """Sizes of balls, links and springs, the ground, and the first view, for pages and pictures."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from vmri_jax.animation.drawing import Connection, Drawing
+from vmri_jax.animation.drawing import Drawing
 from vmri_jax.animation.geometry import grid
 from vmri_jax.animation.motion import Motion
 
@@ -47,6 +47,7 @@ class Layout:
 
     size: diagonal of the box around bodies, solids, spheres and fixed points along the whole motion.
     rod, coil, wire: radius of links, of springs, and of the wire of springs.
+    turns: of each joint, which springs have.
     grounds: planes of the drawing, and a floor if none of them is level.
     hull: (n, 3) points that the view has to contain.
     """
@@ -56,7 +57,7 @@ class Layout:
     rod: float
     coil: float
     wire: float
-    connections: list[Connection]
+    turns: list[int]
     spheres: np.ndarray
     sphere_radii: np.ndarray
     grounds: list[Ground]
@@ -68,21 +69,19 @@ class Layout:
 def layout(motion: Motion) -> Layout:
     """Sizes for a picture: balls do not touch their neighbours, coils are thinner than the shortest spring is long."""
     drawing, points = motion.drawing, motion.thinned(500).points
-    connections = drawing.connections
-    fixed = np.array([c.point for c in connections if c.point is not None]).reshape(-1, 3)
+    fixed = drawing.place([joint.point for joint in drawing.joints if joint.point is not None])
     spheres = drawing.place([sphere.center for sphere in drawing.spheres])
     sphere_radii = np.array([sphere.radius for sphere in drawing.spheres])
     reach = sphere_radii[:, None]
     corners = [corner.reshape(-1, 3) for corner in drawing.corners(points)]
     box = np.concatenate([points.reshape(-1, 3), *corners, fixed, spheres - reach, spheres + reach])
     size = float(np.linalg.norm(np.ptp(box, axis=0))) or 1.0
-    lengths = [float(np.median(connection.length(points))) or size for connection in connections]
+    lengths = [float(np.median(drawing.length(joint, points))) or size for joint in drawing.joints]
     small = min(0.02 * size, 0.3 * min(lengths, default=size))
     balls = [body.shown == "ball" for body in drawing.bodies]
     radii = np.where(balls, [body.radius or small for body in drawing.bodies], HIDDEN_RADIUS * small)
-    sprung = [length for c, length in zip(connections, lengths, strict=True) if c.kind == "spring"]
+    sprung = [length for joint, length in zip(drawing.joints, lengths, strict=True) if joint.kind == "spring"]
     coil = min(0.015 * size, 0.16 * min(sprung, default=size))
-    turns = np.clip(np.rint(np.array(lengths) / (1.1 * coil)), *TURNS_RANGE).astype(int).tolist()
     grounds = _grounds(drawing, box, float(radii.max()), size)
     corners = [g.center + (1.0 if g.solid else FLOOR_IN_VIEW) * (g.corners - g.center) for g in grounds]
     azimuth, elevation = drawing.view or ((-88, 7) if drawing.dimension < 3 else (-62, 14))
@@ -92,7 +91,7 @@ def layout(motion: Motion) -> Layout:
         rod=min(0.0048 * size, 0.4 * min(radii[balls].tolist(), default=small)),
         coil=coil,
         wire=0.11 * coil,
-        connections=[replace(c, turns=count) for c, count in zip(connections, turns, strict=True)],
+        turns=np.clip(np.rint(np.array(lengths) / (1.1 * coil)), *TURNS_RANGE).astype(int).tolist(),
         spheres=spheres,
         sphere_radii=sphere_radii,
         grounds=grounds,

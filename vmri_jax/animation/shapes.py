@@ -24,8 +24,11 @@ AMBIENT_SHADE = -0.12
 """Shade of a face at a right angle to the lamp, from -1 (dark) to 1 (light)."""
 TRAIL_POINTS = (160, 2000)
 """Smallest and largest number of points of a trail."""
+SHADOW = "#000000"
 NAME_SIZE = 7.5
 """Font size of the names of bodies, in points."""
+Place = tuple[float, float, float, float]
+"""Left, bottom, width and height of a panel, in parts of the figure."""
 
 
 @dataclass(frozen=True)
@@ -49,22 +52,9 @@ class Stage:
         aspect = float(np.clip((high[0] - low[0]) / (high[1] - low[1]), 0.5, 8.0))
         return cls(motion, sizes, start.fitted(sizes.hull, radius, aspect), aspect, theme)
 
-    def draw(
-        self,
-        figure: Figure,
-        place: tuple[float, float, float, float],
-        time: float,
-        trail: float,
-        *,
-        names: bool = False,
-    ) -> None:
-        """Draw one moment in a figure in the style of the theme.
-
-        Args:
-            place: left, bottom, width and height of the panel, in parts of the figure.
-            trail: duration of the trail behind each body.
-            names: whether to write names beside bodies where there is room.
-        """
+    def draw(self, figure: Figure, place: Place, time: float, trail: float, *, names: bool = False) -> None:
+        """Draw one moment, with trails of this duration, in a figure in the style of the theme; with `names` beside
+        bodies where there is room."""
         figure.set_layout_engine("none")
         axes = figure.add_axes(place)
         axes.set_axis_off()
@@ -111,24 +101,30 @@ class Stage:
         for ground in sizes.grounds:
             pen.ground(ground)
             if ground.bears:
-                pen.shadows(ground, centers, radii, [c.ends(points) for c in sizes.connections], sizes.rod)
+                ends = [drawing.ends(line, points) for line in drawing.joints]
+                pen.shadows(ground, centers, radii, ends, sizes.rod)
                 for solid, corners in zip(drawing.solids, drawing.corners(points), strict=True):
                     pen.shadow(ground, [corners[list(face)] for face in solid.faces])
         for center, radius in zip(sizes.spheres, sizes.sphere_radii, strict=True):
             pen.ball(center, radius, self.theme.faint)
 
     def _draw_joints(self, pen: "_Pen", points: np.ndarray) -> None:
-        sizes = self.sizes
-        for c in sizes.connections:
-            a, b = c.ends(points)
-            reach = (sizes.radii[c.body], 0.0 if c.other is None else sizes.radii[c.other])
-            ends = joint(a, b, reach)
-            if ends is not None and c.kind == "link":
+        sizes, drawing = self.sizes, self.motion.drawing
+        for line, turns in zip(drawing.joints, sizes.turns, strict=True):
+            a, b = drawing.ends(line, points)
+            reach = [sizes.radii[drawing.numbers[name]] for name in line.bodies] + [0.0] * (line.point is not None)
+            ends = joint(a, b, (reach[0], reach[1]))
+            if ends is not None and line.kind == "link":
                 pen.rod(*ends, sizes.rod, sizes.size)
             elif ends is not None:
-                pen.spring(*ends, sizes.coil, sizes.wire, self.paces[c.pace], c.turns)
-            if c.point is not None and np.linalg.norm(a - b) > reach[0]:  # else the ball of the body hides the point
-                pen.ball(c.point, 1.5 * sizes.rod, self.theme.rod)
+                pen.spring(*ends, sizes.coil, sizes.wire, self.paces[drawing.pace(line)], turns)
+            if line.point is not None and np.linalg.norm(a - b) > reach[0]:  # else the ball of the body hides the point
+                pen.ball(b, 1.5 * sizes.rod, self.theme.rod)
+
+
+def outward(corners) -> np.ndarray:
+    """A vector at a right angle to a face, outwards."""
+    return np.cross(corners[1] - corners[0], corners[2] - corners[1])
 
 
 class _Pen:
@@ -137,6 +133,7 @@ class _Pen:
 
     def __init__(self, axes: Axes, camera: Camera, theme: plots.Theme, points: float):
         self.axes, self.camera, self.theme, self.points = axes, camera, theme, points
+        self.strength = 1.0 if theme is plots.LIGHT else 2.0  # of shadows
 
     def tone(self, color, shade):
         """Shades of a colour: -1 is nearly black, 0 the colour, 1 white."""
@@ -163,7 +160,7 @@ class _Pen:
 
     def face(self, corners, color) -> None:
         """A face of a convex solid, lit by the lamp, if its outer side is turned to the camera."""
-        normal = np.cross(corners[1] - corners[0], corners[2] - corners[1])
+        normal = outward(corners)
         normal = normal / max(float(np.linalg.norm(normal)), 1e-300)
         back = self.camera.axes[2]
         eye = self.camera.target + self.camera.distance * back
@@ -249,27 +246,25 @@ class _Pen:
         overlaps are no darker."""
         angle = np.linspace(0, 2 * np.pi, 25)[:-1]
         circle = np.stack([np.cos(angle), np.sin(angle)], axis=1) @ ground.sides
-        color, strength = "#000000", 1.0 if self.theme is plots.LIGHT else 2.0
         feet = dropped(ground.center, ground.normal, points)
         above = (points - ground.center) @ ground.normal > 0
         # discs of growing radius and low opacity make a soft edge
         for grown in np.arange(0.7, 1.5, 0.1):
             balls = zip(feet[above], radii[above], strict=True)
-            self.polygons([foot + grown * radius * circle for foot, radius in balls], color, 0.026 * strength, -2)
+            self.polygons([foot + grown * radius * circle for foot, radius in balls], SHADOW, 0.026 * self.strength, -2)
         if joints:
             ends = dropped(ground.center, ground.normal, np.array(joints).reshape(-1, 3))
             places, scale = self.camera.project(ends)
             path = Path(places, [Path.MOVETO, Path.LINETO] * len(joints))
             width = max(0.5, 2 * self.points * rod * float(scale.mean()))
-            style = {"capstyle": "round", "linewidth": width, "alpha": 0.06 * strength}
-            self.axes.add_patch(PathPatch(path, fill=False, edgecolor=color, zorder=-2, **style))
+            style = {"capstyle": "round", "linewidth": width, "alpha": 0.06 * self.strength}
+            self.axes.add_patch(PathPatch(path, fill=False, edgecolor=SHADOW, zorder=-2, **style))
 
     def shadow(self, ground: Ground, faces) -> None:
         """The shadow of a convex solid: its faces that are turned upwards, projected straight down."""
-        strength = 1.0 if self.theme is plots.LIGHT else 2.0
         for corners in faces:
-            if np.cross(corners[1] - corners[0], corners[2] - corners[1]) @ ground.normal > 0:
-                self.polygons([dropped(ground.center, ground.normal, corners)], "#000000", 0.1 * strength, -2)
+            if outward(corners) @ ground.normal > 0:
+                self.polygons([dropped(ground.center, ground.normal, corners)], SHADOW, 0.1 * self.strength, -2)
 
     def polygons(self, corners, color, alpha: float, zorder: float) -> None:
         """Polygons with equal numbers of corners, in one path: where they overlap they are no darker."""

@@ -62,10 +62,10 @@ def _cells(drawing: Drawing) -> tuple[list, dict]:
     for body in drawing.bodies:
         if body.shown == "ball":
             cells_by_type.setdefault("vertex", []).append(([index[body.name]], "body", body.pace == "fast"))
-    for line in drawing.connections:
-        end = next_point if line.other is None else line.other
-        next_point += line.other is None
-        cells_by_type.setdefault("line", []).append(([line.body, end], line.kind, line.pace == "fast"))
+    for line in drawing.joints:
+        ends = [index[name] for name in line.bodies] + [next_point] * (line.point is not None)
+        next_point += line.point is not None
+        cells_by_type.setdefault("line", []).append((ends, line.kind, drawing.pace(line) == "fast"))
     for solid in drawing.solids:
         fast = drawing.bodies[index[solid.points[0]]].pace == "fast"
         for face in solid.faces:

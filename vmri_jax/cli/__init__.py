@@ -11,11 +11,9 @@ import typer
 from vmri_jax.cli.animate import animate
 from vmri_jax.cli.check import check
 from vmri_jax.cli.common import refusals
-from vmri_jax.cli.lists import schemes, systems
-from vmri_jax.cli.new import new
+from vmri_jax.cli.lists import new, schemes, systems
 from vmri_jax.cli.run import simulate
-from vmri_jax.cli.scenes import explain
-from vmri_jax.cli.stability import advise, stability
+from vmri_jax.cli.stability import advise, explain, stability
 from vmri_jax.cli.study import cost, tune
 from vmri_jax.cli.sweep import sweep
 from vmri_jax.configure import configure

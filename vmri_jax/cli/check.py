@@ -8,7 +8,7 @@ import typer
 
 from vmri_jax.catalogue import find_problem
 from vmri_jax.cli import options
-from vmri_jax.cli.common import check_target, console, print_failure
+from vmri_jax.cli.common import check_target, console
 from vmri_jax.hard_cases import Case, cases_for, run_cases
 from vmri_jax.running.interrupts import Interrupted
 from vmri_jax.running.progress import progress_shown
@@ -45,7 +45,6 @@ def run_and_show(cases: Sequence[Case], numbers: Sequence[int], full: bool, out:
         for path in report.write(out):
             console.print(f"wrote {path}", soft_wrap=True)
     if stopped is not None:
-        print_failure("Interrupted", f"After {stopped.number} of {stopped.total} cases.")
-        raise typer.Exit(130)
+        raise stopped
     if missed:
         raise typer.Exit(1)

@@ -41,11 +41,7 @@ class ByName:
 
 
 def by_name(problem: Problem, columns: Sequence[str]) -> ByName | None:
-    """The function that sets the numbers which the names of columns say; None where all columns are steps and schemes.
-
-    Raises:
-        ValueError: an unknown name, or two columns for the same number.
-    """
+    """The function that sets the numbers which columns name; None where all columns are steps and schemes."""
     known, places = _known(problem), {}
     for name in columns_of_problems(columns):
         if name not in known:

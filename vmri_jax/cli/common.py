@@ -1,4 +1,4 @@
-"""Parts of all commands: the console, refusals and failures, tables, a spinner, checks of files to write."""
+"""Parts of all commands: the console, refusals, failures and Ctrl-C, tables, checks of files to write."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,6 +12,7 @@ from rich.text import Text
 
 from vmri_jax.refusals import NotInstalled, Refused
 from vmri_jax.running.files import check_writable, make_writable_folder
+from vmri_jax.running.interrupts import Interrupted
 from vmri_jax.running.printed import OutputConsole, PrintedTable
 
 console = OutputConsole()
@@ -32,9 +33,14 @@ FAULT = "This is no error of your command, but of the program. Please report it,
 
 @contextmanager
 def refusals() -> Iterator[None]:
-    """Within this context refusals of the library are shown as panels, other errors of their classes as faults."""
+    """Within this context refusals and Ctrl-C are shown as panels, other errors of classes of refusals as faults."""
     try:
         yield
+    except Interrupted as stopped:
+        count = stopped.number if stopped.total is None else f"{stopped.number} of {stopped.total}"
+        advice = f"; {stopped.advice}".replace("resume=True", "--resume") if stopped.advice else ""
+        print_failure("Interrupted", f"After {count} {stopped.units}{advice}.")
+        raise typer.Exit(130) from stopped
     except Refused as error:
         raise BadInput(str(error)) from error
     except NotInstalled as error:

@@ -124,15 +124,16 @@ def simulate(
             if steps is None:
                 _print_again(trajectory.settings, system, matrix)
         else:
-            code = _print_stop(stopped, saved, streamed)
+            _print_stop(stopped, saved, streamed)
+    if isinstance(stopped, Interrupted):
+        raise stopped
     if stopped is not None:
-        if code == 1:
-            given = {"--macro-dt": macro_dt, "--scheme": scheme, "--num-micro": num_micro}
-            words = [word for name, x in (given | of_scheme).items() if x is not None for word in (name, str(x))]
-            command = escape(shlex.join(["vmri", "advise", system, *words]))
-            text = "Whether this step is stable, which one near it is, and whether slow and fast are swapped"
-            Console(stderr=True).print(f"{text}:\n[bold]{command}[/bold]", soft_wrap=True)
-        raise typer.Exit(code)
+        options_of_step = {"--macro-dt": macro_dt, "--scheme": scheme, "--num-micro": num_micro} | of_scheme
+        words = [word for name, x in options_of_step.items() if x is not None for word in (name, str(x))]
+        command = escape(shlex.join(["vmri", "advise", system, *words]))
+        text = "Whether this step is stable, which one near it is, and whether slow and fast are swapped"
+        Console(stderr=True).print(f"{text}:\n[bold]{command}[/bold]", soft_wrap=True)
+        raise typer.Exit(1)
 
 
 def _check_steps(steps: int | None, accuracy: float | None, t_end: float | None, streamed: bool, error: bool) -> None:
@@ -164,20 +165,18 @@ def _run(run, problem, scheme, arguments: dict):
         return stopped.trajectory if isinstance(stopped, SimulationError) else stopped.done, stopped
 
 
-def _print_stop(stopped: SimulationError | Interrupted, saved: list[str], streamed: bool) -> int:
-    """Print where a run stopped, and its files; return the exit code, 1 for a failure and 130 for Ctrl-C."""
-    kept = f"\n\nThe trajectory up to there is in {' and '.join(saved)}." if saved else ""
+def _print_stop(stopped: SimulationError | Interrupted, saved: list[str], streamed: bool) -> None:
+    """Print the reason of a failure, and the files of a run that was stopped."""
     if isinstance(stopped, SimulationError):
         labels = f"\n\n{stopped.labels}" if stopped.labels else ""
-        reason = f"Macro step {stopped.step} at t = {stopped.time:.6g}: {stopped.result.message}{labels}{kept}"
+        reason = f"Macro step {stopped.step} at t = {stopped.time:.6g}: {stopped.result.message}{labels}"
         print_failure("The run failed", reason)
-        return 1
-    print_failure("Interrupted", f"After {stopped.number} of {stopped.total} macro steps.{kept}")
-    if streamed:
+    if saved:
+        console.print(f"The trajectory up to there is in {escape(' and '.join(saved))}.", soft_wrap=True)
+    if streamed and isinstance(stopped, Interrupted):
         again = [word for word in sys.argv[1:] if word not in ("--resume", "--overwrite")]
         command = escape(shlex.join(["vmri", *again, "--resume"]))
         console.print(f"Go on with it:\n[bold]{command}[/bold]", soft_wrap=True)
-    return 130
 
 
 def _check_out(out: Path | None, resume: bool, overwrite: bool) -> bool:

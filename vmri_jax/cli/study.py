@@ -86,8 +86,7 @@ def _search(out: Path | None) -> Iterator[Progress]:
     except Interrupted as stopped:
         console.print(stopped.done.table())
         _write_runs(stopped.done, out)
-        print_failure("Interrupted", f"After {stopped.number} runs; the best of them are above.")
-        raise typer.Exit(130) from stopped
+        raise
 
 
 def _write_runs(runs: ResultTable, out: Path | None) -> None:

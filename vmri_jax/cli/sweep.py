@@ -14,7 +14,7 @@ from rich.markup import escape
 from typer import Argument, Option
 
 from vmri_jax import plots
-from vmri_jax.animation.checks import check_keys
+from vmri_jax.animation.plain_data import check_keys
 from vmri_jax.catalogue import find_problem
 from vmri_jax.cli.columns import by_name
 from vmri_jax.cli.common import PICTURES, check_target, console, print_failure, print_named, print_written
@@ -25,7 +25,6 @@ from vmri_jax.mechanics.arrays import whole_number
 from vmri_jax.mechanics.state import Problem
 from vmri_jax.refusals import Refused
 from vmri_jax.running.export import extra
-from vmri_jax.running.interrupts import Interrupted
 
 SETTINGS = ("t_end", "num_steps", "macro_dt", "num_micro", "save", "num_saves", "project", "chunk")
 """Entries whose names and values are arguments of `ensemble`."""
@@ -57,9 +56,6 @@ def sweep(
             _print_summary(error.ensemble)
             print_failure("Not all chunks could be computed", str(error))
             raise typer.Exit(1) from error
-        except Interrupted as stopped:
-            print_failure("Interrupted", str(stopped).replace("resume=True", "--resume"))
-            raise typer.Exit(130) from stopped
         except RuntimeError as error:
             print_failure("Stopped", str(error).replace("resume=True", "--resume"))
             raise typer.Exit(1) from error

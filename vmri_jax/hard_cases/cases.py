@@ -1,7 +1,8 @@
 """The hard cases that apply to any system, with steps chosen from its frequencies."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, cached_property, partial
 
 import jax
 import jax.numpy as jnp
@@ -93,9 +94,14 @@ class Resolved:
             {"at_start": smallest[0], "least": smallest.min()},
         )
 
+    @cached_property
+    def _long_run(self) -> Callable[[int], Trajectory]:
+        """A run of this number of steps, which two cases look at."""
+        return cache(lambda steps: long_run(self.problem, self.scheme, self.macro_dt, steps))
+
     def constraints(self, full: bool) -> Outcome:
         steps = 1_000_000 if full else 10_000
-        trajectory = long_run(self.problem, self.scheme, self.macro_dt, steps)
+        trajectory = self._long_run(steps)
         position, velocity = constraints(trajectory)
         nodes = trajectory.states
         system = self.problem.system
@@ -132,7 +138,7 @@ class Resolved:
         )
 
     def _energy(self, steps: int) -> tuple[Trajectory, Energy]:
-        trajectory = long_run(self.problem, self.scheme, self.macro_dt, steps)
+        trajectory = self._long_run(steps)
         return trajectory, energy(trajectory, steps, energy_scale(self.problem, trajectory))
 
     def tolerance(self, full: bool) -> Outcome:

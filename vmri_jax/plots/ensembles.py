@@ -145,7 +145,7 @@ def _plot_maps(values, failed, x: str, y: str, title: str, theme: Theme) -> Note
     columns = min(4, len(panels))
     rows = -(-len(panels) // columns)
     with new_figure(1.2 + 2.6 * columns, 0.9 + 2.3 * rows, title, theme) as figure:
-        grid = panel_grid(figure, len(panels), columns)
+        grid = panel_grid(figure, len(panels), columns, _label(values[x]), _label(values[y]))
         for axes, (name, panel), mark in zip(grid, panels, marks, strict=True):
             colours = {"norm": norm, "cmap": "viridis", "rasterized": True}
             mesh = axes.pcolormesh(values[x], values[y], panel.transpose(y, x), **colours)
@@ -154,10 +154,6 @@ def _plot_maps(values, failed, x: str, y: str, title: str, theme: Theme) -> Note
             axes.set_title(name)
             axes.grid(visible=False)
             _scale(axes, values[x], values[y])
-        for axes in grid[-columns:]:
-            axes.set(xlabel=_label(values[x]))
-        for axes in grid[::columns]:
-            axes.set(ylabel=_label(values[y]))
         bar = figure.colorbar(mesh, ax=list(grid), label=_label(values), pad=0.02)
         bar.outline.set_visible(False)  # pyright: ignore[reportCallIssue]
         if failed.any():
@@ -185,19 +181,17 @@ def _plot_curves(values, x: str, title: str, theme: Theme) -> NotebookFigure:
 
 def _plot_cloud(values, x: str, y: str | None, title: str, theme: Theme) -> NotebookFigure:
     values = values.compute()
-    along, up = values[x].values, (values if y is None else values[y]).values
+    up = values if y is None else values[y]
     with new_figure(6.0, 3.9, title, theme) as figure:
         axes = figure.subplots()
-        size = float(np.clip(3e4 / max(len(along), 1), 0.5, 20.0))
-        if y is None:
-            axes.scatter(along, up, s=size, color=theme.curves[0], alpha=0.6, linewidths=0, rasterized=True)
-            axes.set(ylabel=_label(values))
-        else:
-            points = axes.scatter(along, up, s=size, c=values, norm=_norm(values.values), linewidths=0, rasterized=True)
+        size = float(np.clip(3e4 / max(len(values), 1), 0.5, 20.0))
+        alike, by_value = {"color": theme.curves[0], "alpha": 0.6}, {"c": values, "norm": _norm(values.values)}
+        look: dict[str, Any] = {"s": size, "linewidths": 0, "rasterized": True} | (alike if y is None else by_value)
+        points = axes.scatter(values[x].values, up.values, **look)
+        if y is not None:
             figure.colorbar(points, ax=axes, label=_label(values))
-            axes.set(ylabel=_label(values[y]))
-        axes.set(xlabel=_label(values[x]))
-        _scale(axes, values[x], values if y is None else values[y])
+        axes.set(xlabel=_label(values[x]), ylabel=_label(up))
+        _scale(axes, values[x], up)
     return figure
 
 
@@ -227,12 +221,10 @@ def _plot_bands(data, values, title: str, theme: Theme) -> NotebookFigure:
     panels = _panels(bands, ("quantile", "node"))
     columns = min(3, len(panels))
     with new_figure(0.8 + 3.0 * columns, 0.8 + 2.2 * -(-len(panels) // columns), title, theme) as figure:
-        grid = panel_grid(figure, len(panels), columns)
+        grid = panel_grid(figure, len(panels), columns, "time")
         for axes, (name, panel) in zip(grid, panels, strict=True):
             _fill_bands(axes, time, panel.transpose("quantile", "node").values, theme)
             axes.set_title(name if has_coordinates else _label(values))
-        for axes in grid[-columns:]:
-            axes.set(xlabel="time")
         legend_below(figure)
     return figure
 

@@ -112,17 +112,22 @@ def new_figure(width: float, height: float, title: str, theme: Theme) -> Iterato
         figure.suptitle(title, x=0.01, ha="left")
 
 
-def panel_grid(figure: Figure, count: int, columns: int) -> np.ndarray:
+def panel_grid(figure: Figure, count: int, columns: int, xlabel: str = "", ylabel: str = "") -> np.ndarray:
     """`count` axes in rows of `columns`; the cells left over in the last row stay empty.
 
     Args:
         figure: figure to draw on.
         count: number of panels.
         columns: columns of the grid.
+        xlabel, ylabel: labels of the lowest axes, and of the axes of the first column.
     """
     axes = figure.subplots(math.ceil(count / columns), columns, squeeze=False).reshape(-1)
     for empty in axes[count:]:
         empty.set_axis_off()
+    for lowest in axes[:count][-columns:]:
+        lowest.set(xlabel=xlabel)
+    for first in axes[:count:columns]:
+        first.set(ylabel=ylabel)
     return axes[:count]
 
 
