@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 from vmri_jax.configure import cache_folder, configure
-from vmri_jax.running.timing import Tell, interleaved, seconds_per_call, silent
+from vmri_jax.running.timing import interleaved, seconds_per_call
 from vmri_jax.study.html import processor
 
 __all__ = [
@@ -26,6 +26,13 @@ __all__ = [
     "silent",
     "steps_for",
 ]
+
+Tell = Callable[[str], None]
+"""Called with the name of a run before it is measured."""
+
+
+def silent(_: str) -> None:
+    """A `Tell` that prints nothing."""
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ import multiprocessing
 import traceback
 import warnings
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from random import Random
 from typing import Annotated
@@ -30,8 +30,9 @@ from tests.verification import random_systems as rs
 from vmri_jax.mechanics.constraints import CONSTRAINT_TOLERANCE
 from vmri_jax.refusals import Refused
 from vmri_jax.running.progress import progress_shown
-from vmri_jax.running.timing import Tell, silent
 
+Tell = Callable[[str], None]
+"""Called with what comes next."""
 DRAWS = 50
 """Runs of a structure, which share its compiled programs."""
 FORGET = 10
@@ -190,6 +191,10 @@ def outcomes(seed: int, runs: list[int], limit: float) -> Iterator[tuple[int, st
             for run in now:
                 left.remove(run)
                 yield run, ended
+
+
+def silent(_: str) -> None:
+    """A `Tell` that prints nothing."""
 
 
 def fuzz(count: int, seed: int, path: Path, limit: float, tell: Tell = silent) -> dict[int, str]:

@@ -16,7 +16,7 @@ from vmri_jax.mechanics.names import Names
 from vmri_jax.running.arguments import Steps
 from vmri_jax.running.origin import Origin
 from vmri_jax.running.simulation import simulation
-from vmri_jax.running.trajectory import RunInfo, with_origin
+from vmri_jax.running.trajectory import RunInfo
 from vmri_jax.study import (
     ConvergenceStudy,
     CostReport,
@@ -99,7 +99,8 @@ def test_of_many_coordinates_some_are_named():
 
 
 def test_bodies_give_their_names():
-    axes = plots.plot_trajectory(with_origin(run(), Origin(Names(slow={"cart": 1, "beam": 1}, fast={"bob": 3})))).axes
+    names = Names(slow={"cart": 1, "beam": 1}, fast={"bob": 3})
+    axes = plots.plot_trajectory(dataclasses.replace(run(), origin=Origin(names))).axes
     assert labels(axes[0]) == ["cart", "beam"]
     assert labels(axes[1]) == ["bob x", "bob y", "bob z"]
 

@@ -98,7 +98,7 @@ def test_number_of_saved_nodes():
 def test_steps_beside_resonances():
     """A slow kick once in half a turn of the fast oscillator is resonant; a few percent more steps are not."""
     problem, length, family = linear_model(omega=50.0, kappa=25.0), 20.0, of_order_2(vm.explicit_slow)
-    trials = search.Search(problem, None, None, length)
+    trials = search.Search(problem, length)
     trial = trials.trial(family, 40, 2048)
     resonant = round(length / 0.0625)  # within the window from 0.06223 to 0.06286 of `vmri_jax.stability.advise`
     beside = trials.beside_resonances(trial, resonant)

@@ -1,5 +1,7 @@
 """Which signals a strip shows, and during which time."""
 
+from dataclasses import replace
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -13,7 +15,6 @@ from vmri_jax.animation.html import _data
 from vmri_jax.animation.layout import layout
 from vmri_jax.mechanics.names import Names
 from vmri_jax.running.origin import Origin
-from vmri_jax.running.trajectory import with_origin
 
 OMEGA = 60.0
 DRAWING = {
@@ -86,7 +87,7 @@ def test_curves_are_the_signals(theme):
 
 
 def test_coordinates_without_a_drawing_have_the_names_of_the_run():
-    run = with_origin(crane(), Origin(Names(slow={"cart": 2}, fast={"hook": 2, "load": 2})))
+    run = replace(crane(), origin=Origin(Names(slow={"cart": 2}, fast={"hook": 2, "load": 2})))
     shown = motion(run, Drawing.from_dict(bars(run)))
     assert [body.name for body in shown.drawing.bodies][:3] == ["cart x", "cart y", "hook x"]
 

@@ -13,7 +13,7 @@ from tests.animation.support import swinging
 from vmri_jax.mechanics.names import Names
 from vmri_jax.running.origin import Origin
 from vmri_jax.running.quantities import Work
-from vmri_jax.running.trajectory import RunInfo, with_origin
+from vmri_jax.running.trajectory import RunInfo
 from vmri_jax.steppers.results import Result, Status
 
 NAMES = Names(slow={"bob": 2}, fast={"tip": 2}, constraint={"rod": 1})
@@ -37,7 +37,7 @@ def run():
     residual[7] = 1e-14, 2e-13
     info = RunInfo(np.full(40, 3), np.full(40, 4), np.full(40, 1e-15))
     swing = swinging(constraint_residual=residual, result=np.asarray(0), failed_at=np.asarray(-1))
-    return with_origin(dataclasses.replace(swing, info=info), Origin(NAMES))
+    return dataclasses.replace(swing, info=info, origin=Origin(NAMES))
 
 
 def test_a_run_says_what_it_is_and_what_it_has_kept(run):

@@ -71,7 +71,7 @@ def test_missing_file(tmp_path):
 def test_foreign_npz_file(tmp_path):
     np.savez(tmp_path / "foreign.npz", t=np.arange(3.0))
     with pytest.raises(
-        ValueError, match=r"foreign.npz is a .npz file but not a trajectory saved by Trajectory.save of this version"
+        ValueError, match=r"foreign.npz is a .npz file but no trajectory of Trajectory.save of this version"
     ):
         Trajectory.load(tmp_path / "foreign.npz")
 
@@ -98,7 +98,7 @@ def test_damaged_settings(trajectory, tmp_path):
     with np.load(path) as data:
         arrays = {name: data[name] for name in data.files}
     np.savez(path, **arrays, settings=np.array("{}"))
-    with pytest.raises(ValueError, match=r"run.npz is a damaged trajectory: its names or settings"):
+    with pytest.raises(ValueError, match=r"run.npz is a damaged trajectory: no names or settings"):
         Trajectory.load(path)
 
 

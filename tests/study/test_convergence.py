@@ -112,9 +112,9 @@ def test_progress_hears_of_every_run(reference):
     [
         ({"schemes": {}}, "schemes is empty"),
         ({"macro_dt": ()}, "macro_dt is empty"),
-        ({"macro_dt": (0.03,)}, "macro_dt = 0.03 makes 33.3333 steps"),
-        ({"macro_dt": (-0.1,)}, "macro_dt = -0.1"),
-        ({"macro_dt": (0.25,)}, "multiple of num_saves = 5"),
+        ({"macro_dt": (0.03,)}, r"there are 33\.3333 macro steps of 0\.03"),
+        ({"macro_dt": (-0.1,)}, "macro_dt is -0.1"),
+        ({"macro_dt": (0.25,)}, "multiple of the 5 saved intervals"),
         ({"reference": ReferenceSolution(np.zeros((3, 2)), np.zeros((3, 2)))}, r"both must be \(6, 2\)"),
     ],
 )

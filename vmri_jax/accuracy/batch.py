@@ -1,22 +1,23 @@
 """`simulate_batch`: runs side by side, with an estimate of their errors on request."""
 
 import warnings
+from dataclasses import replace
 from functools import cache
 
 import jax
 import numpy as np
 
-from vmri_jax.accuracy.companions import UncertifiedWarning, estimated_errors, extrapolated, finer, run_error
+from vmri_jax.accuracy.companions import UncertifiedWarning, finer, run_error
 from vmri_jax.mechanics.checks import check_flags
 from vmri_jax.mechanics.driving import Events, driven, events
 from vmri_jax.mechanics.state import Movable, State
 from vmri_jax.running.arguments import Save, Steps
-from vmri_jax.running.batch import Batch, batch
+from vmri_jax.running.batch import Batch, batch, shared
+from vmri_jax.running.origin import is_repeated
 from vmri_jax.running.progress import Working
 from vmri_jax.running.run_error import RunError
-from vmri_jax.running.trajectory import Trajectory, with_origin
-from vmri_jax.schemes.composition import Composition
-from vmri_jax.schemes.scheme import Scheme
+from vmri_jax.running.trajectory import Trajectory
+from vmri_jax.schemes.composition import SchemeLike
 from vmri_jax.steppers.results import Result
 from vmri_jax.steppers.solver import Solver
 
@@ -27,7 +28,7 @@ class FailedLanesWarning(UserWarning):
 
 def simulate_batch(
     system: Movable,
-    scheme: Scheme | Composition,
+    scheme: SchemeLike,
     states: State | None = None,
     *,
     macro_dt=None,
@@ -75,8 +76,9 @@ def simulate_batch(
     with Working("simulate_batch: the starts"):
         lanes = batch(system, scheme, states, steps, params, solver, chunk, devices)
     saved = lanes()
-    plain = saved.trajectory(lanes.runs)
-    trajectory = with_origin(plain, plain.origin, error=_errors(lanes, plain) if error else None)
+    trajectory = plain = saved.trajectory(lanes.runs)
+    if error:
+        trajectory = replace(plain, error=_errors(lanes, plain))
     lanes.runs.tell_of_start("simulate_batch", plain.states)
     lanes.runs.warn("simulate_batch", saved.table, plain.states.t)
     for kind, message in ((FailedLanesWarning, _failures(trajectory)), (UncertifiedWarning, _uncertified(trajectory))):
@@ -90,18 +92,15 @@ def _errors(lanes: Batch, plain: Trajectory) -> RunError:
 
     @cache
     def companions(parts: int, whole: int = 1) -> Trajectory:
-        finer_lanes = lanes.with_steps(finer(lanes.run, parts, whole))
-        return finer_lanes().trajectory(finer_lanes.runs)
+        runs = finer(lanes.runs, parts, whole)
+        if is_repeated(lanes.runs.macro_dt):  # a step of all lanes stays one array
+            runs = replace(runs, macro_dt=shared(runs.macro_dt[0], len(lanes)))
+        return replace(lanes, runs=runs)().trajectory(runs)
 
     def error(i: int) -> RunError:
-        run, coarse, halved = lanes.lane(i), plain.lane(i), companions(2).lane(i)
+        run, coarse = lanes.lane(i), plain.lane(i)
         drives = events(run.system, run.state, float(coarse.t[-1])) if is_driven else Events()
-        if max(coarse.failed_at, halved.failed_at) >= 0:
-            total = extrapolated(run.order, coarse, halved)
-        else:
-            of_lane = lambda *counts: companions(*counts).lane(i)  # noqa: E731
-            total = estimated_errors(run, coarse, halved, drives, companion_of=of_lane)
-        return run_error(run, coarse, halved, total, drives)
+        return run_error(run, coarse, companions(2).lane(i), drives, lambda *counts: companions(*counts).lane(i))
 
     is_driven = driven(lanes.run.system, lanes.run.state)
     return jax.tree.map(lambda *arrays: np.stack(arrays), *map(error, range(len(plain.t))))

@@ -28,6 +28,7 @@ import math
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -37,10 +38,10 @@ from vmri_jax.refusals import Refused
 from vmri_jax.running.arguments import Save
 from vmri_jax.running.observables import SingularCoordinatesWarning
 from vmri_jax.running.run_error import RunError, largest_of
+from vmri_jax.running.saved import Saved
 from vmri_jax.running.simulation import Simulation
-from vmri_jax.running.trajectory import Trajectory, from_named_arrays
-from vmri_jax.schemes.composition import Composition, stage_lengths, stage_scheme
-from vmri_jax.schemes.scheme import Scheme
+from vmri_jax.running.trajectory import Trajectory
+from vmri_jax.schemes.composition import SchemeLike, stage_lengths, stage_scheme
 from vmri_jax.steppers.results import Result
 
 LARGEST_CERTIFIED = 0.1
@@ -80,23 +81,19 @@ def with_error(
 ) -> Trajectory:
     """The trajectory of a run without a failed step, with its `RunError`; warns if the error is not certified over the
     whole run. A `trial` has the companion with half the macro step and the errors (k, n_s + n_f), if they are known."""
-    halved = companion(run, 2) if trial is None else trial[0]
+    drives = events(run.system, run.state, float(trajectory.t[-1])) if trial is None else Events()
+    halved, total = trial or (companion(run, 2), None)
+    error, reason = None, ""
     if int(halved.failed_at) >= 0:
         failed = float(halved.t[0]) + int(halved.failed_at) * float(run.macro_dt) / 2
         reason = f"the error is not known; the same run with half the macro step failed at t = {failed:.4g}."
-        warnings.warn(f"simulate: {reason}", UncertifiedWarning, stacklevel=3)
-        return trajectory
-    drives = events(run.system, run.state, float(trajectory.t[-1])) if trial is None else Events()
-    total = estimated_errors(run, trajectory, halved, drives) if trial is None else trial[1]
-    refined = None
-    if shares:
-        twice = run.scheme.with_num_micro(2 * stage_scheme(run.scheme).num_micro)
-        refined = companion(replace(run, scheme=of_one_type(twice)), 1)
-    error = run_error(run, trajectory, halved, total, drives, refined, of)
-    if not error.is_certified:
-        unseen = first_unseen(run, drives)
-        is_seen = unseen > trajectory.t[-1]
-        reason = _uncertified(error, trajectory, run, halved) if is_seen else _stepped_over(run, drives, unseen)
+    else:
+        error = run_error(run, trajectory, halved, drives, partial(companion, run), total, shares, of)
+        if not error.is_certified:
+            unseen = first_unseen(run, drives)
+            is_seen = unseen > trajectory.t[-1]
+            reason = _uncertified(error, trajectory, run, halved) if is_seen else _stepped_over(run, drives, unseen)
+    if reason:
         warnings.warn(f"simulate: {reason}", UncertifiedWarning, stacklevel=3)
     return replace(trajectory, error=error)
 
@@ -105,15 +102,20 @@ def run_error(
     run: Simulation,
     trajectory: Trajectory,
     halved: Trajectory,
-    total: np.ndarray,
     drives: Events,
-    refined: Trajectory | None = None,
+    companion_of: Callable[[int, int], Trajectory],
+    total: np.ndarray | None = None,
+    shares: bool = False,
     of: Callable | None = None,
 ) -> RunError:
-    """The error of a run, NaN where it is not certified, from the errors of the positions, `total` (k, n_s + n_f);
-    `halved` has half the macro step, `refined` twice the micro steps: without it there are no shares."""
+    """The error of a run or of a lane of a batch, NaN where it is not certified: `total` (k, n_s + n_f), or the
+    `estimated_errors`; `halved` has half the macro step."""
     order = run.order
-    fast = np.full_like(total, np.nan) if refined is None else extrapolated(order, trajectory, refined)
+    total = estimated_errors(run, trajectory, halved, drives, companion_of) if total is None else total
+    fast = np.full_like(total, np.nan)
+    if shares:
+        twice = run.scheme.with_num_micro(2 * stage_scheme(run.scheme).num_micro)
+        fast = extrapolated(order, trajectory, companion(replace(run, scheme=of_one_type(twice)), 1))
     certified, growth = certified_nodes(trajectory, total)
     certified[1:] &= np.asarray(trajectory.t)[1:] <= first_unseen(run, drives)
     until = np.asarray(trajectory.t)[certified][-1]
@@ -139,11 +141,14 @@ def estimated_errors(
     trajectory: Trajectory,
     halved: Trajectory,
     drives: Events,
+    companion_of: Callable[[int, int], Trajectory],
     accuracy: float = 0.0,
-    companion_of: Callable[[int, int], Trajectory] | None = None,
 ) -> np.ndarray:
     """(k, n_s + n_f) errors of the positions, from the companion with half the macro step, and from further ones if the
-    system is driven or its errors are below `DOUBTED` of the accuracy; infinite if a further companion fails."""
+    system is driven or its errors are below `DOUBTED` of the accuracy; NaN after a failure of the run or of this
+    companion, infinite if a further companion fails."""
+    if max(int(trajectory.failed_at), int(halved.failed_at)) >= 0:
+        return extrapolated(run.order, trajectory, halved)
     order = 1 if drives.jump else run.order
     result = extrapolated(order, trajectory, halved)
     if not drives.names and np.abs(result).max(initial=0.0) > DOUBTED * accuracy:
@@ -154,7 +159,7 @@ def estimated_errors(
     whole = stride * run.save_every
     for factor in FURTHER_PARTS if drives.jump else FURTHER_PARTS[:1]:
         parts = next(k for k in range(max(round(factor * whole), 3), 10 * whole + 4) if math.gcd(k, whole) == 1)
-        further = companion_of(parts, whole) if companion_of else companion(run, parts, whole)
+        further = companion_of(parts, whole)
         if int(further.failed_at) >= 0:
             return np.full_like(result, np.inf)
         difference = ratio(order, parts / whole) * (positions(trajectory)[::stride] - positions(further))
@@ -163,14 +168,14 @@ def estimated_errors(
     return result
 
 
-def node_distance(scheme: Scheme | Composition, drives: Events) -> float:
+def node_distance(scheme: SchemeLike, drives: Events) -> float:
     """Largest distance in time of the nodes at which a scheme sees the terms that depend on time, in units of the macro step."""
     stage = stage_scheme(scheme)
     longest = float(np.abs(stage_lengths(scheme)).max())
     return longest * max(getattr(stage, name).largest_gap(stage.num_micro) for name in drives.names)
 
 
-def fewest_steps(scheme: Scheme | Composition, drives: Events, length: float) -> int:
+def fewest_steps(scheme: SchemeLike, drives: Events, length: float) -> int:
     """Fewest macro steps in a time with `NODES_OF_EVENT` nodes in the shortest event."""
     if not drives.names:
         return 1
@@ -226,13 +231,11 @@ def check_function_of_run(of: Callable | None, run: Simulation) -> None:
 
 def resting(run: Simulation) -> Trajectory:
     """A trajectory at the times of a run that stays at the start, without micro nodes: an argument to try functions of runs on."""
-    start, k = run.state, run.num_saves + 1
-    arrays = {name: np.repeat(np.asarray(value)[None], k, axis=0) for name, value in vars(start).items()}
-    arrays["t"] = start.t + np.arange(k) * run.save_every * run.macro_dt
-    arrays |= {"energy": np.zeros(k), "constraint_residual": np.zeros((k, 2))}
-    arrays |= {"method": np.zeros(k - 1, int), "iterations": np.zeros(k - 1, int), "residual": np.zeros(k - 1)}
-    arrays |= {"result": np.asarray(int(Result.CONVERGED)), "failed_at": np.asarray(-1)}
-    return replace(from_named_arrays(arrays), origin=run.origin)
+    run = replace(run, save=Save())
+    _, *phase = vars(run.state).values()
+    rows = np.zeros((run.num_saves + 1, run.columns.width))
+    rows[:, : run.columns.info.start] = np.concatenate(phase)
+    return Saved(rows, np.asarray(int(Result.CONVERGED)), np.asarray(-1)).trajectory(run)
 
 
 def companion(run: Simulation, parts: int, whole: int = 1) -> Trajectory:

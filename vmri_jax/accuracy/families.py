@@ -10,7 +10,7 @@ import numpy as np
 from vmri_jax.mechanics.masses import ConstantMass
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
-from vmri_jax.schemes.composition import Composition, compose, stage_scheme
+from vmri_jax.schemes.composition import SchemeLike, compose, stage_scheme
 from vmri_jax.schemes.scheme import Scheme, explicit_slow, fully_explicit, fully_implicit, galerkin, takahashi_imada
 
 COMPOSED = ((2.5, None), (5.0, "suzuki4"), (8.0, "kahan-li6"), (np.inf, "kahan-li8"))
@@ -30,19 +30,16 @@ class Family:
     """
 
     name: str
-    make: Callable[[int], Scheme | Composition]
+    make: Callable[[int], SchemeLike]
     options: str
     python: str
     first: int = 5
 
     def composed(self, coefficients: str) -> "Family":
         """The family of compositions of its schemes, by the name of their coefficients."""
-
-        def make(num_micro: int) -> Composition:
-            return compose(self.make(num_micro), coefficients)
-
         options, python = f"{self.options} --compose {coefficients}", f'vm.compose({self.python}, "{coefficients}")'
-        return Family(f"{self.name}, {coefficients}", make, options, python)
+        name = f"{self.name}, {coefficients}"
+        return Family(name, lambda num_micro: compose(self.make(num_micro), coefficients), options, python)
 
     def label(self, num_micro: int) -> str:
         """Name with num_micro, for progress and tables."""
@@ -92,7 +89,7 @@ def of_degree(degree: int) -> Family:
     )
 
 
-def of_scheme(scheme: Scheme | Composition) -> Family:
+def of_scheme(scheme: SchemeLike) -> Family:
     """The family of a scheme of the user, with its rules; the search begins with its num_micro."""
     return Family("own", scheme.with_num_micro, "", "scheme.with_num_micro({})", stage_scheme(scheme).num_micro)
 
@@ -118,6 +115,6 @@ def micro_steps_help(system: System, start: State) -> bool:
     return bool(start.q_f.size and (start.q_s.size or system.slow_potential is not None or system.potentials))
 
 
-def unit_of(system: System, scheme: Scheme | Composition) -> int:
+def unit_of(system: System, scheme: SchemeLike) -> int:
     """The number whose multiples are allowed as num_micro: least common multiple of k of rules on every k-th node."""
     return math.lcm(stage_scheme(scheme).unit, *(name for name, _ in system.potentials if isinstance(name, int)))

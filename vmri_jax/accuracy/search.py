@@ -19,7 +19,7 @@ of two families, `vmri_jax.tune` compares the best of many.
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -35,20 +35,18 @@ from vmri_jax.accuracy.companions import (
 )
 from vmri_jax.accuracy.families import Family, micro_steps_help, unit_of
 from vmri_jax.accuracy.trials import LEAST_TIME, Trial, seconds_of_steps
-from vmri_jax.mechanics.arrays import is_concrete
 from vmri_jax.mechanics.driving import Events, events
 from vmri_jax.mechanics.linearisation import Linearisation, linearise
 from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.refusals import Refused
-from vmri_jax.running.arguments import Steps
+from vmri_jax.running.arguments import Steps, refuse_tracers
 from vmri_jax.running.progress import Progress, silent
 from vmri_jax.running.run_error import largest_of
 from vmri_jax.running.saved import check_memory
 from vmri_jax.running.settings import Settings
 from vmri_jax.running.simulation import Simulation, simulation
 from vmri_jax.running.timing import stopwatch
-from vmri_jax.schemes.composition import Composition, stage_lengths, stage_scheme
-from vmri_jax.schemes.scheme import Scheme
+from vmri_jax.schemes.composition import stage_lengths, stage_scheme
 from vmri_jax.steppers.solver import Solver
 
 AIMED_PART = 0.5
@@ -102,10 +100,6 @@ SHORTER_STEPS = (1.0, 0.98, 0.96, 0.93, 0.9, 0.86, 0.82, 0.78)
 """Macro steps that are tried in this order until one is not resonant, in units of the largest step for the accuracy."""
 
 
-COMPARES = "compares runs with numbers; call simulate outside of jax.jit, vmap and grad."
-"""End of the refusal of an error or an accuracy in a transformation."""
-
-
 class Search:
     """Trial runs of several schemes from the same start until `t_end`; arguments as of `vmri_jax.simulate`.
 
@@ -116,34 +110,26 @@ class Search:
     def __init__(
         self,
         moving: Movable,
-        state: State | None,
-        solver: Solver | None,
         t_end: float,
+        *,
+        state: State | None = None,
+        solver: Solver | None = None,
         num_saves: int | None = None,
         of: Callable | None = None,
         progress: Progress = silent,
     ):
         self.system, self.start = start_of("simulate", moving, state)
-        if not is_concrete((vars(self.start), self.system.params, t_end)):
-            raise Refused(f"simulate: an accuracy {COMPARES}")
+        refuse_tracers("simulate: an accuracy", (self.start, self.system.params, t_end))
         self.t_end, self.length = float(t_end), float(t_end - self.start.t)
         if not 0 < self.length < np.inf:
             raise Refused(f"t_end is {self.length:g} after the start; it must be later, by a finite time.")
         self.num_saves, self.progress, self.num_trials = num_saves, progress, 0
         self.seconds: dict[str, float] = {}
+        self._arguments, self._of = (moving, state, solver), of
         self._runs: dict[tuple[str, int], Simulation] = {}
         self._firsts: dict[tuple[str, int], Trial] = {}
         self._chosen: dict[str, Trial] = {}
         self._times: dict[str, Callable[[int], float]] = {}
-
-        def make(scheme: Scheme | Composition) -> Simulation:
-            run = simulation(moving, scheme, state, solver, Steps(self.length, num_steps=1))
-            run.check()
-            check_memory("simulate", run, num_saves=num_saves or MOST_SAVED)
-            check_function_of_run(of, run)
-            return run
-
-        self._make = make
 
     @cached_property
     def drives(self) -> Events:
@@ -209,10 +195,10 @@ class Search:
             elapsed = stopwatch()
             trajectory, halved = run.in_pieces(), companion(run, 2)
             seconds, succeeded = elapsed(), max(int(trajectory.failed_at), int(halved.failed_at)) < 0
-            if succeeded and accuracy is not None:
-                errors = estimated_errors(run, trajectory, halved, self.drives, accuracy)
-            else:
+            if accuracy is None:
                 errors = extrapolated(run.order, trajectory, halved)
+            else:
+                errors = estimated_errors(run, trajectory, halved, self.drives, partial(companion, run), accuracy)
             certified = succeeded and bool(certified_nodes(trajectory, errors)[0].all())
             error = float(largest_of(errors).max()) if certified else np.inf
             trial = Trial(family, num_micro, run, trajectory, halved, errors, error)
@@ -263,7 +249,12 @@ class Search:
         """The run with at least `num_steps` macro steps, and with steps that see all events."""
         key = family.python, num_micro
         if key not in self._runs:
-            self._runs[key] = self._make(family.make(num_micro))
+            moving, state, solver = self._arguments
+            run = simulation(moving, family.make(num_micro), state, solver, Steps(self.length, num_steps=1))
+            run.check()
+            check_memory("simulate", run, num_saves=self.num_saves or MOST_SAVED)
+            check_function_of_run(self._of, run)
+            self._runs[key] = run
         fewest = fewest_steps(self._runs[key].scheme, self.drives, self.length)
         num_steps, save_every = self.rounded(max(num_steps, fewest))
         dt = np.asarray(self.length / num_steps)

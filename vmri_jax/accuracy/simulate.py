@@ -6,25 +6,25 @@ from dataclasses import replace
 from typing import Any
 
 from vmri_jax.accuracy.companions import check_function_of_run, with_error
-from vmri_jax.accuracy.search import COMPARES, Search
+from vmri_jax.accuracy.search import Search
 from vmri_jax.accuracy.steps import with_accuracy
+from vmri_jax.mechanics.arrays import is_concrete
 from vmri_jax.mechanics.checks import check_system
 from vmri_jax.mechanics.state import Movable, State
 from vmri_jax.refusals import Refused
-from vmri_jax.running.arguments import Save, Steps
+from vmri_jax.running.arguments import Save, Steps, refuse_tracers
 from vmri_jax.running.failures import simulation_error
 from vmri_jax.running.progress import progress_to
 from vmri_jax.running.saved import check_memory
 from vmri_jax.running.simulation import simulation
 from vmri_jax.running.trajectory import Trajectory
-from vmri_jax.schemes.composition import Composition
-from vmri_jax.schemes.scheme import Scheme
+from vmri_jax.schemes.composition import SchemeLike
 from vmri_jax.steppers.solver import Solver
 
 
 def simulate(
     system: Movable,
-    scheme: Scheme | Composition | None = None,
+    scheme: SchemeLike | None = None,
     state: State | None = None,
     *,
     macro_dt=None,
@@ -83,9 +83,10 @@ def simulate(
         raise Refused(f"simulate: error is {error!r}; it must be True or False, 'shares', or a function of a run.")
     steps = Steps(macro_dt, num_steps, t_end, save)
     if accuracy is not None:
-        length = _end(steps), Save.of(save).number
-        with progress_to("simulate", Save.of(save).progress) as tell:
-            search = Search(system, state, solver, *length, of, tell)
+        t_end, saved = _end(steps), Save.of(save)
+        with progress_to("simulate", saved.progress) as tell:
+            how = {"state": state, "solver": solver, "num_saves": saved.number, "of": of, "progress": tell}
+            search = Search(system, t_end, **how)
             best = with_accuracy(search, scheme, accuracy)
         origin = replace(best.run.origin, settings=search.settings(best))
         run, trajectory = best.run, replace(best.trajectory, origin=origin)
@@ -97,9 +98,9 @@ def simulate(
     if scheme is None:
         raise Refused("simulate: scheme is None without an accuracy; give one of them, e.g. accuracy=1e-5.")
     run = simulation(system, scheme, state, solver, steps)
-    if not run.is_concrete:
+    if not is_concrete(run.leaves):
         if error:
-            raise Refused(f"simulate: an error {COMPARES}")
+            refuse_tracers("simulate: an error", run.leaves)
         check_system(run.system, run.state.q_s, run.state.q_f)
         return run.traced()
     if state is not None:  # the start of a problem is checked when it is made
@@ -119,10 +120,8 @@ def _end(steps: Steps) -> float:
     if replace(save, every=None if save.every == 1 else save.every, number=None, progress=False) != Save():
         refused.append(f"save={steps.save!r}")
     if refused:
-        raise Refused(
-            f"simulate: got {' and '.join(refused)} with an accuracy, which chooses steps and saved nodes, but for "
-            "Save(number=); leave them out, or the accuracy."
-        )
+        chosen = "an accuracy, which chooses steps and saved nodes, but for Save(number=)"
+        raise Refused(f"simulate: got {' and '.join(refused)} with {chosen}; leave them out, or the accuracy.")
     if steps.t_end is None:
         raise Refused("simulate: an accuracy needs t_end, the time until which it is to be kept.")
     return steps.t_end

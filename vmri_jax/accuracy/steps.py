@@ -11,8 +11,7 @@ from vmri_jax.mechanics.checks import check_number, check_type
 from vmri_jax.mechanics.invariants import velocity
 from vmri_jax.mechanics.state import Problem, State
 from vmri_jax.refusals import Refused
-from vmri_jax.schemes.composition import Composition
-from vmri_jax.schemes.scheme import Scheme
+from vmri_jax.schemes.composition import SchemeLike
 
 MANY_STEPS = 100_000
 """Macro steps that short events demand, above which a warning tells of them; a smaller value warns of fast runs."""
@@ -24,11 +23,11 @@ class AccuracyNotReached(UserWarning):
     """The error of a run exceeds its accuracy, or is not certified."""
 
 
-def with_accuracy(search: Search, scheme: Scheme | Composition | None, accuracy: float) -> Trial:
+def with_accuracy(search: Search, scheme: SchemeLike | None, accuracy: float) -> Trial:
     """The trial whose largest estimated error of a position is at most `accuracy`, with a scheme of the user or with
     one of the usual menu; warns with `AccuracyNotReached` if no trial is as accurate."""
     a_scheme = "a Scheme, e.g. fully_implicit(num_micro=10), or None"
-    check_type("simulate: scheme", scheme, Scheme | Composition | None, a_scheme)
+    check_type("simulate: scheme", scheme, SchemeLike | None, a_scheme)
     check_error("simulate: accuracy", accuracy, search.start)
     best = reached("simulate: accuracy", search, usual_menu(search, scheme, accuracy), accuracy)[0]
     warn_of_events("simulate", search, best.run.scheme, stacklevel=4)
@@ -56,13 +55,11 @@ def check_extent(name: str, search: Search, accuracy: float) -> None:
     extent = search.extent()
     # Driven systems: positions at few saved nodes may hide the motion, and all trials see the events.
     if accuracy > extent and not search.drives.names:
-        until = f"until t = {search.t_end:g}: any run is as accurate"
-        raise Refused(
-            f"{name} is {accuracy:g}, and no position moves by more than {extent:.3g} {until}; give a smaller one."
-        )
+        moves = f"no position moves by more than {extent:.3g} until t = {search.t_end:g}: any run is as accurate"
+        raise Refused(f"{name} is {accuracy:g}, and {moves}; give a smaller one.")
 
 
-def usual_menu(search: Search, scheme: Scheme | Composition | None, accuracy: float) -> list[Family]:
+def usual_menu(search: Search, scheme: SchemeLike | None, accuracy: float) -> list[Family]:
     """The families for an accuracy: the user's scheme alone, or kicks and a single interval of high degree."""
     if scheme is not None:
         return [of_scheme(scheme)]
@@ -79,7 +76,7 @@ def digits_of(search: Search, accuracy: float) -> float:
     return float(np.log10(max((size or speed * search.length) / accuracy, 10.0)))
 
 
-def warn_of_events(caller: str, search: Search, scheme: Scheme | Composition, stacklevel: int) -> None:
+def warn_of_events(caller: str, search: Search, scheme: SchemeLike, stacklevel: int) -> None:
     """Warn if the events of a driven system demand `MANY_STEPS` of a run."""
     drives, fewest = search.drives, fewest_steps(scheme, search.drives, search.length)
     if fewest > MANY_STEPS:

@@ -15,6 +15,7 @@ import numpy as np
 
 from vmri_jax.ensembles.columns import SCHEMES, START, STEPS, Row, columns_of_problems
 from vmri_jax.mechanics.names import Names, near
+from vmri_jax.mechanics.slots import leaves_by_name
 from vmri_jax.mechanics.state import Problem
 from vmri_jax.refusals import Refused
 
@@ -63,8 +64,7 @@ def _arrays(problem: Problem) -> tuple[list, Any]:
 
 def _known(problem: Problem) -> dict[str, Place]:
     """The place of every number by its names; a parameter goes before a coordinate of the same name."""
-    paths, _ = jax.tree_util.tree_flatten_with_path(problem.system.params)
-    labels = [jax.tree_util.keystr(path, simple=True, separator=".") or "params" for path, _ in paths]
+    labels = [name or "params" for name in leaves_by_name(problem.system.params)[0]]
     arrays, _ = _arrays(problem)
     known: dict[str, Place] = {}
     for number, (label, array) in enumerate(zip([*labels, *START], arrays, strict=True)):

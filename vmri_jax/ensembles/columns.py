@@ -50,9 +50,7 @@ def lane_function(
     if vary is None and columns:
         name = columns[0]
         known = near(name, (*STEPS, *SCHEMES))
-        raise Refused(
-            f"ensemble: the column {name!r} is neither a step nor a scheme.{known} Give vary=, which puts it into a problem."
-        )
+        raise Refused(f"ensemble: the column {name!r} is neither a step nor a scheme.{known} Give vary= for it.")
 
     def lane(row: Row) -> Lanes:
         changed = problem if vary is None else vary(problem, {name: row[name] for name in columns})

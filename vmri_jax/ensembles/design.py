@@ -7,6 +7,7 @@
 Rows are numbered from 0. Any row can be made without the others: a random row depends on the seed and on its number alone.
 """
 
+import math
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -68,9 +69,8 @@ class Draw:
         distribution = getattr(stats, name, None)
         if not isinstance(distribution, stats.rv_continuous):
             known = [*ALIASES, *(n for n, d in vars(stats).items() if isinstance(d, stats.rv_continuous))]
-            raise Refused(
-                f"Draws: there is no continuous distribution {self.name!r} in scipy.stats.{near(self.name, known)}"
-            )
+            missing = f"there is no continuous distribution {self.name!r} in scipy.stats"
+            raise Refused(f"Draws: {missing}.{near(self.name, known)}")
         arguments = self.arguments
         try:
             if name == "uniform" and arguments:  # scipy takes the lowest value and the width
@@ -113,16 +113,12 @@ class Product:
         return tuple(axis.values.size for axis in self.axes.values())
 
     def __len__(self) -> int:
-        return int(np.prod(self.shape, dtype=np.int64))
+        return math.prod(self.shape)
 
     def rows(self, first: int, last: int) -> Rows:
         """Rows number `first` to `last - 1`."""
         places = np.unravel_index(np.arange(first, last), self.shape) if self.axes else ()
         return {name: axis.values[place] for (name, axis), place in zip(self.axes.items(), places, strict=True)}
-
-    def combinations(self, names: Sequence[str]) -> Rows:
-        """All different combinations of the values of some columns."""
-        return (part := Product({name: self.axes[name] for name in names})).rows(0, len(part))
 
     def described(self) -> dict[str, dict]:
         """The columns as plain data, for the store."""
@@ -146,10 +142,8 @@ class Table:
         lengths = {name: axis.values.shape[:1] for name, axis in columns.items()}
         if len(set(lengths.values())) != 1 or () in lengths.values() or (0,) in lengths.values():
             texts = [f"{name} {shape[0] if shape else 'a single value'}" for name, shape in lengths.items()]
-            raise Refused(
-                f"Table: columns must have one value for each run, but their lengths are: {', '.join(texts) or 'none'}. "
-                "For all combinations of values take Product."
-            )
+            lengths = ", ".join(texts) or "none"
+            raise Refused(f"Table: give columns of one length, or take Product, but their lengths are: {lengths}.")
         object.__setattr__(self, "columns", columns)
 
     def __len__(self) -> int:
@@ -158,10 +152,6 @@ class Table:
     def rows(self, first: int, last: int) -> Rows:
         """Rows number `first` to `last - 1`."""
         return {name: axis.values[first:last] for name, axis in self.columns.items()}
-
-    def combinations(self, names: Sequence[str]) -> Rows:
-        """All different combinations of the values of some columns."""
-        return unique_rows({name: self.columns[name].values for name in names})[0]
 
     def described(self) -> dict[str, dict]:
         """The columns as plain data, without their values, which the store has in arrays."""
@@ -209,12 +199,6 @@ class Draws:
         points = np.clip(self._points(first, last), 2.0**-53, 1 - 2.0**-53)  # quantiles of 0 and 1 may be infinite
         return {name: draw.quantiles(points[:, i]) for i, (name, draw) in enumerate(self.columns.items())}
 
-    def combinations(self, names: Sequence[str]) -> Rows:
-        """No rows. Drawn values are all different, and each would need a program of its own, so that names are refused."""
-        if names:
-            raise Refused(f"Draws: {', '.join(names)} cannot be drawn: each value needs a program. Give a Table.")
-        return {}
-
     def described(self) -> dict[str, dict]:
         """The columns as plain data, for the store."""
         distributions = {name: [draw.name, *draw.arguments] for name, draw in self.columns.items()}
@@ -241,12 +225,7 @@ Design = Product | Table | Draws
 
 
 class Chunks(NamedTuple):
-    """The division of the runs of an ensemble.
-
-    lanes: number of runs.
-    size: number of runs of a chunk; the last chunk may have fewer.
-    width: number of runs that are computed side by side.
-    """
+    """The runs of an ensemble, the runs of a chunk (the last one may have fewer), and those computed side by side."""
 
     lanes: int
     size: int
@@ -260,6 +239,18 @@ class Chunks(NamedTuple):
     def ends(self, number: int) -> tuple[int, int]:
         """Number of the first run of a chunk, and of the first run after it."""
         return number * self.size, min((number + 1) * self.size, self.lanes)
+
+
+def combinations(design: Design, names: Sequence[str]) -> Rows:
+    """All different combinations of the values of some columns; drawn values are all different, and refused."""
+    if not names:
+        return {}
+    if isinstance(design, Draws):
+        raise Refused(f"Draws: {', '.join(names)} cannot be drawn: each value needs a program. Give a Table.")
+    if isinstance(design, Table):
+        return unique_rows({name: design.columns[name].values for name in names})[0]
+    part = Product({name: design.axes[name] for name in names})
+    return part.rows(0, len(part))
 
 
 def unique_rows(rows: Rows) -> tuple[Rows, np.ndarray]:

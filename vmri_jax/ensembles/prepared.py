@@ -33,7 +33,7 @@ larger ones chunks have fewer runs."""
 
 
 def prepared(work: Work, design: Design, chunk: int | None = None) -> tuple[dict[str, Kept], Chunks, Simulation]:
-    """The arrays of the store, the division of the runs, and the longest run, after a check of all arguments; nothing is computed."""
+    """The arrays of the store, the division of the runs, and the longest run, after all checks; nothing is computed."""
     jax.eval_shape(work.lane, _first_row(design))
     runs = [work.simulation(group) for group in all_groups(work, design)]  # one of each group
     runs[0].check("ensemble: the start", constraints=False)

@@ -21,12 +21,8 @@ from vmri_jax.schemes.scheme import fully_implicit
 
 LEVELS = (0.05, 0.5, 0.95)
 """Probabilities of the quantiles over the saved nodes: the median, and an interval with 90 % of them."""
-
-
 Saved = str | Callable[[Trajectory], Any]
 """An entry of the argument ``save`` of `vmri_jax.ensemble`."""
-
-
 Quantity = Callable[[Trajectory], dict[str, Kept]]
 """A function of a single run that returns arrays by name."""
 
@@ -106,9 +102,9 @@ def quantity(saved: Saved) -> Quantity:
     if isinstance(saved, str) and saved in QUANTITIES:
         return QUANTITIES[saved]
     if not callable(saved) and not (isinstance(saved, str) and ":" in saved):
+        known = f"{near(saved, QUANTITIES)} There are {', '.join(QUANTITIES)}, and functions of your own"
         raise Refused(
-            f"ensemble: save has {saved!r}.{near(saved, QUANTITIES)} There are {', '.join(QUANTITIES)}; your own functions are given as they are, "
-            "or as my_file.py:function, or my_package.my_module:function."
+            f"ensemble: save has {saved!r}.{known}, function, my_file.py:function or my_package.module:function."
         )
     user_function, label = saved if callable(saved) else imported(saved), label_of(saved)
     if not callable(user_function):

@@ -28,8 +28,7 @@ from vmri_jax.running.interrupts import Interrupted, interrupts_noted
 from vmri_jax.running.progress import Progress, ShowsProgress, progress_to
 from vmri_jax.running.store import layout
 from vmri_jax.running.store.identity import check_same
-from vmri_jax.schemes.composition import Composition
-from vmri_jax.schemes.scheme import Scheme
+from vmri_jax.schemes.composition import SchemeLike
 from vmri_jax.steppers.solver import Solver
 
 FAILURES_TO_STOP = 10
@@ -309,7 +308,7 @@ def _progress(runs: Ensemble) -> str:
 def _schemes(scheme) -> dict[str, AnyScheme]:
     if not isinstance(scheme, Mapping):
         scheme = {scheme if isinstance(scheme, str) else "scheme": scheme}
-    known = (isinstance(entry, str | Scheme | Composition) or callable(entry) for entry in scheme.values())
+    known = (isinstance(entry, str | SchemeLike) or callable(entry) for entry in scheme.values())
     if not scheme or not all(known) or not all(isinstance(label, str) for label in scheme):
         one = "a Scheme, the name of one, or a function that makes one for a num_micro"
         raise Refused(f"ensemble: scheme is {scheme!r}; give {one}, or several by label.")

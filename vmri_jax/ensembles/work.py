@@ -11,53 +11,38 @@ import numpy as np
 
 from vmri_jax.accuracy.batch import simulate_batch
 from vmri_jax.catalogue import find_problem, find_scheme
-from vmri_jax.ensembles import columns
-from vmri_jax.ensembles.columns import SCHEMES, STEPS, Lanes, Row, Vary
-from vmri_jax.ensembles.design import Design, Rows, unique_rows
+from vmri_jax.ensembles.columns import SCHEMES, STEPS, Lanes, Row, Vary, columns_of_problems, lane_function, numbers_in
+from vmri_jax.ensembles.design import Design, Rows, combinations, unique_rows
 from vmri_jax.ensembles.quantities import Quantity, Saved, of_lanes, quantity
 from vmri_jax.mechanics.checks import check_type, digest
 from vmri_jax.mechanics.names import unknown
 from vmri_jax.mechanics.state import Problem
 from vmri_jax.refusals import Refused
-from vmri_jax.running import arguments
-from vmri_jax.running.arguments import Save, steps_until
+from vmri_jax.running.arguments import Save, Steps, check_step_size, steps_until
 from vmri_jax.running.batch import consistent_states
 from vmri_jax.running.export import STATUS
 from vmri_jax.running.simulation import Simulation, simulation
-from vmri_jax.schemes.composition import Composition
-from vmri_jax.schemes.scheme import Scheme
+from vmri_jax.schemes.composition import SchemeLike
 from vmri_jax.steppers.solver import Solver
 
-AnyScheme = str | Scheme | Composition | Callable[[int], Scheme | Composition]
+AnyScheme = str | SchemeLike | Callable[[int], SchemeLike]
 """A scheme, the name of one, or a function from the number of micro steps to a scheme."""
 
 
 class Group(NamedTuple):
-    """Runs that one compiled program computes.
-
-    lanes: numbers of their rows.
-    scheme, num_steps: the same for all of them.
-    macro_dt: a number, or an array with one for each run.
-    """
+    """Runs of one compiled program, by the numbers of their rows; `macro_dt` may have a value for each run."""
 
     lanes: np.ndarray
-    scheme: Scheme | Composition
+    scheme: SchemeLike
     macro_dt: Any
     num_steps: int
 
 
 @dataclass(frozen=True)
 class Work:
-    """The arguments that all runs of an ensemble share, and the columns that change some of them for each run.
+    """The arguments of `ensemble` that all runs share, and the columns that change some of them for each run.
 
-    system: name of a system, or a problem that can be pickled.
-    schemes: by label.
-    columns: names of the columns of the design.
-    steps: arguments of `ensemble` about steps by name: t_end, num_steps, macro_dt, as far as they are not columns.
-    num_micro, solver, project: as in `ensemble`.
-    save: names of the quantities that are kept, or functions.
-    num_saves: number of saved nodes after the start.
-    vary: makes the problem of a run from the problem and a row; None where all columns are steps and schemes.
+    steps: t_end, num_steps and macro_dt by name, as far as the user gave them.
     sources: digests of the user's files, by path.
     """
 
@@ -81,9 +66,7 @@ class Work:
         self.__dict__.update(state)
         for file, digest_at_start in self.sources.items():
             if not Path(file).is_file():
-                raise FileNotFoundError(
-                    f"{file} does not exist on this worker; put it where all see it, or into a package."
-                )
+                raise FileNotFoundError(f"{file} does not exist on this worker; put it where all workers see it.")
             if digest(Path(file).read_bytes()) != digest_at_start:
                 raise Refused(f"{file} differs from the file of the process that started the ensemble.")
 
@@ -108,8 +91,8 @@ class Work:
     @cached_property
     def lane(self) -> Callable[[Row], Lanes]:
         """The function from the numbers of a row to the parameters and the start of its run."""
-        names = columns.columns_of_problems(self.columns)
-        return columns.lane_function(self.problem, self.vary, names, "t_end" in self.steps)
+        names = columns_of_problems(self.columns)
+        return lane_function(self.problem, self.vary, names, "t_end" in self.steps)
 
     @cached_property
     def lanes(self) -> Callable[[Rows, int], Lanes]:
@@ -123,7 +106,7 @@ class Work:
 
     @cached_property
     def told_apart(self) -> list[str]:
-        """Columns of which every value needs a group of its own: schemes, number of steps, and step sizes that the number follows from."""
+        """Columns of which every value needs a group: schemes, number of steps, and step sizes that decide it."""
         knows_number = "t_end" not in self.steps or "num_steps" in (*self.columns, *self.steps)
         steps = ("num_steps",) if knows_number else STEPS
         return [name for name in self.columns if name in (*SCHEMES, *steps)]
@@ -143,10 +126,8 @@ class Work:
     def simulation(self, group: Group) -> Simulation:
         """The first run of a group, after a check of its arguments."""
         macro_dt, num_steps = float(np.ravel(group.macro_dt)[0]), group.num_steps
-        if num_steps % self.num_saves:
-            raise Refused(f"ensemble: {num_steps} macro steps are no multiple of num_saves = {self.num_saves}.")
         state = self.problem.state(self.project)
-        steps = arguments.Steps(macro_dt, num_steps, save=Save(number=self.num_saves))
+        steps = Steps(macro_dt, num_steps, save=Save(number=self.num_saves))
         return simulation(self.problem, group.scheme, state, self.solver, steps)
 
     def compute(self, rows: Rows, count: int, width: int) -> dict[str, np.ndarray]:
@@ -165,7 +146,7 @@ class Work:
         filled = np.minimum(np.arange(max(count, width)), count - 1)
         rows = {name: values[filled] for name, values in rows.items()}
         macro_dt = group.macro_dt[filled] if np.ndim(group.macro_dt) else group.macro_dt
-        params, start = self.lanes(columns.numbers_in(rows), len(filled))
+        params, start = self.lanes(numbers_in(rows), len(filled))
         project = self.problem.project if self.project is None else self.project
         states = consistent_states(self.problem.system, params, start, project)
         steps = {"macro_dt": macro_dt, "num_steps": group.num_steps, "save": Save(number=self.num_saves)}
@@ -174,50 +155,44 @@ class Work:
         kept = {name: np.asarray(getattr(trajectory, name)) for name in STATUS} | of_lanes(self.quantities, trajectory)
         return {name: np.asarray(value)[:count] for name, value in kept.items()}
 
-    def _scheme(self, values: Mapping[str, Any]) -> Scheme | Composition:
+    def _scheme(self, values: Mapping[str, Any]) -> SchemeLike:
         label = str(values.get("scheme", next(iter(self.schemes))))
         if label not in self.schemes:
             raise Refused(f"ensemble: {unknown('scheme', label, self.schemes)}")
         scheme = self.schemes[label]
         num_micro = _whole("num_micro", values["num_micro"]) if "num_micro" in values else self.num_micro
-        if isinstance(scheme, Scheme | Composition):
+        if isinstance(scheme, SchemeLike):
             if num_micro is not None:
-                raise Refused(
-                    f"ensemble: the scheme {label!r} has its num_micro already; give its function or its name."
-                )
+                raise Refused(f"ensemble: the scheme {label!r} has its num_micro already; give its name or function.")
             return scheme
         if num_micro is None:
             raise Refused(f"ensemble: num_micro is missing for the scheme {label!r}, as argument or column.")
         made = find_scheme(scheme, num_micro) if isinstance(scheme, str) else scheme(num_micro)
-        check_type(f"ensemble: the value of the scheme {label!r}", made, Scheme | Composition, "a Scheme")
+        check_type(f"ensemble: the value of the scheme {label!r}", made, SchemeLike, "a Scheme")
         return made
 
     def _steps(self, values: Mapping[str, Any]) -> tuple[Any, int]:
         """Macro step, a number or one for each run, and number of macro steps."""
-        values_by_name = dict(self.steps)
-        twice = sorted(set(values_by_name) & set(values))
+        twice = sorted(set(self.steps) & set(values))
         if twice:
             raise Refused(f"ensemble: {', '.join(twice)} is a column and an argument; leave one of them out.")
-        values_by_name |= {name: values[name] for name in STEPS if name in values}
-        names = set(values_by_name)
-        if len(names) != 2:
-            given = ", ".join(sorted(names)) or "nothing"
-            raise Refused(f"ensemble: got {given}; give two of t_end, num_steps and macro_dt, as arguments or columns.")
-        if "num_steps" in values_by_name:
-            values_by_name["num_steps"] = _whole("num_steps", values_by_name["num_steps"])
+        steps = {**self.steps, **{name: values[name] for name in STEPS if name in values}}
+        if len(steps) != 2:
+            got = ", ".join(sorted(steps)) or "nothing"
+            raise Refused(f"ensemble: got {got}; give two of t_end, num_steps and macro_dt, as arguments or columns.")
         start = float(self.problem.t)
-        if names == {"t_end", "num_steps"}:
-            return (float(values_by_name["t_end"]) - start) / values_by_name["num_steps"], values_by_name["num_steps"]
-        macro_dt = np.asarray(values_by_name["macro_dt"], dtype=float)
-        if not np.all(macro_dt > 0):
-            raise Refused(f"ensemble: a step is {np.min(macro_dt)}; steps must be positive.")
+        num_steps: Any = _whole("num_steps", steps["num_steps"]) if "num_steps" in steps else None
+        if "macro_dt" not in steps:
+            return (float(steps["t_end"]) - start) / num_steps, num_steps
+        macro_dt = np.asarray(steps["macro_dt"], dtype=float)
+        check_step_size(macro_dt, "ensemble", ndim=None)
         macro_dt = float(macro_dt) if macro_dt.ndim == 0 else macro_dt
-        return macro_dt, values_by_name.get("num_steps") or steps_until(values_by_name["t_end"], start, macro_dt)
+        return macro_dt, num_steps or steps_until(steps["t_end"], start, macro_dt)
 
 
 def all_groups(work: Work, design: Design) -> Iterator[Group]:
     """All groups that the rows of a design can form, each with a single row."""
-    rows = design.combinations(work.told_apart)
+    rows = combinations(design, work.told_apart)
     step_columns = [name for name in ("macro_dt",) if name in work.columns and name not in rows]
     first = design.rows(0, 1) if step_columns else {}
     count = max((len(values) for values in rows.values()), default=1)

@@ -15,6 +15,7 @@ from vmri_jax.fitting.shooting import Shooting
 from vmri_jax.fitting.unknowns import Unknown, Unknowns
 from vmri_jax.mechanics.arrays import whole_number
 from vmri_jax.mechanics.checks import check_type
+from vmri_jax.mechanics.slots import leaves_by_name
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
 from vmri_jax.refusals import Refused
 from vmri_jax.running.export import extra
@@ -115,8 +116,7 @@ def _model(problem, parameters: Mapping) -> Callable[[Mapping], Problem]:
         return cast(Callable[[Mapping], Problem], problem)
     base = problem_of("fit", cast(Problem, problem))
     params = base.system.params if isinstance(base.system.params, Mapping) else {}
-    numbers, structure = jax.tree.flatten_with_path(params, is_leaf=lambda value: not isinstance(value, Mapping))
-    known = {jax.tree_util.keystr(path, simple=True, separator="."): number for path, number in numbers}
+    known, structure = leaves_by_name(params, is_leaf=lambda value: not isinstance(value, Mapping))
     for name, unknown in parameters.items():
         if name not in known and name not in START:
             places = f"system.params ({', '.join(known) or 'no dict'}) nor of {', '.join(START)}"

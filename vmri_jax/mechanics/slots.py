@@ -1,10 +1,11 @@
 """The one map from names to the entries of a flat vector."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import jax
 import numpy as np
 
 from vmri_jax.mechanics.arrays import library, real_array
@@ -91,6 +92,12 @@ class Slots:
                 )
             pieces.append(library(value).broadcast_to(value, shape).reshape(-1))
         return library(pieces).concatenate([*pieces, library(pieces).zeros(0)])
+
+
+def leaves_by_name(tree: Any, is_leaf: Callable[[Any], bool] | None = None) -> tuple[dict[str, Any], Any]:
+    """The leaves of a pytree of parameters by their names, ``springs.stiffness``, and its structure."""
+    leaves, structure = jax.tree.flatten_with_path(tree, is_leaf)
+    return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}, structure
 
 
 def _repeats(shape: tuple[int, ...], whole: tuple[int, ...]) -> bool:

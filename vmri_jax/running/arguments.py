@@ -11,15 +11,12 @@ from vmri_jax.mechanics.checks import check_arrays, check_flags, check_number, c
 from vmri_jax.mechanics.constraints import check_constraints, check_mass
 from vmri_jax.refusals import Refused
 from vmri_jax.running.progress import ShowsProgress, check_progress
-from vmri_jax.schemes.composition import Composition, stage_scheme
-from vmri_jax.schemes.scheme import Scheme
+from vmri_jax.schemes.composition import SchemeLike, stage_scheme
 from vmri_jax.steppers.solver import Solver
 
 WHOLE_NUMBER_TOLERANCE = 1e-9
 """Relative distance from a whole number up to which ``(t_end - t) / macro_dt`` counts as one. The end of a run misses t_end by at most this
 part of its length; a larger value lets runs end visibly beside t_end."""
-
-
 ADJOINTS = ("auto", "stored", "checkpoint")
 
 
@@ -58,10 +55,8 @@ class Save:
         check_flags(micro=self.micro)
         check_progress("Save", self.progress)
         if self.adjoint not in ADJOINTS:
-            raise Refused(
-                f"Save: adjoint is {self.adjoint!r}; it must be one of {', '.join(map(repr, ADJOINTS))}. For derivatives with "
-                "respect to few numbers without stored steps take jax.jacfwd with adjoint='stored'."
-            )
+            known = ", ".join(map(repr, ADJOINTS))
+            raise Refused(f"Save: adjoint is {self.adjoint!r}; it must be one of {known}; jax.jacfwd needs 'stored'.")
 
     @classmethod
     def of(cls, save: "int | Save") -> "Save":
@@ -71,9 +66,7 @@ class Save:
     def without_bar(self, name: str) -> None:
         """Refuse a bar of a run of the function of this name, which is one program without parts."""
         if self.progress is not False:
-            raise Refused(
-                f"{name}: a run that is one program has no progress; leave it out, or call simulate or stream."
-            )
+            raise Refused(f"{name}: one program has no progress; leave it out, or call simulate or stream.")
 
     def macro_steps(self, num_steps: int) -> int:
         """Macro steps from one saved node to the next in a run of `num_steps`; refuses a run whose end is not saved."""
@@ -81,7 +74,7 @@ class Save:
         if num_steps % (self.number or every):
             counts = f"the {self.number} saved intervals" if self.number else f"save = {every}"
             raise Refused(
-                f"simulate: num_steps = {num_steps} is not a multiple of {counts}; the last saved node would not be the end."
+                f"simulate: num_steps = {num_steps} is not a multiple of {counts}; the end would not be saved."
             )
         return num_steps // self.number if self.number else every
 
@@ -99,7 +92,7 @@ class Steps:
 def check_run(system, scheme, state, solver, steps: Steps) -> tuple[int, int]:
     """Refuse bad arguments of `simulate`; returns the number of macro steps, and how many of them lie between two saved nodes."""
     require_x64()
-    if not isinstance(scheme, Scheme | Composition):
+    if not isinstance(scheme, SchemeLike):
         raise Refused(f"simulate: scheme is {type(scheme).__name__}; give a Scheme, e.g. fully_implicit(num_micro=10).")
     check_params(system.params)
     if not isinstance(solver, Solver | None):
@@ -116,13 +109,8 @@ def check_run(system, scheme, state, solver, steps: Steps) -> tuple[int, int]:
     return num_steps, every
 
 
-def nothing_fast(scheme: Scheme | Composition, num_fast: int) -> str:
-    """Advice where a scene without fast bodies takes several micro steps; empty for any other scene.
-
-    Args:
-        scheme: its micro steps count; of a composition the micro steps of a stage.
-        num_fast: number of fast coordinates, or of fast bodies.
-    """
+def nothing_fast(scheme: SchemeLike, num_fast: int) -> str:
+    """Advice where a scene without fast coordinates or bodies takes several micro steps; empty for any other scene."""
     if num_fast or stage_scheme(scheme).num_micro == 1:
         return ""
     return (
@@ -132,7 +120,7 @@ def nothing_fast(scheme: Scheme | Composition, num_fast: int) -> str:
 
 
 def steps_until(t_end, t, macro_dt) -> int:
-    """The number of macro steps from t to t_end."""
+    """The number of macro steps from t to t_end; refuses one that is not whole."""
     if not is_concrete((t_end, t, macro_dt)):
         raise Refused("simulate: t_end needs times that are known; under transformations of JAX give num_steps.")
     check_number("simulate: t_end", t_end)
@@ -141,20 +129,26 @@ def steps_until(t_end, t, macro_dt) -> int:
     if whole < 1:
         raise Refused(f"simulate: t_end is {t_end:g}, less than a macro step of {macro_dt:g} after the start at {t:g}.")
     if abs(steps - whole) > WHOLE_NUMBER_TOLERANCE * whole:
-        raise Refused(
-            f"simulate: from {t:g} to t_end = {t_end:g} there are {steps:.6g} macro steps of {macro_dt:g}, no whole number. "
-            f"Take macro_dt = {float(t_end - t) / np.ceil(steps):.10g}, or give num_steps."
-        )
+        between = f"from {t:g} to t_end = {t_end:g} there are {steps:.6g} macro steps of {macro_dt:g}, no whole number"
+        near = float(t_end - t) / np.ceil(steps)
+        raise Refused(f"simulate: {between}. Take macro_dt = {near:.10g}, or give num_steps.")
     return whole
 
 
-def check_step_size(macro_dt, caller: str = "simulate") -> None:
-    """Refuse a missing step size, or one that is not positive."""
+def check_step_size(macro_dt, caller: str = "simulate", ndim: int | None = 0) -> None:
+    """Refuse a missing step size, or one that is not positive; one for each lane if `ndim` is None."""
     if macro_dt is None:
         raise Refused(f"{caller}: macro_dt is missing; give the macro step H, num_micro times the micro step.")
-    size = real_array(f"{caller}: macro_dt", macro_dt, 0)
-    if is_concrete(size) and not 0 < np.asarray(size) < np.inf:  # of NumPy: in a program JAX would trace the comparison
+    size = real_array(f"{caller}: macro_dt", macro_dt, ndim)
+    # Of NumPy: in a program JAX would trace the comparison.
+    if is_concrete(size) and not all(0 < h < np.inf for h in np.ravel(size)):
         raise Refused(f"{caller}: macro_dt is {macro_dt}; it must be a positive number.")
+
+
+def refuse_tracers(caller: str, arguments, instead: str = "") -> None:
+    """Refuse a pytree of arguments within a transformation of JAX; `instead` ends the advice."""
+    if not is_concrete(arguments):
+        raise Refused(f"{caller}: arguments are tracers; call it outside of jax.jit, vmap and grad{instead}.")
 
 
 @lru_cache(maxsize=256)

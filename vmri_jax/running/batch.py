@@ -14,20 +14,20 @@ import jax
 import numpy as np
 from jax.sharding import PartitionSpec
 
-from vmri_jax.mechanics.arrays import is_concrete, options_of_runs, real_array, whole_number
+from vmri_jax.mechanics.arrays import options_of_runs, whole_number
 from vmri_jax.mechanics.checks import check_params
 from vmri_jax.mechanics.names import unknown
+from vmri_jax.mechanics.slots import leaves_by_name
 from vmri_jax.mechanics.state import Movable, State, initial_state, opened, start_of
 from vmri_jax.mechanics.system import System
 from vmri_jax.refusals import Refused
-from vmri_jax.running.arguments import Steps, check_step_size
+from vmri_jax.running.arguments import Steps, check_step_size, refuse_tracers
 from vmri_jax.running.engine import FALLING_BACK, Engine
 from vmri_jax.running.origin import is_repeated
 from vmri_jax.running.progress import Working
 from vmri_jax.running.saved import Saved, check_memory
-from vmri_jax.running.simulation import LENGTH, STEPPING, Simulation, simulation
-from vmri_jax.schemes.composition import Composition, stage_scheme
-from vmri_jax.schemes.scheme import Scheme
+from vmri_jax.running.simulation import STEPPING, Simulation, simulation
+from vmri_jax.schemes.composition import SchemeLike, stage_scheme
 
 NUMBERS_PER_CHUNK = 4096
 """Positions at all nodes of a macro step, summed over the lanes of a chunk: 32 kB of float64, the first-level cache of a core. Chunks with
@@ -40,13 +40,7 @@ MOST_LANES = 1024
 
 @dataclass(frozen=True)
 class Batch:
-    """Runs side by side, with checked arguments.
-
-    Attributes:
-        runs: the runs of all lanes, whose arrays have an axis of lanes.
-        width: lanes that are computed side by side.
-        devices: CPU devices that share the lanes.
-    """
+    """Runs with checked arguments, whose arrays have an axis of lanes, `width` of them side by side, on CPU devices."""
 
     runs: Simulation
     width: int
@@ -82,14 +76,6 @@ class Batch:
         """The run of a lane."""
         return jax.tree.map(lambda a: a[i], self.runs)
 
-    def with_steps(self, run: Simulation) -> "Batch":
-        """The batch with the steps of another run of its first lane, in the same ratio for all lanes."""
-        macro_dt = self.runs.macro_dt
-        all_alike = shared(run.macro_dt, len(self))
-        macro_dt = all_alike if is_repeated(macro_dt) else macro_dt * (run.macro_dt / macro_dt[0])
-        length = {name: getattr(run, name) for name in LENGTH}
-        return replace(self, runs=replace(self.runs, macro_dt=macro_dt, **length))
-
     def _in_chunks(self) -> Saved:
         """All lanes, `width` at a time; the last chunk is padded with copies of its last lane, so that one program computes all chunks."""
         run, lanes = self.run, len(self)
@@ -105,7 +91,7 @@ class Batch:
 
 def batch(
     moving: Movable,
-    scheme: Scheme | Composition,
+    scheme: SchemeLike,
     states: State | None,
     steps: Steps,
     params,
@@ -114,22 +100,14 @@ def batch(
     devices: int,
 ) -> Batch:
     """The `Batch` with these arguments of `simulate_batch`; bad arguments raise."""
-    if not is_concrete((states, steps.macro_dt, params)):
-        raise Refused(
-            "simulate_batch: arguments are tracers; call it outside of jax.jit, vmap and grad, or take jax.vmap of simulate."
-        )
+    refuse_tracers("simulate_batch", (states, steps.macro_dt, params), ", or take jax.vmap of simulate")
     _check_devices(devices, chunk)
     problem: Any = opened(moving)
     system, start = start_of("simulate_batch", problem, states)
-    if steps.macro_dt is None:
-        check_step_size(None)
+    check_step_size(steps.macro_dt, "simulate_batch", ndim=None)
     params, start, macro_dt = _with_lanes(system.params, params, start, steps.macro_dt)
-    if not (np.all(np.isfinite(macro_dt)) and np.all(macro_dt > 0)):
-        raise Refused(f"simulate_batch: every macro_dt must be a positive number, got {macro_dt}.")
     if steps.t_end is not None and any(np.ptp(array) > 0 for array in (start.t, macro_dt)):
-        raise Refused(
-            "simulate_batch: t_end with steps or start times that differ; give num_steps, the same for all lanes."
-        )
+        raise Refused("simulate_batch: t_end with steps or start times that differ; give num_steps instead.")
     differs = not all(map(is_repeated, jax.tree.leaves(params)))
     if states is None and differs and not (system.has_constant_mass and not system.is_constrained):
         # momenta M v, and their projection onto constraints, depend on parameters
@@ -159,12 +137,8 @@ def shared(value, lanes: int) -> np.ndarray:
 
 @eqx.filter_jit
 def consistent_states(system: System, params, start: tuple, project: bool, starts_differ: bool = True) -> State:
-    """Consistent states of all lanes, from starts (t, q_s, q_f, v_s, v_f) and parameters.
-
-    Args:
-        params: of all lanes; None for the parameters of the system.
-        starts_differ: whether the arrays of the start have an axis of lanes.
-    """
+    """Consistent states of all lanes, from parameters, None for those of the system, and starts
+    (t, q_s, q_f, v_s, v_f), which have an axis of lanes if they differ."""
 
     def of_lane(lane_params, lane_start):
         t, q_s, q_f, v_s, v_f = lane_start
@@ -175,11 +149,7 @@ def consistent_states(system: System, params, start: tuple, project: bool, start
 
 
 def _named(values, known: Collection[str], path: tuple[str, ...] = ()) -> Iterator[tuple[str, Any]]:
-    """Name and value of each parameter in a part of the parameters, nested or with dots in its names.
-
-    Raises:
-        ValueError: a name that is not known, with the known ones.
-    """
+    """Name and value of each parameter in a part of the parameters, nested or with dots in its names."""
     name = ".".join(path)
     if name in known:
         yield name, np.asarray(values)
@@ -192,35 +162,26 @@ def _named(values, known: Collection[str], path: tuple[str, ...] = ()) -> Iterat
 
 
 def _with_lanes(all_params, params, start: State, macro_dt) -> tuple[Any, State, np.ndarray]:
-    """Parameters, starts and macro steps of all lanes, with the lanes as their first axis.
+    """Parameters (of the system, some replaced by the user's), starts and macro steps, the lanes as their first axis.
 
-    Args:
-        all_params: of the system.
-        params: of the user, some of them with an axis of lanes.
-
-    Raises:
-        ValueError: arrays of other shapes, axes of different lengths, or no axis of lanes at all.
+    Refuses arrays of other shapes, axes of different lengths, and arguments without any axis of lanes.
     """
-    leaves, structure = jax.tree_util.tree_flatten_with_path(all_params)
-    values = {jax.tree_util.keystr(path, simple=True, separator="."): value for path, value in leaves}
+    values, structure = leaves_by_name(all_params)
     new = {} if params is None else dict(_named(params, values))
     check_params(new)
     arrays = {f"params[{name!r}]": (new.get(name, value), np.shape(value)) for name, value in values.items()}
     for name, value in vars(start).items():
         arrays[f"states.{name}"] = value, np.shape(value)[-1:] if name != "t" else ()
-    arrays["macro_dt"] = real_array("simulate_batch: macro_dt", macro_dt), ()
+    arrays["macro_dt"] = np.asarray(macro_dt, dtype=float), ()
     lengths = {name: len(value) for name, (value, shape) in arrays.items() if np.ndim(value) > len(shape)}
     for name, (value, shape) in arrays.items():
         if np.shape(value)[name in lengths :] != shape:
-            raise Refused(
-                f"simulate_batch: {name} has shape {np.shape(value)}; give {shape} for all lanes, or an axis of lanes in front of it."
-            )
+            with_lanes = f"give {shape} for all lanes, or an axis of lanes in front of it"
+            raise Refused(f"simulate_batch: {name} has shape {np.shape(value)}; {with_lanes}.")
     if len(set(lengths.values())) != 1 or 0 in lengths.values():
         listed = ", ".join(f"{name} has {length}" for name, length in lengths.items())
-        raise Refused(
-            f"simulate_batch: {listed or 'no argument has an axis of lanes'}; give params, states or steps with one value for each lane, "
-            "all of the same number."
-        )
+        listed = listed or "no argument has an axis of lanes"
+        raise Refused(f"simulate_batch: {listed}; give params, states or steps with one value for each lane.")
     (lanes,) = set(lengths.values())
     whole = [np.asarray(a) if name in lengths else shared(a, lanes) for name, (a, _) in arrays.items()]
     *of_params, t, q_s, q_f, p_s, p_f, steps = whole
@@ -231,10 +192,8 @@ def _with_lanes(all_params, params, start: State, macro_dt) -> tuple[Any, State,
 
 def _check_devices(devices, chunk) -> None:
     if not 1 <= devices <= jax.device_count():
-        raise Refused(
-            f"simulate_batch: devices is {devices}, but JAX has {jax.device_count()}; call vm.configure(devices={devices}) "
-            "before JAX starts."
-        )
+        advice = f"call vm.configure(devices={devices}) before JAX starts"
+        raise Refused(f"simulate_batch: devices is {devices}, but JAX has {jax.device_count()}; {advice}.")
     if chunk is not None:
         whole_number("simulate_batch: chunk", chunk, otherwise=", or None")
 

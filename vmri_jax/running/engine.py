@@ -61,11 +61,8 @@ class Cursor(NamedTuple):
 class Engine:
     """Compiled runs of all systems and schemes of one structure, as functions of the leaves of a `Simulation` and of numbers of steps.
 
-    A run is flattened once: to flatten a system at every call would take longer than a short run.
-
-    Attributes:
-        structure: structure of the pytree of a run, without its length and names.
-        num_saves: saved intervals that fit into the arrays of a run.
+    A run is flattened once: to flatten a system at every call would take longer than a short run. `structure` is the
+    structure of a run without its length and names, whose arrays have room for `num_saves` saved intervals.
     """
 
     structure: Any
@@ -79,12 +76,11 @@ class Engine:
     def steps(self, leaves: list, save_every, saves=None, cursor: Cursor | None = None, is_first: Any = True):
         """The first `saves` saved intervals: an array of `Saved` rows, and the cursor after them.
 
-        Args:
-            saves: None for all intervals, failed or not: the end of the loop then depends on no lane of a batch, and `jax.vmap` need not select
-                between old and new values in every lane.
-            cursor: None for the start of the run. In place of a cursor the program then returns (2,) result and failed step, since each array
-                costs some microseconds.
-            is_first: whether the memory of a first step replaces the memory of the cursor.
+        `saves` None: all intervals, failed or not. The end of the loop then depends on no lane of a batch, and
+        `jax.vmap` need not select between old and new values in every lane.
+        `cursor` None: the start of the run. In place of a cursor the program then returns (2,) result and failed step,
+        since each array costs some microseconds.
+        `is_first`: whether the memory of a first step replaces the memory of the cursor.
         """
         run: Any = jax.tree.unflatten(self.structure, leaves)
         stepper, begin = run.stepper(), cursor or Cursor.at_start(run.state)
@@ -161,10 +157,6 @@ class Engine:
 
         return jax.jit(observed)  # else JAX would compile the operations of a gradient outside of jit one by one
 
-    def blank_memory(self, leaves: list):
-        """Zeros in the shapes of the memory of the stepper, for a first piece."""
-        return _blank_memory(self, tuple((a.shape, a.dtype) for a in leaves))
-
 
 engine = lru_cache(maxsize=32)(Engine)
 """``engine(structure, num_saves)``: the `Engine` with these attributes, made once. The 33rd structure displaces the one used
@@ -172,7 +164,9 @@ least recently, which compiles again when it is needed: each program takes memor
 
 
 @lru_cache(maxsize=256)
-def _blank_memory(engine: Engine, shapes: tuple):
+def blank_memory(engine: Engine, shapes: tuple):
+    """Zeros in the shapes of the memory of the stepper, from the shapes and types of the leaves of a run."""
+
     def first_memory(leaves):
         run = jax.tree.unflatten(engine.structure, leaves)
         return run.stepper().init(run.state, run.macro_dt)
@@ -202,7 +196,7 @@ def _row(state: State, info: RunInfo, micro) -> Float[Numbers, "numbers"]:
 
 def _nothing(run) -> tuple[RunInfo, Any]:
     """The work of the solver, and the micro nodes, before the first step."""
-    num_micro = run.scheme.num_micro if run.save_micro else 0
+    num_micro = run.scheme.num_micro if run.save.micro else 0
     return RunInfo(np.asarray(0), np.asarray(0), np.zeros(())), jnp.zeros((num_micro, run.state.q_f.shape[0]))
 
 
@@ -223,7 +217,7 @@ def _interval(stepper: Plan, run, repeat: Callable):
         state = State(t_start + (cursor.step + 1) * macro_dt, state.q_s, state.q_f, p_s, p_f)
         result = jnp.where(alive, jnp.maximum(cursor.result, info.result), cursor.result)
         failed_at = jnp.where(alive & ~ok, cursor.step, cursor.failed_at)
-        micro = jnp.where(ok, info.q_f_micro, jnp.nan) if run.save_micro else micro
+        micro = jnp.where(ok, info.q_f_micro, jnp.nan) if run.save.micro else micro
         return Cursor(state, memory, cursor.step + 1, result, failed_at), worst, micro
 
     def interval(cursor: Cursor, count):
@@ -233,14 +227,9 @@ def _interval(stepper: Plan, run, repeat: Callable):
 
 
 def unsolved(result, method):
-    """Whether steps failed that exact matrices may solve.
+    """Whether steps failed that exact matrices may solve, from their worst `Result` and largest `Method`.
 
-    They cannot help explicit and linear equations, the methods up to `Method.LINEAR`, nor steps that were solved but violate implied
-    constraints, `Result.NOT_IMPLIED`.
-
-    Args:
-        result: worst `Result` of the steps, of one run or (lanes,).
-        method: largest `Method` of the steps.
+    They cannot help explicit and linear equations, nor steps that were solved but violate implied constraints.
     """
     return (result > Result.CONVERGED_AT_ROUNDOFF) & (result != Result.NOT_IMPLIED) & (method > Method.LINEAR)
 
@@ -249,12 +238,7 @@ def solved_again(first: Callable, exact: Callable, failed: Callable, arguments: 
     """``first(arguments)``, or ``exact(arguments)`` where that has failed, in one program, to be transformed.
 
     The derivative is the derivative of `exact`, with its value: to differentiate both would compile two programs. Values of the two differ by
-    the tolerance of the solver.
-
-    Args:
-        first, exact: the run with the first matrix and with exact matrices, functions of one pytree of arrays.
-        failed: whether a value of `first` is to be computed again.
-        arguments: of both.
+    the tolerance of the solver. ``failed(value)`` says whether a value of `first` is computed again.
     """
 
     @jax.custom_jvp

@@ -25,10 +25,8 @@ computes steps from positions that have already exploded."""
 
 
 class Motion(NamedTuple):
-    """How far a body, or a coordinate without a body, moves in a step.
+    """How far a body, or a coordinate without a body, moves in a step, in a micro step if it is fast (`micro`).
 
-    name: of the body or coordinate.
-    micro: whether it is fast, so that the motion in a micro step counts.
     amount: radians for a turn; for a move the distance as a part of the extent of all positions.
     turns: whether this is the turn of a rigid body; else it is a move.
     """
@@ -40,15 +38,11 @@ class Motion(NamedTuple):
 
     @property
     def size(self) -> float:
-        """The amount divided by the limit, `LARGE_TURN` or `LARGE_MOVE`."""
+        """The amount divided by its limit."""
         return self.amount / (LARGE_TURN if self.turns else LARGE_MOVE)
 
     def sentence(self, macro_dt: float) -> str:
-        """The motion in words, with advice on the step.
-
-        Args:
-            macro_dt: macro step H in which the motion happens.
-        """
+        """The motion in a macro step H in words, with advice on the step."""
         step = "micro step" if self.micro else "macro step"
         moves = f"turns {self.amount:.2g} rad" if self.turns else f"moves {self.amount:.1%} of the extent of the system"
         if self.size < 1:
@@ -96,11 +90,7 @@ def largest_motion(system: System, state: State, names: Names | None, macro_dt: 
 
 
 def simulation_error(run: SavedRun, macro_dt, save_every: int, num_micro: int) -> SimulationError:
-    """The `SimulationError` of a failed run, in memory or in a store: the failing step, its status, and the largest motion before it.
-
-    Args:
-        macro_dt, save_every, num_micro: of the run.
-    """
+    """The `SimulationError` of a run, in memory or in a store, with the largest motion before the failing step."""
     failed_at, dt = int(run.failed_at), float(macro_dt)
     interval, step = divmod(failed_at, save_every)
     part, moved, jump = run[interval : interval + 2], "", ""  # from the node before the failure
@@ -108,9 +98,7 @@ def simulation_error(run: SavedRun, macro_dt, save_every: int, num_micro: int) -
         system, before = run.origin.system(), part[0]
         motion = largest_motion(system, before, part.names, dt, num_micro)
         moved = "" if motion is None else motion.sentence(dt)
-        jump = in_words(
-            jump_ahead(system, before, (step + 2) * dt), part.names
-        )  # in the failing step or in the next one
+        jump = in_words(jump_ahead(system, before, (step + 2) * dt), part.names)  # in the failing step or in the next
     t, work = float(part.t[0] + step * macro_dt), (int(part.info.iterations[0]), float(part.info.residual[0]))
     error = SimulationError(Result(int(run.result)), failed_at, t, *work, run, moved=moved)
     return error.advised(dt, _swapped(run[:1]), jump)

@@ -1,6 +1,7 @@
 """A single macro step, without a run."""
 
 from dataclasses import replace
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -10,8 +11,7 @@ from vmri_jax.mechanics.state import A_SYSTEM, State
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.engine import solved_again, unsolved
 from vmri_jax.running.observables import Observables, observed
-from vmri_jax.schemes.composition import Composition
-from vmri_jax.schemes.scheme import Scheme
+from vmri_jax.schemes.composition import SchemeLike
 from vmri_jax.steppers.plan import plan
 from vmri_jax.steppers.results import Result
 from vmri_jax.steppers.solver import Solver
@@ -19,7 +19,7 @@ from vmri_jax.steppers.stepper import StepInfo
 
 
 def macro_step(
-    system: System, scheme: Scheme | Composition, state: State, macro_dt, solver: Solver | None = None
+    system: System, scheme: SchemeLike, state: State, macro_dt, solver: Solver | None = None
 ) -> tuple[State, StepInfo]:
     """One macro step, ``(state, info) = macro_step(system, scheme, state, macro_dt)``; a pure function.
 
@@ -50,17 +50,13 @@ def _macro_step(arguments):
     system, scheme, state, _, solver = arguments
     if not plan(system, scheme, state, solver).has_fallback:
         return _step(arguments)
-    return solved_again(_step, _exact_step, lambda end: unsolved(end[1].result, end[1].method), arguments)
+    exact = partial(_step, exact=True)
+    return solved_again(_step, exact, lambda end: unsolved(end[1].result, end[1].method), arguments)
 
 
-def _exact_step(arguments):
-    *others, solver = arguments
-    return _step((*others, solver.exact()))
-
-
-def _step(arguments):
+def _step(arguments, exact: bool = False):
     system, scheme, state, macro_dt, solver = arguments
-    planned = plan(system, scheme, state, solver)
+    planned = plan(system, scheme, state, solver.exact() if exact else solver)
     state, info, _ = planned.step(state, planned.init(state, macro_dt), macro_dt)
     state, now = observed(system, state, solver.tolerance)
     # rows that contradict each other leave increments that converge

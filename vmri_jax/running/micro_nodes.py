@@ -24,12 +24,7 @@ class Nodes(NamedTuple):
 
 
 def why_not(t, t_micro) -> str:
-    """The reason why the micro nodes of a run do not refine its macro nodes; empty if they do.
-
-    Args:
-        t: (k,) times of the macro nodes.
-        t_micro: (k - 1, num_micro) times of the micro nodes before each macro node, or None.
-    """
+    """The reason why micro nodes (k - 1, num_micro), or None, do not refine macro nodes (k,); empty if they do."""
     if np.ndim(t) != 1:
         return "it is a batch; take one lane of it"
     if t_micro is None:
@@ -48,12 +43,7 @@ def why_not(t, t_micro) -> str:
 
 
 def with_micro_nodes(nodes: Nodes, t_micro, q_f_micro) -> Nodes:
-    """All nodes of a run for which `why_not` is empty.
-
-    Args:
-        nodes: the macro nodes, all of them finite.
-        t_micro, q_f_micro: (k - 1, num_micro), (k - 1, num_micro, n_f).
-    """
+    """All nodes of a run for which `why_not` is empty, from macro nodes, finite ones, and micro nodes."""
     from scipy.interpolate import CubicHermiteSpline, CubicSpline  # here: its import takes a fifth of a second
 
     t_micro, q_f_micro = np.asarray(t_micro, dtype=float), np.asarray(q_f_micro, dtype=float)

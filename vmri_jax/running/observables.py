@@ -22,25 +22,21 @@ from vmri_jax.mechanics.system import System
 class LostEnergyWarning(UserWarning):
     """The energy of a system that keeps it has changed by more than half of the largest kinetic energy of a run."""
 
-    @staticmethod
-    def sentence(t: float, change: float, kinetic: float) -> str:
-        """The sentence about a change of the energy at a time, and the largest kinetic energy."""
-        return (
-            f"the computed motion is wrong: the energy, which the system keeps, has changed by {change:.3g} at t = {t:.4g}, "
-            f"and the largest kinetic energy is {kinetic:.3g}. Take smaller steps, or ask vmri_jax.stability.advise(problem, "
-            "scheme, macro_dt=...) which are stable."
-        )
+    sentence = (
+        "the computed motion is wrong: the energy, which the system keeps, has changed by {change:.3g} at t = {t:.4g}, "
+        "and the largest kinetic energy is {kinetic:.3g}. Take smaller steps, or ask "
+        "vmri_jax.stability.advise(problem, scheme, macro_dt=...) which are stable."
+    )
 
 
 class SingularCoordinatesWarning(LostEnergyWarning):
     """A run has changed its energy where its coordinates are nearly singular, as angles near a pole are."""
 
-    @staticmethod
-    def sentence(t: float, change: float, kinetic: float) -> str:
-        return (
-            f"the coordinates are singular near t = {t:.4g}: the mass matrix changes by a factor from one saved node to the next, and the energy "
-            f"by {change:.3g}, with a largest kinetic energy of {kinetic:.3g}. Take other coordinates, or accuracy=."
-        )
+    sentence = (
+        "the coordinates are singular near t = {t:.4g}: the mass matrix changes by a factor from one saved node to the "
+        "next, and the energy by {change:.3g}, with a largest kinetic energy of {kinetic:.3g}. Take other coordinates, "
+        "or accuracy=."
+    )
 
 
 REPORTED_CHANGE = 0.5
@@ -129,12 +125,7 @@ def concerns(table: np.ndarray, t, system: System, macro_dt, save_every: int) ->
     *Singular coordinates*: the mass matrix changes by a factor between two nodes, and the energy changes beside them. Forces change the energy, too:
     where they do, only steps that are all saved tell.
 
-    Args:
-        table: the `Observables` (..., k, 9).
-        t: (..., k) times.
-        system: the system, of which only the structure counts.
-        macro_dt: macro step H, or one for each lane.
-        save_every: macro steps from one saved node to the next.
+    `table` has the `Observables` (..., k, 9) at the times t (..., k); of the system only the structure counts.
     """
     energy, kinetic = table[..., 0], table[..., Observables._fields.index("kinetic")]
     if not np.any(np.ptp(energy, axis=-1) > min(CHANGE_AT_POLE, REPORTED_CHANGE) * kinetic.max(axis=-1)):
@@ -160,6 +151,6 @@ def concerns(table: np.ndarray, t, system: System, macro_dt, save_every: int) ->
             lane = int(wrong.argmax())
             node = sizes[lane].argmax()
             lanes = f"in {wrong.sum()} of {len(wrong)} lanes, the first of them lane {lane}, " if table.ndim > 2 else ""
-            sentence = warning.sentence(t[lane, node], sizes[lane, node], kinetic[lane])
-            warnings_of_lanes.append(warning(lanes + sentence))
+            numbers = {"t": t[lane, node], "change": sizes[lane, node], "kinetic": kinetic[lane]}
+            warnings_of_lanes.append(warning(lanes + warning.sentence.format(**numbers)))
     return warnings_of_lanes

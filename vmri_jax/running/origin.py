@@ -72,10 +72,8 @@ class Origin:
     def system(self, axes: int = 0) -> System:
         """The system with the parameters of the run, which has a number of axes of lanes: of its first lane."""
         if self.simulated is None:
-            raise Refused(
-                "this run does not know its system: it was read from a file, or pickled with functions that Python cannot "
-                "pickle. Give it: run.of(problem), with the Problem, Scene or System that was simulated."
-            )
+            lost = "it was read from a file, or pickled with functions that Python cannot pickle"
+            raise Refused(f"this run does not know its system: {lost}. Give what was simulated: run.of(problem).")
         return jax.tree.map(lambda leaf: leaf[(0,) * axes], self.simulated) if axes else self.simulated
 
     def shaped(self, part: Part, vectors) -> Any:

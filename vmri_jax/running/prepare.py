@@ -3,19 +3,17 @@
 import jax
 
 from vmri_jax.mechanics.state import Movable, State
-from vmri_jax.refusals import Refused
-from vmri_jax.running.arguments import Save, Steps
+from vmri_jax.running.arguments import Save, Steps, refuse_tracers
 from vmri_jax.running.progress import Working
 from vmri_jax.running.saved import check_memory
 from vmri_jax.running.simulation import Simulation, simulation
-from vmri_jax.schemes.composition import Composition
-from vmri_jax.schemes.scheme import Scheme
+from vmri_jax.schemes.composition import SchemeLike
 from vmri_jax.steppers.solver import Solver
 
 
 def prepare(
     system: Movable,
-    scheme: Scheme | Composition,
+    scheme: SchemeLike,
     state: State | None = None,
     *,
     macro_dt=None,
@@ -42,8 +40,7 @@ def prepare(
         ValueError, TypeError: bad arguments, as of `simulate`.
     """
     run = simulation(system, scheme, state, solver, Steps(macro_dt, num_steps, t_end, save))
-    if not run.is_concrete:
-        raise Refused("prepare: arguments are tracers; call it outside of jax.jit, vmap and grad, or take simulate.")
+    refuse_tracers("prepare", run.leaves, ", or take simulate")
     run.check()
     run.save.without_bar("prepare")
     check_memory("prepare", run)

@@ -24,8 +24,6 @@ P = ParamSpec("P")
 R = TypeVar("R")
 ShowsProgress = bool | Progress
 """The argument ``progress`` of all functions that take long: True for a bar, False for occasional lines, or a `Progress` of the user."""
-
-
 SECONDS_BETWEEN_LINES = 2.0
 """Seconds before the first line, and between two lines with different texts; with a larger value the user waits longer in silence."""
 LONGEST_SILENCE = 5.0
@@ -33,8 +31,6 @@ LONGEST_SILENCE = 5.0
 program seems to hang."""
 POLL_SECONDS = 0.5
 """Seconds between two checks of the thread; a larger value delays every line by as much."""
-
-
 STAGES = {
     "/jax/core/compile/jaxpr_trace_duration": "tracing",
     "/jax/core/compile/jaxpr_to_mlir_module_duration": "compiling",
@@ -49,12 +45,8 @@ class Working:
         with Working("fit") as tell:
             tell("the Jacobian at the start", 1, 3)
 
-    Short work costs about a microsecond. Nested contexts share one line, the outermost name first.
-
-    Args:
-        name: of the work.
-        shown: whether to print lines.
-        running: kind of work while JAX neither traces nor compiles.
+    Short work costs about a microsecond. Nested contexts share one line, the outermost name first, if all are `shown`.
+    `running` is the kind of work while JAX neither traces nor compiles.
     """
 
     def __init__(self, name: str, shown: bool = True, running: str = ""):
@@ -161,9 +153,7 @@ def progress_to(name: str, progress: ShowsProgress) -> AbstractContextManager[Pr
 def check_progress(name: str, progress: ShowsProgress) -> None:
     """Refuse an argument `progress` of the function of this name that is neither True nor False nor a function."""
     if not (isinstance(progress, bool) or callable(progress)):
-        raise Refused(
-            f"{name}: progress is {progress!r}; it must be True or False, or a function of (what, done, total)."
-        )
+        raise Refused(f"{name}: progress is {progress!r}; give True, False, or a function of (what, done, total).")
 
 
 def shows_progress(function: Callable[P, R]) -> Callable[P, R]:

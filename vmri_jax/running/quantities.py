@@ -1,7 +1,6 @@
 """Quantities computed from the positions and momenta of a run: velocities, multipliers, reaction forces, work, by name."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
 from typing import Any, NamedTuple, overload
 
 import equinox as eqx
@@ -147,7 +146,7 @@ class Quantities(ABC):
             ValueError: no body of this name.
         """
         run = self.whole()
-        return self._of_body(body, _bodies, body in run.names.carried, (run.states.q_s, run.states.q_f))
+        return self._of_body("position", body, body in run.names.carried, (run.states.q_s, run.states.q_f))
 
     def momentum(self, body: str):
         """Momenta of a body at the saved nodes, (..., k, size); for a rigid body in joint coordinates its own ``M v``, without bodies that it carries.
@@ -157,7 +156,7 @@ class Quantities(ABC):
         run = self.whole()
         # The coordinate p of a root includes all bodies that it carries.
         in_joints = run.names.kinematics is not None and body in (*run.names.rigid, *run.names.carried)
-        return self._of_body(body, _body_momenta, in_joints, (run.states.p_s, run.states.p_f))
+        return self._of_body("momentum", body, in_joints, (run.states.p_s, run.states.p_f))
 
     def velocity(self, body: str):
         """Velocities (..., k, size) of a body, or of a coordinate that has a name.
@@ -165,13 +164,13 @@ class Quantities(ABC):
         Args, Raises: as of `position`; a ValueError, too, if the run does not know its system.
         """
         in_joints = body in self.names.carried
-        return self._of_body(body, _body_rates, in_joints, None if in_joints else self.velocities)
+        return self._of_body("velocity", body, in_joints, None if in_joints else self.velocities)
 
-    def _of_body(self, body: str, of_bodies: Callable, in_joints: bool, values: Any):
-        """(..., k, size) of a body: a part of the `values` (slow, fast) of all coordinates, or of `of_bodies` for a body in joint coordinates."""
+    def _of_body(self, kind: str, body: str, in_joints: bool, values: Any):
+        """(..., k, size) of a body: a part of the `values` (slow, fast) of all coordinates, or of `_of_bodies`."""
         run = self.whole()
         if in_joints:
-            values = at_nodes(of_bodies, run.origin, run.states, run.names.kinematics)
+            values = at_nodes(_of_bodies, run.origin, run.states, run.names.kinematics, kind)
         part, start, size = run.names.place_of(body)
         return values[part == "f"][..., start : start + size]
 
@@ -283,18 +282,15 @@ def _concrete(method: str, run: SavedRun) -> SavedRun:
     return run
 
 
-def _bodies(system: System, state: State, kinematics: Kinematics) -> tuple:
-    return kinematics(state.q_s, state.q_f, system.params[JOINTS])
-
-
-def _body_rates(system: System, state: State, kinematics: Kinematics):
-    v_s, v_f = _velocity(system, state)
-    return kinematics.velocities(state.q_s, state.q_f, v_s, v_f, system.params[JOINTS])
-
-
-def _body_momenta(system: System, state: State, kinematics: Kinematics):
-    v_s, v_f = _velocity(system, state)
-    return kinematics.momenta(state.q_s, state.q_f, v_s, v_f, system.params)
+def _of_bodies(system: System, state: State, kinematics: Kinematics, kind: str):
+    """Positions, velocities or momenta (slow, fast) of all bodies of a system in joint coordinates."""
+    q = state.q_s, state.q_f
+    if kind == "position":
+        return kinematics(*q, system.params[JOINTS])
+    v = _velocity(system, state)
+    if kind == "velocity":
+        return kinematics.velocities(*q, *v, system.params[JOINTS])
+    return kinematics.momenta(*q, *v, system.params)
 
 
 def _states(run: SavedRun, micro: bool, with_start: bool = False) -> State:

@@ -68,9 +68,5 @@ class RunError(NamedTuple):
 
 
 def largest_of(values) -> np.ndarray:
-    """(..., k) largest modulus over the coordinates at each node; NaN where one of them is NaN.
-
-    Args:
-        values: (..., k, n).
-    """
+    """(..., k) largest modulus over the coordinates of values (..., k, n); NaN where one of them is NaN."""
     return np.abs(values).max(axis=-1, initial=0.0)

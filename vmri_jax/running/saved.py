@@ -61,11 +61,7 @@ class Columns(NamedTuple):
 
 
 class Saved(NamedTuple):
-    """Nodes of a run and its status, of JAX or of NumPy, in a batch with an axis of lanes.
-
-    rows: a row for each node, see `Columns`.
-    result, failed_at: of a `Trajectory`.
-    """
+    """Nodes of a run, a row of `Columns` for each, and its status, of JAX or NumPy; in a batch with lanes."""
 
     rows: Float[Numbers, "k width"]
     result: Int[Numbers, ""]
@@ -83,10 +79,7 @@ class Saved(NamedTuple):
         its pole); a lane of a batch started off its constraints; the rows of ``system.implied``, redundant constraints that the solver leaves
         out, are violated; or a stepper of the user leaves the constraints. The last step before the first such node counts as the failed one.
 
-        Args:
-            columns: of the rows, in which there may be anything after a failed step.
-            save_every: macro steps from one saved node to the next.
-            step: macro steps before the first node.
+        Rows after a failed step may have any numbers. There are `step` macro steps before the first node.
         """
         rows, result, failed_at = self
         module, now = library(self), Observables.of(self.table)
@@ -118,7 +111,7 @@ class Saved(NamedTuple):
         t = t_start[..., None] + (step + np.arange(rows.shape[-2]) * run.save_every) * macro_dt[..., None]
         states, first = columns.states(rows, t), columns.info.start
         method, iterations, residual = (rows[..., 1:, first + i] for i in range(len(RunInfo._fields)))
-        if run.save_micro:  # micro node i lies H (1 - c_i) before the end of its macro step
+        if run.save.micro:  # micro node i lies H (1 - c_i) before the end of its macro step
             before_end = macro_dt[..., None, None] * (1 - run.scheme.micro_times)
             shape = *residual.shape, before_end.shape[-1], states.q_f.shape[-1]
             micro = MicroNodes(t[..., 1:, None] - before_end, rows[..., 1:, columns.micro].reshape(shape))
@@ -134,25 +127,14 @@ def joined(pieces: list[Saved]) -> Saved:
 
 
 def check_memory(caller: str, run: Any, lanes: int = 1, num_saves: int | None = None) -> None:
-    """Refuse a run whose trajectory would not fit into the free memory.
-
-    Args:
-        caller: the function that was called, for the message.
-        run: the `Simulation` of one lane.
-        lanes: runs whose trajectories are kept together.
-        num_saves: saved intervals; None for those of the run.
-
-    Raises:
-        ValueError: the trajectory is larger than the free memory.
-    """
+    """Refuse runs side by side, with `num_saves` intervals each, None for those of `run`, that would not fit into the
+    free memory; `caller` begins the message."""
     nodes = 1 + (num_saves or run.num_saves)
     needed = BYTES_PER_NUMBER * run.columns.width * nodes * lanes
     if needed < UNCHECKED_BYTES:
         return
     free = psutil.virtual_memory().available
     if needed > free:
-        raise Refused(
-            f"{caller}: {nodes} saved nodes{f' of {lanes} runs' if lanes > 1 else ''} would take {needed / 1e9:.3g} GB, and "
-            f"{free / 1e9:.3g} GB of memory are free. Save fewer of them (save=...), or write them to disk as they come "
-            "(vmri_jax.stream)."
-        )
+        kept = f"{nodes} saved nodes{f' of {lanes} runs' if lanes > 1 else ''} would take {needed / 1e9:.3g} GB"
+        advice = "Save fewer of them (save=...), or write them to disk as they come (vmri_jax.stream)"
+        raise Refused(f"{caller}: {kept}, and {free / 1e9:.3g} GB of memory are free. {advice}.")

@@ -4,9 +4,8 @@ import shlex
 from dataclasses import dataclass, field
 from typing import Any
 
-from vmri_jax.schemes.composition import Composition, stage_scheme
+from vmri_jax.schemes.composition import SchemeLike, stage_scheme
 from vmri_jax.schemes.plain_data import from_plain, to_plain
-from vmri_jax.schemes.scheme import Scheme
 
 
 @dataclass(frozen=True)
@@ -24,7 +23,7 @@ class Settings:
             from the prices and error shares of the trial runs.
     """
 
-    scheme: Scheme | Composition = field(compare=False)  # `python` and the numbers identify it
+    scheme: SchemeLike = field(compare=False)  # `python` and the numbers identify it
     python: str
     options: str
     macro_dt: float
@@ -50,11 +49,7 @@ class Settings:
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> "Settings":
-        """The inverse of `to_dict`.
-
-        Args:
-            data: from `to_dict`, directly or through JSON.
-        """
+        """The inverse of `to_dict`, also after a round trip through JSON."""
         return cls(**{**data, "scheme": from_plain(data["scheme"])})
 
     def __str__(self) -> str:

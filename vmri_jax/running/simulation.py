@@ -30,7 +30,7 @@ from vmri_jax.mechanics.summary import numbers, summary
 from vmri_jax.mechanics.system import System
 from vmri_jax.refusals import Refused
 from vmri_jax.running.arguments import Save, Steps, check_once, check_run, nothing_fast
-from vmri_jax.running.engine import FALLING_BACK, Cursor, Engine, engine, solved_again, unsolved
+from vmri_jax.running.engine import FALLING_BACK, Cursor, Engine, blank_memory, engine, solved_again, unsolved
 from vmri_jax.running.failures import simulation_error
 from vmri_jax.running.interrupts import Interrupted, interrupts_noted
 from vmri_jax.running.observables import concerns
@@ -38,8 +38,7 @@ from vmri_jax.running.origin import Origin, names_of
 from vmri_jax.running.progress import Working, progress_to
 from vmri_jax.running.saved import Columns, Saved, joined
 from vmri_jax.running.trajectory import Trajectory
-from vmri_jax.schemes.composition import Composition
-from vmri_jax.schemes.scheme import Scheme
+from vmri_jax.schemes.composition import SchemeLike
 from vmri_jax.steppers.plan import Plan, plan, with_rules_for
 from vmri_jax.steppers.solver import Solver
 
@@ -54,8 +53,7 @@ STEPPING = "stepping"
 class Checkpoint(NamedTuple):
     """A run between two steps: everything that its next steps depend on, to the last bit.
 
-    cursor: state, memory of the stepper such as the start of Newton's next iteration, steps done, and status so far. The memory is None where the
-        stepper has none of earlier steps.
+    cursor: state, memory of the stepper, None where it has none of earlier steps, steps done, and status so far.
     fell_back: whether the fallback has replaced the first matrix.
     """
 
@@ -64,7 +62,7 @@ class Checkpoint(NamedTuple):
 
 
 MOTION = ("macro_dt", "state", "solver", "scheme", "system")
-"""The fields of a `Simulation` with the numbers and functions that its motion follows from."""
+"""The fields of a `Simulation` that its motion follows from."""
 LENGTH = ("num_steps", "save_every", "save", "names", "may_fall_back")
 """All other fields."""
 
@@ -88,7 +86,7 @@ class Simulation:
     macro_dt: Any
     state: State
     solver: Solver
-    scheme: Scheme | Composition
+    scheme: SchemeLike
     system: System
     num_steps: int
     save_every: int
@@ -223,20 +221,10 @@ class Simulation:
         """Saved intervals."""
         return self.num_steps // self.save_every
 
-    @property
-    def save_micro(self) -> bool:
-        """Whether micro nodes are saved."""
-        return self.save.micro
-
-    @property
-    def is_concrete(self) -> bool:
-        """Whether all arrays are concrete numbers, not tracers of a transformation."""
-        return is_concrete(self.leaves)
-
     @cached_property
     def columns(self) -> Columns:
         """The columns of its saved nodes."""
-        return Columns.of(self.state, self.scheme.num_micro if self.save_micro else 0)
+        return Columns.of(self.state, self.scheme.num_micro if self.save.micro else 0)
 
     def stepper(self, reverse_only: bool = False) -> Plan:
         """The `Plan` that takes its steps."""
@@ -267,9 +255,14 @@ class Simulation:
         """Its programs for pieces, of a size for runs of all lengths, without the fallback."""
         return self._engine(self.columns.saves_of_a_piece)
 
+    @cached_property
+    def blank_memory(self) -> Any:
+        """Zeros in the shapes of the memory of its stepper."""
+        return blank_memory(self._pieces, tuple((a.shape, a.dtype) for a in self.leaves))
+
     def _engine(self, num_saves: int) -> Engine:
         without_length = replace(
-            self, num_steps=0, save_every=0, save=Save(micro=self.save_micro), names=None, may_fall_back=True
+            self, num_steps=0, save_every=0, save=Save(micro=self.save.micro), names=None, may_fall_back=True
         )
         return engine(jax.tree.structure(without_length), num_saves)
 
@@ -279,11 +272,9 @@ class Simulation:
         return replace(self, solver=self.solver.exact())
 
     def check(self, state_name: str = "simulate: the positions of the state", constraints: bool = True) -> None:
-        """Refuse a system whose functions return wrong types or shapes, and a state that violates the constraints; equal ones are checked once.
+        """Refuse a system whose functions return wrong types or shapes, and a state that violates the constraints.
 
-        Args:
-            state_name: the state in messages.
-            constraints: whether to check the constraints at the state.
+        `state_name` is the state in messages. Equal ones are checked once.
         """
         with Working("checks of the system"):
             check_once(Known((self.system, replace(self.state, p_s=None, p_f=None))), state_name, constraints)
@@ -291,11 +282,6 @@ class Simulation:
     def start(self) -> Checkpoint:
         """The checkpoint before the first step."""
         return Checkpoint(Cursor.at_start(self.state))
-
-    def blank_memory(self, fell_back: bool) -> Any:
-        """Zeros in the shapes of the memory of its stepper."""
-        run = self.exact if fell_back else self
-        return run._pieces.blank_memory(run.leaves)
 
     def advance(self, checkpoint: Checkpoint, saves: int) -> tuple[Saved, Checkpoint]:
         """The next `saves` saved intervals; from the first piece that is not solved, with the fallback.
@@ -316,10 +302,10 @@ class Simulation:
 
     def _advance(self, checkpoint: Checkpoint, saves: int) -> tuple[Saved, Checkpoint]:
         cursor, run = checkpoint.cursor, self.exact if checkpoint.fell_back else self
-        step, is_first, engine = int(cursor.step), cursor.memory is None, run._pieces
+        step, is_first = int(cursor.step), cursor.memory is None
         if is_first:
-            cursor = cursor._replace(memory=engine.blank_memory(run.leaves))
-        rows, cursor = engine.program(run.leaves, self.save_every, saves, cursor, is_first)
+            cursor = cursor._replace(memory=run.blank_memory)
+        rows, cursor = run._pieces.program(run.leaves, self.save_every, saves, cursor, is_first)
         nodes = np.array(np.asarray(rows)[: saves + 1])  # a copy, which holds no memory of a whole piece
         saved = Saved(nodes, np.asarray(cursor.result), np.asarray(cursor.failed_at))
         saved = saved.marked(self.columns, self.save_every, step)

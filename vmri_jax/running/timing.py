@@ -12,13 +12,6 @@ schedulers; a larger value makes measurements take longer."""
 LEAST_SECONDS = 1e-7
 """Seconds of a call that is too short for the clock, or only waits; a smaller value repeats calls that wait for minutes."""
 
-Tell = Callable[[str], None]
-"""Called with the name of a run before it is measured."""
-
-
-def silent(_: str) -> None:
-    """A `Tell` that prints nothing."""
-
 
 def interleaved(
     runs: Mapping[str, Callable[[], object]],
@@ -28,12 +21,7 @@ def interleaved(
     """Seconds per call of every run by a `stopwatch`, `repeats` samples each, after one call that is not counted.
 
     The runs take turns, and every round starts with another run, so that a slow moment of the machine, or the caches as the previous run
-    left them, affect all runs alike.
-
-    Args:
-        runs: callables by name; the clock stops when their results are ready (`jax.block_until_ready`).
-        repeats: samples of each run.
-        min_seconds: seconds of a sample, the mean of several calls.
+    left them, affect all runs alike. A sample is the mean of the calls in `min_seconds`.
     """
     calls, seconds = {}, {name: [] for name in runs}
     for name, run in runs.items():

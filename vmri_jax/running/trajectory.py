@@ -18,13 +18,15 @@ from vmri_jax.mechanics.system import System
 from vmri_jax.refusals import Refused
 from vmri_jax.running.export import INFO, MICRO, NODES, STATUS, Exports, named_arrays
 from vmri_jax.running.files import replaced
-from vmri_jax.running.origin import UNKNOWN, Origin
+from vmri_jax.running.origin import UNKNOWN, Origin, SavedRun
 from vmri_jax.running.run_error import RunError
 from vmri_jax.running.settings import Settings
 from vmri_jax.running.summaries import summary_of
 from vmri_jax.steppers.results import Method, Result, Status
 
 FORMAT = "vmri_jax trajectory 3"
+NOT_READ = ("drawing", "slow_names", "fast_names")
+"""Arrays of a file for other programs."""
 ERROR = tuple(f"error_{name}" for name in RunError._fields)
 """Arrays of the estimated error; absent in runs without one."""
 
@@ -158,11 +160,11 @@ class Trajectory(Exports):
         """
         origin = replace(Origin.of(moving), settings=self.settings)
         origin.check(self.states.q_s.shape[-1], self.states.q_f.shape[-1])
-        return with_origin(self, origin.repeated(np.shape(self.t)[:-1]))
+        return replace(self, origin=origin.repeated(np.shape(self.t)[:-1]))
 
     def with_arrays(self, **arrays) -> "Trajectory":
         """The same run with other arrays, named as in a file written by `save`: ``run.with_arrays(q_f=..., energy=...)``."""
-        return with_origin(from_named_arrays(named_arrays(self) | arrays), self.origin)
+        return from_named_arrays(named_arrays(self) | arrays, self.origin)
 
     def whole(self) -> "Trajectory":
         return self
@@ -175,7 +177,6 @@ class Trajectory(Exports):
         return jax.tree.map(lambda a: a[*lanes, number], self.states)
 
     def _part(self, first: int, last: int, stride: int) -> "Trajectory":
-        """The nodes first, first + stride, ..., last; the work of the solver between two of them is the maximum, and a failure after the last is left out."""
         if not is_concrete(self.energy):
             raise Refused("Trajectory: the run is traced by JAX; take slices of its arrays, run.q_s[a:b].")
         arrays, lanes = named_arrays(self), (slice(None),) * (np.ndim(self.t) - 1)
@@ -183,9 +184,8 @@ class Trajectory(Exports):
         def rows(name: str, chosen: slice):
             return np.asarray(arrays[name])[*lanes, chosen]
 
-        part = part_of(rows, self.result, self.failed_at, (first, last, stride), self.micro is not None)
-        error: Any = None if self.error is None else self.error.part(slice(first, last + 1, stride))
-        return with_origin(part, self.origin, error=error)
+        part = part_of(self, rows, (first, last, stride), self.micro is not None)
+        return part if self.error is None else replace(part, error=self.error.part(slice(first, last + 1, stride)))
 
     def lane(self, i: int) -> "Trajectory":
         """One run of a batch.
@@ -198,7 +198,8 @@ class Trajectory(Exports):
         """
         if np.ndim(self.t) != 2:
             raise Refused("lane: this is one run, no batch of runs.")
-        return with_origin(jax.tree.map(lambda a: a[i], self), jax.tree.map(lambda a: a[i], self.origin))
+        run = jax.tree.map(lambda a: a[i], self)
+        return replace(run, result=status(run.result))
 
     @property
     def success(self):
@@ -244,19 +245,13 @@ class Trajectory(Exports):
             raise Refused(f"{path} is a folder; a run written by stream is opened by StoredTrajectory({str(path)!r}).")
         try:
             with path.open("rb") as file, np.load(file, allow_pickle=False) as data:
-                arrays = {
-                    name: data[name] for name in data.files if name not in ("drawing", "slow_names", "fast_names")
-                }
+                arrays = {name: data[name] for name in data.files if name not in NOT_READ}
         except Exception as error:
-            raise Refused(
-                f"{path} cannot be read as a .npz file ({error}); it is damaged or something else."
-            ) from error
+            raise Refused(f"{path} cannot be read as a .npz file ({error}); it may be damaged.") from error
         known = str(arrays.pop("format", ""))
         if known != FORMAT:
             other = f" It has the format {known!r}, this version of vmri_jax reads {FORMAT!r}." if known else ""
-            raise Refused(
-                f"{path} is a .npz file but not a trajectory saved by Trajectory.save of this version.{other}"
-            )
+            raise Refused(f"{path} is a .npz file but no trajectory of Trajectory.save of this version.{other}")
         texts = [arrays.pop(name, None) for name in ("names", "settings")]
         needed = {*NODES, *INFO, *STATUS}
         missing = needed - set(arrays)
@@ -265,15 +260,8 @@ class Trajectory(Exports):
         try:
             origin = Origin.from_file(*(None if text is None else json.loads(str(text)) for text in texts))
         except (KeyError, TypeError, ValueError) as error:
-            raise Refused(
-                f"{path} is a damaged trajectory: its names or settings cannot be read ({error!r})."
-            ) from error
-        return with_origin(from_named_arrays(arrays), origin)
-
-
-def with_origin(trajectory: Trajectory, origin: Origin, **arrays) -> Trajectory:
-    """A trajectory with its origin, and with a status that prints as a sentence; `arrays` replace other fields."""
-    return replace(trajectory, result=status(trajectory.result), origin=origin, **arrays)
+            raise Refused(f"{path} is a damaged trajectory: no names or settings can be read ({error!r}).") from error
+        return from_named_arrays(arrays, origin)
 
 
 def status(result) -> Any:
@@ -282,24 +270,22 @@ def status(result) -> Any:
     return Status(result) if is_array and is_concrete(result) else result
 
 
-def from_named_arrays(arrays: dict) -> Trajectory:
+def from_named_arrays(arrays: dict, origin: Origin = UNKNOWN) -> Trajectory:
     """The inverse of `named_arrays`; arrays of micro nodes and of the error may be absent."""
-    states = State(*(arrays[name] for name in NODES[:5]))
-    fields = {name: arrays[name] for name in (*NODES[5:], *STATUS)}
-    micro = MicroNodes(*(arrays[name] for name in MICRO)) if MICRO[0] in arrays else None
+    states, info = State(*map(arrays.get, NODES[:5])), RunInfo(*map(arrays.get, INFO))
+    fields = {name: arrays[name] for name in NODES[5:]} | {"result": status(arrays["result"])}
+    micro = MicroNodes(*map(arrays.get, MICRO)) if MICRO[0] in arrays else None
     error: Any = RunError(*map(arrays.get, ERROR)) if ERROR[0] in arrays else None
-    return Trajectory(states, info=RunInfo(*(arrays[name] for name in INFO)), micro=micro, error=error, **fields)
+    return Trajectory(
+        states, info=info, failed_at=arrays["failed_at"], micro=micro, error=error, origin=origin, **fields
+    )
 
 
-def part_of(rows: Callable[[str, slice], np.ndarray], result, failed_at, nodes: tuple, has_micro: bool) -> Trajectory:
-    """The nodes first, first + stride, ..., last of a run; the work of the solver between two of them is the maximum, and a failure after the last is
-    left out.
+def part_of(run: SavedRun, rows: Callable[[str, slice], np.ndarray], nodes: tuple, has_micro: bool) -> Trajectory:
+    """The nodes (first, last, stride) of a run, with the largest work of the solver between two of them.
 
-    Args:
-        rows: gives some rows of an array by its name; row i of the arrays of intervals belongs to the nodes i and i + 1.
-        result, failed_at: status of the run.
-        nodes: (first, last, stride).
-        has_micro: whether there are micro nodes.
+    ``rows(name, slice)`` are some rows of an array; row i of the arrays of intervals belongs to the nodes i and i + 1.
+    A failure after the last node is left out.
     """
     first, last, stride = nodes
     arrays = {name: rows(name, slice(first, last + 1, stride)) for name in NODES}
@@ -308,6 +294,7 @@ def part_of(rows: Callable[[str, slice], np.ndarray], result, failed_at, nodes: 
         arrays[name] = np.maximum.reduceat(between, starts, axis=arrays["t"].ndim - 1) if starts else between
     if has_micro:
         arrays |= {name: rows(name, slice(first + stride - 1, last, stride)) for name in MICRO}
-    fails_later = (np.asarray(failed_at) >= 0) & ~np.isnan(arrays["energy"]).any(axis=-1)
-    arrays["result"] = np.where(fails_later, int(Result.CONVERGED), result)
-    return from_named_arrays(arrays | {"failed_at": np.where(fails_later, -1, failed_at)})
+    fails_later = (np.asarray(run.failed_at) >= 0) & ~np.isnan(arrays["energy"]).any(axis=-1)
+    arrays["result"] = np.where(fails_later, int(Result.CONVERGED), run.result)
+    arrays["failed_at"] = np.where(fails_later, -1, run.failed_at)
+    return from_named_arrays(arrays, run.origin)

@@ -157,7 +157,11 @@ class Composition(eqx.Module):
         return self.scheme.describe().repeated(self.num_stages, self.order, self.is_symmetric)
 
 
-def compose(scheme: Scheme | Composition, coefficients: str | Sequence[float]) -> Composition:
+SchemeLike = Scheme | Composition
+"""A scheme, or a composition of its steps: the argument `scheme` of runs."""
+
+
+def compose(scheme: SchemeLike, coefficients: str | Sequence[float]) -> Composition:
     """Run `scheme` over parts of the macro step, for higher order.
 
     Args:
@@ -193,12 +197,12 @@ def compose(scheme: Scheme | Composition, coefficients: str | Sequence[float]) -
     return Composition(scheme, c)
 
 
-def stage_scheme(scheme: Scheme | Composition) -> Scheme:
+def stage_scheme(scheme: SchemeLike) -> Scheme:
     """The scheme of every stage of a composition; a scheme itself."""
     return scheme.scheme if isinstance(scheme, Composition) else scheme
 
 
-def stage_lengths(scheme: Scheme | Composition):
+def stage_lengths(scheme: SchemeLike):
     """(s,) lengths of the stages of a macro step, in macro steps; ``[1]`` of a scheme."""
     return scheme.coefficients if isinstance(scheme, Composition) else np.ones(1)
 

@@ -20,14 +20,14 @@ from vmri_jax.diagnostics import OrderFit
 from vmri_jax.executors.executor import mapped
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
 from vmri_jax.refusals import Refused
+from vmri_jax.running.arguments import Save, check_step_size, steps_until
 from vmri_jax.running.interrupts import Interrupted
 from vmri_jax.running.prepare import prepare
 from vmri_jax.running.progress import Progress, shows_progress
 from vmri_jax.running.simulation import Simulation
 from vmri_jax.running.timing import interleaved
 from vmri_jax.running.trajectory import Trajectory
-from vmri_jax.schemes.composition import Composition
-from vmri_jax.schemes.scheme import Scheme
+from vmri_jax.schemes.composition import SchemeLike
 from vmri_jax.steppers.solver import Solver
 from vmri_jax.study.reference_solution import ReferenceSolution, reference_solution
 from vmri_jax.study.row import Row, RunTable, WorkPrecision, row_of
@@ -166,7 +166,7 @@ class ConvergenceStudy(RunTable):
 @shows_progress
 def convergence_study(
     problem: Problem | HasProblem,
-    schemes: Mapping[str, Scheme | Composition],
+    schemes: Mapping[str, SchemeLike],
     macro_dt: Sequence[float],
     t_end: float,
     *,
@@ -270,8 +270,7 @@ def _run(*arguments) -> Trajectory:
 
 def _num_steps(t_end: float, macro_dt: float, num_saves: int) -> int:
     """The number of macro steps up to `t_end`."""
-    num_steps = round(t_end / macro_dt) if macro_dt > 0 else 0
-    if num_steps < 1 or abs(num_steps * macro_dt - t_end) > 1e-9 * t_end or num_steps % num_saves:
-        steps = f"macro_dt = {macro_dt:g} makes {t_end / (macro_dt or np.nan):.6g} steps up to t_end = {t_end:g}"
-        raise Refused(f"convergence_study: {steps}; it must make a multiple of num_saves = {num_saves} whole steps.")
+    check_step_size(macro_dt, "convergence_study")
+    num_steps = steps_until(t_end, 0.0, macro_dt)
+    Save(number=num_saves).macro_steps(num_steps)
     return num_steps

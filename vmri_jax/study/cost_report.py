@@ -181,18 +181,14 @@ def prices(problem: Problem) -> dict[str | int, float]:
     return {term.name: seconds_each(gradient(term), q) for term in system.of_kind("potential")}
 
 
-def seconds_of_gradients(price: Mapping[str | int, float], row: Row) -> float:
-    """Seconds of a run in its gradients: evaluations times `prices`."""
-    counts = {"V": row.slow_evaluations, "W": row.fast_evaluations, **row.evaluations}
-    return sum(seconds * counts.get(name, 0) for name, seconds in price.items())
-
-
 def bound_of(price: Mapping[str | int, float], rows: Sequence[Row]) -> tuple[tuple[float, float], ...]:
-    """Seconds and error of runs whose time is that of their gradients alone.
+    """Seconds and error of runs that take the time of their gradients alone, evaluations times `prices`.
 
     A gradient in a loop of its own may take longer than in the run, so that the time of the run bounds it.
     """
-    return tuple((min(seconds_of_gradients(price, row), row.seconds), row.error_q) for row in rows)
+    counts = [{"V": row.slow_evaluations, "W": row.fast_evaluations, **row.evaluations} for row in rows]
+    seconds = [sum(each * count.get(name, 0) for name, each in price.items()) for count in counts]
+    return tuple((min(time, row.seconds), row.error_q) for time, row in zip(seconds, rows, strict=True))
 
 
 def _default_errors(tuning: Tuning, problem: Problem, t_end: float) -> list[float]:
@@ -202,10 +198,8 @@ def _default_errors(tuning: Tuning, problem: Problem, t_end: float) -> list[floa
     errors = [motion * error for error in RELATIVE_ERRORS if motion * error > least]
     if not errors:
         rest = f"until t_end = {t_end:g} positions move by {moved:.1e}, and errors below {least:.1e} are round-off"
-        raise Refused(
-            f"cost_report: {rest}: the system is at rest, or no run until then is certified. Give a start that moves, "
-            "another t_end, or the errors that you accept."
-        )
+        reason = "the system is at rest, or no run until then is certified"
+        raise Refused(f"cost_report: {rest}: {reason}. Give a start that moves, another t_end, or the errors.")
     return errors
 
 

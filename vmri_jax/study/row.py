@@ -12,8 +12,7 @@ from vmri_jax.mechanics.system import System
 from vmri_jax.mechanics.terms import label
 from vmri_jax.running.settings import Settings
 from vmri_jax.running.trajectory import Trajectory
-from vmri_jax.schemes.composition import Composition, stage_scheme
-from vmri_jax.schemes.scheme import Scheme
+from vmri_jax.schemes.composition import SchemeLike, stage_scheme
 from vmri_jax.steppers.results import Method, Result
 from vmri_jax.study.reference_solution import ReferenceSolution
 from vmri_jax.study.table import Column, ResultTable
@@ -97,7 +96,7 @@ def record(row: Row) -> dict[str, Any]:
 def row_of(
     name: str,
     system: System,
-    scheme: Scheme | Composition,
+    scheme: SchemeLike,
     run: Trajectory,
     macro_dt: float,
     num_steps: int,

@@ -14,7 +14,7 @@ from vmri_jax.accuracy.steps import check_error, digits_of, reached, warn_of_eve
 from vmri_jax.accuracy.trials import Trial
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
 from vmri_jax.running.failures import simulation_error
-from vmri_jax.running.progress import Progress, shows_progress, silent
+from vmri_jax.running.progress import shows_progress
 from vmri_jax.steppers.solver import Solver
 from vmri_jax.study.row import Row, WorkPrecision, row_of
 from vmri_jax.study.table import interruptible
@@ -28,16 +28,8 @@ SETTINGS_PRINTED = 5
 class Tuning(Search):
     """A search over a menu, with a row for each of its runs; arguments as of `tune`."""
 
-    def __init__(
-        self,
-        problem: Problem,
-        t_end: float,
-        menu: Sequence[Family] | None = None,
-        num_saves: int | None = None,
-        solver: Solver | None = None,
-        progress: Progress = silent,
-    ):
-        super().__init__(problem, None, solver, problem.t + t_end, num_saves, None, progress)
+    def __init__(self, problem: Problem, t_end: float, menu: Sequence[Family] | None = None, **how: Any):
+        super().__init__(problem, problem.t + t_end, **how)
         self.menu = for_system(families() if menu is None else menu, self.system, self.has_two_rates)
         self._rows: dict[tuple[str, int], Row] = {}
 
@@ -155,7 +147,7 @@ def tune(
     """
     problem = problem_of("tune", problem)
     check_error("tune: error", error, problem)
-    tuning = Tuning(problem, t_end, menu, num_saves, solver, progress)
+    tuning = Tuning(problem, t_end, menu, num_saves=num_saves, solver=solver, progress=progress)
     with interruptible(tuning.runs):
         choice = Recommendation(tuning.look_for("tune: error", error, exhaustive).rows, error=error)
         if not choice.keeping(error):

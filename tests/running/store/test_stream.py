@@ -323,7 +323,7 @@ def test_bad_arguments(run, out, changes, message):
 
 
 def test_no_files_are_written_from_within_a_transformation(run, out):
-    with pytest.raises(ValueError, match=r"tracers; it writes files, call it outside"):
+    with pytest.raises(ValueError, match=r"tracers; call it outside"):
         jax.jit(lambda dt: run(out, macro_dt=dt).load())(0.1)
 
 

@@ -14,7 +14,7 @@ from vmri_jax.mechanics.checks import digest, operations
 from vmri_jax.mechanics.functions import TracedOnce
 from vmri_jax.mechanics.masses import ConstantMass
 from vmri_jax.mechanics.state import State
-from vmri_jax.mechanics.system import Potentials, System
+from vmri_jax.mechanics.system import Potentials
 from vmri_jax.refusals import Refused
 from vmri_jax.running.simulation import Simulation
 
@@ -24,12 +24,21 @@ different runs longer."""
 
 
 def identity(simulation: Simulation, start: State) -> dict[str, str]:
-    """Everything that determines a run, as text by name. A function is identified by its name and by the operations that it traces to."""
-    texts = {"solver": type(simulation.solver).__name__}
-    for name in ("system", "scheme", "solver", "macro_dt", "save_every", "save_micro"):
+    """Everything that determines a run, as text by name.
+
+    A function is identified by its name and by a digest of the operations that it traces to: a changed body with the
+    same name makes another run.
+    """
+    system, texts = simulation.system, {"solver": type(simulation.solver).__name__}
+    for name in ("system", "scheme", "solver", "macro_dt", "save_every"):
         texts |= describe(name, getattr(simulation, name))
-    texts |= describe("state", start)
-    return texts | {f"operations of {name}": text for name, text in _operations(simulation.system, start).items()}
+    texts |= describe("save_micro", simulation.save.micro) | describe("state", start)
+    values = {"t": start.t, "q_s": start.q_s, "q_f": start.q_f, "v_s": start.q_s, "v_f": start.q_f}
+    for term in system.terms:
+        if not isinstance(term.function, ConstantMass):
+            of_term = operations(term.function, *term.of_arguments(values), system.params)
+            texts[f"operations of {term.place}"] = of_term
+    return texts
 
 
 def package_versions() -> dict[str, str]:
@@ -46,11 +55,8 @@ def environment() -> dict[str, str]:
 def check_same(path: Path, attributes: dict, stored: dict, chunk: int | None, complete: bool) -> None:
     """Refuse to go on with the store of another run; warn if its environment was another one, unless it is complete.
 
+    `attributes` are of the store that the user wants, `stored` of the store on disk; `chunk` is the user's, or None.
     Operations are compared only if both were made with the same version of JAX: another version prints them differently.
-
-    Args:
-        attributes, stored: of the store that the user wants, and of the store on disk, with "identity", "made_with" and "chunk".
-        chunk: size of a chunk that the user wants, or None.
     """
     kind, here, there = stored["kind"], attributes["identity"], stored["identity"]
     now, then = attributes["made_with"], stored["made_with"]
@@ -61,10 +67,8 @@ def check_same(path: Path, attributes: dict, stored: dict, chunk: int | None, co
     if chunk not in (None, stored["chunk"]):
         changes.append(f"chunk: {chunk} here, {stored['chunk']} in the store")
     if changes:
-        raise Refused(
-            f"{path} holds another {kind} and cannot go on with this one. Differences: {'; '.join(changes)}. Give the arguments it was started "
-            "with, or another name."
-        )
+        other = f"{path} holds another {kind} and cannot go on with this one. Differences: {'; '.join(changes)}"
+        raise Refused(f"{other}. Give the arguments it was started with, or another name.")
     changed = [f"{name} {value} ({then.get(name)} then)" for name, value in now.items() if value != then.get(name)]
     if changed and not complete:
         warnings.warn(
@@ -98,10 +102,3 @@ def _text(leaf) -> str:
     if array.size <= MOST_NUMBERS_PRINTED:
         return str(array.tolist())
     return f"{array.dtype}{array.shape}, digest {digest(array.tobytes())}"
-
-
-def _operations(system: System, start: State) -> dict[str, str]:
-    """Digests of the operations of the user's functions: a function with a changed body and the same name makes another run."""
-    values = {"t": start.t, "q_s": start.q_s, "q_f": start.q_f, "v_s": start.q_s, "v_f": start.q_f}
-    terms = (term for term in system.terms if not isinstance(term.function, ConstantMass))
-    return {term.place: operations(term.function, *term.of_arguments(values), system.params) for term in terms}

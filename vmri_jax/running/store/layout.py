@@ -50,12 +50,7 @@ MOST_CHUNK_BYTES = 2**26
 
 
 class Kept(NamedTuple):
-    """An array of a store, in one row.
-
-    value: an array, or its shape and type.
-    dimensions: names of its axes.
-    description: of its meaning.
-    """
+    """A row of an array of a store, or its shape and type; the names of its axes, and a description of its meaning."""
 
     value: Any
     dimensions: tuple[str, ...] = ()
@@ -63,12 +58,7 @@ class Kept(NamedTuple):
 
 
 def rows_per_chunk(rows: int, seconds: float, size: int, most_chunks: int) -> float:
-    """Rows of a chunk that takes about `CHUNK_SECONDS`, longer where there would be more than `most_chunks`.
-
-    Args:
-        rows: of the store.
-        seconds, size: time to compute a row, and its bytes.
-    """
+    """Rows of a chunk, from seconds and bytes of a row: `CHUNK_SECONDS`, more where `most_chunks` do not suffice."""
     return min(max(CHUNK_SECONDS / seconds, rows / most_chunks), MOST_CHUNK_BYTES / size)
 
 
@@ -84,10 +74,8 @@ def check_place(caller: str, path: Path, kind: str, resume: bool, overwrite: boo
     stored = read_attributes(path, kind)
     if not (resume or overwrite):
         count = -(-stored["rows"] // stored["chunk"])
-        raise FileExistsError(
-            f"{path} is a stored {kind}, {len(committed(path))} of {count} chunks done. Go on with it (resume=True), replace it "
-            "(overwrite=True), or give another name."
-        )
+        advice = "Go on with it (resume=True), replace it (overwrite=True), or give another name"
+        raise FileExistsError(f"{path} is a stored {kind}, {len(committed(path))} of {count} chunks done. {advice}.")
 
 
 @contextmanager
@@ -96,10 +84,8 @@ def writing(
 ) -> Iterator[None]:
     """Context in which this process alone may write to a store, which is made if there is none, or one to overwrite.
 
-    Args:
-        attributes: of a new store, among them "kind", "rows" and "chunk".
-        arrays: by name, the first axis of each, the rows, left out.
-        design: name of the `dimension` of the rows, and `table`, columns by name.
+    A new store gets these attributes, "kind", "rows" and "chunk" among them, and these arrays, each without its first
+    axis, the rows; `design` has the name of this `dimension` and a `table` of columns.
     """
     if overwrite or not path.exists():
         with explained(path, "Give another place."):
@@ -194,11 +180,7 @@ def change_attributes(path: Path, **changes) -> None:
 
 
 def read_attributes(path: Path, kind: str) -> dict[str, Any]:
-    """Attributes of the store of a kind, "run" or "ensemble".
-
-    Raises:
-        FileNotFoundError, ValueError: there is no such store at the path, or one of another format.
-    """
+    """Attributes of the store of a kind, "run" or "ensemble"; refuses another store, and another format."""
     if not path.exists():
         raise FileNotFoundError(f"{path} does not exist; give the folder of a stored {kind}.")
     try:
@@ -208,10 +190,8 @@ def read_attributes(path: Path, kind: str) -> dict[str, Any]:
         raise Refused(f"{path} is not a stored {kind} ({type(error).__name__}: {error}).") from error
     if known != FORMAT:
         version = attributes.get("made_with", {}).get("vmri_jax", "of another format")
-        raise Refused(
-            f"{path} has the format {known!r}, and this version of vmri_jax reads {FORMAT!r}; read it with the version that "
-            f"wrote it, vmri_jax {version}, or compute it again."
-        )
+        formats = f"the format {known!r}, and this version of vmri_jax reads {FORMAT!r}"
+        raise Refused(f"{path} has {formats}; read it with vmri_jax {version}, or compute it again.")
     if attributes["kind"] != kind:
         raise Refused(f"{path} is not a stored {kind} but a stored {attributes['kind']}.")
     return attributes

@@ -22,17 +22,12 @@ from vmri_jax.running.simulation import Checkpoint, Simulation
 from vmri_jax.running.store import layout
 from vmri_jax.running.store.layout import chunk_file, read_attributes
 from vmri_jax.running.summaries import named_coordinates
-from vmri_jax.running.trajectory import Trajectory, part_of, with_origin
+from vmri_jax.running.trajectory import Trajectory, part_of
 from vmri_jax.steppers.results import Result
 
 
 class Record(NamedTuple):
-    """A `Checkpoint` in a store: a run as far as its chunks are committed.
-
-    saved: number of committed saved intervals.
-    result, failed_at, step, fell_back: of these intervals, as in `Cursor` and `Checkpoint`.
-    leaves: state and memory of the cursor.
-    """
+    """A `Checkpoint` after the committed saved intervals: their number, its counts, leaves of its state and memory."""
 
     saved: int = 0
     result: int = int(Result.CONVERGED)
@@ -73,7 +68,8 @@ class Record(NamedTuple):
         """The checkpoint of the run; a ValueError if the arrays do not fit the memory of its stepper."""
         if not self.leaves:
             return run.start()
-        expected, structure = jax.tree.flatten((run.state, run.blank_memory(self.fell_back)))
+        memory = (run.exact if self.fell_back else run).blank_memory
+        expected, structure = jax.tree.flatten((run.state, memory))
         if [(leaf.shape, leaf.dtype) for leaf in self.leaves] != [(leaf.shape, leaf.dtype) for leaf in expected]:
             raise Refused("the checkpoint was made by a version of vmri_jax whose steps remember something else")
         state, memory = jax.tree.unflatten(structure, map(jnp.asarray, self.leaves))
@@ -108,10 +104,8 @@ class StoredTrajectory(Exports):
     def __init__(self, path):
         self.path = Path(path)
         if self.path.is_file():
-            raise Refused(
-                f"{path} is not a stored run but a file; a run written by Trajectory.save is read by "
-                f"Trajectory.load({str(path)!r})."
-            )
+            advice = f"a run written by Trajectory.save is read by Trajectory.load({str(path)!r})"
+            raise Refused(f"{path} is not a stored run but a file; {advice}.")
         self.attributes: dict[str, Any] = read_attributes(self.path, "run")
         self.num_steps: int = self.attributes["num_steps"]
         self.save_every: int = self.attributes["save_every"]
@@ -175,8 +169,7 @@ class StoredTrajectory(Exports):
         return self[number : number + 1][0]
 
     def _part(self, first: int, last: int, stride: int) -> Trajectory:
-        nodes, has_micro = (first, last, stride), self.attributes["save_micro"]
-        return with_origin(part_of(self._rows, int(self.result), self.failed_at, nodes, has_micro), self.origin)
+        return part_of(self, self._rows, (first, last, stride), self.attributes["save_micro"])
 
     def chunks(self):
         """The trajectory in pieces of a chunk each; a piece starts with the last node of the previous piece."""
@@ -184,7 +177,7 @@ class StoredTrajectory(Exports):
             yield self[first : first + self.chunk + 1]
 
     def _rows(self, name: str, rows: slice) -> np.ndarray:
-        """Committed rows of an array, see `part_of`; a ValueError if one of their files is missing or damaged."""
+        """Committed rows of an array, see `part_of`; refuses missing and damaged files."""
         import zarr
 
         shift = name not in NODES  # the first row of arrays of intervals is blank

@@ -11,7 +11,7 @@ import numpy as np
 from vmri_jax.mechanics.arrays import whole_number
 from vmri_jax.mechanics.state import Movable, State
 from vmri_jax.refusals import Refused
-from vmri_jax.running.arguments import Save, Steps
+from vmri_jax.running.arguments import Save, Steps, refuse_tracers
 from vmri_jax.running.export import DIMENSIONS, rows_of
 from vmri_jax.running.failures import simulation_error
 from vmri_jax.running.files import explained
@@ -25,8 +25,7 @@ from vmri_jax.running.store import layout
 from vmri_jax.running.store.identity import check_same, environment, identity
 from vmri_jax.running.store.layout import Kept
 from vmri_jax.running.store.stored import Record, StoredTrajectory
-from vmri_jax.schemes.composition import Composition
-from vmri_jax.schemes.scheme import Scheme
+from vmri_jax.schemes.composition import SchemeLike
 from vmri_jax.steppers.solver import Solver
 
 CHUNKS_PER_RUN = 100
@@ -37,7 +36,7 @@ MICRO_STEP_SECONDS = 1e-6
 
 def stream(
     system: Movable,
-    scheme: Scheme | Composition,
+    scheme: SchemeLike,
     state: State | None = None,
     *,
     out: str | os.PathLike,
@@ -82,24 +81,25 @@ def stream(
     layout.check_place("stream", path, "run", resume, overwrite)
     run = simulation(system, scheme, state, solver, Steps(macro_dt, num_steps, t_end, save))
     num_steps = run.num_steps
-    if not run.is_concrete:
-        raise Refused("stream: arguments are tracers; it writes files, call it outside of jax.jit, vmap and grad.")
+    refuse_tracers("stream", run.leaves, ", since it writes files")
     run.check("stream: the positions of the state")
     length = {"rows": run.num_saves + 1, "num_steps": num_steps}
     attributes = length | {
         "kind": "run",
         "save_every": run.save_every,
-        "save_micro": run.save_micro,
+        "save_micro": run.save.micro,
         "chunk": _chunk(run) if chunk is None else whole_number("stream: chunk", chunk, otherwise=", or None"),
         "identity": identity(run, run.state),
         "made_with": environment(),
     }
     attributes |= {} if drawing is None else {"drawing": drawing}
     attributes |= {} if run.names is None else {"names": run.names.to_dict()}
+    two_nodes = Saved(np.zeros((2, run.columns.width)), np.asarray(0), np.asarray(-1)).trajectory(run)
+    arrays = {name: Kept(rows[0], DIMENSIONS[name][1:]) for name, rows in rows_of(two_nodes).items()}
     with (
         interrupts_noted() as interrupted,
         progress_to("stream", run.save.progress) as tell,
-        layout.writing(path, attributes, _arrays(run), overwrite),
+        layout.writing(path, attributes, arrays, overwrite),
     ):
         stored = StoredTrajectory(path)
         check_same(path, attributes, stored.attributes, chunk, stored.complete)
@@ -158,12 +158,6 @@ def _advice(step: int) -> str:
     if step:
         return f"The run is kept up to macro step {step}: resume it when there is room."
     return "Give another place."
-
-
-def _arrays(run: Simulation) -> dict[str, Kept]:
-    """The arrays of the store of a run: a row of each, as two blank nodes have them."""
-    blank = Saved(np.zeros((2, run.columns.width)), np.asarray(0), np.asarray(-1)).trajectory(run)
-    return {name: Kept(rows[0], DIMENSIONS[name][1:]) for name, rows in rows_of(blank).items()}
 
 
 def _chunk(run: Simulation) -> int:
