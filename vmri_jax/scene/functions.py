@@ -109,9 +109,7 @@ class KineticEnergy(_OfTerms):
 
         def bodies(q):
             """The coordinates Q_f, or Q_s, of coordinates q."""
-            return (
-                self.bodies(*jnp.split(q, [q_s.size]), params)[number] if q_f else self.bodies(q, None, params)[number]
-            )
+            return self.bodies(q[: q_s.size], q[q_s.size :] if q_f else None, params)[number]
 
         q = jnp.concatenate([q_s, *q_f])
         rates = jax.vmap(jax.linearize(bodies, q)[1])(jnp.eye(q.size))
