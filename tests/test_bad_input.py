@@ -124,7 +124,7 @@ def test_flags_are_true_or_false(fpu):
         start(fpu, project="no")
     for name in ("micro", "progress"):
         flag: Any = {name: 1}
-        with pytest.raises(TypeError, match=f"{name} is 1; it must be True or False"):
+        with pytest.raises(TypeError, match=f"{name} is 1; "):
             Save(**flag)
 
 

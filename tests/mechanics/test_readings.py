@@ -72,7 +72,7 @@ def test_forces_and_velocities_have_the_shape_of_their_position():
     np.testing.assert_array_equal(one_number.v_f, [2.0])
 
 
-def uniform(t, q, v, params):
+def uniform(history, t, q, v, params):
     return (params["force"],)
 
 

@@ -38,7 +38,7 @@ def test_a_dissipative_step_is_not_symplectic():
     problem = linear_model()
     damped = replace(problem, system=problem.system.replace(force=drag))
     found = monodromy(damped, fully_explicit(1), macro_dt=0.02, num_steps=1, solver=MARCH)
-    assert found.symplectic_defect > 1e-4  # 2e-3 without the force: 1e-16
+    assert found.symplectic_defect > 1e-6  # measured 1.4e-6 of the largest |X_ij|^2; without the force 1e-18
 
 
 @pytest.fixture(scope="module")
