@@ -52,10 +52,10 @@ def _entry(cls: type[scene.Effect], folder: Path) -> str:
     effect, base = EXAMPLES.get(cls, (None, BASE))
     path = folder / "effects" / f"{cls.__name__}.png"
     image = ""
-    if effect is not None and effect.drawing({body.name: body for body in base.bodies}):
+    shown = None if effect is None else scene_with(effect, base)
+    if shown is not None and shown.bound[1].drawing():
         image = f".. image:: effects/{path.name}\n   :width: 45%\n   :alt: {cls.__name__} in a small scene\n\n"
         if not path.exists():
-            shown = scene_with(effect, base)
             run = resting(simulation(shown, fully_implicit(1), None, None, Steps(0.01, num_steps=2)))
             run = replace(run, origin=Origin())  # without its system, whose energy a resting run does not have
             plots.save(plot_strip(motion(run, shown), 1), path)
