@@ -56,8 +56,12 @@ def test_the_mass_matrix_of_trees_in_closed_form(seed):
     def kinetic(v):
         return problem.system.kinetic_energy(q_s, q_f, v[: q_s.size], v[q_s.size :])
 
+    kinetic_terms = problem.system.of_kind("kinetic")
     masses, expected = jax.jit(
-        lambda: (closed_masses(problem.system, q_s, q_f), jax.hessian(kinetic)(jnp.zeros(q_s.size + q_f.size)))
+        lambda: (
+            closed_masses(kinetic_terms, q_s, q_f, problem.system.params),
+            jax.hessian(kinetic)(jnp.zeros(q_s.size + q_f.size)),
+        )
     )()
     np.testing.assert_allclose(masses, expected, rtol=0, atol=1e-14 * np.abs(expected).max())
 

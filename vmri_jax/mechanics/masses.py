@@ -1,6 +1,7 @@
 """Constant masses: a mass matrix, stored as its diagonal if it is diagonal."""
 
 from collections.abc import Mapping
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -92,6 +93,14 @@ class ConstantMass(eqx.Module):
     def velocity(self, p_s, p_f):
         """``(M_s^-1 p_s, M_f^-1 p_f)``, over any leading axes."""
         return self.slow_mass.solve(p_s), self.fast_mass.solve(p_f)
+
+
+class WithMassMatrix:
+    """A kinetic energy ``T = v^T M v / 2`` whose masses M, functions of the positions, have a closed form."""
+
+    def mass_matrix(self, q_s, q_f, params) -> Any:
+        """M (n, n); of T_s, for which q_f is None, (n_s, n_s). None for an energy of another form."""
+        raise NotImplementedError
 
 
 def _masses(name: str, masses):

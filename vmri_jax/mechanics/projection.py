@@ -1,5 +1,6 @@
 """Projection of momenta onto the hidden constraints ``G v + dg/dt = 0``, with the velocities of the projected momenta."""
 
+from collections.abc import Iterable
 from functools import partial
 
 import jax
@@ -10,9 +11,11 @@ from vmri_jax.kernels import matmul, matvec
 from vmri_jax.kernels.band import Full, Sparsity
 from vmri_jax.kernels.saddle import saddle
 from vmri_jax.mechanics.constraint_pattern import all_rows
+from vmri_jax.mechanics.masses import WithMassMatrix
 from vmri_jax.mechanics.structure import has_constant_hessian
 from vmri_jax.mechanics.surroundings import innermost
 from vmri_jax.mechanics.system import System
+from vmri_jax.mechanics.terms import Term
 
 MAX_ITERATIONS = 50
 """Most Newton iterations for the velocities of a kinetic energy that is not quadratic. A larger number makes failures slower."""
@@ -34,7 +37,7 @@ def legendre(system: System, q_s, q_f, v_s, v_f):
 
 def mass_and_momentum(system: System, q_s, q_f, v_s, v_f):
     """Mass matrix ``d2T/dv2`` (n, n) and momentum ``dT/dv`` (n,)."""
-    n_s, masses = v_s.size, closed_masses(system, q_s, q_f)
+    n_s, masses = v_s.size, closed_masses(system.of_kind("kinetic"), q_s, q_f, system.params)
     if masses is not None:
         return masses, matvec(masses, jnp.append(v_s, v_f))
     momentum = jax.grad(lambda v: system.kinetic_energy(q_s, q_f, v[:n_s], v[n_s:]))
@@ -42,19 +45,17 @@ def mass_and_momentum(system: System, q_s, q_f, v_s, v_f):
     return jax.vmap(times_mass)(jnp.eye(p.size)), p
 
 
-def closed_masses(system: System, q_s, q_f):
-    """The mass matrix (n, n) by the closed forms of the kinetic energies T: a function T with ``T = v^T M v / 2`` may have a method
-    ``masses(q_s, q_f, params) -> M``, of T_s ``masses(q_s, params)``. None if one of them has no closed form.
-    """
-    total, size = 0.0, q_s.size + q_f.size
-    for term in system.of_kind("kinetic"):
-        masses = getattr(innermost(term.function), "masses", None)
-        of_term = masses and masses(
-            *(q for q, name in ((q_s, "q_s"), (q_f, "q_f")) if name in term.arguments), system.params
-        )
-        if of_term is None:
+def closed_masses(terms: Iterable[Term], q_s, q_f, params):
+    """The mass matrix (n, n) of the kinetic energies of a system by their closed forms, see `WithMassMatrix`; None if one of them has none."""
+    total, n = 0.0, q_s.size + q_f.size
+    for term in terms:
+        energy = innermost(term.function)
+        if not isinstance(energy, WithMassMatrix):
             return None
-        total += jnp.pad(of_term, (0, size - len(of_term)))
+        masses = energy.mass_matrix(q_s, q_f if "q_f" in term.arguments else None, params)
+        if masses is None:
+            return None
+        total += jnp.pad(masses, (0, n - len(masses)))
     return total
 
 
@@ -109,12 +110,14 @@ def _with_masses(system: System, state, guess):
 
     jacobian = jnp.concatenate(jax.jacrev(system.constraints, argnums=(1, 2))(t, q_s, q_f), axis=1)  # (n_g + n_gs, n)
     constraints = jacobian, time_rates(system, t, q_s, q_f)
-    is_quadratic = closed_masses(system, q_s, q_f) is not None or has_constant_hessian(kinetic, p)
-    v = jnp.zeros_like(p)
+    v = gradient = jnp.zeros_like(p)
+    masses = closed_masses(system.of_kind("kinetic"), q_s, q_f, system.params)
+    is_quadratic = masses is not None or has_constant_hessian(kinetic, p)
     if not is_quadratic:
         guess = v if guess is None else jnp.concatenate(guess)
         v, impulse = _velocity_and_impulse(system, q_s, q_f, constraints, p, guess)
-    masses, gradient = mass_and_momentum(system, q_s, q_f, v[:n_s], v[n_s:])
+    if masses is None:
+        masses, gradient = mass_and_momentum(system, q_s, q_f, v[:n_s], v[n_s:])
     if is_quadratic:
         v, impulse = _by_one_solve(masses, p - gradient, *constraints)  # p = M v + dT/dv(0)
     if jacobian.shape[0]:

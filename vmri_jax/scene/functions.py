@@ -13,6 +13,7 @@ import numpy as np
 
 from vmri_jax.kernels import matmul
 from vmri_jax.mechanics.kinematics import JOINTS, MASS, Kinematics
+from vmri_jax.mechanics.masses import WithMassMatrix
 from vmri_jax.mechanics.rows import Entries
 from vmri_jax.mechanics.terms import KINDS
 from vmri_jax.scene.terms import total, totals
@@ -88,7 +89,7 @@ class ConstraintValues(_OfTerms):
         return values / params[IMPLIED] if self.field == "implied" else values
 
 
-class KineticEnergy(_OfTerms):
+class KineticEnergy(_OfTerms, WithMassMatrix):
     """``T = sum m V_f^2 / 2`` of bodies that depend on fast coordinates, plus the velocity-dependent terms; ``T_s = sum m V_s^2 / 2`` of all others."""
 
     def __call__(self, *arguments):
@@ -100,18 +101,17 @@ class KineticEnergy(_OfTerms):
         of_bodies = jnp.sum(params[MASS][part] * rates[number] ** 2) / 2
         return total([of_bodies, *(term.kinetic(*bodies, *rates, params) for term in self.terms)])
 
-    def masses(self, q_s, *q_f_and_params):
-        """The mass matrix ``J^T m J`` of `__call__` in closed form, J = dQ/dq; None with velocity-dependent terms."""
+    def mass_matrix(self, q_s, q_f, params):
+        """``J^T m J`` of the bodies, J = dQ/dq; None with velocity-dependent terms."""
         if self.terms or self.kinematics is None:
             return None
-        *q_f, params = q_f_and_params
-        part, number = ("fast", 1) if q_f else ("slow", 0)
+        part, number = ("slow", 0) if q_f is None else ("fast", 1)
 
         def bodies(q):
-            """The coordinates Q_f, or Q_s, of coordinates q."""
-            return self.bodies(q[: q_s.size], q[q_s.size :] if q_f else None, params)[number]
+            """The coordinates Q_s of q_s, or Q_f of q."""
+            return self.bodies(q[: q_s.size], None if q_f is None else q[q_s.size :], params)[number]
 
-        q = jnp.concatenate([q_s, *q_f])
+        q = q_s if q_f is None else jnp.concatenate([q_s, q_f])
         rates = jax.vmap(jax.linearize(bodies, q)[1])(jnp.eye(q.size))
         return matmul(rates * params[MASS][part], rates.T)
 

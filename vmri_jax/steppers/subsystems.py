@@ -13,7 +13,8 @@ import jax.numpy as jnp
 from jax.scipy.linalg import block_diag
 
 from vmri_jax.mechanics.functions import Rheonomic
-from vmri_jax.mechanics.masses import ConstantMass
+from vmri_jax.mechanics.masses import ConstantMass, WithMassMatrix
+from vmri_jax.mechanics.projection import closed_masses
 from vmri_jax.mechanics.system import RATE_OF, System
 from vmri_jax.mechanics.terms import KINDS, POSITIONS, Term
 from vmri_jax.schemes.discrete_lagrangian import Placed, placed_potentials
@@ -85,7 +86,7 @@ def _part(
 
 
 @dataclass(frozen=True)
-class OfJoined:
+class OfJoined(WithMassMatrix):
     """The sum of energies, the joined rows of constraints, or the forces, as a function of joined variables.
 
     terms: of one kind.
@@ -106,6 +107,9 @@ class OfJoined:
         if self.terms[0].kind == "force":
             return jnp.zeros(0), jnp.concatenate(first)
         return jnp.concatenate([first, *others]) if self.terms[0].kind == "constraint" else sum(others, first)
+
+    def mass_matrix(self, q_s, q_f, params):
+        return closed_masses(self.terms, q_f[: self.num_slow], q_f[self.num_slow :], params)
 
 
 def joined(system: System, scheme: Scheme, num_slow: int) -> tuple[System, Scheme]:
