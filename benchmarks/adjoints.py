@@ -1,4 +1,4 @@
-"""Gradients of runs: time over that of a run, memory, compile time and agreement of all adjoints."""
+"""Gradients of runs: time of a gradient over the time of the run, memory, compile time and agreement of all adjoints."""
 
 import time
 from collections.abc import Callable, Iterator

@@ -120,7 +120,7 @@ def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
 
 
 def _outcomes(size: Size, seats: dict[str, Seat], tell: Tell) -> Iterator[tuple[str, Case, Outcome]]:
-    """Group, case and what it gave, one after the other."""
+    """Group, case and measurement, one after the other."""
     for group, cases in size.groups.items():
         if group in FRESH:
             for case in cases:

@@ -163,7 +163,7 @@ def _picked(lanes: int) -> int:
 
 
 def _do_nothing(client, count: int) -> float:
-    """Seconds that so many tasks take that do nothing."""
+    """Seconds that `count` tasks without work take."""
     with executor_of("ensembles", client) as workers:
         submit = submitter("ensembles", workers, time.sleep, 0.0)
         begin = time.perf_counter()

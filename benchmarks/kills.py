@@ -33,7 +33,7 @@ LANES, CHUNK = 30_000, 500
 PER_ENSEMBLE = 10
 """Workers that are killed during one ensemble."""
 EARLY = 5
-"""Every so many kills come at any time after the start of the process, the others after its next chunk."""
+"""One kill in this number comes at any time after the start of the process, the others after its next chunk."""
 FROM_START, FROM_CHUNK = 6.0, 0.5
 """Most seconds to a kill: from the start of a process, and from its next chunk."""
 PATIENCE = 300.0
@@ -139,7 +139,7 @@ def kill_processes(kind: Kind, count: int, random, folder: Path, tell: Tell, mom
 
 
 def _moment(path: Path) -> str:
-    """What the process was at; files beyond the completed chunks are what it was writing."""
+    """The part of its work in which the process was killed; files beyond the completed chunks belong to the chunk that it was writing."""
     if not path.exists():
         return "before there was a store"
     torn = any(path.rglob("*.partial")) or any(path.glob(f"*/c.{chunks_of(path)}*"))
@@ -212,9 +212,9 @@ def kill_workers(count: int, random, folder: Path, tell: Tell) -> Iterator[dict]
         while not complete:
             wanted = min(PER_ENSEMBLE - kills, count - done - kills)
             with local_workers(2) as client, _killing(client.cluster.workers, wanted, random) as seen:
-                found = ensemble(out, executor=client, resume=True, throw=False)
-            kills, calls, complete = kills + len(seen), calls + 1, found.complete
-            chunks.append(len(found.done))
+                partial_store = ensemble(out, executor=client, resume=True, throw=False)
+            kills, calls, complete = kills + len(seen), calls + 1, partial_store.complete
+            chunks.append(len(partial_store.done))
             tell(f"{done + kills} of {count} workers killed")
         done += kills
         yield _row("workers of an ensemble", kills, chunks[:-1], calls, _same_files(whole, out, complete))
@@ -222,7 +222,7 @@ def kill_workers(count: int, random, folder: Path, tell: Tell) -> Iterator[dict]
 
 @contextmanager
 def _killing(nannies: Mapping[Any, Any], wanted: int, random) -> Iterator[list[int]]:
-    """Meanwhile, so many of these workers are killed at random moments; yields the list of those that were."""
+    """Meanwhile, some of these workers are killed at random moments; yields the list of the killed ones."""
     stop, seen = threading.Event(), []
 
     def kill() -> None:

@@ -226,12 +226,12 @@ def measured(case: Case, problem: vm.Problem, peers: Iterable[str], tell: Tell) 
 
 
 def _steps(run: Simulation, num_steps: int) -> dict[str, Any]:
-    """Arguments of a run of this number of steps, as long as the prepared one of one step."""
+    """Arguments of a run of `num_steps` steps, as long as the prepared run of one step."""
     return {"macro_dt": run.macro_dt / num_steps, "num_steps": num_steps}
 
 
 def _end(run: Simulation, num_steps: int) -> Callable[[], np.ndarray]:
-    """The positions at the end of a run of this number of steps."""
+    """The positions at the end of a run of `num_steps` steps."""
     return lambda: joined(run(**_steps(run, num_steps), throw=False))[0][-1]
 
 

@@ -181,7 +181,7 @@ def _row(
 
 
 def unknowns(problem: Problem, scheme: Scheme | Composition) -> int:
-    """Unknowns of one macro step, all of them solved for at once."""
+    """Number of unknowns of one macro step, for which the dense solve solves at once."""
     n_g, n_gs = problem.system.num_constraints(problem.q_s, problem.q_f)
     return scheme.degree * (problem.q_s.size + n_gs + scheme.num_micro * (problem.q_f.size + n_g))
 

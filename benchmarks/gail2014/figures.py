@@ -28,7 +28,7 @@ SAMPLE = 0.02
 NO_OVERHEAD = "compiled code has hardly any cost of a macro step that more micro steps could share"
 """Why a dense solve is cheapest with fewer micro steps here than in the paper."""
 LONG_STEPS = "longer macro steps take more passes of Newton's iteration, and newer matrices: in macro steps of one length the cost is {:.2f} times"
-"""Why the cost of a structured solve grows with the macro step, while it stays the same in macro steps of one length."""
+"""Reason for which the cost of a structured solve grows with the macro step, while macro steps of one length cost the same."""
 
 
 @contextmanager

@@ -35,9 +35,9 @@ def solution(case: Case, solver, equations):
 
     def solve(y, tol):
         how = {"stepsize_controller": diffrax.PIDController(rtol=tol, atol=tol), "max_steps": most, "throw": False}
-        found = diffrax.diffeqsolve(term, solver, 0.0, case.t_end, None, y, **how)
-        ys: Any = found.ys
-        return jnp.where(found.result == diffrax.RESULTS.successful, ys[0][-1], jnp.nan)
+        solved = diffrax.diffeqsolve(term, solver, 0.0, case.t_end, None, y, **how)
+        ys: Any = solved.ys
+        return jnp.where(solved.result == diffrax.RESULTS.successful, ys[0][-1], jnp.nan)
 
     return solve
 

@@ -26,9 +26,9 @@ def by_family(found: Mapping[str, Sequence[Point]], peers: Sequence[str]) -> dic
     """By file name, functions that draw."""
     drawn: dict[str, Callable[[], Figure]] = {}
     for family, words in FAMILIES.items():
-        own = {title: found[title] for title in found if title.startswith(family)}
-        if own:
-            drawn[f"peers_{family.lower()}"] = partial(draw, own, peers, f"{words}: time to an error")
+        of_family = {title: found[title] for title in found if title.startswith(family)}
+        if of_family:
+            drawn[f"peers_{family.lower()}"] = partial(draw, of_family, peers, f"{words}: time to an error")
     return drawn
 
 

@@ -32,13 +32,13 @@ def first_solver(problem: vm.Problem, scheme: vm.Scheme | vm.Composition, tolera
 def schemes(case: Case) -> dict[str, vm.Scheme | vm.Composition]:
     """Those that are the fastest somewhere on these problems, or close to it."""
     explicit = vm.fully_explicit
-    found: dict[str, vm.Scheme | vm.Composition] = {
+    by_name: dict[str, vm.Scheme | vm.Composition] = {
         f"explicit {n}, {name}": vm.compose(explicit(n), name) for name, micro in COMPOSED.items() for n in micro
     }
     if not case.is_chain:
-        found |= {f"Lobatto {degree}": vm.galerkin(1, degree, "lobatto") for degree in LOBATTO}
-    found |= {f"explicit {n}": explicit(n) for n in EXPLICIT}
-    return found | {f"Takahashi-Imada {n}": vm.takahashi_imada(n) for n in CORRECTED}
+        by_name |= {f"Lobatto {degree}": vm.galerkin(1, degree, "lobatto") for degree in LOBATTO}
+    by_name |= {f"explicit {n}": explicit(n) for n in EXPLICIT}
+    return by_name | {f"Takahashi-Imada {n}": vm.takahashi_imada(n) for n in CORRECTED}
 
 
 def loose(case: Case, scheme: vm.Scheme | vm.Composition) -> tuple[float, ...]:
@@ -64,11 +64,11 @@ def ladders(case: Case) -> list[Ladder]:
 
         return Ladder(name, "steps", step_counts(max(2, 2 * case.t_end), 1e6 * case.t_end), build)
 
-    found = []
+    tried = []
     for name, scheme in schemes(case).items():
-        found.append(ladder(name, scheme, TOLERANCE))
-        found += [ladder(f"{name}, tolerance {tol:.1e}", scheme, tol) for tol in loose(case, scheme)]
-    return found
+        tried.append(ladder(name, scheme, TOLERANCE))
+        tried += [ladder(f"{name}, tolerance {tol:.1e}", scheme, tol) for tol in loose(case, scheme)]
+    return tried
 
 
 def last_positions(run: vm.Trajectory) -> np.ndarray:

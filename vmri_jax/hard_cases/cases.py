@@ -96,7 +96,7 @@ class Resolved:
 
     @cached_property
     def _long_run(self) -> Callable[[int], Trajectory]:
-        """A run of this number of steps, which two cases look at."""
+        """A long run by its number of macro steps, which two cases judge."""
         return cache(lambda steps: long_run(self.problem, self.scheme, self.macro_dt, steps))
 
     def constraints(self, full: bool) -> Outcome:
