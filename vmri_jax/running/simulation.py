@@ -156,7 +156,11 @@ class Simulation:
         if not changes:
             return self
         run = replace(self, **changes)
-        vars(run)["engine"] = self.engine  # of the same structure, whose comparison takes as long as a short run
+        # what stays: to compare structures, or to flatten a system, takes as long as a short run
+        vars(run).update(engine=self.engine, columns=self.columns)
+        if params is None:
+            first = jax.tree.leaves((run.macro_dt, run.state))  # in the order of `MOTION`
+            vars(run)["leaves"] = first + self.leaves[len(first) :]
         return run
 
     def _whole(self) -> Saved:
