@@ -151,17 +151,46 @@ def _opening_in_words(rows: ConstraintRows) -> str:
     )
 
 
+def tied_to_fast(sorting: Sorting) -> dict[str, str]:
+    """The bodies with the pace "auto" that are slow, and without which the fast bodies cannot satisfy constraints on the micro grid; with reasons."""
+    rows = ConstraintRows.of(sorting)
+    micro = rows.numbers("constraint") if rows else []
+    if rows is None or not micro:
+        return {}
+    touched, ties = _beyond_fast(rows, micro)
+    reason = f"tied by {listed(ties)} to fast bodies, which cannot move without it"
+    return {name: reason for name in touched if sorting.bodies[name].pace == "auto"}
+
+
+def _beyond_fast(rows: ConstraintRows, micro: list[int]) -> tuple[list[str], list[str]]:
+    """The slow bodies whose motion changes the rows on the micro grid that the fast bodies cannot satisfy, and the effects of these rows."""
+    sorting, jacobian = rows.sorting, rows.by_masses[micro]
+    num_slow, carried = sorting.layout.sizes[0], _carried(sorting)
+    _, dependent = rank_of(jacobian[:, num_slow:])
+    involved, touched = jacobian[dependent], []
+    involved = involved / np.linalg.norm(involved, axis=1, keepdims=True)
+    for name, place in sorting.layout.coordinates.items():
+        columns = involved[:, sorting.layout.numbers[name]]
+        changes = columns if name in carried else columns @ sorting.bodies[name].motions
+        if place.part == "s" and np.any(np.abs(changes) > RANK):
+            touched.append(carried.get(name, name))
+    return sorted(set(touched)), list(dict.fromkeys(rows.rows[micro[i]].effect.name for i in dependent))
+
+
+def _carried(sorting: Sorting) -> dict[str, str]:
+    """By the name of each coordinate of a joint, the body that the joint carries."""
+    return {label: branch.child for branch in sorting.branches for label in branch.labels}
+
+
 def _advice(rows: ConstraintRows, micro: list[int]) -> str:
     """Advice about constraints on the micro grid that the fast bodies cannot satisfy."""
-    layout, jacobian = rows.sorting.layout, rows.by_masses[micro]
-    fast = [name for name, place in layout.coordinates.items() if place.part == "f"]
-    _, dependent = rank_of(jacobian[:, layout.sizes[0] :])
-    involved, numbers = jacobian[dependent], layout.numbers
-    touched = {name for name in layout.coordinates if name not in fast and involved[:, numbers[name]].any()}
-    make_fast = f"make {' or '.join(sorted(touched))} fast too" if touched else "make more of their bodies fast"
+    sorting, carried = rows.sorting, _carried(rows.sorting)
+    fast = [carried.get(name, name) for name, place in sorting.layout.coordinates.items() if place.part == "f"]
+    touched, _ = _beyond_fast(rows, micro)
+    make_fast = f"make {' or '.join(touched)} fast too" if touched else "make more of their bodies fast"
     return (
-        f"they touch fast bodies and are held on the micro grid, where only {', '.join(fast)} can move; leave one out, or {make_fast}, "
-        'pace="fast"'
+        f"they touch fast bodies and are held on the micro grid, where only {', '.join(dict.fromkeys(fast))} can move; leave one out, or "
+        f'{make_fast}, pace="fast"'
     )
 
 

@@ -75,8 +75,9 @@ def with_rates(
     # the velocities of bodies belong to their positions as the user gave them, where joint coordinates are zero
     body_rates = sorting.to_bodies(sorting.assembled)[1] @ v
     moved = [body.with_rates(body_rates[columns[name]]) for name, body in sorting.bodies.items()]
-    numbers = sorting.layout.numbers
-    return moved, {key: (q[i], v[i]) for key in sorting.layout.freedoms for i in numbers[key]}
+    # where no joint starts at a value of its own, the velocities of the bodies say all
+    keys, numbers = sorting.layout.freedoms if sorting.joint_starts else (), sorting.layout.numbers
+    return moved, {key: (q[i], v[i]) for key in keys for i in numbers[key]}
 
 
 def joint_starts(sorting: Sorting, effects: Sequence[Effect], starts: Mapping[str, Any]) -> dict[Key, tuple[Any, Any]]:
