@@ -111,7 +111,7 @@ def hinge(name, pairs=("ground", "bar")):
 @pytest.mark.parametrize(
     ("joints", "message"),
     [
-        ([hinge("pin"), hinge("pin")], r"the name 'pin' occurs twice; give each body and effect its own name, e.g"),
+        ([hinge("pin"), hinge("pin")], r"the name 'pin' occurs twice among bodies, effects and freedoms"),
         ([hinge("pin"), hinge("again", ("bar", "ground"))], r"pin ground-bar \[0\].* are 5 constraints of rank 0"),
         ([hinge("pin", [("ground", "bar")] * 2)], "join the same bodies: bar and ground by pin ground-bar and pin"),
     ],

@@ -6,19 +6,23 @@ smooth surface there. The dropped rows follow from the kept rows, that is are im
 around the start. The check evaluates them at the ends of random motions along the surface.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from scipy.linalg import qr
 
 from vmri_jax.mechanics.constraints import RANK, rank_of
 from vmri_jax.refusals import Refused
-from vmri_jax.scene.body import listed
+from vmri_jax.scene.body import Bodies, listed
+from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.effects.joint_base import Joint
+from vmri_jax.scene.layout import Key
 from vmri_jax.scene.rigid import Rigidity
 from vmri_jax.scene.rows import ConstraintRows
-from vmri_jax.scene.sorting import HOMES, Sorting
+from vmri_jax.scene.sorting import HOMES, Sorting, sort
+from vmri_jax.scene.trees import Branch
 
 MOTIONS = 3
 """Number of random motions on which dropped rows are evaluated: on a single motion a row may by chance change little. More take longer."""
@@ -37,6 +41,24 @@ FOLLOWS = RANK
 dependent. A larger value accepts rows that change the motion."""
 BEND = "Bend bodies that lie in line or flat at the start by a little, leave other rows out of the scene, or hold the shape by other constraints"
 """Advice for rows that depend on others at the start alone."""
+
+
+def sort_with_loops(
+    bodies: Bodies,
+    effects: Sequence[Effect],
+    branches: Sequence[Branch],
+    joint_starts: Mapping[Key, tuple[Any, Any]],
+    redundant: str,
+) -> Sorting:
+    """The sorting of a scene, where bodies that are tied to fast bodies are fast; with `redundant` as of `Scene`."""
+    tied: dict[str, str] = {}
+    while True:
+        sorting = replace(sort(bodies, effects, branches, tied), joint_starts=joint_starts)
+        sorting = without_redundant(sorting) if redundant == "drop" else sorting
+        more = tied_to_fast(sorting)
+        if not more:
+            return sorting
+        tied |= more
 
 
 def check_constraints(sorting: Sorting) -> None:

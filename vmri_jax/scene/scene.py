@@ -29,13 +29,13 @@ from vmri_jax.scene.effects.joint_base import joint_named
 from vmri_jax.scene.functions import RESERVED, Actuation
 from vmri_jax.scene.layout import Key
 from vmri_jax.scene.ledger import Ledger, ledger
-from vmri_jax.scene.redundancy import check_constraints, tied_to_fast, without_redundant
+from vmri_jax.scene.redundancy import check_constraints, sort_with_loops
 from vmri_jax.scene.rigid import Rigidity
 from vmri_jax.scene.rows import names_of, rows_of
-from vmri_jax.scene.sorting import Sorting, sort
+from vmri_jax.scene.sorting import Sorting
 from vmri_jax.scene.trees import Branch, check_frames, grow
 from vmri_jax.scene.turns import along_run, check_reach, check_run
-from vmri_jax.scene.velocities import joint_starts, with_rates
+from vmri_jax.scene.velocities import check_replaced, joint_starts, with_rates
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 
@@ -111,13 +111,11 @@ class Scene:
                     raise Refused(f"Scene: {item!r} is among {name}; it must be {expected}.")
         if not self.bodies:
             raise Refused("Scene: there are no bodies; give at least one.")
-        names = [item.name for item in (*self.bodies, *self.everything)]
-        names += [label for branch in self.branches for label in branch.labels if label != branch.joint.name]
-        for name, count in Counter(names).items():
+        freedoms = [label for branch in self.branches for label in branch.labels if label != branch.joint.name]
+        for name, count in Counter(freedoms + [item.name for item in (*self.bodies, *self.everything)]).items():
             if count > 1:
                 raise Refused(
-                    f"Scene: the name {name!r} occurs twice; give each body and effect its own name, e.g. name=... The freedoms of "
-                    "joints with several freedoms or pairs of bodies have names, too."
+                    f"Scene: the name {name!r} occurs twice among bodies, effects and freedoms of joints; give each its own, name=..."
                 )
         for name, content in RESERVED.items():
             if name in [effect.name for effect in self.effects]:
@@ -197,14 +195,7 @@ class Scene:
     @cached_property
     def sorting(self) -> Sorting:
         """Which bodies are slow and which are fast, which function of the system each effect is part of, and why."""
-        return self._sorted({})
-
-    def _sorted(self, tied: Mapping[str, str]) -> Sorting:
-        """The sorting with bodies that are fast for these reasons, and with all bodies that are tied to fast ones."""
-        sorting = replace(sort(self.by_name, self.everything, self.branches, tied), joint_starts=self.joint_starts)
-        sorting = without_redundant(sorting) if self.redundant == "drop" else sorting
-        more = tied_to_fast(sorting)
-        return self._sorted({**tied, **more}) if more else sorting
+        return sort_with_loops(self.by_name, self.everything, self.branches, self.joint_starts, self.redundant)
 
     @property
     def dropped(self) -> list[str]:
@@ -335,8 +326,7 @@ class Scene:
             changes: new values of its arguments.
 
         Raises:
-            ValueError: no body or effect of this name, an argument that its class does not have, or a velocity in place of which
-                `with_joints` has set the rate of a joint.
+            ValueError: no body or effect of this name, an argument that its class does not have, a velocity that a joint sets.
         """
         items = {item.name: item for item in (*self.bodies, *self.effects)}
         if name not in items:
@@ -345,14 +335,8 @@ class Scene:
         for key in changes:
             if key not in fields:
                 raise Refused(f"Scene.replace: {name}: {unknown('argument', key, fields)}")
-        rated = [b.joint.name for b in self.branches if b.child == name and self.joint_starts.keys() & b.moves.keys()]
-        if rated and changes.keys() & {"velocity", "spin"}:
-            raise Refused(
-                f"Scene.replace: {name}: {' and '.join(changes)} would change nothing, because with_joints or with_rates has set the rate of {rated[0]}, which "
-                f"carries {name}. Give that rate to them, or call them after replace."
-            )
-        items[name] = replace(items[name], **changes)
-        changed = list(items.values())
+        check_replaced(name, changes, self.branches, self.joint_starts)
+        changed = list((items | {name: replace(items[name], **changes)}).values())
         return replace(self, bodies=changed[: len(self.bodies)], effects=changed[len(self.bodies) :])
 
     def with_rates(self, rates: Mapping[str, Any]) -> "Scene":
