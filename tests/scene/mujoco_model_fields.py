@@ -14,7 +14,7 @@ READ = {
     "joints": """njnt nq nv jnt_type jnt_bodyid jnt_pos jnt_axis jnt_qposadr jnt_dofadr dof_jntid body_jntadr
         body_jntnum""",
     "springs, dampers and armature in joints": "jnt_stiffness dof_damping qpos_spring dof_armature",
-    'limits of joints, for limits="spring"': "jnt_range jnt_solref dof_invweight0",
+    'limits of joints, for limits="spring"': "jnt_range jnt_margin jnt_solref dof_invweight0",
     "the start, where no qpos is given": "qpos0 nkey key_qpos key_qvel key_ctrl key_act key_mpos key_mquat",
     "gravity and its compensation": "opt.gravity body_gravcomp",
     "equalities connect, weld, and of joints and fixed tendons": """tendon_adr tendon_num wrap_type wrap_objid wrap_prm neq eq_type eq_objtype eq_obj1id eq_obj2id eq_active0 eq_data
@@ -56,7 +56,7 @@ _WITH_REFUSED = {
         geom_plugin geom_friction geom_margin geom_gap geom_solmix geom_solref geom_solimp geom_surfacevel geom_adhesion pair_dim
         pair_signature pair_solref pair_solreffriction pair_solimp pair_margin pair_gap pair_adhesion pair_friction opt.o_margin
         opt.o_solref opt.o_solimp opt.o_friction opt.enableflags.OVERRIDE opt.enableflags.SPECULATIVE""",
-    "limits": "jnt_margin jnt_solimp",
+    "limits": "jnt_solimp",
     "frictionloss": "dof_solref dof_solimp",
     "springs that are not linear": "nplastic jnt_plasticadr",
     "fluid": "opt.wind geom_fluid",

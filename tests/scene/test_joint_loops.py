@@ -1,5 +1,7 @@
 """Joints between slow and fast bodies, and in loops."""
 
+from dataclasses import replace
+
 import jax
 import numpy as np
 import pytest
@@ -68,6 +70,36 @@ def test_a_fast_body_between_two_slow_ones_cannot_follow():
         Scene(bodies, [joints])
 
 
+def test_a_stiff_spring_makes_its_loop_fast():
+    """A slider-crank whose piston has a spring: without crank and rod the piston could not move on the micro grid."""
+    pin, wrist = 0.3 * Y, 0.4 * X
+    rod = RigidBody("rod", 0.5, Box((0.5, 0.02, 0.02)), (pin + wrist) / 2, -np.arctan2(0.3, 0.4) * Z)
+    bodies = [
+        RigidBody("crank", 1.0, Box((0.02, 0.3, 0.02)), pin / 2),
+        rod,
+        RigidBody("piston", 0.8, Box((0.06, 0.06, 0.06)), wrist),
+    ]
+    effects = [
+        Revolute(("ground", "crank"), [0, 0, 0], axis=Z, name="bearing"),
+        Revolute(("crank", "rod"), pin, axis=Z, name="crank pin"),
+        Revolute(("rod", "piston"), wrist, axis=Z, name="wrist pin"),
+        Prismatic(("ground", "piston"), wrist, axis=X, name="cylinder"),
+        JointSpring("cylinder", 1e4, neutral=0.05),
+        Gravity([0, -9.81, 0]),
+    ]
+    loop = Scene(bodies, effects, redundant="drop", coordinates="joint")
+    assert {name: pace.value for name, pace in loop.sorting.paces.items()} == dict.fromkeys(loop.by_name, "fast")
+    reason = "tied by wrist pin to fast bodies, which cannot move without it"
+    assert loop.sorting.paces["crank"].reason == loop.sorting.paces["rod"].reason == reason
+    with pytest.raises(ValueError, match="where only piston can move; leave one out, or make crank or rod fast too"):
+        Scene(
+            [replace(body, pace="slow") for body in bodies[:2]] + bodies[2:],
+            effects,
+            redundant="drop",
+            coordinates="joint",
+        )
+
+
 BAR = RigidBody("bar", 1.0, Box((1, 0.1, 0.1)), [0.5, 0, 0])
 
 
@@ -79,7 +111,7 @@ def hinge(name, pairs=("ground", "bar")):
 @pytest.mark.parametrize(
     ("joints", "message"),
     [
-        ([hinge("pin"), hinge("pin")], r"the name 'pin' occurs twice; give each body and effect its own name, e.g"),
+        ([hinge("pin"), hinge("pin")], r"the name 'pin' occurs twice among bodies, effects and freedoms"),
         ([hinge("pin"), hinge("again", ("bar", "ground"))], r"pin ground-bar \[0\].* are 5 constraints of rank 0"),
         ([hinge("pin", [("ground", "bar")] * 2)], "join the same bodies: bar and ground by pin ground-bar and pin"),
     ],

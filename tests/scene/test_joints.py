@@ -92,6 +92,12 @@ def test_a_joint_holds_what_it_says_and_leaves_the_rest(name):
         assert np.ptp(slide((a, b), held)) > 0.02
 
 
+@pytest.mark.parametrize(("normal", "along", "across"), [(Z, X, Y), (Y, X, -Z), (X, Y, Z), (-Z, X, -Y)])
+def test_axes_in_the_plane_of_a_joint_are_axes_of_space(normal, along, across):
+    (axes,) = Planar(("a", "b"), AT, normal).bound(Scene(two_bodies()).by_name).triads
+    np.testing.assert_allclose(axes, [along, across, normal], atol=1e-15)
+
+
 def test_the_motion_of_joints_is_read_by_name():
     bodies = two_bodies(spin=[1.0, -2.0, 0.5], velocity=[0.1, 0.2, -0.3])
     scene = Scene(bodies, [Cylindrical(("a", "b"), AT, Y, name="pipe")], project=True, coordinates="directors")

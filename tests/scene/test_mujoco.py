@@ -243,7 +243,9 @@ def test_limits_as_springs():
     with pytest.raises(ValueError, match=r"for limits of hinges and slides, and t have limits of another kind\."):
         Scene.from_mujoco(arm(limited), limits="spring")
     assert Scene.from_mujoco(arm(limited), limits="spring", ignore=["limits"]).bodies
-    pendulum = arm(joint='range="-20 20" solreflimit="0.1 1"', option='gravity="0 0 0"')
+    # MuJoCo's margin of a joint lies inside its range: -25 to 25 degrees with 5 degrees are -20 to 20
+    margin = f'range="-25 25" margin="{np.radians(5)}" solreflimit="0.1 1"'
+    pendulum = arm(joint=margin, option='gravity="0 0 0"')
     scene = Scene.from_mujoco(pendulum, qpos=[np.radians(25)], limits="spring")
     inertia = 1 / pendulum.dof_invweight0[0]
     spin = np.asarray(state_of(scene).q_s), accelerations(scene)["arm"]

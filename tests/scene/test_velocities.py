@@ -91,6 +91,17 @@ def test_motions_that_are_given_count():
         driven.with_rates({"bearing": 8.0})
 
 
+def test_velocities_of_bodies_and_of_joints_do_not_hide_each_other():
+    bar = RigidBody("bar", 1.0, Box((1.0, 0.1, 0.1)), [0.0, 0.0, 0.0])
+    scene = Scene([bar], [Revolute(("ground", "bar"), at=[0.0, 0.0, 0.0], axis=Z, name="hinge")])
+    assert scene.with_rates({"hinge": 3.0}).replace("bar", spin=5.0 * Z).start[2] == pytest.approx(5.0)
+    turned = scene.with_joints({"hinge": (0.1, 2.0)})
+    with pytest.raises(ValueError, match=r"bar: spin would change nothing, because .* has set the rate of hinge"):
+        turned.replace("bar", spin=5.0 * Z)
+    with pytest.raises(ValueError, match="with_joints has set a start of hinge, which has no coordinate in this scene"):
+        turned.without("hinge")
+
+
 def test_every_pair_of_a_joint_has_a_rate():
     links = [RigidBody(f"link {k}", 1.0, Box((1.0, 0.1, 0.1)), [k + 0.5, 0.0, 0.0]) for k in range(2)]
     pairs = Revolute([("ground", "link 0"), ("link 0", "link 1")], [[0, 0, 0], [1, 0, 0]], axis=Z, name="hinges")

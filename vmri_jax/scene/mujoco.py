@@ -175,7 +175,8 @@ class _Reader(Compiled):
         """Limits of joints as springs, with MuJoCo's stiffness for the inertia that the joint moves at qpos0.
 
         MuJoCo's solref of a limit is (T, z), its time constant and damping ratio: at the depth d it pulls back with the acceleration
-        ``d / (T z)^2``. Negative numbers are (-k, -c), with the acceleration ``k d``. The inertia is ``1 / dof_invweight0``.
+        ``d / (T z)^2``. Negative numbers are (-k, -c), with the acceleration ``k d``. The inertia is ``1 / dof_invweight0``. The depth is
+        counted from the margin of the joint, which lies inside its range.
         Limits of ball joints and of tendons are refused unless they are `ignored`.
         """
         model = self.model
@@ -192,7 +193,8 @@ class _Reader(Compiled):
             time, ratio = model.jnt_solref[j]
             rate = -time if time < 0 else 1 / (time * ratio) ** 2
             stiffness = rate / float(model.dof_invweight0[model.jnt_dofadr[j]])
-            lower, upper = model.jnt_range[j] - self.data.qpos[model.jnt_qposadr[j]]
+            margins = np.array([1.0, -1.0]) * model.jnt_margin[j]
+            lower, upper = model.jnt_range[j] + margins - self.data.qpos[model.jnt_qposadr[j]]
             name, smoothing = self.name("joint", j), SMOOTHING * (upper - lower)
             yield JointLimit(name, lower, upper, stiffness=stiffness, smoothing=smoothing, name=f"{name} limit")
 

@@ -6,19 +6,23 @@ smooth surface there. The dropped rows follow from the kept rows, that is are im
 around the start. The check evaluates them at the ends of random motions along the surface.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from scipy.linalg import qr
 
 from vmri_jax.mechanics.constraints import RANK, rank_of
 from vmri_jax.refusals import Refused
-from vmri_jax.scene.body import listed
+from vmri_jax.scene.body import Bodies, listed
+from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.effects.joint_base import Joint
+from vmri_jax.scene.layout import Key
 from vmri_jax.scene.rigid import Rigidity
 from vmri_jax.scene.rows import ConstraintRows
-from vmri_jax.scene.sorting import HOMES, Sorting
+from vmri_jax.scene.sorting import HOMES, Sorting, sort
+from vmri_jax.scene.trees import Branch
 
 MOTIONS = 3
 """Number of random motions on which dropped rows are evaluated: on a single motion a row may by chance change little. More take longer."""
@@ -37,6 +41,24 @@ FOLLOWS = RANK
 dependent. A larger value accepts rows that change the motion."""
 BEND = "Bend bodies that lie in line or flat at the start by a little, leave other rows out of the scene, or hold the shape by other constraints"
 """Advice for rows that depend on others at the start alone."""
+
+
+def sort_with_loops(
+    bodies: Bodies,
+    effects: Sequence[Effect],
+    branches: Sequence[Branch],
+    joint_starts: Mapping[Key, tuple[Any, Any]],
+    redundant: str,
+) -> Sorting:
+    """The sorting of a scene, where bodies that are tied to fast bodies are fast; with `redundant` as of `Scene`."""
+    tied: dict[str, str] = {}
+    while True:
+        sorting = replace(sort(bodies, effects, branches, tied), joint_starts=joint_starts)
+        sorting = without_redundant(sorting) if redundant == "drop" else sorting
+        more = tied_to_fast(sorting)
+        if not more:
+            return sorting
+        tied |= more
 
 
 def check_constraints(sorting: Sorting) -> None:
@@ -151,17 +173,46 @@ def _opening_in_words(rows: ConstraintRows) -> str:
     )
 
 
+def tied_to_fast(sorting: Sorting) -> dict[str, str]:
+    """The bodies with the pace "auto" that are slow, and without which the fast bodies cannot satisfy constraints on the micro grid; with reasons."""
+    rows = ConstraintRows.of(sorting)
+    micro = rows.numbers("constraint") if rows else []
+    if rows is None or not micro:
+        return {}
+    touched, ties = _beyond_fast(rows, micro)
+    reason = f"tied by {listed(ties)} to fast bodies, which cannot move without it"
+    return {name: reason for name in touched if sorting.bodies[name].pace == "auto"}
+
+
+def _beyond_fast(rows: ConstraintRows, micro: list[int]) -> tuple[list[str], list[str]]:
+    """The slow bodies whose motion changes the rows on the micro grid that the fast bodies cannot satisfy, and the effects of these rows."""
+    sorting, jacobian = rows.sorting, rows.by_masses[micro]
+    num_slow, carried = sorting.layout.sizes[0], _carried(sorting)
+    _, dependent = rank_of(jacobian[:, num_slow:])
+    involved, touched = jacobian[dependent], []
+    involved = involved / np.linalg.norm(involved, axis=1, keepdims=True)
+    for name, place in sorting.layout.coordinates.items():
+        columns = involved[:, sorting.layout.numbers[name]]
+        changes = columns if name in carried else columns @ sorting.bodies[name].motions
+        if place.part == "s" and np.any(np.abs(changes) > RANK):
+            touched.append(carried.get(name, name))
+    return sorted(set(touched)), list(dict.fromkeys(rows.rows[micro[i]].effect.name for i in dependent))
+
+
+def _carried(sorting: Sorting) -> dict[str, str]:
+    """By the name of each coordinate of a joint, the body that the joint carries."""
+    return {label: branch.child for branch in sorting.branches for label in branch.labels}
+
+
 def _advice(rows: ConstraintRows, micro: list[int]) -> str:
     """Advice about constraints on the micro grid that the fast bodies cannot satisfy."""
-    layout, jacobian = rows.sorting.layout, rows.by_masses[micro]
-    fast = [name for name, place in layout.coordinates.items() if place.part == "f"]
-    _, dependent = rank_of(jacobian[:, layout.sizes[0] :])
-    involved, numbers = jacobian[dependent], layout.numbers
-    touched = {name for name in layout.coordinates if name not in fast and involved[:, numbers[name]].any()}
-    make_fast = f"make {' or '.join(sorted(touched))} fast too" if touched else "make more of their bodies fast"
+    sorting, carried = rows.sorting, _carried(rows.sorting)
+    fast = [carried.get(name, name) for name, place in sorting.layout.coordinates.items() if place.part == "f"]
+    touched, _ = _beyond_fast(rows, micro)
+    make_fast = f"make {' or '.join(touched)} fast too" if touched else "make more of their bodies fast"
     return (
-        f"they touch fast bodies and are held on the micro grid, where only {', '.join(fast)} can move; leave one out, or {make_fast}, "
-        'pace="fast"'
+        f"they touch fast bodies and are held on the micro grid, where only {', '.join(dict.fromkeys(fast))} can move; leave one out, or "
+        f'{make_fast}, pace="fast"'
     )
 
 

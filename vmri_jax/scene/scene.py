@@ -29,13 +29,13 @@ from vmri_jax.scene.effects.joint_base import joint_named
 from vmri_jax.scene.functions import RESERVED, Actuation
 from vmri_jax.scene.layout import Key
 from vmri_jax.scene.ledger import Ledger, ledger
-from vmri_jax.scene.redundancy import check_constraints, without_redundant
+from vmri_jax.scene.redundancy import check_constraints, sort_with_loops
 from vmri_jax.scene.rigid import Rigidity
 from vmri_jax.scene.rows import names_of, rows_of
-from vmri_jax.scene.sorting import Sorting, sort
+from vmri_jax.scene.sorting import Sorting
 from vmri_jax.scene.trees import Branch, check_frames, grow
 from vmri_jax.scene.turns import along_run, check_reach, check_run
-from vmri_jax.scene.velocities import joint_starts, with_rates
+from vmri_jax.scene.velocities import check_replaced, joint_starts, with_rates
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 
@@ -69,7 +69,7 @@ class Scene:
             joints that close loops and `Spherical` joints keep their rows. "directors": a centre and directors for each body, joints are
             constraints. "auto": joint coordinates, but directors for mechanisms with chains or loops so many that these are faster, see
             `vmri_jax.scene.trees.LONGEST` and `JOINTS_OF_A_LOOP`; the angle of a joint with a spring, a limit or a gear is a coordinate there, too.
-        joint_starts: values and rates of joint coordinates at the start; `with_joints` sets them.
+        joint_starts: values and rates of joint coordinates at the start; `with_joints` sets them. They go before the velocities of bodies.
 
     Raises:
         TypeError: an object of another class in `bodies` or `effects`.
@@ -111,10 +111,11 @@ class Scene:
                     raise Refused(f"Scene: {item!r} is among {name}; it must be {expected}.")
         if not self.bodies:
             raise Refused("Scene: there are no bodies; give at least one.")
-        for name, count in Counter(item.name for item in (*self.bodies, *self.everything)).items():
+        freedoms = [label for branch in self.branches for label in branch.labels if label != branch.joint.name]
+        for name, count in Counter(freedoms + [item.name for item in (*self.bodies, *self.everything)]).items():
             if count > 1:
                 raise Refused(
-                    f"Scene: the name {name!r} occurs twice; give each body and effect its own name, e.g. name=..."
+                    f"Scene: the name {name!r} occurs twice among bodies, effects and freedoms of joints; give each its own, name=..."
                 )
         for name, content in RESERVED.items():
             if name in [effect.name for effect in self.effects]:
@@ -194,8 +195,7 @@ class Scene:
     @cached_property
     def sorting(self) -> Sorting:
         """Which bodies are slow and which are fast, which function of the system each effect is part of, and why."""
-        sorting = replace(sort(self.by_name, self.everything, self.branches), joint_starts=self.joint_starts)
-        return without_redundant(sorting) if self.redundant == "drop" else sorting
+        return sort_with_loops(self.by_name, self.everything, self.branches, self.joint_starts, self.redundant)
 
     @property
     def dropped(self) -> list[str]:
@@ -326,7 +326,7 @@ class Scene:
             changes: new values of its arguments.
 
         Raises:
-            ValueError: no body or effect of this name, or an argument that its class does not have.
+            ValueError: no body or effect of this name, an argument that its class does not have, a velocity that a joint sets.
         """
         items = {item.name: item for item in (*self.bodies, *self.effects)}
         if name not in items:
@@ -335,8 +335,8 @@ class Scene:
         for key in changes:
             if key not in fields:
                 raise Refused(f"Scene.replace: {name}: {unknown('argument', key, fields)}")
-        items[name] = replace(items[name], **changes)
-        changed = list(items.values())
+        check_replaced(name, changes, self.branches, self.joint_starts)
+        changed = list((items | {name: replace(items[name], **changes)}).values())
         return replace(self, bodies=changed[: len(self.bodies)], effects=changed[len(self.bodies) :])
 
     def with_rates(self, rates: Mapping[str, Any]) -> "Scene":

@@ -21,7 +21,8 @@ The kinetic energy T_s of bodies that depend on slow coordinates alone is on the
 A body with the pace "auto" is fast if one of these effects moves it against another body: a potential or kinetic effect that has the rate
 "fast", a potential with the rate k, or a stiff potential or kinetic effect that has the rate "auto". A stiff potential that touches a body with the pace "slow" does not count, since it is
 part of V. An effect is stiff if its frequency is above the border between slow and fast, see `vmri_jax.scene.rates`. Without a border no
-effect makes bodies fast by its frequency, and every potential between fast bodies with a frequency above zero is stiff.
+effect makes bodies fast by its frequency, and every potential between fast bodies with a frequency above zero is stiff. A body with the pace "auto" is fast, too,
+if constraints tie it to fast bodies that cannot move without it, as in a closed loop, see `vmri_jax.scene.redundancy.tied_to_fast`.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -115,6 +116,11 @@ class Sorting:
         """Coordinates (order 0) or velocities (order 1) with the values or rates in `joint_starts` put in."""
         numbers = self.layout.numbers
         for key, value_and_rate in self.joint_starts.items():
+            if key not in numbers:
+                raise Refused(
+                    f"Scene: with_joints has set a start of {key[0]}, which has no coordinate in this scene. Change effects, bodies and "
+                    "coordinates first, and call with_joints then."
+                )
             (i,), number = numbers[key], value_and_rate[order]
             q = joined([q[:i], library(number).reshape(number, (1,)), q[i + 1 :]])
         return q
@@ -208,14 +214,20 @@ def _chain(name: str, branches: Mapping[str, Branch]) -> list[str]:
     return chain
 
 
-def sort(bodies: Bodies, effects: Sequence[Effect], branches: Sequence[Branch] = ()) -> Sorting:
-    """Paces of all bodies and homes of all effects; refused if traced numbers decide, or nothing can move."""
+def sort(
+    bodies: Bodies, effects: Sequence[Effect], branches: Sequence[Branch] = (), tied: Mapping[str, str] | None = None
+) -> Sorting:
+    """Paces of all bodies and homes of all effects; refused if traced numbers decide, or nothing can move.
+
+    `tied` has the reasons of bodies that are fast because constraints tie them to fast bodies.
+    """
     energies = [effect for effect in effects if effect.kind in ("potential", "kinetic")]
     owned = {effect.name: _owners(effect, branches) for effect in effects}
     measured = _measure(with_weight(bodies, branches), energies, owned)
     limit = border(measured, energies)
     carrying = {(branch.joint.name, branch.element) for branch in branches}
     paces = _paces(bodies, energies, measured, limit, owned)
+    paces |= {name: DecidedPace("fast", reason) for name, reason in (tied or {}).items()}
     placed = []
     for effect in effects:
         homes: dict[Home, dict[int, tuple[str, tuple[str, ...]]]] = {}

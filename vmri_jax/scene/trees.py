@@ -58,6 +58,11 @@ class Branch(NamedTuple):
         return {(self.joint.name, self.element, freedom): move for freedom, move in self.joint.freedoms.items()}
 
     @property
+    def labels(self) -> list[str]:
+        """The names of the coordinates of the joint."""
+        return [self.joint.label(self.element, freedom) for freedom in self.joint.freedoms]
+
+    @property
     def way(self) -> list[tuple[Key, Move]]:
         """The motions in the order from the parent to the child."""
         # the moves are defined from body a to body b of the joint; a child that is body a undoes them, the last one first
@@ -180,8 +185,8 @@ def make_layout(
             coordinates[name] = places[name] = Place(part, ends[part], body.size)
             ends[part] += body.size
             continue
-        for key in branch.moves:
-            coordinates[branch.joint.label(branch.element, key[2])] = freedoms[key] = Place(part, ends[part], 1)
+        for key, label in zip(branch.moves, branch.labels, strict=True):
+            coordinates[label] = freedoms[key] = Place(part, ends[part], 1)
             ends[part] += 1
     if not branches:
         return Layout(places, coordinates), ()

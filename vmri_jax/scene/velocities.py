@@ -19,6 +19,7 @@ from vmri_jax.scene.effects.joint_base import Joint, for_pairs, freedom_of, join
 from vmri_jax.scene.layout import Key
 from vmri_jax.scene.rows import ConstraintRows
 from vmri_jax.scene.sorting import Sorting
+from vmri_jax.scene.trees import Branch
 
 RATE_ERROR = 1e-8
 """Largest error of rates, relative to the largest rate, that counts as round-off. A larger value accepts rates that contradict each other."""
@@ -75,8 +76,21 @@ def with_rates(
     # the velocities of bodies belong to their positions as the user gave them, where joint coordinates are zero
     body_rates = sorting.to_bodies(sorting.assembled)[1] @ v
     moved = [body.with_rates(body_rates[columns[name]]) for name, body in sorting.bodies.items()]
-    numbers = sorting.layout.numbers
-    return moved, {key: (q[i], v[i]) for key in sorting.layout.freedoms for i in numbers[key]}
+    # where no joint starts at a value of its own, the velocities of the bodies say all
+    keys, numbers = sorting.layout.freedoms if sorting.joint_starts else (), sorting.layout.numbers
+    return moved, {key: (q[i], v[i]) for key in keys for i in numbers[key]}
+
+
+def check_replaced(
+    name: str, changes: Mapping[str, Any], branches: Sequence[Branch], starts: Mapping[Key, tuple[Any, Any]]
+) -> None:
+    """Refuse other velocities of a body for which a rate in `joint_starts` stands."""
+    rated = [b.joint.name for b in branches if b.child == name and starts.keys() & b.moves.keys()]
+    if rated and changes.keys() & {"velocity", "spin"}:
+        raise Refused(
+            f"Scene.replace: {name}: {' and '.join(changes)} would change nothing, because with_joints or with_rates has set "
+            f"the rate of {rated[0]}, which carries {name}. Give that rate to them, or call them after replace."
+        )
 
 
 def joint_starts(sorting: Sorting, effects: Sequence[Effect], starts: Mapping[str, Any]) -> dict[Key, tuple[Any, Any]]:

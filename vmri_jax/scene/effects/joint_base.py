@@ -287,9 +287,9 @@ class OfFreedoms(Effect):
 def _triad(axis):
     """(3, 3) orthonormal (m, m', n) with n along a unit vector."""
     xp = library(axis)
-    # the axis of space furthest from n: the product below is not small
-    least_parallel = xp.eye(3)[xp.argmin(xp.abs(axis))]
-    m = xp.cross(least_parallel, axis)
+    # the axis of space furthest from n: its part across n is not small
+    i = xp.argmin(xp.abs(axis))
+    m = xp.eye(3)[i] - axis[i] * axis
     m = m / xp.linalg.norm(m)
     return xp.stack([m, xp.cross(axis, m), axis])
 

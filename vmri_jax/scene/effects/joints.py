@@ -146,7 +146,8 @@ class Screw(AboutAxis):
 class Planar(AboutAxis):
     """b moves in the plane of m and m' and turns about n; three rows, ``n . D = 0, n . e = n . e' = 0``.
 
-    The freedoms are "along" and "across", the distances along m and m', and "turn".
+    The freedoms are "along" and "across", the distances along m and m', and "turn". m is the first of the axes x, y, z of space that make the
+    largest angle with n, or its part in the plane; m' is n x m: x and y for a normal z, x and -z for a normal y, y and z for a normal x.
 
     Args:
         between, at: as of `Joint`.
