@@ -22,15 +22,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.configure import warn_if_slow
-from vmri_jax.mechanics.arrays import Known, is_concrete, of_one_type, quickly_compiled
-from vmri_jax.mechanics.checks import check_arrays, check_params
+from vmri_jax.mechanics.arrays import Known, is_concrete, of_one_type, quickly_compiled, whole_number
+from vmri_jax.mechanics.checks import check_arrays, check_number, check_params, check_type
 from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.projection import legendre, project_momentum
 from vmri_jax.mechanics.state import REPORTED_VIOLATION, Movable, State, opened, start_of
 from vmri_jax.mechanics.summary import numbers, summary
 from vmri_jax.mechanics.system import System
 from vmri_jax.refusals import Refused
-from vmri_jax.running.arguments import Save, Steps, check_once, check_run, nothing_fast
+from vmri_jax.running.arguments import Save, Steps, check_once, check_run, check_step_size, nothing_fast
 from vmri_jax.running.engine import FALLING_BACK, Cursor, Engine, blank_memory, engine, solved_again, unsolved
 from vmri_jax.running.failures import simulation_error
 from vmri_jax.running.interrupts import Interrupted, interrupts_noted
@@ -140,8 +140,13 @@ class Simulation:
 
     def with_arguments(self, state=None, macro_dt=None, params=None, num_steps: int | None = None) -> "Simulation":
         """The run with other arguments, see `__call__`, by the same program."""
-        changes: dict[str, Any] = {} if macro_dt is None else {"macro_dt": _float(macro_dt)}
+        changes: dict[str, Any] = {}
+        if macro_dt is not None:
+            check_step_size(macro_dt, "run")
+            changes["macro_dt"] = _float(macro_dt)
         if state is not None:
+            check_type("run: state", state, State, "a State, e.g. from initial_state(...) or an earlier run[-1]")
+            check_number("run: the t of state", state.t)
             check_arrays(q_s=state.q_s, q_f=state.q_f, p_s=state.p_s, p_f=state.p_f)
             changes["state"] = _with_arrays(state)
             new, shapes = ([a.shape for a in vars(start).values()] for start in (changes["state"], self.state))
@@ -156,7 +161,7 @@ class Simulation:
             if state is None and self.of_problem and not self.system.has_constant_mass:
                 changes["state"] = _with_arrays(_at_same_velocities(self.system, changes["system"], self.state))
         if num_steps is not None:
-            if num_steps < 1 or num_steps % self.num_saves:
+            if whole_number("run: num_steps", num_steps) % self.num_saves:
                 raise Refused(f"num_steps is {num_steps}; it must be a positive multiple of {self.num_saves}.")
             changes |= {"num_steps": num_steps, "save_every": num_steps // self.num_saves}
         if not changes:
