@@ -83,7 +83,7 @@ class Shooting:
     def start(self, u):
         """(2 n,) positions and velocities at the start of the motion, for the search variables u of the parameters."""
         problem = self.model(self.unknowns.at(u))
-        return _phase(problem, _start(problem))
+        return _phase(problem, problem.state())
 
     def starts(self, u) -> np.ndarray:
         """(segments - 1, 2 n) starts of the parts after the first one, along a single run with u."""
