@@ -206,7 +206,7 @@ def starts(problem, lanes: int):
     """So many starts that differ in their velocities, consistent with the constraints, batch axis first."""
     random = np.random.default_rng(0)
     v_s, v_f = (jnp.asarray(v + SPREAD * random.normal(size=(lanes, v.size))) for v in (problem.v_s, problem.v_f))
-    start = jax.vmap(lambda v_s, v_f: vm.initial_state(problem.system, problem.q_s, problem.q_f, v_s, v_f))
+    start = jax.vmap(lambda v_s, v_f: vm.initial_state(problem, v_s=v_s, v_f=v_f, project=True))
     return jax.jit(start)(v_s, v_f)
 
 

@@ -165,7 +165,13 @@ def wrong(q_s, q_f, u, params):
     ("message", "options"),
     [
         ("actuate returns", {"actuate": wrong}),
+        (
+            r"actuate is <lambda>\(u, q_s, q_f, params\); it is called",
+            {"actuate": lambda u, q_s, q_f, params: (u, q_f)},
+        ),
+        (r"cost is <lambda>\(state\); it is called with \(state, u\)", {"cost": lambda state: state.q_s @ state.q_s}),
         ("cost has shape", {"cost": lambda state, u: u}),
+        (r"cost has \(shape \(\)", {"cost": lambda state, u: (u @ u, u @ u)}),
         ("final_cost has shape", {"final_cost": lambda state: state.q_s}),
         (r"goal has shape \(\); it must be a vector", {"goal": lambda state: state.q_s[0]}),
         ("grid is 'fine'", {"grid": "fine"}),

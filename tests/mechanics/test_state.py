@@ -100,6 +100,9 @@ def test_velocities_against_a_constraint_are_said_or_refused():
         assert np.allclose(start(2.0, project=True).p_f, [0.0, 1.0], atol=1e-14)
     for quiet in (start(1e-8), start(0.5, project=True)):
         assert np.allclose(quiet.p_f, [0.0, 1.0], atol=1e-15)
+    in_program = jax.jit(lambda radial: start(radial).p_f)
+    assert np.isnan(in_program(0.5)).all()  # the run of this start fails
+    assert np.allclose(in_program(1e-3), [0.0, 1.0], atol=1e-15)
 
 
 def test_moving_constraints_say_that_they_change_a_start_at_rest():
@@ -114,7 +117,7 @@ def test_moving_constraints_say_that_they_change_a_start_at_rest():
         assert np.allclose(start(0.0, 0.0).p_f, [0.0, 2.0], atol=1e-15)
     with pytest.raises(ValueError, match=r"differ by 100.00% "):  # 2 / sqrt(4 + 1e-6)
         start(1e-3, 0.0)
-    for quiet in (start(0.0, 0.0, project=True), start(0.0, 2.0)):
+    for quiet in (start(0.0, 0.0, project=True), start(0.0, 2.0), jax.jit(start)(0.0, 0.0)):
         assert np.allclose(quiet.p_f, [0.0, 2.0], atol=1e-15)
 
 

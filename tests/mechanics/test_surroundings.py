@@ -91,6 +91,12 @@ def by_module(q_s, q_f, params):
     return module.K * q_s[0] ** 2 / 2
 
 
+def by_import(q_s, q_f, params):
+    from a_module_of_the_user import K  # pyright: ignore[reportMissingImports]
+
+    return K * q_s[0] ** 2 / 2
+
+
 def by_table(q_s, q_f, params):
     return TABLE["k"][0] * q_s[0] ** 2 / 2
 
@@ -149,6 +155,7 @@ def changes():
         "helper of a helper": (by_helper_of_helper, lambda k: setattr(here, "inner", lambda: k)),
         "array written in place": (by_array, entry(NUMBERS, 0)),
         "attribute of a module": (by_module, setting(module, "K")),
+        "import inside of the function": (by_import, setting(module, "K")),
         "entry of a list in a dictionary": (by_table, entry(TABLE["k"], 0)),
         "attribute by a text": (by_settings, setting(settings, "k")),
         "default": (by_default, lambda k: setattr(by_default, "__defaults__", (k,))),

@@ -104,6 +104,11 @@ def test_a_start_off_the_constraints_has_failed(tsp):
     ("changes", "message"),
     [
         ({"num_steps": 7}, "num_steps is 7; it must be a positive multiple of 4"),
+        ({"num_steps": 8.0}, "run: num_steps is 8.0; it must be an integer"),
+        ({"macro_dt": -0.01}, "run: macro_dt is -0.01; it must be a positive number"),
+        ({"macro_dt": [0.01, 0.02]}, r"run: macro_dt has shape \(2,\)"),
+        ({"state": 0.02}, "run: state is float; give a State"),
+        ({"state": State(np.nan, *4 * [np.zeros(3)])}, "run: the t of state is nan; it must be finite"),
         ({"params": {"omega": np.ones(2)}}, "give the pytree of system.params"),
         ({"state": State(0.0, *4 * [np.zeros(2)])}, "the run was prepared for"),
     ],

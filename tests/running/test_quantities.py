@@ -249,14 +249,20 @@ def weighed(q_s, q_f, v_s, v_f, params):
 
 
 def test_prepared_runs_know_their_parameters():
+    """A run of a problem keeps the velocities of its start, as `simulate` of the problem with these parameters does; a run of a state the momenta."""
+
     def kinetic(q_s, q_f, v_s, v_f, params):
         return params["m"] / 2 * v_f @ v_f
 
     system = vm.System(kinetic, params={"m": 2.0})
     problem = vm.Problem(system, [], [0.0], [], [1.0])
-    run = vm.prepare(problem, vm.fully_implicit(2), macro_dt=0.1, num_steps=4)
-    assert np.allclose(run(params={"m": 4.0}).v_f, 0.5)
+    steps = {"scheme": vm.fully_implicit(2), "macro_dt": 0.1, "num_steps": 4}
+    run, of_state = vm.prepare(problem, **steps), vm.prepare(system, state=problem.state(), **steps)
+    heavier = run(params={"m": 4.0})
+    assert np.allclose(heavier.v_f, 1.0)
+    assert np.allclose(heavier.p_f, 4.0)
     assert np.allclose(run().v_f, 1.0)
+    assert np.allclose(of_state(params={"m": 4.0}).v_f, 0.5)
 
 
 def test_files_carry_names(swing, tmp_path):

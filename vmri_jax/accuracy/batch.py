@@ -50,7 +50,8 @@ def simulate_batch(
     Whatever has no axis of lanes holds for all lanes. Lanes are computed side by side (`jax.vmap`), in chunks that fit into the cache. Unlike
     `simulate`, a failed step never raises: its
     lane is NaN after the step and has its status in ``.result`` and ``.failed_at``; other lanes do not change. A
-    `FailedLanesWarning` says how many lanes failed. Lanes that the first matrix of "auto" does not solve are run again with exact
+    `FailedLanesWarning` says how many lanes failed. A lane fails in its first step if its start violates the constraints of its parameters, in
+    positions or velocities. Lanes that the first matrix of "auto" does not solve are run again with exact
     matrices, whose program is compiled at the first such lane.
 
     Args:

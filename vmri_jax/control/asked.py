@@ -11,8 +11,8 @@ from vmri_jax.control.search import Point, rolled
 from vmri_jax.control.transcription import Transcription
 from vmri_jax.diagnostics.linear import phase_vector
 from vmri_jax.mechanics.arrays import real_array, whole_number
-from vmri_jax.mechanics.checks import check_type
-from vmri_jax.mechanics.functions import traced_once
+from vmri_jax.mechanics.checks import check_type, describe
+from vmri_jax.mechanics.functions import check_arguments, traced_once
 from vmri_jax.mechanics.order import order_of
 from vmri_jax.mechanics.state import start_of
 from vmri_jax.refusals import Refused
@@ -34,6 +34,7 @@ def actuation_of(problem, actuate, num_controls) -> tuple[Callable, tuple[str, .
     if scene_actuation is not None:
         raise Refused("minimize: actuate is given, and the scene has Controlled effects; leave one of them out.")
     whole_number("minimize: num_controls", num_controls)
+    check_arguments("minimize: actuate", actuate, "q_s, q_f, u, params")
     return actuate, tuple(f"u {i}" for i in range(num_controls)) if num_controls > 1 else ("u",)
 
 
@@ -60,11 +61,12 @@ def transcribed(
     if not isinstance(forces, tuple) or tuple(getattr(f, "shape", None) for f in forces) != expected:
         raise Refused(f"minimize: actuate returns {forces}; it must return slow and fast forces of shapes {expected}.")
     for name, function in aims.items():
-        arguments = (state, u) if name in ("cost", "limits") else (state,)
-        shape = jax.eval_shape(lambda f=function, g=arguments: f(*g)).shape
+        arguments = {"state": state, "u": u} if name in ("cost", "limits") else {"state": state}
+        check_arguments(f"minimize: {name}", function, ", ".join(arguments))
+        value = jax.eval_shape(lambda f=function, g=arguments: f(*g.values()))
         dimensions, words = (0, "a number") if name in ("cost", "final_cost") else (1, "a vector, (n,)")
-        if len(shape) != dimensions:
-            raise Refused(f"minimize: {name} has shape {shape}; it must be {words}.")
+        if getattr(value, "ndim", None) != dimensions:
+            raise Refused(f"minimize: {name} has {describe(value)}; it must be {words}.")
     functions = {"final_cost": free, "goal": unaimed, **aims}
     return Transcription(
         system.replace(params=params),

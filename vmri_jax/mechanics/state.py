@@ -87,7 +87,8 @@ def initial_state(
         TypeError: a system without positions.
         ValueError: float32 data or 64-bit mode off, wrong shapes, not finite, positions that violate a constraint (with
             the size of the violation), velocities against a constraint, constraints that the fast variables cannot satisfy, a
-            kinetic energy without mass along some coordinate.
+            kinetic energy without mass along some coordinate. Within transformations of JAX, positions that violate a constraint and velocities against
+            a constraint are starts of runs that fail at once, see `vmri_jax.Result`.
     """
     require_x64()
     start = {"q_s": q_s, "q_f": q_f, "v_s": v_s, "v_f": v_f, "t": t}
@@ -122,7 +123,7 @@ def initial_state(
         if is_concrete((system, q_s, q_f)) and not system.has_constant_mass:
             check_system(system, q_s, q_f)
             check_mass(system, q_s, q_f)
-        return _start(arguments, project)[0]
+        return _traced_start(arguments, project)
     state, violation = _checked_start(Known(arguments), project, tolerance)
     at_rest = not any(np.asarray(v).any() for v in (v_s, v_f))
     tell_of_velocities("initial_state", violation, project, at_rest=at_rest)
@@ -137,6 +138,17 @@ def _start(arguments, project: bool):
     check_system(system, q_s, q_f)
     p_s, p_f, violation = consistent_momenta(system, t, q_s, q_f, *velocities)
     return State(t, q_s, q_f, p_s, p_f), violation
+
+
+def _traced_start(arguments, project: bool) -> State:
+    """The state in a program, which cannot refuse: of velocities against the constraints it has momenta that are NaN, so that its run fails."""
+    state, violation = _start(arguments, project)
+    if project or not arguments[0].is_constrained:
+        return state
+    _, _, _, _, *velocities = arguments
+    is_moving = jnp.any(jnp.concatenate(velocities) != 0.0)  # at rest, moving constraints give the velocities
+    fits = (jax.lax.stop_gradient(violation) <= REFUSED_VIOLATION) | ~is_moving
+    return replace(state, **{name: jnp.where(fits, getattr(state, name), jnp.nan) for name in ("p_s", "p_f")})
 
 
 @lru_cache(maxsize=256)

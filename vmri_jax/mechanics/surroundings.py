@@ -18,7 +18,7 @@ import sys
 from collections import deque
 from collections.abc import Callable, Hashable, Mapping
 from functools import cached_property, lru_cache, partial
-from itertools import pairwise
+from itertools import chain, pairwise
 from operator import attrgetter
 from pathlib import Path
 from types import CodeType, FunctionType, MethodType, ModuleType
@@ -108,7 +108,7 @@ class Surroundings:
         of_library = is_of_library(function.__module__)
         if of_library and not cells:
             return function
-        around, read, attributes = names_in(code)
+        around, read, attributes, imported = names_in(code)
         key = [self._read(name, attrgetter(name), function) for name in ("__code__", "__defaults__", "__kwdefaults__")]
         cells = [(name, cell) for name, cell in zip(code.co_freevars, cells, strict=True) if name in read]
         key += [self._read(name, attrgetter("cell_contents"), cell) for name, cell in cells]
@@ -116,6 +116,7 @@ class Surroundings:
             self.have_code = True
             self._attributes |= attributes
             key += [self._read(name, function.__globals__.get, name, _MISSING) for name in around]
+            key += [self._read(name, sys.modules.get, name, _MISSING) for name in imported]
         return tuple(key)
 
     def _of_array(self, array) -> Hashable:
@@ -176,17 +177,21 @@ class Surroundings:
 
 
 @lru_cache(maxsize=4096)
-def names_in(code: CodeType) -> tuple[tuple[str, ...], frozenset[str], dict[str, None]]:
-    """Names that code reads, with the functions inside of it: globals, cells of closures, and attributes, also those in texts for `getattr`."""
+def names_in(code: CodeType) -> tuple[tuple[str, ...], frozenset[str], dict[str, None], tuple[str, ...]]:
+    """Names that code reads, with the functions inside of it: globals, cells of closures, attributes, also those in texts for `getattr`, and modules
+    that the code itself imports."""
     read = [now for now, after in pairwise(dis.get_instructions(code)) if after.argval not in APPENDING]
     inner = [names_in(constant) for constant in code.co_consts if isinstance(constant, CodeType)]
     texts = [text for text in code.co_consts if isinstance(text, str) and text.isidentifier()]
     around = [now.argval for now in read if "GLOBAL" in now.opname or now.opname == "LOAD_NAME"]
     cells = frozenset(now.argval for now in read if "DEREF" in now.opname)
+    modules = [now.argval for now in read if now.opname == "IMPORT_NAME"]
+    globals_inside, cells_inside, attributes_inside, modules_inside = zip(*inner, strict=True) if inner else ((),) * 4
     return (
-        tuple(dict.fromkeys([*around, *(name for names, _, _ in inner for name in names)])),
-        cells.union(*(names for _, names, _ in inner)),
-        dict.fromkeys([*code.co_names, *texts, *(name for _, _, names in inner for name in names)]),
+        tuple(dict.fromkeys([*around, *chain(*globals_inside)])),
+        cells.union(*cells_inside),
+        dict.fromkeys([*code.co_names, *texts, *chain(*attributes_inside)]),
+        tuple(dict.fromkeys([*modules, *chain(*modules_inside)])),
     )
 
 

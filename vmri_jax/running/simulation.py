@@ -22,14 +22,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.configure import warn_if_slow
-from vmri_jax.mechanics.arrays import Known, is_concrete, of_one_type
-from vmri_jax.mechanics.checks import check_arrays, check_params
+from vmri_jax.mechanics.arrays import Known, is_concrete, of_one_type, quickly_compiled, whole_number
+from vmri_jax.mechanics.checks import check_arrays, check_number, check_params, check_type
 from vmri_jax.mechanics.names import Names
+from vmri_jax.mechanics.projection import legendre, project_momentum
 from vmri_jax.mechanics.state import REPORTED_VIOLATION, Movable, State, opened, start_of
 from vmri_jax.mechanics.summary import numbers, summary
 from vmri_jax.mechanics.system import System
 from vmri_jax.refusals import Refused
-from vmri_jax.running.arguments import Save, Steps, check_once, check_run, nothing_fast
+from vmri_jax.running.arguments import Save, Steps, check_once, check_run, check_step_size, nothing_fast
 from vmri_jax.running.engine import FALLING_BACK, Cursor, Engine, blank_memory, engine, solved_again, unsolved
 from vmri_jax.running.failures import simulation_error
 from vmri_jax.running.interrupts import Interrupted, interrupts_noted
@@ -63,7 +64,7 @@ class Checkpoint(NamedTuple):
 
 MOTION = ("macro_dt", "state", "solver", "scheme", "system")
 """The fields of a `Simulation` that its motion follows from."""
-LENGTH = ("num_steps", "save_every", "save", "names", "may_fall_back")
+LENGTH = ("num_steps", "save_every", "save", "names", "of_problem", "may_fall_back")
 """All other fields."""
 
 
@@ -80,6 +81,7 @@ class Simulation:
         state, solver, scheme, system, num_steps, save: as of `simulate`.
         save_every: macro steps from one saved node to the next.
         names: names of bodies and constraints; None if there are none.
+        of_problem: whether the start is the positions and velocities of a problem: with other parameters, the momenta are others.
         may_fall_back: whether the fallback is tried where the first matrix fails; else the run fails.
     """
 
@@ -92,13 +94,15 @@ class Simulation:
     save_every: int
     save: Save
     names: Names | None
+    of_problem: bool
     may_fall_back: bool = True
 
     def __call__(self, state=None, *, macro_dt=None, params=None, num_steps=None, throw: bool = True) -> Trajectory:
         """The trajectory of the run; arguments replace its start, macro step, parameters or number of steps.
 
         Args:
-            state, macro_dt, params: in the shapes of the run; None for the values of the run.
+            state, macro_dt, params: in the shapes of the run; None for the values of the run. With other params, a run of a problem
+                keeps the velocities of its start, a run of a system and a state the momenta.
             num_steps: macro steps, a multiple of `num_saves`, which stays while `save_every` changes; None for the number of the run.
             throw: raise `SimulationError` if a step fails, as `simulate` does; else return the trajectory, NaN from the failure on.
 
@@ -136,8 +140,13 @@ class Simulation:
 
     def with_arguments(self, state=None, macro_dt=None, params=None, num_steps: int | None = None) -> "Simulation":
         """The run with other arguments, see `__call__`, by the same program."""
-        changes: dict[str, Any] = {} if macro_dt is None else {"macro_dt": _float(macro_dt)}
+        changes: dict[str, Any] = {}
+        if macro_dt is not None:
+            check_step_size(macro_dt, "run")
+            changes["macro_dt"] = _float(macro_dt)
         if state is not None:
+            check_type("run: state", state, State, "a State, e.g. from initial_state(...) or an earlier run[-1]")
+            check_number("run: the t of state", state.t)
             check_arrays(q_s=state.q_s, q_f=state.q_f, p_s=state.p_s, p_f=state.p_f)
             changes["state"] = _with_arrays(state)
             new, shapes = ([a.shape for a in vars(start).values()] for start in (changes["state"], self.state))
@@ -149,8 +158,10 @@ class Simulation:
             if structure != expected or list(map(np.shape, new)) != list(map(np.shape, old)):
                 raise Refused(f"params is {params!r}; give the pytree of system.params with other numbers in it.")
             changes["system"] = self.system.with_params(jax.tree.map(np.asarray, params))
+            if state is None and self.of_problem and not self.system.has_constant_mass:
+                changes["state"] = _with_arrays(_at_same_velocities(self.system, changes["system"], self.state))
         if num_steps is not None:
-            if num_steps < 1 or num_steps % self.num_saves:
+            if whole_number("run: num_steps", num_steps) % self.num_saves:
                 raise Refused(f"num_steps is {num_steps}; it must be a positive multiple of {self.num_saves}.")
             changes |= {"num_steps": num_steps, "save_every": num_steps // self.num_saves}
         if not changes:
@@ -266,7 +277,13 @@ class Simulation:
 
     def _engine(self, num_saves: int) -> Engine:
         without_length = replace(
-            self, num_steps=0, save_every=0, save=Save(micro=self.save.micro), names=None, may_fall_back=True
+            self,
+            num_steps=0,
+            save_every=0,
+            save=Save(micro=self.save.micro),
+            names=None,
+            of_problem=False,
+            may_fall_back=True,
         )
         return engine(jax.tree.structure(without_length), num_saves)
 
@@ -358,6 +375,7 @@ def simulation(moving: Movable, scheme, state: State | None, solver: Solver | No
     """The `Simulation` with these arguments of `simulate`; bad arguments raise."""
     warn_if_slow()
     problem = opened(moving)
+    of_problem = state is None
     with Working("the start of the run"):
         system, state = start_of("simulate", problem, state)
     num_steps, save_every = check_run(system, scheme, state, solver, steps)
@@ -367,7 +385,14 @@ def simulation(moving: Movable, scheme, state: State | None, solver: Solver | No
         warnings.warn(f"simulate: {advice}", stacklevel=3)
     chosen_solver, scheme, system = of_one_type((solver or _usual_solver(), scheme, system))
     motion = (_float(steps.macro_dt), _with_arrays(state), chosen_solver, scheme, system)
-    return Simulation(*motion, num_steps, save_every, Save.of(steps.save), names_of(problem))
+    return Simulation(*motion, num_steps, save_every, Save.of(steps.save), names_of(problem), of_problem)
+
+
+@quickly_compiled
+def _at_same_velocities(system: System, other: System, state: State) -> State:
+    """The state of another system at the positions and velocities of a state, ``p = dT/dv``."""
+    _, _, *velocities, _ = project_momentum(system, state)
+    return replace(state, **dict(zip(("p_s", "p_f"), legendre(other, state.q_s, state.q_f, *velocities), strict=True)))
 
 
 @cache

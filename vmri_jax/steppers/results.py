@@ -50,8 +50,9 @@ _MESSAGES = {
     Result.NON_FINITE: (
         "a NaN or infinity appeared. Likely causes: an explicit scheme beyond its stability limit (omega h < 2), a function "
         "evaluated outside its domain (a norm at zero, a logarithm or root of a negative number), an angle of directors near half a turn, "
-        'which a spring, a limit or a gear cannot tell from another turn (give the scene coordinates="joint"). Try a smaller macro_dt, or look '
-        "at the state just before the failure."
+        'which a spring, a limit or a gear cannot tell from another turn (give the scene coordinates="joint"), or, '
+        "in the first step of a lane or of a run in a transformation of JAX, velocities of the start against the constraints. Try a smaller "
+        "macro_dt, or look at the state just before the failure."
     ),
     Result.SINGULAR: (
         "the Newton matrix is singular although the functions are finite. Likely causes: a kinetic energy that does not see "
@@ -65,8 +66,8 @@ _MESSAGES = {
         "Remove rows, make the variables they need fast, or start elsewhere."
     ),
     Result.CONSTRAINT_VIOLATED: (
-        "the increments converged, but the constraints are not kept. Likely causes: rows that contradict each other, or a "
-        "stepper of your own that does not hold them."
+        "the increments converged, but the constraints are not kept. Likely causes: in the first step, a start off the constraints, as of a "
+        "lane or a call with other params; rows that contradict each other; or a stepper of your own that does not hold them."
     ),
     Result.NOT_IMPLIED: (
         'the constraints that are solved for are kept, but rows that were left out as redundant (redundant="drop" of a scene, '
