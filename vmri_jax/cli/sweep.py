@@ -32,7 +32,9 @@ SETTINGS = ("t_end", "num_steps", "macro_dt", "num_micro", "save", "num_saves", 
 
 def sweep(
     file: Annotated[Path, Argument(help="A .toml, which vmri new sweep.toml writes.")] = Path("sweep.toml"),
-    workers: Annotated[str | None, Option(help="Number, or Dask tcp://host:port. [dim]this process[/dim]")] = None,
+    workers: Annotated[
+        str | None, Option(help="Number, or Dask tcp://host:port. [dim]default: this process[/dim]")
+    ] = None,
     resume: Annotated[bool, Option("--resume", help="Compute the missing runs of the store.")] = False,
     overwrite: Annotated[bool, Option("--overwrite", help="Replace the store.")] = False,
     plot: Annotated[Path | None, Option(help="Draw the last saved number of each run: .png, .svg or .pdf.")] = None,
