@@ -49,6 +49,22 @@ def test_the_slow_signal_moves_most_and_the_fast_one_fastest():
     assert fast.frequency == pytest.approx(OMEGA, rel=0.1)
 
 
+@pytest.mark.parametrize(("radius", "label"), [(0.1, "wheel x"), (0.0, "point on axis 1 of wheel, x")])
+def test_a_solid_is_shown_by_its_centre_if_that_moves(radius, label):
+    """The point on the axis, at half the width of the wheel, moves further."""
+    t = np.arange(0.0, 10.0, 0.01)
+    turning = np.stack([np.cos(t), np.sin(t)], axis=1)
+    run = trajectory(
+        t, np.concatenate([radius * turning, turning, turning[:, ::-1] * [-1, 1]], axis=1), np.zeros((t.size, 0))
+    )
+    places = [["s", 0], ["s", 1], [], ["s", 2], ["s", 3], [], ["s", 4], ["s", 5], []]
+    corners = [[x, y] for x in (-2.0, 2.0) for y in (-2.0, 2.0)]
+    wheel = {"name": "wheel", "coordinates": places, "corners": corners, "faces": [[0, 1, 3, 2]]}
+    slow = slow_signal(motion(run, Drawing.from_dict({"solids": [wheel]})))
+    assert slow is not None
+    assert slow.label == label
+
+
 def test_the_window_has_some_periods_where_most_happens():
     fast = fast_signal(moved())
     assert fast is not None

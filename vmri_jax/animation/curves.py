@@ -123,15 +123,20 @@ def _seen(signals: list[Signal]) -> list[Signal]:
 
 
 def _coordinates(motion: Motion) -> list[Signal]:
-    """Signals of the moving coordinates of all bodies, in coordinates of the drawing."""
-    drawing, signals = motion.drawing, []
+    """Signals of the moving coordinates of all bodies, in coordinates of the drawing.
+
+    Points on the axes of a solid, which are not shown, count only where no body of the same pace that is shown moves: a
+    reader knows where the centre is, and not how long the axis is.
+    """
+    drawing, signals, hidden = motion.drawing, [], []
     frame = drawing.frame()
     for i, body in enumerate(drawing.bodies):
         moved = [axis for axis, form in enumerate(body.forms) if form]
         for axis in moved:
             label = body.name if len(moved) == 1 else f"{body.name} {AXES[axis]}"
-            signals += _signal(motion, label, body.pace, lambda points, i=i, axis=axis: points[:, i] @ frame[:, axis])
-    return signals
+            of = _signal(motion, label, body.pace, lambda points, i=i, axis=axis: points[:, i] @ frame[:, axis])
+            (signals if body.shown else hidden).extend(of)
+    return signals + [signal for signal in hidden if signal.pace not in {shown.pace for shown in signals}]
 
 
 def _lengths(motion: Motion) -> list[Signal]:
