@@ -113,7 +113,7 @@ def plot_forces(trajectory: SavedRun, title: str = "", theme: Theme = LIGHT) -> 
 WITHOUT_CURVES = "Joints that carry bodies have no curves here: scene.by_directors(run).plot_forces() draws all joints."
 """Line below the forces of a scene in joint coordinates."""
 UNITS = {
-    "force": "N",
+    "reaction force": "N",
     "torque about centres": "N m",
     "torque on angles": "N m",
     "generalised force": "N, or N m for an angle",
@@ -138,7 +138,10 @@ def _moduli(run: SavedRun) -> dict[str, dict[str, np.ndarray]]:
                 # (k, directors, 3): the first three entries are of the centre
                 both = (np.asarray(a)[:, 3:].reshape(len(force), -1, 3) for a in (force, run.position(body)))
                 pulls, directors = both
-                reactions = {"force": force[:, :3], "torque about centres": np.cross(directors, pulls).sum(axis=1)}
+                reactions = {
+                    "reaction force": force[:, :3],
+                    "torque about centres": np.cross(directors, pulls).sum(axis=1),
+                }
             for unit, reaction in reactions.items():
                 curves, modulus = panels[unit], np.linalg.norm(reaction, axis=1)
                 curves[constraint] = np.maximum(curves.get(constraint, 0.0), modulus)
@@ -147,7 +150,7 @@ def _moduli(run: SavedRun) -> dict[str, dict[str, np.ndarray]]:
         for name, size in largest.items():
             if not size > LEAST_SHOWN * max(largest.values()):
                 del curves[name]
-    return {f"reaction {unit}\n{UNITS[unit]} in SI units": curves for unit, curves in panels.items() if curves}
+    return {f"{unit}\n{UNITS[unit]} in SI units": curves for unit, curves in panels.items() if curves}
 
 
 def position_panels(run: SavedRun) -> list[tuple[np.ndarray, list[str], str, np.ndarray | None]]:
