@@ -126,13 +126,8 @@ def _moduli(run: SavedRun) -> dict[str, dict[str, np.ndarray]]:
     names, panels = run.names, {unit: {} for unit in UNITS}
     for constraint, by_body in run.reaction_forces().items():
         for body, force in by_body.items():
-            kind = (
-                "torque on angles"
-                if body in names.angles
-                else "generalised force"
-                if body in names.numbered
-                else "force"
-            )
+            kind = "generalised force" if body in names.numbered else "reaction force"
+            kind = "torque on angles" if body in names.angles else kind
             reactions = {kind: force}
             if body in names.rigid:
                 # (k, directors, 3): the first three entries are of the centre
