@@ -59,7 +59,7 @@ def sweep(
             print_failure("Not all chunks could be computed", str(error))
             raise typer.Exit(1) from error
         except RuntimeError as error:
-            print_failure("Stopped", str(error).replace("resume=True", "--resume"))
+            print_failure("Stopped", str(error))
             raise typer.Exit(1) from error
     _print_summary(runs)
     if plot is not None:
