@@ -106,6 +106,11 @@ def test_coordinates_without_a_drawing_have_the_names_of_the_run():
     run = replace(crane(), origin=Origin(Names(slow={"cart": 2}, fast={"hook": 2, "load": 2})))
     shown = motion(run, Drawing.from_dict(bars(run)))
     assert [body.name for body in shown.drawing.bodies][:3] == ["cart x", "cart y", "hook x"]
+    small = run.with_arrays(q_s=0.013 * np.asarray(run.q_s))  # its bars are drawn larger than the coordinate
+    shown = motion(small, Drawing.from_dict(bars(small)))
+    slow = slow_signal(shown)
+    assert slow is not None
+    np.testing.assert_allclose(slow.of(shown.points), small.states.q_s[:, 0], atol=1e-12)
 
 
 def test_micro_nodes_without_the_system_move_as_they_do():
