@@ -4,11 +4,13 @@ from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
 from tests.support import compiled_step, largest_difference
 from vmri_jax import (
     ConstantMass,
+    Problem,
     Result,
     State,
     System,
@@ -181,3 +183,19 @@ def test_slow_variable_that_only_sees_round_off():
     run = simulate(system, fully_implicit(4), state, macro_dt=0.1, num_steps=200, solver=EXACT)
     assert int(run.info.iterations.max()) <= 4
     assert float(jnp.abs(run.q_s).max()) < 1e-15  # measured 1e-17
+
+
+def test_round_off_of_coupled_masses_ends_the_iteration():
+    """Masses of condition number 1e8, as those of a chain of a hundred bars: corrections stay at 1e-10 of the increments."""
+    lever = np.tril(np.ones((60, 60))).T @ np.tril(np.ones((60, 60)))
+    masses = lever.T @ lever
+
+    def kinetic(q_s, q_f, v_s, v_f, params):
+        return v_f @ (masses * (1 + jnp.sum(q_f) ** 2)) @ v_f / 2
+
+    def weight(q_f, params):
+        return 9.81 * jnp.sum(masses[0] * q_f)
+
+    problem = Problem(System(kinetic, fast_potential=weight), q_s=[], q_f=np.zeros(60))
+    run = simulate(problem, fully_implicit(1), macro_dt=1e-3, num_steps=3)
+    assert np.max(run.info.residual) < 1e-14

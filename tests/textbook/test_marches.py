@@ -29,6 +29,11 @@ STRUCTURES = {
         Method.MASSES,
         rs.Structure(1, 1, 2, **SPRINGS, scheme="gauss", num_micro=2, degree=3),
     ),
+    "many slow variables": (
+        Method.MASSES,
+        rs.Structure(3, 8, 2, "matrix", **SPRINGS, constraint="rod", scheme="gauss", degree=2),
+    ),
+    "slow variables alone": (Method.MASSES, rs.Structure(3, 9, 0, slow_potential="harmonic", scheme="gauss", degree=2)),
     "modes": (
         Method.MODES,
         rs.Structure(

@@ -6,18 +6,23 @@ from operator import add
 import jax.numpy as jnp
 
 from vmri_jax.mechanics.constraints import residual_of, rows_at
-from vmri_jax.mechanics.projection import project_momentum
+from vmri_jax.mechanics.projection import have_closed_masses, project_momentum
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
 
 
-def energy_parts(system: System, q_s, q_f, p_s, p_f, velocities=None) -> dict:
+def energy_parts(system: System, q_s, q_f, p_s, p_f, velocities=None, masses=None) -> dict:
     """Parts of the Hamiltonian ``p . v - T(q, v) + V + W + sum_i V_i``: "kinetic", "slow", "fast" and the names of `System.potentials`.
 
-    Velocities (v_s, v_f) of the momenta that are known already are not computed again.
+    Velocities (v_s, v_f) of the momenta and masses (n, n) that are known already are not computed again.
     """
     v_s, v_f = velocities or velocity(system, q_s, q_f, p_s, p_f)
-    kinetic = jnp.sum(p_s * v_s) + jnp.sum(p_f * v_f) - system.kinetic_energy(q_s, q_f, v_s, v_f)
+    if masses is not None and have_closed_masses(system.of_kind("kinetic")):
+        v = jnp.concatenate([v_s, v_f])
+        energy_of_motion = v @ masses @ v / 2
+    else:
+        energy_of_motion = system.kinetic_energy(q_s, q_f, v_s, v_f)
+    kinetic = jnp.sum(p_s * v_s) + jnp.sum(p_f * v_f) - energy_of_motion
     return {"kinetic": kinetic, **system.all_potentials(q_s, q_f)}
 
 

@@ -23,7 +23,7 @@ among the coordinates.
 Source: F. C. Park, J. E. Bobrow, S. R. Ploen, A Lie group formulation of robot dynamics, Int. J. Robot. Res. 14 (1995).
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import pairwise
@@ -139,12 +139,49 @@ class Kinematics:
             joints: the constants in the axes of the roots: "turn" T (n, 4, 3) and "slide", the first row of S (n, 3),
                 of all links, "zero" Z (n, 4, 3) of all bodies.
         """
-        (link, body), slow = self.first, sum(body.part == "s" for body in self.bodies)
+        frames, _ = self._against_roots(q_s, q_f, joints)
+        slow, roots = sum(body.part == "s" for body in self.bodies), [body.root for body in self.bodies]
+        frames = after(frames, self._roots(q_s, q_f, roots)) if set(roots) != {GROUND} else frames
+        return jnp.concatenate([q_s, frames[:slow].reshape(-1)]), jnp.concatenate([q_f, frames[slow:].reshape(-1)])
+
+    def _against_roots(self, q_s, q_f, joints: dict[str, Any]):
+        """A (bodies, 4, 3) and J (links, 4, 3), in the axes of the roots."""
+        link, body = self.first
         constants = [joints[name][link : link + len(self.links)] for name in ("turn", "slide")]
         x = Rows.of([link.place for link in self.links]).take(q_s, q_f).reshape(-1) if self.links else jnp.zeros(0)
-        frames, _ = placed(self, x, *constants, joints["zero"][body : body + len(self.bodies)])
-        frames = after(frames, self._roots(q_s, q_f)) if any(b.root != GROUND for b in self.bodies) else frames
-        return jnp.concatenate([q_s, frames[:slow].reshape(-1)]), jnp.concatenate([q_f, frames[slow:].reshape(-1)])
+        return placed(self, x, *constants, joints["zero"][body : body + len(self.bodies)])
+
+    def mass_matrix(self, q_s, q_f, joints: dict[str, Any], masses, part: Part):
+        """``(dQ/dq)^T m dQ/dq`` (n, n) of Q_s or Q_f, in which the bodies behind a coordinate move as one, composite body.
+
+        A body b on joints has the rates ``A_b sum_i K_i v_i`` over the coordinates i on the way to it, with the column (1, 0, 0, 0) before those
+        of A_b. A link has ``K_i = J_i D``, a coordinate of a root a unit row. With the masses ``G_j = sum_b A_b^T m_b A_b`` of the bodies b
+        behind a coordinate j,
+
+            M_ij = M_ji = tr(K_i^T G_j K_j)    for i on the way to j.
+
+        Source: R. Featherstone, Rigid Body Dynamics Algorithms (2008), 6.2.
+
+        Args:
+            q_s, q_f, joints: as of a call.
+            masses: m of Q_s or Q_f; those of a body on joints are equal along each of its directors.
+            part: of Q; all bodies on joints belong to it.
+        """
+        frames, twists = self._against_roots(q_s, q_f, joints)
+        (links, roots), (n_s, n_f) = self._columns, self.sizes
+        n, own = n_s + n_f, n_s if part == "s" else n_f
+        # G_b = A_b^T m_b A_b
+        rows = jnp.concatenate([jnp.broadcast_to(np.eye(4)[:, :1], (len(frames), 4, 1)), frames], axis=2)
+        of_rows = masses[own:].reshape(-1, 4, 3)[:, :, :1]
+        of_bodies = matmul(jnp.swapaxes(rows, 1, 2), of_rows * rows).reshape(-1, 16)
+        # K_i, then tr(K_i^T G_j K_j)
+        if set(self._owners) - {GROUND}:
+            twists = matmul(twists, self._roots(q_s, q_f, self._owners)[:, 1:])
+        columns = (matmul(links, twists.reshape(-1, SIZE)) if self.links else 0.0) + roots
+        composite = matmul(self._behind, of_bodies).reshape(n, 4, 4)
+        momenta = matmul(composite, columns.reshape(n, 4, 3)).reshape(n, SIZE)
+        half = matmul(columns, momenta.T) * (self._on_way + np.eye(n) / 2)
+        return half + half.T + jnp.diag(jnp.pad(masses[:own], (0, n_f) if part == "s" else (n_s, 0)))
 
     def velocities(self, q_s, q_f, v_s, v_f, joints: dict[str, Any]):
         """Rates of (Q_s, Q_f)."""
@@ -220,13 +257,54 @@ class Kinematics:
             sums = _taken(rows, self.lasts)
         return jnp.split(sums.reshape(-1, 4, 3), [len(self.bodies)])
 
-    def _roots(self, q_s, q_f):
-        """(bodies, 4, 3) centre and directors of the root of each body."""
+    def _roots(self, q_s, q_f, numbers: Sequence[int]):
+        """(k, 4, 3) centre and directors of roots by their numbers (k,); (1, 4, 3) if all are the same."""
         roots = [(q_s if part == "s" else q_f)[start : start + size] for part, start, size in self.roots]
-        if len({body.root for body in self.bodies}) == 1:
-            return roots[self.bodies[0].root].reshape(1, 4, 3)
-        chosen = np.array([body.root for body in self.bodies])[:, None] == [*range(len(roots)), GROUND]
+        if len(set(numbers)) == 1:
+            return roots[numbers[0]].reshape(1, 4, 3)
+        chosen = np.array(numbers)[:, None] == [*range(len(roots)), GROUND]
         return matmul(chosen.astype(float), jnp.stack([*roots, UNMOVED.ravel()])).reshape(-1, 4, 3)
+
+    @cached_property
+    def _owners(self) -> list[int]:
+        """Numbers of the roots of the links."""
+        behind = self.before[: len(self.bodies)]
+        return [self.bodies[int(column.argmax())].root if column.any() else GROUND for column in behind.T]
+
+    @cached_property
+    def _numbers(self) -> tuple[np.ndarray, list[np.ndarray]]:
+        """Numbers in (q_s, q_f) of the coordinates of the links (n,), and of each root (SIZE,)."""
+        links = [link.place.numbers(self.sizes[0])[0] for link in self.links]
+        return np.array(links, int), [root.numbers(self.sizes[0]) for root in self.roots]
+
+    @cached_property
+    def _columns(self) -> tuple[np.ndarray, np.ndarray]:
+        """Of K (coordinates, SIZE): the matrix (coordinates, links) that puts those of links at their places, and those of roots."""
+        links, roots = self._numbers
+        of_links, of_roots = np.zeros((sum(self.sizes), len(links))), np.zeros((sum(self.sizes), SIZE))
+        of_links[links, np.arange(len(links))] = 1.0
+        for numbers in roots:
+            of_roots[numbers] = np.eye(SIZE)
+        return of_links, of_roots
+
+    @cached_property
+    def _behind(self) -> np.ndarray:
+        """(coordinates, bodies) 1 for the bodies that a coordinate moves."""
+        behind, (links, roots) = np.zeros((sum(self.sizes), len(self.bodies))), self._numbers
+        behind[links] = self.before[: len(self.bodies)].T
+        for k, numbers in enumerate(roots):
+            behind[numbers] = [body.root == k for body in self.bodies]
+        return behind
+
+    @cached_property
+    def _on_way(self) -> np.ndarray:
+        """(coordinates, coordinates) 1 for each coordinate on the way to another one; of two of one root for the first."""
+        on_way, (links, roots) = np.zeros((sum(self.sizes),) * 2), self._numbers
+        on_way[np.ix_(links, links)] = self.before[len(self.bodies) :].T
+        for k, numbers in enumerate(roots):
+            on_way[np.ix_(numbers, links)] = [owner == k for owner in self._owners]
+            on_way[np.ix_(numbers, numbers)] = np.triu(np.ones((SIZE, SIZE)), 1)
+        return on_way
 
 
 def _placed(tree: Kinematics, x, turn, slide, zero):

@@ -96,10 +96,15 @@ class ConstantMass(eqx.Module):
 
 
 class WithMassMatrix:
-    """A kinetic energy ``T = v^T M v / 2`` whose masses M, functions of the positions, have a closed form."""
+    """A kinetic energy that may have the form ``T = v^T M v / 2`` with masses M, functions of the positions, in closed form."""
+
+    @property
+    def has_mass_matrix(self) -> bool:
+        """Whether it has this form."""
+        raise NotImplementedError
 
     def mass_matrix(self, q_s, q_f, params) -> Any:
-        """M (n, n); of T_s, for which q_f is None, (n_s, n_s). None for an energy of another form."""
+        """M (n, n); of T_s, for which q_f is None, (n_s, n_s)."""
         raise NotImplementedError
 
 

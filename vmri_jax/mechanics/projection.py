@@ -45,16 +45,20 @@ def mass_and_momentum(system: System, q_s, q_f, v_s, v_f):
     return jax.vmap(times_mass)(jnp.eye(p.size)), p
 
 
-def closed_masses(terms: Iterable[Term], q_s, q_f, params):
-    """The mass matrix (n, n) of the kinetic energies of a system by their closed forms, see `WithMassMatrix`; None if one of them has none."""
-    total, n = 0.0, q_s.size + q_f.size
-    for term in terms:
-        energy = innermost(term.function)
-        if not isinstance(energy, WithMassMatrix):
-            return None
-        masses = energy.mass_matrix(q_s, q_f if "q_f" in term.arguments else None, params)
-        if masses is None:
-            return None
+def have_closed_masses(energies: Iterable[Term]) -> bool:
+    """Whether these kinetic energies are ``v^T M v / 2`` with masses M in closed form, see `WithMassMatrix`."""
+    functions = [innermost(term.function) for term in energies]
+    return all(isinstance(function, WithMassMatrix) and function.has_mass_matrix for function in functions)
+
+
+def closed_masses(energies: Iterable[Term], q_s, q_f, params):
+    """The mass matrix (n, n) of kinetic energies by their closed forms; None if one of them has none."""
+    energies, n = list(energies), q_s.size + q_f.size
+    if not have_closed_masses(energies):
+        return None
+    total = 0.0
+    for term in energies:
+        masses = innermost(term.function).mass_matrix(q_s, q_f if "q_f" in term.arguments else None, params)
         total += jnp.pad(masses, (0, n - len(masses)))
     return total
 

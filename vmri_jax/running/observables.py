@@ -94,7 +94,7 @@ def observed(system: System, state: State, tolerance: Any = 0.0) -> tuple[State,
     """
     p_s, p_f, *velocities, masses = project_momentum(system, state)
     phase, v = (state.q_s, state.q_f, p_s, p_f), jnp.concatenate(velocities)
-    parts = list(energy_parts(system, *phase, velocities).values())
+    parts = list(energy_parts(system, *phase, velocities, masses).values())
     if masses is None:
         kinetic, volume, diagonal = parts[0], 0.0, jnp.concatenate(system.kinetic.diagonal)
         rounding = system.kinetic_energy(state.q_s, state.q_f, state.q_s, state.q_f)

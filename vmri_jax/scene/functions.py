@@ -11,7 +11,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.kernels import matmul
 from vmri_jax.mechanics.kinematics import JOINTS, MASS, Kinematics
 from vmri_jax.mechanics.masses import WithMassMatrix
 from vmri_jax.mechanics.rows import Entries
@@ -101,19 +100,16 @@ class KineticEnergy(_OfTerms, WithMassMatrix):
         of_bodies = jnp.sum(params[MASS][part] * rates[number] ** 2) / 2
         return total([of_bodies, *(term.kinetic(*bodies, *rates, params) for term in self.terms)])
 
+    @property
+    def has_mass_matrix(self) -> bool:
+        return self.kinematics is not None and not self.terms
+
     def mass_matrix(self, q_s, q_f, params):
-        """``J^T m J`` of the bodies, J = dQ/dq; None with velocity-dependent terms."""
-        if self.terms or self.kinematics is None:
-            return None
-        part, number = ("slow", 0) if q_f is None else ("fast", 1)
-
-        def bodies(q):
-            """The coordinates Q_s of q_s, or Q_f of q."""
-            return self.bodies(q[: q_s.size], None if q_f is None else q[q_s.size :], params)[number]
-
-        q = q_s if q_f is None else jnp.concatenate([q_s, q_f])
-        rates = jax.vmap(jax.linearize(bodies, q)[1])(jnp.eye(q.size))
-        return matmul(rates * params[MASS][part], rates.T)
+        if q_f is not None:
+            return self.kinematics.mass_matrix(q_s, q_f, params[JOINTS], jnp.asarray(params[MASS]["fast"]), "f")
+        n_s, n_f = self.kinematics.sizes
+        masses = jnp.asarray(params[MASS]["slow"])
+        return self.kinematics.mass_matrix(q_s, jnp.zeros(n_f), params[JOINTS], masses, "s")[:n_s, :n_s]
 
 
 class TotalForce(_OfTerms):

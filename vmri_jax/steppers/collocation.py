@@ -46,6 +46,7 @@ class IntervalEquations:
     """
 
     def __init__(self, equations: StepEquations):
+        assert not equations.q_s.size, "slow variables would not move"
         self.system, self.h, self.r = equations.system, equations.macro_dt, equations.scheme.degree
         self.q_s, self.q, self.p = equations.q_s, equations.q_f, equations.p_f
         self.times = equations.t + self.h * control_nodes(self.r)

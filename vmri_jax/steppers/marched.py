@@ -8,7 +8,7 @@ from jaxtyping import Array, Float, Int
 
 from vmri_jax.kernels import CONTRACTION
 from vmri_jax.schemes.equations import StepEquations, Unknowns
-from vmri_jax.steppers.accept import FLOOR_OF_NEWTON, NO_WEIGHTS, Accepted, Weights, expected
+from vmri_jax.steppers.accept import FLOOR_OF_NEWTON, NO_WEIGHTS, Accepted, Weights, expected, is_solved
 from vmri_jax.steppers.continuation import solve_in_parts, with_dependent_constraints
 from vmri_jax.steppers.march import (
     MarchEquations,
@@ -173,6 +173,8 @@ class Marched(StepSolver):
             passes, size = before.passes + 1, jnp.maximum(slow, fast)
             ratio = accepted.ratio((slow, still_moves), motions, passes)
             at_floor = accepted.at_floor(size, before.size)
+            if march.weights is not NO_WEIGHTS:
+                at_floor |= (size > before.size / 2) & is_solved(now.worst.rows, motions)
             result = jnp.where(ratio <= 1, Result.CONVERGED, jnp.where(at_floor, Result.CONVERGED_AT_ROUNDOFF, RUNNING))
             failed = jnp.where(size > before.size, Result.DIVERGED, Result.STAGNATED)
             result = jnp.where((passes >= limit) & (result == RUNNING), failed, result)

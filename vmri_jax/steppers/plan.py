@@ -192,7 +192,7 @@ def _between_kicks(system: System, scheme: Scheme, choice: _Choice, q_s, q_f) ->
     interval = Interval.of(system, scheme, q_s, q_f)
     if _is_linear(system, scheme, interval, q_s):
         return Linear(system, scheme, interval)
-    approximate = _approximate(system, scheme, solver, interval, rows, q_f.size)
+    approximate = _approximate(system, scheme, solver, interval, rows, q_s.size, q_f.size)
     return Solved(system, scheme, approximate, rows, choice.reverse_only)
 
 
@@ -207,10 +207,10 @@ def _joins(system: System, scheme: Scheme, solver: Solver, n_s: int, n_f: int) -
 
 
 def _approximate(
-    system: System, scheme: Scheme, solver: Solver, interval: Interval, rows: Sparsity, size: int
+    system: System, scheme: Scheme, solver: Solver, interval: Interval, rows: Sparsity, n_s: int, n_f: int
 ) -> StepSolver:
-    """The matrix "masses" or "modes", or the first one of "auto", for constant masses; `size` is the number of fast variables."""
-    small = size <= SMALL  # Nested keeps a larger matrix over many steps, Collocation does not
+    """The matrix "masses" or "modes", or the first one of "auto", for constant masses; modes and drifts know fast variables alone (`_joins`)."""
+    small = n_s == 0 and n_f <= SMALL  # Nested keeps a larger matrix over many steps, Collocation does not
     chosen = COLLOCATES and small and not interval.is_diagonal and _has_modes(system, scheme)
     if solver.matrix == "modes" or (solver.matrix == "auto" and chosen):
         return Collocation(solver)

@@ -14,7 +14,7 @@ from jax.scipy.linalg import block_diag
 
 from vmri_jax.mechanics.functions import Rheonomic
 from vmri_jax.mechanics.masses import ConstantMass, WithMassMatrix
-from vmri_jax.mechanics.projection import closed_masses
+from vmri_jax.mechanics.projection import closed_masses, have_closed_masses
 from vmri_jax.mechanics.system import RATE_OF, System
 from vmri_jax.mechanics.terms import KINDS, POSITIONS, Term
 from vmri_jax.schemes.discrete_lagrangian import Placed, placed_potentials
@@ -107,6 +107,10 @@ class OfJoined(WithMassMatrix):
         if self.terms[0].kind == "force":
             return jnp.zeros(0), jnp.concatenate(first)
         return jnp.concatenate([first, *others]) if self.terms[0].kind == "constraint" else sum(others, first)
+
+    @property
+    def has_mass_matrix(self) -> bool:
+        return have_closed_masses(self.terms)
 
     def mass_matrix(self, q_s, q_f, params):
         return closed_masses(self.terms, q_f[: self.num_slow], q_f[self.num_slow :], params)
