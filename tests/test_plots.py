@@ -285,6 +285,6 @@ def test_forces_have_units_and_name_the_joints_without_curves(sliding_door, monk
     figure = sliding_door.plot_forces()
     assert [axes.get_ylabel() for axes in figure.axes] == [
         "reaction force\nN in SI units",
-        "reaction torque\nN m in SI units",
+        "torque on angles\nN m in SI units",
     ]
     assert "by_directors" in figure.get_supxlabel()

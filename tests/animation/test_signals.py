@@ -49,6 +49,22 @@ def test_the_slow_signal_moves_most_and_the_fast_one_fastest():
     assert fast.frequency == pytest.approx(OMEGA, rel=0.1)
 
 
+@pytest.mark.parametrize(("radius", "label"), [(0.1, "wheel x"), (0.0, "point on axis 1 of wheel, x")])
+def test_a_solid_is_shown_by_its_centre_if_that_moves(radius, label):
+    """The point on the axis, at half the width of the wheel, moves further."""
+    t = np.arange(0.0, 10.0, 0.01)
+    turning = np.stack([np.cos(t), np.sin(t)], axis=1)
+    run = trajectory(
+        t, np.concatenate([radius * turning, turning, turning[:, ::-1] * [-1, 1]], axis=1), np.zeros((t.size, 0))
+    )
+    places = [["s", 0], ["s", 1], [], ["s", 2], ["s", 3], [], ["s", 4], ["s", 5], []]
+    corners = [[x, y] for x in (-2.0, 2.0) for y in (-2.0, 2.0)]
+    wheel = {"name": "wheel", "coordinates": places, "corners": corners, "faces": [[0, 1, 3, 2]]}
+    slow = slow_signal(motion(run, Drawing.from_dict({"solids": [wheel]})))
+    assert slow is not None
+    assert slow.label == label
+
+
 def test_the_window_has_some_periods_where_most_happens():
     fast = fast_signal(moved())
     assert fast is not None
@@ -90,6 +106,11 @@ def test_coordinates_without_a_drawing_have_the_names_of_the_run():
     run = replace(crane(), origin=Origin(Names(slow={"cart": 2}, fast={"hook": 2, "load": 2})))
     shown = motion(run, Drawing.from_dict(bars(run)))
     assert [body.name for body in shown.drawing.bodies][:3] == ["cart x", "cart y", "hook x"]
+    small = run.with_arrays(q_s=0.013 * np.asarray(run.q_s))  # its bars are drawn larger than the coordinate
+    shown = motion(small, Drawing.from_dict(bars(small)))
+    slow = slow_signal(shown)
+    assert slow is not None
+    np.testing.assert_allclose(slow.of(shown.points), small.states.q_s[:, 0], atol=1e-12)
 
 
 def test_micro_nodes_without_the_system_move_as_they_do():

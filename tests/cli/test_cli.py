@@ -170,7 +170,7 @@ def test_simulate_streams_and_resumes(vmri, tmp_path):
     assert "saved run.zarr" in text
     code, text = vmri(*STREAM)
     assert code == 2
-    assert "run.zarr is a stored run, 2 of 2 chunks done" in text
+    assert "run.zarr is a stored run, 2 of 2 chunks done. Go on with it (--resume), replace it (--overwrite)" in text
     code, text = vmri(*STREAM, "--resume", "--plot", "run.png")
     assert code == 0
     assert "per micro step" not in text

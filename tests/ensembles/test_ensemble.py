@@ -49,6 +49,7 @@ def test_runs_are_those_of_simulate(tmp_path):
     assert runs.complete
     assert len(runs) == 32
     assert runs.failed_runs == 0
+    assert "runs, 0 of them failed" in repr(runs)
     data = runs.open()
     assert dict(data.sizes) | {"scheme": 2, "num_micro": 2, "num_steps": 2, "omega": 2, "v_s[0]": 2} == dict(data.sizes)
     for scheme, make in schemes.items():

@@ -5,14 +5,13 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 
 import vmri_jax as vm
 from vmri_jax.fitting import Measured, Unknown
 from vmri_jax.fitting.unknowns import Unknowns
 
 CHAIN = vm.systems.fermi_pasta_ulam(1, omega=20.0)
-SCHEME = vm.fully_explicit(2)
+SCHEME = vm.compose(vm.fully_explicit(2), "kahan-li8")  # of order 8: its steps leave no error in the parameters
 DT = 0.05
 
 
@@ -53,7 +52,9 @@ def test_parameters_are_found_within_their_errors(found):
     assert 0.01 < found.probability < 0.99
     assert not found.undetermined
     assert "chance of worse" in str(found)
-    assert isinstance(vm.plots.plot_fit(found), Figure)
+    titles = [axes.get_title(loc="left") for axes in vm.plots.plot_fit(found).axes]
+    assert "correlations" in titles
+    assert len(titles) == 4  # with the bar of colours
 
 
 def test_the_run_of_a_fit_goes_to_the_last_measurement(found):
@@ -65,8 +66,23 @@ def test_the_run_of_a_fit_goes_to_the_last_measurement(found):
 
 def test_intervals_cover(found):
     """Of 150 intervals of 95 %, 143 +- 3."""
-    coverage = found.bootstrap(150).coverage()
+    bootstrap = found.bootstrap(150)
+    coverage = bootstrap.coverage()
+    assert "Bootstrap of 150 fits" in repr(bootstrap)
     assert all(0.9 < part < 0.99 for part in coverage.values())
+
+
+def test_steps_that_move_the_parameters_are_doubted():
+    """A leapfrog at ``omega h = 0.5`` is too fast by a hundredth, and the fitted frequency too low."""
+    coarse = vm.fit(CHAIN, measured(), {"omega": Unknown(19.8, lower=0)}, scheme=vm.fully_explicit(2), macro_dt=DT)
+    assert "The steps are too large for this data: half the steps would change omega by +" in str(coarse)
+    assert "95 %" not in str(coarse)
+    missing = 20.0 - coarse.values[0]
+    assert len(vm.plots.plot_fit(coarse).axes) == 2  # a single parameter has no correlations
+    assert missing > 10 * coarse.standard_errors["omega"]
+    assert coarse.change_by_half_steps[0] == pytest.approx(3 / 4 * missing, rel=0.2)  # order 2
+    with pytest.warns(vm.UncertifiedWarning, match="intervals: the fit is doubted.*The steps"):
+        coarse.intervals()
 
 
 def test_some_values_of_some_quantities():

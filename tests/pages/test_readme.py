@@ -132,6 +132,13 @@ def test_derivatives(capsys):
     assert float(first.split()[3].rstrip(",")) == pytest.approx(float(up - down) / 2e-5, rel=1e-5)
 
 
+def test_measurements(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (program,) = programs("docs/how_to/measurements.md")
+    exec(program, {})
+    assert f"```text\n{capsys.readouterr().out}```" in (ROOT / "docs/how_to/measurements.md").read_text()
+
+
 def test_a_mechanism(capsys):
     exec(next(program for program in PROGRAMS if "crank pin" in program), {})
     assert f"```text\n{capsys.readouterr().out}```" in (ROOT / "docs/how_to/scenes.md").read_text()

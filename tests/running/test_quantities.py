@@ -16,6 +16,7 @@ import vmri_jax as vm
 from tests.support import until_failure
 from tests.user_systems import GRAVITY, LENGTH, MASS, drag, hanging_weight, own_rod, swinging_rod
 from vmri_jax.plots.runs import _moduli
+from vmri_jax.running.origin import _at_all
 from vmri_jax.scene import Anchor, Body, Gravity, LinearDamping, RigidLink, Scene, Spring
 
 
@@ -85,6 +86,8 @@ def test_names_that_do_not_exist(swing):
         swing.position("bop")
     with pytest.raises(ValueError, match=r"reaction_forces: there is no constraint 'rods'. Did you mean rod\?"):
         swing.reaction_forces("rods")
+    with pytest.raises(ValueError, match=r"micro is 'rod'; it must be True or False"):
+        swing.multipliers("rod")
 
 
 def test_work_accounts_for_the_energy():
@@ -114,7 +117,9 @@ def test_a_scene_gives_its_names(hanging_run):
     forces = run.reaction_forces("links")
     assert set(forces) == {"hook", "load"}
     assert np.allclose(forces["hook"], -forces["load"], atol=1e-9)  # what a link does to one end it does to the other
+    programs = _at_all.cache_info().misses
     assert set(run.reaction_forces("anchors")) == {"hook"}
+    assert _at_all.cache_info().misses == programs  # which constraint is asked for is no part of the program
 
 
 def test_reaction_forces_are_drawn_by_constraint(hanging_run):
@@ -144,9 +149,10 @@ def test_torques_on_rigid_bodies_have_a_panel_of_their_own():
     panels = {label.partition("\n")[0]: curves for label, curves in _moduli(run).items()}
     assert {name: list(curves) for name, curves in panels.items()} == {
         "reaction force": ["pin"],
-        "reaction torque": ["pin", "gear"],
+        "torque about centres": ["pin"],
+        "torque on angles": ["gear"],
     }
-    np.testing.assert_allclose(panels["reaction torque"]["pin"], [2.0, 3.0])
+    np.testing.assert_allclose(panels["torque about centres"]["pin"], [2.0, 3.0])
 
 
 def test_a_system_without_names():

@@ -4,7 +4,7 @@ They are coordinates of bodies and lengths of springs; the motion chooses which.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -36,7 +36,7 @@ PERIODS = 8
 class Signal:
     """A function `of` positions of bodies, from points (k, n_bodies, 3) to values (k,), with the title of its panel.
 
-    size, speed: standard deviations along the motion of the values and of their rate.
+    size, speed: standard deviations along the motion of the values and of their rate, as large as they are drawn.
     """
 
     label: str
@@ -123,15 +123,29 @@ def _seen(signals: list[Signal]) -> list[Signal]:
 
 
 def _coordinates(motion: Motion) -> list[Signal]:
-    """Signals of the moving coordinates of all bodies, in coordinates of the drawing."""
-    drawing, signals = motion.drawing, []
+    """Signals of the moving coordinates of all bodies, in coordinates of the drawing.
+
+    Points on the axes of a solid, which are not shown, count only where no body of the same pace that is shown moves: a
+    reader knows where the centre is, and not how long the axis is.
+    """
+    drawing, signals, hidden = motion.drawing, [], []
     frame = drawing.frame()
     for i, body in enumerate(drawing.bodies):
         moved = [axis for axis, form in enumerate(body.forms) if form]
         for axis in moved:
-            label = body.name if len(moved) == 1 else f"{body.name} {AXES[axis]}"
-            signals += _signal(motion, label, body.pace, lambda points, i=i, axis=axis: points[:, i] @ frame[:, axis])
-    return signals
+            label, form = body.name if len(moved) == 1 else f"{body.name} {AXES[axis]}", body.forms[axis]
+            # a bar is drawn at foot + scale q: its curve is q
+            foot, scale = (body.offset[axis], form[0][0]) if len(form) == 1 and form[0][0] != 1.0 else (0.0, 1.0)
+            along = partial(_along, i, frame[:, axis], foot, scale)
+            for signal in _signal(motion, label, body.pace, along):
+                seen = replace(signal, size=abs(scale) * signal.size, speed=abs(scale) * signal.speed)
+                (signals if body.shown else hidden).append(seen)
+    return signals + [signal for signal in hidden if signal.pace not in {shown.pace for shown in signals}]
+
+
+def _along(body: int, axis: np.ndarray, foot: float, scale: float, points: np.ndarray) -> np.ndarray:
+    """The coordinate q (k,) of a body that is drawn at ``foot + scale q`` along an axis; points (k, n_bodies, 3)."""
+    return (points[:, body] @ axis - foot) / scale
 
 
 def _lengths(motion: Motion) -> list[Signal]:

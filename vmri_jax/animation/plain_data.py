@@ -116,7 +116,7 @@ def read_solid(data: Any, where: str) -> tuple[Solid, list[Body]]:
     for k in range(3):
         directors = forms[3 * (k + 1) : 3 * (k + 2)] or [()] * 3
         along = [(*a, *((size * w, part, i) for w, part, i in b)) for a, b in zip(centre, directors, strict=True)]
-        bodies.append(Body(f"{name} axis {k + 1}", tuple(along), (0.0,) * 3, shown=""))
+        bodies.append(Body(f"point on axis {k + 1} of {name},", tuple(along), (0.0,) * 3, shown=""))
     weights = np.pad(corners / size, [(0, 0), (0, 3 - count)])
     names = tuple(body.name for body in bodies)
     return Solid(names, tuple(map(tuple, weights.tolist())), faces, data.get("color")), bodies

@@ -29,10 +29,14 @@ MOST_STORE_NODES = 100_000
 
 def animate(
     run: Annotated[Path, Argument(help="A saved trajectory, run.npz or run.zarr.")],
-    out: Annotated[Path | None, Option(help=".html, a strip .png/.svg/.pdf, .gif or .pvd. [dim]run.html[/dim]")] = None,
+    out: Annotated[
+        Path | None, Option(help=".html, a strip .png/.svg/.pdf, .gif or .pvd. [dim]default: run.html[/dim]")
+    ] = None,
     system: Annotated[str | None, Option(help="System of the run: fpu, tsp, sam, or my_file.py:my_problem.")] = None,
     drawing: Annotated[Path | None, Option(help="A .json in place of the drawing in the run.", exists=True)] = None,
-    title: Annotated[str | None, Option(help="Over the picture. [dim]name of the system or file[/dim]")] = None,
+    title: Annotated[
+        str | None, Option(help="Over the picture. [dim]default: name of the system or file[/dim]")
+    ] = None,
     start: Annotated[float | None, Option("--from", help="Start at this time.")] = None,
     end: Annotated[float | None, Option("--to", help="Stop at this time.")] = None,
     view: Annotated[str | None, Option(help="Azimuth and elevation in degrees, e.g. -90,90 from above.")] = None,

@@ -25,7 +25,12 @@ class BadInput(typer.BadParameter):
     """A wrong argument: its message is shown in a panel, exit code 2."""
 
     def format_message(self) -> str:
-        return self.message
+        return as_options(self.message)
+
+
+def as_options(text: str) -> str:
+    """The text of a message of the library with options of the command in place of arguments of Python."""
+    return text.replace("resume=True", "--resume").replace("overwrite=True", "--overwrite")
 
 
 FAULT = "This is no error of your command, but of the program. Please report it, with the command and the lines below."
@@ -38,7 +43,7 @@ def refusals() -> Iterator[None]:
         yield
     except Interrupted as stopped:
         count = stopped.number if stopped.total is None else f"{stopped.number} of {stopped.total}"
-        advice = f"; {stopped.advice}".replace("resume=True", "--resume") if stopped.advice else ""
+        advice = f"; {stopped.advice}" if stopped.advice else ""
         print_failure("Interrupted", f"After {count} {stopped.units}{advice}.")
         raise typer.Exit(130) from stopped
     except Refused as error:
@@ -58,7 +63,7 @@ def refusals() -> Iterator[None]:
 
 def print_failure(title: str, text: str) -> None:
     """Print a red panel on the error stream."""
-    Console(stderr=True).print(Panel(Text(text), title=title, title_align="left", border_style="red"))
+    Console(stderr=True).print(Panel(Text(as_options(text)), title=title, title_align="left", border_style="red"))
 
 
 def print_written(title: str, path: Path | None) -> None:

@@ -41,7 +41,9 @@ def simulate(
     system: options.System,
     steps: Annotated[int | None, Option(help="Number of macro steps; not with --accuracy.")] = None,
     macro_dt: options.MacroStep = None,
-    scheme: Annotated[str | None, Option(help="See vmri schemes. [dim]fully-implicit; or chosen[/dim]")] = None,
+    scheme: Annotated[
+        str | None, Option(help="See vmri schemes. [dim]default: fully-implicit; with --accuracy chosen[/dim]")
+    ] = None,
     num_micro: options.NumMicro = 10,
     alpha: options.Alpha = None,
     degree: options.Degree = None,
@@ -50,7 +52,9 @@ def simulate(
     accuracy: Annotated[float | None, Option(help="Largest error of a position, for which steps are chosen.")] = None,
     t_end: Annotated[float | None, Option(help="End of the run, with --accuracy.")] = None,
     error: Annotated[bool, Option("--error", help="Estimate the error of the positions.")] = False,
-    save_every: Annotated[int | None, Option(help=f"Steps per node. [dim]{DEFAULT_SAVED_NODES} nodes[/dim]")] = None,
+    save_every: Annotated[
+        int | None, Option(help=f"Macro steps per saved node. [dim]default: {DEFAULT_SAVED_NODES} nodes[/dim]")
+    ] = None,
     save_micro: Annotated[bool, Option("--save-micro", help="Keep the fast motion within macro steps too.")] = False,
     matrix: Annotated[str, Option(help="auto, masses, modes, exact or null-space.")] = "auto",
     out: Annotated[Path | None, Option(help="Write it here: .npz at the end, or .zarr during the run.")] = None,

@@ -94,9 +94,11 @@ def advise(
 
 
 def stability(
-    system: Annotated[str | None, Argument(help="A system at its start. [dim]a slow and a stiff spring[/dim]")] = None,
-    scheme: Annotated[list[str] | None, Option(help="May be repeated. [dim]explicit-slow[/dim]")] = None,
-    num_micro: Annotated[list[int] | None, Option(help="May be repeated. [dim]2 5 10 20[/dim]")] = None,
+    system: Annotated[
+        str | None, Argument(help="A system at its start. [dim]default: a slow and a stiff spring[/dim]")
+    ] = None,
+    scheme: Annotated[list[str] | None, Option(help="May be repeated. [dim]default: explicit-slow[/dim]")] = None,
+    num_micro: Annotated[list[int] | None, Option(help="May be repeated. [dim]default: 2 5 10 20[/dim]")] = None,
     alpha: options.Alpha = None,
     degree: options.Degree = None,
     rule: options.Rule = None,

@@ -54,8 +54,12 @@ def tune(
 
 def cost(
     system: options.System,
-    t_end: Annotated[float | None, Option(help=f"Simulated time. [dim]{PERIODS} fastest periods[/dim]")] = None,
-    error: Annotated[list[float] | None, Option(help="May be repeated. [dim]1e-2 to 1e-8 of the motion[/dim]")] = None,
+    t_end: Annotated[
+        float | None, Option(help=f"Simulated time. [dim]default: {PERIODS} fastest periods[/dim]")
+    ] = None,
+    error: Annotated[
+        list[float] | None, Option(help="May be repeated. [dim]default: 1e-2 to 1e-8 of the motion[/dim]")
+    ] = None,
     out: Annotated[Path, Option(help="Folder for the page.")] = Path("out/cost"),
 ) -> None:
     """Write a page about the cost of accuracy: time over error, and the best scheme for each error.

@@ -32,7 +32,9 @@ SETTINGS = ("t_end", "num_steps", "macro_dt", "num_micro", "save", "num_saves", 
 
 def sweep(
     file: Annotated[Path, Argument(help="A .toml, which vmri new sweep.toml writes.")] = Path("sweep.toml"),
-    workers: Annotated[str | None, Option(help="Number, or Dask tcp://host:port. [dim]this process[/dim]")] = None,
+    workers: Annotated[
+        str | None, Option(help="Number, or Dask tcp://host:port. [dim]default: this process[/dim]")
+    ] = None,
     resume: Annotated[bool, Option("--resume", help="Compute the missing runs of the store.")] = False,
     overwrite: Annotated[bool, Option("--overwrite", help="Replace the store.")] = False,
     plot: Annotated[Path | None, Option(help="Draw the last saved number of each run: .png, .svg or .pdf.")] = None,
@@ -57,7 +59,7 @@ def sweep(
             print_failure("Not all chunks could be computed", str(error))
             raise typer.Exit(1) from error
         except RuntimeError as error:
-            print_failure("Stopped", str(error).replace("resume=True", "--resume"))
+            print_failure("Stopped", str(error))
             raise typer.Exit(1) from error
     _print_summary(runs)
     if plot is not None:

@@ -22,6 +22,7 @@ from vmri_jax.executors.executor import NotAWorker, as_done, executor_of, submit
 from vmri_jax.mechanics.arrays import require_x64, whole_number
 from vmri_jax.mechanics.checks import check_type
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
+from vmri_jax.mechanics.summary import summary
 from vmri_jax.refusals import Refused
 from vmri_jax.running.files import explained
 from vmri_jax.running.interrupts import Interrupted, interrupts_noted
@@ -59,7 +60,7 @@ class EnsembleError(RuntimeError):
         )
 
 
-@dataclass
+@dataclass(repr=False)
 class Ensemble:
     """An ensemble and its progress.
 
@@ -77,6 +78,10 @@ class Ensemble:
     failures: dict[int, Exception] = field(default_factory=dict)
     seconds: float = 0.0
     computed: int = 0
+
+    def __repr__(self) -> str:
+        done = f"{self.runs_done} of {len(self)} runs, {self.failed_runs} of them failed"
+        return summary(f"Ensemble {self.path}", {"done": done, "to see more": "vm.open_ensemble(path), .failures"})
 
     def __len__(self) -> int:
         """Number of runs."""

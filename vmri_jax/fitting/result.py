@@ -1,5 +1,6 @@
 """The result of a fit: the parameters, how well they are known, and how well the motion fits."""
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
@@ -9,9 +10,11 @@ import numpy as np
 from jaxtyping import Float
 from scipy import stats
 
+from vmri_jax.accuracy.companions import UncertifiedWarning
 from vmri_jax.accuracy.simulate import simulate
 from vmri_jax.fitting.shooting import Shooting
 from vmri_jax.mechanics.state import Problem
+from vmri_jax.mechanics.summary import summary
 from vmri_jax.refusals import Refused
 from vmri_jax.running.trajectory import Trajectory
 
@@ -24,6 +27,9 @@ STARTS_RANK_TOLERANCE = 1e-12
 direction is round-off. A larger one leaves real effects of the starts to the parameters."""
 DOUBTED_PROBABILITY = 1e-6
 """Probability of a chi^2 as large as that of the fit, below which the fit is doubted; a larger one doubts good fits."""
+LARGEST_CHANGE_BY_STEPS = 0.5
+"""Change of a parameter by steps of half the length, in its standard errors, above which the fit is doubted: intervals
+of 95 % that are off by this contain the parameter in 92 % of all cases. A larger one lets intervals miss it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +46,8 @@ class Fit:
         residuals: (m,) predicted minus measured values, in standard deviations.
         freedom: degrees of freedom, m - p.
         sigma: 1, or the estimated standard deviation of the values.
+        change_by_half_steps: (p,) change of the parameters with steps of half the length, to first order; of a scheme
+            of order 2, three quarters of the error that the steps leave in the parameters.
         undetermined: in words, the combinations of parameters that the data does not determine.
         iterations: of the search.
         success: whether the search ended by its tolerance.
@@ -55,6 +63,7 @@ class Fit:
     residuals: Float[np.ndarray, "m"]
     freedom: int
     sigma: float
+    change_by_half_steps: Float[np.ndarray, "p"]
     undetermined: list[str]
     iterations: int
     success: bool
@@ -64,8 +73,8 @@ class Fit:
     again: Callable = field(repr=False)
 
     @classmethod
-    def of(cls, shooting: Shooting, u, misses, jacobians, **search: Any) -> "Fit":
-        """The fit at the end of a search; `jacobians` as of `_covariance`, and the other fields by name."""
+    def of(cls, shooting: Shooting, u, misses, jacobians, change, **search: Any) -> "Fit":
+        """The end of a search; `jacobians` as of `_covariance`, `change` by half the steps, the rest by name."""
         unknowns = shooting.unknowns
         parameters = {name: np.asarray(value) for name, value in unknowns.at(u).items()}
         numbers = np.asarray(unknowns.vector(parameters))
@@ -76,7 +85,7 @@ class Fit:
             sigma = float(np.sqrt(np.sum(misses**2) / max(freedom, 1)))
             misses = misses / sigma
         covariance, undetermined = _covariance(jacobians, numbers, unknowns.labels)
-        estimates = parameters, unknowns.labels, sigma**2 * covariance, misses, freedom, sigma, undetermined
+        estimates = parameters, unknowns.labels, sigma**2 * covariance, misses, freedom, sigma, change, undetermined
         return cls(*estimates, shooting=shooting, **search)
 
     @property
@@ -104,6 +113,8 @@ class Fit:
         """
         if not 0 < level < 1:
             raise Refused(f"intervals: level is {level}; it must lie between 0 and 1, e.g. 0.95.")
+        if self.doubts:
+            warnings.warn(f"intervals: the fit is doubted. {' '.join(self.doubts)}", UncertifiedWarning, stacklevel=2)
         tail = (1 + level) / 2
         q = stats.norm.ppf(tail) if self.shooting.knows_sigma else stats.t.ppf(tail, max(self.freedom, 1))
         pairs = zip(self.values, self.standard_errors.values(), strict=True)
@@ -137,7 +148,7 @@ class Fit:
 
     @property
     def doubts(self) -> list[str]:
-        """Reasons to doubt the fit, in sentences; its intervals say little then, and are not printed."""
+        """Reasons to doubt the fit, in sentences; intervals say little then: none are printed, `intervals` warns."""
         sentences = []
         if not self.success:
             remedies = "raise max_steps, start closer, fit a shorter time first, or cut the motion into segments"
@@ -146,8 +157,16 @@ class Fit:
             remedies = [] if len(self.squares) > 1 else ["starts=8"]
             remedies += [] if self.shooting.segments > 1 else ["segments=10, which cuts the motion into parts"]
             beside = f"the search may have ended beside the best parameters (try {' or '.join(remedies)}), or "
-            cause = f"{beside if remedies else ''}the model or sigma is not right"
+            cause = f"{beside if remedies else ''}the model, its steps or sigma are not right"
             sentences.append(f"Sigma does not explain the misses: {cause}.")
+        off = np.abs(self.change_by_half_steps) / np.sqrt(np.diag(self.covariance))
+        if np.max(off, initial=0.0) > LARGEST_CHANGE_BY_STEPS:
+            i = int(np.argmax(off))
+            change = f"{self.change_by_half_steps[i]:+.2g}, {off[i]:.2g} standard errors"
+            sentences.append(
+                f"The steps are too large for this data: half the steps would change {self.labels[i]} by {change}. "
+                "Take a smaller macro_dt, more micro steps, or a scheme of higher order."
+            )
         return sentences
 
     def __repr__(self) -> str:
@@ -167,9 +186,10 @@ class Fit:
         return "\n".join(lines + [f"The data does not determine {combination}." for combination in self.undetermined])
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Bootstrap:
-    """Fits to synthetic measurements.
+    """Fits to synthetic measurements, made by the model with the fitted parameters and the steps of the fit: whether
+    model and steps are right they do not show.
 
     Attributes:
         labels: names of the p numbers.
@@ -182,6 +202,11 @@ class Bootstrap:
     truth: Float[np.ndarray, "p"]
     estimates: Float[np.ndarray, "repeats p"]
     errors: Float[np.ndarray, "repeats p"]
+
+    def __repr__(self) -> str:
+        scatter = zip(self.labels, self.truth, self.estimates.std(axis=0), strict=True)
+        lines = {label: f"{x:.6g}, estimates scatter by {s:.2g}" for label, x, s in scatter}
+        return summary(f"Bootstrap of {len(self.estimates)} fits", lines | {"see": "coverage(), estimates, errors"})
 
     def coverage(self, level: float = 0.95) -> dict[str, float]:
         """The fraction of the intervals of this level that contain the truth, by label."""

@@ -9,7 +9,6 @@ With the mass matrix ``M = d2T/dv2`` these are linear in the accelerations a and
 where gamma is the second derivative of g in time without acceleration.
 """
 
-from collections.abc import Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -73,17 +72,17 @@ def motion(system: System, state: State) -> Motion:
     return Motion(v_s, v_f, a[:n_s], a[n_s:], multipliers)
 
 
-def reaction_forces(system: System, state: State, constraints: Sequence[Sequence[int]]):
+def reaction_forces(system: System, state: State, chosen):
     """Forces ``-G^T lambda`` (m, n_s + n_f) of m constraints, and (m, n_s + n_f) whether each acts on each coordinate.
 
     Args:
-        constraints: for each of them the indices of its rows among the rows of `constraint` and `slow_constraint`, joined.
+        chosen: (m, rows) for each of them which rows of `constraint` and `slow_constraint`, joined, are its rows. They are
+            values and no part of the program, so that one program computes the forces of every constraint.
     """
     jacobians = jax.jacrev(system.constraints, argnums=(1, 2))(state.t, state.q_s, state.q_f)
     jacobian, multipliers = jnp.concatenate(jacobians, axis=1), motion(system, state).multipliers
-    forces = [-multipliers[jnp.asarray(rows)] @ jacobian[jnp.asarray(rows)] for rows in constraints]
-    touched = [jnp.any(jacobian[jnp.asarray(rows)] != 0, axis=0) for rows in constraints]
-    return jnp.stack(forces), jnp.stack(touched)
+    forces = -jnp.where(chosen, multipliers, 0.0) @ jacobian
+    return forces, jnp.any(jnp.asarray(chosen)[:, :, None] & (jacobian != 0), axis=1)
 
 
 def powers(system: System, state: State):

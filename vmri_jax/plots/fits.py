@@ -12,7 +12,7 @@ DEVIATIONS_OF_95_PERCENT = 1.96
 
 
 def plot_fit(fit: Any, *, title: str = "", theme: Theme = LIGHT) -> NotebookFigure:
-    """Residuals against time, their distribution, and the correlations of the parameters.
+    """Residuals against time, their distribution, and the correlations of several parameters.
 
     Args:
         fit: result of `vmri_jax.fit`.
@@ -20,7 +20,8 @@ def plot_fit(fit: Any, *, title: str = "", theme: Theme = LIGHT) -> NotebookFigu
         theme: colours.
     """
     with new_figure(11, 3.6, title, theme) as figure:
-        over_time, spread, correlation = figure.subplots(1, 3, width_ratios=[2, 1, 1.2])
+        widths = [2, 1, 1.2] if len(fit.labels) > 1 else [2, 1]
+        over_time, spread, *correlations = figure.subplots(1, len(widths), width_ratios=widths)
         first = 0
         for number, m in enumerate(fit.shooting.data):
             is_number = np.isfinite(m.values)
@@ -37,11 +38,12 @@ def plot_fit(fit: Any, *, title: str = "", theme: Theme = LIGHT) -> NotebookFigu
         spread.plot(x, stats.norm.pdf(x))
         spread.set(xlabel="miss / sigma", title="their distribution", yticks=[])
 
-        errors = np.sqrt(np.diag(fit.covariance))
-        image = correlation.imshow(fit.covariance / np.outer(errors, errors), vmin=-1, vmax=1, cmap="RdBu")
-        correlation.set_xticks(range(len(fit.labels)), fit.labels, rotation=45, ha="right")
-        correlation.set_yticks(range(len(fit.labels)), fit.labels)
-        correlation.set_title("correlations")
-        correlation.grid(False)
-        figure.colorbar(image, ax=correlation)
+        for correlation in correlations:
+            errors = np.sqrt(np.diag(fit.covariance))
+            image = correlation.imshow(fit.covariance / np.outer(errors, errors), vmin=-1, vmax=1, cmap="RdBu")
+            correlation.set_xticks(range(len(fit.labels)), fit.labels, rotation=45, ha="right")
+            correlation.set_yticks(range(len(fit.labels)), fit.labels)
+            correlation.set_title("correlations")
+            correlation.grid(False)
+            figure.colorbar(image, ax=correlation)
     return figure

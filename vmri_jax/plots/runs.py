@@ -112,7 +112,12 @@ def plot_forces(trajectory: SavedRun, title: str = "", theme: Theme = LIGHT) -> 
 
 WITHOUT_CURVES = "Joints that carry bodies have no curves here: scene.by_directors(run).plot_forces() draws all joints."
 """Line below the forces of a scene in joint coordinates."""
-UNITS = {"force": "N", "torque": "N m", "generalised force": "N, or N m for an angle"}
+UNITS = {
+    "reaction force": "N",
+    "torque about centres": "N m",
+    "torque on angles": "N m",
+    "generalised force": "N, or N m for an angle",
+}
 """Units of reactions in a system in m, kg and s."""
 
 
@@ -121,13 +126,17 @@ def _moduli(run: SavedRun) -> dict[str, dict[str, np.ndarray]]:
     names, panels = run.names, {unit: {} for unit in UNITS}
     for constraint, by_body in run.reaction_forces().items():
         for body, force in by_body.items():
-            kind = "torque" if body in names.angles else "generalised force" if body in names.numbered else "force"
+            kind = "generalised force" if body in names.numbered else "reaction force"
+            kind = "torque on angles" if body in names.angles else kind
             reactions = {kind: force}
             if body in names.rigid:
                 # (k, directors, 3): the first three entries are of the centre
                 both = (np.asarray(a)[:, 3:].reshape(len(force), -1, 3) for a in (force, run.position(body)))
                 pulls, directors = both
-                reactions = {"force": force[:, :3], "torque": np.cross(directors, pulls).sum(axis=1)}
+                reactions = {
+                    "reaction force": force[:, :3],
+                    "torque about centres": np.cross(directors, pulls).sum(axis=1),
+                }
             for unit, reaction in reactions.items():
                 curves, modulus = panels[unit], np.linalg.norm(reaction, axis=1)
                 curves[constraint] = np.maximum(curves.get(constraint, 0.0), modulus)
@@ -136,7 +145,7 @@ def _moduli(run: SavedRun) -> dict[str, dict[str, np.ndarray]]:
         for name, size in largest.items():
             if not size > LEAST_SHOWN * max(largest.values()):
                 del curves[name]
-    return {f"reaction {unit}\n{UNITS[unit]} in SI units": curves for unit, curves in panels.items() if curves}
+    return {f"{unit}\n{UNITS[unit]} in SI units": curves for unit, curves in panels.items() if curves}
 
 
 def position_panels(run: SavedRun) -> list[tuple[np.ndarray, list[str], str, np.ndarray | None]]:
@@ -224,7 +233,7 @@ def _energy_balance(above: Axes, below: Axes, trajectory: SavedRun, theme: Theme
     below.axhspan(-work.uncertainty, work.uncertainty, color=theme.faint, label="not resolved\nby the nodes")
     below.set_ylabel("energy balance")
     if trajectory.micro is None:
-        terms = "schemes with kicks: terms of $H^2$, a drift among them, without Save(micro=True)"
+        terms = "a scheme with kicks adds terms of $H^2$, a drift among them; Save(micro=True) avoids them"
         below.set_title(terms, fontsize=7.5)
     legend_beside(below, size=7.5)
     _not_below_roundoff(below.yaxis, energy)

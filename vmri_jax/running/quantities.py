@@ -9,6 +9,7 @@ import numpy as np
 
 from vmri_jax.mechanics import invariants
 from vmri_jax.mechanics.arrays import is_concrete
+from vmri_jax.mechanics.checks import check_flags
 from vmri_jax.mechanics.kinematics import JOINTS, Kinematics
 from vmri_jax.mechanics.motion import motion, powers, reaction_forces
 from vmri_jax.mechanics.names import Names, unknown
@@ -204,13 +205,18 @@ class Quantities(ABC):
         """
         run = _concrete("reaction_forces", self.whole())
         names = run.names
-        rows = {name: tuple(rows) for name, rows in names.rows.items() if constraint in (None, name)}
+        rows = {name: list(rows) for name, rows in names.rows.items() if constraint in (None, name)}
         if not rows:
             hint = " Joints that carry bodies have no rows; scene.by_directors(run) gives the run that has."
             known = "" if constraint is None else unknown("constraint", constraint, names.rows)
             missing = known or "the system has no constraints."
             raise Refused(f"reaction_forces: {missing}{hint if names.carried else ''}")
-        forces, touched = at_nodes(reaction_forces, run.origin, _states(run, micro), tuple(rows.values()))
+        states = _states(run, micro)
+        chosen = np.zeros((len(rows), sum(map(len, names.rows.values()))), dtype=bool)
+        for of_constraint, numbers in zip(chosen, rows.values(), strict=True):
+            of_constraint[numbers] = True
+        chosen = np.broadcast_to(chosen, (*np.shape(states.t), *chosen.shape))  # at every node
+        forces, touched = at_nodes(_reaction_forces, run.origin, (states, chosen))
         first = {"s": 0, "f": run.states.q_s.shape[-1]}
         by_constraint: dict[str, dict] = {name: {} for name in rows}
         for body, (part, start, size) in names.bodies.items():
@@ -293,8 +299,13 @@ def _of_bodies(system: System, state: State, kinematics: Kinematics, kind: str):
     return kinematics.momenta(*q, *v, system.params)
 
 
+def _reaction_forces(system: System, node: tuple[State, Any]):
+    return reaction_forces(system, *node)
+
+
 def _states(run: SavedRun, micro: bool, with_start: bool = False) -> State:
     """The states at the saved nodes, or at all micro nodes, with or without the start."""
+    check_flags(micro=micro)
     if not micro:
         return run.states
     reason = why_not(run.t, run.t_micro)

@@ -24,6 +24,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from vmri_jax.mechanics.checks import check_flags
 from vmri_jax.refusals import Refused
 from vmri_jax.running.export import FILL
 from vmri_jax.running.files import check_writable, clear_partial, explained, made_beside, replaced, synchronize
@@ -64,6 +65,7 @@ def rows_per_chunk(rows: int, seconds: float, size: int, most_chunks: int) -> fl
 
 def check_place(caller: str, path: Path, kind: str, resume: bool, overwrite: bool) -> None:
     """Refuse a place where no store of a kind can be made, or where one is that shall neither go on nor be replaced."""
+    check_flags(**{f"{caller}: resume": resume, f"{caller}: overwrite": overwrite})
     if resume and overwrite:
         raise Refused(f"{caller}: both resume and overwrite are true; choose one of them.")
     if not path.resolve().parent.is_dir():
