@@ -20,6 +20,7 @@ Terms of slow variables alone, such as `System.slow_kinetic`, belong to no inter
 These are the equations of `vmri_jax.schemes.equations`, in the order in which a march over the intervals meets them.
 """
 
+from collections.abc import Callable
 from copy import copy
 from dataclasses import replace
 from functools import partial
@@ -202,13 +203,8 @@ class Intervals:
         def with_masses(term: TermOnNodes) -> TermOnNodes:
             if "v_s" not in term.arguments:
                 return term
-            number, matrix = (2, masses) if "v_f" in term.arguments else (1, of_slow)
-
-            def energy(*arguments):
-                v = jnp.concatenate(arguments[-number:])
-                return _quadratic_form(matrix, v)
-
-            return replace(term, integrand=energy)
+            number, form = (2, _quadratic_form(masses)) if "v_f" in term.arguments else (1, _quadratic_form(of_slow))
+            return replace(term, integrand=lambda *arguments: form(jnp.concatenate(arguments[-number:])))
 
         by_masses = copy(self)
         by_masses._terms = [(with_masses(term), nodes) for term, nodes in self._terms]
@@ -332,17 +328,19 @@ class Intervals:
         return (rows, jax.vmap(equations.system.g_slow)(times[1:], nodes[1:])), p_s
 
 
-@jax.custom_jvp
-def _quadratic_form(matrix, v):
-    """``v^T M v / 2`` of a symmetric matrix, whose derivative by v is M v: JAX would take the sum with the transposed product."""
-    return v @ matvec(matrix, v) / 2
+def _quadratic_form(matrix) -> Callable:
+    """``v -> v^T M v / 2`` of a symmetric matrix M, with the derivative M v: JAX would take the sum with the transposed product."""
 
+    @jax.custom_jvp
+    def energy(v):
+        return v @ matvec(matrix, v) / 2
 
-@_quadratic_form.defjvp
-def _slope(arguments, tangents):
-    (matrix, v), (_, dv) = arguments, tangents
-    row = matvec(matrix, v)
-    return v @ row / 2, row @ dv
+    @energy.defjvp
+    def _(v, dv):
+        row = matvec(matrix, *v)
+        return v[0] @ row / 2, row @ dv[0]
+
+    return energy
 
 
 def _where_there_are_nodes(nodes: IntervalNodes, m, function, *paths):
