@@ -234,13 +234,6 @@ def test_rayleigh_damping_is_the_matrix():
         scene.without("springs")
 
 
-def test_rayleigh_damping_of_a_spring_in_a_joint():
-    bar, hinge = RigidBody("bar", 2.0, [1.0, 1.0, 1.0], [0.0, 0.0, 0.0]), Revolute(("ground", "bar"), at=[0, 0, 0])
-    effects = [hinge, JointSpring(hinge.name, 3.0), RayleighDamping(stiffness=0.02)]
-    system, none = Scene([bar], effects, coordinates="joint").system(), jnp.zeros(0)
-    assert float(system.forces(0.0, jnp.array([0.4]), none, jnp.array([2.0]), none)[0][0]) == pytest.approx(-0.12)
-
-
 def test_drawing_is_plain_data():
     scene = Scene(
         [
