@@ -16,6 +16,7 @@ from vmri_jax.scene import (
     Gravity,
     JointSpring,
     NBodyGravity,
+    PlaneContact,
     RayleighDamping,
     Revolute,
     RigidBody,
@@ -209,3 +210,14 @@ def test_copies_of_the_numbers_of_bodies_are_not_changed_alone(coordinates):
     with pytest.raises(Refused, match=r"params: gravity.mass is .*Tracer"):
         jax.eval_shape(replaced, params["gravity"])
     assert jax.eval_shape(lambda all_params: system.replace(params=all_params).params, params) is not None
+
+
+@pytest.mark.compiles
+def test_the_length_of_a_normal_changes_nothing():
+    contact: Any = PlaneContact(point=[0.0, 0.0], normal=[0.0, 2.0], stiffness=1e3, smoothing=0.1)
+    system: Any = Scene([Body("a", 1.0, [0.3, 0.05], pace="slow")], [contact]).system()
+    q, none = jnp.array([0.3, 0.05]), jnp.zeros(0)
+    depth = 0.1 * np.log1p(np.exp(-0.5))
+    for normal in ([0.0, 2.0], [0.0, 6.0]):
+        params = system.params | {contact.name: system.params[contact.name] | {"normal": jnp.array(normal)}}
+        assert float(system.slow_potential(q, none, params)) == pytest.approx(1e3 / 2 * depth**2, rel=1e-12)
