@@ -73,7 +73,8 @@ class PlaneContact(_Contact):
 
     def drawing(self):
         params = self.parameters
-        plane = {name: params[name].tolist() for name in ("point", "normal")}
+        normal = params["normal"] / np.linalg.norm(params["normal"])
+        plane = {"point": params["point"].tolist(), "normal": normal.tolist()}
         return super().drawing() | {"planes": [plane]}
 
 
