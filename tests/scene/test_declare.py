@@ -2,12 +2,26 @@
 
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from vmri_jax import fully_implicit, simulate
-from vmri_jax.scene import Body, Effect, Scene
+from vmri_jax import Refused, fully_implicit, initial_state, simulate, simulate_batch
+from vmri_jax.mechanics.slots import free, leaves_by_name
+from vmri_jax.scene import (
+    Body,
+    Coulomb,
+    Effect,
+    Gravity,
+    JointSpring,
+    NBodyGravity,
+    PlaneContact,
+    RayleighDamping,
+    Revolute,
+    RigidBody,
+    Scene,
+)
 from vmri_jax.scene.declare import array, common, names, number, positive, vector
 
 
@@ -137,3 +151,73 @@ def test_incomplete_classes_of_effects_say_what_they_lack():
             cls(("a", "b"))
     magnets: Any = type("Magnets", (Effect,), dict(body))
     assert magnets(("a", "b")).name == "magnets"
+
+
+ENDS = {"point_a", "point_b", "frame_a", "frame_b"}
+COPIES = {
+    "gravity": {"mass"},
+    "nbody_gravity": {"mass_a", "mass_b"},
+    "coulomb": {"charge_a", "charge_b"},
+    "rayleigh_damping": {"mass_of"},
+    "joint_springs": ENDS,
+}
+"""Numbers of bodies, charges and joints that effects have in their params."""
+HELD = {
+    "directors": {"hinge": {"factors", "offsets"}},
+    "joint": {"mass": {"slow", "fast"}, "kinematics": {"turn", "slide", "zero"}},
+}
+
+
+@pytest.mark.compiles
+@pytest.mark.parametrize("coordinates", HELD)
+def test_copies_of_the_numbers_of_bodies_are_not_changed_alone(coordinates):
+    bodies = [
+        RigidBody("bar", 2.0, [1.0, 1.0, 1.0], [0.0, 0.0, 0.0]),
+        *(Body(name, 1.0, [x, 0.0, 0.0]) for name, x in (("a", 1.0), ("b", 2.0))),
+    ]
+    effects = [
+        Revolute(("ground", "bar"), at=[0, 0, 0], name="hinge"),
+        JointSpring("hinge", 3.0),
+        Gravity(),
+        NBodyGravity(1.0, ["a", "b"]),
+        Coulomb({"a": 1.0, "b": 2.0}),
+        RayleighDamping(mass=0.1),
+    ]
+    problem = Scene(bodies, effects, coordinates=coordinates).problem()
+    system, params = problem.system, problem.system.params
+    names_of, _ = leaves_by_name(params)
+    copies = {f"{name}.{key}" for name, keys in (COPIES | HELD[coordinates]).items() for key in keys}
+    assert set(names_of) - set(free(names_of)) == copies
+    for copy in copies - {"mass.fast"}:  # which is empty: all bodies are slow
+        effect, key = copy.split(".")
+        changed = params | {effect: params[effect] | {key: np.asarray(params[effect][key]) + 1.0}}
+        with pytest.raises(Refused, match=f"params: {copy} is "):
+            system.replace(params=changed)
+        with pytest.raises(Refused, match=f"params: {copy} is "):
+            system.with_params(changed)
+
+    twice = jax.tree.map(lambda value: np.stack([value, value]), params)
+    steps = {"macro_dt": 0.1, "num_steps": 1}
+    for name in ("gravity.mass", "coulomb.charge_a"):
+        effect, key = name.split(".")
+        changed = {name: twice[effect][key] * [[1.0], [2.0]] if np.ndim(params[effect][key]) else np.array([1.0, 2.0])}
+        with pytest.raises(Refused, match=f"params: {name} is "):
+            simulate_batch(problem, fully_implicit(1), initial_state(problem), params=changed, **steps)
+
+    def replaced(weight):
+        return system.replace(params=params | {"gravity": weight}).params
+
+    with pytest.raises(Refused, match=r"params: gravity.mass is .*Tracer"):
+        jax.eval_shape(replaced, params["gravity"])
+    assert jax.eval_shape(lambda all_params: system.replace(params=all_params).params, params) is not None
+
+
+@pytest.mark.compiles
+def test_the_length_of_a_normal_changes_nothing():
+    contact: Any = PlaneContact(point=[0.0, 0.0], normal=[0.0, 2.0], stiffness=1e3, smoothing=0.1)
+    system: Any = Scene([Body("a", 1.0, [0.3, 0.05], pace="slow")], [contact]).system()
+    q, none = jnp.array([0.3, 0.05]), jnp.zeros(0)
+    depth = 0.1 * np.log1p(np.exp(-0.5))
+    for normal in ([0.0, 2.0], [0.0, 6.0]):
+        params = system.params | {contact.name: system.params[contact.name] | {"normal": jnp.array(normal)}}
+        assert float(system.slow_potential(q, none, params)) == pytest.approx(1e3 / 2 * depth**2, rel=1e-12)

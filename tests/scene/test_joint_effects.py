@@ -14,6 +14,7 @@ from vmri_jax.scene import (
     JointLimit,
     JointMotion,
     JointSpring,
+    RayleighDamping,
     Revolute,
     RigidBody,
     Scene,
@@ -91,3 +92,10 @@ def test_a_list_of_joints_is_refused():
     bodies, effects = bars()
     with pytest.raises(TypeError, match=r"joint_springs: joint is \['spring', 'free'\]"):
         Scene(bodies, [*effects[:-4], JointSpring(["spring", "free"], 1.0)]).system()
+
+
+def test_rayleigh_damping_of_a_spring_in_a_joint():
+    bar, hinge = RigidBody("bar", 2.0, [1.0, 1.0, 1.0], [0.0, 0.0, 0.0]), Revolute(("ground", "bar"), at=[0, 0, 0])
+    effects = [hinge, JointSpring(hinge.name, 3.0), RayleighDamping(stiffness=0.02)]
+    system, none = Scene([bar], effects, coordinates="joint").system(), jnp.zeros(0)
+    assert float(system.forces(0.0, jnp.array([0.4]), none, jnp.array([2.0]), none)[0][0]) == pytest.approx(-0.12)

@@ -32,7 +32,7 @@ def below_a_cart(hold) -> Scene:
 
 
 WAYS = {
-    "guided cart": [Guide("cart", cart, params=PARAMS), RigidLink(("cart", "bob"))],
+    "guided cart": [Guide("cart", cart, PARAMS), RigidLink(("cart", "bob"))],
     "custom constraint": [Constraint(level, "cart", PARAMS, timed=True), RigidLink(("cart", "bob"))],
     "moving pivot": [MovingPivot("bob", cart, params=PARAMS)],
 }

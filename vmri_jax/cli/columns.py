@@ -15,7 +15,7 @@ import numpy as np
 
 from vmri_jax.ensembles.columns import SCHEMES, START, STEPS, Row, columns_of_problems
 from vmri_jax.mechanics.names import Names, near
-from vmri_jax.mechanics.slots import leaves_by_name
+from vmri_jax.mechanics.slots import free, leaves_by_name
 from vmri_jax.mechanics.state import Problem
 from vmri_jax.refusals import Refused
 
@@ -45,7 +45,7 @@ def by_name(problem: Problem, columns: Sequence[str]) -> ByName | None:
     known, places = _known(problem), {}
     for name in columns_of_problems(columns):
         if name not in known:
-            listed = [other for other in known if "[" not in other]
+            listed = [other for other in free(known) if "[" not in other]
             raise Refused(
                 f"the column {name!r} sets no number of the problem.{near(name, [*known, *STEPS, *SCHEMES])} There are "
                 f"{', '.join([*listed, *STEPS, *SCHEMES])}, and numbers of arrays, {START[1]}[0] for example."

@@ -15,7 +15,7 @@ from vmri_jax.fitting.shooting import Shooting
 from vmri_jax.fitting.unknowns import Unknown, Unknowns
 from vmri_jax.mechanics.arrays import whole_number
 from vmri_jax.mechanics.checks import check_type
-from vmri_jax.mechanics.slots import leaves_by_name
+from vmri_jax.mechanics.slots import free, leaves_by_name
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
 from vmri_jax.refusals import Refused
 from vmri_jax.running.export import extra
@@ -119,7 +119,7 @@ def _model(problem, parameters: Mapping) -> Callable[[Mapping], Problem]:
     known, structure = leaves_by_name(params, is_leaf=lambda value: not isinstance(value, Mapping))
     for name, unknown in parameters.items():
         if name not in known and name not in START:
-            places = f"system.params ({', '.join(known) or 'no dict'}) nor of {', '.join(START)}"
+            places = f"system.params ({', '.join(free(known)) or 'no dict'}) nor of {', '.join(START)}"
             raise Refused(f"fit: parameters has {name!r}, which is none of {places}. A function may make the Problem.")
         expected = np.shape(known[name] if name in known else getattr(base, name))
         start = unknown.start if isinstance(unknown, Unknown) else unknown

@@ -36,12 +36,13 @@ from jax.custom_derivatives import SymbolicZero
 
 from vmri_jax.kernels import matmul
 from vmri_jax.mechanics.rows import Part, Place, Rows
+from vmri_jax.mechanics.slots import Computed
 
 GROUND = -1
 """The number of the root that does not move."""
-JOINTS = "kinematics"
+JOINTS = Computed("kinematics")
 """Key of the joint constants in the params of a system."""
-MASS = "mass"
+MASS = Computed("mass")
 """Key of the masses of body coordinates in the params of a system; its entries are "slow" and "fast"."""
 SIZE = 12
 """Number of coordinates of a body on a joint: centre and directors."""

@@ -10,7 +10,7 @@ import numpy as np
 
 from vmri_jax.mechanics.kinematics import Kinematics
 from vmri_jax.mechanics.rows import Part, Place
-from vmri_jax.mechanics.slots import Slots
+from vmri_jax.mechanics.slots import Slots, free
 from vmri_jax.mechanics.system import System
 from vmri_jax.refusals import Refused
 
@@ -206,11 +206,11 @@ def unknown(kind: str, name: Any, known: Iterable[str]) -> str:
     Args:
         kind: of the objects with names, e.g. "body".
     """
-    known = list(known)
+    known = free(known)
     return f"there is no {kind} {name!r}.{near(name, known)} There are {', '.join(known) or 'none'}."
 
 
 def near(name: Any, known: Iterable[str]) -> str:
     """A question with the most similar known name; empty if no name is similar."""
-    close = difflib.get_close_matches(str(name), list(known), n=1)
+    close = difflib.get_close_matches(str(name), free(known), n=1)
     return f" Did you mean {close[0]}?" if close else ""

@@ -1,14 +1,14 @@
 """The one map from names to the entries of a flat vector."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import jax
 import numpy as np
 
-from vmri_jax.mechanics.arrays import library, real_array
+from vmri_jax.mechanics.arrays import is_concrete, library, real_array
 from vmri_jax.refusals import Refused
 
 
@@ -94,10 +94,51 @@ class Slots:
         return library(pieces).concatenate([*pieces, library(pieces).zeros(0)])
 
 
+class Computed(str):
+    """Key of a parameter that is computed from numbers of which a system has other copies, such as the mass in the weight of a body.
+
+    A change of this parameter alone belongs to no scene, see `check_computed`.
+    """
+
+    __slots__ = ()
+
+
 def leaves_by_name(tree: Any, is_leaf: Callable[[Any], bool] | None = None) -> tuple[dict[str, Any], Any]:
-    """The leaves of a pytree of parameters by their names, ``springs.stiffness``, and its structure."""
+    """The leaves of a pytree of parameters by their names, ``springs.stiffness``, and its structure.
+
+    The name of a leaf is `Computed` if one of its keys is.
+    """
     leaves, structure = jax.tree.flatten_with_path(tree, is_leaf)
-    return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}, structure
+    names = (jax.tree_util.keystr(path, simple=True, separator=".") for path, _ in leaves)
+    computed = (any(isinstance(getattr(key, "key", None), Computed) for key in path) for path, _ in leaves)
+    kept = (Computed(name) if is_computed else name for name, is_computed in zip(names, computed, strict=True))
+    return {name: leaf for name, (_, leaf) in zip(kept, leaves, strict=True)}, structure
+
+
+def free(names: Iterable[str]) -> list[str]:
+    """The names of parameters that may be changed alone."""
+    return [name for name in names if not isinstance(name, Computed)]
+
+
+def check_computed(params: Any, changed: Any) -> None:
+    """Refuse params of a system whose `Computed` numbers are changed; a leading axis of lanes with equal numbers changes nothing.
+
+    Where all numbers are traced, as in the derivative with respect to all params, nothing shows whether they change.
+    """
+    leaves, _ = leaves_by_name(changed)
+    if not any(map(is_concrete, leaves.values())):
+        return
+    for name, old in leaves_by_name(params)[0].items():
+        new = leaves.get(name, old)
+        if not isinstance(name, Computed) or new is old or not is_concrete(old):
+            continue
+        fits = is_concrete(new) and np.shape(new)[np.ndim(new) - np.ndim(old) :] == np.shape(old)
+        if not (fits and np.all(np.asarray(new) == np.asarray(old))):
+            raise Refused(
+                f"params: {name} is {new}, and the system has {old}: the scene computes this number from its bodies and from fields of its "
+                "effects, and has other copies of these. Make a scene with other bodies or fields instead, one for each value; jax.jit, grad "
+                "and vmap may trace them, if every body has a pace and every potential a rate."
+            )
 
 
 def _repeats(shape: tuple[int, ...], whole: tuple[int, ...]) -> bool:

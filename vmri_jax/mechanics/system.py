@@ -19,6 +19,7 @@ from vmri_jax.mechanics.functions import (
 )
 from vmri_jax.mechanics.masses import ConstantMass
 from vmri_jax.mechanics.order import Order, order_of
+from vmri_jax.mechanics.slots import check_computed
 from vmri_jax.mechanics.summary import numbers, parameters, summary
 from vmri_jax.mechanics.surroundings import name_of
 from vmri_jax.mechanics.terms import KINDS, Term, label
@@ -173,11 +174,21 @@ class System(eqx.Module):
         return {**words, "params": parameters(self.params)}
 
     def replace(self, **changes) -> "System":
-        """The same system with some fields changed, e.g. ``system.replace(params=new)``."""
+        """The same system with some fields changed, e.g. ``system.replace(params=new)``.
+
+        Raises:
+            ValueError: changed numbers that a scene computes, see `with_params`.
+        """
+        check_computed(self.params, changes.get("params"))
         return dataclasses.replace(self, **changes)
 
     def with_params(self, params) -> "System":
-        """The same system with other parameters, without the checks of the constructor, which take a millisecond."""
+        """The same system with other parameters, without the checks of the constructor, which take a millisecond.
+
+        Raises:
+            ValueError: changed numbers that a scene computes from its bodies and has other copies of, such as ``gravity.mass``.
+        """
+        check_computed(self.params, params)
         system = object.__new__(type(self))
         for name, value in {**vars(self), "params": params}.items():
             object.__setattr__(system, name, value)

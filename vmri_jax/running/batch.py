@@ -17,7 +17,7 @@ from jax.sharding import PartitionSpec
 from vmri_jax.mechanics.arrays import options_of_runs, whole_number
 from vmri_jax.mechanics.checks import check_params
 from vmri_jax.mechanics.names import unknown
-from vmri_jax.mechanics.slots import leaves_by_name
+from vmri_jax.mechanics.slots import check_computed, leaves_by_name
 from vmri_jax.mechanics.state import Movable, State, initial_state, opened, start_of
 from vmri_jax.mechanics.system import System
 from vmri_jax.refusals import Refused
@@ -187,7 +187,9 @@ def _with_lanes(all_params, params, start: State, macro_dt) -> tuple[Any, State,
     *of_params, t, q_s, q_f, p_s, p_f, steps = whole
     if all(map(is_repeated, whole)):  # the user gave such views, and `jax.vmap` wants an axis
         t = np.array(t)
-    return jax.tree.unflatten(structure, of_params), State(t, q_s, q_f, p_s, p_f), steps
+    new_params = jax.tree.unflatten(structure, of_params)
+    check_computed(all_params, new_params)
+    return new_params, State(t, q_s, q_f, p_s, p_f), steps
 
 
 def _check_devices(devices, chunk) -> None:

@@ -8,6 +8,7 @@ from typing import Any, ClassVar, Literal, Self
 
 from vmri_jax.mechanics.arrays import library
 from vmri_jax.mechanics.rows import Place, Rows
+from vmri_jax.mechanics.slots import Computed
 from vmri_jax.refusals import Refused
 from vmri_jax.scene.body import GROUND, Attachment, Bodies, Point, body_of, end_of, label_of, moving, weights_of
 from vmri_jax.scene.declare import Declared, Elements, Parameter, real_tree, stacked
@@ -38,7 +39,7 @@ class Bindable(Declared, ABC):
     masses: ClassVar[tuple[str, ...]] = ()
     """Names of parameters that hold the masses of the bodies, one for each role."""
     derived: ClassVar[tuple[str, ...]] = ()
-    """Names of parameters that are computed from fields and bodies, and have an entry for each element."""
+    """Names of parameters that are computed from fields and bodies, and have an entry for each element. As `masses`, they are `Computed`."""
     whole: ClassVar[bool] = False
     """Whether the function gets all coordinates of a rigid body instead of the coordinates of its centre."""
     name: str = field(default="", kw_only=True)
@@ -84,7 +85,9 @@ class Bindable(Declared, ABC):
     @cached_property
     def parameters(self) -> dict[str, Any]:
         """The params of the function: arrays by name; of NumPy unless an entry is traced."""
-        return self._parameters()
+        params = self._parameters()
+        copies = {name: Computed(name) for name in (*self.masses, *self.derived)} if isinstance(params, dict) else {}
+        return {copies.get(name, name): value for name, value in params.items()} if copies else params
 
     @cached_property
     def ends(self) -> tuple[tuple[Point, ...], ...]:

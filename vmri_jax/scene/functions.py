@@ -14,10 +14,11 @@ import numpy as np
 from vmri_jax.mechanics.kinematics import JOINTS, MASS, Kinematics
 from vmri_jax.mechanics.masses import WithMassMatrix
 from vmri_jax.mechanics.rows import Entries
+from vmri_jax.mechanics.slots import Computed
 from vmri_jax.mechanics.terms import KINDS
 from vmri_jax.scene.terms import total, totals
 
-IMPLIED = "implied"
+IMPLIED = Computed("implied")
 """Key of params that holds the sizes of the dropped rows."""
 RESERVED = {
     MASS: "the masses",

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.mechanics.arrays import library, real_array
+from vmri_jax.mechanics.arrays import real_array
 from vmri_jax.scene.body import end_of
 from vmri_jax.scene.declare import array, common, names, number, positive
 from vmri_jax.scene.effect import Effect
@@ -63,12 +63,8 @@ class PlaneContact(_Contact):
     @staticmethod
     def function(q, params):
         (q,) = q
-        return penalty(jnp.sum(params["normal"] * (q - params["point"]), axis=-1) - params["radius"], params)
-
-    def _parameters(self):
-        params = super()._parameters()
-        normal = params["normal"]
-        return params | {"normal": normal / library(normal).linalg.norm(normal)}
+        height = jnp.sum(params["normal"] * (q - params["point"]), axis=-1) / jnp.linalg.norm(params["normal"])
+        return penalty(height - params["radius"], params)
 
     def check_parameters(self):
         normal = real_array(f"{self.name}: normal", self.normal)
@@ -77,7 +73,8 @@ class PlaneContact(_Contact):
 
     def drawing(self):
         params = self.parameters
-        plane = {name: params[name].tolist() for name in ("point", "normal")}
+        normal = params["normal"] / np.linalg.norm(params["normal"])
+        plane = {"point": params["point"].tolist(), "normal": normal.tolist()}
         return super().drawing() | {"planes": [plane]}
 
 

@@ -32,6 +32,7 @@ class _Coupling(OfFreedoms):
     law: ClassVar[Any]
     """The equation ``g(x, params)`` of the freedoms x (n,)."""
     kind = "constraint"
+    derived = ("joints",)
 
     @abstractmethod
     def numbers(self) -> Any:

@@ -118,7 +118,8 @@ class RayleighDamping(Effect):
         for name in names:
             if name not in potentials:
                 raise Refused(f"{self.name}: {unknown('potential', name, potentials)}")
-        return replace(self, of=tuple(potentials[name] for name in names))
+        # a potential in a joint has the joint itself, too, before its terms are asked for
+        return replace(self, of=tuple(potentials[name].resolved(effects).bound(self.by_name) for name in names))
 
     def _elements(self):
         return tuple((name,) for name in self.by_name)

@@ -4,7 +4,6 @@ Each computes the vector x between both ends; ``law(x, params)`` of a derived cl
 """
 
 from collections.abc import Callable
-from dataclasses import field
 from typing import Any, ClassVar
 
 import jax
@@ -93,10 +92,9 @@ class ToFixedPoint(ToPoint):
 
 
 class ToPath(ToPoint):
-    """Between each body and a point that moves along a path."""
+    """Between each body and a point that moves along a path; derived classes declare the `params` of the path as their last field."""
 
     path: Callable = of_time()
-    params: Any = field(default_factory=dict, kw_only=True)
 
     dimensions = (1, 2, 3)
     timed = True
@@ -107,7 +105,7 @@ class ToPath(ToPoint):
         return cls.law(q - path(t, params["path"]), params)
 
     def point_at_start(self, params):
-        return self.path(np.zeros(()), real_tree(f"{self.name}: params", self.params))
+        return self.path(np.zeros(()), real_tree(f"{self.name}: params", vars(self)["params"]))
 
     def check_bodies(self):
         super().check_bodies()

@@ -1,5 +1,6 @@
 """Springs and rigid links between points, to fixed points and to moving points; bodies with a prescribed motion."""
 
+from dataclasses import field
 from typing import Any
 
 import jax.numpy as jnp
@@ -107,6 +108,7 @@ class MovingAnchor(ToPath):
     """
 
     stiffness: Any = positive()
+    params: Any = field(default_factory=dict)
 
     kind = "force"
     default_name = "moving_anchors"
@@ -171,6 +173,8 @@ class MovingPivot(_Rigid, ToPath):
         params: of `path`.
     """
 
+    params: Any = field(default_factory=dict)
+
     default_name = "moving_pivots"
     advice = "move one of them, or take Guide"
 
@@ -183,6 +187,8 @@ class Guide(ToPath):
         path: a, ``path(t, params) -> (d,)``, which starts at the body.
         params: of `path`.
     """
+
+    params: Any = field(default_factory=dict)
 
     kind = "constraint"
     is_analytic = True
