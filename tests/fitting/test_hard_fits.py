@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 
 import vmri_jax as vm
-from tests.fitting.test_fit import CHAIN, DT, SCHEME, measured, product
+from tests.fitting.test_fit import CHAIN, DT, SCHEME, measured, product, spring
 from tests.support import PROBLEMS
 from vmri_jax.fitting import Unknown
+from vmri_jax.fitting.shooting import Shooting
+from vmri_jax.fitting.unknowns import Unknowns
 
 
 def fit_of_long_motion(**options):
@@ -30,6 +32,8 @@ def test_long_motion_in_several_parts():
     assert fit.values[0] == pytest.approx(20.0, abs=5 * fit.standard_errors["omega"])
     assert fit.gap < 1e-6
     assert "10 segments" in str(fit)
+    assert not fit.doubts
+    assert "The parts do not join" in str(replace(fit, gap=1e-3))
     again = fit.bootstrap(2)
     np.testing.assert_allclose(again.errors[:, 0], fit.standard_errors["omega"], rtol=0.01)
     assert np.all(np.abs(again.estimates - again.truth) < 5 * again.errors)
@@ -40,6 +44,19 @@ def test_several_starts_find_the_best_one():
     fit = vm.fit(CHAIN, measured(), start, scheme=SCHEME, macro_dt=DT, starts=12, spread=0.2)
     assert fit.squares.shape == (12,)
     assert fit.values[0] == pytest.approx(20.0, abs=5 * fit.standard_errors["omega"])
+
+
+def test_coordinates_at_rest_do_not_make_their_units_tiny():
+    """Of a point that falls along one axis, but for 1e-9 of its speed; in other units of lengths and masses, too."""
+    sizes = []
+    for unit, mass in ((1.0, 1.0), (1e3, 1e-3)):
+        system = vm.System(vm.ConstantMass([], [mass, mass]), spring, params={"stiffness": np.array(1.0)})
+        problem = vm.Problem(system, [], [unit, 0.0])
+        unknowns, steps = Unknowns({"stiffness": Unknown(1.0)}), [np.arange(21)]
+        shooting = Shooting(lambda _, problem=problem: problem, unknowns, [], steps, SCHEME, vm.Solver(), DT, 2)
+        sizes.append(shooting.sizes(np.zeros(1), unit * np.array([[0.9, 1e-10, -2.0, 2e-9]])) / unit)
+    np.testing.assert_allclose(sizes[0], [1.0, 1e-3, 2.0, 2e-3])  # 1e-3 of the speed, times half a second for positions
+    np.testing.assert_allclose(sizes[1], sizes[0])
 
 
 @pytest.mark.full

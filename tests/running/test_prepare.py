@@ -1,6 +1,7 @@
 """Prepared runs: the same as `simulate`, compiled once for other starts, steps, parameters and numbers of steps."""
 
 from collections import Counter
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -131,5 +132,6 @@ def test_short_floats_are_refused(fpu):
     with pytest.raises(ValueError, match=r"params\['omega'\] has dtype float32; give float64"):
         run(params={"omega": np.float32(30.0)})
     short = jax.tree.map(lambda a: np.asarray(a, dtype=np.float32), fpu.state())
-    with pytest.raises(ValueError, match=r"q_s has dtype float32; give float64"):
-        run(short)
+    for state, name in ((short, "the t of state"), (replace(short, t=0.0), "q_s")):
+        with pytest.raises(ValueError, match=f"{name} has dtype float32; give float64"):
+            run(state)

@@ -158,9 +158,7 @@ class _Search:
             raise Refused(f"fit: {self.count} values for {self.size} unknown numbers; measure more, or fix some.")
         u_start = np.zeros(self.size)
         self.part_starts = shooting.starts(u_start)
-        # The starts of the parts are scaled by the largest value of each coordinate along the first run.
-        scale = np.abs(np.concatenate([self.part_starts, np.asarray(shooting.start(u_start))[None]])).max(axis=0)
-        self.scale = np.where(scale > 0, scale, scale.max() or 1.0)
+        self.scale = shooting.sizes(u_start, self.part_starts)
 
     def residual(self, x, args):
         """Misses of all values in standard deviations, and weighted gaps between the parts, at x = (u, z): search
@@ -189,7 +187,7 @@ class _Search:
             return solution.value, (solution.stats["num_steps"], good)
 
         (u, z), (iterations, good) = jax.lax.scan(stage, (u, z), weights)
-        misses, gaps = self.residual((u, z), (values, 1.0))
+        misses, gaps = self.residual((u, z), (values, 1 / np.sqrt(self.count)))
         return u, z, misses, jnp.sum(iterations), good[-1], jnp.max(jnp.abs(gaps), initial=0.0)
 
     def jacobian(self, u, z, values):

@@ -27,6 +27,9 @@ STARTS_RANK_TOLERANCE = 1e-12
 direction is round-off. A larger one leaves real effects of the starts to the parameters."""
 DOUBTED_PROBABILITY = 1e-6
 """Probability of a chi^2 as large as that of the fit, below which the fit is doubted; a larger one doubts good fits."""
+LARGEST_GAP = 1e-4
+"""Gap between parts, relative to the motion, above which a fit is doubted: searches that end well leave below 1e-6. A
+larger value lets pass a motion that jumps between the parts."""
 LARGEST_CHANGE_BY_STEPS = 0.5
 """Change of a parameter by steps of half the length, in its standard errors, above which the fit is doubted: intervals
 of 95 % that are off by this contain the parameter in 92 % of all cases. A larger one lets intervals miss it."""
@@ -153,6 +156,9 @@ class Fit:
         if not self.success:
             remedies = "raise max_steps, start closer, fit a shorter time first, or cut the motion into segments"
             sentences.append(f"The search did not end by its tolerance: {remedies}.")
+        if self.gap > LARGEST_GAP:
+            jump = f"the largest gap is {self.gap:.1e} of the motion"
+            sentences.append(f"The parts do not join, {jump}: start closer, raise max_steps, or take fewer segments.")
         if self.probability < DOUBTED_PROBABILITY:
             remedies = [] if len(self.squares) > 1 else ["starts=8"]
             remedies += [] if self.shooting.segments > 1 else ["segments=10, which cuts the motion into parts"]

@@ -19,12 +19,18 @@ import numpy as np
 from vmri_jax.accuracy.simulate import simulate
 from vmri_jax.fitting.measured import Measured
 from vmri_jax.fitting.unknowns import Unknowns
+from vmri_jax.mechanics.constraints import known_mass
 from vmri_jax.mechanics.invariants import velocity
 from vmri_jax.mechanics.state import Problem, State, initial_state
 from vmri_jax.running.arguments import Save
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.solver import Solver
+
+SMALLEST_SIZE = 1e-3
+"""Smallest size of a coordinate in a search, relative to the velocity that the kinetic energy of the motion allows it.
+Where a coordinate hardly moves, a smaller value makes the search ill-conditioned, so that it ends while the parts have
+gaps; a larger one weighs the gaps of light bodies less."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,6 +104,18 @@ class Shooting:
         run = simulate(problem, self.scheme, **steps, solver=self.solver)
         nodes = jax.tree.map(lambda a: np.asarray(a)[1:-1], run.states)
         return np.asarray(jax.vmap(partial(_phase, problem))(nodes))
+
+    def sizes(self, u, starts) -> np.ndarray:
+        """(2 n,) units of the starts of the parts in a search: the largest value of each coordinate at all starts, or
+        SMALLEST_SIZE of its bound for a coordinate that hardly moves. The units of coordinates and masses cancel."""
+        problem, phases = self.model(self.unknowns.at(u)), np.concatenate([np.asarray(self.start(u))[None], starts])
+        mass = known_mass(problem.system, problem.q_s, problem.q_f)
+        v = phases[:, len(mass) :]
+        # |v_i| <= sqrt((M^-1)_ii v^T M v), and in the time of a part q_i changes by this velocity times the time
+        fastest = np.sqrt(np.diag(np.linalg.inv(mass)) * np.max(np.sum(v @ mass * v, axis=1)))
+        bounds = np.concatenate([self.length * self.macro_dt * fastest, fastest])
+        size = np.maximum(np.abs(phases).max(axis=0), SMALLEST_SIZE * bounds)
+        return np.where(size > 0, size, size.max() or 1.0)
 
     def predict(self, u, starts):
         """Predicted values (m,), and gaps (segments - 1, 2 n): the end of each part minus the start of the next one."""
