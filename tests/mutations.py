@@ -102,7 +102,7 @@ def main(
     """Run the tests with each mutation; exit status 1 if one survives."""
     mutations = table((ROOT / "tests/data/mutations.txt").read_text())
     for mutation in mutations:
-        mutation.into(ROOT)
+        compile(mutation.into(ROOT)[2], mutation.file, "exec")
         for name in mutation.tests:
             assert (ROOT / "tests" / name).exists(), f"tests/data/mutations.txt: {mutation}\nThere is no tests/{name}."
     chosen = [mutation for mutation in mutations if not numbers or mutation.number in numbers]
