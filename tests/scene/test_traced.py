@@ -19,6 +19,7 @@ from vmri_jax.scene import (
     Revolute,
     RigidBody,
     Scene,
+    Spring,
     SpringAnchor,
 )
 
@@ -121,3 +122,21 @@ def test_names_hold_in_a_trace():
     assert jax.grad(end)(3.0) == pytest.approx(float(slope), rel=1e-8)  # measured 2e-9
     assert np.allclose(jax.vmap(end)(jnp.array([2.99, 3.01])), [end(2.99), end(3.01)], rtol=1e-14, atol=0)
     assert refused
+
+
+def test_a_run_by_lengths_and_masses_has_a_derivative():
+    """Four slow coordinates and no fast one: a joint and a point."""
+
+    def end(numbers):
+        length, mass, stiffness = numbers
+        center = jnp.stack([length / 2, 0.0 * length, 0.0 * length])
+        bar = RigidBody("bar", mass, jnp.stack([mass, mass, mass / 2]), center, pace="slow")
+        weight = Body("weight", 2 * mass, 2 * center - jnp.array([0.0, 0.0, 0.4]), pace="slow")
+        hinge = Revolute(("ground", "bar"), at=[0, 0, 0], axis=[0, 1.0, 0], name="hinge")
+        springs = JointSpring("hinge", stiffness, 0.2), Spring((("bar", center), "weight"), stiffness, 0.4)
+        scene = Scene([bar, weight], [hinge, *springs, Gravity()], coordinates="joint")
+        return vm.simulate(scene, vm.fully_implicit(1), macro_dt=0.02, num_steps=5).position("bar")[-1, 2]
+
+    at, step = np.array([0.8, 1.2, 30.0]), 1e-5
+    slopes = [(end(at + change) - end(at - change)) / (2 * step) for change in step * np.eye(3)]
+    assert np.allclose(jax.grad(end)(jnp.asarray(at)), slopes, rtol=1e-6, atol=1e-9)

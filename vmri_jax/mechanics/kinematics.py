@@ -139,6 +139,8 @@ class Kinematics:
             joints: the constants in the axes of the roots: "turn" T (n, 4, 3) and "slide", the first row of S (n, 3),
                 of all links, "zero" Z (n, 4, 3) of all bodies.
         """
+        if not self.bodies:
+            return q_s, q_f
         frames, _ = self._against_roots(q_s, q_f, joints)
         slow, roots = sum(body.part == "s" for body in self.bodies), [body.root for body in self.bodies]
         frames = after(frames, self._roots(q_s, q_f, roots)) if set(roots) != {GROUND} else frames
@@ -167,9 +169,13 @@ class Kinematics:
             masses: m of Q_s or Q_f; those of a body on joints are equal along each of its directors.
             part: of Q; all bodies on joints belong to it.
         """
+        n_s, n_f = self.sizes
+        n, own, around = n_s + n_f, n_s if part == "s" else n_f, (0, n_f) if part == "s" else (n_s, 0)
+        of_coordinates = jnp.diag(jnp.pad(masses[:own], around))
+        if not self.bodies:
+            return of_coordinates
         frames, twists = self._against_roots(q_s, q_f, joints)
-        (links, roots), (n_s, n_f) = self._columns, self.sizes
-        n, own = n_s + n_f, n_s if part == "s" else n_f
+        links, roots = self._columns
         # G_b = A_b^T m_b A_b
         rows = jnp.concatenate([jnp.broadcast_to(np.eye(4)[:, :1], (len(frames), 4, 1)), frames], axis=2)
         of_rows = masses[own:].reshape(-1, 4, 3)[:, :, :1]
@@ -181,7 +187,7 @@ class Kinematics:
         composite = matmul(self._behind, of_bodies).reshape(n, 4, 4)
         momenta = matmul(composite, columns.reshape(n, 4, 3)).reshape(n, SIZE)
         half = matmul(columns, momenta.T) * (self._on_way + np.eye(n) / 2)
-        return half + half.T + jnp.diag(jnp.pad(masses[:own], (0, n_f) if part == "s" else (n_s, 0)))
+        return half + half.T + of_coordinates
 
     def velocities(self, q_s, q_f, v_s, v_f, joints: dict[str, Any]):
         """Rates of (Q_s, Q_f)."""

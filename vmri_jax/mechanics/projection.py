@@ -124,9 +124,10 @@ def _with_masses(system: System, state, guess):
         masses, gradient = mass_and_momentum(system, q_s, q_f, v[:n_s], v[n_s:])
     if is_quadratic:
         v, impulse = _by_one_solve(masses, p - gradient, *constraints)  # p = M v + dT/dv(0)
+    momenta = state.p_s, state.p_f
     if jacobian.shape[0]:
-        p = p - impulse
-    return p[:n_s], p[n_s:], v[:n_s], v[n_s:], masses
+        momenta = state.p_s - impulse[:n_s], state.p_f - impulse[n_s:]
+    return *momenta, v[:n_s], v[n_s:], masses
 
 
 def _by_one_solve(masses, p, jacobian, rates):
