@@ -50,7 +50,8 @@ def final_position(case: str, solver: vm.Solver | None = None):
 
     def function(stiffness, v, q_f, macro_dt) -> jax.Array:
         system = problem.system.replace(params=replaced(stiffness))
-        state = vm.initial_state(problem.system, problem.q_s, problem.q_f, v[:n_s], v[n_s:])
+        project = problem.system.is_constrained
+        state = vm.initial_state(problem.system, problem.q_s, problem.q_f, v[:n_s], v[n_s:], project=project)
         state = vm.State(state.t, state.q_s, q_f, state.p_s, state.p_f)
         run = vm.simulate(system, scheme, state, macro_dt=macro_dt, num_steps=10, save=5, solver=solver)
         return jnp.sum(jnp.cos(run.q_f[-1] * jnp.arange(1, run.q_f.shape[1] + 1)))
