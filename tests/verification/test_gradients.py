@@ -24,7 +24,7 @@ CASES = {  # problem, scheme, macro_dt, name and entry of the parameter
 }
 FALLS_BACK = "chain, fully implicit"
 """The case with the fallback in its program."""
-LONG = ("chain, gauss 2", "fpu, fully implicit", "tsp, fully implicit", "sam, fully implicit")
+LONG = ("fpu, fully implicit", "tsp, fully implicit", "sam, fully implicit")
 
 
 def central_difference(function, x, step):
