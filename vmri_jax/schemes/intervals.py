@@ -206,7 +206,7 @@ class Intervals:
 
             def energy(*arguments):
                 v = jnp.concatenate(arguments[-number:])
-                return v @ matvec(matrix, v) / 2
+                return _quadratic_form(matrix, v)
 
             return replace(term, integrand=energy)
 
@@ -330,6 +330,19 @@ class Intervals:
         rows = jnp.concatenate([(equations.micro_dt * equations.p_s + start - d.sum(0))[None], d[:-1]]) - impulses
         p_s = equations.p_s + (start - impulses.sum(0)) / equations.micro_dt
         return (rows, jax.vmap(equations.system.g_slow)(times[1:], nodes[1:])), p_s
+
+
+@jax.custom_jvp
+def _quadratic_form(matrix, v):
+    """``v^T M v / 2`` of a symmetric matrix, whose derivative by v is M v: JAX would take the sum with the transposed product."""
+    return v @ matvec(matrix, v) / 2
+
+
+@_quadratic_form.defjvp
+def _slope(arguments, tangents):
+    (matrix, v), (_, dv) = arguments, tangents
+    row = matvec(matrix, v)
+    return v @ row / 2, row @ dv
 
 
 def _where_there_are_nodes(nodes: IntervalNodes, m, function, *paths):
