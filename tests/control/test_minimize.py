@@ -41,13 +41,13 @@ def pull(q_s, q_f, u, params):
     return params["strength"] * u, 0 * q_f
 
 
-def point(steps: int, strength: float = 1.0, **options):
+def point(steps: int, strength: float = 1.0, goal=at_rest_at_one, **options):
     return minimize(
         point_of(strength),
         effort,
         actuate=pull,
         num_controls=1,
-        goal=at_rest_at_one,
+        goal=goal,
         scheme=vm.fully_explicit(1),
         macro_dt=1 / steps,
         num_steps=steps,
@@ -69,6 +69,21 @@ def test_a_double_integrator():
     np.testing.assert_allclose(optimum.multipliers, [-12, 6], rtol=1.5 / steps**2)
     assert abs(optimum.cost - 6) < 12 / steps**2
     assert "converged" in str(optimum)
+
+
+def miss(state):
+    return 3 * jnp.sum((state.q_s - 1.0) ** 2) / 2
+
+
+def test_a_final_cost_instead_of_a_goal():
+    """The least of ``int u^2 / 2 + 3 (x(1) - 1)^2 / 2`` is ``x(1) = 3 W / (1 + 3 W)`` and ``J = 3 / 2 / (1 + 3 W)``, with the sum
+    ``W = sum_k H (1 - t_k)^2`` over the middles t_k of the intervals, exact for controls that are constant in them."""
+    steps = 10
+    optimum = point(steps, goal=None, final_cost=miss)
+    W = np.mean((1 - (np.arange(steps) + 0.5) / steps) ** 2)
+    assert optimum.success
+    assert optimum.trajectory.q_s[-1, 0] == pytest.approx(3 * W / (1 + 3 * W), rel=1e-12)
+    assert optimum.cost == pytest.approx(1.5 / (1 + 3 * W), rel=1e-12)
 
 
 def springs(q_s, q_f, params):

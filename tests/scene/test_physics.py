@@ -20,7 +20,7 @@ from vmri_jax.scene import (
     SpringAnchor,
 )
 
-STIFFNESS, DAMPING, DRIVE, FORCE, G, DRAG = 9.0, 0.6, 2.0, 1.5, 9.81, 0.3
+STIFFNESS, DAMPING, DRIVE, PHASE, FORCE, G, DRAG = 9.0, 0.6, 2.0, 0.7, 1.5, 9.81, 0.3
 CONTACT, SMOOTHING = 200.0, 0.1
 
 
@@ -39,7 +39,7 @@ SCENE = Scene(
     [
         SpringAnchor(["damped", "driven"], 0.0, STIFFNESS),
         LinearDamping(DAMPING, "damped"),
-        HarmonicDrive("driven", FORCE, DRIVE),
+        HarmonicDrive("driven", FORCE, DRIVE, PHASE),
         MovingAnchor("pulled", wave, STIFFNESS, params={"frequency": DRIVE}),
         Gravity(G, ["falling", "bouncing"]),
         QuadraticDrag(DRAG, "falling"),
@@ -48,7 +48,7 @@ SCENE = Scene(
 )
 LAWS = {
     "damped": lambda t, q, v: -STIFFNESS * q - DAMPING * v,
-    "driven": lambda t, q, v: -STIFFNESS * q + FORCE * np.cos(DRIVE * t),
+    "driven": lambda t, q, v: -STIFFNESS * q + FORCE * np.cos(DRIVE * t + PHASE),
     "pulled": lambda t, q, v: -STIFFNESS * q + FORCE * np.cos(DRIVE * t),
     "falling": lambda t, q, v: -G - DRAG * np.abs(v) * v,
     "bouncing": lambda t, q, v: (

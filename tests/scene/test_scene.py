@@ -26,6 +26,7 @@ from vmri_jax.scene import (
     LennardJones,
     LinearDamping,
     MagneticField,
+    NonlinearSpring,
     PlaneContact,
     Potential,
     RayleighDamping,
@@ -197,11 +198,12 @@ def test_bodies_of_different_dimension_share_an_effect_on_single_ones():
     assert np.allclose(force, [-0.1, -0.2, -0.6, -0.3, -0.3])
 
 
-def test_all_pairs_and_dashpots_are_the_formulas():
+def test_pairs_nonlinear_springs_and_dashpots_are_the_formulas():
     points = np.random.default_rng(0).normal(size=(2, 4, 2))
     charges = dict(zip("abcd", [1.0, -2.0, 3.0, 0.5], strict=True))
     bodies = [Body(name, 1.0, q, v) for name, q, v in zip("abcd", *points, strict=True)]
-    scene = Scene(bodies, [Coulomb(charges, 2.0), Dashpot([("a", "b"), ("d", "b")], [0.3, 0.7])])
+    dashpots = Dashpot([("a", "b"), ("d", "b")], [0.3, 0.7])
+    scene = Scene(bodies, [Coulomb(charges, 2.0), NonlinearSpring(("a", "c"), (3.0, 0.5, 2.0), 0.7), dashpots])
     q, v = (jnp.asarray(p.reshape(-1)) for p in points)
     expected = sum(
         2 * charges[a] * charges[b] / np.linalg.norm(points[0, i] - points[0, j])
@@ -209,6 +211,8 @@ def test_all_pairs_and_dashpots_are_the_formulas():
         for j, b in enumerate("abcd")
         if i < j
     )
+    e = np.linalg.norm(points[0, 2] - points[0, 0]) - 0.7
+    expected += 3.0 * e**2 / 2 + 0.5 * e**3 / 3 + 2.0 * e**4 / 4
     none, params = jnp.zeros(0), scene.params
     assert scene.system().slow_potential(q, none, params) == pytest.approx(expected)
     force = np.zeros((4, 2))

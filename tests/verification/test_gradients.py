@@ -24,7 +24,7 @@ CASES = {  # problem, scheme, macro_dt, name and entry of the parameter
 }
 FALLS_BACK = "chain, fully implicit"
 """The case with the fallback in its program."""
-LONG = ("chain, gauss 2", "fpu, fully implicit", "tsp, fully implicit", "sam, fully implicit")
+LONG = ("fpu, fully implicit", "tsp, fully implicit", "sam, fully implicit")
 
 
 def central_difference(function, x, step):
@@ -50,7 +50,8 @@ def final_position(case: str, solver: vm.Solver | None = None):
 
     def function(stiffness, v, q_f, macro_dt) -> jax.Array:
         system = problem.system.replace(params=replaced(stiffness))
-        state = vm.initial_state(problem.system, problem.q_s, problem.q_f, v[:n_s], v[n_s:])
+        project = problem.system.is_constrained
+        state = vm.initial_state(problem.system, problem.q_s, problem.q_f, v[:n_s], v[n_s:], project=project)
         state = vm.State(state.t, state.q_s, q_f, state.p_s, state.p_f)
         run = vm.simulate(system, scheme, state, macro_dt=macro_dt, num_steps=10, save=5, solver=solver)
         return jnp.sum(jnp.cos(run.q_f[-1] * jnp.arange(1, run.q_f.shape[1] + 1)))
@@ -84,6 +85,8 @@ def test_gradient_with_respect_to_a_stiffness(case):
     expected = central_difference(value_by_argument(case, 0), at[0], 1e-3 * at[0])
     assert abs(expected) > 1e-9
     assert float(program(*at)[1][0]) == pytest.approx(expected, rel=2e-7)  # measured 1.6e-8, 1e-6 wanted
+    # derivatives have equations of their own, which move the value if they are others than those of the run
+    assert float(program(*at)[0]) == pytest.approx(float(final_position(case)[0](*at)), rel=1e-11)
 
 
 def test_gradient_with_respect_to_the_initial_velocities():
