@@ -113,13 +113,15 @@ class Simulation:
         run = self.with_arguments(state, macro_dt, params, num_steps)
         with Working("the run", running=STEPPING):
             saved = run._whole()
-        if run.unsolved(saved):
+        if saved.failed_at >= 0 and run.unsolved(saved):
             with Working(FALLING_BACK):
                 saved = run.exact._whole()
         trajectory = saved.trajectory(run)
         if throw and saved.failed_at >= 0:
             raise simulation_error(trajectory, run.macro_dt, run.save_every, run.scheme.num_micro)
-        run.tell_of_start("run", trajectory.states)
+        if run.state is not self.state or run.system is not self.system or not vars(self).get("has_told"):
+            vars(self)["has_told"] = True  # of a start: a further call with the same one is a short run
+            run.tell_of_start("run", trajectory.states)
         run.warn("run", saved.table, trajectory.states.t)
         return trajectory
 
