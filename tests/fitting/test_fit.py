@@ -9,13 +9,14 @@ import pytest
 import vmri_jax as vm
 from vmri_jax.fitting import Measured, Unknown
 from vmri_jax.fitting.unknowns import Unknowns
+from vmri_jax.schemes.composition import SchemeLike
 
 CHAIN = vm.systems.fermi_pasta_ulam(1, omega=20.0)
 SCHEME = vm.compose(vm.fully_explicit(2), "kahan-li8")  # of order 8: its steps leave no error in the parameters
 DT = 0.05
 
 
-def measured(steps=60, sigma=1e-3, seed=0, problem=CHAIN, dt=DT, scheme=SCHEME):
+def measured(steps=60, sigma=1e-3, seed=0, problem=CHAIN, dt=DT, scheme: SchemeLike = SCHEME):
     """Noisy positions of a run."""
     run = vm.simulate(problem, scheme, macro_dt=dt, num_steps=steps)
     q = np.concatenate([run.q_s, run.q_f], axis=1)

@@ -67,7 +67,8 @@ def test_lines_tell_tracing_and_compiling_from_stepping(quick, capsys):
         jax.monitoring.record_event_duration_secs("/jax/core/compile/backend_compile_duration", 0.2)
         time.sleep(0.2)
     lines = [line.split("(")[-1] for line in capsys.readouterr().err.splitlines()]
-    assert list(dict.fromkeys(lines)) == ["tracing)", "compiling)", "stepping)"]
+    # a slow machine may step for some milliseconds before the event of compiling
+    assert (lines[0], lines[-1], set(lines)) == ("tracing)", "stepping)", {"tracing)", "compiling)", "stepping)"})
 
 
 @pytest.mark.compiles

@@ -106,6 +106,7 @@ class KineticEnergy(_OfTerms, WithMassMatrix):
         return self.kinematics is not None and not self.terms
 
     def mass_matrix(self, q_s, q_f, params):
+        assert self.kinematics is not None
         if q_f is not None:
             return self.kinematics.mass_matrix(q_s, q_f, params[JOINTS], jnp.asarray(params[MASS]["fast"]), "f")
         n_s, n_f = self.kinematics.sizes
