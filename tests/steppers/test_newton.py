@@ -186,7 +186,7 @@ def test_slow_variable_that_only_sees_round_off():
 
 
 def test_round_off_of_coupled_masses_ends_the_iteration():
-    """Masses of condition number 1e8, as those of a chain of a hundred bars: corrections stay at 1e-10 of the increments."""
+    """Masses of condition number 1e8, like the masses of a chain of a hundred bars: corrections stay at 1e-10 of the increments."""
     lever = np.tril(np.ones((60, 60))).T @ np.tril(np.ones((60, 60)))
     masses = lever.T @ lever
 

@@ -85,7 +85,7 @@ def test_gradient_with_respect_to_a_stiffness(case):
     expected = central_difference(value_by_argument(case, 0), at[0], 1e-3 * at[0])
     assert abs(expected) > 1e-9
     assert float(program(*at)[1][0]) == pytest.approx(expected, rel=2e-7)  # measured 1.6e-8, 1e-6 wanted
-    # derivatives have equations of their own, which move the value if they are others than those of the run
+    # derivatives have equations of their own; if these differ from the equations of the run, the value differs, too
     assert float(program(*at)[0]) == pytest.approx(float(final_position(case)[0](*at)), rel=1e-11)
 
 

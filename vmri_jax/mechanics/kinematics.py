@@ -286,7 +286,7 @@ class Kinematics:
 
     @cached_property
     def _columns(self) -> tuple[np.ndarray, np.ndarray]:
-        """Of K (coordinates, SIZE): the matrix (coordinates, links) that puts those of links at their places, and those of roots."""
+        """Of the rows K_i: the matrix (coordinates, links) that puts the rows of links at their places, and the rows (coordinates, SIZE) of roots."""
         links, roots = self._numbers
         of_links, of_roots = np.zeros((sum(self.sizes), len(links))), np.zeros((sum(self.sizes), SIZE))
         of_links[links, np.arange(len(links))] = 1.0
@@ -305,7 +305,7 @@ class Kinematics:
 
     @cached_property
     def _on_way(self) -> np.ndarray:
-        """(coordinates, coordinates) 1 for each coordinate on the way to another one; of two of one root for the first."""
+        """(coordinates, coordinates) 1 for each coordinate on the way to another one; of two coordinates of one root, for the first."""
         on_way, (links, roots) = np.zeros((sum(self.sizes),) * 2), self._numbers
         on_way[np.ix_(links, links)] = self.before[len(self.bodies) :].T
         for k, numbers in enumerate(roots):

@@ -1,5 +1,6 @@
 """Constant masses: a mass matrix, stored as its diagonal if it is diagonal."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from typing import Any
 
@@ -95,17 +96,17 @@ class ConstantMass(eqx.Module):
         return self.slow_mass.solve(p_s), self.fast_mass.solve(p_f)
 
 
-class WithMassMatrix:
+class WithMassMatrix(ABC):
     """A kinetic energy that may have the form ``T = v^T M v / 2`` with masses M, functions of the positions, in closed form."""
 
     @property
+    @abstractmethod
     def has_mass_matrix(self) -> bool:
         """Whether it has this form."""
-        raise NotImplementedError
 
+    @abstractmethod
     def mass_matrix(self, q_s, q_f, params) -> Any:
         """M (n, n); of T_s, for which q_f is None, (n_s, n_s)."""
-        raise NotImplementedError
 
 
 def _masses(name: str, masses):

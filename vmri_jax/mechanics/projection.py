@@ -1,6 +1,7 @@
 """Projection of momenta onto the hidden constraints ``G v + dg/dt = 0``, with the velocities of the projected momenta."""
 
 from collections.abc import Iterable
+from dataclasses import replace
 from functools import partial
 
 import jax
@@ -10,6 +11,7 @@ from vmri_jax import kernels
 from vmri_jax.kernels import matmul, matvec
 from vmri_jax.kernels.band import Full, Sparsity
 from vmri_jax.kernels.saddle import saddle
+from vmri_jax.mechanics.arrays import quickly_compiled
 from vmri_jax.mechanics.constraint_pattern import all_rows
 from vmri_jax.mechanics.masses import WithMassMatrix
 from vmri_jax.mechanics.structure import has_constant_hessian
@@ -189,3 +191,10 @@ def _velocity_and_impulse(system: System, q_s, q_f, constraints, p, guess):
         v = v + d
     converged = size <= LARGEST_LAST_STEP
     return jnp.where(converged, v, jnp.nan), jnp.where(converged, impulse, jnp.nan)
+
+
+@quickly_compiled
+def at_same_velocities(system: System, other: System, state):
+    """The state of another system at the positions and velocities of a state, ``p = dT/dv``."""
+    _, _, *velocities, _ = project_momentum(system, state)
+    return replace(state, **dict(zip(("p_s", "p_f"), legendre(other, state.q_s, state.q_f, *velocities), strict=True)))

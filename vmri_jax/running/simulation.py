@@ -22,10 +22,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.configure import warn_if_slow
-from vmri_jax.mechanics.arrays import Known, is_concrete, of_one_type, quickly_compiled, whole_number
+from vmri_jax.mechanics.arrays import Known, is_concrete, of_one_type, whole_number
 from vmri_jax.mechanics.checks import check_arrays, check_number, check_params, check_type
 from vmri_jax.mechanics.names import Names
-from vmri_jax.mechanics.projection import legendre, project_momentum
+from vmri_jax.mechanics.projection import at_same_velocities
 from vmri_jax.mechanics.state import REPORTED_VIOLATION, Movable, State, opened, start_of
 from vmri_jax.mechanics.summary import numbers, summary
 from vmri_jax.mechanics.system import System
@@ -161,7 +161,7 @@ class Simulation:
                 raise Refused(f"params is {params!r}; give the pytree of system.params with other numbers in it.")
             changes["system"] = self.system.with_params(jax.tree.map(np.asarray, params))
             if state is None and self.of_problem and not self.system.has_constant_mass:
-                changes["state"] = _with_arrays(_at_same_velocities(self.system, changes["system"], self.state))
+                changes["state"] = _with_arrays(at_same_velocities(self.system, changes["system"], self.state))
         if num_steps is not None:
             if whole_number("run: num_steps", num_steps) % self.num_saves:
                 raise Refused(f"num_steps is {num_steps}; it must be a positive multiple of {self.num_saves}.")
@@ -278,15 +278,8 @@ class Simulation:
         return blank_memory(self._pieces, tuple((a.shape, a.dtype) for a in self.leaves))
 
     def _engine(self, num_saves: int) -> Engine:
-        without_length = replace(
-            self,
-            num_steps=0,
-            save_every=0,
-            save=Save(micro=self.save.micro),
-            names=None,
-            of_problem=False,
-            may_fall_back=True,
-        )
+        blank = {"num_steps": 0, "save_every": 0, "names": None, "of_problem": False, "may_fall_back": True}
+        without_length = replace(self, save=Save(micro=self.save.micro), **blank)
         return engine(jax.tree.structure(without_length), num_saves)
 
     @cached_property
@@ -388,13 +381,6 @@ def simulation(moving: Movable, scheme, state: State | None, solver: Solver | No
     chosen_solver, scheme, system = of_one_type((solver or _usual_solver(), scheme, system))
     motion = (_float(steps.macro_dt), _with_arrays(state), chosen_solver, scheme, system)
     return Simulation(*motion, num_steps, save_every, Save.of(steps.save), names_of(problem), of_problem)
-
-
-@quickly_compiled
-def _at_same_velocities(system: System, other: System, state: State) -> State:
-    """The state of another system at the positions and velocities of a state, ``p = dT/dv``."""
-    _, _, *velocities, _ = project_momentum(system, state)
-    return replace(state, **dict(zip(("p_s", "p_f"), legendre(other, state.q_s, state.q_f, *velocities), strict=True)))
 
 
 @cache
