@@ -152,7 +152,7 @@ def test_more_steps_than_there_may_be_are_not_tried(monkeypatch):
         ({"accuracy": 1e-3, "t_end": 1.0, "macro_dt": 0.1}, "got macro_dt with an accuracy"),
         ({"accuracy": 1e-3, "t_end": 1.0, "save": 2}, "got save=2 with an accuracy"),
         ({"t_end": 1.0, "macro_dt": 0.1}, "scheme is None without an accuracy"),
-        ({"accuracy": 1e-3, "t_end": 1.0, "save": vm.Save(adjoint="stored")}, "adjoint='stored'.* with an accuracy"),
+        ({"accuracy": 1e-3, "t_end": 1.0, "save": vm.Save(every=3)}, "every=3.* with an accuracy"),
     ],
 )
 def test_refused(arguments, message):

@@ -1,4 +1,4 @@
-"""The benchmark of gradients: a small system through all adjoints."""
+"""The benchmark of gradients, of a small system."""
 
 import pytest
 
@@ -7,11 +7,10 @@ from benchmarks import adjoints
 
 
 @pytest.mark.full
-def test_gradients_are_measured_and_agree():
+def test_gradients_are_measured():
     case = adjoints.Case("chain", lambda: vm.systems.fermi_pasta_ulam(1), 0.01)
     (report,) = adjoints.run(adjoints.Size((case,), 1), "quick")
-    short = {row["gradient"]: row for row in report.rows if row["steps"] == adjoints.SHORT}
-    assert set(adjoints.ADJOINTS) <= set(short)
-    assert all(short[name]["apart"] < adjoints.AGREEMENT for name in adjoints.ADJOINTS)
-    assert all(row["over a run"] > 1 for row in short.values())
-    assert len(report.claims) == 5
+    short, long = report.rows
+    assert (short["steps"], long["steps"]) == (adjoints.SHORT, adjoints.LONG)
+    assert short["over a run"] > 1
+    assert len(report.claims) == 2

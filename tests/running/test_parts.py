@@ -35,30 +35,26 @@ def on_a_rod(gravity, length):
 
 
 ONE = jnp.ones(())
-CASES = {  # system of a parameter, positions, scheme, adjoints
+CASES = {  # system of a parameter, positions, scheme
     "no fast part": (
         lambda k: vm.System(vm.ConstantMass([1.0], []), slow_spring, params=k),
         ([1.0], []),
         vm.fully_explicit(1),
-        ("stored",),
     ),
     "no slow part": (
         lambda k: vm.System(vm.ConstantMass([], [1.0]), fast_potential=fast_spring, params=k),
         ([], [1.0]),
         vm.fully_explicit(1),
-        ("checkpoint",),
     ),
     "solved": (
         lambda k: vm.System(vm.ConstantMass([1.0], []), slow_spring, params=k),
         ([1.0], []),
         vm.fully_implicit(1),
-        ("checkpoint",),
     ),
     "T(q, v)": (
         lambda k: vm.System(bead, fast_potential=fast_spring, params=k),
         ([], [0.5]),
         vm.fully_implicit(1),
-        ("checkpoint",),
     ),
 }
 MASSES = vm.Solver("masses")
@@ -69,9 +65,9 @@ STEPS = {"macro_dt": 0.1, "num_steps": 5}
 
 @pytest.fixture(autouse=True)
 def debug_nans(monkeypatch):
-    """`jax_debug_nans`, which must not stop sound runs; and checkpoints in parts in short runs."""
+    """`jax_debug_nans`, which must not stop sound runs; and adjoints in parts in short runs."""
     monkeypatch.setattr(loops, "MOST_UNDIVIDED", 3)
-    monkeypatch.setattr(engine, "MOST_STORED_STEPS", 1)
+    monkeypatch.setattr(engine, "MOST_STORED_NUMBERS", 0)
     engine.engine.cache_clear()  # programs without parts
     with jax.debug_nans(True):
         yield
@@ -85,17 +81,17 @@ def assert_derivative(program, step=1e-5, tolerance=1e-8):
     np.testing.assert_allclose(program(ONE)[1], difference, rtol=tolerance)
 
 
-def last_position(system, start, scheme, adjoint="auto", solver=None):
-    run = vm.simulate(system, scheme, start, save=vm.Save(adjoint=adjoint), solver=solver, **STEPS)
+def last_position(system, start, scheme, solver=None):
+    run = vm.simulate(system, scheme, start, solver=solver, **STEPS)
     return jnp.concatenate([run.q_s[-1], run.q_f[-1]])[0]
 
 
-@pytest.mark.parametrize(("name", "adjoint"), [(name, adjoint) for name in CASES for adjoint in CASES[name][-1]])
-def test_gradients_of_small_systems(name, adjoint):
-    system, (q_s, q_f), scheme, _ = CASES[name]
+@pytest.mark.parametrize("name", CASES)
+def test_gradients_of_small_systems(name):
+    system, (q_s, q_f), scheme = CASES[name]
     start = vm.Problem(system(1.0 * ONE), q_s, q_f).state()
     solver = MASSES if name in ONE_MATRIX else None
-    assert_derivative(jax.jit(jax.value_and_grad(lambda k: last_position(system(k), start, scheme, adjoint, solver))))
+    assert_derivative(jax.jit(jax.value_and_grad(lambda k: last_position(system(k), start, scheme, solver))))
 
 
 @pytest.mark.parametrize("project", [False, True])
@@ -104,7 +100,7 @@ def test_gradient_with_respect_to_the_length_of_a_rod(project):
 
     def position(length):
         problem = vm.Problem(on_a_rod(9.81 * ONE, length), [], [0.6, -0.8], project=project)
-        return last_position(problem, None, vm.fully_explicit(1), "checkpoint", solver=MASSES)
+        return last_position(problem, None, vm.fully_explicit(1), solver=MASSES)
 
     # 1e-7: a start that stays may violate the constraint by 1e-6
     assert_derivative(jax.jit(jax.value_and_grad(position)), step=1e-7, tolerance=1e-6)

@@ -172,7 +172,7 @@ class Shooting:
 
     def _run(self, problem: Problem, state: State):
         """Observed quantities at the saved nodes of a run of one part from a state, and its end (2 n,)."""
-        steps = {"macro_dt": self.macro_dt, "num_steps": self.length, "save": Save(self.every, adjoint="stored")}
+        steps = {"macro_dt": self.macro_dt, "num_steps": self.length, "save": Save(self.every)}
         nodes = simulate(problem.system, self.scheme, state, **steps, solver=self.solver).states
         observed = [jax.vmap(m.observe)(nodes) for m in self.data]
         return observed, _phase(problem, jax.tree.map(lambda a: a[-1], nodes))

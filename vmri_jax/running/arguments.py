@@ -17,7 +17,6 @@ from vmri_jax.steppers.solver import Solver
 WHOLE_NUMBER_TOLERANCE = 1e-9
 """Relative distance from a whole number up to which ``(t_end - t) / macro_dt`` counts as one. The end of a run misses t_end by at most this
 part of its length; a larger value lets runs end visibly beside t_end."""
-ADJOINTS = ("auto", "stored", "checkpoint")
 
 
 @dataclass(frozen=True)
@@ -30,20 +29,17 @@ class Save:
         every: macro steps from one saved node to the next; 1 where neither `every` nor `number` is given.
         number: in place of `every`, the number of saved intervals, equally spaced, of which there is one node more.
         micro: also keep the fast positions at the micro nodes of the macro step that ends at each saved node.
-        adjoint: states that a run keeps for derivatives, see `vmri_jax.running.engine`: "stored" for all modes, "checkpoint" for reverse
-            mode in little memory; "auto" chooses by length. Outside of transformations of JAX it changes nothing.
         progress: True for a bar of the nodes saved so far, or a function of (what, done, total); Ctrl-C then raises `Interrupted` with
             these nodes. With False a run that takes more than two seconds prints lines on the error stream.
 
     Raises:
-        ValueError: both `every` and `number`, a number below 1, an unknown adjoint.
+        ValueError: both `every` and `number`, a number below 1.
         TypeError: a flag that is neither True nor False.
     """
 
     every: int | None = None
     number: int | None = None
     micro: bool = False
-    adjoint: str = "auto"
     progress: ShowsProgress = False
 
     def __post_init__(self):
@@ -54,9 +50,6 @@ class Save:
             raise Refused(f"Save: got every = {self.every} and number = {self.number}; give one of them.")
         check_flags(micro=self.micro)
         check_progress("Save", self.progress)
-        if self.adjoint not in ADJOINTS:
-            known = ", ".join(map(repr, ADJOINTS))
-            raise Refused(f"Save: adjoint is {self.adjoint!r}; it must be one of {known}; jax.jacfwd needs 'stored'.")
 
     @classmethod
     def of(cls, save: "int | Save") -> "Save":

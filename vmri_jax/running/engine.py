@@ -5,12 +5,8 @@ Names: `save_every` macro steps lie between two saved nodes; `num_saves` saved i
 the first `saves` of them.
 
 The derivative of a step is the derivative of the root of its equations (`vmri_jax.steppers.newton.implicit`). Reverse mode visits
-the steps from the last to the first and needs the state at which each step started. Two adjoints provide this state:
-
-* *stored*: the run keeps the start of every step and the solution of its equations; works in forward and reverse mode, up to second
-  derivatives; third derivatives are NaN where equations are solved by iteration;
-* *checkpoint*: the run keeps the starts of some steps and computes the steps between them again, see `Adjoint`; works in reverse mode,
-  once.
+the steps from the last to the first and needs the state at which each step started, see `Adjoint`. Runs have derivatives in both modes, up to second
+ones; third derivatives are NaN where equations are solved by iteration.
 
 The fallback: what the first matrix of "auto" does not solve is solved again with exact matrices, in a program of its own. `unsolved` decides for all
 runs: for a step (`macro_step`), a run or a piece of it, the lanes of a batch, and runs under transformations of JAX (`solved_again`).
@@ -28,7 +24,7 @@ from jaxtyping import Float, Int
 
 from vmri_jax.mechanics.arrays import Numbers, options_of_runs
 from vmri_jax.mechanics.state import State
-from vmri_jax.running.loops import MOST_STORED_STEPS, Adjoint, plain
+from vmri_jax.running.loops import MOST_STORED_NUMBERS, Adjoint, plain
 from vmri_jax.running.observables import observed
 from vmri_jax.running.saved import Saved
 from vmri_jax.running.trajectory import RunInfo
@@ -83,7 +79,7 @@ class Engine:
         `is_first`: whether the memory of a first step replaces the memory of the cursor.
         """
         run: Any = jax.tree.unflatten(self.structure, leaves)
-        stepper, begin = run.stepper(), cursor or Cursor.at_start(run.state)
+        stepper, begin = run.plan, cursor or Cursor.at_start(run.state)
         memory = stepper.init(begin.state, run.macro_dt)
         if cursor is not None:
             memory = jax.tree.map(partial(jnp.where, is_first), memory, cursor.memory)
@@ -125,14 +121,14 @@ class Engine:
 
     @cached_property
     def differentiable(self):
-        """``differentiable(leaves, save_every, adjoint)``: a whole run as `Saved` without observables, by `jax.lax.scan`, which reverse mode can
+        """``differentiable(leaves, save_every)``: a whole run as `Saved` without observables, by `jax.lax.scan`, which reverse mode can
         differentiate; the numbers of steps are static."""
 
-        def by_scan(leaves: list, save_every: int, adjoint: str) -> Saved:
+        def by_scan(leaves: list, save_every: int) -> Saved:
             run: Any = jax.tree.unflatten(self.structure, leaves)
-            once = adjoint == "checkpoint"
-            loops = Adjoint(save_every, in_parts=once and self.num_saves * save_every > MOST_STORED_STEPS)
-            stepper = run.stepper(reverse_only=once)
+            numbers = sum(a.size for a in jax.tree.leaves(run.state)) * run.scheme.num_micro  # of a step, about
+            loops = Adjoint(save_every, in_parts=self.num_saves * save_every * numbers > MOST_STORED_NUMBERS)
+            stepper = run.plan
             interval = _interval(stepper, run, loops.repeat)
 
             def save(cursor: Cursor, _):
@@ -144,7 +140,7 @@ class Engine:
             first = _row(run.state, *_nothing(run))
             return Saved(jnp.concatenate([first[None], rows]), cursor.result, cursor.failed_at)
 
-        return jax.jit(by_scan, static_argnums=(1, 2))
+        return jax.jit(by_scan, static_argnums=1)
 
     @cached_property
     def observed(self):
@@ -169,7 +165,7 @@ def blank_memory(engine: Engine, shapes: tuple):
 
     def first_memory(leaves):
         run = jax.tree.unflatten(engine.structure, leaves)
-        return run.stepper().init(run.state, run.macro_dt)
+        return run.plan.init(run.state, run.macro_dt)
 
     blank = jax.eval_shape(first_memory, [jax.ShapeDtypeStruct(*shape) for shape in shapes])
     return jax.device_put(jax.tree.map(lambda a: np.zeros(a.shape, a.dtype), blank))

@@ -10,9 +10,9 @@ import jax.numpy as jnp
 
 from vmri_jax.steppers.solved import ROOT
 
-MOST_STORED_STEPS = 1000
-"""Most macro steps for which "checkpoint" keeps every state. A larger value takes more memory and saves the second computation of states
-in runs up to that length."""
+MOST_STORED_NUMBERS = 2**21
+"""Most numbers, 16 MB, of the states and solutions of all steps that an adjoint keeps. A larger value takes more memory, which the lanes of a batch
+multiply; with a smaller one shorter runs compute their steps twice."""
 MOST_UNDIVIDED = 100
 """Most turns of a loop that the adjoint in parts does not divide. A larger value takes more memory, and fewer loops compute states again."""
 

@@ -43,8 +43,6 @@ from vmri_jax.schemes.composition import SchemeLike
 from vmri_jax.steppers.plan import Plan, plan, with_rules_for
 from vmri_jax.steppers.solver import Solver
 
-LONGEST_STORED_RUN = 10_000
-"""Macro steps of the longest run for which the adjoint "auto" stores the start of every step; a larger value takes more memory."""
 PARTS_OF_A_BAR = 50
 """Parts of a run with a progress bar. More parts move the bar more smoothly, and each costs a call of some 30 microseconds."""
 STEPPING = "stepping"
@@ -184,12 +182,8 @@ class Simulation:
 
     def traced(self) -> Trajectory:
         """All steps of a run, some of whose arrays are tracers."""
-        adjoint = self.save.adjoint
-        if adjoint == "auto":
-            adjoint = "stored" if self.num_steps <= LONGEST_STORED_RUN else "checkpoint"
-
         def steps(run: Simulation) -> Callable[[list], Saved]:
-            return lambda leaves: run.engine.differentiable(leaves, run.save_every, adjoint)
+            return lambda leaves: run.engine.differentiable(leaves, run.save_every)
 
         def failed(saved: Saved):
             return unsolved(saved.result, self._method(saved))
@@ -243,14 +237,10 @@ class Simulation:
         """The columns of its saved nodes."""
         return Columns.of(self.state, self.scheme.num_micro if self.save.micro else 0)
 
-    def stepper(self, reverse_only: bool = False) -> Plan:
-        """The `Plan` that takes its steps."""
-        return plan(self.system, self.scheme, self.state, self.solver, reverse_only=reverse_only)
-
     @cached_property
     def plan(self) -> Plan:
-        """The `Plan`, which ``print`` shows in words."""
-        return self.stepper()
+        """The `Plan` that takes its steps; ``print`` shows it in words."""
+        return plan(self.system, self.scheme, self.state, self.solver)
 
     @cached_property
     def origin(self) -> Origin:

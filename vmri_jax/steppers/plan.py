@@ -55,14 +55,6 @@ spans; the keys k increase, start with 1, and each is a multiple of the one befo
 
 
 @dataclass(frozen=True)
-class _Choice:
-    """Settings of all parts of a step: the solver of the user, and whether steps are differentiated in reverse mode only, once."""
-
-    solver: Solver
-    reverse_only: bool
-
-
-@dataclass(frozen=True)
 class Plan:
     """A stepper with its system and scheme: ``memory = init(state, dt)``, then ``state, info, memory = step(state, memory, dt)``.
 
@@ -120,8 +112,6 @@ def plan(
     scheme: Scheme | Composition,
     state: State | None = None,
     solver: Solver | None = None,
-    *,
-    reverse_only: bool = False,
 ) -> Plan:
     """The plan of macro steps of a system under a scheme; ``print`` shows it in words.
 
@@ -131,7 +121,6 @@ def plan(
         state: any state of the system; only the shapes of its arrays matter.
         solver: for implicit equations, by default ``Solver()``. The plan of the matrix "auto" has the first matrix that the structure allows; runs
             solve again what it does not solve (`vmri_jax.running.engine`).
-        reverse_only: whether steps are differentiated in reverse mode only, once, in half the time.
 
     Raises:
         ValueError: a matrix that the system or the scheme does not allow; a scheme that the system does not allow.
@@ -140,9 +129,9 @@ def plan(
     solver, stage = solver or Solver(), stage_scheme(scheme)
     custom = None if solver.stepper is None else solver.stepper.called(system, stage)
     if solver.stepper is None or isinstance(custom, StepSolver):
-        stepper: Stepper = _whole_step(system, stage, _Choice(solver, reverse_only), state.q_s, state.q_f)
+        stepper: Stepper = _whole_step(system, stage, solver, state.q_s, state.q_f)
     else:
-        stepper = whole_step(custom, system, stage, _average(system, stage, _Choice(Solver(), reverse_only)))
+        stepper = whole_step(custom, system, stage, _average(system, stage, Solver()))
     if solver.stepper is not None:
         check_shapes(stepper, system, stage, state)
     if isinstance(scheme, Composition):
@@ -158,42 +147,42 @@ def _solvers(stepper: Stepper) -> list[StepSolver]:
     return [solver for part in inner for solver in _solvers(part)]
 
 
-def _whole_step(system: System, scheme: Scheme, choice: _Choice, q_s, q_f) -> Kicked:
+def _whole_step(system: System, scheme: Scheme, solver: Solver, q_s, q_f) -> Kicked:
     """Kicks, and the stepper between them."""
     kicks = lagrangian(system, scheme).kicks
-    average = _average(system, scheme, choice)
+    average = _average(system, scheme, solver)
     parts = _apart(system, scheme, q_s, q_f)
     if parts is not None:
-        between = _decoupled(system, scheme, choice, q_s, q_f, parts)
+        between = _decoupled(system, scheme, solver, q_s, q_f, parts)
         # Kicks of terms at the macro nodes alone stay here. All other terms, on the micro grid or with further nodes inside, belong to the
         # slow or the fast part, with their kicks.
         kicks = tuple(term for term in kicks if term.grid == "macro" and not term.inside.groups)
         return Kicked(kicks, between, average)
-    return Kicked(kicks, _between_kicks(system, scheme, choice, q_s, q_f), average)
+    return Kicked(kicks, _between_kicks(system, scheme, solver, q_s, q_f), average)
 
 
-def _between_kicks(system: System, scheme: Scheme, choice: _Choice, q_s, q_f) -> Stepper:
-    solver, can_be_nested, rows = choice.solver, _can_be_nested(system, scheme), all_rows(system, q_s, q_f)
+def _between_kicks(system: System, scheme: Scheme, solver: Solver, q_s, q_f) -> Stepper:
+    can_be_nested, rows = _can_be_nested(system, scheme), all_rows(system, q_s, q_f)
     _check_matrix(solver.matrix, system, scheme, can_be_nested)
     if _is_drift(system, scheme) and not system.is_constrained:
         return FreeFlight(system)
     if solver.stepper is not None:
         custom = solver.stepper.called(system, scheme)
-        return Solved(system, scheme, custom, rows, choice.reverse_only)
+        return Solved(system, scheme, custom, rows)
     if q_s.size and _joins(system, scheme, solver, q_s.size, q_f.size):
         (n_g, _), q = system.num_constraints(q_s, q_f), jnp.concatenate([q_s, q_f])
-        return Joined(_between_kicks(*joined(system, scheme, q_s.size), choice, jnp.zeros(0), q), q_s.size, n_g)
+        return Joined(_between_kicks(*joined(system, scheme, q_s.size), solver, jnp.zeros(0), q), q_s.size, n_g)
     if not can_be_nested or solver.matrix in ("exact", "null_space"):
         n_g, n_gs = system.num_constraints(q_s, q_f)
         first = "exact" if system.has_constant_mass else "masses"
         chosen = replace(solver, matrix=first) if solver.matrix == "auto" else solver
         marched = Marched(chosen, (q_s.size, n_gs, q_f.size, n_g, scheme.degree))
-        return Solved(system, scheme, marched, rows, choice.reverse_only)
+        return Solved(system, scheme, marched, rows)
     interval = Interval.of(system, scheme, q_s, q_f)
     if _is_linear(system, scheme, interval, q_s):
         return Linear(system, scheme, interval)
     approximate = _approximate(system, scheme, solver, interval, rows, q_s.size, q_f.size)
-    return Solved(system, scheme, approximate, rows, choice.reverse_only)
+    return Solved(system, scheme, approximate, rows)
 
 
 def _joins(system: System, scheme: Scheme, solver: Solver, n_s: int, n_f: int) -> bool:
@@ -301,15 +290,15 @@ def _apart(system: System, scheme: Scheme, q_s, q_f) -> Parts | None:
     return None if coupled else (slow, fast)
 
 
-def _decoupled(system: System, scheme: Scheme, choice: _Choice, q_s, q_f, potentials: Parts) -> Decoupled:
+def _decoupled(system: System, scheme: Scheme, solver: Solver, q_s, q_f, potentials: Parts) -> Decoupled:
     (of_slow, of_fast), none = potentials, jnp.zeros(0)
     slow, slow_scheme = slow_part(system, of_slow, num_fast=q_f.size)
     parts = {every: fast_part(system, further, num_slow=q_s.size) for every, further in of_fast.items()}
-    fast, length = _whole_step(*parts.pop(1), choice, none, q_f), 1
+    fast, length = _whole_step(*parts.pop(1), solver, none, q_f), 1
     for every, part in parts.items():
         fast = Kicked(lagrangian(*part).kicks, Repeated(fast, every // length))
         length = every
-    return Decoupled(_whole_step(slow, slow_scheme, choice, none, q_s), fast, scheme.num_micro // length)
+    return Decoupled(_whole_step(slow, slow_scheme, solver, none, q_s), fast, scheme.num_micro // length)
 
 
 def with_rules_for(system: System, scheme: Scheme | Composition) -> Scheme | Composition:
@@ -320,7 +309,7 @@ def with_rules_for(system: System, scheme: Scheme | Composition) -> Scheme | Com
     return replace(scheme, potentials={term.label: scheme.rule_of(term.name) for term in further})
 
 
-def _average(system: System, scheme: Scheme, choice: _Choice) -> Callable | None:
+def _average(system: System, scheme: Scheme, solver: Solver) -> Callable | None:
     """The filter of a mollified slow potential, None if the slow potential is not mollified."""
     if not scheme.slow.mollified:
         return None
@@ -338,6 +327,6 @@ def _average(system: System, scheme: Scheme, choice: _Choice) -> Callable | None
 
     def stepper_of(q_s, q_f) -> Kicked:
         alone, rules = frozen_slow(system, scheme, q_s)
-        return _whole_step(alone, rules, choice, jnp.zeros(0), q_f)
+        return _whole_step(alone, rules, solver, jnp.zeros(0), q_f)
 
     return average_over_fast_motion(stepper_of, scheme.num_micro)

@@ -19,7 +19,7 @@ from vmri_jax.mechanics.system import System
 from vmri_jax.schemes.equations import StepEquations, Unknowns
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.accept import NO_WEIGHTS, Weights
-from vmri_jax.steppers.newton.implicit import differentiable, differentiable_reverse_only
+from vmri_jax.steppers.newton.implicit import differentiable
 from vmri_jax.steppers.stepper import StepInfo, Stepper, StepStatus
 
 ROOT = "root"
@@ -97,14 +97,12 @@ class Solved(Stepper):
     never differentiated.
 
     sparsity: of ``G M^-1 G^T`` with all constraints.
-    reverse_only: allows one derivative in reverse mode only, in half the time.
     """
 
     system: System
     scheme: Scheme
     solver: StepSolver
     sparsity: Sparsity
-    reverse_only: bool = False
 
     def init(self, state: State, macro_dt) -> SolvedState:
         n_g, n_gs = self.system.num_constraints(state.q_s, state.q_f)
@@ -122,8 +120,7 @@ class Solved(Stepper):
         # no derivative enters the iteration; `derivative` attaches the one of the root
         solution, solver = self._solve(*jax.lax.stop_gradient((equations, memory)))
         root, status = checkpoint_name(((solution.x, solution.end), solution.status), ROOT)
-        derivative = differentiable_reverse_only if self.reverse_only else differentiable
-        x, (q_f, p_s, p_f) = derivative(equations, *root)
+        x, (q_f, p_s, p_f) = differentiable(equations, *root)
 
         lambdas = equations.multipliers(x, memory.multiplier, memory.slow_multiplier)
         q_f_micro = jnp.concatenate([equations.path(x).fast_start[1:], q_f[None]])

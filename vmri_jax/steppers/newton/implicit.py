@@ -10,14 +10,8 @@ import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
-from vmri_jax.refusals import Refused
 from vmri_jax.schemes.equations import StepEquations, Unknowns
 from vmri_jax.steppers.march import MarchEquations, linearised_pass, solve
-
-ONLY_FIRST_DERIVATIVES = (
-    "the adjoint of this run has first derivatives in reverse mode only. For second derivatives and forward mode take "
-    "vmri_jax.simulate(..., save=vm.Save(adjoint='stored'))."
-)
 
 
 def _direction(equations: StepEquations, x: Unknowns):
@@ -32,6 +26,24 @@ def _direction(equations: StepEquations, x: Unknowns):
 def _end(equations: StepEquations, x: Unknowns):
     """Fast position and momenta at the end of the step."""
     return equations.q_f + x.fast[:, -1].sum(0), *equations.evaluate(x)[1]
+
+
+def _with_derivative_of(values, others):
+    """The values, with the derivatives of `others`, which equal the values up to round-off and are computed for derivatives alone.
+
+    ``y = (value, 1)`` solves ``A y = (value - other, 1)`` with ``A = [[1, -other], [0, 1]]``, and ``dy = -A^-1 dA y = (d other, 0)``, since the
+    first component of the right-hand side is held. `custom_linear_solve` takes its value from the solve alone, here the known one, and
+    differentiates A.
+    """
+    (value, by_name), (other, _) = ravel_pytree(values), ravel_pytree(others)
+
+    def product(y):
+        return jnp.append(y[:-1] - other * y[-1], y[-1])
+
+    def known(_, rows):
+        return rows
+
+    return by_name(jax.lax.custom_linear_solve(product, jnp.append(value, 1.0), known, known)[:-1])
 
 
 def _no_third_derivative(residual):
@@ -51,14 +63,15 @@ def differentiable(equations: StepEquations, x: Unknowns, end):
 
 @differentiable.defjvp
 def _implicit_derivative(primals, tangents):
-    equations, root, _ = primals
+    equations, root, end = primals
     direction = _direction(equations, root)
     # For second derivatives: a Newton step x - (dR/dx)^-1 R at the root changes nothing, but makes x a function of the equations with the
     # right first derivative. A recursive call of `differentiable` would not do: for reverse mode JAX evaluates the first derivative in part,
-    # and this partial evaluation drops the rules of custom derivatives (`process_custom_jvp_call` in jax/_src/interpreters/partial_eval.py).
+    # and this partial evaluation drops the rules of custom derivatives.
     residual = equations.residual(root)
     unknown_beyond = _no_third_derivative(residual)
-    x = jax.tree.map(lambda a, step: a + step + unknown_beyond, root, direction(residual))
+    newton = jax.tree.map(lambda a, step: a + step + unknown_beyond, root, direction(residual))
+    x = _with_derivative_of(root, newton)
     _, change = jax.jvp(lambda e: e.residual(x), (equations,), (tangents[0],))
 
     # dR/dx dx = -dR/de de. `custom_linear_solve` differentiates dx through `product`, that is through dR/dx at x; its own solves take the
@@ -77,47 +90,5 @@ def _implicit_derivative(primals, tangents):
         return jax.linear_transpose(partial(solved, None), rows)(rows)[0]
 
     dx = by_name(jax.lax.custom_linear_solve(product, rows, solved, solved_transposed))
-    end, d_end = jax.jvp(_end, (equations, x), (tangents[0], dx))
-    return (x, end), (dx, d_end)
-
-
-@jax.custom_vjp
-def differentiable_reverse_only(equations: StepEquations, x: Unknowns, end):
-    """x and end unchanged, with one derivative in reverse mode for half the work; any other derivative raises a TypeError."""
-    return x, end
-
-
-def _kept(equations, x, end):
-    return (x, end), (equations, x)
-
-
-def _pulled_back(kept, cotangents):
-    equations, x = only_once(kept)
-    d_x, d_end = cotangents
-    _, pull = jax.vjp(_end, equations, x)
-    by_end, d_x_of_end = pull(d_end)
-    d_x = jax.tree.map(jnp.add, d_x, d_x_of_end)
-    # cotangent of e: (d end/de)^T d_end - (dR/de)^T (dR/dx)^-T d_x, where d_x contains (d end/dx)^T d_end by now
-    (d_residual,) = jax.linear_transpose(_direction(equations, x), x)(d_x)
-    _, pull = jax.vjp(lambda e: e.residual(x), equations)
-    (by_residual,) = pull(d_residual)
-    return jax.tree.map(_sum, by_end, by_residual), *jax.tree.map(jnp.zeros_like, (x, d_end))
-
-
-def _sum(a, b):
-    """The sum of two cotangents; integers have the cotangent type float0, which has no sum."""
-    return a if a.dtype == jax.dtypes.float0 else a + b
-
-
-differentiable_reverse_only.defvjp(_kept, _pulled_back)
-
-
-@jax.custom_jvp
-def only_once(tree):
-    """The tree unchanged; its derivative raises a TypeError."""
-    return tree
-
-
-@only_once.defjvp
-def _refused(primals, tangents):
-    raise Refused(ONLY_FIRST_DERIVATIVES)
+    end_of_x, d_end = jax.jvp(_end, (equations, x), (tangents[0], dx))
+    return (x, _with_derivative_of(end, end_of_x)), (dx, d_end)
