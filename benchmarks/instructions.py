@@ -87,9 +87,9 @@ PROGRAMS: dict[str, Program] = {
     "squeezer by directors, fully_implicit(1)": Program(SQUEEZER, vm.fully_implicit(1), 4970),
     "engine by directors, explicit_slow(5)": Program(ENGINE, vm.explicit_slow(5), 10040),
     "gradient: double pendulum, fully_implicit(1)": Program(
-        double_pendulum, vm.fully_implicit(1), 6290, is_gradient=True
+        double_pendulum, vm.fully_implicit(1), 4070, is_gradient=True
     ),
-    "gradient: TSP, fully_implicit(5)": Program(TSP, vm.fully_implicit(5), 11920, is_gradient=True),
+    "gradient: TSP, fully_implicit(5)": Program(TSP, vm.fully_implicit(5), 8180, is_gradient=True),
 }
 
 

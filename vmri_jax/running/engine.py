@@ -111,7 +111,7 @@ class Engine:
             first = jnp.minimum(i * size, self.num_saves + 1 - size)
             number = first + jnp.arange(size)
             existing = jnp.minimum(number, saves)  # beyond the last node there may be no state
-            new = _as_saved(run, rows[existing], step + existing * save_every)
+            new = jnp.concatenate(_as_saved(run, rows[existing], step + existing * save_every), axis=-1)
             # the last block may overlap the block before, whose nodes are projected already
             is_new = (number >= i * size) & (number <= saves)
             old = jax.lax.dynamic_slice(rows, (first, 0), new.shape)
@@ -171,17 +171,16 @@ def blank_memory(engine: Engine, shapes: tuple):
     return jax.device_put(jax.tree.map(lambda a: np.zeros(a.shape, a.dtype), blank))
 
 
-def _as_saved(run, rows, steps) -> Float[Numbers, "k width"]:
-    """The rows of nodes after these numbers of macro steps, with projected momenta, and with their `Observables`."""
-    columns = run.columns
+def _as_saved(run, rows, steps) -> tuple:
+    """The `Columns` of nodes after these numbers of macro steps, with projected momenta, and with their `Observables`."""
+    q_s, q_f, p_s, p_f, info, micro, _ = run.columns.parts(rows)
 
-    def node(row, step):
-        state = columns.states(row, run.state.t + step * run.macro_dt)
-        state, table = observed(run.system, state, run.solver.tolerance)
-        positions, info = row[: columns.p_s.start], row[columns.info.start : columns.observables.start]
-        return jnp.concatenate([positions, state.p_s, state.p_f, info, table])
+    def node(t, *phase):
+        state, table = observed(run.system, State(t, *phase), run.solver.tolerance)
+        return state.p_s, state.p_f, table
 
-    return jax.vmap(node)(rows, steps)
+    p_s, p_f, table = jax.vmap(node)(run.state.t + steps * run.macro_dt, q_s, q_f, p_s, p_f)
+    return q_s, q_f, p_s, p_f, info, micro, table
 
 
 def _row(state: State, info: RunInfo, micro) -> Float[Numbers, "numbers"]:

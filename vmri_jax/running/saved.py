@@ -55,22 +55,25 @@ class Columns(NamedTuple):
         """Saved intervals of a piece of a run, the same for runs of all lengths, so that they share one program."""
         return max(NUMBERS_PER_PIECE // self.width, 1)
 
-    def states(self, rows, t) -> State:
-        """The states of rows at the times t."""
-        return State(t, *(rows[..., columns] for columns in self[:4]))
+    def parts(self, rows) -> tuple:
+        """The columns of rows one by one."""
+        return rows if isinstance(rows, tuple) else tuple(rows[..., columns] for columns in self)
 
 
 class Saved(NamedTuple):
-    """Nodes of a run, a row of `Columns` for each, and its status, of JAX or NumPy; in a batch with lanes."""
+    """Nodes of a run, a row of `Columns` for each, and its status, of JAX or NumPy; in a batch with lanes.
 
-    rows: Float[Numbers, "k width"]
+    Where JAX differentiates a run, its rows are columns one by one: those that no derivative depends on are then left out.
+    """
+
+    rows: Float[Numbers, "k width"] | tuple
     result: Int[Numbers, ""]
     failed_at: Int[Numbers, ""]
 
     @property
     def table(self) -> Any:
         """(k, 9) the `Observables` of the nodes."""
-        return self.rows[..., -len(Observables._fields) :]
+        return self.rows[-1] if isinstance(self.rows, tuple) else self.rows[..., -len(Observables._fields) :]
 
     def marked(self, columns: Columns, save_every: int, step: int = 0) -> "Saved":
         """The nodes, NaN from a failure on; a node that cannot be right is a failure.
@@ -97,24 +100,23 @@ class Saved(NamedTuple):
         number = np.arange(num_nodes)[:, None]
         lost = number >= module.where(breaks, node, after_step)[..., None, None]
         unreached = number > module.where(breaks, num_nodes, after_step)[..., None, None]
-        # kind by kind: a gradient that reads positions alone then computes only the observables that decide on failures
         marks = [(unreached, 0.0) if part == columns.info else (lost, np.nan) for part in columns]
-        parts = [module.where(*mark, rows[..., part]) for mark, part in zip(marks, columns, strict=True)]
-        rows = module.concatenate(parts, axis=-1)
+        parts = tuple(module.where(*mark, part) for mark, part in zip(marks, columns.parts(rows), strict=True))
+        rows = parts if isinstance(rows, tuple) else module.concatenate(parts, axis=-1)
         failed_here = step + module.maximum(node * save_every - 1, 0)
         return Saved(rows, module.where(breaks, cause, result), module.where(breaks, failed_here, failed_at))
 
     def trajectory(self, run: Any, step: int = 0) -> Trajectory:
         """The nodes as a trajectory of a `Simulation`, in a batch one whose arrays have an axis of lanes, after a number of macro steps."""
-        columns, rows, table, micro = run.columns, self.rows, self.table, None
+        *phase, info, q_f_micro, table = run.columns.parts(self.rows)
         t_start, macro_dt = (np.asarray(a) if is_concrete(a) else a for a in (run.state.t, run.macro_dt))
-        t = t_start[..., None] + (step + np.arange(rows.shape[-2]) * run.save_every) * macro_dt[..., None]
-        states, first = columns.states(rows, t), columns.info.start
-        method, iterations, residual = (rows[..., 1:, first + i] for i in range(len(RunInfo._fields)))
+        t = t_start[..., None] + (step + np.arange(table.shape[-2]) * run.save_every) * macro_dt[..., None]
+        states, micro = State(t, *phase), None
+        method, iterations, residual = (info[..., 1:, i] for i in range(len(RunInfo._fields)))
         if run.save.micro:  # micro node i lies H (1 - c_i) before the end of its macro step
             before_end = macro_dt[..., None, None] * (1 - run.scheme.micro_times)
             shape = *residual.shape, before_end.shape[-1], states.q_f.shape[-1]
-            micro = MicroNodes(t[..., 1:, None] - before_end, rows[..., 1:, columns.micro].reshape(shape))
+            micro = MicroNodes(t[..., 1:, None] - before_end, q_f_micro[..., 1:, :].reshape(shape))
         info = RunInfo(method.astype(int), iterations.astype(int), residual)
         result, residuals = status(self.result), table[..., 1:3]
         return Trajectory(states, table[..., 0], residuals, info, result, self.failed_at, micro, origin=run.origin)
