@@ -34,6 +34,11 @@ def is_concrete(tree) -> bool:
     return not any(map(_is_traced, jax.tree.leaves(tree)))
 
 
+def is_known(tree) -> bool:
+    """Whether a pytree holds values, outside of a program: while JAX stages a program, all new arrays are tracers."""
+    return is_concrete((tree, jnp.asarray(np.zeros(()))))
+
+
 def _is_traced(leaf) -> bool:
     return isinstance(leaf, jax.core.Tracer)  # pyright: ignore[reportAttributeAccessIssue]
 
@@ -80,8 +85,7 @@ def quickly_compiled(function: Callable, static_argnames: str | Sequence[str] = 
 
     @wraps(function)
     def call(*arguments):
-        is_whole = is_concrete((arguments, jnp.zeros(())))  # while JAX stages a program, all new arrays are tracers
-        return (quick if is_whole else part)(*arguments)
+        return (quick if is_known(arguments) else part)(*arguments)
 
     return call
 

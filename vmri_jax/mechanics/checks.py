@@ -86,7 +86,7 @@ def check_system(system: System, q_s, q_f) -> None:
         for name, mass, n in (("slow", system.kinetic.slow_mass, n_s), ("fast", system.kinetic.fast_mass, n_f)):
             if mass.size != n:
                 raise Refused(f"ConstantMass: {name} is for {mass.size} coordinates, the state has {n} {name} ones.")
-    values = {"t": jnp.zeros(()), "q_s": q_s, "q_f": q_f, "v_s": q_s, "v_f": q_f}
+    values = {"t": np.zeros(()), "q_s": q_s, "q_f": q_f, "v_s": q_s, "v_f": q_f}
     for term in system.terms:
         name = f"System: {term.place}"
         shape = shape_of(name, term.function, *term.of_arguments(values), system.params)

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.kernels.saddle import least_norm, regularized
-from vmri_jax.mechanics.arrays import is_concrete, library, quickly_compiled
+from vmri_jax.mechanics.arrays import is_known, library, quickly_compiled
 from vmri_jax.mechanics.constraints import configuration, known_mass, known_mass_and_momentum
 from vmri_jax.mechanics.projection import legendre, project_momentum
 from vmri_jax.mechanics.structure import has_constant_hessian
@@ -25,18 +25,18 @@ PROJECTION_STEPS = 20
 def project_positions(system: System, t, q_s, q_f):
     """Positions moved onto the constraints at a time, along ``M^-1 G^T`` of the start: to first order the nearest point in the mass metric."""
     n_s, q0 = q_s.shape[0], library(q_s, q_f).concatenate([q_s, q_f])
-    is_known = _is_known((system, t, q0))
+    known = is_known((system, t, q0))
 
     def constraints(q):
         return system.constraints(t, q[:n_s], q[n_s:])
 
     def values_and_jacobian(q):
-        if is_known:
+        if known:
             return configuration(system, t, q[:n_s], q[n_s:]).solved
         return constraints(q), jax.jacrev(constraints)(q)
 
     # D = M^-1 G^T at the start, with rows of coordinates over the square roots of masses: all have the same unit
-    mass = known_mass(system, q_s, q_f) if is_known else _mass_at_rest(system, q_s, q_f)
+    mass = known_mass(system, q_s, q_f) if known else _mass_at_rest(system, q_s, q_f)
     jacobian, xp = values_and_jacobian(q0)[1], library(mass, q0)
     root = xp.sqrt(xp.diagonal(mass))
     directions = xp.linalg.solve(mass / (root[:, None] * root), (jacobian / root).T) / root[:, None]
@@ -46,7 +46,7 @@ def project_positions(system: System, t, q_s, q_f):
         values, jacobian = values_and_jacobian(q)
         return q - directions @ least_norm(jacobian @ directions, values)
 
-    if not is_known:
+    if not known:
         q = jax.lax.fori_loop(0, PROJECTION_STEPS, corrected, q0)  # a loop, since its body is compiled once
         return q[:n_s], q[n_s:]
     q = q0
@@ -72,18 +72,13 @@ def consistent_momenta(system: System, t, q_s, q_f, v_s, v_f):
 
     v = library(v_s, v_f).concatenate([v_s, v_f])
     is_quadratic = system.has_constant_mass or has_constant_hessian(kinetic, v)
-    momenta = _momenta_of_numbers if is_quadratic and _is_known(arguments) else _momenta
+    momenta = _momenta_of_numbers if is_quadratic and is_known(arguments) else _momenta
     p, projected_p, projected_v = momenta(*arguments)
     # |v - v'|^2 / max(|v|^2, |v'|^2) with |v|^2 = v . p
     xp = library(v, p, projected_p)
     size = xp.maximum(v @ p, projected_v @ projected_p)
     part = xp.where(size > 0, (v - projected_v) @ (p - projected_p) / xp.where(size > 0, size, 1.0), 0.0)
     return projected_p[:n_s], projected_p[n_s:], xp.sqrt(xp.clip(part, 0.0, 1.0))
-
-
-def _is_known(arguments) -> bool:
-    """Whether the arguments are numbers outside of a program: while JAX stages a program, all new arrays are tracers."""
-    return is_concrete((arguments, jnp.zeros(())))
 
 
 def _mass_at_rest(system: System, q_s, q_f):

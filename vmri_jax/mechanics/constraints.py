@@ -20,7 +20,7 @@ from jaxtyping import Float
 from scipy.linalg import block_diag
 
 from vmri_jax.kernels import matvec, max_abs
-from vmri_jax.mechanics.arrays import Numbers, is_concrete, library, quickly_compiled
+from vmri_jax.mechanics.arrays import Numbers, is_known, library, quickly_compiled
 from vmri_jax.mechanics.by_name import constraint_sizes
 from vmri_jax.mechanics.functions import Rheonomic
 from vmri_jax.mechanics.masses import correlation
@@ -221,8 +221,7 @@ def check_mass(system: System, q_s, q_f) -> None:
     if system.has_constant_mass:
         return
     # velocities may be traced, positions are not; outside of traces each operation would be a program of its own
-    is_staged = not is_concrete(jnp.zeros(()))
-    with jax.ensure_compile_time_eval() if is_staged else nullcontext():
+    with nullcontext() if is_known(()) else jax.ensure_compile_time_eval():
         random = np.random.default_rng(0)
         velocities = (SPEED * random.normal(size=np.size(q)) for q in (q_s, q_f))
         mass, _ = known_mass_and_momentum(system, q_s, q_f, *velocities)

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from vmri_jax.mechanics.arrays import Known, Number, Numbers, is_concrete, of_one_type, require_x64
+from vmri_jax.mechanics.arrays import Known, Number, Numbers, is_concrete, is_known, of_one_type, require_x64
 from vmri_jax.mechanics.by_name import constraint_sizes, flat_system
 from vmri_jax.mechanics.checks import check_arrays, check_flags, check_number, check_params, check_system, check_type
 from vmri_jax.mechanics.consistent import consistent_momenta, project_positions
@@ -119,7 +119,7 @@ def initial_state(
     v_s, v_f = (np.zeros(np.shape(q)) if v is None else v for q, v in ((q_s, v_s), (q_f, v_f)))
     q_s, q_f, v_s, v_f = check_arrays(q_s=q_s, q_f=q_f, v_s=v_s, v_f=v_f)
     arguments = system, t, q_s, q_f, v_s, v_f
-    if not is_concrete((arguments, jnp.zeros(()))):  # while JAX stages a program, all new arrays are tracers
+    if not is_known(arguments):
         if is_concrete((system, q_s, q_f)) and not system.has_constant_mass:
             check_system(system, q_s, q_f)
             check_mass(system, q_s, q_f)
@@ -282,7 +282,7 @@ class Problem:
 
     def _with_rows(self, names: Names) -> Names:
         """Names with the rows that constraints return by name."""
-        values, sizes = {"t": jnp.zeros(()), "q_s": self.q_s, "q_f": self.q_f}, {}
+        values, sizes = {"t": np.zeros(()), "q_s": self.q_s, "q_f": self.q_f}, {}
         for term in self.system.of_kind("constraint"):
             rows = constraint_sizes(term.function, *term.of_arguments(values), self.system.params)
             sizes |= {term.field: rows} if rows else {}

@@ -8,6 +8,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from vmri_jax.mechanics.functions import (
     NO_TIME,
@@ -261,7 +262,7 @@ class System(eqx.Module):
 
     def num_constraints(self, q_s, q_f) -> tuple[int, int]:
         """``(n_g, n_gs)`` for configurations of these shapes."""
-        t = jnp.zeros(())
+        t = np.zeros(())
         return jax.eval_shape(self.g, t, q_s, q_f).shape[0], jax.eval_shape(self.g_slow, t, q_s).shape[0]
 
 

@@ -182,6 +182,7 @@ class Simulation:
 
     def traced(self) -> Trajectory:
         """All steps of a run, some of whose arrays are tracers."""
+
         def steps(run: Simulation) -> Callable[[list], Saved]:
             return lambda leaves: run.engine.differentiable(leaves, run.save_every)
 

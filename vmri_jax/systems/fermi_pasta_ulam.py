@@ -9,7 +9,9 @@ from itertools import pairwise
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 
+from vmri_jax.mechanics.arrays import library
 from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.state import Problem
 from vmri_jax.mechanics.system import ConstantMass, System
@@ -60,7 +62,9 @@ def fermi_pasta_ulam(num_springs: int = 3, omega: float = 50.0) -> Problem:
     """
     if num_springs < 1:
         raise Refused(f"fermi_pasta_ulam: num_springs is {num_springs}; there must be at least 1.")
-    ones, first = jnp.ones(num_springs), jnp.zeros(num_springs).at[0].set(1.0)
-    system = System(ConstantMass(ones, ones), soft_springs, stiff_springs, params={"omega": jnp.asarray(omega)})
+    ones, first = np.ones(num_springs), np.eye(num_springs)[0]
+    system = System(
+        ConstantMass(ones, ones), soft_springs, stiff_springs, params={"omega": library(omega).asarray(omega)}
+    )
     names = Names({"centres": num_springs}, {"elongations": num_springs}, numbered=("centres", "elongations"))
     return Problem(system, first, first / omega, first, first, names=names, drawing=drawing(num_springs))

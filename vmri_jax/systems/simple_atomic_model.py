@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 
+from vmri_jax.mechanics.arrays import library
 from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.state import Problem
 from vmri_jax.mechanics.system import ConstantMass, System
@@ -79,14 +80,15 @@ def simple_atomic_model(
             [radius, 0.0, top - length],
         ]
     )
+    xp = library(masses, stiffness, length, gravity)
     params = {"masses": masses, "stiffness": stiffness, "length": length, "gravity": gravity}
     system = System(
-        kinetic=ConstantMass(jnp.repeat(jnp.asarray(masses[:2]), 3), jnp.repeat(jnp.asarray(masses[2:]), 3)),
+        kinetic=ConstantMass(xp.repeat(xp.asarray(masses[:2]), 3), xp.repeat(xp.asarray(masses[2:]), 3)),
         slow_potential=slow_forces,
         fast_potential=stiff_springs,
         constraint=bonds,
         slow_constraint=slow_bond,
-        params={name: jnp.asarray(value) for name, value in params.items()},
+        params={name: xp.asarray(value) for name, value in params.items()},
     )
     v_s = np.array([[0.0, 0.5, 0.0], [0.3, 0.2, 0.1]])
     v_f = np.array([[0.0, 0.4, 0.2], [-0.5, 0.2, 0.3], [0.2, -0.6, 0.4], [0.7, 0.1, 0.2]])
@@ -96,5 +98,5 @@ def simple_atomic_model(
         constraint={"bond 2-4": 1, "bond 2-5": 1, "bond 3-6": 1},
         slow_constraint={"bond 1": 1},
     )
-    start = (jnp.asarray(a).reshape(-1) for a in (q_s, q_f, v_s, v_f))
+    start = (xp.asarray(a).reshape(-1) for a in (q_s, q_f, v_s, v_f))
     return Problem(system, *start, project=True, names=names, drawing=DRAWING)

@@ -2,6 +2,7 @@
 
 import jax.numpy as jnp
 
+from vmri_jax.mechanics.arrays import library
 from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.state import Problem
 from vmri_jax.mechanics.system import ConstantMass, System
@@ -59,21 +60,22 @@ def triple_spherical_pendulum(
     """
     m_1, m_2, m_3 = masses
     l_1, l_2, l_3 = lengths
+    xp = library(masses, stiffness, lengths, gravity)
     params = {"masses": masses, "stiffness": stiffness, "lengths": lengths, "gravity": gravity}
     system = System(
-        kinetic=ConstantMass(slow=jnp.full(3, m_1), fast=jnp.repeat(jnp.array([m_2, m_3]), 3)),
+        kinetic=ConstantMass(slow=xp.full(3, m_1), fast=xp.repeat(xp.asarray([m_2, m_3]), 3)),
         slow_potential=weight,
         fast_potential=quartic_spring if quartic else spring,
         constraint=second_rod,
         slow_constraint=first_rod,
-        params={name: jnp.asarray(value) for name, value in params.items()},
+        params={name: xp.asarray(value) for name, value in params.items()},
     )
     return Problem(
         system,
-        q_s=jnp.array([l_1, 0.0, 0.0]),
-        q_f=jnp.array([l_1, l_2, 0.0, l_1, l_2, l_3]),
-        v_s=jnp.array([0.0, 1.0, 0.0]),
-        v_f=jnp.array([0.0, 1.0, 0.0, 0.0, 1.0, 0.5]),
+        q_s=xp.asarray([l_1, 0.0, 0.0]),
+        q_f=xp.asarray([l_1, l_2, 0.0, l_1, l_2, l_3]),
+        v_s=[0.0, 1.0, 0.0],
+        v_f=[0.0, 1.0, 0.0, 0.0, 1.0, 0.5],
         names=Names({"bob 1": 3}, {"bob 2": 3, "bob 3": 3}, {"rod 2": 1}, {"rod 1": 1}),
         drawing=DRAWING,
     )
