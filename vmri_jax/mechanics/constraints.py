@@ -294,13 +294,7 @@ def check_constraints(
             f"{place} violate {'constraint' if worst < n_g else 'slow_constraint'}, row {row.strip('[]')}, by {abs(solved[worst]):.3e} (allowed: "
             f"{allowed[worst]:.0e}, {tolerance:.0e} of its size, and round-off); {advice}"
         )
-    implied, allowed = rows.values[n_g + n_gs :], rows.allowed(CONSTRAINT_TOLERANCE)[n_g + n_gs :]
-    opened = np.flatnonzero(~(np.abs(implied) <= allowed))
-    if opened.size:
-        raise Refused(
-            f"System: implied does not follow from the constraints: {place} keep these, and row(s) {opened.tolist()} of implied are "
-            f"{implied[opened]} there (allowed: {allowed[opened]}). Take parameters for which they follow, or hold them as constraint."
-        )
+    _check_implied(rows, n_g + n_gs, place)
 
     size = np.linalg.norm(np.concatenate([slow, fast], axis=1), axis=1)
     slow_only = np.flatnonzero((size > 0) & (np.linalg.norm(fast, axis=1) <= LEAST_FAST_PART * size))
