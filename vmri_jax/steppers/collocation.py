@@ -12,8 +12,8 @@ alone, the matrix then decouples into one complex saddle per pair of eigenvalues
 
 so that matrices have the size of the system for every degree (Butcher 1976; Hairer, Wanner, Solving
 Ordinary Differential Equations II, IV.8). The Hessian has the form ``L^T w L`` with a (d, n) matrix L, where d may be much smaller than n: each
-saddle is eliminated down to d rows and the constraints (`Saddles`). The residual is exact, so that these approximations change only the
-number of iterations.
+saddle is eliminated down to d rows and the constraints (`Saddles`). Where slow variables are joined to the fast ones, it leaves out their
+curvature, which a macro step resolves. The residual is exact, so that these approximations change only the number of iterations.
 """
 
 from dataclasses import dataclass
@@ -42,10 +42,11 @@ from vmri_jax.steppers.time_modes import TimeModes, product, times_i
 class IntervalEquations:
     """The equations of the step, with the nodes as the last axis.
 
+    num_slow: of the variables, whose curvature the Hessian leaves out; they come first.
     directions, along: L (d, n), the combinations of variables along which the potentials are curved, and its pseudo-inverse (n, d).
     """
 
-    def __init__(self, equations: StepEquations):
+    def __init__(self, equations: StepEquations, num_slow: int):
         assert not equations.q_s.size, "slow variables would not move"
         self.system, self.h, self.r = equations.system, equations.macro_dt, equations.scheme.degree
         self.q_s, self.q, self.p = equations.q_s, equations.q_f, equations.p_f
@@ -55,7 +56,9 @@ class IntervalEquations:
         self.potentials = [term for term in terms.potentials.terms if term.inside.groups]
         self.mass = constant_mass(self.system).fast_mass
         self.inverse_mass = self.mass.inverse()
-        self.directions = curved_directions(self.potential, self.q)
+        self.num_slow = num_slow
+        directions = curved_directions(partial(self.potential_of_fast, self.q), self.q[num_slow:])
+        self.directions = np.pad(directions, ((0, 0), (num_slow, 0)))
         self.along = np.linalg.pinv(self.directions)
         self.at_start = self.jacobian(self.times[0], self.q)
 
@@ -83,10 +86,16 @@ class IntervalEquations:
         """All potentials at one point."""
         return -sum((self.of_term(term, q) for term in self.potentials), jnp.zeros(()))
 
+    def potential_of_fast(self, q, fast):
+        """`potential` with the fast variables as an argument of their own."""
+        return self.potential(jnp.concatenate([q[: self.num_slow], fast]))
+
     def curvature(self, q):
-        """(n, d) the product of W'' with `along`."""
-        gradient = jax.grad(self.potential)
-        return jax.vmap(lambda change: jax.jvp(gradient, (q,), (change,))[1], out_axes=1)(self.along.T)
+        """(n, d) the product of W'' with `along`, zero in the rows of slow variables."""
+        gradient, fast = jax.grad(partial(self.potential_of_fast, q)), q[self.num_slow :]
+        changes = self.along.T[:, self.num_slow :]
+        columns = jax.vmap(lambda change: jax.jvp(gradient, (fast,), (change,))[1], out_axes=1)(changes)
+        return jnp.pad(columns, ((self.num_slow, 0), (0, 0)))
 
     def forces(self, x, mu) -> "Forces":
         """Forces of potentials and constraints for the increments x (n, r) and multipliers mu (n_g, r)."""
@@ -250,12 +259,21 @@ at_nodes = partial(jax.vmap, in_axes=-1, out_axes=-1)
 
 @dataclass(frozen=True)
 class Collocation(StepSolver):
-    """Newton steps until the next one would change no increment (`Accepted`); its correction is extrapolated from the last two."""
+    """Newton steps until the next one would change no increment (`Accepted`); its correction is extrapolated from the last two.
+
+    newton: settings.
+    num_slow: of `IntervalEquations`.
+    """
 
     newton: Solver
+    num_slow: int
 
     def solve(self, equations: StepEquations, guess: Unknowns, memory: tuple) -> tuple[Solution, tuple]:
-        newton, interval, modes = self.newton, IntervalEquations(equations), TimeModes.of(equations.scheme)
+        newton, interval, modes = (
+            self.newton,
+            IntervalEquations(equations, self.num_slow),
+            TimeModes.of(equations.scheme),
+        )
         x, mu = guess.fast[0].T, guess.multiplier[0].T
         saddles = Saddles.at(interval, modes, equations.t + interval.h / 2, interval.q + x[:, -1] / 2)
         accepted = Accepted.of(equations, newton)

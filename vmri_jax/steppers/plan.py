@@ -161,7 +161,8 @@ def _whole_step(system: System, scheme: Scheme, solver: Solver, q_s, q_f) -> Kic
     return Kicked(kicks, _between_kicks(system, scheme, solver, q_s, q_f), average)
 
 
-def _between_kicks(system: System, scheme: Scheme, solver: Solver, q_s, q_f) -> Stepper:
+def _between_kicks(system: System, scheme: Scheme, solver: Solver, q_s, q_f, num_slow: int = 0) -> Stepper:
+    """The stepper of all that moves between kicks; of joined variables the first `num_slow` are slow."""
     can_be_nested, rows = _can_be_nested(system, scheme), all_rows(system, q_s, q_f)
     _check_matrix(solver.matrix, system, scheme, can_be_nested)
     if _is_drift(system, scheme) and not system.is_constrained:
@@ -171,7 +172,9 @@ def _between_kicks(system: System, scheme: Scheme, solver: Solver, q_s, q_f) -> 
         return Solved(system, scheme, custom, rows)
     if q_s.size and _joins(system, scheme, solver, q_s.size, q_f.size):
         (n_g, _), q = system.num_constraints(q_s, q_f), jnp.concatenate([q_s, q_f])
-        return Joined(_between_kicks(*joined(system, scheme, q_s.size), solver, jnp.zeros(0), q), q_s.size, n_g)
+        num_slow = q_s.size if q_f.size else 0  # slow variables alone are as stiff as they are
+        together = _between_kicks(*joined(system, scheme, q_s.size), solver, jnp.zeros(0), q, num_slow)
+        return Joined(together, q_s.size, n_g)
     if not can_be_nested or solver.matrix in ("exact", "null_space"):
         n_g, n_gs = system.num_constraints(q_s, q_f)
         first = "exact" if system.has_constant_mass else "masses"
@@ -181,7 +184,7 @@ def _between_kicks(system: System, scheme: Scheme, solver: Solver, q_s, q_f) -> 
     interval = Interval.of(system, scheme, q_s, q_f)
     if _is_linear(system, scheme, interval, q_s):
         return Linear(system, scheme, interval)
-    approximate = _approximate(system, scheme, solver, interval, rows, q_s.size, q_f.size)
+    approximate = _approximate(system, scheme, solver, interval, rows, q_s.size, q_f.size, num_slow)
     return Solved(system, scheme, approximate, rows)
 
 
@@ -196,13 +199,20 @@ def _joins(system: System, scheme: Scheme, solver: Solver, n_s: int, n_f: int) -
 
 
 def _approximate(
-    system: System, scheme: Scheme, solver: Solver, interval: Interval, rows: Sparsity, n_s: int, n_f: int
+    system: System,
+    scheme: Scheme,
+    solver: Solver,
+    interval: Interval,
+    rows: Sparsity,
+    n_s: int,
+    n_f: int,
+    num_slow: int,
 ) -> StepSolver:
     """The matrix "masses" or "modes", or the first one of "auto", for constant masses; modes and drifts know fast variables alone (`_joins`)."""
     small = n_s == 0 and n_f <= SMALL  # Nested keeps a larger matrix over many steps, Collocation does not
     chosen = COLLOCATES and small and not interval.is_diagonal and _has_modes(system, scheme)
     if solver.matrix == "modes" or (solver.matrix == "auto" and chosen):
-        return Collocation(solver)
+        return Collocation(solver, num_slow)
     return Rattle(solver, rows) if DRIFTS and _is_drift(system, scheme) else Nested(solver, interval)
 
 
