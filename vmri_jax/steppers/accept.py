@@ -112,16 +112,16 @@ class Accepted(NamedTuple):
         """Whether corrections no longer shrink, from `before` to `size`, and are at most `floor` units ``eps max |positions|``, or `FLOOR`
         units of the round-off of constraints.
         """
-        is_roundoff = self.is_roundoff(size, floor) | (size <= FLOOR / ROUNDOFF * self.constraints)
-        return (size > before / 2) & is_roundoff
+        return (size > before / 2) & self.is_roundoff(size, floor)
 
     def with_constraints(self, equations: StepEquations, weights: Weights) -> "Accepted":
         """The same with the round-off of constraints."""
         return self._replace(constraints=ROUNDOFF * jnp.finfo(float).eps * constraint_length(equations, weights))
 
     def is_roundoff(self, size, floor=FLOOR):
-        """Whether a correction is at most `floor` units ``eps max |positions|``."""
-        return size <= floor / ROUNDOFF * self.roundoff  # `roundoff` counts ROUNDOFF of these units
+        """Whether a correction is at most `floor` units ``eps max |positions|``, or `FLOOR` units of the round-off of constraints."""
+        # `roundoff` and `constraints` count ROUNDOFF of these units
+        return (size <= floor / ROUNDOFF * self.roundoff) | (size <= FLOOR / ROUNDOFF * self.constraints)
 
     def ratio(self, changes, motions, iterations):
         """Ratio of the next corrections (slow, fast) to the right-hand sides of the formula at the top of this module, the larger of the two.

@@ -88,6 +88,11 @@ class MarchEquations:
         self.n_v = self.intervals.seen.count  # the slow variables that intervals see
         self.num_fast, self.num_slow, self.num_seen = self.r * self.n_f, self.r * self.n_s, self.r * self.n_v
 
+    @property
+    def has_slow_path(self) -> bool:
+        """Whether there are slow unknowns, or several intervals; else the unknowns of one interval are all."""
+        return self.n > 1 or self.num_slow + self.n_gs > 0
+
     def by_masses(self) -> "MarchEquations":
         """The equations with the quadratic form of the masses in place of a kinetic energy that is a function."""
         march = copy(self)

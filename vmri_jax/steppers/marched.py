@@ -33,13 +33,14 @@ guess, and about half of the passes are exact. A larger number makes failing run
 class MarchMemory(NamedTuple):
     """Memory that a macro step hands to the next one.
 
-    slow: predictor of the slow unknowns z.
+    path: predictor of the slow unknowns z, or of the unknowns x of a single interval without slow unknowns.
     fast: unknowns of the last micro interval.
     matrices: the last ones.
-    rate: ratio of the last two corrections with these matrices, of the masses the largest ratio; infinite if there are none.
+    rate: ratio of the last two corrections with these matrices, of the masses the largest ratio; infinite if there are none. Corrections at
+        round-off do not count.
     """
 
-    slow: PolynomialPredictor
+    path: PolynomialPredictor
     fast: Float[Array, "k"]
     matrices: Matrices
     rate: Float[Array, ""]
@@ -84,9 +85,11 @@ class Marched(StepSolver):
     sizes: tuple[int, int, int, int, int] | None = None
 
     def init(self, equations: StepEquations) -> MarchMemory:
-        matrices = self._march(equations, NO_WEIGHTS).no_matrices()
+        march = self._march(equations, NO_WEIGHTS)
+        matrices = march.no_matrices()
         slow, fast = len(matrices.slow), matrices.inverse.shape[-1]
-        return MarchMemory(PolynomialPredictor.empty(slow), jnp.zeros(fast), matrices, jnp.asarray(jnp.inf))
+        path = PolynomialPredictor.empty(slow if march.has_slow_path else fast)
+        return MarchMemory(path, jnp.zeros(fast), matrices, jnp.asarray(jnp.inf))
 
     def solve(self, equations: StepEquations, guess: Unknowns, memory: MarchMemory) -> tuple[Solution, MarchMemory]:
         weights = Weights.of(equations)
@@ -157,9 +160,12 @@ class Marched(StepSolver):
         limit,
         is_first,
     ) -> Progress:
-        """At most `limit` passes. The first attempt starts from the predicted slow unknowns, later attempts from the guess."""
-        (z, x), is_predicted = march.flat(guess), is_first & ~memory.slow.is_empty
-        z = jnp.where(is_first, memory.slow.next(march.num_slow, z), z)
+        """At most `limit` passes. The first attempt starts from the predicted unknowns, later attempts from the guess."""
+        (z, x), is_predicted = march.flat(guess), is_first & ~memory.path.is_empty
+        if march.has_slow_path:
+            z = jnp.where(is_first, memory.path.next(march.num_slow, z), z)
+        else:
+            x, is_predicted = jnp.where(is_first, memory.path.next(march.num_fast, x[0]), x), jnp.asarray(False)
         progress = start._replace(
             passed=start.passed._replace(z=z, x=x, dz=jnp.zeros_like(z), dx=jnp.zeros_like(x)),
             rate=jnp.where(is_first, memory.rate, jnp.inf),
@@ -172,7 +178,8 @@ class Marched(StepSolver):
             motions = march.slow_size(now.z), march.fast_size(now.x)
             passes, size = before.passes + 1, jnp.maximum(slow, fast)
             ratio = accepted.ratio((slow, still_moves), motions, passes)
-            at_floor = accepted.at_floor(size, before.size)
+            # a first correction that is round-off: the prediction was exact, and matrices that contract leave less than the floor of the next
+            at_floor = accepted.at_floor(size, jnp.where(before.passes > 0, before.size, 0.0))
             if march.weights is not NO_WEIGHTS:
                 at_floor |= (size > before.size / 2) & is_solved(now.worst.rows, motions)
             result = jnp.where(ratio <= 1, Result.CONVERGED, jnp.where(at_floor, Result.CONVERGED_AT_ROUNDOFF, RUNNING))
@@ -194,12 +201,13 @@ class Marched(StepSolver):
             after = judged(now, last)
             at_floor = renews & accepted.at_floor(after.size, last.size, FLOOR_OF_NEWTON)
             result = jnp.where(at_floor & (after.result == RUNNING), Result.CONVERGED_AT_ROUNDOFF, after.result)
-            ratio = jnp.where(last.passes > 0, after.size / last.size, last.rate)
+            # corrections at round-off do not tell how fast the iteration contracts
+            ratio = jnp.where((last.passes > 0) & ~accepted.is_roundoff(last.size), after.size / last.size, last.rate)
             curvature = jnp.maximum(last.curvature, jnp.where(renews, 0.0, ratio / last.new_size))
             if self.is_exact:
                 rate = jnp.where(renews, curvature * after.size, ratio)  # kappa |d_new|
-            else:  # without the last pass of a step, which ends in round-off
-                rate = jnp.where(after.result == RUNNING, jnp.maximum(ratio, last.rate), last.rate)
+            else:
+                rate = jnp.maximum(ratio, last.rate)
             new_size = jnp.where(renews, after.size, last.new_size)
             return after._replace(matrices=matrices, rate=rate, curvature=curvature, new_size=new_size, result=result)
 
@@ -219,7 +227,11 @@ class Marched(StepSolver):
 
     def _learned(self, march: MarchEquations, memory: MarchMemory, done: Progress) -> MarchMemory:
         passed = done.passed
-        return MarchMemory(memory.slow.add(passed.z, march.num_slow), passed.x[-1], done.matrices, done.rate)
+        if march.has_slow_path:
+            path = memory.path.add(passed.z, march.num_slow)
+        else:
+            path = memory.path.add(passed.x[0], march.num_fast)
+        return MarchMemory(path, passed.x[-1], done.matrices, done.rate)
 
     def describe(self) -> list[str]:
         if not self.is_exact:
