@@ -75,5 +75,5 @@ def _kinematics(home: str, terms: Sequence, layout: Layout) -> Kinematics | None
     if layout.kinematics is None or not all(term.within(layout.sizes) for term in terms):
         return layout.kinematics
     # a kinetic energy needs in any case the bodies on joints whose masses are part of it
-    of_energies = {"kinetic": layout.kinematics.of_fast, "slow_kinetic": layout.kinematics.of_slow}
-    return of_energies.get(home)
+    part: Any = {"kinetic": "f", "slow_kinetic": "s"}.get(home)
+    return layout.kinematics.of(part) if part else None

@@ -156,6 +156,16 @@ class Effect(Bindable):
         if any(parameter.shape == "vector" for parameter in self.declared.values()):
             self._check_sizes([element[0] for element in self.elements])
 
+    def check_of_time(self, name: str, params: Any) -> None:
+        """Refuse a function of time, in the field of this name, whose values do not have the dimension of the bodies."""
+        value = shape_of(f"{self.name}: {name}", getattr(self, name), jnp.zeros(()), params)
+        shape = getattr(value, "shape", None)
+        for (body,), (end,) in zip(self.elements, self.ends, strict=True):
+            if shape != (end.size,) and (shape, end.size) != ((), 1):
+                raise Refused(
+                    f"{self.name}: {name} returns shape {shape}; {body} has dimension {end.size}, return ({end.size},)."
+                )
+
     def check_parameters(self) -> None:
         """Refuse bodies at one place, parameters of another shape or sign, or that are not finite."""
         if self.apart:

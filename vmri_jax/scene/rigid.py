@@ -12,7 +12,6 @@ mechanical systems, part II: multibody dynamics, Int. J. Numer. Meth. Engng 67 (
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -92,13 +91,10 @@ class RigidBody(AnyBody):
         inertia = self.inertia
         tensor = inertia.inertia(mass) if isinstance(inertia, Shape) else self._numbers("inertia", inertia)
         moments, axes = self._principal(tensor)
-        fields = {"mass": mass, "shape": shape, "moments": moments, "axes": axes}
         for name in ("position", "velocity", "spin"):
             value = getattr(self, name)
-            fields[name] = np.zeros(3) if value is None else self._numbers(name, value, (3,))
-        fields["rotation"] = self._matrix()
-        for name, value in fields.items():
-            object.__setattr__(self, name, value)
+            vars(self)[name] = np.zeros(3) if value is None else self._numbers(name, value, (3,))
+        vars(self).update(mass=mass, shape=shape, moments=moments, axes=axes, rotation=self._matrix())
 
     def _principal(self, inertia) -> tuple[Any, np.ndarray]:
         """Principal moments (3,), and the principal axes as columns, in the axes of the body, of the argument `inertia` as an array."""
@@ -273,15 +269,14 @@ def matrix_of(rotation):
     """(3, 3) matrix of a rotation, which is such a matrix, a quaternion (w, x, y, z) or a rotation vector (3,)."""
     if rotation.shape == (3, 3):
         return rotation
-    if rotation.shape == (4,):
-        # R = 1 + 2 w U + 2 U^2 with the matrix U of x -> u x x, u the vector part
-        w, u = rotation[0], _cross_matrix(rotation[1:])
-        return library(rotation).eye(3) + 2 * w * u + 2 * u @ u
-    if is_concrete(rotation):
-        return Rotation.from_rotvec(np.array(rotation)).as_matrix()
-    # Rodrigues: R = 1 + (sin a / a) U + (1 - cos a) / a^2 U^2, with (1 - cos a) / a^2 = (sin(a/2) / (a/2))^2 / 2
-    angle, u = jnp.sqrt(jnp.sum(rotation**2)), _cross_matrix(rotation)
-    return jnp.eye(3) + jnp.sinc(angle / np.pi) * u + jnp.sinc(angle / (2 * np.pi)) ** 2 / 2 * u @ u
+    xp = library(rotation)
+    if rotation.shape == (3,):
+        # r of length a is the quaternion (cos(a / 2), sin(a / 2) r / a)
+        half = xp.sqrt(xp.sum(rotation**2)) / 2
+        rotation = xp.append(xp.cos(half), xp.sinc(half / np.pi) / 2 * rotation)
+    # R = 1 + 2 w U + 2 U^2 with the matrix U of x -> u x x, u the vector part
+    w, u = rotation[0], _cross_matrix(rotation[1:])
+    return xp.eye(3) + 2 * w * u + 2 * u @ u
 
 
 def _cross_matrix(u):

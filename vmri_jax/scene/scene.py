@@ -27,6 +27,7 @@ from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.effects.freedoms import Freedom
 from vmri_jax.scene.effects.joint_base import joint_named
 from vmri_jax.scene.functions import RESERVED, Actuation
+from vmri_jax.scene.joint_coordinates import along_run, check_reach, check_replaced, check_run, joint_starts, with_rates
 from vmri_jax.scene.layout import Key
 from vmri_jax.scene.ledger import Ledger, ledger
 from vmri_jax.scene.redundancy import check_constraints, sort_with_loops
@@ -34,8 +35,6 @@ from vmri_jax.scene.rigid import Rigidity
 from vmri_jax.scene.rows import names_of, rows_of
 from vmri_jax.scene.sorting import Sorting
 from vmri_jax.scene.trees import Branch, check_frames, grow
-from vmri_jax.scene.turns import along_run, check_reach, check_run
-from vmri_jax.scene.velocities import check_replaced, joint_starts, with_rates
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 

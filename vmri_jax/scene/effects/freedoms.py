@@ -10,7 +10,7 @@ from typing import Any, Literal
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.scene.terms import place, split
+from vmri_jax.scene.terms import Applied, place, split
 
 Freedom = Literal["turn", "slide", "tilt", "along", "across"]
 """In this order: the angle about the axis n, the distance along n, the angle about the second axis e, the distances along m and m'."""
@@ -27,71 +27,58 @@ def triads(q, params):
     return tuple(params[f"frame_{role}"] @ split(x)[1] for role, x in zip("ab", q, strict=True))
 
 
-def dot(u, v):
-    """``u . v`` over the last axis."""
-    return (u * v).sum(axis=-1)
-
-
 M, M_PRIME, N = range(3)
 """Rows of a triad."""
 
 
-def turn_by_sine(q, params):
-    """``(m' . e, m . e)``: sine and cosine of the angle by which b has turned about n from the given position, times a common factor near 1."""
+def by_sine(sine, cosine, q, params):
+    """Sine and cosine of an angle, times a common factor near 1, as products of a vector of a and a vector of b; each by the numbers of both vectors."""
     of_a, of_b = triads(q, params)
-    e = of_b[..., M, :]
-    return dot(of_a[..., M_PRIME, :], e), dot(of_a[..., M, :], e)
+    return tuple((of_a[..., i, :] * of_b[..., j, :]).sum(axis=-1) for i, j in (sine, cosine))
 
 
-def tilt_by_sine(q, params):
-    """``(n . e', n . f)``: sine and cosine of the angle by which b has turned about its axis e from the given position, times a common factor near 1."""
-    of_a, of_b = triads(q, params)
-    n = of_a[..., N, :]
-    return dot(of_b[..., M_PRIME, :], n), dot(of_b[..., N, :], n)
+def angle(sine_and_cosine, q, params):
+    """The angle, rad, between -pi and pi."""
+    return jnp.arctan2(*sine_and_cosine(q, params))
 
 
-def slide(q, params, axis: int = N):
-    """How far b has moved from the given position along n, or along another vector of the triad of a: ``n . D``, m, (...)."""
-    return dot(triads(q, params)[0][..., axis, :], gap(q, params))
+def distance(axis, q, params):
+    """How far b has moved from the given position along a vector of the triad of a, as ``n . D``, m, (...)."""
+    return (triads(q, params)[0][..., axis, :] * gap(q, params)).sum(axis=-1)
 
 
-ANGLES: dict[str, Any] = {"turn": turn_by_sine, "tilt": tilt_by_sine}
+ANGLES: dict[str, Any] = {
+    "turn": Applied(by_sine, ((M_PRIME, M), (M, M))),  # m' . e, m . e
+    "tilt": Applied(by_sine, ((N, M_PRIME), (N, N))),  # n . e', n . f
+}
 """For each freedom that is an angle, the function that gives its sine and cosine."""
+FREEDOMS: dict[str, Any] = {
+    "turn": Applied(angle, (ANGLES["turn"],)),
+    "slide": Applied(distance, (N,)),
+    "tilt": Applied(angle, (ANGLES["tilt"],)),
+    "along": Applied(distance, (M,)),
+    "across": Applied(distance, (M_PRIME,)),
+}
+"""For each freedom, the function ``(q, params) -> (...)`` of the coordinates of both bodies that gives its value against the given position."""
 REACH = 5 * np.pi / 6
 """rad: an effect that counts whole turns may take an angle from directors up to this size. Directors know angles up to whole turns; the gap of
 a third of a turn between REACH and -REACH is too wide to be jumped over by a run with six steps in a turn. A larger value narrows the gap."""
-COORDINATE = "coordinate"
-"""In `FREEDOMS`, the name of any freedom that is a coordinate of the scene, ``q = ((..., 1),)``."""
-FREEDOMS: dict[str, Any] = {
-    "turn": lambda q, params: jnp.arctan2(*turn_by_sine(q, params)),
-    "slide": slide,
-    "tilt": lambda q, params: jnp.arctan2(*tilt_by_sine(q, params)),
-    "along": lambda q, params: slide(q, params, M),
-    "across": lambda q, params: slide(q, params, M_PRIME),
-    COORDINATE: lambda q, params: q[0][..., 0],
-}
-"""For each freedom, the function ``(q, params) -> (...)`` of the coordinates of both bodies that gives its value against the given position: rad,
-between -pi and pi, or m."""
 
 
-def within_reach(angle):
-    """The angle, rad; beyond `REACH` NaN with all its derivatives, which ends a run in place of a wrong number of turns."""
+def within_reach(freedom, q, params):
+    """An angle, rad; beyond `REACH` NaN with all its derivatives, which ends a run in place of a wrong number of turns."""
+    angle = freedom(q, params)
     return angle * jnp.where(jnp.abs(angle) < REACH, 1.0, jnp.nan)
 
 
-IN_REACH = {freedom: f"{freedom} within reach" for freedom in ANGLES}
-"""For each angle, the name in `FREEDOMS` of the same angle `within_reach`."""
-SINES = {freedom: f"sine and cosine of {freedom}" for freedom in ANGLES}
-"""For each angle, the name in `FREEDOMS` of its function in `ANGLES`."""
-FREEDOMS |= {SINES[freedom]: function for freedom, function in ANGLES.items()} | {
-    name: lambda q, params, angle=FREEDOMS[freedom]: within_reach(angle(q, params))
-    for freedom, name in IN_REACH.items()
-}
+def coordinate(q, params):
+    """A freedom that is a coordinate of the scene, ``q = ((..., 1),)``."""
+    return q[0][..., 0]
 
 
-def freedoms_of(names: tuple[str, ...], q: Iterable[Any], params: Mapping[str, Any]) -> tuple[Any, ...]:
-    """The freedoms with these names in `FREEDOMS`, by the coordinate of each or by the coordinates of both bodies of its joint."""
+def freedoms_of(functions: tuple[Any, ...], q: Iterable[Any], params: Mapping[str, Any]) -> tuple[Any, ...]:
+    """Freedoms by these functions, of the coordinate of each or of the coordinates of both bodies of its joint."""
     roles, frames = iter(q), params.get("joints", (params,))
-    sizes = (1 if name == COORDINATE else 2 for name in names)
-    of_each = zip(names, sizes, frames, strict=True)
-    return tuple(FREEDOMS[name](tuple(islice(roles, size)), of_joint) for name, size, of_joint in of_each)
+    sizes = (1 if function is coordinate else 2 for function in functions)
+    of_each = zip(functions, sizes, frames, strict=True)
+    return tuple(function(tuple(islice(roles, size)), of_joint) for function, size, of_joint in of_each)

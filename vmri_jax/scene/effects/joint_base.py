@@ -20,7 +20,7 @@ from vmri_jax.refusals import Refused
 from vmri_jax.scene.body import GROUND, GROUND_COORDINATES, Attachment, body_of, label_of
 from vmri_jax.scene.declare import names, stacked
 from vmri_jax.scene.effect import START, Effect
-from vmri_jax.scene.effects.freedoms import COORDINATE, FREEDOMS, IN_REACH, Freedom, freedoms_of
+from vmri_jax.scene.effects.freedoms import ANGLES, FREEDOMS, Freedom, coordinate, freedoms_of, within_reach
 from vmri_jax.scene.layout import Key, Layout
 from vmri_jax.scene.products import FRAME, products
 from vmri_jax.scene.rigid import RigidBody
@@ -247,12 +247,22 @@ class OfFreedoms(Effect):
     marks: ClassVar[tuple[str, ...]] = ()
     """Names of parameters that are values of the freedom, such as limits."""
 
+    @property
     @abstractmethod
-    def freedoms_of(self, i: int) -> tuple[Key, ...]: ...
+    def joint_freedoms(self) -> Sequence[tuple[Joint, Freedom]]:
+        """The joints, of as many pairs each, and the freedom in each, of which an element takes one."""
 
-    def by_directors(self, freedom: str) -> str:
-        """The name in `FREEDOMS` of a freedom that is no coordinate of the scene."""
-        return IN_REACH.get(freedom, freedom) if self.counts_turns else freedom
+    def freedoms_of(self, i: int) -> tuple[Key, ...]:
+        return tuple((joint.name, i, freedom) for joint, freedom in self.joint_freedoms)
+
+    def by_directors(self, freedom: str) -> Any:
+        """The function of the coordinates of both bodies for a freedom that is no coordinate of the scene."""
+        function = FREEDOMS[freedom]
+        return Applied(within_reach, (function,)) if self.counts_turns and freedom in ANGLES else function
+
+    def _elements(self):
+        pairs = zip(*(joint.elements for joint, _ in self.joint_freedoms), strict=False)
+        return tuple(tuple(chain(*names)) for names in pairs)
 
     def positions(self, group):
         """The freedoms at the positions in `bodies`, which are zero."""
@@ -272,7 +282,7 @@ class OfFreedoms(Effect):
         roles, freedoms = [], []
         for j, is_coordinate in enumerate(free):
             keys = [self.freedoms_of(i)[j] for i in group]
-            freedoms.append(COORDINATE if is_coordinate else self.by_directors(keys[0][2]))
+            freedoms.append(coordinate if is_coordinate else self.by_directors(keys[0][2]))
             if is_coordinate:
                 roles.append(Role(Rows.of([layout.freedoms[key] for key in keys]), len(group), 1))
                 continue

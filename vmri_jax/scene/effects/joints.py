@@ -29,7 +29,7 @@ from vmri_jax.mechanics.arrays import library
 from vmri_jax.mechanics.kinematics import Move
 from vmri_jax.scene.declare import number
 from vmri_jax.scene.effect import START
-from vmri_jax.scene.effects.freedoms import M_PRIME, M, N, slide, turn_by_sine
+from vmri_jax.scene.effects.freedoms import ANGLES, M_PRIME, M, N, distance
 from vmri_jax.scene.effects.joint_base import GAP, PARALLEL, AboutAxis, Joint
 from vmri_jax.scene.products import products
 
@@ -103,8 +103,8 @@ class Cylindrical(AboutAxis):
 def screwed(q, params):
     """The rows of `Cylindrical` and ``m' . e cos a - m . e sin a``, (..., 5)."""
     # rather than a difference of angles, which would jump by 2 pi after half a turn
-    angle, xp = 2 * np.pi * slide(q, params) / params["pitch"], library(q)
-    sine, cosine = turn_by_sine(q, params)
+    angle, xp = 2 * np.pi * distance(N, q, params) / params["pitch"], library(q)
+    sine, cosine = ANGLES["turn"](q, params)
     difference = sine * xp.cos(angle) - cosine * xp.sin(angle)
     q = [xp.broadcast_to(x, (*difference.shape, x.shape[-1])) for x in q]
     return xp.concatenate([products(len(Cylindrical.rows), q, params), difference[..., None]], axis=-1)

@@ -14,8 +14,7 @@ from vmri_jax.refusals import Refused
 from vmri_jax.scene.body import end_of
 from vmri_jax.scene.declare import array, names, number, positive, real_tree, stacked
 from vmri_jax.scene.effect import Effect
-from vmri_jax.scene.effects.points import distance
-from vmri_jax.scene.effects.springs import elastic_energy
+from vmri_jax.scene.effects.springs import distance, elastic_energy
 
 
 class NBodyGravity(Effect):
