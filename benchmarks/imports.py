@@ -92,7 +92,7 @@ def their_accelerations(model: Any, data: Any) -> dict[str, np.ndarray]:
 
 def apart(scene: Any, model: Any, data: Any) -> tuple[float, float]:
     """Largest difference of the accelerations of a scene and of MuJoCo, and their size, the largest of MuJoCo."""
-    from benchmarks.body_motions import accelerations, state_of  # only now: scenes start JAX
+    from vmri_jax.scene.body_motions import accelerations, state_of  # only now: scenes start JAX
 
     ours, theirs = accelerations(scene, state_of(scene)), their_accelerations(model, data)
     differences = (float(np.abs(ours[name][2][:3] - a).max()) for name, a in theirs.items())

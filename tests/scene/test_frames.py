@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from benchmarks.body_motions import accelerations, state_of
 from tests.scene.mechanics import assert_mechanics_as_by_directors, assert_same_mechanics, by_directors, mechanics
 from vmri_jax.scene import (
     Box,
@@ -25,6 +24,7 @@ from vmri_jax.scene import (
     Scene,
     Universal,
 )
+from vmri_jax.scene.body_motions import accelerations, state_of
 
 PLATE = RigidBody("plate", 1.5, Box((0.4, 0.6, 0.2)), [0.3, 0.2, 0.1])
 HAND = RigidBody("hand", 0.5, Box((0.3, 0.1, 0.2)), [0.3, 0.7, 0.1])

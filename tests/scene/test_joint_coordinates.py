@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 import vmri_jax as vm
-from benchmarks.body_motions import accelerations
 from tests.scene.mechanics import assert_mechanics_as_by_directors, mechanics
 from tests.scene.random_trees import random_scene
 from vmri_jax.animation.drawing import Drawing
@@ -34,6 +33,7 @@ from vmri_jax.scene import (
     angular_momentum,
     trees,
 )
+from vmri_jax.scene.body_motions import accelerations
 
 DRAWN = (0, 6, 11)
 """Seeds whose scenes have all kinds of joints between them, from the first body to the second and back."""

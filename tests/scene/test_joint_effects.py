@@ -6,7 +6,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from benchmarks.body_motions import accelerations, state_of
 from vmri_jax.scene import (
     Cylinder,
     Gravity,
@@ -20,6 +19,7 @@ from vmri_jax.scene import (
     RigidBody,
     Scene,
 )
+from vmri_jax.scene.body_motions import accelerations, state_of
 
 Y = np.array([0.0, 1.0, 0.0])
 MASS, LENGTH, TILT, WEIGHT = 2.0, 0.7, 0.5, 2.0 * 9.81

@@ -23,7 +23,7 @@ from vmri_jax.scene import (
     Spherical,
     Universal,
 )
-from vmri_jax.scene.effects.freedoms import FREEDOMS
+from vmri_jax.scene.effects.joint_base import FREEDOMS
 from vmri_jax.scene.rigid import rotation
 
 MOMENTS = [1.0, 2.0, 2.5]

@@ -19,8 +19,7 @@ from vmri_jax.scene import (
     Spherical,
     Universal,
 )
-from vmri_jax.scene.effects.freedoms import gap, triads
-from vmri_jax.scene.effects.joint_base import Joint
+from vmri_jax.scene.effects.joint_base import Joint, gap, triads
 from vmri_jax.scene.rows import ConstraintRows
 
 RANDOM = np.random.default_rng(0)

@@ -196,15 +196,6 @@ class Kinematics:
         )
 
     @cached_property
-    def places(self) -> tuple[Place, ...]:
-        """Places of the bodies in Q_s and Q_f."""
-        ends, places = dict(zip("sf", self.sizes, strict=True)), []
-        for part, *_ in self.bodies:
-            places.append(Place(part, ends[part], SIZE))
-            ends[part] += SIZE
-        return tuple(places)
-
-    @cached_property
     def lasts(self) -> np.ndarray:
         """(bodies + links,) number of the last link before each body and before each link; -1 for none."""
         return np.array([*(body.link for body in self.bodies), *(link.parent for link in self.links)], int)

@@ -17,11 +17,10 @@ from vmri_jax.mechanics.arrays import is_concrete
 from vmri_jax.mechanics.constraints import RANK, configuration, known_mass_and_momentum
 from vmri_jax.mechanics.system import System
 from vmri_jax.refusals import Refused
+from vmri_jax.scene.binding import Key
 from vmri_jax.scene.body import AnyBody, moving
 from vmri_jax.scene.effect import Effect
-from vmri_jax.scene.effects.freedoms import ANGLES, REACH
-from vmri_jax.scene.effects.joint_base import Joint, OfFreedoms, for_pairs, freedom_of, joint_named
-from vmri_jax.scene.layout import Key
+from vmri_jax.scene.effects.joint_base import ANGLES, REACH, Joint, OfFreedoms, for_pairs, freedom_of, joint_named
 from vmri_jax.scene.rows import ConstraintRows
 from vmri_jax.scene.sorting import Sorting
 from vmri_jax.scene.trees import Branch

@@ -19,7 +19,7 @@ from vmri_jax.refusals import Refused
 from vmri_jax.running.prepare import prepare
 from vmri_jax.running.printed import PrintedTable
 from vmri_jax.running.timing import interleaved, seconds_each
-from vmri_jax.scene.assembly import build
+from vmri_jax.scene.functions import build
 from vmri_jax.scene.sorting import Sorting
 from vmri_jax.schemes.composition import Composition, stage_scheme
 from vmri_jax.schemes.scheme import Scheme

@@ -191,18 +191,21 @@ class RigidBody(AnyBody):
         """The same body with other velocities; the spin of a rod about its axis is zero."""
         return replace(self, velocity=rates[:3], spin=np.linalg.lstsq(self._turns(), rates[3:], rcond=None)[0])
 
-    def components(self, vector):
-        """(3,) components of a vector along the principal axes; refused along an axis without width and director."""
-        components = vector @ self.axes
+    def weights(self, offset: Any) -> Any:
+        """(3,) components X of a point ``phi + sum_i X_i d_i``, first those along the directors that the body has, then zeros.
+
+        Refused along an axis without width and director.
+        """
+        components = offset @ self.axes
         thin = [i for i in range(3) if i not in self.wide]
         if thin and is_concrete(components):
             sizes = np.abs(np.asarray(components))
             if np.any(sizes[thin] > ORTHONORMAL * sizes.max()):
                 raise Refused(
-                    f"{np.asarray(vector)} sticks out of {self.name}: with the moments of inertia {np.asarray(self.moments)} it is a plate "
+                    f"{np.asarray(offset)} sticks out of {self.name}: with the moments of inertia {np.asarray(self.moments)} it is a plate "
                     "or a rod without width in this direction. Give the body some width."
                 )
-        return components
+        return joined([components[np.array(self.wide)], np.zeros(len(thin))])
 
     @property
     def _drawn_shape(self) -> Shape:
@@ -235,11 +238,6 @@ class RigidBody(AnyBody):
         components = (corners @ self.axes)[:, list(self.wide)].tolist()
         coordinates = [[part, start + i] for i in range(self.size)]
         return {"solids": [{"name": self.name, "coordinates": coordinates, "corners": components, "faces": faces}]}
-
-    def weights(self, offset: Any) -> Any:
-        """(3,) components X of a point ``phi + sum_i X_i d_i``, first those along the directors that the body has, then zeros."""
-        components = self.components(offset)
-        return joined([components[np.array(self.wide)], np.zeros(3 - len(self.wide))])
 
 
 class Rigidity(Effect):

@@ -18,22 +18,19 @@ from vmri_jax.mechanics.summary import listed, summary
 from vmri_jax.mechanics.system import System
 from vmri_jax.refusals import Refused
 from vmri_jax.running.trajectory import Trajectory
-from vmri_jax.scene.assembly import actuation, build
-from vmri_jax.scene.binding import bound
+from vmri_jax.scene.binding import Key, bound
 from vmri_jax.scene.body import AnyBody, Frame
 from vmri_jax.scene.declare import arrays
 from vmri_jax.scene.drawing import drawing
 from vmri_jax.scene.effect import Effect
-from vmri_jax.scene.effects.freedoms import Freedom
-from vmri_jax.scene.effects.joint_base import joint_named
-from vmri_jax.scene.functions import RESERVED, Actuation
+from vmri_jax.scene.effects.joint_base import Freedom, joint_named
+from vmri_jax.scene.functions import RESERVED, Actuation, actuation, build
 from vmri_jax.scene.joint_coordinates import along_run, check_reach, check_replaced, check_run, joint_starts, with_rates
-from vmri_jax.scene.layout import Key
 from vmri_jax.scene.ledger import Ledger, ledger
 from vmri_jax.scene.redundancy import check_constraints, sort_with_loops
 from vmri_jax.scene.rigid import Rigidity
-from vmri_jax.scene.rows import names_of, rows_of
-from vmri_jax.scene.sorting import Sorting
+from vmri_jax.scene.rows import names_of
+from vmri_jax.scene.sorting import Sorting, rows_of
 from vmri_jax.scene.trees import Branch, check_frames, grow
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme

@@ -17,15 +17,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from vmri_jax.mechanics.arrays import is_concrete, library
-from vmri_jax.mechanics.kinematics import Carried, Kinematics, Link, Move
+from vmri_jax.mechanics.kinematics import SIZE, Carried, Kinematics, Link, Move
 from vmri_jax.mechanics.rows import Part, Place
 from vmri_jax.refusals import Refused
+from vmri_jax.scene.binding import DecidedPace, Key, Layout
 from vmri_jax.scene.body import GROUND, Bodies, Frame, body_of
 from vmri_jax.scene.effect import Effect
-from vmri_jax.scene.effects.freedoms import ANGLES
-from vmri_jax.scene.effects.joint_base import Joint, OfFreedoms
-from vmri_jax.scene.layout import DecidedPace, Key, Layout
+from vmri_jax.scene.effects.joint_base import ANGLES, Joint, OfFreedoms
 from vmri_jax.scene.rigid import RigidBody
+from vmri_jax.scene.terms import split
 
 LONGEST = 100
 """Most bodies between the root and a leaf of a tree for which coordinates="auto" chooses joint coordinates. The kinetic energy couples all
@@ -178,22 +178,24 @@ def make_layout(
     ends: dict[Part, int] = {"s": 0, "f": 0}
     on_joints = {branch.child: branch for branch in branches}
     coordinates, places, freedoms = {}, {}, {}
+
+    def following(part: Part, size: int) -> Place:
+        ends[part] += size
+        return Place(part, ends[part] - size, size)
+
     for name, body in bodies.items():
         part: Part = "f" if paces[name].value == "fast" else "s"
         branch = on_joints.get(name)
         if branch is None:
-            coordinates[name] = places[name] = Place(part, ends[part], body.size)
-            ends[part] += body.size
+            coordinates[name] = places[name] = following(part, body.size)
             continue
         for key, label in zip(branch.moves, branch.labels, strict=True):
-            coordinates[label] = freedoms[key] = Place(part, ends[part], 1)
-            ends[part] += 1
+            coordinates[label] = freedoms[key] = following(part, 1)
     if not branches:
         return Layout(places, coordinates), ()
     kinematics, ordered = _kinematics(branches, places, freedoms, (ends["s"], ends["f"]))
-    on_joint = {branch.child: place for branch, place in zip(ordered, kinematics.places, strict=True)}
-    all_places = {name: places.get(name) or on_joint[name] for name in bodies}
-    return Layout(all_places, coordinates, freedoms, kinematics), ordered
+    places |= {b.child: following(body.part, SIZE) for b, body in zip(ordered, kinematics.bodies, strict=True)}
+    return Layout({name: places[name] for name in bodies}, coordinates, freedoms, kinematics), ordered
 
 
 def _kinematics(branches: Sequence[Branch], places, freedoms, sizes) -> tuple[Kinematics, tuple[Branch, ...]]:
@@ -232,16 +234,14 @@ def joint_constants(bodies: Bodies, branches: Sequence[Branch]) -> dict[str, Any
     zeros, turns, slides = [], [], []
     for branch in branches:
         root, shift = _root(branch, on_joints)
-        centre, directors = _frame(bodies, root)
-        origin, axes = _frame(bodies, branch.child)
+        centre, directors = split(body_of(bodies, root).coordinates)
+        origin, axes = split(body_of(bodies, branch.child).coordinates)
         # a vector y in space has the components y D^T along the directors of the root, the rows of D
         place = origin + shift - centre
         zeros.append(library(place, axes).concatenate([place[None], axes]) @ directors.T)
         point = (branch.points[1] + shift - centre) @ directors.T
-        pitches = branch.joint.parameters.get(
-            "pitch", np.zeros(())
-        )  # of a screw: how far b moves along the axis per turn, m
-        pitch = (pitches[branch.element] if pitches.ndim else pitches) / (2 * np.pi)
+        # of a screw: how far b moves along the axis per turn, m
+        pitch = branch.joint.params_of((branch.element,)).get("pitch", 0.0) / (2 * np.pi)
         for _, move in branch.way:
             # a positive value of a freedom moves body b of the joint along its axis
             axis = (1.0 if branch.forward else -1.0) * branch.joint.triads[branch.element][move.axis] @ directors.T
@@ -263,12 +263,6 @@ def _root(branch: Branch | None, on_joints: Mapping[str, Branch]) -> tuple[str, 
         (of_parent, of_child), name = branch.points, branch.parent
         shift, branch = shift + of_parent - of_child, on_joints.get(name)
     return name, shift
-
-
-def _frame(bodies: Bodies, name: str) -> tuple[Any, Any]:
-    """Centre (3,) and directors (3, 3) of a body as the user gave them."""
-    rows = body_of(bodies, name).coordinates.reshape(4, 3)  # pyright: ignore[reportAttributeAccessIssue]
-    return rows[0], rows[1:]
 
 
 def _turn(axis, point):

@@ -1,4 +1,4 @@
-"""Base classes of joints: two bodies, the points and triads of the joint in them, and its freedoms.
+"""Base classes of joints: two bodies, the points and triads of the joint in them, and its freedoms, functions of the coordinates of both bodies.
 
 For the letters see `vmri_jax.scene.effects.joints`.
 """
@@ -6,25 +6,25 @@ For the letters see `vmri_jax.scene.effects.joints`.
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
-from itertools import chain
-from typing import Any, ClassVar
+from itertools import chain, islice
+from typing import Any, ClassVar, Literal
 
 import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.mechanics.arrays import is_concrete, library, real_array
+from vmri_jax.mechanics.constraints import START
 from vmri_jax.mechanics.kinematics import UNMOVED, Move
 from vmri_jax.mechanics.names import unknown
 from vmri_jax.mechanics.rows import Rows
 from vmri_jax.refusals import Refused
+from vmri_jax.scene.binding import Key, Layout
 from vmri_jax.scene.body import GROUND, GROUND_COORDINATES, Attachment, body_of, label_of
 from vmri_jax.scene.declare import names, stacked
-from vmri_jax.scene.effect import START, Effect
-from vmri_jax.scene.effects.freedoms import ANGLES, FREEDOMS, Freedom, coordinate, freedoms_of, within_reach
-from vmri_jax.scene.layout import Key, Layout
+from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.products import FRAME, products
 from vmri_jax.scene.rigid import RigidBody
-from vmri_jax.scene.terms import Applied, EffectTerm, Role
+from vmri_jax.scene.terms import Applied, EffectTerm, Role, place, split
 
 GAP = (("D", "x"), ("D", "y"), ("D", "z"))
 """Rows that keep the points of both bodies at one place: the components of D along the axes of space."""
@@ -32,6 +32,79 @@ PARALLEL = (("n", "e"), ("n", "e'"))
 """Rows that keep the axes n and f parallel."""
 AXES = dict(zip("xyz", np.eye(3), strict=True))
 """The axes of space, which a row may have as one of its two vectors."""
+
+
+Freedom = Literal["turn", "slide", "tilt", "along", "across"]
+"""In this order: the angle about the axis n, the distance along n, the angle about the second axis e, the distances along m and m'."""
+
+
+def gap(q, params):
+    """``D = phi_b + rho_b - phi_a - rho_a``, (..., 3) m."""
+    a, b = q
+    return place(b, params["point_b"]) - place(a, params["point_a"])
+
+
+def triads(q, params):
+    """``(m, m', n)`` of a and ``(e, e', f)`` of b in space, (..., 3, 3) with one vector per row."""
+    return tuple(params[f"frame_{role}"] @ split(x)[1] for role, x in zip("ab", q, strict=True))
+
+
+M, M_PRIME, N = range(3)
+"""Rows of a triad."""
+
+
+def by_sine(body, turned, rows, q, params):
+    """Sine and cosine of an angle, times a common factor near 1: products of the vector `turned` of a (0) or b (1) with two rows of the other body."""
+    both = triads(q, params)
+    vector, other = both[body][..., turned, :], both[1 - body]
+    return tuple((other[..., row, :] * vector).sum(axis=-1) for row in rows)
+
+
+def angle(sine_and_cosine, q, params):
+    """The angle, rad, between -pi and pi."""
+    return jnp.arctan2(*sine_and_cosine(q, params))
+
+
+def distance(axis, q, params):
+    """How far b has moved from the given position along a vector of the triad of a, as ``n . D``, m, (...)."""
+    return (triads(q, params)[0][..., axis, :] * gap(q, params)).sum(axis=-1)
+
+
+ANGLES: dict[str, Any] = {
+    "turn": Applied(by_sine, (1, M, (M_PRIME, M))),  # m' . e, m . e
+    "tilt": Applied(by_sine, (0, N, (M_PRIME, N))),  # n . e', n . f
+}
+"""For each freedom that is an angle, the function that gives its sine and cosine."""
+FREEDOMS: dict[str, Any] = {
+    "turn": Applied(angle, (ANGLES["turn"],)),
+    "slide": Applied(distance, (N,)),
+    "tilt": Applied(angle, (ANGLES["tilt"],)),
+    "along": Applied(distance, (M,)),
+    "across": Applied(distance, (M_PRIME,)),
+}
+"""For each freedom, the function ``(q, params) -> (...)`` of the coordinates of both bodies that gives its value against the given position."""
+REACH = 5 * np.pi / 6
+"""rad: an effect that counts whole turns may take an angle from directors up to this size. Directors know angles up to whole turns; the gap of
+a third of a turn between REACH and -REACH is too wide to be jumped over by a run with six steps in a turn. A larger value narrows the gap."""
+
+
+def within_reach(freedom, q, params):
+    """An angle, rad; beyond `REACH` NaN with all its derivatives, which ends a run in place of a wrong number of turns."""
+    angle = freedom(q, params)
+    return angle * jnp.where(jnp.abs(angle) < REACH, 1.0, jnp.nan)
+
+
+def coordinate(q, params):
+    """A freedom that is a coordinate of the scene, ``q = ((..., 1),)``."""
+    return q[0][..., 0]
+
+
+def freedoms_of(functions: tuple[Any, ...], q: Iterable[Any], params: Mapping[str, Any]) -> tuple[Any, ...]:
+    """Freedoms by these functions, of the coordinate of each or of the coordinates of both bodies of its joint."""
+    roles, frames = iter(q), params.get("joints", (params,))
+    sizes = (1 if function is coordinate else 2 for function in functions)
+    of_each = zip(functions, sizes, frames, strict=True)
+    return tuple(function(tuple(islice(roles, size)), of_joint) for function, size, of_joint in of_each)
 
 
 class Joint(Effect):
@@ -133,18 +206,16 @@ class Joint(Effect):
             expected = f"{first} and {second}; they must coincide at the start"
             self.require(coincide, f"the distance of the points of {a}-{b}", f"{float(distance):.6g}", expected)
 
-    def drawn_points(self):
+    def drawing(self):
         points = {role: self._components[f"point_{role}"] for role in "ab"}
-        return {
+        ends = {
             f"{self.name} {'-'.join(element)} in {name}": (name, points[role][i])
             for i, element in enumerate(self.elements)
             for role, name in zip("ab", element, strict=True)
             # a line to a point outside the drawn shape of a body is drawn from the centre
             if isinstance(body := body_of(self.by_name, name), RigidBody) and not body.covers(points[role][i])
         }
-
-    def drawing(self):
-        return {"links": [[name, end] for end, (name, _) in self.drawn_points().items()]}
+        return {"links": [[name, end] for end, (name, _) in ends.items()], "points": ends}
 
     @cached_property
     def joining_points(self):

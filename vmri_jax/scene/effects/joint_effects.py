@@ -10,14 +10,13 @@ import numpy as np
 
 from vmri_jax.mechanics.arrays import library, real_array
 from vmri_jax.mechanics.checks import describe, shape_of
+from vmri_jax.mechanics.constraints import START
 from vmri_jax.mechanics.functions import NO_VELOCITY, check_arguments
 from vmri_jax.refusals import Refused
 from vmri_jax.scene.binding import MOST_ROLES
 from vmri_jax.scene.declare import number, of_time, positive, real_tree
-from vmri_jax.scene.effect import START
-from vmri_jax.scene.effects.contact import penalty
-from vmri_jax.scene.effects.freedoms import ANGLES, FREEDOMS, Freedom
-from vmri_jax.scene.effects.joint_base import Joint, OfFreedoms, freedom_of, joint_named
+from vmri_jax.scene.effects.joint_base import ANGLES, FREEDOMS, Freedom, Joint, OfFreedoms, freedom_of, joint_named
+from vmri_jax.scene.effects.potentials import penalty
 from vmri_jax.scene.effects.springs import elastic_energy
 from vmri_jax.scene.terms import Applied
 

@@ -26,11 +26,10 @@ from typing import Any, ClassVar
 import numpy as np
 
 from vmri_jax.mechanics.arrays import library
+from vmri_jax.mechanics.constraints import START
 from vmri_jax.mechanics.kinematics import Move
 from vmri_jax.scene.declare import number
-from vmri_jax.scene.effect import START
-from vmri_jax.scene.effects.freedoms import ANGLES, M_PRIME, M, N, distance
-from vmri_jax.scene.effects.joint_base import GAP, PARALLEL, AboutAxis, Joint
+from vmri_jax.scene.effects.joint_base import ANGLES, GAP, M_PRIME, PARALLEL, AboutAxis, Joint, M, N, distance
 from vmri_jax.scene.products import products
 
 ACROSS = (("m", "D"), ("m'", "D"))

@@ -11,10 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.mechanics.arrays import library
+from vmri_jax.mechanics.constraints import START
 from vmri_jax.refusals import Refused
 from vmri_jax.scene.body import end_of, label_of
 from vmri_jax.scene.declare import array, names, of_time, positive, real_tree, vector
-from vmri_jax.scene.effect import START, Effect
+from vmri_jax.scene.effect import Effect
 
 
 def distance(q, params=None):
@@ -88,7 +89,7 @@ class ToFixedPoint(ToPoint):
         for (name,), point in zip(self.elements, points.tolist(), strict=True):
             if not end_of(self.by_name, name).block:
                 anchors.append({"body": label_of(name), "point": point, "kind": self.drawn_as})
-        return {"anchors": anchors}
+        return super().drawing() | {"anchors": anchors}
 
 
 class ToPath(ToPoint):
