@@ -19,8 +19,9 @@ from vmri_jax.scene import (
     Spherical,
     Universal,
 )
-from vmri_jax.scene.effects.joint_base import Joint, gap, triads
+from vmri_jax.scene.effects.joint_base import Joint
 from vmri_jax.scene.rows import ConstraintRows
+from vmri_jax.scene.terms import place, split
 
 RANDOM = np.random.default_rng(0)
 X, Y, Z = np.eye(3)
@@ -47,6 +48,11 @@ ROWS: Any = ConstraintRows.of(SCENE.sorting)
 Q = RANDOM.normal(size=ROWS.start.size)
 
 
+def gap(q, params):
+    """``D = phi_b + rho_b - phi_a - rho_a``."""
+    return place(q[1], params["point_b"]) - place(q[0], params["point_a"])
+
+
 def test_rows_are_the_products_of_the_table():
     """Each row of a joint is the product of two of the vectors D, m, m', n, e, e', f and x, y, z, which the joint has by name."""
     values, _ = ROWS.evaluate(0.0, Q)
@@ -55,12 +61,18 @@ def test_rows_are_the_products_of_the_table():
     for joint in [part.effect for part in SCENE.sorting.placed if isinstance(part.effect, Joint)]:
         of_joint = [value for value, row in zip(values, ROWS.rows, strict=True) if row.effect is joint]
         expected = []
-        for i in [i for group in joint.by_size() for i in group]:
-            q, params = tuple(coordinates[name] for name in joint.elements[i]), joint.params_of((i,), joint.frames)
+        for i in [i for group in joint.groups() for i in group]:
+            q = [coordinates[name] for name in joint.elements[i]]
+            params = {name: values[i] for name, values in joint._components.items()}
             vectors = dict(zip("xyz", np.eye(3), strict=True)) | {"D": gap(q, params)}
             if joint.triads is not None:
-                vectors |= zip(("m", "m'", "n", "e", "e'", "f"), np.concatenate(triads(q, params)), strict=True)
-            expected += [vectors[u] @ vectors[v] for u, v in joint.rows]
+                vectors |= zip(
+                    ("m", "m'", "n", "e", "e'", "f"),
+                    np.concatenate([params[f"frame_{role}"] @ split(x)[1] for role, x in zip("ab", q, strict=True)]),
+                    strict=True,
+                )
+            rows = Cylindrical.rows if isinstance(joint, Screw) else joint.rows
+            expected += [vectors[u] @ vectors[v] for u, v in rows]
             if isinstance(joint, Screw):
                 angle = 2 * np.pi * vectors["n"] @ vectors["D"] / 0.7
                 expected.append(

@@ -27,7 +27,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import pairwise
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -51,17 +51,6 @@ LARGEST_MATRIX = 16
 number makes the programs of small trees larger."""
 UNMOVED = np.concatenate([np.zeros((1, 3)), np.eye(3)])
 """(4, 3) the motion of nothing; centre and directors of the ground."""
-
-
-class Move(NamedTuple):
-    """The motion of a triad with one coordinate of a joint.
-
-    kind: "turn" about a vector of the triad, "slide" along it, or "screw": both.
-    axis: number of the vector.
-    """
-
-    kind: Literal["turn", "slide", "screw"]
-    axis: int
 
 
 class Link(NamedTuple):

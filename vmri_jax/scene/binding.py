@@ -205,7 +205,7 @@ class Bindable(Declared, ABC):
     def at_start(self, params: Mapping[str, Any]):
         """The measured value of every element at the start, (n,), or () of a single element."""
         values: dict[int, Any] = {}
-        for group in self.by_size():
+        for group in self.groups():
             of_group = self.rest(self.positions(group), self.params_of(group, params))
             values |= zip(group, library(of_group).atleast_1d(of_group), strict=True)
         return stacked([values[i] for i in sorted(values)])
@@ -243,24 +243,28 @@ class Bindable(Declared, ABC):
         """The freedoms of joints that element i is a function of; () if it depends on other coordinates."""
         return ()
 
-    def by_size(self, select: Sequence[int] | None = None) -> list[list[int]]:
-        """Some or all elements, by their numbers, in groups between bodies of the same sizes and kinds: each group is a term."""
+    def kind_of(self, i: int, layout: Layout | None = None) -> tuple:
+        """Equal for elements that can be one term: between bodies of the same sizes and kinds."""
+        return tuple(
+            (name == GROUND, isinstance(name, Attachment), body_of(self.by_name, name).size, end.size)
+            for name, end in zip(self.attached[i], self.ends[i], strict=True)
+        )
+
+    def groups(self, select: Sequence[int] | None = None, layout: Layout | None = None) -> list[list[int]]:
+        """Some or all elements, by their numbers, in groups of one kind."""
         groups: dict[tuple, list[int]] = {}
         for i in range(len(self.elements)) if select is None else select:
-            kinds = tuple(
-                (name == GROUND, isinstance(name, Attachment), body_of(self.by_name, name).size, end.size)
-                for name, end in zip(self.attached[i], self.ends[i], strict=True)
-            )
-            groups.setdefault(kinds, []).append(i)
+            groups.setdefault(self.kind_of(i, layout), []).append(i)
         return list(groups.values())
 
     def terms(self, select: Sequence[int], layout: Layout) -> tuple:
-        """The terms of some elements, one for each group `by_size`."""
-        terms = []
-        for group in self.by_size(select):
-            roles = zip(POINTS, zip(*(self.attached[i] for i in group), strict=True), strict=False)
-            terms.append(self._term([self._role(*role, layout.bodies) for role in roles], group))
-        return tuple(terms)
+        """The terms of some elements, one for each group."""
+        return tuple(self.term(group, layout) for group in self.groups(select, layout))
+
+    def term(self, group: Sequence[int], layout: Layout) -> EffectTerm:
+        """The term of elements of one kind."""
+        roles = zip(POINTS, zip(*(self.attached[i] for i in group), strict=True), strict=False)
+        return self._term([self._role(*role, layout.bodies) for role in roles], group)
 
     def _term(self, roles: Iterable[Role], group: Sequence[int], through: Any = None) -> EffectTerm:
         """Some elements as a term."""

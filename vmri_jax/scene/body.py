@@ -8,7 +8,6 @@ import jax
 import numpy as np
 
 from vmri_jax.mechanics.arrays import is_concrete, library, real_array
-from vmri_jax.mechanics.kinematics import UNMOVED
 from vmri_jax.refusals import Refused
 
 Pace = Literal["slow", "fast", "auto"]
@@ -16,8 +15,6 @@ LARGEST_POINT = 3
 """Most coordinates of a point; a body with more is a block of general coordinates."""
 GROUND = "ground"
 """Name in effects of the body that does not move."""
-GROUND_COORDINATES = UNMOVED.ravel()
-"""The twelve coordinates (phi, d_1, d_2, d_3) of the ground as a rigid body."""
 
 
 class Attachment(str):

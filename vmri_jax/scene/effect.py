@@ -241,7 +241,7 @@ def check_function(effect: Any, moved: bool) -> None:
     """
     if effect.kind == "control" or getattr(effect.function, "__module__", "").startswith(LIBRARY):
         return
-    for group in effect.by_size():
+    for group in effect.groups():
         q = jax.device_put(effect.positions(group))
         t, v = jax.device_put(((np.zeros(()),), tuple(np.zeros(x.shape) for x in q)))
         before = {"force": (*t, q, v), "kinetic": (q, v)}.get(effect.kind, (*t, q) if effect.timed else (q,))

@@ -164,7 +164,7 @@ def build(sorting: Sorting, placed: Sequence[Placed]) -> System:
         terms.setdefault("kinetic", [])
     if "kinetic" in terms and layout.sizes[0]:
         terms["slow_kinetic"] = []
-    taken = _taken(placed) if "implied" in terms else {}
+    taken = _taken(placed, layout) if "implied" in terms else {}
     functions: dict[str, Any] = {"potentials": {}}
     for home, of_home in terms.items():
         is_rows = home in (*HOMES, "implied")  # whose values keep the order of `rows_of`
@@ -188,9 +188,9 @@ def build(sorting: Sorting, placed: Sequence[Placed]) -> System:
     return System(kinetic, **functions, params=params)
 
 
-def _taken(placed: Sequence[Placed]) -> dict[Any, Entries]:
+def _taken(placed: Sequence[Placed], layout: Layout) -> dict[Any, Entries]:
     """The rows that each function of constraints takes of its terms."""
-    rows = rows_of(placed)
+    rows = rows_of(placed, layout)
     taken: dict[Any, Entries] = {home: Entries.of([row.kept for row in rows if row.home == home]) for home in HOMES}
     return taken | {"implied": Entries.of([not row.kept for row in rows if placed[row.part].dropped])}
 

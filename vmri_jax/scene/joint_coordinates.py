@@ -89,7 +89,7 @@ def check_replaced(
     name: str, changes: Mapping[str, Any], branches: Sequence[Branch], starts: Mapping[Key, tuple[Any, Any]]
 ) -> None:
     """Refuse other velocities of a body for which a rate in `joint_starts` stands."""
-    rated = [b.joint.name for b in branches if b.child == name and starts.keys() & b.moves.keys()]
+    rated = [b.joint.name for b in branches if b.child == name and starts.keys() & set(b.keys)]
     if rated and changes.keys() & {"velocity", "spin"}:
         raise Refused(
             f"Scene.replace: {name}: {' and '.join(changes)} would change nothing, because with_joints or with_rates has set "

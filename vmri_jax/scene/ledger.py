@@ -24,11 +24,6 @@ from vmri_jax.scene.sorting import Sorting
 from vmri_jax.schemes.composition import Composition, stage_scheme
 from vmri_jax.schemes.scheme import Scheme
 
-OTHER_TERMS: dict[Any, tuple[str, str]] = {
-    "control": ("F", "control u"),
-    "fast": ("fast", "potential on the micro grid"),
-}
-"""For each term of an effect that is no argument of `System`, the key of its rule in `Scheme.rule_of`, and its name in the ledger."""
 STEPS = 20
 """Macro steps of the program that is timed: enough that the call of the program takes little of the time. More take longer."""
 DEFAULT_FREQUENCY = 10.0
@@ -116,7 +111,9 @@ def _term(home: Any) -> tuple[Any, str]:
     if home in KINDS:
         kind = KINDS[home]
         return kind.symbol, f"{kind.in_words} {kind.symbol}"
-    return OTHER_TERMS.get(home, (home, f"potential on one in {home} micro nodes"))
+    if home == "control":
+        return "F", "control u"
+    return home, "potential on the micro grid" if home == "fast" else f"potential on one in {home} micro nodes"
 
 
 def ledger_of_functions(

@@ -167,8 +167,7 @@ class RigidBody(AnyBody):
     @property
     def rates(self):
         """(n,) velocity of the centre of mass, ``d_i' = spin x d_i``."""
-        turned = library(self.spin, self.directors).cross(self.spin, self.directors)
-        return joined([self.velocity, *(turned[i] for i in self.wide)])
+        return joined([self.velocity, self._turns() @ self.spin])
 
     @property
     def masses(self):
@@ -183,9 +182,9 @@ class RigidBody(AnyBody):
         matrix = np.block([[np.eye(3), np.zeros((3, 3))], [np.zeros((len(turns), 3)), turns]])
         return matrix if len(self.wide) > 1 else np.linalg.svd(matrix)[0][:, :5]  # a rod does not turn about itself
 
-    def _turns(self) -> np.ndarray:
+    def _turns(self) -> Any:
         """(3 k, 3) matrix from the angular velocity to the rates of the k directors, ``d_i' = -d_i x spin``."""
-        return np.concatenate([-_cross_matrix(np.asarray(self.directors[i])) for i in self.wide])
+        return joined([-_cross_matrix(self.directors[i]) for i in self.wide])
 
     def with_rates(self, rates: np.ndarray) -> "RigidBody":
         """The same body with other velocities; the spin of a rod about its axis is zero."""

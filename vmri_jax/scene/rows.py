@@ -99,7 +99,7 @@ class ConstraintRows:
     @cached_property
     def rows(self) -> list[Row]:
         """The names and origins of the rows."""
-        return rows_of(self.sorting.placed)
+        return rows_of(self.sorting.placed, self.sorting.layout)
 
     @cached_property
     def params(self) -> dict[str, Any]:
@@ -206,7 +206,9 @@ def names_of(sorting: Sorting) -> Names:
     for name, place in sorting.layout.coordinates.items():
         sizes[place.part][name] = place.size
     for home in HOMES:
-        sizes[home] = dict(Counter(row.label for row in rows_of(sorting.placed) if row.kept and row.home == home))
+        sizes[home] = dict(
+            Counter(row.label for row in rows_of(sorting.placed, sorting.layout) if row.kept and row.home == home)
+        )
     blocks, rigid = (
         [name for name, body in sorting.bodies.items() if getattr(body, kind)] for kind in ("block", "rigid")
     )

@@ -196,7 +196,7 @@ class Scene:
     @property
     def dropped(self) -> list[str]:
         """Names of the rows of constraints that the scene leaves out because they depend on others."""
-        return [row.name for row in rows_of(self.sorting.placed) if not row.kept]
+        return [row.name for row in rows_of(self.sorting.placed, self.sorting.layout) if not row.kept]
 
     @property
     def places(self) -> dict[str, Place]:

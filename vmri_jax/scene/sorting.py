@@ -364,12 +364,12 @@ class Row(NamedTuple):
     kept: bool
 
 
-def rows_of(placed: Sequence[Placed]) -> list[Row]:
+def rows_of(placed: Sequence[Placed], layout: Layout) -> list[Row]:
     """The rows of constraints, in the order of `Sorting.placed` and of the terms of each effect."""
     rows = []
     for i, part in enumerate(placed):
         effect, number = part.effect, 0
-        for group in effect.by_size(part.elements) if part.home in HOMES else ():
+        for group in effect.groups(part.elements, layout) if part.home in HOMES else ():
             # all elements of a group have as many rows
             t, one = (np.zeros(()),) if effect.timed else (), group[:1]
             size = jax.eval_shape(effect.called, *t, effect.positions(one), effect.params_of(one)).size

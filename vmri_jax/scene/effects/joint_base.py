@@ -5,6 +5,7 @@ For the letters see `vmri_jax.scene.effects.joints`.
 
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
 from itertools import chain, islice
 from typing import Any, ClassVar, Literal
@@ -14,17 +15,17 @@ import numpy as np
 
 from vmri_jax.mechanics.arrays import is_concrete, library, real_array
 from vmri_jax.mechanics.constraints import START
-from vmri_jax.mechanics.kinematics import UNMOVED, Move
+from vmri_jax.mechanics.kinematics import UNMOVED
 from vmri_jax.mechanics.names import unknown
 from vmri_jax.mechanics.rows import Rows
 from vmri_jax.refusals import Refused
-from vmri_jax.scene.binding import Key, Layout
-from vmri_jax.scene.body import GROUND, GROUND_COORDINATES, Attachment, body_of, label_of
+from vmri_jax.scene.binding import Key
+from vmri_jax.scene.body import GROUND, Attachment, body_of, label_of
 from vmri_jax.scene.declare import names, stacked
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.products import FRAME, products
 from vmri_jax.scene.rigid import RigidBody
-from vmri_jax.scene.terms import Applied, EffectTerm, Role, place, split
+from vmri_jax.scene.terms import Applied, Role
 
 GAP = (("D", "x"), ("D", "y"), ("D", "z"))
 """Rows that keep the points of both bodies at one place: the components of D along the axes of space."""
@@ -38,60 +39,44 @@ Freedom = Literal["turn", "slide", "tilt", "along", "across"]
 """In this order: the angle about the axis n, the distance along n, the angle about the second axis e, the distances along m and m'."""
 
 
-def gap(q, params):
-    """``D = phi_b + rho_b - phi_a - rho_a``, (..., 3) m."""
-    a, b = q
-    return place(b, params["point_b"]) - place(a, params["point_a"])
-
-
-def triads(q, params):
-    """``(m, m', n)`` of a and ``(e, e', f)`` of b in space, (..., 3, 3) with one vector per row."""
-    return tuple(params[f"frame_{role}"] @ split(x)[1] for role, x in zip("ab", q, strict=True))
-
-
-M, M_PRIME, N = range(3)
-"""Rows of a triad."""
-
-
-def by_sine(body, turned, rows, q, params):
-    """Sine and cosine of an angle, times a common factor near 1: products of the vector `turned` of a (0) or b (1) with two rows of the other body."""
-    both = triads(q, params)
-    vector, other = both[body][..., turned, :], both[1 - body]
-    return tuple((other[..., row, :] * vector).sum(axis=-1) for row in rows)
-
-
-def angle(sine_and_cosine, q, params):
-    """The angle, rad, between -pi and pi."""
-    return jnp.arctan2(*sine_and_cosine(q, params))
-
-
-def distance(axis, q, params):
-    """How far b has moved from the given position along a vector of the triad of a, as ``n . D``, m, (...)."""
-    return (triads(q, params)[0][..., axis, :] * gap(q, params)).sum(axis=-1)
-
-
-ANGLES: dict[str, Any] = {
-    "turn": Applied(by_sine, (1, M, (M_PRIME, M))),  # m' . e, m . e
-    "tilt": Applied(by_sine, (0, N, (M_PRIME, N))),  # n . e', n . f
+FREEDOMS: dict[str, tuple[tuple[str, str], ...]] = {
+    "turn": (("m'", "e"), ("m", "e")),
+    "slide": (("n", "D"),),
+    "tilt": (("n", "e'"), ("n", "f")),
+    "along": (("m", "D"),),
+    "across": (("m'", "D"),),
 }
-"""For each freedom that is an angle, the function that gives its sine and cosine."""
-FREEDOMS: dict[str, Any] = {
-    "turn": Applied(angle, (ANGLES["turn"],)),
-    "slide": Applied(distance, (N,)),
-    "tilt": Applied(angle, (ANGLES["tilt"],)),
-    "along": Applied(distance, (M,)),
-    "across": Applied(distance, (M_PRIME,)),
-}
-"""For each freedom, the function ``(q, params) -> (...)`` of the coordinates of both bodies that gives its value against the given position."""
+"""For each freedom, the pairs of vectors whose products are its value against the given position, m; of an angle its sine and its cosine, times a
+common factor near 1."""
+ANGLES = ("turn", "tilt")
+"""The freedoms that are angles."""
+AXES_OF = {"turn": 2, "slide": 2, "tilt": 0, "along": 0, "across": 1}
+"""For each freedom, the number of the vector of the triad (m, m', n) about which or along which b moves."""
 REACH = 5 * np.pi / 6
 """rad: an effect that counts whole turns may take an angle from directors up to this size. Directors know angles up to whole turns; the gap of
 a third of a turn between REACH and -REACH is too wide to be jumped over by a run with six steps in a turn. A larger value narrows the gap."""
 
 
-def within_reach(freedom, q, params):
+def sine_and_cosine(q, params):
+    """Those of an angle by the products of its pairs of vectors."""
+    rows = products(2, q, params)
+    return rows[..., 0], rows[..., 1]
+
+
+def angle(q, params):
+    """An angle, rad, between -pi and pi."""
+    return jnp.arctan2(*sine_and_cosine(q, params))
+
+
+def within_reach(q, params):
     """An angle, rad; beyond `REACH` NaN with all its derivatives, which ends a run in place of a wrong number of turns."""
-    angle = freedom(q, params)
-    return angle * jnp.where(jnp.abs(angle) < REACH, 1.0, jnp.nan)
+    x = angle(q, params)
+    return x * jnp.where(jnp.abs(x) < REACH, 1.0, jnp.nan)
+
+
+def distance(q, params):
+    """A displacement, m."""
+    return products(1, q, params)[..., 0]
 
 
 def coordinate(q, params):
@@ -101,9 +86,9 @@ def coordinate(q, params):
 
 def freedoms_of(functions: tuple[Any, ...], q: Iterable[Any], params: Mapping[str, Any]) -> tuple[Any, ...]:
     """Freedoms by these functions, of the coordinate of each or of the coordinates of both bodies of its joint."""
-    roles, frames = iter(q), params.get("joints", (params,))
+    roles, numbers = iter(q), params.get("joints", (params,))
     sizes = (1 if function is coordinate else 2 for function in functions)
-    of_each = zip(functions, sizes, frames, strict=True)
+    of_each = zip(functions, sizes, numbers, strict=True)
     return tuple(function(tuple(islice(roles, size)), of_joint) for function, size, of_joint in of_each)
 
 
@@ -124,13 +109,13 @@ class Joint(Effect):
     is_analytic = True
     whole = True
     same_size = False
-    derived = ("point_a", "point_b", "frame_a", "frame_b", "factors", "offsets")
+    derived = ("factors", "offsets")
     rows: ClassVar[tuple[tuple[str, str], ...]] = GAP
     """Pairs of vectors whose scalar products are the rows: of the gap D, both triads, and the axes x, y, z of space."""
     carries: ClassVar[bool] = False
     """Whether the joint can carry a body, whose position is then a function of the freedoms: these must be coordinates without a singularity."""
-    freedoms: ClassVar[dict[Freedom, Move]] = {}
-    """For each freedom the motion of the triad of b against the triad of a; the motions are applied one after the other."""
+    freedoms: ClassVar[tuple[Freedom, ...]] = ()
+    """The motions of the triad of b against the triad of a, applied one after the other."""
 
     def _elements(self):
         return tuple(tuple(map(str, element)) for element in super()._elements())
@@ -146,18 +131,13 @@ class Joint(Effect):
         return tuple((b if a == GROUND else a, a if b == GROUND else b) for a, b in self.elements)
 
     def _parameters(self):
-        return super()._parameters() | self._factors()
+        return super()._parameters() | self.numbers(self.rows)
 
-    @cached_property
-    def frames(self) -> dict[str, Any]:
-        """Points and triads as components along the directors of each body: "point_a", "point_b", "frame_a", "frame_b"."""
-        return {name: stacked([*values]) for name, values in self._components.items()}
-
-    def _factors(self) -> dict[str, Any]:
-        """The numbers of the rows of all pairs, see `products`."""
+    def numbers(self, rows: Sequence[tuple[str, str]]) -> dict[str, Any]:
+        """The numbers of the products of pairs of vectors, for all pairs of bodies, see `products`."""
         frames = self._components
         xp, count = library(frames), len(self.elements)
-        named, zero = [name for side in zip(*self.rows, strict=True) for name in side], np.zeros((count, FRAME))
+        named, zero = [name for side in zip(*rows, strict=True) for name in side], np.zeros((count, FRAME))
         offsets, halves = np.stack([AXES.get(name, np.zeros(3)) for name in named]), []
         for role, names_of_role, sign in (("a", ("m", "m'", "n"), -1.0), ("b", ("e", "e'", "f"), 1.0)):
             # the gap D has the centres and points of both bodies, with opposite signs; the vectors of a triad have no centre
@@ -178,8 +158,8 @@ class Joint(Effect):
 
     def value(self, freedom: str, i: int, coordinates: Mapping[str, Any]):
         """A freedom of the i-th pair, (...) rad or m, by the coordinates (..., n) of bodies by name; an angle is between -pi and pi."""
-        ends = (GROUND_COORDINATES if name == GROUND else coordinates[name] for name in self.elements[i])
-        return FREEDOMS[freedom](tuple(map(jnp.asarray, ends)), self.params_of((i,), self.parameters | self.frames))
+        q = tuple(jnp.asarray(coordinates[name]) for name in self.attached[i])
+        return (angle if freedom in ANGLES else distance)(q, self.params_of((i,), self.numbers(FREEDOMS[freedom])))
 
     @cached_property
     def triads(self) -> Any:
@@ -243,7 +223,7 @@ class Joint(Effect):
 
     @cached_property
     def _components(self) -> dict[str, Any]:
-        """`frames` with an axis for the pairs."""
+        """Points and triads as components along the directors of each body: (n, 3) "point_a", "point_b", (n, 3, 3) "frame_a", "frame_b"."""
         points, triads = self.joining_points, self.triads
         components: dict[str, list] = {}
         for i, element in enumerate(self.elements):
@@ -328,38 +308,42 @@ class OfFreedoms(Effect):
 
     def by_directors(self, freedom: str) -> Any:
         """The function of the coordinates of both bodies for a freedom that is no coordinate of the scene."""
-        function = FREEDOMS[freedom]
-        return Applied(within_reach, (function,)) if self.counts_turns and freedom in ANGLES else function
+        if freedom not in ANGLES:
+            return distance
+        return within_reach if self.counts_turns else angle
 
     def _elements(self):
         pairs = zip(*(joint.elements for joint, _ in self.joint_freedoms), strict=False)
+        return tuple(tuple(chain(*names)) for names in pairs)
+
+    @cached_property
+    def attached(self):
+        pairs = zip(*(joint.attached for joint, _ in self.joint_freedoms), strict=False)
         return tuple(tuple(chain(*names)) for names in pairs)
 
     def positions(self, group):
         """The freedoms at the positions in `bodies`, which are zero."""
         return tuple(stacked([0.0] * len(group)) for _ in self.freedoms_of(group[0]))
 
-    def terms(self, select, layout):
-        groups: dict[Any, list[int]] = {}
-        for number, group in enumerate(self.by_size(select)):
-            for i in group:
-                free = tuple(key in layout.freedoms for key in self.freedoms_of(i))
-                # elements whose freedoms are all coordinates are one term, whatever their bodies are
-                groups.setdefault((free, None if all(free) else number), []).append(i)
-        return tuple(self._along(free, group, layout) for (free, _), group in groups.items())
+    def kind_of(self, i, layout=None):
+        is_free = tuple(layout is not None and key in layout.freedoms for key in self.freedoms_of(i))
+        # elements whose freedoms are all coordinates are one term, whatever their bodies are
+        return is_free if all(is_free) else (*is_free, super().kind_of(i))
 
-    def _along(self, free: Sequence[bool], group: Sequence[int], layout: Layout) -> EffectTerm:
-        """Some elements as a term; `free` says which of their freedoms are coordinates."""
+    def term(self, group, layout):
         roles, freedoms = [], []
-        for j, is_coordinate in enumerate(free):
-            keys = [self.freedoms_of(i)[j] for i in group]
-            freedoms.append(coordinate if is_coordinate else self.by_directors(keys[0][2]))
-            if is_coordinate:
+        for j, keys in enumerate(zip(*map(self.freedoms_of, group), strict=True)):
+            if keys[0] in layout.freedoms:
+                freedoms.append(coordinate)
                 roles.append(Role(Rows.of([layout.freedoms[key] for key in keys]), len(group), 1))
                 continue
+            freedoms.append(self.by_directors(keys[0][2]))
             for role in (2 * j, 2 * j + 1):
-                roles.append(self._role("", [self.elements[i][role] for i in group], layout.bodies))
-        return self._term(roles, group, Applied(freedoms_of, (tuple(freedoms),)))
+                roles.append(self._role("", [self.attached[i][role] for i in group], layout.bodies))
+        term = self._term(roles, group, Applied(freedoms_of, (tuple(freedoms),)))
+        # coordinates need no numbers of joints, whose shapes differ
+        unused = self.derived if set(freedoms) == {coordinate} else ()
+        return replace(term, split=tuple(name for name in term.split if name not in unused))
 
     def check_bodies(self):
         """Nothing: the joints check their bodies themselves."""

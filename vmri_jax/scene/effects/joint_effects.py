@@ -15,7 +15,16 @@ from vmri_jax.mechanics.functions import NO_VELOCITY, check_arguments
 from vmri_jax.refusals import Refused
 from vmri_jax.scene.binding import MOST_ROLES
 from vmri_jax.scene.declare import number, of_time, positive, real_tree
-from vmri_jax.scene.effects.joint_base import ANGLES, FREEDOMS, Freedom, Joint, OfFreedoms, freedom_of, joint_named
+from vmri_jax.scene.effects.joint_base import (
+    ANGLES,
+    FREEDOMS,
+    Freedom,
+    Joint,
+    OfFreedoms,
+    freedom_of,
+    joint_named,
+    sine_and_cosine,
+)
 from vmri_jax.scene.effects.potentials import penalty
 from vmri_jax.scene.effects.springs import elastic_energy
 from vmri_jax.scene.terms import Applied
@@ -45,7 +54,7 @@ class InJoint(OfFreedoms):
         return ((self.joint, self.of),)
 
     def _parameters(self):
-        return super()._parameters() | self.joint.frames
+        return super()._parameters() | self.joint.numbers(FREEDOMS[self.of])
 
 
 class JointSpring(InJoint):
@@ -198,7 +207,7 @@ class JointMotion(InJoint):
         return sine * xp.cos(a) - cosine * xp.sin(a)
 
     def by_directors(self, freedom):
-        return ANGLES.get(freedom, FREEDOMS[freedom])
+        return sine_and_cosine if freedom in ANGLES else super().by_directors(freedom)
 
     def check_parameters(self):
         super().check_parameters()
@@ -268,7 +277,7 @@ class JointCoupling(OfFreedoms):
         return real_tree(f"{self.name}: params", self.params)
 
     def _parameters(self):
-        return {"law": self.numbers(), "joints": tuple(joint.frames for joint, _ in self.joints)}
+        return {"law": self.numbers(), "joints": tuple(joint.numbers(FREEDOMS[of]) for joint, of in self.joints)}
 
     def check_parameters(self):
         value: Any = shape_of(f"{self.name}: law", self.law, jnp.zeros(len(self.joints)), self.numbers())
