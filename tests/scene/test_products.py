@@ -48,11 +48,6 @@ ROWS: Any = ConstraintRows.of(SCENE.sorting)
 Q = RANDOM.normal(size=ROWS.start.size)
 
 
-def gap(q, params):
-    """``D = phi_b + rho_b - phi_a - rho_a``."""
-    return place(q[1], params["point_b"]) - place(q[0], params["point_a"])
-
-
 def test_rows_are_the_products_of_the_table():
     """Each row of a joint is the product of two of the vectors D, m, m', n, e, e', f and x, y, z, which the joint has by name."""
     values, _ = ROWS.evaluate(0.0, Q)
@@ -63,14 +58,11 @@ def test_rows_are_the_products_of_the_table():
         expected = []
         for i in [i for group in joint.groups() for i in group]:
             q = [coordinates[name] for name in joint.elements[i]]
-            params = {name: values[i] for name, values in joint._components.items()}
-            vectors = dict(zip("xyz", np.eye(3), strict=True)) | {"D": gap(q, params)}
+            of_a, of_b = (of_role[i, :, 1:] for of_role in joint.vectors)
+            vectors = dict(zip("xyz", np.eye(3), strict=True)) | {"D": place(q[1], of_b[0]) - place(q[0], of_a[0])}
             if joint.triads is not None:
-                vectors |= zip(
-                    ("m", "m'", "n", "e", "e'", "f"),
-                    np.concatenate([params[f"frame_{role}"] @ split(x)[1] for role, x in zip("ab", q, strict=True)]),
-                    strict=True,
-                )
+                vectors |= zip(("m", "m'", "n"), of_a[1:] @ split(q[0])[1], strict=True)
+                vectors |= zip(("e", "e'", "f"), of_b[1:] @ split(q[1])[1], strict=True)
             rows = Cylindrical.rows if isinstance(joint, Screw) else joint.rows
             expected += [vectors[u] @ vectors[v] for u, v in rows]
             if isinstance(joint, Screw):

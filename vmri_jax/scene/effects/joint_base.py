@@ -7,7 +7,7 @@ from abc import abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
-from itertools import chain, islice
+from itertools import chain, islice, repeat
 from typing import Any, ClassVar, Literal
 
 import jax.numpy as jnp
@@ -20,10 +20,10 @@ from vmri_jax.mechanics.names import unknown
 from vmri_jax.mechanics.rows import Rows
 from vmri_jax.refusals import Refused
 from vmri_jax.scene.binding import Key
-from vmri_jax.scene.body import GROUND, Attachment, body_of, label_of
+from vmri_jax.scene.body import GROUND, Attachment, body_of, joined, label_of
 from vmri_jax.scene.declare import names, stacked
 from vmri_jax.scene.effect import Effect
-from vmri_jax.scene.products import FRAME, products
+from vmri_jax.scene.products import products
 from vmri_jax.scene.rigid import RigidBody
 from vmri_jax.scene.terms import Applied, Role
 
@@ -33,6 +33,8 @@ PARALLEL = (("n", "e"), ("n", "e'"))
 """Rows that keep the axes n and f parallel."""
 AXES = dict(zip("xyz", np.eye(3), strict=True))
 """The axes of space, which a row may have as one of its two vectors."""
+VECTORS = ["D", "m", "m'", "n"], ["D", "e", "e'", "f"]
+"""The vectors that a row may have from a and from b; of the gap D the point of the joint."""
 
 
 Freedom = Literal["turn", "slide", "tilt", "along", "across"]
@@ -135,20 +137,16 @@ class Joint(Effect):
 
     def numbers(self, rows: Sequence[tuple[str, str]]) -> dict[str, Any]:
         """The numbers of the products of pairs of vectors, for all pairs of bodies, see `products`."""
-        frames = self._components
-        xp, count = library(frames), len(self.elements)
-        named, zero = [name for side in zip(*rows, strict=True) for name in side], np.zeros((count, FRAME))
-        offsets, halves = np.stack([AXES.get(name, np.zeros(3)) for name in named]), []
-        for role, names_of_role, sign in (("a", ("m", "m'", "n"), -1.0), ("b", ("e", "e'", "f"), 1.0)):
-            # the gap D has the centres and points of both bodies, with opposite signs; the vectors of a triad have no centre
-            vectors = {"D": sign * xp.concatenate([np.ones((count, 1)), frames[f"point_{role}"]], axis=-1)}
-            for i, name in enumerate(names_of_role if f"frame_{role}" in frames else ()):
-                vectors[name] = xp.concatenate([np.zeros((count, 1)), frames[f"frame_{role}"][:, i]], axis=-1)
-            half = xp.stack([vectors.get(name, zero) for name in named], axis=1)
-            is_ground = np.array([pair["ab".index(role)] == GROUND for pair in self.elements])[:, None, None]
+        named, halves = [name for side in zip(*rows, strict=True) for name in side], []
+        offsets = np.stack([AXES.get(name, np.zeros(3)) for name in named])
+        for role, vectors in enumerate(self.vectors):
+            # the gap D is the point of b less that of a
+            sign = np.array([(-1.0, 1.0)[role], *[1.0] * (vectors.shape[1] - 1)])
+            half = sign * (np.array(named)[:, None] == VECTORS[role][: len(sign)]) @ vectors
+            is_ground = np.array([pair[role] == GROUND for pair in self.elements])[:, None, None]
             offsets = offsets + is_ground * (half @ UNMOVED)
             halves.append(~is_ground * half)
-        factors = xp.concatenate(halves, axis=-1)
+        factors = library(halves).concatenate(halves, axis=-1)
         return {"factors": stacked([*factors]), "offsets": stacked([*offsets])}
 
     def label(self, i: int, freedom: str = "") -> str:
@@ -187,11 +185,11 @@ class Joint(Effect):
             self.require(coincide, f"the distance of the points of {a}-{b}", f"{float(distance):.6g}", expected)
 
     def drawing(self):
-        points = {role: self._components[f"point_{role}"] for role in "ab"}
+        points = [vectors[:, 0, 1:] for vectors in self.vectors]
         ends = {
             f"{self.name} {'-'.join(element)} in {name}": (name, points[role][i])
             for i, element in enumerate(self.elements)
-            for role, name in zip("ab", element, strict=True)
+            for role, name in enumerate(element)
             # a line to a point outside the drawn shape of a body is drawn from the centre
             if isinstance(body := body_of(self.by_name, name), RigidBody) and not body.covers(points[role][i])
         }
@@ -222,27 +220,25 @@ class Joint(Effect):
         return joining
 
     @cached_property
-    def _components(self) -> dict[str, Any]:
-        """Points and triads as components along the directors of each body: (n, 3) "point_a", "point_b", (n, 3, 3) "frame_a", "frame_b"."""
-        points, triads = self.joining_points, self.triads
-        components: dict[str, list] = {}
-        for i, element in enumerate(self.elements):
-            for role, name, point in zip("ab", element, points[i], strict=True):
+    def vectors(self) -> list[Any]:
+        """Of a and of b: the `VECTORS` of all pairs as factors (c, X) of the centre and the directors of the body, (n, 4, 4); (n, 1, 4) without axes."""
+        ends: list[list] = [[], []]
+        for element, points, triad in zip(self.elements, self.joining_points, self.triads or repeat(()), strict=False):
+            for of_role, name, point in zip(ends, element, points, strict=True):
                 body = body_of(self.by_name, name)
-                if not body.rigid and triads is not None:
+                if not body.rigid and self.triads:
                     raise Refused(
                         f"{self.name}: {name} is a point, which has no axes; a point can be joined by Spherical alone."
                     )
                 # X = R^T (x - phi): the point in the axes of the body
                 offset = (point - body.position) @ body.rotation if body.rigid else np.zeros(3)
-                components.setdefault(f"point_{role}", []).append(body.weights(offset))
-                if triads is not None:
-                    try:
-                        rows = [body.weights(vector @ body.rotation) for vector in triads[i]]
-                    except ValueError as error:
-                        raise Refused(f"{self.name}: {error}") from None
-                    components.setdefault(f"frame_{role}", []).append(library(rows).stack(rows))
-        return {name: library(values).stack(values) for name, values in components.items()}
+                rows = [joined([np.ones(1), body.weights(offset)])]
+                try:
+                    rows += [joined([np.zeros(1), body.weights(vector @ body.rotation)]) for vector in triad]
+                except ValueError as error:
+                    raise Refused(f"{self.name}: {error}") from None
+                of_role.append(library(rows).stack(rows))
+        return [library(end).stack(end) for end in ends]
 
 
 class AboutAxis(Joint):
