@@ -158,7 +158,7 @@ COPIES = {
     "nbody_gravity": {"mass_a", "mass_b"},
     "coulomb": {"charge_a", "charge_b"},
     "rayleigh_damping": {"mass_of"},
-    "joint_springs": {"factors", "offsets"},
+    "joint_springs": {"of_a", "of_b"},
 }
 """Numbers of bodies, charges and joints that effects have in their params."""
 HELD = {

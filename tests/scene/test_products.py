@@ -59,7 +59,7 @@ def test_rows_are_the_products_of_the_table():
         for i in [i for group in joint.groups() for i in group]:
             q = [coordinates[name] for name in joint.elements[i]]
             of_a, of_b = (of_role[i, :, 1:] for of_role in joint.vectors)
-            vectors = dict(zip("xyz", np.eye(3), strict=True)) | {"D": place(q[1], of_b[0]) - place(q[0], of_a[0])}
+            vectors = dict(zip("xyz", np.eye(3), strict=True)) | {"D": place(q[1], of_b[0]) - place(q[0], -of_a[0])}
             if joint.triads is not None:
                 vectors |= zip(("m", "m'", "n"), of_a[1:] @ split(q[0])[1], strict=True)
                 vectors |= zip(("e", "e'", "f"), of_b[1:] @ split(q[1])[1], strict=True)

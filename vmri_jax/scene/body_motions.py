@@ -1,5 +1,7 @@
 """Accelerations of the bodies of a scene at a state, by its continuous equations of motion."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 
@@ -26,7 +28,7 @@ def accelerations(scene: Scene, state: State) -> dict[str, tuple[jax.Array, jax.
     derivatives = jax.jit(motion)(scene.system(), state)
     q, v, a = (state.q_s, state.q_f), (derivatives.v_s, derivatives.v_f), (derivatives.a_s, derivatives.a_f)
     layout, joints = scene.sorting.layout, scene.sorting.joints
-    kinematics = layout.kinematics or UNCHANGED
+    kinematics: Any = layout.kinematics or UNCHANGED
 
     def velocities(q, v):
         return kinematics.velocities(*q, *v, joints)

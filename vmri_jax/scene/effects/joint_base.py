@@ -5,7 +5,6 @@ For the letters see `vmri_jax.scene.effects.joints`.
 
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
 from functools import cached_property
 from itertools import chain, islice, repeat
 from typing import Any, ClassVar, Literal
@@ -34,7 +33,7 @@ PARALLEL = (("n", "e"), ("n", "e'"))
 AXES = dict(zip("xyz", np.eye(3), strict=True))
 """The axes of space, which a row may have as one of its two vectors."""
 VECTORS = ["D", "m", "m'", "n"], ["D", "e", "e'", "f"]
-"""The vectors that a row may have from a and from b; of the gap D the point of the joint."""
+"""The vectors that a row may have from a and from b; the gap D is the point of b less the point of a."""
 
 
 Freedom = Literal["turn", "slide", "tilt", "along", "across"]
@@ -59,26 +58,29 @@ REACH = 5 * np.pi / 6
 a third of a turn between REACH and -REACH is too wide to be jumped over by a run with six steps in a turn. A larger value narrows the gap."""
 
 
-def sine_and_cosine(q, params):
-    """Those of an angle by the products of its pairs of vectors."""
-    rows = products(2, q, params)
-    return rows[..., 0], rows[..., 1]
+def products_in_space(pairs, q, params):
+    """Products (...) of pairs of vectors, from the `VECTORS` "of_a", "of_b" of a joint as factors of centres and directors."""
+    factors = (params[f"of_{role}"][..., : x.shape[-1] // 3] for role, x in zip("ab", q, strict=True))
+    a, b = (numbers @ x.reshape(*x.shape[:-1], -1, 3) for numbers, x in zip(factors, q, strict=True))
+    vectors = {name: rows[..., i, :] for rows, own in zip((a, b), VECTORS, strict=True) for i, name in enumerate(own)}
+    vectors["D"] = a[..., 0, :] + b[..., 0, :]
+    return tuple((vectors[u] * vectors[v]).sum(axis=-1) for u, v in pairs)
 
 
-def angle(q, params):
+def angle(pairs, q, params):
     """An angle, rad, between -pi and pi."""
-    return jnp.arctan2(*sine_and_cosine(q, params))
+    return jnp.arctan2(*products_in_space(pairs, q, params))
 
 
-def within_reach(q, params):
+def within_reach(pairs, q, params):
     """An angle, rad; beyond `REACH` NaN with all its derivatives, which ends a run in place of a wrong number of turns."""
-    x = angle(q, params)
+    x = angle(pairs, q, params)
     return x * jnp.where(jnp.abs(x) < REACH, 1.0, jnp.nan)
 
 
-def distance(q, params):
+def distance(pairs, q, params):
     """A displacement, m."""
-    return products(1, q, params)[..., 0]
+    return products_in_space(pairs, q, params)[0]
 
 
 def coordinate(q, params):
@@ -111,7 +113,7 @@ class Joint(Effect):
     is_analytic = True
     whole = True
     same_size = False
-    derived = ("factors", "offsets")
+    derived = ("factors", "offsets", "of_a", "of_b")
     rows: ClassVar[tuple[tuple[str, str], ...]] = GAP
     """Pairs of vectors whose scalar products are the rows: of the gap D, both triads, and the axes x, y, z of space."""
     carries: ClassVar[bool] = False
@@ -133,16 +135,19 @@ class Joint(Effect):
         return tuple((b if a == GROUND else a, a if b == GROUND else b) for a, b in self.elements)
 
     def _parameters(self):
-        return super()._parameters() | self.numbers(self.rows)
+        return super()._parameters() | self._numbers()
 
-    def numbers(self, rows: Sequence[tuple[str, str]]) -> dict[str, Any]:
-        """The numbers of the products of pairs of vectors, for all pairs of bodies, see `products`."""
-        named, halves = [name for side in zip(*rows, strict=True) for name in side], []
+    @property
+    def frames(self) -> dict[str, Any]:
+        """The `VECTORS` of both bodies, see `products_in_space`."""
+        return {f"of_{role}": stacked([*vectors]) for role, vectors in zip("ab", self.vectors, strict=True)}
+
+    def _numbers(self) -> dict[str, Any]:
+        """The numbers of the rows of all pairs, see `products`."""
+        named, halves = [name for side in zip(*self.rows, strict=True) for name in side], []
         offsets = np.stack([AXES.get(name, np.zeros(3)) for name in named])
         for role, vectors in enumerate(self.vectors):
-            # the gap D is the point of b less that of a
-            sign = np.array([(-1.0, 1.0)[role], *[1.0] * (vectors.shape[1] - 1)])
-            half = sign * (np.array(named)[:, None] == VECTORS[role][: len(sign)]) @ vectors
+            half = (np.array(named)[:, None] == VECTORS[role][: vectors.shape[1]]) @ vectors
             is_ground = np.array([pair[role] == GROUND for pair in self.elements])[:, None, None]
             offsets = offsets + is_ground * (half @ UNMOVED)
             halves.append(~is_ground * half)
@@ -156,8 +161,9 @@ class Joint(Effect):
 
     def value(self, freedom: str, i: int, coordinates: Mapping[str, Any]):
         """A freedom of the i-th pair, (...) rad or m, by the coordinates (..., n) of bodies by name; an angle is between -pi and pi."""
-        q = tuple(jnp.asarray(coordinates[name]) for name in self.attached[i])
-        return (angle if freedom in ANGLES else distance)(q, self.params_of((i,), self.numbers(FREEDOMS[freedom])))
+        ends = (UNMOVED.ravel() if name == GROUND else coordinates[name] for name in self.elements[i])
+        function = angle if freedom in ANGLES else distance
+        return function(FREEDOMS[freedom], tuple(map(jnp.asarray, ends)), self.params_of((i,), self.frames))
 
     @cached_property
     def triads(self) -> Any:
@@ -185,7 +191,7 @@ class Joint(Effect):
             self.require(coincide, f"the distance of the points of {a}-{b}", f"{float(distance):.6g}", expected)
 
     def drawing(self):
-        points = [vectors[:, 0, 1:] for vectors in self.vectors]
+        points = [vectors[:, 0, :1] * vectors[:, 0, 1:] for vectors in self.vectors]  # their signs are those of D
         ends = {
             f"{self.name} {'-'.join(element)} in {name}": (name, points[role][i])
             for i, element in enumerate(self.elements)
@@ -224,7 +230,7 @@ class Joint(Effect):
         """Of a and of b: the `VECTORS` of all pairs as factors (c, X) of the centre and the directors of the body, (n, 4, 4); (n, 1, 4) without axes."""
         ends: list[list] = [[], []]
         for element, points, triad in zip(self.elements, self.joining_points, self.triads or repeat(()), strict=False):
-            for of_role, name, point in zip(ends, element, points, strict=True):
+            for of_role, name, point, sign in zip(ends, element, points, (-1.0, 1.0), strict=True):
                 body = body_of(self.by_name, name)
                 if not body.rigid and self.triads:
                     raise Refused(
@@ -232,7 +238,7 @@ class Joint(Effect):
                     )
                 # X = R^T (x - phi): the point in the axes of the body
                 offset = (point - body.position) @ body.rotation if body.rigid else np.zeros(3)
-                rows = [joined([np.ones(1), body.weights(offset)])]
+                rows = [sign * joined([np.ones(1), body.weights(offset)])]
                 try:
                     rows += [joined([np.zeros(1), body.weights(vector @ body.rotation)]) for vector in triad]
                 except ValueError as error:
@@ -304,17 +310,11 @@ class OfFreedoms(Effect):
 
     def by_directors(self, freedom: str) -> Any:
         """The function of the coordinates of both bodies for a freedom that is no coordinate of the scene."""
-        if freedom not in ANGLES:
-            return distance
-        return within_reach if self.counts_turns else angle
+        of_angle = within_reach if self.counts_turns else angle
+        return Applied(of_angle if freedom in ANGLES else distance, (FREEDOMS[freedom],))
 
     def _elements(self):
         pairs = zip(*(joint.elements for joint, _ in self.joint_freedoms), strict=False)
-        return tuple(tuple(chain(*names)) for names in pairs)
-
-    @cached_property
-    def attached(self):
-        pairs = zip(*(joint.attached for joint, _ in self.joint_freedoms), strict=False)
         return tuple(tuple(chain(*names)) for names in pairs)
 
     def positions(self, group):
@@ -335,11 +335,8 @@ class OfFreedoms(Effect):
                 continue
             freedoms.append(self.by_directors(keys[0][2]))
             for role in (2 * j, 2 * j + 1):
-                roles.append(self._role("", [self.attached[i][role] for i in group], layout.bodies))
-        term = self._term(roles, group, Applied(freedoms_of, (tuple(freedoms),)))
-        # coordinates need no numbers of joints, whose shapes differ
-        unused = self.derived if set(freedoms) == {coordinate} else ()
-        return replace(term, split=tuple(name for name in term.split if name not in unused))
+                roles.append(self._role("", [self.elements[i][role] for i in group], layout.bodies))
+        return self._term(roles, group, Applied(freedoms_of, (tuple(freedoms),)))
 
     def check_bodies(self):
         """Nothing: the joints check their bodies themselves."""

@@ -23,7 +23,7 @@ from vmri_jax.scene.effects.joint_base import (
     OfFreedoms,
     freedom_of,
     joint_named,
-    sine_and_cosine,
+    products_in_space,
 )
 from vmri_jax.scene.effects.potentials import penalty
 from vmri_jax.scene.effects.springs import elastic_energy
@@ -54,7 +54,7 @@ class InJoint(OfFreedoms):
         return ((self.joint, self.of),)
 
     def _parameters(self):
-        return super()._parameters() | self.joint.numbers(FREEDOMS[self.of])
+        return super()._parameters() | self.joint.frames
 
 
 class JointSpring(InJoint):
@@ -207,7 +207,8 @@ class JointMotion(InJoint):
         return sine * xp.cos(a) - cosine * xp.sin(a)
 
     def by_directors(self, freedom):
-        return sine_and_cosine if freedom in ANGLES else super().by_directors(freedom)
+        is_angle = freedom in ANGLES
+        return Applied(products_in_space, (FREEDOMS[freedom],)) if is_angle else super().by_directors(freedom)
 
     def check_parameters(self):
         super().check_parameters()
@@ -277,7 +278,7 @@ class JointCoupling(OfFreedoms):
         return real_tree(f"{self.name}: params", self.params)
 
     def _parameters(self):
-        return {"law": self.numbers(), "joints": tuple(joint.numbers(FREEDOMS[of]) for joint, of in self.joints)}
+        return {"law": self.numbers(), "joints": tuple(joint.frames for joint, _ in self.joints)}
 
     def check_parameters(self):
         value: Any = shape_of(f"{self.name}: law", self.law, jnp.zeros(len(self.joints)), self.numbers())
