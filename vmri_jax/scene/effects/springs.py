@@ -46,8 +46,6 @@ class ToPoint(Effect):
     bodies: Any = names()
 
     law: ClassVar[Any]
-    advice: ClassVar[str] = "move one of them"
-    """End of the message about bodies that start at the point."""
 
     def point_at_start(self, params):
         """The point p at t = 0."""
@@ -61,7 +59,7 @@ class ToPoint(Effect):
     def require_apart(self):
         """Refuse bodies that start at the point."""
         distance = self.at_start(self.parameters)
-        expected = f"bodies must not start there; {self.advice}"
+        expected = f"bodies must not start there; move one of them{', or take Guide' if self.timed else ''}"
         self.require(distance > 0, "the distance of a body from its point", distance, expected)
 
 
@@ -106,7 +104,7 @@ class ToPath(ToPoint):
         return cls.law(q - path(t, params["path"]), params)
 
     def point_at_start(self, params):
-        return self.path(np.zeros(()), real_tree(f"{self.name}: params", vars(self)["params"]))
+        return self.path(np.zeros(()), params["path"])
 
     def check_bodies(self):
         super().check_bodies()
@@ -278,7 +276,6 @@ class MovingPivot(_Rigid, ToPath):
     params: Any = field(default_factory=dict)
 
     default_name = "moving_pivots"
-    advice = "move one of them, or take Guide"
 
 
 class Guide(ToPath):
