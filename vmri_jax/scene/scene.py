@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any, Literal
 
@@ -327,10 +327,10 @@ class Scene:
         items = {item.name: item for item in (*self.bodies, *self.effects)}
         if name not in items:
             raise Refused(f"Scene.replace: {unknown('body or effect', name, items)}")
-        fields = items[name].__dataclass_fields__
+        arguments = [argument.name for argument in fields(items[name]) if argument.init]
         for key in changes:
-            if key not in fields:
-                raise Refused(f"Scene.replace: {name}: {unknown('argument', key, fields)}")
+            if key not in arguments:
+                raise Refused(f"Scene.replace: {name}: {unknown('argument', key, arguments)}")
         check_replaced(name, changes, self.branches, self.joint_starts)
         changed = list((items | {name: replace(items[name], **changes)}).values())
         return replace(self, bodies=changed[: len(self.bodies)], effects=changed[len(self.bodies) :])
