@@ -35,11 +35,8 @@ AXES = dict(zip("xyz", np.eye(3), strict=True))
 VECTORS = ["D", "m", "m'", "n"], ["D", "e", "e'", "f"]
 """The vectors that a row may have from a and from b; the gap D is the point of b less the point of a."""
 
-
 Freedom = Literal["turn", "slide", "tilt", "along", "across"]
 """In this order: the angle about the axis n, the distance along n, the angle about the second axis e, the distances along m and m'."""
-
-
 FREEDOMS: dict[str, tuple[tuple[str, str], ...]] = {
     "turn": (("m'", "e"), ("m", "e")),
     "slide": (("n", "D"),),
