@@ -11,7 +11,6 @@ from benchmarks import programs
 from benchmarks.gail2014.cost import Curve, cost_study
 from benchmarks.measure import Ratio, Tell, exactly, quartiles, silent
 from benchmarks.report import Claim, Report, spread
-from vmri_jax.scene.ledger import temporary_bytes
 
 MICRO_DT = 1e-5
 """So small that the largest macro step is still an ordinary one."""
@@ -84,4 +83,4 @@ def _slopes(label: str, samples: Mapping[int, Sequence[float]], memory: Mapping[
 def _bytes(problem: vm.Problem, scheme: vm.Scheme) -> int:
     """Temporary memory of one compiled macro step."""
     step = jax.jit(vm.macro_step).lower(problem.system, scheme, problem.state(), scheme.num_micro * MICRO_DT)
-    return temporary_bytes(step.compile())
+    return step.compile().memory_analysis().temp_size_in_bytes

@@ -8,10 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from vmri_jax import Problem
+from vmri_jax import Problem, Refused
 from vmri_jax.scene import (
     Anchor,
     Angle,
+    Ball,
     Body,
     Constraint,
     Coulomb,
@@ -185,6 +186,8 @@ def test_unknown_names_come_with_the_near_miss():
         scene.replace("bop", mass=1.0)
     with pytest.raises(ValueError, match=r"Scene.replace: springs: there is no argument 'stifness'"):
         scene.replace("springs", stifness=1.0)
+    with pytest.raises(Refused, match=r"Scene.replace: hub: there is no argument 'moments'"):
+        Scene([RigidBody("hub", 1.0, Ball(0.1), [0, 0, 0])]).replace("hub", moments=[1.0, 1.0, 1.0])
     assert isinstance(scene.problem(), Problem)
 
 

@@ -153,13 +153,12 @@ def test_incomplete_classes_of_effects_say_what_they_lack():
     assert magnets(("a", "b")).name == "magnets"
 
 
-ENDS = {"point_a", "point_b", "frame_a", "frame_b"}
 COPIES = {
     "gravity": {"mass"},
     "nbody_gravity": {"mass_a", "mass_b"},
     "coulomb": {"charge_a", "charge_b"},
     "rayleigh_damping": {"mass_of"},
-    "joint_springs": ENDS,
+    "joint_springs": {"of_a", "of_b"},
 }
 """Numbers of bodies, charges and joints that effects have in their params."""
 HELD = {

@@ -25,6 +25,7 @@ from vmri_jax.scene import (
     Universal,
 )
 from vmri_jax.scene.body_motions import accelerations, state_of
+from vmri_jax.scene.effects.joint_base import AXES_OF
 
 PLATE = RigidBody("plate", 1.5, Box((0.4, 0.6, 0.2)), [0.3, 0.2, 0.1])
 HAND = RigidBody("hand", 0.5, Box((0.3, 0.1, 0.2)), [0.3, 0.7, 0.1])
@@ -43,7 +44,7 @@ def test_joints_in_a_row_are_one_joint_of_several_freedoms():
         (Planar(("ground", "plate"), [0, 0, 0], axis=axis, name="joint"), [Prismatic, Prismatic, Revolute]),
     ]
     for whole, kinds in cases:
-        axes = whole.bound({PLATE.name: PLATE}).triads[0][[move.axis for move in whole.freedoms.values()]]
+        axes = whole.bound({PLATE.name: PLATE}).triads[0][[AXES_OF[freedom] for freedom in whole.freedoms]]
         frames = [Frame(f"frame {i}", [0.1 * i, 0.2, 0.3]) for i in range(len(kinds) - 1)]
         names = ["ground", *(frame.name for frame in frames), "plate"]
         row = [

@@ -20,6 +20,7 @@ from vmri_jax.scene import (
     Scene,
 )
 from vmri_jax.scene.body_motions import accelerations, state_of
+from vmri_jax.scene.rows import ConstraintRows
 
 Y = np.array([0.0, 1.0, 0.0])
 MASS, LENGTH, TILT, WEIGHT = 2.0, 0.7, 0.5, 2.0 * 9.81
@@ -99,3 +100,20 @@ def test_rayleigh_damping_of_a_spring_in_a_joint():
     effects = [hinge, JointSpring(hinge.name, 3.0), RayleighDamping(stiffness=0.02)]
     system, none = Scene([bar], effects, coordinates="joint").system(), jnp.zeros(0)
     assert float(system.forces(0.0, jnp.array([0.4]), none, jnp.array([2.0]), none)[0][0]) == pytest.approx(-0.12)
+
+
+def test_motions_of_pairs_with_and_without_coordinates_have_the_names_of_their_pairs():
+    """The pair of b closes a loop, and its angle comes from directors: its row is a term of its own, after those of the other pairs."""
+    bodies = [RigidBody(name, 1.0, [1.0, 1.0, 1.0], [x, 1.0, 0.0]) for name, x in (("a", 0.0), ("b", 1.0), ("e", 5.0))]
+    hinges = Revolute([("ground", name) for name in "abe"], [[0, 0, 0], [1, 0, 0], [5, 0, 0]], name="hinges")
+    pin = Revolute(("a", "b"), [0.5, 2.0, 0.0], name="pin")
+    effects = [hinges, pin, JointSpring("pin", 1.0), JointMotion("hinges", lambda t, params: 0.0 * t)]
+    sorting = Scene(bodies, effects, coordinates="joint", redundant="drop").sorting
+    rows, numbers = ConstraintRows(sorting), sorting.layout.numbers
+    touched = {
+        row.name: [name for name in ("hinges ground-a", "hinges ground-e", "pin") if np.any(gradient[numbers[name]])]
+        for row, gradient in zip(rows.rows, rows.jacobian, strict=True)
+    }
+    assert touched["joint_motion ground-a"] == ["hinges ground-a"]
+    assert touched["joint_motion ground-b"] == ["hinges ground-a", "pin"]
+    assert touched["joint_motion ground-e"] == ["hinges ground-e"]

@@ -23,7 +23,6 @@ from vmri_jax.scene import (
     Spherical,
     Universal,
 )
-from vmri_jax.scene.effects.freedoms import FREEDOMS, slide
 from vmri_jax.scene.rigid import rotation
 
 MOMENTS = [1.0, 2.0, 2.5]
@@ -83,13 +82,15 @@ def test_a_joint_holds_what_it_says_and_leaves_the_rest(name):
     assert np.ptp(run.energy) < 2e-3 * run.energy[0]
     turned = np.abs(relative - relative[0]).max()
     assert (turned > 0.05) == (not isinstance(joint, Fixed | Prismatic)), turned
-    held = joint.bound(scene.by_name).frames
+    bound, q = joint.bound(scene.by_name), {"a": a, "b": b}
     if isinstance(joint, Revolute | Cylindrical):
-        axes = [held[f"frame_{role}"][2] @ q[:, 3:].reshape(-1, 3, 3) for role, q in zip("ab", (a, b), strict=True)]
+        axes = [
+            of_role[0, 3, 1:] @ q[:, 3:].reshape(-1, 3, 3) for of_role, q in zip(bound.vectors, (a, b), strict=True)
+        ]
         np.testing.assert_allclose(axes[0], axes[1], atol=1e-12)
-        assert np.ptp(FREEDOMS["turn"]((a, b), held)) > 0.3
+        assert np.ptp(bound.value("turn", 0, q)) > 0.3
     if "slide" in joint.freedoms:
-        assert np.ptp(slide((a, b), held)) > 0.02
+        assert np.ptp(bound.value("slide", 0, q)) > 0.02
 
 
 @pytest.mark.parametrize(("normal", "along", "across"), [(Z, X, Y), (Y, X, -Z), (X, Y, Z), (-Z, X, -Y)])

@@ -24,7 +24,7 @@ from vmri_jax.scene import (
     Scene,
     Spring,
     SpringAnchor,
-    assembly,
+    functions,
 )
 from vmri_jax.scene.declare import names, positive
 from vmri_jax.scene.effect import Effect
@@ -86,7 +86,7 @@ def values(scene: Scene, system, params):
 def test_one_term_has_the_values_of_several(monkeypatch):
     scene = one_by_one()
     joined, params = scene.system(), scene.params
-    monkeypatch.setattr(assembly, "joined", lambda terms, in_order=False: tuple(terms))
+    monkeypatch.setattr(functions, "joined", lambda terms, in_order=False: tuple(terms))
     several = scene.system()
     energy, spring = (
         lambda params, system=system: sum(values(scene, system, params)[0]) for system in (joined, several)
@@ -116,7 +116,7 @@ def test_six_hinges_cost_what_six_elements_of_one_hinge_cost(monkeypatch):
     alone = equations(Scene(bars, [Revolute(pairs, points, SIDE)], coordinates="directors"))
     assert equations(scene) < 1.2 * alone  # measured: 1.17; 16 equations join the numbers of the six effects
     assert [*scene.names.slow_constraint] == [*(f"rigid {bar.name}" for bar in bars), *(hinge.name for hinge in hinges)]
-    monkeypatch.setattr(assembly, "joined", lambda terms, in_order=False: tuple(terms))
+    monkeypatch.setattr(functions, "joined", lambda terms, in_order=False: tuple(terms))
     assert equations(scene) > 1.3 * alone  # measured: 1.47
 
 

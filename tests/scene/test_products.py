@@ -19,9 +19,9 @@ from vmri_jax.scene import (
     Spherical,
     Universal,
 )
-from vmri_jax.scene.effects.freedoms import gap, triads
 from vmri_jax.scene.effects.joint_base import Joint
 from vmri_jax.scene.rows import ConstraintRows
+from vmri_jax.scene.terms import place, split
 
 RANDOM = np.random.default_rng(0)
 X, Y, Z = np.eye(3)
@@ -56,12 +56,15 @@ def test_rows_are_the_products_of_the_table():
     for joint in [part.effect for part in SCENE.sorting.placed if isinstance(part.effect, Joint)]:
         of_joint = [value for value, row in zip(values, ROWS.rows, strict=True) if row.effect is joint]
         expected = []
-        for i in [i for group in joint.by_size() for i in group]:
-            q, params = tuple(coordinates[name] for name in joint.elements[i]), joint.params_of((i,), joint.frames)
-            vectors = dict(zip("xyz", np.eye(3), strict=True)) | {"D": gap(q, params)}
+        for i in [i for group in joint.groups() for i in group]:
+            q = [coordinates[name] for name in joint.elements[i]]
+            of_a, of_b = (of_role[i, :, 1:] for of_role in joint.vectors)
+            vectors = dict(zip("xyz", np.eye(3), strict=True)) | {"D": place(q[1], of_b[0]) - place(q[0], -of_a[0])}
             if joint.triads is not None:
-                vectors |= zip(("m", "m'", "n", "e", "e'", "f"), np.concatenate(triads(q, params)), strict=True)
-            expected += [vectors[u] @ vectors[v] for u, v in joint.rows]
+                vectors |= zip(("m", "m'", "n"), of_a[1:] @ split(q[0])[1], strict=True)
+                vectors |= zip(("e", "e'", "f"), of_b[1:] @ split(q[1])[1], strict=True)
+            rows = Cylindrical.rows if isinstance(joint, Screw) else joint.rows
+            expected += [vectors[u] @ vectors[v] for u, v in rows]
             if isinstance(joint, Screw):
                 angle = 2 * np.pi * vectors["n"] @ vectors["D"] / 0.7
                 expected.append(

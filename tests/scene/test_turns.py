@@ -29,9 +29,8 @@ from vmri_jax.scene import (
     trees,
 )
 from vmri_jax.scene.binding import bound
-from vmri_jax.scene.effects.freedoms import REACH
-from vmri_jax.scene.effects.joint_base import OfFreedoms
-from vmri_jax.scene.turns import at_start
+from vmri_jax.scene.effects.joint_base import REACH, OfFreedoms
+from vmri_jax.scene.joint_coordinates import at_start
 from vmri_jax.steppers.results import Result
 
 Z = np.array([0.0, 0.0, 1.0])

@@ -27,7 +27,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import pairwise
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -51,17 +51,6 @@ LARGEST_MATRIX = 16
 number makes the programs of small trees larger."""
 UNMOVED = np.concatenate([np.zeros((1, 3)), np.eye(3)])
 """(4, 3) the motion of nothing; centre and directors of the ground."""
-
-
-class Move(NamedTuple):
-    """The motion of a triad with one coordinate of a joint.
-
-    kind: "turn" about a vector of the triad, "slide" along it, or "screw": both.
-    axis: number of the vector.
-    """
-
-    kind: Literal["turn", "slide", "screw"]
-    axis: int
 
 
 class Link(NamedTuple):
@@ -109,18 +98,8 @@ class Kinematics:
     sizes: tuple[int, int]
     first: tuple[int, int] = (0, 0)
 
-    @property
-    def of_slow(self) -> "Kinematics":
-        """The map from q_s to Q_s, with q_f as Q_f."""
-        return self._of("s")
-
-    @property
-    def of_fast(self) -> "Kinematics":
-        """The map from q to Q_f, with q_s as Q_s."""
-        return self._of("f")
-
-    def _of(self, part: Part) -> "Kinematics":
-        """The map with the bodies of one part, and the links that move them."""
+    def of(self, part: Part) -> "Kinematics":
+        """The map with the bodies of one part, and the links that move them; the coordinates of the other part stay as they are."""
         numbers = [i for i, body in enumerate(self.bodies) if body.part == part]
         moving = np.flatnonzero(self.before[numbers].any(axis=0))
         first = int(moving.min(initial=len(self.links)))
@@ -176,7 +155,7 @@ class Kinematics:
         if not self.bodies:
             return of_coordinates
         frames, twists = self._against_roots(q_s, q_f, joints)
-        links, roots = self._columns
+        links, roots, behind, on_way = self._tables
         # G_b = A_b^T m_b A_b
         rows = jnp.concatenate([jnp.broadcast_to(np.eye(4)[:, :1], (len(frames), 4, 1)), frames], axis=2)
         of_rows = masses[own:].reshape(-1, 4, 3)[:, :, :1]
@@ -185,19 +164,14 @@ class Kinematics:
         if set(self._owners) - {GROUND}:
             twists = matmul(twists, self._roots(q_s, q_f, self._owners)[:, 1:])
         columns = (matmul(links, twists.reshape(-1, SIZE)) if self.links else 0.0) + roots
-        composite = matmul(self._behind, of_bodies).reshape(n, 4, 4)
+        composite = matmul(behind, of_bodies).reshape(n, 4, 4)
         momenta = matmul(composite, columns.reshape(n, 4, 3)).reshape(n, SIZE)
-        half = matmul(columns, momenta.T) * (self._on_way + np.eye(n) / 2)
+        half = matmul(columns, momenta.T) * on_way
         return half + half.T + of_coordinates
 
     def velocities(self, q_s, q_f, v_s, v_f, joints: dict[str, Any]):
         """Rates of (Q_s, Q_f)."""
         return jax.jvp(lambda q_s, q_f: self(q_s, q_f, joints), (q_s, q_f), (v_s, v_f))[1]
-
-    def momenta(self, q_s, q_f, v_s, v_f, params: dict[str, Any]):
-        """Momenta of the bodies: masses times velocities."""
-        rates = self.velocities(q_s, q_f, v_s, v_f, params[JOINTS])
-        return tuple(params[MASS][part] * rate for part, rate in zip(("slow", "fast"), rates, strict=True))
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> "Kinematics":
@@ -209,15 +183,6 @@ class Kinematics:
             tuple(data["sizes"]),
             tuple(data["first"]),
         )
-
-    @cached_property
-    def places(self) -> tuple[Place, ...]:
-        """Places of the bodies in Q_s and Q_f."""
-        ends, places = dict(zip("sf", self.sizes, strict=True)), []
-        for part, *_ in self.bodies:
-            places.append(Place(part, ends[part], SIZE))
-            ends[part] += SIZE
-        return tuple(places)
 
     @cached_property
     def lasts(self) -> np.ndarray:
@@ -279,39 +244,20 @@ class Kinematics:
         return [self.bodies[int(column.argmax())].root if column.any() else GROUND for column in behind.T]
 
     @cached_property
-    def _numbers(self) -> tuple[np.ndarray, list[np.ndarray]]:
-        """Numbers in (q_s, q_f) of the coordinates of the links (n,), and of each root (SIZE,)."""
-        links = [link.place.numbers(self.sizes[0])[0] for link in self.links]
-        return np.array(links, int), [root.numbers(self.sizes[0]) for root in self.roots]
-
-    @cached_property
-    def _columns(self) -> tuple[np.ndarray, np.ndarray]:
-        """Of the rows K_i: the matrix (coordinates, links) that puts the rows of links at their places, and the rows (coordinates, SIZE) of roots."""
-        links, roots = self._numbers
-        of_links, of_roots = np.zeros((sum(self.sizes), len(links))), np.zeros((sum(self.sizes), SIZE))
-        of_links[links, np.arange(len(links))] = 1.0
-        for numbers in roots:
-            of_roots[numbers] = np.eye(SIZE)
-        return of_links, of_roots
-
-    @cached_property
-    def _behind(self) -> np.ndarray:
-        """(coordinates, bodies) 1 for the bodies that a coordinate moves."""
-        behind, (links, roots) = np.zeros((sum(self.sizes), len(self.bodies))), self._numbers
-        behind[links] = self.before[: len(self.bodies)].T
-        for k, numbers in enumerate(roots):
-            behind[numbers] = [body.root == k for body in self.bodies]
-        return behind
-
-    @cached_property
-    def _on_way(self) -> np.ndarray:
-        """(coordinates, coordinates) 1 for each coordinate on the way to another one; of two coordinates of one root, for the first."""
-        on_way, (links, roots) = np.zeros((sum(self.sizes),) * 2), self._numbers
-        on_way[np.ix_(links, links)] = self.before[len(self.bodies) :].T
-        for k, numbers in enumerate(roots):
-            on_way[np.ix_(numbers, links)] = [owner == k for owner in self._owners]
-            on_way[np.ix_(numbers, numbers)] = np.triu(np.ones((SIZE, SIZE)), 1)
-        return on_way
+    def _tables(self) -> tuple[np.ndarray, ...]:
+        """Over the n coordinates: the matrix (n, links) that puts the rows K_i of links at their places, and the rows (n, SIZE) of roots; (n, bodies) 1
+        for the bodies behind a coordinate; (n, n) 1 for each coordinate on the way to another one, 1/2 for two that move the same bodies."""
+        n = sum(self.sizes)
+        links, roots, behind = (np.zeros((n, k)) for k in (len(self.links), SIZE, len(self.bodies)))
+        for i, link in enumerate(self.links):
+            number = link.place.numbers(self.sizes[0])
+            links[number, i], behind[number] = 1.0, self.before[: len(self.bodies), i]
+        for k, root in enumerate(self.roots):
+            numbers = root.numbers(self.sizes[0])
+            roots[numbers], behind[numbers] = np.eye(SIZE), [body.root == k for body in self.bodies]
+        # i is on the way to j if all bodies behind j are behind i
+        on_way = behind @ behind.T == behind.sum(axis=1)
+        return links, roots, behind, on_way / (1.0 + on_way.T)
 
 
 def _placed(tree: Kinematics, x, turn, slide, zero):
@@ -322,11 +268,11 @@ def _placed(tree: Kinematics, x, turn, slide, zero):
         turn, slide, zero: T (n, 4, 3), the first row of S (n, 3), and Z (bodies, 4, 3).
     """
     sine, versine = jnp.sin(x)[:, None, None], (1 - jnp.cos(x))[:, None, None]
-    motions = UNMOVED + sine * turn + versine * matmul(turn, turn[:, 1:]) + _first_row(x[:, None] * slide)
+    motions = UNMOVED + sine * turn + versine * matmul(turn, turn[:, 1:]) + _pad((x[:, None] * slide)[:, None])
     for parents in tree.jumps():
         motions = after(motions, _with_unmoved(motions)[parents])  # after k turns, motions of the last 2^k links
     inverse = jnp.swapaxes(motions[:, 1:], 1, 2)
-    twists = matmul(turn + _first_row(slide), motions[:, 1:])
+    twists = matmul(turn + _pad(slide[:, None]), motions[:, 1:])
     turning = matmul(inverse, twists[:, 1:])
     moving = twists[:, :1] - matmul(motions[:, :1], turning)
     frames = after(zero, _with_unmoved(motions)[tree.lasts[: len(tree.bodies)]])
@@ -381,11 +327,6 @@ def _taken(rows, numbers):
 def _pad(first):
     """(n, 4, 3) rows of which only the first one (n, 1, 3) is not zero."""
     return jnp.pad(first, ((0, 0), (0, 3), (0, 0)))
-
-
-def _first_row(vectors):
-    """(n, 4, 3) rows of which only the first one (n, 3) is not zero."""
-    return _pad(vectors[:, None])
 
 
 def _with_unmoved(motions):

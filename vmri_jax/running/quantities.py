@@ -10,7 +10,7 @@ import numpy as np
 from vmri_jax.mechanics import invariants
 from vmri_jax.mechanics.arrays import is_concrete
 from vmri_jax.mechanics.checks import check_flags
-from vmri_jax.mechanics.kinematics import JOINTS, Kinematics
+from vmri_jax.mechanics.kinematics import JOINTS, MASS, Kinematics
 from vmri_jax.mechanics.motion import motion, powers, reaction_forces
 from vmri_jax.mechanics.names import Names, unknown
 from vmri_jax.mechanics.projection import legendre
@@ -293,10 +293,10 @@ def _of_bodies(system: System, state: State, kinematics: Kinematics, kind: str):
     q = state.q_s, state.q_f
     if kind == "position":
         return kinematics(*q, system.params[JOINTS])
-    v = _velocity(system, state)
+    rates = kinematics.velocities(*q, *_velocity(system, state), system.params[JOINTS])
     if kind == "velocity":
-        return kinematics.velocities(*q, *v, system.params[JOINTS])
-    return kinematics.momenta(*q, *v, system.params)
+        return rates
+    return tuple(system.params[MASS][part] * rate for part, rate in zip(("slow", "fast"), rates, strict=True))
 
 
 def _reaction_forces(system: System, node: tuple[State, Any]):

@@ -2,14 +2,24 @@
 
 from vmri_jax.scene.body import Body, Frame
 from vmri_jax.scene.effect import Effect
-from vmri_jax.scene.effects.contact import PlaneContact, SphereContact
 from vmri_jax.scene.effects.controls import Controlled
-from vmri_jax.scene.effects.couplings import Gear, JointCoupling
 from vmri_jax.scene.effects.custom import Constraint, CustomEffect, Force, Kinetic, Potential
-from vmri_jax.scene.effects.damping import Dashpot, LinearDamping, QuadraticDrag, RayleighDamping
-from vmri_jax.scene.effects.fields import ConstantForce, Drive, FollowerForce, Gravity, HarmonicDrive, MagneticField
+from vmri_jax.scene.effects.forces import (
+    ConstantForce,
+    Dashpot,
+    Drive,
+    FollowerForce,
+    Gravity,
+    HarmonicDrive,
+    LinearDamping,
+    MagneticField,
+    QuadraticDrag,
+    RayleighDamping,
+)
 from vmri_jax.scene.effects.joint_base import Joint
 from vmri_jax.scene.effects.joint_effects import (
+    Gear,
+    JointCoupling,
     JointDamper,
     JointDrive,
     JointLimit,
@@ -18,7 +28,17 @@ from vmri_jax.scene.effects.joint_effects import (
     RotorInertia,
 )
 from vmri_jax.scene.effects.joints import Cylindrical, Fixed, Planar, Prismatic, Revolute, Screw, Spherical, Universal
-from vmri_jax.scene.effects.potentials import Angle, Bending, Coulomb, LennardJones, NBodyGravity, Torsion, within_bonds
+from vmri_jax.scene.effects.potentials import (
+    Angle,
+    Bending,
+    Coulomb,
+    LennardJones,
+    NBodyGravity,
+    PlaneContact,
+    SphereContact,
+    Torsion,
+    within_bonds,
+)
 from vmri_jax.scene.effects.springs import (
     Anchor,
     Guide,

@@ -1,18 +1,20 @@
-"""Binding of effects to the bodies of a scene: elements, parameters, values at the start, and terms are computed once."""
+"""Binding of effects to the bodies of a scene: elements, parameters, values at the start, and terms are computed once. And the places of all coordinates."""
 
 from abc import ABC
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import field, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal, NamedTuple, Self
+
+import numpy as np
 
 from vmri_jax.mechanics.arrays import library
+from vmri_jax.mechanics.kinematics import Kinematics
 from vmri_jax.mechanics.rows import Place, Rows
 from vmri_jax.mechanics.slots import Computed
 from vmri_jax.refusals import Refused
 from vmri_jax.scene.body import GROUND, Attachment, Bodies, Point, body_of, end_of, label_of, moving, weights_of
 from vmri_jax.scene.declare import Declared, Elements, Parameter, real_tree, stacked
-from vmri_jax.scene.layout import Key, Layout
 from vmri_jax.scene.terms import Applied, EffectTerm, Role, Source, choose, is_of_package
 
 MOST_ROLES = 32
@@ -21,6 +23,62 @@ POINTS = tuple(f"at_{role}" for role in range(MOST_ROLES))
 """Names of the parameters that hold points fixed in rigid bodies, one for each role."""
 ALONE = "alone"
 """Name of the term of a single element, the same for all effects, so that equal functions share a compiled program."""
+
+
+Key = tuple[str, int, str]
+"""Name of a joint, number of its pair of bodies, and name of a freedom of the joint."""
+
+
+class DecidedPace(NamedTuple):
+    """Whether a body is slow or fast, and why."""
+
+    value: Literal["slow", "fast"]
+    reason: str
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Places of the coordinates q of the scene and of the coordinates Q of its bodies.
+
+    Attributes:
+        bodies: by name of the body, the place in Q_s or Q_f of its coordinates as a point or rigid body, see `Kinematics`. A body that is
+            no function of joint coordinates has the same place in q_s or q_f.
+        coordinates: by name, the place in q_s or q_f of the coordinates of a body or of a freedom of a joint.
+        freedoms: places of the freedoms of joints in q_s or q_f.
+        kinematics: the map from q to Q; None if Q = q.
+    """
+
+    bodies: dict[str, Place]
+    coordinates: dict[str, Place]
+    freedoms: dict[Key, Place] = field(default_factory=dict)
+    kinematics: Kinematics | None = None
+
+    @property
+    def sizes(self) -> tuple[int, int]:
+        """(n_s, n_f)."""
+        return _ends([*self.coordinates.values()])
+
+    @property
+    def ends(self) -> tuple[int, int]:
+        """Lengths of Q_s and Q_f."""
+        return _ends([*self.coordinates.values(), *self.bodies.values()])
+
+    @property
+    def columns(self) -> dict[str | Key, np.ndarray]:
+        """Numbers of the coordinates of every body, and of every freedom of a joint, in (Q_s, Q_f), taken as one vector."""
+        num_slow, places = self.ends[0], {**self.bodies, **self.freedoms}
+        return {name: place.numbers(num_slow) for name, place in places.items()}
+
+    @property
+    def numbers(self) -> dict[str | Key, np.ndarray]:
+        """Numbers of the coordinates of every name and freedom in (q_s, q_f), taken as one vector."""
+        num_slow, places = self.sizes[0], {**self.coordinates, **self.freedoms}
+        return {name: place.numbers(num_slow) for name, place in places.items()}
+
+
+def _ends(places: Sequence[Place]) -> tuple[int, int]:
+    slow, fast = (max((p.start + p.size for p in places if p.part == part), default=0) for part in ("s", "f"))
+    return slow, fast
 
 
 class Bindable(Declared, ABC):
@@ -147,7 +205,7 @@ class Bindable(Declared, ABC):
     def at_start(self, params: Mapping[str, Any]):
         """The measured value of every element at the start, (n,), or () of a single element."""
         values: dict[int, Any] = {}
-        for group in self.by_size():
+        for group in self.groups():
             of_group = self.rest(self.positions(group), self.params_of(group, params))
             values |= zip(group, library(of_group).atleast_1d(of_group), strict=True)
         return stacked([values[i] for i in sorted(values)])
@@ -185,24 +243,28 @@ class Bindable(Declared, ABC):
         """The freedoms of joints that element i is a function of; () if it depends on other coordinates."""
         return ()
 
-    def by_size(self, select: Sequence[int] | None = None) -> list[list[int]]:
-        """Some or all elements, by their numbers, in groups between bodies of the same sizes and kinds: each group is a term."""
+    def kind_of(self, i: int, layout: Layout | None = None) -> tuple:
+        """Equal for elements that can be one term: between bodies of the same sizes and kinds."""
+        return tuple(
+            (name == GROUND, isinstance(name, Attachment), body_of(self.by_name, name).size, end.size)
+            for name, end in zip(self.attached[i], self.ends[i], strict=True)
+        )
+
+    def groups(self, select: Sequence[int] | None = None, layout: Layout | None = None) -> list[list[int]]:
+        """Some or all elements, by their numbers, in groups of one kind."""
         groups: dict[tuple, list[int]] = {}
         for i in range(len(self.elements)) if select is None else select:
-            kinds = tuple(
-                (name == GROUND, isinstance(name, Attachment), body_of(self.by_name, name).size, end.size)
-                for name, end in zip(self.attached[i], self.ends[i], strict=True)
-            )
-            groups.setdefault(kinds, []).append(i)
+            groups.setdefault(self.kind_of(i, layout), []).append(i)
         return list(groups.values())
 
     def terms(self, select: Sequence[int], layout: Layout) -> tuple:
-        """The terms of some elements, one for each group `by_size`."""
-        terms = []
-        for group in self.by_size(select):
-            roles = zip(POINTS, zip(*(self.attached[i] for i in group), strict=True), strict=False)
-            terms.append(self._term([self._role(*role, layout.bodies) for role in roles], group))
-        return tuple(terms)
+        """The terms of some elements, one for each group."""
+        return tuple(self.term(group, layout) for group in self.groups(select, layout))
+
+    def term(self, group: Sequence[int], layout: Layout) -> EffectTerm:
+        """The term of elements of one kind."""
+        roles = zip(POINTS, zip(*(self.attached[i] for i in group), strict=True), strict=False)
+        return self._term([self._role(*role, layout.bodies) for role in roles], group)
 
     def _term(self, roles: Iterable[Role], group: Sequence[int], through: Any = None) -> EffectTerm:
         """Some elements as a term."""

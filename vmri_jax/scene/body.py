@@ -8,7 +8,6 @@ import jax
 import numpy as np
 
 from vmri_jax.mechanics.arrays import is_concrete, library, real_array
-from vmri_jax.mechanics.kinematics import UNMOVED
 from vmri_jax.refusals import Refused
 
 Pace = Literal["slow", "fast", "auto"]
@@ -16,8 +15,6 @@ LARGEST_POINT = 3
 """Most coordinates of a point; a body with more is a block of general coordinates."""
 GROUND = "ground"
 """Name in effects of the body that does not move."""
-GROUND_COORDINATES = UNMOVED.ravel()
-"""The twelve coordinates (phi, d_1, d_2, d_3) of the ground as a rigid body."""
 
 
 class Attachment(str):
@@ -131,6 +128,8 @@ class AnyBody:
         """The centre of the body, or the point at `offset` (3,) m from it in the axes of the body, at the start."""
         if offset is None:
             return Point(self.name, self.position, self.mass, self.block)
+        if not self.rigid:
+            raise Refused(f"{self.name} is no rigid body, so that no point is fixed in it; give its name alone.")
         if offset.shape != (3,):
             raise Refused(f"the point in {self.name} has shape {offset.shape}; give (3,), in the axes of the body.")
         self.weights(offset)  # refuses a point outside a plate or a rod
@@ -214,8 +213,7 @@ class Body(AnyBody):
         if self.radius is not None and is_concrete(self.radius) and not 0 < self.radius < np.inf:
             raise Refused(f"Body {self.name}: radius is {self.radius!r}; it must be a positive number, or None.")
         block = self.block or position.size > LARGEST_POINT
-        for name, value in (("position", position), ("velocity", velocity), ("mass", mass), ("block", block)):
-            object.__setattr__(self, name, value)
+        vars(self).update(position=position, velocity=velocity, mass=mass, block=block)
 
     def _vector(self, name: str, argument):
         value = self._numbers(name, argument)
@@ -223,11 +221,6 @@ class Body(AnyBody):
         if value.ndim != 1 or not value.size:
             raise Refused(f"Body {self.name}: {name} has shape {value.shape}; give a vector of coordinates, (n,).")
         return value
-
-    @property
-    def coordinates(self):
-        """(n,) position."""
-        return self.position
 
     @property
     def rates(self):
@@ -238,12 +231,6 @@ class Body(AnyBody):
     def masses(self):
         """(n,) masses."""
         return self.mass + np.zeros(self.size)
-
-    def point(self, offset: Any = None) -> Point:
-        """The position of the body at the start; an offset, as if the body were rigid, is refused."""
-        if offset is not None:
-            raise Refused(f"{self.name} is no rigid body, so that no point is fixed in it; give its name alone.")
-        return super().point()
 
     def with_rates(self, rates: np.ndarray) -> "Body":
         return replace(self, velocity=rates)
@@ -290,7 +277,7 @@ class Frame(AnyBody):
 
     def __post_init__(self):
         self._check_names()
-        object.__setattr__(self, "position", self._numbers("position", self.position, (3,)))
+        vars(self).update(position=self._numbers("position", self.position, (3,)))
 
 
 Bodies = Mapping[str, AnyBody]

@@ -1,11 +1,14 @@
 """Accelerations of the bodies of a scene at a state, by its continuous equations of motion."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 
 from vmri_jax.mechanics.motion import motion
 from vmri_jax.mechanics.projection import legendre
 from vmri_jax.mechanics.state import State
+from vmri_jax.scene.functions import UNCHANGED
 from vmri_jax.scene.scene import Scene
 
 
@@ -25,18 +28,14 @@ def accelerations(scene: Scene, state: State) -> dict[str, tuple[jax.Array, jax.
     derivatives = jax.jit(motion)(scene.system(), state)
     q, v, a = (state.q_s, state.q_f), (derivatives.v_s, derivatives.v_f), (derivatives.a_s, derivatives.a_f)
     layout, joints = scene.sorting.layout, scene.sorting.joints
-    kinematics = layout.kinematics
-    if kinematics is not None:  # joint coordinates x: positions q(x), velocities q' v, accelerations d/dt (q' v)
+    kinematics: Any = layout.kinematics or UNCHANGED
 
-        @jax.jit
-        def of_bodies(q, v, a):
-            def velocities(q, v):
-                return kinematics.velocities(*q, *v, joints)  # pyright: ignore[reportCallIssue]
+    def velocities(q, v):
+        return kinematics.velocities(*q, *v, joints)
 
-            return kinematics(*q, joints), *jax.jvp(velocities, (q, v), (v, a))  # pyright: ignore[reportCallIssue]
-
-        q, v, a = of_bodies(q, v, a)
+    # of coordinates x: positions q(x), velocities q' v, accelerations d/dt (q' v)
+    motions = jax.jit(lambda q, v, a: (kinematics(*q, joints), *jax.jvp(velocities, (q, v), (v, a))))(q, v, a)
     return {
-        name: tuple(slow_and_fast[part == "f"][start : start + size] for slow_and_fast in (q, v, a))
+        name: tuple(slow_and_fast[part == "f"][start : start + size] for slow_and_fast in motions)
         for name, (part, start, size) in layout.bodies.items()
     }

@@ -43,20 +43,13 @@ class Names:
         """The elements of an argument ``("a", "b")``, ``[("a", "b"), ("b", "c")]`` or None; `about` begins messages."""
         if argument is None and self.may_be_all:
             argument = tuple(name for name, body in bodies.items() if not isinstance(body, Frame))
-        if is_entry(argument):
-            items: tuple[Any, ...] = (argument,)
-        else:
-            items = tuple(argument) if isinstance(argument, Iterable) else ()
-        flat = bool(items) and all(is_entry(item) for item in items)
+        items = _listed(argument)
+        flat = bool(items) and all(map(is_entry, items))
         if self.pairs and flat:
             if len(items) < 2:
                 raise Refused(f"{about} is {argument!r}; give at least two bodies, or a list of pairs.")
             return tuple(combinations(map(entry, items), 2))
-        if self.count > 1 and flat:
-            items = (items,)
-        elements = tuple(
-            tuple(item) if isinstance(item, Iterable) and not is_entry(item) else (item,) for item in items
-        )
+        elements = (items,) if self.count > 1 and flat else tuple(map(_listed, items))
         wrong = any(len(element) != self.count or not all(map(is_entry, element)) for element in elements)
         if not elements or wrong:
             expected = "the name of a body" if self.count == 1 else f"{self.count} names of bodies"
@@ -64,6 +57,11 @@ class Names:
                 f"{about} is {argument!r}; give {expected}, or a list of such. A point in a rigid body is (name, [x, y, z])."
             )
         return tuple(tuple(map(entry, element)) for element in elements)
+
+
+def _listed(argument: Any) -> tuple[Any, ...]:
+    """The items of a list; a name alone, or what is no list, as the only item."""
+    return tuple(argument) if isinstance(argument, Iterable) and not is_entry(argument) else (argument,)
 
 
 @dataclass(frozen=True)

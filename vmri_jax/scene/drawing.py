@@ -29,13 +29,13 @@ def drawing(sorting: Sorting, effects: Sequence[Effect]) -> dict[str, Any]:
             entries["blocks" if body.block else "bodies"].append({"name": body.name, "coordinates": coordinates})
     points: dict[str, dict[str, Any]] = {}
     for effect in effects:
+        of_effect = effect.drawing()
         # ends phi + sum_i X_i d_i of links and springs in rigid bodies, as bodies that are not shown themselves
-        for label, (name, components) in effect.drawn_points().items():
+        for label, (name, components) in of_effect.get("points", {}).items():
             part, start, size = sorting.layout.bodies[name]
             weights = [1.0, *np.asarray(components).tolist()][: size // 3]
             forms = [[[w, part, start + 3 * k + i] for k, w in enumerate(weights) if w] for i in range(3)]
             points[label] = {"name": label, "coordinates": forms, "shown": ""}
-        of_effect = effect.drawing()
         for kind in EFFECT_LISTS:
             entries[kind] += of_effect.get(kind, [])
         radii |= dict(of_effect.get("radii", []))

@@ -13,8 +13,7 @@ from jax.flatten_util import ravel_pytree
 
 from vmri_jax.mechanics.arrays import is_concrete, library
 from vmri_jax.mechanics.checks import describe, shape_of
-from vmri_jax.mechanics.constraints import START as KEPT_AT_START
-from vmri_jax.mechanics.constraints import Rows
+from vmri_jax.mechanics.constraints import START, Rows
 from vmri_jax.mechanics.functions import check_arguments
 from vmri_jax.mechanics.names import unknown
 from vmri_jax.refusals import Refused
@@ -23,10 +22,6 @@ from vmri_jax.scene.body import GROUND, Attachment, end_of, label_of, moving, we
 from vmri_jax.scene.declare import arrays, lasting
 
 Kind = Literal["kinetic", "potential", "constraint", "force", "control"]
-START = 1e-9
-"""Largest violation of a constraint at the start, relative to the value that it keeps. A larger one would start runs off the constraints;
-a smaller one would refuse lengths that are written with ten digits."""
-
 LIBRARY = "vmri_jax."
 """Beginning of the names of modules whose functions are not checked: the tests of the package do that."""
 
@@ -156,6 +151,16 @@ class Effect(Bindable):
         if any(parameter.shape == "vector" for parameter in self.declared.values()):
             self._check_sizes([element[0] for element in self.elements])
 
+    def check_of_time(self, name: str, params: Any) -> None:
+        """Refuse a function of time, in the field of this name, whose values do not have the dimension of the bodies."""
+        value = shape_of(f"{self.name}: {name}", getattr(self, name), jnp.zeros(()), params)
+        shape = getattr(value, "shape", None)
+        for (body,), (end,) in zip(self.elements, self.ends, strict=True):
+            if shape != (end.size,) and (shape, end.size) != ((), 1):
+                raise Refused(
+                    f"{self.name}: {name} returns shape {shape}; {body} has dimension {end.size}, return ({end.size},)."
+                )
+
     def check_parameters(self) -> None:
         """Refuse bodies at one place, parameters of another shape or sign, or that are not finite."""
         if self.apart:
@@ -175,20 +180,16 @@ class Effect(Bindable):
         """Largest second derivative of the energy of each element, () or (n,), if the start does not show it (contacts that are open); else None."""
         return None
 
-    def drawn_points(self) -> dict[str, tuple[str, Any]]:
-        """Points in rigid bodies where a drawn link or spring ends: their labels, with the body and the components of the point in it."""
+    def drawing(self) -> dict[str, Any]:
+        """Entries of this effect in the lists of `Scene.drawing`, "radii" of bodies as pairs (name, number), and "points": by label the points in rigid
+        bodies where a drawn link or spring ends, with the body and the components of the point in it."""
         if self.drawn_as is None:
             return {}
-        return {
+        points = {
             name.label: (str(name), weights_of(self.by_name, name))
             for name in chain(*self.elements)
             if isinstance(name, Attachment) and name != GROUND
         }
-
-    def drawing(self) -> dict[str, list]:
-        """Entries of this effect in the lists of `Scene.drawing`, and "radii" of bodies as pairs (name, number)."""
-        if self.drawn_as is None:
-            return {}
         pairs = [pair for element in self.elements for pair in pairwise(element)]
         between = [[label_of(a), label_of(b)] for a, b in pairs if GROUND not in (a, b)]
         to_ground = [(a, b) if b == GROUND else (b, a) for a, b in pairs if GROUND in (a, b)]
@@ -196,7 +197,7 @@ class Effect(Bindable):
             {"body": label_of(body), "point": end_of(self.by_name, ground).position.tolist(), "kind": self.drawn_as}
             for body, ground in to_ground
         ]
-        return {f"{self.drawn_as}s": between, "anchors": anchors}
+        return {f"{self.drawn_as}s": between, "anchors": anchors, "points": points}
 
     def require(self, condition: Any, quantity: str, value: Any, expected: str) -> None:
         """Raise ValueError, "{quantity} is {value}; {expected}.", unless a condition is true everywhere, or traced."""
@@ -240,7 +241,7 @@ def check_function(effect: Any, moved: bool) -> None:
     """
     if effect.kind == "control" or getattr(effect.function, "__module__", "").startswith(LIBRARY):
         return
-    for group in effect.by_size():
+    for group in effect.groups():
         q = jax.device_put(effect.positions(group))
         t, v = jax.device_put(((np.zeros(()),), tuple(np.zeros(x.shape) for x in q)))
         before = {"force": (*t, q, v), "kinetic": (q, v)}.get(effect.kind, (*t, q) if effect.timed else (q,))
@@ -249,7 +250,7 @@ def check_function(effect: Any, moved: bool) -> None:
         _check_value(effect, value, [x.shape for x in q], len(group))
         if effect.kind == "constraint" and not moved and is_concrete(arguments):
             rows = _rows(effect.called, *arguments)
-            if np.any(np.abs(rows.values) > rows.allowed(KEPT_AT_START)):
+            if np.any(np.abs(rows.values) > rows.allowed(START)):
                 raise Refused(
                     f"{effect.name}: the positions at the start violate this constraint by {np.abs(rows.values).max():.3g}; move the "
                     "bodies, or let the scene do so, Scene(..., project=True)."

@@ -1,7 +1,5 @@
 """The ledger of a scene or of a system of functions: grid, unknowns, evaluations and computing time of every body and effect."""
 
-import re
-from collections import Counter
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,18 +18,12 @@ from vmri_jax.mechanics.terms import KINDS
 from vmri_jax.refusals import Refused
 from vmri_jax.running.prepare import prepare
 from vmri_jax.running.printed import PrintedTable
-from vmri_jax.running.simulation import Simulation
 from vmri_jax.running.timing import interleaved, seconds_each
-from vmri_jax.scene.assembly import build
+from vmri_jax.scene.functions import build
 from vmri_jax.scene.sorting import Sorting
 from vmri_jax.schemes.composition import Composition, stage_scheme
 from vmri_jax.schemes.scheme import Scheme
 
-OTHER_TERMS: dict[Any, tuple[str, str]] = {
-    "control": ("F", "control u"),
-    "fast": ("fast", "potential on the micro grid"),
-}
-"""For each term of an effect that is no argument of `System`, the key of its rule in `Scheme.rule_of`, and its name in the ledger."""
 STEPS = 20
 """Macro steps of the program that is timed: enough that the call of the program takes little of the time. More take longer."""
 DEFAULT_FREQUENCY = 10.0
@@ -119,7 +111,9 @@ def _term(home: Any) -> tuple[Any, str]:
     if home in KINDS:
         kind = KINDS[home]
         return kind.symbol, f"{kind.in_words} {kind.symbol}"
-    return OTHER_TERMS.get(home, (home, f"potential on one in {home} micro nodes"))
+    if home == "control":
+        return "F", "control u"
+    return home, "potential on the micro grid" if home == "fast" else f"potential on one in {home} micro nodes"
 
 
 def ledger_of_functions(
@@ -183,7 +177,8 @@ def _macro_step(system: System, scheme, start, macro_dt: float | None) -> float:
         turning = float(largest_v / max(largest_q, 1e-300))  # rad/s; of a spinning body roughly its angular velocity
         frequency = float(linearise(system, state).frequencies.max(initial=0.0)) or turning or DEFAULT_FREQUENCY
         macro_dt = scheme.num_micro * 0.1 / frequency
-    seconds = interleaved({"": prepare_steps(system, scheme, state, macro_dt).timed()}, 5)[""]
+    steps = prepare(system, scheme, state, macro_dt=macro_dt, num_steps=STEPS, save=STEPS)
+    seconds = interleaved({"": steps.timed()}, 5)[""]
     return 1e6 * float(np.median(seconds)) / STEPS
 
 
@@ -205,24 +200,3 @@ def _first_derivatives(system: System, n_s: int, v_s, v_f):
         return total
 
     return derivatives
-
-
-def prepare_steps(system: System, scheme: Scheme | Composition, state, macro_dt, num_steps: int = STEPS) -> Simulation:
-    """A simulation, see `vmri_jax.prepare`, that saves the end alone; `operations` and `temporary_bytes` take its ``.compiled()``."""
-    return prepare(system, scheme, state, macro_dt=macro_dt, num_steps=num_steps, save=num_steps)
-
-
-NO_OPERATION = {"parameter", "constant", "tuple", "get-tuple-element", "bitcast"}
-"""Names of instructions in a compiled program that compute nothing."""
-INSTRUCTION = re.compile(r"^\s*(?:ROOT )?%?[\w.-]+ = (?:\(.*?\)|\S+) ([a-z][a-z0-9-]*)\(", re.MULTILINE)
-"""A line of XLA's text of a program, with the name of the instruction as its group."""
-
-
-def operations(compiled) -> Counter:
-    """Number of instructions of each name in a compiled program, with the instructions inside its fusions and loops."""
-    return Counter(name for name in INSTRUCTION.findall(compiled.as_text()) if name not in NO_OPERATION)
-
-
-def temporary_bytes(compiled) -> int:
-    """Temporary memory of a compiled program, bytes."""
-    return compiled.memory_analysis().temp_size_in_bytes

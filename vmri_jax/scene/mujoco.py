@@ -26,7 +26,7 @@ from vmri_jax.refusals import NotInstalled, Refused
 from vmri_jax.scene.body import Frame
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.effects.custom import Potential
-from vmri_jax.scene.effects.fields import Gravity
+from vmri_jax.scene.effects.forces import Gravity
 from vmri_jax.scene.effects.joint_base import Joint
 from vmri_jax.scene.effects.joint_effects import JointDamper, JointLimit, JointSpring, RotorInertia
 from vmri_jax.scene.effects.joints import Fixed, Prismatic, Revolute, Spherical
@@ -201,10 +201,8 @@ class _Reader(Compiled):
     def closing(self) -> Iterator[Joint]:
         """Joints that close loops, from the equalities connect and weld."""
         for loop in loops(self):
-            first, second = loop.ends
-            kind = Fixed if loop.welded else Spherical
-            between = self.group(first.body), self.group(second.body)
-            yield kind(between, first.point, name=self.name("equality", loop.number))
+            kind = Spherical if len(loop.gap) == 1 else Fixed
+            yield kind(tuple(map(self.group, loop.bodies)), loop.points[0], name=self.name("equality", loop.number))
 
     def weights(self, bodies: list[RigidBody | Frame]) -> Iterator[Effect]:
         """Gravity, unless the model switches it off, and the forces ``-c m g`` in centres of mass that compensate a fraction c of it."""

@@ -25,7 +25,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from vmri_jax.refusals import Refused
-from vmri_jax.scene.effects.couplings import JointCoupling
+from vmri_jax.scene.effects.joint_effects import JointCoupling
 from vmri_jax.scene.mujoco_model import Compiled
 
 WIDEST_GAP = 1e-3
@@ -48,39 +48,40 @@ ADVICE = (
 """End of messages about equalities that the start violates."""
 
 
-class End(NamedTuple):
-    """An end of an equality: number of its body, and its point (3,) and frame (3, 3) in space."""
-
-    body: int
-    point: np.ndarray
-    frame: np.ndarray
-
-
 class Loop(NamedTuple):
-    """An equality connect, or weld, which holds the frames of both ends together, too; with its number in the model."""
+    """An active equality connect, or weld, between bodies that can move against each other.
+
+    number: in the model.
+    bodies: numbers of both.
+    points: (2, 3) of both ends in space.
+    gap: r of the module: (1, 3) m between the points; of a weld (2, 3), followed by the rotation vector between the frames, rad.
+    """
 
     number: int
-    welded: bool
-    ends: tuple[End, End]
-
-    @property
-    def gap(self) -> np.ndarray:
-        """r of the module: (3,) m between the points; of a weld (6,), followed by the rotation vector between the frames, rad."""
-        first, second = self.ends
-        distance = first.point - second.point
-        if not self.welded:
-            return distance
-        return np.concatenate([distance, Rotation.from_matrix(first.frame @ second.frame.T).as_rotvec()])
+    bodies: list[int]
+    points: np.ndarray
+    gap: np.ndarray
 
 
 def loops(compiled: Compiled) -> list[Loop]:
-    """The active equalities connect and weld between bodies that can move against each other."""
-    closed = []
-    for i in compiled.equalities:
-        if compiled.closes(i):
-            ends = _ends(compiled, i)
-            if compiled.group(ends[0].body) != compiled.group(ends[1].body):
-                closed.append(Loop(i, compiled.model.eq_type[i] == compiled.mujoco.mjtEq.mjEQ_WELD, ends))
+    """The loops at the positions in the data, with ends as MuJoCo's engine defines them."""
+    model, data, closed = compiled.model, compiled.data, []
+    for i in filter(compiled.closes, compiled.equalities):
+        bodies = [int(model.eq_obj1id[i]), int(model.eq_obj2id[i])]
+        is_weld = model.eq_type[i] == compiled.mujoco.mjtEq.mjEQ_WELD
+        if model.eq_objtype[i] == compiled.mujoco.mjtObj.mjOBJ_SITE:
+            sites, bodies = bodies, model.site_bodyid[bodies].tolist()
+            points, frames = data.site_xpos[sites], data.site_xmat[sites].reshape(2, 3, 3)
+        else:
+            # eq_data of a weld: anchor in the second body, then position and quaternion of the second body in the first
+            anchors = model.eq_data[i, :6].reshape(2, 3)[:: -1 if is_weld else 1]
+            frames = data.xmat[bodies].reshape(2, 3, 3)
+            points = data.xpos[bodies] + (frames @ anchors[..., None])[..., 0]
+            if is_weld:
+                frames[0] @= Rotation.from_quat(model.eq_data[i, 6:10], scalar_first=True).as_matrix()
+        if compiled.group(bodies[0]) != compiled.group(bodies[1]):
+            turned = [Rotation.from_matrix(frames[0] @ frames[1].T).as_rotvec()] if is_weld else []
+            closed.append(Loop(i, bodies, points, np.array([points[0] - points[1], *turned])))
     return closed
 
 
@@ -93,7 +94,7 @@ def close(compiled: Compiled) -> None:
         if max((_size(compiled, loop) for loop in closing), default=0.0) <= ROUND_OFF_GAP:
             return
         jacobian = np.concatenate([_jacobian(compiled, loop) for loop in closing])
-        gaps = np.concatenate([loop.gap for loop in closing])
+        gaps = np.concatenate([loop.gap.ravel() for loop in closing])
         mujoco.mj_integratePos(model, data.qpos, np.linalg.lstsq(jacobian, -gaps, rcond=RANK)[0], 1.0)
         mujoco.mj_forward(model, data)
     _refuse_gaps(compiled, WIDEST_LEFT, "does not close; its remaining gap is")
@@ -104,49 +105,24 @@ def _refuse_gaps(compiled: Compiled, widest: float, phrase: str) -> None:
     gaps = []
     for loop in loops(compiled):
         if _size(compiled, loop) > widest:
-            distances = np.linalg.norm(loop.gap.reshape(-1, 3), axis=1)
-            angle = f" and {distances[1]:.3g} rad" if loop.welded else ""
-            gaps.append(f"{compiled.name('equality', loop.number)} {phrase} {distances[0]:.3g} m{angle}")
+            sizes = zip(np.linalg.norm(loop.gap, axis=1), ("m", "rad"), strict=False)
+            gap = " and ".join(f"{size:.3g} {unit}" for size, unit in sizes)
+            gaps.append(f"{compiled.name('equality', loop.number)} {phrase} {gap}")
     if gaps:
         raise Refused(f"Scene.from_mujoco: {'; '.join(gaps)}. {ADVICE}")
 
 
 def _size(compiled: Compiled, loop: Loop) -> float:
     """The gap of a loop, in extents of the model or rad."""
-    distances = np.linalg.norm(loop.gap.reshape(-1, 3), axis=1)
-    return float(np.max(distances / [float(compiled.model.stat.extent), 1.0][: len(distances)]))
-
-
-def _ends(compiled: Compiled, i: int) -> tuple[End, End]:
-    """Both ends of an equality, as MuJoCo's engine defines them."""
-    model, data = compiled.model, compiled.data
-    objects = int(model.eq_obj1id[i]), int(model.eq_obj2id[i])
-    if model.eq_objtype[i] == compiled.mujoco.mjtObj.mjOBJ_SITE:
-        first, second = (
-            End(int(model.site_bodyid[s]), data.site_xpos[s].copy(), data.site_xmat[s].reshape(3, 3).copy())
-            for s in objects
-        )
-        return first, second
-    in_first, in_second, rotation = model.eq_data[i, :3], model.eq_data[i, 3:6], np.eye(3)
-    if model.eq_type[i] == compiled.mujoco.mjtEq.mjEQ_WELD:
-        # eq_data of a weld: anchor in the second body, then position and quaternion of the second body in the first
-        in_first, in_second = in_second, in_first
-        rotation = Rotation.from_quat(model.eq_data[i, 6:10], scalar_first=True).as_matrix()
-    frames = [data.xmat[b].reshape(3, 3).copy() for b in objects]
-    points = [
-        data.xpos[b] + frame @ point for b, frame, point in zip(objects, frames, (in_first, in_second), strict=True)
-    ]
-    return End(objects[0], points[0], frames[0] @ rotation), End(objects[1], points[1], frames[1])
+    return float(np.max(np.linalg.norm(loop.gap, axis=1) / [compiled.model.stat.extent, 1.0][: len(loop.gap)]))
 
 
 def _jacobian(compiled: Compiled, loop: Loop) -> np.ndarray:
     """The Jacobian of the gap with respect to MuJoCo's velocities, (3, nv), of a weld (6, nv)."""
-    model, sides = compiled.model, []
-    for end in loop.ends:
-        of_point, of_rotation = np.zeros((3, model.nv)), np.zeros((3, model.nv))
-        compiled.mujoco.mj_jac(model, compiled.data, of_point, of_rotation, end.point, end.body)
-        sides.append(np.concatenate([of_point, of_rotation]) if loop.welded else of_point)
-    return sides[0] - sides[1]
+    sides = np.zeros((2, 2, 3, compiled.model.nv))
+    for (of_point, of_rotation), body, point in zip(sides, loop.bodies, loop.points, strict=True):
+        compiled.mujoco.mj_jac(compiled.model, compiled.data, of_point, of_rotation, point, body)
+    return (sides[0] - sides[1])[: len(loop.gap)].reshape(-1, compiled.model.nv)
 
 
 def polynomial(x, params):
@@ -158,9 +134,7 @@ def polynomial(x, params):
 def couplings(compiled: Compiled) -> Iterator[JointCoupling]:
     """The couplings that the model does not switch off, none of which the start may violate."""
     model = compiled.model
-    for i in compiled.equalities:
-        if not compiled.ties(i):
-            continue
+    for i in filter(compiled.ties, compiled.equalities):
         sides = [_ratios(compiled, i, int(number)) for number in (model.eq_obj1id[i], model.eq_obj2id[i])]
         joints = sorted({j for side in sides for j in side})
         ratios = np.array([[side.get(j, 0.0) for j in joints] for side in sides])

@@ -15,10 +15,10 @@ from scipy.linalg import qr
 
 from vmri_jax.mechanics.constraints import RANK, rank_of
 from vmri_jax.refusals import Refused
+from vmri_jax.scene.binding import Key
 from vmri_jax.scene.body import Bodies, listed
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.effects.joint_base import Joint
-from vmri_jax.scene.layout import Key
 from vmri_jax.scene.rigid import Rigidity
 from vmri_jax.scene.rows import ConstraintRows
 from vmri_jax.scene.sorting import HOMES, Sorting, sort
@@ -36,9 +36,6 @@ SHORTENING = 4.0
 """Factor by which a motion is shortened after corrections that shrink too slowly; a larger factor may skip usable lengths."""
 NUM_LENGTHS = 10
 """Most lengths of a motion that are tried. The last of ten suits a molecule of a millionth of the extent of the scene."""
-FOLLOWS = RANK
-"""Largest value of a dropped row, relative to its size, that counts as zero: the accuracy to which the choice of dropped rows finds them
-dependent. A larger value accepts rows that change the motion."""
 BEND = "Bend bodies that lie in line or flat at the start by a little, leave other rows out of the scene, or hold the shape by other constraints"
 """Advice for rows that depend on others at the start alone."""
 
@@ -117,7 +114,7 @@ def find_opening(rows: ConstraintRows) -> tuple[dict[int, float], float]:
     if not is_reached:
         return {}, 0.0  # positions far off the constraints: the initial state refuses them with a message of its own
     worst, length = np.abs(values[dropped]), 0.0
-    if worst.max() <= FOLLOWS:
+    if worst.max() <= RANK:  # the accuracy to which the choice of dropped rows finds them dependent
         random, timed = np.random.default_rng(0), any(row.effect.timed for row in rows.rows)
         for _ in range(MOTIONS):
             time, motion = random.normal() * timed, random.normal(size=rows.start.size)
@@ -129,7 +126,7 @@ def find_opening(rows: ConstraintRows) -> tuple[dict[int, float], float]:
                     worst, length = np.maximum(worst, np.abs(values[dropped])), max(length, step)
                     break
                 step /= SHORTENING
-    return {i: value for i, value in zip(dropped, worst.tolist(), strict=True) if value > FOLLOWS}, length
+    return {i: value for i, value in zip(dropped, worst.tolist(), strict=True) if value > RANK}, length
 
 
 def _cure(sorting: Sorting) -> str:

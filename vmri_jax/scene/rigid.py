@@ -12,7 +12,6 @@ mechanical systems, part II: multibody dynamics, Int. J. Numer. Meth. Engng 67 (
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -92,13 +91,10 @@ class RigidBody(AnyBody):
         inertia = self.inertia
         tensor = inertia.inertia(mass) if isinstance(inertia, Shape) else self._numbers("inertia", inertia)
         moments, axes = self._principal(tensor)
-        fields = {"mass": mass, "shape": shape, "moments": moments, "axes": axes}
         for name in ("position", "velocity", "spin"):
             value = getattr(self, name)
-            fields[name] = np.zeros(3) if value is None else self._numbers(name, value, (3,))
-        fields["rotation"] = self._matrix()
-        for name, value in fields.items():
-            object.__setattr__(self, name, value)
+            vars(self)[name] = np.zeros(3) if value is None else self._numbers(name, value, (3,))
+        vars(self).update(mass=mass, shape=shape, moments=moments, axes=axes, rotation=self._matrix())
 
     def _principal(self, inertia) -> tuple[Any, np.ndarray]:
         """Principal moments (3,), and the principal axes as columns, in the axes of the body, of the argument `inertia` as an array."""
@@ -171,8 +167,7 @@ class RigidBody(AnyBody):
     @property
     def rates(self):
         """(n,) velocity of the centre of mass, ``d_i' = spin x d_i``."""
-        turned = library(self.spin, self.directors).cross(self.spin, self.directors)
-        return joined([self.velocity, *(turned[i] for i in self.wide)])
+        return joined([self.velocity, self._turns() @ self.spin])
 
     @property
     def masses(self):
@@ -187,26 +182,29 @@ class RigidBody(AnyBody):
         matrix = np.block([[np.eye(3), np.zeros((3, 3))], [np.zeros((len(turns), 3)), turns]])
         return matrix if len(self.wide) > 1 else np.linalg.svd(matrix)[0][:, :5]  # a rod does not turn about itself
 
-    def _turns(self) -> np.ndarray:
+    def _turns(self) -> Any:
         """(3 k, 3) matrix from the angular velocity to the rates of the k directors, ``d_i' = -d_i x spin``."""
-        return np.concatenate([-_cross_matrix(np.asarray(self.directors[i])) for i in self.wide])
+        return joined([-_cross_matrix(self.directors[i]) for i in self.wide])
 
     def with_rates(self, rates: np.ndarray) -> "RigidBody":
         """The same body with other velocities; the spin of a rod about its axis is zero."""
         return replace(self, velocity=rates[:3], spin=np.linalg.lstsq(self._turns(), rates[3:], rcond=None)[0])
 
-    def components(self, vector):
-        """(3,) components of a vector along the principal axes; refused along an axis without width and director."""
-        components = vector @ self.axes
+    def weights(self, offset: Any) -> Any:
+        """(3,) components X of a point ``phi + sum_i X_i d_i``, first those along the directors that the body has, then zeros.
+
+        Refused along an axis without width and director.
+        """
+        components = offset @ self.axes
         thin = [i for i in range(3) if i not in self.wide]
         if thin and is_concrete(components):
             sizes = np.abs(np.asarray(components))
             if np.any(sizes[thin] > ORTHONORMAL * sizes.max()):
                 raise Refused(
-                    f"{np.asarray(vector)} sticks out of {self.name}: with the moments of inertia {np.asarray(self.moments)} it is a plate "
+                    f"{np.asarray(offset)} sticks out of {self.name}: with the moments of inertia {np.asarray(self.moments)} it is a plate "
                     "or a rod without width in this direction. Give the body some width."
                 )
-        return components
+        return joined([components[np.array(self.wide)], np.zeros(len(thin))])
 
     @property
     def _drawn_shape(self) -> Shape:
@@ -240,11 +238,6 @@ class RigidBody(AnyBody):
         coordinates = [[part, start + i] for i in range(self.size)]
         return {"solids": [{"name": self.name, "coordinates": coordinates, "corners": components, "faces": faces}]}
 
-    def weights(self, offset: Any) -> Any:
-        """(3,) components X of a point ``phi + sum_i X_i d_i``, first those along the directors that the body has, then zeros."""
-        components = self.components(offset)
-        return joined([components[np.array(self.wide)], np.zeros(3 - len(self.wide))])
-
 
 class Rigidity(Effect):
     """The constraints of rigid bodies by directors, ``g = (d_i . d_j - delta_ij) / (1 + delta_ij)``; every scene adds this effect itself.
@@ -273,15 +266,14 @@ def matrix_of(rotation):
     """(3, 3) matrix of a rotation, which is such a matrix, a quaternion (w, x, y, z) or a rotation vector (3,)."""
     if rotation.shape == (3, 3):
         return rotation
-    if rotation.shape == (4,):
-        # R = 1 + 2 w U + 2 U^2 with the matrix U of x -> u x x, u the vector part
-        w, u = rotation[0], _cross_matrix(rotation[1:])
-        return library(rotation).eye(3) + 2 * w * u + 2 * u @ u
-    if is_concrete(rotation):
-        return Rotation.from_rotvec(np.array(rotation)).as_matrix()
-    # Rodrigues: R = 1 + (sin a / a) U + (1 - cos a) / a^2 U^2, with (1 - cos a) / a^2 = (sin(a/2) / (a/2))^2 / 2
-    angle, u = jnp.sqrt(jnp.sum(rotation**2)), _cross_matrix(rotation)
-    return jnp.eye(3) + jnp.sinc(angle / np.pi) * u + jnp.sinc(angle / (2 * np.pi)) ** 2 / 2 * u @ u
+    xp = library(rotation)
+    if rotation.shape == (3,):
+        # r of length a is the quaternion (cos(a / 2), sin(a / 2) r / a)
+        half = xp.sqrt(xp.sum(rotation**2)) / 2
+        rotation = xp.append(xp.cos(half), xp.sinc(half / np.pi) / 2 * rotation)
+    # R = 1 + 2 w U + 2 U^2 with the matrix U of x -> u x x, u the vector part
+    w, u = rotation[0], _cross_matrix(rotation[1:])
+    return xp.eye(3) + 2 * w * u + 2 * u @ u
 
 
 def _cross_matrix(u):

@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,13 +14,12 @@ from vmri_jax.mechanics.arrays import is_concrete, quickly_compiled
 from vmri_jax.mechanics.constraints import RANK
 from vmri_jax.mechanics.functions import TracedOnce
 from vmri_jax.mechanics.names import Names
-from vmri_jax.scene.body import LARGEST_POINT, label_of
+from vmri_jax.scene.body import LARGEST_POINT
 from vmri_jax.scene.declare import stacked
-from vmri_jax.scene.effect import Effect
-from vmri_jax.scene.effects.freedoms import ANGLES
+from vmri_jax.scene.effects.joint_base import ANGLES
 from vmri_jax.scene.functions import ConstraintValues
 from vmri_jax.scene.rates import positions
-from vmri_jax.scene.sorting import HOMES, Home, Placed, Sorting
+from vmri_jax.scene.sorting import HOMES, Home, Row, Sorting, rows_of
 from vmri_jax.scene.terms import EffectTerm, Role
 
 CANCELLED = 1e-14
@@ -36,43 +35,6 @@ COMPLEX_STEP = 1e-30
 underflow in products."""
 CORRECTIONS = 20
 """Most corrections of Newton's iteration; from nearby six reach round-off. More only delay the message that it fails."""
-
-
-class Row(NamedTuple):
-    """A row of a constraint.
-
-    label: of its element: the name of the effect and, if it has several elements, names of the bodies.
-    name: of the effect and the bodies, with a number if an element has several rows.
-    part: number of its entry in `Sorting.placed`, which has this effect and home.
-    number: of the row in this entry, in the order of its terms.
-    kept: False for a row that the scene leaves out.
-    """
-
-    label: str
-    name: str
-    part: int
-    number: int
-    effect: Effect
-    home: Home
-    kept: bool
-
-
-def rows_of(placed: Sequence[Placed]) -> list[Row]:
-    """The rows of constraints, in the order of `Sorting.placed` and of the terms of each effect."""
-    rows = []
-    for i, part in enumerate(placed):
-        effect, number = part.effect, 0
-        for group in effect.by_size(part.elements) if part.home in HOMES else ():
-            # all elements of a group have as many rows
-            t, one = (np.zeros(()),) if effect.timed else (), group[:1]
-            size = jax.eval_shape(effect.called, *t, effect.positions(one), effect.params_of(one)).size
-            for element in group:
-                named = f"{effect.name} {'-'.join(map(label_of, effect.elements[element]))}"
-                label = effect.name if len(effect.elements) == 1 else named
-                for name in [named] if size == 1 else [f"{named} [{j}]" for j in range(size)]:
-                    rows.append(Row(label, name, i, number, effect, part.home, number not in part.dropped))
-                    number += 1
-    return rows
 
 
 def _derivatives(
@@ -137,7 +99,7 @@ class ConstraintRows:
     @cached_property
     def rows(self) -> list[Row]:
         """The names and origins of the rows."""
-        return rows_of(self.sorting.placed)
+        return rows_of(self.sorting.placed, self.sorting.layout)
 
     @cached_property
     def params(self) -> dict[str, Any]:
@@ -244,7 +206,9 @@ def names_of(sorting: Sorting) -> Names:
     for name, place in sorting.layout.coordinates.items():
         sizes[place.part][name] = place.size
     for home in HOMES:
-        sizes[home] = dict(Counter(row.label for row in rows_of(sorting.placed) if row.kept and row.home == home))
+        sizes[home] = dict(
+            Counter(row.label for row in rows_of(sorting.placed, sorting.layout) if row.kept and row.home == home)
+        )
     blocks, rigid = (
         [name for name, body in sorting.bodies.items() if getattr(body, kind)] for kind in ("block", "rigid")
     )

@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any, Literal
 
@@ -18,24 +18,20 @@ from vmri_jax.mechanics.summary import listed, summary
 from vmri_jax.mechanics.system import System
 from vmri_jax.refusals import Refused
 from vmri_jax.running.trajectory import Trajectory
-from vmri_jax.scene.assembly import actuation, build
-from vmri_jax.scene.binding import bound
+from vmri_jax.scene.binding import Key, bound
 from vmri_jax.scene.body import AnyBody, Frame
 from vmri_jax.scene.declare import arrays
 from vmri_jax.scene.drawing import drawing
 from vmri_jax.scene.effect import Effect
-from vmri_jax.scene.effects.freedoms import Freedom
-from vmri_jax.scene.effects.joint_base import joint_named
-from vmri_jax.scene.functions import RESERVED, Actuation
-from vmri_jax.scene.layout import Key
+from vmri_jax.scene.effects.joint_base import Freedom, joint_named
+from vmri_jax.scene.functions import RESERVED, Actuation, actuation, build
+from vmri_jax.scene.joint_coordinates import along_run, check_reach, check_replaced, check_run, joint_starts, with_rates
 from vmri_jax.scene.ledger import Ledger, ledger
 from vmri_jax.scene.redundancy import check_constraints, sort_with_loops
 from vmri_jax.scene.rigid import Rigidity
-from vmri_jax.scene.rows import names_of, rows_of
-from vmri_jax.scene.sorting import Sorting
+from vmri_jax.scene.rows import names_of
+from vmri_jax.scene.sorting import Sorting, rows_of
 from vmri_jax.scene.trees import Branch, check_frames, grow
-from vmri_jax.scene.turns import along_run, check_reach, check_run
-from vmri_jax.scene.velocities import check_replaced, joint_starts, with_rates
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 
@@ -200,7 +196,7 @@ class Scene:
     @property
     def dropped(self) -> list[str]:
         """Names of the rows of constraints that the scene leaves out because they depend on others."""
-        return [row.name for row in rows_of(self.sorting.placed) if not row.kept]
+        return [row.name for row in rows_of(self.sorting.placed, self.sorting.layout) if not row.kept]
 
     @property
     def places(self) -> dict[str, Place]:
@@ -331,10 +327,10 @@ class Scene:
         items = {item.name: item for item in (*self.bodies, *self.effects)}
         if name not in items:
             raise Refused(f"Scene.replace: {unknown('body or effect', name, items)}")
-        fields = items[name].__dataclass_fields__
+        arguments = [argument.name for argument in fields(items[name]) if argument.init]
         for key in changes:
-            if key not in fields:
-                raise Refused(f"Scene.replace: {name}: {unknown('argument', key, fields)}")
+            if key not in arguments:
+                raise Refused(f"Scene.replace: {name}: {unknown('argument', key, arguments)}")
         check_replaced(name, changes, self.branches, self.joint_starts)
         changed = list((items | {name: replace(items[name], **changes)}).values())
         return replace(self, bodies=changed[: len(self.bodies)], effects=changed[len(self.bodies) :])

@@ -39,9 +39,9 @@ from scipy.sparse import eye_array
 from vmri_jax.mechanics.arrays import is_concrete, library, quickly_compiled
 from vmri_jax.mechanics.kinematics import Kinematics
 from vmri_jax.refusals import Refused
-from vmri_jax.scene.body import GROUND, Bodies, joined, listed
+from vmri_jax.scene.binding import DecidedPace, Layout
+from vmri_jax.scene.body import GROUND, Bodies, joined, label_of, listed
 from vmri_jax.scene.effect import Effect
-from vmri_jax.scene.layout import DecidedPace, Layout
 from vmri_jax.scene.rates import SEPARATION, Rates, border, measure
 from vmri_jax.scene.trees import Branch, joint_constants, make_layout, with_weight
 
@@ -343,3 +343,40 @@ def _summary(reasons: Iterable[tuple[str, tuple[str, ...]]]) -> str:
         count = f" ({len(bodies)})" if len(bodies_by_text) > 1 else ""
         parts.append(text.format(listed(names, NAMED), "is" if len(names) == 1 else "are") + count)
     return "; ".join(parts)
+
+
+class Row(NamedTuple):
+    """A row of a constraint.
+
+    label: of its element: the name of the effect and, if it has several elements, names of the bodies.
+    name: of the effect and the bodies, with a number if an element has several rows.
+    part: number of its entry in `Sorting.placed`, which has this effect and home.
+    number: of the row in this entry, in the order of its terms.
+    kept: False for a row that the scene leaves out.
+    """
+
+    label: str
+    name: str
+    part: int
+    number: int
+    effect: Effect
+    home: Home
+    kept: bool
+
+
+def rows_of(placed: Sequence[Placed], layout: Layout) -> list[Row]:
+    """The rows of constraints, in the order of `Sorting.placed` and of the terms of each effect."""
+    rows = []
+    for i, part in enumerate(placed):
+        effect, number = part.effect, 0
+        for group in effect.groups(part.elements, layout) if part.home in HOMES else ():
+            # all elements of a group have as many rows
+            t, one = (np.zeros(()),) if effect.timed else (), group[:1]
+            size = jax.eval_shape(effect.called, *t, effect.positions(one), effect.params_of(one)).size
+            for element in group:
+                named = f"{effect.name} {'-'.join(map(label_of, effect.elements[element]))}"
+                label = effect.name if len(effect.elements) == 1 else named
+                for name in [named] if size == 1 else [f"{named} [{j}]" for j in range(size)]:
+                    rows.append(Row(label, name, i, number, effect, part.home, number not in part.dropped))
+                    number += 1
+    return rows

@@ -15,8 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.mechanics.arrays import library
+from vmri_jax.mechanics.kinematics import UNMOVED
 from vmri_jax.mechanics.rows import Rows
-from vmri_jax.scene.body import GROUND_COORDINATES
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,8 @@ class Role:
             return place(q, params[self.point]) if self.point else q
         if self.point:
             return params[self.point][..., : self.size]
-        return GROUND_COORDINATES if self.count == 1 else np.broadcast_to(GROUND_COORDINATES, (self.count, self.size))
+        ground = UNMOVED.ravel()  # the ground as a rigid body
+        return ground if self.count == 1 else np.broadcast_to(ground, (self.count, self.size))
 
 
 class Source(NamedTuple):

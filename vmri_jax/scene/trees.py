@@ -17,15 +17,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from vmri_jax.mechanics.arrays import is_concrete, library
-from vmri_jax.mechanics.kinematics import Carried, Kinematics, Link, Move
+from vmri_jax.mechanics.kinematics import SIZE, Carried, Kinematics, Link
 from vmri_jax.mechanics.rows import Part, Place
 from vmri_jax.refusals import Refused
+from vmri_jax.scene.binding import DecidedPace, Key, Layout
 from vmri_jax.scene.body import GROUND, Bodies, Frame, body_of
 from vmri_jax.scene.effect import Effect
-from vmri_jax.scene.effects.freedoms import ANGLES
-from vmri_jax.scene.effects.joint_base import Joint, OfFreedoms
-from vmri_jax.scene.layout import DecidedPace, Key, Layout
+from vmri_jax.scene.effects.joint_base import ANGLES, AXES_OF, Joint, OfFreedoms
 from vmri_jax.scene.rigid import RigidBody
+from vmri_jax.scene.terms import split
 
 LONGEST = 100
 """Most bodies between the root and a leaf of a tree for which coordinates="auto" chooses joint coordinates. The kinetic energy couples all
@@ -53,9 +53,9 @@ class Branch(NamedTuple):
     forward: bool
 
     @property
-    def moves(self) -> dict[Key, Move]:
-        """The motions of the joint by the keys of `Layout.freedoms`."""
-        return {(self.joint.name, self.element, freedom): move for freedom, move in self.joint.freedoms.items()}
+    def keys(self) -> list[Key]:
+        """The freedoms of the joint, as keys of `Layout.freedoms`."""
+        return [(self.joint.name, self.element, freedom) for freedom in self.joint.freedoms]
 
     @property
     def labels(self) -> list[str]:
@@ -63,10 +63,10 @@ class Branch(NamedTuple):
         return [self.joint.label(self.element, freedom) for freedom in self.joint.freedoms]
 
     @property
-    def way(self) -> list[tuple[Key, Move]]:
-        """The motions in the order from the parent to the child."""
-        # the moves are defined from body a to body b of the joint; a child that is body a undoes them, the last one first
-        return list(self.moves.items())[:: 1 if self.forward else -1]
+    def way(self) -> list[Key]:
+        """The freedoms in the order from the parent to the child."""
+        # the motions are defined from body a to body b of the joint; a child that is body a undoes them, the last one first
+        return self.keys[:: 1 if self.forward else -1]
 
     @property
     def points(self) -> tuple[Any, Any]:
@@ -178,22 +178,24 @@ def make_layout(
     ends: dict[Part, int] = {"s": 0, "f": 0}
     on_joints = {branch.child: branch for branch in branches}
     coordinates, places, freedoms = {}, {}, {}
+
+    def following(part: Part, size: int) -> Place:
+        ends[part] += size
+        return Place(part, ends[part] - size, size)
+
     for name, body in bodies.items():
         part: Part = "f" if paces[name].value == "fast" else "s"
         branch = on_joints.get(name)
         if branch is None:
-            coordinates[name] = places[name] = Place(part, ends[part], body.size)
-            ends[part] += body.size
+            coordinates[name] = places[name] = following(part, body.size)
             continue
-        for key, label in zip(branch.moves, branch.labels, strict=True):
-            coordinates[label] = freedoms[key] = Place(part, ends[part], 1)
-            ends[part] += 1
+        for key, label in zip(branch.keys, branch.labels, strict=True):
+            coordinates[label] = freedoms[key] = following(part, 1)
     if not branches:
         return Layout(places, coordinates), ()
     kinematics, ordered = _kinematics(branches, places, freedoms, (ends["s"], ends["f"]))
-    on_joint = {branch.child: place for branch, place in zip(ordered, kinematics.places, strict=True)}
-    all_places = {name: places.get(name) or on_joint[name] for name in bodies}
-    return Layout(all_places, coordinates, freedoms, kinematics), ordered
+    places |= {b.child: following(body.part, SIZE) for b, body in zip(ordered, kinematics.bodies, strict=True)}
+    return Layout({name: places[name] for name in bodies}, coordinates, freedoms, kinematics), ordered
 
 
 def _kinematics(branches: Sequence[Branch], places, freedoms, sizes) -> tuple[Kinematics, tuple[Branch, ...]]:
@@ -203,22 +205,22 @@ def _kinematics(branches: Sequence[Branch], places, freedoms, sizes) -> tuple[Ki
     """
     fast = {name for name, place in places.items() if place.part == "f"}  # bodies that depend on fast coordinates
     for branch in branches:
-        if branch.parent in fast or any(freedoms[key].part == "f" for key in branch.moves):
+        if branch.parent in fast or any(freedoms[key].part == "f" for key in branch.keys):
             fast.add(branch.child)
     carriers: set[str] = set()  # the bodies that carry, at any depth, fast ones
     for branch in reversed(branches):
         if branch.child in fast or branch.child in carriers:
             carriers.add(branch.parent)
     ordered = sorted(branches, key=lambda branch: 2 if branch.child in fast else branch.child in carriers)
-    ends = np.cumsum([len(branch.moves) for branch in ordered]).tolist()
-    firsts = {branch.child: end - len(branch.moves) for branch, end in zip(ordered, ends, strict=True)}
+    ends = np.cumsum([len(branch.keys) for branch in ordered]).tolist()
+    firsts = {branch.child: end - len(branch.keys) for branch, end in zip(ordered, ends, strict=True)}
     numbers = {name: i for i, name in enumerate(dict.fromkeys(b.parent for b in branches if b.parent in places))}
     numbers[GROUND] = -1
     links, lasts = {}, {}
     for branch in branches:
         numbers[branch.child] = numbers[branch.parent]
         last = lasts.get(branch.parent, -1)
-        for number, (key, _) in enumerate(branch.way, firsts[branch.child]):
+        for number, key in enumerate(branch.way, firsts[branch.child]):
             links[number], last = Link(freedoms[key], last), number
         lasts[branch.child] = last
     carried = (Carried("f" if b.child in fast else "s", numbers[b.child], lasts[b.child]) for b in ordered)
@@ -232,21 +234,21 @@ def joint_constants(bodies: Bodies, branches: Sequence[Branch]) -> dict[str, Any
     zeros, turns, slides = [], [], []
     for branch in branches:
         root, shift = _root(branch, on_joints)
-        centre, directors = _frame(bodies, root)
-        origin, axes = _frame(bodies, branch.child)
+        centre, directors = split(body_of(bodies, root).coordinates)
+        origin, axes = split(body_of(bodies, branch.child).coordinates)
         # a vector y in space has the components y D^T along the directors of the root, the rows of D
         place = origin + shift - centre
         zeros.append(library(place, axes).concatenate([place[None], axes]) @ directors.T)
         point = (branch.points[1] + shift - centre) @ directors.T
-        pitches = branch.joint.parameters.get(
-            "pitch", np.zeros(())
-        )  # of a screw: how far b moves along the axis per turn, m
-        pitch = (pitches[branch.element] if pitches.ndim else pitches) / (2 * np.pi)
-        for _, move in branch.way:
+        # of a screw: how far b moves along the axis per turn, m
+        pitch = branch.joint.params_of((branch.element,)).get("pitch", 0.0) / (2 * np.pi)
+        for *_, freedom in branch.way:
             # a positive value of a freedom moves body b of the joint along its axis
-            axis = (1.0 if branch.forward else -1.0) * branch.joint.triads[branch.element][move.axis] @ directors.T
-            turns.append((move.kind != "slide") * _turn(axis, point))
-            slides.append({"turn": 0.0, "slide": 1.0, "screw": pitch}[move.kind] * axis)
+            axis = (
+                (1.0 if branch.forward else -1.0) * branch.joint.triads[branch.element][AXES_OF[freedom]] @ directors.T
+            )
+            turns.append((freedom in ANGLES) * _turn(axis, point))
+            slides.append((pitch if freedom in ANGLES else 1.0) * axis)
     xp = library(zeros, turns, slides)
     of_links = {"turn": xp.reshape(xp.asarray(turns), (-1, 4, 3)), "slide": xp.reshape(xp.asarray(slides), (-1, 3))}
     return of_links | {"zero": xp.stack(zeros)}
@@ -263,12 +265,6 @@ def _root(branch: Branch | None, on_joints: Mapping[str, Branch]) -> tuple[str, 
         (of_parent, of_child), name = branch.points, branch.parent
         shift, branch = shift + of_parent - of_child, on_joints.get(name)
     return name, shift
-
-
-def _frame(bodies: Bodies, name: str) -> tuple[Any, Any]:
-    """Centre (3,) and directors (3, 3) of a body as the user gave them."""
-    rows = body_of(bodies, name).coordinates.reshape(4, 3)  # pyright: ignore[reportAttributeAccessIssue]
-    return rows[0], rows[1:]
 
 
 def _turn(axis, point):

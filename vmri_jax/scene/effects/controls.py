@@ -69,13 +69,12 @@ class Controlled(Effect):
 
     def resolved(self, effects):
         """The effect itself, or a `ControlledJoint` if `body` is the name of a joint."""
-        joints = {effect.name: effect for effect in effects if isinstance(effect, Joint)}
-        if not isinstance(self.body, str) or self.body not in joints:
+        if self.body not in [effect.name for effect in effects if isinstance(effect, Joint)]:
             return self
         if self.along is not None:
             raise Refused(f"{self.name}: along is {self.along!r}; a joint has an axis of its own. Leave it out.")
         freedom: Any = "turn" if self.load == "torque" else "slide"
-        return ControlledJoint(joints[self.body], of=freedom, name=self.name)
+        return ControlledJoint(self.body, of=freedom, name=self.name).resolved(effects)
 
     @property
     def function(self) -> Callable:

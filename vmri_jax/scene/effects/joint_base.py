@@ -1,4 +1,4 @@
-"""Base classes of joints: two bodies, the points and triads of the joint in them, and its freedoms.
+"""Base classes of joints: two bodies, the points and triads of the joint in them, and its freedoms, functions of the coordinates of both bodies.
 
 For the letters see `vmri_jax.scene.effects.joints`.
 """
@@ -6,25 +6,25 @@ For the letters see `vmri_jax.scene.effects.joints`.
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
-from itertools import chain
-from typing import Any, ClassVar
+from itertools import chain, islice, repeat
+from typing import Any, ClassVar, Literal
 
 import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.mechanics.arrays import is_concrete, library, real_array
-from vmri_jax.mechanics.kinematics import UNMOVED, Move
+from vmri_jax.mechanics.constraints import START
+from vmri_jax.mechanics.kinematics import UNMOVED
 from vmri_jax.mechanics.names import unknown
 from vmri_jax.mechanics.rows import Rows
 from vmri_jax.refusals import Refused
-from vmri_jax.scene.body import GROUND, GROUND_COORDINATES, Attachment, body_of, label_of
+from vmri_jax.scene.binding import Key
+from vmri_jax.scene.body import GROUND, Attachment, body_of, joined, label_of
 from vmri_jax.scene.declare import names, stacked
-from vmri_jax.scene.effect import START, Effect
-from vmri_jax.scene.effects.freedoms import COORDINATE, FREEDOMS, IN_REACH, Freedom, freedoms_of
-from vmri_jax.scene.layout import Key, Layout
-from vmri_jax.scene.products import FRAME, products
+from vmri_jax.scene.effect import Effect
+from vmri_jax.scene.products import products
 from vmri_jax.scene.rigid import RigidBody
-from vmri_jax.scene.terms import Applied, EffectTerm, Role
+from vmri_jax.scene.terms import Applied, Role
 
 GAP = (("D", "x"), ("D", "y"), ("D", "z"))
 """Rows that keep the points of both bodies at one place: the components of D along the axes of space."""
@@ -32,6 +32,65 @@ PARALLEL = (("n", "e"), ("n", "e'"))
 """Rows that keep the axes n and f parallel."""
 AXES = dict(zip("xyz", np.eye(3), strict=True))
 """The axes of space, which a row may have as one of its two vectors."""
+VECTORS = ["D", "m", "m'", "n"], ["D", "e", "e'", "f"]
+"""The vectors that a row may have from a and from b; the gap D is the point of b less the point of a."""
+
+Freedom = Literal["turn", "slide", "tilt", "along", "across"]
+"""In this order: the angle about the axis n, the distance along n, the angle about the second axis e, the distances along m and m'."""
+FREEDOMS: dict[str, tuple[tuple[str, str], ...]] = {
+    "turn": (("m'", "e"), ("m", "e")),
+    "slide": (("n", "D"),),
+    "tilt": (("n", "e'"), ("n", "f")),
+    "along": (("m", "D"),),
+    "across": (("m'", "D"),),
+}
+"""For each freedom, the pairs of vectors whose products are its value against the given position, m; of an angle its sine and its cosine, times a
+common factor near 1."""
+ANGLES = ("turn", "tilt")
+"""The freedoms that are angles."""
+AXES_OF = {"turn": 2, "slide": 2, "tilt": 0, "along": 0, "across": 1}
+"""For each freedom, the number of the vector of the triad (m, m', n) about which or along which b moves."""
+REACH = 5 * np.pi / 6
+"""rad: an effect that counts whole turns may take an angle from directors up to this size. Directors know angles up to whole turns; the gap of
+a third of a turn between REACH and -REACH is too wide to be jumped over by a run with six steps in a turn. A larger value narrows the gap."""
+
+
+def products_in_space(pairs, q, params):
+    """Products (...) of pairs of vectors, from the `VECTORS` "of_a", "of_b" of a joint as factors of centres and directors."""
+    factors = (params[f"of_{role}"][..., : x.shape[-1] // 3] for role, x in zip("ab", q, strict=True))
+    a, b = (numbers @ x.reshape(*x.shape[:-1], -1, 3) for numbers, x in zip(factors, q, strict=True))
+    vectors = {name: rows[..., i, :] for rows, own in zip((a, b), VECTORS, strict=True) for i, name in enumerate(own)}
+    vectors["D"] = a[..., 0, :] + b[..., 0, :]
+    return tuple((vectors[u] * vectors[v]).sum(axis=-1) for u, v in pairs)
+
+
+def angle(pairs, q, params):
+    """An angle, rad, between -pi and pi."""
+    return jnp.arctan2(*products_in_space(pairs, q, params))
+
+
+def within_reach(pairs, q, params):
+    """An angle, rad; beyond `REACH` NaN with all its derivatives, which ends a run in place of a wrong number of turns."""
+    x = angle(pairs, q, params)
+    return x * jnp.where(jnp.abs(x) < REACH, 1.0, jnp.nan)
+
+
+def distance(pairs, q, params):
+    """A displacement, m."""
+    return products_in_space(pairs, q, params)[0]
+
+
+def coordinate(q, params):
+    """A freedom that is a coordinate of the scene, ``q = ((..., 1),)``."""
+    return q[0][..., 0]
+
+
+def freedoms_of(functions: tuple[Any, ...], q: Iterable[Any], params: Mapping[str, Any]) -> tuple[Any, ...]:
+    """Freedoms by these functions, of the coordinate of each or of the coordinates of both bodies of its joint."""
+    roles, numbers = iter(q), params.get("joints", (params,))
+    sizes = (1 if function is coordinate else 2 for function in functions)
+    of_each = zip(functions, sizes, numbers, strict=True)
+    return tuple(function(tuple(islice(roles, size)), of_joint) for function, size, of_joint in of_each)
 
 
 class Joint(Effect):
@@ -51,13 +110,13 @@ class Joint(Effect):
     is_analytic = True
     whole = True
     same_size = False
-    derived = ("point_a", "point_b", "frame_a", "frame_b", "factors", "offsets")
+    derived = ("factors", "offsets", "of_a", "of_b")
     rows: ClassVar[tuple[tuple[str, str], ...]] = GAP
     """Pairs of vectors whose scalar products are the rows: of the gap D, both triads, and the axes x, y, z of space."""
     carries: ClassVar[bool] = False
     """Whether the joint can carry a body, whose position is then a function of the freedoms: these must be coordinates without a singularity."""
-    freedoms: ClassVar[dict[Freedom, Move]] = {}
-    """For each freedom the motion of the triad of b against the triad of a; the motions are applied one after the other."""
+    freedoms: ClassVar[tuple[Freedom, ...]] = ()
+    """The motions of the triad of b against the triad of a, applied one after the other."""
 
     def _elements(self):
         return tuple(tuple(map(str, element)) for element in super()._elements())
@@ -73,29 +132,23 @@ class Joint(Effect):
         return tuple((b if a == GROUND else a, a if b == GROUND else b) for a, b in self.elements)
 
     def _parameters(self):
-        return super()._parameters() | self._factors()
+        return super()._parameters() | self._numbers()
 
-    @cached_property
+    @property
     def frames(self) -> dict[str, Any]:
-        """Points and triads as components along the directors of each body: "point_a", "point_b", "frame_a", "frame_b"."""
-        return {name: stacked([*values]) for name, values in self._components.items()}
+        """The `VECTORS` of both bodies, see `products_in_space`."""
+        return {f"of_{role}": stacked([*vectors]) for role, vectors in zip("ab", self.vectors, strict=True)}
 
-    def _factors(self) -> dict[str, Any]:
+    def _numbers(self) -> dict[str, Any]:
         """The numbers of the rows of all pairs, see `products`."""
-        frames = self._components
-        xp, count = library(frames), len(self.elements)
-        named, zero = [name for side in zip(*self.rows, strict=True) for name in side], np.zeros((count, FRAME))
-        offsets, halves = np.stack([AXES.get(name, np.zeros(3)) for name in named]), []
-        for role, names_of_role, sign in (("a", ("m", "m'", "n"), -1.0), ("b", ("e", "e'", "f"), 1.0)):
-            # the gap D has the centres and points of both bodies, with opposite signs; the vectors of a triad have no centre
-            vectors = {"D": sign * xp.concatenate([np.ones((count, 1)), frames[f"point_{role}"]], axis=-1)}
-            for i, name in enumerate(names_of_role if f"frame_{role}" in frames else ()):
-                vectors[name] = xp.concatenate([np.zeros((count, 1)), frames[f"frame_{role}"][:, i]], axis=-1)
-            half = xp.stack([vectors.get(name, zero) for name in named], axis=1)
-            is_ground = np.array([pair["ab".index(role)] == GROUND for pair in self.elements])[:, None, None]
+        named, halves = [name for side in zip(*self.rows, strict=True) for name in side], []
+        offsets = np.stack([AXES.get(name, np.zeros(3)) for name in named])
+        for role, vectors in enumerate(self.vectors):
+            half = (np.array(named)[:, None] == VECTORS[role][: vectors.shape[1]]) @ vectors
+            is_ground = np.array([pair[role] == GROUND for pair in self.elements])[:, None, None]
             offsets = offsets + is_ground * (half @ UNMOVED)
             halves.append(~is_ground * half)
-        factors = xp.concatenate(halves, axis=-1)
+        factors = library(halves).concatenate(halves, axis=-1)
         return {"factors": stacked([*factors]), "offsets": stacked([*offsets])}
 
     def label(self, i: int, freedom: str = "") -> str:
@@ -105,8 +158,9 @@ class Joint(Effect):
 
     def value(self, freedom: str, i: int, coordinates: Mapping[str, Any]):
         """A freedom of the i-th pair, (...) rad or m, by the coordinates (..., n) of bodies by name; an angle is between -pi and pi."""
-        ends = (GROUND_COORDINATES if name == GROUND else coordinates[name] for name in self.elements[i])
-        return FREEDOMS[freedom](tuple(map(jnp.asarray, ends)), self.params_of((i,), self.parameters | self.frames))
+        ends = (UNMOVED.ravel() if name == GROUND else coordinates[name] for name in self.elements[i])
+        function = angle if freedom in ANGLES else distance
+        return function(FREEDOMS[freedom], tuple(map(jnp.asarray, ends)), self.params_of((i,), self.frames))
 
     @cached_property
     def triads(self) -> Any:
@@ -133,18 +187,16 @@ class Joint(Effect):
             expected = f"{first} and {second}; they must coincide at the start"
             self.require(coincide, f"the distance of the points of {a}-{b}", f"{float(distance):.6g}", expected)
 
-    def drawn_points(self):
-        points = {role: self._components[f"point_{role}"] for role in "ab"}
-        return {
+    def drawing(self):
+        points = [vectors[:, 0, :1] * vectors[:, 0, 1:] for vectors in self.vectors]  # their signs are those of D
+        ends = {
             f"{self.name} {'-'.join(element)} in {name}": (name, points[role][i])
             for i, element in enumerate(self.elements)
-            for role, name in zip("ab", element, strict=True)
+            for role, name in enumerate(element)
             # a line to a point outside the drawn shape of a body is drawn from the centre
             if isinstance(body := body_of(self.by_name, name), RigidBody) and not body.covers(points[role][i])
         }
-
-    def drawing(self):
-        return {"links": [[name, end] for end, (name, _) in self.drawn_points().items()]}
+        return {"links": [[name, end] for end, (name, _) in ends.items()], "points": ends}
 
     @cached_property
     def joining_points(self):
@@ -171,27 +223,25 @@ class Joint(Effect):
         return joining
 
     @cached_property
-    def _components(self) -> dict[str, Any]:
-        """`frames` with an axis for the pairs."""
-        points, triads = self.joining_points, self.triads
-        components: dict[str, list] = {}
-        for i, element in enumerate(self.elements):
-            for role, name, point in zip("ab", element, points[i], strict=True):
+    def vectors(self) -> list[Any]:
+        """Of a and of b: the `VECTORS` of all pairs as factors (c, X) of the centre and the directors of the body, (n, 4, 4); (n, 1, 4) without axes."""
+        ends: list[list] = [[], []]
+        for element, points, triad in zip(self.elements, self.joining_points, self.triads or repeat(()), strict=False):
+            for of_role, name, point, sign in zip(ends, element, points, (-1.0, 1.0), strict=True):
                 body = body_of(self.by_name, name)
-                if not body.rigid and triads is not None:
+                if not body.rigid and self.triads:
                     raise Refused(
                         f"{self.name}: {name} is a point, which has no axes; a point can be joined by Spherical alone."
                     )
                 # X = R^T (x - phi): the point in the axes of the body
                 offset = (point - body.position) @ body.rotation if body.rigid else np.zeros(3)
-                components.setdefault(f"point_{role}", []).append(body.weights(offset))
-                if triads is not None:
-                    try:
-                        rows = [body.weights(vector @ body.rotation) for vector in triads[i]]
-                    except ValueError as error:
-                        raise Refused(f"{self.name}: {error}") from None
-                    components.setdefault(f"frame_{role}", []).append(library(rows).stack(rows))
-        return {name: library(values).stack(values) for name, values in components.items()}
+                rows = [sign * joined([np.ones(1), body.weights(offset)])]
+                try:
+                    rows += [joined([np.zeros(1), body.weights(vector @ body.rotation)]) for vector in triad]
+                except ValueError as error:
+                    raise Refused(f"{self.name}: {error}") from None
+                of_role.append(library(rows).stack(rows))
+        return [library(end).stack(end) for end in ends]
 
 
 class AboutAxis(Joint):
@@ -247,35 +297,40 @@ class OfFreedoms(Effect):
     marks: ClassVar[tuple[str, ...]] = ()
     """Names of parameters that are values of the freedom, such as limits."""
 
+    @property
     @abstractmethod
-    def freedoms_of(self, i: int) -> tuple[Key, ...]: ...
+    def joint_freedoms(self) -> Sequence[tuple[Joint, Freedom]]:
+        """The joints, of as many pairs each, and the freedom in each, of which an element takes one."""
 
-    def by_directors(self, freedom: str) -> str:
-        """The name in `FREEDOMS` of a freedom that is no coordinate of the scene."""
-        return IN_REACH.get(freedom, freedom) if self.counts_turns else freedom
+    def freedoms_of(self, i: int) -> tuple[Key, ...]:
+        return tuple((joint.name, i, freedom) for joint, freedom in self.joint_freedoms)
+
+    def by_directors(self, freedom: str) -> Any:
+        """The function of the coordinates of both bodies for a freedom that is no coordinate of the scene."""
+        of_angle = within_reach if self.counts_turns else angle
+        return Applied(of_angle if freedom in ANGLES else distance, (FREEDOMS[freedom],))
+
+    def _elements(self):
+        pairs = zip(*(joint.elements for joint, _ in self.joint_freedoms), strict=False)
+        return tuple(tuple(chain(*names)) for names in pairs)
 
     def positions(self, group):
         """The freedoms at the positions in `bodies`, which are zero."""
         return tuple(stacked([0.0] * len(group)) for _ in self.freedoms_of(group[0]))
 
-    def terms(self, select, layout):
-        groups: dict[Any, list[int]] = {}
-        for number, group in enumerate(self.by_size(select)):
-            for i in group:
-                free = tuple(key in layout.freedoms for key in self.freedoms_of(i))
-                # elements whose freedoms are all coordinates are one term, whatever their bodies are
-                groups.setdefault((free, None if all(free) else number), []).append(i)
-        return tuple(self._along(free, group, layout) for (free, _), group in groups.items())
+    def kind_of(self, i, layout=None):
+        is_free = tuple(layout is not None and key in layout.freedoms for key in self.freedoms_of(i))
+        # elements whose freedoms are all coordinates are one term, whatever their bodies are
+        return is_free if all(is_free) else (*is_free, super().kind_of(i))
 
-    def _along(self, free: Sequence[bool], group: Sequence[int], layout: Layout) -> EffectTerm:
-        """Some elements as a term; `free` says which of their freedoms are coordinates."""
+    def term(self, group, layout):
         roles, freedoms = [], []
-        for j, is_coordinate in enumerate(free):
-            keys = [self.freedoms_of(i)[j] for i in group]
-            freedoms.append(COORDINATE if is_coordinate else self.by_directors(keys[0][2]))
-            if is_coordinate:
+        for j, keys in enumerate(zip(*map(self.freedoms_of, group), strict=True)):
+            if keys[0] in layout.freedoms:
+                freedoms.append(coordinate)
                 roles.append(Role(Rows.of([layout.freedoms[key] for key in keys]), len(group), 1))
                 continue
+            freedoms.append(self.by_directors(keys[0][2]))
             for role in (2 * j, 2 * j + 1):
                 roles.append(self._role("", [self.elements[i][role] for i in group], layout.bodies))
         return self._term(roles, group, Applied(freedoms_of, (tuple(freedoms),)))

@@ -1,4 +1,5 @@
-"""Effects along a freedom of a joint: springs, limits, dampers, rotors, drives, prescribed motions."""
+"""Effects along a freedom of a joint: springs, limits, dampers, rotors, drives, prescribed motions; and equations between the freedoms of several joints:
+gears, racks, differentials, tendon-driven fingers."""
 
 from collections.abc import Callable
 from dataclasses import KW_ONLY, field, replace
@@ -7,13 +8,26 @@ from typing import Any, Literal
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.mechanics.arrays import library
-from vmri_jax.scene.declare import number, of_time, positive
-from vmri_jax.scene.effect import START
-from vmri_jax.scene.effects.contact import penalty
-from vmri_jax.scene.effects.freedoms import ANGLES, SINES, Freedom
-from vmri_jax.scene.effects.joint_base import Joint, OfFreedoms, freedom_of, joint_named
+from vmri_jax.mechanics.arrays import library, real_array
+from vmri_jax.mechanics.checks import describe, shape_of
+from vmri_jax.mechanics.constraints import START
+from vmri_jax.mechanics.functions import NO_VELOCITY, check_arguments
+from vmri_jax.refusals import Refused
+from vmri_jax.scene.binding import MOST_ROLES
+from vmri_jax.scene.declare import number, of_time, positive, real_tree
+from vmri_jax.scene.effects.joint_base import (
+    ANGLES,
+    FREEDOMS,
+    Freedom,
+    Joint,
+    OfFreedoms,
+    freedom_of,
+    joint_named,
+    products_in_space,
+)
+from vmri_jax.scene.effects.potentials import penalty
 from vmri_jax.scene.effects.springs import elastic_energy
+from vmri_jax.scene.terms import Applied
 
 
 class InJoint(OfFreedoms):
@@ -31,19 +45,13 @@ class InJoint(OfFreedoms):
     derived = Joint.derived
 
     def resolved(self, effects):
-        """A copy with the joint itself instead of its name."""
-        return replace(self, joint=joint_named(self.name, self.joint, effects))
+        """A copy with the joint itself instead of its name, and the freedom by its name."""
+        joint = joint_named(self.name, self.joint, effects)
+        return replace(self, joint=joint, of=freedom_of(joint, self.of, f"{self.name}: "))
 
     @property
-    def freedom(self) -> Freedom:
-        """Name of the freedom that the effect acts on."""
-        return freedom_of(self.joint, self.of, f"{self.name}: ")
-
-    def _elements(self):
-        return self.joint.elements
-
-    def freedoms_of(self, i):
-        return ((self.joint.name, i, self.freedom),)
+    def joint_freedoms(self):
+        return ((self.joint, self.of),)
 
     def _parameters(self):
         return super()._parameters() | self.joint.frames
@@ -99,7 +107,7 @@ class JointLimit(InJoint):
         return penalty(x - params["lower"], params) + penalty(params["upper"] - x, params)
 
     def curvature(self):
-        return None if self.freedom in ANGLES else self.stiffness
+        return None if self.of in ANGLES else self.stiffness
 
     def check_parameters(self):
         super().check_parameters()
@@ -199,9 +207,122 @@ class JointMotion(InJoint):
         return sine * xp.cos(a) - cosine * xp.sin(a)
 
     def by_directors(self, freedom):
-        return SINES.get(freedom, freedom)
+        is_angle = freedom in ANGLES
+        return Applied(products_in_space, (FREEDOMS[freedom],)) if is_angle else super().by_directors(freedom)
 
     def check_parameters(self):
         super().check_parameters()
         start = self.path(np.zeros(()), self.parameters["path"])
         self.require(abs(library(start).asarray(start)) < START, "path(0)", start, "the joint starts at zero")
+
+
+def equation(law, q, params):
+    """``g(x, params)`` of the freedoms x."""
+    return law(jnp.stack(q), params["law"])
+
+
+class JointCoupling(OfFreedoms):
+    """An equation between the freedoms x of joints, ``g(x, params) = 0``.
+
+        def cam(x, params):
+            turn, lift = x
+            return lift - params["stroke"] * (1 - jnp.cos(turn)) / 2
+
+        JointCoupling(["camshaft", "valve"], cam, {"stroke": 0.01})
+
+    Args:
+        joints: names of 1 to 16 joints of the scene, each with a single pair of bodies; ``(name, freedom)`` for a joint with several freedoms.
+        law: ``g(x, params) -> ()`` or (k,) with the freedoms x (n,) in the order of `joints`, rad and m from the given position; zero at x = 0.
+        params: numbers, arrays or trees of them that the law gets. They may change without a new compilation, and runs have derivatives
+            with respect to them.
+    """
+
+    joints: Any
+    law: Callable
+    params: Any = field(default_factory=dict)
+
+    kind = "constraint"
+    derived = ("joints",)
+    default_name = "coupling"
+
+    def __post_init__(self):
+        super().__post_init__()
+        joints = () if isinstance(self.joints, str) else tuple(self.joints)
+        if not 1 <= len(joints) <= MOST_ROLES // 2:
+            raise Refused(
+                f"{self.name}: joints is {self.joints!r}; give names of 1 to {MOST_ROLES // 2} joints, ['motor', 'wheel']."
+            )
+        object.__setattr__(self, "joints", joints)
+        instead = NO_VELOCITY.format(moving="JointMotion, of one joint", force="JointDamper")
+        check_arguments(f"{self.name}: law", self.law, "x, params", instead)
+
+    def resolved(self, effects):
+        """A copy with pairs (joint, freedom) in `joints` instead of names."""
+        pairs = []
+        for item in self.joints:
+            name, freedom = (item, "auto") if isinstance(item, str) else item
+            joint = joint_named(self.name, name, effects)
+            pairs.append((joint, freedom_of(joint, freedom, f"{self.name}: ")))
+        return replace(self, joints=tuple(pairs))
+
+    @property
+    def joint_freedoms(self):
+        return self.joints
+
+    @property
+    def function(self):
+        return Applied(equation, (self.law,))
+
+    def numbers(self) -> Any:
+        """The params of the law."""
+        return real_tree(f"{self.name}: params", self.params)
+
+    def _parameters(self):
+        return {"law": self.numbers(), "joints": tuple(joint.frames for joint, _ in self.joints)}
+
+    def check_parameters(self):
+        value: Any = shape_of(f"{self.name}: law", self.law, jnp.zeros(len(self.joints)), self.numbers())
+        if getattr(value, "ndim", 2) > 1:
+            raise Refused(f"{self.name}: law returns {describe(value)}; it must return one value () or several (k,).")
+        super().check_parameters()
+        for joint, _ in self.joints:
+            count, expected = len(joint.elements), "give each pair a joint of its own name"
+            self.require(count == 1, f"the number of pairs of {joint.name}", count, expected)
+
+    def check_start(self):
+        violation = abs(self.law(np.zeros(len(self.joints)), self.numbers()))
+        expected = (
+            "it must be zero at the positions in `bodies`, where all freedoms are zero; change it, or set project=True"
+        )
+        self.require(violation < START, "the equation", violation, expected)
+
+
+def weighted_sum(x, params):
+    """``sum_i r_i x_i``."""
+    return (params["ratios"] * x).sum()
+
+
+class Gear(JointCoupling):
+    """Joints whose freedoms move in fixed ratios, ``sum_i r_i x_i = 0``.
+
+        Gear(["motor", "wheel"], ratios=[1.0, -4.0])  # the motor turns four times as fast as the wheel, the same way
+
+    Args:
+        joints: as of `JointCoupling`.
+        ratios: (n,) r, not zero, in the order of `joints`.
+    """
+
+    law: Callable = field(default_factory=lambda: weighted_sum, init=False)
+    params: Any = field(default=None, init=False)
+    ratios: Any
+
+    default_name = "gear"
+
+    def numbers(self):
+        return {"ratios": real_array(f"{self.name}: ratios", self.ratios)}
+
+    def check_parameters(self):
+        ratios = self.numbers()["ratios"]
+        self.require(np.shape(ratios) == (len(self.joints),), "ratios", self.ratios, "give one for each of the joints")
+        self.require(ratios != 0, "ratios", self.ratios, "none of them may be zero")
+        super().check_parameters()

@@ -21,16 +21,14 @@ Source: P. Betsch, S. Leyendecker, Int. J. Numer. Meth. Engng 67 (2006).
 """
 
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
 from vmri_jax.mechanics.arrays import library
-from vmri_jax.mechanics.kinematics import Move
+from vmri_jax.mechanics.constraints import START
 from vmri_jax.scene.declare import number
-from vmri_jax.scene.effect import START
-from vmri_jax.scene.effects.freedoms import M_PRIME, M, N, slide, turn_by_sine
-from vmri_jax.scene.effects.joint_base import GAP, PARALLEL, AboutAxis, Joint
+from vmri_jax.scene.effects.joint_base import FREEDOMS, GAP, PARALLEL, AboutAxis, Joint
 from vmri_jax.scene.products import products
 
 ACROSS = (("m", "D"), ("m'", "D"))
@@ -54,7 +52,7 @@ class Revolute(AboutAxis):
         between, at, axis: as of `Joint`, and the axis in space at the start.
     """
 
-    freedoms: ClassVar = {"turn": Move("turn", N)}
+    freedoms = ("turn",)
 
 
 class Universal(AboutAxis):
@@ -68,7 +66,7 @@ class Universal(AboutAxis):
 
     second: Any = (1.0, 0.0, 0.0)
 
-    freedoms: ClassVar = {"turn": Move("turn", N), "tilt": Move("turn", M)}
+    freedoms = ("turn", "tilt")
     rows = (*GAP, ("n", "e"))
 
     @cached_property
@@ -96,18 +94,18 @@ class Cylindrical(AboutAxis):
         between, at, axis: as of `Revolute`.
     """
 
-    freedoms: ClassVar = {"turn": Move("turn", N), "slide": Move("slide", N)}
+    freedoms = ("turn", "slide")
     rows = (*ACROSS, *PARALLEL)
 
 
 def screwed(q, params):
     """The rows of `Cylindrical` and ``m' . e cos a - m . e sin a``, (..., 5)."""
     # rather than a difference of angles, which would jump by 2 pi after half a turn
-    angle, xp = 2 * np.pi * slide(q, params) / params["pitch"], library(q)
-    sine, cosine = turn_by_sine(q, params)
+    rows, xp = products(len(Screw.rows), q, params), library(q)
+    sine, cosine, slide = rows[..., -3], rows[..., -2], rows[..., -1]
+    angle = 2 * np.pi * slide / params["pitch"]
     difference = sine * xp.cos(angle) - cosine * xp.sin(angle)
-    q = [xp.broadcast_to(x, (*difference.shape, x.shape[-1])) for x in q]
-    return xp.concatenate([products(len(Cylindrical.rows), q, params), difference[..., None]], axis=-1)
+    return xp.concatenate([rows[..., :-3], difference[..., None]], axis=-1)
 
 
 class Screw(AboutAxis):
@@ -123,8 +121,8 @@ class Screw(AboutAxis):
 
     pitch: Any = number(default=1e-3)
 
-    freedoms: ClassVar = {"turn": Move("screw", N)}
-    rows = Cylindrical.rows
+    freedoms = ("turn",)
+    rows = (*Cylindrical.rows, *FREEDOMS["turn"], *FREEDOMS["slide"])
 
     def check_parameters(self):
         super().check_parameters()
@@ -134,13 +132,6 @@ class Screw(AboutAxis):
     @property
     def function(self):
         return screwed
-
-    @cached_property
-    def attached(self):
-        return self.elements
-
-    def _parameters(self):
-        return super()._parameters() | self.frames
 
 
 class Planar(AboutAxis):
@@ -154,7 +145,7 @@ class Planar(AboutAxis):
         axis: (3,) the normal n of the plane in space at the start; or a normal for each pair, (n, 3).
     """
 
-    freedoms: ClassVar = {"along": Move("slide", M), "across": Move("slide", M_PRIME), "turn": Move("turn", N)}
+    freedoms = ("along", "across", "turn")
     rows = (("n", "D"), *PARALLEL)
 
 
@@ -165,5 +156,5 @@ class Prismatic(AboutAxis):
         between, at, axis: as of `Revolute`.
     """
 
-    freedoms: ClassVar = {"slide": Move("slide", N)}
+    freedoms = ("slide",)
     rows = (*ACROSS, *PARALLEL, UNTURNED)

@@ -1,6 +1,11 @@
-"""Starts from joints: velocities of all bodies from the rates of a few joints, and closed loops from the values of a few joints."""
+"""Freedoms of joints by name: velocities of all bodies from the rates of a few joints, closed loops from the values of a few joints, and whole turns.
+
+A coordinate of a joint counts whole turns, directors do not: those of two bodies give the sine and the cosine of the angle between them. An effect to
+which turns matter takes such an angle up to `REACH` alone; along a run turns are counted from one saved node to the next.
+"""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from itertools import chain
 from typing import Any
 
@@ -12,11 +17,10 @@ from vmri_jax.mechanics.arrays import is_concrete
 from vmri_jax.mechanics.constraints import RANK, configuration, known_mass_and_momentum
 from vmri_jax.mechanics.system import System
 from vmri_jax.refusals import Refused
+from vmri_jax.scene.binding import Key
 from vmri_jax.scene.body import AnyBody, moving
 from vmri_jax.scene.effect import Effect
-from vmri_jax.scene.effects.freedoms import ANGLES
-from vmri_jax.scene.effects.joint_base import Joint, for_pairs, freedom_of, joint_named
-from vmri_jax.scene.layout import Key
+from vmri_jax.scene.effects.joint_base import ANGLES, REACH, Joint, OfFreedoms, for_pairs, freedom_of, joint_named
 from vmri_jax.scene.rows import ConstraintRows
 from vmri_jax.scene.sorting import Sorting
 from vmri_jax.scene.trees import Branch
@@ -85,7 +89,7 @@ def check_replaced(
     name: str, changes: Mapping[str, Any], branches: Sequence[Branch], starts: Mapping[Key, tuple[Any, Any]]
 ) -> None:
     """Refuse other velocities of a body for which a rate in `joint_starts` stands."""
-    rated = [b.joint.name for b in branches if b.child == name and starts.keys() & b.moves.keys()]
+    rated = [b.joint.name for b in branches if b.child == name and starts.keys() & set(b.keys)]
     if rated and changes.keys() & {"velocity", "spin"}:
         raise Refused(
             f"Scene.replace: {name}: {' and '.join(changes)} would change nothing, because with_joints or with_rates has set "
@@ -179,3 +183,82 @@ def _by_freedom(method: str, effects: Sequence[Effect], numbers: Mapping[str, An
             except ValueError as error:
                 raise Refused(f'{method}: {error} Give a dictionary, {{"turn": ..., "slide": ...}}.') from None
             yield joint, known, of_freedom
+
+
+def along_run(sorting: Sorting, joint: Joint, run: Any, of: str, pair: int) -> np.ndarray:
+    """The freedom of a joint along a run, (k,) rad or m, whole turns included; see `Scene.joint_motion`."""
+    freedom, elements = freedom_of(joint, of), joint.elements
+    pair = range(len(elements))[pair]  # raises IndexError
+    if (label := joint.label(pair, freedom)) in run.names.bodies:
+        return np.asarray(run.position(label))[..., 0]
+    value = partial(joint.value, freedom, pair)
+    q = {name: run.position(name) for name in moving(elements[pair])}
+    if freedom not in ANGLES:
+        return np.asarray(value(q))
+    angle, rate = map(np.asarray, jax.jvp(value, (q,), ({name: run.velocity(name) for name in q},)))
+    counted, dt, rates = np.unwrap(angle), np.diff(run.t), (rate[..., 1:], rate[..., :-1])
+    fastest, excess = np.maximum(*np.abs(rates)), np.abs(np.diff(counted) - dt * np.mean(rates, axis=0))
+    # an angle that moves by a quarter of a turn more or less than both rates say is faster in between
+    unknown = np.argwhere((fastest * dt >= np.pi) | (excess >= np.pi / 2))
+    if unknown.size:
+        node = unknown[0, -1]
+        raise Refused(
+            f"Scene.joint_motion: {joint.label(pair)} may turn by half a turn or more between the saved nodes {node} and "
+            f"{node + 1}, and its angle comes from directors, which know no whole turns. Save nodes less than "
+            f'{np.pi / 2 / np.nanmax(fastest):.2g} s apart, save=..., or give the scene coordinates="joint".'
+        )
+    turns = np.round((at_start(sorting, joint, pair, freedom) - angle[..., :1]) / (2 * np.pi))
+    return counted + 2 * np.pi * turns
+
+
+def check_reach(sorting: Sorting) -> None:
+    """Refuse limits, neutral angles and starts that effects which count turns cannot take from directors."""
+    for effect, i, joint, freedom in _from_directors(sorting):
+        for mark in effect.marks:
+            value = effect.parameters[mark]
+            _require_reach(effect, mark, value[i] if np.ndim(value) else value, joint)
+        _require_reach(effect, "the start", at_start(sorting, joint, i, freedom), joint)
+
+
+def check_run(sorting: Sorting, run: Any, twin: Sorting) -> None:
+    """Refuse a run with angles that effects of the same scene by directors, `twin`, could not take from these."""
+    for effect, i, joint, freedom in _from_directors(twin):
+        angle = np.nanmax(np.abs(along_run(sorting, joint, run, freedom, i)))
+        _require_reach(effect, "the largest angle of the run", angle, joint)
+
+
+def _from_directors(sorting: Sorting) -> Iterator[tuple[OfFreedoms, int, Joint, str]]:
+    """(effect, number of its element and of the pair of the joint, joint, freedom) for all angles that effects which count turns take from directors."""
+    for part in sorting.placed:
+        effect = part.effect
+        if isinstance(effect, OfFreedoms) and effect.counts_turns:
+            for i in part.elements:
+                for joint, freedom in effect.joint_freedoms:
+                    if freedom in ANGLES and (joint.name, i, freedom) not in sorting.layout.freedoms:
+                        yield effect, i, joint, freedom
+
+
+def _require_reach(effect: OfFreedoms, quantity: str, value: Any, joint: Joint) -> None:
+    """Refuse an angle of `REACH` or more."""
+    expected = (
+        f"the angle of {joint.name} comes from directors, which know no whole turns, and has to stay within {REACH:.4g} rad: give the scene "
+        'coordinates="joint", or where all joints of a loop have such effects leave one of these out'
+    )
+    effect.require(abs(value) < REACH, quantity, value, expected)
+
+
+def at_start(sorting: Sorting, joint: Joint, pair: int, freedom: str) -> Any:
+    """The angle of a joint without a coordinate at the start, rad; it is zero at the positions in `bodies`.
+
+    From there turns are counted along the straight line to the start in joint coordinates.
+    """
+    starts, begin = sorting.joint_starts, sorting.assembled if is_concrete(sorting.positions) else None
+    if not starts or begin is None:
+        return 0.0
+    way = sorting.positions - begin
+    names, columns, angles = moving(joint.elements[pair]), sorting.layout.columns, []
+    for fraction in np.linspace(0.0, 1.0, 1 + steps_of(starts, (value for value, _ in starts.values()))):
+        bodies = sorting.to_bodies(begin + fraction * way)[0]
+        coordinates = {name: bodies[columns[name]] for name in names}
+        angles.append(joint.value(freedom, pair, coordinates))
+    return float(np.unwrap(angles)[-1])
