@@ -7,7 +7,7 @@ from functools import cache
 import jax
 import numpy as np
 
-from vmri_jax.accuracy.companions import UncertifiedWarning, finer, run_error
+from vmri_jax.accuracy.companions import Compared, UncertifiedWarning, finer, run_error
 from vmri_jax.mechanics.checks import check_flags
 from vmri_jax.mechanics.driving import Events, driven, events
 from vmri_jax.mechanics.state import Movable, State
@@ -101,7 +101,7 @@ def _errors(lanes: Batch, plain: Trajectory) -> RunError:
     def error(i: int) -> RunError:
         run, coarse = lanes.lane(i), plain.lane(i)
         drives = events(run.system, run.state, float(coarse.t[-1])) if is_driven else Events()
-        return run_error(run, coarse, companions(2).lane(i), drives, lambda *counts: companions(*counts).lane(i))
+        return run_error(Compared.of(run, coarse, drives, lambda *counts: companions(*counts).lane(i)))
 
     is_driven = driven(lanes.run.system, lanes.run.state)
     return jax.tree.map(lambda *arrays: np.stack(arrays), *map(error, range(len(plain.t))))

@@ -8,7 +8,6 @@ from functools import partial
 import numpy as np
 
 from vmri_jax.mechanics.masses import ConstantMass
-from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
 from vmri_jax.schemes.composition import SchemeLike, compose, stage_scheme
 from vmri_jax.schemes.scheme import Scheme, explicit_slow, fully_explicit, fully_implicit, galerkin, takahashi_imada
@@ -108,11 +107,6 @@ def by_promise(menu: Sequence[Family], digits: float) -> list[Family]:
     """The menu, first the families whose order is near the number of digits of the accuracy: lower orders take many
     steps, and higher orders long to compile."""
     return sorted(menu, key=lambda family: abs(np.log(family.make(family.first).order / max(digits, 2.0))))
-
-
-def micro_steps_help(system: System, start: State) -> bool:
-    """Whether micro steps may save time: there are fast coordinates, and slow ones or potentials for the macro grid."""
-    return bool(start.q_f.size and (start.q_s.size or system.slow_potential is not None or system.potentials))
 
 
 def unit_of(system: System, scheme: SchemeLike) -> int:

@@ -3,13 +3,18 @@
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
-from vmri_jax.accuracy.companions import check_function_of_run, with_error
-from vmri_jax.accuracy.search import Search
-from vmri_jax.accuracy.steps import with_accuracy
+import numpy as np
+
+from vmri_jax.accuracy.companions import Compared, check_function_of_run, companion, with_error
+from vmri_jax.accuracy.families import for_system, of_scheme, two_families
+from vmri_jax.accuracy.search import MOST_COORDINATES, Search
+from vmri_jax.accuracy.trials import Trial
 from vmri_jax.mechanics.arrays import is_concrete
-from vmri_jax.mechanics.checks import check_system
+from vmri_jax.mechanics.checks import check_system, check_type
+from vmri_jax.mechanics.driving import events
 from vmri_jax.mechanics.state import Movable, State
 from vmri_jax.refusals import Refused
 from vmri_jax.running.arguments import Save, Steps, refuse_tracers
@@ -20,6 +25,10 @@ from vmri_jax.running.simulation import simulation
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes.composition import SchemeLike
 from vmri_jax.steppers.solver import Solver
+
+
+class AccuracyNotReached(UserWarning):
+    """The error of a run exceeds its accuracy, or is not certified."""
 
 
 def simulate(
@@ -40,7 +49,7 @@ def simulate(
         run = vm.simulate(problem, vm.fully_implicit(10), macro_dt=0.01, t_end=10.0)
         run = vm.simulate(problem, accuracy=1e-5, t_end=10.0)
 
-    With an accuracy, trial runs choose the steps, and the scheme if none is given, see `vmri_jax.accuracy.steps`; ``run.settings`` has the
+    With an accuracy, trial runs choose the steps, and the scheme if none is given, see `vmri_jax.accuracy.search`; ``run.settings`` has the
     choice, ``run.error`` the error of the run. Resonant steps are avoided in systems of up to 60 coordinates.
 
     Outside of transformations, `simulate` compiles once per structure of system and scheme: macro steps, parameters, rule weights, starts,
@@ -87,14 +96,14 @@ def simulate(
         with progress_to("simulate", saved.progress) as tell:
             how = {"state": state, "solver": solver, "num_saves": saved.number, "of": of, "progress": tell}
             search = Search(system, t_end, **how)
-            best = with_accuracy(search, scheme, accuracy)
+            best = _with_accuracy(search, scheme, accuracy)
         origin = replace(best.run.origin, settings=search.settings(best))
-        run, trajectory = best.run, replace(best.trajectory, origin=origin)
+        trajectory = replace(best.trajectory, origin=origin)
         if int(trajectory.failed_at) >= 0:
-            raise simulation_error(trajectory, run.macro_dt, run.save_every, run.scheme.num_micro)
+            raise simulation_error(trajectory, best.run.macro_dt, best.run.save_every, best.run.scheme.num_micro)
         for concern in trajectory.concerns():
             warnings.warn(type(concern)(f"simulate: {concern}"), stacklevel=2)
-        return with_error(run, trajectory, of, error == "shares", trial=(best.halved, best.errors))
+        return with_error(replace(best, trajectory=trajectory), of, error == "shares")
     if scheme is None:
         raise Refused("simulate: scheme is None without an accuracy; give one of them, e.g. accuracy=1e-5.")
     run = simulation(system, scheme, state, solver, steps)
@@ -110,7 +119,34 @@ def simulate(
     trajectory = run.in_pieces("simulate")
     if int(trajectory.failed_at) >= 0:
         raise simulation_error(trajectory, run.macro_dt, run.save_every, scheme.num_micro)
-    return with_error(run, trajectory, of, error == "shares") if error else trajectory
+    if not error:
+        return trajectory
+    drives = events(run.system, run.state, float(trajectory.t[-1]))
+    return with_error(Compared.of(run, trajectory, drives, partial(companion, run)), of, error == "shares")
+
+
+def _with_accuracy(search: Search, scheme: SchemeLike | None, accuracy: float) -> Trial:
+    """The trial whose largest estimated error of a position is at most `accuracy`, with a scheme of the user or with one of the usual menu."""
+    check_type("simulate: scheme", scheme, SchemeLike | None, "a Scheme, e.g. fully_implicit(num_micro=10), or None")
+    search.check(accuracy)
+    if scheme is None:
+        size = search.start.q_s.size + search.start.q_f.size
+        menu = two_families(search.system, size, search.digits(accuracy), MOST_COORDINATES)
+        menu = for_system(menu, search.system, search.has_two_rates)
+    else:
+        menu = [of_scheme(scheme)]
+    (best,) = search.cheapest(menu, accuracy)
+    search.warn_of_events("simulate", best.run.scheme, stacklevel=4)
+    if not best.error <= accuracy:
+        uncertified = "no error is certified over its length"
+        reached_error = f"its error is {best.error:.1e}" if np.isfinite(best.error) else uncertified
+        warnings.warn(
+            f"simulate: accuracy {accuracy:g} is not reached with {best.run.num_steps} macro steps, {reached_error}; "
+            "give a shorter t_end, a larger accuracy, or another scheme.",
+            AccuracyNotReached,
+            stacklevel=3,
+        )
+    return best
 
 
 def _end(steps: Steps) -> float:

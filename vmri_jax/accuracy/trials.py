@@ -4,10 +4,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from vmri_jax.accuracy.companions import Compared
 from vmri_jax.accuracy.families import Family
 from vmri_jax.running.simulation import Simulation
 from vmri_jax.running.timing import least_seconds
-from vmri_jax.running.trajectory import Trajectory
 
 LEAST_TIME = 0.02
 """Least seconds a and b N in ``a + b N``, as a part of the seconds of a macro step, and of the steps of a run, as a
@@ -25,20 +25,11 @@ TIMED_SECONDS = 0.02
 
 
 @dataclass(frozen=True)
-class Trial:
-    """A run of a scheme, its companion with half the macro step, and its errors.
-
-    errors: (k, n_s + n_f) errors of the positions.
-    error: the largest error; infinite unless all errors are certified.
-    """
+class Trial(Compared):
+    """A run of a scheme of a family, its companion and its errors."""
 
     family: Family
     num_micro: int
-    run: Simulation
-    trajectory: Trajectory
-    halved: Trajectory
-    errors: np.ndarray
-    error: float
 
     @property
     def python(self) -> str:

@@ -13,7 +13,6 @@ import numpy as np
 
 from vmri_jax import plots
 from vmri_jax.accuracy.families import Family
-from vmri_jax.accuracy.steps import check_error, check_extent, round_off
 from vmri_jax.mechanics.linearisation import linearise
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
 from vmri_jax.mechanics.terms import Term
@@ -145,18 +144,18 @@ def cost_report(
     problem, out = problem_of("cost_report", problem), Path(out)
     make_writable_folder(out)
     t_end = default_t_end(problem) if t_end is None else t_end
+    tuning, answered = Tuning("cost_report: one of errors", problem, t_end, menu, progress=progress), []
     for error in errors or ():
-        check_error("cost_report: each of errors", error, problem)
-    tuning, answered = Tuning(problem, t_end, menu, progress=progress), []
+        tuning.check(error)
     with interruptible(tuning.runs):  # around the drawing as well, so that Ctrl-C there keeps the runs, too
         tuning.first_trials(tuning.menu[:1], np.inf)  # they tell how far the system moves
-        errors = sorted(errors or _default_errors(tuning, problem, t_end))
-        check_extent("cost_report: the largest of errors", tuning, errors[-1])
+        errors = sorted(errors or _default_errors(tuning))
+        tuning.check_extent(errors[-1])
         try:
             # The smallest error first: families that are given up for it are hopeless for larger errors.
             for i, error in enumerate(errors):
                 tuning.progress = part(progress, i, len(errors))
-                tuning.look_for("cost_report: error", error)
+                tuning.look_for(error)
                 answered.append(error)
         finally:
             report = CostReport(out / "cost.html", name, t_end, tuple(answered), tuning.runs())
@@ -191,13 +190,15 @@ def bound_of(price: Mapping[str | int, float], rows: Sequence[Row]) -> tuple[tup
     return tuple((min(time, row.seconds), row.error_q) for time, row in zip(seconds, rows, strict=True))
 
 
-def _default_errors(tuning: Tuning, problem: Problem, t_end: float) -> list[float]:
+def _default_errors(tuning: Tuning) -> list[float]:
     """RELATIVE_ERRORS of a power of ten near how far the system moves, without errors that round-off hides."""
-    moved, least = tuning.extent(), round_off(problem)[1]
+    moved, least = tuning.extent(), tuning.round_off
     motion = 10.0 ** math.floor(math.log10(moved)) if moved > 0 else 0.0
     errors = [motion * error for error in RELATIVE_ERRORS if motion * error > least]
     if not errors:
-        rest = f"until t_end = {t_end:g} positions move by {moved:.1e}, and errors below {least:.1e} are round-off"
+        rest = (
+            f"until t_end = {tuning.length:g} positions move by {moved:.1e}, and errors below {least:.1e} are round-off"
+        )
         reason = "the system is at rest, or no run until then is certified"
         raise Refused(f"cost_report: {rest}: {reason}. Give a start that moves, another t_end, or the errors.")
     return errors

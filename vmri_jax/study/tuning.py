@@ -10,7 +10,6 @@ import numpy as np
 
 from vmri_jax.accuracy.families import Family, by_promise, families, for_system
 from vmri_jax.accuracy.search import Search
-from vmri_jax.accuracy.steps import check_error, digits_of, reached, warn_of_events
 from vmri_jax.accuracy.trials import Trial
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
 from vmri_jax.running.failures import simulation_error
@@ -28,8 +27,8 @@ SETTINGS_PRINTED = 5
 class Tuning(Search):
     """A search over a menu, with a row for each of its runs; arguments as of `tune`."""
 
-    def __init__(self, problem: Problem, t_end: float, menu: Sequence[Family] | None = None, **how: Any):
-        super().__init__(problem, problem.t + t_end, **how)
+    def __init__(self, name: str, problem: Problem, t_end: float, menu: Sequence[Family] | None = None, **how: Any):
+        super().__init__(problem, problem.t + t_end, name=name, **how)
         self.menu = for_system(families() if menu is None else menu, self.system, self.has_two_rates)
         self._rows: dict[tuple[str, int], Row] = {}
 
@@ -41,10 +40,9 @@ class Tuning(Search):
         row = row_of(label, run.system, run.scheme, trial.trajectory, *numbers, **measured)
         self._rows[trial.python, run.num_steps] = row
 
-    def look_for(self, name: str, error: float, exhaustive: bool = False) -> WorkPrecision:
-        """Search for an error, and return the table of all runs so far; `name` begins messages."""
-        menu = by_promise(self.menu, digits_of(self, error))
-        finals = reached(name, self, menu, error, finalists=FINALISTS, exhaustive=exhaustive)
+    def look_for(self, error: float, exhaustive: bool = False) -> WorkPrecision:
+        """Search for an error, and return the table of all runs so far."""
+        finals = self.cheapest(by_promise(self.menu, self.digits(error)), error, FINALISTS, exhaustive)
         self.measure([trial for trial in finals if np.isfinite(trial.error)])
         return self.runs()
 
@@ -146,14 +144,14 @@ def tune(
         UserWarning: events of forces demand many steps.
     """
     problem = problem_of("tune", problem)
-    check_error("tune: error", error, problem)
-    tuning = Tuning(problem, t_end, menu, num_saves=num_saves, solver=solver, progress=progress)
+    tuning = Tuning("tune: error", problem, t_end, menu, num_saves=num_saves, solver=solver, progress=progress)
+    tuning.check(error)
     with interruptible(tuning.runs):
-        choice = Recommendation(tuning.look_for("tune: error", error, exhaustive).rows, error=error)
+        choice = Recommendation(tuning.look_for(error, exhaustive).rows, error=error)
         if not choice.keeping(error):
             raise _nothing(tuning, error)
     progress("done", 1, 1)
-    warn_of_events("tune", tuning, choice.scheme, stacklevel=4)
+    tuning.warn_of_events("tune", choice.scheme, stacklevel=4)
     return choice
 
 
