@@ -21,7 +21,7 @@ from vmri_jax.running.files import make_writable_folder
 from vmri_jax.running.progress import part, shows_progress
 from vmri_jax.running.timing import seconds_each
 from vmri_jax.study.html import embedded, write_page
-from vmri_jax.study.row import Row, WorkPrecision, duration, pareto_front, record
+from vmri_jax.study.row import Row, WorkPrecision, duration, record
 from vmri_jax.study.table import Column, ResultTable, interruptible
 from vmri_jax.study.tuning import Tuning
 
@@ -88,7 +88,7 @@ class CostReport(ResultTable):
         fronts: list[Row] = []
         for family in dict.fromkeys(row.family for row in self.runs.rows):
             of_family = [replace(row, scheme=family) for row in self.runs.rows if row.family == family]
-            fronts += pareto_front(of_family, "seconds", "error_q")
+            fronts += WorkPrecision(tuple(of_family)).pareto()
         return WorkPrecision(tuple(fronts))
 
     @property
@@ -99,10 +99,6 @@ class CostReport(ResultTable):
     def records(self) -> list[dict[str, Any]]:
         """A dictionary for each answer: the error and the columns of its run."""
         return [{"error": a.error, **(record(a.setting) if a.setting else {})} for a in self.rows]
-
-    def figure(self, title: str, theme: plots.Theme) -> plots.NotebookFigure:
-        """Error against time: a curve for each family, the answers, and the bound."""
-        return plots.plot_work_precision(self.curves, title, theme=theme, ringed=self.reached, bound=self.bound)
 
 
 def default_t_end(problem: Problem) -> float:
@@ -210,10 +206,11 @@ def _write(report: CostReport, problem: Problem) -> None:
     rows = sum(problem.system.num_constraints(problem.q_s, problem.q_f))
     sizes = {"slow variables": problem.q_s.size, "fast variables": problem.q_f.size, "constraints": rows}
     title = f"{report.name}: what accuracy costs over a time of {report.t_end:g}"
+    draw = partial(plots.plot_work_precision, report.curves, ringed=report.reached, bound=report.bound)
     try:
         for end, theme in (("", plots.LIGHT), ("_dark", plots.DARK)):
-            plots.save(report.figure(title, theme), report.path.parent / f"cost{end}.png", theme)
-        figure = embedded(partial(report.figure, ""))
+            plots.save(draw(title, theme=theme), report.path.parent / f"cost{end}.png", theme)
+        figure = embedded(lambda theme: draw(theme=theme))
         write_page(report.path, TEMPLATE, report=report, sizes=sizes, duration=duration, figure=figure)
     except Exception as fault:
         fault.add_note(f"{report.path} could not be drawn or written; all runs are in cost.csv beside it.")

@@ -1,6 +1,6 @@
 """Runs of a study: a row with errors, invariants, evaluations and time, their table, and the Pareto front of all runs."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from operator import attrgetter
 from typing import Any
@@ -179,7 +179,11 @@ class WorkPrecision(RunTable):
         Args:
             work: "seconds", "slow_evaluations", "fast_evaluations" or "solves".
         """
-        return pareto_front(self.rows, work, "error_q")
+        front, done = [], [row for row in self.rows if np.isfinite([row.error_q, getattr(row, work)]).all()]
+        for row in sorted(done, key=attrgetter(work, "error_q")):
+            if not front or row.error_q < front[-1].error_q:
+                front.append(row)
+        return front
 
     def keeping(self, error: float) -> list[Row]:
         """The runs that keep an error of the positions and whose time is known, the fastest first."""
@@ -193,12 +197,3 @@ class WorkPrecision(RunTable):
     def plot(self, title: str = "", work: str = "seconds"):
         """Error against work, see `vmri_jax.plots.plot_work_precision`."""
         return plots.plot_work_precision(self, title, work)
-
-
-def pareto_front(items: Sequence[Any], work: str, error: str) -> list[Any]:
-    """The items that no other item beats both in the attribute `work` and in the attribute `error`, the cheapest first."""
-    front, finite = [], [item for item in items if np.isfinite([getattr(item, error), getattr(item, work)]).all()]
-    for item in sorted(finite, key=attrgetter(work, error)):
-        if not front or getattr(item, error) < getattr(front[-1], error):
-            front.append(item)
-    return front
