@@ -14,10 +14,9 @@ import numpy as np
 
 from vmri_jax.ensembles.columns import Vary
 from vmri_jax.ensembles.design import Chunks, Design, Draws, Product, Rows, Table
-from vmri_jax.ensembles.prepared import attributes_of, prepared
 from vmri_jax.ensembles.quantities import Saved
 from vmri_jax.ensembles.reading import LANE, open_ensemble
-from vmri_jax.ensembles.work import AnyScheme, Work
+from vmri_jax.ensembles.work import AnyScheme, Work, attributes_of, prepared
 from vmri_jax.executors.executor import NotAWorker, as_done, executor_of, submitter
 from vmri_jax.mechanics.arrays import require_x64, whole_number
 from vmri_jax.mechanics.checks import check_type

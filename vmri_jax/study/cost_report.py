@@ -140,7 +140,7 @@ def cost_report(
     problem, out = problem_of("cost_report", problem), Path(out)
     make_writable_folder(out)
     t_end = default_t_end(problem) if t_end is None else t_end
-    tuning, answered = Tuning("cost_report: one of errors", problem, t_end, menu, progress=progress), []
+    tuning, answered = Tuning("cost_report: each of errors", problem, t_end, menu, progress=progress), []
     for error in errors or ():
         tuning.check(error)
     with interruptible(tuning.runs):  # around the drawing as well, so that Ctrl-C there keeps the runs, too
