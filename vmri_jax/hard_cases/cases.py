@@ -1,6 +1,6 @@
 """The hard cases that apply to any system, with steps chosen from its frequencies."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from functools import cache, cached_property, partial
 
@@ -14,7 +14,7 @@ from vmri_jax.accuracy.companions import positions
 from vmri_jax.accuracy.simulate import simulate
 from vmri_jax.diagnostics import step_condition
 from vmri_jax.diagnostics.linear import phase_vector
-from vmri_jax.hard_cases.case import Case, Outcome, draw_energy
+from vmri_jax.hard_cases.case import Case, Outcome, Report, draw_energy, run_cases
 from vmri_jax.hard_cases.derivatives import derivatives
 from vmri_jax.hard_cases.measures import (
     Energy,
@@ -34,7 +34,7 @@ from vmri_jax.mechanics.motion import motion
 from vmri_jax.mechanics.projection import legendre
 from vmri_jax.mechanics.state import HasProblem, Problem, State, initial_state, problem_of
 from vmri_jax.mechanics.system import System
-from vmri_jax.running.progress import Working
+from vmri_jax.running.progress import ShowsProgress, Working
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes.scheme import Scheme, fully_explicit, fully_implicit
 from vmri_jax.stability import advise
@@ -97,7 +97,7 @@ class Resolved:
     @cached_property
     def _long_run(self) -> Callable[[int], Trajectory]:
         """A long run by its number of macro steps, which two cases judge."""
-        return cache(lambda steps: long_run(self.problem, self.scheme, self.macro_dt, steps))
+        return cache(partial(long_run, self.problem, self.scheme, self.macro_dt))
 
     def constraints(self, full: bool) -> Outcome:
         steps = 1_000_000 if full else 10_000
@@ -320,6 +320,24 @@ def cases_for(problem: Problem | HasProblem) -> tuple[Case, ...]:
         Case(number, title, setup, criterion, run, "".join(reason))
         for number, (title, setup, criterion, run, *reason) in enumerate(rows, start=1)
     )
+
+
+def check(
+    problem: Problem | HasProblem, numbers: Collection[int] = (), full: bool = False, progress: ShowsProgress = False
+) -> Report:
+    """Put a system to the hard cases: constraints, energy, tolerance, tiny steps, reversal, batches, bad input.
+
+    Args:
+        problem: a `Problem` or a scene; steps are chosen from its frequencies.
+        numbers, full, progress: as of `run_cases`.
+
+    Returns:
+        The `Report`, an outcome for each case.
+
+    Raises:
+        ValueError, Interrupted: as of `run_cases`.
+    """
+    return run_cases(cases_for(problem), numbers, full, progress)
 
 
 def _outside(system: System) -> str:
