@@ -3,7 +3,7 @@ arguments, its chunks, the arrays of its store, and the record that identifies i
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -103,12 +103,13 @@ class Work:
         """The problem whose parameters and start the columns change."""
         return find_problem(self.system) if isinstance(self.system, str) else self.system
 
-    def lane(self, row: Row) -> tuple[Any, tuple[Any, ...]]:
+    def lane(self, problem: Problem, row: Row) -> tuple[Any, tuple[Any, ...]]:
         """The parameters of the run of a row, None if `vary` changes none, and its start (t, q_s, q_f, v_s, v_f).
 
-        `vary` gets the columns in their order in the design, which JAX would sort.
+        The problem is an argument, since this function is traced: a problem that it made would have tracers. `vary` gets the columns in their order in
+        the design, which JAX would sort.
         """
-        problem, columns = self.problem, columns_of_problems(self.columns)
+        columns = columns_of_problems(self.columns)
         if self.vary is None and columns:
             known = near(columns[0], (*STEPS, *SCHEMES))
             reason = f"the column {columns[0]!r} is neither a step nor a scheme"
@@ -124,7 +125,8 @@ class Work:
     @cached_property
     def lanes(self) -> Callable[[Rows, int], tuple]:
         """The compiled function from the numbers of some rows, and their count, to the parameters and starts of their runs."""
-        return jax.jit(lambda rows, count: jax.vmap(self.lane, axis_size=count)(rows), static_argnums=1)
+        lane = partial(self.lane, self.problem)
+        return jax.jit(lambda rows, count: jax.vmap(lane, axis_size=count)(rows), static_argnums=1)
 
     @cached_property
     def quantities(self) -> list[Quantity]:
@@ -247,7 +249,7 @@ def _whole(name: str, value) -> int:
 
 def prepared(work: Work, design: Design, chunk: int | None = None) -> tuple[dict[str, Kept], Chunks, Simulation]:
     """The arrays of the store, the division of the runs, and the longest run, after all checks; nothing is computed."""
-    jax.eval_shape(work.lane, _first_row(design))
+    jax.eval_shape(partial(work.lane, work.problem), _first_row(design))
     runs = [work.simulation(group) for group in all_groups(work, design)]  # one of each group
     runs[0].check("ensemble: the start", constraints=False)
     over_nodes = [name for name in OVER_NODES if name in work.save]
@@ -325,7 +327,7 @@ def _identity(work: Work, design: Design, run: Simulation) -> dict[str, str]:
     identity_record |= {f"file {Path(file).name}": digest for file, digest in work.sources.items()}
     if work.vary is not None:
         identity_record |= describe("vary", work.vary)
-        identity_record |= {"operations of vary": operations(work.lane, _first_row(design))}
+        identity_record |= {"operations of vary": operations(partial(work.lane, work.problem), _first_row(design))}
     identity_record |= {"design": type(design).__name__}
     if isinstance(design, Draws):
         identity_record |= {"method": design.method, "seed": str(design.seed)}
