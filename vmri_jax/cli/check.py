@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from vmri_jax.catalogue import find_problem
-from vmri_jax.cli import options
+from vmri_jax.cli import common
 from vmri_jax.cli.common import check_target, console
 from vmri_jax.hard_cases import Case, cases_for, run_cases
 from vmri_jax.running.interrupts import Interrupted
@@ -18,7 +18,7 @@ Full = Annotated[bool, typer.Option("--full", help="Full forms: runs of up to a 
 Out = Annotated[Path | None, typer.Option(help="Folder for a table, cases.csv, and pictures.")]
 
 
-def check(system: options.System, case: Numbers = None, full: Full = False, out: Out = None) -> None:
+def check(system: common.System, case: Numbers = None, full: Full = False, out: Out = None) -> None:
     """Put a system to the hard cases: constraints, energy, tolerance, tiny steps, reversal, batches, bad input.
 
     Steps are chosen from its frequencies. Cases that do not apply say why. Ends with code 1 if a criterion is not met.

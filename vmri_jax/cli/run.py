@@ -17,7 +17,7 @@ from typer import Option
 from vmri_jax import plots
 from vmri_jax.accuracy.simulate import simulate as run_at_once
 from vmri_jax.catalogue import find_problem, find_scheme
-from vmri_jax.cli import options
+from vmri_jax.cli import common
 from vmri_jax.cli.common import PICTURES, check_target, console, print_failure, print_named
 from vmri_jax.refusals import Refused
 from vmri_jax.running.arguments import Save, nothing_fast
@@ -38,17 +38,17 @@ MOST_READ_NODES = 10_000
 
 
 def simulate(
-    system: options.System,
+    system: common.System,
     steps: Annotated[int | None, Option(help="Number of macro steps; not with --accuracy.")] = None,
-    macro_dt: options.MacroStep = None,
+    macro_dt: common.MacroStep = None,
     scheme: Annotated[
         str | None, Option(help="See vmri schemes. [dim]default: fully-implicit; with --accuracy chosen[/dim]")
     ] = None,
-    num_micro: options.NumMicro = 10,
-    alpha: options.Alpha = None,
-    degree: options.Degree = None,
-    rule: options.Rule = None,
-    compose: options.Compose = None,
+    num_micro: common.NumMicro = 10,
+    alpha: common.Alpha = None,
+    degree: common.Degree = None,
+    rule: common.Rule = None,
+    compose: common.Compose = None,
     accuracy: Annotated[float | None, Option(help="Largest error of a position, for which steps are chosen.")] = None,
     t_end: Annotated[float | None, Option(help="End of the run, with --accuracy.")] = None,
     error: Annotated[bool, Option("--error", help="Estimate the error of the positions.")] = False,

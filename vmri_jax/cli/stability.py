@@ -10,7 +10,7 @@ from typer import Argument, Option
 
 from vmri_jax import plots
 from vmri_jax.catalogue import find_problem, find_scene_or_problem, find_scheme
-from vmri_jax.cli import options
+from vmri_jax.cli import common
 from vmri_jax.cli.common import PICTURES, check_target, console, print_written
 from vmri_jax.mechanics.linearisation import linearise
 from vmri_jax.mechanics.state import Problem
@@ -25,14 +25,14 @@ from vmri_jax.stability.map import windows_text
 
 
 def explain(
-    system: options.System,
-    scheme: options.Scheme = "fully-implicit",
-    num_micro: options.NumMicro = 10,
-    alpha: options.Alpha = None,
-    degree: options.Degree = None,
-    rule: options.Rule = None,
-    compose: options.Compose = None,
-    macro_dt: options.MacroStep = None,
+    system: common.System,
+    scheme: common.Scheme = "fully-implicit",
+    num_micro: common.NumMicro = 10,
+    alpha: common.Alpha = None,
+    degree: common.Degree = None,
+    rule: common.Rule = None,
+    compose: common.Compose = None,
+    macro_dt: common.MacroStep = None,
     measure: Annotated[bool, Option(help="Time a macro step, and the derivatives of every effect.")] = True,
 ) -> None:
     """Show the grid of every body and effect of a scene, or function of a system, why, its cost, and frequencies.
@@ -65,14 +65,14 @@ def explain(
 
 
 def advise(
-    system: options.System,
+    system: common.System,
     macro_dt: Annotated[float, Option(help="Macro step H, of num_micro micro steps.")],
-    scheme: options.Scheme = "fully-implicit",
-    num_micro: options.NumMicro = 10,
-    alpha: options.Alpha = None,
-    degree: options.Degree = None,
-    rule: options.Rule = None,
-    compose: options.Compose = None,
+    scheme: common.Scheme = "fully-implicit",
+    num_micro: common.NumMicro = 10,
+    alpha: common.Alpha = None,
+    degree: common.Degree = None,
+    rule: common.Rule = None,
+    compose: common.Compose = None,
 ) -> None:
     """Judge a step before a long run: resonances, limits, labels, and the nearest safe step.
 
@@ -99,10 +99,10 @@ def stability(
     ] = None,
     scheme: Annotated[list[str] | None, Option(help="May be repeated. [dim]default: explicit-slow[/dim]")] = None,
     num_micro: Annotated[list[int] | None, Option(help="May be repeated. [dim]default: 2 5 10 20[/dim]")] = None,
-    alpha: options.Alpha = None,
-    degree: options.Degree = None,
-    rule: options.Rule = None,
-    compose: options.Compose = None,
+    alpha: common.Alpha = None,
+    degree: common.Degree = None,
+    rule: common.Rule = None,
+    compose: common.Compose = None,
     until: Annotated[float, Option(help="Largest omega H, in units of pi.", min=0.1)] = 4.0,
     out: Annotated[Path | None, Option(help="Draw the map here: .png, .svg or .pdf.")] = None,
 ) -> None:

@@ -11,7 +11,7 @@ from typer import Option
 
 from vmri_jax import study
 from vmri_jax.catalogue import find_problem
-from vmri_jax.cli import options
+from vmri_jax.cli import common
 from vmri_jax.cli.common import check_target, console, print_failure, print_written
 from vmri_jax.running.interrupts import Interrupted
 from vmri_jax.running.progress import Progress, progress_shown
@@ -22,7 +22,7 @@ from vmri_jax.study.tuning import NothingReached
 
 
 def tune(
-    system: options.System,
+    system: common.System,
     error: Annotated[float, Option(help="Largest accepted error of a position in the run, in its unit.")],
     t_end: Annotated[float, Option(help="Simulated time.")],
     exhaustive: Annotated[bool, Option("--exhaustive", help="Search without shortcuts.")] = False,
@@ -53,7 +53,7 @@ def tune(
 
 
 def cost(
-    system: options.System,
+    system: common.System,
     t_end: Annotated[
         float | None, Option(help=f"Simulated time. [dim]default: {PERIODS} fastest periods[/dim]")
     ] = None,
