@@ -1,6 +1,7 @@
 """`simulate_batch`: runs side by side, with an estimate of their errors on request."""
 
 import warnings
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
 
@@ -82,9 +83,8 @@ def simulate_batch(
         trajectory = replace(plain, error=_errors(lanes, plain))
     lanes.runs.tell_of_start("simulate_batch", plain.states)
     lanes.runs.warn("simulate_batch", saved.table, plain.states.t)
-    for kind, message in ((FailedLanesWarning, _failures(trajectory)), (UncertifiedWarning, _uncertified(trajectory))):
-        if warn and message:
-            warnings.warn(f"simulate_batch: {message}", kind, stacklevel=2)
+    for kind, message in _about_lanes(trajectory) if warn else ():
+        warnings.warn(f"simulate_batch: {message}", kind, stacklevel=2)
     return trajectory
 
 
@@ -107,28 +107,27 @@ def _errors(lanes: Batch, plain: Trajectory) -> RunError:
     return jax.tree.map(lambda *arrays: np.stack(arrays), *map(error, range(len(plain.t))))
 
 
-def _failures(trajectory: Trajectory) -> str:
-    """The number of failed lanes, with the failing step and the status of the first one; empty if no lane failed."""
+def _about_lanes(trajectory: Trajectory) -> Iterator[tuple[type[UserWarning], str]]:
+    """Warnings about the lanes that failed, and about those that did not and whose error is not certified: kind, and number with the first lane."""
     failed_at = np.asarray(trajectory.failed_at)
     failed = np.flatnonzero(failed_at >= 0)
-    if not failed.size:
-        return ""
-    first = int(failed[0])
-    result = Result(int(trajectory.result[first]))
-    return (
-        f"{failed.size} of {failed_at.size} lanes failed and are NaN from there on; .result and .failed_at say "
-        f"which. The first is lane {first}, at macro step {failed_at[first]} ({result.name}): {result.message}"
-    )
-
-
-def _uncertified(trajectory: Trajectory) -> str:
-    """The number of lanes that did not fail and whose error is not certified, and the first one; empty if there are none."""
+    if failed.size:
+        first = int(failed[0])
+        result = Result(int(trajectory.result[first]))
+        yield (
+            FailedLanesWarning,
+            (
+                f"{failed.size} of {failed_at.size} lanes failed and are NaN from there on; .result and .failed_at say "
+                f"which. The first is lane {first}, at macro step {failed_at[first]} ({result.name}): {result.message}"
+            ),
+        )
     error = trajectory.error
-    certified = error is None or error.is_certified
-    lanes = np.flatnonzero((np.asarray(trajectory.failed_at) < 0) & ~np.asarray(certified))
-    if not lanes.size:
-        return ""
-    return (
-        f"the error of {lanes.size} of {len(error.slow)} lanes is not certified over the whole run, as run.error.largest says; the first is lane "
-        f"{lanes[0]}, certified until t = {error.certified_until[lanes[0]]:.4g}. Take smaller steps, or a scheme of higher order."
-    )
+    lanes = np.flatnonzero((failed_at < 0) & ~np.asarray(error is None or error.is_certified))
+    if lanes.size:
+        yield (
+            UncertifiedWarning,
+            (
+                f"the error of {lanes.size} of {failed_at.size} lanes is not certified over the whole run, as run.error.largest says; the first is lane "
+                f"{lanes[0]}, certified until t = {error.certified_until[lanes[0]]:.4g}. Take smaller steps, or a scheme of higher order."
+            ),
+        )

@@ -95,12 +95,8 @@ def of_scheme(scheme: SchemeLike) -> Family:
 
 def for_system(menu: Sequence[Family], system: System, has_two_rates: bool) -> list[Family]:
     """The families with a first num_micro that the rates of the potentials divide, the least one without two rates."""
-
-    def adapted(family: Family) -> Family:
-        unit = unit_of(system, family.make(family.first))
-        return replace(family, first=unit * -(-family.first // unit) if has_two_rates else unit)
-
-    return [adapted(family) for family in menu]
+    units = ((family, unit_of(system, family.make(family.first))) for family in menu)
+    return [replace(family, first=unit * -(-family.first // unit) if has_two_rates else unit) for family, unit in units]
 
 
 def by_promise(menu: Sequence[Family], digits: float) -> list[Family]:
