@@ -4,7 +4,7 @@ They are coordinates of bodies and lengths of springs; the motion chooses which.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -137,9 +137,7 @@ def _coordinates(motion: Motion) -> list[Signal]:
             # a bar is drawn at foot + scale q: its curve is q
             foot, scale = (body.offset[axis], form[0][0]) if len(form) == 1 and form[0][0] != 1.0 else (0.0, 1.0)
             along = partial(_along, i, frame[:, axis], foot, scale)
-            for signal in _signal(motion, label, body.pace, along):
-                seen = replace(signal, size=abs(scale) * signal.size, speed=abs(scale) * signal.speed)
-                (signals if body.shown else hidden).append(seen)
+            (signals if body.shown else hidden).extend(_signal(motion, label, body.pace, along, abs(scale)))
     return signals + [signal for signal in hidden if signal.pace not in {shown.pace for shown in signals}]
 
 
@@ -158,11 +156,11 @@ def _lengths(motion: Motion) -> list[Signal]:
     return signals
 
 
-def _signal(motion: Motion, label: str, pace: str, of: Callable[[np.ndarray], np.ndarray]) -> list[Signal]:
-    """A list of the signal, empty if it does not move."""
+def _signal(motion: Motion, label: str, pace: str, of: Callable, scale: float = 1.0) -> list[Signal]:
+    """A list of the signal, which is drawn `scale` times as large as its values; empty if it does not move."""
     values = of(motion.points)
     if len(values) < 3 or np.ptp(values) <= 1e-9 * np.abs(values).max():
         return []
     # differences from node to node: central differences would be zero for a signal that turns by pi between nodes
     rates = np.diff(values) / np.diff(motion.t)
-    return [Signal(label, pace, of, float(np.std(values)), float(np.std(rates)))]
+    return [Signal(label, pace, of, scale * float(np.std(values)), scale * float(np.std(rates)))]

@@ -1,40 +1,17 @@
 """The drawing of a system: its parts, where they are for given coordinates, and plain data that is stored next to a
 run."""
 
-import json
-from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
-from itertools import chain
+from functools import cached_property
 from typing import Any
 
 import jax
 import numpy as np
 
-from vmri_jax.animation.parts import KINDS, PACES, Block, Body, Joint, Plane, Solid, Sphere
-from vmri_jax.animation.plain_data import (
-    angles,
-    check_keys,
-    direction,
-    entries,
-    numbers,
-    positive,
-    read_anchor,
-    read_block,
-    read_body,
-    read_carried,
-    read_joint,
-    read_record,
-    read_solid,
-)
+from vmri_jax.animation.parts import PACES, Block, Body, Joint, Plane, Solid, Sphere, read_drawing
 from vmri_jax.mechanics.kinematics import Kinematics
 from vmri_jax.refusals import Refused
-
-KEYS = (
-    *("bodies", "solids", "blocks", "links", "springs", "anchors", "planes", "spheres"),
-    *("up", "view", "caption", "kinematics"),
-)
 
 
 @dataclass(frozen=True)
@@ -85,37 +62,7 @@ class Drawing:
         Raises:
             ValueError: other data; the message names the wrong entry.
         """
-        if isinstance(data, str):
-            try:
-                data = json.loads(data)
-            except json.JSONDecodeError as error:
-                raise Refused(f"drawing: not valid JSON ({error}).") from error
-        check_keys(data, (), KEYS, "drawing")
-
-        def all_of(key: str, read: Callable) -> tuple:
-            return tuple(read(entry, f"drawing: {key}[{i}]") for i, entry in enumerate(entries(data, key, "drawing")))
-
-        bodies, blocks, solids = all_of("bodies", read_body), all_of("blocks", read_block), all_of("solids", read_solid)
-        bodies = (*chain(*(points for _, points in solids)), *bodies)
-        names = [body.name for body in bodies]
-        if not bodies and not blocks:
-            raise Refused("drawing: there are no bodies and no blocks; there must be at least one.")
-        for name, count in Counter([*names, *(block.name for block in blocks)]).items():
-            if count > 1:
-                raise Refused(f"drawing: {count} bodies are named {name!r}; names must be unique.")
-        links, springs = (all_of(f"{kind}s", partial(read_joint, kind, names)) for kind in KINDS)
-        return cls(
-            bodies=bodies,
-            blocks=blocks,
-            solids=tuple(solid for solid, _ in solids),
-            joints=links + springs + all_of("anchors", partial(read_anchor, names)),
-            planes=all_of("planes", partial(read_record, Plane, {"point": numbers, "normal": direction})),
-            spheres=all_of("spheres", partial(read_record, Sphere, {"center": numbers, "radius": positive})),
-            up=None if data.get("up") is None else direction(data["up"], "drawing: up"),
-            view=None if data.get("view") is None else angles(data["view"], "drawing: view"),
-            caption=str(data.get("caption") or ""),
-            carried=read_carried(data.get("kinematics")),
-        )
+        return cls(**read_drawing(data))
 
     def extended(self, q_s, q_f, v_s, v_f) -> tuple[np.ndarray, ...]:
         """Coordinates of the bodies and their rates, slow and fast, (k, n) each, for coordinates and rates of a run."""

@@ -24,7 +24,7 @@ from rich.markup import escape
 from typer import Argument, Option
 
 from vmri_jax import plots
-from vmri_jax.animation.plain_data import check_keys
+from vmri_jax.animation.parts import check_keys
 from vmri_jax.catalogue import find_problem
 from vmri_jax.cli.common import PICTURES, check_target, console, print_failure, print_named, print_written
 from vmri_jax.ensembles import Axis, Draw, Draws, Ensemble, EnsembleError, Product, ensemble
