@@ -160,13 +160,10 @@ class _Search:
         self.part_starts = shooting.starts(u_start)
         self.scale = shooting.sizes(u_start, self.part_starts)
 
-    def residual(self, x, args):
+    def residual(self, x, args, shooting: Shooting | None = None):
         """Misses of all values in standard deviations, and weighted gaps between the parts, at x = (u, z): search
         variables, and starts of the parts in units of `scale`; `args` are the values and the weight of gaps."""
-        return self._residual_of(self.shooting, x, args)
-
-    def _residual_of(self, shooting: Shooting, x, args):
-        (u, z), (values, weight) = x, args
+        (u, z), (values, weight), shooting = x, args, shooting or self.shooting
         predicted, gaps = shooting.predict(u, z * self.scale)
         misses = (predicted - values) / shooting.sigma
         finite = jnp.isfinite(misses)
@@ -235,10 +232,8 @@ class _Search:
         stiffness makes up for it. Neither the misses nor the covariance show this error.
         """
         point = (u, z), (self.shooting.values, GAP_WEIGHTS[-1])
-        coarse, fine = (
-            jax.jit(partial(self._residual_of, shooting))(*point)
-            for shooting in (self.shooting, self.shooting.with_half_steps())
-        )
+        runs = self.shooting, self.shooting.with_half_steps()
+        coarse, fine = (jax.jit(partial(self.residual, shooting=shooting))(*point) for shooting in runs)
         difference = np.concatenate([np.ravel(b - a) for a, b in zip(coarse, fine, strict=True)])
         jacobian = np.asarray(without_starts(*jacobians))
         size = np.linalg.norm(jacobian, axis=0)

@@ -7,6 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 
 from vmri_jax.mechanics.arrays import real_array
 from vmri_jax.refusals import Refused
@@ -76,18 +77,17 @@ class Unknowns:
 
     def __init__(self, unknowns: Mapping[str, Unknown]):
         self.unknowns = dict(unknowns)
-        self.sizes = {name: unknown.start.size for name, unknown in self.unknowns.items()}
-        self.size = sum(self.sizes.values())
+        numbers, self._parts = ravel_pytree([unknown.start for unknown in self.unknowns.values()])
+        self.size = numbers.size
 
     def at(self, u) -> dict:
         """The parameters by name."""
-        parts = jnp.split(jnp.asarray(u), np.cumsum(list(self.sizes.values()))[:-1])
-        shaped = zip(self.unknowns.items(), parts, strict=True)
-        return {name: unknown.at(part.reshape(unknown.start.shape)) for (name, unknown), part in shaped}
+        parts = zip(self.unknowns.items(), self._parts(jnp.asarray(u)), strict=True)
+        return {name: unknown.at(part) for (name, unknown), part in parts}
 
     def vector(self, parameters: Mapping) -> jax.Array:
         """All numbers in a row."""
-        return jnp.concatenate([jnp.ravel(parameters[name]) for name in self.unknowns])
+        return ravel_pytree([parameters[name] for name in self.unknowns])[0]
 
     @property
     def labels(self) -> list[str]:
