@@ -136,14 +136,12 @@ def _coordinates(motion: Motion) -> list[Signal]:
             label, form = body.name if len(moved) == 1 else f"{body.name} {AXES[axis]}", body.forms[axis]
             # a bar is drawn at foot + scale q: its curve is q
             foot, scale = (body.offset[axis], form[0][0]) if len(form) == 1 and form[0][0] != 1.0 else (0.0, 1.0)
-            along = partial(_along, i, frame[:, axis], foot, scale)
+
+            def along(points, i=i, axis=frame[:, axis], foot=foot, scale=scale):
+                return (points[:, i] @ axis - foot) / scale
+
             (signals if body.shown else hidden).extend(_signal(motion, label, body.pace, along, abs(scale)))
     return signals + [signal for signal in hidden if signal.pace not in {shown.pace for shown in signals}]
-
-
-def _along(body: int, axis: np.ndarray, foot: float, scale: float, points: np.ndarray) -> np.ndarray:
-    """The coordinate q (k,) of a body that is drawn at ``foot + scale q`` along an axis; points (k, n_bodies, 3)."""
-    return (points[:, body] @ axis - foot) / scale
 
 
 def _lengths(motion: Motion) -> list[Signal]:

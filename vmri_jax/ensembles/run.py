@@ -193,7 +193,9 @@ def ensemble(
     layout.check_place("ensemble", path, "ensemble", resume, overwrite)
     if not isinstance(system, str):
         system = problem_of("ensemble", system)
-    schemes, design = _schemes(scheme), _design(design)
+    schemes, design = _schemes(scheme), Product(design) if isinstance(design, Mapping) else design
+    designs = "a Product, Table or Draws of vmri_jax.ensembles, or a mapping of axes, {'omega': [10, 50]}"
+    check_type("ensemble: design", design, Product | Table | Draws, designs)
     if len(schemes) > 1 and "scheme" not in design.described():
         if not isinstance(design, Product):
             raise Refused("ensemble: there are several schemes; give a column 'scheme' that chooses one for each run.")
@@ -317,11 +319,3 @@ def _schemes(scheme) -> dict[str, AnyScheme]:
         one = "a Scheme, the name of one, or a function that makes one for a num_micro"
         raise Refused(f"ensemble: scheme is {scheme!r}; give {one}, or several by label.")
     return dict(scheme)
-
-
-def _design(design) -> Design:
-    if isinstance(design, Mapping):
-        return Product(design)
-    designs = "a Product, Table or Draws of vmri_jax.ensembles, or a mapping of axes, {'omega': [10, 50]}"
-    check_type("ensemble: design", design, Product | Table | Draws, designs)
-    return design

@@ -121,7 +121,8 @@ class Shooting:
         """Predicted values (m,), and gaps (segments - 1, 2 n): the end of each part minus the start of the next one."""
         if self.segments == 1:  # the start follows from u: JAX's own derivative needs tangents for u alone
             problem = self.model(self.unknowns.at(u))
-            observed, ends = jax.tree.map(lambda a: a[None], self._run(problem, _start(problem)))
+            start = problem.state(problem.project or problem.system.is_constrained)  # any parameters keep constraints
+            observed, ends = jax.tree.map(lambda a: a[None], self._run(problem, start))
         else:
             observed, ends = self._parts(u, jnp.concatenate([self.start(u)[None], starts]))
         predicted = [
@@ -182,8 +183,3 @@ def _phase(problem: Problem, state: State):
     """(2 n,) positions and velocities of a state."""
     v_s, v_f = velocity(problem.system, state.q_s, state.q_f, state.p_s, state.p_f)
     return jnp.concatenate([state.q_s, state.q_f, v_s, v_f])
-
-
-def _start(problem: Problem) -> State:
-    """The start of a motion, on the constraints of any parameters that a search tries."""
-    return problem.state(problem.project or problem.system.is_constrained)
