@@ -100,6 +100,10 @@ class CostReport(ResultTable):
         """A dictionary for each answer: the error and the columns of its run."""
         return [{"error": a.error, **(record(a.setting) if a.setting else {})} for a in self.rows]
 
+    def figure(self, title: str, theme: plots.Theme) -> plots.NotebookFigure:
+        """Error against time: a curve for each family, the answers, and the bound."""
+        return plots.plot_work_precision(self.curves, title, theme=theme, ringed=self.reached, bound=self.bound)
+
 
 def default_t_end(problem: Problem) -> float:
     """PERIODS periods of the fastest vibration, rounded to one digit; 1 if nothing vibrates."""
@@ -206,11 +210,10 @@ def _write(report: CostReport, problem: Problem) -> None:
     rows = sum(problem.system.num_constraints(problem.q_s, problem.q_f))
     sizes = {"slow variables": problem.q_s.size, "fast variables": problem.q_f.size, "constraints": rows}
     title = f"{report.name}: what accuracy costs over a time of {report.t_end:g}"
-    draw = partial(plots.plot_work_precision, report.curves, ringed=report.reached, bound=report.bound)
     try:
         for end, theme in (("", plots.LIGHT), ("_dark", plots.DARK)):
-            plots.save(draw(title, theme=theme), report.path.parent / f"cost{end}.png", theme)
-        figure = embedded(lambda theme: draw(theme=theme))
+            plots.save(report.figure(title, theme), report.path.parent / f"cost{end}.png", theme)
+        figure = embedded(partial(report.figure, ""))
         write_page(report.path, TEMPLATE, report=report, sizes=sizes, duration=duration, figure=figure)
     except Exception as fault:
         fault.add_note(f"{report.path} could not be drawn or written; all runs are in cost.csv beside it.")
