@@ -8,7 +8,7 @@ import pytest
 
 import vmri_jax as vm
 from vmri_jax.fitting import Measured, Unknown
-from vmri_jax.fitting.unknowns import Unknowns
+from vmri_jax.fitting.given import Unknowns
 from vmri_jax.schemes.composition import SchemeLike
 
 CHAIN = vm.systems.fermi_pasta_ulam(1, omega=20.0)

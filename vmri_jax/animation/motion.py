@@ -12,8 +12,7 @@ import numpy as np
 from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
 from vmri_jax import diagnostics
-from vmri_jax.animation.bars import bars, with_bars
-from vmri_jax.animation.drawing import Drawing
+from vmri_jax.animation.drawing import Drawing, bars, with_bars
 from vmri_jax.mechanics.checks import check_type
 from vmri_jax.mechanics.state import HasProblem, Problem, opened
 from vmri_jax.mechanics.system import System
@@ -28,7 +27,7 @@ class Motion:
     """Positions of the bodies of a drawing, a cubic Hermite polynomial between nodes.
 
     Attributes:
-        drawing: with a body for each coordinate of its blocks, see `vmri_jax.animation.bars`.
+        drawing: with a body for each coordinate of its blocks, see `bars`.
         t: (k,) times of the nodes.
         points, velocities: (k, n_bodies, 3) in the coordinates of the picture, where z points upwards.
         energy: (k, c) change of the energy since the start. For a system that keeps its energy it is relative to the

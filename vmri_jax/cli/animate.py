@@ -9,7 +9,7 @@ from rich.markup import escape
 from typer import Argument, Option
 
 from vmri_jax import plots
-from vmri_jax.animation.bars import bars
+from vmri_jax.animation.drawing import bars
 from vmri_jax.animation.frames import plot_strip, write_gif
 from vmri_jax.animation.html import write_html
 from vmri_jax.animation.motion import Motion, motion

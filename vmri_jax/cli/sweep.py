@@ -28,7 +28,7 @@ from vmri_jax.animation.parts import check_keys
 from vmri_jax.catalogue import find_problem
 from vmri_jax.cli.common import PICTURES, check_target, console, print_failure, print_named, print_written
 from vmri_jax.ensembles import Axis, Draw, Draws, Ensemble, EnsembleError, Product, ensemble
-from vmri_jax.ensembles.columns import SCHEMES, START, STEPS, Row, columns_of_problems
+from vmri_jax.ensembles.design import SCHEMES, START, STEPS, Row, columns_of_problems
 from vmri_jax.ensembles.quantities import drawn_by_default
 from vmri_jax.executors.executor import local_workers
 from vmri_jax.mechanics.arrays import whole_number

@@ -12,8 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from vmri_jax.ensembles.columns import Vary
-from vmri_jax.ensembles.design import Chunks, Design, Draws, Product, Rows, Table
+from vmri_jax.ensembles.design import Chunks, Design, Draws, Product, Rows, Table, Vary
 from vmri_jax.ensembles.quantities import Saved
 from vmri_jax.ensembles.reading import LANE, open_ensemble
 from vmri_jax.ensembles.work import AnyScheme, Work, attributes_of, prepared

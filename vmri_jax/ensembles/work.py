@@ -13,8 +13,23 @@ import numpy as np
 from vmri_jax.accuracy.batch import simulate_batch
 from vmri_jax.accuracy.companions import resting
 from vmri_jax.catalogue import find_problem, find_scheme
-from vmri_jax.ensembles.columns import SCHEMES, START, STEPS, Row, Vary, columns_of_problems, numbers_in
-from vmri_jax.ensembles.design import Axis, Chunks, Design, Draws, Product, Rows, combinations, unique_rows
+from vmri_jax.ensembles.design import (
+    SCHEMES,
+    START,
+    STEPS,
+    Axis,
+    Chunks,
+    Design,
+    Draws,
+    Product,
+    Row,
+    Rows,
+    Vary,
+    columns_of_problems,
+    combinations,
+    numbers_in,
+    unique_rows,
+)
 from vmri_jax.ensembles.quantities import OVER_NODES, Quantity, Saved, label_of, of_lanes, quantity, what_is_kept
 from vmri_jax.mechanics.arrays import is_concrete, whole_number
 from vmri_jax.mechanics.checks import check_type, digest

@@ -9,10 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.fitting.measured import Measured
+from vmri_jax.fitting.given import Measured, Unknown, Unknowns
 from vmri_jax.fitting.result import SINGULAR_VALUE_TOLERANCE, Fit, without_starts
 from vmri_jax.fitting.shooting import Shooting
-from vmri_jax.fitting.unknowns import Unknown, Unknowns
 from vmri_jax.mechanics.arrays import whole_number
 from vmri_jax.mechanics.checks import check_type
 from vmri_jax.mechanics.slots import free, leaves_by_name

@@ -17,8 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.accuracy.simulate import simulate
-from vmri_jax.fitting.measured import Measured
-from vmri_jax.fitting.unknowns import Unknowns
+from vmri_jax.fitting.given import Measured, Unknowns
 from vmri_jax.mechanics.constraints import known_mass
 from vmri_jax.mechanics.invariants import velocity
 from vmri_jax.mechanics.state import Problem, State, initial_state

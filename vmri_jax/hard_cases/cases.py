@@ -15,10 +15,10 @@ from vmri_jax.accuracy.simulate import simulate
 from vmri_jax.diagnostics import step_condition
 from vmri_jax.diagnostics.linear import phase_vector
 from vmri_jax.hard_cases.case import Case, Outcome, Report, draw_energy, run_cases
-from vmri_jax.hard_cases.derivatives import derivatives
 from vmri_jax.hard_cases.measures import (
     Energy,
     constraints,
+    derivatives,
     difference,
     drift_meter,
     energy,
