@@ -32,8 +32,7 @@ from vmri_jax.accuracy.companions import (
     extrapolated,
     fewest_steps,
 )
-from vmri_jax.accuracy.families import Family, unit_of
-from vmri_jax.accuracy.trials import LEAST_TIME, Trial, seconds_of_steps
+from vmri_jax.accuracy.families import LEAST_TIME, Family, Trial, seconds_of_steps, unit_of
 from vmri_jax.mechanics.checks import check_number
 from vmri_jax.mechanics.driving import Events, events
 from vmri_jax.mechanics.invariants import velocity

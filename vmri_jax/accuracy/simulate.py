@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 
 from vmri_jax.accuracy.companions import Compared, check_function_of_run, companion, with_error
-from vmri_jax.accuracy.families import for_system, of_scheme, two_families
+from vmri_jax.accuracy.families import Trial, for_system, of_scheme, two_families
 from vmri_jax.accuracy.search import MOST_COORDINATES, Search
-from vmri_jax.accuracy.trials import Trial
 from vmri_jax.mechanics.arrays import is_concrete
 from vmri_jax.mechanics.checks import check_system, check_type
 from vmri_jax.mechanics.driving import events

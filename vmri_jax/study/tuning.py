@@ -8,9 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from vmri_jax.accuracy.families import Family, by_promise, families, for_system
+from vmri_jax.accuracy.families import Family, Trial, by_promise, families, for_system
 from vmri_jax.accuracy.search import Search
-from vmri_jax.accuracy.trials import Trial
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
 from vmri_jax.running.failures import simulation_error
 from vmri_jax.running.progress import shows_progress
