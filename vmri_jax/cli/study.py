@@ -16,9 +16,8 @@ from vmri_jax.cli.common import check_target, console, print_failure, print_writ
 from vmri_jax.running.interrupts import Interrupted
 from vmri_jax.running.progress import Progress, progress_shown
 from vmri_jax.steppers.results import SimulationError
-from vmri_jax.study.cost_report import PERIODS
 from vmri_jax.study.table import ResultTable
-from vmri_jax.study.tuning import NothingReached
+from vmri_jax.study.tuning import PERIODS, NothingReached
 
 
 def tune(

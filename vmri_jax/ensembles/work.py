@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from vmri_jax.accuracy.batch import simulate_batch
 from vmri_jax.accuracy.companions import resting
+from vmri_jax.accuracy.simulate import simulate_batch
 from vmri_jax.catalogue import find_problem, find_scheme
 from vmri_jax.ensembles.design import (
     SCHEMES,

@@ -9,9 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax import textbook
-from vmri_jax.accuracy.batch import simulate_batch
 from vmri_jax.accuracy.companions import positions
-from vmri_jax.accuracy.simulate import simulate
+from vmri_jax.accuracy.simulate import simulate, simulate_batch
 from vmri_jax.diagnostics import step_condition
 from vmri_jax.diagnostics.linear import phase_vector
 from vmri_jax.hard_cases.case import Case, Outcome, Report, draw_energy, run_cases

@@ -29,8 +29,7 @@ from vmri_jax.running.timing import interleaved
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes.composition import SchemeLike
 from vmri_jax.steppers.solver import Solver
-from vmri_jax.study.reference_solution import ReferenceSolution, reference_solution
-from vmri_jax.study.row import Row, RunTable, WorkPrecision, row_of
+from vmri_jax.study.row import ReferenceSolution, Row, RunTable, WorkPrecision, reference_solution, row_of
 from vmri_jax.study.table import Column, interruptible
 
 MIN_ERROR_OVER_REFERENCE = 100.0
