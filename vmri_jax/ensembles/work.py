@@ -335,9 +335,7 @@ def _identity(work: Work, design: Design, run: Simulation) -> dict[str, str]:
     saved = [label_of(entry) if callable(entry) else Path(entry).name for entry in work.save]
     identity_record |= {"num_micro": str(work.num_micro), "save": ", ".join(saved)}
     for entry in filter(callable, work.save):
-        kept = quantity(entry)
-        traced = operations(lambda run, kept=kept: {name: a.value for name, a in kept(run).items()}, resting(run))
-        identity_record |= {f"operations of {label_of(entry)}": traced}
+        identity_record |= {f"operations of {label_of(entry)}": operations(quantity(entry), resting(run))}
     identity_record |= {"num_saves": str(work.num_saves), "project": str(work.project), "runs": str(len(design))}
     identity_record |= {f"file {Path(file).name}": digest for file, digest in work.sources.items()}
     if work.vary is not None:
