@@ -57,26 +57,24 @@ def refusals() -> Iterator[None]:
     except Interrupted as stopped:
         count = stopped.number if stopped.total is None else f"{stopped.number} of {stopped.total}"
         advice = f"; {stopped.advice}" if stopped.advice else ""
-        print_failure("Interrupted", f"After {count} {stopped.units}{advice}.")
-        raise typer.Exit(130) from stopped
+        raise print_failure("Interrupted", f"After {count} {stopped.units}{advice}.", 130) from stopped
     except Refused as error:
         raise BadInput(str(error)) from error
     except NotInstalled as error:
-        print_failure("Not installed", str(error))
-        raise typer.Exit(1) from error
+        raise print_failure("Not installed", str(error)) from error
     except (ValueError, TypeError, ImportError):
         print_failure("A fault inside", FAULT)
         raise
     except (FileExistsError, FileNotFoundError) as error:
         raise BadInput(str(error)) from error
     except OSError as error:
-        print_failure("Not written", error.strerror or str(error))
-        raise typer.Exit(1) from error
+        raise print_failure("Not written", error.strerror or str(error)) from error
 
 
-def print_failure(title: str, text: str) -> None:
-    """Print a red panel on the error stream."""
+def print_failure(title: str, text: str, code: int = 1) -> typer.Exit:
+    """Print a red panel on the error stream; returns the exit with this code, to be raised."""
     Console(stderr=True).print(Panel(Text(as_options(text)), title=title, title_align="left", border_style="red"))
+    return typer.Exit(code)
 
 
 def print_written(title: str, path: Path | None) -> None:

@@ -5,7 +5,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
-import typer
 from rich.markup import escape
 from typer import Option
 
@@ -43,8 +42,7 @@ def tune(
     except NothingReached as failure:
         console.print(failure.runs.table())
         _write_runs(failure.runs, out)
-        print_failure("Nothing reached the error", f"{failure} The best runs are above.")
-        raise typer.Exit(1) from failure
+        raise print_failure("Nothing reached the error", f"{failure} The best runs are above.") from failure
     console.print("[bold]Errors against time[/bold], the best of all runs\n", choice.runs.table(), "\n", choice.table())
     command = f"{choice.setting.settings.command(system)} --out run.npz"
     console.print(f"\n[bold]{escape(command)}[/bold]", soft_wrap=True)
@@ -84,8 +82,7 @@ def _search(out: Path | None) -> Iterator[Progress]:
         with progress_shown() as tell:
             yield tell
     except SimulationError as failure:
-        print_failure("All runs failed", str(failure))
-        raise typer.Exit(1) from failure
+        raise print_failure("All runs failed", str(failure)) from failure
     except Interrupted as stopped:
         console.print(stopped.done.table())
         _write_runs(stopped.done, out)

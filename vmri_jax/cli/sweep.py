@@ -19,7 +19,6 @@ from typing import Annotated, Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import typer
 from rich.markup import escape
 from typer import Argument, Option
 
@@ -70,11 +69,9 @@ def sweep(
             runs = ensemble(**arguments, executor=client, resume=resume, overwrite=overwrite, progress=True)
         except EnsembleError as error:
             _print_summary(error.ensemble)
-            print_failure("Not all chunks could be computed", str(error))
-            raise typer.Exit(1) from error
+            raise print_failure("Not all chunks could be computed", str(error)) from error
         except RuntimeError as error:
-            print_failure("Stopped", str(error))
-            raise typer.Exit(1) from error
+            raise print_failure("Stopped", str(error)) from error
     _print_summary(runs)
     if plot is not None:
         plots.save(plots.plot_ensemble(runs.open(), drawn, title=file.stem), plot)
