@@ -109,6 +109,7 @@ class Search:
 
     name: of the accuracy, which begins messages.
     system, start, t_end, length: of all runs.
+    falls_back: whether trials may take the fallback.
     seconds: measured seconds of a macro step by the Python expression of the scheme.
     """
 
@@ -129,7 +130,7 @@ class Search:
         self.name, self.t_end, self.length = name, float(t_end), float(t_end - self.start.t)
         if not 0 < self.length < np.inf:
             raise Refused(f"t_end is {self.length:g} after the start; it must be later, by a finite time.")
-        self.num_saves, self.progress, self.num_trials = num_saves, progress, 0
+        self.num_saves, self.progress, self.num_trials, self.falls_back = num_saves, progress, 0, False
         self.seconds: dict[str, float] = {}
         self._arguments, self._of = (moving, state, solver), of
         self._runs: dict[tuple[str, int], Simulation] = {}
@@ -195,27 +196,26 @@ class Search:
     def first_trials(self, menu: Sequence[Family], accuracy: float) -> list[Trial]:
         """A trial of each family, which the search makes once: without the fallback, since steps that are too large for
         the motion fail with any method, and with it only if no scheme of the menu succeeds without it."""
-        for falls_back in (False, True):
-            limit = np.inf
-            for family in menu:
-                key = family.python, family.first
-                before = self._firsts.get(key)
-                if before is None or (falls_back and not before.run.may_fall_back):
-                    how = {"falls_back": falls_back, "most_seconds": max(limit, LEAST_TRIAL_SECONDS)}
-                    self._firsts[key] = self.trial(family, family.first, FEWEST_STEPS, **how)
-                if len(menu) > 1:
-                    limit = min(limit, MOST_TIME_RATIO * self.time_for(self._firsts[key], AIMED_PART * accuracy))
-            trials = [self._firsts[family.python, family.first] for family in menu]
-            if any(int(trial.trajectory.failed_at) < 0 for trial in trials):
-                break
-        return trials
+        limit, trials = np.inf, []
+        for family in menu:
+            key = family.python, family.first
+            if key not in self._firsts:
+                most_seconds = max(limit, LEAST_TRIAL_SECONDS)
+                self._firsts[key] = self.trial(family, family.first, FEWEST_STEPS, most_seconds=most_seconds)
+            trials.append(self._firsts[key])
+            if len(menu) > 1:
+                limit = min(limit, MOST_TIME_RATIO * self.time_for(trials[-1], AIMED_PART * accuracy))
+        if self.falls_back or any(int(trial.trajectory.failed_at) < 0 for trial in trials):
+            return trials
+        self.falls_back = True
+        self._firsts.clear()
+        return self.first_trials(menu, accuracy)
 
     def trial(
         self,
         family: Family,
         num_micro: int,
         num_steps: int,
-        falls_back: bool = False,
         accuracy: float | None = None,
         most_seconds: float = np.inf,
     ) -> Trial:
@@ -223,7 +223,7 @@ class Search:
         runs out of steps, or of time, `most_seconds`. With an accuracy its errors look at events, see `Compared.of`."""
         most = MOST_TRIAL_SECONDS
         while True:
-            run = replace(self.run(family, num_micro, num_steps), may_fall_back=falls_back)
+            run = replace(self.run(family, num_micro, num_steps), may_fall_back=self.falls_back)
             total = max(USUAL_TRIALS, self.num_trials + 1)
             self.progress(f"trial of {family.label(num_micro)}, {run.num_steps} macro steps", self.num_trials, total)
             self.num_trials += 1
@@ -251,7 +251,7 @@ class Search:
             num_steps = self.beside_resonances(before, wanted)
             if num_steps > max(MOST_STEPS, fewest_steps(run.scheme, self.drives, self.length)):
                 break
-            trial = self.trial(before.family, before.num_micro, num_steps, run.may_fall_back, accuracy)
+            trial = self.trial(before.family, before.num_micro, num_steps, accuracy)
             if trial.error <= accuracy:
                 break
             order = self._observed_order(before, trial)
@@ -331,7 +331,7 @@ class Search:
             return trial
         python, run = trial.family.python, trial.run
         if python not in self._chosen:
-            finer = self.trial(trial.family, 2 * trial.num_micro, run.num_steps, run.may_fall_back)
+            finer = self.trial(trial.family, 2 * trial.num_micro, run.num_steps)
             comparable = np.isfinite(finer.error) and finer.run.num_steps == run.num_steps
             trials = [trial, finer, *self._third(trial, finer)] if comparable else [trial]
             self._chosen[python] = min(trials, key=lambda candidate: self.time_for(candidate, error))
@@ -362,7 +362,7 @@ class Search:
         if min(time(num_micro), time(2 * num_micro)) < WORTH_COMPILING * time(best):
             return []
         num_steps = max(1, round(run.num_steps * num_micro / best))  # micro steps of the same length
-        return [self.trial(trial.family, best, num_steps, run.may_fall_back)]
+        return [self.trial(trial.family, best, num_steps)]
 
     @cached_property
     def _linear(self) -> Linearisation | None:
