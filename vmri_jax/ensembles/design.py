@@ -34,7 +34,6 @@ ALIASES = {"normal": "norm", "exponential": "expon"}
 """Further names of distributions, and the names that `scipy.stats` has for them."""
 STEPS = ("macro_dt", "num_steps")
 SCHEMES = ("scheme", "num_micro")
-START = ("t", "q_s", "q_f", "v_s", "v_f")
 
 Row = Mapping[str, Any]
 """The value of each column in a row of a design."""

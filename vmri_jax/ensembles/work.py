@@ -15,7 +15,6 @@ from vmri_jax.accuracy.simulate import simulate_batch
 from vmri_jax.catalogue import find_problem, find_scheme
 from vmri_jax.ensembles.design import (
     SCHEMES,
-    START,
     STEPS,
     Axis,
     Chunks,
@@ -34,6 +33,7 @@ from vmri_jax.ensembles.quantities import OVER_NODES, Quantity, Saved, label_of,
 from vmri_jax.mechanics.arrays import is_concrete, whole_number
 from vmri_jax.mechanics.checks import check_type, digest
 from vmri_jax.mechanics.names import Names, near, unknown
+from vmri_jax.mechanics.places import START
 from vmri_jax.mechanics.state import Problem
 from vmri_jax.refusals import Refused
 from vmri_jax.running.arguments import Save, Steps, check_step_size, steps_until

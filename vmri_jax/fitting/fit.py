@@ -1,7 +1,6 @@
 """Identification: parameters of a system from measurements of its motion, with what is known about them afterwards."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from functools import partial
 from typing import cast
 
@@ -14,7 +13,8 @@ from vmri_jax.fitting.result import SINGULAR_VALUE_TOLERANCE, Fit, without_start
 from vmri_jax.fitting.shooting import Shooting
 from vmri_jax.mechanics.arrays import whole_number
 from vmri_jax.mechanics.checks import check_type
-from vmri_jax.mechanics.slots import free, leaves_by_name
+from vmri_jax.mechanics.places import Placed, places_of
+from vmri_jax.mechanics.slots import free
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
 from vmri_jax.refusals import Refused
 from vmri_jax.running.export import extra
@@ -24,8 +24,6 @@ from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.solver import Solver
 
-START = ("q_s", "q_f", "v_s", "v_f")
-"""Unknowns of these names are the start of the problem."""
 GAP_WEIGHTS = (1e-2, 1.0, 1e2, 1e4, 1e6)
 """Weights of the gaps between the parts of multiple shooting, for searches one after the other, each from the end of
 the one before. A gap as large as the motion counts like a miss of every value by this many standard deviations. A
@@ -64,10 +62,11 @@ def fit(
     Jacobian in forward mode. A fit that takes more than two seconds shows its phases on the error stream.
 
     Args:
-        problem: a problem whose ``system.params`` is a dict; `parameters` name its entries, or "q_s", "q_f", "v_s",
-            "v_f" for the start. Or a function ``{name: value} -> Problem``, for everything else.
+        problem: a problem; `parameters` name its params, "bonds.stiffness", the parts of its start, "q_s", "q_f",
+            "v_s", "v_f", or numbers in them, "masses[1]", "hub x". Or a function ``{name: value} -> Problem``, for
+            everything else.
         data: one or several sets of measurements.
-        parameters: an `Unknown` for each name, or the number where its search starts. Nested names: "bonds.stiffness".
+        parameters: an `Unknown` for each name, or the number where its search starts.
         scheme, macro_dt, solver: as in `simulate`. The times of measurement must be macro nodes. Where the solver is
             not chosen, runs have no fallback.
         segments: parts of multiple shooting; more than one for long or chaotic motion.
@@ -114,24 +113,17 @@ def _model(problem, parameters: Mapping) -> Callable[[Mapping], Problem]:
     if not isinstance(problem, Problem) and callable(problem) and not hasattr(problem, "problem"):
         return cast(Callable[[Mapping], Problem], problem)
     base = problem_of("fit", cast(Problem, problem))
-    params = base.system.params if isinstance(base.system.params, Mapping) else {}
-    known, structure = leaves_by_name(params, is_leaf=lambda value: not isinstance(value, Mapping))
+    known = {name: place for name, place in places_of(base).items() if name != "t"}
     for name, unknown in parameters.items():
-        if name not in known and name not in START:
-            places = f"system.params ({', '.join(free(known)) or 'no dict'}) nor of {', '.join(START)}"
-            raise Refused(f"fit: parameters has {name!r}, which is none of {places}. A function may make the Problem.")
-        expected = np.shape(known[name] if name in known else getattr(base, name))
+        if name not in known:
+            arrays = ", ".join(free(other for other in known if "[" not in other))
+            names = f"system.params and of the start ({arrays}), and numbers of arrays, q_f[0] for example"
+            raise Refused(f"fit: parameters has {name!r}, which is none of {names}. A function may make the Problem.")
+        expected = known[name][1]
         start = unknown.start if isinstance(unknown, Unknown) else unknown
         if np.shape(start) != expected:
             raise Refused(f"fit: the start of {name!r} has shape {np.shape(start)}; in the problem it has {expected}.")
-
-    def model(values: Mapping) -> Problem:
-        inside = {name: value for name, value in values.items() if name in known}
-        start = {name: value for name, value in values.items() if name not in known}
-        system = base.system.replace(params=structure.unflatten((known | inside).values())) if inside else base.system
-        return replace(base, system=system, **start)
-
-    return model
+    return partial(Placed({name: known[name][0] for name in parameters}), base)
 
 
 def _check(data: list, segments: int, starts: int, max_steps: int) -> None:
