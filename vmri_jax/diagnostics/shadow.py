@@ -101,7 +101,7 @@ def shadow_energy(system: Movable, scheme: Scheme | Composition, trajectory: Tra
     whole_number("shadow_energy: k", k)
     system = _checked(system, scheme, trajectory, k)
     t = np.asarray(trajectory.t)
-    nodes = State(*(jnp.asarray(a) for a in (t, *list(vars(trajectory.states).values())[1:])))
+    nodes = jax.tree.map(jnp.asarray, trajectory.states)
     macro_dt = (t[-1] - t[0]) / (len(t) - 1)
     actions, miss, result = _actions(system, scheme, nodes, macro_dt)
     if int(result) > Result.CONVERGED_AT_ROUNDOFF or not float(miss) < LARGEST_MISS:
@@ -118,9 +118,7 @@ def shadow_energy(system: Movable, scheme: Scheme | Composition, trajectory: Tra
 
 def _checked(system: Movable, scheme: Scheme | Composition, trajectory: Trajectory, k: int) -> System:
     """The system; refuses runs that conserve no energy, failed or have too few nodes."""
-    _, *nodes = vars(trajectory.states).values()
-    start = State(trajectory.t[..., 0], *(a[..., 0, :] for a in nodes))
-    system, _ = start_of("shadow_energy", system, start)
+    system, _ = start_of("shadow_energy", system, trajectory[0])
     if system.force is not None or system.is_rheonomic:
         cause = "forces" if system.force is not None else "constraints that depend on time"
         raise Refused(f"shadow_energy: the system has {cause}: no energy is kept. Leave them out.")

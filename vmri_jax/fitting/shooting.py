@@ -9,7 +9,7 @@ Source: H. G. Bock, Recent advances in parameter identification techniques for O
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from math import gcd
 
 import jax
@@ -101,8 +101,7 @@ class Shooting:
         problem = self.model(self.unknowns.at(u))
         steps = {"macro_dt": self.macro_dt, "num_steps": self.length * self.segments, "save": self.length}
         run = simulate(problem, self.scheme, **steps, solver=self.solver)
-        nodes = jax.tree.map(lambda a: np.asarray(a)[1:-1], run.states)
-        return np.asarray(jax.vmap(partial(_phase, problem))(nodes))
+        return np.concatenate([run.states.q_s, run.states.q_f, *run.velocities], axis=1)[1:-1]
 
     def sizes(self, u, starts) -> np.ndarray:
         """(2 n,) units of the starts of the parts in a search: the largest value of each coordinate at all starts, or

@@ -14,7 +14,6 @@ from vmri_jax import diagnostics
 from vmri_jax.accuracy.simulate import simulate
 from vmri_jax.diagnostics.shadow import ShadowEnergy
 from vmri_jax.hard_cases.case import Outcome
-from vmri_jax.mechanics.invariants import velocity
 from vmri_jax.mechanics.state import Problem, State
 from vmri_jax.refusals import Refused
 from vmri_jax.running.observables import LostEnergyWarning
@@ -163,9 +162,7 @@ def _terms(problem: Problem, scheme: Scheme, macro_dt: float) -> Iterator[tuple[
     start and nodes of a short run."""
     system, n_s = problem.system, problem.q_s.size
     along = run(problem, scheme, macro_dt, 20, save=5)
-    speeds = jax.jit(jax.vmap(lambda *z: jnp.concatenate(velocity(system, *z))))
-    velocities = np.asarray(speeds(along.q_s, along.q_f, along.p_s, along.p_f))
-    points = np.concatenate([along.q_s, along.q_f, velocities], axis=1)
+    points = np.concatenate([along.q_s, along.q_f, *along.velocities], axis=1)
     points, t = points[np.isfinite(points).all(axis=1)], along.t[0]
     n = points.shape[1] // 2
     for term in system.of_kind("potential"):
