@@ -76,8 +76,7 @@ class Drawing:
         kinematics, joints = self.carried
 
         def bodies_and_rates(q_s, q_f, v_s, v_f):
-            bodies, rates = jax.jvp(lambda q_s, q_f: kinematics(q_s, q_f, joints), (q_s, q_f), (v_s, v_f))
-            return *bodies, *rates
+            return *kinematics(q_s, q_f, joints), *kinematics.velocities(q_s, q_f, v_s, v_f, joints)
 
         return tuple(map(np.asarray, jax.jit(jax.vmap(bodies_and_rates))(q_s, q_f, v_s, v_f)))
 

@@ -126,9 +126,6 @@ def motion(
         raise Refused("motion: the trajectory has no node with finite positions; there is nothing to draw.")
     run = (trajectory if system is None else _of(trajectory, system))[:count]
     t, q_s, q_f = t[:count], q_s[:count], q_f[:count]
-    slow, fast, *_ = drawing.extended(q_s, q_f, 0 * q_s, 0 * q_f)
-    drawing = with_bars(drawing, slow, fast)
-    offset, matrix = drawing.maps(slow.shape[1], fast.shape[1])
     v_s, v_f = map(np.asarray, run.velocities) if run.origin.knows_system else _differences(t, q_s, q_f)
     all_nodes = Nodes(t, q_s, q_f, v_s, v_f)
     if run.micro is not None and not why_not(t, run.micro.t):
@@ -137,6 +134,8 @@ def motion(
             all_nodes = all_nodes._replace(v_f=CubicSpline(all_nodes.t, all_nodes.q_f)(all_nodes.t, 1))
     times, *phase = all_nodes
     slow, fast, v_slow, v_fast = drawing.extended(*phase)
+    drawing = with_bars(drawing, slow, fast)
+    offset, matrix = drawing.maps(slow.shape[1], fast.shape[1])
     q, v = np.concatenate([slow, fast], axis=1), np.concatenate([v_slow, v_fast], axis=1)
     energies, relative = _energies(run)
     residual = np.asarray(run.constraint_residual, dtype=float).reshape(count, -1)
