@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from vmri_jax.mechanics.kinematics import Kinematics
-from vmri_jax.mechanics.names import near
+from vmri_jax.mechanics.names import unknown
 from vmri_jax.refusals import Refused
 
 KINDS = ("link", "spring")
@@ -124,7 +124,7 @@ def check_keys(data: Any, needed: Sequence[str], optional: Sequence[str], where:
         raise Refused(f"{where} is {type(data).__name__}; it must be a dict with {', '.join(known)}.")
     for key in data:
         if key not in known:
-            raise Refused(f"{where} has no entry {key!r}.{near(str(key), known)} There are {', '.join(known)}.")
+            raise Refused(f"{where}: {unknown('entry', key, known)}")
     for key in needed:
         if key not in data:
             raise Refused(f"{where} lacks the entry {key!r}.")
@@ -282,10 +282,7 @@ def read_record(kind: type, readers: dict[str, Callable], data: Any, where: str)
 
 def _body_name(name: Any, names: Sequence[str], where: str) -> str:
     if name not in names:
-        listed = ", ".join(names[:12]) + (", ..." if len(names) > 12 else "")
-        raise Refused(
-            f"{where} names the body {name!r}, which does not exist.{near(str(name), names)} There are {listed}."
-        )
+        raise Refused(f"{where}: {unknown('body', name, names)}")
     return name
 
 
