@@ -288,8 +288,7 @@ def cases_for(problem: Problem | HasProblem) -> tuple[Case, ...]:
         ValueError: the problem is refused by `initial_state`.
     """
     problem = problem_of("cases_for", problem)
-    with Working("cases_for") as tell:
-        tell("small motions about the start", 0, 1)
+    with Working("cases_for: small motions about the start"):
         cases = resolved(problem)
     system = problem.system
     unconstrained = "" if system.is_constrained else "the system has no constraints"
