@@ -154,7 +154,10 @@ def motion(
 
 def _of(trajectory: Trajectory, system: System) -> Trajectory:
     """The run with its system, which must be the one of the run."""
-    run = trajectory.of(system)
+    try:
+        run = trajectory.of(system)
+    except Refused as error:
+        raise Refused(f"motion: {error} Give the system that was simulated.") from error
     _, *phase = vars(run[0]).values()
     energy, run_energy = float(diagnostics.energy(system, *phase)), float(trajectory.energy[0])
     if abs(energy - run_energy) > 1e-6 * max(1.0, abs(run_energy)):
