@@ -23,8 +23,7 @@ from vmri_jax.refusals import Refused
 from vmri_jax.running.prepare import prepare
 from vmri_jax.running.progress import ShowsProgress, progress_to
 from vmri_jax.running.trajectory import Trajectory
-from vmri_jax.schemes.composition import Composition
-from vmri_jax.schemes.scheme import Scheme
+from vmri_jax.schemes.composition import SchemeLike
 from vmri_jax.steppers.plan import plan
 from vmri_jax.steppers.results import SimulationError
 from vmri_jax.steppers.solver import Solver
@@ -77,7 +76,7 @@ def minimize(
     problem: Problem | HasProblem,
     cost: Callable,
     *,
-    scheme: Scheme | Composition,
+    scheme: SchemeLike,
     macro_dt: float,
     num_steps: int,
     actuate: Callable | None = None,

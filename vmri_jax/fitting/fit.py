@@ -20,8 +20,7 @@ from vmri_jax.refusals import Refused
 from vmri_jax.running.export import extra
 from vmri_jax.running.prepare import prepare
 from vmri_jax.running.progress import Progress, Working
-from vmri_jax.schemes.composition import Composition
-from vmri_jax.schemes.scheme import Scheme
+from vmri_jax.schemes.composition import SchemeLike
 from vmri_jax.steppers.solver import Solver
 
 GAP_WEIGHTS = (1e-2, 1.0, 1e2, 1e4, 1e6)
@@ -43,7 +42,7 @@ def fit(
     data: Measured | Sequence[Measured],
     parameters: Mapping[str, Unknown | float],
     *,
-    scheme: Scheme | Composition,
+    scheme: SchemeLike,
     macro_dt: float,
     segments: int = 1,
     starts: int = 1,

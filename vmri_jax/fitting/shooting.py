@@ -22,8 +22,7 @@ from vmri_jax.mechanics.constraints import known_mass
 from vmri_jax.mechanics.invariants import velocity
 from vmri_jax.mechanics.state import Problem, State, initial_state
 from vmri_jax.running.arguments import Save
-from vmri_jax.schemes.composition import Composition
-from vmri_jax.schemes.scheme import Scheme
+from vmri_jax.schemes.composition import SchemeLike
 from vmri_jax.steppers.solver import Solver
 
 SMALLEST_SIZE = 1e-3
@@ -48,7 +47,7 @@ class Shooting:
     unknowns: Unknowns
     data: Sequence[Measured]
     steps: Sequence[np.ndarray]
-    scheme: Scheme | Composition
+    scheme: SchemeLike
     solver: Solver
     macro_dt: float
     segments: int

@@ -16,8 +16,8 @@ from vmri_jax.mechanics.driving import driven, generic, sampled_with_rates
 from vmri_jax.mechanics.linearisation import Linearisation
 from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.mechanics.system import System
-from vmri_jax.schemes.composition import Composition, stage_scheme
-from vmri_jax.schemes.scheme import Scheme, fully_implicit
+from vmri_jax.schemes.composition import SchemeLike, stage_scheme
+from vmri_jax.schemes.scheme import fully_implicit
 from vmri_jax.stability.multipliers import monodromy
 
 SAMPLES = 1024
@@ -137,9 +137,7 @@ def growth_over_period(moving: Movable, linear: Linearisation) -> DrivenMotion |
     return None if period is None else driven_motion(system, fully_implicit(1), state, step, period)
 
 
-def driven_motion(
-    system: System, scheme: Scheme | Composition, state: State, macro_dt: float, period: float
-) -> DrivenMotion:
+def driven_motion(system: System, scheme: SchemeLike, state: State, macro_dt: float, period: float) -> DrivenMotion:
     """The mean growth over a period of the drive, from steps of T/n, which are halved until two of them agree."""
     n, micro, tried = max(1, int(np.ceil(period / macro_dt - 1e-6))), stage_scheme(scheme).num_micro, {}
     followed = period, periods_of_run(macro_dt, period)
