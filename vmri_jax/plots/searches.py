@@ -36,9 +36,7 @@ def plot_control(optimum: Any, *, title: str = "", theme: Theme = LIGHT) -> Note
         limit_times(above, t)
         legend_beside(above)
         for axes, (values, labels, quantity, _) in zip(middle, panels, strict=True):
-            coordinates(axes, t, values, labels, theme)
-            axes.set(ylabel=quantity)
-            limit_times(axes, t)
+            coordinates(axes, t, values, labels, quantity, theme)
         (middle or [above])[-1].set_xlabel("time $t$")
         for name, color in zip(("update", "gap", "miss", "over"), theme.curves, strict=False):
             values = np.array([iteration[name] for iteration in optimum.history])
