@@ -19,8 +19,7 @@ from benchmarks.measure import Tell, exactly, ratio, silent
 from benchmarks.report import Claim, Report
 from vmri_jax import plots
 from vmri_jax.ensembles import Axis, Draws, Ensemble, Product
-from vmri_jax.ensembles.prepared import prepared
-from vmri_jax.ensembles.work import Work
+from vmri_jax.ensembles.work import Work, prepared
 from vmri_jax.executors.executor import as_done, executor_of, local_workers, submitter
 from vmri_jax.running.store.layout import committed
 

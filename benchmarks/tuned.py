@@ -14,7 +14,7 @@ from benchmarks.dear.systems import molecules
 from benchmarks.measure import Tell, quartiles, ratio, silent
 from benchmarks.report import Claim, Report
 from vmri_jax.accuracy.companions import UncertifiedWarning
-from vmri_jax.accuracy.steps import AccuracyNotReached
+from vmri_jax.accuracy.simulate import AccuracyNotReached
 from vmri_jax.mechanics.state import problem_of
 from vmri_jax.running.timing import interleaved, stopwatch
 from vmri_jax.study import families, reference_solution, tune

@@ -51,10 +51,8 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
 from vmri_jax import diagnostics
-from vmri_jax.accuracy.batch import FailedLanesWarning, simulate_batch
 from vmri_jax.accuracy.companions import UncertifiedWarning
-from vmri_jax.accuracy.simulate import simulate
-from vmri_jax.accuracy.steps import AccuracyNotReached
+from vmri_jax.accuracy.simulate import AccuracyNotReached, FailedLanesWarning, simulate, simulate_batch
 from vmri_jax.configure import NotConfiguredWarning, configure
 from vmri_jax.mechanics.functions import CompiledAgainWarning
 from vmri_jax.mechanics.names import Names

@@ -21,7 +21,7 @@ from benchmarks.report import Claim, Report
 from vmri_jax import plots
 from vmri_jax.running.simulation import Simulation
 from vmri_jax.running.timing import seconds_each
-from vmri_jax.study.reference_solution import joined
+from vmri_jax.study.row import joined
 
 TARGET = 1e-5
 """Error of the positions at the end at which times are compared."""

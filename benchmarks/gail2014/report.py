@@ -96,8 +96,7 @@ def gail2014(
     console.print("\n" + escape("\n".join(report.in_five_lines())), soft_wrap=True)
     if report.failed:
         reasons = "\n".join(f"{figure.name}: {figure.error}" for figure in report.failed)
-        print_failure("Figures that failed", reasons)
-        raise typer.Exit(1)
+        raise print_failure("Figures that failed", reasons)
 
 
 def _figure_done(result: FigureResult) -> None:

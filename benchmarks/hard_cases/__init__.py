@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from benchmarks.measure import prepare
-from vmri_jax.cli.check import Full, Numbers, Out, run_and_show
+from vmri_jax.cli.right import Full, Numbers, Out, run_and_show
 from vmri_jax.hard_cases import Case, Outcome
 from vmri_jax.running.trajectory import Trajectory
 

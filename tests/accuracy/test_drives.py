@@ -113,7 +113,7 @@ def test_steps_over_a_pulse_are_not_certified():
 
 
 def test_events_demand_many_steps(monkeypatch):
-    monkeypatch.setattr("vmri_jax.accuracy.steps.MANY_STEPS", 100)
+    monkeypatch.setattr("vmri_jax.accuracy.search.MANY_STEPS", 100)
     with pytest.warns(UserWarning, match="force of the system changes and changes back within 0.03"):
         vm.simulate(oscillator(RECTANGLE, 7.123, 0.03, 20.0), vm.fully_explicit(1), accuracy=1e-1, t_end=LENGTH)
 

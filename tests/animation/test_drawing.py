@@ -83,7 +83,7 @@ def changed(path, value):
         ({"blocks": [{"name": "modes", "coordinates": [[[2.0, "s", 1]]]}]}, ["blocks[0]: coordinates"]),
         (PENDULUM | {"blocks": [{"name": "bob", "coordinates": [["s", 0]]}]}, ["2 bodies are named 'bob'"]),
         (changed(["spring"], []), ["no entry 'spring'", "Did you mean springs?"]),
-        (changed(["links"], [["bob", "tipp"]]), ["links[0]", "'tipp'", "does not exist", "Did you mean tip?"]),
+        (changed(["links"], [["bob", "tipp"]]), ["links[0]", "no body 'tipp'", "Did you mean tip?"]),
         (changed(["links"], [["bob", "bob"]]), ["links[0]", "with itself"]),
         (changed(["links"], [["bob"]]), ["links[0]", "pair of names"]),
         (changed(["links"], [["bob", "tip", "quick"]]), ["links[0]", "'quick'", "slow or fast"]),

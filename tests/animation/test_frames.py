@@ -12,7 +12,7 @@ from PIL import Image
 from tests.animation.support import PENDULUM, swinging
 from vmri_jax import plots
 from vmri_jax.animation import Drawing, motion, plot_strip, write_gif
-from vmri_jax.animation.camera import FILLED_PART, Camera
+from vmri_jax.animation.geometry import FILLED_PART, Camera
 from vmri_jax.animation.layout import layout, nice
 from vmri_jax.animation.shapes import Stage
 

@@ -104,7 +104,7 @@ def test_wrong_systems_and_batches_are_refused():
     with pytest.raises(ValueError, match=r"has the energy 8\.75 at the start, the run 9\.5"):
         motion(run, LINE, heavier)
     larger = vm.System(vm.ConstantMass([1.0, 1.0, 1.0], [1.0]), harmonic, stiff)
-    with pytest.raises(ValueError, match="does not go with a run of 2 slow and 1 fast"):
+    with pytest.raises(ValueError, match="the run has 2 slow and 1 fast coordinates"):
         motion(run.with_arrays(q_s=np.ones((11, 2)), p_s=np.ones((11, 2))), LINE, larger)
     batch = run.with_arrays(t=np.ones((5, 11)))
     with pytest.raises(ValueError, match=r"batch of shape \(5,\)"):

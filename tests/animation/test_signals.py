@@ -10,7 +10,7 @@ import vmri_jax as vm
 from tests.animation.support import trajectory
 from vmri_jax import plots
 from vmri_jax.animation import Drawing, bars, motion, plot_strip
-from vmri_jax.animation.curves import PERIODS, fast_signal, slow_signal, window
+from vmri_jax.animation.frames import PERIODS, fast_signal, slow_signal, window
 from vmri_jax.animation.html import _data
 from vmri_jax.animation.layout import layout
 from vmri_jax.mechanics.names import Names

@@ -13,7 +13,7 @@ import vmri_jax as vm
 from benchmarks import c_loops, dear
 from benchmarks.dear import compare, figures, peers, spacecraft, systems
 from vmri_jax.mechanics.invariants import potential_energy
-from vmri_jax.study.reference_solution import joined
+from vmri_jax.study.row import joined
 
 
 def test_two_molecules(monkeypatch):

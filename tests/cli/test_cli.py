@@ -377,13 +377,13 @@ def test_simulate_composes(vmri):
 # --- places that cannot be written, and parts that fail late -----------------------------------------------------------
 
 
-COMPUTING = {
-    "cli.run": "_run",
-    "study": "tune",
-    "study.cost_report": "Tuning",
-    "cli.stability": "stability_map",
-    "cli.check": "cases_for",
-}
+COMPUTING = (
+    ("cli.run", "_run"),
+    ("study", "tune"),
+    ("study.tuning", "Tuning"),
+    ("cli.right", "stability_map"),
+    ("cli.right", "cases_for"),
+)
 """What the commands compute with."""
 
 
@@ -408,7 +408,7 @@ def test_a_place_that_cannot_be_written_is_refused_before_any_compute(vmri, monk
     def too_early(*_, **__):
         raise AssertionError("computed before the place was checked")
 
-    for module, name in COMPUTING.items():
+    for module, name in COMPUTING:
         monkeypatch.setattr(importlib.import_module(f"vmri_jax.{module}"), name, too_early)
     code, text = vmri(*(word.replace("PLACE", place) for word in arguments))
     assert code in (1, 2)
@@ -437,7 +437,7 @@ NOTHING = WorkPrecision(())
 
 def test_a_page_that_cannot_be_drawn_leaves_the_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    page = importlib.import_module("vmri_jax.study.cost_report")
+    page = importlib.import_module("vmri_jax.study.tuning")
 
     def failing(problem, name, out, **_):
         page._write(page.CostReport(out / "cost.html", name, 1.0, (1e-2,), NOTHING), problem)

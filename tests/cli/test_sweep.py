@@ -13,8 +13,7 @@ from typer.testing import CliRunner
 
 import vmri_jax as vm
 from vmri_jax import cli
-from vmri_jax.cli.columns import by_name
-from vmri_jax.cli.sweep import read_sweep
+from vmri_jax.cli.sweep import by_name, read_sweep
 from vmri_jax.ensembles.quantities import drawn_by_default
 
 SMALL = """

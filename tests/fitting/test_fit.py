@@ -8,7 +8,8 @@ import pytest
 
 import vmri_jax as vm
 from vmri_jax.fitting import Measured, Unknown
-from vmri_jax.fitting.unknowns import Unknowns
+from vmri_jax.fitting.fit import _model
+from vmri_jax.fitting.given import Unknowns
 from vmri_jax.schemes.composition import SchemeLike
 
 CHAIN = vm.systems.fermi_pasta_ulam(1, omega=20.0)
@@ -183,7 +184,9 @@ def test_numbers_of_a_scene_have_the_names_of_their_effects():
     data = Measured(run.t, run.states.q_s, sigma=1e-6, observe=lambda state: state.q_s)
     found = vm.fit(scene, data, {"bond.stiffness": Unknown(36.0, lower=0)}, scheme=single, macro_dt=DT)
     assert found.parameters["bond.stiffness"] == pytest.approx(40.0, rel=1e-6)
-    with pytest.raises(ValueError, match=r"'bond.length_', which is none of system.params \(bond.length"):
+    with pytest.raises(
+        ValueError, match=r"'bond.length_', which is none of system.params and of the start \(bond.length"
+    ):
         vm.fit(scene, data, {"bond.length_": 1.0}, scheme=single, macro_dt=DT)
     with pytest.raises(TypeError, match="start is a dict; name its numbers one by one"):
         Unknown({"stiffness": 1.0})
@@ -207,3 +210,8 @@ def test_systems_without_slow_variables_are_fitted():
     data = Measured(run.t, run.q_f, sigma=1e-3, observe=lambda s: s.q_f)
     found = vm.fit(problem, data, {"stiffness": Unknown(7.0, lower=0)}, scheme=vm.fully_explicit(1), macro_dt=0.05)
     assert found.parameters["stiffness"] == pytest.approx(8.0, abs=1e-9)  # measured: 1e-13
+
+
+def test_a_single_number_of_the_start_is_an_unknown(fpu):
+    model = _model(fpu, {"q_f[1]": 0.5})
+    np.testing.assert_array_equal(model({"q_f[1]": 0.7}).q_f, [fpu.q_f[0], 0.7, *fpu.q_f[2:]])

@@ -9,8 +9,8 @@ import vmri_jax as vm
 from tests.fitting.test_fit import CHAIN, DT, SCHEME, measured, product, spring
 from tests.support import PROBLEMS
 from vmri_jax.fitting import Unknown
+from vmri_jax.fitting.given import Unknowns
 from vmri_jax.fitting.shooting import Shooting
-from vmri_jax.fitting.unknowns import Unknowns
 
 
 def fit_of_long_motion(**options):

@@ -14,7 +14,7 @@ from vmri_jax.study import (
     convergence_study,
     cost_report,
 )
-from vmri_jax.study.reference_solution import joined
+from vmri_jax.study.row import joined
 
 SCHEME, T_END = vm.fully_explicit(1), 0.08
 
@@ -59,7 +59,7 @@ def test_cost_reports_keep_their_runs_while_the_page_is_drawn(monkeypatch, tmp_p
     def drawing(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(import_module("vmri_jax.study.cost_report"), "_write", drawing)
+    monkeypatch.setattr(import_module("vmri_jax.study.tuning"), "_write", drawing)
     menu = [replace(of_order_2(vm.fully_explicit), first=1)]
     with pytest.raises(vm.Interrupted) as caught:
         cost_report(one_coordinate(), "mass", tmp_path, t_end=T_END, errors=[1e-3], menu=menu)

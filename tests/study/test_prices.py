@@ -9,7 +9,7 @@ import pytest
 import vmri_jax as vm
 from tests.small_systems import no_constraint
 from vmri_jax.study import ReferenceSolution, Row, WorkPrecision, convergence_study
-from vmri_jax.study.cost_report import bound_of, prices
+from vmri_jax.study.tuning import bound_of, prices
 
 EXACT = ReferenceSolution(np.zeros((2, 4)), np.zeros((2, 4)))
 ROW = Row("kicks", 5, 2, 4, 0.1, 1e-3, seconds=2.0, slow_evaluations=4, fast_evaluations=20)

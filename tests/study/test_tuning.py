@@ -14,8 +14,7 @@ from vmri_jax.accuracy import search
 from vmri_jax.accuracy.families import by_promise
 from vmri_jax.running.interrupts import Interrupted
 from vmri_jax.study import cost_report, families, reference_solution, tune
-from vmri_jax.study.cost_report import default_t_end
-from vmri_jax.study.tuning import NothingReached
+from vmri_jax.study.tuning import NothingReached, default_t_end
 
 SHORT_MENU = [family for family in families() if family.name in ("fully explicit", "fully explicit, suzuki4")]
 

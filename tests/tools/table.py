@@ -63,7 +63,7 @@ class Cell:
     def quick_searches(self) -> None:
         """Let searches know one family, without micro steps."""
         self.patch.setattr("vmri_jax.study.tuning.families", lambda: MENU)
-        self.patch.setattr("vmri_jax.accuracy.search.micro_steps_help", lambda *_: False)
+        self.patch.setattr("vmri_jax.accuracy.search.Search.has_two_rates", False)
 
 
 @cache

@@ -27,13 +27,14 @@ all nodes before it are small against the extent of the motion.
 import math
 import warnings
 from collections.abc import Callable
-from dataclasses import replace
-from functools import partial
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, Self
 
 import numpy as np
 
 from vmri_jax.mechanics.arrays import of_one_type
-from vmri_jax.mechanics.driving import Events, events
+from vmri_jax.mechanics.driving import Events
 from vmri_jax.refusals import Refused
 from vmri_jax.running.arguments import Save
 from vmri_jax.running.observables import SingularCoordinatesWarning
@@ -72,55 +73,77 @@ class UncertifiedWarning(UserWarning):
     """The error of a run is not certified over all of its length."""
 
 
-def with_error(
-    run: Simulation,
-    trajectory: Trajectory,
-    of: Callable | None = None,
-    shares: bool = False,
-    trial: tuple[Trajectory, np.ndarray] | None = None,
-) -> Trajectory:
-    """The trajectory of a run without a failed step, with its `RunError`; warns if the error is not certified over the
-    whole run. A `trial` has the companion with half the macro step and the errors (k, n_s + n_f), if they are known."""
-    drives = events(run.system, run.state, float(trajectory.t[-1])) if trial is None else Events()
-    halved, total = trial or (companion(run, 2), None)
+@dataclass(frozen=True)
+class Compared:
+    """A run, or a lane of a batch, beside its companion with half the macro step.
+
+    errors: (k, n_s + n_f) of the positions; NaN after a failure of the run or of this companion, infinite if a further companion fails.
+    drives: events that the steps have to see.
+    """
+
+    run: Simulation
+    trajectory: Trajectory
+    halved: Trajectory
+    errors: np.ndarray
+    drives: Events
+
+    @classmethod
+    def of(
+        cls,
+        run: Simulation,
+        trajectory: Trajectory,
+        drives: Events,
+        companion_of: Callable[..., Trajectory],
+        accuracy: float = 0.0,
+        **more: Any,
+    ) -> Self:
+        """A run with its errors, from the companion ``companion_of(2)``, and from further ones, ``companion_of(parts, whole)``, if the system is
+        driven or its errors are below `DOUBTED` of the accuracy; `more` are fields of a subclass."""
+        halved, order = companion_of(2), 1 if drives.jump else run.order
+        errors = extrapolated(order, trajectory, halved)
+        has_failed = max(int(trajectory.failed_at), int(halved.failed_at)) >= 0
+        is_believed = not drives.names and np.abs(errors).max(initial=0.0) > DOUBTED * accuracy
+        if not (has_failed or is_believed):
+            errors = _with_further_companions(run, trajectory, errors, drives, companion_of, order)
+        return cls(run, trajectory, halved, errors, drives, **more)
+
+    @cached_property
+    def error(self) -> float:
+        """The largest error; infinite unless all errors are certified."""
+        certified, _ = certified_nodes(self.trajectory, self.errors)
+        return float(largest_of(self.errors).max()) if certified.all() else np.inf
+
+
+def with_error(compared: Compared, of: Callable | None = None, shares: bool = False) -> Trajectory:
+    """The trajectory of a run without a failed step, with its `RunError`; warns if the error is not certified over the whole run."""
+    run, trajectory, halved = compared.run, compared.trajectory, compared.halved
     error, reason = None, ""
     if int(halved.failed_at) >= 0:
         failed = float(halved.t[0]) + int(halved.failed_at) * float(run.macro_dt) / 2
         reason = f"the error is not known; the same run with half the macro step failed at t = {failed:.4g}."
     else:
-        error = run_error(run, trajectory, halved, drives, partial(companion, run), total, shares, of)
+        error = run_error(compared, of, shares)
         if not error.is_certified:
-            unseen = first_unseen(run, drives)
+            unseen = first_unseen(run, compared.drives)
             is_seen = unseen > trajectory.t[-1]
-            reason = _uncertified(error, trajectory, run, halved) if is_seen else _stepped_over(run, drives, unseen)
+            reason = _uncertified(error, compared) if is_seen else _stepped_over(run, compared.drives, unseen)
     if reason:
         warnings.warn(f"simulate: {reason}", UncertifiedWarning, stacklevel=3)
     return replace(trajectory, error=error)
 
 
-def run_error(
-    run: Simulation,
-    trajectory: Trajectory,
-    halved: Trajectory,
-    drives: Events,
-    companion_of: Callable[[int, int], Trajectory],
-    total: np.ndarray | None = None,
-    shares: bool = False,
-    of: Callable | None = None,
-) -> RunError:
-    """The error of a run or of a lane of a batch, NaN where it is not certified: `total` (k, n_s + n_f), or the
-    `estimated_errors`; `halved` has half the macro step."""
-    order = run.order
-    total = estimated_errors(run, trajectory, halved, drives, companion_of) if total is None else total
+def run_error(compared: Compared, of: Callable | None = None, shares: bool = False) -> RunError:
+    """The error of a run, NaN where it is not certified."""
+    run, trajectory, total = compared.run, compared.trajectory, compared.errors
     fast = np.full_like(total, np.nan)
     if shares:
         twice = run.scheme.with_num_micro(2 * stage_scheme(run.scheme).num_micro)
-        fast = extrapolated(order, trajectory, companion(replace(run, scheme=of_one_type(twice)), 1))
+        fast = extrapolated(run.order, trajectory, companion(replace(run, scheme=of_one_type(twice)), 1))
     certified, growth = certified_nodes(trajectory, total)
-    certified[1:] &= np.asarray(trajectory.t)[1:] <= first_unseen(run, drives)
+    certified[1:] &= np.asarray(trajectory.t)[1:] <= first_unseen(run, compared.drives)
     until = np.asarray(trajectory.t)[certified][-1]
     total, slow, fast = (np.where(certified[:, None], a, np.nan) for a in (total, total - fast, fast))
-    of_error = None if of is None else _of_error(of, order, trajectory, halved, certified)
+    of_error = None if of is None else _of_error(of, compared, certified)
     q_s, q_f = np.split(total, [trajectory.states.q_s.shape[-1]], axis=1)
     shares_at_nodes = largest_of(slow), largest_of(fast)
     return RunError(q_s, q_f, *shares_at_nodes, of_error, np.asarray(until), np.asarray(growth))
@@ -136,23 +159,8 @@ def extrapolated(order: int, trajectory: Trajectory, finer: Trajectory) -> np.nd
     return ratio(order) * (positions(trajectory) - positions(finer))
 
 
-def estimated_errors(
-    run: Simulation,
-    trajectory: Trajectory,
-    halved: Trajectory,
-    drives: Events,
-    companion_of: Callable[[int, int], Trajectory],
-    accuracy: float = 0.0,
-) -> np.ndarray:
-    """(k, n_s + n_f) errors of the positions, from the companion with half the macro step, and from further ones if the
-    system is driven or its errors are below `DOUBTED` of the accuracy; NaN after a failure of the run or of this
-    companion, infinite if a further companion fails."""
-    if max(int(trajectory.failed_at), int(halved.failed_at)) >= 0:
-        return extrapolated(run.order, trajectory, halved)
-    order = 1 if drives.jump else run.order
-    result = extrapolated(order, trajectory, halved)
-    if not drives.names and np.abs(result).max(initial=0.0) > DOUBTED * accuracy:
-        return result
+def _with_further_companions(run, trajectory, errors, drives: Events, companion_of, order: int) -> np.ndarray:
+    """The largest of the errors and of the errors from further companions at each node; infinite if one of them fails."""
     # From a compared node to the next, `stride` saved nodes later: `whole` steps of the run, `parts` of the companion.
     strides = [s for s in range(1, run.num_saves + 1) if run.num_saves % s == 0]
     stride = next((s for s in strides if s * run.save_every >= FEWEST_DIVIDED), run.num_saves)
@@ -161,11 +169,11 @@ def estimated_errors(
         parts = next(k for k in range(max(round(factor * whole), 3), 10 * whole + 4) if math.gcd(k, whole) == 1)
         further = companion_of(parts, whole)
         if int(further.failed_at) >= 0:
-            return np.full_like(result, np.inf)
+            return np.full_like(errors, np.inf)
         difference = ratio(order, parts / whole) * (positions(trajectory)[::stride] - positions(further))
-        errors = np.concatenate([difference[:1], np.repeat(difference[1:], stride, axis=0)])
-        result = np.where(np.abs(errors) > np.abs(result), errors, result)
-    return result
+        others = np.concatenate([difference[:1], np.repeat(difference[1:], stride, axis=0)])
+        errors = np.where(np.abs(others) > np.abs(errors), others, errors)
+    return errors
 
 
 def node_distance(scheme: SchemeLike, drives: Events) -> float:
@@ -191,12 +199,11 @@ def first_unseen(run: Simulation, drives: Events) -> float:
     return float(starts.min(initial=np.inf))
 
 
-def _of_error(
-    of: Callable, order: int, trajectory: Trajectory, halved: Trajectory, certified: np.ndarray
-) -> np.ndarray:
+def _of_error(of: Callable, compared: Compared, certified: np.ndarray) -> np.ndarray:
     """Error of a function of the run: NaN at nodes that are not certified; of a function without a value for each node
     NaN unless all nodes are certified."""
-    error = ratio(order) * (np.asarray(of(trajectory)) - np.asarray(of(halved)))
+    values, halved_values = (np.asarray(of(run)) for run in (compared.trajectory, compared.halved))
+    error = ratio(compared.run.order) * (values - halved_values)
     has_node_values = error.shape[:1] == certified.shape
     shown = certified.reshape(-1, *(1,) * (error.ndim - 1)) if has_node_values else certified.all()
     return np.where(shown, error, np.nan)
@@ -260,13 +267,14 @@ def positions(trajectory: Trajectory) -> np.ndarray:
     return np.concatenate([trajectory.states.q_s, trajectory.states.q_f], axis=1)
 
 
-def _is_chaotic(error: RunError, trajectory: Trajectory, run: Simulation, halved: Trajectory) -> bool:
+def _is_chaotic(error: RunError, compared: Compared) -> bool:
     """Whether small differences grow like exp(L t) by the motion itself, and not by large steps: between two runs with
     a half and a quarter of the macro step. Driven motions, which may be pumped, are left out."""
+    trajectory = compared.trajectory
     if not (float(error.growth) > CHAOTIC_GROWTH and trajectory.keeps_energy) or trajectory.concerns():
         return False
-    quartered = companion(run, 4)
-    envelope = np.maximum.accumulate(largest_of(positions(halved) - positions(quartered)))
+    quartered = companion(compared.run, 4)
+    envelope = np.maximum.accumulate(largest_of(positions(compared.halved) - positions(quartered)))
     t = np.asarray(trajectory.t)
     half, last = np.searchsorted(t, [(t[0] + error.certified_until) / 2, error.certified_until])
     return bool(envelope[last] > CHAOTIC_GROWTH * envelope[half])  # False for NaN, where a companion failed
@@ -281,12 +289,13 @@ def _stepped_over(run: Simulation, drives: Events, unseen: float) -> str:
     )
 
 
-def _uncertified(error: RunError, trajectory: Trajectory, run: Simulation, halved: Trajectory) -> str:
+def _uncertified(error: RunError, compared: Compared) -> str:
     """The reason why an error is not certified, and advice."""
+    trajectory = compared.trajectory
     t, energy = float(error.certified_until), np.asarray(trajectory.energy)
     change = np.abs(energy - energy[0]).max()
     kept = f" The energy has changed by at most {change:.1e}." if trajectory.keeps_energy else ""
-    if _is_chaotic(error, trajectory, run, halved):
+    if _is_chaotic(error, compared):
         return (
             f"the motion is chaotic, small errors have grown {float(error.growth):.0f} times in the second half of the time until t = {t:.4g}: "
             f"from there on an error of positions means nothing.{kept}"

@@ -17,6 +17,7 @@ families that promise the least time; their steps for the accuracy. `vmri_jax.si
 of two families, `vmri_jax.tune` compares the best of many.
 """
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
@@ -25,17 +26,16 @@ import numpy as np
 
 from vmri_jax.accuracy.companions import (
     FEWEST_DIVIDED,
-    certified_nodes,
     check_function_of_run,
     companion,
-    estimated_errors,
     extent_of,
     extrapolated,
     fewest_steps,
 )
-from vmri_jax.accuracy.families import Family, micro_steps_help, unit_of
-from vmri_jax.accuracy.trials import LEAST_TIME, Trial, seconds_of_steps
+from vmri_jax.accuracy.families import LEAST_TIME, Family, Trial, seconds_of_steps, unit_of
+from vmri_jax.mechanics.checks import check_number
 from vmri_jax.mechanics.driving import Events, events
+from vmri_jax.mechanics.invariants import velocity
 from vmri_jax.mechanics.linearisation import Linearisation, linearise
 from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.refusals import Refused
@@ -46,14 +46,18 @@ from vmri_jax.running.saved import check_memory
 from vmri_jax.running.settings import Settings
 from vmri_jax.running.simulation import Simulation, simulation
 from vmri_jax.running.timing import stopwatch
-from vmri_jax.schemes.composition import stage_lengths, stage_scheme
+from vmri_jax.schemes.composition import SchemeLike, stage_lengths, stage_scheme
 from vmri_jax.steppers.solver import Solver
 
 AIMED_PART = 0.5
 """Part of the accuracy for which steps are chosen. Trials predict errors of finer runs to about a factor of 2: with a
 larger part more runs miss the accuracy and are repeated, with a smaller part all runs take more steps."""
+ROUNDOFF = 100 * np.finfo(float).eps
+"""Error refused as round-off, as a part of the largest position; a larger value refuses reachable accuracies."""
 MOST_SAVED = 1000
 """Most saved intervals of a run with an accuracy if the user gives no number; a larger value takes more memory."""
+MANY_STEPS = 100_000
+"""Macro steps that short events demand, above which a warning tells of them; a smaller value warns of fast runs."""
 FEWEST_STEPS = 16
 """Macro steps of the first trial of a scheme; a trial without a certified error is repeated with twice the steps. A
 larger value makes searches with large accuracies slower."""
@@ -103,7 +107,9 @@ SHORTER_STEPS = (1.0, 0.98, 0.96, 0.93, 0.9, 0.86, 0.82, 0.78)
 class Search:
     """Trial runs of several schemes from the same start until `t_end`; arguments as of `vmri_jax.simulate`.
 
+    name: of the accuracy, which begins messages.
     system, start, t_end, length: of all runs.
+    falls_back: whether trials may take the fallback.
     seconds: measured seconds of a macro step by the Python expression of the scheme.
     """
 
@@ -117,13 +123,14 @@ class Search:
         num_saves: int | None = None,
         of: Callable | None = None,
         progress: Progress = silent,
+        name: str = "simulate: accuracy",
     ):
         self.system, self.start = start_of("simulate", moving, state)
         refuse_tracers("simulate: an accuracy", (self.start, self.system.params, t_end))
-        self.t_end, self.length = float(t_end), float(t_end - self.start.t)
+        self.name, self.t_end, self.length = name, float(t_end), float(t_end - self.start.t)
         if not 0 < self.length < np.inf:
             raise Refused(f"t_end is {self.length:g} after the start; it must be later, by a finite time.")
-        self.num_saves, self.progress, self.num_trials = num_saves, progress, 0
+        self.num_saves, self.progress, self.num_trials, self.falls_back = num_saves, progress, 0, False
         self.seconds: dict[str, float] = {}
         self._arguments, self._of = (moving, state, solver), of
         self._runs: dict[tuple[str, int], Simulation] = {}
@@ -138,20 +145,49 @@ class Search:
 
     @cached_property
     def has_two_rates(self) -> bool:
-        """Whether micro steps may save time."""
-        return micro_steps_help(self.system, self.start)
+        """Whether micro steps may save time: there are fast coordinates, and slow ones or potentials for the macro grid."""
+        has_slow = self.start.q_s.size or self.system.slow_potential is not None or self.system.potentials
+        return bool(self.start.q_f.size and has_slow)
+
+    @property
+    def round_off(self) -> float:
+        """The error of positions that round-off alone causes."""
+        return ROUNDOFF * max(float(np.abs(np.asarray(q)).max(initial=0.0)) for q in (self.start.q_s, self.start.q_f))
+
+    def check(self, accuracy: float) -> None:
+        """Refuse accuracies that round-off hides."""
+        check_number(self.name, accuracy)
+        if not accuracy > self.round_off:
+            size = f"the largest position is {self.round_off / ROUNDOFF:.3g}"
+            reason = f"{size}, so that round-off of float64 alone is about {self.round_off:.0e}"
+            raise Refused(f"{self.name} is {accuracy:g}; {reason}. Give a larger one, in the unit of the positions.")
+
+    def check_extent(self, accuracy: float) -> None:
+        """Refuse an accuracy above the extent of the motion in the first trials."""
+        extent = self.extent()
+        # Driven systems: positions at few saved nodes may hide the motion, and all trials see the events.
+        if accuracy > extent and not self.drives.names:
+            moves = f"no position moves by more than {extent:.3g} until t = {self.t_end:g}: any run is as accurate"
+            raise Refused(f"{self.name} is {accuracy:g}, and {moves}; give a smaller one.")
+
+    def digits(self, accuracy: float) -> float:
+        """The digits of an accuracy, at least one, relative to the largest position, or largest speed times length."""
+        q, v = (self.start.q_s, self.start.q_f), velocity(self.system, *list(vars(self.start).values())[1:])
+        size, speed = (max(np.abs(np.asarray(a)).max(initial=0.0) for a in pair) for pair in (q, v))
+        return float(np.log10(max((size or speed * self.length) / accuracy, 10.0)))
 
     def cheapest(
         self, menu: Sequence[Family], accuracy: float, finalists: int = 1, exhaustive: bool = False
     ) -> list[Trial]:
         """Trials with steps for the accuracy, of the families that promise the least time, the most promising one
-        first; exhaustive ones of all families with all of `NUM_MICRO`."""
+        first; exhaustive ones of all families with all of `NUM_MICRO`. Refuses an accuracy that any run keeps."""
         if exhaustive:
             units = [(family, unit_of(self.system, family.make(family.first))) for family in menu]
             menu = [replace(family, first=unit * n) for family, unit in units for n in NUM_MICRO]
             finalists = len(menu)
-        aimed = AIMED_PART * accuracy
-        trials = sorted(self.first_trials(menu, accuracy), key=lambda trial: self.time_for(trial, aimed))
+        aimed, trials = AIMED_PART * accuracy, self.first_trials(menu, accuracy)
+        self.check_extent(accuracy)
+        trials = sorted(trials, key=lambda trial: self.time_for(trial, aimed))
         most = MOST_TIME_RATIO * self.time_for(trials[0], aimed)
         promising = [trial for trial in trials[:finalists] if self.time_for(trial, aimed) <= most]
         chosen = promising if exhaustive else [self._with_best_num_micro(trial, aimed) for trial in promising]
@@ -160,52 +196,44 @@ class Search:
     def first_trials(self, menu: Sequence[Family], accuracy: float) -> list[Trial]:
         """A trial of each family, which the search makes once: without the fallback, since steps that are too large for
         the motion fail with any method, and with it only if no scheme of the menu succeeds without it."""
-        for falls_back in (False, True):
-            limit = np.inf
-            for family in menu:
-                key = family.python, family.first
-                before = self._firsts.get(key)
-                if before is None or (falls_back and not before.run.may_fall_back):
-                    how = {"falls_back": falls_back, "most_seconds": max(limit, LEAST_TRIAL_SECONDS)}
-                    self._firsts[key] = self.trial(family, family.first, FEWEST_STEPS, **how)
-                if len(menu) > 1:
-                    limit = min(limit, MOST_TIME_RATIO * self.time_for(self._firsts[key], AIMED_PART * accuracy))
-            trials = [self._firsts[family.python, family.first] for family in menu]
-            if any(int(trial.trajectory.failed_at) < 0 for trial in trials):
-                break
-        return trials
+        limit, trials = np.inf, []
+        for family in menu:
+            key = family.python, family.first
+            if key not in self._firsts:
+                most_seconds = max(limit, LEAST_TRIAL_SECONDS)
+                self._firsts[key] = self.trial(family, family.first, FEWEST_STEPS, most_seconds=most_seconds)
+            trials.append(self._firsts[key])
+            if len(menu) > 1:
+                limit = min(limit, MOST_TIME_RATIO * self.time_for(trials[-1], AIMED_PART * accuracy))
+        if self.falls_back or any(int(trial.trajectory.failed_at) < 0 for trial in trials):
+            return trials
+        self.falls_back = True
+        self._firsts.clear()
+        return self.first_trials(menu, accuracy)
 
     def trial(
         self,
         family: Family,
         num_micro: int,
         num_steps: int,
-        falls_back: bool = False,
         accuracy: float | None = None,
         most_seconds: float = np.inf,
     ) -> Trial:
         """The first trial with a certified error, of 1, 2, 4, ... times the macro steps; the last trial if the search
-        runs out of steps, or of time, `most_seconds`. With an accuracy `estimated_errors` gives the errors."""
+        runs out of steps, or of time, `most_seconds`. With an accuracy its errors look at events, see `Compared.of`."""
         most = MOST_TRIAL_SECONDS
         while True:
-            run = replace(self.run(family, num_micro, num_steps), may_fall_back=falls_back)
+            run = replace(self.run(family, num_micro, num_steps), may_fall_back=self.falls_back)
             total = max(USUAL_TRIALS, self.num_trials + 1)
             self.progress(f"trial of {family.label(num_micro)}, {run.num_steps} macro steps", self.num_trials, total)
             self.num_trials += 1
             elapsed = stopwatch()
-            trajectory, halved = run.in_pieces(), companion(run, 2)
-            seconds, succeeded = elapsed(), max(int(trajectory.failed_at), int(halved.failed_at)) < 0
-            if accuracy is None:
-                errors = extrapolated(run.order, trajectory, halved)
-            else:
-                errors = estimated_errors(run, trajectory, halved, self.drives, partial(companion, run), accuracy)
-            certified = succeeded and bool(certified_nodes(trajectory, errors)[0].all())
-            error = float(largest_of(errors).max()) if certified else np.inf
-            trial = Trial(family, num_micro, run, trajectory, halved, errors, error)
+            runs = run, run.in_pieces(), Events() if accuracy is None else self.drives, partial(companion, run)
+            trial = Trial.of(*runs, accuracy or 0.0, family=family, num_micro=num_micro)
             self.note(trial)
             # The seconds of the first trial include compiling, which later trials do not repeat.
-            is_late = seconds > most and run.num_steps > FEWEST_STEPS
-            if certified or is_late or 2 * run.num_steps > MOST_STEPS:
+            is_late = elapsed() > most and run.num_steps > FEWEST_STEPS
+            if np.isfinite(trial.error) or is_late or 2 * run.num_steps > MOST_STEPS:
                 return trial
             num_steps, most = 2 * run.num_steps, min(most_seconds, MOST_TRIAL_SECONDS)
 
@@ -223,7 +251,7 @@ class Search:
             num_steps = self.beside_resonances(before, wanted)
             if num_steps > max(MOST_STEPS, fewest_steps(run.scheme, self.drives, self.length)):
                 break
-            trial = self.trial(before.family, before.num_micro, num_steps, run.may_fall_back, accuracy)
+            trial = self.trial(before.family, before.num_micro, num_steps, accuracy)
             if trial.error <= accuracy:
                 break
             order = self._observed_order(before, trial)
@@ -278,6 +306,17 @@ class Search:
         for trial, seconds in zip(trials, seconds_of_steps(*[trial.run for trial in trials]), strict=True):
             self.seconds[trial.python] = float(seconds)
 
+    def warn_of_events(self, caller: str, scheme: SchemeLike, stacklevel: int) -> None:
+        """Warn if the events of a driven system demand `MANY_STEPS` of a run."""
+        drives, fewest = self.drives, fewest_steps(scheme, self.drives, self.length)
+        if fewest > MANY_STEPS:
+            warnings.warn(
+                f"{caller}: {' and '.join(drives.names)} of the system changes and changes back within "
+                f"{drives.shortest:.2g}, so that the run takes at least {fewest} macro steps until "
+                f"t = {self.t_end:g}; a run in parts, with its steps for each part, takes fewer.",
+                stacklevel=stacklevel,
+            )
+
     def settings(self, trial: Trial) -> Settings:
         """The arguments of `vmri_jax.simulate` that repeat the run of a trial."""
         run, time = trial.run, self._times.get(trial.family.python)
@@ -292,7 +331,7 @@ class Search:
             return trial
         python, run = trial.family.python, trial.run
         if python not in self._chosen:
-            finer = self.trial(trial.family, 2 * trial.num_micro, run.num_steps, run.may_fall_back)
+            finer = self.trial(trial.family, 2 * trial.num_micro, run.num_steps)
             comparable = np.isfinite(finer.error) and finer.run.num_steps == run.num_steps
             trials = [trial, finer, *self._third(trial, finer)] if comparable else [trial]
             self._chosen[python] = min(trials, key=lambda candidate: self.time_for(candidate, error))
@@ -323,7 +362,7 @@ class Search:
         if min(time(num_micro), time(2 * num_micro)) < WORTH_COMPILING * time(best):
             return []
         num_steps = max(1, round(run.num_steps * num_micro / best))  # micro steps of the same length
-        return [self.trial(trial.family, best, num_steps, run.may_fall_back)]
+        return [self.trial(trial.family, best, num_steps)]
 
     @cached_property
     def _linear(self) -> Linearisation | None:

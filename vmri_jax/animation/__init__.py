@@ -1,7 +1,6 @@
 """Seeing a run: a self-contained page, strips of pictures and GIFs from a trajectory and a drawing of its bodies."""
 
-from vmri_jax.animation.bars import bars
-from vmri_jax.animation.drawing import Drawing
+from vmri_jax.animation.drawing import Drawing, bars
 from vmri_jax.animation.frames import plot_strip, write_gif
 from vmri_jax.animation.html import write_html
 from vmri_jax.animation.motion import Motion, motion

@@ -1,40 +1,22 @@
 """The drawing of a system: its parts, where they are for given coordinates, and plain data that is stored next to a
 run."""
 
-import json
-from collections import Counter
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import cached_property, partial
-from itertools import chain
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import jax
 import numpy as np
 
-from vmri_jax.animation.parts import KINDS, PACES, Block, Body, Joint, Plane, Solid, Sphere
-from vmri_jax.animation.plain_data import (
-    angles,
-    check_keys,
-    direction,
-    entries,
-    numbers,
-    positive,
-    read_anchor,
-    read_block,
-    read_body,
-    read_carried,
-    read_joint,
-    read_record,
-    read_solid,
-)
+from vmri_jax.animation.parts import PACES, Block, Body, Joint, Plane, Solid, Sphere, read_drawing
 from vmri_jax.mechanics.kinematics import Kinematics
 from vmri_jax.refusals import Refused
+from vmri_jax.running.trajectory import Trajectory
 
-KEYS = (
-    *("bodies", "solids", "blocks", "links", "springs", "anchors", "planes", "spheres"),
-    *("up", "view", "caption", "kinematics"),
-)
+BALL_RADIUS = 0.24
+"""Radius of the ball on a bar, over the distance between bars: below a half, else neighbours touch."""
 
 
 @dataclass(frozen=True)
@@ -85,37 +67,7 @@ class Drawing:
         Raises:
             ValueError: other data; the message names the wrong entry.
         """
-        if isinstance(data, str):
-            try:
-                data = json.loads(data)
-            except json.JSONDecodeError as error:
-                raise Refused(f"drawing: not valid JSON ({error}).") from error
-        check_keys(data, (), KEYS, "drawing")
-
-        def all_of(key: str, read: Callable) -> tuple:
-            return tuple(read(entry, f"drawing: {key}[{i}]") for i, entry in enumerate(entries(data, key, "drawing")))
-
-        bodies, blocks, solids = all_of("bodies", read_body), all_of("blocks", read_block), all_of("solids", read_solid)
-        bodies = (*chain(*(points for _, points in solids)), *bodies)
-        names = [body.name for body in bodies]
-        if not bodies and not blocks:
-            raise Refused("drawing: there are no bodies and no blocks; there must be at least one.")
-        for name, count in Counter([*names, *(block.name for block in blocks)]).items():
-            if count > 1:
-                raise Refused(f"drawing: {count} bodies are named {name!r}; names must be unique.")
-        links, springs = (all_of(f"{kind}s", partial(read_joint, kind, names)) for kind in KINDS)
-        return cls(
-            bodies=bodies,
-            blocks=blocks,
-            solids=tuple(solid for solid, _ in solids),
-            joints=links + springs + all_of("anchors", partial(read_anchor, names)),
-            planes=all_of("planes", partial(read_record, Plane, {"point": numbers, "normal": direction})),
-            spheres=all_of("spheres", partial(read_record, Sphere, {"center": numbers, "radius": positive})),
-            up=None if data.get("up") is None else direction(data["up"], "drawing: up"),
-            view=None if data.get("view") is None else angles(data["view"], "drawing: view"),
-            caption=str(data.get("caption") or ""),
-            carried=read_carried(data.get("kinematics")),
-        )
+        return cls(**read_drawing(data))
 
     def extended(self, q_s, q_f, v_s, v_f) -> tuple[np.ndarray, ...]:
         """Coordinates of the bodies and their rates, slow and fast, (k, n) each, for coordinates and rates of a run."""
@@ -124,8 +76,7 @@ class Drawing:
         kinematics, joints = self.carried
 
         def bodies_and_rates(q_s, q_f, v_s, v_f):
-            bodies, rates = jax.jvp(lambda q_s, q_f: kinematics(q_s, q_f, joints), (q_s, q_f), (v_s, v_f))
-            return *bodies, *rates
+            return *kinematics(q_s, q_f, joints), *kinematics.velocities(q_s, q_f, v_s, v_f, joints)
 
         return tuple(map(np.asarray, jax.jit(jax.vmap(bodies_and_rates))(q_s, q_f, v_s, v_f)))
 
@@ -228,3 +179,76 @@ def _upright(up: np.ndarray) -> np.ndarray:
     x = x - (x @ up) * up
     x /= np.linalg.norm(x)
     return np.array([x, np.cross(up, x), up])
+
+
+def bars(trajectory: Trajectory) -> dict:
+    """A drawing of any run: all coordinates of q_s, and all of q_f, as bars.
+
+    Args:
+        trajectory: one run.
+
+    Returns:
+        Plain data for `Drawing.from_dict`.
+    """
+    names = trajectory.names
+    parts = (("s", names.slow_coordinates), ("f", names.fast_coordinates))
+    blocks = [
+        {"name": f"q_{part}", "coordinates": [[part, i] for i in range(len(labels))], "labels": labels}
+        for part, labels in parts
+        if labels
+    ]
+    return {"blocks": blocks}
+
+
+def with_bars(drawing: Drawing, q_s: np.ndarray, q_f: np.ndarray) -> Drawing:
+    """The drawing with a body for each coordinate of its blocks, right of all others; q (k, n) along the run.
+
+    Each block has a scale, 1, 2 or 5 times a power of ten, with which its largest coordinate in the run just fits the
+    height of the bars; the caption tells the scales.
+    """
+    if not drawing.blocks:
+        return drawing
+    values = {"s": q_s, "f": q_f}
+    for block in drawing.blocks:
+        for part, i in block.coordinates:
+            check_index(block.name, part, i, q_s.shape[1], q_f.shape[1])
+    corner, height = _room(drawing, q_s, q_f)
+    unit = height / max(2.0, 0.22 * sum(len(block.coordinates) for block in drawing.blocks))
+    axes = drawing.frame(max(2, drawing.dimension))
+    bodies, posts, scales, x = [], [], [], 0.0
+    for block in drawing.blocks:
+        largest = max(float(np.abs(values[part][:, i]).max()) for part, i in block.coordinates)
+        scale = _round(height / largest) if largest > 0 else 1.0
+        scales.append(f"{block.name} times {scale:g}")
+        for label, coordinate in zip(block.labels, block.coordinates, strict=True):
+            foot = tuple(((corner + np.array([x, 0.0, 0.0])) @ axes).tolist())
+            forms = tuple(((scale * float(weight), *coordinate),) if weight else () for weight in axes[2])
+            bodies.append(Body(label, forms, foot, BALL_RADIUS * unit))
+            posts.append(Joint("link", (bodies[-1].name,), foot))
+            x += unit
+        x += unit
+    heights = f"Heights are {', '.join(scales[:-1])}{' and ' if scales[:-1] else ''}{scales[-1]}."
+    return replace(
+        drawing,
+        bodies=(*drawing.bodies, *bodies),
+        blocks=(),
+        joints=(*drawing.joints, *posts),
+        caption=f"{drawing.caption} {heights}".strip(),
+    )
+
+
+def _room(drawing: Drawing, q_s: np.ndarray, q_f: np.ndarray) -> tuple[np.ndarray, float]:
+    """Foot (3,) of the first bar in the picture, and the largest height of bars, up and down."""
+    if not drawing.bodies:
+        return np.zeros(3), 2.0
+    offset, matrix = drawing.maps(q_s.shape[1], q_f.shape[1])
+    points = (offset + np.einsum("iaq,kq->kia", matrix, np.concatenate([q_s, q_f], axis=1))).reshape(-1, 3)
+    low, high = points.min(axis=0), points.max(axis=0)
+    height = float(np.linalg.norm(high - low)) / 3 or 1.0
+    return np.array([high[0] + height, *(low + high)[1:] / 2]), height
+
+
+def _round(x: float) -> float:
+    """The largest of 1, 2, 5 times a power of ten that is not above x."""
+    power = 10.0 ** math.floor(math.log10(x))
+    return max(digit * power for digit in (1, 2, 5) if digit * power <= x * (1 + 1e-12))

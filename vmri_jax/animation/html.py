@@ -9,7 +9,7 @@ import numpy as np
 from vmri_jax import plots
 from vmri_jax.animation.drawing import Drawing
 from vmri_jax.animation.geometry import JOINT_END, LAMP, helix
-from vmri_jax.animation.layout import Ground, Layout, layout, nice
+from vmri_jax.animation.layout import Layout, layout, nice
 from vmri_jax.animation.motion import Motion
 from vmri_jax.animation.parts import Joint
 from vmri_jax.running.files import check_place
@@ -43,6 +43,7 @@ def write_html(motion: Motion, path: str | Path, title: str = "") -> None:
         data["caption"] = f"{drawing.caption} Drawn from every {every}{ending} node.".strip()
     loader = jinja2.PackageLoader("vmri_jax.animation", "page")
     environment = jinja2.Environment(loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True)
+    environment.policies["json.dumps_kwargs"] = {"default": np.ndarray.tolist}
     text = environment.get_template("page.html.j2").render(
         title=title or "Motion",
         description=_description(motion),
@@ -84,11 +85,9 @@ def _data(motion: Motion, sizes: Layout) -> dict:
             vars(solid) | {"points": [drawing.numbers[name] for name in solid.points]} for solid in drawing.solids
         ],
         "connections": lines,
-        "planes": [_plain(ground) | {"grid": _packed(ground.grid), "bears": ground.bears} for ground in sizes.grounds],
-        "spheres": [
-            {"center": c.tolist(), "radius": float(r)} for c, r in zip(sizes.spheres, sizes.sphere_radii, strict=True)
-        ],
-        "helices": {n: helix(n, 10 if many else 16).tolist() for n in turns},
+        "planes": [vars(ground) | {"grid": _packed(ground.grid), "bears": ground.bears} for ground in sizes.grounds],
+        "spheres": [{"center": c, "radius": r} for c, r in zip(sizes.spheres, sizes.sphere_radii, strict=True)],
+        "helices": {n: helix(n, 10 if many else 16) for n in turns},
         "lamp": LAMP,
         "span": JOINT_END,
         "size": sizes.size,
@@ -96,7 +95,7 @@ def _data(motion: Motion, sizes: Layout) -> dict:
         "coil": sizes.coil,
         "wire": sizes.wire,
         "view": {"azimuth": sizes.azimuth, "elevation": sizes.elevation},
-        "fitted": sizes.hull.tolist(),
+        "fitted": sizes.hull,
         "margin": float(sizes.radii.max()),
         "trails": any(
             sum(map(bool, body.forms)) > 1 for body in drawing.bodies if body.shown
@@ -111,14 +110,9 @@ def _data(motion: Motion, sizes: Layout) -> dict:
 def _line(drawing: Drawing, joint: Joint, turns: int) -> dict:
     """A link or spring from a body, by its number, to another body, or to a fixed point in the picture."""
     body, *other = (drawing.numbers[name] for name in joint.bodies)
-    point = None if joint.point is None else drawing.place([joint.point])[0].tolist()
+    point = None if joint.point is None else drawing.place([joint.point])[0]
     line = {"kind": joint.kind, "body": body, "other": next(iter(other), None), "point": point}
     return line | {"pace": drawing.pace(joint), "turns": turns}
-
-
-def _plain(ground: Ground) -> dict:
-    """The fields of a ground by name, arrays as lists."""
-    return {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in vars(ground).items()}
 
 
 def _packed(array: np.ndarray, dtype: type = np.float32) -> str:

@@ -3,17 +3,13 @@ two nodes."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
 from vmri_jax import diagnostics
-from vmri_jax.animation.bars import bars, with_bars
-from vmri_jax.animation.drawing import Drawing
+from vmri_jax.animation.drawing import Drawing, bars, with_bars
 from vmri_jax.mechanics.checks import check_type
 from vmri_jax.mechanics.state import HasProblem, Problem, opened
 from vmri_jax.mechanics.system import System
@@ -28,7 +24,7 @@ class Motion:
     """Positions of the bodies of a drawing, a cubic Hermite polynomial between nodes.
 
     Attributes:
-        drawing: with a body for each coordinate of its blocks, see `vmri_jax.animation.bars`.
+        drawing: with a body for each coordinate of its blocks, see `bars`.
         t: (k,) times of the nodes.
         points, velocities: (k, n_bodies, 3) in the coordinates of the picture, where z points upwards.
         energy: (k, c) change of the energy since the start. For a system that keeps its energy it is relative to the
@@ -123,38 +119,53 @@ def motion(
     if np.ndim(trajectory.t) != 1:
         raise Refused(f"motion: the trajectory is a batch of shape {np.shape(trajectory.t)[:-1]}; give one run of it.")
     drawing = _drawing(trajectory, drawing)
-    system = system or (trajectory.origin.system() if trajectory.origin.knows_system else None)
     q_s, q_f, t = (np.asarray(a, dtype=float) for a in (trajectory.states.q_s, trajectory.states.q_f, trajectory.t))
     finite = np.isfinite(np.concatenate([q_s, q_f, t[:, None]], axis=1)).all(axis=1)
     count = len(t) if finite.all() else int(np.argmin(finite))
     if count == 0:
         raise Refused("motion: the trajectory has no node with finite positions; there is nothing to draw.")
+    run = (trajectory if system is None else _of(trajectory, system))[:count]
     t, q_s, q_f = t[:count], q_s[:count], q_f[:count]
-    slow, fast, *_ = drawing.extended(q_s, q_f, 0 * q_s, 0 * q_f)
+    v_s, v_f = map(np.asarray, run.velocities) if run.origin.knows_system else _differences(t, q_s, q_f)
+    all_nodes = Nodes(t, q_s, q_f, v_s, v_f)
+    if run.micro is not None and not why_not(t, run.micro.t):
+        all_nodes = with_micro_nodes(all_nodes, *run.micro)
+        if not run.origin.knows_system:  # differences between macro nodes miss the fast motion
+            all_nodes = all_nodes._replace(v_f=CubicSpline(all_nodes.t, all_nodes.q_f)(all_nodes.t, 1))
+    times, *phase = all_nodes
+    slow, fast, v_slow, v_fast = drawing.extended(*phase)
     drawing = with_bars(drawing, slow, fast)
     offset, matrix = drawing.maps(slow.shape[1], fast.shape[1])
-    v_s, v_f = _differences(t, q_s, q_f) if system is None else _velocities(system, trajectory, count)
-    nodes = all_nodes = Nodes(t, q_s, q_f, v_s, v_f)
-    if (micro := trajectory.micro) is not None and not why_not(t, micro.t[: count - 1]):
-        all_nodes = with_micro_nodes(nodes, micro.t[: count - 1], micro.q_f[: count - 1])
-    if system is None and len(all_nodes.t) > count:  # differences between macro nodes miss the fast motion
-        all_nodes = all_nodes._replace(v_f=CubicSpline(all_nodes.t, all_nodes.q_f)(all_nodes.t, 1))
-    t, *phase = all_nodes
-    slow, fast, v_slow, v_fast = drawing.extended(*phase)
     q, v = np.concatenate([slow, fast], axis=1), np.concatenate([v_slow, v_fast], axis=1)
-    energies, relative = _energies(trajectory, count, system)
-    residual = np.asarray(trajectory.constraint_residual, dtype=float)[:count].reshape(count, -1)
+    energies, relative = _energies(run)
+    residual = np.asarray(run.constraint_residual, dtype=float).reshape(count, -1)
     return Motion(
         drawing,
-        t,
+        times,
         offset + np.einsum("iaq,kq->kia", matrix, q),
         np.einsum("iaq,kq->kia", matrix, v),
-        np.stack([np.interp(t, nodes.t, column) for column in energies.values()], axis=1),
+        np.stack([np.interp(times, t, column) for column in energies.values()], axis=1),
         tuple(energies),
         relative,
-        np.stack([np.interp(t, nodes.t, column) for column in residual.T], axis=1),
+        np.stack([np.interp(times, t, column) for column in residual.T], axis=1),
         _ending(trajectory, count),
     )
+
+
+def _of(trajectory: Trajectory, system: System) -> Trajectory:
+    """The run with its system, which must be the one of the run."""
+    try:
+        run = trajectory.of(system)
+    except Refused as error:
+        raise Refused(f"motion: {error} Give the system that was simulated.") from error
+    _, *phase = vars(run[0]).values()
+    energy, run_energy = float(diagnostics.energy(system, *phase)), float(trajectory.energy[0])
+    if abs(energy - run_energy) > 1e-6 * max(1.0, abs(run_energy)):
+        raise Refused(
+            f"motion: the system has the energy {energy:.6g} at the start, the run {run_energy:.6g}; give the "
+            "system that was simulated, with its parameters."
+        )
+    return run
 
 
 def _drawing(trajectory: Trajectory, shown: Any) -> Drawing:
@@ -168,18 +179,17 @@ def _drawing(trajectory: Trajectory, shown: Any) -> Drawing:
     return shown
 
 
-def _energies(trajectory: Trajectory, count: int, system: System | None) -> tuple[dict[str, np.ndarray], bool]:
+def _energies(run: Trajectory) -> tuple[dict[str, np.ndarray], bool]:
     """Columns of `Motion.energy` by name, and `Motion.relative`."""
-    energy = np.asarray(trajectory.energy, dtype=float)[:count]
+    energy = np.asarray(run.energy, dtype=float)
     change = energy - energy[0]
-    if system is not None and not system.keeps_energy:
-        of_known_system = trajectory if trajectory.origin.knows_system else trajectory.of(system)
-        work = of_known_system[:count].work()
+    if run.keeps_energy is False:
+        work = run.work()
         parts = {"work of forces": work.forces, "work of moving constraints": work.constraints}
         works = {name: values for name, values in parts.items() if np.any(values != 0)}
         return {"energy": change, **works, "balance": work.balance}, False
     relative = bool(abs(energy[0]) > 1e-12)
-    name = "energy change" if system is None else "energy error"
+    name = "energy error" if run.keeps_energy else "energy change"
     return {name: change / (abs(energy[0]) if relative else 1.0)}, relative
 
 
@@ -188,25 +198,6 @@ def _differences(t, *values) -> list[np.ndarray]:
     if len(t) == 1:
         return [np.zeros_like(x) for x in values]
     return [np.gradient(x, t, axis=0, edge_order=2 if len(t) > 2 else 1) for x in values]
-
-
-def _velocities(system: System, trajectory: Trajectory, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """(count, n_s) and (count, n_f) velocities from the momenta of the first nodes; the system must be the one of the
-    run."""
-    phase = [jnp.asarray(a)[:count] for a in tuple(vars(trajectory.states).values())[1:]]
-    try:
-        start_energy = float(diagnostics.energy(system, *(a[0] for a in phase)))
-        v_s, v_f = jax.jit(jax.vmap(partial(diagnostics.velocity, system)))(*phase)
-    except (TypeError, ValueError, IndexError) as error:
-        sizes = f"{phase[0].shape[1]} slow and {phase[1].shape[1]} fast coordinates"
-        raise Refused(f"motion: the system does not go with a run of {sizes}: {error}") from error
-    run_energy = float(trajectory.energy[0])
-    if abs(start_energy - run_energy) > 1e-6 * max(1.0, abs(run_energy)):
-        raise Refused(
-            f"motion: the system has the energy {start_energy:.6g} at the start, the run {run_energy:.6g}; give the "
-            "system that was simulated, with its parameters."
-        )
-    return np.asarray(v_s), np.asarray(v_f)
 
 
 def _ending(trajectory: Trajectory, count: int) -> str:

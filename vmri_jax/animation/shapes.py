@@ -13,8 +13,7 @@ from matplotlib.patches import PathPatch
 from matplotlib.path import Path
 
 from vmri_jax import plots
-from vmri_jax.animation.camera import Camera
-from vmri_jax.animation.geometry import LAMP, dropped, joint, spring
+from vmri_jax.animation.geometry import LAMP, Camera, dropped, joint, spring
 from vmri_jax.animation.layout import Ground, Layout, layout
 from vmri_jax.animation.motion import Motion
 

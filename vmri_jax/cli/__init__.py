@@ -9,11 +9,10 @@ import jax
 import typer
 
 from vmri_jax.cli.animate import animate
-from vmri_jax.cli.check import check
 from vmri_jax.cli.common import refusals
 from vmri_jax.cli.lists import new, schemes, systems
+from vmri_jax.cli.right import advise, check, explain, stability
 from vmri_jax.cli.run import simulate
-from vmri_jax.cli.stability import advise, explain, stability
 from vmri_jax.cli.study import cost, tune
 from vmri_jax.cli.sweep import sweep
 from vmri_jax.configure import configure

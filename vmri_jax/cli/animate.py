@@ -9,11 +9,11 @@ from rich.markup import escape
 from typer import Argument, Option
 
 from vmri_jax import plots
-from vmri_jax.animation.bars import bars
+from vmri_jax.animation.drawing import bars
 from vmri_jax.animation.frames import plot_strip, write_gif
 from vmri_jax.animation.html import write_html
 from vmri_jax.animation.motion import Motion, motion
-from vmri_jax.animation.plain_data import angles
+from vmri_jax.animation.parts import angles
 from vmri_jax.animation.vtk import write_vtk
 from vmri_jax.catalogue import SYSTEMS, find_problem
 from vmri_jax.cli.common import PICTURES, check_target, console

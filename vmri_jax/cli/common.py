@@ -1,14 +1,16 @@
-"""Parts of all commands: the console, refusals, failures and Ctrl-C, tables, checks of files to write."""
+"""Parts of all commands: options, the console, refusals, failures and Ctrl-C, tables, checks of files to write."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Annotated
 
 import typer
 from rich.console import Console
 from rich.markup import escape
 from rich.panel import Panel
 from rich.text import Text
+from typer import Argument, Option
 
 from vmri_jax.refusals import NotInstalled, Refused
 from vmri_jax.running.files import check_writable, make_writable_folder
@@ -19,6 +21,17 @@ console = OutputConsole()
 
 PICTURES = (".png", ".svg", ".pdf")
 """Endings of files of figures."""
+
+System = Annotated[str, Argument(help="fpu, tsp, sam, my_file.py:my_problem, or my_file.py alone.")]
+MacroStep = Annotated[float | None, Option(help="Macro step H, of num_micro micro steps.")]
+Scheme = Annotated[str, Option(help="See [bold]vmri schemes[/bold].")]
+NumMicro = Annotated[int, Option(help="Micro steps per macro step.")]
+Alpha = Annotated[
+    float | None, Option(help="Part of each kick at the start of a step, explicit schemes. [dim]default: 0.5[/dim]")
+]
+Degree = Annotated[int | None, Option(help="Degree of the path of galerkin.")]
+Rule = Annotated[str | None, Option(help="Nodes of galerkin: gauss or lobatto. [dim]default: gauss[/dim]")]
+Compose = Annotated[str | None, Option(help="Compose the scheme to a higher order, e.g. suzuki4, kahan-li8.")]
 
 
 class BadInput(typer.BadParameter):
@@ -44,26 +57,24 @@ def refusals() -> Iterator[None]:
     except Interrupted as stopped:
         count = stopped.number if stopped.total is None else f"{stopped.number} of {stopped.total}"
         advice = f"; {stopped.advice}" if stopped.advice else ""
-        print_failure("Interrupted", f"After {count} {stopped.units}{advice}.")
-        raise typer.Exit(130) from stopped
+        raise print_failure("Interrupted", f"After {count} {stopped.units}{advice}.", 130) from stopped
     except Refused as error:
         raise BadInput(str(error)) from error
     except NotInstalled as error:
-        print_failure("Not installed", str(error))
-        raise typer.Exit(1) from error
+        raise print_failure("Not installed", str(error)) from error
     except (ValueError, TypeError, ImportError):
         print_failure("A fault inside", FAULT)
         raise
     except (FileExistsError, FileNotFoundError) as error:
         raise BadInput(str(error)) from error
     except OSError as error:
-        print_failure("Not written", error.strerror or str(error))
-        raise typer.Exit(1) from error
+        raise print_failure("Not written", error.strerror or str(error)) from error
 
 
-def print_failure(title: str, text: str) -> None:
-    """Print a red panel on the error stream."""
+def print_failure(title: str, text: str, code: int = 1) -> typer.Exit:
+    """Print a red panel on the error stream; returns the exit with this code, to be raised."""
     Console(stderr=True).print(Panel(Text(as_options(text)), title=title, title_align="left", border_style="red"))
+    return typer.Exit(code)
 
 
 def print_written(title: str, path: Path | None) -> None:

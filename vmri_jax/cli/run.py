@@ -17,12 +17,11 @@ from typer import Option
 from vmri_jax import plots
 from vmri_jax.accuracy.simulate import simulate as run_at_once
 from vmri_jax.catalogue import find_problem, find_scheme
-from vmri_jax.cli import options
+from vmri_jax.cli import common
 from vmri_jax.cli.common import PICTURES, check_target, console, print_failure, print_named
 from vmri_jax.refusals import Refused
 from vmri_jax.running.arguments import Save, nothing_fast
 from vmri_jax.running.interrupts import Interrupted
-from vmri_jax.running.settings import Settings
 from vmri_jax.running.store import StoredTrajectory, stream
 from vmri_jax.running.summaries import summary_of
 from vmri_jax.running.trajectory import Trajectory
@@ -38,17 +37,17 @@ MOST_READ_NODES = 10_000
 
 
 def simulate(
-    system: options.System,
+    system: common.System,
     steps: Annotated[int | None, Option(help="Number of macro steps; not with --accuracy.")] = None,
-    macro_dt: options.MacroStep = None,
+    macro_dt: common.MacroStep = None,
     scheme: Annotated[
         str | None, Option(help="See vmri schemes. [dim]default: fully-implicit; with --accuracy chosen[/dim]")
     ] = None,
-    num_micro: options.NumMicro = 10,
-    alpha: options.Alpha = None,
-    degree: options.Degree = None,
-    rule: options.Rule = None,
-    compose: options.Compose = None,
+    num_micro: common.NumMicro = 10,
+    alpha: common.Alpha = None,
+    degree: common.Degree = None,
+    rule: common.Rule = None,
+    compose: common.Compose = None,
     accuracy: Annotated[float | None, Option(help="Largest error of a position, for which steps are chosen.")] = None,
     t_end: Annotated[float | None, Option(help="End of the run, with --accuracy.")] = None,
     error: Annotated[bool, Option("--error", help="Estimate the error of the positions.")] = False,
@@ -74,17 +73,13 @@ def simulate(
 
     vmri simulate my_file.py:my_problem --scheme galerkin --degree 2 --macro-dt 0.05 --steps 400
     """
-    streamed = _check_out(out, resume, overwrite)
     check_target("--plot", plot, *PICTURES)
-    problem = find_problem(system)
-    _check_steps(steps, accuracy, t_end, streamed, error)
-    of_scheme = {"--compose": compose, "--alpha": alpha, "--degree": degree, "--rule": rule}
-    chosen = None
+    streamed, problem = _check_options(out, resume, overwrite, steps, accuracy, t_end, error), find_problem(system)
+    of_scheme, chosen = {"compose": compose, "alpha": alpha, "degree": degree, "rule": rule}, None
     if scheme is not None or accuracy is None:
         scheme = scheme or DEFAULT_SCHEME
-        chosen = find_scheme(scheme, num_micro, compose, alpha=alpha, degree=degree, rule=rule)
-    elif any(value is not None for value in of_scheme.values()):
-        without = " and ".join(name for name, value in of_scheme.items() if value is not None)
+        chosen = find_scheme(scheme, num_micro, **of_scheme)
+    elif without := " and ".join(f"--{name}" for name, value in of_scheme.items() if value is not None):
         raise Refused(f"got {without} without --scheme, which --accuracy chooses then; give --scheme with it.")
     before = StoredTrajectory(out) if out is not None and resume and out.exists() else None
     if save_every is None and steps is not None and not save_micro:
@@ -125,40 +120,20 @@ def simulate(
             lines["saved"] = ", ".join(saved) or "nothing; give --out run.npz or --plot run.png"
             lines[""] = "" if chosen is None else nothing_fast(chosen, problem.q_f.size)
             print_named(lines)
-            if steps is None:
-                _print_again(trajectory.settings, system, matrix)
+            if steps is None and trajectory.settings.options:  # the scheme was chosen
+                command = trajectory.settings.command(system) + ("" if matrix == "auto" else f" --matrix {matrix}")
+                console.print(f"The same run again:\n[bold]{escape(command)}[/bold]", soft_wrap=True)
         else:
             _print_stop(stopped, saved, streamed)
     if isinstance(stopped, Interrupted):
         raise stopped
     if stopped is not None:
-        options_of_step = {"--macro-dt": macro_dt, "--scheme": scheme, "--num-micro": num_micro} | of_scheme
-        words = [word for name, x in options_of_step.items() if x is not None for word in (name, str(x))]
+        of_step = {"macro-dt": macro_dt, "scheme": scheme, "num-micro": num_micro} | of_scheme
+        words = [word for name, x in of_step.items() if x is not None for word in (f"--{name}", str(x))]
         command = escape(shlex.join(["vmri", "advise", system, *words]))
         text = "Whether this step is stable, which one near it is, and whether slow and fast are swapped"
         Console(stderr=True).print(f"{text}:\n[bold]{command}[/bold]", soft_wrap=True)
         raise typer.Exit(1)
-
-
-def _check_steps(steps: int | None, accuracy: float | None, t_end: float | None, streamed: bool, error: bool) -> None:
-    """Refuse options that do not fix the length of a run, or contradict each other."""
-    if (steps is None) == (accuracy is None):
-        got = "neither" if steps is None else "both"
-        raise Refused(f"got {got} of --steps and --accuracy; give exactly one of them.")
-    if (t_end is None) != (accuracy is None):
-        raise Refused("--accuracy and --t-end go together: the largest error, and the time until which it is kept.")
-    if streamed and (error or accuracy is not None):
-        option = "--error" if error else "--accuracy"
-        raise Refused(f"{option} compares runs that are in memory; give --out with a file that ends in .npz.")
-
-
-def _print_again(chosen: Settings, system: str, matrix: str) -> None:
-    """Print the command for a run with the chosen scheme and steps, unless the user gave the scheme."""
-    if not chosen.options:
-        return
-    matrix_option = "" if matrix == "auto" else f" --matrix {matrix}"
-    command = f"{chosen.command(system)}{matrix_option}"
-    console.print(f"The same run again:\n[bold]{escape(command)}[/bold]", soft_wrap=True)
 
 
 def _run(run, problem, scheme, arguments: dict):
@@ -183,14 +158,22 @@ def _print_stop(stopped: SimulationError | Interrupted, saved: list[str], stream
         console.print(f"Go on with it:\n[bold]{command}[/bold]", soft_wrap=True)
 
 
-def _check_out(out: Path | None, resume: bool, overwrite: bool) -> bool:
-    """Whether to stream the run into a store, after a check of the options about files."""
+def _check_options(out, resume, overwrite, steps, accuracy, t_end, error) -> bool:
+    """Whether to stream the run into a store; refuses options that contradict each other or do not fix its length."""
     streamed = out is not None and out.suffix.lower() == ".zarr"
     if (resume or overwrite) and not streamed:
         option = "--resume" if resume else "--overwrite"
         raise Refused(f"{option} is for a run that is written while it goes; give --out run.zarr.")
     if out is not None and not (streamed and out.is_dir()):  # `stream` checks an existing store
         check_target("--out", out, ".npz", ".zarr")
+    if (steps is None) == (accuracy is None):
+        got = "neither" if steps is None else "both"
+        raise Refused(f"got {got} of --steps and --accuracy; give exactly one of them.")
+    if (t_end is None) != (accuracy is None):
+        raise Refused("--accuracy and --t-end go together: the largest error, and the time until which it is kept.")
+    if streamed and (error or accuracy is not None):
+        option = "--error" if error else "--accuracy"
+        raise Refused(f"{option} compares runs that are in memory; give --out with a file that ends in .npz.")
     return streamed
 
 

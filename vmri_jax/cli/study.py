@@ -5,24 +5,22 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
-import typer
 from rich.markup import escape
 from typer import Option
 
 from vmri_jax import study
 from vmri_jax.catalogue import find_problem
-from vmri_jax.cli import options
+from vmri_jax.cli import common
 from vmri_jax.cli.common import check_target, console, print_failure, print_written
 from vmri_jax.running.interrupts import Interrupted
 from vmri_jax.running.progress import Progress, progress_shown
 from vmri_jax.steppers.results import SimulationError
-from vmri_jax.study.cost_report import PERIODS
 from vmri_jax.study.table import ResultTable
-from vmri_jax.study.tuning import NothingReached
+from vmri_jax.study.tuning import PERIODS, NothingReached
 
 
 def tune(
-    system: options.System,
+    system: common.System,
     error: Annotated[float, Option(help="Largest accepted error of a position in the run, in its unit.")],
     t_end: Annotated[float, Option(help="Simulated time.")],
     exhaustive: Annotated[bool, Option("--exhaustive", help="Search without shortcuts.")] = False,
@@ -44,8 +42,7 @@ def tune(
     except NothingReached as failure:
         console.print(failure.runs.table())
         _write_runs(failure.runs, out)
-        print_failure("Nothing reached the error", f"{failure} The best runs are above.")
-        raise typer.Exit(1) from failure
+        raise print_failure("Nothing reached the error", f"{failure} The best runs are above.") from failure
     console.print("[bold]Errors against time[/bold], the best of all runs\n", choice.runs.table(), "\n", choice.table())
     command = f"{choice.setting.settings.command(system)} --out run.npz"
     console.print(f"\n[bold]{escape(command)}[/bold]", soft_wrap=True)
@@ -53,7 +50,7 @@ def tune(
 
 
 def cost(
-    system: options.System,
+    system: common.System,
     t_end: Annotated[
         float | None, Option(help=f"Simulated time. [dim]default: {PERIODS} fastest periods[/dim]")
     ] = None,
@@ -85,8 +82,7 @@ def _search(out: Path | None) -> Iterator[Progress]:
         with progress_shown() as tell:
             yield tell
     except SimulationError as failure:
-        print_failure("All runs failed", str(failure))
-        raise typer.Exit(1) from failure
+        raise print_failure("All runs failed", str(failure)) from failure
     except Interrupted as stopped:
         console.print(stopped.done.table())
         _write_runs(stopped.done, out)

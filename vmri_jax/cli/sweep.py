@@ -1,27 +1,29 @@
-"""`vmri sweep`: an ensemble that a .toml file describes."""
+"""`vmri sweep`: an ensemble of a .toml file; the name of a column says which number of a problem it sets."""
 
 import json
 import os
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-import typer
 from rich.markup import escape
 from typer import Argument, Option
 
 from vmri_jax import plots
-from vmri_jax.animation.plain_data import check_keys
+from vmri_jax.animation.parts import check_keys
 from vmri_jax.catalogue import find_problem
-from vmri_jax.cli.columns import by_name
 from vmri_jax.cli.common import PICTURES, check_target, console, print_failure, print_named, print_written
 from vmri_jax.ensembles import Axis, Draw, Draws, Ensemble, EnsembleError, Product, ensemble
+from vmri_jax.ensembles.design import SCHEMES, STEPS, columns_of_problems
 from vmri_jax.ensembles.quantities import drawn_by_default
 from vmri_jax.executors.executor import local_workers
 from vmri_jax.mechanics.arrays import whole_number
+from vmri_jax.mechanics.names import near
+from vmri_jax.mechanics.places import START, Place, Placed, places_of
+from vmri_jax.mechanics.slots import free
 from vmri_jax.mechanics.state import Problem
 from vmri_jax.refusals import Refused
 from vmri_jax.running.export import extra
@@ -56,11 +58,9 @@ def sweep(
             runs = ensemble(**arguments, executor=client, resume=resume, overwrite=overwrite, progress=True)
         except EnsembleError as error:
             _print_summary(error.ensemble)
-            print_failure("Not all chunks could be computed", str(error))
-            raise typer.Exit(1) from error
+            raise print_failure("Not all chunks could be computed", str(error)) from error
         except RuntimeError as error:
-            print_failure("Stopped", str(error))
-            raise typer.Exit(1) from error
+            raise print_failure("Stopped", str(error)) from error
     _print_summary(runs)
     if plot is not None:
         plots.save(plots.plot_ensemble(runs.open(), drawn, title=file.stem), plot)
@@ -163,3 +163,21 @@ def _print_summary(runs: Ensemble) -> None:
         "store": f'{runs.path}; read it with vmri_jax.open_ensemble("{os.path.relpath(runs.path)}")',
     }
     print_named(texts)
+
+
+def by_name(problem: Problem, columns: Sequence[str]) -> Placed | None:
+    """The function that sets the numbers which columns name; None where all columns are steps and schemes."""
+    known = {name: place for name, (place, shape) in places_of(problem).items() if not shape}
+    places: dict[str, Place] = {}
+    for name in columns_of_problems(columns):
+        if name not in known:
+            listed = [other for other in free(known) if "[" not in other]
+            raise Refused(
+                f"the column {name!r} sets no number of the problem.{near(name, [*known, *STEPS, *SCHEMES])} There are "
+                f"{', '.join([*listed, *STEPS, *SCHEMES])}, and numbers of arrays, {START[1]}[0] for example."
+            )
+        twice = [other for other, place in places.items() if place == known[name]]
+        if twice:
+            raise Refused(f"the columns {twice[0]!r} and {name!r} set the same number; leave one of them out.")
+        places[name] = known[name]
+    return Placed(places) if places else None

@@ -1,6 +1,5 @@
 """Optimal control on macro and micro grids."""
 
-from vmri_jax.control.minimize import minimize
-from vmri_jax.control.optimum import Optimum
+from vmri_jax.control.minimize import Optimum, minimize
 
 __all__ = ["Optimum", "minimize"]

@@ -46,16 +46,6 @@ class Solution(NamedTuple):
     nu: Float[Numbers, "e"]
 
 
-class _Value(NamedTuple):
-    """Coefficients of the cost from a stage on, see the head of this file."""
-
-    S: Float[Numbers, "n n"]
-    s: Float[Numbers, "n"]
-    M: Float[Numbers, "n e"]
-    m: Float[Numbers, "e"]
-    W: Float[Numbers, "e e"]
-
-
 @jax.jit
 def solve(stages: Stages, final: Final) -> Solution:
     """The solution of the linear-quadratic problem.
@@ -64,11 +54,11 @@ def solve(stages: Stages, final: Final) -> Solution:
     """
     n, e = final.S.shape[0], len(final.g)
 
-    def back(value: _Value, stage: Stages):
+    def back(value, stage: Stages):
+        S, s, M, m, W = value  # the coefficients of the cost from the next stage on, see the head of this file
         A, B, c = stage.A, stage.B, stage.c
         Q, N, R = stage.hessian[:n, :n], stage.hessian[n:, :n], stage.hessian[n:, n:]
         q, r = stage.gradient[:n], stage.gradient[n:]
-        S, s, M = value.S, value.s, value.M
         # du = K dz + k + K_nu nu minimises the cost of the stage plus the cost from the next stage on, at  dz' = A dz +
         # B du + c:
         #     (R + B^T S B) du = -(H_ux dz + r + B^T (S c + s) + B^T M nu)    with    H_ux = N + B^T S A
@@ -79,19 +69,19 @@ def solve(stages: Stages, final: Final) -> Solution:
         K, k, K_nu = gains[:, :n], gains[:, n], gains[:, n + 1 :]
         # The coefficients before the stage follow by insertion of du.
         S_before = Q + A.T @ S @ A + H_ux.T @ K
-        before = _Value(
+        before = (
             (S_before + S_before.T) / 2,  # symmetric in spite of round-off
             q + A.T @ ahead + H_ux.T @ k,
             A.T @ M + H_ux.T @ K_nu,
-            value.m + M.T @ (c + B @ k),
-            value.W - M.T @ B @ K_nu,
+            m + M.T @ (c + B @ k),
+            W - M.T @ B @ K_nu,
         )
         return before, (K, k, K_nu)
 
-    last = _Value(final.S, final.s, final.G.T, final.g, jnp.zeros((e, e)))
-    first, gains = jax.lax.scan(back, last, stages, reverse=True)
+    last = final.S, final.s, final.G.T, final.g, jnp.zeros((e, e))
+    (*_, m, W), gains = jax.lax.scan(back, last, stages, reverse=True)
     # dz_0 = 0, and the cost is stationary by nu:  m - W nu = 0
-    nu = jnp.linalg.lstsq(first.W, first.m)[0] if e else first.m
+    nu = jnp.linalg.lstsq(W, m)[0] if e else m
 
     def forward(dz, stage_and_gains):
         stage, (K, k, K_nu) = stage_and_gains

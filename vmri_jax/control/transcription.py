@@ -24,8 +24,7 @@ from vmri_jax.mechanics.arrays import Numbers
 from vmri_jax.mechanics.functions import TracedOnce
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
-from vmri_jax.schemes.composition import Composition
-from vmri_jax.schemes.scheme import Scheme
+from vmri_jax.schemes.composition import SchemeLike
 from vmri_jax.steppers.results import Result
 from vmri_jax.steppers.solver import Solver
 
@@ -54,7 +53,7 @@ class Transcription(eqx.Module):
 
     system: System
     start: State
-    scheme: Scheme | Composition
+    scheme: SchemeLike
     solver: Solver
     macro_dt: Float[Numbers, ""]
     actuate: TracedOnce

@@ -11,7 +11,7 @@ from vmri_jax.mechanics.invariants import velocity
 from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.macro_step import macro_step
-from vmri_jax.schemes.composition import Composition
+from vmri_jax.schemes.composition import SchemeLike
 from vmri_jax.schemes.equations import StepEquations
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.solver import Solver
@@ -31,7 +31,7 @@ def state_of(z, t, like: State) -> State:
     return State(t, *jnp.split(z, (n_s, n, n + n_s)))
 
 
-def phase_step(system: System, scheme: Scheme | Composition, like: State, t, z, *, macro_dt, solver: Solver | None):
+def phase_step(system: System, scheme: SchemeLike, like: State, t, z, *, macro_dt, solver: Solver | None):
     """The end (2 n,) of a macro step from z (2 n,) at time t, and the `StepStatus` of the step; `like` is any state of the system."""
     end, info = macro_step(system, scheme, state_of(z, t, like), macro_dt, solver)
     return phase_vector(end), info.status

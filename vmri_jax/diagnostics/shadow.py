@@ -27,7 +27,7 @@ from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.mechanics.system import System
 from vmri_jax.refusals import Refused
 from vmri_jax.running.trajectory import Trajectory
-from vmri_jax.schemes.composition import Composition, stage_lengths, stage_scheme
+from vmri_jax.schemes.composition import SchemeLike, stage_lengths, stage_scheme
 from vmri_jax.schemes.discrete_lagrangian import lagrangian
 from vmri_jax.schemes.equations import StepEquations
 from vmri_jax.schemes.scheme import Scheme
@@ -81,7 +81,7 @@ class ShadowEnergy:
         return f"shadow energy: band {self.band:.1e} (energy of the system: {self.energy_band:.1e}), {drift}"
 
 
-def shadow_energy(system: Movable, scheme: Scheme | Composition, trajectory: Trajectory, k: int = 5) -> ShadowEnergy:
+def shadow_energy(system: Movable, scheme: SchemeLike, trajectory: Trajectory, k: int = 5) -> ShadowEnergy:
     """The shadow energy of a symplectic scheme along a run, and its drift.
 
         run = vm.simulate(problem, scheme, macro_dt=0.01, num_steps=10_000)
@@ -101,7 +101,7 @@ def shadow_energy(system: Movable, scheme: Scheme | Composition, trajectory: Tra
     whole_number("shadow_energy: k", k)
     system = _checked(system, scheme, trajectory, k)
     t = np.asarray(trajectory.t)
-    nodes = State(*(jnp.asarray(a) for a in (t, *list(vars(trajectory.states).values())[1:])))
+    nodes = jax.tree.map(jnp.asarray, trajectory.states)
     macro_dt = (t[-1] - t[0]) / (len(t) - 1)
     actions, miss, result = _actions(system, scheme, nodes, macro_dt)
     if int(result) > Result.CONVERGED_AT_ROUNDOFF or not float(miss) < LARGEST_MISS:
@@ -116,11 +116,9 @@ def shadow_energy(system: Movable, scheme: Scheme | Composition, trajectory: Tra
     return ShadowEnergy(t[inner], energy, *bands, drift, error, rounding)
 
 
-def _checked(system: Movable, scheme: Scheme | Composition, trajectory: Trajectory, k: int) -> System:
+def _checked(system: Movable, scheme: SchemeLike, trajectory: Trajectory, k: int) -> System:
     """The system; refuses runs that conserve no energy, failed or have too few nodes."""
-    _, *nodes = vars(trajectory.states).values()
-    start = State(trajectory.t[..., 0], *(a[..., 0, :] for a in nodes))
-    system, _ = start_of("shadow_energy", system, start)
+    system, _ = start_of("shadow_energy", system, trajectory[0])
     if system.force is not None or system.is_rheonomic:
         cause = "forces" if system.force is not None else "constraints that depend on time"
         raise Refused(f"shadow_energy: the system has {cause}: no energy is kept. Leave them out.")
@@ -136,7 +134,7 @@ def _checked(system: Movable, scheme: Scheme | Composition, trajectory: Trajecto
 
 
 @jax.jit
-def _actions(system: System, scheme: Scheme | Composition, nodes: State, macro_dt):
+def _actions(system: System, scheme: SchemeLike, nodes: State, macro_dt):
     """Discrete Lagrangian of every step, largest distance of a step from the next node relative to its length, worst `Result`."""
 
     def step(nodes):

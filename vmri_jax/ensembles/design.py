@@ -4,12 +4,15 @@
     Table({"omega": [10, 50], "v_s[0]": [0.1, 0.2]})           a run for each row: 10 with 0.1, 50 with 0.2
     Draws(1000, {"omega": ("uniform", 10, 50)}, seed=1)        1000 runs with random values
 
+A function ``(problem, row) -> problem`` makes the problem of a run from the values of its row by column; columns with the names macro_dt,
+num_steps, num_micro and scheme choose steps and schemes instead.
+
 Rows are numbered from 0. Any row can be made without the others: a random row depends on the seed and on its number alone.
 """
 
 import math
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -18,6 +21,7 @@ import numpy as np
 
 from vmri_jax.mechanics.arrays import whole_number
 from vmri_jax.mechanics.names import near, unknown
+from vmri_jax.mechanics.state import Problem
 from vmri_jax.refusals import Refused
 
 Rows = dict[str, np.ndarray]
@@ -28,6 +32,13 @@ MOST_POINTS = {"sobol": 2**30, "latin-hypercube": 2**22, "random": np.inf}
 worker makes the whole table of a Latin hypercube: 32 MiB for each column, more with a larger number."""
 ALIASES = {"normal": "norm", "exponential": "expon"}
 """Further names of distributions, and the names that `scipy.stats` has for them."""
+STEPS = ("macro_dt", "num_steps")
+SCHEMES = ("scheme", "num_micro")
+
+Row = Mapping[str, Any]
+"""The value of each column in a row of a design."""
+Vary = Callable[[Problem, Row], Problem]
+"""A function that makes the problem of a run from a problem and a row."""
 
 
 @dataclass(frozen=True)
@@ -296,3 +307,17 @@ def _values(subject: str, values) -> np.ndarray:
 def _words(axis: Axis | Draw) -> dict[str, str]:
     texts = {"units": axis.unit, "description": axis.description}
     return {name: text for name, text in texts.items() if text}
+
+
+def columns_of_problems(columns: Sequence[str]) -> list[str]:
+    """The columns that choose neither steps nor schemes."""
+    return [name for name in columns if name not in (*STEPS, *SCHEMES)]
+
+
+def numbers_in(rows: Rows) -> Rows:
+    """The columns of numbers that change the problem; steps and schemes are left out."""
+    columns = {name: rows[name] for name in columns_of_problems(list(rows))}
+    for name, values in columns.items():
+        if values.dtype.kind not in "if":
+            raise Refused(f"ensemble: the column {name!r} has labels; give numbers. Only 'scheme' may have labels.")
+    return columns

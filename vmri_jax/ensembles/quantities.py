@@ -1,6 +1,7 @@
 """Quantities of a run that the store keeps: arrays by name, which a worker computes from the saved nodes of the run."""
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import jax
@@ -142,14 +143,7 @@ def kept(quantities: Sequence[Quantity], run: Trajectory) -> dict[str, Kept]:
 
 def what_is_kept(quantities: Sequence[Quantity], run: Simulation) -> dict[str, Kept]:
     """The arrays that the store keeps of a run, with shapes in place of values; nothing is computed."""
-    arrays: dict[str, Kept] = {}
-
-    def shapes(trajectory: Trajectory):
-        arrays.update(kept(quantities, trajectory))
-        return {name: array.value for name, array in arrays.items()}
-
-    values = jax.eval_shape(shapes, resting(run))
-    return {name: array._replace(value=values[name]) for name, array in arrays.items()}
+    return jax.eval_shape(partial(kept, quantities), resting(run))
 
 
 def drawn_by_default(names: Sequence[str], problem: Problem) -> list[str]:
@@ -161,10 +155,9 @@ def drawn_by_default(names: Sequence[str], problem: Problem) -> list[str]:
 
 def of_lanes(quantities: Sequence[Quantity], run: Trajectory) -> dict[str, Any]:
     """The arrays that the store keeps of a batch, a row for each run, by a program that JAX keeps for these quantities."""
-    return _of_lanes(list(map(TracedOnce, quantities)), run)
+    return {name: array.value for name, array in _of_lanes(list(map(TracedOnce, quantities)), run).items()}
 
 
 @jax.jit
-def _of_lanes(functions: list[TracedOnce], run: Trajectory) -> dict[str, Any]:
-    quantities = [function.function for function in functions]
-    return jax.vmap(lambda run: {name: array.value for name, array in kept(quantities, run).items()})(run)
+def _of_lanes(functions: list[TracedOnce], run: Trajectory) -> dict[str, Kept]:
+    return jax.vmap(partial(kept, [function.function for function in functions]))(run)

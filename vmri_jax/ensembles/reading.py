@@ -44,7 +44,8 @@ def open_ensemble(path: str | os.PathLike) -> "xarray.Dataset":
     if attributes["design"]["kind"] == "Product":
         data = _on_axes(data, columns_record, xarray)
     else:
-        columns = _drawn(attributes) if attributes["design"]["kind"] == "Draws" else _table(path)
+        is_drawn = attributes["design"]["kind"] == "Draws"
+        columns = _drawn(attributes) if is_drawn else dict(np.load(path / layout.TABLE, allow_pickle=False))
         axes = {name: (LANE, *(f"{name}_{i}" for i in range(array.ndim - 1))) for name, array in columns.items()}
         data = data.assign_coords({name: (axes[name], array) for name, array in columns.items()})
     for name, column in columns_record.items():
@@ -96,9 +97,3 @@ def _drawn(attributes: dict[str, Any]):
         return dask.array.map_blocks(block, dtype=float, chunks=(sizes,), meta=np.zeros(0))
 
     return {name: column(name) for name in design.columns}
-
-
-def _table(path: Path) -> dict[str, np.ndarray]:
-    """Columns of a design that is a table."""
-    with np.load(path / layout.TABLE, allow_pickle=False) as columns:
-        return dict(columns)

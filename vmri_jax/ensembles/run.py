@@ -12,12 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from vmri_jax.ensembles.columns import Vary
-from vmri_jax.ensembles.design import Chunks, Design, Draws, Product, Rows, Table
-from vmri_jax.ensembles.prepared import attributes_of, prepared
+from vmri_jax.ensembles.design import Chunks, Design, Draws, Product, Rows, Table, Vary
 from vmri_jax.ensembles.quantities import Saved
 from vmri_jax.ensembles.reading import LANE, open_ensemble
-from vmri_jax.ensembles.work import AnyScheme, Work
+from vmri_jax.ensembles.work import AnyScheme, Work, attributes_of, prepared
 from vmri_jax.executors.executor import NotAWorker, as_done, executor_of, submitter
 from vmri_jax.mechanics.arrays import require_x64, whole_number
 from vmri_jax.mechanics.checks import check_type
@@ -194,7 +192,9 @@ def ensemble(
     layout.check_place("ensemble", path, "ensemble", resume, overwrite)
     if not isinstance(system, str):
         system = problem_of("ensemble", system)
-    schemes, design = _schemes(scheme), _design(design)
+    schemes, design = _schemes(scheme), Product(design) if isinstance(design, Mapping) else design
+    designs = "a Product, Table or Draws of vmri_jax.ensembles, or a mapping of axes, {'omega': [10, 50]}"
+    check_type("ensemble: design", design, Product | Table | Draws, designs)
     if len(schemes) > 1 and "scheme" not in design.described():
         if not isinstance(design, Product):
             raise Refused("ensemble: there are several schemes; give a column 'scheme' that chooses one for each run.")
@@ -318,11 +318,3 @@ def _schemes(scheme) -> dict[str, AnyScheme]:
         one = "a Scheme, the name of one, or a function that makes one for a num_micro"
         raise Refused(f"ensemble: scheme is {scheme!r}; give {one}, or several by label.")
     return dict(scheme)
-
-
-def _design(design) -> Design:
-    if isinstance(design, Mapping):
-        return Product(design)
-    designs = "a Product, Table or Draws of vmri_jax.ensembles, or a mapping of axes, {'omega': [10, 50]}"
-    check_type("ensemble: design", design, Product | Table | Draws, designs)
-    return design

@@ -1,29 +1,59 @@
-"""The work of an ensemble: a small object that pickle can send, with which a worker computes some of the runs."""
+"""The work of an ensemble: a small object that pickle can send, with which a worker computes some of the runs; and its preparation, the checks of all
+arguments, its chunks, the arrays of its store, and the record that identifies it."""
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
-from vmri_jax.accuracy.batch import simulate_batch
+from vmri_jax.accuracy.companions import resting
+from vmri_jax.accuracy.simulate import simulate_batch
 from vmri_jax.catalogue import find_problem, find_scheme
-from vmri_jax.ensembles.columns import SCHEMES, STEPS, Lanes, Row, Vary, columns_of_problems, lane_function, numbers_in
-from vmri_jax.ensembles.design import Design, Rows, combinations, unique_rows
-from vmri_jax.ensembles.quantities import Quantity, Saved, of_lanes, quantity
+from vmri_jax.ensembles.design import (
+    SCHEMES,
+    STEPS,
+    Axis,
+    Chunks,
+    Design,
+    Draws,
+    Product,
+    Row,
+    Rows,
+    Vary,
+    columns_of_problems,
+    combinations,
+    numbers_in,
+    unique_rows,
+)
+from vmri_jax.ensembles.quantities import OVER_NODES, Quantity, Saved, label_of, of_lanes, quantity, what_is_kept
+from vmri_jax.mechanics.arrays import is_concrete, whole_number
 from vmri_jax.mechanics.checks import check_type, digest
-from vmri_jax.mechanics.names import unknown
+from vmri_jax.mechanics.names import Names, near, unknown
+from vmri_jax.mechanics.places import START
 from vmri_jax.mechanics.state import Problem
 from vmri_jax.refusals import Refused
 from vmri_jax.running.arguments import Save, Steps, check_step_size, steps_until
-from vmri_jax.running.batch import consistent_states
+from vmri_jax.running.batch import consistent_states, lanes_at_once
 from vmri_jax.running.export import STATUS
 from vmri_jax.running.simulation import Simulation, simulation
+from vmri_jax.running.store.identity import describe, environment, identity, operations
+from vmri_jax.running.store.layout import Kept, rows_per_chunk
 from vmri_jax.schemes.composition import SchemeLike
 from vmri_jax.steppers.solver import Solver
+
+MOST_CHUNKS = 20_000
+"""Largest number of chunks of an ensemble, unless limits need more. A scheduler hands out some hundreds of tasks a second,
+and every chunk has its files: a larger number costs more time than the runs."""
+FEWEST_CHUNKS = 64
+"""Target for the smallest number of chunks, so that workers share the runs evenly; batches that are computed side by side are not cut for
+it. A larger one makes chunks so small that writing their files takes most of the time."""
+MICRO_STEP_NANOSECONDS = {"explicit": 1.0, "implicit": 25.0}
+"""Rough nanoseconds of a micro step, for each coordinate of each run in a batch, by kind of step. They only choose the size of chunks: with
+larger ones chunks have fewer runs."""
 
 AnyScheme = str | SchemeLike | Callable[[int], SchemeLike]
 """A scheme, the name of one, or a function from the number of micro steps to a scheme."""
@@ -88,16 +118,30 @@ class Work:
         """The problem whose parameters and start the columns change."""
         return find_problem(self.system) if isinstance(self.system, str) else self.system
 
-    @cached_property
-    def lane(self) -> Callable[[Row], Lanes]:
-        """The function from the numbers of a row to the parameters and the start of its run."""
-        names = columns_of_problems(self.columns)
-        return lane_function(self.problem, self.vary, names, "t_end" in self.steps)
+    def lane(self, problem: Problem, row: Row) -> tuple[Any, tuple[Any, ...]]:
+        """The parameters of the run of a row, None if `vary` changes none, and its start (t, q_s, q_f, v_s, v_f).
+
+        The problem is an argument, since this function is traced: a problem that it made would have tracers. `vary` gets the columns in their order in
+        the design, which JAX would sort.
+        """
+        columns = columns_of_problems(self.columns)
+        if self.vary is None and columns:
+            known = near(columns[0], (*STEPS, *SCHEMES))
+            reason = f"the column {columns[0]!r} is neither a step nor a scheme"
+            raise Refused(f"ensemble: {reason}.{known} Give vary= for it.")
+        changed = problem if self.vary is None else self.vary(problem, {name: row[name] for name in columns})
+        check_type("ensemble: vary(problem, row)", changed, Problem, "dataclasses.replace(problem, q_s=...)")
+        _check_only_values_differ(problem, changed)
+        if "t_end" in self.steps and changed.t is not problem.t:
+            raise Refused("ensemble: vary changes t, so that t_end does not fix the number of steps; give num_steps.")
+        is_same = changed.system.params is problem.system.params
+        return None if is_same else changed.system.params, tuple(getattr(changed, part) for part in START)
 
     @cached_property
-    def lanes(self) -> Callable[[Rows, int], Lanes]:
+    def lanes(self) -> Callable[[Rows, int], tuple]:
         """The compiled function from the numbers of some rows, and their count, to the parameters and starts of their runs."""
-        return jax.jit(lambda rows, count: jax.vmap(self.lane, axis_size=count)(rows), static_argnums=1)
+        lane = partial(self.lane, self.problem)
+        return jax.jit(lambda rows, count: jax.vmap(lane, axis_size=count)(rows), static_argnums=1)
 
     @cached_property
     def quantities(self) -> list[Quantity]:
@@ -199,7 +243,108 @@ def all_groups(work: Work, design: Design) -> Iterator[Group]:
     yield from work.groups(rows | {name: np.repeat(first[name], count) for name in step_columns}, count)
 
 
+def _check_only_values_differ(problem: Problem, changed: Problem) -> None:
+    """Refuse a row whose run the program of the problem cannot compute: another system but for parameters, or arrays of other shapes."""
+    leaves, structure = jax.tree.flatten(problem.system.replace(params=None))
+    new_leaves, new_structure = jax.tree.flatten(changed.system.replace(params=None))
+    are_equal = (a is b or (is_concrete(b) and np.array_equal(a, b)) for a, b in zip(leaves, new_leaves, strict=False))
+    same_system = structure == new_structure and all(are_equal)
+    before, after = ((entry.system.params, [getattr(entry, part) for part in START]) for entry in (problem, changed))
+    same_shapes = jax.tree.map(np.shape, before) == jax.tree.map(np.shape, after)
+    if not (same_system and same_shapes):
+        changes = "the system besides its params" if same_shapes else "the structure or shape of one of them"
+        raise Refused(f"ensemble: vary changes {changes}; it may change values of system.params and of the start.")
+
+
 def _whole(name: str, value) -> int:
     if float(value) != int(value) or value < 1:
         raise Refused(f"ensemble: a value of {name} is {value}; it must be a whole number of at least 1.")
     return int(value)
+
+
+def prepared(work: Work, design: Design, chunk: int | None = None) -> tuple[dict[str, Kept], Chunks, Simulation]:
+    """The arrays of the store, the division of the runs, and the longest run, after all checks; nothing is computed."""
+    jax.eval_shape(partial(work.lane, work.problem), _first_row(design))
+    runs = [work.simulation(group) for group in all_groups(work, design)]  # one of each group
+    runs[0].check("ensemble: the start", constraints=False)
+    over_nodes = [name for name in OVER_NODES if name in work.save]
+    if over_nodes and work.num_saves == 1:
+        looks = f"{', '.join(over_nodes)} looks at the saved nodes of a run"
+        raise Refused(f"ensemble: {looks}, and only its end is saved; give num_saves, for example 50.")
+    runs.sort(key=lambda run: run.num_steps * run.scheme.num_micro, reverse=True)
+    arrays = {
+        "result": Kept(np.empty((), np.int32), (), "status of the run, see flag_meanings"),
+        "failed_at": Kept(np.empty((), np.int32), (), "macro step that failed, -1 if none did"),
+    }
+    arrays |= what_is_kept(work.quantities, runs[0])
+    return arrays, _chunks(runs, len(design), arrays, chunk), runs[0]
+
+
+def _first_row(design: Design) -> Row:
+    """The numbers of the first row of a design."""
+    return {name: values[0] for name, values in numbers_in(design.rows(0, 1)).items()}
+
+
+def _chunks(runs: list[Simulation], lanes: int, arrays: dict[str, Kept], chunk: int | None) -> Chunks:
+    """Chunks of about `CHUNK_SECONDS`, of a power of two times `width` runs; `width` runs are computed side by side."""
+    run = runs[0]
+    # A chunk has runs of every group: a batch wider than the share of one group would be filled with copies.
+    width = min(lanes_at_once(run), 2 ** (-(-lanes // len(runs)) - 1).bit_length(), lanes)
+    if chunk is not None:
+        size = min(whole_number("ensemble: chunk", chunk, otherwise=", or None"), lanes)
+        return Chunks(lanes, size, min(width, size))
+    kind = "implicit" if run.system.is_constrained or run.plan.has_fallback else "explicit"
+    size_q = run.state.q_s.size + run.state.q_f.size
+    micro_steps = run.num_steps * run.scheme.num_micro
+    seconds = 1e-9 * MICRO_STEP_NANOSECONDS[kind] * micro_steps * run.scheme.degree**2 * size_q
+    array_bytes = sum(kept.value.dtype.itemsize * int(np.prod(kept.value.shape)) for kept in arrays.values())
+    bytes_of_run = array_bytes + 8 * (2 * size_q + 8) * (run.num_saves + 1)
+    most_lanes = min(rows_per_chunk(lanes, seconds, bytes_of_run, MOST_CHUNKS), lanes / FEWEST_CHUNKS)
+    size = width * 2 ** max(0, int(np.log2(max(most_lanes / width, 1.0))))
+    return Chunks(lanes, min(size, lanes), width)
+
+
+def attributes_of(work: Work, design: Design, run: Simulation, chunks: Chunks) -> dict[str, Any]:
+    """Attributes of the store of an ensemble: the design, names of coordinates, the record that identifies it, versions."""
+    names = (run.names or Names()).of_coordinates(run.state.q_s.size, run.state.q_f.size)
+    design_record = {"kind": type(design).__name__, "columns": design.described()}
+    if isinstance(design, Draws):
+        design_record |= {"method": design.method, "seed": design.seed}
+    return {
+        "kind": "ensemble",
+        "rows": chunks.lanes,
+        "chunk": chunks.size,
+        "width": chunks.width,
+        "design": design_record,
+        "system": work.system if isinstance(work.system, str) else "a problem",
+        "slow": names.slow_coordinates,
+        "fast": names.fast_coordinates,
+        "identity": _identity(work, design, run),
+        "made_with": environment(),
+    }
+
+
+def _identity(work: Work, design: Design, run: Simulation) -> dict[str, str]:
+    """In words and digests, by name, everything that the results depend on."""
+    about_run = identity(run, run.state).items()
+    identity_record = {name: text for name, text in about_run if not name.startswith(("scheme", "macro_dt"))}
+    for label, scheme in work.schemes.items():
+        name = scheme if isinstance(scheme, str) else getattr(scheme, "__qualname__", None)
+        identity_record |= {f"scheme {label}": name} if name else describe(f"scheme {label}", scheme)
+    identity_record |= {name: str(value) for name, value in work.steps.items()}
+    saved = [label_of(entry) if callable(entry) else Path(entry).name for entry in work.save]
+    identity_record |= {"num_micro": str(work.num_micro), "save": ", ".join(saved)}
+    for entry in filter(callable, work.save):
+        identity_record |= {f"operations of {label_of(entry)}": operations(quantity(entry), resting(run))}
+    identity_record |= {"num_saves": str(work.num_saves), "project": str(work.project), "runs": str(len(design))}
+    identity_record |= {f"file {Path(file).name}": digest for file, digest in work.sources.items()}
+    if work.vary is not None:
+        identity_record |= describe("vary", work.vary)
+        identity_record |= {"operations of vary": operations(partial(work.lane, work.problem), _first_row(design))}
+    identity_record |= {"design": type(design).__name__}
+    if isinstance(design, Draws):
+        identity_record |= {"method": design.method, "seed": str(design.seed)}
+    for name, column in (design.axes if isinstance(design, Product) else design.columns).items():
+        values = column.values if isinstance(column, Axis) else (column.name, *column.arguments)
+        identity_record |= describe(f"column {name}", values)
+    return identity_record

@@ -1,7 +1,6 @@
 """Identification: parameters of a system from measurements of its motion, with what is known about them afterwards."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from functools import partial
 from typing import cast
 
@@ -9,24 +8,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.fitting.measured import Measured
+from vmri_jax.fitting.given import Measured, Unknown, Unknowns
 from vmri_jax.fitting.result import SINGULAR_VALUE_TOLERANCE, Fit, without_starts
 from vmri_jax.fitting.shooting import Shooting
-from vmri_jax.fitting.unknowns import Unknown, Unknowns
 from vmri_jax.mechanics.arrays import whole_number
 from vmri_jax.mechanics.checks import check_type
-from vmri_jax.mechanics.slots import free, leaves_by_name
+from vmri_jax.mechanics.places import Placed, places_of
+from vmri_jax.mechanics.slots import free
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
 from vmri_jax.refusals import Refused
 from vmri_jax.running.export import extra
 from vmri_jax.running.prepare import prepare
 from vmri_jax.running.progress import Progress, Working
-from vmri_jax.schemes.composition import Composition
-from vmri_jax.schemes.scheme import Scheme
+from vmri_jax.schemes.composition import SchemeLike
 from vmri_jax.steppers.solver import Solver
 
-START = ("q_s", "q_f", "v_s", "v_f")
-"""Unknowns of these names are the start of the problem."""
 GAP_WEIGHTS = (1e-2, 1.0, 1e2, 1e4, 1e6)
 """Weights of the gaps between the parts of multiple shooting, for searches one after the other, each from the end of
 the one before. A gap as large as the motion counts like a miss of every value by this many standard deviations. A
@@ -46,7 +42,7 @@ def fit(
     data: Measured | Sequence[Measured],
     parameters: Mapping[str, Unknown | float],
     *,
-    scheme: Scheme | Composition,
+    scheme: SchemeLike,
     macro_dt: float,
     segments: int = 1,
     starts: int = 1,
@@ -65,10 +61,11 @@ def fit(
     Jacobian in forward mode. A fit that takes more than two seconds shows its phases on the error stream.
 
     Args:
-        problem: a problem whose ``system.params`` is a dict; `parameters` name its entries, or "q_s", "q_f", "v_s",
-            "v_f" for the start. Or a function ``{name: value} -> Problem``, for everything else.
+        problem: a problem; `parameters` name its params, "bonds.stiffness", the parts of its start, "q_s", "q_f",
+            "v_s", "v_f", or numbers in them, "masses[1]", "hub x". Or a function ``{name: value} -> Problem``, for
+            everything else.
         data: one or several sets of measurements.
-        parameters: an `Unknown` for each name, or the number where its search starts. Nested names: "bonds.stiffness".
+        parameters: an `Unknown` for each name, or the number where its search starts.
         scheme, macro_dt, solver: as in `simulate`. The times of measurement must be macro nodes. Where the solver is
             not chosen, runs have no fallback.
         segments: parts of multiple shooting; more than one for long or chaotic motion.
@@ -115,24 +112,17 @@ def _model(problem, parameters: Mapping) -> Callable[[Mapping], Problem]:
     if not isinstance(problem, Problem) and callable(problem) and not hasattr(problem, "problem"):
         return cast(Callable[[Mapping], Problem], problem)
     base = problem_of("fit", cast(Problem, problem))
-    params = base.system.params if isinstance(base.system.params, Mapping) else {}
-    known, structure = leaves_by_name(params, is_leaf=lambda value: not isinstance(value, Mapping))
+    known = {name: place for name, place in places_of(base).items() if name != "t"}
     for name, unknown in parameters.items():
-        if name not in known and name not in START:
-            places = f"system.params ({', '.join(free(known)) or 'no dict'}) nor of {', '.join(START)}"
-            raise Refused(f"fit: parameters has {name!r}, which is none of {places}. A function may make the Problem.")
-        expected = np.shape(known[name] if name in known else getattr(base, name))
+        if name not in known:
+            arrays = ", ".join(free(other for other in known if "[" not in other))
+            names = f"system.params and of the start ({arrays}), and numbers of arrays, q_f[0] for example"
+            raise Refused(f"fit: parameters has {name!r}, which is none of {names}. A function may make the Problem.")
+        expected = known[name][1]
         start = unknown.start if isinstance(unknown, Unknown) else unknown
         if np.shape(start) != expected:
             raise Refused(f"fit: the start of {name!r} has shape {np.shape(start)}; in the problem it has {expected}.")
-
-    def model(values: Mapping) -> Problem:
-        inside = {name: value for name, value in values.items() if name in known}
-        start = {name: value for name, value in values.items() if name not in known}
-        system = base.system.replace(params=structure.unflatten((known | inside).values())) if inside else base.system
-        return replace(base, system=system, **start)
-
-    return model
+    return partial(Placed({name: known[name][0] for name in parameters}), base)
 
 
 def _check(data: list, segments: int, starts: int, max_steps: int) -> None:
@@ -160,13 +150,10 @@ class _Search:
         self.part_starts = shooting.starts(u_start)
         self.scale = shooting.sizes(u_start, self.part_starts)
 
-    def residual(self, x, args):
+    def residual(self, x, args, shooting: Shooting | None = None):
         """Misses of all values in standard deviations, and weighted gaps between the parts, at x = (u, z): search
         variables, and starts of the parts in units of `scale`; `args` are the values and the weight of gaps."""
-        return self._residual_of(self.shooting, x, args)
-
-    def _residual_of(self, shooting: Shooting, x, args):
-        (u, z), (values, weight) = x, args
+        (u, z), (values, weight), shooting = x, args, shooting or self.shooting
         predicted, gaps = shooting.predict(u, z * self.scale)
         misses = (predicted - values) / shooting.sigma
         finite = jnp.isfinite(misses)
@@ -235,10 +222,8 @@ class _Search:
         stiffness makes up for it. Neither the misses nor the covariance show this error.
         """
         point = (u, z), (self.shooting.values, GAP_WEIGHTS[-1])
-        coarse, fine = (
-            jax.jit(partial(self._residual_of, shooting))(*point)
-            for shooting in (self.shooting, self.shooting.with_half_steps())
-        )
+        runs = self.shooting, self.shooting.with_half_steps()
+        coarse, fine = (jax.jit(partial(self.residual, shooting=shooting))(*point) for shooting in runs)
         difference = np.concatenate([np.ravel(b - a) for a, b in zip(coarse, fine, strict=True)])
         jacobian = np.asarray(without_starts(*jacobians))
         size = np.linalg.norm(jacobian, axis=0)

@@ -9,7 +9,7 @@ Source: H. G. Bock, Recent advances in parameter identification techniques for O
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from math import gcd
 
 import jax
@@ -17,14 +17,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.accuracy.simulate import simulate
-from vmri_jax.fitting.measured import Measured
-from vmri_jax.fitting.unknowns import Unknowns
+from vmri_jax.fitting.given import Measured, Unknowns
 from vmri_jax.mechanics.constraints import known_mass
 from vmri_jax.mechanics.invariants import velocity
 from vmri_jax.mechanics.state import Problem, State, initial_state
 from vmri_jax.running.arguments import Save
-from vmri_jax.schemes.composition import Composition
-from vmri_jax.schemes.scheme import Scheme
+from vmri_jax.schemes.composition import SchemeLike
 from vmri_jax.steppers.solver import Solver
 
 SMALLEST_SIZE = 1e-3
@@ -49,7 +47,7 @@ class Shooting:
     unknowns: Unknowns
     data: Sequence[Measured]
     steps: Sequence[np.ndarray]
-    scheme: Scheme | Composition
+    scheme: SchemeLike
     solver: Solver
     macro_dt: float
     segments: int
@@ -102,8 +100,7 @@ class Shooting:
         problem = self.model(self.unknowns.at(u))
         steps = {"macro_dt": self.macro_dt, "num_steps": self.length * self.segments, "save": self.length}
         run = simulate(problem, self.scheme, **steps, solver=self.solver)
-        nodes = jax.tree.map(lambda a: np.asarray(a)[1:-1], run.states)
-        return np.asarray(jax.vmap(partial(_phase, problem))(nodes))
+        return np.concatenate([run.states.q_s, run.states.q_f, *run.velocities], axis=1)[1:-1]
 
     def sizes(self, u, starts) -> np.ndarray:
         """(2 n,) units of the starts of the parts in a search: the largest value of each coordinate at all starts, or
@@ -121,7 +118,8 @@ class Shooting:
         """Predicted values (m,), and gaps (segments - 1, 2 n): the end of each part minus the start of the next one."""
         if self.segments == 1:  # the start follows from u: JAX's own derivative needs tangents for u alone
             problem = self.model(self.unknowns.at(u))
-            observed, ends = jax.tree.map(lambda a: a[None], self._run(problem, _start(problem)))
+            start = problem.state(problem.project or problem.system.is_constrained)  # any parameters keep constraints
+            observed, ends = jax.tree.map(lambda a: a[None], self._run(problem, start))
         else:
             observed, ends = self._parts(u, jnp.concatenate([self.start(u)[None], starts]))
         predicted = [
@@ -182,8 +180,3 @@ def _phase(problem: Problem, state: State):
     """(2 n,) positions and velocities of a state."""
     v_s, v_f = velocity(problem.system, state.q_s, state.q_f, state.p_s, state.p_f)
     return jnp.concatenate([state.q_s, state.q_f, v_s, v_f])
-
-
-def _start(problem: Problem) -> State:
-    """The start of a motion, on the constraints of any parameters that a search tries."""
-    return problem.state(problem.project or problem.system.is_constrained)

@@ -1,7 +1,6 @@
 """Hard cases for any system: constraints, energy, tolerance, tiny steps, reversal, the textbook, bad input."""
 
-from vmri_jax.hard_cases.case import Case, Outcome
-from vmri_jax.hard_cases.cases import cases_for
-from vmri_jax.hard_cases.report import Report, check, run_cases
+from vmri_jax.hard_cases.case import Case, Outcome, Report, run_cases
+from vmri_jax.hard_cases.cases import cases_for, check
 
 __all__ = ["Case", "Outcome", "Report", "cases_for", "check", "run_cases"]

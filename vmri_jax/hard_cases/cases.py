@@ -1,6 +1,6 @@
 """The hard cases that apply to any system, with steps chosen from its frequencies."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from functools import cache, cached_property, partial
 
@@ -9,16 +9,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax import textbook
-from vmri_jax.accuracy.batch import simulate_batch
 from vmri_jax.accuracy.companions import positions
-from vmri_jax.accuracy.simulate import simulate
+from vmri_jax.accuracy.simulate import simulate, simulate_batch
 from vmri_jax.diagnostics import step_condition
 from vmri_jax.diagnostics.linear import phase_vector
-from vmri_jax.hard_cases.case import Case, Outcome, draw_energy
-from vmri_jax.hard_cases.derivatives import derivatives
+from vmri_jax.hard_cases.case import Case, Outcome, Report, draw_energy, run_cases
 from vmri_jax.hard_cases.measures import (
     Energy,
     constraints,
+    derivatives,
     difference,
     drift_meter,
     energy,
@@ -28,13 +27,12 @@ from vmri_jax.hard_cases.measures import (
     run,
     status,
 )
-from vmri_jax.mechanics.constraints import rows_at, weights_at
+from vmri_jax.mechanics.constraints import known_mass, rows_at, weights_at
 from vmri_jax.mechanics.linearisation import linearise
 from vmri_jax.mechanics.motion import motion
-from vmri_jax.mechanics.projection import legendre
 from vmri_jax.mechanics.state import HasProblem, Problem, State, initial_state, problem_of
 from vmri_jax.mechanics.system import System
-from vmri_jax.running.progress import Working
+from vmri_jax.running.progress import ShowsProgress, Working
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes.scheme import Scheme, fully_explicit, fully_implicit
 from vmri_jax.stability import advise
@@ -97,7 +95,7 @@ class Resolved:
     @cached_property
     def _long_run(self) -> Callable[[int], Trajectory]:
         """A long run by its number of macro steps, which two cases judge."""
-        return cache(lambda steps: long_run(self.problem, self.scheme, self.macro_dt, steps))
+        return cache(partial(long_run, self.problem, self.scheme, self.macro_dt))
 
     def constraints(self, full: bool) -> Outcome:
         steps = 1_000_000 if full else 10_000
@@ -206,9 +204,7 @@ class Resolved:
         oracle = simulated(system, scheme, state, macro_dt, num_steps=steps)
         runs = run(self.problem, scheme, macro_dt, steps).states, oracle
         (q, p), (q_oracle, p_oracle) = (np.split(np.asarray(phase_vector(states)), 2, axis=1) for states in runs)
-        n_s, still = state.q_s.size, jnp.zeros(q.shape[1])
-        mass = jax.jacfwd(lambda v: jnp.concatenate(legendre(system, state.q_s, state.q_f, v[:n_s], v[n_s:])))(still)
-        size = float(jnp.abs(mass).max())
+        size = float(np.abs(known_mass(system, state.q_s, state.q_f)).max())
         largest_q, largest_p = (max(np.abs(a).max(), 1e-300) for a in (q_oracle, p_oracle))
         round_off = steps * ROUND_OFF * size * largest_q * scheme.num_micro / macro_dt
         return max(difference(q, q_oracle) / largest_q, max(difference(p, p_oracle) - round_off, 0.0) / largest_p)
@@ -292,8 +288,7 @@ def cases_for(problem: Problem | HasProblem) -> tuple[Case, ...]:
         ValueError: the problem is refused by `initial_state`.
     """
     problem = problem_of("cases_for", problem)
-    with Working("cases_for") as tell:
-        tell("small motions about the start", 0, 1)
+    with Working("cases_for: small motions about the start"):
         cases = resolved(problem)
     system = problem.system
     unconstrained = "" if system.is_constrained else "the system has no constraints"
@@ -320,6 +315,24 @@ def cases_for(problem: Problem | HasProblem) -> tuple[Case, ...]:
         Case(number, title, setup, criterion, run, "".join(reason))
         for number, (title, setup, criterion, run, *reason) in enumerate(rows, start=1)
     )
+
+
+def check(
+    problem: Problem | HasProblem, numbers: Collection[int] = (), full: bool = False, progress: ShowsProgress = False
+) -> Report:
+    """Put a system to the hard cases: constraints, energy, tolerance, tiny steps, reversal, batches, bad input.
+
+    Args:
+        problem: a `Problem` or a scene; steps are chosen from its frequencies.
+        numbers, full, progress: as of `run_cases`.
+
+    Returns:
+        The `Report`, an outcome for each case.
+
+    Raises:
+        ValueError, Interrupted: as of `run_cases`.
+    """
+    return run_cases(cases_for(problem), numbers, full, progress)
 
 
 def _outside(system: System) -> str:

@@ -84,7 +84,7 @@ def events(system: System, state, t_end: float) -> Events:
     names, t_0 = driven(system, state), float(state.t)
     if not names or not t_end > t_0:
         return Events(names)
-    program = partial(_sampled, system, names, _generic(state, t_end - t_0))
+    program = partial(_sampled, system, names, generic(state, t_end - t_0))
     size = jax.eval_shape(program, jnp.zeros(1)).shape[1]
     chunk = 2 ** int(np.log2(np.clip(CHUNK // size, PARTS, SAMPLES // PARTS)))
 
@@ -162,7 +162,13 @@ def _sampled(system: System, names: tuple[str, ...], configuration, times):
     return jax.vmap(entries)(times)
 
 
-def _generic(state, length: float) -> tuple:
+@partial(jax.jit, static_argnames="names")
+def sampled_with_rates(system: System, names: tuple[str, ...], configuration, times):
+    """(k, m) entries of the terms `names` at the times (k,) in a configuration (q_s, q_f, v_s, v_f), and their rates of change."""
+    return jax.jvp(partial(_sampled, system, names, configuration), (times,), (jnp.ones_like(times),))
+
+
+def generic(state, length: float) -> tuple:
     """Positions and velocities (q_s, q_f, v_s, v_f) near a state, always the same: positions a hundredth away, velocities of ten sizes in a run."""
     random, q = np.random.default_rng(0), (np.asarray(state.q_s), np.asarray(state.q_f))
     size = max(float(np.abs(a).max(initial=0.0)) for a in q) or 1.0

@@ -4,10 +4,9 @@ Every function returns a matplotlib `Figure` made without pyplot: no window open
 notebook shows it when it is the value of a cell. Colours follow Okabe and Ito, told apart by the colour-blind.
 """
 
-from vmri_jax.plots.controls import plot_control
 from vmri_jax.plots.ensembles import plot_ensemble
-from vmri_jax.plots.fits import plot_fit
 from vmri_jax.plots.runs import plot_forces, plot_trajectory
+from vmri_jax.plots.searches import plot_control, plot_fit
 from vmri_jax.plots.studies import plot_convergence, plot_work_precision
 from vmri_jax.plots.theme import (
     DARK,

@@ -74,6 +74,7 @@ def plot_ensemble(
     for name in (x, y):
         if name is not None and name not in data.coords:
             raise Refused(f"plot_ensemble: {unknown('axis or column', name, map(str, data.coords))}")
+    values = values.compute()
     axes = sorted((str(d) for d in values.dims if d != "lane"), key=lambda d: -values.sizes[d])
     if x is None and y is None and "lane" not in values.dims:
         numbers = [name for name in axes if values[name].dtype.kind in "if" and values.sizes[name] > 1]
@@ -139,7 +140,7 @@ def _named(axis: str, value) -> str:
 
 
 def _plot_maps(values, failed, x: str, y: str, title: str, theme: Theme) -> NotebookFigure:
-    values, failed = values.compute(), failed.compute()
+    failed = failed.compute()
     panels, marks = _panels(values, (x, y)), [panel for _, panel in _panels(failed, (x, y))]
     norm = _norm(values.values)
     columns = min(4, len(panels))
@@ -162,7 +163,6 @@ def _plot_maps(values, failed, x: str, y: str, title: str, theme: Theme) -> Note
 
 
 def _plot_curves(values, x: str, title: str, theme: Theme) -> NotebookFigure:
-    values = values.compute()
     curve_axes = [d for d in values.dims if d != x]
     with new_figure(7.0, 3.8, title, theme) as figure:
         axes = figure.subplots()
@@ -180,7 +180,6 @@ def _plot_curves(values, x: str, title: str, theme: Theme) -> NotebookFigure:
 
 
 def _plot_cloud(values, x: str, y: str | None, title: str, theme: Theme) -> NotebookFigure:
-    values = values.compute()
     up = values if y is None else values[y]
     with new_figure(6.0, 3.9, title, theme) as figure:
         axes = figure.subplots()

@@ -55,8 +55,7 @@ def plot_trajectory(trajectory: SavedRun, title: str = "", theme: Theme = LIGHT)
     with new_figure(7.2, 0.4 + 1.85 * count, title, theme) as figure:
         axes = figure.subplots(count, sharex=True, squeeze=False)[:, 0]
         for panel, (values, labels, quantity, error) in zip(axes, positions, strict=False):
-            coordinates(panel, t, values, labels, theme, error)
-            panel.set_ylabel(quantity)
+            coordinates(panel, t, values, labels, quantity, theme, error)
         below = axes[len(positions) :]
         if has_error:
             _position_error(below[0], t, trajectory.error, theme)
@@ -100,10 +99,9 @@ def plot_forces(trajectory: SavedRun, title: str = "", theme: Theme = LIGHT) -> 
     with new_figure(7.2, 0.4 + 1.85 * len(panels), title, theme) as figure:
         axes = figure.subplots(len(panels), sharex=True, squeeze=False)[:, 0]
         for panel, (quantity, curves) in zip(axes, panels.items(), strict=True):
-            coordinates(panel, t, np.stack(list(curves.values()), axis=1), list(curves), theme)
-            panel.set(ylabel=quantity, ylim=(0.0, None))
+            coordinates(panel, t, np.stack(list(curves.values()), axis=1), list(curves), quantity, theme)
+            panel.set_ylim(0.0, None)
         axes[-1].set(xlabel="time $t$")
-        limit_times(axes[-1], t)
         figure.align_ylabels()
         if trajectory.names.carried:
             figure.supxlabel(WITHOUT_CURVES, fontsize=7.5, x=0.01, ha="left")
@@ -172,9 +170,11 @@ def limit_times(axes: Axes, t) -> None:
         axes.set_xlim(reached[0], reached[-1])
 
 
-def coordinates(axes: Axes, t, values, names: Sequence[str], theme: Theme, error=None) -> None:
-    """One curve for each coordinate, with a band of its error, and at most `MOST_NAMED` names beside the panel."""
+def coordinates(axes: Axes, t, values, names: Sequence[str], quantity: str, theme: Theme, error=None) -> None:
+    """One curve for each coordinate, with a band of its error; at most `MOST_NAMED` names stand beside the panel."""
     n = values.shape[1]
+    axes.set_ylabel(quantity)
+    limit_times(axes, t)
     colors: Any = theme.curves
     if n > len(theme.curves):
         low, high = (0.3, 1.0) if theme is DARK else (0.0, 0.88)

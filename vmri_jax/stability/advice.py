@@ -12,8 +12,7 @@ from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.mechanics.terms import label
 from vmri_jax.running.arguments import check_step_size
 from vmri_jax.running.origin import names_of
-from vmri_jax.schemes.composition import Composition, stage_lengths, stage_scheme
-from vmri_jax.schemes.scheme import Scheme
+from vmri_jax.schemes.composition import Composition, SchemeLike, stage_lengths, stage_scheme
 from vmri_jax.stability.drive import LEAST_STEPS, drive_period, driven_motion, growth_of_run, in_words, periods_of_run
 from vmri_jax.stability.map import Window, measure
 from vmri_jax.stability.multipliers import TOLERANCE, multipliers
@@ -126,7 +125,7 @@ class Advice(ResultTable):
 
 def advise(
     system: Movable,
-    scheme: Scheme | Composition,
+    scheme: SchemeLike,
     state: State | None = None,
     *,
     macro_dt: float,
@@ -163,7 +162,7 @@ def advise(
     """
     names = names_of(system)
     system, state = start_of("advise", system, state)
-    check_type("advise: scheme", scheme, Scheme | Composition, "a Scheme, e.g. fully_implicit(num_micro=10)")
+    check_type("advise: scheme", scheme, SchemeLike, "a Scheme, e.g. fully_implicit(num_micro=10)")
     check_step_size(macro_dt, "advise")
     macro_dt, linear = float(macro_dt), linearise(system, state, names)
     period = drive_period(system, state, macro_dt)
@@ -272,13 +271,13 @@ def _nearest_safe(macro_dt: float, windows, lower: float, upper: float) -> float
     return min(free, key=lambda end: abs(end - macro_dt), default=np.nan)
 
 
-def _cause(linear: Linearisation, scheme: Scheme | Composition, macro_dt: float) -> tuple[str, str]:
+def _cause(linear: Linearisation, scheme: SchemeLike, macro_dt: float) -> tuple[str, str]:
     """Kind and description of an instability at this step."""
     limit = _stability_limit(linear, scheme, macro_dt)
     return ("stability limit", limit) if limit else _resonance(linear, scheme, macro_dt)
 
 
-def _stability_limit(linear: Linearisation, scheme: Scheme | Composition, macro_dt: float) -> str:
+def _stability_limit(linear: Linearisation, scheme: SchemeLike, macro_dt: float) -> str:
     """A sentence about a potential for which alone the step is unstable; empty if there is none."""
     stage = stage_scheme(scheme)
     longest = macro_dt * np.abs(stage_lengths(scheme)).max()
@@ -307,7 +306,7 @@ def _stability_limit(linear: Linearisation, scheme: Scheme | Composition, macro_
     return ""
 
 
-def _resonance(linear: Linearisation, scheme: Scheme | Composition, macro_dt: float) -> tuple[str, str]:
+def _resonance(linear: Linearisation, scheme: SchemeLike, macro_dt: float) -> tuple[str, str]:
     """Kind of resonance, and the vibrations with the most energy in the eigenvector of the largest multiplier."""
     spectrum = multipliers(linear, scheme, [macro_dt])
     worst = np.argmax(np.where(spectrum.growing[0], 0.0, np.abs(spectrum.values[0])))
@@ -332,7 +331,7 @@ def _resonance(linear: Linearisation, scheme: Scheme | Composition, macro_dt: fl
     )
 
 
-def _kicks_in_phase(linear: Linearisation, scheme: Scheme | Composition, macro_dt: float) -> Iterator[Finding]:
+def _kicks_in_phase(linear: Linearisation, scheme: SchemeLike, macro_dt: float) -> Iterator[Finding]:
     """A warning for each vibration that kicks of the constant slow force f meet in phase.
 
     Between kicks H f the vibration turns by phi. The periodic motion has ``p = H f / 2`` after a kick and the amplitude
@@ -370,7 +369,7 @@ def _is_fast(linear: Linearisation, i) -> bool:
     return bool(modes[:, i] @ linear.hessians["fast"] @ modes[:, i] >= frequencies[i] ** 2 / 2)
 
 
-def _turn(linear: Linearisation, scheme: Scheme | Composition, macro_dt: float, i) -> float:
+def _turn(linear: Linearisation, scheme: SchemeLike, macro_dt: float, i) -> float:
     """Angle that vibration i turns in a macro step: the phase of the micro steps if W carries it, else ``omega H``."""
     exact = float(linear.frequencies[i] * macro_dt)
     if not _is_fast(linear, i):
@@ -381,7 +380,7 @@ def _turn(linear: Linearisation, scheme: Scheme | Composition, macro_dt: float, 
     return turn if np.isfinite(turn) else exact
 
 
-def _stages(scheme: Scheme | Composition) -> Iterator[Finding]:
+def _stages(scheme: SchemeLike) -> Iterator[Finding]:
     """A note on backward steps of a composition."""
     parts = np.asarray(stage_lengths(scheme))
     if not (parts > 0).all():

@@ -10,19 +10,14 @@ from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import partial
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.diagnostics.linear import state_of
-from vmri_jax.mechanics.arrays import quickly_compiled
-from vmri_jax.mechanics.driving import driven
-from vmri_jax.mechanics.invariants import velocity
+from vmri_jax.mechanics.driving import driven, generic, sampled_with_rates
 from vmri_jax.mechanics.linearisation import Linearisation
 from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.mechanics.system import System
-from vmri_jax.schemes.composition import Composition, stage_scheme
-from vmri_jax.schemes.scheme import Scheme, fully_implicit
+from vmri_jax.schemes.composition import SchemeLike, stage_scheme
+from vmri_jax.schemes.scheme import fully_implicit
 from vmri_jax.stability.multipliers import monodromy
 
 SAMPLES = 1024
@@ -75,17 +70,19 @@ def in_words(growth: float) -> str:
 
 
 def drive_period(system: System, state: State, scale: float) -> float | None:
-    """The smallest period of all terms that depend on time and of their derivatives, at a state.
+    """The smallest period of all terms that depend on time, at a generic configuration near a state.
 
     Periods of 1/500 to 2000 times `scale`, such as the macro step, are seen. None if nothing depends on time, or no
     period is seen, as for pulses, chirps, and drives with jumps.
     """
-    if not driven(system, state) or not 0 < scale < np.inf:
+    names = driven(system, state)
+    if not names or not 0 < scale < np.inf:
         return None
+    entries = partial(sampled_with_rates, system, names, generic(state, scale * SPANS[-1]))
     start, random = float(state.t), np.random.default_rng(0)
     for span in scale * SPANS:
         step, times = span / SAMPLES, start + np.arange(SAMPLES) * span / SAMPLES
-        signal = _signal(system, state, times)
+        signal = _signal(entries, times)
         before, anywhere = signal(times)[0], start + 16 * span * random.random(SAMPLES)
         windows = np.lib.stride_tricks.sliding_window_view(before, SAMPLES // 2)
         apart = np.square(windows - windows[0]).mean(axis=1)
@@ -101,30 +98,14 @@ def drive_period(system: System, state: State, scale: float) -> float | None:
     return None
 
 
-def _signal(system: System, state: State, times: np.ndarray) -> Callable[[np.ndarray], tuple]:
-    """One function of times (k,) for all terms, each in units of its amplitude, and its rate of change, (k,) both."""
-    values = np.nan_to_num(_drive(system, state, times)[0], posinf=0.0, neginf=0.0)
+def _signal(entries: Callable, times: np.ndarray) -> Callable[[np.ndarray], tuple]:
+    """One function of times (k,) for all entries, each in units of its amplitude, and its rate of change, (k,) both."""
+    values = np.nan_to_num(entries(times)[0], posinf=0.0, neginf=0.0)
     amplitude = np.ptp(values, axis=0)
     moves = amplitude > 1e-9 * np.abs(values).max(axis=0)
-    # weights by which no two terms cancel
+    # weights by which no two entries cancel
     weights = np.where(moves, np.cos(1.0 + np.arange(moves.size)), 0.0) / np.where(moves, amplitude, 1.0)
-    return lambda times: tuple(np.nan_to_num(part) @ weights for part in _drive(system, state, times))
-
-
-@quickly_compiled
-def _drive(system: System, state: State, times):
-    """Forces and constraints at k times with a derivative along one direction of (q, v), and their rates, (k, m)."""
-    z = jnp.concatenate([state.q_s, state.q_f, *velocity(system, state.q_s, state.q_f, state.p_s, state.p_f)])
-    direction = jnp.cos(2.0 + jnp.arange(z.size))
-
-    def terms(t, z):
-        _, q_s, q_f, v_s, v_f = vars(state_of(z, t, state)).values()
-        return jnp.concatenate([*system.forces(t, q_s, q_f, v_s, v_f), system.constraints(t, q_s, q_f)])
-
-    def terms_and_derivatives(t):
-        return jnp.concatenate(jax.jvp(partial(terms, t), (z,), (direction,)))
-
-    return jax.vmap(lambda t: jax.jvp(terms_and_derivatives, (t,), (jnp.ones(()),)))(times)
+    return lambda times: tuple(np.nan_to_num(part) @ weights for part in entries(times))
 
 
 def periods_of_run(macro_dt: float, period: float) -> int:
@@ -156,9 +137,7 @@ def growth_over_period(moving: Movable, linear: Linearisation) -> DrivenMotion |
     return None if period is None else driven_motion(system, fully_implicit(1), state, step, period)
 
 
-def driven_motion(
-    system: System, scheme: Scheme | Composition, state: State, macro_dt: float, period: float
-) -> DrivenMotion:
+def driven_motion(system: System, scheme: SchemeLike, state: State, macro_dt: float, period: float) -> DrivenMotion:
     """The mean growth over a period of the drive, from steps of T/n, which are halved until two of them agree."""
     n, micro, tried = max(1, int(np.ceil(period / macro_dt - 1e-6))), stage_scheme(scheme).num_micro, {}
     followed = period, periods_of_run(macro_dt, period)

@@ -15,8 +15,7 @@ from vmri_jax.mechanics.linearisation import Linearisation, linearise
 from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.plots import LIGHT, NotebookFigure, Theme, new_figure, panel_grid
 from vmri_jax.refusals import Refused
-from vmri_jax.schemes.composition import Composition
-from vmri_jax.schemes.scheme import Scheme
+from vmri_jax.schemes.composition import SchemeLike
 from vmri_jax.stability.multipliers import multipliers
 from vmri_jax.study.table import Column, ResultTable
 
@@ -105,7 +104,7 @@ class StabilityMap(ResultTable):
 
 def stability_map(
     system: Movable | Mapping[Any, Movable],
-    scheme: Scheme | Composition | Mapping[Any, Scheme | Composition],
+    scheme: SchemeLike | Mapping[Any, SchemeLike],
     omega_H: Sequence[float] | np.ndarray,
     *,
     state: State | None = None,
@@ -136,7 +135,7 @@ def stability_map(
     grid = _grid(omega_H)
     systems = system if isinstance(system, Mapping) else {"": system}
     schemes = scheme if isinstance(scheme, Mapping) else {"": scheme}
-    if not schemes or not all(isinstance(s, Scheme | Composition) for s in schemes.values()):
+    if not schemes or not all(isinstance(s, SchemeLike) for s in schemes.values()):
         raise Refused(f"stability_map: scheme is {scheme!r}; give a Scheme, e.g. explicit_slow(10), or a dict of them.")
     if min(len(systems), len(schemes)) != 1:
         raise Refused(f"stability_map: {len(systems)} systems and {len(schemes)} schemes; give one of either.")
@@ -159,7 +158,7 @@ def stability_map(
 
 
 def measure(
-    linear: Linearisation, scheme: Scheme | Composition, macro_dt, resolution: float = RESOLUTION
+    linear: Linearisation, scheme: SchemeLike, macro_dt, resolution: float = RESOLUTION
 ) -> tuple[np.ndarray, list[Window]]:
     """Spectral radius (n,) at n increasing macro steps, and the unstable windows between the first and the last."""
 

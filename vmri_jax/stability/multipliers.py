@@ -21,8 +21,7 @@ from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.mechanics.system import System
 from vmri_jax.refusals import Refused
 from vmri_jax.running.arguments import check_step_size
-from vmri_jax.schemes.composition import Composition, stage_lengths, stage_scheme
-from vmri_jax.schemes.scheme import Scheme
+from vmri_jax.schemes.composition import SchemeLike, stage_lengths, stage_scheme
 from vmri_jax.steppers.results import Result
 from vmri_jax.steppers.solver import Solver
 
@@ -77,7 +76,7 @@ class Multipliers:
         return signatures
 
 
-def multipliers(linear: Linearisation, scheme: Scheme | Composition, macro_dt) -> Multipliers:
+def multipliers(linear: Linearisation, scheme: SchemeLike, macro_dt) -> Multipliers:
     """Multipliers of a macro step for k lengths of the step.
 
     The derivative of the step is exact: of `macro_step` of the expansion at rest, on the tangent space of the
@@ -178,7 +177,7 @@ class Monodromy:
 
 def monodromy(
     system: Movable,
-    scheme: Scheme | Composition,
+    scheme: SchemeLike,
     state: State | None = None,
     *,
     macro_dt,
@@ -216,7 +215,7 @@ def _constraint_rows(system: System, state: State):
 
 
 @quickly_compiled
-def _followed(system: System, scheme: Scheme | Composition, start: State, macro_dt, solver, num_steps, directions):
+def _followed(system: System, scheme: SchemeLike, start: State, macro_dt, solver, num_steps, directions):
     """The end z_N (2 n,), the images (k, 2 n) of directions at the start, the number of steps that were taken, and the
     result of the last one: a step that fails is the last."""
 

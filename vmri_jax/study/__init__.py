@@ -2,11 +2,9 @@
 
 from vmri_jax.accuracy.families import Family, families
 from vmri_jax.study.convergence import ConvergenceStudy, convergence_study
-from vmri_jax.study.cost_report import CostReport, cost_report
-from vmri_jax.study.reference_solution import ReferenceSolution, reference_solution
-from vmri_jax.study.row import Row, WorkPrecision
+from vmri_jax.study.row import ReferenceSolution, Row, WorkPrecision, reference_solution
 from vmri_jax.study.table import Column, ResultTable
-from vmri_jax.study.tuning import Recommendation, tune
+from vmri_jax.study.tuning import CostReport, Recommendation, cost_report, tune
 
 __all__ = [
     "Column",

@@ -7,7 +7,7 @@ The error of a run is the largest difference over all saved nodes and all coordi
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import partial
 from itertools import product
 from operator import attrgetter, itemgetter
 from typing import Any
@@ -29,37 +29,12 @@ from vmri_jax.running.timing import interleaved
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes.composition import SchemeLike
 from vmri_jax.steppers.solver import Solver
-from vmri_jax.study.reference_solution import ReferenceSolution, reference_solution
-from vmri_jax.study.row import Row, RunTable, WorkPrecision, row_of
+from vmri_jax.study.row import ReferenceSolution, Row, RunTable, WorkPrecision, reference_solution, row_of
 from vmri_jax.study.table import Column, interruptible
 
 MIN_ERROR_OVER_REFERENCE = 100.0
 """Least ratio of a fitted error to the error of the reference; at it the
 reference changes the error of the scheme by 1 %; a larger ratio fits fewer runs."""
-
-
-@dataclass(frozen=True)
-class Case:
-    """One set of parameters: its label, the problem with it, and the reference solution."""
-
-    label: str
-    problem: Problem
-    reference: ReferenceSolution
-
-    @cached_property
-    def energies(self) -> np.ndarray | None:
-        """(num_saves + 1,) energies of the reference; None where the system keeps its energy: the energy at the start then serves."""
-        if self.problem.system.keeps_energy:
-            return None
-        n_s = self.problem.q_s.size
-        phase = [part for array in (self.reference.q, self.reference.p) for part in np.split(array, [n_s], axis=1)]
-        return np.asarray(jax.jit(jax.vmap(partial(diagnostics.energy, self.problem.system)))(*phase))
-
-    def row(self, name: str, scheme, num_steps: int, t_end: float, run: Trajectory) -> Row:
-        """The row of a run of a scheme to `t_end`."""
-        error_q, error_p = self.reference.errors(run)
-        known = {"error_q": error_q, "error_p": error_p, "case": self.label}
-        return row_of(name, self.problem.system, scheme, run, t_end / num_steps, num_steps, self.energies, **known)
 
 
 def _order(fit: OrderFit) -> str:
@@ -207,8 +182,8 @@ def convergence_study(
     if not steps:
         raise Refused("convergence_study: macro_dt is empty; give the macro steps to run.")
     cases = _cases(problem, params, reference, t_end, num_saves, progress)
-    labels = [(label, case, n) for label in schemes for case in cases for n in steps]
-    arguments = [(case.problem, schemes[label], t_end, num_saves, solver, n) for label, case, n in labels]
+    labels = list(product(schemes, cases, steps))
+    arguments = [(cases[case][0], schemes[label], t_end, num_saves, solver, n) for label, case, n in labels]
     total = len(labels)
 
     def tell(done: int, i: int) -> None:
@@ -219,9 +194,14 @@ def convergence_study(
         runs = mapped("convergence_study", _run, arguments, executor, tell)
     except Interrupted as interrupted:
         runs, stopped = interrupted.done, interrupted
-    done = [(labels[i], run) for i, run in enumerate(runs) if run is not None]
-    rows = [case.row(label, schemes[label], n, t_end, run) for (label, case, n), run in done]
-    study = ConvergenceStudy(tuple(rows), {case.label: case.reference for case in cases})
+    energies, rows = {case: _energies(*of_case) for case, of_case in cases.items()}, []
+    for (label, case, n), run in zip(labels, runs, strict=True):
+        if run is not None:
+            problem, reference = cases[case]
+            errors = dict(zip(("error_q", "error_p"), reference.errors(run), strict=True))
+            numbers = t_end / n, n, energies[case]
+            rows.append(row_of(label, problem.system, schemes[label], run, *numbers, **errors, case=case))
+    study = ConvergenceStudy(tuple(rows), {case: reference for case, (_, reference) in cases.items()})
     if stopped is not None:
         raise Interrupted(study, len(rows), None, "runs") from None
     if repeats:
@@ -236,8 +216,12 @@ def convergence_study(
     return study
 
 
-def _cases(problem: Problem, params, reference, t_end: float, num_saves: int, progress: Progress) -> list[Case]:
-    """The cases of `convergence_study`; refuses references with other labels or of another shape."""
+Case = tuple[Problem, ReferenceSolution]
+"""The problem with a set of parameters, and its reference solution."""
+
+
+def _cases(problem: Problem, params, reference, t_end: float, num_saves: int, progress: Progress) -> dict[str, Case]:
+    """The cases of `convergence_study` by label; refuses references with other labels or of another shape."""
     if params is not None and not params:
         raise Refused("convergence_study: params is empty; give a set of parameters by label, or leave it out.")
     sets = {"": problem.system.params} if params is None else params
@@ -255,7 +239,15 @@ def _cases(problem: Problem, params, reference, t_end: float, num_saves: int, pr
         if shapes != (shape, shape):
             nodes = "num_saves + 1 nodes from the start to t_end, slow coordinates first"
             raise Refused(f"convergence_study: reference has shapes {shapes}; both must be {shape}: {nodes}.")
-    return [Case(label, problem, reference[label]) for label, problem in problems.items()]
+    return {label: (problem, reference[label]) for label, problem in problems.items()}
+
+
+def _energies(problem: Problem, reference: ReferenceSolution) -> np.ndarray | None:
+    """(num_saves + 1,) energies of the reference; None where the system keeps its energy: the energy at the start then serves."""
+    if problem.system.keeps_energy:
+        return None
+    phase = [part for array in (reference.q, reference.p) for part in np.split(array, [problem.q_s.size], axis=1)]
+    return np.asarray(jax.jit(jax.vmap(partial(diagnostics.energy, problem.system)))(*phase))
 
 
 def _prepared(problem: Problem, scheme, t_end: float, num_saves: int, solver, num_steps: int) -> Simulation:

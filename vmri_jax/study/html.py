@@ -42,14 +42,10 @@ def processor() -> str:
 
 def embedded(draw: Callable[[plots.Theme], Figure]) -> tuple[str, str]:
     """A figure as two data URLs, the light one and the dark one."""
-    images = [svg(draw(theme), theme) for theme in (plots.LIGHT, plots.DARK)]
-    light, dark = (f"data:image/svg+xml;base64,{base64.b64encode(image).decode()}" for image in images)
-    return light, dark
-
-
-def svg(figure: Figure, theme: plots.Theme) -> bytes:
-    """The figure as an SVG file."""
-    buffer = BytesIO()
-    with plots.style(theme):
-        figure.savefig(buffer, format="svg", metadata={"Date": None})
-    return buffer.getvalue()
+    urls = []
+    for theme in (plots.LIGHT, plots.DARK):
+        buffer = BytesIO()
+        with plots.style(theme):
+            draw(theme).savefig(buffer, format="svg", metadata={"Date": None})
+        urls.append(f"data:image/svg+xml;base64,{base64.b64encode(buffer.getvalue()).decode()}")
+    return urls[0], urls[1]

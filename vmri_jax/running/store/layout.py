@@ -20,8 +20,9 @@ import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
+import equinox as eqx
 import numpy as np
 
 from vmri_jax.mechanics.checks import check_flags
@@ -50,12 +51,12 @@ MOST_CHUNK_BYTES = 2**26
 """Largest size of a chunk, which is in memory as a whole, in bytes: 64 MiB. A larger one needs more memory per worker."""
 
 
-class Kept(NamedTuple):
+class Kept(eqx.Module):
     """A row of an array of a store, or its shape and type; the names of its axes, and a description of its meaning."""
 
     value: Any
-    dimensions: tuple[str, ...] = ()
-    description: str = ""
+    dimensions: tuple[str, ...] = eqx.field(default=(), static=True)
+    description: str = eqx.field(default="", static=True)
 
 
 def rows_per_chunk(rows: int, seconds: float, size: int, most_chunks: int) -> float:
@@ -104,8 +105,8 @@ def _create(path: Path, attributes, arrays, dimension: str = "t", table=None) ->
     rows, chunk = attributes["rows"], attributes["chunk"]
     with locked(path) if path.exists() else nullcontext(), made_beside(path) as partial:
         group = zarr.create_group(partial, attributes={"format": FORMAT, **attributes})
-        for name, (value, axes, description) in arrays.items():
-            words = ({"description": description} if description else {}) | (FLAGS if name == "result" else {})
+        for name, kept in arrays.items():
+            value, words = kept.value, {"description": kept.description} if kept.description else {}
             group.create_array(
                 name,
                 shape=(rows, *value.shape),
@@ -113,10 +114,10 @@ def _create(path: Path, attributes, arrays, dimension: str = "t", table=None) ->
                 dtype=value.dtype,
                 fill_value=FILL.get(value.dtype.kind, 0),
                 compressors=Crc32cCodec(),
-                dimension_names=(dimension, *axes),
+                dimension_names=(dimension, *kept.dimensions),
                 config=CONFIG,
                 chunk_key_encoding=KEYS,
-                attributes=words,
+                attributes=words | (FLAGS if name == "result" else {}),
             )
         # An empty array, since zarr libraries warn of folders that are neither arrays nor groups.
         group.require_group(NOTES.parent.name).create_array(NOTES.name, shape=(), dtype="uint8")

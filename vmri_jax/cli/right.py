@@ -1,5 +1,6 @@
-"""`vmri explain`, `vmri advise`, `vmri stability`: grids and frequencies of a system, and which steps are stable."""
+"""`vmri explain`, `vmri advise`, `vmri stability`, `vmri check`: whether a system, its grids and steps are right."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -10,29 +11,35 @@ from typer import Argument, Option
 
 from vmri_jax import plots
 from vmri_jax.catalogue import find_problem, find_scene_or_problem, find_scheme
-from vmri_jax.cli import options
+from vmri_jax.cli import common
 from vmri_jax.cli.common import PICTURES, check_target, console, print_written
+from vmri_jax.hard_cases import Case, cases_for, run_cases
 from vmri_jax.mechanics.linearisation import linearise
 from vmri_jax.mechanics.state import Problem
 from vmri_jax.running.arguments import nothing_fast
+from vmri_jax.running.interrupts import Interrupted
 from vmri_jax.running.printed import PrintedTable
-from vmri_jax.running.progress import Working
+from vmri_jax.running.progress import Working, progress_shown
 from vmri_jax.scene.ledger import ledger_of_functions
 from vmri_jax.stability import advise as advise_on
 from vmri_jax.stability import linear_model, plot_stability, stability_map
 from vmri_jax.stability.drive import growth_over_period
 from vmri_jax.stability.map import windows_text
 
+Numbers = Annotated[list[int] | None, typer.Option("--case", help="Number of a case; may be repeated.")]
+Full = Annotated[bool, typer.Option("--full", help="Full forms: runs of up to a million steps, minutes.")]
+Out = Annotated[Path | None, typer.Option(help="Folder for a table, cases.csv, and pictures.")]
+
 
 def explain(
-    system: options.System,
-    scheme: options.Scheme = "fully-implicit",
-    num_micro: options.NumMicro = 10,
-    alpha: options.Alpha = None,
-    degree: options.Degree = None,
-    rule: options.Rule = None,
-    compose: options.Compose = None,
-    macro_dt: options.MacroStep = None,
+    system: common.System,
+    scheme: common.Scheme = "fully-implicit",
+    num_micro: common.NumMicro = 10,
+    alpha: common.Alpha = None,
+    degree: common.Degree = None,
+    rule: common.Rule = None,
+    compose: common.Compose = None,
+    macro_dt: common.MacroStep = None,
     measure: Annotated[bool, Option(help="Time a macro step, and the derivatives of every effect.")] = True,
 ) -> None:
     """Show the grid of every body and effect of a scene, or function of a system, why, its cost, and frequencies.
@@ -65,14 +72,14 @@ def explain(
 
 
 def advise(
-    system: options.System,
+    system: common.System,
     macro_dt: Annotated[float, Option(help="Macro step H, of num_micro micro steps.")],
-    scheme: options.Scheme = "fully-implicit",
-    num_micro: options.NumMicro = 10,
-    alpha: options.Alpha = None,
-    degree: options.Degree = None,
-    rule: options.Rule = None,
-    compose: options.Compose = None,
+    scheme: common.Scheme = "fully-implicit",
+    num_micro: common.NumMicro = 10,
+    alpha: common.Alpha = None,
+    degree: common.Degree = None,
+    rule: common.Rule = None,
+    compose: common.Compose = None,
 ) -> None:
     """Judge a step before a long run: resonances, limits, labels, and the nearest safe step.
 
@@ -99,10 +106,10 @@ def stability(
     ] = None,
     scheme: Annotated[list[str] | None, Option(help="May be repeated. [dim]default: explicit-slow[/dim]")] = None,
     num_micro: Annotated[list[int] | None, Option(help="May be repeated. [dim]default: 2 5 10 20[/dim]")] = None,
-    alpha: options.Alpha = None,
-    degree: options.Degree = None,
-    rule: options.Rule = None,
-    compose: options.Compose = None,
+    alpha: common.Alpha = None,
+    degree: common.Degree = None,
+    rule: common.Rule = None,
+    compose: common.Compose = None,
     until: Annotated[float, Option(help="Largest omega H, in units of pi.", min=0.1)] = 4.0,
     out: Annotated[Path | None, Option(help="Draw the map here: .png, .svg or .pdf.")] = None,
 ) -> None:
@@ -132,3 +139,35 @@ def stability(
             table.add_row(name, str(n), windows_text(windows))
     console.print(table)
     print_written("Figure", out)
+
+
+def check(system: common.System, case: Numbers = None, full: Full = False, out: Out = None) -> None:
+    """Put a system to the hard cases: constraints, energy, tolerance, tiny steps, reversal, batches, bad input.
+
+    Steps are chosen from its frequencies. Cases that do not apply say why. Ends with code 1 if a criterion is not met.
+    """
+    check_target("--out", out)
+    cases = cases_for(find_problem(system))
+    run_and_show(cases, case or (), full, out)
+
+
+def run_and_show(cases: Sequence[Case], numbers: Sequence[int], full: bool, out: Path | None) -> None:
+    """Run cases, show and write their results; exit code 1: a missed criterion, 2: a wrong number, 130: Ctrl-C."""
+    stopped = None
+    with progress_shown() as tell:
+        try:
+            report = run_cases(cases, numbers, full, tell)
+        except Interrupted as interrupted:
+            report, stopped = interrupted.done, interrupted
+    console.print(report.table())
+    judged, missed = [row for row in report.rows if row.passed is not None], report.missed
+    console.print(f"{len(judged) - len(missed)} of {len(judged)} criteria met")
+    if missed:
+        console.print(f"missed: {', '.join(str(row.case.number) for row in missed)}")
+    if out is not None:
+        for path in report.write(out):
+            console.print(f"wrote {path}", soft_wrap=True)
+    if stopped is not None:
+        raise stopped
+    if missed:
+        raise typer.Exit(1)
