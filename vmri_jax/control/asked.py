@@ -8,15 +8,19 @@ import numpy as np
 
 from vmri_jax.control.optimum import Optimum
 from vmri_jax.control.search import Point, rolled
-from vmri_jax.control.transcription import Transcription
+from vmri_jax.control.transcription import Transcription, held
 from vmri_jax.diagnostics.linear import phase_vector
 from vmri_jax.mechanics.arrays import real_array, whole_number
+from vmri_jax.mechanics.by_name import ByName
 from vmri_jax.mechanics.checks import check_type, describe
 from vmri_jax.mechanics.functions import check_arguments, traced_once
+from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.order import order_of
 from vmri_jax.mechanics.state import start_of
 from vmri_jax.refusals import Refused
 from vmri_jax.running.prepare import prepare
+from vmri_jax.schemes.composition import SchemeLike, stage_lengths, stage_scheme
+from vmri_jax.schemes.quadrature import NODE_TOLERANCE
 from vmri_jax.steppers.plan import plan
 
 
@@ -52,10 +56,14 @@ def transcribed(
     params = {} if system.params is None else system.params
     check_type("minimize: system.params", params, Mapping, "a dict, or None")
     prepare(problem, scheme, macro_dt=macro_dt, num_steps=1, solver=solver)  # makes the checks of a run
+    parts = scheme.num_micro if grid == "micro" else 1
+    _check_durations(scheme, grid, parts)
     # A fallback is a branch of the compiled step: `jax.vmap` over all steps would compute both of its sides.
     solver = solver or plan(system, scheme, state).first
     u = np.zeros(num_controls)
-    actuate = traced_once(actuate, order_of(params))
+    names = problem.names or Names()
+    slots = (names.arrays("s", state.q_s.size), names.arrays("f", state.q_f.size))
+    actuate = traced_once(ByName(actuate, ("q_s", "q_f", "u", "params"), *slots), order_of(params))
     forces = jax.eval_shape(lambda: actuate(state.q_s, state.q_f, u, params))
     expected = (state.q_s.shape, state.q_f.shape)
     if not isinstance(forces, tuple) or tuple(getattr(f, "shape", None) for f in forces) != expected:
@@ -77,8 +85,29 @@ def transcribed(
         traced_once(actuate),
         **{name: traced_once(function) for name, function in functions.items()},
         bounds=_bounds(bounds, num_controls),
-        parts=scheme.num_micro if grid == "micro" else 1,
+        parts=parts,
     )
+
+
+def _check_durations(scheme: SchemeLike, grid: str, parts: int) -> None:
+    """Refuse a scheme whose steps weigh a control by another time than its duration, or see controls of other steps.
+
+    The optimisation has steps with the `parts` controls of their own macro interval, the run has controls by time.
+    """
+    stage, lengths = stage_scheme(scheme), np.asarray(stage_lengths(scheme))
+    rule, starts = stage.force.composite(stage.num_micro), np.cumsum(lengths) - lengths
+    times = (starts[:, None] + lengths[:, None] * np.asarray(rule.nodes)).ravel()
+    weights = (lengths[:, None] * np.asarray(rule.weights)).ravel()
+    shares = weights @ jax.vmap(lambda t: held(t, jnp.eye(parts), 0.0, 1.0 / parts))(times) * parts
+    # A run has the mean of two controls at a macro node: as the steps have if their rule weighs both ends alike.
+    first, last = (weights[np.abs(times - end) <= NODE_TOLERANCE].sum() for end in (0, 1))
+    is_inside = np.all((times >= -NODE_TOLERANCE) & (times <= 1 + NODE_TOLERANCE))
+    if not (is_inside and np.allclose([*shares, 1 + first - last], 1, rtol=0, atol=NODE_TOLERANCE)):
+        raise Refused(
+            f"minimize: scheme is {scheme!r} with grid={grid!r}: the nodes of its force rule do not weigh each control "
+            "by its duration, or lie in intervals of other controls. Take a scheme that is no composition, with its "
+            "force rule on the micro grid; or grid='macro' and the composition 'suzuki4', whose nodes stay inside."
+        )
 
 
 def free(state):

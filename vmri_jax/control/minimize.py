@@ -61,7 +61,8 @@ def minimize(
         problem: system and start, a scene with `vmri_jax.scene.Controlled` effects or a problem with a dict of params.
         cost: C, cost per time, ``cost(state, u) -> ()``, with a positive second derivative in u.
         scheme, macro_dt, num_steps, solver: as in `simulate`. Forces act on the grid of the scheme for forces.
-        actuate: generalised forces of the controls, ``actuate(q_s, q_f, u, params) -> (f_s, f_f)``; None for a scene.
+        actuate: generalised forces of the controls, ``actuate(q_s, q_f, u, params) -> (f_s, f_f)``, of dictionaries if
+            the problem has dictionaries; None for a scene.
         num_controls: m, length of u; a scene knows its number.
         final_cost: cost of the last state, ``final_cost(state) -> ()``.
         goal: equations for the last state, ``goal(state) -> (e,)``, zero where the goal is reached.
@@ -69,7 +70,7 @@ def minimize(
         limits: inequalities, ``limits(state, u) -> (c,)``, not above zero at the end of every interval.
         start: controls of the first iteration, of the shape of `Optimum.controls`, or an `Optimum` of the same
             duration, perhaps on a coarser grid; zero if None.
-        grid: controls for every macro interval, or for every micro interval.
+        grid: controls for every macro interval, or for every micro interval; then no composition.
         tolerance: largest update, gap, miss of the goal and violation of a limit of a converged optimum; updates and
             gaps are relative to the largest node and the largest control.
         max_iterations: largest number of linear-quadratic problems that are solved.
