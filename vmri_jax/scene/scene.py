@@ -17,10 +17,7 @@ from vmri_jax.mechanics.state import Problem, State, initial_state, tell_of_velo
 from vmri_jax.mechanics.summary import listed, summary
 from vmri_jax.mechanics.system import System
 from vmri_jax.refusals import Refused
-from vmri_jax.running.micro_nodes import Nodes
-from vmri_jax.running.origin import at_nodes
-from vmri_jax.running.quantities import momenta_at
-from vmri_jax.running.trajectory import Trajectory
+from vmri_jax.running.trajectory import Trajectory, in_coordinates
 from vmri_jax.scene.assembly import actuation, build
 from vmri_jax.scene.binding import bound
 from vmri_jax.scene.body import AnyBody, Frame
@@ -294,12 +291,8 @@ class Scene:
         effects = [replace(effect, rate="auto") for effect in self.effects]
         twin = replace(self, bodies=bodies, effects=effects, coordinates="directors", joint_starts={})
         check_run(self.sorting, run, twin.sorting)
-        q_s, v_s = (np.concatenate([of(name) for name in twin.places], axis=-1) for of in (run.position, run.velocity))
-        none, micro = q_s[..., :0], {"t_micro": None, "q_f_micro": None}
-        moving = run.with_arrays(q_s=q_s, q_f=none, p_s=v_s, p_f=none, **micro).of(twin)
-        # Momenta of the twin: kinetic effects, such as rotors and charges in a magnetic field, add to the M v of the bodies.
-        p_s, _ = at_nodes(momenta_at, moving.origin, Nodes(run.t, q_s, none, v_s, none))
-        return moving.with_arrays(p_s=p_s)
+        q, v = (np.concatenate([of(name) for name in twin.places], axis=-1) for of in (run.position, run.velocity))
+        return in_coordinates(run, twin, (q, q[..., :0]), (v, v[..., :0]))
 
     def without(self, *names: str) -> "Scene":
         """The scene without these effects.
