@@ -266,7 +266,9 @@ class Trajectory(Exports):
         return from_named_arrays(arrays, origin)
 
 
-def in_coordinates(run: Trajectory, moving: System | Problem | HasProblem, q: tuple, v: tuple) -> Trajectory:
+def in_coordinates(
+    run: Trajectory, moving: System | Problem | HasProblem, q: tuple[Any, Any], v: tuple[Any, Any]
+) -> Trajectory:
     """The motion of a run in the coordinates of another system, without micro nodes and error.
 
     Its momenta are ``dT/dv`` of that system: kinetic effects, such as rotors and charges in a magnetic field, add to the M v of bodies.
