@@ -1,5 +1,7 @@
 """Optimal control against solutions that are known, and under constraints."""
 
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -176,6 +178,39 @@ def wrong(q_s, q_f, u, params):
     return u[:0], q_f
 
 
+def weight(t, q_s, q_f, v_s, v_f, params):
+    return {"x": -q_s["x"] - t}, {}
+
+
+def pull_by_name(q_s, q_f, u, params):
+    return {"x": u * (1 + 0 * q_s["x"])}, {}
+
+
+def test_a_problem_with_dictionaries_and_a_force():
+    """``x'' = u - x - t`` from t = 2 on: the controls of the same system by vectors, and a trajectory that reaches the goal."""
+    masses = vm.ConstantMass(slow={"x": 1.0}, fast={})
+    problem = vm.Problem(vm.System(masses, force=weight), q_s={"x": 0.0}, q_f={}, t=2.0)
+    steps = {"scheme": vm.compose(vm.fully_explicit(1), "suzuki4"), "macro_dt": 0.05, "num_steps": 20}
+    goal = {"goal": lambda state: jnp.concatenate([state.q_s - 1.0, state.p_s]), "num_controls": 1}
+    optimum = minimize(problem, effort, actuate=pull_by_name, **goal, **steps)
+    assert optimum.success
+    assert optimum.trajectory.q_s["x"][-1] == pytest.approx(1.0, abs=1e-9)
+    # u = B^T exp(A^T (T - s)) W^-1 d, with the miss d of the motion without controls: x = 2 cos s + sin s - 2 - s
+    A, middle = np.array([[0.0, 1.0], [-1.0, 0.0]]), optimum.t - 2.0 + 0.025
+    W, _ = quad_vec(lambda s: np.outer(expm(A * s)[:, 1], expm(A * s)[:, 1]), 0.0, 1.0)
+    free = np.array([2 * np.cos(1.0) + np.sin(1.0) - 3.0, -2 * np.sin(1.0) + np.cos(1.0) - 1.0])
+    at_end = np.linalg.solve(W, np.array([1.0, 0.0]) - free)
+    expected = np.array([expm(A * (1 - s))[:, 1] @ at_end for s in middle])
+    np.testing.assert_allclose(optimum.controls[:, 0], expected, atol=0.03)
+
+
+KICKS: dict[str, Any] = {
+    "kinetic": vm.micro(vm.quadrature.midpoint),
+    "slow": vm.macro(vm.quadrature.trapezoidal),
+    "fast": vm.micro(vm.quadrature.trapezoidal),
+}
+
+
 @pytest.mark.parametrize(
     ("message", "options"),
     [
@@ -190,6 +225,15 @@ def wrong(q_s, q_f, u, params):
         ("final_cost has shape", {"final_cost": lambda state: state.q_s}),
         (r"goal has shape \(\); it must be a vector", {"goal": lambda state: state.q_s[0]}),
         ("grid is 'fine'", {"grid": "fine"}),
+        # The cost of such an optimum was a tenth of the least cost: a force in an interval of large weight costs little.
+        ("weigh each control", {"grid": "micro", "scheme": vm.compose(vm.fully_explicit(4), "suzuki4")}),
+        # Micro steps beyond the macro step take controls of its neighbours in a run: the goal was missed by 1e-4.
+        ("weigh each control", {"scheme": vm.compose(vm.fully_explicit(4), "yoshida4")}),
+        ("weigh each control", {"scheme": vm.Scheme(1, **KICKS, force=vm.micro(vm.quadrature.left))}),
+        (
+            "weigh each control",
+            {"grid": "micro", "scheme": vm.Scheme(4, **KICKS, force=vm.macro(vm.quadrature.midpoint))},
+        ),
         ("num_controls is 0", {"num_controls": 0}),
         (r"start has shape \(3,\); the controls have \(10, 1\)", {"start": [1.0, 2.0, 3.0]}),
         ("tolerance", {"tolerance": -1.0}),

@@ -29,6 +29,7 @@ from vmri_jax.scene import (
     JointSpring,
     Revolute,
     RigidBody,
+    RotorInertia,
     Scene,
     angular_momentum,
     trees,
@@ -123,6 +124,18 @@ def test_reaction_forces_are_those_of_the_rows(run):
     np.testing.assert_allclose(forces[5][:3], acceleration[:3], atol=1e-10)  # 1 kg, and nothing else pulls its centre
     with pytest.raises(ValueError, match="by_directors"):
         run.reaction_forces("hinge")
+
+
+def test_reaction_forces_of_a_joint_with_a_rotor():
+    """A rotor adds to the momenta of directors: ``M v`` of the body alone is the momentum of a slower motion, with other forces."""
+    arm = RigidBody("arm", 2.0, [0.2, 0.3, 0.4], [0.5, 0.0, 0.0])
+    hinge = Revolute(("ground", "arm"), at=[0.0, 0.0, 0.0], axis=[0.0, 0.0, 1.0], name="hinge")
+    scene = Scene([arm], [hinge, RotorInertia("hinge", 3.0)], coordinates="joint").with_rates({"hinge": 2.0})
+    run = vm.simulate(scene, vm.fully_implicit(1), macro_dt=0.1, num_steps=3)
+    twin = scene.by_directors(run)
+    np.testing.assert_allclose(twin.velocity("arm"), run.velocity("arm"), atol=1e-12)
+    pull = np.linalg.norm(twin.reaction_forces("hinge")["arm"][:, :3], axis=1)
+    np.testing.assert_allclose(pull, 2.0 * 0.5 * 2.0**2, rtol=1e-12)  # m r omega^2
 
 
 def test_a_stored_run_is_drawn_as_it_moved(run, tmp_path):

@@ -6,8 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tests.stability.systems import double_pendulum
-from vmri_jax import fully_explicit, initial_state
+from tests.stability.systems import double_pendulum, hanging
+from vmri_jax import fully_explicit, galerkin, initial_state
 from vmri_jax.diagnostics import linearise
 from vmri_jax.stability import linear_model, monodromy, multipliers, stability_map
 from vmri_jax.steppers.solver import Solver
@@ -67,6 +67,16 @@ def test_on_a_constraint_manifold(swinging):
         ends.append(np.concatenate([end.q_s, end.q_f, end.p_s, end.p_f]))
     predicted = direction @ found.images
     assert (ends[0] - ends[1]) / 2e-5 == pytest.approx(predicted, abs=1e-5 * np.abs(predicted).max())
+
+
+def test_at_rest_the_multipliers_of_constraints_count():
+    """Corrections of a step at rest are zero from the first pass on, and the weights that the rods carry make its frequencies."""
+    system = double_pendulum()
+    at_rest = monodromy(system, galerkin(2, 2), hanging(system), macro_dt=0.05, num_steps=1)
+    frequencies = linearise(system, hanging(system)).frequencies
+    angles = np.abs(np.angle(at_rest.multipliers))
+    np.testing.assert_allclose(np.sort(angles), 0.05 * np.repeat(frequencies[::-1], 2), rtol=3e-4)  # 2e-4
+    assert at_rest.symplectic_defect < 1e-13  # 1e-3 with the multipliers of the guess
 
 
 def test_failing_steps_and_bad_input(swinging):

@@ -19,6 +19,7 @@ from vmri_jax import (
     fully_implicit,
     galerkin,
     initial_state,
+    macro_step,
     simulate,
     systems,
 )
@@ -111,6 +112,24 @@ def test_a_heavy_slow_body_at_rest_at_the_origin(scheme):
     assert int(run.info.iterations.max()) <= 20  # without it: a hundred, and the fallback
     momentum = 500.0 * run.v_s[:, 0] + run.v_f[:, 0]
     np.testing.assert_allclose(momentum, 0.0, atol=1e-12)
+
+
+def hangs(q_s, q_f, params):
+    return 10.0 * q_s[1] + (q_s[0] - q_f[0]) ** 2
+
+
+def rod(q_s, params):
+    return jnp.array([(q_s @ q_s - 1.0) / 2])
+
+
+@pytest.mark.parametrize("matrix", ["masses", "exact"])
+def test_the_first_pass_of_a_step_at_rest_has_its_slow_multipliers(matrix):
+    pendulum = Problem(System(ConstantMass([1.0, 1.0], [1.0]), hangs, slow_constraint=rod), [0.0, -1.0], [0.0])
+    end, info = macro_step(pendulum.system, galerkin(2, 2), pendulum.state(), 0.1, Solver(matrix))
+    np.testing.assert_allclose(
+        info.slow_multiplier, 10.0, rtol=1e-12
+    )  # they carry the weight; zero without a correction
+    np.testing.assert_allclose(end.p_s, 0.0, atol=1e-14)
 
 
 @pytest.mark.full

@@ -12,18 +12,21 @@ from jaxtyping import Float
 from vmri_jax.accuracy.simulate import simulate
 from vmri_jax.control import bounded
 from vmri_jax.control.search import Point, line_search, rolled, update
-from vmri_jax.control.transcription import Transcription
+from vmri_jax.control.transcription import Transcription, held
 from vmri_jax.diagnostics.linear import phase_vector
 from vmri_jax.mechanics.arrays import real_array, whole_number
+from vmri_jax.mechanics.by_name import ByName
 from vmri_jax.mechanics.checks import check_number, check_type, describe
 from vmri_jax.mechanics.functions import check_arguments, traced_once
+from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.order import order_of
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of, start_of
 from vmri_jax.refusals import Refused
 from vmri_jax.running.prepare import prepare
 from vmri_jax.running.progress import ShowsProgress, progress_to
 from vmri_jax.running.trajectory import Trajectory
-from vmri_jax.schemes.composition import SchemeLike
+from vmri_jax.schemes.composition import SchemeLike, stage_lengths, stage_scheme
+from vmri_jax.schemes.quadrature import NODE_TOLERANCE
 from vmri_jax.steppers.plan import plan
 from vmri_jax.steppers.results import SimulationError
 from vmri_jax.steppers.solver import Solver
@@ -111,7 +114,8 @@ def minimize(
         problem: system and start, a scene with `vmri_jax.scene.Controlled` effects or a problem with a dict of params.
         cost: C, cost per time, ``cost(state, u) -> ()``, with a positive second derivative in u.
         scheme, macro_dt, num_steps, solver: as in `simulate`. Forces act on the grid of the scheme for forces.
-        actuate: generalised forces of the controls, ``actuate(q_s, q_f, u, params) -> (f_s, f_f)``; None for a scene.
+        actuate: generalised forces of the controls, ``actuate(q_s, q_f, u, params) -> (f_s, f_f)``, of dictionaries if
+            the problem has dictionaries; None for a scene.
         num_controls: m, length of u; a scene knows its number.
         final_cost: cost of the last state, ``final_cost(state) -> ()``.
         goal: equations for the last state, ``goal(state) -> (e,)``, zero where the goal is reached.
@@ -119,7 +123,7 @@ def minimize(
         limits: inequalities, ``limits(state, u) -> (c,)``, not above zero at the end of every interval.
         start: controls of the first iteration, of the shape of `Optimum.controls`, or an `Optimum` of the same
             duration, perhaps on a coarser grid; zero if None.
-        grid: controls for every macro interval, or for every micro interval.
+        grid: controls for every macro interval, or for every micro interval; then no composition.
         tolerance: largest update, gap, miss of the goal and violation of a limit of a converged optimum; updates and
             gaps are relative to the largest node and the largest control.
         max_iterations: largest number of linear-quadratic problems that are solved.
@@ -210,10 +214,14 @@ def transcribed(
     params = {} if system.params is None else system.params
     check_type("minimize: system.params", params, Mapping, "a dict, or None")
     prepare(problem, scheme, macro_dt=macro_dt, num_steps=1, solver=solver)  # makes the checks of a run
+    parts = scheme.num_micro if grid == "micro" else 1
+    _check_durations(scheme, grid, parts)
     # A fallback is a branch of the compiled step: `jax.vmap` over all steps would compute both of its sides.
     solver = solver or plan(system, scheme, state).first
     u = np.zeros(num_controls)
-    actuate = traced_once(actuate, order_of(params))
+    names = problem.names or Names()
+    slots = (names.arrays("s", state.q_s.size), names.arrays("f", state.q_f.size))
+    actuate = traced_once(ByName(actuate, ("q_s", "q_f", "u", "params"), *slots), order_of(params))
     forces = jax.eval_shape(lambda: actuate(state.q_s, state.q_f, u, params))
     expected = (state.q_s.shape, state.q_f.shape)
     if not isinstance(forces, tuple) or tuple(getattr(f, "shape", None) for f in forces) != expected:
@@ -235,8 +243,29 @@ def transcribed(
         traced_once(actuate),
         **{name: traced_once(function) for name, function in functions.items()},
         bounds=_bounds(bounds, num_controls),
-        parts=scheme.num_micro if grid == "micro" else 1,
+        parts=parts,
     )
+
+
+def _check_durations(scheme: SchemeLike, grid: str, parts: int) -> None:
+    """Refuse a scheme whose steps weigh a control by another time than its duration, or see controls of other steps.
+
+    The optimisation has steps with the `parts` controls of their own macro interval, the run has controls by time.
+    """
+    stage, lengths = stage_scheme(scheme), np.asarray(stage_lengths(scheme))
+    rule, starts = stage.force.composite(stage.num_micro), np.cumsum(lengths) - lengths
+    times = (starts[:, None] + lengths[:, None] * np.asarray(rule.nodes)).ravel()
+    weights = (lengths[:, None] * np.asarray(rule.weights)).ravel()
+    shares = weights @ jax.vmap(lambda t: held(t, jnp.eye(parts), 0.0, 1.0 / parts))(times) * parts
+    # A run has the mean of two controls at a macro node: as the steps have if their rule weighs both ends alike.
+    first, last = (weights[np.abs(times - end) <= NODE_TOLERANCE].sum() for end in (0, 1))
+    is_inside = np.all((times >= -NODE_TOLERANCE) & (times <= 1 + NODE_TOLERANCE))
+    if not (is_inside and np.allclose([*shares, 1 + first - last], 1, rtol=0, atol=NODE_TOLERANCE)):
+        raise Refused(
+            f"minimize: scheme is {scheme!r} with grid={grid!r}: the nodes of its force rule do not weigh each control "
+            "by its duration, or lie in intervals of other controls. Take a scheme that is no composition, with its "
+            "force rule on the micro grid; or grid='macro' and the composition 'suzuki4', whose nodes stay inside."
+        )
 
 
 def free(state):

@@ -21,6 +21,7 @@ from vmri_jax.control.bounded import Limits
 from vmri_jax.control.riccati import Final, Stages
 from vmri_jax.diagnostics.linear import phase_step, phase_vector, state_of, with_slopes
 from vmri_jax.mechanics.arrays import Numbers
+from vmri_jax.mechanics.by_name import ByName
 from vmri_jax.mechanics.functions import TracedOnce
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
@@ -191,7 +192,8 @@ def _forces(system_force: Callable | None, actuate: Callable) -> Callable:
         system_s, system_f = system_force(t, q_s, q_f, v_s, v_f, params)
         return f_s + system_s, f_f + system_f
 
-    return force
+    # A problem with dictionaries leaves a `ByName` as it is: here a function of vectors.
+    return ByName(force, ("t", "q_s", "q_f", "v_s", "v_f", "params"), None, None)
 
 
 def held(t, u, t_start, length):

@@ -312,7 +312,7 @@ def _states(run: SavedRun, micro: bool, with_start: bool = False) -> State:
     if reason:
         raise Refused(f"micro nodes: they do not fill all intervals of the run: {reason}.")
     nodes = _all_nodes(run)
-    p_s, p_f = at_nodes(_momenta, run.origin, nodes)
+    p_s, p_f = at_nodes(momenta_at, run.origin, nodes)
     states = State(nodes.t, nodes.q_s, nodes.q_f, p_s, p_f)
     return states if with_start else jax.tree.map(lambda a: a[1:], states)
 
@@ -351,7 +351,8 @@ def _velocity(system: System, state: State):
     return invariants.velocity(system, state.q_s, state.q_f, state.p_s, state.p_f)
 
 
-def _momenta(system: System, node: Nodes):
+def momenta_at(system: System, node: Nodes):
+    """Momenta (p_s, p_f) of positions and velocities at a node."""
     return legendre(system, node.q_s, node.q_f, node.v_s, node.v_f)
 
 

@@ -18,7 +18,9 @@ from vmri_jax.mechanics.system import System
 from vmri_jax.refusals import Refused
 from vmri_jax.running.export import INFO, MICRO, NODES, STATUS, Exports, named_arrays
 from vmri_jax.running.files import replaced
-from vmri_jax.running.origin import UNKNOWN, Origin, SavedRun
+from vmri_jax.running.micro_nodes import Nodes
+from vmri_jax.running.origin import UNKNOWN, Origin, SavedRun, at_nodes
+from vmri_jax.running.quantities import momenta_at
 from vmri_jax.running.run_error import RunError
 from vmri_jax.running.settings import Settings
 from vmri_jax.running.summaries import summary_of
@@ -262,6 +264,23 @@ class Trajectory(Exports):
         except (KeyError, TypeError, ValueError) as error:
             raise Refused(f"{path} is a damaged trajectory: no names or settings can be read ({error!r}).") from error
         return from_named_arrays(arrays, origin)
+
+
+def in_coordinates(
+    run: Trajectory, moving: System | Problem | HasProblem, q: tuple[Any, Any], v: tuple[Any, Any]
+) -> Trajectory:
+    """The motion of a run in the coordinates of another system, without micro nodes and error.
+
+    Its momenta are ``dT/dv`` of that system: kinetic effects, such as rotors and charges in a magnetic field, add to the M v of bodies.
+
+    Args:
+        run: the motion.
+        moving: the other system.
+        q, v: slow and fast positions and velocities in its coordinates, (..., k, n) each.
+    """
+    bare = replace(run, states=State(run.t, *q, *v), micro=None, error=None).of(moving)
+    p_s, p_f = at_nodes(momenta_at, bare.origin, Nodes(run.t, *q, *v))
+    return replace(bare, states=State(run.t, *q, p_s, p_f))
 
 
 def status(result) -> Any:

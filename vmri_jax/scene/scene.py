@@ -17,7 +17,7 @@ from vmri_jax.mechanics.state import Problem, State, initial_state, tell_of_velo
 from vmri_jax.mechanics.summary import listed, summary
 from vmri_jax.mechanics.system import System
 from vmri_jax.refusals import Refused
-from vmri_jax.running.trajectory import Trajectory
+from vmri_jax.running.trajectory import Trajectory, in_coordinates
 from vmri_jax.scene.binding import Key, bound
 from vmri_jax.scene.body import AnyBody, Frame
 from vmri_jax.scene.declare import arrays
@@ -287,9 +287,8 @@ class Scene:
         effects = [replace(effect, rate="auto") for effect in self.effects]
         twin = replace(self, bodies=bodies, effects=effects, coordinates="directors", joint_starts={})
         check_run(self.sorting, run, twin.sorting)
-        q_s, p_s = (np.concatenate([of(name) for name in twin.places], axis=-1) for of in (run.position, run.momentum))
-        none = q_s[..., :0]
-        return run.with_arrays(q_s=q_s, q_f=none, p_s=p_s, p_f=none, t_micro=None, q_f_micro=None).of(twin)
+        q, v = (np.concatenate([of(name) for name in twin.places], axis=-1) for of in (run.position, run.velocity))
+        return in_coordinates(run, twin, (q, q[..., :0]), (v, v[..., :0]))
 
     def without(self, *names: str) -> "Scene":
         """The scene without these effects.

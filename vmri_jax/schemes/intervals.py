@@ -318,14 +318,20 @@ class Intervals:
         if self._slow_terms:
             by_start, by_slow = jax.grad(self._slow_action, argnums=(0, 1))(equations.q_s, slow)
             start, d = start + by_start, d + by_slow
-        times = equations.t + equations.macro_dt * control_nodes(equations.scheme.degree)
-        nodes = jnp.concatenate([equations.q_s[None], equations.q_s + slow])
-        pull = jax.vjp(lambda q: jax.vmap(equations.system.g_slow)(times[:-1], q), nodes[:-1])[1]
-        impulses = pull(multiplier / equations.scheme.num_micro)[0]
+        impulses = self.slow_impulses(slow, multiplier)
         # h (p_s + D_{S_0} A), h D_{S_i} A, 0 < i < r
         rows = jnp.concatenate([(equations.micro_dt * equations.p_s + start - d.sum(0))[None], d[:-1]]) - impulses
         p_s = equations.p_s + (start - impulses.sum(0)) / equations.micro_dt
-        return (rows, jax.vmap(equations.system.g_slow)(times[1:], nodes[1:])), p_s
+        times = equations.t + equations.macro_dt * control_nodes(equations.scheme.degree)[1:]
+        return (rows, jax.vmap(equations.system.g_slow)(times, equations.q_s + slow)), p_s
+
+    def slow_impulses(self, slow, multiplier):
+        """(r, n_s) impulses ``G_s^T nu``, times h, of the slow constraint at S_0..S_{r-1}; arguments as of `slow_evaluate`."""
+        equations = self.equations
+        times = equations.t + equations.macro_dt * control_nodes(equations.scheme.degree)[:-1]
+        nodes = jnp.concatenate([equations.q_s[None], equations.q_s + slow[:-1]])
+        pull = jax.vjp(partial(jax.vmap(equations.system.g_slow), times), nodes)[1]
+        return pull(multiplier / equations.scheme.num_micro)[0]
 
 
 def _quadratic_form(matrix) -> Callable:

@@ -212,6 +212,8 @@ class MarchEquations:
     def passed(self, matrices: Matrices, z, x, worst: "Worst", end: Handed, slow_values) -> "Passed":
         """The pass after its last interval: the slow correction ``dz = -S^-1 R_s``, and ``dx_m = (dx_m/dz) dz``.
 
+        The returned z and p_s contain the correction of the slow multipliers already, dz the correction of the increments alone.
+
         Args:
             matrices: of this pass or kept ones.
             z, x: unknowns, x corrected by the pass.
@@ -223,7 +225,13 @@ class MarchEquations:
         dz = -matvec(matrices.slow, residual)
         dx = jnp.sum(matrices.response * self.seen(dz), axis=-1)
         rows = largest(residual[: self.num_slow], self.of_momenta.slow)
-        return Passed(z, x, dz, dx, end, p_s, worst.add(residual, dz, rows, worst.moved))
+        worst = worst.add(residual, dz, rows, worst.moved)
+        if self.n_gs:
+            # Slow multipliers take their correction in this pass, as those of the intervals: a step at rest has no other pass.
+            slow, dnu = z[: self.num_slow].reshape(self.r, self.n_s), dz[self.num_slow :]
+            z, dz = z.at[self.num_slow :].add(dnu), dz.at[self.num_slow :].set(0.0)
+            p_s -= self.intervals.slow_impulses(slow, dnu.reshape(self.r, self.n_gs)).sum(0) / self.equations.micro_dt
+        return Passed(z, x, dz, dx, end, p_s, worst)
 
 
 def _gradients(on: Arriving):
@@ -268,8 +276,8 @@ class Worst(NamedTuple):
 class Passed(NamedTuple):
     """The unknowns after a pass, and the slow correction with which the next pass begins.
 
-    z, x: unknowns, x corrected by the pass.
-    dz, dx: correction of z, and the change of x that follows from it.
+    z, x: unknowns, x and the slow multipliers in z corrected by the pass.
+    dz, dx: correction of the slow increments in z, and the change of x that follows from it.
     end, p_s: the quantities that the last interval hands on, and the slow momentum at the end of the step.
     """
 

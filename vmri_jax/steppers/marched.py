@@ -204,10 +204,8 @@ class Marched(StepSolver):
             # corrections at round-off do not tell how fast the iteration contracts
             ratio = jnp.where((last.passes > 0) & ~accepted.is_roundoff(last.size), after.size / last.size, last.rate)
             curvature = jnp.maximum(last.curvature, jnp.where(renews, 0.0, ratio / last.new_size))
-            if self.is_exact:
-                rate = jnp.where(renews, curvature * after.size, ratio)  # kappa |d_new|
-            else:
-                rate = jnp.maximum(ratio, last.rate)
+            kept = ratio if self.is_exact else jnp.maximum(ratio, last.rate)
+            rate = jnp.where(renews, curvature * after.size, kept)  # kappa |d_new|
             new_size = jnp.where(renews, after.size, last.new_size)
             return after._replace(matrices=matrices, rate=rate, curvature=curvature, new_size=new_size, result=result)
 

@@ -65,7 +65,7 @@ class NestedState(NamedTuple):
 class Pass(NamedTuple):
     """Unknowns after a pass, the totals of its micro intervals, and the state of the iteration.
 
-    d: the next update of the slow unknowns, by their linearised equations.
+    d: the next update of the slow increments, by the linearised slow equations; their update of the multipliers is in `slow_multiplier` already.
     inertia: masses that constraints tie to the slow variables, from the first pass.
     impulse: on the slow variables over the step, times h.
     rows: estimated residual of the momentum equations, times h: ``max(|R_s|, max M_f |c|)`` with the expected fast correction c. M_f stands
@@ -76,7 +76,7 @@ class Pass(NamedTuple):
     slow_multiplier: Float[Array, "r n_gs"]
     fast: FastUnknowns
     totals: SweepTotals
-    d: Float[Array, "r*(n_s+n_gs)"]
+    d: Float[Array, "r*n_s"]
     inertia: ConstraintInertia | None
     slow_model_error: Float[Array, ""]
     impulse: Float[Array, "n_s"]
@@ -197,7 +197,7 @@ class _Passes:
         return now._replace(slow_model_error=max_abs(missing) / (max_abs(update) + jnp.finfo(float).tiny))
 
     def _moved_by(self, d, last: Pass) -> Pass:
-        z = _flat(last.slow, last.slow_multiplier) + d
+        z = _flat(last.slow + d.reshape(last.slow.shape), last.slow_multiplier)
         fast, totals = self.sweep.next_pass(self._apart(z)[0], last.fast)
         still_moves = expected(totals.moved, last.totals.moved)
         return self._judged(
@@ -228,14 +228,15 @@ class _Passes:
         equations, inverse_fast = self.equations, self.mass.fast_mass.inverse().times
         slow, slow_multiplier = self._apart(z)
         x = Unknowns(slow, slow_multiplier, fast.increments, fast.multiplier)
-        d, rows, impulse = self.slow_equations.update(x, totals.d_start, totals.d_increments, inertia)
+        update, rows, impulse = self.slow_equations.update(x, totals.d_start, totals.d_increments, inertia)
+        d, d_multiplier = update
         arrives, leaves = inverse_fast(equations.micro_dt * equations.p_f), inverse_fast(totals.p_f)
         # size of the fast motion: largest |h M_f^-1 p_f| at both ends of the macro step
         motion = jnp.maximum(max_abs(arrives), max_abs(leaves))
-        changes = max_abs(d[: self.r * self.n_s]), still_moves
+        changes = max_abs(d), still_moves
         result = self.newton.status(self.accepted.ratio(changes, (max_abs(slow), motion), passes), passes)
         rows = jnp.maximum(max_abs(rows), max_abs(self.mass.fast) * still_moves)
-        passes = jnp.asarray(passes)
+        passes, slow_multiplier = jnp.asarray(passes), slow_multiplier + d_multiplier
         return Pass(slow, slow_multiplier, fast, totals, d, inertia, error, impulse, rows, passes, result)
 
     def _apart(self, z):

@@ -95,6 +95,8 @@ class SlowEquations(NamedTuple):
     def update(self, x: Unknowns, start, increments, inertia: ConstraintInertia | None):
         """Update of the slow unknowns, residual R of the slow momentum equations, and slow impulse over the step, the latter two times h.
 
+        A step at rest ends with its first pass: its multipliers are those of this update, which the impulse contains.
+
         With the masses K_s (and the tied ones), and the Jacobians G_0, G_1 of g_s at the macro control nodes 0..r-1 and 1..r,
 
             K_s dx - G_0^T dnu = -R        G_1 dx = -g_s
@@ -116,8 +118,9 @@ class SlowEquations(NamedTuple):
         d = increments + self.kinetic.slow_rows(x.slow) / n
         rows = jnp.concatenate([(start - d.sum(0) + equations.micro_dt * equations.p_s)[None], d[:-1]]) - pull
         dx, d_nu = solve_saddle(lambda rows: self._by_masses(rows, inertia), jacobian, push, rows, g)
-        # impulse: p_s+ - p_s = D_{S_0} A + ... + D_{S_r} A, times h; d cancels in the sum
-        return jnp.concatenate([dx.reshape(-1), n * d_nu.reshape(-1)]), rows, start - pull.sum(0)
+        pull += jnp.sum(d_nu[..., None] * jacobian, axis=1)
+        # impulse: p_s+ - p_s = D_{S_0} A + ... + D_{S_r} A, times h, d cancels in the sum
+        return (dx.reshape(-1), n * d_nu), rows, start - pull.sum(0)
 
     def with_forces(self, d, x: Unknowns):
         """The update ``(1 + K_s^-1 C)^-1 d`` for an update d by the masses alone, with the derivative C of the slow forces,
