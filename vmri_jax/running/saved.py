@@ -63,10 +63,10 @@ class Columns(NamedTuple):
 class Saved(NamedTuple):
     """Nodes of a run, a row of `Columns` for each, and its status, of JAX or NumPy; in a batch with lanes.
 
-    Where JAX differentiates a run, its rows are columns one by one: those that no derivative depends on are then left out.
+    rows: (k, width). Where JAX differentiates a run, the columns one by one: those that no derivative depends on are then left out.
     """
 
-    rows: Float[Numbers, "k width"] | tuple
+    rows: Any
     result: Int[Numbers, ""]
     failed_at: Int[Numbers, ""]
 
