@@ -46,7 +46,9 @@ def final_position(case: str, solver: vm.Solver | None = None):
     def replaced(stiffness):
         if parameter is None:
             return stiffness
-        return params | {parameter: stiffness if entry is None else params[parameter].at[entry].set(stiffness)}
+        return params | {
+            parameter: stiffness if entry is None else jnp.asarray(params[parameter]).at[entry].set(stiffness)
+        }
 
     def function(stiffness, v, q_f, macro_dt) -> jax.Array:
         system = problem.system.replace(params=replaced(stiffness))
@@ -73,7 +75,7 @@ def value_by_argument(case: str, argument: int, entry: int | None = None):
     program, at = gradient_program(case)
 
     def function(x):
-        value = x if entry is None else at[argument].at[entry].set(x)
+        value = x if entry is None else jnp.asarray(at[argument]).at[entry].set(x)
         return program(*at[:argument], value, *at[argument + 1 :])[0]
 
     return function

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import psutil
-from jaxtyping import Float, Int
+from jaxtyping import Int
 
 from vmri_jax.mechanics.arrays import Numbers, is_concrete, library
 from vmri_jax.mechanics.state import State
