@@ -43,5 +43,5 @@ def reference_run(name: str, macro_dt: float) -> vm.Trajectory:
     with np.load(DATA / "reference" / f"{name}.npz") as data:
         phase = [data[key] for key in ("q_s", "q_f", "p_s", "p_f")]
     system = PROBLEMS[name[:3]]().system
-    energy = jax.vmap(lambda *phase: vm.diagnostics.energy(system, *phase))(*phase)
+    energy = jax.jit(jax.vmap(lambda *phase: vm.diagnostics.energy(system, *phase)))(*phase)
     return trajectory(macro_dt * np.arange(len(phase[0])), *phase, energy=np.asarray(energy))

@@ -46,21 +46,14 @@ RUN = ["--macro-dt", "0.1", "--steps", "4", "--scheme", "fully-explicit"]
 
 
 @pytest.fixture
-def vmri(tmp_path, monkeypatch):
-    """Runs ``vmri`` in an empty folder: (exit code, everything printed with frames and line breaks taken out)."""
-    monkeypatch.chdir(tmp_path)
+def vmri(vmri, tmp_path):
+    """In a folder with files of a user."""
     (tmp_path / "user.py").write_text(USER_FILE)
     (tmp_path / "empty.py").write_text("x = 1")
     (tmp_path / "two.py").write_text(f"{USER_FILE}first = second = my_problem\ndel my_problem")
     (tmp_path / "folder.npz").mkdir()
     (tmp_path / "folder.zarr").mkdir()
-
-    def run(*arguments):
-        result = CliRunner().invoke(cli.app, [str(argument) for argument in arguments])
-        assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
-        return result.exit_code, re.sub(r"[\s│╭╮╰╯─]+", " ", result.output)
-
-    return run
+    return vmri
 
 
 def test_systems_lists_all_with_their_parameters(vmri):

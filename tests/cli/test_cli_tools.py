@@ -4,9 +4,6 @@ import re
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
-
-from vmri_jax import cli
 
 SCENE = """
 from vmri_jax.scene import Anchor, Body, Gravity, Scene, Spring
@@ -19,17 +16,10 @@ scene = Scene(
 
 
 @pytest.fixture
-def vmri(tmp_path, monkeypatch):
-    """Runs ``vmri`` in a folder with a scene: (exit code, everything printed on one line)."""
-    monkeypatch.chdir(tmp_path)
+def vmri(vmri, tmp_path):
+    """In a folder with a scene."""
     (tmp_path / "my.py").write_text(SCENE)
-
-    def run(*arguments):
-        result = CliRunner().invoke(cli.app, [str(argument) for argument in arguments])
-        assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
-        return result.exit_code, re.sub(r"[\s│╭╮╰╯─]+", " ", result.output)
-
-    return run
+    return vmri
 
 
 def test_advice_against_an_unstable_step(vmri):

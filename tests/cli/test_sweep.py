@@ -9,10 +9,8 @@ from importlib.resources import files
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 import vmri_jax as vm
-from vmri_jax import cli
 from vmri_jax.cli.sweep import by_name, read_sweep
 from vmri_jax.ensembles.quantities import drawn_by_default
 
@@ -29,17 +27,10 @@ omega = [20.0, 50.0]
 
 
 @pytest.fixture
-def vmri(tmp_path, monkeypatch):
-    """Runs ``vmri`` in an empty folder: (exit code, everything printed with frames and line breaks taken out)."""
-    monkeypatch.chdir(tmp_path)
+def vmri(vmri, tmp_path):
+    """In a folder with a small sweep."""
     (tmp_path / "sweep.toml").write_text(SMALL)
-
-    def run(*arguments):
-        result = CliRunner().invoke(cli.app, [str(argument) for argument in arguments])
-        assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
-        return result.exit_code, re.sub(r"[\s│╭╮╰╯─]+", " ", result.output)
-
-    return run
+    return vmri
 
 
 def test_a_sweep_runs_is_drawn_and_gone_on_with(vmri, tmp_path):

@@ -224,7 +224,7 @@ def test_lanes_of_vmap_have_their_parameters():
         system = problem.system.replace(params={"m": m})
         return vm.simulate(dataclasses.replace(problem, system=system), vm.fully_implicit(2), **steps)
 
-    lanes = jax.vmap(run)(jnp.array([1.0, 4.0]))
+    lanes = jax.jit(jax.vmap(run))(np.array([1.0, 4.0]))
     assert np.allclose(lanes.v_f, 1.0)
     for second in (lanes.lane(1), jax.tree.map(lambda a: a[1], lanes)):
         assert np.allclose(second.p_f, 4.0)

@@ -44,13 +44,18 @@ TIME, ANGLE, SPIN = 0.4, 0.7, 1.3
 
 def motion_of(system, q_s, v_s):
     """Constraints, their rates, and the motion by the continuous equations, where the bob swings on the moved pivot."""
-    x, rate = (float(f(TIME, PARAMS)) for f in (by_hand.pivot, jax.grad(by_hand.pivot)))
+    x, rate = (float(value) for value in jax.jit(jax.value_and_grad(by_hand.pivot))(TIME, PARAMS))
     out, along = (np.array([np.sin(ANGLE), -np.cos(ANGLE)]), np.array([np.cos(ANGLE), np.sin(ANGLE)]))
     bob = by_hand.LENGTH * out + [x, 0.0], by_hand.LENGTH * SPIN * along + [rate, 0.0]
     start = q_s(x), bob[0], v_s(rate), bob[1]
+    return moved(system, *start)
+
+
+@jax.jit
+def moved(system, *start):
+    """Constraints and their rates, and the motion by the continuous equations."""
     held = system.constraints(TIME, *start[:2]), system.constraint_rates(TIME, *start)
-    state = State(jnp.asarray(TIME), *start[:2], *jax.jit(legendre)(system, *start))
-    return held, jax.jit(motion)(system, state)
+    return held, motion(system, State(jnp.asarray(TIME), *start[:2], *legendre(system, *start)))
 
 
 @pytest.mark.parametrize("way", WAYS)

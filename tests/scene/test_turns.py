@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import permutations
 from typing import Any
 
@@ -86,23 +87,23 @@ def wheels(*effects, coordinates: Any = "auto", spin=(0.0, 0.0)):
     return Scene(bodies, [*hinges, *effects], coordinates=coordinates)
 
 
-def turned(scene, angles):
-    """q_s of both wheels at these angles, and dq_s/dangle (n, 2)."""
-    if scene.branches:
-        return np.asarray(angles), np.eye(2)
+@jax.jit
+def directors(angles):
+    """q_s (24,) of both wheels at these angles, and dq_s/dangle (24, 2)."""
 
     def coordinates(angles):
         c, s = jnp.cos(angles), jnp.sin(angles)
         wheels = [jnp.stack([x, 0, 0, c[i], s[i], 0, -s[i], c[i], 0, 0, 0, 1]) for i, x in enumerate((0.0, 3.0))]
         return jnp.concatenate(wheels)
 
-    return coordinates(jnp.asarray(angles)), np.asarray(jax.jacfwd(coordinates)(jnp.asarray(angles)))
+    return coordinates(angles), jax.jacfwd(coordinates)(angles)
 
 
-def seen(scene, angles, rate=0.8):
+@partial(jax.jit, static_argnums=0)
+def seen(scene, angles):
     """What the effects of a scene do to the angles: forces of potentials, forces, controls, energy of rotors, rows of couplings."""
-    q, motions = turned(scene, angles)
-    v, none, system = motions @ np.array([rate, 0.0]), jnp.zeros(0), scene.system()
+    q, motions = (angles, jnp.eye(2)) if scene.branches else directors(angles)
+    v, none, system = motions @ jnp.array([0.8, 0.0]), jnp.zeros(0), scene.system()
     numbers = [system.kinetic_energy(q, none, v, none) if not system.has_constant_mass else v @ v / 4]
     if system.slow_potential is not None:
         numbers += [*(jax.grad(system.slow_potential)(q, none, system.params) @ motions)]
@@ -114,22 +115,26 @@ def seen(scene, angles, rate=0.8):
     rows_of_angles = [
         i for name, rows in scene.names.rows.items() if name in ("gear", "coupling", "joint_motion") for i in rows
     ]
-    return np.array([*numbers, *(rows[i] for i in rows_of_angles)], dtype=float)
+    return jnp.stack([*numbers, *(rows[i] for i in rows_of_angles)])
 
 
 @pytest.mark.parametrize("name", EFFECTS)
 def test_effects_know_turns_or_need_none(name):
     """In joint coordinates, and by directors within reach or without turns: the same; beyond reach NaN, which ends a run."""
     make, counts = EFFECTS[name]
-    joint, directors = (wheels(make("hinge"), coordinates=kind) for kind in ("auto", "directors"))
-    assert (len(joint.branches), len(directors.branches)) == (2, 0)
+    joint, bodies = (wheels(make("hinge"), coordinates=kind) for kind in ("auto", "directors"))
+    assert (len(joint.branches), len(bodies.branches)) == (2, 0)
+
+    def both(angle):
+        return [np.array(seen(scene, np.array([angle, 0.2]))) for scene in (joint, bodies)]
+
     for angle in (0.7, -2.5):
-        here, there = seen(joint, [angle, 0.2]), seen(directors, [angle, 0.2])
+        here, there = both(angle)
         if name == "motion":  # the row of directors is the sine of the difference
             here[-1] = np.sin(here[-1])
         np.testing.assert_allclose(there, here, atol=1e-12)
     for angle in (0.7 + 2 * np.pi, 2.7, -3.0):
-        here, there = seen(joint, [angle, 0.2]), seen(directors, [angle, 0.2])
+        here, there = both(angle)
         if counts:
             assert np.isfinite(here).all()
             assert np.isnan(there).any() == (abs(angle) < np.pi)  # an angle past the gap is an end of its run already
@@ -249,10 +254,10 @@ def test_runs_by_directors():
     assert np.arctan2(*reached[::-1]) == pytest.approx(REACH, abs=0.1)
     angles = np.stack([np.linspace(0.0, 100.0, 101), np.zeros(101)], axis=1)
     free = wheels(coordinates="directors")
-    q, motions = zip(*(turned(free, angle) for angle in angles), strict=True)
+    q, motions = map(np.asarray, jax.vmap(directors)(angles))
     masses: Any = free.system().kinetic
-    momenta = np.asarray(masses.slow) * (np.stack(motions) @ np.array([100.0, 0.0]))
-    spinning = replace(run, states=replace(run.states, q_s=np.stack(q), p_s=momenta))
+    momenta = np.asarray(masses.slow) * (motions @ np.array([100.0, 0.0]))
+    spinning = replace(run, states=replace(run.states, q_s=q, p_s=momenta))
     assert free.joint_motion(spinning, "hinge")[-1] == pytest.approx(100.0, abs=1e-12)
     with pytest.raises(ValueError, match=r"hinge may turn by half a turn or more .* nodes 0 and 1.*save="):
         free.joint_motion(spinning[::5], "hinge")

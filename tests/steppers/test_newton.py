@@ -17,7 +17,6 @@ from vmri_jax import (
     fully_implicit,
     initial_state,
     kernels,
-    macro_step,
     simulate,
     simulate_batch,
 )
@@ -156,7 +155,7 @@ def test_contradicting_constraints_are_violated():
     system = System(ConstantMass([1.0], [1.0, 1.0]), constraint=on_two_circles)
     one, zero = jnp.ones(1), jnp.zeros(1)
     state = State(jnp.zeros(()), zero, jnp.array([1.0, 0.0]), one, jnp.array([0.0, 0.5]))
-    _, info = macro_step(system, fully_implicit(2), state, 0.1, EXACT)
+    _, info = compiled_step(system, fully_implicit(2), state, 0.1, EXACT)
     assert Result(int(info.result)) is Result.CONSTRAINT_VIOLATED
 
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from tests.support import NAMES, area_change, largest_difference, node
-from vmri_jax import ConstantMass, Problem, System, fully_implicit, galerkin, initial_state, simulate, textbook
+from tests.textbook.residual import residual
+from vmri_jax import ConstantMass, Problem, Save, System, fully_implicit, galerkin, initial_state, simulate, textbook
 from vmri_jax.diagnostics import fit_order
 
 
@@ -52,11 +53,10 @@ def end_of(problem, scheme, num_steps):
     return [np.asarray(getattr(run, name)[-1]) for name in NAMES]
 
 
-@pytest.mark.parametrize("name", SCHEMES)
-def test_a_step_is_that_of_the_textbook(name):
-    scheme, moved = SCHEMES[name][0], problem()
+def test_a_step_of_degree_two_is_that_of_the_textbook():
+    scheme, moved = SCHEMES["gauss 2"][0], problem()
     ours = simulate(moved, scheme, macro_dt=0.05, num_steps=1).final_state
-    theirs = jax.jit(textbook.step, static_argnums=())(moved.system, scheme, moved.state(), 0.05)
+    theirs = jax.jit(textbook.step)(moved.system, scheme, moved.state(), 0.05)
     for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-13)
 
@@ -72,15 +72,19 @@ def test_order(name):
     assert observed == pytest.approx([order] * 4, abs=0.2)
 
 
-def test_symplectic():
-    moved = problem()
+def test_steps_of_degree_one_are_those_of_the_textbook_and_symplectic():
+    moved, scheme = problem(), SCHEMES["fully implicit"][0]
 
-    def ends(x):
+    def run(x):
         at = moved.q_s, moved.q_f, moved.v_s, moved.v_f
         start = initial_state(moved.system, *(a + dx for a, dx in zip(at, np.split(x, 4), strict=True)))
-        run = simulate(moved.system, SCHEMES["fully implicit"][0], start, macro_dt=0.02, num_steps=20, save=20)
-        return start, node(run, 1)
+        return simulate(moved.system, scheme, start, macro_dt=0.02, num_steps=20, save=Save(micro=True))
 
+    def ends(x):
+        nodes = run(x)
+        return node(nodes, 0), node(nodes, 20)
+
+    assert residual(moved.system, scheme, run(np.zeros(4)), 0.02) < 1e-13
     assert area_change(ends, 4) < 1e-11
 
 

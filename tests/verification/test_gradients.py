@@ -59,8 +59,9 @@ def final_position(case: str, solver: vm.Solver | None = None):
         return jnp.sum(jnp.cos(run.q_f[-1] * jnp.arange(1, run.q_f.shape[1] + 1)))
 
     stiffness = params if parameter is None else params[parameter]
-    stiffness = jnp.asarray(stiffness if entry is None else stiffness[entry])
-    return function, (stiffness, jnp.concatenate([problem.v_s, problem.v_f]), problem.q_f, jnp.asarray(macro_dt))
+    velocities = np.concatenate([problem.v_s, problem.v_f])
+    at = stiffness if entry is None else stiffness[entry], velocities, problem.q_f, macro_dt
+    return function, tuple(np.asarray(x, float) for x in at)
 
 
 @cache
@@ -75,7 +76,8 @@ def value_by_argument(case: str, argument: int, entry: int | None = None):
     program, at = gradient_program(case)
 
     def function(x):
-        value = x if entry is None else jnp.asarray(at[argument]).at[entry].set(x)
+        value = np.array(at[argument])
+        value[... if entry is None else entry] = x
         return program(*at[:argument], value, *at[argument + 1 :])[0]
 
     return function

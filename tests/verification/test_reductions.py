@@ -13,22 +13,27 @@ from vmri_jax.mechanics.surroundings import name_of
 H, STEPS, OMEGA = 0.02, 25, 50.0
 
 
+def minus_slow(q, system):
+    return -system.slow_potential(*jnp.split(q, [system.kinetic.slow.size]), system.params)
+
+
+def minus_fast(q, system):
+    return -system.fast_potential(q[system.kinetic.slow.size :], system.params)
+
+
+DERIVATIVES = [
+    jax.jit(derivative)
+    for derivative in (
+        jax.grad(minus_slow),
+        jax.grad(minus_fast),
+        jax.hessian(lambda q, system: minus_slow(q, system) + minus_fast(q, system)),
+    )
+]
+
+
 def forces(problem):
     """``-dV/dq``, ``-dW/dq`` and the derivative of their sum, of all variables together."""
-    system, n_s = problem.system, problem.q_s.size
-
-    def slow(q):
-        return -system.slow_potential(q[:n_s], q[n_s:], system.params)
-
-    def fast(q):
-        return -system.fast_potential(q[n_s:], system.params)
-
-    def in_numpy(function):
-        compiled = jax.jit(function)
-        return lambda q: np.asarray(compiled(q))
-
-    slope = jax.hessian(lambda q: slow(q) + fast(q))
-    return in_numpy(jax.grad(slow)), in_numpy(jax.grad(fast)), in_numpy(slope)
+    return [lambda q, f=f: np.asarray(f(q, problem.system)) for f in DERIVATIVES]
 
 
 def check(problem, scheme, step, macro_dt=H, num_steps=STEPS, p_bound=1e-12):

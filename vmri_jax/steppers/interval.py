@@ -154,6 +154,7 @@ class Interval:
         """K filled with zeros, for its shapes."""
         return jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(self.matrix, equations))
 
+    @partial(jax.jit, static_argnums=0)  # traced once for the shapes of `no_matrix` and for the steps
     def matrix(self, equations: StepEquations) -> Matrix:
         """K on the first micro interval of a macro step, on the straight path from its start."""
         system, scheme = interval_problem(equations.system, equations.scheme)

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -180,16 +181,14 @@ def average_over_fast_motion(stepper_of: Callable, num_micro: int) -> Callable:
         num_micro: micro steps per macro step.
     """
 
-    def average(macro_dt):
-        def averaged(q_s, q_f):
-            stepper, micro_dt, none = stepper_of(q_s, q_f), macro_dt / num_micro, jnp.zeros(0)
-            start = State(jnp.zeros(()), none, q_f, none, jnp.zeros_like(q_f))
-            memory = stepper.init(start, micro_dt)
-            _, info, _ = stepper.advance_many(start, memory, micro_dt, num_micro)
-            x = info.q_f_micro
-            a = (q_f / 2 + jnp.sum(x[:-1], axis=0) + x[-1] / 2) / num_micro
-            return jnp.where(info.result <= Result.CONVERGED_AT_ROUNDOFF, a, jnp.nan)
+    @jax.jit  # a step needs it at its start and at its end: it is traced once
+    def averaged(macro_dt, q_s, q_f):
+        stepper, micro_dt, none = stepper_of(q_s, q_f), macro_dt / num_micro, jnp.zeros(0)
+        start = State(jnp.zeros(()), none, q_f, none, jnp.zeros_like(q_f))
+        memory = stepper.init(start, micro_dt)
+        _, info, _ = stepper.advance_many(start, memory, micro_dt, num_micro)
+        x = info.q_f_micro
+        a = (q_f / 2 + jnp.sum(x[:-1], axis=0) + x[-1] / 2) / num_micro
+        return jnp.where(info.result <= Result.CONVERGED_AT_ROUNDOFF, a, jnp.nan)
 
-        return averaged
-
-    return average
+    return lambda macro_dt: partial(averaged, macro_dt)
