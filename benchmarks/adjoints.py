@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import vmri_jax as vm
-from benchmarks.measure import Ratio, Tell, exactly, interleaved, quartiles, silent
+from benchmarks.measure import Ratio, Tell, exactly, interleaved, quartiles, silent, temporary_bytes
 from benchmarks.report import Claim, Report
 
 FACTOR, GROWTH = 4.0, 4.0
@@ -78,7 +78,7 @@ def measured(case: Case, repeats: int, tell: Tell) -> tuple[list[dict], Ratio]:
         tell(f"{case.name}, {steps} steps")
         began = time.perf_counter()
         program = jax.jit(jax.grad(cost, (0, 1))).lower(params, start.p_f).compile()
-        seconds, memory = time.perf_counter() - began, program.memory_analysis().temp_size_in_bytes / 1e6
+        seconds, memory = time.perf_counter() - began, temporary_bytes(program) / 1e6
         return program, {"system": case.name, "steps": steps, "compile s": seconds, "MB": memory}
 
     options = {"macro_dt": case.macro_dt, "num_steps": SHORT, "save": SHORT // 10, "solver": solver}

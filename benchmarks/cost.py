@@ -9,7 +9,7 @@ import numpy as np
 import vmri_jax as vm
 from benchmarks import programs
 from benchmarks.gail2014.cost import Curve, cost_study
-from benchmarks.measure import Ratio, Tell, exactly, quartiles, silent
+from benchmarks.measure import Ratio, Tell, exactly, quartiles, silent, temporary_bytes
 from benchmarks.report import Claim, Report, spread
 
 MICRO_DT = 1e-5
@@ -83,4 +83,4 @@ def _slopes(label: str, samples: Mapping[int, Sequence[float]], memory: Mapping[
 def _bytes(problem: vm.Problem, scheme: vm.Scheme) -> int:
     """Temporary memory of one compiled macro step."""
     step = jax.jit(vm.macro_step).lower(problem.system, scheme, problem.state(), scheme.num_micro * MICRO_DT)
-    return step.compile().memory_analysis().temp_size_in_bytes
+    return temporary_bytes(step.compile())

@@ -119,3 +119,10 @@ def prepare(core: int | None = -1, cache: bool = True) -> None:
     """Before JAX starts: keep to one core, set the compiler's flags and its cache, switch 64-bit floats on."""
     pin(core)
     configure(cache=cache_folder() if cache else None)
+
+
+def temporary_bytes(program: jax.stages.Compiled) -> int:
+    """Memory that a compiled program needs besides what goes in and out."""
+    analysis = program.memory_analysis()
+    assert analysis is not None
+    return analysis.temp_size_in_bytes
