@@ -23,7 +23,7 @@ ELEMENTWISE = 16
 # Memory of the steppers from step to step, and special cases that they know. Results agree without them, up to the tolerance.
 
 SLOW_ORDER = 10
-"""Highest order of the polynomial through the slow unknowns of the last steps that predicts the next step. With a lower order small steps take
+"""Highest order of the polynomial through the unknowns of the last steps that predicts the next step. With a lower order small steps take
 more passes; a higher order is never the best."""
 CONTRACTION = 0.03
 """Largest ratio of the corrections of two passes with which exact matrices are kept. An exact pass costs about as much as four passes with

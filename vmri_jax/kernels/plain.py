@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 
 SLOW_ORDER = 0
-"""Order 0: slow unknowns start from their last values."""
+"""Order 0: unknowns start from their last values."""
 CONTRACTION = -1.0
 """Largest ratio of two corrections with which matrices are kept: negative, so that all passes are exact."""
 LARGEST_RENEWED = 10**9

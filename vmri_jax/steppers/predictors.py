@@ -1,4 +1,4 @@
-"""Prediction of the slow unknowns of a step from the steps before."""
+"""Prediction of the unknowns of a slow path, or of a single interval, from the steps before."""
 
 from typing import NamedTuple
 
