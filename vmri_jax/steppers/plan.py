@@ -23,7 +23,7 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from vmri_jax.kernels import COLLOCATES, DRIFTS
+from vmri_jax.kernels import COLLOCATES, DRIFTS, LARGEST_RENEWED
 from vmri_jax.kernels.band import Sparsity
 from vmri_jax.mechanics.constraint_pattern import all_rows
 from vmri_jax.mechanics.state import Movable, State, start_of
@@ -170,7 +170,7 @@ def _between_kicks(system: System, scheme: Scheme, solver: Solver, q_s, q_f, num
     if solver.stepper is not None:
         custom = solver.stepper.called(system, scheme)
         return Solved(system, scheme, custom, rows)
-    if q_s.size and _joins(system, scheme, solver, q_s.size, q_f.size):
+    if q_s.size and _joins(system, scheme, solver, q_s, q_f):
         (n_g, _), q = system.num_constraints(q_s, q_f), jnp.concatenate([q_s, q_f])
         num_slow = q_s.size if q_f.size else 0  # slow variables alone are as stiff as they are
         together = _between_kicks(*joined(system, scheme, q_s.size), solver, jnp.zeros(0), q, num_slow)
@@ -188,14 +188,19 @@ def _between_kicks(system: System, scheme: Scheme, solver: Solver, q_s, q_f, num
     return Solved(system, scheme, approximate, rows)
 
 
-def _joins(system: System, scheme: Scheme, solver: Solver, n_s: int, n_f: int) -> bool:
+def _joins(system: System, scheme: Scheme, solver: Solver, q_s, q_f) -> bool:
     """Whether slow and fast variables are unknowns of one kind: on one micro interval, where the nested iteration does not keep to smaller matrices.
 
-    Of many variables it keeps a matrix of the fast ones alone, and it solves for slow variables alone by their masses.
+    Of many variables it keeps a matrix of the fast ones alone, of a diagonal K one number for each, and it solves for slow variables alone by their
+    masses.
     """
     nested = _can_be_nested(system, scheme) and solver.matrix in ("auto", "masses") and not _is_drift(system, scheme)
-    is_small = n_s + n_f <= SMALL and (n_f > 0 or _has_modes(system, scheme))
-    return scheme.num_micro == 1 and (is_small or not nested)
+    if scheme.num_micro > 1 or not nested:
+        return scheme.num_micro == 1
+    if _has_modes(system, scheme):
+        return q_s.size + q_f.size <= SMALL
+    is_small = q_f.size > 0 and q_s.size + q_f.size <= LARGEST_RENEWED
+    return is_small and not Interval.of(system, scheme, q_s, q_f).is_diagonal
 
 
 def _approximate(
