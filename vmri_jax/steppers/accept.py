@@ -109,8 +109,8 @@ class Accepted(NamedTuple):
         return cls(newton.tolerance / SAFETY, *roundoff)
 
     def at_floor(self, size, before, floor=FLOOR):
-        """Whether corrections no longer shrink, from `before` to `size`, and are at most `floor` units ``eps max |positions|``, or `FLOOR`
-        units of the round-off of constraints.
+        """Whether corrections no longer shrink, from `before` to `size`, and are round-off, see `is_roundoff`. With `before` zero, in a first pass,
+        round-off is enough.
         """
         return (size > before / 2) & self.is_roundoff(size, floor)
 
