@@ -7,6 +7,7 @@ from vmri_jax import (
     compose,
     explicit_slow,
     fully_explicit,
+    fully_implicit,
     galerkin,
     micro,
     mollified_impulse,
@@ -14,6 +15,7 @@ from vmri_jax import (
     quadrature,
     takahashi_imada,
 )
+from vmri_jax.steppers.decoupled import Joined
 
 FPU_EXPLICIT = """\
 order           1, not symmetric
@@ -101,3 +103,15 @@ def test_a_mollified_scheme_refuses_potentials_on_the_micro_grid(fpu):
             mollified_impulse(4).with_potentials(bends=micro(quadrature.midpoint)),
             fpu.state(),
         )
+
+
+def test_slow_variables_are_joined_where_the_matrices_are_no_larger(fpu, tsp, sam):
+    """Modes leave out the curvature of slow variables; an iteration with a diagonal or a kept matrix of the fast variables keeps to it."""
+    inner = {
+        (name, scheme.degree): plan(problem, scheme).stepper.inner
+        for name, problem in (("fpu", fpu), ("tsp", tsp), ("sam", sam))
+        for scheme in (fully_implicit(1), galerkin(1, 3))
+    }
+    joined = {key for key, stepper in inner.items() if isinstance(stepper, Joined)}
+    assert joined == {("tsp", 1), ("fpu", 3), ("tsp", 3), ("sam", 3)}
+    assert inner["sam", 3].inner.solver.num_slow == sam.q_s.size
