@@ -185,7 +185,7 @@ class Fit:
         chance, estimate = f"chance of worse {self.probability:.2g}", f"sigma estimated: {self.sigma:.3g}"
         quality = f"{self.freedom} degrees of freedom ({chance if self.shooting.knows_sigma else estimate})"
         squares = float(np.sum(self.residuals**2))
-        lines.append(f"chi^2 {squares:.4g} for {quality}, {self.iterations} iterations")
+        lines.append(f"chi^2 {squares:.4g} for {quality}")
         lines += self.doubts
         if self.shooting.segments > 1:
             lines.append(f"{self.shooting.segments} segments, largest gap {self.gap:.1e} of the motion")
