@@ -71,7 +71,9 @@ def test_an_estimate_has_seen_the_force(kind, center, width, size, accuracy):
     run = vm.simulate(problem, vm.fully_explicit(1), accuracy=accuracy, t_end=LENGTH)
     true = np.abs(run.q_s[:, 0] - motion(np.asarray(run.t), problem.system.params)).max()
     assert run.error.largest <= accuracy
-    assert true <= 3 * run.error.largest  # 0.4 to 1.1 measured
+    assert true <= 3 * run.error.largest  # 0.2 to 1.03 measured
+    if kind == STEP:  # of order one
+        assert true >= 0.8 * run.error.largest
 
 
 TWENTY = [

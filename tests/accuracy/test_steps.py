@@ -11,7 +11,7 @@ import pytest
 import vmri_jax as vm
 from tests.small_systems import SYSTEMS, no_constraint
 from vmri_jax.accuracy import search
-from vmri_jax.accuracy.families import of_order_2
+from vmri_jax.accuracy.families import Trial, of_order_2
 from vmri_jax.schemes.composition import stage_scheme
 from vmri_jax.stability import linear_model
 from vmri_jax.study import reference_solution
@@ -100,10 +100,27 @@ def test_steps_beside_resonances():
     problem, length, family = linear_model(omega=50.0, kappa=25.0), 20.0, of_order_2(vm.explicit_slow)
     trials = search.Search(problem, length)
     trial = trials.trial(family, 40, 2048)
+    assert trial.steps_for(trial.error / 4) == 2 * trial.run.num_steps
+    assert trial.steps_for(trial.error / 4, order=1) == 4 * trial.run.num_steps
     resonant = round(length / 0.0625)  # within the window from 0.06223 to 0.06286 of `vmri_jax.stability.advise`
     beside = trials.beside_resonances(trial, resonant)
     assert resonant < beside < 1.3 * resonant
     assert trials.beside_resonances(trial, beside) == beside
+
+
+def test_steps_that_miss_the_accuracy_are_not_the_last(monkeypatch):
+    """A second trial follows a first one with too few steps."""
+    told, predicted = [], Trial.steps_for
+
+    def too_few_at_first(trial, *arguments):
+        told.append(trial)
+        return predicted(trial, *arguments) // (3 if len(told) == 1 else 1)
+
+    monkeypatch.setattr(Trial, "steps_for", too_few_at_first)
+    trials = search.Search(SYSTEMS["no_constraint"], LENGTH)
+    trial = trials.accurate(trials.trial(of_order_2(vm.fully_explicit), 2, 64), 1e-4)
+    assert 0 < trial.error <= 1e-4
+    assert len(told) == 2
 
 
 def test_a_later_start_and_a_single_saved_interval():

@@ -1,15 +1,18 @@
 """Identification: parameters are found within their errors, intervals cover, and what cannot work is refused."""
 
 import sys
+from dataclasses import replace
 from typing import Any, cast
 
 import numpy as np
 import pytest
 
 import vmri_jax as vm
+from tests.small_systems import driven
 from vmri_jax.fitting import Measured, Unknown
 from vmri_jax.fitting.fit import _model
 from vmri_jax.fitting.given import Unknowns
+from vmri_jax.fitting.shooting import Shooting
 from vmri_jax.schemes.composition import SchemeLike
 
 CHAIN = vm.systems.fermi_pasta_ulam(1, omega=20.0)
@@ -42,6 +45,19 @@ def fit_of_two(data):
 @pytest.fixture(scope="module")
 def found():
     return fit_of_two(measured())
+
+
+def test_parts_of_a_driven_motion_start_at_their_times():
+    """From the starts of a single run each part ends where the next one starts."""
+
+    def model(values):
+        return replace(driven(), v_f=driven().v_f * values["speed"])
+
+    data = measured(steps=24, problem=driven(), scheme=vm.fully_explicit(2))
+    unknowns, steps, u = Unknowns({"speed": Unknown(1.0)}), [np.arange(25)], np.zeros(1)
+    shooting = Shooting(model, unknowns, [data], steps, vm.fully_explicit(2), vm.Solver("masses"), DT, 3)
+    _, gaps = shooting.predict(u, shooting.starts(u))
+    assert np.abs(gaps).max() < 1e-12
 
 
 def test_parameters_are_found_within_their_errors(found):

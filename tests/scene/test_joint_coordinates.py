@@ -67,6 +67,30 @@ def test_the_mass_matrix_of_trees_in_closed_form(seed):
     np.testing.assert_allclose(masses, expected, rtol=0, atol=1e-14 * np.abs(expected).max())
 
 
+@pytest.mark.parametrize("seed", DRAWN[:2])
+def test_the_derivative_of_the_kinetic_energy_of_trees(seed):
+    """By positions, against differences: it contains the derivatives of twists, `vmri_jax.mechanics.kinematics.placed`."""
+    problem = random_scene(seed)[0].problem()
+    random, n_s = np.random.default_rng(seed), problem.q_s.size
+    q = np.concatenate([problem.q_s, problem.q_f])
+    q, v, along = q + 0.3 * random.normal(size=q.size), random.normal(size=q.size), random.normal(size=q.size)
+
+    @jax.jit
+    def slope(x):
+        """The kinetic energy at q + x along, and its derivative by x."""
+
+        def kinetic(x):
+            at = q + x * along
+            return problem.system.kinetic_energy(at[:n_s], at[n_s:], v[:n_s], v[n_s:])
+
+        return kinetic(x), jax.grad(kinetic)(x)
+
+    h = 1e-5
+    difference = (slope(h)[0] - slope(-h)[0]) / (2 * h)
+    assert abs(difference) > 1e-2
+    np.testing.assert_allclose(slope(0.0)[1], difference, rtol=1e-7)
+
+
 SPIN = np.array([0.05, 0.02, 0.2])
 DRIFT = np.array([0.1, 0.0, 0.0])
 

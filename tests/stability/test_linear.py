@@ -79,6 +79,10 @@ def test_constraint_forces_stiffen_a_pendulum():
         assert motions.stiffness == pytest.approx(-side * 9.81 / 2)
         assert motions.hessians["slow"] == pytest.approx(-side * 9.81 / 2)
         assert motions.growing == pytest.approx([np.sqrt(9.81 / 2)] if side > 0 else [])
+    found = multipliers(motions, fully_explicit(1), [0.05])  # standing
+    assert found.growing.sum() == 1
+    assert np.abs(found.values[found.growing]) == pytest.approx(np.exp(0.05 * motions.growing), rel=1e-3)
+    assert found.radius[0] < 1
     spinning = linearise(system, initial_state(system, none, [0.0, -2.0], none, [4.0, 0.0]))
     assert spinning.stiffness == pytest.approx(9.81 / 2 + 4.0**2 / 2**2)  # and the centripetal force
 

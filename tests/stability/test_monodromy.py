@@ -22,6 +22,8 @@ def test_powers_of_a_linear_step():
     once = monodromy(problem, scheme, macro_dt=macro_dt, num_steps=1)
     often = monodromy(problem, scheme, macro_dt=macro_dt, num_steps=40)
     assert often.matrix == pytest.approx(np.linalg.matrix_power(once.matrix, 40), rel=1e-10, abs=1e-9)
+    change = np.array([0.1, -0.2, 0.3, 0.4])  # of the start, in the coordinates of the tangents
+    assert once.tangents.T @ once.matrix @ change == pytest.approx(once.images.T @ change, abs=1e-12)
     expected = multipliers(linearise(problem), scheme, [macro_dt]).radius[0]
     assert expected > 1.01
     assert np.abs(often.multipliers[0]) == pytest.approx(expected**40, rel=1e-9)
