@@ -11,6 +11,7 @@ from scipy.linalg import expm
 import vmri_jax as vm
 from tests.user_systems import cart
 from vmri_jax.control import minimize
+from vmri_jax.control.transcription import held
 
 NONE = np.zeros(0)
 
@@ -264,3 +265,9 @@ def test_params_must_be_a_dict():
             macro_dt=0.1,
             num_steps=10,
         )
+
+
+def test_a_border_has_the_mean_of_its_controls():
+    u = jnp.array([[1.0], [5.0]])
+    for t, control in ((2.1, 1.0), (2.5, 3.0), (2.5 + 1e-9, 3.0), (2.9, 5.0), (1.0, 1.0), (9.0, 5.0)):
+        assert held(t, u, 2.0, 0.5)[0] == pytest.approx(control)
