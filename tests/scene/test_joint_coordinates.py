@@ -67,7 +67,7 @@ def test_the_mass_matrix_of_trees_in_closed_form(seed):
     np.testing.assert_allclose(masses, expected, rtol=0, atol=1e-14 * np.abs(expected).max())
 
 
-@pytest.mark.parametrize("seed", DRAWN[:2])
+@pytest.mark.parametrize("seed", [7, 11])  # of joints behind joints
 def test_the_derivative_of_the_kinetic_energy_of_trees(seed):
     """By positions, against differences: it contains the derivatives of twists, `vmri_jax.mechanics.kinematics.placed`."""
     problem = random_scene(seed)[0].problem()
