@@ -1,5 +1,7 @@
 """Plans in words."""
 
+from typing import Any
+
 import jax.numpy as jnp
 import pytest
 
@@ -107,7 +109,7 @@ def test_a_mollified_scheme_refuses_potentials_on_the_micro_grid(fpu):
 
 def test_slow_variables_are_joined_where_the_matrices_are_no_larger(fpu, tsp, sam):
     """Modes leave out the curvature of slow variables; an iteration with a diagonal or a kept matrix of the fast variables keeps to it."""
-    inner = {
+    inner: dict[Any, Any] = {
         (name, scheme.degree): plan(problem, scheme).stepper.inner
         for name, problem in (("fpu", fpu), ("tsp", tsp), ("sam", sam))
         for scheme in (fully_implicit(1), galerkin(1, 3))
