@@ -13,7 +13,7 @@ from benchmarks.measure import Ratio, Tell, exactly, interleaved, quartiles, sil
 from benchmarks.report import Claim, Report
 
 FACTOR, GROWTH = 4.0, 4.0
-"""Targets: time over that of a run, memory over a thousand times as many steps."""
+"""Targets: time of a gradient over the time of a run, memory of a gradient of a million steps over that of a thousand."""
 SHORT, LONG = 1_000, 1_000_000
 """Steps of the gradients that are timed, and of those whose memory is read off the compiled program."""
 
@@ -61,7 +61,7 @@ def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
 
 
 def measured(case: Case, repeats: int, tell: Tell) -> tuple[list[dict], Ratio]:
-    """A row for each number of steps, and the time of the short gradient over that of a run."""
+    """A row for each number of steps, and the time of the short gradient over the time of a run."""
     problem, scheme, solver = case.problem(), vm.fully_implicit(10), vm.Solver("masses")
     start, params = problem.state(), jax.tree.map(jnp.asarray, problem.system.params)
 

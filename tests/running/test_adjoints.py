@@ -172,6 +172,9 @@ def test_second_derivatives(second, parts, in_parts):
 
 
 def test_a_gradient_has_the_values_of_the_run():
-    """The program of a gradient solves the equations of a step once: its values are those of the run, bit by bit."""
+    """The steps of both are the same, up to the round-off of their two programs: the value of a gradient is no Newton step beside the root."""
     cost, at = simple_cost()
-    assert jax.jit(jax.value_and_grad(cost))(at)[0] == jax.jit(cost)(at)
+    value, expected = jax.jit(jax.value_and_grad(cost))(at)[0], jax.jit(cost)(at)
+    assert float(value) == pytest.approx(
+        float(expected), rel=1e-14
+    )  # 2e-16; the same bits without LLVM's optimisations

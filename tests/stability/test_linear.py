@@ -79,7 +79,7 @@ def test_constraint_forces_stiffen_a_pendulum():
         assert motions.stiffness == pytest.approx(-side * 9.81 / 2)
         assert motions.hessians["slow"] == pytest.approx(-side * 9.81 / 2)
         assert motions.growing == pytest.approx([np.sqrt(9.81 / 2)] if side > 0 else [])
-    found = multipliers(motions, fully_explicit(1), [0.05])  # standing
+    found = multipliers(motions, fully_explicit(1), [0.05])  # of the standing pendulum
     assert found.growing.sum() == 1
     assert np.abs(found.values[found.growing]) == pytest.approx(np.exp(0.05 * motions.growing), rel=1e-3)
     assert found.radius[0] < 1

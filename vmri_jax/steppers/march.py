@@ -93,6 +93,10 @@ class MarchEquations:
         """Whether there are slow unknowns, or several intervals; else the unknowns of one interval are all."""
         return self.n > 1 or self.num_slow + self.n_gs > 0
 
+    def predicted(self, z, x):
+        """The unknowns that steps before predict, z or those of the only interval, and how many of them are increments."""
+        return (z, self.num_slow) if self.has_slow_path else (x[0], self.num_fast)
+
     def by_masses(self) -> "MarchEquations":
         """The equations with the quadratic form of the masses in place of a kinetic energy that is a function."""
         march = copy(self)

@@ -161,11 +161,11 @@ class Marched(StepSolver):
         is_first,
     ) -> Progress:
         """At most `limit` passes. The first attempt starts from the predicted unknowns, later attempts from the guess."""
-        (z, x), is_predicted = march.flat(guess), is_first & ~memory.path.is_empty
-        if march.has_slow_path:
-            z = jnp.where(is_first, memory.path.next(march.num_slow, z), z)
-        else:
-            x, is_predicted = jnp.where(is_first, memory.path.next(march.num_fast, x[0]), x), jnp.asarray(False)
+        z, x = march.flat(guess)
+        unknowns, measured = march.predicted(z, x)
+        unknowns = jnp.where(is_first, memory.path.next(measured, unknowns), unknowns)
+        z, x = (unknowns, x) if march.has_slow_path else (z, unknowns[None])
+        is_predicted = is_first & ~memory.path.is_empty & march.has_slow_path
         progress = start._replace(
             passed=start.passed._replace(z=z, x=x, dz=jnp.zeros_like(z), dx=jnp.zeros_like(x)),
             rate=jnp.where(is_first, memory.rate, jnp.inf),
@@ -225,10 +225,7 @@ class Marched(StepSolver):
 
     def _learned(self, march: MarchEquations, memory: MarchMemory, done: Progress) -> MarchMemory:
         passed = done.passed
-        if march.has_slow_path:
-            path = memory.path.add(passed.z, march.num_slow)
-        else:
-            path = memory.path.add(passed.x[0], march.num_fast)
+        path = memory.path.add(*march.predicted(passed.z, passed.x))
         return MarchMemory(path, passed.x[-1], done.matrices, done.rate)
 
     def describe(self) -> list[str]:

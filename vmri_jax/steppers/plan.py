@@ -17,7 +17,7 @@ The plan chooses the cheapest stepper that the rules and the system allow, from 
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial
 from itertools import pairwise
 from typing import Any
 
@@ -170,9 +170,12 @@ def _between_kicks(system: System, scheme: Scheme, solver: Solver, q_s, q_f, num
     if solver.stepper is not None:
         custom = solver.stepper.called(system, scheme)
         return Solved(system, scheme, custom, rows)
-    if q_s.size and _joins(system, scheme, solver, q_s, q_f):
+    interval = cache(
+        partial(Interval.of, system, scheme, q_s, q_f)
+    )  # the structure of a micro interval, where it is needed
+    if q_s.size and _joins(system, scheme, solver, interval, q_s.size, q_f.size):
         (n_g, _), q = system.num_constraints(q_s, q_f), jnp.concatenate([q_s, q_f])
-        num_slow = q_s.size if q_f.size else 0  # slow variables alone are as stiff as they are
+        num_slow = q_s.size if q_f.size else 0  # of slow variables alone the Hessian has all
         together = _between_kicks(*joined(system, scheme, q_s.size), solver, jnp.zeros(0), q, num_slow)
         return Joined(together, q_s.size, n_g)
     if not can_be_nested or solver.matrix in ("exact", "null_space"):
@@ -181,14 +184,15 @@ def _between_kicks(system: System, scheme: Scheme, solver: Solver, q_s, q_f, num
         chosen = replace(solver, matrix=first) if solver.matrix == "auto" else solver
         marched = Marched(chosen, (q_s.size, n_gs, q_f.size, n_g, scheme.degree))
         return Solved(system, scheme, marched, rows)
-    interval = Interval.of(system, scheme, q_s, q_f)
-    if _is_linear(system, scheme, interval, q_s):
-        return Linear(system, scheme, interval)
-    approximate = _approximate(system, scheme, solver, interval, rows, q_s.size, q_f.size, num_slow)
+    if _is_linear(system, scheme, interval(), q_s):
+        return Linear(system, scheme, interval())
+    approximate = _approximate(system, scheme, solver, interval(), rows, q_s.size, q_f.size, num_slow)
     return Solved(system, scheme, approximate, rows)
 
 
-def _joins(system: System, scheme: Scheme, solver: Solver, q_s, q_f) -> bool:
+def _joins(
+    system: System, scheme: Scheme, solver: Solver, interval: Callable[[], Interval], n_s: int, n_f: int
+) -> bool:
     """Whether slow and fast variables are unknowns of one kind: on one micro interval, where the nested iteration does not keep to smaller matrices.
 
     Of many variables it keeps a matrix of the fast ones alone, of a diagonal K one number for each, and it solves for slow variables alone by their
@@ -198,9 +202,8 @@ def _joins(system: System, scheme: Scheme, solver: Solver, q_s, q_f) -> bool:
     if scheme.num_micro > 1 or not nested:
         return scheme.num_micro == 1
     if _has_modes(system, scheme):
-        return q_s.size + q_f.size <= SMALL
-    is_small = q_f.size > 0 and q_s.size + q_f.size <= LARGEST_RENEWED
-    return is_small and not Interval.of(system, scheme, q_s, q_f).is_diagonal
+        return n_s + n_f <= SMALL
+    return n_f > 0 and n_s + n_f <= LARGEST_RENEWED and not interval().is_diagonal
 
 
 def _approximate(
