@@ -14,6 +14,7 @@ from vmri_jax.schemes.discrete_lagrangian import TermOnNodes, lagrangian
 from vmri_jax.schemes.equations import StepEquations, slow_basis_at_control_nodes
 from vmri_jax.schemes.path import control_nodes
 from vmri_jax.steppers.interval import Matrix, constant_mass, interval_problem, weighted_sum
+from vmri_jax.steppers.solver import only_if
 
 
 class SweepTotals(NamedTuple):
@@ -36,12 +37,12 @@ class FastUnknowns(NamedTuple):
     """Unknowns of one micro interval, or of all with the intervals as first axis, and the matrix that corrects the multipliers.
 
     increments, multiplier: fast increments, and scaled multipliers mu.
-    schur_inverse: ``S = (G_1 K^-1 G_0^T)^-1`` of the first pass, kept in the later ones; None before the first pass.
+    schur_inverse: ``S = (G_1 K^-1 G_0^T)^-1`` of the first pass, kept in the later ones.
     """
 
     increments: Float[Array, "*num_micro r n_f"]
     multiplier: Float[Array, "*num_micro r n_g"]
-    schur_inverse: FullInverse | BandInverse | None
+    schur_inverse: FullInverse | BandInverse
 
 
 class MicroSweep(NamedTuple):
@@ -60,35 +61,39 @@ class MicroSweep(NamedTuple):
     scale: Float[Numbers, "num_micro r 1"]
     sparsity: Sparsity
 
-    def first_pass(self, slow, multiplier) -> tuple[FastUnknowns, SweepTotals]:
-        """The first pass. Guess of every interval: straight motion at the momentum that arrives, multipliers of the interval before.
+    def unsolved(self) -> FastUnknowns:
+        """The fast unknowns before the first pass."""
+        equations, seeds = self.equations, self.sparsity.seeds
+        r, (n_g, _) = equations.scheme.degree, equations.system.num_constraints(equations.q_s, equations.q_f)
+        schur_inverse = jax.eval_shape(self.sparsity.inverse, seeds)
+        of_interval = FastUnknowns(jnp.zeros((r, equations.q_f.size)), jnp.zeros((r, n_g)), schur_inverse)
+        return jax.tree.map(lambda a: jnp.zeros((equations.scheme.num_micro, *a.shape), a.dtype), of_interval)
+
+    def corrected(self, slow, fast: FastUnknowns, multiplier, is_first) -> tuple[FastUnknowns, SweepTotals]:
+        """A pass. In the first one every interval starts from straight motion at the momentum that arrives, with the multipliers of the interval before.
 
         Args:
             slow: (r, n_s) increments of the slow path.
+            fast: unknowns of the pass before.
             multiplier: (r, n_g) multipliers lambda of the last interval of the step before.
+            is_first: whether this is the first pass.
         """
         r = self.equations.scheme.degree
         velocity = constant_mass(self.equations.system).fast_mass.inverse().times
 
         def interval(carry, numbers):
-            (arriving, multiplier), (m, basis, scale) = carry, numbers
+            (arriving, multiplier), (m, basis, scale, before) = carry, numbers
             straight = control_nodes(r)[1:, None] * velocity(arriving.p_f)  # c_j h M^-1 p_f
-            guess = FastUnknowns(straight, scale * multiplier, None)
-            unknowns, totals = self._corrected(slow, arriving, m, basis, guess)
+            guess = before._replace(
+                increments=jnp.where(is_first, straight, before.increments),
+                multiplier=jnp.where(is_first, scale * multiplier, before.multiplier),
+            )
+            unknowns, totals = self._corrected(slow, arriving, m, basis, guess, is_first)
             return (totals, unknowns.multiplier / scale), unknowns
 
-        (totals, _), fast = jax.lax.scan(interval, (self._start(slow), multiplier), (*self._intervals(), self.scale))
-        return fast, totals
-
-    def next_pass(self, slow, fast: FastUnknowns) -> tuple[FastUnknowns, SweepTotals]:
-        """A later pass, from the fast unknowns of the pass before and with its matrices S."""
-
-        def interval(arriving, numbers):
-            m, basis, before = numbers
-            unknowns, totals = self._corrected(slow, arriving, m, basis, before)
-            return totals, unknowns
-
-        totals, fast = jax.lax.scan(interval, self._start(slow), (*self._intervals(), fast))
+        (totals, _), fast = jax.lax.scan(
+            interval, (self.start(slow), multiplier), (*self._intervals(), self.scale, fast)
+        )
         return fast, totals
 
     def _intervals(self):
@@ -96,13 +101,13 @@ class MicroSweep(NamedTuple):
         n, r = self.equations.scheme.num_micro, self.equations.scheme.degree
         return jnp.arange(n), jnp.asarray(slow_basis_at_control_nodes(n, r)[..., 1:])
 
-    def _start(self, slow) -> SweepTotals:
+    def start(self, slow) -> SweepTotals:
         equations = self.equations
         zero = jnp.zeros_like(equations.q_s), jnp.zeros_like(slow), jnp.zeros(())
         return SweepTotals(equations.q_f, equations.micro_dt * equations.p_f, *zero)
 
     def _corrected(
-        self, slow, arriving: SweepTotals, m, basis, guess: FastUnknowns
+        self, slow, arriving: SweepTotals, m, basis, guess: FastUnknowns, is_first
     ) -> tuple[FastUnknowns, SweepTotals]:
         """Interval m, corrected once by a Newton step on its exact residual, and the totals after it."""
         equations, h, n = self.equations, self.equations.micro_dt, self.equations.scheme.num_micro
@@ -110,7 +115,7 @@ class MicroSweep(NamedTuple):
         system, scheme = interval_problem(equations.system, equations.scheme)
         at_rest = jnp.zeros_like(q_s), jnp.zeros_like(arriving.q_f)
         local = StepEquations(system, scheme, equations.t + m * h, q_s, arriving.q_f, *at_rest, h)
-        unknowns, p_f, d_start, d_steps, moved = correct(self, local, steps, arriving.p_f, guess)
+        unknowns, p_f, d_start, d_steps, moved = correct(self, local, steps, arriving.p_f, guess, is_first)
 
         # Chain rule: with the slow increments S of the macro step and the rows b_j of the basis, the slow path of this interval starts
         # at q_s + b_0 S and has the increments (b_j - b_0) S.
@@ -141,7 +146,7 @@ def kick_weight(term: TermOnNodes, h):
     return term.times_step(h) * sum(w for w in (term.start, term.end) if w is not None)
 
 
-def correct(sweep: MicroSweep, local: StepEquations, steps, p_f, guess: FastUnknowns):
+def correct(sweep: MicroSweep, local: StepEquations, steps, p_f, guess: FastUnknowns, is_first):
     """One Newton step on the equations of one micro interval, for the fast increments x and the multipliers mu,
 
         K dx - G_0^T dmu = -R        R = rows - G_0^T mu        G_1 dx = -g
@@ -155,7 +160,8 @@ def correct(sweep: MicroSweep, local: StepEquations, steps, p_f, guess: FastUnkn
         local: the interval as a problem of its own, from the positions at its start.
         steps: (r, n_s) increments of the slow path over the interval.
         p_f: momentum times h that arrives.
-        guess: unknowns before the correction; S is computed here if they come without it.
+        guess: unknowns before the correction.
+        is_first: whether this is the first pass, which computes S.
 
     Returns:
         (unknowns with S, p_f times h at the end, gradients of h times the action with respect to the start and the increments of the slow path,
@@ -167,10 +173,7 @@ def correct(sweep: MicroSweep, local: StepEquations, steps, p_f, guess: FastUnkn
     slow_nodes = jnp.concatenate([local.q_s[None], local.q_s + steps])
     fast_nodes = jnp.concatenate([local.q_f[None], local.q_f + increments[:-1]])
     pull = jax.vjp(partial(jax.vmap(system.g), times[:-1]), slow_nodes[:-1], fast_nodes)[1]  # G_0^T
-    # G_0^T mu and, without S, the columns of G_0^T for its seeds: one map for all, since each use of a function is compiled anew
-    seeds = jnp.zeros((0, r * n_g)) if schur is not None else sweep.sparsity.seeds
-    pulled_s, pulled_f = jax.vmap(pull)(jnp.concatenate([mu[None], seeds.reshape(len(seeds), r, n_g)]))
-    pull_s, pull_f, columns = pulled_s[0], pulled_f[0], pulled_f[1:]
+    pull_s, pull_f = pull(mu)
     # K x = -(h p_f - G_0^T mu): the momentum equations hold exactly, and only the constraints have a residual
     if sweep.is_explicit:
         increments = -matrix.solve(p_f - pull_f)
@@ -183,16 +186,20 @@ def correct(sweep: MicroSweep, local: StepEquations, steps, p_f, guess: FastUnkn
     d, change = jax.linearize(gradient, increments)
     d_fast = d.fast[0] + lagrangian(system, local.scheme).kinetic.fast_rows(increments)
     g, push = jax.linearize(lambda x: jax.vmap(system.g)(times[1:], slow_nodes[1:], local.q_f + x), increments)
+    dx, g_after_dx = jnp.zeros_like(increments), g
     if not sweep.is_explicit:
         # momentum equations at the nodes 0..r-1: h p_f + h D_{F_0} L, h D_{F_j} L
         rows = jnp.concatenate([(d.fast_start - d_fast.sum(0)) + p_f, d_fast[:-1]])
-        columns = jnp.concatenate([columns, (pull_f - rows)[None]])
-    # K^-1 of the columns of G_0^T and, if the increments are unknowns, of -R; then G_1 of these
-    response = jax.vmap(matrix.solve)(columns)
-    pushed = jax.vmap(push)(response)
-    dx, g_after_dx = (jnp.zeros_like(increments), g) if sweep.is_explicit else (response[-1], g + pushed[-1])
-    if schur is None:
-        schur = sweep.sparsity.inverse(pushed[: len(seeds)].reshape(seeds.shape))
+        dx = matrix.solve(pull_f - rows)
+        g_after_dx += push(dx)
+
+    def schur_inverse(_):
+        seeds = sweep.sparsity.seeds
+        columns = jax.vmap(lambda seed: pull(seed)[1])(seeds.reshape(len(seeds), r, n_g))
+        return sweep.sparsity.inverse(jax.vmap(push)(jax.vmap(matrix.solve)(columns)).reshape(seeds.shape))
+
+    if n_g:
+        schur = only_if(is_first, schur_inverse, schur)
     # dmu = -S (g + G_1 dx), then dx <- dx + K^-1 G_0^T dmu
     dmu = -schur.times(g_after_dx.reshape(-1)).reshape(r, n_g)
     pull_dmu_s, pull_dmu_f = pull(dmu)

@@ -30,10 +30,10 @@ from vmri_jax.steppers.accept import Accepted, expected
 from vmri_jax.steppers.interval import Interval, Matrix, constant_mass
 from vmri_jax.steppers.micro_intervals import FastUnknowns, MicroSweep, SweepTotals
 from vmri_jax.steppers.predictors import PolynomialPredictor
-from vmri_jax.steppers.results import Method
+from vmri_jax.steppers.results import RUNNING, Method
 from vmri_jax.steppers.slow_equations import ConstraintInertia, SlowEquations
 from vmri_jax.steppers.solved import Solution, StepSolver, status_of
-from vmri_jax.steppers.solver import Solver, iterated
+from vmri_jax.steppers.solver import Solver, iterated, only_if
 
 EXTRA_PASSES = 1
 """Passes above the fewest with a matrix K that the solver tolerates; it renews K after a step with more. A larger number lets steps with an old K
@@ -123,7 +123,7 @@ class Nested(StepSolver):
         scale, _ = equations.multiplier_scales()
         sweep = MicroSweep(equations, self.interval.is_explicit, memory.matrix, scale, self.interval.sparsity)
         passes = _Passes(equations, memory, sweep, self.newton)
-        done = iterated(passes.next, passes.first())
+        done = iterated(passes.next, passes.start())
 
         x = Unknowns(done.slow, done.slow_multiplier, done.fast.increments, done.fast.multiplier)
         per_h = 1 / equations.micro_dt
@@ -166,16 +166,20 @@ class _Passes:
         self.r, self.n_s = equations.scheme.degree, equations.q_s.size
         self.num_multipliers = equations.system.num_constraints(equations.q_s, equations.q_f)[1]
 
-    def first(self) -> Pass:
-        """The first pass, from the predicted slow unknowns; in the first step, whose momenta are on the hidden constraints, from straight motion."""
+    def start(self) -> Pass:
+        """The unknowns before the first pass: slow ones as predicted; in the first step, whose momenta are on the hidden constraints, from straight motion."""
         increment = self.equations.macro_dt * self.mass.slow_mass.inverse().times(self.equations.p_s)
         straight = (control_nodes(self.r)[1:, None] * increment).reshape(-1)
-        z = self.memory.slow.next(self.r * self.n_s, jnp.pad(straight, (0, self.r * self.num_multipliers)))
-        fast, totals = self.sweep.first_pass(self._apart(z)[0], self.memory.multiplier)
-        inertia = self.slow_equations.constraint_inertia(jax.tree.map(lambda a: a[0], fast.schur_inverse))
-        return self._judged(
-            z, fast, totals, inertia, error=self.memory.slow_model_error, still_moves=totals.moved, passes=1
-        )
+        slow = self.memory.slow.next(self.r * self.n_s, jnp.pad(straight, (0, self.r * self.num_multipliers)))
+        z, fast, zero = self._apart(slow), self.sweep.unsolved(), jnp.zeros(())
+        inertia = jax.eval_shape(self._inertia, fast)
+        inertia = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), inertia)
+        none, error = jnp.zeros(self.r * self.n_s), self.memory.slow_model_error
+        totals = self.sweep.start(z[0])
+        return Pass(*z, fast, totals, none, inertia, error, none[: self.n_s], zero, jnp.asarray(0), jnp.asarray(RUNNING))
+
+    def _inertia(self, fast: FastUnknowns) -> ConstraintInertia | None:
+        return self.slow_equations.constraint_inertia(jax.tree.map(lambda a: a[0], fast.schur_inverse))
 
     def next(self, last: Pass) -> Pass:
         """The next pass, with corrected slow unknowns."""
@@ -194,50 +198,39 @@ class _Passes:
         d = jax.lax.cond(is_hard, lambda: self.slow_equations.with_forces(wanted, x), lambda: last.d)
         now = self._moved_by(d, last)
         missing, update = jnp.where(is_hard, jnp.stack([d - last.d, d]), jnp.stack([now.d, last.d]))
-        return now._replace(slow_model_error=max_abs(missing) / (max_abs(update) + jnp.finfo(float).tiny))
+        error = max_abs(missing) / (max_abs(update) + jnp.finfo(float).tiny)
+        return now._replace(slow_model_error=jnp.where(last.passes > 0, error, last.slow_model_error))
 
     def _moved_by(self, d, last: Pass) -> Pass:
-        z = _flat(last.slow + d.reshape(last.slow.shape), last.slow_multiplier)
-        fast, totals = self.sweep.next_pass(self._apart(z)[0], last.fast)
-        still_moves = expected(totals.moved, last.totals.moved)
-        return self._judged(
-            z,
-            fast,
-            totals,
-            last.inertia,
-            error=last.slow_model_error,
-            still_moves=still_moves,
-            passes=last.passes + 1,
-        )
-
-    def _judged(
-        self,
-        z,
-        fast: FastUnknowns,
-        totals: SweepTotals,
-        inertia: ConstraintInertia | None,
-        *,
-        error,
-        still_moves,
-        passes,
-    ) -> Pass:
-        """A pass with slow unknowns z, with their next update d, and with the `Result` of the iteration so far.
-
-        `error` is its slow_model_error, `still_moves` the expected next correction of the fast increments.
-        """
-        equations, inverse_fast = self.equations, self.mass.fast_mass.inverse().times
-        slow, slow_multiplier = self._apart(z)
+        """The pass after the update d, with its own next update, and with the `Result` of the iteration so far."""
+        equations, is_first = self.equations, last.passes == 0
+        slow, slow_multiplier = last.slow + d.reshape(last.slow.shape), last.slow_multiplier
+        fast, totals = self.sweep.corrected(slow, last.fast, self.memory.multiplier, is_first)
+        inertia = last.inertia
+        if equations.system.constraint is not None:
+            inertia = only_if(is_first, lambda _: self._inertia(fast), inertia)
         x = Unknowns(slow, slow_multiplier, fast.increments, fast.multiplier)
         update, rows, impulse = self.slow_equations.update(x, totals.d_start, totals.d_increments, inertia)
-        d, d_multiplier = update
+        next_d, d_multiplier = update
+        inverse_fast = self.mass.fast_mass.inverse().times
         arrives, leaves = inverse_fast(equations.micro_dt * equations.p_f), inverse_fast(totals.p_f)
         # size of the fast motion: largest |h M_f^-1 p_f| at both ends of the macro step
-        motion = jnp.maximum(max_abs(arrives), max_abs(leaves))
-        changes = max_abs(d), still_moves
-        result = self.newton.status(self.accepted.ratio(changes, (max_abs(slow), motion), passes), passes)
+        motion, still_moves = jnp.maximum(max_abs(arrives), max_abs(leaves)), expected(totals.moved, last.totals.moved)
+        passes = last.passes + 1
+        ratio = self.accepted.ratio((max_abs(next_d), still_moves), (max_abs(slow), motion), passes)
         rows = jnp.maximum(max_abs(rows), max_abs(self.mass.fast) * still_moves)
-        passes, slow_multiplier = jnp.asarray(passes), slow_multiplier + d_multiplier
-        return Pass(slow, slow_multiplier, fast, totals, d, inertia, error, impulse, rows, passes, result)
+        return last._replace(
+            slow=slow,
+            slow_multiplier=slow_multiplier + d_multiplier,
+            fast=fast,
+            totals=totals,
+            d=next_d,
+            inertia=inertia,
+            impulse=impulse,
+            rows=rows,
+            passes=passes,
+            result=self.newton.status(ratio, passes),
+        )
 
     def _apart(self, z):
         """Slow increments (r, n_s) and slow multipliers (r, n_gs) of z."""
