@@ -25,10 +25,11 @@ from jaxtyping import Array, Float, Int
 
 from vmri_jax.kernels import LINEARISES_FORCES, max_abs
 from vmri_jax.schemes.equations import StepEquations, Unknowns
+from vmri_jax.schemes.intervals import Arriving, Intervals
 from vmri_jax.schemes.path import control_nodes
 from vmri_jax.steppers.accept import Accepted, expected
 from vmri_jax.steppers.interval import Interval, Matrix, constant_mass
-from vmri_jax.steppers.micro_intervals import FastUnknowns, MicroSweep, SweepTotals
+from vmri_jax.steppers.micro_intervals import FastUnknowns, MicroSweep
 from vmri_jax.steppers.predictors import PolynomialPredictor
 from vmri_jax.steppers.results import RUNNING, Method
 from vmri_jax.steppers.slow_equations import ConstraintInertia, SlowEquations
@@ -63,11 +64,12 @@ class NestedState(NamedTuple):
 
 
 class Pass(NamedTuple):
-    """Unknowns after a pass, the totals of its micro intervals, and the state of the iteration.
+    """Unknowns after a pass, the quantities that its last interval hands on, and the state of the iteration.
 
+    moved: largest correction of a fast increment.
     d: the next update of the slow increments, by the linearised slow equations; their update of the multipliers is in `slow_multiplier` already.
     inertia: masses that constraints tie to the slow variables, from the first pass.
-    impulse: on the slow variables over the step, times h.
+    p_s: slow momentum at the end of the step.
     rows: estimated residual of the momentum equations, times h: ``max(|R_s|, max M_f |c|)`` with the expected fast correction c. M_f stands
         for K here: for stiff W at the midpoint, |K c| is larger by the factor ``1 + h^2 W'' / (4 M_f)``.
     """
@@ -75,11 +77,12 @@ class Pass(NamedTuple):
     slow: Float[Array, "r n_s"]
     slow_multiplier: Float[Array, "r n_gs"]
     fast: FastUnknowns
-    totals: SweepTotals
+    end: Arriving
+    moved: Float[Array, ""]
     d: Float[Array, "r*n_s"]
     inertia: ConstraintInertia | None
     slow_model_error: Float[Array, ""]
-    impulse: Float[Array, "n_s"]
+    p_s: Float[Array, "n_s"]
     rows: Float[Array, ""]
     passes: Int[Array, ""]
     result: Int[Array, ""]
@@ -121,13 +124,12 @@ class Nested(StepSolver):
 
     def solve(self, equations: StepEquations, guess: Unknowns, memory: NestedState) -> tuple[Solution, NestedState]:
         scale, _ = equations.multiplier_scales()
-        sweep = MicroSweep(equations, self.interval.is_explicit, memory.matrix, scale, self.interval.sparsity)
-        passes = _Passes(equations, memory, sweep, self.newton)
+        sweep = MicroSweep(Intervals(equations), self.interval, memory.matrix, scale, memory.multiplier)
+        passes = _Passes(memory, sweep, self.newton)
         done = iterated(passes.next, passes.start())
 
         x = Unknowns(done.slow, done.slow_multiplier, done.fast.increments, done.fast.multiplier)
-        per_h = 1 / equations.micro_dt
-        end = done.totals.q_f, equations.p_s + per_h * done.impulse, per_h * done.totals.p_f
+        end = done.end.q_f, done.p_s, done.end.p_f / equations.micro_dt
         status = status_of(equations, done.result, Method.MASSES, done.passes, rows=done.rows, end=end)
 
         learned = NestedState(
@@ -158,9 +160,10 @@ class Nested(StepSolver):
 class _Passes:
     """The iteration over passes of one macro step."""
 
-    def __init__(self, equations: StepEquations, memory: NestedState, sweep: MicroSweep, newton: Solver):
-        self.equations, self.memory, self.sweep, self.newton = equations, memory, sweep, newton
-        self.slow_equations = SlowEquations.of(equations)
+    def __init__(self, memory: NestedState, sweep: MicroSweep, newton: Solver):
+        self.memory, self.sweep, self.newton = memory, sweep, newton
+        self.equations = equations = sweep.intervals.equations
+        self.slow_equations = SlowEquations.of(sweep.intervals)
         self.accepted = Accepted.of(equations, newton)
         self.mass = constant_mass(equations.system)
         self.r, self.n_s = equations.scheme.degree, equations.q_s.size
@@ -175,8 +178,8 @@ class _Passes:
         inertia = jax.eval_shape(self._inertia, fast)
         inertia = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), inertia)
         none, error = jnp.zeros(self.r * self.n_s), self.memory.slow_model_error
-        totals = self.sweep.start(z[0])
-        return Pass(*z, fast, totals, none, inertia, error, none[: self.n_s], zero, jnp.asarray(0), jnp.asarray(RUNNING))
+        numbers = zero, jnp.asarray(0), jnp.asarray(RUNNING)
+        return Pass(*z, fast, self.sweep.intervals.start(), zero, none, inertia, error, self.equations.p_s, *numbers)
 
     def _inertia(self, fast: FastUnknowns) -> ConstraintInertia | None:
         return self.slow_equations.constraint_inertia(jax.tree.map(lambda a: a[0], fast.schur_inverse))
@@ -205,17 +208,16 @@ class _Passes:
         """The pass after the update d, with its own next update, and with the `Result` of the iteration so far."""
         equations, is_first = self.equations, last.passes == 0
         slow, slow_multiplier = last.slow + d.reshape(last.slow.shape), last.slow_multiplier
-        fast, totals = self.sweep.corrected(slow, last.fast, self.memory.multiplier, is_first)
+        fast, end, moved = self.sweep.corrected(slow, last.fast, is_first)
         inertia = last.inertia
         if equations.system.constraint is not None:
             inertia = only_if(is_first, lambda _: self._inertia(fast), inertia)
-        x = Unknowns(slow, slow_multiplier, fast.increments, fast.multiplier)
-        update, rows, impulse = self.slow_equations.update(x, totals.d_start, totals.d_increments, inertia)
+        update, rows, p_s = self.slow_equations.update(slow, slow_multiplier, end, inertia)
         next_d, d_multiplier = update
         inverse_fast = self.mass.fast_mass.inverse().times
-        arrives, leaves = inverse_fast(equations.micro_dt * equations.p_f), inverse_fast(totals.p_f)
+        arrives, leaves = inverse_fast(equations.micro_dt * equations.p_f), inverse_fast(end.p_f)
         # size of the fast motion: largest |h M_f^-1 p_f| at both ends of the macro step
-        motion, still_moves = jnp.maximum(max_abs(arrives), max_abs(leaves)), expected(totals.moved, last.totals.moved)
+        motion, still_moves = jnp.maximum(max_abs(arrives), max_abs(leaves)), expected(moved, last.moved)
         passes = last.passes + 1
         ratio = self.accepted.ratio((max_abs(next_d), still_moves), (max_abs(slow), motion), passes)
         rows = jnp.maximum(max_abs(rows), max_abs(self.mass.fast) * still_moves)
@@ -223,10 +225,11 @@ class _Passes:
             slow=slow,
             slow_multiplier=slow_multiplier + d_multiplier,
             fast=fast,
-            totals=totals,
+            end=end,
+            moved=moved,
             d=next_d,
             inertia=inertia,
-            impulse=impulse,
+            p_s=p_s,
             rows=rows,
             passes=passes,
             result=self.newton.status(ratio, passes),

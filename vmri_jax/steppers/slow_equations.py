@@ -31,8 +31,9 @@ from jaxtyping import Array, Float
 
 from vmri_jax.kernels import inverse, matmul, max_abs, solve
 from vmri_jax.kernels.band import BandInverse, FullInverse
-from vmri_jax.schemes.discrete_lagrangian import QuadraticKinetic, lagrangian, placed_potentials
+from vmri_jax.schemes.discrete_lagrangian import placed_potentials
 from vmri_jax.schemes.equations import StepEquations, Unknowns, slow_basis_at_control_nodes
+from vmri_jax.schemes.intervals import Arriving, Intervals
 from vmri_jax.schemes.path import control_nodes, lagrange_basis, lagrange_derivative
 from vmri_jax.schemes.quadrature import gauss
 from vmri_jax.steppers.interval import constant_mass, solve_saddle
@@ -64,17 +65,22 @@ class SlowEquations(NamedTuple):
     inverse_mass: ``v -> M_s^-1 v``.
     """
 
-    equations: StepEquations
-    kinetic: QuadraticKinetic
+    intervals: Intervals
     inverse_form: Float[Array, "r r"]
     inverse_mass: Callable
 
     @classmethod
-    def of(cls, equations: StepEquations) -> "SlowEquations":
+    def of(cls, intervals: Intervals) -> "SlowEquations":
         """The slow equations of a macro step."""
-        kinetic = lagrangian(equations.system, equations.scheme).kinetic
+        equations, kinetic = intervals.equations, intervals.kinetic
+        assert kinetic is not None
         inverse_form = equations.scheme.num_micro * inverse(kinetic.slow_form[:-1, 1:])
-        return cls(equations, kinetic, inverse_form, constant_mass(equations.system).slow_mass.inverse().times)
+        return cls(intervals, inverse_form, constant_mass(equations.system).slow_mass.inverse().times)
+
+    @property
+    def equations(self) -> StepEquations:
+        """Of the macro step."""
+        return self.intervals.equations
 
     def constraint_inertia(self, schur: FullInverse | BandInverse) -> ConstraintInertia | None:
         """U and P from the matrix S (r n_g, r n_g) of the first micro interval; None without constraints."""
@@ -92,35 +98,34 @@ class SlowEquations(NamedTuple):
         both = np.eye(len(multipliers)) + matmul(multipliers, responses.reshape(-1, r * n_s).T)
         return ConstraintInertia(responses, solve(both, multipliers).reshape(responses.shape))
 
-    def update(self, x: Unknowns, start, increments, inertia: ConstraintInertia | None):
-        """Update of the slow unknowns, residual R of the slow momentum equations, and slow impulse over the step, the latter two times h.
+    def update(self, slow, multiplier, arriving: Arriving, inertia: ConstraintInertia | None):
+        """Update of the slow unknowns, residual R of the slow momentum equations, times h, and slow momentum at the end of the step.
 
-        A step at rest ends with its first pass: its multipliers are those of this update, which the impulse contains.
+        A step at rest ends with its first pass: its multipliers are those of this update, whose impulse the momentum contains.
 
         With the masses K_s (and the tied ones), and the Jacobians G_0, G_1 of g_s at the macro control nodes 0..r-1 and 1..r,
 
             K_s dx - G_0^T dnu = -R        G_1 dx = -g_s
 
         Args:
-            x: unknowns of the macro step.
-            start, increments: (n_s,), (r, n_s) gradients of h times the action with respect to the start and the increments of the slow path,
-                without the slow kinetic energy and the slow constraint.
+            slow, multiplier: slow unknowns.
+            arriving: quantities that the last micro interval hands on.
             inertia: of the tied masses, None without constraints.
         """
         equations, n, r = self.equations, self.equations.scheme.num_micro, self.equations.scheme.degree
-        system, q_s = equations.system, equations.q_s
-        times = equations.t + equations.macro_dt * control_nodes(r)
-        g, push = jax.linearize(lambda inc: jax.vmap(system.g_slow)(times[1:], q_s + inc), x.slow)
-        nodes = jnp.concatenate([q_s[None], q_s + x.slow[:-1]])
-        jacobian = jax.vmap(jax.jacrev(system.g_slow, argnums=1))(times[:-1], nodes)
-        pull = jnp.sum(x.slow_multiplier[..., None] / n * jacobian, axis=1)
-        # R: h p_s + h D_{S_0} A, h D_{S_i} A; nu is scaled by n = num_micro (`multiplier_scales`)
-        d = increments + self.kinetic.slow_rows(x.slow) / n
-        rows = jnp.concatenate([(start - d.sum(0) + equations.micro_dt * equations.p_s)[None], d[:-1]]) - pull
+        times = equations.t + equations.macro_dt * control_nodes(r)[:-1]
+        g, push = jax.linearize(self.intervals.slow_constraints, slow)
+        nodes = jnp.concatenate([equations.q_s[None], equations.q_s + slow[:-1]])
+        jacobian = jax.vmap(jax.jacrev(equations.system.g_slow, argnums=1))(times, nodes)
+
+        def impulses(multiplier):
+            """``G_0^T nu``; nu is scaled by n = num_micro (`multiplier_scales`)."""
+            return jnp.sum(multiplier[..., None] / n * jacobian, axis=1)
+
+        rows, p_s = self.intervals.slow_rows(slow, impulses(multiplier), arriving)
         dx, d_nu = solve_saddle(lambda rows: self._by_masses(rows, inertia), jacobian, push, rows, g)
-        pull += jnp.sum(d_nu[..., None] * jacobian, axis=1)
-        # impulse: p_s+ - p_s = D_{S_0} A + ... + D_{S_r} A, times h, d cancels in the sum
-        return (dx.reshape(-1), n * d_nu), rows, start - pull.sum(0)
+        p_s -= impulses(n * d_nu).sum(0) / equations.micro_dt
+        return (dx.reshape(-1), n * d_nu), rows, p_s
 
     def with_forces(self, d, x: Unknowns):
         """The update ``(1 + K_s^-1 C)^-1 d`` for an update d by the masses alone, with the derivative C of the slow forces,
