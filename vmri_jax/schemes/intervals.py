@@ -24,7 +24,7 @@ from collections.abc import Callable
 from copy import copy
 from dataclasses import replace
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -83,18 +83,18 @@ class IntervalNodes:
     def __init__(self, groups: list[list[NodeGroup]], num_micro: int, degree: int):
         n = num_micro
         c = np.zeros((n, len(groups)))
-        self.has_nodes = np.zeros(n, bool)
+        self.has_nodes = np.full(n, all(_meet(row, n) for row in groups))
         for k, row in enumerate(groups):
             for group in row:
                 c[np.array(group.intervals), k] = group.c
                 self.has_nodes[np.array(group.intervals)] = True
-        if self.has_nodes.all() and all(len(row) == 1 for row in groups):
+        if all(len(row) == 1 and row[0].size == n for row in groups):
             self.weights = jnp.stack([row[0].weights[0] for row in groups])[None]  # of all intervals
         else:
             self.weights = jnp.stack(
                 [sum((_padded(group, n) for group in row), jnp.zeros(n)) for row in groups], axis=1
             )
-        self.theta = (np.arange(n)[:, None] + c) / n
+        self.c, self.theta = c, (np.arange(n)[:, None] + c) / n
         self.tables = {
             "q_s": lagrange_basis(degree, self.theta)[..., 1:],
             "v_s": lagrange_derivative(degree, self.theta)[..., 1:],
@@ -151,6 +151,12 @@ def with_unseen(values, name: str, equations: StepEquations, seen: Entries):
     return seen.put(values, jnp.broadcast_to(at_rest, (len(values), at_rest.size)))
 
 
+def _meet(row: list[NodeGroup], num_micro: int) -> bool:
+    """Whether a row has the nodes where intervals meet, at the start of all but the first one. There functions are evaluated with the weight 0, without a
+    branch, at the start of the macro step, where the same rule has a node of the step before."""
+    return all(group.c == 0 and group.size == num_micro - 1 for group in row)
+
+
 def _padded(group: NodeGroup, num_micro: int):
     """(num_micro,) weights of a group of nodes, 0 in intervals without a node of the group."""
     if group.step > 1:
@@ -162,7 +168,7 @@ def of_interval(table, m):
     """The rows of a table for interval m; a constant, without a lookup, if the rows of all intervals are equal."""
     if len(table) == 1 or (isinstance(table, np.ndarray) and np.ptp(table, axis=0).max(initial=0.0) == 0.0):
         return table[0]
-    return jnp.asarray(table)[m]
+    return jnp.asarray(table).at[m].get(mode="promise_in_bounds")
 
 
 class Intervals:
@@ -248,9 +254,9 @@ class Intervals:
         pull = jax.vjp(partial(self.constraints, m=m, nodes=slice(0, -1)), path)[1]
         return lambda mu: pull(mu)[0]
 
-    def rows(self, d: IntervalPath):
-        """``D_{F_0}``, then ``D_{F_j}``, 0 < j < r, (r, n_f) of a function with the gradient d: its momentum equations."""
-        return jnp.concatenate([(d.fast_start - d.fast.sum(0))[None], d.fast[:-1]])
+    def rows(self, d: IntervalPath, p_f: Any = 0.0):
+        """The momentum equations ``p + D_{F_0}``, then ``D_{F_j}``, 0 < j < r, (r, n_f) of a function with the gradient d."""
+        return jnp.concatenate([(p_f + d.fast_start - d.fast.sum(0))[None], d.fast[:-1]])
 
     def with_inertia(self, d: IntervalPath, fast) -> IntervalPath:
         """The gradient d with that of the kinetic energy of constant masses, for fast increments (r, n_f)."""
@@ -277,8 +283,10 @@ class Intervals:
             slow: (r, n_v) increments of the slow path that are seen.
         """
         path = self.path(arriving, slow, x.fast)
-        d = jax.grad(lambda path, held: self._action(path, held, m) - self._constraint_work(path, x.multiplier, m))(path, path)
-        rows = self.rows(self.with_inertia(d, x.fast)).at[0].add(arriving.p_f)
+        d = jax.grad(lambda path, held: self._action(path, held, m) - self._constraint_work(path, x.multiplier, m))(
+            path, path
+        )
+        rows = self.rows(self.with_inertia(d, x.fast), arriving.p_f)
         residual = IntervalUnknowns(rows, self.constraints(path, m, slice(1, None)))
         return residual, self.handed_on(arriving, d, x.fast[-1])
 

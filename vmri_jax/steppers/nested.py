@@ -198,7 +198,7 @@ class _Passes:
         )
         wanted = jnp.where(is_hard, last.d, 0.0)  # in lanes of a batch without a hard step the loop ends at once
         x = Unknowns(last.slow, last.slow_multiplier, last.fast.increments, last.fast.multiplier)
-        d = jax.lax.cond(is_hard, lambda: self.slow_equations.with_forces(wanted, x), lambda: last.d)
+        d = only_if(is_hard, lambda _: self.slow_equations.with_forces(wanted, x), last.d)
         now = self._moved_by(d, last)
         missing, update = jnp.where(is_hard, jnp.stack([d - last.d, d]), jnp.stack([now.d, last.d]))
         error = max_abs(missing) / (max_abs(update) + jnp.finfo(float).tiny)
