@@ -24,9 +24,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from vmri_jax.kernels import DIAGONAL_MATRICES, LARGEST_RENEWED, inverse, solve
+from vmri_jax.kernels import DIAGONAL_MATRICES, LARGEST_RENEWED, inverse
 from vmri_jax.kernels.band import Band, BandInverse, Full, FullInverse, Sparsity, sparsity
-from vmri_jax.kernels.saddle import regularized
 from vmri_jax.mechanics.arrays import is_concrete
 from vmri_jax.mechanics.constraint_pattern import MOST_ROWS_OF_FULL_MATRIX, fast_rows
 from vmri_jax.mechanics.masses import ConstantMass
@@ -215,26 +214,3 @@ def _diagonal_matrix(intervals: Intervals, path: IntervalPath) -> DiagonalMatrix
     if len(block) == 1:
         return DiagonalMatrix(1 / block)
     return DiagonalMatrix(jnp.moveaxis(jax.vmap(inverse, in_axes=-1)(block), 0, -1))
-
-
-def solve_saddle(solve_k, jacobian, push, rows, g):
-    """(dx, dmu) with ``K dx - G_0^T dmu = -rows`` and ``G_1 dx = -g``, by the Schur complement ``G_1 K^-1 G_0^T``.
-
-    Args:
-        solve_k: K^-1, (r, n) rows to (r, n) increments.
-        jacobian: (r, n_g, n) G_0, at the control nodes 0..r-1, where the multipliers act.
-        push: G_1 as a function, changes (r, n) of the control points 1..r to changes (r, n_g) of the constraints.
-        rows, g: (r, n) and (r, n_g).
-    """
-    r, n_g = g.shape
-    if n_g == 0:
-        return -solve_k(rows), g
-    # Columns of G_0^T and -rows, then K^-1 and G_1 of them: one map for all, since each use of a function is compiled anew. vmap stacks
-    # columns in rows, so that `schur` is the transposed complement.
-    columns = np.eye(r)[:, None, :, None] * jacobian[:, :, None, :]  # (node, constraint, row, coordinate)
-    columns = jnp.concatenate([columns.reshape(r * n_g, r, -1), -rows[None]])
-    response = jax.vmap(solve_k)(columns)
-    pushed = jax.vmap(push)(response).reshape(-1, r * n_g)
-    response, dx, schur, g_of_dx = response[:-1], response[-1], regularized(pushed[:-1]), pushed[-1]
-    dmu = -solve(schur.T, (g.reshape(-1) + g_of_dx)[:, None])
-    return dx + jnp.sum(dmu[..., None] * response, axis=0), dmu.reshape(r, n_g)

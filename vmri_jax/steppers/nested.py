@@ -2,7 +2,8 @@
 
 A pass holds the slow path fixed. It visits the micro intervals in order; each corrects its fast increments and multipliers once, by a
 Newton step on its exact residual, and adds its impulse to the slow equations. Then the pass corrects the slow increments and slow
-multipliers by the residual of the slow equations. All matrices are cheap approximations:
+multipliers by the residual of the slow equations. All equations are those of the march (`vmri_jax.schemes.intervals`); all matrices are cheap
+approximations:
 
 * micro interval: ``[K, -G_0^T; G_1, 0]`` with K of `vmri_jax.steppers.interval`, e.g. ``-(M_f + h^2 W'' / 4)`` for the implicit midpoint
   rule, at the start of the macro step, or of an earlier one while that costs at most `EXTRA_PASSES`. Where the fast equations are explicit,

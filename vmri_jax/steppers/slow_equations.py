@@ -31,12 +31,13 @@ from jaxtyping import Array, Float
 
 from vmri_jax.kernels import inverse, matmul, max_abs, solve
 from vmri_jax.kernels.band import BandInverse, FullInverse
+from vmri_jax.kernels.saddle import regularized
 from vmri_jax.schemes.discrete_lagrangian import placed_potentials
 from vmri_jax.schemes.equations import StepEquations, Unknowns, slow_basis_at_control_nodes
 from vmri_jax.schemes.intervals import Arriving, Intervals
 from vmri_jax.schemes.path import control_nodes, lagrange_basis, lagrange_derivative
 from vmri_jax.schemes.quadrature import gauss
-from vmri_jax.steppers.interval import constant_mass, solve_saddle
+from vmri_jax.steppers.interval import constant_mass
 
 NODES = 4
 """Gauss nodes per macro step at which the slow forces are linearised. A larger number makes the solve dearer; with a smaller one, steps in which
@@ -177,6 +178,29 @@ class SlowEquations(NamedTuple):
             return dx
         mu = jnp.sum(inertia.multipliers * dx, axis=(1, 2))
         return dx - jnp.sum(mu[:, None, None] * inertia.responses, axis=0)
+
+
+def solve_saddle(solve_k, jacobian, push, rows, g):
+    """(dx, dmu) with ``K dx - G_0^T dmu = -rows`` and ``G_1 dx = -g``, by the Schur complement ``G_1 K^-1 G_0^T``.
+
+    Args:
+        solve_k: K^-1, (r, n) rows to (r, n) increments.
+        jacobian: (r, n_g, n) G_0, at the control nodes 0..r-1, where the multipliers act.
+        push: G_1 as a function, changes (r, n) of the control points 1..r to changes (r, n_g) of the constraints.
+        rows, g: (r, n) and (r, n_g).
+    """
+    r, n_g = g.shape
+    if n_g == 0:
+        return -solve_k(rows), g
+    # Columns of G_0^T and -rows, then K^-1 and G_1 of them: one map for all, since each use of a function is compiled anew. vmap stacks
+    # columns in rows, so that `schur` is the transposed complement.
+    columns = np.eye(r)[:, None, :, None] * jacobian[:, :, None, :]  # (node, constraint, row, coordinate)
+    columns = jnp.concatenate([columns.reshape(r * n_g, r, -1), -rows[None]])
+    response = jax.vmap(solve_k)(columns)
+    pushed = jax.vmap(push)(response).reshape(-1, r * n_g)
+    response, dx, schur, g_of_dx = response[:-1], response[-1], regularized(pushed[:-1]), pushed[-1]
+    dmu = -solve(schur.T, (g.reshape(-1) + g_of_dx)[:, None])
+    return dx + jnp.sum(dmu[..., None] * response, axis=0), dmu.reshape(r, n_g)
 
 
 def minimal_residuals(operator, b):
