@@ -81,7 +81,7 @@ class Pass(NamedTuple):
     end: Arriving
     moved: Float[Array, ""]
     d: Float[Array, "r*n_s"]
-    inertia: ConstraintInertia | None
+    inertia: ConstraintInertia
     slow_model_error: Float[Array, ""]
     p_s: Float[Array, "n_s"]
     rows: Float[Array, ""]
@@ -176,14 +176,10 @@ class _Passes:
         straight = (control_nodes(self.r)[1:, None] * increment).reshape(-1)
         slow = self.memory.slow.next(self.r * self.n_s, jnp.pad(straight, (0, self.r * self.num_multipliers)))
         z, fast, zero = self._apart(slow), self.sweep.unsolved(), jnp.zeros(())
-        inertia = jax.eval_shape(self._inertia, fast)
-        inertia = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), inertia)
+        inertia = ConstraintInertia.none(self.memory.multiplier.size, z[0])
         none, error = jnp.zeros(self.r * self.n_s), self.memory.slow_model_error
         numbers = zero, jnp.asarray(0), jnp.asarray(RUNNING)
         return Pass(*z, fast, self.sweep.intervals.start(), zero, none, inertia, error, self.equations.p_s, *numbers)
-
-    def _inertia(self, fast: FastUnknowns) -> ConstraintInertia | None:
-        return self.slow_equations.constraint_inertia(jax.tree.map(lambda a: a[0], fast.schur_inverse))
 
     def next(self, last: Pass) -> Pass:
         """The next pass, with corrected slow unknowns."""
@@ -211,8 +207,9 @@ class _Passes:
         slow, slow_multiplier = last.slow + d.reshape(last.slow.shape), last.slow_multiplier
         fast, end, moved = self.sweep.corrected(slow, last.fast, is_first)
         inertia = last.inertia
-        if equations.system.constraint is not None:
-            inertia = only_if(is_first, lambda _: self._inertia(fast), inertia)
+        if inertia.responses.size:
+            of_first = jax.tree.map(lambda a: a[0], fast.schur_inverse)
+            inertia = only_if(is_first, lambda _: self.slow_equations.constraint_inertia(of_first), inertia)
         update, rows, p_s = self.slow_equations.update(slow, slow_multiplier, end, inertia)
         next_d, d_multiplier = update
         inverse_fast = self.mass.fast_mass.inverse().times

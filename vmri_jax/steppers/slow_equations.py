@@ -58,6 +58,11 @@ class ConstraintInertia(NamedTuple):
     responses: Float[Array, "r*n_g r n_s"]
     multipliers: Float[Array, "r*n_g r n_s"]
 
+    @classmethod
+    def none(cls, num_rows: int, slow) -> "ConstraintInertia":
+        """Of no tied masses, for r n_g rows and slow increments (r, n_s)."""
+        return cls(*2 * [jnp.zeros((num_rows, *slow.shape))])
+
 
 class SlowEquations(NamedTuple):
     """The slow equations, with ``K_s^-1`` as the Kronecker product of a matrix for the nodes and an operator for the coordinates.
@@ -83,12 +88,10 @@ class SlowEquations(NamedTuple):
         """Of the macro step."""
         return self.intervals.equations
 
-    def constraint_inertia(self, schur: FullInverse | BandInverse) -> ConstraintInertia | None:
-        """U and P from the matrix S (r n_g, r n_g) of the first micro interval; None without constraints."""
+    def constraint_inertia(self, schur: FullInverse | BandInverse) -> ConstraintInertia:
+        """U and P from the matrix S (r n_g, r n_g) of the first micro interval, with constraints."""
         equations, r, n_s = self.equations, self.equations.scheme.degree, self.equations.q_s.shape[0]
         jacobian = jax.jacrev(equations.system.g, argnums=1)(equations.t, equations.q_s, equations.q_f)
-        if not jacobian.size:
-            return None
         # keeps round-off independent of the expression of the constraint
         jacobian = jax.lax.optimization_barrier(jacobian)
         basis = slow_basis_at_control_nodes(equations.scheme.num_micro, r)[0]
@@ -99,7 +102,7 @@ class SlowEquations(NamedTuple):
         both = np.eye(len(multipliers)) + matmul(multipliers, responses.reshape(-1, r * n_s).T)
         return ConstraintInertia(responses, solve(both, multipliers).reshape(responses.shape))
 
-    def update(self, slow, multiplier, arriving: Arriving, inertia: ConstraintInertia | None):
+    def update(self, slow, multiplier, arriving: Arriving, inertia: ConstraintInertia):
         """Update of the slow unknowns, residual R of the slow momentum equations, times h, and slow momentum at the end of the step.
 
         A step at rest ends with its first pass: its multipliers are those of this update, whose impulse the momentum contains.
@@ -111,7 +114,7 @@ class SlowEquations(NamedTuple):
         Args:
             slow, multiplier: slow unknowns.
             arriving: quantities that the last micro interval hands on.
-            inertia: of the tied masses, None without constraints.
+            inertia: of the tied masses.
         """
         equations, n, r = self.equations, self.equations.scheme.num_micro, self.equations.scheme.degree
         times = equations.t + equations.macro_dt * control_nodes(r)[:-1]
