@@ -45,7 +45,7 @@ JOINTS = [
 SCENE = Scene(BODIES, JOINTS, coordinates="directors", redundant="drop")
 """Each joint has a pair with another kind of body, or with the ground."""
 ROWS: Any = ConstraintRows.of(SCENE.sorting)
-Q = RANDOM.normal(size=ROWS.start.size)
+Q = RANDOM.normal(size=ROWS.sorting.positions.size)
 
 
 def test_rows_are_the_products_of_the_table():

@@ -22,7 +22,7 @@ from vmri_jax.ensembles.quantities import drawn_by_default
 from vmri_jax.executors.executor import local_workers
 from vmri_jax.mechanics.arrays import whole_number
 from vmri_jax.mechanics.names import near
-from vmri_jax.mechanics.places import START, Place, Placed, places_of
+from vmri_jax.mechanics.places import START, Index, Placed, places_of
 from vmri_jax.mechanics.slots import free
 from vmri_jax.mechanics.state import Problem
 from vmri_jax.refusals import Refused
@@ -168,7 +168,7 @@ def _print_summary(runs: Ensemble) -> None:
 def by_name(problem: Problem, columns: Sequence[str]) -> Placed | None:
     """The function that sets the numbers which columns name; None where all columns are steps and schemes."""
     known = {name: place for name, (place, shape) in places_of(problem).items() if not shape}
-    places: dict[str, Place] = {}
+    places: dict[str, Index] = {}
     for name in columns_of_problems(columns):
         if name not in known:
             listed = [other for other in free(known) if "[" not in other]

@@ -18,7 +18,7 @@ from vmri_jax.mechanics.slots import leaves_by_name
 from vmri_jax.mechanics.state import Problem
 
 START = ("t", "q_s", "q_f", "v_s", "v_f")
-Place = tuple[int, tuple[int, ...]]
+Index = tuple[int, tuple[int, ...]]
 """Number of an array among the `_arrays` of a problem, and the index of a number in it, () for the whole array."""
 
 
@@ -26,7 +26,7 @@ Place = tuple[int, tuple[int, ...]]
 class Placed:
     """A function ``(problem, values) -> problem`` that puts each value in the place of its name, and that pickle can send."""
 
-    places: dict[str, Place]
+    places: dict[str, Index]
 
     def __call__(self, problem: Problem, values: Mapping[str, Any]) -> Problem:
         arrays, structure = _arrays(problem)
@@ -43,10 +43,10 @@ def _arrays(problem: Problem) -> tuple[list, Any]:
     return jax.tree.flatten((problem.system.params, [getattr(problem, part) for part in START]))
 
 
-def places_of(problem: Problem) -> dict[str, tuple[Place, tuple[int, ...]]]:
+def places_of(problem: Problem) -> dict[str, tuple[Index, tuple[int, ...]]]:
     """The place and the shape of all arrays and all numbers by name; a parameter goes before a coordinate of the same name."""
     labels = [name or "params" for name in leaves_by_name(problem.system.params)[0]]
-    known: dict[str, tuple[Place, tuple[int, ...]]] = {}
+    known: dict[str, tuple[Index, tuple[int, ...]]] = {}
     for number, (label, array) in enumerate(zip([*labels, *START], _arrays(problem)[0], strict=True)):
         known.setdefault(label, ((number, ()), np.shape(array)))
         for index in np.ndindex(np.shape(array)):

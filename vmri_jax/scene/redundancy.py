@@ -109,15 +109,15 @@ def find_opening(rows: ConstraintRows) -> tuple[dict[int, float], float]:
     unit = (rows.jacobian * rows.scales / rows.sizes[:, None])[kept]
     basis, triangle = np.linalg.qr(unit.T)
     step = NEARBY * float(np.linalg.svd(triangle, compute_uv=False).min(initial=1.0))
-    everywhere = np.arange(rows.start.size)
-    q, values, is_reached = rows.onto(kept, rows.start, everywhere)
+    everywhere = np.arange(rows.sorting.positions.size)
+    q, values, is_reached = rows.onto(kept, rows.sorting.positions, everywhere)
     if not is_reached:
         return {}, 0.0  # positions far off the constraints: the initial state refuses them with a message of its own
     worst, length = np.abs(values[dropped]), 0.0
     if worst.max() <= RANK:  # the accuracy to which the choice of dropped rows finds them dependent
         random, timed = np.random.default_rng(0), any(row.effect.timed for row in rows.rows)
         for _ in range(MOTIONS):
-            time, motion = random.normal() * timed, random.normal(size=rows.start.size)
+            time, motion = random.normal() * timed, random.normal(size=rows.sorting.positions.size)
             motion -= basis @ (basis.T @ motion)
             for _ in range(NUM_LENGTHS):
                 start = q + rows.scales * step * motion

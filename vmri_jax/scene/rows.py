@@ -89,12 +89,7 @@ class ConstraintRows:
     def of(cls, sorting: Sorting) -> "ConstraintRows | None":
         """The rows of a scene; None if it has none, or if their numbers are traced."""
         rows = cls(sorting)
-        return rows if rows.params and is_concrete((rows.start, sorting.joints, rows.params)) else None
-
-    @property
-    def start(self) -> np.ndarray:
-        """(n,) positions at the start."""
-        return self.sorting.positions
+        return rows if rows.params and is_concrete((sorting.positions, sorting.joints, rows.params)) else None
 
     @cached_property
     def rows(self) -> list[Row]:
@@ -157,7 +152,7 @@ class ConstraintRows:
     @cached_property
     def jacobian(self) -> np.ndarray:
         """The Jacobian (k, n) at the start."""
-        return self.evaluate(0.0, self.start)[1]
+        return self.evaluate(0.0, self.sorting.positions)[1]
 
     @cached_property
     def by_masses(self) -> np.ndarray:
@@ -168,7 +163,7 @@ class ConstraintRows:
         """
         of_bodies, masses = self.sorting.of_bodies("masses"), np.ones(1)
         if is_concrete(of_bodies):
-            jacobian = self.sorting.to_bodies(self.start)[1]
+            jacobian = self.sorting.to_bodies(self.sorting.positions)[1]
             masses = of_bodies @ (jacobian * jacobian)
         return self.jacobian / np.sqrt(np.where(masses > 0, masses, 1.0))
 
@@ -179,7 +174,7 @@ class ConstraintRows:
         sorting, layout, points = self.sorting, self.sorting.layout, positions(self.sorting.bodies)
         # largest distance from the mean along an axis; of bodies at one place their largest coordinate, or 1 at the origin
         extent = float(np.abs(points - points.mean(axis=0)).max() or np.abs(points).max() or 1.0)
-        numbers, scales = layout.numbers, np.zeros(self.start.size)
+        numbers, scales = layout.numbers, np.zeros(self.sorting.positions.size)
         for name in layout.coordinates.keys() & sorting.bodies.keys():
             body = sorting.bodies[name]
             largest = np.abs(np.asarray(body.coordinates)).max() or 1.0

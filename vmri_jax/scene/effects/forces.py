@@ -182,7 +182,16 @@ def norm(v):
     return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
 
 
-class LinearDamping(Effect):
+class _AgainstMotion(Effect):
+    """Base class of forces ``-c ... v`` against the motion of each body."""
+
+    coefficient: Any = positive()
+    bodies: Any = names(default=None)
+
+    kind = "force"
+
+
+class LinearDamping(_AgainstMotion):
     """Damping of points and of the centres of rigid bodies against the ground, ``F = -c v``; rotations are not damped.
 
     Args:
@@ -190,10 +199,6 @@ class LinearDamping(Effect):
         bodies: names; all bodies of the scene by default.
     """
 
-    coefficient: Any = positive()
-    bodies: Any = names(default=None)
-
-    kind = "force"
     default_name = "damping"
 
     @staticmethod
@@ -202,7 +207,7 @@ class LinearDamping(Effect):
         return (-params["coefficient"][..., None] * v,)
 
 
-class QuadraticDrag(Effect):
+class QuadraticDrag(_AgainstMotion):
     """Drag of a resting fluid, ``F = -c |v| v``.
 
     Args:
@@ -210,10 +215,6 @@ class QuadraticDrag(Effect):
         bodies: names; all bodies of the scene by default.
     """
 
-    coefficient: Any = positive()
-    bodies: Any = names(default=None)
-
-    kind = "force"
     default_name = "drag"
 
     @staticmethod
