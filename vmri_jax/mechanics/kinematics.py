@@ -98,17 +98,16 @@ class Kinematics:
     sizes: tuple[int, int]
     first: tuple[int, int] = (0, 0)
 
-    def of(self, part: Part) -> "Kinematics":
-        """The map with the bodies of one part, and the links that move them; the coordinates of the other part stay as they are."""
-        numbers = [i for i, body in enumerate(self.bodies) if body.part == part]
-        moving = np.flatnonzero(self.before[numbers].any(axis=0))
+    def of(self, start: int, stop: int) -> "Kinematics":
+        """The map with the bodies ``bodies[start:stop]`` alone, and the links that move them."""
+        bodies, moving = self.bodies[start:stop], np.flatnonzero(self.before[start:stop].any(axis=0))
         first = int(moving.min(initial=len(self.links)))
         links = self.links[first : int(moving.max(initial=-1)) + 1]
         return replace(
             self,
             links=tuple(link._replace(parent=max(link.parent - first, -1)) for link in links),
-            bodies=tuple(self.bodies[i]._replace(link=max(self.bodies[i].link - first, -1)) for i in numbers),
-            first=(self.first[0] + first, self.first[1] + min(numbers, default=0)),
+            bodies=tuple(body._replace(link=max(body.link - first, -1)) for body in bodies),
+            first=(self.first[0] + first, self.first[1] + start),
         )
 
     def __call__(self, q_s, q_f, joints: dict[str, Any]) -> tuple[Any, Any]:
@@ -133,8 +132,8 @@ class Kinematics:
         x = Rows.of([link.place for link in self.links]).take(q_s, q_f).reshape(-1) if self.links else jnp.zeros(0)
         return placed(self, x, *constants, joints["zero"][body : body + len(self.bodies)])
 
-    def mass_matrix(self, q_s, q_f, joints: dict[str, Any], masses, part: Part):
-        """``(dQ/dq)^T m dQ/dq`` (n, n) of Q_s or Q_f, in which the bodies behind a coordinate move as one, composite body.
+    def mass_matrix(self, q_s, q_f, joints: dict[str, Any], masses: Sequence[Any]):
+        """``(dQ/dq)^T m dQ/dq`` (n, n), in which the bodies behind a coordinate move as one, composite body.
 
         A body b on joints has the rates ``A_b sum_i K_i v_i`` over the coordinates i on the way to it, with the column (1, 0, 0, 0) before those
         of A_b. A link has ``K_i = J_i D``, a coordinate of a root a unit row. With the masses ``G_j = sum_b A_b^T m_b A_b`` of the bodies b
@@ -146,25 +145,24 @@ class Kinematics:
 
         Args:
             q_s, q_f, joints: as of a call.
-            masses: m of Q_s or Q_f; those of a body on joints are equal along each of its directors.
-            part: of Q; all bodies on joints belong to it.
+            masses: m of Q_s and of Q_f; those of a body on joints are equal along each of its directors.
         """
-        n_s, n_f = self.sizes
-        n, own, around = n_s + n_f, n_s if part == "s" else n_f, (0, n_f) if part == "s" else (n_s, 0)
-        of_coordinates = jnp.diag(jnp.pad(masses[:own], around))
+        n = sum(self.sizes)
+        own, of_bodies = zip(*(jnp.split(m, [size]) for m, size in zip(masses, self.sizes, strict=True)), strict=True)
+        of_coordinates = jnp.diag(jnp.concatenate(own))
         if not self.bodies:
             return of_coordinates
         frames, twists = self._against_roots(q_s, q_f, joints)
         links, roots, behind, on_way = self._tables
         # G_b = A_b^T m_b A_b
         rows = jnp.concatenate([jnp.broadcast_to(np.eye(4)[:, :1], (len(frames), 4, 1)), frames], axis=2)
-        of_rows = masses[own:].reshape(-1, 4, 3)[:, :, :1]
-        of_bodies = matmul(jnp.swapaxes(rows, 1, 2), of_rows * rows).reshape(-1, 16)
+        of_rows = jnp.concatenate(of_bodies).reshape(-1, 4, 3)[:, :, :1]
+        of_frames = matmul(jnp.swapaxes(rows, 1, 2), of_rows * rows).reshape(-1, 16)
         # K_i, then tr(K_i^T G_j K_j)
         if set(self._owners) - {GROUND}:
             twists = matmul(twists, self._roots(q_s, q_f, self._owners)[:, 1:])
         columns = (matmul(links, twists.reshape(-1, SIZE)) if self.links else 0.0) + roots
-        composite = matmul(behind, of_bodies).reshape(n, 4, 4)
+        composite = matmul(behind, of_frames).reshape(n, 4, 4)
         momenta = matmul(composite, columns.reshape(n, 4, 3)).reshape(n, SIZE)
         half = matmul(columns, momenta.T) * on_way
         return half + half.T + of_coordinates
@@ -271,12 +269,12 @@ def _placed(tree: Kinematics, x, turn, slide, zero):
     motions = UNMOVED + sine * turn + versine * matmul(turn, turn[:, 1:]) + _pad((x[:, None] * slide)[:, None])
     for parents in tree.jumps():
         motions = after(motions, _with_unmoved(motions)[parents])  # after k turns, motions of the last 2^k links
-    inverse = jnp.swapaxes(motions[:, 1:], 1, 2)
-    twists = matmul(turn + _pad(slide[:, None]), motions[:, 1:])
-    turning = matmul(inverse, twists[:, 1:])
-    moving = twists[:, :1] - matmul(motions[:, :1], turning)
-    frames = after(zero, _with_unmoved(motions)[tree.lasts[: len(tree.bodies)]])
-    return frames, jnp.concatenate([moving, turning], axis=1)
+    twists = turn + _pad(slide[:, None])
+    if tree.is_deep:  # else E_i = exp(x_i Y_i), which leaves its own Y_i as it is
+        twists = matmul(twists, motions[:, 1:])
+        turning = matmul(jnp.swapaxes(motions[:, 1:], 1, 2), twists[:, 1:])
+        twists = jnp.concatenate([twists[:, :1] - matmul(motions[:, :1], turning), turning], axis=1)
+    return after(zero, _with_unmoved(motions)[tree.lasts[: len(tree.bodies)]]), twists
 
 
 placed = jax.custom_jvp(_placed, nondiff_argnums=(0,))

@@ -105,8 +105,8 @@ class WithMassMatrix(ABC):
         """Whether it has this form."""
 
     @abstractmethod
-    def mass_matrix(self, q_s, q_f, params) -> Any:
-        """M (n, n); of T_s, for which q_f is None, (n_s, n_s)."""
+    def mass_matrix(self, q_s, q_f, params, *others: Any) -> Any:
+        """M (n, n) of this energy and of `others` of its system, which have this form, too."""
 
 
 def _masses(name: str, masses):

@@ -55,14 +55,11 @@ def have_closed_masses(energies: Iterable[Term]) -> bool:
 
 def closed_masses(energies: Iterable[Term], q_s, q_f, params):
     """The mass matrix (n, n) of kinetic energies by their closed forms; None if one of them has none."""
-    energies, n = list(energies), q_s.size + q_f.size
+    energies = list(energies)
     if not have_closed_masses(energies):
         return None
-    total = 0.0
-    for term in energies:
-        masses = innermost(term.function).mass_matrix(q_s, q_f if "q_f" in term.arguments else None, params)
-        total += jnp.pad(masses, (0, n - len(masses)))
-    return total
+    first, *others = (innermost(term.function) for term in energies)
+    return first.mass_matrix(q_s, q_f, params, *others)
 
 
 def project_momentum(system: System, state, guess=None, sparsity: Sparsity | None = None):

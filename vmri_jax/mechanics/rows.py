@@ -18,6 +18,11 @@ class Place(NamedTuple):
     start: int
     size: int
 
+    @property
+    def order(self) -> tuple[bool, int]:
+        """Sort key of places: the order of the coordinates in (q_s, q_f)."""
+        return self.part == "f", self.start
+
     def numbers(self, num_slow: int) -> np.ndarray:
         """(size,) numbers of the coordinates in (q_s, q_f), taken as one vector whose first `num_slow` entries are q_s."""
         return self.start + (num_slow if self.part == "f" else 0) + np.arange(self.size)
@@ -117,12 +122,6 @@ class Rows:
             for part, start, count, same in self.runs
             for i in range(count)
         ]
-
-    def within(self, sizes: tuple[int, int]) -> bool:
-        """Whether all rows are among the first (n_s, n_f) coordinates."""
-        most = {"s": sizes[0], "f": sizes[1]}
-        ends = [(run.part, run.start + self.stride * (1 if run.same else run.count)) for run in self.runs]
-        return all(end <= most[part] for part, end in ends)
 
     def take(self, q_s, q_f):
         """The rows of q_s and q_f, which may also be velocities; for a single place (..., n) arrays."""

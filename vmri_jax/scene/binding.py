@@ -1,7 +1,7 @@
 """Binding of effects to the bodies of a scene: elements, parameters, values at the start, and terms are computed once. And the places of all coordinates."""
 
 from abc import ABC
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any, ClassVar, Literal, NamedTuple, Self
@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Literal, NamedTuple, Self
 import numpy as np
 
 from vmri_jax.mechanics.arrays import library
-from vmri_jax.mechanics.kinematics import Kinematics
+from vmri_jax.mechanics.kinematics import SIZE, Kinematics
 from vmri_jax.mechanics.rows import Place, Rows
 from vmri_jax.mechanics.slots import Computed
 from vmri_jax.refusals import Refused
@@ -62,6 +62,20 @@ class Layout:
     def ends(self) -> tuple[int, int]:
         """Lengths of Q_s and Q_f."""
         return _ends([*self.coordinates.values(), *self.bodies.values()])
+
+    def of(self, names: Collection[str]) -> "Layout":
+        """The layout of functions of some bodies alone, and of the bodies on joints between them in the order of the kinematics."""
+        if self.kinematics is None:
+            return self
+        carried = sorted(self.bodies.keys() - self.coordinates.keys(), key=lambda name: self.bodies[name].order)
+        numbers = [i for i, name in enumerate(carried) if name in names]
+        first, end = min(numbers, default=0), max(numbers, default=-1) + 1
+        kinematics, ends = self.kinematics.of(first, end), dict(zip("sf", self.sizes, strict=True))
+        bodies = {name: place for name, place in self.bodies.items() if name in self.coordinates}
+        for name, body in zip(carried[first:end], kinematics.bodies, strict=True):
+            bodies[name] = Place(body.part, ends[body.part], SIZE)
+            ends[body.part] += SIZE
+        return replace(self, bodies=bodies, kinematics=kinematics)
 
     @property
     def columns(self) -> dict[str | Key, np.ndarray]:

@@ -90,8 +90,14 @@ class ConstraintValues(_OfTerms):
         return values / params[IMPLIED] if self.field == "implied" else values
 
 
+@dataclass(frozen=True)
 class KineticEnergy(_OfTerms, WithMassMatrix):
-    """``T = sum m V_f^2 / 2`` of bodies that depend on fast coordinates, plus the velocity-dependent terms; ``T_s = sum m V_s^2 / 2`` of all others."""
+    """``T = sum m V_f^2 / 2`` of bodies that depend on fast coordinates, plus the velocity-dependent terms; ``T_s = sum m V_s^2 / 2`` of all others.
+
+    whole: the map from q to the coordinates of all bodies, whose masses T and T_s have together.
+    """
+
+    whole: Kinematics = UNCHANGED
 
     def __call__(self, *arguments):
         _, q_s, q_f, v_s, v_f, params = self.by_name(arguments)
@@ -104,14 +110,13 @@ class KineticEnergy(_OfTerms, WithMassMatrix):
 
     @property
     def has_mass_matrix(self) -> bool:
-        return self.kinematics != UNCHANGED and not self.terms
+        return self.whole != UNCHANGED and not self.terms
 
-    def mass_matrix(self, q_s, q_f, params):
-        if q_f is not None:
-            return self.kinematics.mass_matrix(q_s, q_f, params[JOINTS], jnp.asarray(params[MASS]["fast"]), "f")
-        n_s, n_f = self.kinematics.sizes
-        masses = jnp.asarray(params[MASS]["slow"])
-        return self.kinematics.mass_matrix(q_s, jnp.zeros(n_f), params[JOINTS], masses, "s")[:n_s, :n_s]
+    def mass_matrix(self, q_s, q_f, params, *others):
+        fields = [energy.field for energy in (self, *others)]
+        parts = (("slow", "slow_kinetic"), ("fast", "kinetic"))
+        masses = [jnp.asarray(params[MASS][part]) * (field in fields) for part, field in parts]
+        return self.whole.mass_matrix(q_s, q_f, params[JOINTS], masses)
 
 
 class TotalForce(_OfTerms):
@@ -154,27 +159,31 @@ FUNCTIONS: dict[str, Any] = {
 def build(sorting: Sorting, placed: Sequence[Placed]) -> System:
     """The system of the bodies and of some or all effects; a function without effects is None."""
     layout = sorting.layout
-    terms: dict[Any, list] = {}
+    parts: dict[Any, list[Placed]] = {}
     for part in placed:
         for home in (part.home, "implied") if part.dropped else (part.home,):
-            terms.setdefault(home, []).extend(part.effect.terms(part.elements, layout))
-    terms = {home: of_home for home, of_home in terms.items() if of_home and home != "control"}
+            parts.setdefault(home, []).append(part)
+    parts = {home: of_home for home, of_home in parts.items() if home != "control"}
     # with joint coordinates the masses depend on positions, so that T is a function even without kinetic effects
     if layout.kinematics is not None:
-        terms.setdefault("kinetic", [])
-    if "kinetic" in terms and layout.sizes[0]:
-        terms["slow_kinetic"] = []
-    taken = _taken(placed, layout) if "implied" in terms else {}
+        parts.setdefault("kinetic", [])
+    if "kinetic" in parts and layout.sizes[0]:
+        parts["slow_kinetic"] = []
+    taken = _taken(placed, layout) if "implied" in parts else {}
     functions: dict[str, Any] = {"potentials": {}}
-    for home, of_home in terms.items():
+    for home, of_home in parts.items():
+        terms, kinematics = _terms(of_home, layout, {"kinetic": "f", "slow_kinetic": "s"}.get(home, ""))
+        if not terms and of_home:
+            continue  # Rayleigh damping of no potential
         is_rows = home in (*HOMES, "implied")  # whose values keep the order of `rows_of`
-        of_home = joined(of_home, in_order=is_rows)
+        terms = joined(terms, in_order=is_rows)
         field = home if home in KINDS else "potentials"  # a potential with a rate of its own
-        function = FUNCTIONS[KINDS[field].kind](field, of_home, _kinematics(home, of_home, layout), taken.get(home))
+        of_masses = (layout.kinematics or UNCHANGED,) if KINDS[field].kind == "kinetic" else ()
+        function = FUNCTIONS[KINDS[field].kind](field, terms, kinematics, taken.get(home), *of_masses)
         if field == "potentials":
             functions[field][home] = function
         else:
-            functions[home] = Rheonomic(function) if is_rows and any(term.timed for term in of_home) else function
+            functions[home] = Rheonomic(function) if is_rows and any(term.timed for term in terms) else function
     params: dict[str, Any] = {part.effect.name: arrays(part.effect.parameters) for part in placed}
     masses, num_slow = sorting.of_bodies("masses"), layout.ends[0]
     slow, fast = masses[:num_slow], masses[num_slow:]
@@ -199,16 +208,22 @@ def actuation(sorting: Sorting) -> Actuation | None:
     """The forces of the controls of a scene, None if it has no controls."""
     layout = sorting.layout
     controls: list[Any] = [part for part in sorting.placed if part.home == "control"]
-    terms = tuple(part.effect.terms(part.elements, layout)[0] for part in controls)
+    terms, kinematics = _terms(controls, layout)
     names = tuple(part.effect.components() for part in controls)
-    return Actuation("control", terms, _kinematics("control", terms, layout), names=names) if controls else None
+    return Actuation("control", tuple(terms), kinematics, names=names) if controls else None
 
 
-def _kinematics(home: str, terms: Sequence, layout: Layout) -> Kinematics:
-    """The map from q to Q that a function with these terms needs."""
-    kinematics = layout.kinematics or UNCHANGED
-    if not all(term.within(layout.sizes) for term in terms):
-        return kinematics
-    # a kinetic energy needs in any case the bodies on joints whose masses are part of it
-    part: Any = {"kinetic": "f", "slow_kinetic": "s"}.get(home)
-    return kinematics.of(part) if part else UNCHANGED
+def _terms(parts: Sequence[Placed], layout: Layout, with_masses_of: str = "") -> tuple[list[Any], Kinematics]:
+    """The terms of some elements, and the map from q to the coordinates of the bodies on which they depend.
+
+    The kinetic energy with the masses of a part, "s" or "f", depends on all bodies of this part.
+    """
+
+    def terms(layout: Layout) -> list[Any]:
+        return [term for part in parts for term in part.effect.terms(part.elements, layout)]
+
+    touched = {place for term in terms(layout) for place in term.places}
+    names = [name for name, place in layout.bodies.items() if place in touched or place.part == with_masses_of]
+    of_bodies = layout.of(names)
+    kinematics = of_bodies.kinematics or UNCHANGED
+    return terms(of_bodies), kinematics if kinematics.bodies or with_masses_of else UNCHANGED

@@ -139,7 +139,7 @@ class Sorting:
         layout = self.layout
         pieces = {place: getattr(self.bodies[name], quantity) for name, place in layout.bodies.items()}
         pieces |= {place: np.zeros(1) for place in layout.freedoms.values()}
-        return joined([pieces[place] for place in sorted(pieces, key=lambda place: (place.part == "f", place.start))])
+        return joined([pieces[place] for place in sorted(pieces, key=lambda place: place.order)])
 
     def to_bodies(self, q: Any) -> tuple[Any, Any]:
         """Q = (Q_s, Q_f) of q = (q_s, q_f), each one vector, and the Jacobian dQ/dq."""

@@ -16,7 +16,7 @@ import numpy as np
 
 from vmri_jax.mechanics.arrays import library
 from vmri_jax.mechanics.kinematics import UNMOVED
-from vmri_jax.mechanics.rows import Rows
+from vmri_jax.mechanics.rows import Place, Rows
 
 
 @dataclass(frozen=True)
@@ -174,9 +174,10 @@ class EffectTerm:
         q, pull = jax.vjp(self._map(params), q_s, q_f)
         return pull(tuple(jnp.broadcast_to(jnp.asarray(f, float), x.shape) for f, x in zip(forces, q, strict=True)))
 
-    def within(self, sizes: tuple[int, int]) -> bool:
-        """Whether the term depends only on the coordinates of the scene, the first n_s of Q_s and the first n_f of Q_f."""
-        return all(role.rows is None or role.rows.within(sizes) for role in self.roles)
+    @property
+    def places(self) -> list[Place]:
+        """Places of the coordinates that the term depends on."""
+        return [*chain(*(role.rows.places for role in self.roles if role.rows))]
 
 
 @dataclass(frozen=True)
@@ -197,9 +198,10 @@ class TangentDamping:
         products = jax.jvp(jax.grad(energy), ((q_s, q_f),), ((v_s, v_f),))[1]
         return tuple(-params[self.name]["stiffness"] * product for product in products)
 
-    def within(self, sizes: tuple[int, int]) -> bool:
-        """See `EffectTerm.within`."""
-        return all(term.within(sizes) for term in self.terms)
+    @property
+    def places(self) -> list[Place]:
+        """Places of the coordinates that the terms depend on."""
+        return [*chain(*(term.places for term in self.terms))]
 
 
 def choose(params, select: Sequence[int], split: Sequence[str]):

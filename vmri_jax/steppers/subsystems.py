@@ -112,7 +112,7 @@ class OfJoined(WithMassMatrix):
     def has_mass_matrix(self) -> bool:
         return have_closed_masses(self.terms)
 
-    def mass_matrix(self, q_s, q_f, params):
+    def mass_matrix(self, q_s, q_f, params, *others):
         return closed_masses(self.terms, q_f[: self.num_slow], q_f[self.num_slow :], params)
 
 
