@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from vmri_jax.mechanics.surroundings import innermost
 from vmri_jax.scene import (
     Anchor,
     Body,
@@ -86,6 +87,8 @@ def values(scene: Scene, system, params):
 def test_one_term_has_the_values_of_several(monkeypatch):
     scene = one_by_one()
     joined, params = scene.system(), scene.params
+    # between points in bodies, and to the ground
+    assert sum(term.function == Spring.function for term in innermost(joined.slow_potential).terms) == 1
     monkeypatch.setattr(functions, "joined", lambda terms, in_order=False: tuple(terms))
     several = scene.system()
     energy, spring = (

@@ -6,7 +6,7 @@ All classes here are compared by value: scenes of the same structure give equal 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
-from itertools import chain
+from itertools import chain, groupby
 from operator import add
 from typing import Any, NamedTuple
 
@@ -68,18 +68,11 @@ class Role:
     point: str = ""
 
     @property
-    def kind(self) -> tuple:
-        """Equal for roles that can be one role."""
-        return self.rows and self.rows.stride, self.size, self.point
+    def pieces(self) -> "tuple[Role, ...]":
+        """The role itself, see `Roles`."""
+        return (self,)
 
-    @classmethod
-    def joined(cls, roles: Sequence["Role"]) -> "Role":
-        """One role of the elements of roles of one kind, one after the other."""
-        places = [*chain(*(role.rows.places for role in roles if role.rows))]
-        rows = Rows.of(places, roles[0].rows.size) if roles[0].rows else None
-        return replace(roles[0], rows=rows, count=sum(role.count for role in roles))
-
-    def positions(self, q_s, q_f, params):
+    def positions(self, q_s, q_f, params) -> Any:
         """(d,) or (n, d) coordinates or points."""
         return self.of_bodies(None if self.rows is None else self.rows.take(q_s, q_f), params)
 
@@ -91,6 +84,37 @@ class Role:
             return params[self.point][..., : self.size]
         ground = UNMOVED.ravel()  # the ground as a rigid body
         return ground if self.count == 1 else np.broadcast_to(ground, (self.count, self.size))
+
+
+@dataclass(frozen=True)
+class Roles:
+    """Roles of bodies of several kinds as one role: the elements of the first one, then of the second one, and so on."""
+
+    pieces: tuple[Role, ...]
+
+    @classmethod
+    def joined(cls, roles: "Iterable[Role | Roles]") -> "Role | Roles":
+        """One role of the elements of roles of one size, one after the other."""
+        pieces: list[Any] = [*chain(*(role.pieces for role in roles))]
+        of_kinds = []
+        for (stride, _), (*same,) in groupby(pieces, key=lambda role: (role.rows and role.rows.stride, role.point)):
+            rows = Rows.of([*chain(*(role.rows.places for role in same))], same[0].rows.size) if stride else None
+            of_kinds.append(replace(same[0], rows=rows, count=sum(role.count for role in same)))
+        return of_kinds[0] if len(of_kinds) == 1 else cls(tuple(of_kinds))
+
+    @property
+    def size(self) -> int:
+        """As of each of the roles."""
+        return self.pieces[0].size
+
+    def positions(self, q_s, q_f, params):
+        """(n, d) coordinates or points."""
+        of_pieces, end = [], 0
+        for role in self.pieces:
+            first, end = end, end + role.count
+            points = {role.point: pick(params[role.point], range(first, end))} if role.point else {}
+            of_pieces.append(role.positions(q_s, q_f, points).reshape(role.count, role.size))
+        return jnp.concatenate(of_pieces)
 
 
 class Source(NamedTuple):
@@ -110,7 +134,7 @@ class EffectTerm:
     """The function of one or more effects of a kind on some of their elements.
 
     sources: the elements.
-    roles: the maps from q_s and q_f to the coordinates of each role.
+    roles: the maps from q_s and q_f to the coordinates of each role, `Role` or `Roles`.
     split: names of the parameters that have an entry for each element.
     timed: whether the first argument of the function is the time.
     is_joined: whether the terms of several effects with this function are one term, see `joined`.
@@ -119,7 +143,7 @@ class EffectTerm:
 
     sources: tuple[Source, ...]
     function: Callable
-    roles: tuple[Role, ...]
+    roles: tuple[Any, ...]
     split: tuple[str, ...] = ()
     timed: bool = False
     is_joined: bool = False
@@ -177,7 +201,7 @@ class EffectTerm:
     @property
     def places(self) -> list[Place]:
         """Places of the coordinates that the term depends on."""
-        return [*chain(*(role.rows.places for role in self.roles if role.rows))]
+        return [*chain(*(piece.rows.places for role in self.roles for piece in role.pieces if piece.rows))]
 
 
 @dataclass(frozen=True)
@@ -222,7 +246,7 @@ def joined(terms: Iterable[Any], in_order: bool = False) -> tuple[Any, ...]:
     for term in terms:
         kind: Any = id(term)
         if getattr(term, "is_joined", False):
-            kind = term.function, term.through, tuple(role.kind for role in term.roles), term.split, term.timed
+            kind = term.function, term.through, tuple(role.size for role in term.roles), term.split, term.timed
         run += in_order and kind != last
         groups.setdefault((run, kind), []).append(term)
         last = kind
@@ -233,7 +257,7 @@ def _as_one(terms: Sequence[Any]) -> Any:
     """A term of all elements of terms of one kind."""
     if len(terms) == 1:
         return terms[0]
-    roles = (Role.joined(roles) for roles in zip(*(term.roles for term in terms), strict=True))
+    roles = (Roles.joined(roles) for roles in zip(*(term.roles for term in terms), strict=True))
     return replace(terms[0], sources=tuple(chain(*(term.sources for term in terms))), roles=tuple(roles))
 
 
