@@ -83,9 +83,9 @@ PROGRAMS: dict[str, Program] = {
     "TSP, fully_implicit(5), exact matrices": Program(TSP, vm.fully_implicit(5), 5230, "exact"),
     "SAM, fully_implicit(5)": Program(SAM, vm.fully_implicit(5), 6470),
     "SAM, fully_implicit(5), exact matrices": Program(SAM, vm.fully_implicit(5), 7020, "exact"),
-    "satellite in joint coordinates, fully_explicit(5)": Program(SATELLITE, vm.fully_explicit(5), 8420),
+    "satellite in joint coordinates, fully_explicit(5)": Program(SATELLITE, vm.fully_explicit(5), 7220),
     "squeezer by directors, fully_implicit(1)": Program(SQUEEZER, vm.fully_implicit(1), 4970),
-    "engine by directors, explicit_slow(5)": Program(ENGINE, vm.explicit_slow(5), 10040),
+    "engine by directors, explicit_slow(5)": Program(ENGINE, vm.explicit_slow(5), 9390),
     "gradient: double pendulum, fully_implicit(1)": Program(
         double_pendulum, vm.fully_implicit(1), 4070, is_gradient=True
     ),
