@@ -25,6 +25,7 @@ from vmri_jax import (
     plan,
     simulate,
 )
+from vmri_jax.running.engine import Cursor
 from vmri_jax.scene import Body, Scene, Spring
 
 SCHEME = fully_explicit(3)
@@ -325,8 +326,8 @@ def test_pieces_of_a_run_make_the_whole(fpu, tsp, monkeypatch):
 
     # each piece starts with the saved node at which the one before ends, momenta on the hidden constraints
     constrained = vm.prepare(tsp, fully_explicit(2), macro_dt=0.02, num_steps=8, save=2)
-    first, checkpoint = constrained.advance(constrained.start(), 2)
-    second, _ = constrained.advance(checkpoint, 2)
+    first, cursor, _ = constrained.advance(Cursor.at_start(constrained.state), 2)
+    second, *_ = constrained.advance(cursor, 2)
     np.testing.assert_array_equal(second.rows[0, constrained.columns.p_f], first.rows[-1, constrained.columns.p_f])
     np.testing.assert_array_equal(second.table[0], first.table[-1])
     assert second.table[:, 2].max() < 1e-11

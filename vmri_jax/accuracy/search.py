@@ -39,7 +39,7 @@ from vmri_jax.mechanics.invariants import velocity
 from vmri_jax.mechanics.linearisation import Linearisation, linearise
 from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.refusals import Refused
-from vmri_jax.running.arguments import Steps, refuse_tracers
+from vmri_jax.running.arguments import refuse_tracers
 from vmri_jax.running.progress import Progress, silent
 from vmri_jax.running.run_error import largest_of
 from vmri_jax.running.saved import check_memory
@@ -278,7 +278,7 @@ class Search:
         key = family.python, num_micro
         if key not in self._runs:
             moving, state, solver = self._arguments
-            run = simulation(moving, family.make(num_micro), state, solver, Steps(self.length, num_steps=1))
+            run = simulation(moving, family.make(num_micro), state, solver, self.length, num_steps=1)
             run.check()
             check_memory("simulate", run, num_saves=self.num_saves or MOST_SAVED)
             check_function_of_run(self._of, run)

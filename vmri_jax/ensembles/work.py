@@ -36,7 +36,7 @@ from vmri_jax.mechanics.names import Names, near, unknown
 from vmri_jax.mechanics.places import START
 from vmri_jax.mechanics.state import Problem
 from vmri_jax.refusals import Refused
-from vmri_jax.running.arguments import Save, Steps, check_step_size, steps_until
+from vmri_jax.running.arguments import Save, check_step_size, steps_until
 from vmri_jax.running.batch import consistent_states, lanes_at_once
 from vmri_jax.running.export import STATUS
 from vmri_jax.running.simulation import Simulation, simulation
@@ -171,8 +171,8 @@ class Work:
         """The first run of a group, after a check of its arguments."""
         macro_dt, num_steps = float(np.ravel(group.macro_dt)[0]), group.num_steps
         state = self.problem.state(self.project)
-        steps = Steps(macro_dt, num_steps, save=Save(number=self.num_saves))
-        return simulation(self.problem, group.scheme, state, self.solver, steps)
+        save = Save(number=self.num_saves)
+        return simulation(self.problem, group.scheme, state, self.solver, macro_dt, num_steps, save=save)
 
     def compute(self, rows: Rows, count: int, width: int) -> dict[str, np.ndarray]:
         """Kept quantities and status of the runs of `count` rows, `width` of them side by side; arrays by name, a row for each run."""

@@ -39,7 +39,8 @@ the first-level cache, and a run of a few nodes takes longer."""
 
 
 class Cursor(NamedTuple):
-    """Progress of a run: state and memory before macro step `step`, the worst `result` so far, the failed step or -1."""
+    """A run between two steps, all that its next steps depend on: state and memory of the stepper before macro step `step`, the worst `result` so far,
+    the failed step or -1. Memory None: the stepper has none of earlier steps."""
 
     state: State
     memory: Any

@@ -15,7 +15,7 @@ from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -30,7 +30,7 @@ from vmri_jax.mechanics.state import REPORTED_VIOLATION, Movable, State, opened,
 from vmri_jax.mechanics.summary import numbers, summary
 from vmri_jax.mechanics.system import System
 from vmri_jax.refusals import Refused
-from vmri_jax.running.arguments import Save, Steps, check_once, check_run, check_step_size, nothing_fast
+from vmri_jax.running.arguments import Save, check_once, check_run, check_step_size, nothing_fast
 from vmri_jax.running.engine import FALLING_BACK, Cursor, Engine, blank_memory, engine, solved_again, unsolved
 from vmri_jax.running.failures import simulation_error
 from vmri_jax.running.interrupts import Interrupted, interrupts_noted
@@ -47,17 +47,6 @@ PARTS_OF_A_BAR = 50
 """Parts of a run with a progress bar. More parts move the bar more smoothly, and each costs a call of some 30 microseconds."""
 STEPPING = "stepping"
 """The work of a run that is compiled, for lines about runs that take more than two seconds."""
-
-
-class Checkpoint(NamedTuple):
-    """A run between two steps: everything that its next steps depend on, to the last bit.
-
-    cursor: state, memory of the stepper, None where it has none of earlier steps, steps done, and status so far.
-    fell_back: whether the fallback has replaced the first matrix.
-    """
-
-    cursor: Cursor
-    fell_back: bool = False
 
 
 MOTION = ("macro_dt", "state", "solver", "scheme", "system")
@@ -115,8 +104,8 @@ class Simulation:
             with Working(FALLING_BACK):
                 saved = run.exact._whole()
         trajectory = saved.trajectory(run)
-        if throw and saved.failed_at >= 0:
-            raise simulation_error(trajectory, run.macro_dt, run.save_every, run.scheme.num_micro)
+        if throw:
+            run.raise_failure(trajectory)
         if run.state is not self.state or run.system is not self.system or not vars(self).get("has_told"):
             vars(self)["has_told"] = True  # of a start: a further call with the same one is a short run
             run.tell_of_start("run", trajectory.states)
@@ -194,6 +183,11 @@ class Simulation:
             run = partial(solved_again, run, steps(self.exact), failed)
         saved = run(self.leaves)
         return self.engine.observed(self.leaves, saved, self.save_every).trajectory(self)
+
+    def raise_failure(self, trajectory: Any) -> None:
+        """Raise the `SimulationError` of a run, in memory or in a store, one of whose steps failed."""
+        if trajectory.failed_at >= 0:
+            raise simulation_error(self, trajectory)
 
     def tell_of_start(self, caller: str, saved: State, stacklevel: int = 3) -> None:
         """Warn about momenta of the start that are off the hidden constraints: the run takes their projection, the first node of the saved states."""
@@ -286,39 +280,34 @@ class Simulation:
         with Working("checks of the system"):
             check_once(Known((self.system, replace(self.state, p_s=None, p_f=None))), state_name, constraints)
 
-    def start(self) -> Checkpoint:
-        """The checkpoint before the first step."""
-        return Checkpoint(Cursor.at_start(self.state))
-
-    def advance(self, checkpoint: Checkpoint, saves: int) -> tuple[Saved, Checkpoint]:
-        """The next `saves` saved intervals; from the first piece that is not solved, with the fallback.
+    def advance(self, cursor: Cursor, saves: int) -> "tuple[Saved, Cursor, Simulation]":
+        """The next `saves` saved intervals, the cursor after them, and the run that goes on from there: the fallback from the first piece on that
+        is not solved.
 
         After a failure nothing is computed, and all further nodes are NaN.
         """
-        pieces, room = [], self._pieces.num_saves
+        run, pieces, room = self, [], self._pieces.num_saves
         for done in range(0, saves, room):
             size = min(room, saves - done)
-            piece, after = self._advance(checkpoint, size)
-            if not checkpoint.fell_back and checkpoint.cursor.failed_at < 0 and self.unsolved(piece):
+            piece, after = run._advance(cursor, size)
+            if cursor.failed_at < 0 and run.unsolved(piece):
                 with Working(FALLING_BACK):
-                    again = Checkpoint(checkpoint.cursor._replace(memory=None), fell_back=True)
-                    piece, after = self._advance(again, size)
+                    run = run.exact
+                    piece, after = run._advance(cursor._replace(memory=None), size)
             pieces.append(piece)
-            checkpoint = after
-        return joined(pieces), checkpoint
+            cursor = after
+        return joined(pieces), cursor, run
 
-    def _advance(self, checkpoint: Checkpoint, saves: int) -> tuple[Saved, Checkpoint]:
-        cursor, run = checkpoint.cursor, self.exact if checkpoint.fell_back else self
+    def _advance(self, cursor: Cursor, saves: int) -> tuple[Saved, Cursor]:
         step, is_first = int(cursor.step), cursor.memory is None
         if is_first:
-            cursor = cursor._replace(memory=run.blank_memory)
-        rows, cursor = run._pieces.program(run.leaves, self.save_every, saves, cursor, is_first)
+            cursor = cursor._replace(memory=self.blank_memory)
+        rows, cursor = self._pieces.program(self.leaves, self.save_every, saves, cursor, is_first)
         nodes = np.array(np.asarray(rows)[: saves + 1])  # a copy, which holds no memory of a whole piece
         saved = Saved(nodes, np.asarray(cursor.result), np.asarray(cursor.failed_at))
         saved = saved.marked(self.columns, self.save_every, step)
         reached = np.asarray(step + saves * self.save_every)
-        cursor = cursor._replace(step=reached, result=saved.result, failed_at=saved.failed_at)
-        return saved, checkpoint._replace(cursor=cursor)
+        return saved, cursor._replace(step=reached, result=saved.result, failed_at=saved.failed_at)
 
     def unsolved(self, saved: Saved) -> np.ndarray:
         """Whether the fallback may solve a run or a piece, or (lanes,) the runs of a batch."""
@@ -336,7 +325,7 @@ class Simulation:
 
         With the name of a `caller` it warns about the motion, see `warn`.
         """
-        bar, checkpoint, pieces = self.save.progress is not False, self.start(), []
+        bar, cursor, run, pieces = self.save.progress is not False, Cursor.at_start(self.state), self, []
         size = -(-self.num_saves // (PARTS_OF_A_BAR if bar else 1))
         noted = interrupts_noted() if bar else nullcontext(lambda: False)
         shown = progress_to("simulate", self.save.progress) if bar else Working("the run", running=STEPPING)
@@ -344,11 +333,11 @@ class Simulation:
             for done in range(0, self.num_saves, size):
                 if bar:
                     tell("simulating", done, self.num_saves)
-                piece, checkpoint = self.advance(checkpoint, min(size, self.num_saves - done))
+                piece, cursor, run = run.advance(cursor, min(size, self.num_saves - done))
                 pieces.append(piece)
                 if interrupted():
-                    steps = int(checkpoint.cursor.step)
-                    raise Interrupted(joined(pieces).trajectory(self), steps, self.num_steps, "macro steps")
+                    done = joined(pieces).trajectory(self)
+                    raise Interrupted(done, int(cursor.step), self.num_steps, "macro steps")
         saved = joined(pieces)
         trajectory = saved.trajectory(self)
         if caller:
@@ -357,21 +346,30 @@ class Simulation:
         return trajectory
 
 
-def simulation(moving: Movable, scheme, state: State | None, solver: Solver | None, steps: Steps) -> Simulation:
+def simulation(
+    moving: Movable,
+    scheme,
+    state: State | None,
+    solver: Solver | None,
+    macro_dt,
+    num_steps=None,
+    t_end=None,
+    save: int | Save = 1,
+) -> Simulation:
     """The `Simulation` with these arguments of `simulate`; bad arguments raise."""
     warn_if_slow()
     problem = opened(moving)
     of_problem = state is None
     with Working("the start of the run"):
         system, state = start_of("simulate", problem, state)
-    num_steps, save_every = check_run(system, scheme, state, solver, steps)
+    num_steps, save_every = check_run(system, scheme, state, solver, macro_dt, num_steps, t_end, save)
     # Scenes only: `opened` returns problems as they are.
     advice = nothing_fast(scheme, state.q_f.size) if moving is not problem else ""
     if advice:
         warnings.warn(f"simulate: {advice}", stacklevel=3)
     chosen_solver, scheme, system = of_one_type((solver or _usual_solver(), scheme, system))
-    motion = (_float(steps.macro_dt), _with_arrays(state), chosen_solver, scheme, system)
-    return Simulation(*motion, num_steps, save_every, Save.of(steps.save), names_of(problem), of_problem)
+    motion = (_float(macro_dt), _with_arrays(state), chosen_solver, scheme, system)
+    return Simulation(*motion, num_steps, save_every, Save.of(save), names_of(problem), of_problem)
 
 
 @cache

@@ -116,7 +116,7 @@ def reference_solution(
         coarse, n = fine, 2 * n
     if best is not None:
         return best
-    raise simulation_error(trajectory, t_end / n, n // num_saves, num_micro=1)
+    raise simulation_error(run.with_arguments(macro_dt=t_end / n, num_steps=n), trajectory)
 
 
 @dataclass(frozen=True)

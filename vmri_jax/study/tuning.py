@@ -175,7 +175,7 @@ def _nothing(tuning: Tuning, error: float) -> Exception:
     """The reason why no setting keeps the error: all runs failed, or none is as accurate."""
     runs, trial = tuning.runs(), tuning.first_trials(tuning.menu, error)[0]
     if all(row.result not in ("CONVERGED", "CONVERGED_AT_ROUNDOFF") for row in runs.rows):
-        return simulation_error(trial.trajectory, trial.run.macro_dt, trial.run.save_every, trial.run.scheme.num_micro)
+        return simulation_error(trial.run, trial.trajectory)
     best = min(runs.rows, key=lambda row: np.nan_to_num(row.error_q, nan=np.inf))
     certified = f"the best error was {best.error_q:.1e}, with {best.scheme} and {best.num_steps} steps"
     reason = certified if np.isfinite(best.error_q) else "no error is certified until t_end"

@@ -11,9 +11,8 @@ import numpy as np
 from vmri_jax.mechanics.arrays import whole_number
 from vmri_jax.mechanics.state import Movable, State
 from vmri_jax.refusals import Refused
-from vmri_jax.running.arguments import Save, Steps, refuse_tracers
+from vmri_jax.running.arguments import Save, refuse_tracers
 from vmri_jax.running.export import DIMENSIONS, rows_of
-from vmri_jax.running.failures import simulation_error
 from vmri_jax.running.files import explained
 from vmri_jax.running.interrupts import Interrupted, interrupts_noted
 from vmri_jax.running.observables import Observables, observables
@@ -79,7 +78,7 @@ def stream(
     """
     path = Path(out)
     layout.check_place("stream", path, "run", resume, overwrite)
-    run = simulation(system, scheme, state, solver, Steps(macro_dt, num_steps, t_end, save))
+    run = simulation(system, scheme, state, solver, macro_dt, num_steps, t_end, save)
     num_steps = run.num_steps
     refuse_tracers("stream", run.leaves, ", since it writes files")
     run.check("stream: the positions of the state")
@@ -113,8 +112,7 @@ def stream(
                 raise Interrupted(StoredTrajectory(path), step, num_steps, "macro steps")
     stored = StoredTrajectory(path)
     stored = stored.with_origin(run.origin) if len(stored) else stored
-    if not stored.success:
-        raise simulation_error(stored, run.macro_dt, run.save_every, scheme.num_micro)
+    run.raise_failure(stored)
     return stored
 
 
@@ -125,7 +123,7 @@ def _continue(stored: StoredTrajectory, run: Simulation, tell: Progress) -> Iter
     if record.saved == rows or not stored.success:
         return
     try:
-        checkpoint = record.checkpoint(run)
+        cursor, current = record.cursor(run)
     except ValueError as error:
         raise Refused(f"{path} can be read, but its run cannot go on: {error}.") from error
     with explained(path, _advice(record.step)):
@@ -137,7 +135,7 @@ def _continue(stored: StoredTrajectory, run: Simulation, tell: Progress) -> Iter
     sizes = [end - begin for begin, end in pairwise([record.saved + 1, *ends])]
     for size in sizes:
         tell("simulating", record.saved, rows)
-        saved, checkpoint = run.advance(checkpoint, size)
+        saved, cursor, current = current.advance(cursor, size)
         piece, table = saved.trajectory(run, record.step), np.concatenate([before, saved.table])
         if not record.saved:
             run.tell_of_start("stream", piece.states, stacklevel=4)
@@ -146,7 +144,7 @@ def _continue(stored: StoredTrajectory, run: Simulation, tell: Progress) -> Iter
         first = record.saved + 1 if record.saved else 0  # the first chunk has the start
         values = {name: value[1 if record.saved else 0 :] for name, value in rows_of(piece).items()}
         with explained(path, _advice(record.step)):
-            record = Record.of(checkpoint, record.saved + size)
+            record = Record.of(cursor, record.saved + size, fell_back=current is not run)
             writer.write(first, values, record.packed())
         yield record.step
         if record.failed_at >= 0:
