@@ -39,7 +39,6 @@ from vmri_jax.refusals import Refused
 from vmri_jax.running.arguments import Save
 from vmri_jax.running.observables import SingularCoordinatesWarning
 from vmri_jax.running.run_error import RunError, largest_of
-from vmri_jax.running.saved import Saved
 from vmri_jax.running.simulation import Simulation
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes.composition import SchemeLike, stage_lengths, stage_scheme
@@ -242,7 +241,7 @@ def resting(run: Simulation) -> Trajectory:
     _, *phase = vars(run.state).values()
     rows = np.zeros((run.num_saves + 1, run.columns.width))
     rows[:, : run.columns.info.start] = np.concatenate(phase)
-    return Saved(rows, np.asarray(int(Result.CONVERGED)), np.asarray(-1)).trajectory(run)
+    return run.columns.saved(rows, np.asarray(int(Result.CONVERGED)), np.asarray(-1)).trajectory(run)
 
 
 def companion(run: Simulation, parts: int, whole: int = 1) -> Trajectory:

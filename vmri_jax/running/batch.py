@@ -71,7 +71,7 @@ def _in_chunks(runs: Simulation, run: Simulation, width: int, devices: int) -> S
         part = _taken(runs, np.minimum(np.arange(start, start + width), lanes - 1))
         chunks.append(program([a[0] if is_repeated(a) else a for a in part.leaves], run.save_every))
     rows, status = jax.tree.map(lambda *parts: np.concatenate(parts)[:lanes], *chunks)
-    return Saved(rows, status[..., 0].copy(), status[..., 1].copy()).marked(run.columns, run.save_every)
+    return run.columns.saved(rows, status[..., 0].copy(), status[..., 1].copy()).marked(run.save_every)
 
 
 def batch(

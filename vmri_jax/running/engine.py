@@ -112,7 +112,8 @@ class Engine:
             first = jnp.minimum(i * size, self.num_saves + 1 - size)
             number = first + jnp.arange(size)
             existing = jnp.minimum(number, saves)  # beyond the last node there may be no state
-            new = jnp.concatenate(_as_saved(run, rows[existing], step + existing * save_every), axis=-1)
+            saved = _as_saved(run, run.columns.saved(rows[existing], 0, -1), step + existing * save_every)
+            new = jnp.concatenate(saved[: len(run.columns)], axis=-1)
             # the last block may overlap the block before, whose nodes are projected already
             is_new = (number >= i * size) & (number <= saves)
             old = jax.lax.dynamic_slice(rows, (first, 0), new.shape)
@@ -139,7 +140,7 @@ class Engine:
             cursor = Cursor.at_start(run.state, stepper.init(run.state, run.macro_dt))
             cursor, rows = loops.scan(save, jax.tree.map(jnp.asarray, cursor), self.num_saves)
             first = _row(run.state, *_nothing(run))
-            return Saved(jnp.concatenate([first[None], rows]), cursor.result, cursor.failed_at)
+            return run.columns.saved(jnp.concatenate([first[None], rows]), cursor.result, cursor.failed_at)
 
         return jax.jit(by_scan, static_argnums=1)
 
@@ -149,8 +150,7 @@ class Engine:
 
         def observed(leaves: list, saved: Saved, save_every) -> Saved:
             run: Any = jax.tree.unflatten(self.structure, leaves)
-            rows = _as_saved(run, saved.rows, jnp.arange(self.num_saves + 1) * save_every)
-            return saved._replace(rows=rows).marked(run.columns, save_every)
+            return _as_saved(run, saved, jnp.arange(self.num_saves + 1) * save_every).marked(save_every)
 
         return jax.jit(observed)  # else JAX would compile the operations of a gradient outside of jit one by one
 
@@ -172,16 +172,15 @@ def blank_memory(engine: Engine, shapes: tuple):
     return jax.device_put(jax.tree.map(lambda a: np.zeros(a.shape, a.dtype), blank))
 
 
-def _as_saved(run, rows, steps) -> tuple:
-    """The `Columns` of nodes after these numbers of macro steps, with projected momenta, and with their `Observables`."""
-    q_s, q_f, p_s, p_f, info, micro, _ = run.columns.parts(rows)
+def _as_saved(run, saved: Saved, steps) -> Saved:
+    """Nodes after these numbers of macro steps, with projected momenta, and with their `Observables`."""
 
     def node(t, *phase):
         state, table = observed(run.system, State(t, *phase), run.solver.tolerance)
         return state.p_s, state.p_f, table
 
-    p_s, p_f, table = jax.vmap(node)(run.state.t + steps * run.macro_dt, q_s, q_f, p_s, p_f)
-    return q_s, q_f, p_s, p_f, info, micro, table
+    p_s, p_f, table = jax.vmap(node)(run.state.t + steps * run.macro_dt, *saved[:4])
+    return saved._replace(p_s=p_s, p_f=p_f, table=table)
 
 
 def _row(state: State, info: RunInfo, micro) -> Float[Numbers, "numbers"]:

@@ -1,6 +1,6 @@
-"""Saved nodes of a run: one row of numbers for each node, and the status of the run.
+"""Saved nodes of a run: the columns of their numbers, and the status of the run.
 
-A node is a single write into a single array: XLA on CPU would take longer for one write into each field.
+A program writes the numbers of a node as one row into one array: XLA on CPU would take longer for one write into each column.
 """
 
 from itertools import accumulate, pairwise
@@ -55,36 +55,34 @@ class Columns(NamedTuple):
         """Saved intervals of a piece of a run, the same for runs of all lengths, so that they share one program."""
         return max(NUMBERS_PER_PIECE // self.width, 1)
 
-    def parts(self, rows) -> tuple:
-        """The columns of rows one by one."""
-        return rows if isinstance(rows, tuple) else tuple(rows[..., columns] for columns in self)
+    def saved(self, rows, result, failed_at) -> "Saved":
+        """Rows of a program, column by column, with the status of their run."""
+        return Saved(*(rows[..., columns] for columns in self), result, failed_at)
 
 
 class Saved(NamedTuple):
-    """Nodes of a run, a row of `Columns` for each, and its status, of JAX or NumPy; in a batch with lanes.
+    """Nodes of a run by `Columns`, (k, ...) each, and its status, of JAX or NumPy; in a batch with lanes."""
 
-    rows: (k, width). Where JAX differentiates a run, the columns one by one: those that no derivative depends on are then left out.
-    """
-
-    rows: Any
+    q_s: Any
+    q_f: Any
+    p_s: Any
+    p_f: Any
+    info: Any
+    micro: Any
+    table: Any
     result: Int[Numbers, ""]
     failed_at: Int[Numbers, ""]
 
-    @property
-    def table(self) -> Any:
-        """(k, 9) the `Observables` of the nodes."""
-        return self.rows[-1] if isinstance(self.rows, tuple) else self.rows[..., -len(Observables._fields) :]
-
-    def marked(self, columns: Columns, save_every: int, step: int = 0) -> "Saved":
+    def marked(self, save_every: int, step: int = 0) -> "Saved":
         """The nodes, NaN from a failure on; a node that cannot be right is a failure.
 
         A node may be wrong although its steps succeeded, for four reasons: the energy is not finite although its gradient is (a logarithm beyond
         its pole); a lane of a batch started off its constraints; the rows of ``system.implied``, redundant constraints that the solver leaves
         out, are violated; or a stepper of the user leaves the constraints. The last step before the first such node counts as the failed one.
 
-        Rows after a failed step may have any numbers. There are `step` macro steps before the first node.
+        Nodes after a failed step may have any numbers. There are `step` macro steps before the first node.
         """
-        rows, result, failed_at = self
+        *columns, result, failed_at = self
         module, now = library(self), Observables.of(self.table)
         right = module.isfinite(now.energy) & (now.solved > 0) & (now.implied > 0)
         # a prepared run is called many times, and an operation of JAX takes as long as many steps
@@ -100,15 +98,14 @@ class Saved(NamedTuple):
         number = np.arange(num_nodes)[:, None]
         lost = number >= module.where(breaks, node, after_step)[..., None, None]
         unreached = number > module.where(breaks, num_nodes, after_step)[..., None, None]
-        marks = [(unreached, 0.0) if part == columns.info else (lost, np.nan) for part in columns]
-        parts = tuple(module.where(*mark, part) for mark, part in zip(marks, columns.parts(rows), strict=True))
-        rows = parts if isinstance(rows, tuple) else module.concatenate(parts, axis=-1)
+        marks = [(unreached, 0.0) if column is self.info else (lost, np.nan) for column in columns]
+        columns = (module.where(*mark, column) for mark, column in zip(marks, columns, strict=True))
         failed_here = step + module.maximum(node * save_every - 1, 0)
-        return Saved(rows, module.where(breaks, cause, result), module.where(breaks, failed_here, failed_at))
+        return Saved(*columns, module.where(breaks, cause, result), module.where(breaks, failed_here, failed_at))
 
     def trajectory(self, run: Any, step: int = 0) -> Trajectory:
         """The nodes as a trajectory of a `Simulation`, in a batch one whose arrays have an axis of lanes, after a number of macro steps."""
-        *phase, info, q_f_micro, table = run.columns.parts(self.rows)
+        *phase, info, q_f_micro, table, result, failed_at = self
         t_start, macro_dt = (np.asarray(a) if is_concrete(a) else a for a in (run.state.t, run.macro_dt))
         t = t_start[..., None] + (step + np.arange(table.shape[-2]) * run.save_every) * macro_dt[..., None]
         states, micro = State(t, *phase), None
@@ -118,14 +115,16 @@ class Saved(NamedTuple):
             shape = *residual.shape, before_end.shape[-1], states.q_f.shape[-1]
             micro = MicroNodes(t[..., 1:, None] - before_end, q_f_micro[..., 1:, :].reshape(shape))
         info = RunInfo(method.astype(int), iterations.astype(int), residual)
-        result, residuals = status(self.result), table[..., 1:3]
-        return Trajectory(states, table[..., 0], residuals, info, result, self.failed_at, micro, origin=run.origin)
+        return Trajectory(
+            states, table[..., 0], table[..., 1:3], info, status(result), failed_at, micro, origin=run.origin
+        )
 
 
 def joined(pieces: list[Saved]) -> Saved:
     """Consecutive pieces as one; each starts with the last node of the piece before, and has the worst status of all before it."""
-    rows = [piece.rows[min(i, 1) :] for i, piece in enumerate(pieces)]
-    return pieces[-1]._replace(rows=rows[0] if len(rows) == 1 else np.concatenate(rows))
+    *columns, results, failures = zip(*pieces, strict=True)
+    parts = [[part[min(i, 1) :] for i, part in enumerate(column)] for column in columns]
+    return Saved(*(part[0] if len(part) == 1 else np.concatenate(part) for part in parts), results[-1], failures[-1])
 
 
 def check_memory(caller: str, run: Any, lanes: int = 1, num_saves: int | None = None) -> None:

@@ -167,7 +167,7 @@ class Simulation:
         """The run by one program, without the fallback."""
         rows, status = self.engine.program(self.leaves, self.save_every, self.num_saves)
         status = np.asarray(status)
-        return Saved(np.asarray(rows), status[..., 0], status[..., 1]).marked(self.columns, self.save_every)
+        return self.columns.saved(np.asarray(rows), status[..., 0], status[..., 1]).marked(self.save_every)
 
     def traced(self) -> Trajectory:
         """All steps of a run, some of whose arrays are tracers."""
@@ -304,8 +304,8 @@ class Simulation:
             cursor = cursor._replace(memory=self.blank_memory)
         rows, cursor = self._pieces.program(self.leaves, self.save_every, saves, cursor, is_first)
         nodes = np.array(np.asarray(rows)[: saves + 1])  # a copy, which holds no memory of a whole piece
-        saved = Saved(nodes, np.asarray(cursor.result), np.asarray(cursor.failed_at))
-        saved = saved.marked(self.columns, self.save_every, step)
+        saved = self.columns.saved(nodes, np.asarray(cursor.result), np.asarray(cursor.failed_at))
+        saved = saved.marked(self.save_every, step)
         reached = np.asarray(step + saves * self.save_every)
         return saved, cursor._replace(step=reached, result=saved.result, failed_at=saved.failed_at)
 
@@ -318,7 +318,7 @@ class Simulation:
 
     def _method(self, saved: Saved):
         """The largest `Method` of the steps."""
-        return saved.rows[..., self.columns.info.start].max(axis=-1)
+        return saved.info[..., 0].max(axis=-1)
 
     def in_pieces(self, caller: str = "") -> Trajectory:
         """The whole run; with a progress bar Ctrl-C raises `Interrupted` with the trajectory computed so far.
