@@ -37,8 +37,9 @@ from vmri_jax.mechanics.arrays import of_one_type
 from vmri_jax.mechanics.driving import Events
 from vmri_jax.refusals import Refused
 from vmri_jax.running.arguments import Save
-from vmri_jax.running.observables import SingularCoordinatesWarning
+from vmri_jax.running.observables import LostEnergyWarning, SingularCoordinatesWarning
 from vmri_jax.running.run_error import RunError, largest_of
+from vmri_jax.running.saved import Saved
 from vmri_jax.running.simulation import Simulation
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes.composition import SchemeLike, stage_lengths, stage_scheme
@@ -81,7 +82,7 @@ class Compared:
     """
 
     run: Simulation
-    trajectory: Trajectory
+    saved: Saved
     halved: Trajectory
     errors: np.ndarray
     drives: Events
@@ -90,7 +91,7 @@ class Compared:
     def of(
         cls,
         run: Simulation,
-        trajectory: Trajectory,
+        saved: Saved,
         drives: Events,
         companion_of: Callable[..., Trajectory],
         accuracy: float = 0.0,
@@ -98,13 +99,23 @@ class Compared:
     ) -> Self:
         """A run with its errors, from the companion ``companion_of(2)``, and from further ones, ``companion_of(parts, whole)``, if the system is
         driven or its errors are below `DOUBTED` of the accuracy; `more` are fields of a subclass."""
-        halved, order = companion_of(2), 1 if drives.jump else run.order
+        halved, order, trajectory = companion_of(2), 1 if drives.jump else run.order, saved.trajectory(run)
         errors = extrapolated(order, trajectory, halved)
-        has_failed = max(int(trajectory.failed_at), int(halved.failed_at)) >= 0
+        has_failed = max(int(saved.failed_at), int(halved.failed_at)) >= 0
         is_believed = not drives.names and np.abs(errors).max(initial=0.0) > DOUBTED * accuracy
         if not (has_failed or is_believed):
             errors = _with_further_companions(run, trajectory, errors, drives, companion_of, order)
-        return cls(run, trajectory, halved, errors, drives, **more)
+        return cls(run, saved, halved, errors, drives, **more)
+
+    @cached_property
+    def trajectory(self) -> Trajectory:
+        """The trajectory of the run."""
+        return self.saved.trajectory(self.run)
+
+    @cached_property
+    def concerns(self) -> list[LostEnergyWarning]:
+        """What is wrong with its motion."""
+        return self.run.concerns(self.saved.table, self.trajectory.t)
 
     @cached_property
     def error(self) -> float:
@@ -113,8 +124,8 @@ class Compared:
         return float(largest_of(self.errors).max()) if certified.all() else np.inf
 
 
-def with_error(compared: Compared, of: Callable | None = None, shares: bool = False) -> Trajectory:
-    """The trajectory of a run without a failed step, with its `RunError`; warns if the error is not certified over the whole run."""
+def told_error(compared: Compared, of: Callable | None = None, shares: bool = False) -> Any:
+    """The `RunError` of a run without a failed step, None if its companion fails; warns if the error is not certified over the whole run."""
     run, trajectory, halved = compared.run, compared.trajectory, compared.halved
     error, reason = None, ""
     if int(halved.failed_at) >= 0:
@@ -128,7 +139,7 @@ def with_error(compared: Compared, of: Callable | None = None, shares: bool = Fa
             reason = _uncertified(error, compared) if is_seen else _stepped_over(run, compared.drives, unseen)
     if reason:
         warnings.warn(f"simulate: {reason}", UncertifiedWarning, stacklevel=3)
-    return replace(trajectory, error=error)
+    return error
 
 
 def run_error(compared: Compared, of: Callable | None = None, shares: bool = False) -> RunError:
@@ -247,7 +258,8 @@ def resting(run: Simulation) -> Trajectory:
 def companion(run: Simulation, parts: int, whole: int = 1) -> Trajectory:
     """The run with every `whole` macro steps divided into equal parts, at the nodes of the run or every `whole` steps;
     it may fail."""
-    return finer(run, parts, whole).in_pieces()
+    divided = finer(run, parts, whole)
+    return divided.in_pieces().trajectory(divided)
 
 
 def finer(run: Simulation, parts: int, whole: int = 1) -> Simulation:
@@ -270,7 +282,7 @@ def _is_chaotic(error: RunError, compared: Compared) -> bool:
     """Whether small differences grow like exp(L t) by the motion itself, and not by large steps: between two runs with
     a half and a quarter of the macro step. Driven motions, which may be pumped, are left out."""
     trajectory = compared.trajectory
-    if not (float(error.growth) > CHAOTIC_GROWTH and trajectory.keeps_energy) or trajectory.concerns():
+    if not (float(error.growth) > CHAOTIC_GROWTH and trajectory.keeps_energy) or compared.concerns:
         return False
     quartered = companion(compared.run, 4)
     envelope = np.maximum.accumulate(largest_of(positions(compared.halved) - positions(quartered)))
@@ -299,7 +311,7 @@ def _uncertified(error: RunError, compared: Compared) -> str:
             f"the motion is chaotic, small errors have grown {float(error.growth):.0f} times in the second half of the time until t = {t:.4g}: "
             f"from there on an error of positions means nothing.{kept}"
         )
-    reasons = [f" {concern}" for concern in trajectory.concerns() if isinstance(concern, SingularCoordinatesWarning)]
+    reasons = [f" {concern}" for concern in compared.concerns if isinstance(concern, SingularCoordinatesWarning)]
     advice = "".join(reasons) or " Take smaller steps, or a scheme of higher order."
     return (
         f"from t = {t:.4g} on positions are wrong by more than {LARGEST_CERTIFIED:.0%} of the extent of the motion, and no error is "

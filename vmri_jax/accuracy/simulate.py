@@ -17,7 +17,7 @@ from vmri_jax.accuracy.companions import (
     companion,
     finer,
     run_error,
-    with_error,
+    told_error,
 )
 from vmri_jax.accuracy.families import Trial, for_system, of_scheme, two_families
 from vmri_jax.accuracy.search import MOST_COORDINATES, Search
@@ -108,12 +108,9 @@ def simulate(
             how = {"state": state, "solver": solver, "num_saves": saved.number, "of": of, "progress": tell}
             search = Search(system, t_end, **how)
             best = _with_accuracy(search, scheme, accuracy)
-        origin = replace(best.run.origin, settings=search.settings(best))
-        trajectory = replace(best.trajectory, origin=origin)
-        best.run.raise_failure(trajectory)
-        for concern in trajectory.concerns():
-            warnings.warn(type(concern)(f"simulate: {concern}"), stacklevel=2)
-        return with_error(replace(best, trajectory=trajectory), of, error == "shares")
+        trajectory = best.run.finished("simulate", best.saved)
+        origin = replace(trajectory.origin, settings=search.settings(best))
+        return replace(trajectory, origin=origin, error=told_error(best, of, error == "shares"))
     if scheme is None:
         raise Refused("simulate: scheme is None without an accuracy; give one of them, e.g. accuracy=1e-5.")
     run = simulation(system, scheme, state, solver, macro_dt, num_steps, t_end, save)
@@ -126,12 +123,13 @@ def simulate(
         run.check()
     check_memory("simulate", run)
     check_function_of_run(of, run)
-    trajectory = run.in_pieces("simulate")
-    run.raise_failure(trajectory)
+    saved = run.in_pieces()
+    trajectory = run.finished("simulate", saved)
     if not error:
         return trajectory
     drives = events(run.system, run.state, float(trajectory.t[-1]))
-    return with_error(Compared.of(run, trajectory, drives, partial(companion, run)), of, error == "shares")
+    compared = Compared.of(run, saved, drives, partial(companion, run))
+    return replace(trajectory, error=told_error(compared, of, error == "shares"))
 
 
 def _with_accuracy(search: Search, scheme: SchemeLike | None, accuracy: float) -> Trial:
@@ -227,18 +225,16 @@ def simulate_batch(
     with Working("simulate_batch: the starts"):
         runs, computed = batch(system, scheme, states, macro_dt, params, solver, chunk, devices, **steps)
     saved = computed(runs)
-    trajectory = plain = saved.trajectory(runs)
+    trajectory = runs.finished("simulate_batch", saved, throw=False)
     if error:
-        trajectory = replace(plain, error=_errors(runs, computed, plain))
-    runs.tell_of_start("simulate_batch", plain.states)
-    runs.warn("simulate_batch", saved.table, plain.states.t)
+        trajectory = replace(trajectory, error=_errors(runs, computed, saved))
     for kind, message in _about_lanes(trajectory) if warn else ():
         warnings.warn(f"simulate_batch: {message}", kind, stacklevel=2)
     return trajectory
 
 
-def _errors(runs: Simulation, computed: Callable[[Simulation], Saved], plain: Trajectory) -> RunError:
-    """The errors of all lanes, from batches of companions; `plain` are the runs, with arrays of NumPy."""
+def _errors(runs: Simulation, computed: Callable[[Simulation], Saved], saved: Saved) -> RunError:
+    """The errors of all lanes, from batches of companions."""
 
     @cache
     def companions(parts: int, whole: int = 1) -> Trajectory:
@@ -248,12 +244,13 @@ def _errors(runs: Simulation, computed: Callable[[Simulation], Saved], plain: Tr
         return computed(divided).trajectory(divided)
 
     def error(i: int) -> RunError:
-        run, coarse = lane(runs, i), plain.lane(i)
-        drives = events(run.system, run.state, float(coarse.t[-1])) if is_driven else Events()
-        return run_error(Compared.of(run, coarse, drives, lambda *counts: companions(*counts).lane(i)))
+        run = lane(runs, i)
+        t_end = float(run.state.t + run.num_steps * run.macro_dt)
+        drives = events(run.system, run.state, t_end) if is_driven else Events()
+        return run_error(Compared.of(run, saved.lane(i), drives, lambda *counts: companions(*counts).lane(i)))
 
     is_driven = driven(lane(runs, 0).system, lane(runs, 0).state)
-    return jax.tree.map(lambda *arrays: np.stack(arrays), *map(error, range(len(plain.t))))
+    return jax.tree.map(lambda *arrays: np.stack(arrays), *map(error, range(len(runs.macro_dt))))
 
 
 def _about_lanes(trajectory: Trajectory) -> Iterator[tuple[type[UserWarning], str]]:

@@ -57,7 +57,7 @@ class Columns(NamedTuple):
 
     def saved(self, rows, result, failed_at) -> "Saved":
         """Rows of a program, column by column, with the status of their run."""
-        return Saved(*(rows[..., columns] for columns in self), result, failed_at)
+        return Saved._make([*(rows[..., columns] for columns in self), result, failed_at])
 
 
 class Saved(NamedTuple):
@@ -101,7 +101,12 @@ class Saved(NamedTuple):
         marks = [(unreached, 0.0) if column is self.info else (lost, np.nan) for column in columns]
         columns = (module.where(*mark, column) for mark, column in zip(marks, columns, strict=True))
         failed_here = step + module.maximum(node * save_every - 1, 0)
-        return Saved(*columns, module.where(breaks, cause, result), module.where(breaks, failed_here, failed_at))
+        result, failed_at = module.where(breaks, cause, result), module.where(breaks, failed_here, failed_at)
+        return Saved._make([*columns, result, failed_at])
+
+    def lane(self, i: int) -> "Saved":
+        """One run of a batch."""
+        return Saved(*(array[i] for array in self))
 
     def trajectory(self, run: Any, step: int = 0) -> Trajectory:
         """The nodes as a trajectory of a `Simulation`, in a batch one whose arrays have an axis of lanes, after a number of macro steps."""
@@ -124,7 +129,8 @@ def joined(pieces: list[Saved]) -> Saved:
     """Consecutive pieces as one; each starts with the last node of the piece before, and has the worst status of all before it."""
     *columns, results, failures = zip(*pieces, strict=True)
     parts = [[part[min(i, 1) :] for i, part in enumerate(column)] for column in columns]
-    return Saved(*(part[0] if len(part) == 1 else np.concatenate(part) for part in parts), results[-1], failures[-1])
+    whole = (part[0] if len(part) == 1 else np.concatenate(part) for part in parts)
+    return Saved._make([*whole, results[-1], failures[-1]])
 
 
 def check_memory(caller: str, run: Any, lanes: int = 1, num_saves: int | None = None) -> None:

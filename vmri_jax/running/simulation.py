@@ -34,7 +34,7 @@ from vmri_jax.running.arguments import Save, check_once, check_run, check_step_s
 from vmri_jax.running.engine import FALLING_BACK, Cursor, Engine, blank_memory, engine, solved_again, unsolved
 from vmri_jax.running.failures import simulation_error
 from vmri_jax.running.interrupts import Interrupted, interrupts_noted
-from vmri_jax.running.observables import concerns
+from vmri_jax.running.observables import LostEnergyWarning, concerns
 from vmri_jax.running.origin import Origin, names_of
 from vmri_jax.running.progress import Working, progress_to
 from vmri_jax.running.saved import Columns, Saved, joined
@@ -103,14 +103,9 @@ class Simulation:
         if saved.failed_at >= 0 and run.unsolved(saved):
             with Working(FALLING_BACK):
                 saved = run.exact._whole()
-        trajectory = saved.trajectory(run)
-        if throw:
-            run.raise_failure(trajectory)
-        if run.state is not self.state or run.system is not self.system or not vars(self).get("has_told"):
-            vars(self)["has_told"] = True  # of a start: a further call with the same one is a short run
-            run.tell_of_start("run", trajectory.states)
-        run.warn("run", saved.table, trajectory.states.t)
-        return trajectory
+        is_told = run.state is self.state and run.system is self.system and "is_told" in vars(self)
+        vars(self)["is_told"] = True  # of a start: a further call with the same one is a short run
+        return run.finished("run", saved, throw, is_told)
 
     def compiled(self) -> jax.stages.Compiled:
         """The compiled program of the run without its fallback, for inspection."""
@@ -184,12 +179,23 @@ class Simulation:
         saved = run(self.leaves)
         return self.engine.observed(self.leaves, saved, self.save_every).trajectory(self)
 
+    def finished(self, caller: str, saved: Saved, throw: bool = True, is_told: bool = False) -> Trajectory:
+        """The trajectory of a whole run, or of runs with an axis of lanes, after the warnings about its start, unless the user `is_told`, and about its
+        motion; raises the `SimulationError` of a run with a failed step if `throw` is true."""
+        trajectory = saved.trajectory(self)
+        if not is_told:
+            self.tell_of_start(caller, trajectory.states)
+        self.warn(caller, saved.table, trajectory.states.t)
+        if throw:
+            self.raise_failure(trajectory)
+        return trajectory
+
     def raise_failure(self, trajectory: Any) -> None:
         """Raise the `SimulationError` of a run, in memory or in a store, one of whose steps failed."""
         if trajectory.failed_at >= 0:
             raise simulation_error(self, trajectory)
 
-    def tell_of_start(self, caller: str, saved: State, stacklevel: int = 3) -> None:
+    def tell_of_start(self, caller: str, saved: State) -> None:
         """Warn about momenta of the start that are off the hidden constraints: the run takes their projection, the first node of the saved states."""
         if not self.system.is_constrained:
             return
@@ -199,14 +205,20 @@ class Simulation:
             warnings.warn(
                 f"{caller}: the momenta of the start are off the hidden constraints, by {change:.3g} where the largest of them is {size:.3g}; the run "
                 "starts with their projection. Make the start by initial_state(...).",
-                stacklevel=stacklevel,
+                stacklevel=4,
             )
 
-    def warn(self, caller: str, table, t, stacklevel: int = 3) -> bool:
-        """Give the warnings about the motion of a run, or of runs with an axis of lanes, see `concerns`; returns whether there are any."""
-        all_concerns = concerns(table, t, self.system, self.macro_dt, self.save_every)
+    def concerns(self, table, t) -> list[LostEnergyWarning]:
+        """What is wrong with the motion of a run, or of runs with an axis of lanes, see `concerns` of the observables."""
+        return concerns(table, t, self.system, self.macro_dt, self.save_every)
+
+    def warn(self, caller: str, table, t) -> bool:
+        """Give the warnings about the motion; returns whether there are any."""
+        all_concerns = self.concerns(table, t)
         for concern in all_concerns:
-            warnings.warn(type(concern)(f"{caller}: {concern}"), stacklevel=stacklevel)
+            warnings.warn(
+                type(concern)(f"{caller}: {concern}"), stacklevel=4
+            )  # of the caller of the function of the user
         return bool(all_concerns)
 
     def __repr__(self) -> str:
@@ -320,11 +332,8 @@ class Simulation:
         """The largest `Method` of the steps."""
         return saved.info[..., 0].max(axis=-1)
 
-    def in_pieces(self, caller: str = "") -> Trajectory:
-        """The whole run; with a progress bar Ctrl-C raises `Interrupted` with the trajectory computed so far.
-
-        With the name of a `caller` it warns about the motion, see `warn`.
-        """
+    def in_pieces(self) -> Saved:
+        """The nodes of the whole run; with a progress bar Ctrl-C raises `Interrupted` with the trajectory computed so far."""
         bar, cursor, run, pieces = self.save.progress is not False, Cursor.at_start(self.state), self, []
         size = -(-self.num_saves // (PARTS_OF_A_BAR if bar else 1))
         noted = interrupts_noted() if bar else nullcontext(lambda: False)
@@ -338,12 +347,7 @@ class Simulation:
                 if interrupted():
                     done = joined(pieces).trajectory(self)
                     raise Interrupted(done, int(cursor.step), self.num_steps, "macro steps")
-        saved = joined(pieces)
-        trajectory = saved.trajectory(self)
-        if caller:
-            self.tell_of_start(caller, trajectory.states, stacklevel=4)
-            self.warn(caller, saved.table, trajectory.states.t, stacklevel=4)
-        return trajectory
+        return joined(pieces)
 
 
 def simulation(

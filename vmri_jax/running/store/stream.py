@@ -138,8 +138,8 @@ def _continue(stored: StoredTrajectory, run: Simulation, tell: Progress) -> Iter
         saved, cursor, current = current.advance(cursor, size)
         piece, table = saved.trajectory(run, record.step), np.concatenate([before, saved.table])
         if not record.saved:
-            run.tell_of_start("stream", piece.states, stacklevel=4)
-        has_warned = has_warned or run.warn("stream", table, np.append(run.state.t, piece.states.t), stacklevel=4)
+            run.tell_of_start("stream", piece.states)
+        has_warned = has_warned or run.warn("stream", table, np.append(run.state.t, piece.states.t))
         before = Observables.of(table).so_far()
         first = record.saved + 1 if record.saved else 0  # the first chunk has the start
         values = {name: value[1 if record.saved else 0 :] for name, value in rows_of(piece).items()}
