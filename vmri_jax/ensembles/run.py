@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, CancelledError, Future
 from contextlib import ExitStack
 from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -222,7 +221,7 @@ def ensemble(
     table = design if isinstance(design, Table) else None
     with ExitStack() as opened:
         tasks = opened.enter_context(executor_of("ensemble", executor, processes))
-        submit = submitter("ensemble", tasks, ChunkTask(path.resolve(), chunks, work))
+        submit = submitter("ensemble", tasks, chunk_task, path.resolve(), chunks, work)
         columns = None if table is None else table.rows(0, len(table))
         opened.enter_context(layout.writing(path, attributes, arrays, overwrite, dimension=LANE, table=columns))
         tell = opened.enter_context(progress_to("ensemble", progress))
@@ -236,27 +235,14 @@ def ensemble(
     return runs
 
 
-@dataclass(frozen=True)
-class ChunkTask:
-    """The computation of a chunk: it writes and commits results to the store, and returns how many runs failed."""
-
-    path: Path
-    chunks: Chunks
-    work: Work
-
-    @cached_property
-    def writer(self) -> layout.Writer:
-        """The writer of the store, which a worker opens once."""
-        return layout.Writer(self.path)
-
-    def __call__(self, number: int, rows: Rows | Design) -> int:
-        """`rows` are the rows of the chunk, or the design that makes them."""
-        first, last = self.chunks.ends(number)
-        rows = rows if isinstance(rows, dict) else rows.rows(first, last)
-        values = self.work.compute(rows, last - first, self.chunks.width)
-        failed = int(np.count_nonzero(values["failed_at"] >= 0))
-        self.writer.write(first, values, failed.to_bytes(NOTE_BYTES, "little"))
-        return failed
+def chunk_task(path: Path, chunks: Chunks, work: Work, number: int, rows: Rows | Design) -> int:
+    """Compute a chunk, write and commit its results to the store, and return how many runs failed; `rows` are its rows, or the design that makes them."""
+    first, last = chunks.ends(number)
+    rows = rows if isinstance(rows, dict) else rows.rows(first, last)
+    values = work.compute(rows, last - first, chunks.width)
+    failed = int(np.count_nonzero(values["failed_at"] >= 0))
+    layout.Writer(path).write(first, values, failed.to_bytes(NOTE_BYTES, "little"))
+    return failed
 
 
 def _compute(runs: Ensemble, submit: Callable[[int], Future], tell: Progress, interrupted) -> None:
