@@ -5,7 +5,7 @@ Names: `save_every` macro steps lie between two saved nodes; `num_saves` saved i
 the first `saves` of them.
 
 The derivative of a step is the derivative of the root of its equations (`vmri_jax.steppers.newton.implicit`). Reverse mode visits
-the steps from the last to the first and needs the state at which each step started, see `Adjoint`. Runs have derivatives in both modes, up to second
+the steps from the last to the first and needs the state at which each step started, see `loops`. Runs have derivatives in both modes, up to second
 ones; third derivatives are NaN where equations are solved by iteration.
 
 The fallback: what the first matrix of "auto" does not solve is solved again with exact matrices, in a program of its own. `unsolved` decides for all
@@ -24,7 +24,8 @@ from jaxtyping import Float, Int
 
 from vmri_jax.mechanics.arrays import Numbers, options_of_runs
 from vmri_jax.mechanics.state import State
-from vmri_jax.running.loops import MOST_STORED_NUMBERS, Adjoint, plain
+from vmri_jax.running import loops
+from vmri_jax.running.loops import MOST_STORED_NUMBERS
 from vmri_jax.running.observables import observed
 from vmri_jax.running.saved import Saved
 from vmri_jax.running.trajectory import RunInfo
@@ -84,7 +85,7 @@ class Engine:
         memory = stepper.init(begin.state, run.macro_dt)
         if cursor is not None:
             memory = jax.tree.map(partial(jnp.where, is_first), memory, cursor.memory)
-        interval = _interval(stepper, run, plain)
+        interval = _interval(stepper, run, loops.plain)
 
         def goes_on(loop):
             number, cursor, _ = loop
@@ -129,16 +130,15 @@ class Engine:
         def by_scan(leaves: list, save_every: int) -> Saved:
             run: Any = jax.tree.unflatten(self.structure, leaves)
             numbers = sum(a.size for a in jax.tree.leaves(run.state)) * run.scheme.num_micro  # of a step, about
-            loops = Adjoint(save_every, in_parts=self.num_saves * save_every * numbers > MOST_STORED_NUMBERS)
-            stepper = run.plan
-            interval = _interval(stepper, run, loops.repeat)
+            in_parts, stepper = self.num_saves * save_every * numbers > MOST_STORED_NUMBERS, run.plan
+            interval = _interval(stepper, run, partial(loops.differentiable, in_parts=in_parts))
 
             def save(cursor: Cursor, _):
                 cursor, info, micro = interval(cursor, save_every)
                 return cursor, _row(cursor.state, info, micro)
 
             cursor = Cursor.at_start(run.state, stepper.init(run.state, run.macro_dt))
-            cursor, rows = loops.scan(save, jax.tree.map(jnp.asarray, cursor), self.num_saves)
+            cursor, rows = loops.scan(save, jax.tree.map(jnp.asarray, cursor), self.num_saves, in_parts, save_every)
             first = _row(run.state, *_nothing(run))
             return run.columns.saved(jnp.concatenate([first[None], rows]), cursor.result, cursor.failed_at)
 
