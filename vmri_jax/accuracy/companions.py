@@ -126,17 +126,13 @@ class Compared:
 
 def told_error(compared: Compared, of: Callable | None = None, shares: bool = False) -> Any:
     """The `RunError` of a run without a failed step, None if its companion fails; warns if the error is not certified over the whole run."""
-    run, trajectory, halved = compared.run, compared.trajectory, compared.halved
-    error, reason = None, ""
+    halved, error = compared.halved, None
     if int(halved.failed_at) >= 0:
-        failed = float(halved.t[0]) + int(halved.failed_at) * float(run.macro_dt) / 2
+        failed = float(halved.t[0]) + int(halved.failed_at) * float(compared.run.macro_dt) / 2
         reason = f"the error is not known; the same run with half the macro step failed at t = {failed:.4g}."
     else:
         error = run_error(compared, of, shares)
-        if not error.is_certified:
-            unseen = first_unseen(run, compared.drives)
-            is_seen = unseen > trajectory.t[-1]
-            reason = _uncertified(error, compared) if is_seen else _stepped_over(run, compared.drives, unseen)
+        reason = "" if error.is_certified else _uncertified(error, compared)
     if reason:
         warnings.warn(f"simulate: {reason}", UncertifiedWarning, stacklevel=3)
     return error
@@ -291,18 +287,16 @@ def _is_chaotic(error: RunError, compared: Compared) -> bool:
     return bool(envelope[last] > CHAOTIC_GROWTH * envelope[half])  # False for NaN, where a companion failed
 
 
-def _stepped_over(run: Simulation, drives: Events, unseen: float) -> str:
-    """Events that the steps of a run do not see, and advice."""
-    step = drives.shortest / (NODES_OF_EVENT * node_distance(run.scheme, drives))
-    return (
-        f"from t = {unseen:.4g} on no error is certified: {' and '.join(drives.names)} of the system changes and changes back within "
-        f"{drives.shortest:.2g}, which steps of {float(run.macro_dt):.4g} see too seldom or not at all; take macro_dt = {step:.2g} or less, or accuracy="
-    )
-
-
 def _uncertified(error: RunError, compared: Compared) -> str:
     """The reason why an error is not certified, and advice."""
-    trajectory = compared.trajectory
+    trajectory, drives, macro_dt = compared.trajectory, compared.drives, float(compared.run.macro_dt)
+    unseen = first_unseen(compared.run, drives)
+    if unseen <= trajectory.t[-1]:
+        step = drives.shortest / (NODES_OF_EVENT * node_distance(compared.run.scheme, drives))
+        return (
+            f"from t = {unseen:.4g} on no error is certified: {' and '.join(drives.names)} of the system changes and changes back within "
+            f"{drives.shortest:.2g}, which steps of {macro_dt:.4g} see too seldom or not at all; take macro_dt = {step:.2g} or less, or accuracy="
+        )
     t, energy = float(error.certified_until), np.asarray(trajectory.energy)
     change = np.abs(energy - energy[0]).max()
     kept = f" The energy has changed by at most {change:.1e}." if trajectory.keeps_energy else ""

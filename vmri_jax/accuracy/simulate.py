@@ -228,8 +228,8 @@ def simulate_batch(
     trajectory = runs.finished("simulate_batch", saved, throw=False)
     if error:
         trajectory = replace(trajectory, error=_errors(runs, computed, saved))
-    for kind, message in _about_lanes(trajectory) if warn else ():
-        warnings.warn(f"simulate_batch: {message}", kind, stacklevel=2)
+    for warning in _about_lanes(trajectory) if warn else ():
+        warnings.warn(warning, stacklevel=2)
     return trajectory
 
 
@@ -253,27 +253,21 @@ def _errors(runs: Simulation, computed: Callable[[Simulation], Saved], saved: Sa
     return jax.tree.map(lambda *arrays: np.stack(arrays), *map(error, range(len(runs.macro_dt))))
 
 
-def _about_lanes(trajectory: Trajectory) -> Iterator[tuple[type[UserWarning], str]]:
-    """Warnings about the lanes that failed, and about those that did not and whose error is not certified: kind, and number with the first lane."""
+def _about_lanes(trajectory: Trajectory) -> Iterator[UserWarning]:
+    """Warnings about the lanes that failed, and about those that did not and whose error is not certified, with their number and the first of them."""
     failed_at = np.asarray(trajectory.failed_at)
     failed = np.flatnonzero(failed_at >= 0)
     if failed.size:
         first = int(failed[0])
         result = Result(int(trajectory.result[first]))
-        yield (
-            FailedLanesWarning,
-            (
-                f"{failed.size} of {failed_at.size} lanes failed and are NaN from there on; .result and .failed_at say "
-                f"which. The first is lane {first}, at macro step {failed_at[first]} ({result.name}): {result.message}"
-            ),
+        yield FailedLanesWarning(
+            f"simulate_batch: {failed.size} of {failed_at.size} lanes failed and are NaN from there on; .result and .failed_at say "
+            f"which. The first is lane {first}, at macro step {failed_at[first]} ({result.name}): {result.message}"
         )
     error = trajectory.error
     lanes = np.flatnonzero((failed_at < 0) & ~np.asarray(error is None or error.is_certified))
     if lanes.size:
-        yield (
-            UncertifiedWarning,
-            (
-                f"the error of {lanes.size} of {failed_at.size} lanes is not certified over the whole run, as run.error.largest says; the first is lane "
-                f"{lanes[0]}, certified until t = {error.certified_until[lanes[0]]:.4g}. Take smaller steps, or a scheme of higher order."
-            ),
+        yield UncertifiedWarning(
+            f"simulate_batch: the error of {lanes.size} of {failed_at.size} lanes is not certified over the whole run, as run.error.largest says; the first "
+            f"is lane {lanes[0]}, certified until t = {error.certified_until[lanes[0]]:.4g}. Take smaller steps, or a scheme of higher order."
         )

@@ -40,17 +40,15 @@ MOST_LANES = 1024
 
 def computed(runs: Simulation, width: int, devices: int) -> Saved:
     """Runs whose arrays have an axis of lanes, `width` of them side by side, on CPU devices; lanes that are not solved are computed again by the fallback."""
-    lanes, run = len(runs.macro_dt), lane(runs, 0)
+    run, lanes = lane(runs, 0), len(runs.macro_dt)
     with Working(f"simulate_batch, {lanes} lanes", running=STEPPING):
-        done = _in_chunks(runs, run, width, devices)
+        done = _in_chunks(run, runs.leaves, np.arange(lanes), width, devices)
     failed = np.flatnonzero(run.unsolved(done))
     if failed.size:
         # Failed lanes are padded to a power of two with copies of the last one, so that few programs serve all numbers of failures.
-        padded_size = 2 ** int(failed.size - 1).bit_length()
-        padded = failed[np.minimum(np.arange(padded_size), failed.size - 1)]
+        padded = failed[np.minimum(np.arange(2 ** int(failed.size - 1).bit_length()), failed.size - 1)]
         with Working(f"simulate_batch, {failed.size} of {lanes} lanes: {FALLING_BACK}"):
-            exact = jax.tree.unflatten(jax.tree.structure(run.exact), runs.leaves)
-            again = _in_chunks(_taken(exact, padded), run.exact, width, devices)
+            again = _in_chunks(run.exact, runs.leaves, padded, width, devices)
         for old, new in zip(done, again, strict=True):
             old[failed] = new[: failed.size]
     return done
@@ -61,16 +59,15 @@ def lane(runs: Simulation, i: int) -> Simulation:
     return jax.tree.map(lambda a: a[i], runs)
 
 
-def _in_chunks(runs: Simulation, run: Simulation, width: int, devices: int) -> Saved:
-    """All lanes, the first of which is `run`, `width` at a time; the last chunk is padded with copies of its last lane, so that one program computes all
+def _in_chunks(run: Simulation, leaves: list, lanes: np.ndarray, width: int, devices: int) -> Saved:
+    """Some lanes of runs shaped like `run`, `width` at a time; the last chunk is padded with copies of its last lane, so that one program computes all
     chunks."""
-    lanes, chunks = len(runs.macro_dt), []
-    width = min(width, -(-lanes // devices) * devices)
-    program = _side_by_side(run.engine, tuple(not is_repeated(a) for a in runs.leaves), devices)
-    for start in range(0, lanes, width):
-        part = _taken(runs, np.minimum(np.arange(start, start + width), lanes - 1))
-        chunks.append(program([a[0] if is_repeated(a) else a for a in part.leaves], run.save_every))
-    rows, status = jax.tree.map(lambda *parts: np.concatenate(parts)[:lanes], *chunks)
+    width, chunks = min(width, -(-len(lanes) // devices) * devices), []
+    program = _side_by_side(run.engine, tuple(not is_repeated(a) for a in leaves), devices)
+    for start in range(0, len(lanes), width):
+        chosen = lanes[np.minimum(np.arange(start, start + width), len(lanes) - 1)]
+        chunks.append(program([a[0] if is_repeated(a) else a[chosen] for a in leaves], run.save_every))
+    rows, status = jax.tree.map(lambda *parts: np.concatenate(parts)[: len(lanes)], *chunks)
     return run.columns.saved(rows, status[..., 0].copy(), status[..., 1].copy()).marked(run.save_every)
 
 
@@ -109,11 +106,6 @@ def batch(
     runs = jax.tree.map(lambda a: shared(a, lanes), run)
     runs = replace(runs, macro_dt=macro_dt, state=start, system=runs.system.with_params(params))
     return runs, partial(computed, width=width, devices=devices)
-
-
-def _taken(runs: Simulation, index: np.ndarray) -> Simulation:
-    """The lanes with these numbers."""
-    return jax.tree.map(lambda a: shared(a[0], len(index)) if is_repeated(a) else a[index], runs)
 
 
 def shared(value, lanes: int) -> np.ndarray:
