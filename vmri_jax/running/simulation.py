@@ -13,7 +13,7 @@ All of them return `Saved`. With the matrix "auto" a piece that is not solved is
 import warnings
 from collections.abc import Callable
 from contextlib import nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, partial
 from typing import Any
 
@@ -77,11 +77,11 @@ class Simulation:
     solver: Solver
     scheme: SchemeLike
     system: System
-    num_steps: int
-    save_every: int
-    save: Save
-    names: Names | None
-    of_problem: bool
+    num_steps: int = 0
+    save_every: int = 0
+    save: Save = field(default_factory=Save)
+    names: Names | None = None
+    of_problem: bool = False
     may_fall_back: bool = True
 
     def __call__(self, state=None, *, macro_dt=None, params=None, num_steps=None, throw: bool = True) -> Trajectory:
@@ -184,7 +184,7 @@ class Simulation:
         motion; raises the `SimulationError` of a run with a failed step if `throw` is true."""
         trajectory = saved.trajectory(self)
         if not is_told:
-            self.tell_of_start(caller, trajectory.states)
+            self.tell_of_start(caller, saved)
         self.warn(caller, saved.table, trajectory.states.t)
         if throw:
             self.raise_failure(trajectory)
@@ -195,8 +195,8 @@ class Simulation:
         if trajectory.failed_at >= 0:
             raise simulation_error(self, trajectory)
 
-    def tell_of_start(self, caller: str, saved: State) -> None:
-        """Warn about momenta of the start that are off the hidden constraints: the run takes their projection, the first node of the saved states."""
+    def tell_of_start(self, caller: str, saved: Saved) -> None:
+        """Warn about momenta of the start that are off the hidden constraints: the run takes their projection, which its first node has."""
         if not self.system.is_constrained:
             return
         given, taken = (np.concatenate([a.p_s, a.p_f], axis=-1) for a in (self.state, saved))
@@ -216,9 +216,7 @@ class Simulation:
         """Give the warnings about the motion; returns whether there are any."""
         all_concerns = self.concerns(table, t)
         for concern in all_concerns:
-            warnings.warn(
-                type(concern)(f"{caller}: {concern}"), stacklevel=4
-            )  # of the caller of the function of the user
+            warnings.warn(type(concern)(f"{caller}: {concern}"), stacklevel=4)
         return bool(all_concerns)
 
     def __repr__(self) -> str:
@@ -275,9 +273,8 @@ class Simulation:
         return blank_memory(self._pieces, tuple((a.shape, a.dtype) for a in self.leaves))
 
     def _engine(self, num_saves: int) -> Engine:
-        blank = {"num_steps": 0, "save_every": 0, "names": None, "of_problem": False, "may_fall_back": True}
-        without_length = replace(self, save=Save(micro=self.save.micro), **blank)
-        return engine(jax.tree.structure(without_length), num_saves)
+        motion = Simulation(*(getattr(self, name) for name in MOTION), save=Save(micro=self.save.micro))
+        return engine(jax.tree.structure(motion), num_saves)
 
     @cached_property
     def exact(self) -> "Simulation":

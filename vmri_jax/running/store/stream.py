@@ -2,7 +2,6 @@
 
 import os
 from collections.abc import Iterator
-from itertools import pairwise
 from pathlib import Path
 
 import jax
@@ -119,7 +118,7 @@ def stream(
 def _continue(stored: StoredTrajectory, run: Simulation, tell: Progress) -> Iterator[int]:
     """Compute and write the missing chunks; yields the number of macro steps done after every chunk."""
     path, chunk, record = stored.path, stored.chunk, stored.record
-    rows = stored.num_steps // run.save_every
+    rows = run.num_saves
     if record.saved == rows or not stored.success:
         return
     try:
@@ -128,27 +127,30 @@ def _continue(stored: StoredTrajectory, run: Simulation, tell: Progress) -> Iter
         raise Refused(f"{path} can be read, but its run cannot go on: {error}.") from error
     with explained(path, _advice(record.step)):
         writer = layout.Writer(path)
-    # The start and the largest values so far, as a node before each chunk: energies are compared with the start of the run.
-    before, has_warned = at_nodes(observables, run.origin, jax.tree.map(lambda a: a[None], run.state)), False
-    # Every write but the last ends at a multiple of `chunk` rows, so that no file is written twice.
-    ends = [*range((record.saved + 1) // chunk * chunk + chunk, rows + 1, chunk), rows + 1]
-    sizes = [end - begin for begin, end in pairwise([record.saved + 1, *ends])]
-    for size in sizes:
+    # The start and the largest values so far, as a node before each chunk but the first: energies are compared with the start of the run.
+    start, before, has_warned = (
+        jax.tree.map(lambda a: a[None], run.state),
+        np.zeros((0, len(Observables._fields))),
+        False,
+    )
+    if record.saved:
+        before = at_nodes(observables, run.origin, start)
+    while record.saved < rows and record.failed_at < 0:
         tell("simulating", record.saved, rows)
+        # Every write but the last ends at a multiple of `chunk` rows, so that no file is written twice.
+        size = min(chunk - (record.saved + 1) % chunk, rows - record.saved)
         saved, cursor, current = current.advance(cursor, size)
         piece, table = saved.trajectory(run, record.step), np.concatenate([before, saved.table])
         if not record.saved:
-            run.tell_of_start("stream", piece.states)
-        has_warned = has_warned or run.warn("stream", table, np.append(run.state.t, piece.states.t))
+            run.tell_of_start("stream", saved)
+        has_warned = has_warned or run.warn("stream", table, np.append(start.t[: len(before)], piece.states.t))
         before = Observables.of(table).so_far()
-        first = record.saved + 1 if record.saved else 0  # the first chunk has the start
-        values = {name: value[1 if record.saved else 0 :] for name, value in rows_of(piece).items()}
+        skip = int(record.saved > 0)  # the first chunk has the start
+        first, values = record.saved + skip, {name: value[skip:] for name, value in rows_of(piece).items()}
         with explained(path, _advice(record.step)):
             record = Record.of(cursor, record.saved + size, fell_back=current is not run)
             writer.write(first, values, record.packed())
         yield record.step
-        if record.failed_at >= 0:
-            return
 
 
 def _advice(step: int) -> str:
