@@ -51,10 +51,10 @@ class Tuning(Search):
     def note(self, trial: Trial) -> None:
         """Add the row of a trial; a failed or uncertified run has an error of NaN."""
         run, error = trial.run, trial.error if np.isfinite(trial.error) else np.nan
-        label, numbers = trial.family.label(trial.num_micro), (float(run.macro_dt), run.num_steps)
+        label, numbers = trial.family.label(trial.family.first), (float(run.macro_dt), run.num_steps)
         measured = {"error_q": error, "settings": self.settings(trial), "family": trial.family.name}
         row = row_of(label, run.system, run.scheme, trial.trajectory, *numbers, **measured)
-        self._rows[trial.python, run.num_steps] = row
+        self._rows[trial.family.expression, run.num_steps] = row
 
     def look_for(self, error: float, exhaustive: bool = False) -> WorkPrecision:
         """Search for an error, and return the table of all runs so far."""
