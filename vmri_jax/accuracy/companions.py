@@ -37,7 +37,7 @@ from vmri_jax.mechanics.arrays import of_one_type
 from vmri_jax.mechanics.driving import Events
 from vmri_jax.refusals import Refused
 from vmri_jax.running.arguments import Save
-from vmri_jax.running.observables import LostEnergyWarning, SingularCoordinatesWarning
+from vmri_jax.running.observables import LostEnergyWarning, SingularCoordinatesWarning, concerns
 from vmri_jax.running.run_error import RunError, largest_of
 from vmri_jax.running.saved import Saved
 from vmri_jax.running.simulation import Simulation
@@ -115,7 +115,8 @@ class Compared:
     @cached_property
     def concerns(self) -> list[LostEnergyWarning]:
         """What is wrong with its motion."""
-        return self.run.concerns(self.saved.table, self.trajectory.t)
+        run = self.run
+        return concerns(self.saved.table, self.trajectory.t, run.system, run.macro_dt, run.save_every)
 
     @cached_property
     def error(self) -> float:

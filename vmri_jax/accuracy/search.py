@@ -133,8 +133,8 @@ class Search:
         self.num_saves, self.progress, self.num_trials, self.falls_back = num_saves, progress, 0, False
         self.seconds: dict[str, float] = {}
         self._arguments, self._of = (moving, state, solver), of
-        self._runs: dict[tuple[str, int], Simulation] = {}
-        self._firsts: dict[tuple[str, int], Trial] = {}
+        self._runs: dict[str, Simulation] = {}
+        self._firsts: dict[str, Trial] = {}
         self._chosen: dict[str, Trial] = {}
         self._times: dict[str, Callable[[int], float]] = {}
 

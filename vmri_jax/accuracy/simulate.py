@@ -244,10 +244,10 @@ def _errors(runs: Simulation, computed: Callable[[Simulation], Saved], saved: Sa
         return computed(divided).trajectory(divided)
 
     def error(i: int) -> RunError:
-        run = lane(runs, i)
+        run, of_lane = lane(runs, i), jax.tree.map(lambda a: a[i], saved)
         t_end = float(run.state.t + run.num_steps * run.macro_dt)
         drives = events(run.system, run.state, t_end) if is_driven else Events()
-        return run_error(Compared.of(run, saved.lane(i), drives, lambda *counts: companions(*counts).lane(i)))
+        return run_error(Compared.of(run, of_lane, drives, lambda *counts: companions(*counts).lane(i)))
 
     is_driven = driven(lane(runs, 0).system, lane(runs, 0).state)
     return jax.tree.map(lambda *arrays: np.stack(arrays), *map(error, range(len(runs.macro_dt))))

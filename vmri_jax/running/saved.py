@@ -104,10 +104,6 @@ class Saved(NamedTuple):
         result, failed_at = module.where(breaks, cause, result), module.where(breaks, failed_here, failed_at)
         return Saved._make([*columns, result, failed_at])
 
-    def lane(self, i: int) -> "Saved":
-        """One run of a batch."""
-        return Saved(*(array[i] for array in self))
-
     def trajectory(self, run: Any, step: int = 0) -> Trajectory:
         """The nodes as a trajectory of a `Simulation`, in a batch one whose arrays have an axis of lanes, after a number of macro steps."""
         *phase, info, q_f_micro, table, result, failed_at = self

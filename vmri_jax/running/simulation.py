@@ -14,7 +14,7 @@ import warnings
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
-from functools import cache, cached_property, partial
+from functools import cached_property, partial
 from typing import Any
 
 import jax
@@ -34,7 +34,7 @@ from vmri_jax.running.arguments import Save, check_once, check_run, check_step_s
 from vmri_jax.running.engine import FALLING_BACK, Cursor, Engine, blank_memory, engine, solved_again, unsolved
 from vmri_jax.running.failures import simulation_error
 from vmri_jax.running.interrupts import Interrupted, interrupts_noted
-from vmri_jax.running.observables import LostEnergyWarning, concerns
+from vmri_jax.running.observables import concerns
 from vmri_jax.running.origin import Origin, names_of
 from vmri_jax.running.progress import Working, progress_to
 from vmri_jax.running.saved import Columns, Saved, joined
@@ -186,14 +186,9 @@ class Simulation:
         if not is_told:
             self.tell_of_start(caller, saved)
         self.warn(caller, saved.table, trajectory.states.t)
-        if throw:
-            self.raise_failure(trajectory)
-        return trajectory
-
-    def raise_failure(self, trajectory: Any) -> None:
-        """Raise the `SimulationError` of a run, in memory or in a store, one of whose steps failed."""
-        if trajectory.failed_at >= 0:
+        if throw and trajectory.failed_at >= 0:
             raise simulation_error(self, trajectory)
+        return trajectory
 
     def tell_of_start(self, caller: str, saved: Saved) -> None:
         """Warn about momenta of the start that are off the hidden constraints: the run takes their projection, which its first node has."""
@@ -208,13 +203,9 @@ class Simulation:
                 stacklevel=4,
             )
 
-    def concerns(self, table, t) -> list[LostEnergyWarning]:
-        """What is wrong with the motion of a run, or of runs with an axis of lanes, see `concerns` of the observables."""
-        return concerns(table, t, self.system, self.macro_dt, self.save_every)
-
     def warn(self, caller: str, table, t) -> bool:
-        """Give the warnings about the motion; returns whether there are any."""
-        all_concerns = self.concerns(table, t)
+        """Give the warnings about the motion of a run, or of runs with an axis of lanes, see `concerns`; returns whether there are any."""
+        all_concerns = concerns(table, t, self.system, self.macro_dt, self.save_every)
         for concern in all_concerns:
             warnings.warn(type(concern)(f"{caller}: {concern}"), stacklevel=4)
         return bool(all_concerns)
@@ -368,14 +359,9 @@ def simulation(
     advice = nothing_fast(scheme, state.q_f.size) if moving is not problem else ""
     if advice:
         warnings.warn(f"simulate: {advice}", stacklevel=3)
-    chosen_solver, scheme, system = of_one_type((solver or _usual_solver(), scheme, system))
+    chosen_solver, scheme, system = of_one_type((solver or Solver(), scheme, system))
     motion = (_float(macro_dt), _with_arrays(state), chosen_solver, scheme, system)
     return Simulation(*motion, num_steps, save_every, Save.of(save), names_of(problem), of_problem)
-
-
-@cache
-def _usual_solver() -> Solver:
-    return Solver()
 
 
 def _with_arrays(state: State) -> State:

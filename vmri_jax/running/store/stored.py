@@ -17,7 +17,7 @@ from vmri_jax.mechanics.system import System
 from vmri_jax.refusals import Refused
 from vmri_jax.running.engine import Cursor
 from vmri_jax.running.export import NODES, Exports
-from vmri_jax.running.origin import Origin
+from vmri_jax.running.origin import UNKNOWN, Origin
 from vmri_jax.running.simulation import Simulation
 from vmri_jax.running.store import layout
 from vmri_jax.running.store.layout import chunk_file, read_attributes
@@ -98,6 +98,8 @@ class StoredTrajectory(Exports):
         ValueError: the path is no store, or a damaged one.
     """
 
+    origin: Origin = UNKNOWN
+
     def __init__(self, path):
         self.path = Path(path)
         if self.path.is_file():
@@ -109,7 +111,7 @@ class StoredTrajectory(Exports):
         self.chunk: int = self.attributes["chunk"]
         self.record = Record.last_of(self.path)
         self.step, self.result, self.failed_at = self.record.step, Result(self.record.result), self.record.failed_at
-        self._origin = Origin.from_file(self.attributes.get("names"))
+        self.origin = Origin.from_file(self.attributes.get("names"))
 
     def __repr__(self) -> str:
         state = "complete" if self.complete else "not complete" if self.success else f"failed: {self.result.name}"
@@ -121,10 +123,6 @@ class StoredTrajectory(Exports):
         title = f"StoredTrajectory {self.path}: {len(self)} saved nodes, one every {self.save_every} macro steps"
         return summary(title, lines)
 
-    @property
-    def origin(self) -> Origin:
-        return self._origin
-
     def of(self, moving: System | Problem | HasProblem) -> "StoredTrajectory":
         """The same run with its system, see `Trajectory.of`."""
         return self.with_origin(self[:1].of(moving).origin)
@@ -132,7 +130,7 @@ class StoredTrajectory(Exports):
     def with_origin(self, origin: Origin) -> "StoredTrajectory":
         """The same run with another origin."""
         stored = copy(self)
-        stored._origin = origin
+        stored.origin = origin
         return stored
 
     @property

@@ -12,6 +12,7 @@ from vmri_jax.mechanics.state import Movable, State
 from vmri_jax.refusals import Refused
 from vmri_jax.running.arguments import Save, refuse_tracers
 from vmri_jax.running.export import DIMENSIONS, rows_of
+from vmri_jax.running.failures import simulation_error
 from vmri_jax.running.files import explained
 from vmri_jax.running.interrupts import Interrupted, interrupts_noted
 from vmri_jax.running.observables import Observables, observables
@@ -111,7 +112,8 @@ def stream(
                 raise Interrupted(StoredTrajectory(path), step, num_steps, "macro steps")
     stored = StoredTrajectory(path)
     stored = stored.with_origin(run.origin) if len(stored) else stored
-    run.raise_failure(stored)
+    if not stored.success:
+        raise simulation_error(run, stored)
     return stored
 
 
