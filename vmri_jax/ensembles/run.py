@@ -14,7 +14,7 @@ import numpy as np
 from vmri_jax.ensembles.design import Chunks, Design, Draws, Product, Rows, Table, Vary
 from vmri_jax.ensembles.quantities import Saved
 from vmri_jax.ensembles.reading import LANE, open_ensemble
-from vmri_jax.ensembles.work import AnyScheme, Work, attributes_of, prepared
+from vmri_jax.ensembles.work import AnyScheme, Work, prepared
 from vmri_jax.executors.executor import NotAWorker, as_done, executor_of, submitter
 from vmri_jax.mechanics.arrays import require_x64, whole_number
 from vmri_jax.mechanics.checks import check_type
@@ -211,8 +211,7 @@ def ensemble(
         num_saves=whole_number("ensemble: num_saves", num_saves),
         vary=vary,
     ).with_sources()
-    arrays, chunks, run = prepared(work, design, chunk)
-    attributes = attributes_of(work, design, run, chunks)
+    attributes, arrays, chunks = prepared(work, design, chunk)
     if resume and path.exists():
         stored = layout.read_attributes(path, "ensemble")
         # On another machine the default division may differ; files in the store have the old one.
