@@ -320,7 +320,7 @@ def test_lengths_of_runs_share_a_program(fpu, request):
 def test_pieces_of_a_run_make_the_whole(fpu, tsp, monkeypatch):
     """Short pieces: the same nodes, to the last bit, micro nodes too; and after a failure in one of them NaN to the end."""
     whole = simulate(fpu, fully_implicit(2), macro_dt=0.05, num_steps=36, save=vm.Save(2, micro=True))
-    monkeypatch.setattr("vmri_jax.running.saved.NUMBERS_PER_PIECE", 100)
+    monkeypatch.setattr("vmri_jax.running.simulation.NUMBERS_PER_PIECE", 100)
     pieces = simulate(fpu, fully_implicit(2), macro_dt=0.05, num_steps=36, save=vm.Save(2, micro=True))
     jax.tree.map(np.testing.assert_array_equal, whole, pieces)
 
@@ -347,7 +347,7 @@ def springs(q_s, q_f, params):
 
 def test_systems_of_the_same_functions_and_other_sizes(monkeypatch):
     """Pieces with room for as many nodes, which are of other sizes."""
-    monkeypatch.setattr("vmri_jax.running.saved.NUMBERS_PER_PIECE", 1)
+    monkeypatch.setattr("vmri_jax.running.simulation.NUMBERS_PER_PIECE", 1)
     for n_s, n_f in ((1, 2), (2, 1), (2, 2), (1, 2)):
         system = vm.System(vm.ConstantMass([1.0] * n_s, [1.0] * n_f), springs, None)
         problem = vm.Problem(system, q_s=[0.1] * n_s, q_f=[0.2] * n_f)

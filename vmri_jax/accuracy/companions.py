@@ -247,9 +247,9 @@ def resting(run: Simulation) -> Trajectory:
     """A trajectory at the times of a run that stays at the start, without micro nodes: an argument to try functions of runs on."""
     run = replace(run, save=Save())
     _, *phase = vars(run.state).values()
-    rows = np.zeros((run.num_saves + 1, run.columns.width))
-    rows[:, : run.columns.info.start] = np.concatenate(phase)
-    return run.columns.saved(rows, np.asarray(int(Result.CONVERGED)), np.asarray(-1)).trajectory(run)
+    row = np.concatenate([*phase, np.zeros(run.width - sum(map(len, phase)))])
+    rows, status = np.tile(row, (run.num_saves + 1, 1)), (np.asarray(int(Result.CONVERGED)), np.asarray(-1))
+    return Saved.of(rows, run.columns, *status).trajectory(run)
 
 
 def companion(run: Simulation, parts: int, whole: int = 1) -> Trajectory:

@@ -100,7 +100,7 @@ class Engine:
             return number + 1, cursor, jax.lax.dynamic_update_slice(rows, row[None], (number, 0))
 
         begin = jax.tree.map(jnp.asarray, begin._replace(memory=memory))
-        rows = jnp.zeros((self.num_saves + 1, run.columns.width))  # `jax_debug_nans` stops a program that returns NaN
+        rows = jnp.zeros((self.num_saves + 1, run.width))  # `jax_debug_nans` stops a program that returns NaN
         _, end, rows = jax.lax.while_loop(goes_on, save, (jnp.asarray(0), begin, rows))
         rows = self._observed(run, rows, begin.step, save_every, self.num_saves if saves is None else saves)
         return rows, jnp.stack([end.result, end.failed_at]) if cursor is None else end
@@ -113,7 +113,7 @@ class Engine:
             first = jnp.minimum(i * size, self.num_saves + 1 - size)
             number = first + jnp.arange(size)
             existing = jnp.minimum(number, saves)  # beyond the last node there may be no state
-            saved = _as_saved(run, run.columns.saved(rows[existing], 0, -1), step + existing * save_every)
+            saved = _as_saved(run, Saved.of(rows[existing], run.columns, 0, -1), step + existing * save_every)
             new = jnp.concatenate(saved[: len(run.columns)], axis=-1)
             # the last block may overlap the block before, whose nodes are projected already
             is_new = (number >= i * size) & (number <= saves)
@@ -140,7 +140,7 @@ class Engine:
             cursor = Cursor.at_start(run.state, stepper.init(run.state, run.macro_dt))
             cursor, rows = loops.scan(save, jax.tree.map(jnp.asarray, cursor), self.num_saves, in_parts, save_every)
             first = _row(run.state, *_nothing(run))
-            return run.columns.saved(jnp.concatenate([first[None], rows]), cursor.result, cursor.failed_at)
+            return Saved.of(jnp.concatenate([first[None], rows]), run.columns, cursor.result, cursor.failed_at)
 
         return jax.jit(by_scan, static_argnums=1)
 

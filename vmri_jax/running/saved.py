@@ -17,51 +17,27 @@ from vmri_jax.running.observables import Observables
 from vmri_jax.running.trajectory import MicroNodes, RunInfo, Trajectory, status
 from vmri_jax.steppers.results import Result
 
-NUMBERS_PER_PIECE = 2**15
-"""Numbers in the nodes of a piece of a run, 256 kB. With a larger value short runs wait for memory that they do not use; a smaller one divides
-long runs into more calls of some 50 microseconds each."""
 BYTES_PER_NUMBER = 8
 UNCHECKED_BYTES = 100e6
 """Bytes of a trajectory up to which free memory is not looked up: the look-up takes some ten microseconds, as long as a short run. With a
 larger value more runs may fill a small machine."""
 
 
-class Columns(NamedTuple):
-    """Columns of a row: positions and momenta of the `State`; `RunInfo` of the steps since the node before, and fast positions at the micro nodes of
-    the last of them; `Observables` of the state."""
-
-    q_s: slice
-    q_f: slice
-    p_s: slice
-    p_f: slice
-    info: slice
-    micro: slice
-    observables: slice
-
-    @classmethod
-    def of(cls, state: State, num_micro: int = 0) -> "Columns":
-        """The columns of nodes shaped like a state, or like the states of a batch, with `num_micro` saved micro nodes."""
-        n_s, n_f = state.q_s.shape[-1], state.q_f.shape[-1]
-        sizes = n_s, n_f, n_s, n_f, len(RunInfo._fields), num_micro * n_f, len(Observables._fields)
-        return cls(*(slice(*ends) for ends in pairwise(accumulate(sizes, initial=0))))
-
-    @property
-    def width(self) -> int:
-        """Numbers of a row."""
-        return self.observables.stop
-
-    @property
-    def saves_of_a_piece(self) -> int:
-        """Saved intervals of a piece of a run, the same for runs of all lengths, so that they share one program."""
-        return max(NUMBERS_PER_PIECE // self.width, 1)
-
-    def saved(self, rows, result, failed_at) -> "Saved":
-        """Rows of a program, column by column, with the status of their run."""
-        return Saved._make([*(rows[..., columns] for columns in self), result, failed_at])
+def columns_of(state: State, num_micro: int) -> tuple[slice, ...]:
+    """The columns of a row, in the order of `Saved`, of nodes shaped like a state, or like the states of a batch, with `num_micro` saved micro nodes."""
+    n_s, n_f = state.q_s.shape[-1], state.q_f.shape[-1]
+    sizes = n_s, n_f, n_s, n_f, len(RunInfo._fields), num_micro * n_f, len(Observables._fields)
+    return tuple(slice(*ends) for ends in pairwise(accumulate(sizes, initial=0)))
 
 
 class Saved(NamedTuple):
-    """Nodes of a run by `Columns`, (k, ...) each, and its status, of JAX or NumPy; in a batch with lanes."""
+    """Nodes of a run, (k, ...) each, and its status, of JAX or NumPy; in a batch with lanes.
+
+    q_s, q_f, p_s, p_f: positions and momenta, as of a `State`.
+    info: `RunInfo` of the steps since the node before.
+    micro: fast positions at the micro nodes of the last of these steps.
+    table: `Observables` of the state.
+    """
 
     q_s: Any
     q_f: Any
@@ -72,6 +48,11 @@ class Saved(NamedTuple):
     table: Any
     result: Int[Numbers, ""]
     failed_at: Int[Numbers, ""]
+
+    @classmethod
+    def of(cls, rows, columns: tuple[slice, ...], result, failed_at) -> "Saved":
+        """Rows of a program, column by column, with the status of their run."""
+        return cls._make([*(rows[..., column] for column in columns), result, failed_at])
 
     def marked(self, save_every: int, step: int = 0) -> "Saved":
         """The nodes, NaN from a failure on; a node that cannot be right is a failure.
@@ -133,7 +114,7 @@ def check_memory(caller: str, run: Any, lanes: int = 1, num_saves: int | None = 
     """Refuse runs side by side, with `num_saves` intervals each, None for those of `run`, that would not fit into the
     free memory; `caller` begins the message."""
     nodes = 1 + (num_saves or run.num_saves)
-    needed = BYTES_PER_NUMBER * run.columns.width * nodes * lanes
+    needed = BYTES_PER_NUMBER * run.width * nodes * lanes
     if needed < UNCHECKED_BYTES:
         return
     free = psutil.virtual_memory().available

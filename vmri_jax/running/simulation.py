@@ -37,12 +37,15 @@ from vmri_jax.running.interrupts import Interrupted, interrupts_noted
 from vmri_jax.running.observables import concerns
 from vmri_jax.running.origin import Origin, names_of
 from vmri_jax.running.progress import Working, progress_to
-from vmri_jax.running.saved import Columns, Saved, joined
+from vmri_jax.running.saved import Saved, columns_of, joined
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes.composition import SchemeLike
 from vmri_jax.steppers.plan import Plan, plan, with_rules_for
 from vmri_jax.steppers.solver import Solver
 
+NUMBERS_PER_PIECE = 2**15
+"""Numbers in the nodes of a piece of a run, 256 kB. With a larger value short runs wait for memory that they do not use; a smaller one divides
+long runs into more calls of some 50 microseconds each."""
 PARTS_OF_A_BAR = 50
 """Parts of a run with a progress bar. More parts move the bar more smoothly, and each costs a call of some 30 microseconds."""
 STEPPING = "stepping"
@@ -162,7 +165,7 @@ class Simulation:
         """The run by one program, without the fallback."""
         rows, status = self.engine.program(self.leaves, self.save_every, self.num_saves)
         status = np.asarray(status)
-        return self.columns.saved(np.asarray(rows), status[..., 0], status[..., 1]).marked(self.save_every)
+        return Saved.of(np.asarray(rows), self.columns, status[..., 0], status[..., 1]).marked(self.save_every)
 
     def traced(self) -> Trajectory:
         """All steps of a run, some of whose arrays are tracers."""
@@ -229,9 +232,14 @@ class Simulation:
         return self.num_steps // self.save_every
 
     @cached_property
-    def columns(self) -> Columns:
+    def columns(self) -> tuple[slice, ...]:
         """The columns of its saved nodes."""
-        return Columns.of(self.state, self.scheme.num_micro if self.save.micro else 0)
+        return columns_of(self.state, self.scheme.num_micro if self.save.micro else 0)
+
+    @property
+    def width(self) -> int:
+        """Numbers of a saved node."""
+        return self.columns[-1].stop
 
     @cached_property
     def plan(self) -> Plan:
@@ -255,8 +263,8 @@ class Simulation:
 
     @cached_property
     def _pieces(self) -> Engine:
-        """Its programs for pieces, of a size for runs of all lengths, without the fallback."""
-        return self._engine(self.columns.saves_of_a_piece)
+        """Its programs for pieces, of a size for runs of all lengths, which then share them, without the fallback."""
+        return self._engine(max(NUMBERS_PER_PIECE // self.width, 1))
 
     @cached_property
     def blank_memory(self) -> Any:
@@ -304,7 +312,7 @@ class Simulation:
             cursor = cursor._replace(memory=self.blank_memory)
         rows, cursor = self._pieces.program(self.leaves, self.save_every, saves, cursor, is_first)
         nodes = np.array(np.asarray(rows)[: saves + 1])  # a copy, which holds no memory of a whole piece
-        saved = self.columns.saved(nodes, np.asarray(cursor.result), np.asarray(cursor.failed_at))
+        saved = Saved.of(nodes, self.columns, np.asarray(cursor.result), np.asarray(cursor.failed_at))
         saved = saved.marked(self.save_every, step)
         reached = np.asarray(step + saves * self.save_every)
         return saved, cursor._replace(step=reached, result=saved.result, failed_at=saved.failed_at)
@@ -333,8 +341,8 @@ class Simulation:
                 piece, cursor, run = run.advance(cursor, min(size, self.num_saves - done))
                 pieces.append(piece)
                 if interrupted():
-                    done = joined(pieces).trajectory(self)
-                    raise Interrupted(done, int(cursor.step), self.num_steps, "macro steps")
+                    so_far = joined(pieces).trajectory(self)
+                    raise Interrupted(so_far, int(cursor.step), self.num_steps, "macro steps")
         return joined(pieces)
 
 

@@ -18,7 +18,7 @@ from vmri_jax.running.interrupts import Interrupted, interrupts_noted
 from vmri_jax.running.observables import Observables, observables
 from vmri_jax.running.origin import at_nodes
 from vmri_jax.running.progress import Progress, progress_to
-from vmri_jax.running.saved import BYTES_PER_NUMBER
+from vmri_jax.running.saved import BYTES_PER_NUMBER, Saved
 from vmri_jax.running.simulation import Simulation, simulation
 from vmri_jax.running.store import layout
 from vmri_jax.running.store.identity import check_same, environment, identity
@@ -93,7 +93,7 @@ def stream(
     }
     attributes |= {} if drawing is None else {"drawing": drawing}
     attributes |= {} if run.names is None else {"names": run.names.to_dict()}
-    two_nodes = run.columns.saved(np.zeros((2, run.columns.width)), np.asarray(0), np.asarray(-1)).trajectory(run)
+    two_nodes = Saved.of(np.zeros((2, run.width)), run.columns, np.asarray(0), np.asarray(-1)).trajectory(run)
     arrays = {name: Kept(rows[0], DIMENSIONS[name][1:]) for name, rows in rows_of(two_nodes).items()}
     with (
         interrupts_noted() as interrupted,
@@ -165,5 +165,5 @@ def _advice(step: int) -> str:
 def _chunk(run: Simulation) -> int:
     """Saved intervals per chunk where the user gives none."""
     seconds = MICRO_STEP_SECONDS * run.scheme.num_micro * run.save_every
-    rows = layout.rows_per_chunk(run.num_saves, seconds, BYTES_PER_NUMBER * run.columns.width, CHUNKS_PER_RUN)
+    rows = layout.rows_per_chunk(run.num_saves, seconds, BYTES_PER_NUMBER * run.width, CHUNKS_PER_RUN)
     return max(1, min(int(rows), run.num_saves))
