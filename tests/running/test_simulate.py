@@ -341,6 +341,15 @@ def test_pieces_of_a_run_make_the_whole(fpu, tsp, monkeypatch):
     np.testing.assert_allclose(failed.t, 0.01 * np.arange(61), rtol=1e-15)
 
 
+def test_a_single_step_ends_as_a_run_does():
+    """Beyond the pole of a logarithm, where forces are numbers and the energy is none."""
+    system = System(ConstantMass([], [1.0]), fast_potential=lambda q_f, params: 1e-3 * jnp.log(1.0 - q_f[0]))
+    state = initial_state(system, [], [0.9], [], [10.0])
+    _, info = macro_step(system, fully_explicit(1), state, 0.1)
+    assert info.result == until_failure(system, fully_explicit(1), state, macro_dt=0.1, num_steps=1).result
+    assert info.result == Result.NON_FINITE
+
+
 def springs(q_s, q_f, params):
     return jnp.sum(q_s**2) / 2 + jnp.sum(q_f**2) / 2 + jnp.sum(q_s) * jnp.sum(q_f) / 10
 

@@ -93,9 +93,8 @@ class Engine:
 
         def save(loop):
             number, cursor, rows = loop
-            is_later = number > 0  # turn 0 saves the start, so that the code for nodes is compiled once
-            moved, info, micro = interval(cursor, jnp.where(is_later, save_every, 0))
-            cursor = jax.tree.map(lambda a, b: a if a is b else jnp.where(is_later, a, b), moved, cursor)
+            # turn 0 takes no step and saves the start, so that the code for nodes is compiled once
+            cursor, info, micro = interval(cursor, jnp.where(number > 0, save_every, 0))
             row = _row(cursor.state, info, micro)
             return number + 1, cursor, jax.lax.dynamic_update_slice(rows, row[None], (number, 0))
 

@@ -55,27 +55,20 @@ class Saved(NamedTuple):
         return cls._make([*(rows[..., column] for column in columns), result, failed_at])
 
     def marked(self, save_every: int, step: int = 0) -> "Saved":
-        """The nodes, NaN from a failure on; a node that cannot be right is a failure.
-
-        A node may be wrong although its steps succeeded, for four reasons: the energy is not finite although its gradient is (a logarithm beyond
-        its pole); a lane of a batch started off its constraints; the rows of ``system.implied``, redundant constraints that the solver leaves
-        out, are violated; or a stepper of the user leaves the constraints. The last step before the first such node counts as the failed one.
+        """The nodes, NaN from a failure on; a node that cannot be right, see `is_right`, is a failure, of the last step before it.
 
         Nodes after a failed step may have any numbers. There are `step` macro steps before the first node.
         """
         *columns, result, failed_at = self
         module, now = library(self), Observables.of(self.table)
-        right = module.isfinite(now.energy) & (now.solved > 0) & (now.implied > 0)
+        right = is_right(now)
         # a prepared run is called many times, and an operation of JAX takes as long as many steps
         if module is np and right.all() and (failed_at < 0).all():
             return self
         node, num_nodes = right.argmin(axis=-1), right.shape[-1]
         after_step = module.where(failed_at < 0, num_nodes, (failed_at - step) // save_every + 1)
         breaks = ~right.all(axis=-1) & (node < after_step)
-        energy, solved = (module.take_along_axis(a, node[..., None], -1)[..., 0] for a in (now.energy, now.solved))
-        # If the solved rows are kept, the implied rows are to blame.
-        violated = module.where(solved > 0, int(Result.NOT_IMPLIED), int(Result.CONSTRAINT_VIOLATED))
-        cause = module.where(module.isfinite(energy), violated, int(Result.NON_FINITE))
+        cause = module.take_along_axis(fault(now), node[..., None], -1)[..., 0]
         number = np.arange(num_nodes)[:, None]
         lost = number >= module.where(breaks, node, after_step)[..., None, None]
         unreached = number > module.where(breaks, num_nodes, after_step)[..., None, None]
@@ -100,6 +93,23 @@ class Saved(NamedTuple):
         return Trajectory(
             states, table[..., 0], table[..., 1:3], info, status(result), failed_at, micro, origin=run.origin
         )
+
+
+def is_right(now: Observables) -> Any:
+    """Whether nodes may be right.
+
+    A node may be wrong although its steps succeeded, for four reasons: the energy is not finite although its gradient is (a logarithm beyond
+    its pole); a lane of a batch started off its constraints; the rows of ``system.implied``, redundant constraints that the solver leaves
+    out, are violated; or a stepper of the user leaves the constraints.
+    """
+    return library(now.energy).isfinite(now.energy) & (now.solved > 0) & (now.implied > 0)
+
+
+def fault(now: Observables) -> Any:
+    """The `Result` of nodes that are not right; if the solved rows are kept, the implied rows are to blame."""
+    module = library(now.energy)
+    violated = module.where(now.solved > 0, int(Result.NOT_IMPLIED), int(Result.CONSTRAINT_VIOLATED))
+    return module.where(module.isfinite(now.energy), violated, int(Result.NON_FINITE))
 
 
 def joined(pieces: list[Saved]) -> Saved:
