@@ -121,8 +121,7 @@ class Compared:
     @cached_property
     def error(self) -> float:
         """The largest error; infinite unless all errors are certified."""
-        certified, _ = certified_nodes(self.trajectory, self.errors)
-        return float(largest_of(self.errors).max()) if certified.all() else np.inf
+        return run_error(self).largest
 
 
 def told_error(compared: Compared, of: Callable | None = None, shares: bool = False) -> Any:
