@@ -72,7 +72,7 @@ class Engine:
         return jax.jit(self.steps, compiler_options=options_of_runs())
 
     def steps(self, leaves: list, save_every, saves=None, cursor: Cursor | None = None, is_first: Any = True):
-        """The first `saves` saved intervals: an array of `Saved` rows, and the cursor after them.
+        """The first `saves` saved intervals: an array of `Saved` rows, longer than them by a part of a block, and the cursor after them.
 
         `saves` None: all intervals, failed or not. The end of the loop then depends on no lane of a batch, and
         `jax.vmap` need not select between old and new values in every lane.
@@ -99,27 +99,27 @@ class Engine:
             return number + 1, cursor, jax.lax.dynamic_update_slice(rows, row[None], (number, 0))
 
         begin = jax.tree.map(jnp.asarray, begin._replace(memory=memory))
-        rows = jnp.zeros((self.num_saves + 1, run.width))  # `jax_debug_nans` stops a program that returns NaN
+        room = (self.num_saves // self._block + 1) * self._block  # of whole blocks
+        rows = jnp.zeros((room, run.width))  # `jax_debug_nans` stops a program that returns NaN
         _, end, rows = jax.lax.while_loop(goes_on, save, (jnp.asarray(0), begin, rows))
         rows = self._observed(run, rows, begin.step, save_every, self.num_saves if saves is None else saves)
         return rows, jnp.stack([end.result, end.failed_at]) if cursor is None else end
 
+    @property
+    def _block(self) -> int:
+        """Nodes whose observables are computed side by side."""
+        return min(NODES_AT_ONCE, self.num_saves + 1)
+
     def _observed(self, run, rows, step, save_every, saves):
-        """The rows as they are saved, of blocks of `NODES_AT_ONCE` nodes side by side, up to the node `saves`."""
-        size = min(NODES_AT_ONCE, self.num_saves + 1)
+        """The rows as they are saved, block by block, up to the node `saves`, and copies of this node up to the end of its block."""
 
         def block(i, rows):
-            first = jnp.minimum(i * size, self.num_saves + 1 - size)
-            number = first + jnp.arange(size)
-            existing = jnp.minimum(number, saves)  # beyond the last node there may be no state
-            saved = _as_saved(run, Saved.of(rows[existing], run.columns, 0, -1), step + existing * save_every)
-            new = jnp.concatenate(saved[: len(run.columns)], axis=-1)
-            # the last block may overlap the block before, whose nodes are projected already
-            is_new = (number >= i * size) & (number <= saves)
-            old = jax.lax.dynamic_slice(rows, (first, 0), new.shape)
-            return jax.lax.dynamic_update_slice(rows, jnp.where(is_new[:, None], new, old), (first, 0))
+            number = jnp.minimum(i * self._block + jnp.arange(self._block), saves)  # beyond it there may be no state
+            saved = _as_saved(run, Saved.of(rows[number], run.columns, 0, -1), step + number * save_every)
+            row = jnp.concatenate(saved[: len(run.columns)], axis=-1)
+            return jax.lax.dynamic_update_slice(rows, row, (i * self._block, 0))
 
-        return jax.lax.fori_loop(0, saves // size + 1, block, rows)
+        return jax.lax.fori_loop(0, saves // self._block + 1, block, rows)
 
     @cached_property
     def differentiable(self):

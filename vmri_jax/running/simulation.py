@@ -163,9 +163,10 @@ class Simulation:
 
     def _whole(self) -> Saved:
         """The run by one program, without the fallback."""
-        rows, status = self.engine.program(self.leaves, self.save_every, self.num_saves)
-        status = np.asarray(status)
-        return Saved.of(np.asarray(rows), self.columns, status[..., 0], status[..., 1]).marked(self.save_every)
+        rows, status = map(np.asarray, self.engine.program(self.leaves, self.save_every, self.num_saves))
+        return Saved.of(rows[: self.num_saves + 1], self.columns, status[..., 0], status[..., 1]).marked(
+            self.save_every
+        )
 
     def traced(self) -> Trajectory:
         """All steps of a run, some of whose arrays are tracers."""
