@@ -68,9 +68,8 @@ def _in_chunks(run: Simulation, leaves: list, lanes: np.ndarray, width: int, dev
         chosen = lanes[np.minimum(np.arange(start, start + width), len(lanes) - 1)]
         chunks.append(program([a[0] if is_repeated(a) else a[chosen] for a in leaves], run.save_every))
     rows, status = jax.tree.map(lambda *parts: np.concatenate(parts)[: len(lanes)], *chunks)
-    return Saved.of(rows[:, : run.num_saves + 1], run.columns, status[..., 0].copy(), status[..., 1].copy()).marked(
-        run.save_every
-    )
+    saved = Saved.of(rows[:, : run.num_saves + 1], run.columns, *np.moveaxis(status, -1, 0).copy())
+    return saved.marked(run.save_every)
 
 
 def batch(

@@ -164,9 +164,8 @@ class Simulation:
     def _whole(self) -> Saved:
         """The run by one program, without the fallback."""
         rows, status = map(np.asarray, self.engine.program(self.leaves, self.save_every, self.num_saves))
-        return Saved.of(rows[: self.num_saves + 1], self.columns, status[..., 0], status[..., 1]).marked(
-            self.save_every
-        )
+        saved = Saved.of(rows[: self.num_saves + 1], self.columns, status[..., 0], status[..., 1])
+        return saved.marked(self.save_every)
 
     def traced(self) -> Trajectory:
         """All steps of a run, some of whose arrays are tracers."""
