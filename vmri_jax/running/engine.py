@@ -28,9 +28,9 @@ from vmri_jax.running import loops
 from vmri_jax.running.loops import MOST_STORED_NUMBERS
 from vmri_jax.running.observables import observed
 from vmri_jax.running.saved import Saved
-from vmri_jax.running.trajectory import RunInfo
 from vmri_jax.steppers.plan import Plan
 from vmri_jax.steppers.results import Method, Result
+from vmri_jax.steppers.stepper import StepStatus
 
 FALLING_BACK = 'a step was not solved: computing its part of the run again with exact matrices (matrix "exact"), as accurate but slower'
 """Line about a fallback that takes more than two seconds."""
@@ -94,8 +94,8 @@ class Engine:
         def save(loop):
             number, cursor, rows = loop
             # turn 0 takes no step and saves the start, so that the code for nodes is compiled once
-            cursor, info, micro = interval(cursor, jnp.where(number > 0, save_every, 0))
-            row = _row(cursor.state, info, micro)
+            cursor, worst, micro = interval(cursor, jnp.where(number > 0, save_every, 0))
+            row = _row(cursor.state, worst, micro)
             return number + 1, cursor, jax.lax.dynamic_update_slice(rows, row[None], (number, 0))
 
         begin = jax.tree.map(jnp.asarray, begin._replace(memory=memory))
@@ -133,8 +133,8 @@ class Engine:
             interval = _interval(stepper, run, partial(loops.differentiable, in_parts=in_parts))
 
             def save(cursor: Cursor, _):
-                cursor, info, micro = interval(cursor, save_every)
-                return cursor, _row(cursor.state, info, micro)
+                cursor, worst, micro = interval(cursor, save_every)
+                return cursor, _row(cursor.state, worst, micro)
 
             cursor = Cursor.at_start(run.state, stepper.init(run.state, run.macro_dt))
             cursor, rows = loops.scan(save, jax.tree.map(jnp.asarray, cursor), self.num_saves, in_parts, save_every)
@@ -182,20 +182,20 @@ def _as_saved(run, saved: Saved, steps) -> Saved:
     return saved._replace(p_s=p_s, p_f=p_f, table=table)
 
 
-def _row(state: State, info: RunInfo, micro) -> Float[Numbers, "numbers"]:
-    """The row of a node before its observables."""
+def _row(state: State, worst: StepStatus, micro) -> Float[Numbers, "numbers"]:
+    """The row of a node before its observables; of the steps before it the largest `RunInfo`."""
     phase = state.q_s, state.q_f, state.p_s, state.p_f
-    return jnp.concatenate([*phase, *(jnp.asarray(a, float)[None] for a in info), micro.reshape(-1)])
+    return jnp.concatenate([*phase, *(jnp.asarray(a, float)[None] for a in worst[1:]), micro.reshape(-1)])
 
 
-def _nothing(run) -> tuple[RunInfo, Any]:
-    """The work of the solver, and the micro nodes, before the first step."""
+def _nothing(run) -> tuple[StepStatus, Any]:
+    """The status of the steps, and the micro nodes, before the first step."""
     num_micro = run.scheme.num_micro if run.save.micro else 0
-    return RunInfo(np.asarray(0), np.asarray(0), np.zeros(())), jnp.zeros((num_micro, run.state.q_f.shape[0]))
+    return StepStatus.direct(Method.EXPLICIT), jnp.zeros((num_micro, run.state.q_f.shape[0]))
 
 
 def _interval(stepper: Plan, run, repeat: Callable):
-    """``cursor, info, micro = interval(cursor, count)``: the `count` macro steps between two saved nodes."""
+    """``cursor, worst, micro = interval(cursor, count)``: the `count` macro steps between two saved nodes."""
     t_start, macro_dt = run.state.t, run.macro_dt
 
     def step(_, carry):
@@ -203,19 +203,18 @@ def _interval(stepper: Plan, run, repeat: Callable):
         alive = cursor.failed_at < 0
         state, info, memory = stepper.step(cursor.state, cursor.memory, macro_dt)
         ok = alive & (info.result <= Result.CONVERGED_AT_ROUNDOFF)
-        info_of_step = RunInfo(info.method, info.iterations, info.residual)
-        worst = jax.tree.map(lambda a, b: jnp.where(alive, jnp.maximum(a, b), a), worst, info_of_step)
+        worst = jax.tree.map(lambda a, b: jnp.where(alive, jnp.maximum(a, b), a), worst, info.status)
         # NaN in the momenta alone: the next step carries it into all positions.
         p_s, p_f = (jnp.where(ok, p, jnp.nan) for p in (state.p_s, state.p_f))
         # t_k = t_0 + k H from the step number, since a sum of steps would accumulate round-off; the time of the stepper is ignored.
         state = State(t_start + (cursor.step + 1) * macro_dt, state.q_s, state.q_f, p_s, p_f)
-        result = jnp.where(alive, jnp.maximum(cursor.result, info.result), cursor.result)
         failed_at = jnp.where(alive & ~ok, cursor.step, cursor.failed_at)
         micro = jnp.where(ok, info.q_f_micro, jnp.nan) if run.save.micro else micro
-        return Cursor(state, memory, cursor.step + 1, result, failed_at), worst, micro
+        return Cursor(state, memory, cursor.step + 1, cursor.result, failed_at), worst, micro
 
     def interval(cursor: Cursor, count):
-        return repeat(count, step, (cursor, *_nothing(run)))
+        cursor, worst, micro = repeat(count, step, (cursor, *_nothing(run)))
+        return cursor._replace(result=jnp.maximum(cursor.result, worst.result)), worst, micro
 
     return interval
 
