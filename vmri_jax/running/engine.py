@@ -25,7 +25,6 @@ from jaxtyping import Float, Int
 from vmri_jax.mechanics.arrays import Numbers, options_of_runs
 from vmri_jax.mechanics.state import State
 from vmri_jax.running import loops
-from vmri_jax.running.loops import MOST_STORED_NUMBERS
 from vmri_jax.running.observables import observed
 from vmri_jax.running.saved import Saved
 from vmri_jax.steppers.plan import Plan
@@ -129,7 +128,7 @@ class Engine:
         def by_scan(leaves: list, save_every: int) -> Saved:
             run: Any = jax.tree.unflatten(self.structure, leaves)
             numbers = sum(a.size for a in jax.tree.leaves(run.state)) * run.scheme.num_micro  # of a step, about
-            in_parts, stepper = self.num_saves * save_every * numbers > MOST_STORED_NUMBERS, run.plan
+            in_parts, stepper = self.num_saves * save_every * numbers > loops.MOST_STORED_NUMBERS, run.plan
             interval = _interval(stepper, run, partial(loops.differentiable, in_parts=in_parts))
 
             def save(cursor: Cursor, _):

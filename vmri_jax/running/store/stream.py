@@ -130,13 +130,8 @@ def _continue(stored: StoredTrajectory, run: Simulation, tell: Progress) -> Iter
     with explained(path, _advice(record.step)):
         writer = layout.Writer(path)
     # The start and the largest values so far, as a node before each chunk but the first: energies are compared with the start of the run.
-    start, before, has_warned = (
-        jax.tree.map(lambda a: a[None], run.state),
-        np.zeros((0, len(Observables._fields))),
-        False,
-    )
-    if record.saved:
-        before = at_nodes(observables, run.origin, start)
+    start, has_warned = jax.tree.map(lambda a: a[None], run.state), False
+    before = at_nodes(observables, run.origin, start) if record.saved else np.zeros((0, len(Observables._fields)))
     while record.saved < rows and record.failed_at < 0:
         tell("simulating", record.saved, rows)
         # Every write but the last ends at a multiple of `chunk` rows, so that no file is written twice.
