@@ -12,6 +12,7 @@ import pytest
 import vmri_jax as vm
 from vmri_jax.running.engine import Cursor, _interval
 from vmri_jax.running.loops import plain
+from vmri_jax.running.origin import _at_all
 from vmri_jax.scene import Body, Scene, SpringAnchor
 
 EXPLICIT, MIDPOINT = vm.fully_explicit(1), vm.fully_implicit(1)
@@ -179,6 +180,14 @@ def test_every_road_says_that_the_momenta_of_the_start_are_projected(road, tmp_p
     pushed = PushedStart(moving.system, moving.q_s, moving.q_f, moving.v_s, moving.v_f)
     with pytest.warns(UserWarning, match="off the hidden constraints, by 0.5 where the largest of them is 1;"):
         road(pushed, EXPLICIT, {"macro_dt": 0.01, "num_steps": 40}, tmp_path / "run.zarr")
+
+
+def test_no_road_computes_observables_again(tmp_path):
+    """The first chunk of a store, and the trial that an accuracy chooses, have the observables of their nodes."""
+    moving, asked = problem(of_masses(1.0), potential, [1.0], [0.0]), _at_all.cache_info()
+    vm.stream(moving, EXPLICIT, macro_dt=0.01, num_steps=20, out=tmp_path / "run.zarr")
+    vm.simulate(moving, EXPLICIT, accuracy=1e-3, t_end=0.4)
+    assert _at_all.cache_info() == asked
 
 
 @pytest.mark.filterwarnings("ignore::vmri_jax.SingularCoordinatesWarning")
