@@ -13,7 +13,6 @@ import vmri_jax as vm
 from vmri_jax import plots
 from vmri_jax.accuracy.companions import resting
 from vmri_jax.mechanics.names import Names
-from vmri_jax.running.arguments import Steps
 from vmri_jax.running.origin import Origin
 from vmri_jax.running.simulation import simulation
 from vmri_jax.running.trajectory import RunInfo
@@ -269,7 +268,7 @@ def sliding_door():
     rail = vm.scene.Prismatic(("ground", "cart"), at=[0.0, 0.0, 0.0], axis=[1.0, 0.0, 0.0], name="rail")
     hinge = vm.scene.Revolute(("cart", "door"), at=[0.5, 0.0, 0.0], axis=[0.0, 0.0, 1.0], name="hinge")
     scene = vm.scene.Scene([cart, door], [rail, hinge])
-    return resting(simulation(scene, vm.fully_implicit(1), None, None, Steps(0.1, num_steps=4)))
+    return resting(simulation(scene, vm.fully_implicit(1), None, None, 0.1, num_steps=4))
 
 
 def test_angles_and_lengths_have_panels_of_their_own(sliding_door):

@@ -99,7 +99,7 @@ def test_steps_beside_resonances():
     """A slow kick once in half a turn of the fast oscillator is resonant; a few percent more steps are not."""
     problem, length, family = linear_model(omega=50.0, kappa=25.0), 20.0, of_order_2(vm.explicit_slow)
     trials = search.Search(problem, length)
-    trial = trials.trial(family, 40, 2048)
+    trial = trials.trial(replace(family, first=40), 2048)
     assert trial.steps_for(trial.error / 4) == 2 * trial.run.num_steps
     assert trial.steps_for(trial.error / 4, order=1) == 4 * trial.run.num_steps
     resonant = round(length / 0.0625)  # within the window from 0.06223 to 0.06286 of `vmri_jax.stability.advise`
@@ -118,7 +118,7 @@ def test_steps_that_miss_the_accuracy_are_not_the_last(monkeypatch):
 
     monkeypatch.setattr(Trial, "steps_for", too_few_at_first)
     trials = search.Search(SYSTEMS["no_constraint"], LENGTH)
-    trial = trials.accurate(trials.trial(of_order_2(vm.fully_explicit), 2, 64), 1e-4)
+    trial = trials.accurate(trials.trial(replace(of_order_2(vm.fully_explicit), first=2), 64), 1e-4)
     assert 0 < trial.error <= 1e-4
     assert len(told) == 2
 

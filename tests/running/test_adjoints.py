@@ -94,7 +94,7 @@ def in_parts(monkeypatch):
 
     def divide(most_undivided: int = 3):
         monkeypatch.setattr(loops, "MOST_UNDIVIDED", most_undivided)
-        monkeypatch.setattr(engine, "MOST_STORED_NUMBERS", 0)
+        monkeypatch.setattr(loops, "MOST_STORED_NUMBERS", 0)
         engine.engine.cache_clear()  # programs without parts
 
     yield divide

@@ -67,7 +67,7 @@ STEPS = {"macro_dt": 0.1, "num_steps": 5}
 def debug_nans(monkeypatch):
     """`jax_debug_nans`, which must not stop sound runs; and adjoints in parts in short runs."""
     monkeypatch.setattr(loops, "MOST_UNDIVIDED", 3)
-    monkeypatch.setattr(engine, "MOST_STORED_NUMBERS", 0)
+    monkeypatch.setattr(loops, "MOST_STORED_NUMBERS", 0)
     engine.engine.cache_clear()  # programs without parts
     with jax.debug_nans(True):
         yield

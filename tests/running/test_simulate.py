@@ -25,6 +25,7 @@ from vmri_jax import (
     plan,
     simulate,
 )
+from vmri_jax.running.engine import Cursor
 from vmri_jax.scene import Body, Scene, Spring
 
 SCHEME = fully_explicit(3)
@@ -319,15 +320,15 @@ def test_lengths_of_runs_share_a_program(fpu, request):
 def test_pieces_of_a_run_make_the_whole(fpu, tsp, monkeypatch):
     """Short pieces: the same nodes, to the last bit, micro nodes too; and after a failure in one of them NaN to the end."""
     whole = simulate(fpu, fully_implicit(2), macro_dt=0.05, num_steps=36, save=vm.Save(2, micro=True))
-    monkeypatch.setattr("vmri_jax.running.saved.NUMBERS_PER_PIECE", 100)
+    monkeypatch.setattr("vmri_jax.running.simulation.NUMBERS_PER_PIECE", 100)
     pieces = simulate(fpu, fully_implicit(2), macro_dt=0.05, num_steps=36, save=vm.Save(2, micro=True))
     jax.tree.map(np.testing.assert_array_equal, whole, pieces)
 
     # each piece starts with the saved node at which the one before ends, momenta on the hidden constraints
     constrained = vm.prepare(tsp, fully_explicit(2), macro_dt=0.02, num_steps=8, save=2)
-    first, checkpoint = constrained.advance(constrained.start(), 2)
-    second, _ = constrained.advance(checkpoint, 2)
-    np.testing.assert_array_equal(second.rows[0, constrained.columns.p_f], first.rows[-1, constrained.columns.p_f])
+    first, cursor, _ = constrained.advance(Cursor.at_start(constrained.state), 2)
+    second, *_ = constrained.advance(cursor, 2)
+    np.testing.assert_array_equal(second.p_f[0], first.p_f[-1])
     np.testing.assert_array_equal(second.table[0], first.table[-1])
     assert second.table[:, 2].max() < 1e-11
 
@@ -340,13 +341,22 @@ def test_pieces_of_a_run_make_the_whole(fpu, tsp, monkeypatch):
     np.testing.assert_allclose(failed.t, 0.01 * np.arange(61), rtol=1e-15)
 
 
+def test_a_single_step_ends_as_a_run_does():
+    """Beyond the pole of a logarithm, where forces are numbers and the energy is none."""
+    system = System(ConstantMass([], [1.0]), fast_potential=lambda q_f, params: 1e-3 * jnp.log(1.0 - q_f[0]))
+    state = initial_state(system, [], [0.9], [], [10.0])
+    _, info = macro_step(system, fully_explicit(1), state, 0.1)
+    assert info.result == until_failure(system, fully_explicit(1), state, macro_dt=0.1, num_steps=1).result
+    assert info.result == Result.NON_FINITE
+
+
 def springs(q_s, q_f, params):
     return jnp.sum(q_s**2) / 2 + jnp.sum(q_f**2) / 2 + jnp.sum(q_s) * jnp.sum(q_f) / 10
 
 
 def test_systems_of_the_same_functions_and_other_sizes(monkeypatch):
     """Pieces with room for as many nodes, which are of other sizes."""
-    monkeypatch.setattr("vmri_jax.running.saved.NUMBERS_PER_PIECE", 1)
+    monkeypatch.setattr("vmri_jax.running.simulation.NUMBERS_PER_PIECE", 1)
     for n_s, n_f in ((1, 2), (2, 1), (2, 2), (1, 2)):
         system = vm.System(vm.ConstantMass([1.0] * n_s, [1.0] * n_f), springs, None)
         problem = vm.Problem(system, q_s=[0.1] * n_s, q_f=[0.2] * n_f)

@@ -12,6 +12,7 @@ import pytest
 import vmri_jax as vm
 from vmri_jax.running.engine import Cursor, _interval
 from vmri_jax.running.loops import plain
+from vmri_jax.running.origin import _at_all
 from vmri_jax.scene import Body, Scene, SpringAnchor
 
 EXPLICIT, MIDPOINT = vm.fully_explicit(1), vm.fully_implicit(1)
@@ -100,6 +101,10 @@ def by_prepare(moving, scheme, steps, out):
     return vm.prepare(moving, scheme, **steps)().result
 
 
+def by_accuracy(moving, scheme, steps, out):
+    return vm.simulate(moving, scheme, accuracy=1e-3, t_end=steps["macro_dt"] * steps["num_steps"]).result
+
+
 def by_stream(moving, scheme, steps, out):
     return vm.stream(moving, scheme, out=out, chunk=steps["num_steps"] // 2, **steps).result
 
@@ -169,12 +174,20 @@ def test_every_road_says_it(road, cause, tmp_path):
         assert "the coordinates are singular near t = 0.53" in str(given[0].message)
 
 
-@pytest.mark.parametrize("road", [by_simulate, by_prepare, by_stream, by_batch])
+@pytest.mark.parametrize("road", [by_simulate, by_prepare, by_accuracy, by_stream, by_batch])
 def test_every_road_says_that_the_momenta_of_the_start_are_projected(road, tmp_path):
     moving = problem(of_masses(1.0, 1.0), None, [0.0, 0.0], [0.0, 1.0], constraint=line)
     pushed = PushedStart(moving.system, moving.q_s, moving.q_f, moving.v_s, moving.v_f)
     with pytest.warns(UserWarning, match="off the hidden constraints, by 0.5 where the largest of them is 1;"):
         road(pushed, EXPLICIT, {"macro_dt": 0.01, "num_steps": 40}, tmp_path / "run.zarr")
+
+
+def test_no_road_computes_observables_again(tmp_path):
+    """The first chunk of a store, and the trial that an accuracy chooses, have the observables of their nodes."""
+    moving, asked = problem(of_masses(1.0), potential, [1.0], [0.0]), _at_all.cache_info()
+    vm.stream(moving, EXPLICIT, macro_dt=0.01, num_steps=20, out=tmp_path / "run.zarr")
+    vm.simulate(moving, EXPLICIT, accuracy=1e-3, t_end=0.4)
+    assert _at_all.cache_info() == asked
 
 
 @pytest.mark.filterwarnings("ignore::vmri_jax.SingularCoordinatesWarning")

@@ -114,7 +114,7 @@ def test_ctrl_c_keeps_the_runs(monkeypatch):
     def stopped(self, trials):
         if len(self.seconds) == 1:
             raise KeyboardInterrupt
-        self.seconds[trials[0].python] = 1.0
+        self.seconds[trials[0].family.expression] = 1.0
 
     monkeypatch.setattr(search.Search, "measure", stopped)
     with pytest.raises(Interrupted, match="interrupted after") as caught:

@@ -37,7 +37,7 @@ from vmri_jax.mechanics.arrays import of_one_type
 from vmri_jax.mechanics.driving import Events
 from vmri_jax.refusals import Refused
 from vmri_jax.running.arguments import Save
-from vmri_jax.running.observables import SingularCoordinatesWarning
+from vmri_jax.running.observables import LostEnergyWarning, SingularCoordinatesWarning, concerns
 from vmri_jax.running.run_error import RunError, largest_of
 from vmri_jax.running.saved import Saved
 from vmri_jax.running.simulation import Simulation
@@ -82,7 +82,7 @@ class Compared:
     """
 
     run: Simulation
-    trajectory: Trajectory
+    saved: Saved
     halved: Trajectory
     errors: np.ndarray
     drives: Events
@@ -91,7 +91,7 @@ class Compared:
     def of(
         cls,
         run: Simulation,
-        trajectory: Trajectory,
+        saved: Saved,
         drives: Events,
         companion_of: Callable[..., Trajectory],
         accuracy: float = 0.0,
@@ -99,37 +99,43 @@ class Compared:
     ) -> Self:
         """A run with its errors, from the companion ``companion_of(2)``, and from further ones, ``companion_of(parts, whole)``, if the system is
         driven or its errors are below `DOUBTED` of the accuracy; `more` are fields of a subclass."""
-        halved, order = companion_of(2), 1 if drives.jump else run.order
+        halved, order, trajectory = companion_of(2), 1 if drives.jump else run.order, saved.trajectory(run)
         errors = extrapolated(order, trajectory, halved)
-        has_failed = max(int(trajectory.failed_at), int(halved.failed_at)) >= 0
+        has_failed = max(int(saved.failed_at), int(halved.failed_at)) >= 0
         is_believed = not drives.names and np.abs(errors).max(initial=0.0) > DOUBTED * accuracy
         if not (has_failed or is_believed):
             errors = _with_further_companions(run, trajectory, errors, drives, companion_of, order)
-        return cls(run, trajectory, halved, errors, drives, **more)
+        return cls(run, saved, halved, errors, drives, **more)
+
+    @cached_property
+    def trajectory(self) -> Trajectory:
+        """The trajectory of the run."""
+        return self.saved.trajectory(self.run)
+
+    @cached_property
+    def concerns(self) -> list[LostEnergyWarning]:
+        """What is wrong with its motion."""
+        run = self.run
+        return concerns(self.saved.table, self.trajectory.t, run.system, run.macro_dt, run.save_every)
 
     @cached_property
     def error(self) -> float:
         """The largest error; infinite unless all errors are certified."""
-        certified, _ = certified_nodes(self.trajectory, self.errors)
-        return float(largest_of(self.errors).max()) if certified.all() else np.inf
+        return run_error(self).largest
 
 
-def with_error(compared: Compared, of: Callable | None = None, shares: bool = False) -> Trajectory:
-    """The trajectory of a run without a failed step, with its `RunError`; warns if the error is not certified over the whole run."""
-    run, trajectory, halved = compared.run, compared.trajectory, compared.halved
-    error, reason = None, ""
+def told_error(compared: Compared, of: Callable | None = None, shares: bool = False) -> Any:
+    """The `RunError` of a run without a failed step, None if its companion fails; warns if the error is not certified over the whole run."""
+    halved, error = compared.halved, None
     if int(halved.failed_at) >= 0:
-        failed = float(halved.t[0]) + int(halved.failed_at) * float(run.macro_dt) / 2
+        failed = float(halved.t[0]) + int(halved.failed_at) * float(compared.run.macro_dt) / 2
         reason = f"the error is not known; the same run with half the macro step failed at t = {failed:.4g}."
     else:
         error = run_error(compared, of, shares)
-        if not error.is_certified:
-            unseen = first_unseen(run, compared.drives)
-            is_seen = unseen > trajectory.t[-1]
-            reason = _uncertified(error, compared) if is_seen else _stepped_over(run, compared.drives, unseen)
+        reason = "" if error.is_certified else _uncertified(error, compared)
     if reason:
         warnings.warn(f"simulate: {reason}", UncertifiedWarning, stacklevel=3)
-    return replace(trajectory, error=error)
+    return error
 
 
 def run_error(compared: Compared, of: Callable | None = None, shares: bool = False) -> RunError:
@@ -240,15 +246,16 @@ def resting(run: Simulation) -> Trajectory:
     """A trajectory at the times of a run that stays at the start, without micro nodes: an argument to try functions of runs on."""
     run = replace(run, save=Save())
     _, *phase = vars(run.state).values()
-    rows = np.zeros((run.num_saves + 1, run.columns.width))
-    rows[:, : run.columns.info.start] = np.concatenate(phase)
-    return Saved(rows, np.asarray(int(Result.CONVERGED)), np.asarray(-1)).trajectory(run)
+    row = np.concatenate([*phase, np.zeros(run.width - sum(map(len, phase)))])
+    rows, status = np.tile(row, (run.num_saves + 1, 1)), (np.asarray(int(Result.CONVERGED)), np.asarray(-1))
+    return Saved.of(rows, run.columns, *status).trajectory(run)
 
 
 def companion(run: Simulation, parts: int, whole: int = 1) -> Trajectory:
     """The run with every `whole` macro steps divided into equal parts, at the nodes of the run or every `whole` steps;
     it may fail."""
-    return finer(run, parts, whole).in_pieces()
+    divided = finer(run, parts, whole)
+    return divided.in_pieces().trajectory(divided)
 
 
 def finer(run: Simulation, parts: int, whole: int = 1) -> Simulation:
@@ -271,7 +278,7 @@ def _is_chaotic(error: RunError, compared: Compared) -> bool:
     """Whether small differences grow like exp(L t) by the motion itself, and not by large steps: between two runs with
     a half and a quarter of the macro step. Driven motions, which may be pumped, are left out."""
     trajectory = compared.trajectory
-    if not (float(error.growth) > CHAOTIC_GROWTH and trajectory.keeps_energy) or trajectory.concerns():
+    if not (float(error.growth) > CHAOTIC_GROWTH and trajectory.keeps_energy) or compared.concerns:
         return False
     quartered = companion(compared.run, 4)
     envelope = np.maximum.accumulate(largest_of(positions(compared.halved) - positions(quartered)))
@@ -280,18 +287,16 @@ def _is_chaotic(error: RunError, compared: Compared) -> bool:
     return bool(envelope[last] > CHAOTIC_GROWTH * envelope[half])  # False for NaN, where a companion failed
 
 
-def _stepped_over(run: Simulation, drives: Events, unseen: float) -> str:
-    """Events that the steps of a run do not see, and advice."""
-    step = drives.shortest / (NODES_OF_EVENT * node_distance(run.scheme, drives))
-    return (
-        f"from t = {unseen:.4g} on no error is certified: {' and '.join(drives.names)} of the system changes and changes back within "
-        f"{drives.shortest:.2g}, which steps of {float(run.macro_dt):.4g} see too seldom or not at all; take macro_dt = {step:.2g} or less, or accuracy="
-    )
-
-
 def _uncertified(error: RunError, compared: Compared) -> str:
     """The reason why an error is not certified, and advice."""
-    trajectory = compared.trajectory
+    trajectory, drives, macro_dt = compared.trajectory, compared.drives, float(compared.run.macro_dt)
+    unseen = first_unseen(compared.run, drives)
+    if unseen <= trajectory.t[-1]:
+        step = drives.shortest / (NODES_OF_EVENT * node_distance(compared.run.scheme, drives))
+        return (
+            f"from t = {unseen:.4g} on no error is certified: {' and '.join(drives.names)} of the system changes and changes back within "
+            f"{drives.shortest:.2g}, which steps of {macro_dt:.4g} see too seldom or not at all; take macro_dt = {step:.2g} or less, or accuracy="
+        )
     t, energy = float(error.certified_until), np.asarray(trajectory.energy)
     change = np.abs(energy - energy[0]).max()
     kept = f" The energy has changed by at most {change:.1e}." if trajectory.keeps_energy else ""
@@ -300,7 +305,7 @@ def _uncertified(error: RunError, compared: Compared) -> str:
             f"the motion is chaotic, small errors have grown {float(error.growth):.0f} times in the second half of the time until t = {t:.4g}: "
             f"from there on an error of positions means nothing.{kept}"
         )
-    reasons = [f" {concern}" for concern in trajectory.concerns() if isinstance(concern, SingularCoordinatesWarning)]
+    reasons = [f" {concern}" for concern in compared.concerns if isinstance(concern, SingularCoordinatesWarning)]
     advice = "".join(reasons) or " Take smaller steps, or a scheme of higher order."
     return (
         f"from t = {t:.4g} on positions are wrong by more than {LARGEST_CERTIFIED:.0%} of the extent of the motion, and no error is "

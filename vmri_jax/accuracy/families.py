@@ -41,7 +41,8 @@ class Family:
     make: the scheme with a number of micro steps (per stage, in a composition).
     options: options of the scheme on the command line.
     python: Python expression of the scheme, with ``{}`` for num_micro.
-    first: the num_micro that a search tries first. One far from the best number makes its trials take longer.
+    first: the num_micro that a search tries first; each trial has a family of its own, whose first is its num_micro. One far from the best number makes
+        trials take longer.
     """
 
     name: str
@@ -49,6 +50,16 @@ class Family:
     options: str
     python: str
     first: int = 5
+
+    @property
+    def scheme(self) -> SchemeLike:
+        """The scheme with the first number of micro steps."""
+        return self.make(self.first)
+
+    @property
+    def expression(self) -> str:
+        """The Python expression of this scheme, which identifies it in a search."""
+        return self.python.format(self.first)
 
     def composed(self, coefficients: str) -> "Family":
         """The family of compositions of its schemes, by the name of their coefficients."""
@@ -111,14 +122,14 @@ def of_scheme(scheme: SchemeLike) -> Family:
 
 def for_system(menu: Sequence[Family], system: System, has_two_rates: bool) -> list[Family]:
     """The families with a first num_micro that the rates of the potentials divide, the least one without two rates."""
-    units = ((family, unit_of(system, family.make(family.first))) for family in menu)
+    units = ((family, unit_of(system, family.scheme)) for family in menu)
     return [replace(family, first=unit * -(-family.first // unit) if has_two_rates else unit) for family, unit in units]
 
 
 def by_promise(menu: Sequence[Family], digits: float) -> list[Family]:
     """The menu, first the families whose order is near the number of digits of the accuracy: lower orders take many
     steps, and higher orders long to compile."""
-    return sorted(menu, key=lambda family: abs(np.log(family.make(family.first).order / max(digits, 2.0))))
+    return sorted(menu, key=lambda family: abs(np.log(family.scheme.order / max(digits, 2.0))))
 
 
 def unit_of(system: System, scheme: SchemeLike) -> int:
@@ -131,12 +142,6 @@ class Trial(Compared):
     """A run of a scheme of a family, its companion and its errors."""
 
     family: Family
-    num_micro: int
-
-    @property
-    def python(self) -> str:
-        """The Python expression of the scheme, which identifies it in a search."""
-        return self.family.python.format(self.num_micro)
 
     def steps_for(self, error: float, order: float | None = None) -> int:
         """Macro steps for this error, ``n (e / error)^(1 / p)``, with the order of the scheme if None is given."""

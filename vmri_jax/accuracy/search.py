@@ -39,7 +39,7 @@ from vmri_jax.mechanics.invariants import velocity
 from vmri_jax.mechanics.linearisation import Linearisation, linearise
 from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.refusals import Refused
-from vmri_jax.running.arguments import Steps, refuse_tracers
+from vmri_jax.running.arguments import refuse_tracers
 from vmri_jax.running.progress import Progress, silent
 from vmri_jax.running.run_error import largest_of
 from vmri_jax.running.saved import check_memory
@@ -133,8 +133,8 @@ class Search:
         self.num_saves, self.progress, self.num_trials, self.falls_back = num_saves, progress, 0, False
         self.seconds: dict[str, float] = {}
         self._arguments, self._of = (moving, state, solver), of
-        self._runs: dict[tuple[str, int], Simulation] = {}
-        self._firsts: dict[tuple[str, int], Trial] = {}
+        self._runs: dict[str, Simulation] = {}
+        self._firsts: dict[str, Trial] = {}
         self._chosen: dict[str, Trial] = {}
         self._times: dict[str, Callable[[int], float]] = {}
 
@@ -182,7 +182,7 @@ class Search:
         """Trials with steps for the accuracy, of the families that promise the least time, the most promising one
         first; exhaustive ones of all families with all of `NUM_MICRO`. Refuses an accuracy that any run keeps."""
         if exhaustive:
-            units = [(family, unit_of(self.system, family.make(family.first))) for family in menu]
+            units = [(family, unit_of(self.system, family.scheme)) for family in menu]
             menu = [replace(family, first=unit * n) for family, unit in units for n in NUM_MICRO]
             finalists = len(menu)
         aimed, trials = AIMED_PART * accuracy, self.first_trials(menu, accuracy)
@@ -198,11 +198,10 @@ class Search:
         the motion fail with any method, and with it only if no scheme of the menu succeeds without it."""
         limit, trials = np.inf, []
         for family in menu:
-            key = family.python, family.first
-            if key not in self._firsts:
+            if family.expression not in self._firsts:
                 most_seconds = max(limit, LEAST_TRIAL_SECONDS)
-                self._firsts[key] = self.trial(family, family.first, FEWEST_STEPS, most_seconds=most_seconds)
-            trials.append(self._firsts[key])
+                self._firsts[family.expression] = self.trial(family, FEWEST_STEPS, most_seconds=most_seconds)
+            trials.append(self._firsts[family.expression])
             if len(menu) > 1:
                 limit = min(limit, MOST_TIME_RATIO * self.time_for(trials[-1], AIMED_PART * accuracy))
         if self.falls_back or any(int(trial.trajectory.failed_at) < 0 for trial in trials):
@@ -214,7 +213,6 @@ class Search:
     def trial(
         self,
         family: Family,
-        num_micro: int,
         num_steps: int,
         accuracy: float | None = None,
         most_seconds: float = np.inf,
@@ -223,13 +221,13 @@ class Search:
         runs out of steps, or of time, `most_seconds`. With an accuracy its errors look at events, see `Compared.of`."""
         most = MOST_TRIAL_SECONDS
         while True:
-            run = replace(self.run(family, num_micro, num_steps), may_fall_back=self.falls_back)
+            run = replace(self.run(family, num_steps), may_fall_back=self.falls_back)
             total = max(USUAL_TRIALS, self.num_trials + 1)
-            self.progress(f"trial of {family.label(num_micro)}, {run.num_steps} macro steps", self.num_trials, total)
+            self.progress(f"trial of {family.label(family.first)}, {run.num_steps} macro steps", self.num_trials, total)
             self.num_trials += 1
             elapsed = stopwatch()
             runs = run, run.in_pieces(), Events() if accuracy is None else self.drives, partial(companion, run)
-            trial = Trial.of(*runs, accuracy or 0.0, family=family, num_micro=num_micro)
+            trial = Trial.of(*runs, accuracy or 0.0, family=family)
             self.note(trial)
             # The seconds of the first trial include compiling, which later trials do not repeat.
             is_late = elapsed() > most and run.num_steps > FEWEST_STEPS
@@ -251,7 +249,7 @@ class Search:
             num_steps = self.beside_resonances(before, wanted)
             if num_steps > max(MOST_STEPS, fewest_steps(run.scheme, self.drives, self.length)):
                 break
-            trial = self.trial(before.family, before.num_micro, num_steps, accuracy)
+            trial = self.trial(before.family, num_steps, accuracy)
             if trial.error <= accuracy:
                 break
             order = self._observed_order(before, trial)
@@ -273,12 +271,12 @@ class Search:
             saves = -(-saves // FEWEST_DIVIDED) * FEWEST_DIVIDED if self.drives.names else saves
         return saves * save_every, save_every
 
-    def run(self, family: Family, num_micro: int, num_steps: int) -> Simulation:
+    def run(self, family: Family, num_steps: int) -> Simulation:
         """The run with at least `num_steps` macro steps, and with steps that see all events."""
-        key = family.python, num_micro
+        key = family.expression
         if key not in self._runs:
             moving, state, solver = self._arguments
-            run = simulation(moving, family.make(num_micro), state, solver, Steps(self.length, num_steps=1))
+            run = simulation(moving, family.scheme, state, solver, self.length, num_steps=1)
             run.check()
             check_memory("simulate", run, num_saves=self.num_saves or MOST_SAVED)
             check_function_of_run(self._of, run)
@@ -297,14 +295,14 @@ class Search:
         """Seconds of the steps of a run with this error; infinite if the error of the trial is not certified."""
         if not np.isfinite(trial.error):
             return np.inf
-        if trial.python not in self.seconds:
+        if trial.family.expression not in self.seconds:
             self.measure([trial])
-        return trial.steps_for(error) * self.seconds[trial.python]
+        return trial.steps_for(error) * self.seconds[trial.family.expression]
 
     def measure(self, trials: Sequence[Trial]) -> None:
         """Measure the seconds of a macro step of each trial, in turns."""
         for trial, seconds in zip(trials, seconds_of_steps(*[trial.run for trial in trials]), strict=True):
-            self.seconds[trial.python] = float(seconds)
+            self.seconds[trial.family.expression] = float(seconds)
 
     def warn_of_events(self, caller: str, scheme: SchemeLike, stacklevel: int) -> None:
         """Warn if the events of a driven system demand `MANY_STEPS` of a run."""
@@ -319,10 +317,10 @@ class Search:
 
     def settings(self, trial: Trial) -> Settings:
         """The arguments of `vmri_jax.simulate` that repeat the run of a trial."""
-        run, time = trial.run, self._times.get(trial.family.python)
+        run, family, time = trial.run, trial.family, self._times.get(trial.family.python)
         numbers = float(run.macro_dt), run.num_steps, run.save_every
-        gain = 1.0 if time is None else time(1) / time(trial.num_micro)
-        return Settings(run.scheme, trial.python, trial.family.options, *numbers, gain)
+        gain = 1.0 if time is None else time(1) / time(family.first)
+        return Settings(run.scheme, family.expression, family.options, *numbers, gain)
 
     def _with_best_num_micro(self, trial: Trial, error: float) -> Trial:
         """A trial with the number of micro steps of the least time; an interval of high degree stays single."""
@@ -331,7 +329,7 @@ class Search:
             return trial
         python, run = trial.family.python, trial.run
         if python not in self._chosen:
-            finer = self.trial(trial.family, 2 * trial.num_micro, run.num_steps)
+            finer = self.trial(replace(trial.family, first=2 * trial.family.first), run.num_steps)
             comparable = np.isfinite(finer.error) and finer.run.num_steps == run.num_steps
             trials = [trial, finer, *self._third(trial, finer)] if comparable else [trial]
             self._chosen[python] = min(trials, key=lambda candidate: self.time_for(candidate, error))
@@ -340,13 +338,13 @@ class Search:
     def _third(self, trial: Trial, finer: Trial) -> list[Trial]:
         """A trial with the number of micro steps of the least time for an error, ``N^(p + 1) = (a / b) (F / S)``, if it
         promises less time than the number N of a trial, and 2 N of a `finer` one with the same macro steps."""
-        num_micro, p, run = trial.num_micro, trial.run.order, trial.run
+        num_micro, p, run = trial.family.first, trial.run.order, trial.run
         fast_share = extrapolated(p, trial.trajectory, finer.trajectory)
         fast, slow = (float(largest_of(share).max()) for share in (fast_share, trial.errors - fast_share))
         slow, fast = max(slow, LEAST_SHARE * fast), num_micro**p * fast
         # time(N) = a + b N: b = (time(2 N) - time(N)) / N and a = time(N) - N b
         self.measure([trial, finer])
-        seconds, finer_seconds = self.seconds[trial.python], self.seconds[finer.python]
+        seconds, finer_seconds = (self.seconds[t.family.expression] for t in (trial, finer))
         least = LEAST_TIME * seconds
         micro_seconds = max(finer_seconds - seconds, least) / num_micro
         macro_seconds = max(seconds - num_micro * micro_seconds, least)
@@ -362,7 +360,7 @@ class Search:
         if min(time(num_micro), time(2 * num_micro)) < WORTH_COMPILING * time(best):
             return []
         num_steps = max(1, round(run.num_steps * num_micro / best))  # micro steps of the same length
-        return [self.trial(trial.family, best, num_steps)]
+        return [self.trial(replace(trial.family, first=best), num_steps)]
 
     @cached_property
     def _linear(self) -> Linearisation | None:
@@ -378,7 +376,7 @@ class Search:
 
     def beside_resonances(self, trial: Trial, num_steps: int) -> int:
         """This number of macro steps, or the next larger number for which small motions about the start do not grow."""
-        if trial.num_micro == 1 or self._linear is None:
+        if trial.family.first == 1 or self._linear is None:
             return num_steps
         longest = max(1.0, float(np.abs(stage_lengths(trial.run.scheme)).max())) * self.length / num_steps
         if self._linear.frequencies.max() * longest < LEAST_RESONANT_ANGLE:

@@ -17,7 +17,7 @@ from vmri_jax.accuracy.companions import (
     companion,
     finer,
     run_error,
-    with_error,
+    told_error,
 )
 from vmri_jax.accuracy.families import Trial, for_system, of_scheme, two_families
 from vmri_jax.accuracy.search import MOST_COORDINATES, Search
@@ -26,14 +26,13 @@ from vmri_jax.mechanics.checks import check_flags, check_system, check_type
 from vmri_jax.mechanics.driving import Events, driven, events
 from vmri_jax.mechanics.state import Movable, State
 from vmri_jax.refusals import Refused
-from vmri_jax.running.arguments import Save, Steps, refuse_tracers
-from vmri_jax.running.batch import Batch, batch, shared
-from vmri_jax.running.failures import simulation_error
+from vmri_jax.running.arguments import Save, refuse_tracers
+from vmri_jax.running.batch import batch, lane, shared
 from vmri_jax.running.origin import is_repeated
 from vmri_jax.running.progress import Working, progress_to
 from vmri_jax.running.run_error import RunError
-from vmri_jax.running.saved import check_memory
-from vmri_jax.running.simulation import simulation
+from vmri_jax.running.saved import Saved, check_memory
+from vmri_jax.running.simulation import Simulation, simulation
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes.composition import SchemeLike
 from vmri_jax.steppers.results import Result
@@ -103,23 +102,18 @@ def simulate(
     of = error if callable(error) else None
     if not (of or isinstance(error, bool) or error == "shares"):
         raise Refused(f"simulate: error is {error!r}; it must be True or False, 'shares', or a function of a run.")
-    steps = Steps(macro_dt, num_steps, t_end, save)
     if accuracy is not None:
-        t_end, saved = _end(steps), Save.of(save)
+        t_end, saved = _end(macro_dt, num_steps, t_end, save), Save.of(save)
         with progress_to("simulate", saved.progress) as tell:
             how = {"state": state, "solver": solver, "num_saves": saved.number, "of": of, "progress": tell}
             search = Search(system, t_end, **how)
             best = _with_accuracy(search, scheme, accuracy)
-        origin = replace(best.run.origin, settings=search.settings(best))
-        trajectory = replace(best.trajectory, origin=origin)
-        if int(trajectory.failed_at) >= 0:
-            raise simulation_error(trajectory, best.run.macro_dt, best.run.save_every, best.run.scheme.num_micro)
-        for concern in trajectory.concerns():
-            warnings.warn(type(concern)(f"simulate: {concern}"), stacklevel=2)
-        return with_error(replace(best, trajectory=trajectory), of, error == "shares")
+        trajectory = best.run.finished("simulate", best.saved)
+        origin = replace(trajectory.origin, settings=search.settings(best))
+        return replace(trajectory, origin=origin, error=told_error(best, of, error == "shares"))
     if scheme is None:
         raise Refused("simulate: scheme is None without an accuracy; give one of them, e.g. accuracy=1e-5.")
-    run = simulation(system, scheme, state, solver, steps)
+    run = simulation(system, scheme, state, solver, macro_dt, num_steps, t_end, save)
     if not is_concrete(run.leaves):
         if error:
             refuse_tracers("simulate: an error", run.leaves)
@@ -129,13 +123,13 @@ def simulate(
         run.check()
     check_memory("simulate", run)
     check_function_of_run(of, run)
-    trajectory = run.in_pieces("simulate")
-    if int(trajectory.failed_at) >= 0:
-        raise simulation_error(trajectory, run.macro_dt, run.save_every, scheme.num_micro)
+    saved = run.in_pieces()
+    trajectory = run.finished("simulate", saved)
     if not error:
         return trajectory
     drives = events(run.system, run.state, float(trajectory.t[-1]))
-    return with_error(Compared.of(run, trajectory, drives, partial(companion, run)), of, error == "shares")
+    compared = Compared.of(run, saved, drives, partial(companion, run))
+    return replace(trajectory, error=told_error(compared, of, error == "shares"))
 
 
 def _with_accuracy(search: Search, scheme: SchemeLike | None, accuracy: float) -> Trial:
@@ -162,18 +156,18 @@ def _with_accuracy(search: Search, scheme: SchemeLike | None, accuracy: float) -
     return best
 
 
-def _end(steps: Steps) -> float:
+def _end(macro_dt, num_steps, t_end, save) -> float:
     """`t_end` of a run with an accuracy; refuses arguments of step size and saving, which the accuracy determines."""
-    refused = [name for name in ("macro_dt", "num_steps") if getattr(steps, name) is not None]
-    save = Save.of(steps.save)
-    if replace(save, every=None if save.every == 1 else save.every, number=None, progress=False) != Save():
-        refused.append(f"save={steps.save!r}")
+    refused = [name for name, value in (("macro_dt", macro_dt), ("num_steps", num_steps)) if value is not None]
+    saved = Save.of(save)
+    if replace(saved, every=None if saved.every == 1 else saved.every, number=None, progress=False) != Save():
+        refused.append(f"save={save!r}")
     if refused:
         chosen = "an accuracy, which chooses steps and saved nodes, but for Save(number=)"
         raise Refused(f"simulate: got {' and '.join(refused)} with {chosen}; leave them out, or the accuracy.")
-    if steps.t_end is None:
+    if t_end is None:
         raise Refused("simulate: an accuracy needs t_end, the time until which it is to be kept.")
-    return steps.t_end
+    return t_end
 
 
 class FailedLanesWarning(UserWarning):
@@ -227,60 +221,53 @@ def simulate_batch(
         ValueError, TypeError: bad arguments, before anything is computed.
     """
     check_flags(warn=warn, error=error)
-    steps = Steps(macro_dt, num_steps, t_end, save)
+    steps = {"num_steps": num_steps, "t_end": t_end, "save": save}
     with Working("simulate_batch: the starts"):
-        lanes = batch(system, scheme, states, steps, params, solver, chunk, devices)
-    saved = lanes()
-    trajectory = plain = saved.trajectory(lanes.runs)
+        runs, computed = batch(system, scheme, states, macro_dt, params, solver, chunk, devices, **steps)
+    saved = computed(runs)
+    trajectory = runs.finished("simulate_batch", saved, throw=False)
     if error:
-        trajectory = replace(plain, error=_errors(lanes, plain))
-    lanes.runs.tell_of_start("simulate_batch", plain.states)
-    lanes.runs.warn("simulate_batch", saved.table, plain.states.t)
-    for kind, message in _about_lanes(trajectory) if warn else ():
-        warnings.warn(f"simulate_batch: {message}", kind, stacklevel=2)
+        trajectory = replace(trajectory, error=_errors(runs, computed, saved))
+    for warning in _about_lanes(trajectory) if warn else ():
+        warnings.warn(warning, stacklevel=2)
     return trajectory
 
 
-def _errors(lanes: Batch, plain: Trajectory) -> RunError:
-    """The errors of all lanes, from batches of companions; `plain` are the runs, with arrays of NumPy."""
+def _errors(runs: Simulation, computed: Callable[[Simulation], Saved], saved: Saved) -> RunError:
+    """The errors of all lanes, from batches of companions."""
 
     @cache
     def companions(parts: int, whole: int = 1) -> Trajectory:
-        runs = finer(lanes.runs, parts, whole)
-        if is_repeated(lanes.runs.macro_dt):  # a step of all lanes stays one array
-            runs = replace(runs, macro_dt=shared(runs.macro_dt[0], len(lanes)))
-        return replace(lanes, runs=runs)().trajectory(runs)
+        divided = finer(runs, parts, whole)
+        if is_repeated(runs.macro_dt):  # a step of all lanes stays one array
+            divided = replace(divided, macro_dt=shared(divided.macro_dt[0], len(runs.macro_dt)))
+        return computed(divided).trajectory(divided)
 
     def error(i: int) -> RunError:
-        run, coarse = lanes.lane(i), plain.lane(i)
-        drives = events(run.system, run.state, float(coarse.t[-1])) if is_driven else Events()
-        return run_error(Compared.of(run, coarse, drives, lambda *counts: companions(*counts).lane(i)))
+        run, of_lane = lane(runs, i), jax.tree.map(lambda a: a[i], saved)
+        t_end = float(run.state.t + run.num_steps * run.macro_dt)
+        drives = events(run.system, run.state, t_end) if is_driven else Events()
+        return run_error(Compared.of(run, of_lane, drives, lambda *counts: companions(*counts).lane(i)))
 
-    is_driven = driven(lanes.run.system, lanes.run.state)
-    return jax.tree.map(lambda *arrays: np.stack(arrays), *map(error, range(len(plain.t))))
+    is_driven = driven(lane(runs, 0).system, lane(runs, 0).state)
+    return jax.tree.map(lambda *arrays: np.stack(arrays), *map(error, range(len(runs.macro_dt))))
 
 
-def _about_lanes(trajectory: Trajectory) -> Iterator[tuple[type[UserWarning], str]]:
-    """Warnings about the lanes that failed, and about those that did not and whose error is not certified: kind, and number with the first lane."""
+def _about_lanes(trajectory: Trajectory) -> Iterator[UserWarning]:
+    """Warnings about the lanes that failed, and about those that did not and whose error is not certified, with their number and the first of them."""
     failed_at = np.asarray(trajectory.failed_at)
     failed = np.flatnonzero(failed_at >= 0)
     if failed.size:
         first = int(failed[0])
         result = Result(int(trajectory.result[first]))
-        yield (
-            FailedLanesWarning,
-            (
-                f"{failed.size} of {failed_at.size} lanes failed and are NaN from there on; .result and .failed_at say "
-                f"which. The first is lane {first}, at macro step {failed_at[first]} ({result.name}): {result.message}"
-            ),
+        yield FailedLanesWarning(
+            f"simulate_batch: {failed.size} of {failed_at.size} lanes failed and are NaN from there on; .result and .failed_at say "
+            f"which. The first is lane {first}, at macro step {failed_at[first]} ({result.name}): {result.message}"
         )
     error = trajectory.error
     lanes = np.flatnonzero((failed_at < 0) & ~np.asarray(error is None or error.is_certified))
     if lanes.size:
-        yield (
-            UncertifiedWarning,
-            (
-                f"the error of {lanes.size} of {failed_at.size} lanes is not certified over the whole run, as run.error.largest says; the first is lane "
-                f"{lanes[0]}, certified until t = {error.certified_until[lanes[0]]:.4g}. Take smaller steps, or a scheme of higher order."
-            ),
+        yield UncertifiedWarning(
+            f"simulate_batch: the error of {lanes.size} of {failed_at.size} lanes is not certified over the whole run, as run.error.largest says; the first "
+            f"is lane {lanes[0]}, certified until t = {error.certified_until[lanes[0]]:.4g}. Take smaller steps, or a scheme of higher order."
         )

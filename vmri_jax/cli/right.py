@@ -19,7 +19,7 @@ from vmri_jax.mechanics.state import Problem
 from vmri_jax.running.arguments import nothing_fast
 from vmri_jax.running.interrupts import Interrupted
 from vmri_jax.running.printed import PrintedTable
-from vmri_jax.running.progress import Working, progress_shown
+from vmri_jax.running.progress import Working
 from vmri_jax.scene.ledger import ledger_of_functions
 from vmri_jax.stability import advise as advise_on
 from vmri_jax.stability import linear_model, plot_stability, stability_map
@@ -154,11 +154,10 @@ def check(system: common.System, case: Numbers = None, full: Full = False, out: 
 def run_and_show(cases: Sequence[Case], numbers: Sequence[int], full: bool, out: Path | None) -> None:
     """Run cases, show and write their results; exit code 1: a missed criterion, 2: a wrong number, 130: Ctrl-C."""
     stopped = None
-    with progress_shown() as tell:
-        try:
-            report = run_cases(cases, numbers, full, tell)
-        except Interrupted as interrupted:
-            report, stopped = interrupted.done, interrupted
+    try:
+        report = run_cases(cases, numbers, full, progress=True)
+    except Interrupted as interrupted:
+        report, stopped = interrupted.done, interrupted
     console.print(report.table())
     judged, missed = [row for row in report.rows if row.passed is not None], report.missed
     console.print(f"{len(judged) - len(missed)} of {len(judged)} criteria met")

@@ -13,7 +13,6 @@ from vmri_jax.catalogue import find_problem
 from vmri_jax.cli import common
 from vmri_jax.cli.common import check_target, console, print_failure, print_written
 from vmri_jax.running.interrupts import Interrupted
-from vmri_jax.running.progress import Progress, progress_shown
 from vmri_jax.steppers.results import SimulationError
 from vmri_jax.study.table import ResultTable
 from vmri_jax.study.tuning import PERIODS, NothingReached
@@ -37,8 +36,8 @@ def tune(
     check_target("--out", out, ".csv")
     problem = find_problem(system)
     try:
-        with _search(out) as tell:
-            choice = study.tune(problem, error, t_end, exhaustive=exhaustive, progress=tell)
+        with _search(out):
+            choice = study.tune(problem, error, t_end, exhaustive=exhaustive, progress=True)
     except NothingReached as failure:
         console.print(failure.runs.table())
         _write_runs(failure.runs, out)
@@ -69,18 +68,17 @@ def cost(
     """
     problem = find_problem(system)
     check_target("--out", out)
-    with _search(None) as tell:
-        report = study.cost_report(problem, system, out, t_end=t_end, errors=error, progress=tell)
+    with _search(None):
+        report = study.cost_report(problem, system, out, t_end=t_end, errors=error, progress=True)
     console.print(report.table())
     print_written("\nPage", report.path)
 
 
 @contextmanager
-def _search(out: Path | None) -> Iterator[Progress]:
-    """A progress bar for a search, a panel if all its runs fail; after Ctrl-C the runs, also in `out`."""
+def _search(out: Path | None) -> Iterator[None]:
+    """A panel if all runs of a search fail; after Ctrl-C the runs, also in `out`."""
     try:
-        with progress_shown() as tell:
-            yield tell
+        yield
     except SimulationError as failure:
         raise print_failure("All runs failed", str(failure)) from failure
     except Interrupted as stopped:

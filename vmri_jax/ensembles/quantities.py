@@ -13,7 +13,6 @@ from vmri_jax.mechanics.functions import TracedOnce
 from vmri_jax.mechanics.names import near
 from vmri_jax.mechanics.state import Problem
 from vmri_jax.refusals import Refused
-from vmri_jax.running.arguments import Steps
 from vmri_jax.running.export import DIMENSIONS
 from vmri_jax.running.simulation import Simulation, simulation
 from vmri_jax.running.store.layout import Kept
@@ -148,7 +147,7 @@ def what_is_kept(quantities: Sequence[Quantity], run: Simulation) -> dict[str, K
 
 def drawn_by_default(names: Sequence[str], problem: Problem) -> list[str]:
     """Arrays of these quantities that `vmri_jax.plots.plot_ensemble` draws: one number per run, or one per saved node."""
-    run = simulation(problem, fully_implicit(1), None, None, Steps(1.0, num_steps=1))
+    run = simulation(problem, fully_implicit(1), None, None, 1.0, num_steps=1)
     arrays = what_is_kept(list(map(quantity, names)), run)
     return [name for name, kept in arrays.items() if kept.dimensions in ((), ("node",)) and name != "node_t"]
 

@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, CancelledError, Future
 from contextlib import ExitStack
 from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,7 @@ import numpy as np
 from vmri_jax.ensembles.design import Chunks, Design, Draws, Product, Rows, Table, Vary
 from vmri_jax.ensembles.quantities import Saved
 from vmri_jax.ensembles.reading import LANE, open_ensemble
-from vmri_jax.ensembles.work import AnyScheme, Work, attributes_of, prepared
+from vmri_jax.ensembles.work import AnyScheme, Work, prepared
 from vmri_jax.executors.executor import NotAWorker, as_done, executor_of, submitter
 from vmri_jax.mechanics.arrays import require_x64, whole_number
 from vmri_jax.mechanics.checks import check_type
@@ -212,8 +211,7 @@ def ensemble(
         num_saves=whole_number("ensemble: num_saves", num_saves),
         vary=vary,
     ).with_sources()
-    arrays, chunks, run = prepared(work, design, chunk)
-    attributes = attributes_of(work, design, run, chunks)
+    attributes, arrays, chunks = prepared(work, design, chunk)
     if resume and path.exists():
         stored = layout.read_attributes(path, "ensemble")
         # On another machine the default division may differ; files in the store have the old one.
@@ -222,7 +220,7 @@ def ensemble(
     table = design if isinstance(design, Table) else None
     with ExitStack() as opened:
         tasks = opened.enter_context(executor_of("ensemble", executor, processes))
-        submit = submitter("ensemble", tasks, ChunkTask(path.resolve(), chunks, work))
+        submit = submitter("ensemble", tasks, chunk_task, path.resolve(), chunks, work)
         columns = None if table is None else table.rows(0, len(table))
         opened.enter_context(layout.writing(path, attributes, arrays, overwrite, dimension=LANE, table=columns))
         tell = opened.enter_context(progress_to("ensemble", progress))
@@ -236,27 +234,14 @@ def ensemble(
     return runs
 
 
-@dataclass(frozen=True)
-class ChunkTask:
-    """The computation of a chunk: it writes and commits results to the store, and returns how many runs failed."""
-
-    path: Path
-    chunks: Chunks
-    work: Work
-
-    @cached_property
-    def writer(self) -> layout.Writer:
-        """The writer of the store, which a worker opens once."""
-        return layout.Writer(self.path)
-
-    def __call__(self, number: int, rows: Rows | Design) -> int:
-        """`rows` are the rows of the chunk, or the design that makes them."""
-        first, last = self.chunks.ends(number)
-        rows = rows if isinstance(rows, dict) else rows.rows(first, last)
-        values = self.work.compute(rows, last - first, self.chunks.width)
-        failed = int(np.count_nonzero(values["failed_at"] >= 0))
-        self.writer.write(first, values, failed.to_bytes(NOTE_BYTES, "little"))
-        return failed
+def chunk_task(path: Path, chunks: Chunks, work: Work, number: int, rows: Rows | Design) -> int:
+    """Compute a chunk, write and commit its results to the store, and return how many runs failed; `rows` are its rows, or the design that makes them."""
+    first, last = chunks.ends(number)
+    rows = rows if isinstance(rows, dict) else rows.rows(first, last)
+    values = work.compute(rows, last - first, chunks.width)
+    failed = int(np.count_nonzero(values["failed_at"] >= 0))
+    layout.Writer(path).write(first, values, failed.to_bytes(NOTE_BYTES, "little"))
+    return failed
 
 
 def _compute(runs: Ensemble, submit: Callable[[int], Future], tell: Progress, interrupted) -> None:

@@ -36,7 +36,7 @@ from vmri_jax.mechanics.names import Names, near, unknown
 from vmri_jax.mechanics.places import START
 from vmri_jax.mechanics.state import Problem
 from vmri_jax.refusals import Refused
-from vmri_jax.running.arguments import Save, Steps, check_step_size, steps_until
+from vmri_jax.running.arguments import Save, check_step_size, steps_until
 from vmri_jax.running.batch import consistent_states, lanes_at_once
 from vmri_jax.running.export import STATUS
 from vmri_jax.running.simulation import Simulation, simulation
@@ -171,8 +171,8 @@ class Work:
         """The first run of a group, after a check of its arguments."""
         macro_dt, num_steps = float(np.ravel(group.macro_dt)[0]), group.num_steps
         state = self.problem.state(self.project)
-        steps = Steps(macro_dt, num_steps, save=Save(number=self.num_saves))
-        return simulation(self.problem, group.scheme, state, self.solver, steps)
+        save = Save(number=self.num_saves)
+        return simulation(self.problem, group.scheme, state, self.solver, macro_dt, num_steps, save=save)
 
     def compute(self, rows: Rows, count: int, width: int) -> dict[str, np.ndarray]:
         """Kept quantities and status of the runs of `count` rows, `width` of them side by side; arrays by name, a row for each run."""
@@ -262,8 +262,11 @@ def _whole(name: str, value) -> int:
     return int(value)
 
 
-def prepared(work: Work, design: Design, chunk: int | None = None) -> tuple[dict[str, Kept], Chunks, Simulation]:
-    """The arrays of the store, the division of the runs, and the longest run, after all checks; nothing is computed."""
+def prepared(work: Work, design: Design, chunk: int | None = None) -> tuple[dict[str, Any], dict[str, Kept], Chunks]:
+    """Attributes and arrays of the store of an ensemble, and the division of its runs, after all checks; nothing is computed.
+
+    Attributes: the design, names of coordinates, the record that identifies the ensemble, versions.
+    """
     jax.eval_shape(partial(work.lane, work.problem), _first_row(design))
     runs = [work.simulation(group) for group in all_groups(work, design)]  # one of each group
     runs[0].check("ensemble: the start", constraints=False)
@@ -272,12 +275,28 @@ def prepared(work: Work, design: Design, chunk: int | None = None) -> tuple[dict
         looks = f"{', '.join(over_nodes)} looks at the saved nodes of a run"
         raise Refused(f"ensemble: {looks}, and only its end is saved; give num_saves, for example 50.")
     runs.sort(key=lambda run: run.num_steps * run.scheme.num_micro, reverse=True)
+    run = runs[0]
     arrays = {
         "result": Kept(np.empty((), np.int32), (), "status of the run, see flag_meanings"),
         "failed_at": Kept(np.empty((), np.int32), (), "macro step that failed, -1 if none did"),
     }
-    arrays |= what_is_kept(work.quantities, runs[0])
-    return arrays, _chunks(runs, len(design), arrays, chunk), runs[0]
+    arrays |= what_is_kept(work.quantities, run)
+    chunks = _chunks(runs, len(design), arrays, chunk)
+    names = (run.names or Names()).of_coordinates(run.state.q_s.size, run.state.q_f.size)
+    drawn = {"method": design.method, "seed": design.seed} if isinstance(design, Draws) else {}
+    attributes = {
+        "kind": "ensemble",
+        "rows": chunks.lanes,
+        "chunk": chunks.size,
+        "width": chunks.width,
+        "design": {"kind": type(design).__name__, "columns": design.described()} | drawn,
+        "system": work.system if isinstance(work.system, str) else "a problem",
+        "slow": names.slow_coordinates,
+        "fast": names.fast_coordinates,
+        "identity": _identity(work, design, run) | {name: str(value) for name, value in drawn.items()},
+        "made_with": environment(),
+    }
+    return attributes, arrays, chunks
 
 
 def _first_row(design: Design) -> Row:
@@ -304,26 +323,6 @@ def _chunks(runs: list[Simulation], lanes: int, arrays: dict[str, Kept], chunk: 
     return Chunks(lanes, min(size, lanes), width)
 
 
-def attributes_of(work: Work, design: Design, run: Simulation, chunks: Chunks) -> dict[str, Any]:
-    """Attributes of the store of an ensemble: the design, names of coordinates, the record that identifies it, versions."""
-    names = (run.names or Names()).of_coordinates(run.state.q_s.size, run.state.q_f.size)
-    design_record = {"kind": type(design).__name__, "columns": design.described()}
-    if isinstance(design, Draws):
-        design_record |= {"method": design.method, "seed": design.seed}
-    return {
-        "kind": "ensemble",
-        "rows": chunks.lanes,
-        "chunk": chunks.size,
-        "width": chunks.width,
-        "design": design_record,
-        "system": work.system if isinstance(work.system, str) else "a problem",
-        "slow": names.slow_coordinates,
-        "fast": names.fast_coordinates,
-        "identity": _identity(work, design, run),
-        "made_with": environment(),
-    }
-
-
 def _identity(work: Work, design: Design, run: Simulation) -> dict[str, str]:
     """In words and digests, by name, everything that the results depend on."""
     about_run = identity(run, run.state).items()
@@ -342,8 +341,6 @@ def _identity(work: Work, design: Design, run: Simulation) -> dict[str, str]:
         identity_record |= describe("vary", work.vary)
         identity_record |= {"operations of vary": operations(partial(work.lane, work.problem), _first_row(design))}
     identity_record |= {"design": type(design).__name__}
-    if isinstance(design, Draws):
-        identity_record |= {"method": design.method, "seed": str(design.seed)}
     for name, column in (design.axes if isinstance(design, Product) else design.columns).items():
         values = column.values if isinstance(column, Axis) else (column.name, *column.arguments)
         identity_record |= describe(f"column {name}", values)

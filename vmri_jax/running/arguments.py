@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 
@@ -72,17 +71,7 @@ class Save:
         return num_steps // self.number if self.number else every
 
 
-@dataclass(frozen=True)
-class Steps:
-    """The arguments of `vmri_jax.simulate` for step size, length and saved nodes, as the user gave them; exactly one of num_steps and t_end."""
-
-    macro_dt: Any = None
-    num_steps: int | None = None
-    t_end: float | None = None
-    save: int | Save = 1
-
-
-def check_run(system, scheme, state, solver, steps: Steps) -> tuple[int, int]:
+def check_run(system, scheme, state, solver, macro_dt, num_steps, t_end, save) -> tuple[int, int]:
     """Refuse bad arguments of `simulate`; returns the number of macro steps, and how many of them lie between two saved nodes."""
     require_x64()
     if not isinstance(scheme, SchemeLike):
@@ -90,14 +79,15 @@ def check_run(system, scheme, state, solver, steps: Steps) -> tuple[int, int]:
     check_params(system.params)
     if not isinstance(solver, Solver | None):
         raise Refused(f"simulate: solver is {solver!r}; give a Solver, e.g. vm.Solver(tolerance=1e-10).")
-    dt, num_steps, t_end = steps.macro_dt, steps.num_steps, steps.t_end
-    check_step_size(dt)
+    check_step_size(macro_dt)
     check_number("simulate: the t of state", state.t)
     if (num_steps is None) == (t_end is None):
         got = "neither" if num_steps is None else "both"
         raise Refused(f"simulate: got {got} of num_steps and t_end; give exactly one of them.")
-    num_steps = steps_until(t_end, state.t, dt) if num_steps is None else whole_number("simulate: num_steps", num_steps)
-    every = Save.of(steps.save).macro_steps(num_steps)
+    num_steps = (
+        steps_until(t_end, state.t, macro_dt) if num_steps is None else whole_number("simulate: num_steps", num_steps)
+    )
+    every = Save.of(save).macro_steps(num_steps)
     check_arrays(q_s=state.q_s, q_f=state.q_f, p_s=state.p_s, p_f=state.p_f)
     return num_steps, every
 

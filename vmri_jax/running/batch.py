@@ -4,9 +4,9 @@ Every array of a batch has the lanes as its first axis. An array that all lanes 
 get it once.
 """
 
-from collections.abc import Collection, Iterator
-from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import replace
+from functools import lru_cache, partial
 from typing import Any
 
 import equinox as eqx
@@ -21,7 +21,7 @@ from vmri_jax.mechanics.slots import check_computed, leaves_by_name
 from vmri_jax.mechanics.state import Movable, State, initial_state, opened, start_of
 from vmri_jax.mechanics.system import System
 from vmri_jax.refusals import Refused
-from vmri_jax.running.arguments import Steps, check_step_size, refuse_tracers
+from vmri_jax.running.arguments import check_step_size, refuse_tracers
 from vmri_jax.running.engine import FALLING_BACK, Engine
 from vmri_jax.running.origin import is_repeated
 from vmri_jax.running.progress import Working
@@ -38,75 +38,59 @@ MOST_LANES = 1024
 """Most lanes of a chunk; with more, the last chunk of a batch may be mostly padding."""
 
 
-@dataclass(frozen=True)
-class Batch:
-    """Runs with checked arguments, whose arrays have an axis of lanes, `width` of them side by side, on CPU devices."""
+def computed(runs: Simulation, width: int, devices: int) -> Saved:
+    """Runs whose arrays have an axis of lanes, `width` of them side by side, on CPU devices; lanes that are not solved are computed again by the fallback."""
+    run, lanes = lane(runs, 0), len(runs.macro_dt)
+    with Working(f"simulate_batch, {lanes} lanes", running=STEPPING):
+        done = _in_chunks(run, runs.leaves, np.arange(lanes), width, devices)
+    failed = np.flatnonzero(run.unsolved(done))
+    if failed.size:
+        # Failed lanes are padded to a power of two with copies of the last one, so that few programs serve all numbers of failures.
+        padded = failed[np.minimum(np.arange(2 ** int(failed.size - 1).bit_length()), failed.size - 1)]
+        with Working(f"simulate_batch, {failed.size} of {lanes} lanes: {FALLING_BACK}"):
+            again = _in_chunks(run.exact, runs.leaves, padded, width, devices)
+        for old, new in zip(done, again, strict=True):
+            old[failed] = new[: failed.size]
+    return done
 
-    runs: Simulation
-    width: int
-    devices: int
 
-    def __call__(self) -> Saved:
-        """The runs; lanes that are not solved are computed again by the fallback."""
-        lanes, run = len(self), self.run
-        with Working(f"simulate_batch, {lanes} lanes", running=STEPPING):
-            done = self._in_chunks()
-        failed = np.flatnonzero(run.unsolved(done))
-        if failed.size:
-            # Failed lanes are padded to a power of two with copies of the last one, so that few programs serve all numbers of failures.
-            padded_size = 2 ** int(failed.size - 1).bit_length()
-            padded = failed[np.minimum(np.arange(padded_size), failed.size - 1)]
-            with Working(f"simulate_batch, {failed.size} of {lanes} lanes: {FALLING_BACK}"):
-                exact = jax.tree.unflatten(jax.tree.structure(run.exact), self.runs.leaves)
-                again = replace(self, runs=_taken(exact, padded))._in_chunks()
-            for old, new in zip(done, again, strict=True):
-                old[failed] = new[: failed.size]
-        return done
+def lane(runs: Simulation, i: int) -> Simulation:
+    """The run of a lane."""
+    return jax.tree.map(lambda a: a[i], runs)
 
-    def __len__(self) -> int:
-        """Number of lanes."""
-        return len(self.runs.macro_dt)
 
-    @cached_property
-    def run(self) -> Simulation:
-        """The run of the first lane."""
-        return self.lane(0)
-
-    def lane(self, i: int) -> Simulation:
-        """The run of a lane."""
-        return jax.tree.map(lambda a: a[i], self.runs)
-
-    def _in_chunks(self) -> Saved:
-        """All lanes, `width` at a time; the last chunk is padded with copies of its last lane, so that one program computes all chunks."""
-        run, lanes = self.run, len(self)
-        width = min(self.width, -(-lanes // self.devices) * self.devices)
-        program = _side_by_side(run.engine, tuple(not is_repeated(a) for a in self.runs.leaves), self.devices)
-        chunks = []
-        for start in range(0, lanes, width):
-            part = _taken(self.runs, np.minimum(np.arange(start, start + width), lanes - 1))
-            chunks.append(program([a[0] if is_repeated(a) else a for a in part.leaves], run.save_every))
-        rows, status = jax.tree.map(lambda *parts: np.concatenate(parts)[:lanes], *chunks)
-        return Saved(rows, status[..., 0].copy(), status[..., 1].copy()).marked(run.columns, run.save_every)
+def _in_chunks(run: Simulation, leaves: list, lanes: np.ndarray, width: int, devices: int) -> Saved:
+    """Some lanes of runs shaped like `run`, `width` at a time; the last chunk is padded with copies of its last lane, so that one program computes all
+    chunks."""
+    width, chunks = min(width, -(-len(lanes) // devices) * devices), []
+    program = _side_by_side(run.engine, tuple(not is_repeated(a) for a in leaves), devices)
+    for start in range(0, len(lanes), width):
+        chosen = lanes[np.minimum(np.arange(start, start + width), len(lanes) - 1)]
+        chunks.append(program([a[0] if is_repeated(a) else a[chosen] for a in leaves], run.save_every))
+    rows, status = jax.tree.map(lambda *parts: np.concatenate(parts)[: len(lanes)], *chunks)
+    saved = Saved.of(rows[:, : run.num_saves + 1], run.columns, *np.moveaxis(status, -1, 0).copy())
+    return saved.marked(run.save_every)
 
 
 def batch(
     moving: Movable,
     scheme: SchemeLike,
     states: State | None,
-    steps: Steps,
+    macro_dt,
     params,
     solver,
     chunk,
     devices: int,
-) -> Batch:
-    """The `Batch` with these arguments of `simulate_batch`; bad arguments raise."""
-    refuse_tracers("simulate_batch", (states, steps.macro_dt, params), ", or take jax.vmap of simulate")
+    **steps: Any,
+) -> tuple[Simulation, Callable[[Simulation], Saved]]:
+    """The runs with these arguments of `simulate_batch`, and the function that computes them; bad arguments raise."""
+    refuse_tracers("simulate_batch", (states, macro_dt, params), ", or take jax.vmap of simulate")
     _check_devices(devices, chunk)
     problem: Any = opened(moving)
     system, start = start_of("simulate_batch", problem, states)
-    check_step_size(steps.macro_dt, "simulate_batch", ndim=None)
-    params, start, macro_dt = _with_lanes(system.params, params, start, steps.macro_dt)
-    if steps.t_end is not None and any(np.ptp(array) > 0 for array in (start.t, macro_dt)):
+    check_step_size(macro_dt, "simulate_batch", ndim=None)
+    params, start, macro_dt = _with_lanes(system.params, params, start, macro_dt)
+    if steps["t_end"] is not None and any(np.ptp(array) > 0 for array in (start.t, macro_dt)):
         raise Refused("simulate_batch: t_end with steps or start times that differ; give num_steps instead.")
     differs = not all(map(is_repeated, jax.tree.leaves(params)))
     if states is None and differs and not (system.has_constant_mass and not system.is_constrained):
@@ -114,20 +98,15 @@ def batch(
         fixed = tuple(getattr(problem, name) for name in ("t", "q_s", "q_f", "v_s", "v_f"))
         start = consistent_states(system, params, fixed, problem.project, starts_differ=False)
     start = State(*map(np.asarray, vars(start).values()))
-    first, steps = jax.tree.map(lambda a: a[0], start), replace(steps, macro_dt=macro_dt[0])
-    run, lanes = simulation(problem, scheme, first, solver, steps), len(macro_dt)
+    first, lanes = jax.tree.map(lambda a: a[0], start), len(macro_dt)
+    run = simulation(problem, scheme, first, solver, macro_dt[0], **steps)
     run.save.without_bar("simulate_batch")
     run.check("simulate_batch: the positions of the first state", constraints=not differs)
     check_memory("simulate_batch", run, lanes)
     width = (lanes_at_once(run) if chunk is None else chunk) * devices
     runs = jax.tree.map(lambda a: shared(a, lanes), run)
     runs = replace(runs, macro_dt=macro_dt, state=start, system=runs.system.with_params(params))
-    return Batch(runs, width, devices)
-
-
-def _taken(runs: Simulation, index: np.ndarray) -> Simulation:
-    """The lanes with these numbers."""
-    return jax.tree.map(lambda a: shared(a[0], len(index)) if is_repeated(a) else a[index], runs)
+    return runs, partial(computed, width=width, devices=devices)
 
 
 def shared(value, lanes: int) -> np.ndarray:

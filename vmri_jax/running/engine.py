@@ -5,7 +5,7 @@ Names: `save_every` macro steps lie between two saved nodes; `num_saves` saved i
 the first `saves` of them.
 
 The derivative of a step is the derivative of the root of its equations (`vmri_jax.steppers.newton.implicit`). Reverse mode visits
-the steps from the last to the first and needs the state at which each step started, see `Adjoint`. Runs have derivatives in both modes, up to second
+the steps from the last to the first and needs the state at which each step started, see `loops`. Runs have derivatives in both modes, up to second
 ones; third derivatives are NaN where equations are solved by iteration.
 
 The fallback: what the first matrix of "auto" does not solve is solved again with exact matrices, in a program of its own. `unsolved` decides for all
@@ -24,12 +24,12 @@ from jaxtyping import Float, Int
 
 from vmri_jax.mechanics.arrays import Numbers, options_of_runs
 from vmri_jax.mechanics.state import State
-from vmri_jax.running.loops import MOST_STORED_NUMBERS, Adjoint, plain
+from vmri_jax.running import loops
 from vmri_jax.running.observables import observed
 from vmri_jax.running.saved import Saved
-from vmri_jax.running.trajectory import RunInfo
 from vmri_jax.steppers.plan import Plan
 from vmri_jax.steppers.results import Method, Result
+from vmri_jax.steppers.stepper import StepStatus
 
 FALLING_BACK = 'a step was not solved: computing its part of the run again with exact matrices (matrix "exact"), as accurate but slower'
 """Line about a fallback that takes more than two seconds."""
@@ -39,7 +39,8 @@ the first-level cache, and a run of a few nodes takes longer."""
 
 
 class Cursor(NamedTuple):
-    """Progress of a run: state and memory before macro step `step`, the worst `result` so far, the failed step or -1."""
+    """A run between two steps, all that its next steps depend on: state and memory of the stepper before macro step `step`, the worst `result` so far,
+    the failed step or -1. Memory None: the stepper has none of earlier steps."""
 
     state: State
     memory: Any
@@ -70,7 +71,7 @@ class Engine:
         return jax.jit(self.steps, compiler_options=options_of_runs())
 
     def steps(self, leaves: list, save_every, saves=None, cursor: Cursor | None = None, is_first: Any = True):
-        """The first `saves` saved intervals: an array of `Saved` rows, and the cursor after them.
+        """The first `saves` saved intervals: an array of `Saved` rows, longer than them by a part of a block, and the cursor after them.
 
         `saves` None: all intervals, failed or not. The end of the loop then depends on no lane of a batch, and
         `jax.vmap` need not select between old and new values in every lane.
@@ -83,7 +84,7 @@ class Engine:
         memory = stepper.init(begin.state, run.macro_dt)
         if cursor is not None:
             memory = jax.tree.map(partial(jnp.where, is_first), memory, cursor.memory)
-        interval = _interval(stepper, run, plain)
+        interval = _interval(stepper, run, loops.plain)
 
         def goes_on(loop):
             number, cursor, _ = loop
@@ -91,33 +92,33 @@ class Engine:
 
         def save(loop):
             number, cursor, rows = loop
-            is_later = number > 0  # turn 0 saves the start, so that the code for nodes is compiled once
-            moved, info, micro = interval(cursor, jnp.where(is_later, save_every, 0))
-            cursor = jax.tree.map(lambda a, b: a if a is b else jnp.where(is_later, a, b), moved, cursor)
-            row = _row(cursor.state, info, micro)
+            # turn 0 takes no step and saves the start, so that the code for nodes is compiled once
+            cursor, worst, micro = interval(cursor, jnp.where(number > 0, save_every, 0))
+            row = _row(cursor.state, worst, micro)
             return number + 1, cursor, jax.lax.dynamic_update_slice(rows, row[None], (number, 0))
 
         begin = jax.tree.map(jnp.asarray, begin._replace(memory=memory))
-        rows = jnp.zeros((self.num_saves + 1, run.columns.width))  # `jax_debug_nans` stops a program that returns NaN
+        room = (self.num_saves // self._block + 1) * self._block  # of whole blocks
+        rows = jnp.zeros((room, run.width))  # `jax_debug_nans` stops a program that returns NaN
         _, end, rows = jax.lax.while_loop(goes_on, save, (jnp.asarray(0), begin, rows))
         rows = self._observed(run, rows, begin.step, save_every, self.num_saves if saves is None else saves)
         return rows, jnp.stack([end.result, end.failed_at]) if cursor is None else end
 
+    @property
+    def _block(self) -> int:
+        """Nodes whose observables are computed side by side."""
+        return min(NODES_AT_ONCE, self.num_saves + 1)
+
     def _observed(self, run, rows, step, save_every, saves):
-        """The rows as they are saved, of blocks of `NODES_AT_ONCE` nodes side by side, up to the node `saves`."""
-        size = min(NODES_AT_ONCE, self.num_saves + 1)
+        """The rows as they are saved, block by block, up to the node `saves`, and copies of this node up to the end of its block."""
 
         def block(i, rows):
-            first = jnp.minimum(i * size, self.num_saves + 1 - size)
-            number = first + jnp.arange(size)
-            existing = jnp.minimum(number, saves)  # beyond the last node there may be no state
-            new = jnp.concatenate(_as_saved(run, rows[existing], step + existing * save_every), axis=-1)
-            # the last block may overlap the block before, whose nodes are projected already
-            is_new = (number >= i * size) & (number <= saves)
-            old = jax.lax.dynamic_slice(rows, (first, 0), new.shape)
-            return jax.lax.dynamic_update_slice(rows, jnp.where(is_new[:, None], new, old), (first, 0))
+            number = jnp.minimum(i * self._block + jnp.arange(self._block), saves)  # beyond it there may be no state
+            saved = _as_saved(run, Saved.of(rows[number], run.columns, 0, -1), step + number * save_every)
+            row = jnp.concatenate(saved[: len(run.columns)], axis=-1)
+            return jax.lax.dynamic_update_slice(rows, row, (i * self._block, 0))
 
-        return jax.lax.fori_loop(0, saves // size + 1, block, rows)
+        return jax.lax.fori_loop(0, saves // self._block + 1, block, rows)
 
     @cached_property
     def differentiable(self):
@@ -127,18 +128,17 @@ class Engine:
         def by_scan(leaves: list, save_every: int) -> Saved:
             run: Any = jax.tree.unflatten(self.structure, leaves)
             numbers = sum(a.size for a in jax.tree.leaves(run.state)) * run.scheme.num_micro  # of a step, about
-            loops = Adjoint(save_every, in_parts=self.num_saves * save_every * numbers > MOST_STORED_NUMBERS)
-            stepper = run.plan
-            interval = _interval(stepper, run, loops.repeat)
+            in_parts, stepper = self.num_saves * save_every * numbers > loops.MOST_STORED_NUMBERS, run.plan
+            interval = _interval(stepper, run, partial(loops.differentiable, in_parts=in_parts))
 
             def save(cursor: Cursor, _):
-                cursor, info, micro = interval(cursor, save_every)
-                return cursor, _row(cursor.state, info, micro)
+                cursor, worst, micro = interval(cursor, save_every)
+                return cursor, _row(cursor.state, worst, micro)
 
             cursor = Cursor.at_start(run.state, stepper.init(run.state, run.macro_dt))
-            cursor, rows = loops.scan(save, jax.tree.map(jnp.asarray, cursor), self.num_saves)
+            cursor, rows = loops.scan(save, jax.tree.map(jnp.asarray, cursor), self.num_saves, in_parts, save_every)
             first = _row(run.state, *_nothing(run))
-            return Saved(jnp.concatenate([first[None], rows]), cursor.result, cursor.failed_at)
+            return Saved.of(jnp.concatenate([first[None], rows]), run.columns, cursor.result, cursor.failed_at)
 
         return jax.jit(by_scan, static_argnums=1)
 
@@ -148,8 +148,7 @@ class Engine:
 
         def observed(leaves: list, saved: Saved, save_every) -> Saved:
             run: Any = jax.tree.unflatten(self.structure, leaves)
-            rows = _as_saved(run, saved.rows, jnp.arange(self.num_saves + 1) * save_every)
-            return saved._replace(rows=rows).marked(run.columns, save_every)
+            return _as_saved(run, saved, jnp.arange(self.num_saves + 1) * save_every).marked(save_every)
 
         return jax.jit(observed)  # else JAX would compile the operations of a gradient outside of jit one by one
 
@@ -171,32 +170,31 @@ def blank_memory(engine: Engine, shapes: tuple):
     return jax.device_put(jax.tree.map(lambda a: np.zeros(a.shape, a.dtype), blank))
 
 
-def _as_saved(run, rows, steps) -> tuple:
-    """The `Columns` of nodes after these numbers of macro steps, with projected momenta, and with their `Observables`."""
-    q_s, q_f, p_s, p_f, info, micro, _ = run.columns.parts(rows)
+def _as_saved(run, saved: Saved, steps) -> Saved:
+    """Nodes after these numbers of macro steps, with projected momenta, and with their `Observables`."""
 
     def node(t, *phase):
         state, table = observed(run.system, State(t, *phase), run.solver.tolerance)
         return state.p_s, state.p_f, table
 
-    p_s, p_f, table = jax.vmap(node)(run.state.t + steps * run.macro_dt, q_s, q_f, p_s, p_f)
-    return q_s, q_f, p_s, p_f, info, micro, table
+    p_s, p_f, table = jax.vmap(node)(run.state.t + steps * run.macro_dt, *saved[:4])
+    return saved._replace(p_s=p_s, p_f=p_f, table=table)
 
 
-def _row(state: State, info: RunInfo, micro) -> Float[Numbers, "numbers"]:
-    """The row of a node before its observables."""
+def _row(state: State, worst: StepStatus, micro) -> Float[Numbers, "numbers"]:
+    """The row of a node before its observables; of the steps before it the largest `RunInfo`."""
     phase = state.q_s, state.q_f, state.p_s, state.p_f
-    return jnp.concatenate([*phase, *(jnp.asarray(a, float)[None] for a in info), micro.reshape(-1)])
+    return jnp.concatenate([*phase, *(jnp.asarray(a, float)[None] for a in worst[1:]), micro.reshape(-1)])
 
 
-def _nothing(run) -> tuple[RunInfo, Any]:
-    """The work of the solver, and the micro nodes, before the first step."""
+def _nothing(run) -> tuple[StepStatus, Any]:
+    """The status of the steps, and the micro nodes, before the first step."""
     num_micro = run.scheme.num_micro if run.save.micro else 0
-    return RunInfo(np.asarray(0), np.asarray(0), np.zeros(())), jnp.zeros((num_micro, run.state.q_f.shape[0]))
+    return StepStatus.direct(Method.EXPLICIT), jnp.zeros((num_micro, run.state.q_f.shape[0]))
 
 
 def _interval(stepper: Plan, run, repeat: Callable):
-    """``cursor, info, micro = interval(cursor, count)``: the `count` macro steps between two saved nodes."""
+    """``cursor, worst, micro = interval(cursor, count)``: the `count` macro steps between two saved nodes."""
     t_start, macro_dt = run.state.t, run.macro_dt
 
     def step(_, carry):
@@ -204,19 +202,18 @@ def _interval(stepper: Plan, run, repeat: Callable):
         alive = cursor.failed_at < 0
         state, info, memory = stepper.step(cursor.state, cursor.memory, macro_dt)
         ok = alive & (info.result <= Result.CONVERGED_AT_ROUNDOFF)
-        info_of_step = RunInfo(info.method, info.iterations, info.residual)
-        worst = jax.tree.map(lambda a, b: jnp.where(alive, jnp.maximum(a, b), a), worst, info_of_step)
+        worst = jax.tree.map(lambda a, b: jnp.where(alive, jnp.maximum(a, b), a), worst, info.status)
         # NaN in the momenta alone: the next step carries it into all positions.
         p_s, p_f = (jnp.where(ok, p, jnp.nan) for p in (state.p_s, state.p_f))
         # t_k = t_0 + k H from the step number, since a sum of steps would accumulate round-off; the time of the stepper is ignored.
         state = State(t_start + (cursor.step + 1) * macro_dt, state.q_s, state.q_f, p_s, p_f)
-        result = jnp.where(alive, jnp.maximum(cursor.result, info.result), cursor.result)
         failed_at = jnp.where(alive & ~ok, cursor.step, cursor.failed_at)
         micro = jnp.where(ok, info.q_f_micro, jnp.nan) if run.save.micro else micro
-        return Cursor(state, memory, cursor.step + 1, result, failed_at), worst, micro
+        return Cursor(state, memory, cursor.step + 1, cursor.result, failed_at), worst, micro
 
     def interval(cursor: Cursor, count):
-        return repeat(count, step, (cursor, *_nothing(run)))
+        cursor, worst, micro = repeat(count, step, (cursor, *_nothing(run)))
+        return cursor._replace(result=jnp.maximum(cursor.result, worst.result)), worst, micro
 
     return interval
 

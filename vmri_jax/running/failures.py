@@ -1,6 +1,6 @@
 """The exception of a failed run, with its probable cause: the body that moves most in the step, a force that jumps, swapped rates."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -89,19 +89,19 @@ def largest_motion(system: System, state: State, names: Names | None, macro_dt: 
     return max((motion for motion in motions if np.isfinite(motion.amount)), key=lambda m: m.size, default=None)
 
 
-def simulation_error(run: SavedRun, macro_dt, save_every: int, num_micro: int) -> SimulationError:
-    """The `SimulationError` of a run, in memory or in a store, with the largest motion before the failing step."""
-    failed_at, dt = int(run.failed_at), float(macro_dt)
-    interval, step = divmod(failed_at, save_every)
-    part, moved, jump = run[interval : interval + 2], "", ""  # from the node before the failure
-    if run.origin.knows_system:
-        system, before = run.origin.system(), part[0]
-        motion = largest_motion(system, before, part.names, dt, num_micro)
+def simulation_error(run: Any, trajectory: SavedRun) -> SimulationError:
+    """The `SimulationError` of a `Simulation`, whose trajectory is in memory or in a store, with the largest motion before the failing step."""
+    failed_at, dt = int(trajectory.failed_at), float(run.macro_dt)
+    interval, step = divmod(failed_at, run.save_every)
+    part, moved, jump = trajectory[interval : interval + 2], "", ""  # from the node before the failure
+    if trajectory.origin.knows_system:
+        system, before = trajectory.origin.system(), part[0]
+        motion = largest_motion(system, before, part.names, dt, run.scheme.num_micro)
         moved = "" if motion is None else motion.sentence(dt)
         jump = in_words(jump_ahead(system, before, (step + 2) * dt), part.names)  # in the failing step or in the next
-    t, work = float(part.t[0] + step * macro_dt), (int(part.info.iterations[0]), float(part.info.residual[0]))
-    error = SimulationError(Result(int(run.result)), failed_at, t, *work, run, moved=moved)
-    return error.advised(dt, _swapped(run[:1]), jump)
+    t, work = float(part.t[0] + step * run.macro_dt), (int(part.info.iterations[0]), float(part.info.residual[0]))
+    error = SimulationError(Result(int(trajectory.result)), failed_at, t, *work, trajectory, moved=moved)
+    return error.advised(dt, _swapped(trajectory[:1]), jump)
 
 
 def _swapped(start: SavedRun) -> str:

@@ -1,7 +1,6 @@
 """Loops of steps: the plain loop of JAX, and loops whose derivatives in reverse mode need little memory."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from math import isqrt
 
@@ -22,9 +21,8 @@ def plain(count, step: Callable, carry):
     return jax.lax.fori_loop(0, count, step, carry)
 
 
-@dataclass(frozen=True)
-class Adjoint:
-    """Loops whose derivatives in reverse mode keep the solutions of equations, and compute everything else again.
+def differentiable(count: int, step: Callable, carry, in_parts: bool):
+    """As `plain`, with derivatives in reverse mode, which keep the solutions of equations, and compute everything else again.
 
     `Solved` gives the solution of a step and its status the name `ROOT`; the steps of any other stepper are computed again.
 
@@ -32,26 +30,17 @@ class Adjoint:
     through it. A run of n steps in sqrt(n) parts then takes memory for 2 sqrt(n) states, and computes every step twice.
 
     Source: A. Griewank, A. Walther, Evaluating Derivatives, 2nd ed., SIAM (2008), chapter 12.
-
-    Attributes:
-        every: macro steps from one saved node to the next.
-        in_parts: else every step is stored.
     """
+    body = _keeps_root(lambda carry, i: (step(i, carry), None))
+    return (_in_parts if in_parts else _scan)(body, carry, count)[0]
 
-    every: int
-    in_parts: bool
 
-    def repeat(self, count: int, step: Callable, carry):
-        """As `plain`."""
-        body = _keeps_root(lambda carry, i: (step(i, carry), None))
-        return (_in_parts if self.in_parts else _scan)(body, carry, count)[0]
-
-    def scan(self, body: Callable, carry, count: int):
-        """``carry, y = body(carry, i)``, `count` times; returns the last carry and the stacked y."""
-        if not self.in_parts:
-            return _scan(body, carry, count)
-        # With every == 1 the body is a single step, whose root is kept; else `repeat` keeps the roots inside of the body.
-        return _in_parts((_keeps_root if self.every == 1 else _keeps_start)(body), carry, count)
+def scan(body: Callable, carry, count: int, in_parts: bool, every: int):
+    """``carry, y = body(carry, i)``, `count` times, each with `every` steps of `differentiable`; returns the last carry and the stacked y."""
+    if not in_parts:
+        return _scan(body, carry, count)
+    # With every == 1 the body is a single step, whose root is kept; else `differentiable` keeps the roots inside of the body.
+    return _in_parts((_keeps_root if every == 1 else _keeps_start)(body), carry, count)
 
 
 def _scan(body: Callable, carry, count: int):

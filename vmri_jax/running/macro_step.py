@@ -11,6 +11,7 @@ from vmri_jax.mechanics.state import A_SYSTEM, State
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.engine import solved_again, unsolved
 from vmri_jax.running.observables import Observables, observed
+from vmri_jax.running.saved import fault, is_right
 from vmri_jax.schemes.composition import SchemeLike
 from vmri_jax.steppers.plan import plan
 from vmri_jax.steppers.results import Result
@@ -58,7 +59,8 @@ def _step(arguments, exact: bool = False):
     system, scheme, state, macro_dt, solver = arguments
     planned = plan(system, scheme, state, solver.exact() if exact else solver)
     state, info, _ = planned.step(state, planned.init(state, macro_dt), macro_dt)
-    state, now = observed(system, state, solver.tolerance)
+    state, table = observed(system, state, solver.tolerance)
+    now = Observables.of(table)
     # rows that contradict each other leave increments that converge
-    fails = (info.result <= Result.CONVERGED_AT_ROUNDOFF) & (Observables.of(now).solved == 0)
-    return state, replace(info, result=jnp.where(fails, Result.CONSTRAINT_VIOLATED, info.result))
+    fails = (info.result <= Result.CONVERGED_AT_ROUNDOFF) & ~is_right(now)
+    return state, replace(info, result=jnp.where(fails, fault(now), info.result))

@@ -116,15 +116,15 @@ def at_nodes(function, origin: Origin, nodes, *static):
     arrays, shape = of_one_type(arrays), np.shape(jax.tree.leaves(nodes)[0])
     axes, count = len(shape) - 1, math.prod(shape)
     # Arrays that all lanes share go in once: for each node they would be copied.
-    is_shared = [not axes or is_repeated(array, axes) for array in arrays]
-    shared = [array[(0,) * axes] if once else None for array, once in zip(arrays, is_shared, strict=True)]
-    of_lanes = _in_a_row([None if once else array for array, once in zip(arrays, is_shared, strict=True)], axes)
-    of_nodes, program, pieces = _in_a_row(nodes, axes + 1), _at_all(function, structure, static), []
+    is_shared = tuple(not axes or is_repeated(array, axes) for array in arrays)
+    arrays = [a[(0,) * axes] if once else _in_a_row(a, axes) for a, once in zip(arrays, is_shared, strict=True)]
+    of_nodes, program, pieces = _in_a_row(nodes, axes + 1), _at_all(function, structure, is_shared, static), []
     size = NODES_PER_CALL if is_concrete((arrays, nodes)) else count
     with Working("quantities of the run"):
         for first in range(0, count, size):
             node = np.minimum(np.arange(first, first + size), count - 1)  # the last node fills up the last call
-            pieces.append(program(shared, _rows(of_lanes, node // shape[-1]), _rows(of_nodes, node)))
+            lanes = [a if once else a[node // shape[-1]] for a, once in zip(arrays, is_shared, strict=True)]
+            pieces.append(program(lanes, jax.tree.map(lambda a, node=node: a[node], of_nodes)))
 
     def joined(*parts):
         return library(parts).concatenate(parts)[:count].reshape(*shape, *parts[0].shape[1:])
@@ -143,16 +143,11 @@ def _in_a_row(tree, axes: int):
     return jax.tree.map(lambda a: as_array(a).reshape(int(np.prod(a.shape[:axes])), *a.shape[axes:]), tree)
 
 
-def _rows(tree, rows: np.ndarray):
-    return jax.tree.map(lambda a: a[rows], tree)
-
-
 @lru_cache(maxsize=64)
-def _at_all(function, structure, static: tuple) -> Callable:
-    """``program(shared, of_lanes, of_nodes)``: values at all nodes."""
+def _at_all(function, structure, is_shared: tuple[bool, ...], static: tuple) -> Callable:
+    """``program(arrays, nodes)``: values at all nodes; arrays of the system that are not shared have one for each node."""
 
-    def at_node(shared, of_lane, node):
-        arrays = [lane if array is None else array for array, lane in zip(shared, of_lane, strict=True)]
+    def at_node(arrays, node):
         return function(jax.tree.unflatten(structure, arrays), node, *static)
 
-    return jax.jit(jax.vmap(at_node, (None, 0, 0)))
+    return jax.jit(jax.vmap(at_node, ([None if once else 0 for once in is_shared], 0)))

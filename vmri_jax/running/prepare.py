@@ -3,7 +3,7 @@
 import jax
 
 from vmri_jax.mechanics.state import Movable, State
-from vmri_jax.running.arguments import Save, Steps, refuse_tracers
+from vmri_jax.running.arguments import Save, refuse_tracers
 from vmri_jax.running.progress import Working
 from vmri_jax.running.saved import check_memory
 from vmri_jax.running.simulation import Simulation, simulation
@@ -39,7 +39,7 @@ def prepare(
     Raises:
         ValueError, TypeError: bad arguments, as of `simulate`.
     """
-    run = simulation(system, scheme, state, solver, Steps(macro_dt, num_steps, t_end, save))
+    run = simulation(system, scheme, state, solver, macro_dt, num_steps, t_end, save)
     refuse_tracers("prepare", run.leaves, ", or take simulate")
     run.check()
     run.save.without_bar("prepare")

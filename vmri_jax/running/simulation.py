@@ -13,9 +13,9 @@ All of them return `Saved`. With the matrix "auto" a piece that is not solved is
 import warnings
 from collections.abc import Callable
 from contextlib import nullcontext
-from dataclasses import dataclass, replace
-from functools import cache, cached_property, partial
-from typing import Any, NamedTuple
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -30,34 +30,26 @@ from vmri_jax.mechanics.state import REPORTED_VIOLATION, Movable, State, opened,
 from vmri_jax.mechanics.summary import numbers, summary
 from vmri_jax.mechanics.system import System
 from vmri_jax.refusals import Refused
-from vmri_jax.running.arguments import Save, Steps, check_once, check_run, check_step_size, nothing_fast
+from vmri_jax.running.arguments import Save, check_once, check_run, check_step_size, nothing_fast
 from vmri_jax.running.engine import FALLING_BACK, Cursor, Engine, blank_memory, engine, solved_again, unsolved
 from vmri_jax.running.failures import simulation_error
 from vmri_jax.running.interrupts import Interrupted, interrupts_noted
 from vmri_jax.running.observables import concerns
 from vmri_jax.running.origin import Origin, names_of
 from vmri_jax.running.progress import Working, progress_to
-from vmri_jax.running.saved import Columns, Saved, joined
+from vmri_jax.running.saved import Saved, columns_of, joined
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes.composition import SchemeLike
 from vmri_jax.steppers.plan import Plan, plan, with_rules_for
 from vmri_jax.steppers.solver import Solver
 
+NUMBERS_PER_PIECE = 2**15
+"""Numbers in the nodes of a piece of a run, 256 kB. With a larger value short runs wait for memory that they do not use; a smaller one divides
+long runs into more calls of some 50 microseconds each."""
 PARTS_OF_A_BAR = 50
 """Parts of a run with a progress bar. More parts move the bar more smoothly, and each costs a call of some 30 microseconds."""
 STEPPING = "stepping"
 """The work of a run that is compiled, for lines about runs that take more than two seconds."""
-
-
-class Checkpoint(NamedTuple):
-    """A run between two steps: everything that its next steps depend on, to the last bit.
-
-    cursor: state, memory of the stepper, None where it has none of earlier steps, steps done, and status so far.
-    fell_back: whether the fallback has replaced the first matrix.
-    """
-
-    cursor: Cursor
-    fell_back: bool = False
 
 
 MOTION = ("macro_dt", "state", "solver", "scheme", "system")
@@ -88,11 +80,11 @@ class Simulation:
     solver: Solver
     scheme: SchemeLike
     system: System
-    num_steps: int
-    save_every: int
-    save: Save
-    names: Names | None
-    of_problem: bool
+    num_steps: int = 0
+    save_every: int = 0
+    save: Save = field(default_factory=Save)
+    names: Names | None = None
+    of_problem: bool = False
     may_fall_back: bool = True
 
     def __call__(self, state=None, *, macro_dt=None, params=None, num_steps=None, throw: bool = True) -> Trajectory:
@@ -114,14 +106,9 @@ class Simulation:
         if saved.failed_at >= 0 and run.unsolved(saved):
             with Working(FALLING_BACK):
                 saved = run.exact._whole()
-        trajectory = saved.trajectory(run)
-        if throw and saved.failed_at >= 0:
-            raise simulation_error(trajectory, run.macro_dt, run.save_every, run.scheme.num_micro)
-        if run.state is not self.state or run.system is not self.system or not vars(self).get("has_told"):
-            vars(self)["has_told"] = True  # of a start: a further call with the same one is a short run
-            run.tell_of_start("run", trajectory.states)
-        run.warn("run", saved.table, trajectory.states.t)
-        return trajectory
+        is_told = run.state is self.state and run.system is self.system and "is_told" in vars(self)
+        vars(self)["is_told"] = True  # of a start: a further call with the same one is a short run
+        return run.finished("run", saved, throw, is_told)
 
     def compiled(self) -> jax.stages.Compiled:
         """The compiled program of the run without its fallback, for inspection."""
@@ -176,9 +163,9 @@ class Simulation:
 
     def _whole(self) -> Saved:
         """The run by one program, without the fallback."""
-        rows, status = self.engine.program(self.leaves, self.save_every, self.num_saves)
-        status = np.asarray(status)
-        return Saved(np.asarray(rows), status[..., 0], status[..., 1]).marked(self.columns, self.save_every)
+        rows, status = map(np.asarray, self.engine.program(self.leaves, self.save_every, self.num_saves))
+        saved = Saved.of(rows[: self.num_saves + 1], self.columns, status[..., 0], status[..., 1])
+        return saved.marked(self.save_every)
 
     def traced(self) -> Trajectory:
         """All steps of a run, some of whose arrays are tracers."""
@@ -195,8 +182,19 @@ class Simulation:
         saved = run(self.leaves)
         return self.engine.observed(self.leaves, saved, self.save_every).trajectory(self)
 
-    def tell_of_start(self, caller: str, saved: State, stacklevel: int = 3) -> None:
-        """Warn about momenta of the start that are off the hidden constraints: the run takes their projection, the first node of the saved states."""
+    def finished(self, caller: str, saved: Saved, throw: bool = True, is_told: bool = False) -> Trajectory:
+        """The trajectory of a whole run, or of runs with an axis of lanes, after the warnings about its start, unless the user `is_told`, and about its
+        motion; raises the `SimulationError` of a run with a failed step if `throw` is true."""
+        trajectory = saved.trajectory(self)
+        if not is_told:
+            self.tell_of_start(caller, saved)
+        self.warn(caller, saved.table, trajectory.states.t)
+        if throw and trajectory.failed_at >= 0:
+            raise simulation_error(self, trajectory)
+        return trajectory
+
+    def tell_of_start(self, caller: str, saved: Saved) -> None:
+        """Warn about momenta of the start that are off the hidden constraints: the run takes their projection, which its first node has."""
         if not self.system.is_constrained:
             return
         given, taken = (np.concatenate([a.p_s, a.p_f], axis=-1) for a in (self.state, saved))
@@ -205,14 +203,14 @@ class Simulation:
             warnings.warn(
                 f"{caller}: the momenta of the start are off the hidden constraints, by {change:.3g} where the largest of them is {size:.3g}; the run "
                 "starts with their projection. Make the start by initial_state(...).",
-                stacklevel=stacklevel,
+                stacklevel=4,
             )
 
-    def warn(self, caller: str, table, t, stacklevel: int = 3) -> bool:
+    def warn(self, caller: str, table, t) -> bool:
         """Give the warnings about the motion of a run, or of runs with an axis of lanes, see `concerns`; returns whether there are any."""
         all_concerns = concerns(table, t, self.system, self.macro_dt, self.save_every)
         for concern in all_concerns:
-            warnings.warn(type(concern)(f"{caller}: {concern}"), stacklevel=stacklevel)
+            warnings.warn(type(concern)(f"{caller}: {concern}"), stacklevel=4)
         return bool(all_concerns)
 
     def __repr__(self) -> str:
@@ -234,9 +232,14 @@ class Simulation:
         return self.num_steps // self.save_every
 
     @cached_property
-    def columns(self) -> Columns:
+    def columns(self) -> tuple[slice, ...]:
         """The columns of its saved nodes."""
-        return Columns.of(self.state, self.scheme.num_micro if self.save.micro else 0)
+        return columns_of(self.state, self.scheme.num_micro if self.save.micro else 0)
+
+    @property
+    def width(self) -> int:
+        """Numbers of a saved node."""
+        return self.columns[-1].stop
 
     @cached_property
     def plan(self) -> Plan:
@@ -260,8 +263,8 @@ class Simulation:
 
     @cached_property
     def _pieces(self) -> Engine:
-        """Its programs for pieces, of a size for runs of all lengths, without the fallback."""
-        return self._engine(self.columns.saves_of_a_piece)
+        """Its programs for pieces, of a size for runs of all lengths, which then share them, without the fallback."""
+        return self._engine(max(NUMBERS_PER_PIECE // self.width, 1))
 
     @cached_property
     def blank_memory(self) -> Any:
@@ -269,9 +272,8 @@ class Simulation:
         return blank_memory(self._pieces, tuple((a.shape, a.dtype) for a in self.leaves))
 
     def _engine(self, num_saves: int) -> Engine:
-        blank = {"num_steps": 0, "save_every": 0, "names": None, "of_problem": False, "may_fall_back": True}
-        without_length = replace(self, save=Save(micro=self.save.micro), **blank)
-        return engine(jax.tree.structure(without_length), num_saves)
+        motion = Simulation(*(getattr(self, name) for name in MOTION), save=Save(micro=self.save.micro))
+        return engine(jax.tree.structure(motion), num_saves)
 
     @cached_property
     def exact(self) -> "Simulation":
@@ -286,39 +288,34 @@ class Simulation:
         with Working("checks of the system"):
             check_once(Known((self.system, replace(self.state, p_s=None, p_f=None))), state_name, constraints)
 
-    def start(self) -> Checkpoint:
-        """The checkpoint before the first step."""
-        return Checkpoint(Cursor.at_start(self.state))
-
-    def advance(self, checkpoint: Checkpoint, saves: int) -> tuple[Saved, Checkpoint]:
-        """The next `saves` saved intervals; from the first piece that is not solved, with the fallback.
+    def advance(self, cursor: Cursor, saves: int) -> "tuple[Saved, Cursor, Simulation]":
+        """The next `saves` saved intervals, the cursor after them, and the run that goes on from there: the fallback from the first piece on that
+        is not solved.
 
         After a failure nothing is computed, and all further nodes are NaN.
         """
-        pieces, room = [], self._pieces.num_saves
+        run, pieces, room = self, [], self._pieces.num_saves
         for done in range(0, saves, room):
             size = min(room, saves - done)
-            piece, after = self._advance(checkpoint, size)
-            if not checkpoint.fell_back and checkpoint.cursor.failed_at < 0 and self.unsolved(piece):
+            piece, after = run._advance(cursor, size)
+            if cursor.failed_at < 0 and run.unsolved(piece):
                 with Working(FALLING_BACK):
-                    again = Checkpoint(checkpoint.cursor._replace(memory=None), fell_back=True)
-                    piece, after = self._advance(again, size)
+                    run = run.exact
+                    piece, after = run._advance(cursor._replace(memory=None), size)
             pieces.append(piece)
-            checkpoint = after
-        return joined(pieces), checkpoint
+            cursor = after
+        return joined(pieces), cursor, run
 
-    def _advance(self, checkpoint: Checkpoint, saves: int) -> tuple[Saved, Checkpoint]:
-        cursor, run = checkpoint.cursor, self.exact if checkpoint.fell_back else self
+    def _advance(self, cursor: Cursor, saves: int) -> tuple[Saved, Cursor]:
         step, is_first = int(cursor.step), cursor.memory is None
         if is_first:
-            cursor = cursor._replace(memory=run.blank_memory)
-        rows, cursor = run._pieces.program(run.leaves, self.save_every, saves, cursor, is_first)
+            cursor = cursor._replace(memory=self.blank_memory)
+        rows, cursor = self._pieces.program(self.leaves, self.save_every, saves, cursor, is_first)
         nodes = np.array(np.asarray(rows)[: saves + 1])  # a copy, which holds no memory of a whole piece
-        saved = Saved(nodes, np.asarray(cursor.result), np.asarray(cursor.failed_at))
-        saved = saved.marked(self.columns, self.save_every, step)
+        saved = Saved.of(nodes, self.columns, np.asarray(cursor.result), np.asarray(cursor.failed_at))
+        saved = saved.marked(self.save_every, step)
         reached = np.asarray(step + saves * self.save_every)
-        cursor = cursor._replace(step=reached, result=saved.result, failed_at=saved.failed_at)
-        return saved, checkpoint._replace(cursor=cursor)
+        return saved, cursor._replace(step=reached, result=saved.result, failed_at=saved.failed_at)
 
     def unsolved(self, saved: Saved) -> np.ndarray:
         """Whether the fallback may solve a run or a piece, or (lanes,) the runs of a batch."""
@@ -329,14 +326,11 @@ class Simulation:
 
     def _method(self, saved: Saved):
         """The largest `Method` of the steps."""
-        return saved.rows[..., self.columns.info.start].max(axis=-1)
+        return saved.info[..., 0].max(axis=-1)
 
-    def in_pieces(self, caller: str = "") -> Trajectory:
-        """The whole run; with a progress bar Ctrl-C raises `Interrupted` with the trajectory computed so far.
-
-        With the name of a `caller` it warns about the motion, see `warn`.
-        """
-        bar, checkpoint, pieces = self.save.progress is not False, self.start(), []
+    def in_pieces(self) -> Saved:
+        """The nodes of the whole run; with a progress bar Ctrl-C raises `Interrupted` with the trajectory computed so far."""
+        bar, cursor, run, pieces = self.save.progress is not False, Cursor.at_start(self.state), self, []
         size = -(-self.num_saves // (PARTS_OF_A_BAR if bar else 1))
         noted = interrupts_noted() if bar else nullcontext(lambda: False)
         shown = progress_to("simulate", self.save.progress) if bar else Working("the run", running=STEPPING)
@@ -344,39 +338,38 @@ class Simulation:
             for done in range(0, self.num_saves, size):
                 if bar:
                     tell("simulating", done, self.num_saves)
-                piece, checkpoint = self.advance(checkpoint, min(size, self.num_saves - done))
+                piece, cursor, run = run.advance(cursor, min(size, self.num_saves - done))
                 pieces.append(piece)
                 if interrupted():
-                    steps = int(checkpoint.cursor.step)
-                    raise Interrupted(joined(pieces).trajectory(self), steps, self.num_steps, "macro steps")
-        saved = joined(pieces)
-        trajectory = saved.trajectory(self)
-        if caller:
-            self.tell_of_start(caller, trajectory.states, stacklevel=4)
-            self.warn(caller, saved.table, trajectory.states.t, stacklevel=4)
-        return trajectory
+                    so_far = joined(pieces).trajectory(self)
+                    raise Interrupted(so_far, int(cursor.step), self.num_steps, "macro steps")
+        return joined(pieces)
 
 
-def simulation(moving: Movable, scheme, state: State | None, solver: Solver | None, steps: Steps) -> Simulation:
+def simulation(
+    moving: Movable,
+    scheme,
+    state: State | None,
+    solver: Solver | None,
+    macro_dt,
+    num_steps=None,
+    t_end=None,
+    save: int | Save = 1,
+) -> Simulation:
     """The `Simulation` with these arguments of `simulate`; bad arguments raise."""
     warn_if_slow()
     problem = opened(moving)
     of_problem = state is None
     with Working("the start of the run"):
         system, state = start_of("simulate", problem, state)
-    num_steps, save_every = check_run(system, scheme, state, solver, steps)
+    num_steps, save_every = check_run(system, scheme, state, solver, macro_dt, num_steps, t_end, save)
     # Scenes only: `opened` returns problems as they are.
     advice = nothing_fast(scheme, state.q_f.size) if moving is not problem else ""
     if advice:
         warnings.warn(f"simulate: {advice}", stacklevel=3)
-    chosen_solver, scheme, system = of_one_type((solver or _usual_solver(), scheme, system))
-    motion = (_float(steps.macro_dt), _with_arrays(state), chosen_solver, scheme, system)
-    return Simulation(*motion, num_steps, save_every, Save.of(steps.save), names_of(problem), of_problem)
-
-
-@cache
-def _usual_solver() -> Solver:
-    return Solver()
+    chosen_solver, scheme, system = of_one_type((solver or Solver(), scheme, system))
+    motion = (_float(macro_dt), _with_arrays(state), chosen_solver, scheme, system)
+    return Simulation(*motion, num_steps, save_every, Save.of(save), names_of(problem), of_problem)
 
 
 def _with_arrays(state: State) -> State:

@@ -1,6 +1,7 @@
 """Runs of a study: a row with errors, invariants, evaluations and time, and their table; the reference solution that errors
 of runs are measured against, with its own errors."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from operator import attrgetter
@@ -93,12 +94,14 @@ def reference_solution(
     """
     problem = problem_of("reference_solution", problem)
     run = prepare(problem, galerkin(1, degree, "gauss"), macro_dt=t_end / num_saves, num_steps=num_saves)
-    fixed = num_steps is not None
     drives = events(problem.system, run.state, float(run.state.t) + t_end)
     fewest = max(32, fewest_steps(run.scheme, drives, t_end))  # steps that see the events of forces
-    n = num_steps if fixed else num_saves * -(-fewest // num_saves)
+    first, halvings = num_steps, 1
+    if first is None:
+        first = num_saves * -(-fewest // num_saves)
+        halvings = max(0, math.ceil(math.log2(max(MAX_STEPS, 2 * fewest) / first)))
     coarse, best, last_error = None, None, np.inf
-    while True:
+    for n in (first * 2**k for k in range(halvings + 1)):
         progress(f"reference solution, {n} steps", 0, 1)
         trajectory = run(macro_dt=t_end / n, num_steps=n, throw=False)
         fine = joined(trajectory) if bool(trajectory.success) else None
@@ -107,16 +110,14 @@ def reference_solution(
             if best is None or error_q < best.error_q:
                 best = ReferenceSolution(*fine, error_q, error_p)
             # a difference that no longer falls has reached round-off or the floor of a chaotic motion; above 1e-6 of the positions the steps may still be too large
-            settled = error_q > last_error / 2 and error_q < 1e-6 * np.abs(fine[0]).max()
-            if fixed or settled or error_q <= ROUNDOFF * np.abs(fine[0]).max():
-                return best
+            size = np.abs(fine[0]).max()
+            if error_q <= ROUNDOFF * size or last_error / 2 < error_q < 1e-6 * size:
+                break
             last_error = error_q
-        if (fixed and (fine is None or n > num_steps)) or n >= max(MAX_STEPS, 2 * fewest):
-            break
-        coarse, n = fine, 2 * n
-    if best is not None:
-        return best
-    raise simulation_error(trajectory, t_end / n, n // num_saves, num_micro=1)
+        coarse = fine
+    if best is None:
+        raise simulation_error(run.with_arguments(macro_dt=t_end / n, num_steps=n), trajectory)
+    return best
 
 
 @dataclass(frozen=True)

@@ -51,10 +51,10 @@ class Tuning(Search):
     def note(self, trial: Trial) -> None:
         """Add the row of a trial; a failed or uncertified run has an error of NaN."""
         run, error = trial.run, trial.error if np.isfinite(trial.error) else np.nan
-        label, numbers = trial.family.label(trial.num_micro), (float(run.macro_dt), run.num_steps)
+        label, numbers = trial.family.label(trial.family.first), (float(run.macro_dt), run.num_steps)
         measured = {"error_q": error, "settings": self.settings(trial), "family": trial.family.name}
         row = row_of(label, run.system, run.scheme, trial.trajectory, *numbers, **measured)
-        self._rows[trial.python, run.num_steps] = row
+        self._rows[trial.family.expression, run.num_steps] = row
 
     def look_for(self, error: float, exhaustive: bool = False) -> WorkPrecision:
         """Search for an error, and return the table of all runs so far."""
@@ -88,8 +88,9 @@ class Recommendation(WorkPrecision):
 
     @property
     def setting(self) -> Row:
-        """The recommended run, with its error and time; `setting.settings.arguments` are all arguments for `vmri_jax.simulate`."""
-        return self.keeping(self.error)[0]
+        """The recommended run, with its error and time; `setting.settings.arguments` are all arguments for `vmri_jax.simulate`. None, in a report on several
+        errors, where no run keeps the error."""
+        return next(iter(self.keeping(self.error)), None)  # pyright: ignore[reportReturnType] `tune` raises then
 
     @property
     def runs(self) -> WorkPrecision:
@@ -164,7 +165,7 @@ def tune(
     tuning.check(error)
     with interruptible(tuning.runs):
         choice = Recommendation(tuning.look_for(error, exhaustive).rows, error=error)
-        if not choice.keeping(error):
+        if choice.setting is None:
             raise _nothing(tuning, error)
     progress("done", 1, 1)
     tuning.warn_of_events("tune", choice.scheme, stacklevel=4)
@@ -175,7 +176,7 @@ def _nothing(tuning: Tuning, error: float) -> Exception:
     """The reason why no setting keeps the error: all runs failed, or none is as accurate."""
     runs, trial = tuning.runs(), tuning.first_trials(tuning.menu, error)[0]
     if all(row.result not in ("CONVERGED", "CONVERGED_AT_ROUNDOFF") for row in runs.rows):
-        return simulation_error(trial.trajectory, trial.run.macro_dt, trial.run.save_every, trial.run.scheme.num_micro)
+        return simulation_error(trial.run, trial.trajectory)
     best = min(runs.rows, key=lambda row: np.nan_to_num(row.error_q, nan=np.inf))
     certified = f"the best error was {best.error_q:.1e}, with {best.scheme} and {best.num_steps} steps"
     reason = certified if np.isfinite(best.error_q) else "no error is certified until t_end"
@@ -183,15 +184,7 @@ def _nothing(tuning: Tuning, error: float) -> Exception:
     return NothingReached(text, runs)
 
 
-@dataclass(frozen=True)
-class Answer:
-    """The largest accepted error of the positions, and the run of the cheapest setting; None if no setting keeps it."""
-
-    error: float
-    setting: Row | None
-
-
-def _of_setting(form: Callable[[Row], str]) -> Callable[[Answer], str]:
+def _of_setting(form: Callable[[Row], str]) -> Callable[[Recommendation], str]:
     """The text of a column: `form` of the run, empty if none keeps the error."""
     return lambda answer: "" if answer.setting is None else form(answer.setting)
 
@@ -223,10 +216,9 @@ class CostReport(ResultTable):
     bound: tuple[tuple[float, float], ...] = ()
 
     @property
-    def rows(self) -> list[Answer]:
+    def rows(self) -> list[Recommendation]:
         """The answers by error, the largest first: the fastest run that keeps the error, for whichever error the search made it."""
-        errors = sorted(self.errors, reverse=True)
-        return [Answer(error, next(iter(self.runs.keeping(error)), None)) for error in errors]
+        return [Recommendation(self.runs.rows, error=error) for error in sorted(self.errors, reverse=True)]
 
     @property
     def caption(self) -> str:

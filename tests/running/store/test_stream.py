@@ -128,7 +128,7 @@ def test_a_complete_run_is_made_longer(run, uninterrupted, out, steps):
 
 
 def test_a_complete_run_is_returned_at_once(run, uninterrupted, monkeypatch):
-    monkeypatch.setattr(Simulation, "start", None)
+    monkeypatch.setattr(Simulation, "advance", None)
     assert run(uninterrupted.path, resume=True).complete
 
 

@@ -17,8 +17,8 @@ from vmri_jax.mechanics.system import System
 from vmri_jax.refusals import Refused
 from vmri_jax.running.engine import Cursor
 from vmri_jax.running.export import NODES, Exports
-from vmri_jax.running.origin import Origin
-from vmri_jax.running.simulation import Checkpoint, Simulation
+from vmri_jax.running.origin import UNKNOWN, Origin
+from vmri_jax.running.simulation import Simulation
 from vmri_jax.running.store import layout
 from vmri_jax.running.store.layout import chunk_file, read_attributes
 from vmri_jax.running.summaries import named_coordinates
@@ -27,7 +27,7 @@ from vmri_jax.steppers.results import Result
 
 
 class Record(NamedTuple):
-    """A `Checkpoint` after the committed saved intervals: their number, its counts, leaves of its state and memory."""
+    """A `Cursor` after the committed saved intervals: their number, its counts, whether the fallback goes on from there, leaves of state and memory."""
 
     saved: int = 0
     result: int = int(Result.CONVERGED)
@@ -37,12 +37,10 @@ class Record(NamedTuple):
     leaves: list[np.ndarray] = []  # noqa: RUF012 (never changed)
 
     @classmethod
-    def of(cls, checkpoint: Checkpoint, saved: int) -> "Record":
-        """The record of a checkpoint."""
-        state, memory, *counts = checkpoint.cursor
-        step, result, failed_at = map(int, counts)
-        leaves = list(map(np.asarray, jax.tree.leaves((state, memory))))
-        return cls(saved, result, failed_at, step, checkpoint.fell_back, leaves)
+    def of(cls, cursor: Cursor, saved: int, fell_back: bool) -> "Record":
+        """The record of a cursor."""
+        leaves = list(map(np.asarray, jax.tree.leaves((cursor.state, cursor.memory))))
+        return cls(saved, int(cursor.result), int(cursor.failed_at), int(cursor.step), fell_back, leaves)
 
     @classmethod
     def last_of(cls, path: Path) -> "Record":
@@ -64,17 +62,16 @@ class Record(NamedTuple):
         np.savez(out, counts=np.array(self[:-1], dtype=np.int64), **leaves)  # pyright: ignore[reportArgumentType]
         return out.getvalue()
 
-    def checkpoint(self, run: Simulation) -> Checkpoint:
-        """The checkpoint of the run; a ValueError if the arrays do not fit the memory of its stepper."""
+    def cursor(self, run: Simulation) -> tuple[Cursor, Simulation]:
+        """The cursor, and the run that goes on from it, `run` or its fallback; a ValueError if the arrays do not fit the memory of its stepper."""
         if not self.leaves:
-            return run.start()
-        memory = (run.exact if self.fell_back else run).blank_memory
-        expected, structure = jax.tree.flatten((run.state, memory))
+            return Cursor.at_start(run.state), run
+        run = run.exact if self.fell_back else run
+        expected, structure = jax.tree.flatten((run.state, run.blank_memory))
         if [(leaf.shape, leaf.dtype) for leaf in self.leaves] != [(leaf.shape, leaf.dtype) for leaf in expected]:
             raise Refused("the checkpoint was made by a version of vmri_jax whose steps remember something else")
         state, memory = jax.tree.unflatten(structure, map(jnp.asarray, self.leaves))
-        status = map(np.asarray, (self.step, self.result, self.failed_at))
-        return Checkpoint(Cursor(state, memory, *status), self.fell_back)
+        return Cursor(state, memory, *map(np.asarray, (self.step, self.result, self.failed_at))), run
 
 
 class StoredTrajectory(Exports):
@@ -101,6 +98,8 @@ class StoredTrajectory(Exports):
         ValueError: the path is no store, or a damaged one.
     """
 
+    origin: Origin = UNKNOWN
+
     def __init__(self, path):
         self.path = Path(path)
         if self.path.is_file():
@@ -112,7 +111,7 @@ class StoredTrajectory(Exports):
         self.chunk: int = self.attributes["chunk"]
         self.record = Record.last_of(self.path)
         self.step, self.result, self.failed_at = self.record.step, Result(self.record.result), self.record.failed_at
-        self._origin = Origin.from_file(self.attributes.get("names"))
+        self.origin = Origin.from_file(self.attributes.get("names"))
 
     def __repr__(self) -> str:
         state = "complete" if self.complete else "not complete" if self.success else f"failed: {self.result.name}"
@@ -124,10 +123,6 @@ class StoredTrajectory(Exports):
         title = f"StoredTrajectory {self.path}: {len(self)} saved nodes, one every {self.save_every} macro steps"
         return summary(title, lines)
 
-    @property
-    def origin(self) -> Origin:
-        return self._origin
-
     def of(self, moving: System | Problem | HasProblem) -> "StoredTrajectory":
         """The same run with its system, see `Trajectory.of`."""
         return self.with_origin(self[:1].of(moving).origin)
@@ -135,7 +130,7 @@ class StoredTrajectory(Exports):
     def with_origin(self, origin: Origin) -> "StoredTrajectory":
         """The same run with another origin."""
         stored = copy(self)
-        stored._origin = origin
+        stored.origin = origin
         return stored
 
     @property

@@ -2,7 +2,6 @@
 
 import os
 from collections.abc import Iterator
-from itertools import pairwise
 from pathlib import Path
 
 import jax
@@ -11,7 +10,7 @@ import numpy as np
 from vmri_jax.mechanics.arrays import whole_number
 from vmri_jax.mechanics.state import Movable, State
 from vmri_jax.refusals import Refused
-from vmri_jax.running.arguments import Save, Steps, refuse_tracers
+from vmri_jax.running.arguments import Save, refuse_tracers
 from vmri_jax.running.export import DIMENSIONS, rows_of
 from vmri_jax.running.failures import simulation_error
 from vmri_jax.running.files import explained
@@ -79,7 +78,7 @@ def stream(
     """
     path = Path(out)
     layout.check_place("stream", path, "run", resume, overwrite)
-    run = simulation(system, scheme, state, solver, Steps(macro_dt, num_steps, t_end, save))
+    run = simulation(system, scheme, state, solver, macro_dt, num_steps, t_end, save)
     num_steps = run.num_steps
     refuse_tracers("stream", run.leaves, ", since it writes files")
     run.check("stream: the positions of the state")
@@ -94,7 +93,7 @@ def stream(
     }
     attributes |= {} if drawing is None else {"drawing": drawing}
     attributes |= {} if run.names is None else {"names": run.names.to_dict()}
-    two_nodes = Saved(np.zeros((2, run.columns.width)), np.asarray(0), np.asarray(-1)).trajectory(run)
+    two_nodes = Saved.of(np.zeros((2, run.width)), run.columns, np.asarray(0), np.asarray(-1)).trajectory(run)
     arrays = {name: Kept(rows[0], DIMENSIONS[name][1:]) for name, rows in rows_of(two_nodes).items()}
     with (
         interrupts_noted() as interrupted,
@@ -114,43 +113,41 @@ def stream(
     stored = StoredTrajectory(path)
     stored = stored.with_origin(run.origin) if len(stored) else stored
     if not stored.success:
-        raise simulation_error(stored, run.macro_dt, run.save_every, scheme.num_micro)
+        raise simulation_error(run, stored)
     return stored
 
 
 def _continue(stored: StoredTrajectory, run: Simulation, tell: Progress) -> Iterator[int]:
     """Compute and write the missing chunks; yields the number of macro steps done after every chunk."""
     path, chunk, record = stored.path, stored.chunk, stored.record
-    rows = stored.num_steps // run.save_every
+    rows = run.num_saves
     if record.saved == rows or not stored.success:
         return
     try:
-        checkpoint = record.checkpoint(run)
+        cursor, current = record.cursor(run)
     except ValueError as error:
         raise Refused(f"{path} can be read, but its run cannot go on: {error}.") from error
     with explained(path, _advice(record.step)):
         writer = layout.Writer(path)
-    # The start and the largest values so far, as a node before each chunk: energies are compared with the start of the run.
-    before, has_warned = at_nodes(observables, run.origin, jax.tree.map(lambda a: a[None], run.state)), False
-    # Every write but the last ends at a multiple of `chunk` rows, so that no file is written twice.
-    ends = [*range((record.saved + 1) // chunk * chunk + chunk, rows + 1, chunk), rows + 1]
-    sizes = [end - begin for begin, end in pairwise([record.saved + 1, *ends])]
-    for size in sizes:
+    # The start and the largest values so far, as a node before each chunk but the first: energies are compared with the start of the run.
+    start, has_warned = jax.tree.map(lambda a: a[None], run.state), False
+    before = at_nodes(observables, run.origin, start) if record.saved else np.zeros((0, len(Observables._fields)))
+    while record.saved < rows and record.failed_at < 0:
         tell("simulating", record.saved, rows)
-        saved, checkpoint = run.advance(checkpoint, size)
+        # Every write but the last ends at a multiple of `chunk` rows, so that no file is written twice.
+        size = min(chunk - (record.saved + 1) % chunk, rows - record.saved)
+        saved, cursor, current = current.advance(cursor, size)
         piece, table = saved.trajectory(run, record.step), np.concatenate([before, saved.table])
         if not record.saved:
-            run.tell_of_start("stream", piece.states, stacklevel=4)
-        has_warned = has_warned or run.warn("stream", table, np.append(run.state.t, piece.states.t), stacklevel=4)
+            run.tell_of_start("stream", saved)
+        has_warned = has_warned or run.warn("stream", table, np.append(start.t[: len(before)], piece.states.t))
         before = Observables.of(table).so_far()
-        first = record.saved + 1 if record.saved else 0  # the first chunk has the start
-        values = {name: value[1 if record.saved else 0 :] for name, value in rows_of(piece).items()}
+        skip = int(record.saved > 0)  # the first chunk has the start
+        first, values = record.saved + skip, {name: value[skip:] for name, value in rows_of(piece).items()}
         with explained(path, _advice(record.step)):
-            record = Record.of(checkpoint, record.saved + size)
+            record = Record.of(cursor, record.saved + size, fell_back=current is not run)
             writer.write(first, values, record.packed())
         yield record.step
-        if record.failed_at >= 0:
-            return
 
 
 def _advice(step: int) -> str:
@@ -163,5 +160,5 @@ def _advice(step: int) -> str:
 def _chunk(run: Simulation) -> int:
     """Saved intervals per chunk where the user gives none."""
     seconds = MICRO_STEP_SECONDS * run.scheme.num_micro * run.save_every
-    rows = layout.rows_per_chunk(run.num_saves, seconds, BYTES_PER_NUMBER * run.columns.width, CHUNKS_PER_RUN)
+    rows = layout.rows_per_chunk(run.num_saves, seconds, BYTES_PER_NUMBER * run.width, CHUNKS_PER_RUN)
     return max(1, min(int(rows), run.num_saves))
