@@ -21,6 +21,7 @@ from vmri_jax.ensembles.design import SCHEMES, STEPS, columns_of_problems
 from vmri_jax.ensembles.quantities import drawn_by_default
 from vmri_jax.executors.executor import local_workers
 from vmri_jax.mechanics.arrays import whole_number
+from vmri_jax.mechanics.checks import check_flags, check_number
 from vmri_jax.mechanics.names import near
 from vmri_jax.mechanics.places import START, Place, Placed, places_of
 from vmri_jax.mechanics.slots import free
@@ -113,8 +114,12 @@ def _axis(subject: str, entry) -> Any:
         return Axis(entry["values"], *words)
     if not {"from", "to", "count"} <= set(entry):
         raise Refused(f"{subject}: give values, or from, to and count.")
-    spaced = np.geomspace if entry.get("log") else np.linspace
-    return Axis(spaced(float(entry["from"]), float(entry["to"]), int(entry["count"])), *words)
+    logarithmic, count = entry.get("log", False), whole_number(f"{subject}: count", entry["count"])
+    check_flags(**{f"{subject}: log": logarithmic})
+    ends = [check_number(f"{subject}: {name}", entry[name]) for name in ("from", "to")]
+    if logarithmic and not all(end > 0 for end in ends):
+        raise Refused(f"{subject}: from is {ends[0]} and to is {ends[1]}; with log = true both are positive.")
+    return Axis((np.geomspace if logarithmic else np.linspace)(*ends, count), *words)
 
 
 def _draws(file: Path, entries: Mapping[str, Any]) -> Draws:
