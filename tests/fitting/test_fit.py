@@ -89,6 +89,10 @@ def test_intervals_cover(found):
     coverage = bootstrap.coverage()
     assert "Bootstrap of 150 fits" in repr(bootstrap)
     assert all(0.9 < part < 0.99 for part in coverage.values())
+    with pytest.raises(ValueError, match="level is 95; it must lie between 0 and 1"):
+        bootstrap.coverage(95)
+    with pytest.raises(ValueError, match="repeats is 0"):
+        found.bootstrap(0)
 
 
 def test_steps_that_move_the_parameters_are_doubted():
@@ -166,6 +170,11 @@ GOOD = measured(5)
             ValueError,
             "1 values for 2 unknown numbers",
             lambda: fit(Measured([0.05], [0.0], sigma=1.0, observe=slow_position), {"omega": 1.0, "v_s": [0.0]}),
+        ),
+        (
+            ValueError,
+            "1 values for 1 unknown numbers and sigma",
+            lambda: fit(Measured([0.05], [0.0], observe=slow_position), {"omega": 1.0}),
         ),
         (ValueError, "all measurements are at the start of the", lambda: fit(Measured([0.0], [[0.0, 0.0]], sigma=1.0))),
         (TypeError, "the model", lambda: vm.fit(cast(Any, lambda p: 3), GOOD, {"a": 1.0}, scheme=SCHEME, macro_dt=DT)),

@@ -151,8 +151,9 @@ class _Search:
         self.compiled_jacobian = jax.jit(self.jacobian)
         self.size = shooting.unknowns.size
         self.count = len(shooting.values)
-        if self.count < self.size:
-            raise Refused(f"fit: {self.count} values for {self.size} unknown numbers; measure more, or fix some.")
+        if self.count < self.size + (not shooting.knows_sigma):
+            numbers = f"{self.size} unknown numbers{'' if shooting.knows_sigma else ' and sigma'}"
+            raise Refused(f"fit: {self.count} values for {numbers}; measure more, or fix some.")
         u_start = np.zeros(self.size)
         self.part_starts = shooting.starts(u_start)
         self.scale = shooting.sizes(u_start, self.part_starts)
