@@ -101,7 +101,7 @@ def test_a_failed_run_is_drawn_up_to_its_failure():
 def test_wrong_systems_and_batches_are_refused():
     run = oscillating(11)
     heavier = OSCILLATORS.replace(kinetic=vm.ConstantMass([2 * MASS], [1.0]))
-    with pytest.raises(ValueError, match=r"has the energy 8\.75 at the start, the run 9\.5"):
+    with pytest.raises(ValueError, match=r"of the system is 8\.75 where the energy of the run is 9\.5"):
         motion(run, LINE, heavier)
     larger = vm.System(vm.ConstantMass([1.0, 1.0, 1.0], [1.0]), harmonic, stiff)
     with pytest.raises(ValueError, match="the run has 2 slow and 1 fast coordinates"):

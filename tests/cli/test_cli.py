@@ -104,7 +104,9 @@ def test_simulate_runs_a_users_own_problem(vmri, name):
 
 
 @pytest.mark.parametrize("out", ["run.npz", "run.zarr"])
-def test_a_saved_run_keeps_the_names_of_its_problem(vmri, tmp_path, out):
+def test_a_saved_run_keeps_the_names_of_its_problem(vmri, tmp_path, monkeypatch, out):
+    """The report has all nodes of the run, also where a figure has fewer."""
+    monkeypatch.setattr("vmri_jax.cli.run.MOST_READ_NODES", 2)
     names = 'vm.Names(slow={"trolley": 1}, fast={"bell": 1})'
     (tmp_path / "named.py").write_text(
         USER_FILE.replace("one, one)\n\ndef make", f"one, one, names={names})\n\ndef make")
@@ -112,6 +114,7 @@ def test_a_saved_run_keeps_the_names_of_its_problem(vmri, tmp_path, out):
     code, text = vmri("simulate", "named.py:my_problem", *RUN, "--out", out)
     assert code == 0, text
     run = vm.Trajectory.load(out) if out.endswith(".npz") else vm.StoredTrajectory(out)[:]
+    assert "5 saved nodes from t = 0 to 0.4" in text
     assert run.position("bell").shape == (5, 1)
     assert run.names.slow_coordinates == ["trolley"]
 

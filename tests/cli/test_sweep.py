@@ -146,7 +146,11 @@ def test_axes_and_files_are_seen_from_the_folder(tmp_path):
     [
         (("out =", "oout ="), "no entry 'oout'. Did you mean out?"),
         (('system = "fpu"\n', ""), "lacks the entry 'system'"),
-        (("omega = [20.0, 50.0]", "omega = { from = 1 }"), "the axis omega: give values, or from, to and count"),
+        (("omega = [20.0, 50.0]", "omega = { from = 1 }"), "the axis omega lacks the entry 'to'"),
+        (("omega = [20.0, 50.0]", "omega = { values = [1], from = 1 }"), "the axis omega: there is no entry 'from'"),
+        (("omega = [20.0, 50.0]", "omega = { from = 1, to = 2, count = 3.7 }"), "the axis omega: count is 3.7"),
+        (("omega = [20.0, 50.0]", "omega = { from = 0, to = 2, count = 3, log = true }"), "both are positive"),
+        (("omega = [20.0, 50.0]", "omega = { from = 1, to = 2, count = 3, log = 'false' }"), "log is 'false'; it must"),
         (("omega = [20.0, 50.0]", "omega = { form = 1 }"), "no entry 'form'. Did you mean from?"),
         (("omega", "omga"), "the column 'omga' sets no number of the problem. Did you mean omega?"),
         (("omega", '"q_s[7]"'), "the column 'q_s[7]' sets no number of the problem"),
@@ -163,6 +167,21 @@ def test_bad_files_are_refused(vmri, tmp_path, change, message):
     assert code == 2
     assert message in text
     assert not (tmp_path / "runs.zarr").exists()
+
+
+@pytest.mark.parametrize(
+    ("column", "message"),
+    [
+        ("{ unit = 'm' }", "draws: omega lacks the entry 'distribution'"),
+        ("{ distribution = 'normal' }", "the column 'omega' is 'normal'; give a distribution"),
+    ],
+)
+def test_bad_draws_are_refused(tmp_path, column, message):
+    axes = SMALL[SMALL.index("[axes]") :]
+    draws = f"[draws]\ncount = 3\n[draws.columns]\nomega = {column}\n"
+    (tmp_path / "sweep.toml").write_text(SMALL.replace(axes, draws))
+    with pytest.raises(ValueError, match=message):
+        read_sweep(tmp_path / "sweep.toml")
 
 
 def test_bad_options_are_refused(vmri):

@@ -238,6 +238,8 @@ KICKS: dict[str, Any] = {
         ("num_controls is 0", {"num_controls": 0}),
         (r"start has shape \(3,\); the controls have \(10, 1\)", {"start": [1.0, 2.0, 3.0]}),
         ("tolerance", {"tolerance": -1.0}),
+        ("derivatives of cost, the steps or the goal are not finite", {"cost": lambda state, u: jnp.sqrt(u @ u)}),
+        ("the second derivative of cost in u is not positive", {"cost": lambda state, u: u[0]}),
     ],
 )
 def test_bad_input(message, options):
@@ -249,7 +251,7 @@ def test_bad_input(message, options):
         "macro_dt": 0.1,
         "num_steps": 10,
     }
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises((ValueError, RuntimeError), match=message):
         minimize(POINT, **(given | options))
 
 

@@ -109,6 +109,14 @@ def test_steps_of_each_lane(tmp_path):
     assert np.allclose(data.p_s[2], run.p_s[-1], rtol=0, atol=1e-13)
 
 
+def test_a_column_that_changes_nothing_is_told(tmp_path):
+    def frequency_alone(problem, row):
+        return replace(problem, system=problem.system.with_params({"omega": row["omega"]}))
+
+    with pytest.warns(UserWarning, match="ensemble: no run depends on mass: vary does not use"):
+        few(tmp_path / "runs.zarr", design={"omega": [20.0], "mass": [1.0, 2.0]}, vary=frequency_alone)
+
+
 def test_draws_can_be_read_and_repeated(tmp_path):
     design = Draws(300, {"omega": ("uniform", 20, 60), "v_f[0]": ("normal", 0, 0.1)}, seed=5)
     data = few(tmp_path / "draws.zarr", design=design, chunk=100).open()

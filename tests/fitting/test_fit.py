@@ -4,6 +4,7 @@ import sys
 from dataclasses import replace
 from typing import Any, cast
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -11,7 +12,7 @@ import vmri_jax as vm
 from tests.small_systems import driven
 from vmri_jax.fitting import Measured, Unknown
 from vmri_jax.fitting.fit import _model
-from vmri_jax.fitting.given import Unknowns
+from vmri_jax.fitting.given import Unknowns, positions
 from vmri_jax.fitting.shooting import Shooting
 from vmri_jax.schemes.composition import SchemeLike
 
@@ -88,6 +89,10 @@ def test_intervals_cover(found):
     coverage = bootstrap.coverage()
     assert "Bootstrap of 150 fits" in repr(bootstrap)
     assert all(0.9 < part < 0.99 for part in coverage.values())
+    with pytest.raises(ValueError, match="level is 95; it must lie between 0 and 1"):
+        bootstrap.coverage(95)
+    with pytest.raises(ValueError, match="repeats is 0"):
+        found.bootstrap(0)
 
 
 def test_steps_that_move_the_parameters_are_doubted():
@@ -166,14 +171,37 @@ GOOD = measured(5)
             "1 values for 2 unknown numbers",
             lambda: fit(Measured([0.05], [0.0], sigma=1.0, observe=slow_position), {"omega": 1.0, "v_s": [0.0]}),
         ),
+        (
+            ValueError,
+            "1 values for 1 unknown numbers and sigma",
+            lambda: fit(Measured([0.05], [0.0], observe=slow_position), {"omega": 1.0}),
+        ),
         (ValueError, "all measurements are at the start of the", lambda: fit(Measured([0.0], [[0.0, 0.0]], sigma=1.0))),
         (TypeError, "the model", lambda: vm.fit(cast(Any, lambda p: 3), GOOD, {"a": 1.0}, scheme=SCHEME, macro_dt=DT)),
         (ValueError, "segments is 0", lambda: fit(GOOD, segments=0)),
+        (ValueError, "spread is nan", lambda: fit(GOOD, spread=np.nan)),
+        (ValueError, "seed is -1", lambda: fit(GOOD, seed=-1)),
+        (
+            ValueError,
+            "fit: macro_dt is -0.05",
+            lambda: vm.fit(CHAIN, GOOD, {"omega": 1.0}, scheme=SCHEME, macro_dt=-DT),
+        ),
+        (ValueError, "lower is -inf; it must be finite, or None", lambda: Unknown(1.0, lower=-np.inf)),
+        (ValueError, "scale is inf; it must be finite, or None", lambda: Unknown(1.0, scale=np.inf)),
+        (ValueError, "but for NaN in place of missing values", lambda: Measured([0.1, 0.2], [1.0, np.inf])),
+        (TypeError, r"observe is <lambda>\(state, params\)", lambda: watched(lambda state, params: state.q_f)),
+        (ValueError, r"observe returns shape \(1,\); it must return 2 real", lambda: watched(lambda state: state.q_f)),
+        (ValueError, "observe returns dict; it must return 2 real", lambda: watched(lambda state: {"q": state.q_f})),
+        (ValueError, r"observe returns \[.*nan.*\] at t = ", lambda: watched(lambda state: jnp.log(positions(state)))),
     ],
 )
 def test_bad_input(error, message, call):
     with pytest.raises(error, match=message):
         call()
+
+
+def watched(observe):
+    return fit(Measured(GOOD.t, GOOD.values, sigma=1.0, observe=observe))
 
 
 def fit(data, parameters=None, **options):

@@ -96,6 +96,18 @@ def three(chain):
     return batch_of_three(chain, spread(chain, 3))
 
 
+def well(q_f, params):
+    return jnp.sum(q_f**4)
+
+
+def test_lanes_that_start_at_the_nodes_of_a_run_without_slow_coordinates():
+    """The empty array of slow positions of a run has other strides than a copy of it."""
+    single = vm.Problem(vm.System(vm.ConstantMass([], [1.0]), fast_potential=well), [], [1.0])
+    run = simulate(single, fully_explicit(2), macro_dt=0.05, num_steps=6)
+    lanes = simulate_batch(single, fully_explicit(2), run.states, macro_dt=0.05, num_steps=2)
+    np.testing.assert_allclose(lanes.q_f[:-2, 2], run.q_f[2:], rtol=1e-14)
+
+
 def test_step_sizes_and_params_per_lane(chain, three):
     for lane in range(3):
         system = chain.system.replace(params={"omega": OMEGAS[lane]})

@@ -111,6 +111,21 @@ def test_a_run_is_a_chain_of_macro_steps(fpu, every_step):
     assert float(state.t) == pytest.approx(float(every_step.t[5]), abs=1e-15)
 
 
+@pytest.mark.parametrize("macro_dt", [-H, 0.0, np.nan, None, [H, H], "0.1"])
+def test_a_macro_step_refuses_what_a_run_refuses(fpu, macro_dt):
+    with pytest.raises((ValueError, TypeError), match="macro_dt"):
+        macro_step(fpu.system, SCHEME, fpu.state(), macro_dt)
+    with pytest.raises((ValueError, TypeError), match="macro_dt"):
+        vm.diagnostics.step_condition(fpu, SCHEME, macro_dt=macro_dt)
+
+
+def test_a_macro_step_refuses_a_state_of_another_system(fpu):
+    with pytest.raises(ValueError, match="the state has 1 slow ones"):
+        macro_step(fpu.system, SCHEME, vm.systems.fermi_pasta_ulam(1).state(), H)
+    with pytest.raises(TypeError, match="scheme is str; give a Scheme"):
+        macro_step(fpu.system, "fully-implicit", fpu.state(), H)  # pyright: ignore[reportArgumentType]
+
+
 def test_progress_changes_nothing(fpu, every_step, capsys):
     assert_equal(run(fpu, save=vm.Save(micro=True, progress=True)), every_step, 1e-14)
     with_progress = run(fpu, save=vm.Save(micro=True, progress=True), num_steps=60)

@@ -1,11 +1,13 @@
 """Trajectories on disk and as xarray datasets."""
 
 import errno
+from dataclasses import replace
 
 import equinox as eqx
 import numpy as np
 import pytest
 
+import vmri_jax as vm
 from tests.support import joined
 from vmri_jax import Result, Save, State, Trajectory, explicit_slow, simulate
 
@@ -130,3 +132,17 @@ def test_the_status_of_all_pieces(trajectory, at):
     roundoff = np.asarray(int(Result.CONVERGED_AT_ROUNDOFF))
     pieces[at] = eqx.tree_at(lambda piece: piece.result, trajectory, roundoff)
     assert int(joined(pieces).result) == Result.CONVERGED_AT_ROUNDOFF
+
+
+def test_a_run_refuses_a_system_with_other_parameters(tmp_path):
+    """At the start the spring is relaxed: the energy at the end alone tells."""
+    problem = vm.systems.fermi_pasta_ulam(1, omega=20.0)
+    relaxed = replace(problem, q_s=np.ones(1), q_f=np.zeros(1))
+    run = vm.simulate(relaxed, vm.fully_explicit(1), macro_dt=0.01, num_steps=5)
+    run.save(tmp_path / "run.npz")
+    loaded = vm.Trajectory.load(tmp_path / "run.npz")
+    assert loaded.of(relaxed).work().balance == pytest.approx(run.work().balance)
+    stiffer = replace(relaxed, system=relaxed.system.with_params({"omega": 20.001}))
+    for made in (run, loaded):
+        with pytest.raises(ValueError, match=r"of: the energy of the system is .*; give the system that was simulated"):
+            made.of(stiffer)

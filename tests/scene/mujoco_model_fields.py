@@ -16,7 +16,7 @@ READ = {
     "springs, dampers and armature in joints": "jnt_stiffness dof_damping qpos_spring dof_armature",
     'limits of joints, for limits="spring"': "jnt_range jnt_margin jnt_solref dof_invweight0",
     "the start, where no qpos is given": "qpos0 nkey key_qpos key_qvel key_ctrl key_act key_mpos key_mquat",
-    "gravity and its compensation": "opt.gravity body_gravcomp",
+    "gravity and its compensation": "opt.gravity body_gravcomp ngravcomp",
     "equalities connect, weld, and of joints and fixed tendons": """tendon_adr tendon_num wrap_type wrap_objid wrap_prm neq eq_type eq_objtype eq_obj1id eq_obj2id eq_active0 eq_data
         nsite site_bodyid site_pos site_quat""",
     "which bodies could touch": "ngeom geom_bodyid pair_geom1 pair_geom2 nexclude exclude_signature",
@@ -34,7 +34,7 @@ IDLE = {
         site_sameframe jnt_group paths npaths""",
     "sensors": "sensor_* nsensor* opt.magnetic opt.disableflags.SENSOR",
     "data of users, and other fields of keyframes": "body_user jnt_user geom_user site_user nuser* numeric_* nnumeric* text_* ntext* tuple_* ntuple* key_*",
-    "values that MuJoCo derives from other fields": """stat.* signature flg_* ngravcomp body_rootid body_dofnum body_dofadr
+    "values that MuJoCo derives from other fields": """stat.* signature flg_* body_rootid body_dofnum body_dofadr
         body_treeid body_geomnum body_geomadr body_simple body_sameframe body_subtreemass body_invweight0 body_margin body_contype
         body_conaffinity body_bvhadr body_bvhnum bvh_* nbvh* oct_* noct dof_bodyid dof_parentid dof_treeid dof_Madr dof_simplenum
         dof_M0 dof_length tree_bodyadr tree_bodynum tree_dofadr tree_dofnum ntree B_* D_* M_* mapD2M mapM2D mapM2M

@@ -87,6 +87,10 @@ def test_a_given_motion_starts_where_the_joint_does():
     bodies, effects = bars()
     with pytest.raises(ValueError, match=r"joint_motion: path\(0\)"):
         Scene(bodies, [*effects, JointMotion("motion", lambda t, params: 1.0 + t)])
+    with pytest.raises(ValueError, match=r"joint_motion: path returns shape \(2,\); it must return a number"):
+        Scene(bodies, [*effects, JointMotion("motion", lambda t, params: t * jnp.ones(2))])
+    with pytest.raises(ValueError, match=r"pulse: history returns \(shape \(\)\); it must return"):
+        Scene(bodies, [*effects, JointDrive("motion", lambda t, params: (t,), name="pulse")])
 
 
 def test_a_list_of_joints_is_refused():

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
-from vmri_jax import diagnostics
 from vmri_jax.animation.drawing import Drawing, bars, with_bars
 from vmri_jax.mechanics.checks import check_type
 from vmri_jax.mechanics.state import HasProblem, Problem, opened
@@ -124,7 +123,7 @@ def motion(
     count = len(t) if finite.all() else int(np.argmin(finite))
     if count == 0:
         raise Refused("motion: the trajectory has no node with finite positions; there is nothing to draw.")
-    run = (trajectory if system is None else _of(trajectory, system))[:count]
+    run = (trajectory if system is None else trajectory.of(system))[:count]
     t, q_s, q_f = t[:count], q_s[:count], q_f[:count]
     v_s, v_f = map(np.asarray, run.velocities) if run.origin.knows_system else _differences(t, q_s, q_f)
     all_nodes = Nodes(t, q_s, q_f, v_s, v_f)
@@ -150,22 +149,6 @@ def motion(
         np.stack([np.interp(times, t, column) for column in residual.T], axis=1),
         _ending(trajectory, count),
     )
-
-
-def _of(trajectory: Trajectory, system: System) -> Trajectory:
-    """The run with its system, which must be the one of the run."""
-    try:
-        run = trajectory.of(system)
-    except Refused as error:
-        raise Refused(f"motion: {error} Give the system that was simulated.") from error
-    _, *phase = vars(run[0]).values()
-    energy, run_energy = float(diagnostics.energy(system, *phase)), float(trajectory.energy[0])
-    if abs(energy - run_energy) > 1e-6 * max(1.0, abs(run_energy)):
-        raise Refused(
-            f"motion: the system has the energy {energy:.6g} at the start, the run {run_energy:.6g}; give the "
-            "system that was simulated, with its parameters."
-        )
-    return run
 
 
 def _drawing(trajectory: Trajectory, shown: Any) -> Drawing:

@@ -33,7 +33,7 @@ DEFAULT_SCHEME = "fully-implicit"
 DEFAULT_SAVED_NODES = 1000
 """Approximate number of saved nodes of a run without --save-every; more make larger files."""
 MOST_READ_NODES = 10_000
-"""Largest number of nodes of a run in its summary and figure; more are not seen, and take longer."""
+"""Largest number of nodes of a figure, and of a store in its summary; more are not seen, and take longer."""
 
 
 def simulate(
@@ -98,7 +98,8 @@ def simulate(
     start = time.perf_counter()
     trajectory, stopped = _run(stream if streamed else run_at_once, problem, chosen, arguments)
     seconds, compiled = time.perf_counter() - start, sum(compiling)
-    saved, nodes = [str(out)] if streamed else [], trajectory[:: -(-len(trajectory) // MOST_READ_NODES)]
+    stride = -(-len(trajectory) // MOST_READ_NODES)
+    saved, nodes = [str(out)] if streamed else [], trajectory[::stride]
     try:  # the report is printed even if a file cannot be written
         if out is not None and isinstance(trajectory, Trajectory):
             trajectory.save(out, problem.drawing)
@@ -109,8 +110,10 @@ def simulate(
             saved.append(str(plot))
     finally:
         if stopped is None:
-            title, lines = summary_of(nodes)
-            lines["nodes"] = title.partition(": ")[2]
+            _, lines = summary_of(nodes if streamed else trajectory)
+            times = f"t = {trajectory[0].t:.6g} to {trajectory[-1].t:.6g}"
+            read = f"; this summary is of one in {stride}" if streamed and stride > 1 else ""
+            lines["nodes"] = f"{len(trajectory)} saved nodes from {times}{read}"
             if steps is not None and chosen is not None:  # else the time includes trial runs
                 lines["macro steps"] = f"{steps}, of {chosen.num_micro} micro steps each"
                 done = (steps - (0 if before is None else before.step)) * chosen.num_micro

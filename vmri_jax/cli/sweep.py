@@ -21,6 +21,7 @@ from vmri_jax.ensembles.design import SCHEMES, STEPS, columns_of_problems
 from vmri_jax.ensembles.quantities import drawn_by_default
 from vmri_jax.executors.executor import local_workers
 from vmri_jax.mechanics.arrays import whole_number
+from vmri_jax.mechanics.checks import check_flags, check_number
 from vmri_jax.mechanics.names import near
 from vmri_jax.mechanics.places import START, Index, Placed, places_of
 from vmri_jax.mechanics.slots import free
@@ -30,6 +31,8 @@ from vmri_jax.running.export import extra
 
 SETTINGS = ("t_end", "num_steps", "macro_dt", "num_micro", "save", "num_saves", "project", "chunk")
 """Entries whose names and values are arguments of `ensemble`."""
+WORDS = ("unit", "description")
+"""Entries of axes and draws that the store keeps with the results."""
 
 
 def sweep(
@@ -107,14 +110,17 @@ def read_sweep(file: Path) -> dict[str, Any]:
 def _axis(subject: str, entry) -> Any:
     if not isinstance(entry, Mapping):
         return np.atleast_1d(np.asarray(entry))
-    check_keys(entry, (), ("from", "to", "count", "log", "values", "unit", "description"), subject)
     words = entry.get("unit", ""), entry.get("description", "")
     if "values" in entry:
+        check_keys(entry, ("values",), WORDS, subject)
         return Axis(entry["values"], *words)
-    if not {"from", "to", "count"} <= set(entry):
-        raise Refused(f"{subject}: give values, or from, to and count.")
-    spaced = np.geomspace if entry.get("log") else np.linspace
-    return Axis(spaced(float(entry["from"]), float(entry["to"]), int(entry["count"])), *words)
+    check_keys(entry, ("from", "to", "count"), ("log", "values", *WORDS), subject)
+    logarithmic, count = entry.get("log", False), whole_number(f"{subject}: count", entry["count"])
+    check_flags(**{f"{subject}: log": logarithmic})
+    first, last = (float(check_number(f"{subject}: {name}", entry[name])) for name in ("from", "to"))
+    if logarithmic and min(first, last) <= 0:
+        raise Refused(f"{subject}: from is {first:g} and to is {last:g}; with log = true both are positive.")
+    return Axis((np.geomspace if logarithmic else np.linspace)(first, last, count), *words)
 
 
 def _draws(file: Path, entries: Mapping[str, Any]) -> Draws:
@@ -122,8 +128,9 @@ def _draws(file: Path, entries: Mapping[str, Any]) -> Draws:
     columns = dict(entries["columns"])
     for name, entry in columns.items():
         if isinstance(entry, Mapping):
-            kind, *numbers = entry["distribution"]
-            columns[name] = Draw(kind, tuple(numbers), entry.get("unit", ""), entry.get("description", ""))
+            check_keys(entry, ("distribution",), WORDS, f"{file}: draws: {name}")
+            draw, words = entry["distribution"], (entry.get("unit", ""), entry.get("description", ""))
+            columns[name] = Draw(draw[0], tuple(draw[1:]), *words) if isinstance(draw, list) and draw else draw
     chosen = {name: entries[name] for name in ("seed", "method") if name in entries}
     return Draws(entries["count"], columns, **chosen)
 

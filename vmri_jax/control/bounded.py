@@ -45,7 +45,7 @@ class Limits(NamedTuple):
 
 
 class Unsolved(RuntimeError):
-    """PIQP finds no solution, although the relaxed problem has one."""
+    """The linear-quadratic problem of an iteration has no solution, or PIQP finds none."""
 
 
 def solve(stages: Stages, final: Final, limits: Limits) -> tuple[Solution, float]:

@@ -134,7 +134,7 @@ def minimize(
 
     Raises:
         ImportError: bounds or limits without the package piqp.
-        RuntimeError: PIQP solves none of the linear-quadratic problems.
+        RuntimeError: the first linear-quadratic problem has no solution: the cost is not finite, or not convex in u.
         ValueError, TypeError: bad arguments, functions that return other shapes.
     """
     whole_number("minimize: max_iterations", max_iterations)

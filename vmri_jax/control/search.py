@@ -17,6 +17,9 @@ SHORTEST_PART = 2.0**-10
 SUFFICIENT_DECREASE = 1e-4
 """Armijo's constant: the merit decreases by at least this part of the prediction; a larger one refuses more."""
 
+ELSEWHERE = "Start from other controls, or change these functions there: no root or logarithm of zero or less."
+"""End of the message about functions that are not finite."""
+
 
 class Point(NamedTuple):
     """A point of the search.
@@ -50,10 +53,17 @@ def slope(setup: Transcription, point: Point, dz, du):
 def update(setup: Transcription, point: Point) -> tuple[riccati.Solution, float, riccati.Stages, riccati.Final]:
     """The solution of the linear-quadratic problem at a point, the largest absolute multiplier, and the problem."""
     stages, final = setup.linearised(point.z, point.u)
-    if setup.bounded:
-        change, steepest = bounded.solve(stages, final, setup.limited(point.z, point.u))
+    limits = setup.limited(point.z, point.u) if setup.bounded else None
+    for name, part in (("cost, the steps or the goal", (stages, final)), ("limits", limits and limits[:3])):
+        if not all(np.isfinite(a).all() for a in jax.tree.leaves(part)):
+            raise bounded.Unsolved(f"minimize: values or derivatives of {name} are not finite. {ELSEWHERE}")
+    if limits is not None:
+        change, steepest = bounded.solve(stages, final, limits)
         return change, steepest, stages, final
     change = riccati.solve(stages, final)
+    if not all(np.isfinite(a).all() for a in change):
+        lacking = "the second derivative of cost in u is not positive: without it controls have no least cost"
+        raise bounded.Unsolved(f"minimize: {lacking}. Add a small multiple of u @ u, or give bounds.")
     return change, float(np.abs(change.nu).max(initial=0.0)), stages, final
 
 

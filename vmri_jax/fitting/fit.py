@@ -12,11 +12,12 @@ from vmri_jax.fitting.given import Measured, Unknown, Unknowns
 from vmri_jax.fitting.result import SINGULAR_VALUE_TOLERANCE, Fit, without_starts
 from vmri_jax.fitting.shooting import Shooting
 from vmri_jax.mechanics.arrays import whole_number
-from vmri_jax.mechanics.checks import check_type
+from vmri_jax.mechanics.checks import check_number, check_type
 from vmri_jax.mechanics.places import Placed, places_of
 from vmri_jax.mechanics.slots import free
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
 from vmri_jax.refusals import Refused
+from vmri_jax.running.arguments import check_step_size
 from vmri_jax.running.export import extra
 from vmri_jax.running.prepare import prepare
 from vmri_jax.running.progress import Progress, Working
@@ -87,8 +88,12 @@ def fit(
     unknowns = Unknowns({name: u if isinstance(u, Unknown) else Unknown(u) for name, u in parameters.items()})
     data = [data] if isinstance(data, Measured) else list(data)
     _check(data, segments, starts, max_steps)
+    if not check_number("fit: spread", spread) > 0:
+        raise Refused(f"fit: spread is {spread}; it must be positive.")
+    whole_number("fit: seed", seed, least=0)
     first = model(unknowns.at(np.zeros(unknowns.size)))
     check_type("fit: the model", first, Problem, "a vmri_jax.Problem from its parameters")
+    check_step_size(macro_dt, "fit")
     # steps[i] are the numbers of the macro nodes at which the set i of data was measured
     steps = [m.steps(float(first.t), macro_dt) for m in data]
     if max(s.max() for s in steps) < 1:
@@ -96,7 +101,9 @@ def fit(
     with Working("fit") as tell:
         tell("a run with the first parameters", 0, NUM_PHASES)
         run = prepare(first, scheme, macro_dt=macro_dt, num_steps=max(int(s.max()) for s in steps), solver=solver)
-        run()
+        nodes = run().states
+        for m, places in zip(data, steps, strict=True):
+            m.check(jax.tree.map(lambda a, places=places: a[places], nodes))
         # A fallback is a branch of the compiled step: `jax.vmap` over searches would compute both of its sides.
         shooting = Shooting(model, unknowns, data, steps, scheme, solver or run.plan.first, float(macro_dt), segments)
         search = _Search(shooting, max_steps)
@@ -144,8 +151,9 @@ class _Search:
         self.compiled_jacobian = jax.jit(self.jacobian)
         self.size = shooting.unknowns.size
         self.count = len(shooting.values)
-        if self.count < self.size:
-            raise Refused(f"fit: {self.count} values for {self.size} unknown numbers; measure more, or fix some.")
+        if self.count < self.size + (not shooting.knows_sigma):
+            numbers = f"{self.size} unknown numbers{'' if shooting.knows_sigma else ' and sigma'}"
+            raise Refused(f"fit: {self.count} values for {numbers}; measure more, or fix some.")
         u_start = np.zeros(self.size)
         self.part_starts = shooting.starts(u_start)
         self.scale = shooting.sizes(u_start, self.part_starts)

@@ -10,6 +10,8 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from vmri_jax.mechanics.arrays import real_array
+from vmri_jax.mechanics.checks import describe, shape_of
+from vmri_jax.mechanics.functions import check_arguments
 from vmri_jax.mechanics.state import State
 from vmri_jax.refusals import Refused
 
@@ -52,8 +54,9 @@ class Measured:
         if values.ndim not in (1, 2) or len(values) != len(t) or not len(t):
             raise Refused(f"Measured: values have shape {values.shape}, t has {t.shape}; give one row for each time.")
         shape, values = values.shape, values.reshape(len(t), -1)
-        if not np.isfinite(t).all() or not np.isfinite(values).any():
-            raise Refused("Measured: t must be finite, and at least one value must be a number.")
+        if not np.isfinite(t).all() or np.isinf(values).any() or np.isnan(values).all():
+            raise Refused("Measured: t and values must be finite, but for NaN in place of missing values, not of all.")
+        check_arguments("Measured: observe", self.observe, "state")
         if self.sigma is not None:
             sigma = np.asarray(real_array("Measured: sigma", self.sigma))
             if not (np.isfinite(sigma).all() and np.all(sigma > 0)):
@@ -67,6 +70,22 @@ class Measured:
             object.__setattr__(self, "sigma", sigma)
         object.__setattr__(self, "t", t)
         object.__setattr__(self, "values", values)
+
+    def check(self, nodes: State) -> None:
+        """Refuse an `observe` that does not predict the values from the states (k,) at the times of measurement."""
+        state, missing = jax.tree.map(lambda a: a[0], nodes), ~np.isfinite(self.values)
+        value = shape_of("Measured: observe", lambda state, params: self.observe(state), state, {})
+        count = self.values.shape[1]
+        if getattr(value, "size", None) != count or not np.issubdtype(value.dtype, np.floating):
+            expected = f"it must return {count} real numbers, since values has {count} for each time"
+            raise Refused(f"Measured: observe returns {describe(value)}; {expected}.")
+        predicted = np.asarray(jax.jit(jax.vmap(self.observe))(nodes)).reshape(self.values.shape)
+        off = np.flatnonzero((~np.isfinite(predicted) & ~missing).any(axis=1))
+        if off.size:
+            raise Refused(
+                f"fit: observe returns {predicted[off[0]]} at t = {self.t[off[0]]:g} with the first parameters; start "
+                "elsewhere, or leave these values out as NaN."
+            )
 
     def steps(self, t_start: float, macro_dt: float) -> np.ndarray:
         """Numbers of the macro nodes at the times of measurement.
@@ -127,6 +146,8 @@ class Unknown:
                 value = np.asarray(real_array(f"Unknown: {name}", value))
                 if value.shape not in ((), start.shape):
                     raise Refused(f"Unknown: {name} has shape {value.shape}; give a number, or {start.shape}.")
+                if not np.isfinite(value).all():
+                    raise Refused(f"Unknown: {name} is {value}; it must be finite, or None.")
                 object.__setattr__(self, name, np.broadcast_to(value, start.shape))
         too_small = self.lower is not None and not np.all(self.lower < start)
         too_large = self.upper is not None and not np.all(start < self.upper)

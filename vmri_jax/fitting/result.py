@@ -13,6 +13,7 @@ from scipy import stats
 from vmri_jax.accuracy.companions import UncertifiedWarning
 from vmri_jax.accuracy.simulate import simulate
 from vmri_jax.fitting.shooting import Shooting
+from vmri_jax.mechanics.arrays import whole_number
 from vmri_jax.mechanics.state import Problem
 from vmri_jax.mechanics.summary import summary
 from vmri_jax.refusals import Refused
@@ -114,11 +115,9 @@ class Fit:
         Raises:
             ValueError: a level that is not between 0 and 1.
         """
-        if not 0 < level < 1:
-            raise Refused(f"intervals: level is {level}; it must lie between 0 and 1, e.g. 0.95.")
+        tail = _below(level)
         if self.doubts:
             warnings.warn(f"intervals: the fit is doubted. {' '.join(self.doubts)}", UncertifiedWarning, stacklevel=2)
-        tail = (1 + level) / 2
         q = stats.norm.ppf(tail) if self.shooting.knows_sigma else stats.t.ppf(tail, max(self.freedom, 1))
         pairs = zip(self.values, self.standard_errors.values(), strict=True)
         return dict(zip(self.labels, ((float(x - q * s), float(x + q * s)) for x, s in pairs), strict=True))
@@ -142,6 +141,7 @@ class Fit:
             repeats: number of synthetic sets of measurements.
             seed: of their errors.
         """
+        whole_number("bootstrap: repeats", repeats)
         # residuals are (predicted - measured) / (sigma of the values, times the estimate)
         exact = self.shooting.values + self.residuals * self.sigma * self.shooting.sigma
         noise = np.random.default_rng(seed).standard_normal((repeats, len(exact)))
@@ -216,9 +216,16 @@ class Bootstrap:
 
     def coverage(self, level: float = 0.95) -> dict[str, float]:
         """The fraction of the intervals of this level that contain the truth, by label."""
-        q = stats.norm.ppf((1 + level) / 2)
+        q = stats.norm.ppf(_below(level))
         covers = np.abs(self.estimates - self.truth) <= q * self.errors
         return dict(zip(self.labels, covers.mean(axis=0).tolist(), strict=True))
+
+
+def _below(level: float) -> float:
+    """The probability of a value below the upper end of an interval of this level."""
+    if not 0 < level < 1:
+        raise Refused(f"intervals: level is {level}; it must lie between 0 and 1, e.g. 0.95.")
+    return (1 + level) / 2
 
 
 def without_starts(by_parameters, by_starts):

@@ -6,9 +6,10 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 
-from vmri_jax.mechanics.checks import check_type
+from vmri_jax.mechanics.checks import check_system, check_type
 from vmri_jax.mechanics.state import A_SYSTEM, State
 from vmri_jax.mechanics.system import System
+from vmri_jax.running.arguments import Steps, check_run
 from vmri_jax.running.engine import solved_again, unsolved
 from vmri_jax.running.observables import Observables, observed
 from vmri_jax.running.saved import fault, is_right
@@ -40,15 +41,18 @@ def macro_step(
 
     Raises:
         TypeError: no System, or no State.
+        ValueError: bad arguments, as of `simulate`.
     """
     check_type("macro_step: system", system, System, A_SYSTEM)
     check_type("macro_step: state", state, State, "a State, e.g. problem.state()")
+    check_run(system, scheme, state, solver, Steps(macro_dt, num_steps=1))
     return _macro_step((system, scheme, state, macro_dt, solver or Solver()))
 
 
 @jax.jit
 def _macro_step(arguments):
     system, scheme, state, _, solver = arguments
+    check_system(system, state.q_s, state.q_f)  # here once for each program: a check takes longer than a step
     if not plan(system, scheme, state, solver).has_fallback:
         return _step(arguments)
     exact = partial(_step, exact=True)

@@ -133,8 +133,8 @@ def at_nodes(function, origin: Origin, nodes, *static):
 
 
 def is_repeated(array, axes: int = 1) -> bool:
-    """Whether an array of NumPy is a view with zero strides along the lanes, as `Origin.repeated` makes it."""
-    return isinstance(array, np.ndarray) and axes > 0 and not any(array.strides[:axes])
+    """Whether an array of NumPy is a view with zero strides along the lanes, as `Origin.repeated` makes it, or is empty, with any strides."""
+    return isinstance(array, np.ndarray) and axes > 0 and not (array.size and any(array.strides[:axes]))
 
 
 def _in_a_row(tree, axes: int):

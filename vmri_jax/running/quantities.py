@@ -92,7 +92,9 @@ class Quantities(ABC):
     def __getitem__(self, nodes):
         kind, count = type(self).__name__, len(self)
         if isinstance(nodes, int | np.integer):
-            return self._node(range(count)[nodes])  # raises IndexError beyond the ends
+            if not -count <= nodes < count:
+                raise IndexError(f"{kind}: there is no node {nodes}; it has {count} nodes, counted from 0.")
+            return self._node(int(nodes) % count)
         if not isinstance(nodes, slice):
             raise Refused(f"{kind}: the index is {nodes!r}; give the number of a node, or a slice as in run[:100].")
         first, stop, stride = nodes.indices(count)

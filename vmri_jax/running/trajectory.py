@@ -8,10 +8,12 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from vmri_jax.mechanics.arrays import Numbers, is_concrete
+from vmri_jax.mechanics.arrays import Numbers, is_concrete, is_known
+from vmri_jax.mechanics.invariants import energy_parts
 from vmri_jax.mechanics.state import HasProblem, Problem, State
 from vmri_jax.mechanics.summary import has_values, summary
 from vmri_jax.mechanics.system import System
@@ -29,6 +31,9 @@ from vmri_jax.steppers.results import Method, Result, Status
 FORMAT = "vmri_jax trajectory 3"
 NOT_READ = ("drawing", "slow_names", "fast_names")
 """Arrays of a file for other programs."""
+ENERGY_TOLERANCE = 1e-9
+"""Difference of two energies of the same state, as a part of the sum of the moduli of their terms, up to which it is round-off. A larger value
+accepts a run whose parameters differ by little."""
 ERROR = tuple(f"error_{name}" for name in RunError._fields)
 """Arrays of the estimated error; absent in runs without one."""
 
@@ -158,11 +163,31 @@ class Trajectory(Exports):
 
         Raises:
             TypeError: `moving` is none of the three.
-            ValueError: its numbers of coordinates differ from the run.
+            ValueError: its numbers of coordinates, or its energies at the first and the last node, differ from the run.
         """
+        run = self._with_origin(moving)
+        if is_known((run.energy, run.origin)):
+            run._check_energy()
+        return run
+
+    def _with_origin(self, moving: System | Problem | HasProblem) -> "Trajectory":
+        """The same states with an origin of as many coordinates, and all lanes of a batch with the same one."""
         origin = replace(Origin.of(moving), settings=self.settings)
         origin.check(self.states.q_s.shape[-1], self.states.q_f.shape[-1])
         return replace(self, origin=origin.repeated(np.shape(self.t)[:-1]))
+
+    def _check_energy(self) -> None:
+        """Refuse an origin whose energy at the first or the last node is not the energy of the run: its parameters are other ones."""
+        axis = np.ndim(self.t) - 1
+        states, energy = jax.tree.map(lambda a: np.take(a, (0, -1), axis), (self.states, self.energy))
+        parts = at_nodes(energies_at, self.origin, states)
+        off = np.abs(parts.sum(axis=-1) - energy) > ENERGY_TOLERANCE * np.abs(parts).sum(axis=-1)
+        if off.any():
+            ours, theirs = parts.sum(axis=-1)[off][0], energy[off][0]
+            raise Refused(
+                f"of: the energy of the system is {ours:.9g} where the energy of the run is {theirs:.9g}; give the system that was "
+                "simulated, with its parameters."
+            )
 
     def with_arrays(self, **arrays) -> "Trajectory":
         """The same run with other arrays, named as in a file written by `save`: ``run.with_arrays(q_f=..., energy=...)``."""
@@ -278,9 +303,14 @@ def in_coordinates(
         moving: the other system.
         q, v: slow and fast positions and velocities in its coordinates, (..., k, n) each.
     """
-    bare = replace(run, states=State(run.t, *q, *v), micro=None, error=None).of(moving)
+    bare = replace(run, states=State(run.t, *q, *v), micro=None, error=None)._with_origin(moving)
     p_s, p_f = at_nodes(momenta_at, bare.origin, Nodes(run.t, *q, *v))
     return replace(bare, states=State(run.t, *q, p_s, p_f))
+
+
+def energies_at(system: System, node: State):
+    """The parts of the energy of a state, see `energy_parts`, as a vector."""
+    return jnp.stack(list(energy_parts(system, node.q_s, node.q_f, node.p_s, node.p_f).values()))
 
 
 def status(result) -> Any:

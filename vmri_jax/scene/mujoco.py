@@ -176,7 +176,8 @@ class _Reader(Compiled):
 
         MuJoCo's solref of a limit is (T, z), its time constant and damping ratio: at the depth d it pulls back with the acceleration
         ``d / (T z)^2``. Negative numbers are (-k, -c), with the acceleration ``k d``. The inertia is ``1 / dof_invweight0``. The depth is
-        counted from the margin of the joint, which lies inside its range.
+        counted from the margin of the joint, which lies inside its range. This is the stiffness of an impact; MuJoCo scales a steady load, too,
+        by one minus the impedance of solimp, so that its limits give way to a load by a twentieth of the depth here.
         Limits of ball joints and of tendons are refused unless they are `ignored`.
         """
         model = self.model

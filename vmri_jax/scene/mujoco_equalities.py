@@ -114,7 +114,7 @@ def _refuse_gaps(compiled: Compiled, widest: float, phrase: str) -> None:
 
 def _size(compiled: Compiled, loop: Loop) -> float:
     """The gap of a loop, in extents of the model or rad."""
-    return float(np.max(np.linalg.norm(loop.gap, axis=1) / [compiled.model.stat.extent, 1.0][: len(loop.gap)]))
+    return float(np.max(np.linalg.norm(loop.gap, axis=1) / [compiled.extent, 1.0][: len(loop.gap)]))
 
 
 def _jacobian(compiled: Compiled, loop: Loop) -> np.ndarray:

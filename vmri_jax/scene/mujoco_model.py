@@ -134,10 +134,19 @@ class Compiled:
         """(3,) acceleration, m/s^2; zero if the model switches gravity off."""
         return np.zeros(3) if self.off("GRAVITY") else np.array(self.model.opt.gravity)
 
+    @cached_property
+    def extent(self) -> float:
+        """Size of the moving bodies, m: of the box around their centres and joints, and their radius of gyration. (MuJoCo's own extent may be set by
+        the author for the camera.)"""
+        model, moving = self.model, [b for b in range(1, self.model.nbody) if self.root(b)]
+        points = np.concatenate([self.data.xipos[moving], self.data.xanchor])
+        radii = np.sqrt(model.body_inertia[moving].sum(axis=1) / 2 / np.maximum(model.body_mass[moving], 1e-300))
+        return float(np.ptp(points, axis=0).max() + radii.max())
+
     @property
     def compensated(self) -> list[int]:
-        """Numbers of the moving bodies with gravcomp."""
-        if self.off(PASSIVE) or not self.gravity.any():
+        """Numbers of the moving bodies with gravcomp; none where MuJoCo has not counted them, as after a change without mj_setConst."""
+        if self.off(PASSIVE) or not self.gravity.any() or not self.model.ngravcomp:
             return []
         return [b for b in np.flatnonzero(self.model.body_gravcomp).tolist() if self.root(b)]
 

@@ -55,7 +55,7 @@ def test_single_nodes_are_states(uninterrupted):
         assert isinstance(run[3], State)
         assert np.array_equal(run[3].q_f, whole.q_f[3])
         assert float(run[-1].t) == float(whole.t[-1])
-        with pytest.raises(IndexError):
+        with pytest.raises(IndexError, match="there is no node 13; it has 13 nodes, counted from 0"):
             run[13]
 
 

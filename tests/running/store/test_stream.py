@@ -255,6 +255,8 @@ def test_another_system_is_not_resumed(run, uninterrupted, out):
     moved = type(state)(state.t, state.q_s + 0.1, state.q_f, state.p_s, state.p_f)
     with pytest.raises(ValueError, match=r"state.q_s: \[.*\] here, \[.*\] in the store"):
         run(uninterrupted.path, resume=True, state=moved)
+    with pytest.raises(ValueError, match=r"names\['slow'\]\['centres'\]: 3 here, none in the store"):
+        run(uninterrupted.path, resume=True, system=run.problem, state=None)
     run(out, num_steps=PER_CHUNK, system=system.replace(fast_potential=same_name(2)))
     with pytest.raises(ValueError, match=r"Differences: operations of fast_potential: digest \w+ here, digest \w+ in"):
         run(out, num_steps=PER_CHUNK, resume=True, system=system.replace(fast_potential=same_name(4)))

@@ -1,6 +1,7 @@
 """The identity of a run: functions, parameters, scheme, step and start as text, so that a run can be compared with the run of a store."""
 
 import dataclasses
+import json
 import os
 import platform
 import warnings
@@ -58,7 +59,11 @@ def check_same(path: Path, attributes: dict, stored: dict, chunk: int | None, co
     `attributes` are of the store that the user wants, `stored` of the store on disk; `chunk` is the user's, or None.
     Operations are compared only if both were made with the same version of JAX: another version prints them differently.
     """
-    kind, here, there = stored["kind"], attributes["identity"], stored["identity"]
+    kind = stored["kind"]
+    # a column of the store has the name of its coordinate
+    here, there = (
+        a["identity"] | describe("names", json.loads(json.dumps(a.get("names")))) for a in (attributes, stored)
+    )
     now, then = attributes["made_with"], stored["made_with"]
     names = [name for name in {**here, **there} if here.get(name) != there.get(name)]
     if now["jax"] != then["jax"]:

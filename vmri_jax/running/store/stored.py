@@ -125,6 +125,7 @@ class StoredTrajectory(Exports):
 
     def of(self, moving: System | Problem | HasProblem) -> "StoredTrajectory":
         """The same run with its system, see `Trajectory.of`."""
+        self[-1:].of(moving)  # refuses the system of another run
         return self.with_origin(self[:1].of(moving).origin)
 
     def with_origin(self, origin: Origin) -> "StoredTrajectory":

@@ -56,6 +56,13 @@ class InJoint(OfFreedoms):
     def _parameters(self):
         return super()._parameters() | self.joint.frames
 
+    def check_of_time(self, name, params):
+        """Refuse a function of time that returns no number; of forces also one number for each pair of the joint."""
+        value: Any = shape_of(f"{self.name}: {name}", getattr(self, name), jnp.zeros(()), params)
+        sizes = {1, len(self.elements)} if self.kind == "force" else {1}
+        if getattr(value, "size", None) not in sizes:
+            raise Refused(f"{self.name}: {name} returns {describe(value)}; it must return a number, ().")
+
 
 class JointSpring(InJoint):
     """Springs in joints, ``V = sum k/2 (x - x_0)^2``.
@@ -176,6 +183,10 @@ class JointDrive(InJoint):
     def function(history, t, q, v, params):
         return (history(t, params["history"]),)
 
+    def check_parameters(self):
+        super().check_parameters()
+        self.check_of_time("history", self.parameters["history"])
+
 
 class JointMotion(InJoint):
     """A prescribed angle or displacement of a joint, ``x = a(t)``.
@@ -212,6 +223,7 @@ class JointMotion(InJoint):
 
     def check_parameters(self):
         super().check_parameters()
+        self.check_of_time("path", self.parameters["path"])
         start = self.path(np.zeros(()), self.parameters["path"])
         self.require(abs(library(start).asarray(start)) < START, "path(0)", start, "the joint starts at zero")
 
