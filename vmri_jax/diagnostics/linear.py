@@ -10,7 +10,7 @@ from jax.flatten_util import ravel_pytree
 from vmri_jax.mechanics.invariants import velocity
 from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.mechanics.system import System
-from vmri_jax.running.arguments import Steps, check_run
+from vmri_jax.running.arguments import check_run
 from vmri_jax.running.macro_step import macro_step
 from vmri_jax.schemes.composition import SchemeLike
 from vmri_jax.schemes.equations import StepEquations
@@ -58,7 +58,7 @@ def step_condition(system: Movable, scheme: Scheme, state: State | None = None, 
         system, scheme, state, macro_dt: as in `simulate`.
     """
     system, state = start_of("step_condition", system, state)
-    check_run(system, scheme, state, None, Steps(macro_dt, num_steps=1))
+    check_run(system, scheme, state, None, macro_dt, num_steps=1, t_end=None, save=1)
     a = np.asarray(newton_matrix(system, scheme, state, macro_dt))
     for _ in range(SWEEPS):
         rows, columns = np.linalg.norm(a, axis=1), np.linalg.norm(a, axis=0)

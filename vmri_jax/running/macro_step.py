@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from vmri_jax.mechanics.checks import check_system, check_type
 from vmri_jax.mechanics.state import A_SYSTEM, State
 from vmri_jax.mechanics.system import System
-from vmri_jax.running.arguments import Steps, check_run
+from vmri_jax.running.arguments import check_run
 from vmri_jax.running.engine import solved_again, unsolved
 from vmri_jax.running.observables import Observables, observed
 from vmri_jax.running.saved import fault, is_right
@@ -45,7 +45,7 @@ def macro_step(
     """
     check_type("macro_step: system", system, System, A_SYSTEM)
     check_type("macro_step: state", state, State, "a State, e.g. problem.state()")
-    check_run(system, scheme, state, solver, Steps(macro_dt, num_steps=1))
+    check_run(system, scheme, state, solver, macro_dt, num_steps=1, t_end=None, save=1)
     return _macro_step((system, scheme, state, macro_dt, solver or Solver()))
 
 
