@@ -12,6 +12,8 @@ import vmri_jax as vm
 from tests.small_systems import NONE, SYSTEMS, no_constraint
 from vmri_jax.accuracy import search
 from vmri_jax.accuracy.companions import UncertifiedWarning
+from vmri_jax.running.arguments import Steps
+from vmri_jax.running.simulation import simulation
 from vmri_jax.study import reference_solution
 
 LENGTH, NODES = 2.0, 10
@@ -86,15 +88,15 @@ def test_error_of_a_function():
 
 
 @pytest.mark.parametrize(
-    ("arguments", "kind", "message"),
+    ("error", "message"),
     [
-        ({"error": lambda run: "far"}, TypeError, "returned 'far'"),
-        ({"error": 1e-3}, TypeError, "error is 0.001; it must be True or False, 'shares', or a function of a run"),
+        (lambda run: "far", "returned 'far'"),
+        (1e-3, "error is 0.001; it must be True or False, 'shares', or a function of a run"),
     ],
 )
-def test_refused(arguments, kind, message):
-    with pytest.raises(kind, match=message):
-        vm.simulate(SYSTEMS["no_constraint"], vm.fully_explicit(4), macro_dt=0.05, num_steps=2, **arguments)
+def test_refused(error, message):
+    with pytest.raises(vm.Refused, match=message):
+        vm.simulate(SYSTEMS["no_constraint"], vm.fully_explicit(4), macro_dt=0.05, num_steps=2, error=error)
 
 
 def test_not_in_transformations():
@@ -169,9 +171,9 @@ def test_steps_that_do_not_see_the_motion_are_not_certified():
 def test_the_order_is_that_of_all_potentials():
     """A potential on every second micro node has the trapezoidal rule, whatever the order of the scheme."""
     problem = no_constraint()
-    problem = replace(problem, system=problem.system.replace(potentials={2: spring}))
-    assert vm.prepare(problem, vm.galerkin(2, 3), macro_dt=0.1, num_steps=1).order == 2
-    assert vm.prepare(no_constraint(), vm.galerkin(2, 3), macro_dt=0.1, num_steps=1).order == 6
+    joined = replace(problem, system=problem.system.replace(potentials={2: spring}))
+    for moving, order in ((problem, 6), (joined, 2)):
+        assert simulation(moving, vm.galerkin(2, 3), None, None, Steps(0.1, num_steps=1)).order == order
 
 
 def spring(q_s, q_f, params):
