@@ -34,10 +34,7 @@ def vmri(vmri, tmp_path):
 
 
 def test_a_sweep_runs_is_drawn_and_gone_on_with(vmri, tmp_path):
-    with (tmp_path / "sweep.toml").open("r+") as file:
-        text = file.read()
-        file.seek(0)
-        file.write(f'save = ["end", "iterations"]\n{text}')
+    (tmp_path / "sweep.toml").write_text(f'save = ["end", "iterations"]\n{SMALL}')
     code, text = vmri("sweep", "sweep.toml", "--plot", "map.png")
     assert code == 0
     assert "Figure of iterations: map.png" in text
