@@ -55,15 +55,9 @@ CRANE = vm.Problem(
     q_f={"hook": [3.0, -4.0], "load": [3.0, -5.0]},
     v_f={"load": [0.0, 0.1]},
 )
+FLAT_MASSES = vm.ConstantMass([500.0], [HOOK, HOOK, LOAD, LOAD])
 FLAT = vm.Problem(
-    vm.System(
-        vm.ConstantMass([500.0], [HOOK, HOOK, LOAD, LOAD]),
-        flat_weight,
-        flat_sling,
-        flat_rope,
-        force=flat_drag,
-        params=PARAMS,
-    ),
+    vm.System(FLAT_MASSES, flat_weight, flat_sling, flat_rope, force=flat_drag, params=PARAMS),
     q_s=[0.0],
     q_f=[3.0, -4.0, 3.0, -5.0],
     v_f=[0.0, 0.0, 0.0, 0.1],

@@ -43,15 +43,8 @@ def cost_of(problem: vm.Problem, scheme, macro_dt, steps, save: vm.Save, solver=
 
     def cost(params, p_s, p_f, macro_dt):
         start = vm.State(state.t, state.q_s, state.q_f, p_s, p_f)
-        run = vm.simulate(
-            system.replace(params=params),
-            scheme,
-            start,
-            macro_dt=macro_dt,
-            num_steps=steps,
-            save=save,
-            solver=solver,
-        )
+        how = {"macro_dt": macro_dt, "num_steps": steps, "save": save, "solver": solver}
+        run = vm.simulate(system.replace(params=params), scheme, start, **how)
         inside = jnp.sum(jnp.sin(run.q_f_micro)) + jnp.sum(run.t_micro) if save.micro else 0.0
         ends = jnp.sum(jnp.cos(run.q_f[1:])) + jnp.sum(run.q_s[-1] ** 2) + jnp.sum(run.p_s[1] ** 2) + jnp.sum(run.t)
         return ends + jnp.mean(run.energy) + inside
@@ -109,11 +102,10 @@ def test_derivatives_in_parts(case, in_parts):
     assert_agree(gradient(case, 4, micro=True), expected)
 
 
-@pytest.mark.parametrize("every", [1, 5])
-def test_parts_of_saved_nodes_and_of_the_steps_between_them(every, in_parts):
-    expected = stored_gradient("kicks", every)
+def test_parts_of_saved_nodes_alone(in_parts):
+    expected = stored_gradient("kicks", 1)
     in_parts()
-    assert_agree(gradient("kicks", every), expected, 1e-11)
+    assert_agree(gradient("kicks", 1), expected, 1e-11)
 
 
 @pytest.mark.full
@@ -175,6 +167,4 @@ def test_a_gradient_has_the_values_of_the_run():
     """The steps of both are the same, up to the round-off of their two programs: the value of a gradient is no Newton step beside the root."""
     cost, at = simple_cost()
     value, expected = jax.jit(jax.value_and_grad(cost))(at)[0], jax.jit(cost)(at)
-    assert float(value) == pytest.approx(
-        float(expected), rel=1e-14
-    )  # 2e-16; the same bits without LLVM's optimisations
+    assert float(value) == pytest.approx(float(expected), rel=1e-14)  # 2e-16; the same bits without optimisations
