@@ -3,6 +3,7 @@
 import pickle
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -126,7 +127,11 @@ def test_a_later_start_and_a_single_saved_interval():
 def test_a_motion_without_error():
     """Free flight in steps of 2^-k: no scheme has an error, a third run with other steps says so, and no share is divided by."""
     free = vm.Problem(vm.System(vm.ConstantMass([1.0], [1.0])), [0.0], [0.0], [1.0], [1.0])
-    for how in ({"accuracy": 1e-3, "t_end": 1.0}, {"macro_dt": 0.25, "num_steps": 8, "error": True}):
+    hows: tuple[dict[str, Any], ...] = (
+        {"accuracy": 1e-3, "t_end": 1.0},
+        {"macro_dt": 0.25, "num_steps": 8, "error": True},
+    )
+    for how in hows:
         assert vm.simulate(free, vm.fully_explicit(4), **how).error.largest < 1e-14  # 3e-15
 
 

@@ -173,7 +173,7 @@ def test_bad_input(message, call):
         call()
 
 
-def fit(data, parameters=None, model=CHAIN, **options):
+def fit(data, parameters=None, model: Any = CHAIN, **options):
     parameters = {"omega": 19.0} if parameters is None else parameters
     return vm.fit(model, data, parameters, scheme=SCHEME, macro_dt=DT, **options)
 

@@ -1,6 +1,7 @@
 """Trajectories on disk and as xarray datasets."""
 
 import errno
+from typing import Any
 
 import equinox as eqx
 import numpy as np
@@ -66,11 +67,12 @@ def test_files_that_are_no_trajectories(trajectory, tmp_path):
     trajectory.save(path)
     whole = path.read_bytes()
     with np.load(path) as data:
-        arrays = {name: data[name] for name in data.files}
+        arrays: dict[str, Any] = {name: data[name] for name in data.files}
     for part in (0.3, 0.9):
         path.write_bytes(whole[: int(part * len(whole))])
         refused(r"run.npz cannot be read as a .npz file .*damaged")
-    np.savez(path, **arrays | {"settings": np.array("{}")})
+    settings: Any = np.array("{}")
+    np.savez(path, **arrays | {"settings": settings})
     refused(r"run.npz is a damaged trajectory: no names or settings")
     np.savez(path, **{name: array for name, array in arrays.items() if name != "p_f"})
     refused(r"run.npz")

@@ -139,7 +139,7 @@ def test_placed_rules():
         (lambda: Rule((0.0, 1.0), (1.0,)), "one weight per node"),
         (lambda: Rule((-0.1, 1.0), (0.5, 0.5)), r"lie in \[0, 1\]"),
         (lambda: Rule((0.5, 0.5), (0.5, 0.5)), "increase strictly; add two rules"),
-        *((lambda n=n: gauss(n), "gauss: the number of nodes is") for n in (0, 1.5, True)),
+        *((lambda n=n: gauss(n), "gauss: the number of nodes is") for n in (0, 1.5, True)),  # pyright: ignore[reportArgumentType]
         (lambda: lobatto(1), "lobatto: the number of nodes is"),
         (lambda: radau(0), "radau: the number of nodes is"),
         (lambda: radau(2, "middle"), "'left' or 'right'"),  # pyright: ignore[reportArgumentType]

@@ -85,8 +85,9 @@ def test_potentials_have_rules_by_name():
     assert scheme.with_potentials(c=micro(quadrature.left)).order == 1
     assert not scheme.with_potentials(c=micro(quadrature.left)).is_symmetric
     base = fully_explicit(4)
-    rules = {"kinetic": base.kinetic, "slow": base.slow, "fast": base.fast}
-    assert "V_2" in str(Scheme(4, **rules, potentials={2: micro(kicks, every=2)}).describe())
+    second = {2: micro(kicks, every=2)}
+    rates = Scheme(4, kinetic=base.kinetic, slow=base.slow, fast=base.fast, potentials=second)
+    assert "V_2" in str(rates.describe())
 
 
 @pytest.mark.parametrize(

@@ -106,8 +106,8 @@ SCHEMES = {"explicit": vm.fully_explicit(4)}
 
 def test_progress_hears_of_every_run(reference):
     heard = []
-    news = {"progress": lambda *words: heard.append(words)}
-    convergence_study(PROBLEM, SCHEMES, STEPS, 1.0, num_saves=5, reference=reference, **news)
+    how = {"num_saves": 5, "reference": reference}
+    convergence_study(PROBLEM, SCHEMES, STEPS, 1.0, **how, progress=lambda *news: heard.append(news))
     assert heard[0] == ("explicit, H = 0.02", 0, 3)
     assert heard[-1] == ("done", 3, 3)
 
