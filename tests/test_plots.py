@@ -11,6 +11,7 @@ import pytest
 
 import vmri_jax as vm
 from tests.animation.support import trajectory
+from tests.support import set_up
 from vmri_jax import plots
 from vmri_jax.accuracy.companions import resting
 from vmri_jax.mechanics.names import Names
@@ -103,7 +104,7 @@ def test_the_energy_of_a_driven_system_has_a_balance():
     assert labels(axes[1]) == ["energy", "work of forces"]
     assert np.abs(y_data(axes[2].lines[0])).max() < 1e-3 * np.abs(y_data(axes[1].lines[0])).max()
     free = dataclasses.replace(problem, system=problem.system.replace(force=None))
-    kept = resting(simulation(free, vm.fully_implicit(1), None, None, Steps(0.01, num_steps=20)))
+    kept = resting(set_up(free, vm.fully_implicit(1), 0.01, 20))
     for shown, label in ((kept, "energy error"), (dataclasses.replace(kept, origin=Origin()), "energy change")):
         assert plots.plot_trajectory(shown).axes[1].get_ylabel().startswith(label)
 

@@ -10,10 +10,9 @@ from scipy.integrate import solve_ivp
 
 import vmri_jax as vm
 from tests.small_systems import NONE, SYSTEMS, no_constraint
+from tests.support import set_up
 from vmri_jax.accuracy import search
 from vmri_jax.accuracy.companions import UncertifiedWarning
-from vmri_jax.running.arguments import Steps
-from vmri_jax.running.simulation import simulation
 from vmri_jax.study import reference_solution
 
 LENGTH, NODES = 2.0, 10
@@ -171,13 +170,9 @@ def test_steps_that_do_not_see_the_motion_are_not_certified():
 def test_the_order_is_that_of_all_potentials():
     """A potential on every second micro node has the trapezoidal rule, whatever the order of the scheme."""
     problem = no_constraint()
-    joined = replace(problem, system=problem.system.replace(potentials={2: spring}))
+    joined = replace(problem, system=problem.system.replace(potentials={2: lambda q_s, q_f, params: jnp.sum(q_f**2)}))
     for moving, order in ((problem, 6), (joined, 2)):
-        assert simulation(moving, vm.galerkin(2, 3), None, None, Steps(0.1, num_steps=1)).order == order
-
-
-def spring(q_s, q_f, params):
-    return jnp.sum(q_f**2)
+        assert set_up(moving, vm.galerkin(2, 3), 0.1, 1).order == order
 
 
 def test_past_a_singular_configuration():

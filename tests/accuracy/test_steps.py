@@ -77,14 +77,10 @@ def test_settings_are_kept_by_files_and_pickles(tmp_path):
 
 def test_rates_of_potentials_divide_the_micro_steps():
     problem = no_constraint()
-    problem = replace(problem, system=problem.system.replace(potentials={4: quartic}))
+    problem = replace(problem, system=problem.system.replace(potentials={4: lambda q_s, q_f, params: jnp.sum(q_f**4)}))
     run = vm.simulate(problem, vm.fully_explicit(4), accuracy=1e-3, t_end=LENGTH)
     assert run.error.largest <= 1e-3
     assert stage_scheme(run.settings.scheme).num_micro % 4 == 0
-
-
-def quartic(q_s, q_f, params):
-    return jnp.sum(q_f**4)
 
 
 def test_steps_beside_resonances():

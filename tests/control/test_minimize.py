@@ -109,10 +109,6 @@ def push(q_s, q_f, u, params):
     return u, 0 * q_f
 
 
-def gravity(q_s, q_f, params):
-    return 9.81 * q_f[1]
-
-
 def test_a_cart_with_a_pendulum_from_rest_to_rest():
     """Under a constraint, with controls on the micro grid; the bob hangs still at the end."""
 
@@ -120,7 +116,7 @@ def test_a_cart_with_a_pendulum_from_rest_to_rest():
         return jnp.concatenate([state.q_s - 0.5, state.q_f[:1] - 0.5, state.p_s, state.p_f[:1]])
 
     problem = cart()
-    system = problem.system.replace(params={"stiffness": 0.0}, slow_potential=gravity)
+    system = problem.system.replace(params={"stiffness": 0.0}, slow_potential=lambda q_s, q_f, params: 9.81 * q_f[1])
     how: dict[str, Any] = {"actuate": push, "num_controls": 1, "scheme": vm.fully_implicit(2), "solver": MARCH}
     steps: dict[str, Any] = {"macro_dt": 0.1, "num_steps": 12, "grid": "micro"}
     optimum = minimize(vm.Problem(system, problem.q_s, problem.q_f), effort, goal=there, **how, **steps)
@@ -188,10 +184,6 @@ def test_another_optimum_to_start_from():
     assert fine.cost == pytest.approx(cold.cost, rel=1e-9)
 
 
-def wrong(q_s, q_f, u, params):
-    return u[:0], q_f
-
-
 KICKS: dict[str, Any] = {
     "kinetic": vm.micro(vm.quadrature.midpoint),
     "slow": vm.macro(vm.quadrature.trapezoidal),
@@ -204,7 +196,7 @@ BY_ARRAY = vm.Problem(vm.System(vm.ConstantMass([1.0], NONE), params=jnp.ones(2)
 @pytest.mark.parametrize(
     ("message", "options"),
     [
-        ("actuate returns", {"actuate": wrong}),
+        ("actuate returns", {"actuate": lambda q_s, q_f, u, params: (u[:0], q_f)}),
         (
             r"actuate is <lambda>\(u, q_s, q_f, params\); it is called",
             {"actuate": lambda u, q_s, q_f, params: (u, q_f)},

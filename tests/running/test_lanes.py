@@ -30,7 +30,6 @@ SYSTEMS = PROBLEMS | {"chain": partial(vm.systems.fermi_pasta_ulam, 1), "pendulu
 RUN: dict[str, Any] = {"num_steps": 20, "save": 5}
 WAYS = {  # system, scheme, macro_dt, largest difference of a lane from its single run
     "kicks": ("chain", vm.fully_explicit(3), 0.05, 1e-13),  # measured 3e-15
-    "linear fast equations": ("chain", vm.explicit_slow(3), 0.05, 1e-13),
     "nested": ("pendulum", vm.fully_implicit(3), 0.05, 1e-13),
     "drift along constraints": ("tsp", vm.fully_explicit(1), 0.002, 1e-13),
     "collocation": ("pendulum", vm.galerkin(1, 2), 0.05, 1e-12),

@@ -7,10 +7,9 @@ from scipy.special import ellipj
 
 import vmri_jax as vm
 from tests.scene.mechanics import mechanics
+from tests.support import set_up
 from vmri_jax import scene as sc
 from vmri_jax.accuracy.companions import resting
-from vmri_jax.running.arguments import Steps
-from vmri_jax.running.simulation import simulation
 from vmri_jax.scene.rigid import angular_momentum, angular_velocity, matrix_of, quaternion, rotation
 
 MOMENTS = np.array([1.0, 2.0, 2.5])
@@ -256,7 +255,7 @@ def test_coordinates_are_called_by_centre_and_directors():
     assert names.slow_coordinates == ["hub x", "hub y", "hub z", *directors]
     assert names.fast_coordinates == ["bar x", "bar y", "bar z", "bar d1 x", "bar d1 y", "bar d1 z"]
     assert [names.positions(part) for part in ("s", "f")] == [[0, 1, 2], [0, 1, 2]]
-    run = resting(simulation(scene, vm.fully_explicit(1), None, None, Steps(0.1, num_steps=2)))  # nothing is computed
+    run = resting(set_up(scene, vm.fully_explicit(1), 0.1, 2))
     panel = run.plot().axes[0]
     np.testing.assert_array_equal(panel.lines[2].get_ydata(), run.position("hub")[:, 2])
     assert len(panel.lines) == 3

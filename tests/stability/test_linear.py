@@ -26,14 +26,10 @@ def step_matrix(system, scheme, state, macro_dt, motions):
     return np.asarray(jax.jit(jax.jacfwd(step), compiler_options=QUICK)(jnp.zeros(motions.embed.shape[1])))
 
 
-def damping(t, q_s, q_f, v_s, v_f, params):
-    return -3.0 * v_s, -2e-5 * v_f + 0.01 * q_f
-
-
 def swinging_with_damping():
     problem = user_systems.double_pendulum()  # in angles, at rest below: a kinetic function with coupled masses
     zero = jnp.zeros(1)
-    system = problem.system.replace(force=damping)
+    system = problem.system.replace(force=lambda t, q_s, q_f, v_s, v_f, params: (-3.0 * v_s, -2e-5 * v_f + 0.01 * q_f))
     return system, vm.initial_state(system, zero, zero, zero, zero)
 
 
@@ -106,26 +102,18 @@ def test_multipliers_of_the_impulse_method():
     assert found.radius[0] == pytest.approx(np.abs(expected).max(), abs=1e-13)
 
 
-def corner(q_s, q_f, params):
-    return jnp.linalg.norm(q_s)
-
-
 def test_no_second_derivative():
     one = jnp.zeros(1)
-    system = vm.System(vm.ConstantMass([1.0], [1.0]), corner)
+    system = vm.System(vm.ConstantMass([1.0], [1.0]), lambda q_s, q_f, params: jnp.linalg.norm(q_s))
     with pytest.raises(ValueError, match=r"expansion of .*slow.* is not finite"):
         linearise(system, vm.State(0.0, one, one, one, one))
-
-
-def fixed(q_s, params):
-    return q_s - 1.0
 
 
 def test_nothing_moves():
     one, none = jnp.ones(1), jnp.zeros(0)
     with pytest.raises(ValueError, match="the constraints leave none of the 1 coordinates free"):
         advise(
-            vm.System(vm.ConstantMass([1.0], []), slow_constraint=fixed),
+            vm.System(vm.ConstantMass([1.0], []), slow_constraint=lambda q_s, params: q_s - 1.0),
             vm.fully_implicit(1),
             vm.State(0.0, one, none, 0 * one, none),
             macro_dt=0.1,
