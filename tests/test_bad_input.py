@@ -8,59 +8,39 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from vmri_jax import (
-    ConstantMass,
-    Refused,
-    Rheonomic,
-    Save,
-    Scheme,
-    SimulationError,
-    System,
-    explicit_slow,
-    fully_explicit,
-    fully_implicit,
-    galerkin,
-    initial_state,
-    macro,
-    micro,
-    mollified_impulse,
-    quadrature,
-    simulate,
-    simulate_batch,
-    systems,
-)
+import vmri_jax as vm
 
 
 def start(problem, system=None, **changes):
     vectors = {"q_s": problem.q_s, "q_f": problem.q_f, "v_s": problem.v_s, "v_f": problem.v_f} | changes
-    return initial_state(system or problem.system, **vectors)
+    return vm.initial_state(system or problem.system, **vectors)
 
 
 def step(problem, system=None, state=None, **how):
     """One step of a run."""
-    how = {"scheme": fully_implicit(2), "macro_dt": 0.1, "num_steps": 1} | how
-    return simulate(system or problem.system, state=state or problem.state(), **how)
+    how = {"scheme": vm.fully_implicit(2), "macro_dt": 0.1, "num_steps": 1} | how
+    return vm.simulate(system or problem.system, state=state or problem.state(), **how)
 
 
 def test_bad_data(fpu):
-    with pytest.raises(Refused, match=r"q_s has dtype float32; give float64"):
+    with pytest.raises(vm.Refused, match=r"q_s has dtype float32; give float64"):
         start(fpu, q_s=jnp.asarray(fpu.q_s, dtype=jnp.float32))
     state = fpu.state()
-    with pytest.raises(Refused, match=r"p_f has dtype float32; give float64"):
+    with pytest.raises(vm.Refused, match=r"p_f has dtype float32; give float64"):
         step(fpu, state=replace(state, p_f=state.p_f.astype(jnp.float32)))
-    with pytest.raises(Refused, match=r"p_s has entries that are not finite at \[0, 1, 2\]"):
+    with pytest.raises(vm.Refused, match=r"p_s has entries that are not finite at \[0, 1, 2\]"):
         step(fpu, state=replace(state, p_s=state.p_s * np.nan))
     for value, message in ((np.nan, "t is nan; it must be finite"), ([0.0], "t has shape")):
-        with pytest.raises(Refused, match=message):
+        with pytest.raises(vm.Refused, match=message):
             start(fpu, t=value)
-    with pytest.raises(Refused, match="project is 'no'; it must be True or False"):
+    with pytest.raises(vm.Refused, match="project is 'no'; it must be True or False"):
         start(fpu, project="no")
     for name in ("micro", "progress"):
         flag: Any = {name: 1}
-        with pytest.raises(Refused, match=f"{name} is 1; "):
-            Save(**flag)
-    with pytest.raises(Refused, match="num_springs is 0; there must be at least 1"):
-        systems.fermi_pasta_ulam(num_springs=0)
+        with pytest.raises(vm.Refused, match=f"{name} is 1; "):
+            vm.Save(**flag)
+    with pytest.raises(vm.Refused, match="num_springs is 0; there must be at least 1"):
+        vm.systems.fermi_pasta_ulam(num_springs=0)
 
 
 @pytest.mark.parametrize(
@@ -88,11 +68,11 @@ def test_what_is_no_number(fpu, junk: Any):
             start(fpu, **{name: junk})
     masses: Any = {"a": "heavy"} if junk == {"a": 1} else junk  # masses may be given by name
     with pytest.raises(TypeError, match=r"ConstantMass: fast(\['a'\])? is .*; give real numbers"):
-        ConstantMass([1.0], masses)
+        vm.ConstantMass([1.0], masses)
     with pytest.raises(TypeError, match=r"affine: alpha is .*; give a real number"):
-        explicit_slow(2, junk)
+        vm.explicit_slow(2, junk)
     with pytest.raises(TypeError, match=r"Rule: weights is .*; give real numbers"):
-        quadrature.Rule((0.5,), junk)
+        vm.quadrature.Rule((0.5,), junk)
     with pytest.raises(TypeError, match=r"simulate: macro_dt is .*; give a real number"):
         step(fpu, macro_dt=junk)
 
@@ -106,9 +86,9 @@ def test_what_is_no_number(fpu, junk: Any):
 )
 def test_bad_parameters(fpu, params, message):
     system = fpu.system.replace(params=params)
-    with pytest.raises(Refused, match=message):
+    with pytest.raises(vm.Refused, match=message):
         start(fpu, system)
-    with pytest.raises(Refused, match=message):
+    with pytest.raises(vm.Refused, match=message):
         step(fpu, system)
 
 
@@ -116,7 +96,7 @@ def test_parameters_of_a_batch(fpu):
     states = jax.tree.map(lambda a: jnp.stack([a, a]), fpu.state())
     for params in ("stiff", {"other": jnp.ones(2)}, jax.tree.map(lambda a: jnp.stack([a] * 3), fpu.system.params)):
         with pytest.raises((ValueError, TypeError), match="params"):
-            simulate_batch(fpu.system, fully_implicit(2), states, macro_dt=0.1, num_steps=1, params=params)
+            vm.simulate_batch(fpu.system, vm.fully_implicit(2), states, macro_dt=0.1, num_steps=1, params=params)
 
 
 def vector_fast_potential(q_f, params):
@@ -175,9 +155,9 @@ def entry_that_is_not_there(q_f, params):
 )
 def test_user_functions_of_the_wrong_shape(fpu, changes, message):
     system = fpu.system.replace(**changes)
-    with pytest.raises(Refused, match=message):
+    with pytest.raises(vm.Refused, match=message):
         start(fpu, system)
-    with pytest.raises(Refused, match=message):
+    with pytest.raises(vm.Refused, match=message):
         step(fpu, system)
 
 
@@ -198,7 +178,10 @@ VELOCITY = (
         ({"kinetic": lambda t, q_s, q_f, v_s, v_f, params: 0.0}, f"kinetic is .* {TIME}"),
         ({"constraint": lambda q_s, q_f, v_s, v_f, params: q_f}, f"constraint is .* {VELOCITY}"),
         ({"slow_constraint": lambda t, q_s, params: q_s}, "slow_constraint is .* one that moves with time is"),
-        ({"constraint": Rheonomic(lambda q_s, q_f, params: q_f)}, r"called with \(t, q_s, q_f, params\)\. Give it all"),
+        (
+            {"constraint": vm.Rheonomic(lambda q_s, q_f, params: q_f)},
+            r"called with \(t, q_s, q_f, params\)\. Give it all",
+        ),
     ],
 )
 def test_user_functions_of_other_arguments(fpu, changes, message):
@@ -217,9 +200,9 @@ def ring(q_s, q_f, params):
 
 @pytest.mark.parametrize("num_fast", [0, 1])
 def test_constraints_of_slow_coordinates_alone(num_fast):
-    system = System(ConstantMass([1.0, 1.0], [1.0] * num_fast), constraint=ring)
+    system = vm.System(vm.ConstantMass([1.0, 1.0], [1.0] * num_fast), constraint=ring)
     with pytest.raises(ValueError, match=r"\[0\] of constraint do not depend on the fast .*System\(slow_constraint="):
-        initial_state(system, [1.0, 0.0], [0.0] * num_fast, [0.0, 0.0], [0.0] * num_fast)
+        vm.initial_state(system, [1.0, 0.0], [0.0] * num_fast, [0.0, 0.0], [0.0] * num_fast)
 
 
 @pytest.mark.parametrize(
@@ -235,18 +218,18 @@ def test_constraints_of_slow_coordinates_alone(num_fast):
 )
 def test_bad_masses(slow, message):
     with pytest.raises(ValueError, match=message):
-        ConstantMass(slow, [1.0])
+        vm.ConstantMass(slow, [1.0])
 
 
 def test_system_fields_of_the_wrong_type():
     with pytest.raises(TypeError, match=r"kinetic is 3.0; give ConstantMass"):
-        System(3.0)
+        vm.System(3.0)
     with pytest.raises(TypeError, match="slow_potential is a ConstantMass; masses come first"):
-        System(vector_fast_potential, ConstantMass([1.0], [1.0]))
+        vm.System(vector_fast_potential, vm.ConstantMass([1.0], [1.0]))
     with pytest.raises(TypeError, match="slow_potential is 2; it must be a function or None"):
-        System(ConstantMass([1.0], [1.0]), slow_potential=2)
+        vm.System(vm.ConstantMass([1.0], [1.0]), slow_potential=2)
     with pytest.raises(TypeError, match=r"force is Unhashable.*, which has no hash"):
-        System(ConstantMass([1.0], [1.0]), force=Unhashable())
+        vm.System(vm.ConstantMass([1.0], [1.0]), force=Unhashable())
 
 
 @dataclass
@@ -259,7 +242,7 @@ class Unhashable:
         return v_s, v_f
 
 
-@pytest.mark.parametrize("make", [fully_implicit, explicit_slow, lambda n: galerkin(n, 2)])
+@pytest.mark.parametrize("make", [vm.fully_implicit, vm.explicit_slow, lambda n: vm.galerkin(n, 2)])
 def test_bad_num_micro(make):
     for bad in (0, -3):
         with pytest.raises(ValueError, match=f"num_micro is {bad}; it must be at least 1"):
@@ -269,7 +252,7 @@ def test_bad_num_micro(make):
             make(bad)
 
 
-HALF = micro(quadrature.midpoint)
+HALF = vm.micro(vm.quadrature.midpoint)
 
 
 @pytest.mark.parametrize(
@@ -277,18 +260,18 @@ HALF = micro(quadrature.midpoint)
     [
         ({"degree": 0}, "degree is 0; it must be at least 1"),
         ({"degree": 1.5}, "degree is 1.5; it must be an integer"),
-        ({"slow": macro(2 * quadrature.left)}, "weights of the slow rule sum to 2; they must sum to 1"),
-        ({"fast": quadrature.left}, r"fast is a bare rule; say on which grid .* macro\(rule\) or micro"),
+        ({"slow": vm.macro(2 * vm.quadrature.left)}, "weights of the slow rule sum to 2; they must sum to 1"),
+        ({"fast": vm.quadrature.left}, r"fast is a bare rule; say on which grid .* macro\(rule\) or micro"),
         ({"fast": "midpoint"}, r"fast is 'midpoint'; give macro\(rule\) or micro\(rule\)"),
-        ({"kinetic": macro(quadrature.midpoint)}, r"kinetic rule must be placed with micro"),
-        ({"constraint": micro(quadrature.gauss(2))}, r"constraint must be held .* give"),
-        ({"slow_constraint": micro(quadrature.trapezoidal)}, r"give macro\(lobatto\(2\)\), got micro"),
+        ({"kinetic": vm.macro(vm.quadrature.midpoint)}, r"kinetic rule must be placed with micro"),
+        ({"constraint": vm.micro(vm.quadrature.gauss(2))}, r"constraint must be held .* give"),
+        ({"slow_constraint": vm.micro(vm.quadrature.trapezoidal)}, r"give macro\(lobatto\(2\)\), got micro"),
     ],
 )
 def test_bad_schemes(changes, message):
     fields = {"num_micro": 3, "kinetic": HALF, "slow": HALF, "fast": HALF} | changes
-    with pytest.raises(Refused, match=message):
-        Scheme(**fields)
+    with pytest.raises(vm.Refused, match=message):
+        vm.Scheme(**fields)
 
 
 @pytest.mark.parametrize(
@@ -303,34 +286,34 @@ def test_bad_schemes(changes, message):
         ({"macro_dt": 0.1, "num_steps": 10.0}, "num_steps is 10.0; it must be an integer"),
         ({"macro_dt": 0.1, "save": 0}, "save is 0; it must be an integer of at least 1, or a Save"),
         ({"macro_dt": 0.1, "save": 3}, "num_steps = 10 is not a multiple of save = 3"),
-        ({"macro_dt": 0.1, "save": Save(number=3)}, "not a multiple of the 3 saved intervals"),
+        ({"macro_dt": 0.1, "save": vm.Save(number=3)}, "not a multiple of the 3 saved intervals"),
         ({"macro_dt": 0.1, "scheme": "fully_implicit"}, "scheme is str; give a Scheme"),
         ({"macro_dt": 0.1, "state": None}, r"a System has no start; give a State, e.g. from initial_state"),
     ],
 )
 def test_bad_arguments_of_simulate(fpu, changes, message):
-    arguments = {"scheme": fully_implicit(2), "state": fpu.state(), "num_steps": 10} | changes
-    with pytest.raises(Refused, match=message):
-        simulate(fpu.system, **arguments)
+    arguments = {"scheme": vm.fully_implicit(2), "state": fpu.state(), "num_steps": 10} | changes
+    with pytest.raises(vm.Refused, match=message):
+        vm.simulate(fpu.system, **arguments)
 
 
 @pytest.mark.compiles
 def test_nan_from_a_user_function(fpu):
     system = fpu.system.replace(fast_potential=lambda q_f, params: jnp.sum(jnp.sqrt(-1.0 - q_f**2)))
-    with pytest.raises(SimulationError, match=r"a NaN or infinity appeared.*outside its domain") as caught:
+    with pytest.raises(vm.SimulationError, match=r"a NaN or infinity appeared.*outside its domain") as caught:
         step(fpu, system)
     assert caught.value.step == 0
 
 
 def test_bad_rules():
-    for place in (macro, micro):
-        with pytest.raises(Refused, match="rule is 'midpoint'; give a Rule"):
+    for place in (vm.macro, vm.micro):
+        with pytest.raises(vm.Refused, match="rule is 'midpoint'; give a Rule"):
             place("midpoint")  # pyright: ignore[reportArgumentType]
-    with pytest.raises(Refused, match="rule is 3; give a Rule"):
-        galerkin(2, 1, 3)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(vm.Refused, match="rule is 3; give a Rule"):
+        vm.galerkin(2, 1, 3)  # pyright: ignore[reportArgumentType]
     for alpha in (2.0, -0.5, np.nan):
-        for make in (explicit_slow, fully_explicit, mollified_impulse):
-            with pytest.raises(Refused, match=f"alpha is {alpha}; it must be from 0 to 1: it is the part of a kick"):
+        for make in (vm.explicit_slow, vm.fully_explicit, vm.mollified_impulse):
+            with pytest.raises(vm.Refused, match=f"alpha is {alpha}; it must be from 0 to 1: it is the part of a kick"):
                 make(2, alpha)
 
 
@@ -340,4 +323,4 @@ def test_results_that_do_not_fit_into_memory(fpu):
         step(fpu, num_steps=10**11)
     states = jax.tree.map(lambda a: jnp.stack([a, a]), fpu.state())
     with pytest.raises(ValueError, match="simulate_batch: 100000000001 saved nodes of 2 runs would take 3"):
-        simulate_batch(fpu.system, fully_implicit(2), states, macro_dt=0.1, num_steps=10**11)
+        vm.simulate_batch(fpu.system, vm.fully_implicit(2), states, macro_dt=0.1, num_steps=10**11)

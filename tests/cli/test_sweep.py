@@ -169,8 +169,7 @@ def test_bad_options_are_refused(vmri):
 
 
 @pytest.mark.parametrize(
-    ("package", "options"),
-    [("dask.array", ["--plot", "map.png"]), ("distributed", ["--workers", "tcp://localhost:1"])],
+    ("package", "options"), [("dask.array", ["--plot", "map.png"]), ("distributed", ["--workers", "tcp://localhost:1"])]
 )
 def test_a_package_that_is_not_installed_is_named_before_any_compute(vmri, tmp_path, monkeypatch, package, options):
     monkeypatch.setitem(sys.modules, package, None)

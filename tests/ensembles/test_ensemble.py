@@ -79,9 +79,7 @@ def test_runs_are_those_of_simulate(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("system", "function"),
-    [(own.hung, own.lengths), (f"{OWN}:hung", f"{OWN}:lengths")],
-    ids=["problem", "file"],
+    ("system", "function"), [(own.hung, own.lengths), (f"{OWN}:hung", f"{OWN}:lengths")], ids=["problem", "file"]
 )
 def test_positions_as_dictionaries(tmp_path, system, function):
     """The store has vectors; functions of the user get a run with its dictionaries and names."""

@@ -467,11 +467,7 @@ def fields(model):
 
 def treatments(name):
     """How a field is treated: by an entry of its own, or else by those that stand for many."""
-    table = [
-        ("read", READ),
-        ("idle", IDLE),
-        ("refused", REFUSED_FIELDS),
-    ]
+    table = [("read", READ), ("idle", IDLE), ("refused", REFUSED_FIELDS)]
     entries = [(how, why, entry) for how, group in table for why, text in group.items() for entry in text.split()]
     exact = [(how, why) for how, why, entry in entries if entry == name]
     return exact or [(how, why) for how, why, entry in entries if fnmatchcase(name, entry)]

@@ -273,10 +273,7 @@ ALIKE = ("another rule", "degree 2", "kinetic function", "W between the grids", 
 """For --full: rules and kinetic functions are in `tests/textbook`, W between the grids is beside V there, and `hinge` is on other grids."""
 
 
-@pytest.mark.parametrize(
-    "name",
-    [pytest.param(n, marks=pytest.mark.full if n in ALIKE else ()) for n in PLACEMENTS],
-)
+@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.full if n in ALIKE else ()) for n in PLACEMENTS])
 def test_every_placement_is_that_of_the_textbook(name):
     system, scheme, start = PLACEMENTS[name]
     state = vm.initial_state(system, *start)
