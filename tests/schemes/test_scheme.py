@@ -50,6 +50,8 @@ def test_galerkin_schemes(degree, rule):
         (galerkin(2, 3, quadrature.lobatto(3)), 4),
         (galerkin(2, 2, quadrature.radau(2)), 3),
         (Scheme(2, kinetic=HALF, slow=ON_MACRO, fast=ON_MACRO), 2),
+        (Scheme(1, 2, kinetic=TWO, slow=macro(quadrature.gauss(2)), fast=TWO), 4),
+        (Scheme(4, 2, kinetic=TWO, slow=macro(quadrature.gauss(2)), fast=TWO), 2),
     ],
 )
 def test_order_is_the_least_of_path_and_rules(scheme, order):
