@@ -31,7 +31,7 @@ from vmri_jax.mechanics.arrays import Number, Numbers
 from vmri_jax.mechanics.masses import ConstantMass
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
-from vmri_jax.schemes.discrete_lagrangian import Sum, lagrangian
+from vmri_jax.schemes.discrete_lagrangian import lagrangian
 from vmri_jax.schemes.path import Nodes, Path, control_nodes, lagrange_basis, velocity_nodes
 from vmri_jax.schemes.scheme import Scheme
 
@@ -101,23 +101,13 @@ class StepEquations(eqx.Module):
         return tuple(jnp.split(jnp.diagonal(self.masses), [self.q_s.size]))
 
     def path(self, x: Unknowns) -> Path:
-        """The path of the unknowns."""
-        return self.path_of(x.slow, x.fast)
-
-    def path_of(self, slow, fast) -> Path:
-        """The path of these increments: fast starts are their running sums over whole intervals."""
-        return Path(self.t, self.macro_dt, self.q_s, slow, self.q_f + sum_before(fast[:, -1]), fast)
+        """The path of the unknowns: fast starts are the running sums of the increments over whole intervals."""
+        return Path(self.t, self.macro_dt, self.q_s, x.slow, self.q_f + sum_before(x.fast[:, -1]), x.fast)
 
     def action(self, path: Path, held: Path, x: Unknowns):
         """Augmented action times h, with the virtual work of forces along `held` on displacements of `path`."""
-        return self._action(lagrangian(self.system, self.scheme), path, held) - self.constraint_work(path, x)
-
-    def without_kinetic(self, path: Path, held: Path):
-        """`action` without constraints and without the kinetic energy of constant masses."""
-        return self._action(lagrangian(self.system, self.scheme).potentials, path, held)
-
-    def _action(self, terms: Sum, path: Path, held: Path):
-        return self.micro_dt * (terms.at_nodes_inside(path) + self.virtual_work(path, held))
+        energies = lagrangian(self.system, self.scheme).at_nodes_inside(path)
+        return self.micro_dt * (energies + self.virtual_work(path, held)) - self.constraint_work(path, x)
 
     def virtual_work(self, path: Path, held: Path):
         """Lagrange-d'Alembert: ``H sum_i w_i F(t_i, q_i, v_i) . Q_i``, with q_i and v_i on the path `held`, which is not varied, and Q_i on `path`."""

@@ -6,7 +6,7 @@ Interval m starts with the fast position F_0 and the momentum p at the end of th
                 - sum_j mu_j . g(q at its control node j) / h        (0 <= j < r)
 
 with S_0..S_r the slow control points of the macro step, F_0..F_r the fast ones of this interval. A node where two intervals meet belongs
-to the later one; `MicroSweep` takes it, equivalently, as a kick at the end of the earlier one. The equations, all times h, are
+to the later one. The equations, all times h, are
 
     p + D_{F_0} A_m = 0      D_{F_j} A_m = 0  (0 < j < r)      g = 0 at its control nodes 1..r
 
@@ -24,7 +24,7 @@ from collections.abc import Callable
 from copy import copy
 from dataclasses import replace
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -83,18 +83,18 @@ class IntervalNodes:
     def __init__(self, groups: list[list[NodeGroup]], num_micro: int, degree: int):
         n = num_micro
         c = np.zeros((n, len(groups)))
-        self.has_nodes = np.zeros(n, bool)
+        self.has_nodes = np.full(n, all(_meet(row, n) for row in groups))
         for k, row in enumerate(groups):
             for group in row:
                 c[np.array(group.intervals), k] = group.c
                 self.has_nodes[np.array(group.intervals)] = True
-        if self.has_nodes.all() and all(len(row) == 1 for row in groups):
+        if all(len(row) == 1 and row[0].size == n for row in groups):
             self.weights = jnp.stack([row[0].weights[0] for row in groups])[None]  # of all intervals
         else:
             self.weights = jnp.stack(
                 [sum((_padded(group, n) for group in row), jnp.zeros(n)) for row in groups], axis=1
             )
-        self.theta = (np.arange(n)[:, None] + c) / n
+        self.c, self.theta = c, (np.arange(n)[:, None] + c) / n
         self.tables = {
             "q_s": lagrange_basis(degree, self.theta)[..., 1:],
             "v_s": lagrange_derivative(degree, self.theta)[..., 1:],
@@ -132,7 +132,9 @@ class IntervalNodes:
             if name == "t":
                 return equations.t + equations.macro_dt * of_interval(self.theta, m)
             start, increments = (path.slow_start, path.slow) if name[2] == "s" else (path.fast_start, path.fast)
-            moved = matmul(of_interval(self.tables[name], m), increments)
+            table = of_interval(self.tables[name], m)
+            is_start = isinstance(table, np.ndarray) and not table.any()  # there JAX has to know that nothing moves
+            moved = jnp.zeros((len(table), start.size)) if is_start else matmul(table, increments)
             # q(c) = q_0 + sum_j l_j(c) Delta_j,  v(c) = sum_j l_j'(c) Delta_j / T, with T = H for slow and T = h for fast variables
             if name[0] == "q":
                 values = start + moved
@@ -149,6 +151,12 @@ def with_unseen(values, name: str, equations: StepEquations, seen: Entries):
     return seen.put(values, jnp.broadcast_to(at_rest, (len(values), at_rest.size)))
 
 
+def _meet(row: list[NodeGroup], num_micro: int) -> bool:
+    """Whether a row has the nodes where intervals meet, at the start of all but the first one. There functions are evaluated with the weight 0, without a
+    branch, at the start of the macro step, where the same rule has a node of the step before."""
+    return all(group.c == 0 and group.size == num_micro - 1 for group in row)
+
+
 def _padded(group: NodeGroup, num_micro: int):
     """(num_micro,) weights of a group of nodes, 0 in intervals without a node of the group."""
     if group.step > 1:
@@ -160,7 +168,7 @@ def of_interval(table, m):
     """The rows of a table for interval m; a constant, without a lookup, if the rows of all intervals are equal."""
     if len(table) == 1 or (isinstance(table, np.ndarray) and np.ptp(table, axis=0).max(initial=0.0) == 0.0):
         return table[0]
-    return jnp.asarray(table)[m]
+    return jnp.asarray(table).at[m].get(mode="promise_in_bounds")
 
 
 class Intervals:
@@ -177,12 +185,12 @@ class Intervals:
     def __init__(self, equations: StepEquations):
         self.equations = equations
         terms = lagrangian(equations.system, equations.scheme).terms
-        self._kinetic = next((term for term in terms if isinstance(term, QuadraticKinetic)), None)
+        self.kinetic = next((term for term in terms if isinstance(term, QuadraticKinetic)), None)
         inner = [term for term in terms if isinstance(term, TermOnNodes) and term.inside.groups]
         of_slow = [all(name.endswith("_s") for name in term.arguments) for term in inner]
         self._slow_terms = [term for term, alone in zip(inner, of_slow, strict=True) if alone]
         of_fast = (term for term, alone in zip(inner, of_slow, strict=True) if not alone)
-        self._terms = [(term, nodes) for term in of_fast for nodes in IntervalNodes.of(term.inside)]
+        self.terms = [(term, nodes) for term in of_fast for nodes in IntervalNodes.of(term.inside)]
         has_force = equations.system.force is not None
         self._force_nodes = IntervalNodes.of(equations.force_nodes) if has_force else []
         self.seen = self._seen()
@@ -207,7 +215,7 @@ class Intervals:
             return replace(term, integrand=lambda *arguments: form(jnp.concatenate(arguments[-number:])))
 
         by_masses = copy(self)
-        by_masses._terms = [(with_masses(term), nodes) for term, nodes in self._terms]
+        by_masses.terms = [(with_masses(term), nodes) for term, nodes in self.terms]
         by_masses._slow_terms = [with_masses(term) for term in self._slow_terms]
         return by_masses
 
@@ -219,13 +227,53 @@ class Intervals:
         def values(slow):
             """Values of all these functions, for slow positions and velocities in one vector (2 n_s,)."""
             values_of = {"q_s": slow[:n_s], "v_s": slow[n_s:], "q_f": equations.q_f, "v_f": equations.q_f}
-            integrands = [term.integrand(*(values_of[name] for name in term.arguments)) for term, _ in self._terms]
+            integrands = [term.integrand(*(values_of[name] for name in term.arguments)) for term, _ in self.terms]
             return integrands, system.g(equations.t, values_of["q_s"], values_of["q_f"])
 
         if self._force_nodes:
             return Entries.of([True] * n_s)
         marked = entries_seen(values, jnp.concatenate([equations.q_s, equations.q_s]))
         return Entries.of((marked[:n_s] | marked[n_s:]).tolist())
+
+    def start(self) -> Arriving:
+        """The quantities that arrive at the first interval."""
+        equations = self.equations
+        zero = jnp.zeros(self.seen.count), jnp.zeros((equations.scheme.degree, self.seen.count))
+        return Arriving(equations.q_f, equations.micro_dt * equations.p_f, *zero)
+
+    def path(self, arriving: Arriving, slow, fast) -> IntervalPath:
+        """The path of fast increments (r, n_f), and of the slow increments (r, n_v) that are seen."""
+        return IntervalPath(self.seen.take(self.equations.q_s), slow, arriving.q_f, fast)
+
+    def gradient(self, m, path: IntervalPath) -> IntervalPath:
+        """The gradient of ``h A_m`` by the path, without constraints and without the kinetic energy of constant masses."""
+        return jax.grad(self._action)(path, path, m)
+
+    def constraint_impulses(self, m, path: IntervalPath) -> Callable[..., IntervalPath]:
+        """The map from multipliers mu (r, n_g) to the gradient of ``sum_j mu_j . g`` by the path, ``G_0^T mu``."""
+        pull = jax.vjp(partial(self.constraints, m=m, nodes=slice(0, -1)), path)[1]
+        return lambda mu: pull(mu)[0]
+
+    def rows(self, d: IntervalPath, p_f: Any = 0.0):
+        """The momentum equations ``p + D_{F_0}``, then ``D_{F_j}``, 0 < j < r, (r, n_f) of a function with the gradient d."""
+        return jnp.concatenate([(p_f + d.fast_start - d.fast.sum(0))[None], d.fast[:-1]])
+
+    def with_inertia(self, d: IntervalPath, fast) -> IntervalPath:
+        """The gradient d with that of the kinetic energy of constant masses, for fast increments (r, n_f)."""
+        return d if self.kinetic is None else d._replace(fast=d.fast + self.kinetic.fast_rows(fast))
+
+    def handed_on(self, arriving: Arriving, d: IntervalPath, last) -> Arriving:
+        """The quantities that an interval hands on, from the gradient d of ``h A_m`` without the inertia of constant masses.
+
+        The momentum is ``h p + h D_{F_0} A_m + ... + h D_{F_r} A_m``, the start momentum plus all impulses. At a root that is h D_{F_r} A_m; but an error
+        e of the increments, below the round-off of the positions, would change that by M e, and does not change the impulses of the inertia.
+
+        Args:
+            last: (n_f,) fast increment from the start of the interval to its end.
+        """
+        return Arriving(
+            arriving.q_f + last, arriving.p_f + d.fast_start, arriving.start + d.slow_start, arriving.slow + d.slow
+        )
 
     def evaluate(self, m, x: IntervalUnknowns, arriving: Arriving, slow) -> tuple[IntervalUnknowns, Arriving]:
         """Residual of interval m, and the quantities that it hands on.
@@ -234,39 +282,34 @@ class Intervals:
             arriving: from the intervals before.
             slow: (r, n_v) increments of the slow path that are seen.
         """
-        equations = self.equations
-        path = IntervalPath(self.seen.take(equations.q_s), slow, arriving.q_f, x.fast)
-        d = jax.grad(self._action)(path, path, x.multiplier, m)
-        d_fast = d.fast
-        if self._kinetic is not None:
-            d_fast += self._kinetic.fast_rows(x.fast)
-        # h p + h D_{F_0} A_m + ... + h D_{F_r} A_m: the start momentum plus all impulses. At a root that is h D_{F_r} A_m; but an error e of
-        # the increments, below the round-off of the positions, would change that by M e, and does not change the impulses of the inertia.
-        p_f = arriving.p_f + d.fast_start
-        # h (p + D_{F_0} A_m), then h D_{F_j} A_m, 0 < j < r
-        rows = jnp.concatenate([(p_f - d_fast.sum(0))[None], d_fast[:-1]])
-        residual = IntervalUnknowns(rows, self._constraints(path, m, slice(1, None)))
-        on = Arriving(arriving.q_f + x.fast[-1], p_f, arriving.start + d.slow_start, arriving.slow + d.slow)
-        return residual, on
+        path = self.path(arriving, slow, x.fast)
+        d = jax.grad(lambda path, held: self._action(path, held, m) - self._constraint_work(path, x.multiplier, m))(
+            path, path
+        )
+        rows = self.rows(self.with_inertia(d, x.fast), arriving.p_f)
+        residual = IntervalUnknowns(rows, self.constraints(path, m, slice(1, None)))
+        return residual, self.handed_on(arriving, d, x.fast[-1])
 
     def impulses(self, m, x: IntervalUnknowns, arriving: Arriving, slow, multiplier) -> Arriving:
         """Change of the quantities that interval m hands on if `multiplier` is added to its multipliers."""
-        path = IntervalPath(self.seen.take(self.equations.q_s), slow, arriving.q_f, x.fast)
-        (d,) = jax.vjp(partial(self._constraints, m=m, nodes=slice(0, -1)), path)[1](-multiplier)
+        d = self.constraint_impulses(m, self.path(arriving, slow, x.fast))(-multiplier)
         return Arriving(jnp.zeros_like(arriving.q_f), d.fast_start, d.slow_start, d.slow)
 
-    def _action(self, path: IntervalPath, held: IntervalPath, mu, m):
-        """``h A_m`` without the kinetic energy of constant masses, with the work of forces along `held` on displacements of `path`."""
-        equations = self.equations
+    def _action(self, path: IntervalPath, held: IntervalPath, m):
+        """``h A_m`` without constraints and without the kinetic energy of constant masses, with the work of forces along `held` on displacements of
+        `path`."""
         total = jnp.zeros(())
-        for term, nodes in self._terms:
+        for term, nodes in self.terms:
             total += _where_there_are_nodes(nodes, m, partial(self._of_term, term, nodes, m), path)
         for nodes in self._force_nodes:
             total += _where_there_are_nodes(nodes, m, partial(self._virtual_work, nodes, m), path, held)
-        total *= equations.micro_dt
-        if equations.system.constraint is not None:
-            total -= jnp.sum(mu * self._constraints(path, m, slice(0, -1)))
-        return total
+        return self.equations.micro_dt * total
+
+    def _constraint_work(self, path: IntervalPath, mu, m):
+        """``sum_j mu_j . g`` at the control nodes 0..r-1."""
+        if self.equations.system.constraint is None:
+            return 0.0
+        return jnp.sum(mu * self.constraints(path, m, slice(0, -1)))
 
     def _of_term(self, term: TermOnNodes, nodes: IntervalNodes, m, path: IntervalPath):
         equations = self.equations
@@ -289,7 +332,7 @@ class Intervals:
         work = jnp.sum(f_s * q_s, axis=1) + jnp.sum(f_f * q_f, axis=1)
         return equations.macro_dt * jnp.sum(of_interval(nodes.weights, m) * work)
 
-    def _constraints(self, path: IntervalPath, m, nodes: slice):
+    def constraints(self, path: IntervalPath, m, nodes: slice):
         """(r, n_g) values of g at control nodes of interval m."""
         equations = self.equations
         c = control_nodes(equations.scheme.degree)[nodes]
@@ -299,34 +342,38 @@ class Intervals:
         q_f = jnp.concatenate([path.fast_start[None], path.fast_start + path.fast])[nodes]
         return jax.vmap(equations.system.g)(times, q_s, q_f)
 
-    def slow_evaluate(self, slow, multiplier, arriving: Arriving):
-        """Residual of the slow equations ((r, n_s), (r, n_gs)), and the slow momentum at the end of the step.
+    def slow_rows(self, slow, impulses, arriving: Arriving):
+        """Rows (r, n_s) of the slow momentum equations, and the slow momentum at the end of the step.
 
         The end momentum is computed as the start momentum plus all impulses, ``p_s + D_{S_0} A + ... + D_{S_r} A``. Potentials that are
         invariant under translations of the slow variables have impulses of sum zero, so that momentum is conserved to round-off.
 
         Args:
-            slow, multiplier: (r, n_s) increments, (r, n_gs) scaled multipliers.
+            slow: (r, n_s) increments.
+            impulses: (r, n_s) of the slow constraint, see `slow_impulses`.
             arriving: quantities that the last micro interval hands on.
         """
         equations = self.equations
         start, d = (
             self.seen.put(a, jnp.zeros((*a.shape[:-1], equations.q_s.size))) for a in (arriving.start, arriving.slow)
         )
-        if self._kinetic is not None:
-            d += self._kinetic.slow_rows(slow) / equations.scheme.num_micro
+        if self.kinetic is not None:
+            d += self.kinetic.slow_rows(slow) / equations.scheme.num_micro
         if self._slow_terms:
             by_start, by_slow = jax.grad(self._slow_action, argnums=(0, 1))(equations.q_s, slow)
             start, d = start + by_start, d + by_slow
-        impulses = self.slow_impulses(slow, multiplier)
         # h (p_s + D_{S_0} A), h D_{S_i} A, 0 < i < r
         rows = jnp.concatenate([(equations.micro_dt * equations.p_s + start - d.sum(0))[None], d[:-1]]) - impulses
-        p_s = equations.p_s + (start - impulses.sum(0)) / equations.micro_dt
+        return rows, equations.p_s + (start - impulses.sum(0)) / equations.micro_dt
+
+    def slow_constraints(self, slow):
+        """(r, n_gs) values of the slow constraint at S_1..S_r, for increments (r, n_s)."""
+        equations = self.equations
         times = equations.t + equations.macro_dt * control_nodes(equations.scheme.degree)[1:]
-        return (rows, jax.vmap(equations.system.g_slow)(times, equations.q_s + slow)), p_s
+        return jax.vmap(equations.system.g_slow)(times, equations.q_s + slow)
 
     def slow_impulses(self, slow, multiplier):
-        """(r, n_s) impulses ``G_s^T nu``, times h, of the slow constraint at S_0..S_{r-1}; arguments as of `slow_evaluate`."""
+        """(r, n_s) impulses ``G_s^T nu``, times h, of the slow constraint at S_0..S_{r-1}, for increments (r, n_s) and scaled multipliers (r, n_gs)."""
         equations = self.equations
         times = equations.t + equations.macro_dt * control_nodes(equations.scheme.degree)[:-1]
         nodes = jnp.concatenate([equations.q_s[None], equations.q_s + slow[:-1]])
@@ -353,4 +400,6 @@ def _where_there_are_nodes(nodes: IntervalNodes, m, function, *paths):
     """``function(*paths)``, or zero without evaluation in intervals where the rule has no nodes."""
     if nodes.has_nodes.all():
         return function(*paths)
+    if isinstance(m, int):
+        return function(*paths) if nodes.has_nodes[m] else jnp.zeros(())
     return jax.lax.cond(jnp.asarray(nodes.has_nodes)[m], function, lambda *_: jnp.zeros(()), *paths)

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
 from vmri_jax.schemes.equations import StepEquations
+from vmri_jax.schemes.intervals import Intervals
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.interval import Interval, Matrix, constant_mass
 from vmri_jax.steppers.results import Method
@@ -42,23 +43,17 @@ class Linear(Stepper):
         return self.interval.matrix(StepEquations.of(self.system, self.scheme, state, macro_dt))
 
     def advance(self, state: State, memory: Matrix, macro_dt) -> tuple[State, StepInfo, Matrix]:
-        equations = StepEquations.of(self.system, self.scheme, state, macro_dt)
-        h, zero = macro_dt, jnp.zeros((self.scheme.degree, state.q_f.size))
-
-        def gradient(increments):
-            path = equations.path_of(jnp.zeros((self.scheme.degree, 0)), increments[None])
-            return jax.grad(equations.without_kinetic)(path, path)
-
+        intervals = Intervals(StepEquations.of(self.system, self.scheme, state, macro_dt))
+        start, none = intervals.start(), jnp.zeros((self.scheme.degree, 0))
+        path = intervals.path(start, none, jnp.zeros((self.scheme.degree, state.q_f.size)))
         # r(0): h p_f + h D_{F_0} L and h D_{F_j} L, 0 < j < r
-        d, change = jax.linearize(gradient, zero)
-        rows = jnp.concatenate([d.fast_start - d.fast[0].sum(0) + h * state.p_f, d.fast[0, :-1]])
-        increments = -memory.solve(rows)
+        d, change = jax.linearize(lambda fast: intervals.gradient(0, path._replace(fast=fast)), path.fast)
+        increments = -memory.solve(intervals.rows(d, start.p_f))
 
         # h p_f + h D_{F_0} L + ... + h D_{F_r} L: the impulses of the potentials over the step
-        p_f = state.p_f + (d.fast_start + change(increments).fast_start)[0] / h
+        p_f = state.p_f + (d.fast_start + change(increments).fast_start) / macro_dt
         q_f = state.q_f + increments[-1]
-        none = jnp.zeros((1, self.scheme.degree, 0)), jnp.zeros((self.scheme.degree, 0))
-        info = StepInfo(*StepStatus.direct(Method.LINEAR), q_f[None], *none)
+        info = StepInfo(*StepStatus.direct(Method.LINEAR), q_f[None], none[None], none)
         return State(state.t + macro_dt, state.q_s, q_f, state.p_s, p_f), info, memory
 
     def describe(self) -> list[str]:

@@ -1,4 +1,4 @@
-"""One micro interval as a problem of its own, and the Newton matrix K of its fast increments.
+"""The structure of a micro interval, and the Newton matrix K of its fast increments.
 
 K (r n_f, r n_f) is the derivative of the fast momentum equations, times h and without constraint forces, by the fast increments.
 Its rows i = 0..r-1 and columns j = 1..r are
@@ -14,9 +14,9 @@ For r = 1, without forces and with W at the midpoint, ``K = -(M_f + h^2 W'' / 4)
 that couple coordinates of a long chain lie in a band, which O(n_f) operations eliminate.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -24,18 +24,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from vmri_jax.kernels import DIAGONAL_MATRICES, LARGEST_RENEWED, inverse, solve
+from vmri_jax.kernels import DIAGONAL_MATRICES, LARGEST_RENEWED, inverse
 from vmri_jax.kernels.band import Band, BandInverse, Full, FullInverse, Sparsity, sparsity
-from vmri_jax.kernels.saddle import regularized
 from vmri_jax.mechanics.arrays import is_concrete
 from vmri_jax.mechanics.constraint_pattern import MOST_ROWS_OF_FULL_MATRIX, fast_rows
 from vmri_jax.mechanics.masses import ConstantMass
+from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.structure import has_constant_hessian, has_diagonal_hessian, is_linear
 from vmri_jax.mechanics.system import System
-from vmri_jax.schemes.discrete_lagrangian import QuadraticKinetic, TermOnNodes, lagrangian, placed_potentials
+from vmri_jax.schemes.discrete_lagrangian import TermOnNodes, lagrangian
 from vmri_jax.schemes.equations import StepEquations
-from vmri_jax.schemes.path import Path, control_nodes, lagrange_basis
-from vmri_jax.schemes.quadrature import micro, midpoint
+from vmri_jax.schemes.intervals import IntervalPath, Intervals, of_interval
+from vmri_jax.schemes.path import control_nodes, lagrange_basis
 from vmri_jax.schemes.scheme import Scheme
 
 SMALL = 24
@@ -56,21 +56,10 @@ def constant_mass(system: System) -> ConstantMass:
     return system.kinetic
 
 
-def interval_problem(system: System, scheme: Scheme) -> tuple[System, Scheme]:
-    """System and scheme of one micro interval, without the slow constraint and without terms that only some intervals have."""
-    local = {term: rule for term, rule in placed_potentials(system, scheme) if rule.is_local}
-    parts = system.only(lambda term: term in local if term.kind == "potential" else term.field != "slow_constraint")
-    # the rule of a term that is left out does not matter
-    rules = {name: getattr(scheme, name) for name in ("slow", "fast", "force")}
-    rules: dict[str, Any] = {name: rule if rule.is_local else micro(midpoint) for name, rule in rules.items()}
-    rules["potentials"] = {term.name: rule for term, rule in local.items() if term.field == "potentials"}
-    return parts, Scheme(1, scheme.degree, kinetic=scheme.kinetic, constraint=scheme.constraint, **rules)
-
-
 def implicit_terms(system: System, scheme: Scheme) -> list[TermOnNodes]:
-    """The potentials with nodes inside a micro interval, whose gradients depend on the fast unknowns."""
-    terms = lagrangian(*interval_problem(system, scheme)).terms
-    return [term for term in terms if isinstance(term, TermOnNodes) and term.inside.groups]
+    """The potentials with nodes inside micro intervals, whose gradients depend on the fast unknowns."""
+    terms = [term for term in lagrangian(system, scheme).terms if isinstance(term, TermOnNodes)]
+    return [term for term in terms if any(group.c > 0 for group in term.inside.groups)]
 
 
 def _of_fast(term: TermOnNodes, q_s, q_f):
@@ -157,26 +146,23 @@ class Interval:
     @partial(jax.jit, static_argnums=0)  # traced once for the shapes of `no_matrix` and for the steps
     def matrix(self, equations: StepEquations) -> Matrix:
         """K on the first micro interval of a macro step, on the straight path from its start."""
-        system, scheme = interval_problem(equations.system, equations.scheme)
-        start = equations.q_s, equations.q_f, equations.p_s, equations.p_f
-        local = StepEquations(system, scheme, equations.t, *start, equations.micro_dt)
-        velocities = constant_mass(system).velocity(equations.p_s, equations.p_f)
-        slow, fast = (local.macro_dt * control_nodes(scheme.degree)[1:, None] * v for v in velocities)
-        path = local.path_of(slow, fast[None])
+        velocities = constant_mass(equations.system).velocity(equations.p_s, equations.p_f)
+        c, lengths = control_nodes(equations.scheme.degree)[1:, None], (equations.macro_dt, equations.micro_dt)
+        slow, fast = (length * c * v for length, v in zip(lengths, velocities, strict=True))
+        intervals = Intervals(equations)
+        path = intervals.path(intervals.start(), intervals.seen.take(slow), fast)
         if self.is_diagonal:
-            return _diagonal_matrix(local, path)
-        times_k = jax.linearize(partial(_fast_rows, local, path), path.fast[0])[1]
+            return _diagonal_matrix(intervals, path)
+        times_k = jax.linearize(partial(_rows, intervals, path), fast)[1]
         seeds = self.curved.seeds
-        products = jax.vmap(times_k)(seeds.reshape(len(seeds), *path.fast[0].shape))
+        products = jax.vmap(times_k)(seeds.reshape(len(seeds), *fast.shape))
         return JoinedMatrix(self.curved.inverse(products.reshape(seeds.shape), may_depend=False))
 
 
-def _fast_rows(local: StepEquations, path: Path, increments):
-    """``h D_{F_i} L`` (r, n_f), i = 0..r-1, of the action L of an interval without constraints, with forces along the same path."""
-    varied = replace(path, fast=increments[None])
-    d = jax.grad(local.without_kinetic)(varied, varied)
-    d_fast = d.fast[0] + lagrangian(local.system, local.scheme).kinetic.fast_rows(increments)
-    return jnp.concatenate([d.fast_start - d_fast.sum(0), d_fast[:-1]])
+def _rows(intervals: Intervals, path: IntervalPath, fast):
+    """Fast momentum equations (r, n_f) of the first interval, without constraints and the momentum that arrives, with forces along the same path."""
+    d = intervals.gradient(0, path._replace(fast=fast))
+    return intervals.rows(intervals.with_inertia(d, fast))
 
 
 def _curved(system: System, scheme: Scheme, n_s: int, n_f: int) -> Sparsity:
@@ -184,7 +170,7 @@ def _curved(system: System, scheme: Scheme, n_s: int, n_f: int) -> Sparsity:
 
     An entry that differs from zero elsewhere alone is missed, which costs passes, not accuracy.
     """
-    touched, parts = np.zeros((n_f, n_f), bool), interval_problem(system, scheme)
+    touched, parts = np.zeros((n_f, n_f), bool), (system, scheme)
     for seed in range(PATHS):
         rng = np.random.default_rng(seed)
         numbers = [rng.normal(size=n) for n in (n_s, n_f, n_s, n_f)]
@@ -198,10 +184,11 @@ def _curved(system: System, scheme: Scheme, n_s: int, n_f: int) -> Sparsity:
 @eqx.filter_jit
 def _touched(parts: tuple[System, Scheme], numbers, fast):
     """(n_f, n_f) whether the rows of each coordinate change with each other one, on the path with these positions and increments."""
-    (system, scheme), (q_s, q_f, p_s, p_f) = parts, numbers
-    local = StepEquations(system, scheme, jnp.zeros(()), q_s, q_f, p_s, p_f, jnp.ones(()))
-    path = local.path_of(jnp.zeros((scheme.degree, q_s.size)), fast[None])
-    times_k = jax.linearize(partial(_fast_rows, local, path), fast)[1]
+    system, scheme = parts
+    start = State(jnp.zeros(()), *numbers)
+    intervals = Intervals(StepEquations.of(system, scheme, start, jnp.asarray(float(scheme.num_micro))))
+    path = intervals.path(intervals.start(), intervals.start().slow, fast)
+    times_k = jax.linearize(partial(_rows, intervals, path), fast)[1]
 
     def column(i):
         # every change counts, however small: K is the exact matrix of linear equations
@@ -210,44 +197,20 @@ def _touched(parts: tuple[System, Scheme], numbers, fast):
     return jax.lax.map(column, jnp.arange(fast.shape[1]))
 
 
-def _diagonal_matrix(local: StepEquations, path: Path) -> DiagonalMatrix:
-    _, r, n_f = path.fast.shape
+def _diagonal_matrix(intervals: Intervals, path: IntervalPath) -> DiagonalMatrix:
+    equations, kinetic = intervals.equations, intervals.kinetic
+    assert kinetic is not None
     # block_ija = k_ij M_a - h^2 sum_k w_k l_i(c_k) l_j(c_k) W''_aa, i = 0..r-1, j = 1..r, coordinate a
-    block = jnp.zeros((r, r, n_f))
-    for term in lagrangian(local.system, local.scheme).terms:
-        if isinstance(term, QuadraticKinetic):
-            block += term.fast_form[:-1, 1:, None] * term.mass.fast
-        elif term.inside.groups and term.arguments == ("q_f",):
-            q = term.inside.sample(path, ("q_f",))["q_f"]
-            gradient = jax.vmap(jax.grad(term.integrand))
-            # W'' times ones: its diagonal, since W is a sum over coordinates
-            curvature = jax.jvp(gradient, (q,), (jnp.ones_like(q),))[1]
-            basis = lagrange_basis(r, np.array([group.c for group in term.inside.groups]))
-            weights = term.sign * local.macro_dt**2 * term.inside.weights
-            block += jnp.einsum("k,ki,kj,ka->ija", weights, basis[:, :-1], basis[:, 1:], curvature)
-    if r == 1:
+    block = kinetic.fast_form[:-1, 1:, None] * kinetic.mass.fast
+    for term, nodes in intervals.terms:
+        if term.arguments != ("q_f",):
+            continue
+        (q,) = nodes.sample(path, equations, intervals.seen, 0, ("q_f",))
+        # W'' times ones: its diagonal, since W is a sum over coordinates
+        curvature = jax.jvp(jax.vmap(jax.grad(term.integrand)), (q,), (jnp.ones_like(q),))[1]
+        basis = lagrange_basis(equations.scheme.degree, nodes.c[0])
+        weights = term.sign * equations.micro_dt * term.times_step(equations.macro_dt) * of_interval(nodes.weights, 0)
+        block += jnp.einsum("k,ki,kj,ka->ija", weights, basis[:, :-1], basis[:, 1:], curvature)
+    if len(block) == 1:
         return DiagonalMatrix(1 / block)
     return DiagonalMatrix(jnp.moveaxis(jax.vmap(inverse, in_axes=-1)(block), 0, -1))
-
-
-def solve_saddle(solve_k, jacobian, push, rows, g):
-    """(dx, dmu) with ``K dx - G_0^T dmu = -rows`` and ``G_1 dx = -g``, by the Schur complement ``G_1 K^-1 G_0^T``.
-
-    Args:
-        solve_k: K^-1, (r, n) rows to (r, n) increments.
-        jacobian: (r, n_g, n) G_0, at the control nodes 0..r-1, where the multipliers act.
-        push: G_1 as a function, changes (r, n) of the control points 1..r to changes (r, n_g) of the constraints.
-        rows, g: (r, n) and (r, n_g).
-    """
-    r, n_g = g.shape
-    if n_g == 0:
-        return -solve_k(rows), g
-    # Columns of G_0^T and -rows, then K^-1 and G_1 of them: one map for all, since each use of a function is compiled anew. vmap stacks
-    # columns in rows, so that `schur` is the transposed complement.
-    columns = np.eye(r)[:, None, :, None] * jacobian[:, :, None, :]  # (node, constraint, row, coordinate)
-    columns = jnp.concatenate([columns.reshape(r * n_g, r, -1), -rows[None]])
-    response = jax.vmap(solve_k)(columns)
-    pushed = jax.vmap(push)(response).reshape(-1, r * n_g)
-    response, dx, schur, g_of_dx = response[:-1], response[-1], regularized(pushed[:-1]), pushed[-1]
-    dmu = -solve(schur.T, (g.reshape(-1) + g_of_dx)[:, None])
-    return dx + jnp.sum(dmu[..., None] * response, axis=0), dmu.reshape(r, n_g)

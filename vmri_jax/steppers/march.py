@@ -158,8 +158,9 @@ class MarchEquations:
     def slow_equations(self, z, arriving: Handed):
         """Residual (b,) of the slow equations, and the slow momentum at the end."""
         slow, multiplier = z[: self.num_slow].reshape(self.r, self.n_s), z[self.num_slow :].reshape(self.r, self.n_gs)
-        (rows, g), p_s = self.intervals.slow_evaluate(slow, multiplier, self._apart(arriving))
-        return jnp.concatenate([rows.reshape(-1), g.reshape(-1)]), p_s
+        impulses = self.intervals.slow_impulses(slow, multiplier)
+        rows, p_s = self.intervals.slow_rows(slow, impulses, self._apart(arriving))
+        return jnp.concatenate([rows.reshape(-1), self.intervals.slow_constraints(slow).reshape(-1)]), p_s
 
     def _apart(self, arriving: Handed) -> Arriving:
         p_f, start, slow = jnp.split(arriving.gradients, [self.n_f, self.n_f + self.n_v])

@@ -1,6 +1,5 @@
 """One pass over the micro intervals of a macro step: every interval is corrected once, in order, with the slow path held fixed."""
 
-from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -8,202 +7,126 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from vmri_jax.kernels import max_abs
-from vmri_jax.kernels.band import BandInverse, FullInverse, Sparsity
+from vmri_jax.kernels.band import BandInverse, FullInverse
 from vmri_jax.mechanics.arrays import Numbers
-from vmri_jax.schemes.discrete_lagrangian import TermOnNodes, lagrangian
-from vmri_jax.schemes.equations import StepEquations, slow_basis_at_control_nodes
+from vmri_jax.schemes.intervals import Arriving, Intervals
 from vmri_jax.schemes.path import control_nodes
-from vmri_jax.steppers.interval import Matrix, constant_mass, interval_problem, weighted_sum
-
-
-class SweepTotals(NamedTuple):
-    """Quantities that a pass accumulates over the micro intervals; they arrive at the next interval, and at last at the slow equations.
-
-    q_f, p_f: position and momentum times h at the end of the last interval.
-    d_start, d_increments: gradients of h times the action with respect to the start and the increments of the slow path, without the slow
-        kinetic energy.
-    moved: largest correction of a fast increment.
-    """
-
-    q_f: Float[Numbers, "n_f"]
-    p_f: Float[Numbers, "n_f"]
-    d_start: Float[Array, "n_s"]
-    d_increments: Float[Array, "r n_s"]
-    moved: Float[Array, ""]
+from vmri_jax.steppers.interval import Interval, Matrix, constant_mass
+from vmri_jax.steppers.solver import only_if
 
 
 class FastUnknowns(NamedTuple):
     """Unknowns of one micro interval, or of all with the intervals as first axis, and the matrix that corrects the multipliers.
 
     increments, multiplier: fast increments, and scaled multipliers mu.
-    schur_inverse: ``S = (G_1 K^-1 G_0^T)^-1`` of the first pass, kept in the later ones; None before the first pass.
+    schur_inverse: ``S = (G_1 K^-1 G_0^T)^-1`` of the first pass, kept in the later ones.
     """
 
     increments: Float[Array, "*num_micro r n_f"]
     multiplier: Float[Array, "*num_micro r n_g"]
-    schur_inverse: FullInverse | BandInverse | None
+    schur_inverse: FullInverse | BandInverse
 
 
 class MicroSweep(NamedTuple):
     """The quantities that all passes of a macro step share.
 
-    equations: of the macro step.
-    is_explicit: whether fast increments are explicit functions of the multipliers, see `Interval`.
+    intervals: the equations.
+    structure: of an interval.
     matrix: K of the micro intervals.
     scale: factor ``mu / lambda`` of the scaled multipliers.
-    sparsity: of ``G K^-1 G^T`` of one interval.
+    multiplier: multipliers lambda of the last interval of the step before.
     """
 
-    equations: StepEquations
-    is_explicit: bool
+    intervals: Intervals
+    structure: Interval
     matrix: Matrix
     scale: Float[Numbers, "num_micro r 1"]
-    sparsity: Sparsity
+    multiplier: Float[Array, "r n_g"]
 
-    def first_pass(self, slow, multiplier) -> tuple[FastUnknowns, SweepTotals]:
-        """The first pass. Guess of every interval: straight motion at the momentum that arrives, multipliers of the interval before.
+    def unsolved(self) -> FastUnknowns:
+        """The fast unknowns before the first pass."""
+        equations, sparsity = self.intervals.equations, self.structure.sparsity
+        schur_inverse = jax.eval_shape(sparsity.inverse, sparsity.seeds)
+        increments = jnp.zeros((equations.scheme.degree, equations.q_f.size))
+        of_interval = FastUnknowns(increments, jnp.zeros_like(self.multiplier), schur_inverse)
+        return jax.tree.map(lambda a: jnp.zeros((equations.scheme.num_micro, *a.shape), a.dtype), of_interval)
+
+    def corrected(self, slow, fast: FastUnknowns, is_first) -> tuple[FastUnknowns, Arriving, Float[Array, ""]]:
+        """A pass. In the first one every interval starts from straight motion at the momentum that arrives, with the multipliers of the interval before.
 
         Args:
             slow: (r, n_s) increments of the slow path.
-            multiplier: (r, n_g) multipliers lambda of the last interval of the step before.
+            fast: unknowns of the pass before.
+            is_first: whether this is the first pass.
+
+        Returns:
+            The unknowns, the quantities that the last interval hands on, and the largest correction of a fast increment.
         """
-        r = self.equations.scheme.degree
-        velocity = constant_mass(self.equations.system).fast_mass.inverse().times
+        equations, r = self.intervals.equations, self.intervals.equations.scheme.degree
+        velocity = constant_mass(equations.system).fast_mass.inverse().times
+        seen = self.intervals.seen.take(slow)
 
         def interval(carry, numbers):
-            (arriving, multiplier), (m, basis, scale) = carry, numbers
+            (arriving, multiplier, worst), (m, scale, before) = carry, numbers
             straight = control_nodes(r)[1:, None] * velocity(arriving.p_f)  # c_j h M^-1 p_f
-            guess = FastUnknowns(straight, scale * multiplier, None)
-            unknowns, totals = self._corrected(slow, arriving, m, basis, guess)
-            return (totals, unknowns.multiplier / scale), unknowns
+            # sums, since the unknowns before the first pass are zero: a selection costs a batch a quarter of its time
+            guess = before._replace(
+                increments=before.increments + is_first * straight,
+                multiplier=before.multiplier + is_first * scale * multiplier,
+            )
+            unknowns, arriving, moved = self._corrected(m, guess, arriving, seen, is_first)
+            return (arriving, unknowns.multiplier / scale, jnp.maximum(worst, moved)), unknowns
 
-        (totals, _), fast = jax.lax.scan(interval, (self._start(slow), multiplier), (*self._intervals(), self.scale))
-        return fast, totals
+        start = self.intervals.start(), self.multiplier, jnp.zeros(())
+        (end, _, moved), fast = jax.lax.scan(
+            interval, start, (jnp.arange(equations.scheme.num_micro), self.scale, fast)
+        )
+        return fast, end, moved
 
-    def next_pass(self, slow, fast: FastUnknowns) -> tuple[FastUnknowns, SweepTotals]:
-        """A later pass, from the fast unknowns of the pass before and with its matrices S."""
+    def _corrected(self, m, guess: FastUnknowns, arriving: Arriving, slow, is_first):
+        """One Newton step on the equations of interval m, for the fast increments x and the multipliers mu,
 
-        def interval(arriving, numbers):
-            m, basis, before = numbers
-            unknowns, totals = self._corrected(slow, arriving, m, basis, before)
-            return totals, unknowns
+            K dx - G_0^T dmu = -R        R = rows - G_0^T mu        G_1 dx = -g
 
-        totals, fast = jax.lax.scan(interval, self._start(slow), (*self._intervals(), fast))
-        return fast, totals
+        where R is the residual of the momentum equations, `rows` its part without constraint forces, and G_0, G_1 the Jacobians of g at the
+        nodes 0..r-1 and 1..r. Solved by the Schur complement: first dx without dmu, then ``G_1 K^-1 G_0^T dmu = -g`` with g at x + dx, then dx
+        with dmu.
 
-    def _intervals(self):
-        """Numbers m of the intervals, and the basis (n, r + 1, r) of the slow path at their nodes, by slow increments."""
-        n, r = self.equations.scheme.num_micro, self.equations.scheme.degree
-        return jnp.arange(n), jnp.asarray(slow_basis_at_control_nodes(n, r)[..., 1:])
+        Args:
+            guess: unknowns before the correction.
+            arriving: from the intervals before.
+            slow: (r, n_v) increments of the slow path that are seen.
+            is_first: whether this is the first pass, which computes S.
 
-    def _start(self, slow) -> SweepTotals:
-        equations = self.equations
-        zero = jnp.zeros_like(equations.q_s), jnp.zeros_like(slow), jnp.zeros(())
-        return SweepTotals(equations.q_f, equations.micro_dt * equations.p_f, *zero)
+        Returns:
+            (unknowns, the quantities that are handed on, largest correction of a fast increment).
+        """
+        (x, mu, schur), intervals, solve = guess, self.intervals, self.matrix.solve
+        if self.structure.is_explicit:  # K is exact: the increments follow from the multipliers, wherever they start
+            x = jnp.zeros_like(x)
+        path = intervals.path(arriving, slow, x)
+        pull = intervals.constraint_impulses(m, path)  # G_0^T
+        # gradient of h times the action without kinetic energy and constraints, and the change of it with x
+        d, change = jax.linearize(lambda x: intervals.gradient(m, path._replace(fast=x)), x)
+        d = jax.tree.map(jnp.subtract, d, pull(mu))
+        dx = -solve(intervals.rows(intervals.with_inertia(d, x), arriving.p_f))
+        if self.structure.is_explicit:
+            x, dx = dx, x
+        if mu.size:
+            g, push = jax.linearize(lambda x: intervals.constraints(path._replace(fast=x), m, slice(1, None)), x + dx)
 
-    def _corrected(
-        self, slow, arriving: SweepTotals, m, basis, guess: FastUnknowns
-    ) -> tuple[FastUnknowns, SweepTotals]:
-        """Interval m, corrected once by a Newton step on its exact residual, and the totals after it."""
-        equations, h, n = self.equations, self.equations.micro_dt, self.equations.scheme.num_micro
-        q_s, steps = equations.q_s + weighted_sum(basis[0], slow), weighted_sum(basis[1:] - basis[0], slow)
-        system, scheme = interval_problem(equations.system, equations.scheme)
-        at_rest = jnp.zeros_like(q_s), jnp.zeros_like(arriving.q_f)
-        local = StepEquations(system, scheme, equations.t + m * h, q_s, arriving.q_f, *at_rest, h)
-        unknowns, p_f, d_start, d_steps, moved = correct(self, local, steps, arriving.p_f, guess)
+            def schur_inverse(_):
+                sparsity = self.structure.sparsity
+                seeds = sparsity.seeds
+                columns = jax.vmap(lambda seed: push(solve(intervals.rows(pull(seed)))))(seeds.reshape(-1, *mu.shape))
+                return sparsity.inverse(columns.reshape(seeds.shape))
 
-        # Chain rule: with the slow increments S of the macro step and the rows b_j of the basis, the slow path of this interval starts
-        # at q_s + b_0 S and has the increments (b_j - b_0) S.
-        d_increments = arriving.d_increments + basis[0][:, None] * d_start
-        d_increments += jnp.sum((basis[1:] - basis[0])[..., None] * d_steps[:, None], axis=0)
-        d_start, q_f = arriving.d_start + d_start, arriving.q_f + unknowns.increments[-1]
-        # Kicks ``p_f <- p_f + h w dL/dq_f`` at the node where this interval ends and the next one starts; those at the end of the macro
-        # step are taken outside.
-        end = equations.q_s + weighted_sum(basis[-1], slow), q_f
-        kicks = []  # weights and gradients
-        for term in lagrangian(system, scheme).kicks if n > 1 else ():
-            kicks.append((jnp.where(m < n - 1, h * kick_weight(term, h), 0.0), term.gradient(*end)))
-        for term in lagrangian(equations.system, equations.scheme).kicks:
-            if term.every > 1:  # only at the nodes where two copies of the rule meet
-                meets = ((m + 1) % term.every == 0) & (m < n - 1)
-                gradient = jax.lax.cond(meets, term.gradient, lambda *q: jax.tree.map(jnp.zeros_like, q), *end)
-                kicks.append((h * kick_weight(term, equations.macro_dt), gradient))
-        for weight, (d_s, d_f) in kicks:
-            d_start, p_f = d_start + weight * d_s, p_f + weight * d_f
-            d_increments += basis[-1][:, None] * (weight * d_s)
-
-        totals = SweepTotals(q_f, p_f, d_start, d_increments, jnp.maximum(arriving.moved, moved))
-        return unknowns, totals
-
-
-def kick_weight(term: TermOnNodes, h):
-    """Weight of a kick at a node where one interval ends and the next one starts, times the power of h of the term."""
-    return term.times_step(h) * sum(w for w in (term.start, term.end) if w is not None)
-
-
-def correct(sweep: MicroSweep, local: StepEquations, steps, p_f, guess: FastUnknowns):
-    """One Newton step on the equations of one micro interval, for the fast increments x and the multipliers mu,
-
-        K dx - G_0^T dmu = -R        R = rows - G_0^T mu        G_1 dx = -g
-
-    where R is the residual of the momentum equations, `rows` its part without constraint forces, and G_0, G_1 the Jacobians of g at the
-    nodes 0..r-1 and 1..r. Solved by the Schur complement: first dx without dmu, then ``G_1 K^-1 G_0^T dmu = -(g + G_1 dx)``, then
-    dx with dmu.
-
-    Args:
-        sweep: K, the sparsity of the Schur complement, and whether the increments are explicit functions of mu.
-        local: the interval as a problem of its own, from the positions at its start.
-        steps: (r, n_s) increments of the slow path over the interval.
-        p_f: momentum times h that arrives.
-        guess: unknowns before the correction; S is computed here if they come without it.
-
-    Returns:
-        (unknowns with S, p_f times h at the end, gradients of h times the action with respect to the start and the increments of the slow path,
-        largest correction of a fast increment).
-    """
-    (increments, mu, schur), matrix = guess, sweep.matrix
-    system, (r, n_g) = local.system, mu.shape
-    times = local.t + local.macro_dt * control_nodes(r)
-    slow_nodes = jnp.concatenate([local.q_s[None], local.q_s + steps])
-    fast_nodes = jnp.concatenate([local.q_f[None], local.q_f + increments[:-1]])
-    pull = jax.vjp(partial(jax.vmap(system.g), times[:-1]), slow_nodes[:-1], fast_nodes)[1]  # G_0^T
-    # G_0^T mu and, without S, the columns of G_0^T for its seeds: one map for all, since each use of a function is compiled anew
-    seeds = jnp.zeros((0, r * n_g)) if schur is not None else sweep.sparsity.seeds
-    pulled_s, pulled_f = jax.vmap(pull)(jnp.concatenate([mu[None], seeds.reshape(len(seeds), r, n_g)]))
-    pull_s, pull_f, columns = pulled_s[0], pulled_f[0], pulled_f[1:]
-    # K x = -(h p_f - G_0^T mu): the momentum equations hold exactly, and only the constraints have a residual
-    if sweep.is_explicit:
-        increments = -matrix.solve(p_f - pull_f)
-
-    def gradient(increments):
-        path = local.path_of(steps, increments[None])
-        return jax.grad(local.without_kinetic)(path, path)
-
-    # d: gradients of h times the action of the interval, without kinetic energy and constraints; change: their derivative with respect to x
-    d, change = jax.linearize(gradient, increments)
-    d_fast = d.fast[0] + lagrangian(system, local.scheme).kinetic.fast_rows(increments)
-    g, push = jax.linearize(lambda x: jax.vmap(system.g)(times[1:], slow_nodes[1:], local.q_f + x), increments)
-    if not sweep.is_explicit:
-        # momentum equations at the nodes 0..r-1: h p_f + h D_{F_0} L, h D_{F_j} L
-        rows = jnp.concatenate([(d.fast_start - d_fast.sum(0)) + p_f, d_fast[:-1]])
-        columns = jnp.concatenate([columns, (pull_f - rows)[None]])
-    # K^-1 of the columns of G_0^T and, if the increments are unknowns, of -R; then G_1 of these
-    response = jax.vmap(matrix.solve)(columns)
-    pushed = jax.vmap(push)(response)
-    dx, g_after_dx = (jnp.zeros_like(increments), g) if sweep.is_explicit else (response[-1], g + pushed[-1])
-    if schur is None:
-        schur = sweep.sparsity.inverse(pushed[: len(seeds)].reshape(seeds.shape))
-    # dmu = -S (g + G_1 dx), then dx <- dx + K^-1 G_0^T dmu
-    dmu = -schur.times(g_after_dx.reshape(-1)).reshape(r, n_g)
-    pull_dmu_s, pull_dmu_f = pull(dmu)
-    if n_g:
-        dx += matrix.solve(pull_dmu_f)
-
-    # gradients at x + dx to first order, and the constraint impulses -G_s^T (mu + dmu) at the nodes 0..r-1
-    coupling, impulse = change(dx), -(pull_s + pull_dmu_s)
-    later = jnp.concatenate([impulse[1:], jnp.zeros_like(impulse[:1])])
-    d_start, d_steps = d.slow_start + coupling.slow_start + impulse.sum(0), d.slow + coupling.slow + later
-    # The momentum at the end is the start momentum plus all impulses, h p_f + h D_{F_0} L + ... + h D_{F_r} L. At the root that is h D_{F_r} L; but
-    # an error e of x, below the round-off of the positions, would change that by M e, and does not change the impulses of the inertia.
-    p_f += (d.fast_start + coupling.fast_start)[0] - (pull_f + pull_dmu_f).sum(0)
-    return FastUnknowns(increments + dx, mu + dmu, schur), p_f, d_start, d_steps, max_abs(dx)
+            schur = only_if(is_first, schur_inverse, schur)
+            dmu = -schur.times(g.reshape(-1)).reshape(mu.shape)
+            impulses = pull(dmu)
+            dx, mu = dx + solve(intervals.rows(impulses)), mu + dmu
+            d = jax.tree.map(jnp.subtract, d, impulses)
+        # gradients at x + dx to first order
+        d = jax.tree.map(jnp.add, d, change(dx))
+        on = intervals.handed_on(arriving, d, x[-1] + dx[-1])
+        return FastUnknowns(x + dx, mu, schur), on, max_abs(dx)

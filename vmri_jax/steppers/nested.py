@@ -2,7 +2,8 @@
 
 A pass holds the slow path fixed. It visits the micro intervals in order; each corrects its fast increments and multipliers once, by a
 Newton step on its exact residual, and adds its impulse to the slow equations. Then the pass corrects the slow increments and slow
-multipliers by the residual of the slow equations. All matrices are cheap approximations:
+multipliers by the residual of the slow equations. All equations are those of the march (`vmri_jax.schemes.intervals`); all matrices are cheap
+approximations:
 
 * micro interval: ``[K, -G_0^T; G_1, 0]`` with K of `vmri_jax.steppers.interval`, e.g. ``-(M_f + h^2 W'' / 4)`` for the implicit midpoint
   rule, at the start of the macro step, or of an earlier one while that costs at most `EXTRA_PASSES`. Where the fast equations are explicit,
@@ -25,15 +26,16 @@ from jaxtyping import Array, Float, Int
 
 from vmri_jax.kernels import LINEARISES_FORCES, max_abs
 from vmri_jax.schemes.equations import StepEquations, Unknowns
+from vmri_jax.schemes.intervals import Arriving, Intervals
 from vmri_jax.schemes.path import control_nodes
 from vmri_jax.steppers.accept import Accepted, expected
 from vmri_jax.steppers.interval import Interval, Matrix, constant_mass
-from vmri_jax.steppers.micro_intervals import FastUnknowns, MicroSweep, SweepTotals
+from vmri_jax.steppers.micro_intervals import FastUnknowns, MicroSweep
 from vmri_jax.steppers.predictors import PolynomialPredictor
-from vmri_jax.steppers.results import Method
+from vmri_jax.steppers.results import RUNNING, Method
 from vmri_jax.steppers.slow_equations import ConstraintInertia, SlowEquations
 from vmri_jax.steppers.solved import Solution, StepSolver, status_of
-from vmri_jax.steppers.solver import Solver, iterated
+from vmri_jax.steppers.solver import Solver, iterated, only_if
 
 EXTRA_PASSES = 1
 """Passes above the fewest with a matrix K that the solver tolerates; it renews K after a step with more. A larger number lets steps with an old K
@@ -63,11 +65,12 @@ class NestedState(NamedTuple):
 
 
 class Pass(NamedTuple):
-    """Unknowns after a pass, the totals of its micro intervals, and the state of the iteration.
+    """Unknowns after a pass, the quantities that its last interval hands on, and the state of the iteration.
 
+    moved: largest correction of a fast increment.
     d: the next update of the slow increments, by the linearised slow equations; their update of the multipliers is in `slow_multiplier` already.
     inertia: masses that constraints tie to the slow variables, from the first pass.
-    impulse: on the slow variables over the step, times h.
+    p_s: slow momentum at the end of the step.
     rows: estimated residual of the momentum equations, times h: ``max(|R_s|, max M_f |c|)`` with the expected fast correction c. M_f stands
         for K here: for stiff W at the midpoint, |K c| is larger by the factor ``1 + h^2 W'' / (4 M_f)``.
     """
@@ -75,11 +78,12 @@ class Pass(NamedTuple):
     slow: Float[Array, "r n_s"]
     slow_multiplier: Float[Array, "r n_gs"]
     fast: FastUnknowns
-    totals: SweepTotals
+    end: Arriving
+    moved: Float[Array, ""]
     d: Float[Array, "r*n_s"]
-    inertia: ConstraintInertia | None
+    inertia: ConstraintInertia
     slow_model_error: Float[Array, ""]
-    impulse: Float[Array, "n_s"]
+    p_s: Float[Array, "n_s"]
     rows: Float[Array, ""]
     passes: Int[Array, ""]
     result: Int[Array, ""]
@@ -121,13 +125,12 @@ class Nested(StepSolver):
 
     def solve(self, equations: StepEquations, guess: Unknowns, memory: NestedState) -> tuple[Solution, NestedState]:
         scale, _ = equations.multiplier_scales()
-        sweep = MicroSweep(equations, self.interval.is_explicit, memory.matrix, scale, self.interval.sparsity)
-        passes = _Passes(equations, memory, sweep, self.newton)
-        done = iterated(passes.next, passes.first())
+        sweep = MicroSweep(Intervals(equations), self.interval, memory.matrix, scale, memory.multiplier)
+        passes = _Passes(memory, sweep, self.newton)
+        done = iterated(passes.next, passes.start())
 
         x = Unknowns(done.slow, done.slow_multiplier, done.fast.increments, done.fast.multiplier)
-        per_h = 1 / equations.micro_dt
-        end = done.totals.q_f, equations.p_s + per_h * done.impulse, per_h * done.totals.p_f
+        end = done.end.q_f, done.p_s, done.end.p_f / equations.micro_dt
         status = status_of(equations, done.result, Method.MASSES, done.passes, rows=done.rows, end=end)
 
         learned = NestedState(
@@ -158,24 +161,25 @@ class Nested(StepSolver):
 class _Passes:
     """The iteration over passes of one macro step."""
 
-    def __init__(self, equations: StepEquations, memory: NestedState, sweep: MicroSweep, newton: Solver):
-        self.equations, self.memory, self.sweep, self.newton = equations, memory, sweep, newton
-        self.slow_equations = SlowEquations.of(equations)
+    def __init__(self, memory: NestedState, sweep: MicroSweep, newton: Solver):
+        self.memory, self.sweep, self.newton = memory, sweep, newton
+        self.equations = equations = sweep.intervals.equations
+        self.slow_equations = SlowEquations.of(sweep.intervals)
         self.accepted = Accepted.of(equations, newton)
         self.mass = constant_mass(equations.system)
         self.r, self.n_s = equations.scheme.degree, equations.q_s.size
         self.num_multipliers = equations.system.num_constraints(equations.q_s, equations.q_f)[1]
 
-    def first(self) -> Pass:
-        """The first pass, from the predicted slow unknowns; in the first step, whose momenta are on the hidden constraints, from straight motion."""
+    def start(self) -> Pass:
+        """The unknowns before the first pass: slow ones as predicted; in the first step, whose momenta are on the hidden constraints, from straight motion."""
         increment = self.equations.macro_dt * self.mass.slow_mass.inverse().times(self.equations.p_s)
         straight = (control_nodes(self.r)[1:, None] * increment).reshape(-1)
-        z = self.memory.slow.next(self.r * self.n_s, jnp.pad(straight, (0, self.r * self.num_multipliers)))
-        fast, totals = self.sweep.first_pass(self._apart(z)[0], self.memory.multiplier)
-        inertia = self.slow_equations.constraint_inertia(jax.tree.map(lambda a: a[0], fast.schur_inverse))
-        return self._judged(
-            z, fast, totals, inertia, error=self.memory.slow_model_error, still_moves=totals.moved, passes=1
-        )
+        slow = self.memory.slow.next(self.r * self.n_s, jnp.pad(straight, (0, self.r * self.num_multipliers)))
+        z, fast, zero = self._apart(slow), self.sweep.unsolved(), jnp.zeros(())
+        inertia = ConstraintInertia.none(self.memory.multiplier.size, z[0])
+        none, error = jnp.zeros(self.r * self.n_s), self.memory.slow_model_error
+        numbers = zero, jnp.asarray(0), jnp.asarray(RUNNING)
+        return Pass(*z, fast, self.sweep.intervals.start(), zero, none, inertia, error, self.equations.p_s, *numbers)
 
     def next(self, last: Pass) -> Pass:
         """The next pass, with corrected slow unknowns."""
@@ -191,53 +195,43 @@ class _Passes:
         )
         wanted = jnp.where(is_hard, last.d, 0.0)  # in lanes of a batch without a hard step the loop ends at once
         x = Unknowns(last.slow, last.slow_multiplier, last.fast.increments, last.fast.multiplier)
-        d = jax.lax.cond(is_hard, lambda: self.slow_equations.with_forces(wanted, x), lambda: last.d)
+        d = only_if(is_hard, lambda _: self.slow_equations.with_forces(wanted, x), last.d)
         now = self._moved_by(d, last)
         missing, update = jnp.where(is_hard, jnp.stack([d - last.d, d]), jnp.stack([now.d, last.d]))
-        return now._replace(slow_model_error=max_abs(missing) / (max_abs(update) + jnp.finfo(float).tiny))
+        error = max_abs(missing) / (max_abs(update) + jnp.finfo(float).tiny)
+        return now._replace(slow_model_error=jnp.where(last.passes > 0, error, last.slow_model_error))
 
     def _moved_by(self, d, last: Pass) -> Pass:
-        z = _flat(last.slow + d.reshape(last.slow.shape), last.slow_multiplier)
-        fast, totals = self.sweep.next_pass(self._apart(z)[0], last.fast)
-        still_moves = expected(totals.moved, last.totals.moved)
-        return self._judged(
-            z,
-            fast,
-            totals,
-            last.inertia,
-            error=last.slow_model_error,
-            still_moves=still_moves,
-            passes=last.passes + 1,
-        )
-
-    def _judged(
-        self,
-        z,
-        fast: FastUnknowns,
-        totals: SweepTotals,
-        inertia: ConstraintInertia | None,
-        *,
-        error,
-        still_moves,
-        passes,
-    ) -> Pass:
-        """A pass with slow unknowns z, with their next update d, and with the `Result` of the iteration so far.
-
-        `error` is its slow_model_error, `still_moves` the expected next correction of the fast increments.
-        """
-        equations, inverse_fast = self.equations, self.mass.fast_mass.inverse().times
-        slow, slow_multiplier = self._apart(z)
-        x = Unknowns(slow, slow_multiplier, fast.increments, fast.multiplier)
-        update, rows, impulse = self.slow_equations.update(x, totals.d_start, totals.d_increments, inertia)
-        d, d_multiplier = update
-        arrives, leaves = inverse_fast(equations.micro_dt * equations.p_f), inverse_fast(totals.p_f)
+        """The pass after the update d, with its own next update, and with the `Result` of the iteration so far."""
+        equations, is_first = self.equations, last.passes == 0
+        slow, slow_multiplier = last.slow + d.reshape(last.slow.shape), last.slow_multiplier
+        fast, end, moved = self.sweep.corrected(slow, last.fast, is_first)
+        inertia = last.inertia
+        if inertia.responses.size:
+            of_first = jax.tree.map(lambda a: a[0], fast.schur_inverse)
+            inertia = only_if(is_first, lambda _: self.slow_equations.constraint_inertia(of_first), inertia)
+        update, rows, p_s = self.slow_equations.update(slow, slow_multiplier, end, inertia)
+        next_d, d_multiplier = update
+        inverse_fast = self.mass.fast_mass.inverse().times
+        arrives, leaves = inverse_fast(equations.micro_dt * equations.p_f), inverse_fast(end.p_f)
         # size of the fast motion: largest |h M_f^-1 p_f| at both ends of the macro step
-        motion = jnp.maximum(max_abs(arrives), max_abs(leaves))
-        changes = max_abs(d), still_moves
-        result = self.newton.status(self.accepted.ratio(changes, (max_abs(slow), motion), passes), passes)
+        motion, still_moves = jnp.maximum(max_abs(arrives), max_abs(leaves)), expected(moved, last.moved)
+        passes = last.passes + 1
+        ratio = self.accepted.ratio((max_abs(next_d), still_moves), (max_abs(slow), motion), passes)
         rows = jnp.maximum(max_abs(rows), max_abs(self.mass.fast) * still_moves)
-        passes, slow_multiplier = jnp.asarray(passes), slow_multiplier + d_multiplier
-        return Pass(slow, slow_multiplier, fast, totals, d, inertia, error, impulse, rows, passes, result)
+        return last._replace(
+            slow=slow,
+            slow_multiplier=slow_multiplier + d_multiplier,
+            fast=fast,
+            end=end,
+            moved=moved,
+            d=next_d,
+            inertia=inertia,
+            p_s=p_s,
+            rows=rows,
+            passes=passes,
+            result=self.newton.status(ratio, passes),
+        )
 
     def _apart(self, z):
         """Slow increments (r, n_s) and slow multipliers (r, n_gs) of z."""

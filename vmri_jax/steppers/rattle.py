@@ -22,7 +22,7 @@ from vmri_jax.kernels.band import Full, Sparsity
 from vmri_jax.schemes.equations import StepEquations, Unknowns
 from vmri_jax.steppers.accept import Accepted
 from vmri_jax.steppers.interval import constant_mass, weighted_sum
-from vmri_jax.steppers.results import Method
+from vmri_jax.steppers.results import RUNNING, Method
 from vmri_jax.steppers.solved import Solution, StepSolver, status_of
 from vmri_jax.steppers.solver import Solver, iterated
 
@@ -88,9 +88,8 @@ class Rattle(StepSolver):
             x = last.x - last.dx
             return judged(x, last.mu + last.dmu, constraints(equations.t + h, q + x), last.iterations + 1)
 
-        # nearly all steps need one correction: outside of the loop it is cheaper
-        first = corrected(judged(x, mu, g, 0))
-        done = iterated(corrected, first)
+        start = judged(x, mu, g, 0)._replace(result=jnp.asarray(RUNNING))  # at least one correction, of multipliers too
+        done = iterated(corrected, start)
 
         # p+ = p - G_0^T mu / h
         end = q + done.x, equations.p_s, equations.p_f - force(done.mu) / h

@@ -31,11 +31,13 @@ from jaxtyping import Array, Float
 
 from vmri_jax.kernels import inverse, matmul, max_abs, solve
 from vmri_jax.kernels.band import BandInverse, FullInverse
-from vmri_jax.schemes.discrete_lagrangian import QuadraticKinetic, lagrangian, placed_potentials
+from vmri_jax.kernels.saddle import regularized
+from vmri_jax.schemes.discrete_lagrangian import placed_potentials
 from vmri_jax.schemes.equations import StepEquations, Unknowns, slow_basis_at_control_nodes
+from vmri_jax.schemes.intervals import Arriving, Intervals
 from vmri_jax.schemes.path import control_nodes, lagrange_basis, lagrange_derivative
 from vmri_jax.schemes.quadrature import gauss
-from vmri_jax.steppers.interval import constant_mass, solve_saddle
+from vmri_jax.steppers.interval import constant_mass
 
 NODES = 4
 """Gauss nodes per macro step at which the slow forces are linearised. A larger number makes the solve dearer; with a smaller one, steps in which
@@ -56,6 +58,11 @@ class ConstraintInertia(NamedTuple):
     responses: Float[Array, "r*n_g r n_s"]
     multipliers: Float[Array, "r*n_g r n_s"]
 
+    @classmethod
+    def none(cls, num_rows: int, slow) -> "ConstraintInertia":
+        """Of no tied masses, for r n_g rows and slow increments (r, n_s)."""
+        return cls(*2 * [jnp.zeros((num_rows, *slow.shape))])
+
 
 class SlowEquations(NamedTuple):
     """The slow equations, with ``K_s^-1`` as the Kronecker product of a matrix for the nodes and an operator for the coordinates.
@@ -64,24 +71,27 @@ class SlowEquations(NamedTuple):
     inverse_mass: ``v -> M_s^-1 v``.
     """
 
-    equations: StepEquations
-    kinetic: QuadraticKinetic
+    intervals: Intervals
     inverse_form: Float[Array, "r r"]
     inverse_mass: Callable
 
     @classmethod
-    def of(cls, equations: StepEquations) -> "SlowEquations":
+    def of(cls, intervals: Intervals) -> "SlowEquations":
         """The slow equations of a macro step."""
-        kinetic = lagrangian(equations.system, equations.scheme).kinetic
+        equations, kinetic = intervals.equations, intervals.kinetic
+        assert kinetic is not None
         inverse_form = equations.scheme.num_micro * inverse(kinetic.slow_form[:-1, 1:])
-        return cls(equations, kinetic, inverse_form, constant_mass(equations.system).slow_mass.inverse().times)
+        return cls(intervals, inverse_form, constant_mass(equations.system).slow_mass.inverse().times)
 
-    def constraint_inertia(self, schur: FullInverse | BandInverse) -> ConstraintInertia | None:
-        """U and P from the matrix S (r n_g, r n_g) of the first micro interval; None without constraints."""
+    @property
+    def equations(self) -> StepEquations:
+        """Of the macro step."""
+        return self.intervals.equations
+
+    def constraint_inertia(self, schur: FullInverse | BandInverse) -> ConstraintInertia:
+        """U and P from the matrix S (r n_g, r n_g) of the first micro interval, with constraints."""
         equations, r, n_s = self.equations, self.equations.scheme.degree, self.equations.q_s.shape[0]
         jacobian = jax.jacrev(equations.system.g, argnums=1)(equations.t, equations.q_s, equations.q_f)
-        if not jacobian.size:
-            return None
         # keeps round-off independent of the expression of the constraint
         jacobian = jax.lax.optimization_barrier(jacobian)
         basis = slow_basis_at_control_nodes(equations.scheme.num_micro, r)[0]
@@ -92,35 +102,34 @@ class SlowEquations(NamedTuple):
         both = np.eye(len(multipliers)) + matmul(multipliers, responses.reshape(-1, r * n_s).T)
         return ConstraintInertia(responses, solve(both, multipliers).reshape(responses.shape))
 
-    def update(self, x: Unknowns, start, increments, inertia: ConstraintInertia | None):
-        """Update of the slow unknowns, residual R of the slow momentum equations, and slow impulse over the step, the latter two times h.
+    def update(self, slow, multiplier, arriving: Arriving, inertia: ConstraintInertia):
+        """Update of the slow unknowns, residual R of the slow momentum equations, times h, and slow momentum at the end of the step.
 
-        A step at rest ends with its first pass: its multipliers are those of this update, which the impulse contains.
+        A step at rest ends with its first pass: its multipliers are those of this update, whose impulse the momentum contains.
 
         With the masses K_s (and the tied ones), and the Jacobians G_0, G_1 of g_s at the macro control nodes 0..r-1 and 1..r,
 
             K_s dx - G_0^T dnu = -R        G_1 dx = -g_s
 
         Args:
-            x: unknowns of the macro step.
-            start, increments: (n_s,), (r, n_s) gradients of h times the action with respect to the start and the increments of the slow path,
-                without the slow kinetic energy and the slow constraint.
-            inertia: of the tied masses, None without constraints.
+            slow, multiplier: slow unknowns.
+            arriving: quantities that the last micro interval hands on.
+            inertia: of the tied masses.
         """
         equations, n, r = self.equations, self.equations.scheme.num_micro, self.equations.scheme.degree
-        system, q_s = equations.system, equations.q_s
-        times = equations.t + equations.macro_dt * control_nodes(r)
-        g, push = jax.linearize(lambda inc: jax.vmap(system.g_slow)(times[1:], q_s + inc), x.slow)
-        nodes = jnp.concatenate([q_s[None], q_s + x.slow[:-1]])
-        jacobian = jax.vmap(jax.jacrev(system.g_slow, argnums=1))(times[:-1], nodes)
-        pull = jnp.sum(x.slow_multiplier[..., None] / n * jacobian, axis=1)
-        # R: h p_s + h D_{S_0} A, h D_{S_i} A; nu is scaled by n = num_micro (`multiplier_scales`)
-        d = increments + self.kinetic.slow_rows(x.slow) / n
-        rows = jnp.concatenate([(start - d.sum(0) + equations.micro_dt * equations.p_s)[None], d[:-1]]) - pull
+        times = equations.t + equations.macro_dt * control_nodes(r)[:-1]
+        g, push = jax.linearize(self.intervals.slow_constraints, slow)
+        nodes = jnp.concatenate([equations.q_s[None], equations.q_s + slow[:-1]])
+        jacobian = jax.vmap(jax.jacrev(equations.system.g_slow, argnums=1))(times, nodes)
+
+        def impulses(multiplier):
+            """``G_0^T nu``; nu is scaled by n = num_micro (`multiplier_scales`)."""
+            return jnp.sum(multiplier[..., None] / n * jacobian, axis=1)
+
+        rows, p_s = self.intervals.slow_rows(slow, impulses(multiplier), arriving)
         dx, d_nu = solve_saddle(lambda rows: self._by_masses(rows, inertia), jacobian, push, rows, g)
-        pull += jnp.sum(d_nu[..., None] * jacobian, axis=1)
-        # impulse: p_s+ - p_s = D_{S_0} A + ... + D_{S_r} A, times h, d cancels in the sum
-        return (dx.reshape(-1), n * d_nu), rows, start - pull.sum(0)
+        p_s -= impulses(n * d_nu).sum(0) / equations.micro_dt
+        return (dx.reshape(-1), n * d_nu), rows, p_s
 
     def with_forces(self, d, x: Unknowns):
         """The update ``(1 + K_s^-1 C)^-1 d`` for an update d by the masses alone, with the derivative C of the slow forces,
@@ -172,6 +181,29 @@ class SlowEquations(NamedTuple):
             return dx
         mu = jnp.sum(inertia.multipliers * dx, axis=(1, 2))
         return dx - jnp.sum(mu[:, None, None] * inertia.responses, axis=0)
+
+
+def solve_saddle(solve_k, jacobian, push, rows, g):
+    """(dx, dmu) with ``K dx - G_0^T dmu = -rows`` and ``G_1 dx = -g``, by the Schur complement ``G_1 K^-1 G_0^T``.
+
+    Args:
+        solve_k: K^-1, (r, n) rows to (r, n) increments.
+        jacobian: (r, n_g, n) G_0, at the control nodes 0..r-1, where the multipliers act.
+        push: G_1 as a function, changes (r, n) of the control points 1..r to changes (r, n_g) of the constraints.
+        rows, g: (r, n) and (r, n_g).
+    """
+    r, n_g = g.shape
+    if n_g == 0:
+        return -solve_k(rows), g
+    # Columns of G_0^T and -rows, then K^-1 and G_1 of them: one map for all, since each use of a function is compiled anew. vmap stacks
+    # columns in rows, so that `schur` is the transposed complement.
+    columns = np.eye(r)[:, None, :, None] * jacobian[:, :, None, :]  # (node, constraint, row, coordinate)
+    columns = jnp.concatenate([columns.reshape(r * n_g, r, -1), -rows[None]])
+    response = jax.vmap(solve_k)(columns)
+    pushed = jax.vmap(push)(response).reshape(-1, r * n_g)
+    response, dx, schur, g_of_dx = response[:-1], response[-1], regularized(pushed[:-1]), pushed[-1]
+    dmu = -solve(schur.T, (g.reshape(-1) + g_of_dx)[:, None])
+    return dx + jnp.sum(dmu[..., None] * response, axis=0), dmu.reshape(r, n_g)
 
 
 def minimal_residuals(operator, b):
