@@ -157,7 +157,7 @@ def tasks(size: Size, name: str, folder: Path, tell: Tell) -> Report:
 def _picked(lanes: int) -> int:
     """The chunk that the library takes for so many runs."""
     work = Work("fpu", {"scheme": SCHEME}, tuple(START), RUN, vary=moved)
-    _, chunks, _ = prepared(work, Draws(lanes, START))
+    *_, chunks = prepared(work, Draws(lanes, START))
     return chunks.size
 
 

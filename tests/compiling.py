@@ -8,10 +8,7 @@ import jax
 
 SKIPPED_PASSES = ("while-loop-invariant-code-motion", "simplify-while-loops")
 """Passes of XLA over loops that take up to a quarter of the time to compile; without them a loop computes the same, and slower."""
-QUICK_FLAGS = (
-    "--xla_cpu_use_fusion_emitters=false",
-    "--xla_cpu_parallel_codegen_split_count=1",
-)
+QUICK_FLAGS = ("--xla_cpu_use_fusion_emitters=false", "--xla_cpu_parallel_codegen_split_count=1")
 """Kernels are written in LLVM's language at once, not by the dozens of MLIR passes of the newer emitters; in one module, where
 several are copied and split. With LLVM's optimisations and `SKIPPED_PASSES` off, half the time to compile."""
 OBJECTS_UNTIL_COLLECTION = 50_000

@@ -13,7 +13,7 @@ FOLDER = Path(__file__).parent
 FILES = (
     *("test_arrows.py", "test_bad_input.py", "test_front_door.py", "test_refusals.py"),
     *(f"animation/test_{name}.py" for name in ("drawing", "page")),
-    *("cli/test_scene.py", "ensembles/test_design.py", "hard_cases/test_report.py"),
+    *("ensembles/test_design.py", "hard_cases/test_report.py"),
     *(f"running/test_{name}.py" for name in ("arguments", "files", "interrupts", "printed", "progress", "summaries")),
     *(f"scene/test_{name}.py" for name in ("bad_input", "declare", "sorting")),
     *(f"schemes/test_{name}.py" for name in ("path", "plain_data", "quadrature", "scheme")),

@@ -8,6 +8,7 @@ import numpy as np
 
 from vmri_jax import SimulationError, Solver, State, Trajectory, initial_state, macro_step, plan, simulate, systems
 from vmri_jax.running.export import NODES, named_arrays
+from vmri_jax.running.simulation import simulation
 
 DATA = Path(__file__).parent / "data"
 PROBLEMS = {
@@ -35,6 +36,11 @@ def step_matrix(system, scheme, macro_dt):
         return jnp.concatenate([end.q_s, end.q_f, end.p_s, end.p_f])
 
     return jax.jacfwd(step)(jnp.zeros(4))
+
+
+def set_up(moving, scheme, macro_dt: float, num_steps: int):
+    """A run of a problem or a scene that nobody computes."""
+    return simulation(moving, scheme, None, None, macro_dt, num_steps)
 
 
 def until_failure(*arguments, **options) -> Trajectory:

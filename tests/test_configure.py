@@ -67,28 +67,24 @@ except RuntimeError as error:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "folder"),
-    [("", "/tmp/somewhere/vmri_jax"), ("cache=False", "None"), ("cache='/tmp/mine'", "/tmp/mine")],
+    ("before", "arguments", "folder"),
+    [
+        ("", "", "/tmp/somewhere/vmri_jax"),
+        ("", "cache=False", "None"),
+        ("", "cache='/tmp/mine'", "/tmp/mine"),
+        ("jax.config.update('jax_compilation_cache_dir', '/tmp/mine')", "", "/tmp/mine"),  # it is kept
+    ],
 )
-def test_programs_are_kept_on_disk(printed, arguments, folder):
+def test_programs_are_kept_on_disk(printed, before, arguments, folder):
     program = f"""
 import os, jax
 os.environ["XDG_CACHE_HOME"] = "/tmp/somewhere"
 import vmri_jax as vm
+{before}
 vm.configure({arguments})
 print(jax.config.jax_compilation_cache_dir)
 """
     assert printed(program).split() == [folder]
-
-
-def test_a_folder_that_jax_has_already_is_kept(printed):
-    program = """
-import jax, vmri_jax as vm
-jax.config.update("jax_compilation_cache_dir", "/tmp/mine")
-vm.configure()
-print(jax.config.jax_compilation_cache_dir)
-"""
-    assert printed(program).split() == ["/tmp/mine"]
 
 
 def test_import_and_questions_change_nothing(printed):
@@ -118,9 +114,3 @@ with warnings.catch_warnings(record=True) as caught:
 print(len(caught), caught[0].category is NotConfiguredWarning, "vm.configure()" in str(caught[0].message))
 """
     assert printed(program).split() == ["1", "True", "True"]
-
-
-def test_the_import_leaves_figures_and_studies_for_later(printed):
-    """matplotlib and the rooms that draw take half a second; runs do not need them."""
-    program = "import sys, vmri_jax; print([name for name in ('matplotlib', 'vmri_jax.study') if name in sys.modules])"
-    assert printed(program).strip() == "[]"

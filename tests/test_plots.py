@@ -10,19 +10,14 @@ import numpy as np
 import pytest
 
 import vmri_jax as vm
+from tests.animation.support import trajectory
+from tests.support import set_up
 from vmri_jax import plots
 from vmri_jax.accuracy.companions import resting
 from vmri_jax.mechanics.names import Names
 from vmri_jax.running.origin import Origin
 from vmri_jax.running.simulation import simulation
-from vmri_jax.running.trajectory import RunInfo
-from vmri_jax.study import (
-    ConvergenceStudy,
-    CostReport,
-    ReferenceSolution,
-    Row,
-    WorkPrecision,
-)
+from vmri_jax.study import ConvergenceStudy, CostReport, ReferenceSolution, Row, WorkPrecision
 
 
 def run(num_nodes=21, n_s=2, n_f=3, constrained=False):
@@ -32,18 +27,8 @@ def run(num_nodes=21, n_s=2, n_f=3, constrained=False):
     def wave(n):
         return np.sin(t[:, None] * np.arange(1, n + 1))
 
-    return vm.Trajectory(
-        vm.State(t, q_s=wave(n_s), q_f=wave(n_f), p_s=wave(n_s), p_f=wave(n_f)),
-        energy=2.0 + 1e-3 * np.sin(t),
-        constraint_residual=np.full((num_nodes, 2), 1e-14 if constrained else 0.0),
-        info=RunInfo(
-            method=np.ones(num_nodes - 1, dtype=int),
-            iterations=np.ones(num_nodes - 1),
-            residual=np.zeros(num_nodes - 1),
-        ),
-        result=0,
-        failed_at=-1,
-    )
+    residual = np.full((num_nodes, 2), 1e-14 if constrained else 0.0)
+    return trajectory(t, wave(n_s), wave(n_f), energy=2.0 + 1e-3 * np.sin(t), constraint_residual=residual)
 
 
 def study(orders=(1, 2)):
@@ -117,19 +102,10 @@ def test_the_energy_of_a_driven_system_has_a_balance():
     assert [a.get_ylabel() for a in axes] == ["slow positions $q_s$", "energy and work", "energy balance"]
     assert labels(axes[1]) == ["energy", "work of forces"]
     assert np.abs(y_data(axes[2].lines[0])).max() < 1e-3 * np.abs(y_data(axes[1].lines[0])).max()
-    kept = vm.simulate(
-        vm.Problem(vm.System(vm.ConstantMass([1.0], []), spring), [1.0], [], [0.0], []),
-        vm.fully_implicit(1),
-        macro_dt=0.01,
-        num_steps=20,
-    )
-    assert plots.plot_trajectory(kept).axes[1].get_ylabel().startswith("energy error")
-    assert (
-        plots.plot_trajectory(dataclasses.replace(kept, origin=Origin()))
-        .axes[1]
-        .get_ylabel()
-        .startswith("energy change")
-    )
+    free = dataclasses.replace(problem, system=problem.system.replace(force=None))
+    kept = resting(set_up(free, vm.fully_implicit(1), 0.01, 20))
+    for shown, label in ((kept, "energy error"), (dataclasses.replace(kept, origin=Origin()), "energy change")):
+        assert plots.plot_trajectory(shown).axes[1].get_ylabel().startswith(label)
 
 
 def test_convergence_names_the_orders_and_draws_guides_only_where_asked():
@@ -282,8 +258,6 @@ def test_forces_have_units_and_name_the_joints_without_curves(sliding_door, monk
     forces = {"stop": {"hinge": np.ones((5, 1)), "rail": np.ones((5, 1))}}
     monkeypatch.setattr(vm.Trajectory, "reaction_forces", lambda run: forces)
     figure = sliding_door.plot_forces()
-    assert [axes.get_ylabel() for axes in figure.axes] == [
-        "reaction force\nN in SI units",
-        "torque on angles\nN m in SI units",
-    ]
+    labels = ["reaction force\nN in SI units", "torque on angles\nN m in SI units"]
+    assert [axes.get_ylabel() for axes in figure.axes] == labels
     assert "by_directors" in figure.get_supxlabel()

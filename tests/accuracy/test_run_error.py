@@ -10,6 +10,7 @@ from scipy.integrate import solve_ivp
 
 import vmri_jax as vm
 from tests.small_systems import NONE, SYSTEMS, no_constraint
+from tests.support import set_up
 from vmri_jax.accuracy import search
 from vmri_jax.accuracy.companions import UncertifiedWarning
 from vmri_jax.study import reference_solution
@@ -86,15 +87,15 @@ def test_error_of_a_function():
 
 
 @pytest.mark.parametrize(
-    ("arguments", "kind", "message"),
+    ("error", "message"),
     [
-        ({"error": lambda run: "far"}, TypeError, "returned 'far'"),
-        ({"error": 1e-3}, TypeError, "error is 0.001; it must be True or False, 'shares', or a function of a run"),
+        (lambda run: "far", "returned 'far'"),
+        (1e-3, "error is 0.001; it must be True or False, 'shares', or a function of a run"),
     ],
 )
-def test_refused(arguments, kind, message):
-    with pytest.raises(kind, match=message):
-        vm.simulate(SYSTEMS["no_constraint"], vm.fully_explicit(4), macro_dt=0.05, num_steps=2, **arguments)
+def test_refused(error, message):
+    with pytest.raises(vm.Refused, match=message):
+        vm.simulate(SYSTEMS["no_constraint"], vm.fully_explicit(4), macro_dt=0.05, num_steps=2, error=error)
 
 
 def test_not_in_transformations():
@@ -169,13 +170,9 @@ def test_steps_that_do_not_see_the_motion_are_not_certified():
 def test_the_order_is_that_of_all_potentials():
     """A potential on every second micro node has the trapezoidal rule, whatever the order of the scheme."""
     problem = no_constraint()
-    problem = replace(problem, system=problem.system.replace(potentials={2: spring}))
-    assert vm.prepare(problem, vm.galerkin(2, 3), macro_dt=0.1, num_steps=1).order == 2
-    assert vm.prepare(no_constraint(), vm.galerkin(2, 3), macro_dt=0.1, num_steps=1).order == 6
-
-
-def spring(q_s, q_f, params):
-    return jnp.sum(q_f**2)
+    joined = replace(problem, system=problem.system.replace(potentials={2: lambda q_s, q_f, params: jnp.sum(q_f**2)}))
+    for moving, order in ((problem, 6), (joined, 2)):
+        assert set_up(moving, vm.galerkin(2, 3), 0.1, 1).order == order
 
 
 def test_past_a_singular_configuration():

@@ -24,11 +24,7 @@ def test_plain_data_and_its_json_text_give_the_same_drawing():
     assert [body.pace for body in drawing.bodies] == ["slow", "fast"]
     assert drawing.joints == (Joint("link", ("bob", "tip")), Joint("spring", ("bob",), (0.0, 0.0)))
     assert drawing.dimension == 2
-
-
-def test_pace_of_a_joint_is_its_own_or_that_of_its_bodies():
-    drawing = Drawing.from_dict(PENDULUM)
-    assert drawing.pace(Joint("link", ("bob", "tip"))) == "slow"
+    assert drawing.pace(Joint("link", ("bob", "tip"))) == "slow"  # of its bodies, or its own
     assert drawing.pace(Joint("link", ("tip", "tip"))) == "fast"
     assert drawing.pace(Joint("spring", ("bob", "tip"), pace="fast")) == "fast"
 
@@ -113,6 +109,9 @@ def test_wrong_drawings_are_refused(data, pieces):
 def test_coordinates_that_the_run_does_not_have():
     with pytest.raises(ValueError, match=r"'tip' uses \['f', 1\], but the run has 1 fast"):
         Drawing.from_dict(PENDULUM).maps(2, 1)
+    blocks = [{"name": "modes", "coordinates": [["f", 2]]}]
+    with pytest.raises(ValueError, match=r"'modes' uses \['f', 2\], but the run has 2 fast"):
+        motion(swinging(), Drawing.from_dict({"blocks": blocks}))
 
 
 def test_missing_coordinates_are_zero():
@@ -153,13 +152,8 @@ def test_the_drawn_chain_stretches_as_its_potentials_say(fpu, monkeypatch):
     soft, stiff = stretch[-1, ::2], stretch[-1, 1::2]
     np.testing.assert_allclose(np.sum((np.sqrt(2) * soft) ** 4) / 4, system.slow_potential(q_s, q_f, system.params))
     np.testing.assert_allclose(stiff, np.sqrt(2) * q_f, atol=1e-14)
-    assert [drawing.pace(spring) for spring in drawing.joints if spring.point is None] == [
-        "fast",
-        "slow",
-        "fast",
-        "slow",
-        "fast",
-    ]
+    paces = [drawing.pace(spring) for spring in drawing.joints if spring.point is None]
+    assert paces == ["fast", "slow", "fast", "slow", "fast"]
 
 
 def test_without_a_drawing_every_coordinate_is_a_bar_at_its_scale():
@@ -189,9 +183,3 @@ def test_blocks_stand_upright_beside_the_points(coordinates, up):
     np.testing.assert_allclose(heights[..., 2], scale * run.q_f, atol=1e-13)
     np.testing.assert_allclose(heights[..., :2], 0.0, atol=1e-13)
     assert moved.drawing.caption == f"Heights are modes times {scale:g}."
-
-
-def test_a_block_of_coordinates_that_the_run_does_not_have():
-    blocks = [{"name": "modes", "coordinates": [["f", 2]]}]
-    with pytest.raises(ValueError, match=r"'modes' uses \['f', 2\], but the run has 2 fast"):
-        motion(swinging(), Drawing.from_dict({"blocks": blocks}))

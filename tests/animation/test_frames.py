@@ -73,9 +73,22 @@ def test_bodies_are_drawn_where_the_camera_sees_them(pendulum, theme):
     np.testing.assert_allclose(image[2, 2], to_rgb(theme.paper), atol=0.01)
 
 
-def test_a_strip_has_its_moments(pendulum):
-    labels = [panel.texts[-1].get_text() for panel in plot_strip(pendulum, 3, "Title").axes if panel.texts]
+def test_a_strip_has_moments_names_a_legend_and_a_caption(pendulum):
+    drawing = dataclasses.replace(pendulum.drawing, caption="Heights are modes times 2.")
+    strip = plot_strip(pendulum, 3, "Pendulum")
+    labels = [panel.texts[-1].get_text() for panel in strip.axes if panel.texts]
     assert labels == ["$t = 0.00$", "$t = 2.00$", "$t = 4.00$"]
+    assert {text.get_text() for text in strip.axes[0].texts} == {"bob", "tip", "$t = 0.00$"}
+    assert len(strip.axes[1].texts) == 1
+    [legend] = strip.legends
+    shown = {text.get_text(): line.get_color() for text, line in zip(legend.texts, legend.get_lines(), strict=True)}
+    assert shown == {"slow": plots.LIGHT.curves[0], "fast": plots.LIGHT.curves[1]}
+    figure = plot_strip(dataclasses.replace(pendulum, drawing=drawing), 3, "Pendulum")
+    assert [text.get_text() for text in figure.texts] == ["Pendulum", "Heights are modes times 2."]
+    assert figure.get_figheight() > strip.get_figheight()
+    bodies = [{"name": name, "coordinates": [["s", 0], ["s", 1]]} for name in ("one", "same place")]
+    crowded = motion(swinging(), Drawing.from_dict({"bodies": [*bodies, {**bodies[0], "name": "third"}]}))
+    assert len(plot_strip(crowded, 1).axes[0].texts) == 3  # one name to the right, one to the left, the time
     with pytest.raises(ValueError, match=r"times is .*give at least one"):
         plot_strip(pendulum, [])
 
@@ -103,28 +116,6 @@ def test_a_gif_moves_and_takes_its_time(pendulum, tmp_path):
     assert done[-1] == (8, 8)
     with pytest.raises(ValueError, match="seconds is 0"):
         write_gif(pendulum, tmp_path / "no.gif", 0)
-
-
-def test_a_strip_says_its_caption(pendulum):
-    drawing = dataclasses.replace(pendulum.drawing, caption="Heights are modes times 2.")
-    figure = plot_strip(dataclasses.replace(pendulum, drawing=drawing), 3, "Pendulum")
-    assert [text.get_text() for text in figure.texts] == ["Pendulum", "Heights are modes times 2."]
-    assert figure.get_figheight() > plot_strip(pendulum, 3, "Pendulum").get_figheight()
-
-
-def test_the_legend_says_which_colours_are_slow_and_fast(pendulum):
-    [legend] = plot_strip(pendulum, 3).legends
-    shown = {text.get_text(): line.get_color() for text, line in zip(legend.texts, legend.get_lines(), strict=True)}
-    assert shown == {"slow": plots.LIGHT.curves[0], "fast": plots.LIGHT.curves[1]}
-
-
-def test_bodies_are_named_in_the_first_picture_where_there_is_room(pendulum):
-    first, second, *_ = plot_strip(pendulum, 3).axes
-    assert {text.get_text() for text in first.texts} == {"bob", "tip", "$t = 0.00$"}
-    assert len(second.texts) == 1
-    bodies = [{"name": name, "coordinates": [["s", 0], ["s", 1]]} for name in ("one", "same place")]
-    crowded = motion(swinging(), Drawing.from_dict({"bodies": [*bodies, {**bodies[0], "name": "third"}]}))
-    assert len(plot_strip(crowded, 1).axes[0].texts) == 3  # one name to the right, one to the left, the time
 
 
 def test_trails_have_as_many_places_as_nodes():

@@ -198,11 +198,7 @@ def check_chains(found):
     assert row["joint, first s"] > 0
 
 
-CHECKS = {
-    "cost": check_cost,
-    "floor": check_floor,
-    "chains": check_chains,
-}
+CHECKS = {"cost": check_cost, "floor": check_floor, "chains": check_chains}
 
 
 def test_floor_without_a_compiler(monkeypatch):

@@ -18,12 +18,7 @@ def study():
 
 
 def test_rows(study):
-    assert [(row.method, row.num_micro) for row in study.rows] == [
-        ("auto", 1),
-        ("auto", 3),
-        ("dense", 1),
-        ("dense", 3),
-    ]
+    assert [(row.method, row.num_micro) for row in study.rows] == [("auto", 1), ("auto", 3), ("dense", 1), ("dense", 3)]
     assert {(row.method, row.solved_by) for row in study.rows} == {("auto", "LINEAR"), ("dense", "EXACT")}
     assert [row.num_unknowns for row in study.rows] == [4, 8, 4, 8]
     assert all(row.result == "CONVERGED" for row in study.rows)

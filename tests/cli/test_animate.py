@@ -38,22 +38,16 @@ def names(data: dict) -> list[str]:
     return [body["name"] for body in data["bodies"]]
 
 
-def test_the_drawing_stored_with_the_run_is_taken(animate):
+def test_which_drawing_is_taken(animate):
+    """One's own goes first, then that stored with the run; without any, all coordinates are shown."""
     assert animate("drawn.npz")[0] == 0
     assert names(page("drawn.html")) == ["bob", "tip"]
-
-
-def test_without_a_drawing_all_coordinates_are_shown(animate):
     code, text = animate("plain.npz", "--out", "run.html")
     assert code == 0
     assert "run.html 0.0" in text
     assert names(page()) == ["q_s[0]", "q_s[1]", "q_f[0]", "q_f[1]"]
-
-
-def test_a_drawing_of_ones_own_goes_first(animate):
-    bodies = {"bodies": [{"name": "mine", "coordinates": [["s", 0]]}]}
     with open("mine.json", "w", encoding="utf-8") as file:
-        json.dump(bodies, file)
+        json.dump({"bodies": [{"name": "mine", "coordinates": [["s", 0]]}]}, file)
     assert animate("drawn.npz", "--drawing", "mine.json", "--out", "run.html")[0] == 0
     assert names(page()) == ["mine"]
 

@@ -34,10 +34,7 @@ def vmri(vmri, tmp_path):
 
 
 def test_a_sweep_runs_is_drawn_and_gone_on_with(vmri, tmp_path):
-    with (tmp_path / "sweep.toml").open("r+") as file:
-        text = file.read()
-        file.seek(0)
-        file.write(f'save = ["end", "iterations"]\n{text}')
+    (tmp_path / "sweep.toml").write_text(f'save = ["end", "iterations"]\n{SMALL}')
     code, text = vmri("sweep", "sweep.toml", "--plot", "map.png")
     assert code == 0
     assert "Figure of iterations: map.png" in text
@@ -191,8 +188,7 @@ def test_bad_options_are_refused(vmri):
 
 
 @pytest.mark.parametrize(
-    ("package", "options"),
-    [("dask.array", ["--plot", "map.png"]), ("distributed", ["--workers", "tcp://localhost:1"])],
+    ("package", "options"), [("dask.array", ["--plot", "map.png"]), ("distributed", ["--workers", "tcp://localhost:1"])]
 )
 def test_a_package_that_is_not_installed_is_named_before_any_compute(vmri, tmp_path, monkeypatch, package, options):
     monkeypatch.setitem(sys.modules, package, None)

@@ -1,8 +1,9 @@
-"""The sweep against the dense equations of the same linear-quadratic problem."""
+"""The sweep, and the solver with limits, against the dense equations of the same linear-quadratic problem."""
 
 import jax.numpy as jnp
 import numpy as np
 
+from vmri_jax.control import bounded
 from vmri_jax.control.riccati import Final, Stages, solve
 
 N, STATES, CONTROLS, GOALS = 6, 4, 2, 3
@@ -54,6 +55,10 @@ def test_the_sweep_solves_the_whole_problem():
         stages, final = random_problem(seed)
         for found, expected in zip(solve(stages, final), dense(stages, final), strict=True):
             np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
+    far, row = np.full((N, CONTROLS), 1e4), np.random.default_rng(3).normal(size=(N, 1, STATES + CONTROLS))
+    limits = bounded.Limits(row[..., :STATES], row[..., STATES:], np.full((N, 1), -1e5), -far, far)
+    for a, b in zip(bounded.solve(stages, final, limits)[0], dense(stages, final), strict=True):  # none of them holds
+        np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-6)
 
 
 def test_a_goal_that_cannot_be_reached_is_missed_by_the_least():

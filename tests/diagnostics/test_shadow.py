@@ -79,7 +79,7 @@ def test_no_drift_where_there_is_none(run):
 
 
 def test_refusals(run):
-    sparse = vm.simulate(CHAIN, SCHEME, macro_dt=0.01, num_steps=4 * STEPS, save=4)
+    sparse = vm.simulate(CHAIN, SCHEME, macro_dt=0.01, num_steps=400, save=4)
     with pytest.raises(ValueError, match="every macro node saved"):
         shadow_energy(CHAIN, SCHEME, sparse)
     with pytest.raises(ValueError, match="at least 31 nodes"):

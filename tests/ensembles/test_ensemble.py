@@ -40,6 +40,15 @@ def chain(omega: float, num_springs: int = 3) -> vm.Problem:
     return replace(problem, system=problem.system.replace(params={"omega": np.asarray(omega)}))
 
 
+def more_params(problem, row):
+    return replace(problem, system=problem.system.replace(params=problem.system.params | {"more": 1.0}))
+
+
+def heavier(problem, row):
+    masses = vm.ConstantMass(np.full(3, 2.0), np.full(3, 2.0))
+    return replace(problem, system=problem.system.replace(kinetic=masses))
+
+
 def test_runs_are_those_of_simulate(tmp_path):
     schemes = {"explicit": vm.fully_explicit, "implicit": vm.fully_implicit}
     axes = {"num_micro": [1, 4], "num_steps": [8, 16], "omega": [20.0, 50.0], "v_s[0]": [0.1, 0.3]}
@@ -70,9 +79,7 @@ def test_runs_are_those_of_simulate(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("system", "function"),
-    [(own.hung, own.lengths), (f"{OWN}:hung", f"{OWN}:lengths")],
-    ids=["problem", "file"],
+    ("system", "function"), [(own.hung, own.lengths), (f"{OWN}:hung", f"{OWN}:lengths")], ids=["problem", "file"]
 )
 def test_positions_as_dictionaries(tmp_path, system, function):
     """The store has vectors; functions of the user get a run with its dictionaries and names."""
@@ -88,25 +95,18 @@ def test_positions_as_dictionaries(tmp_path, system, function):
     assert np.allclose(one.distance, np.linalg.norm(run.q_f["load"] - run.q_f["hook"], axis=-1), rtol=0, atol=1e-13)
 
 
-def test_steps_of_their_own_in_a_table_in_any_order(tmp_path):
-    columns = {"num_steps": [20, 10, 20, 40, 10], "omega": [10.0, 20.0, 30.0, 40.0, 50.0]}
-    runs = few(tmp_path / "table.zarr", design=Table(columns), macro_dt=None, t_end=0.2)
-    data = runs.open()
+@pytest.mark.parametrize("steps", ["num_steps", "macro_dt"])
+def test_steps_of_their_own_in_a_table_in_any_order(tmp_path, steps):
+    numbers = np.array([20, 10, 20, 40, 10])
+    columns = {"omega": [10.0, 20.0, 30.0, 40.0, 50.0], "v_f": 0.01 * np.arange(15.0).reshape(5, 3)}
+    columns[steps] = numbers if steps == "num_steps" else 0.2 / numbers
+    data = few(tmp_path / "table.zarr", design=Table(columns), macro_dt=None, t_end=0.2).open()
     assert data.omega.values.tolist() == columns["omega"]
-    for i in range(5):
-        steps = columns["num_steps"][i]
-        problem = chain(columns["omega"][i])
-        run = vm.simulate(problem, vm.fully_explicit(3), macro_dt=0.2 / steps, num_steps=steps, save=steps)
+    for i, n in enumerate(numbers):
+        problem = replace(chain(columns["omega"][i]), v_f=columns["v_f"][i])
+        run = vm.simulate(problem, vm.fully_explicit(3), macro_dt=0.2 / n, num_steps=n, save=n)
         assert np.allclose(data.q_f[i], run.q_f[-1], rtol=0, atol=1e-13)
-
-
-def test_steps_of_each_lane(tmp_path):
-    design = Table({"macro_dt": [0.01, 0.02, 0.013], "q_f": 0.01 * np.arange(9.0).reshape(3, 3)})
-    data = few(tmp_path / "lanes.zarr", design=design, macro_dt=None, t_end=None, num_steps=10).open()
-    problem = vm.systems.fermi_pasta_ulam()
-    problem = replace(problem, q_f=design.columns["q_f"].values[2])
-    run = vm.simulate(problem, vm.fully_explicit(3), macro_dt=0.013, num_steps=10, save=10)
-    assert np.allclose(data.p_s[2], run.p_s[-1], rtol=0, atol=1e-13)
+        assert np.allclose(data.p_s[i], run.p_s[-1], rtol=0, atol=1e-13)
 
 
 def test_a_column_that_changes_nothing_is_told(tmp_path):
@@ -142,13 +142,8 @@ def test_own_quantities_systems_and_units(tmp_path):
 
 
 def test_failed_runs_have_a_status_and_others_do_not_notice(tmp_path):
-    runs = few(
-        tmp_path / "failed.zarr",
-        design={"omega": [20.0, 1e9]},
-        t_end=2.0,
-        save=("end", "energy_error"),
-        num_saves=10,
-    )
+    design, save = {"omega": [20.0, 1e9]}, ("end", "energy_error")
+    runs = few(tmp_path / "failed.zarr", design=design, t_end=2.0, save=save, num_saves=10)
     assert runs.failed_runs == 1
     data = runs.open()
     good, bad = data.isel(omega=0), data.isel(omega=1)
@@ -218,8 +213,11 @@ def test_a_store_that_takes_the_place_of_another(tmp_path):
     assert np.isfinite(longer.open().q_f).all()
 
 
-def test_resume_starts_what_is_not_there(tmp_path):
-    assert few(tmp_path / "new.zarr", resume=True).complete
+def test_resume_starts_what_is_not_there_and_no_columns_are_a_single_run(tmp_path):
+    runs = few(tmp_path / "new.zarr", design=Product({}), resume=True)
+    assert runs.complete
+    assert len(runs) == 1
+    assert runs.open().q_f.shape == (3,)
 
 
 @pytest.mark.parametrize(
@@ -281,46 +279,44 @@ def test_a_full_disk_keeps_the_chunks_before(tmp_path, monkeypatch):
     assert not list(files.Path(out).rglob("*.partial"))
 
 
+NO_STEP = {"macro_dt": None}
+
+
 @pytest.mark.parametrize(
-    ("changes", "error", "message"),
+    ("changes", "message"),
     [
-        ({"design": {"num_mirco": [1]}, "vary": None}, ValueError, r"the column 'num_mirco' is neither a step nor a"),
-        ({"design": {"q_s": [1.0]}}, ValueError, r"q_s has shape \(\); it must be a vector"),
-        ({"design": {"omega": ["fast"]}}, ValueError, r"'omega' has labels; give numbers"),
-        ({"design": {"scheme": ["leapfrog"]}}, ValueError, r"no scheme 'leapfrog'"),
-        ({"design": {"num_micro": [2.5]}, "num_micro": None}, ValueError, r"num_micro is 2\.5; it must be a whole"),
-        ({"design": {"macro_dt": [0.03]}, "macro_dt": None}, ValueError, r"no whole number"),
-        ({"design": {"macro_dt": [0.01]}}, ValueError, r"macro_dt is a column and an argument"),
-        (
-            {"design": {"macro_dt": [-0.01]}, "macro_dt": None},
-            ValueError,
-            r"macro_dt is .*; it must be a positive number",
-        ),
-        (
-            {"design": Draws(4, {"num_steps": ("uniform", 1, 9)}), "macro_dt": None},
-            ValueError,
-            r"num_steps cannot be drawn",
-        ),
-        ({"design": {"t": [0.0, 1.0]}}, ValueError, r"vary changes t, so that t_end does not fix the number of steps"),
-        ({"t_end": None}, ValueError, r"got macro_dt; give two of"),
-        ({"num_micro": None}, ValueError, r"num_micro is missing for the scheme 'fully-explicit'"),
-        ({"scheme": vm.fully_implicit(2)}, ValueError, r"has its num_micro already"),
-        ({"scheme": 3}, TypeError, r"scheme is .*3.*; give a Scheme"),
-        ({"scheme": {}}, TypeError, r"give a Scheme"),
-        ({"design": [1, 2]}, TypeError, r"design is list; give a Product, Table or Draws"),
-        ({"save": "enrgy_error"}, ValueError, r"save has 'enrgy_error'\. Did you mean energy_error\?"),
-        ({"save": "energy_error"}, ValueError, r"looks at the saved nodes of a run, and only its end is saved"),
-        ({"save": ("end", "end")}, ValueError, r"two arrays called"),
-        ({"save": f"{OWN}:rech"}, ValueError, r"has no name 'rech'\. Did you mean reach\?"),
-        ({"num_saves": 3}, ValueError, r"num_steps = 10 is not a multiple of the 3 saved intervals"),
-        ({"system": "fup"}, ValueError, r"there is no system 'fup'"),
-        ({"system": "no.such:thing"}, ValueError, r"the module no\.such cannot be imported"),
-        ({"executor": 3}, TypeError, r"executor is int; give a dask\.distributed\.Client"),
-        ({"chunk": 0}, ValueError, r"chunk is 0"),
+        ({"design": {"num_mirco": [1]}, "vary": None}, r"the column 'num_mirco' is neither a step nor a"),
+        ({"design": {"q_s": [1.0]}}, r"q_s has shape \(\); it must be a vector"),
+        ({"design": {"omega": ["fast"]}}, r"'omega' has labels; give numbers"),
+        ({"design": {"scheme": ["leapfrog"]}}, r"no scheme 'leapfrog'"),
+        ({"design": {"num_micro": [2.5]}, "num_micro": None}, r"num_micro is 2\.5; it must be a whole"),
+        ({"design": {"macro_dt": [0.03]}} | NO_STEP, r"no whole number"),
+        ({"design": {"macro_dt": [0.01]}}, r"macro_dt is a column and an argument"),
+        ({"design": {"macro_dt": [-0.01]}} | NO_STEP, r"macro_dt is .*; it must be a positive number"),
+        ({"design": Draws(4, {"num_steps": ("uniform", 1, 9)})} | NO_STEP, r"num_steps cannot be drawn"),
+        ({"design": {"t": [0.0, 1.0]}}, r"vary changes t, so that t_end does not fix the number of steps"),
+        ({"t_end": None}, r"got macro_dt; give two of"),
+        ({"num_micro": None}, r"num_micro is missing for the scheme 'fully-explicit'"),
+        ({"scheme": vm.fully_implicit(2)}, r"has its num_micro already"),
+        ({"scheme": 3}, r"scheme is .*3.*; give a Scheme"),
+        ({"scheme": {}}, r"give a Scheme"),
+        ({"design": [1, 2]}, r"design is list; give a Product, Table or Draws"),
+        ({"save": "enrgy_error"}, r"save has 'enrgy_error'\. Did you mean energy_error\?"),
+        ({"save": "energy_error"}, r"looks at the saved nodes of a run, and only its end is saved"),
+        ({"save": ("end", "end")}, r"two arrays called"),
+        ({"save": f"{OWN}:rech"}, r"has no name 'rech'\. Did you mean reach\?"),
+        ({"num_saves": 3}, r"num_steps = 10 is not a multiple of the 3 saved intervals"),
+        ({"system": "fup"}, r"there is no system 'fup'"),
+        ({"system": "no.such:thing"}, r"the module no\.such cannot be imported"),
+        ({"executor": 3}, r"executor is int; give a dask\.distributed\.Client"),
+        ({"chunk": 0}, r"chunk is 0"),
+        ({"vary": lambda problem, row: row}, r"vary\(problem, row\) is dict; give dataclasses\.replace"),
+        ({"vary": more_params}, "the structure or shape of one of them"),
+        ({"vary": heavier}, "the system besides its params"),
     ],
 )
-def test_bad_input_is_refused_before_anything_is_written(tmp_path, changes, error, message):
-    with pytest.raises(error, match=message):
+def test_bad_input_is_refused_before_anything_is_written(tmp_path, changes, message):
+    with pytest.raises(vm.Refused, match=message):
         few(tmp_path / "runs.zarr", **changes)
     assert not any(tmp_path.iterdir())
 
@@ -335,25 +331,10 @@ def test_several_schemes_need_a_column_in_a_table(tmp_path):
     assert not np.array_equal(data.q_f[0], data.q_f[1])
 
 
-def test_no_columns_are_a_single_run(tmp_path):
-    runs = few(tmp_path / "one.zarr", design=Product({}))
-    assert len(runs) == 1
-    assert runs.open().q_f.shape == (3,)
-
-
 def test_constrained_systems(tmp_path, tsp):
-    runs = vm.ensemble(
-        tsp,
-        vm.fully_implicit(2),
-        {"v_s[0]": [0.0, 0.1]},
-        vary=own.put,
-        macro_dt=0.01,
-        num_steps=10,
-        project=True,
-        save=("end", "constraint_residual"),
-        num_saves=5,
-        out=tmp_path / "tsp.zarr",
-    )
+    design, save = {"v_s[0]": [0.0, 0.1]}, ("end", "constraint_residual")
+    how = {"macro_dt": 0.01, "num_steps": 10, "project": True, "num_saves": 5}
+    runs = vm.ensemble(tsp, vm.fully_implicit(2), design, vary=own.put, save=save, **how, out=tmp_path / "tsp.zarr")
     data = runs.open()
     assert runs.failed_runs == 0
     assert float(data.constraint_residual.max()) < 1e-11
@@ -379,3 +360,23 @@ def test_functions_of_runs_are_kept_by_their_names(tmp_path):
     for save in (lambda run: 1.0, 3.0):
         with pytest.raises(ValueError, match=r"a function without a name|There are end, nodes"):
             few(out, design=design, save=save, overwrite=True)
+
+
+def test_a_function_of_rows_makes_the_problems(tmp_path):
+    design = Table({"speed": [0.5, 2.0, 1.0], "frequency": [20.0, 50.0, 30.0], "num_micro": [3, 3, 4]})
+    runs = few(tmp_path / "runs.zarr", system=chain(50.0), design=design, num_micro=None, vary=own.faster)
+    data = runs.open()
+    assert data.speed.values.tolist() == [0.5, 2.0, 1.0]
+    problem = chain(20.0)
+    run = vm.simulate(replace(problem, v_s=0.5 * problem.v_s), vm.fully_explicit(3), macro_dt=0.02, num_steps=10)
+    assert np.allclose(data.q_f[0], run.q_f[-1], rtol=0, atol=1e-14)
+    slower = lambda problem, row: own.faster(problem, row | {"speed": row["speed"] / 2})  # noqa: E731
+    with pytest.raises(ValueError, match="operations of vary"):
+        few(runs.path, system=chain(50.0), design=design, num_micro=None, vary=slower, resume=True)
+
+
+def test_a_function_of_rows_with_dictionaries(tmp_path):
+    vary = lambda problem, row: replace(problem, q_f={"hook": problem.q_f[:2], "load": jnp.stack([row["x"], -1.2])})  # noqa: E731
+    runs = few(tmp_path / "runs.zarr", system=own.hung, design={"x": [0.7, 1.0]}, vary=vary)
+    run = vm.simulate(own.hung, vm.fully_explicit(3), macro_dt=0.02, num_steps=10)
+    assert np.allclose(runs.open().q_f.sel(x=1.0), run.states.q_f[-1], rtol=0, atol=1e-14)

@@ -120,7 +120,7 @@ def test_a_function_of_rows_travels(tmp_path, client):
 
 
 def test_studies_travel(client):
-    """With the cluster as an executor; `tests/study/test_executor.py` says more about their results."""
+    """With the cluster as an executor; `tests/study/test_convergence.py` says more about their results."""
     problem, schemes = two_oscillators(), {str(n): vm.fully_explicit(n) for n in (2, 5)}
     study = partial(convergence_study, problem, schemes, [0.02, 0.01], 0.2, num_saves=2)
     assert study().to_pandas().equals(study(executor=client).to_pandas())

@@ -31,8 +31,7 @@ def measured(steps=60, sigma=1e-3, seed=0, problem=CHAIN, dt=DT, scheme: SchemeL
 
 def product(parameters):
     """Only the product of two parameters counts."""
-    omega = parameters["a"] * parameters["b"]
-    return vm.Problem(CHAIN.system.replace(params={"omega": omega}), CHAIN.q_s, CHAIN.q_f, CHAIN.v_s, CHAIN.v_f)
+    return replace(CHAIN, system=CHAIN.system.replace(params={"omega": parameters["a"] * parameters["b"]}))
 
 
 def slow_position(state):
@@ -84,10 +83,10 @@ def test_the_run_of_a_fit_goes_to_the_last_measurement(found):
 
 
 def test_intervals_cover(found):
-    """Of 150 intervals of 95 %, 143 +- 3."""
-    bootstrap = found.bootstrap(150)
+    """Of 100 intervals of 95 %, 95 +- 2."""
+    bootstrap = found.bootstrap(100)
     coverage = bootstrap.coverage()
-    assert "Bootstrap of 150 fits" in repr(bootstrap)
+    assert "Bootstrap of 100 fits" in repr(bootstrap)
     assert all(0.9 < part < 0.99 for part in coverage.values())
     with pytest.raises(ValueError, match="level is 95; it must lie between 0 and 1"):
         bootstrap.coverage(95)
@@ -108,23 +107,18 @@ def test_steps_that_move_the_parameters_are_doubted():
         coarse.intervals()
 
 
-def test_some_values_of_some_quantities():
+def test_some_values_of_some_quantities_without_their_sigma(found):
     """Derivatives of equations that are solved by iteration are in `tests/verification/test_gradients.py`."""
     whole = measured()
     values = whole.values.copy()
     values[::3, 0] = np.nan
-    slow = Measured(whole.t[10:30], whole.values[10:30, 0], sigma=1e-3, observe=slow_position)
-    fit = vm.fit(CHAIN, [Measured(whole.t, values, sigma=1e-3), slow], {"omega": 19.8}, scheme=SCHEME, macro_dt=DT)
+    slow = Measured(whole.t[10:30], whole.values[10:30, 0], observe=slow_position)
+    fit = fit_of_two([Measured(whole.t, values), slow])
     assert len(fit.residuals) == np.isfinite(values).sum() + 20
     assert fit.values[0] == pytest.approx(20.0, abs=5 * fit.standard_errors["omega"])
-
-
-def test_a_sigma_that_is_not_known_is_estimated(found):
-    whole = measured()
-    unknown = fit_of_two(Measured(whole.t, whole.values))
-    assert unknown.sigma == pytest.approx(1e-3, rel=0.2)
-    assert unknown.standard_errors["omega"] == pytest.approx(found.standard_errors["omega"], rel=0.2)
-    assert "sigma estimated" in str(unknown)
+    assert fit.sigma == pytest.approx(1e-3, rel=0.2)
+    assert fit.standard_errors["omega"] == pytest.approx(found.standard_errors["omega"], rel=0.2)
+    assert "sigma estimated" in str(fit)
 
 
 @pytest.mark.parametrize(
@@ -148,55 +142,53 @@ def test_labels():
 
 
 GOOD = measured(5)
+LITTLE = Measured([0.05], [0.0], sigma=1.0, observe=slow_position)
+
+
+def without_b(parameters):
+    return replace(CHAIN, system=CHAIN.system.replace(params={"omega": parameters["a"]}))
 
 
 @pytest.mark.parametrize(
-    ("error", "message", "call"),
+    ("message", "call"),
     [
-        (ValueError, "sigma is 0.0; it must be positive", lambda: Measured([0.1], [1.0], sigma=0.0)),
-        (ValueError, "sigma has shape", lambda: Measured([0.1], [[1.0, 2.0]], sigma=[1.0, 1.0, 1.0])),
-        (ValueError, "one row for each time", lambda: Measured([0.1, 0.2], [1.0])),
-        (ValueError, "must lie between lower", lambda: Unknown(1.0, lower=2.0)),
-        (ValueError, "scale is -1.0", lambda: Unknown(1.0, scale=-1.0)),
-        (ValueError, "the time 0.07 lies between its nodes", lambda: fit(Measured([0.07], [[0.0, 0.0]], sigma=1.0))),
-        (ValueError, "lies before the start", lambda: fit(Measured([-0.05], [[0.0, 0.0]], sigma=1.0))),
-        (ValueError, "'stifness', which is none of system.params", lambda: fit(GOOD, {"stifness": 1.0})),
-        (ValueError, "start of 'omega' has shape", lambda: fit(GOOD, {"omega": [1.0, 2.0]})),
-        (ValueError, "parameters is empty", lambda: fit(GOOD, {})),
-        (ValueError, "data is empty", lambda: fit([])),
-        (TypeError, "fit: data", lambda: fit([np.zeros(3)])),
-        (ValueError, "some of data have a sigma", lambda: fit([GOOD, Measured(GOOD.t, GOOD.values)])),
+        ("sigma is 0.0; it must be positive", lambda: Measured([0.1], [1.0], sigma=0.0)),
+        ("sigma has shape", lambda: Measured([0.1], [[1.0, 2.0]], sigma=[1.0, 1.0, 1.0])),
+        ("one row for each time", lambda: Measured([0.1, 0.2], [1.0])),
+        ("must lie between lower", lambda: Unknown(1.0, lower=2.0)),
+        ("scale is -1.0", lambda: Unknown(1.0, scale=-1.0)),
+        ("the time 0.07 lies between its nodes", lambda: fit(Measured([0.07], [[0.0, 0.0]], sigma=1.0))),
+        ("lies before the start", lambda: fit(Measured([-0.05], [[0.0, 0.0]], sigma=1.0))),
+        ("'stifness', which is none of system.params", lambda: fit(GOOD, {"stifness": 1.0})),
+        ("start of 'omega' has shape", lambda: fit(GOOD, {"omega": [1.0, 2.0]})),
+        ("parameters is empty", lambda: fit(GOOD, {})),
+        ("data is empty", lambda: fit([])),
+        ("fit: data", lambda: fit([np.zeros(3)])),
+        ("some of data have a sigma", lambda: fit([GOOD, Measured(GOOD.t, GOOD.values)])),
+        ("1 values for 2 unknown numbers", lambda: fit(LITTLE, {"omega": 1.0, "v_s": [0.0]})),
+        ("all measurements are at the start of the", lambda: fit(Measured([0.0], [[0.0, 0.0]], sigma=1.0))),
+        ("the model", lambda: vm.fit(cast(Any, lambda p: 3), GOOD, {"a": 1.0}, scheme=SCHEME, macro_dt=DT)),
+        ("segments is 0", lambda: fit(GOOD, segments=0)),
+        ("no measured value depends on b", lambda: fit(GOOD, {"a": 19.0, "b": 1.0}, model=without_b)),
+        ("start is a dict; name its numbers one by one", lambda: Unknown(cast(Any, {"stiffness": 1.0}))),
         (
-            ValueError,
-            "1 values for 2 unknown numbers",
-            lambda: fit(Measured([0.05], [0.0], sigma=1.0, observe=slow_position), {"omega": 1.0, "v_s": [0.0]}),
-        ),
-        (
-            ValueError,
             "1 values for 1 unknown numbers and sigma",
             lambda: fit(Measured([0.05], [0.0], observe=slow_position), {"omega": 1.0}),
         ),
-        (ValueError, "all measurements are at the start of the", lambda: fit(Measured([0.0], [[0.0, 0.0]], sigma=1.0))),
-        (TypeError, "the model", lambda: vm.fit(cast(Any, lambda p: 3), GOOD, {"a": 1.0}, scheme=SCHEME, macro_dt=DT)),
-        (ValueError, "segments is 0", lambda: fit(GOOD, segments=0)),
-        (ValueError, "spread is nan", lambda: fit(GOOD, spread=np.nan)),
-        (ValueError, "seed is -1", lambda: fit(GOOD, seed=-1)),
-        (
-            ValueError,
-            "fit: macro_dt is -0.05",
-            lambda: vm.fit(CHAIN, GOOD, {"omega": 1.0}, scheme=SCHEME, macro_dt=-DT),
-        ),
-        (ValueError, "lower is -inf; it must be finite, or None", lambda: Unknown(1.0, lower=-np.inf)),
-        (ValueError, "scale is inf; it must be finite, or None", lambda: Unknown(1.0, scale=np.inf)),
-        (ValueError, "but for NaN in place of missing values", lambda: Measured([0.1, 0.2], [1.0, np.inf])),
-        (TypeError, r"observe is <lambda>\(state, params\)", lambda: watched(lambda state, params: state.q_f)),
-        (ValueError, r"observe returns shape \(1,\); it must return 2 real", lambda: watched(lambda state: state.q_f)),
-        (ValueError, "observe returns dict; it must return 2 real", lambda: watched(lambda state: {"q": state.q_f})),
-        (ValueError, r"observe returns \[.*nan.*\] at t = ", lambda: watched(lambda state: jnp.log(positions(state)))),
+        ("spread is nan", lambda: fit(GOOD, spread=np.nan)),
+        ("seed is -1", lambda: fit(GOOD, seed=-1)),
+        ("fit: macro_dt is -0.05", lambda: vm.fit(CHAIN, GOOD, {"omega": 1.0}, scheme=SCHEME, macro_dt=-DT)),
+        ("lower is -inf; it must be finite, or None", lambda: Unknown(1.0, lower=-np.inf)),
+        ("scale is inf; it must be finite, or None", lambda: Unknown(1.0, scale=np.inf)),
+        ("but for NaN in place of missing values", lambda: Measured([0.1, 0.2], [1.0, np.inf])),
+        (r"observe is <lambda>\(state, params\)", lambda: watched(lambda state, params: state.q_f)),
+        (r"observe returns shape \(1,\); it must return 2 real", lambda: watched(lambda state: state.q_f)),
+        ("observe returns dict; it must return 2 real", lambda: watched(lambda state: {"q": state.q_f})),
+        (r"observe returns \[.*nan.*\] at t = ", lambda: watched(lambda state: jnp.log(positions(state)))),
     ],
 )
-def test_bad_input(error, message, call):
-    with pytest.raises(error, match=message):
+def test_bad_input(message, call):
+    with pytest.raises(vm.Refused, match=message):
         call()
 
 
@@ -204,19 +196,9 @@ def watched(observe):
     return fit(Measured(GOOD.t, GOOD.values, sigma=1.0, observe=observe))
 
 
-def fit(data, parameters=None, **options):
+def fit(data, parameters=None, model: Any = CHAIN, **options):
     parameters = {"omega": 19.0} if parameters is None else parameters
-    return vm.fit(CHAIN, data, parameters, scheme=SCHEME, macro_dt=DT, **options)
-
-
-def test_a_parameter_that_nothing_depends_on_is_refused():
-    def model(parameters):
-        return vm.Problem(
-            CHAIN.system.replace(params={"omega": parameters["a"]}), CHAIN.q_s, CHAIN.q_f, CHAIN.v_s, CHAIN.v_f
-        )
-
-    with pytest.raises(ValueError, match="no measured value depends on b"):
-        vm.fit(model, GOOD, {"a": 19.0, "b": 1.0}, scheme=SCHEME, macro_dt=DT)
+    return vm.fit(model, data, parameters, scheme=SCHEME, macro_dt=DT, **options)
 
 
 def test_numbers_of_a_scene_have_the_names_of_their_effects():
@@ -228,12 +210,8 @@ def test_numbers_of_a_scene_have_the_names_of_their_effects():
     data = Measured(run.t, run.states.q_s, sigma=1e-6, observe=lambda state: state.q_s)
     found = vm.fit(scene, data, {"bond.stiffness": Unknown(36.0, lower=0)}, scheme=single, macro_dt=DT)
     assert found.parameters["bond.stiffness"] == pytest.approx(40.0, rel=1e-6)
-    with pytest.raises(
-        ValueError, match=r"'bond.length_', which is none of system.params and of the start \(bond.length"
-    ):
+    with pytest.raises(ValueError, match=r"'bond.length_', which is none of system.params .* \(bond.length"):
         vm.fit(scene, data, {"bond.length_": 1.0}, scheme=single, macro_dt=DT)
-    with pytest.raises(TypeError, match="start is a dict; name its numbers one by one"):
-        Unknown({"stiffness": 1.0})
 
 
 def test_without_optimistix(monkeypatch):

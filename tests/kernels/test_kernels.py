@@ -19,12 +19,7 @@ def definite(n: int):
 def test_solve_and_inverse(n):
     a, b = definite(n), jnp.asarray(np.random.default_rng(0).normal(size=(n, 3)))
     assert float(jnp.abs(a @ jax.jit(algebra.solve)(a, b) - b).max()) < 1e-13  # measured 5e-15
-    assert float(jnp.abs(jax.jit(algebra.inverse)(a) @ a - jnp.eye(n)).max()) < 1e-13
-
-
-@pytest.mark.parametrize("n", [3, 20])
-def test_inverses_of_several(n):
-    several = jnp.stack([definite(n), 2 * definite(n).T])
+    several = jnp.stack([a, 2 * a.T])
     assert float(jnp.abs(jax.jit(algebra.inverse)(several) @ several - jnp.eye(n)).max()) < 1e-13
 
 
@@ -82,6 +77,6 @@ def test_a_band_in_any_order_is_inverted_like_the_full_matrix(n, width, nodes):
     structure = sparsity(pattern, nodes)
     assert isinstance(structure, Full if width == 8 else Band)
     products = jnp.asarray(structure.seeds @ a.T)
-    expected = np.linalg.solve(a, g)
-    assert np.abs(structure.inverse(products).times(jnp.asarray(g)) - expected).max() < 1e-13
-    assert np.abs(structure.solve(products, jnp.asarray(g)) - expected).max() < 1e-13
+    both = jax.jit(lambda products, g: (structure.inverse(products).times(g), structure.solve(products, g)))
+    for solution in both(products, g):
+        assert np.abs(solution - np.linalg.solve(a, g)).max() < 1e-13

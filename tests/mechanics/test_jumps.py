@@ -18,16 +18,8 @@ def dry_in_the_plane(t, q_s, q_f, v_s, v_f, params):
     return -LOAD * v_s / jnp.linalg.norm(v_s) + jnp.array([1.0, 0.0]), 0 * v_f
 
 
-def smoothed(t, q_s, q_f, v_s, v_f, params):
-    return -LOAD * jnp.tanh(v_s / 0.02), 0 * v_f
-
-
 def switched(t, q_s, q_f, v_s, v_f, params):
     return jnp.where(t > 0.007, 1.0, 2.0) * jnp.ones_like(v_s), 0 * v_f
-
-
-def wedge(q_s, q_f, params):
-    return jnp.abs(q_s[0] - 0.001)
 
 
 def far_away(q_s, q_f, params):
@@ -42,9 +34,9 @@ def far_away(q_s, q_f, params):
         ({"force": dry}, [0.01, 5.0], (3.0, True)),
         ({"force": dry_in_the_plane}, [0.0, -0.02], (3.0, True)),
         ({"force": switched}, [0.3], (0.5, False)),
-        ({"slow_potential": wedge}, [0.3], (1.0, False)),
+        ({"slow_potential": lambda q_s, q_f, params: jnp.abs(q_s[0] - 0.001)}, [0.3], (1.0, False)),
         ({"force": dry}, [5.0], None),  # it does not stop within the time
-        ({"force": smoothed}, [0.01], None),
+        ({"force": lambda t, q_s, q_f, v_s, v_f, params: (-LOAD * jnp.tanh(v_s / 0.02), 0 * v_f)}, [0.01], None),
         ({"slow_potential": far_away}, [0.3], None),
     ],
 )

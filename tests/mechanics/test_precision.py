@@ -4,12 +4,12 @@ import os
 import subprocess
 import sys
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import vmri_jax as vm
-from vmri_jax import ConstantMass, System, fully_explicit, initial_state, simulate, simulate_batch
 
 EARLY = """
 import jax.numpy as jnp
@@ -33,21 +33,25 @@ print(float(jnp.abs(runs[0].q_f - runs[1].q_f).max()), MASSES.fast.dtype)
 SHORT = """
 import jax, jax.numpy as jnp
 import vmri_jax as vm
-try:
-    vm.ConstantMass(jnp.array([0.1]), [0.1])
-except ValueError as error:
-    print(error)
-params = {"k": jnp.array(0.1)}
-masses = jnp.array([0.1])
-jax.config.update("jax_enable_x64", True)
-for make in (
-    lambda: vm.ConstantMass([0.1], masses),
-    lambda: vm.initial_state(vm.System(vm.ConstantMass([0.1], [0.1]), params=params), [0.1], [0.1], [0.0], [0.0]),
-):
+
+def error_of(make):
     try:
         make()
     except ValueError as error:
-        print(error)
+        print(str(error).replace(chr(10), " "))
+
+for make in (
+    lambda: vm.ConstantMass(jnp.array([0.1]), [0.1]),
+    lambda: vm.systems.fermi_pasta_ulam(),
+    lambda: vm.initial_state(None, [1.0], [1.0], [0.0], [0.0]),
+    lambda: vm.simulate(None, vm.fully_implicit(2), None, macro_dt=0.1, num_steps=1),
+):
+    error_of(make)
+params, masses = {"k": jnp.array(0.1)}, jnp.array([0.1])
+jax.config.update("jax_enable_x64", True)
+error_of(lambda: vm.ConstantMass([0.1], masses))
+system = vm.System(vm.ConstantMass([0.1], [0.1]), params=params)
+error_of(lambda: vm.initial_state(system, [0.1], [0.1], [0.0], [0.0]))
 """
 
 
@@ -63,10 +67,13 @@ def test_masses_and_params_made_before_64_bit_mode_are_exact():
     assert printed(EARLY) == ["0.0 float64"]
 
 
-def test_arrays_of_jax_made_before_64_bit_mode_are_refused_by_name():
-    off, masses, params = printed(SHORT)
-    assert "vmri_jax needs 64-bit floats" in off
-    assert "vm.configure()" in off
+def test_every_door_asks_for_64_bit_mode_and_arrays_made_before_are_refused_by_name():
+    *off, masses, params = printed(SHORT)
+    assert len(off) == 4
+    for message in off:
+        assert "needs 64-bit floats" in message
+        assert "vm.configure()" in message
+        assert 'jax.config.update("jax_enable_x64", True)' in message
     assert "ConstantMass: fast has dtype float32; give float64" in masses
     assert "System: params['k'] has dtype float32; give float64" in params
     assert "made after vm.configure()" in params
@@ -76,31 +83,25 @@ def one_spring(q_f, params):
     return jnp.sum(params["stiff"]["k"] * q_f**2) / 2
 
 
-SYSTEM = System(ConstantMass([1.0], [1.0]), None, one_spring, params={"stiff": {"k": jnp.ones(1)}})
+SYSTEM = vm.System(vm.ConstantMass([1.0], [1.0]), None, one_spring, params={"stiff": {"k": jnp.ones(1)}})
 
 
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.bfloat16, np.float16, np.complex64])
 def test_params_are_refused_at_every_door(dtype):
-    state = initial_state(SYSTEM, [0.0], [1.0], [0.0], [0.0])
-    short = {"stiff": {"k": jnp.ones(1, dtype)}}
-    system = SYSTEM.replace(params=short)
+    start, step = ([0.0], [1.0], [0.0], [0.0]), {"macro_dt": 0.1, "num_steps": 1}
+    state, short = vm.initial_state(SYSTEM, *start), {"stiff": {"k": jnp.ones(1, dtype)}}
+    lanes = jax.tree.map(lambda a: jnp.stack([jnp.asarray(a)] * 2), state)
+    params = {"stiff": {"k": jnp.ones((2, 1), dtype)}}
     message = rf"System: params\['stiff(\.|'\]\[')k'\] has dtype {np.dtype(dtype).name}; give float64"
-    with pytest.raises(ValueError, match=message):
-        initial_state(system, [0.0], [1.0], [0.0], [0.0])
-    with pytest.raises(ValueError, match=message):
-        simulate(system, fully_explicit(2), state, macro_dt=0.1, num_steps=1)
-    states = vm.State(*(jnp.stack([a, a]) for a in (state.t, state.q_s, state.q_f, state.p_s, state.p_f)))
-    with pytest.raises(ValueError, match=message):
-        simulate_batch(
-            SYSTEM,
-            fully_explicit(2),
-            states,
-            macro_dt=0.1,
-            num_steps=1,
-            params={"stiff": {"k": jnp.ones((2, 1), dtype)}},
-        )
+    for call in (
+        lambda: vm.initial_state(SYSTEM.replace(params=short), *start),
+        lambda: vm.simulate(SYSTEM.replace(params=short), vm.fully_explicit(2), state, **step),
+        lambda: vm.simulate_batch(SYSTEM, vm.fully_explicit(2), lanes, **step, params=params),
+    ):
+        with pytest.raises(ValueError, match=message):
+            call()
 
 
 def test_whole_numbers_and_flags_may_be_params():
     system = SYSTEM.replace(params={"stiff": {"k": 1}, "flag": True, "count": np.int32(3)})
-    assert initial_state(system, [0.0], [1.0], [0.0], [0.0]).p_f.dtype == float
+    assert vm.initial_state(system, [0.0], [1.0], [0.0], [0.0]).p_f.dtype == float

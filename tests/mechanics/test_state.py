@@ -20,10 +20,7 @@ def test_momenta_are_mass_times_velocity(fpu):
     assert np.array_equal(state.p_s, fpu.v_s)
     assert np.array_equal(state.q_f, fpu.q_f)
     assert float(state.t) == 0.0
-
-
-def test_a_problem_starts_at_rest_by_default():
-    problem = Problem(System(ConstantMass([1.0], [1.0, 2.0])), [0.5], [1.0, 2.0])
+    problem = Problem(System(ConstantMass([1.0], [1.0, 2.0])), [0.5], [1.0, 2.0])  # at rest by default
     np.testing.assert_array_equal(problem.v_s, [0.0])
     np.testing.assert_array_equal(problem.state().p_f, [0.0, 0.0])
 
@@ -32,9 +29,7 @@ def test_a_problem_takes_plain_lists():
     """Functions of the system get arrays, also where studies call them with the start of a problem."""
     ring = System(ConstantMass([1.0, 1.0], [1.0]), slow_constraint=lambda q_s, params: jnp.array([q_s @ q_s - 1.0]))
     problem = Problem(ring, [0.0, 1], [2], [0.5, 0.0], [0])
-    assert {name: getattr(problem, name).dtype for name in ("q_s", "q_f", "v_s", "v_f")} == dict.fromkeys(
-        ("q_s", "q_f", "v_s", "v_f"), np.dtype(float)
-    )
+    assert {getattr(problem, name).dtype for name in ("q_s", "q_f", "v_s", "v_f")} == {np.dtype(float)}
     assert problem.system.num_constraints(problem.q_s, problem.q_f) == (0, 1)
     with pytest.raises(TypeError, match=r"Problem: system is int; give a vmri_jax\.System"):
         Problem(1, [0.0], [1.0], [0.0], [0.0])  # pyright: ignore[reportArgumentType]
@@ -142,30 +137,19 @@ def test_a_kinetic_energy_without_mass_is_refused_at_the_start():
     assert np.allclose(initial_state(System(quartic), [0.0], [1.0], [1.0], [0.5]).p_f, [0.5], atol=1e-15)
 
 
-def test_inconsistent_positions_are_refused_with_the_violation(tsp):
+def test_projection_repairs_positions(tsp):
     q_f = tsp.q_f + 0.1 * np.eye(6)[1]  # rod of length 2: (2.1^2 - 2^2) / 2 = 0.205
     with pytest.raises(ValueError, match=r"violate constraint, row 0, by 2.050e-01 .*pass project=True"):
         initial_state(tsp.system, tsp.q_s, q_f, tsp.v_s, tsp.v_f)
-
-
-def test_projection_repairs_positions(tsp):
-    q_f = tsp.q_f + 0.1 * np.eye(6)[1]
     state = initial_state(tsp.system, tsp.q_s, q_f, tsp.v_s, tsp.v_f, project=True)
     residual = constraint_residual(tsp.system, state)
     assert float(jnp.max(residual)) < 1e-13
     # nearest in the mass metric: masses 1 and 100 at the ends of the rod share 0.1 as 100 : 1 (about)
     assert float(state.q_f[1] - q_f[1]) == pytest.approx(-0.1 * 100 / 101, rel=0.01)
     assert float(state.q_s[1]) == pytest.approx(0.1 / 101, rel=0.01)
-
-
-def test_projection_that_fails_says_so(tsp):
-    system = tsp.system.replace(constraint=unsatisfiable)
+    system = tsp.system.replace(constraint=lambda q_s, q_f, params: jnp.sum(q_f**2, keepdims=True) + 1.0)
     with pytest.raises(ValueError, match="projection did not reach the constraints; start closer"):
         initial_state(system, tsp.q_s, tsp.q_f, tsp.v_s, tsp.v_f, project=True)
-
-
-def unsatisfiable(q_s, q_f, params):
-    return jnp.sum(q_f**2, keepdims=True) + 1.0
 
 
 def first_rod_as_constraint(q_s, q_f, params):
@@ -199,17 +183,13 @@ def the_same_twice(q_s, q_f, params):
     return jnp.stack([g, 2 * g])
 
 
-def two_slow_constraints(q_s, params):
-    return jnp.stack([q_s[0], q_s[0] ** 2])
-
-
 def test_more_constraints_than_variables_are_refused():
     one = jnp.ones(1)
     kinetic = double_pendulum().system.params
     system = System(arms_kinetic, constraint=two_constraints, params=kinetic)
     with pytest.raises(ValueError, match="constraint returns 2 values for 1 fast variables"):
         initial_state(system, one, one, one, one)
-    system = System(arms_kinetic, slow_constraint=two_slow_constraints, params=kinetic)
+    system = System(arms_kinetic, slow_constraint=lambda q_s, params: jnp.stack([q_s[0], q_s[0] ** 2]), params=kinetic)
     with pytest.raises(ValueError, match="slow_constraint returns 2 values for 1 slow variables; at most 1"):
         initial_state(system, 0 * one, one, one, one)
 

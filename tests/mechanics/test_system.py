@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from vmri_jax import ConstantMass, System
+from vmri_jax import ConstantMass, Refused, System
 from vmri_jax.diagnostics import energy
 from vmri_jax.mechanics.functions import traced_once
 from vmri_jax.mechanics.structure import depends_on
@@ -61,26 +61,19 @@ def test_terms_are_filtered_and_mapped(sam):
     def twice(term):
         return term.function if term.kind == "kinetic" else lambda *arguments: 2 * term.function(*arguments)
 
-    for values, doubled in (
-        (system.all_potentials(sam.q_s, sam.q_f), system.mapped(twice).all_potentials(sam.q_s, sam.q_f)),
-        (
-            {"g": system.constraints(0.0, sam.q_s, sam.q_f)},
-            {"g": system.mapped(twice).constraints(0.0, sam.q_s, sam.q_f)},
-        ),
-    ):
-        for name, value in values.items():
-            np.testing.assert_allclose(doubled[name], 2 * value, rtol=1e-15)
+    def values(system):
+        q = sam.q_s, sam.q_f
+        return np.concatenate([list(system.all_potentials(*q).values()), system.constraints(0.0, *q)])
+
+    np.testing.assert_allclose(values(system.mapped(twice)), 2 * values(system), rtol=1e-15)
 
 
-def test_constraints_join_coupling_and_slow_ones(sam):
+def test_constraints_join_coupling_and_slow_ones(sam, fpu):
     values = sam.system.constraints(0.0, sam.q_s + 0.1, sam.q_f)
     assert values.shape == (4,)
     assert np.array_equal(values[:3], sam.system.constraint(sam.q_s + 0.1, sam.q_f, sam.system.params))
     assert np.array_equal(values[3:], sam.system.slow_constraint(sam.q_s + 0.1, sam.system.params))
     assert sam.system.num_constraints(sam.q_s, sam.q_f) == (3, 1)
-
-
-def test_a_system_without_constraints_has_none(fpu):
     assert fpu.system.constraints(0.0, fpu.q_s, fpu.q_f).shape == (0,)
     assert fpu.system.num_constraints(fpu.q_s, fpu.q_f) == (0, 0)
 
@@ -107,29 +100,24 @@ def of_both(q_s, q_f, params):
 def test_further_potentials_count_in_the_energy():
     system = System(ConstantMass([1.0], [2.0]), potentials={"a": of_both, 4: of_both, "fast": of_both})
     q_s, q_f = jnp.array([2.0]), jnp.array([3.0])
-    assert {name: float(value) for name, value in system.all_potentials(q_s, q_f).items()} == {
-        "slow": 0.0,
-        "fast": 6.0,
-        "a": 6.0,
-        4: 6.0,
-    }
+    assert system.all_potentials(q_s, q_f) == {"slow": 0.0, "fast": 6.0, "a": 6.0, 4: 6.0}
     assert float(energy(system, q_s, q_f, 0 * q_s, 0 * q_f)) == 18.0
     assert system.replace(params=1.0).potentials == system.potentials
     assert "potential a" in repr(system)
 
 
 @pytest.mark.parametrize(
-    ("potentials", "error", "message"),
+    ("potentials", "message"),
     [
-        (of_both, TypeError, "give functions by name"),
-        ({0: of_both}, ValueError, "a whole number k of at least 1"),
-        ({"kinetic": of_both}, ValueError, "the name of another term"),
-        ({"V_2": of_both, 2: of_both}, ValueError, "the name of another term"),
-        ({"W": of_both}, ValueError, "the name of another term"),
-        ({"a": 1.0}, TypeError, r"potentials\['a'\] is 1.0; it must be a function"),
-        ({"a": lambda q_f, params: 0.0}, TypeError, r"it is called with \(q_s, q_f, params\)"),
+        (of_both, "give functions by name"),
+        ({0: of_both}, "a whole number k of at least 1"),
+        ({"kinetic": of_both}, "the name of another term"),
+        ({"V_2": of_both, 2: of_both}, "the name of another term"),
+        ({"W": of_both}, "the name of another term"),
+        ({"a": 1.0}, r"potentials\['a'\] is 1.0; it must be a function"),
+        ({"a": lambda q_f, params: 0.0}, r"it is called with \(q_s, q_f, params\)"),
     ],
 )
-def test_further_potentials_that_are_refused(potentials, error, message):
-    with pytest.raises(error, match=message):
+def test_further_potentials_that_are_refused(potentials, message):
+    with pytest.raises(Refused, match=message):
         System(ConstantMass([1.0], [2.0]), potentials=potentials)

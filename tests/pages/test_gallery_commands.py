@@ -18,8 +18,7 @@ def scene(block) -> str:
 
 
 @pytest.mark.parametrize(
-    "block",
-    [pytest.param(b, marks=() if scene(b) in OFTEN else pytest.mark.full, id=scene(b)) for b in blocks(PAGE)],
+    "block", [pytest.param(b, marks=() if scene(b) in OFTEN else pytest.mark.full, id=scene(b)) for b in blocks(PAGE)]
 )
 def test_commands_run_as_printed(block, tmp_path):
     (tmp_path / "notebooks").symlink_to(ROOT / "notebooks")

@@ -13,8 +13,7 @@ LARGEST = 600_000
 
 
 @pytest.mark.parametrize(
-    "path",
-    [pytest.param(path, marks=pytest.mark.full if path.stem in LONG else (), id=path.stem) for path in paths()],
+    "path", [pytest.param(path, marks=pytest.mark.full if path.stem in LONG else (), id=path.stem) for path in paths()]
 )
 def test_a_notebook_shows_what_it_holds(path, tmp_path):
     """Else `make notebooks` stores what it shows now."""

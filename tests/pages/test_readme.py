@@ -15,53 +15,40 @@ TEXT = "\n".join(path.read_text() for path in PAGES)
 PROGRAMS = re.findall(r"```python\n(.*?)```", TEXT, re.DOTALL)
 
 
-def test_example_runs(tmp_path):
-    """In a process of its own, since settings are read when JAX starts. The steps that it chooses depend on measured times."""
-    example, results = programs("README.md")
-    checks = 'assert run.q_f["atoms"].shape == (len(run), 32, 2, 3)\nassert run.error.largest <= 1e-5\n'
-    run = [sys.executable, "-c", example + results + checks]
-    done = subprocess.run(run, capture_output=True, text=True, check=False, cwd=tmp_path)
+def programs(page: str) -> list[str]:
+    """The programs of a page."""
+    return re.findall(r"```python\n(.*?)```", (ROOT / page).read_text(), re.DOTALL)
+
+
+def printed(program: str, folder: Path) -> str:
+    """What a program prints, which runs in a folder and in a process of its own, since settings are read when JAX starts."""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False, cwd=folder)
     assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_example_runs(tmp_path):
+    """The steps that it chooses depend on measured times."""
+    checks = 'assert run.q_f["atoms"].shape == (len(run), 32, 2, 3)\nassert run.error.largest <= 1e-5\n'
+    said = printed("".join([*programs("README.md"), checks]), tmp_path)
     numbers = re.compile(r"\d[\d.e-]*")
     shown = re.search(r"It prints.*?```text\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
     assert shown is not None
-    assert [numbers.sub("", line) for line in done.stdout.splitlines()[1:]] == [
-        numbers.sub("", line) for line in shown.group(1).splitlines()[1:]
-    ]
-    num_micro, gain = (int(re.findall(r"explicit\((\d+)", done.stdout)[0]), float(numbers.findall(done.stdout)[-1]))
-    assert num_micro > 1
-    assert gain > 2  # measured 3.5 to 4.6, on a busy core, too
+    ours, theirs = ([numbers.sub("", line) for line in text.splitlines()[1:]] for text in (said, shown.group(1)))
+    assert ours == theirs
+    assert int(re.findall(r"explicit\((\d+)", said)[0]) > 1
+    assert float(numbers.findall(said)[-1]) > 2  # the gain; measured 3.5 to 4.6, on a busy core, too
     assert (tmp_path / "run.png").stat().st_size > 10_000
     assert (tmp_path / "run.csv").read_text().startswith('t,"atoms[0,0] x","atoms[0,0] y",')
 
 
 def test_the_program_of_the_nutshell_runs(tmp_path):
     """A crane whose bodies have names: it prints what the page says."""
-    example, results = programs("docs/nutshell.md")[:2]
     checks = 'assert run.q_f["load"].shape == (201, 2)\nassert len(run[100:]) == 101\n'
-    run = [sys.executable, "-c", example + results + checks]
-    done = subprocess.run(run, capture_output=True, text=True, check=False, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert [f"`{line}`" in TEXT for line in done.stdout.splitlines()] == [True, True], done.stdout
+    said = printed("".join([*programs("docs/nutshell.md")[:2], checks]), tmp_path)
+    assert [f"`{line}`" in TEXT for line in said.splitlines()] == [True, True], said
     assert (tmp_path / "run.png").stat().st_size > 10_000
     assert (tmp_path / "run.csv").read_text().startswith("t,trolley,hook x,hook y,load x,load y,v trolley,")
-
-
-def programs(page: str) -> list[str]:
-    """The programs of a page."""
-    return re.findall(r"```python\n(.*?)```", (ROOT / page).read_text(), re.DOTALL)
-
-
-def test_systems_of_functions(capsys):
-    """A crane that hoists, then a bob in polar coordinates: they print what the page says."""
-    page = (ROOT / "docs/how_to/systems.md").read_text()
-    crane, bob = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
-    scope = {}
-    exec(crane, scope)
-    assert f"```text\n{capsys.readouterr().out}```" in page
-    assert scope["run"].reaction_forces("rail")["trolley"].shape == (801, 2)
-    exec(bob, scope)
-    assert f"`{capsys.readouterr().out.strip()}`" in page
 
 
 def test_scenes_run():
@@ -75,22 +62,33 @@ def test_scenes_run():
         assert vm.simulate(scene, vm.fully_implicit(num_micro=10), macro_dt=0.01, num_steps=10).success
 
 
-def test_many_runs(tmp_path):
-    program = next(program for program in PROGRAMS if "vm.ensemble(" in program)
-    run = [sys.executable, "-c", program]
-    done = subprocess.run(run, capture_output=True, text=True, check=False, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert f"It prints `{done.stdout.strip()}`." in TEXT, done.stdout
-    assert (tmp_path / "runs.png").stat().st_size > 10_000
+@pytest.mark.parametrize(("call", "picture"), [("vm.ensemble(", "runs.png"), ("vm.fit(", "fit.png")])
+def test_programs_with_figures(call, picture, tmp_path):
+    said = printed(next(program for program in PROGRAMS if call in program), tmp_path)
+    assert f"`{said.strip()}`" in TEXT or said.splitlines()[0] in TEXT, said
+    assert (tmp_path / picture).stat().st_size > 10_000
 
 
-def test_a_fit(tmp_path):
-    program = next(program for program in PROGRAMS if "vm.fit(" in program)
-    run = [sys.executable, "-c", program]
-    done = subprocess.run(run, capture_output=True, text=True, check=False, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.strip().splitlines()[0] in TEXT, done.stdout
-    assert (tmp_path / "fit.png").stat().st_size > 10_000
+SHOWN = {  # words of programs of a page, which run one after the other in one namespace, each with what it prints below it
+    "how_to/systems.md": ("", 'q_f["radius"]'),
+    "how_to/steppers.md": ("class Rotation",),
+    "coming_from/index.md": ("25.0 * q_s[",),
+    "how_to/measurements.md": ("",),
+    "how_to/scenes.md": ("crank pin",),
+    "how_to/accuracy.md": ("hinge",),
+}
+
+
+@pytest.mark.parametrize("page", SHOWN)
+def test_programs_print_what_their_page_shows(page, capsys, tmp_path, monkeypatch):
+    text, scope = (ROOT / "docs" / page).read_text(), {"__name__": "program", "vm": vm}
+    monkeypatch.chdir(tmp_path)
+    for words in SHOWN[page]:
+        exec(next(program for program in programs(f"docs/{page}") if words in program), scope)
+        said = capsys.readouterr().out
+        assert f"```text\n{said}```" in text or f"`{said.strip()}`" in text, said
+    if page == "how_to/systems.md":
+        assert scope["run"].reaction_forces("rail")["trolley"].shape == (801, 2)
 
 
 def test_optimal_control(tmp_path, monkeypatch):
@@ -102,29 +100,16 @@ def test_optimal_control(tmp_path, monkeypatch):
 
 
 def test_a_scheme_of_ones_own(capsys):
-    program = "".join(re.findall(r"```python\n(.*?)```", (ROOT / "docs/how_to/schemes.md").read_text(), re.DOTALL))
-    exec(program, {})
+    exec("".join(programs("docs/how_to/schemes.md")), {})
     printed = capsys.readouterr().out
     assert "order 2.0" in printed
     (rates,) = re.findall(r"```text\n(.*?)```", (ROOT / "docs/how_to/schemes.md").read_text(), re.DOTALL)
     assert printed.endswith(rates)
 
 
-def test_a_stepper_of_ones_own(capsys):
-    exec(next(program for program in PROGRAMS if "class Rotation" in program), {"__name__": "rotation"})
-    assert f"```text\n{capsys.readouterr().out}```" in (ROOT / "docs/how_to/steppers.md").read_text()
-
-
-def test_the_problem_that_others_solve_too(capsys):
-    exec(next(program for program in PROGRAMS if "25.0 * q_s[" in program), {})
-    printed = capsys.readouterr().out.strip()
-    assert f"`{printed}`" in (ROOT / "docs/coming_from/index.md").read_text()
-
-
 def test_derivatives(capsys):
-    program = "".join(re.findall(r"```python\n(.*?)```", (ROOT / "docs/how_to/derivatives.md").read_text(), re.DOTALL))
     scope = {}
-    exec(program, scope)
+    exec("".join(programs("docs/how_to/derivatives.md")), scope)
     first, *others = capsys.readouterr().out.splitlines()
     assert others == ["(8,)", "True"]
     squared, params = scope["squared"], scope["params"]
@@ -132,28 +117,16 @@ def test_derivatives(capsys):
     assert float(first.split()[3].rstrip(",")) == pytest.approx(float(up - down) / 2e-5, rel=1e-5)
 
 
-def test_measurements(capsys, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (program,) = programs("docs/how_to/measurements.md")
-    exec(program, {})
-    assert f"```text\n{capsys.readouterr().out}```" in (ROOT / "docs/how_to/measurements.md").read_text()
-
-
-def test_a_mechanism(capsys):
-    exec(next(program for program in PROGRAMS if "crank pin" in program), {})
-    assert f"```text\n{capsys.readouterr().out}```" in (ROOT / "docs/how_to/scenes.md").read_text()
-
-
 def test_joint_coordinates(capsys):
     page = (ROOT / "docs/how_to/scenes.md").read_text()
-    programs = [p for p in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "hinge = " in p or "with_joints" in p]
-    exec("".join(["import numpy as np\n", *programs]), {})
+    parts = [part for part in programs("docs/how_to/scenes.md") if "hinge = " in part or "with_joints" in part]
+    exec("".join(["import numpy as np\n", *parts]), {})
     assert f"```text\n{capsys.readouterr().out}```" in page
 
 
 def test_molecules(capsys):
     page = (ROOT / "docs/how_to/molecules.md").read_text()
-    first, rigid, steps, many = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    first, rigid, steps, many = programs("docs/how_to/molecules.md")
     scope = {}
     exec(first + rigid, scope)
     free, held = capsys.readouterr().out.splitlines()
@@ -176,13 +149,6 @@ def test_effects_of_ones_own(capsys):
     ):
         exec(program, scope)
         assert capsys.readouterr().out == shown
-
-
-def test_the_error_of_a_point(capsys):
-    """The program of the page on accuracy with a hinge: it prints what the page says."""
-    page = (ROOT / "docs/how_to/accuracy.md").read_text()
-    exec(next(program for program in programs("docs/how_to/accuracy.md") if "hinge" in program), {"vm": vm})
-    assert f"`{capsys.readouterr().out.strip()}`" in page
 
 
 def test_a_run_of_a_scene_is_animated(tmp_path, monkeypatch):

@@ -8,29 +8,17 @@ from vmri_jax.running.files import check_place, replaced
 
 
 def test_a_file_is_replaced_when_all_is_written(tmp_path):
-    path = tmp_path / "file"
+    path, link = tmp_path / "file", tmp_path / "link"
     path.write_bytes(b"old")
-    with replaced(path) as file:
-        file.write(b"new")
-        assert path.read_bytes() == b"old"
-    assert path.read_bytes() == b"new"
-
-
-def test_an_error_leaves_the_old_file(tmp_path):
-    path = tmp_path / "file"
-    path.write_bytes(b"old")
+    link.symlink_to(path)
     with pytest.raises(KeyboardInterrupt), replaced(path):
         raise KeyboardInterrupt
-    assert path.read_bytes() == b"old"
-    assert [path.name for path in tmp_path.iterdir()] == ["file"]
-
-
-def test_a_link_stays_a_link(tmp_path):
-    (tmp_path / "link").symlink_to(tmp_path / "file")
-    with replaced(tmp_path / "link") as file:
+    with replaced(link) as file:
         file.write(b"new")
-    assert (tmp_path / "link").is_symlink()
-    assert (tmp_path / "file").read_bytes() == b"new"
+        assert path.read_bytes() == b"old"
+    assert link.is_symlink()
+    assert path.read_bytes() == b"new"
+    assert {path.name for path in tmp_path.iterdir()} == {"file", "link"}
 
 
 def test_a_device_is_written_to():

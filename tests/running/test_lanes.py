@@ -16,42 +16,28 @@ import vmri_jax as vm
 from tests.stability.systems import swinging
 from tests.support import PROBLEMS, largest_difference, until_failure
 from tests.user_systems import cart, two_oscillators
-from vmri_jax import (
-    Method,
-    Result,
-    State,
-    compose,
-    explicit_slow,
-    fully_explicit,
-    fully_implicit,
-    galerkin,
-    initial_state,
-    simulate,
-    simulate_batch,
-)
 
 
-def spread(problem, lanes: int) -> State:
+def spread(problem, lanes: int) -> vm.State:
     """States that differ in their velocities."""
     state = problem.state()
     scale = 1 + 0.02 * jnp.arange(lanes)[:, None]
     q_s, q_f = jnp.tile(state.q_s, (lanes, 1)), jnp.tile(state.q_f, (lanes, 1))
-    return State(jnp.zeros(lanes), q_s, q_f, scale * state.p_s, scale * state.p_f)
+    return vm.State(jnp.zeros(lanes), q_s, q_f, scale * state.p_s, scale * state.p_f)
 
 
 SYSTEMS = PROBLEMS | {"chain": partial(vm.systems.fermi_pasta_ulam, 1), "pendulum": swinging, "cart": cart}
 RUN: dict[str, Any] = {"num_steps": 20, "save": 5}
 WAYS = {  # system, scheme, macro_dt, largest difference of a lane from its single run
-    "kicks": ("chain", fully_explicit(3), 0.05, 1e-13),  # measured 3e-15
-    "linear fast equations": ("chain", explicit_slow(3), 0.05, 1e-13),
-    "nested": ("pendulum", fully_implicit(3), 0.05, 1e-13),
-    "drift along constraints": ("tsp", fully_explicit(1), 0.002, 1e-13),
-    "collocation": ("pendulum", galerkin(1, 2), 0.05, 1e-12),
-    "composition": ("chain", compose(fully_explicit(2), "yoshida4"), 0.02, 1e-13),
+    "kicks": ("chain", vm.fully_explicit(3), 0.05, 1e-13),  # measured 3e-15
+    "nested": ("pendulum", vm.fully_implicit(3), 0.05, 1e-13),
+    "drift along constraints": ("tsp", vm.fully_explicit(1), 0.002, 1e-13),
+    "collocation": ("pendulum", vm.galerkin(1, 2), 0.05, 1e-12),
+    "composition": ("chain", vm.compose(vm.fully_explicit(2), "yoshida4"), 0.02, 1e-13),
 }
 
 
-def lane_of(states: State, lane: int) -> State:
+def lane_of(states: vm.State, lane: int) -> vm.State:
     return jax.tree.map(lambda a: a[lane], states)
 
 
@@ -60,28 +46,28 @@ def single(way: str, lane: int):
     """The run of one of five lanes."""
     name, scheme, macro_dt, _ = WAYS[way]
     problem = SYSTEMS[name]()
-    return simulate(problem.system, scheme, lane_of(spread(problem, 5), lane), macro_dt=macro_dt, **RUN)
+    return vm.simulate(problem.system, scheme, lane_of(spread(problem, 5), lane), macro_dt=macro_dt, **RUN)
 
 
 @pytest.mark.parametrize(("way", "chunk"), [(way, 2 if way == "nested" else None) for way in WAYS])
 def test_lanes_equal_single_runs(way, chunk):
     name, scheme, macro_dt, bound = WAYS[way]
     problem = SYSTEMS[name]()
-    batch = simulate_batch(problem.system, scheme, spread(problem, 5), macro_dt=macro_dt, chunk=chunk, **RUN)
+    batch = vm.simulate_batch(problem.system, scheme, spread(problem, 5), macro_dt=macro_dt, chunk=chunk, **RUN)
     assert batch.q_f.shape == (5, 5, problem.q_f.size)
-    assert np.all(np.asarray(batch.result) <= Result.CONVERGED_AT_ROUNDOFF)
+    assert np.all(np.asarray(batch.result) <= vm.Result.CONVERGED_AT_ROUNDOFF)
     for lane in (0, 4):
         assert largest_difference(batch.q_f[lane], single(way, lane).q_f) < bound
         assert largest_difference(batch.t[lane], single(way, lane).t) == 0
 
 
 STEPS, OMEGAS = jnp.array([0.01, 0.02, 0.03]), jnp.array([30.0, 50.0, 60.0])
-SCHEME_OF_THREE, MARCH = fully_implicit(2), vm.Solver("masses")
+SCHEME_OF_THREE, MARCH = vm.fully_implicit(2), vm.Solver("masses")
 
 
-def batch_of_three(chain, states: State):
+def batch_of_three(chain, states: vm.State):
     """Each lane with a step size and a stiffness of its own."""
-    return simulate_batch(
+    return vm.simulate_batch(
         chain.system, SCHEME_OF_THREE, states, macro_dt=STEPS, num_steps=10, params={"omega": OMEGAS}, solver=MARCH
     )
 
@@ -103,8 +89,8 @@ def well(q_f, params):
 def test_lanes_that_start_at_the_nodes_of_a_run_without_slow_coordinates():
     """The empty array of slow positions of a run has other strides than a copy of it."""
     single = vm.Problem(vm.System(vm.ConstantMass([], [1.0]), fast_potential=well), [], [1.0])
-    run = simulate(single, fully_explicit(2), macro_dt=0.05, num_steps=6)
-    lanes = simulate_batch(single, fully_explicit(2), run.states, macro_dt=0.05, num_steps=2)
+    run = vm.simulate(single, vm.fully_explicit(2), macro_dt=0.05, num_steps=6)
+    lanes = vm.simulate_batch(single, vm.fully_explicit(2), run.states, macro_dt=0.05, num_steps=2)
     np.testing.assert_allclose(lanes.q_f[:-2, 2], run.q_f[2:], rtol=1e-14)
 
 
@@ -112,13 +98,13 @@ def test_step_sizes_and_params_per_lane(chain, three):
     for lane in range(3):
         system = chain.system.replace(params={"omega": OMEGAS[lane]})
         state = lane_of(spread(chain, 3), lane)
-        alone = simulate(system, SCHEME_OF_THREE, state, macro_dt=STEPS[lane], num_steps=10, solver=MARCH)
+        alone = vm.simulate(system, SCHEME_OF_THREE, state, macro_dt=STEPS[lane], num_steps=10, solver=MARCH)
         assert largest_difference(three.p_f[lane], alone.p_f) < 1e-12
 
 
 def test_a_failing_lane_leaves_the_others_alone(chain, three):
     states = spread(chain, 3)
-    states = State(states.t, states.q_s.at[1, 0].set(1e200), states.q_f, states.p_s, states.p_f)
+    states = vm.State(states.t, states.q_s.at[1, 0].set(1e200), states.q_f, states.p_s, states.p_f)
     with pytest.warns(vm.FailedLanesWarning, match=r"1 of 3 lanes failed .* lane 1, at macro step 0 \(NON_FINITE\)"):
         batch = batch_of_three(chain, states)
     assert np.asarray(batch.failed_at).tolist() == [-1, 0, -1]
@@ -131,7 +117,7 @@ LANES, BAD = 16, 7
 
 def test_vmap_of_simulate_equals_the_loop():
     """Over starts, step sizes and parameters. One start has velocities beyond what a double can square."""
-    problem, scheme, macro_dt, rng = SYSTEMS["cart"](), explicit_slow(2), 0.02, np.random.default_rng(5)
+    problem, scheme, macro_dt, rng = SYSTEMS["cart"](), vm.explicit_slow(2), 0.02, np.random.default_rng(5)
     v_s = np.array(problem.v_s + 0.3 * rng.normal(size=(LANES, problem.v_s.size)))
     v_f = np.array(problem.v_f + 0.3 * rng.normal(size=(LANES, problem.v_f.size)))
     v_f[BAD] *= 1e200
@@ -140,13 +126,13 @@ def test_vmap_of_simulate_equals_the_loop():
 
     def go(v_s, v_f, macro_dt, params):
         system = problem.system.replace(params=params)
-        state = initial_state(system, problem.q_s, problem.q_f, v_s, v_f, project=True)
+        state = vm.initial_state(system, problem.q_s, problem.q_f, v_s, v_f, project=True)
         return until_failure(system, scheme, state, macro_dt=macro_dt, solver=MARCH, **RUN)
 
     batch = jax.jit(jax.vmap(go))(v_s, v_f, steps, params)
     assert batch.q_f.shape == (LANES, 5, problem.q_f.size)
     assert np.flatnonzero(~np.asarray(batch.success)).tolist() == [BAD]
-    assert Result(int(batch.result[BAD])) in (Result.NON_FINITE, Result.DIVERGED, Result.STAGNATED)
+    assert vm.Result(int(batch.result[BAD])) in (vm.Result.NON_FINITE, vm.Result.DIVERGED, vm.Result.STAGNATED)
     assert int(batch.failed_at[BAD]) == 0
     assert np.isnan(batch.q_f[BAD, 1:]).all()
     worst = 0.0
@@ -164,17 +150,17 @@ def test_lanes_that_the_march_does_not_solve_are_solved_exactly():
     """At H = 2 the curvature of V outweighs the mass of the slow variables."""
     problem = two_oscillators(kappa=25.0)
     step = {"macro_dt": 40.0, "num_steps": 3, "solver": vm.Solver(max_iterations=20)}
-    run = simulate_batch(problem.system, fully_implicit(20), spread(problem, 3), **step)
-    assert np.all(np.asarray(run.result) <= Result.CONVERGED_AT_ROUNDOFF)
-    assert np.any(np.asarray(run.info.method) == Method.EXACT)
+    run = vm.simulate_batch(problem.system, vm.fully_implicit(20), spread(problem, 3), **step)
+    assert np.all(np.asarray(run.result) <= vm.Result.CONVERGED_AT_ROUNDOFF)
+    assert np.any(np.asarray(run.info.method) == vm.Method.EXACT)
 
 
 def test_chunks_of_a_batch_do_not_change_it(fpu):
     """Eighteen chunks of two lanes, the last of them half full."""
     states = spread(fpu, 35)
     run = {"macro_dt": 0.02, "num_steps": 12, "save": 4}
-    whole = simulate_batch(fpu.system, fully_explicit(3), states, **run)
-    in_chunks = simulate_batch(fpu.system, fully_explicit(3), states, chunk=2, **run)
+    whole = vm.simulate_batch(fpu.system, vm.fully_explicit(3), states, **run)
+    in_chunks = vm.simulate_batch(fpu.system, vm.fully_explicit(3), states, chunk=2, **run)
     assert in_chunks.q_f.shape == whole.q_f.shape == (35, 4, 3)
     for name in ("q_s", "p_f", "energy"):
         assert largest_difference(getattr(in_chunks, name), getattr(whole, name)) < 1e-13
@@ -190,9 +176,9 @@ def test_one_compilation_for_all_chunks_and_step_sizes(fpu):
         return params["omega"] ** 2 / 2 * jnp.sum(q_f**2)
 
     system = fpu.system.replace(fast_potential=counted)
-    simulate_batch(system, fully_explicit(4), spread(fpu, 7), macro_dt=0.02, num_steps=10, chunk=2)
+    vm.simulate_batch(system, vm.fully_explicit(4), spread(fpu, 7), macro_dt=0.02, num_steps=10, chunk=2)
     before = calls
-    simulate_batch(system, fully_explicit(4), spread(fpu, 5), macro_dt=0.01, num_steps=20, save=2, chunk=2)
+    vm.simulate_batch(system, vm.fully_explicit(4), spread(fpu, 5), macro_dt=0.01, num_steps=20, save=2, chunk=2)
     assert calls == before
 
 
@@ -212,16 +198,24 @@ def test_one_compilation_for_all_chunks_and_step_sizes(fpu):
 )
 def test_bad_input_is_refused(fpu, changes, message):
     with pytest.raises(ValueError, match=message):
-        simulate_batch(fpu.system, fully_explicit(4), spread(fpu, 3), **({"macro_dt": 0.1, "num_steps": 2} | changes))
+        vm.simulate_batch(
+            fpu.system, vm.fully_explicit(4), spread(fpu, 3), **({"macro_dt": 0.1, "num_steps": 2} | changes)
+        )
 
 
-def test_states_without_a_batch_axis_are_refused(fpu):
+def test_states_without_a_batch_axis_and_tracers_are_refused(fpu):
+    def go(omega):
+        params = {"omega": jnp.stack([omega, omega])}
+        return vm.simulate_batch(fpu, vm.explicit_slow(5), macro_dt=0.01, num_steps=10, params=params).q_s[-1, -1, 0]
+
     with pytest.raises(ValueError, match="no argument has an axis of lanes; give params"):
-        simulate_batch(fpu.system, fully_explicit(4), fpu.state(), macro_dt=0.1, num_steps=1)
+        vm.simulate_batch(fpu.system, vm.fully_explicit(4), fpu.state(), macro_dt=0.1, num_steps=1)
+    with pytest.raises(ValueError, match=r"simulate_batch: arguments are tracers; .*jax\.vmap of simulate"):
+        jax.grad(go)(50.0)
 
 
-def test_devices_share_a_batch_and_configure_comes_first():
-    """In a process of its own: flags are read when JAX starts."""
+def test_devices_share_a_batch():
+    """In a process of its own: flags are read when JAX starts; `tests/test_configure.py` has settings that come too late."""
     program = """
 import numpy as np
 import vmri_jax as vm
@@ -235,11 +229,6 @@ one, two, chunks = (
 )
 assert jax.device_count() == 2
 assert np.abs(one.q_f - two.q_f).max() < 1e-13 and np.abs(one.q_f - chunks.q_f).max() < 1e-13
-try:
-    vm.configure(devices=3)
-except RuntimeError as error:
-    assert "already started" in str(error)
-vm.configure(devices=2)  # nothing new: fine
 print("same")
 """
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=300, check=False)
@@ -251,35 +240,24 @@ def test_a_lane_off_the_constraints_has_failed():
     problem = SYSTEMS[name]()
     states = spread(problem, 5)
     states = eqx.tree_at(lambda s: s.q_f, states, states.q_f.at[1].multiply(1.01))
-    run = simulate_batch(problem.system, scheme, states, macro_dt=macro_dt, solver=MARCH, warn=False, **RUN)
+    run = vm.simulate_batch(problem.system, scheme, states, macro_dt=macro_dt, solver=MARCH, warn=False, **RUN)
     assert np.flatnonzero(run.result).tolist() == [1]
-    assert run.result[1] == Result.CONSTRAINT_VIOLATED
+    assert run.result[1] == vm.Result.CONSTRAINT_VIOLATED
     assert run.failed_at.tolist() == [-1, 0, -1, -1, -1]
     assert np.isnan(run.q_f[1]).all()
     assert run.constraint_residual[0].max() < 1e-10
 
 
-def test_tracers_are_refused(fpu):
-    def end(omega):
-        states = jax.tree.map(lambda a: jnp.stack([a, a]), fpu.state())
-        params = {"omega": jnp.stack([omega, omega])}
-        run = vm.simulate_batch(fpu, vm.explicit_slow(5), states, macro_dt=0.01, num_steps=10, params=params)
-        return run.q_s[-1, -1, 0]
-
-    with pytest.raises(ValueError, match=r"simulate_batch: arguments are tracers; .*jax\.vmap of simulate"):
-        jax.grad(end)(50.0)
-
-
-SWEEP = {"scheme": fully_explicit(3), "macro_dt": 0.02, "t_end": 0.4}
+SWEEP = {"scheme": vm.fully_explicit(3), "macro_dt": 0.02, "t_end": 0.4}
 
 
 def test_a_sweep_in_one_line(chain):
     """From the problem, with the error of each lane; params whole, for all lanes, are those of the problem."""
-    batch = simulate_batch(chain, params={"omega": [30.0, 50.0]}, error=True, **SWEEP)
+    batch = vm.simulate_batch(chain, params={"omega": [30.0, 50.0]}, error=True, **SWEEP)
     assert batch.error.largest.shape == (2,)
     for lane, omega in enumerate((30.0, 50.0)):
         problem = replace(chain, system=chain.system.replace(params={"omega": np.asarray(omega)}))
-        alone = simulate(problem, error=True, **SWEEP)
+        alone = vm.simulate(problem, error=True, **SWEEP)
         assert largest_difference(batch.q_f[lane], alone.q_f) < 1e-13  # measured 1e-17
         assert batch.error.largest[lane] == pytest.approx(alone.error.largest, rel=1e-9)
         assert batch.lane(lane).error.is_certified
@@ -303,19 +281,14 @@ def rod() -> vm.Problem:
 def test_params_nested_partial_and_shared():
     """Momenta of the start fit the constraint of each lane; an array of the shape of the parameter holds for all lanes."""
     heavier = {"rods": {"mass": [2.0, 6.0, 2.0]}, "gravity": np.array([0.0, 4.0])}
-    batch = simulate_batch(rod(), fully_implicit(2), params=heavier, macro_dt=0.01, num_steps=3)
+    batch = vm.simulate_batch(rod(), vm.fully_implicit(2), params=heavier, macro_dt=0.01, num_steps=3)
     assert (np.asarray(batch.failed_at) == -1).all()
     assert largest_difference(batch.q_f[0], batch.q_f[2]) == 0
     assert largest_difference(batch.q_f[0], batch.q_f[1]) > 1e-4
     lanes: Any = batch.origin.simulated
     assert lanes.params["gravity"].shape == (3, 2)
-    with_dots = simulate_batch(
-        rod(),
-        fully_implicit(2),
-        params={"rods.mass": [6.0, 6.0, 6.0]} | {"gravity": heavier["gravity"]},
-        macro_dt=0.01,
-        num_steps=3,
-    )
+    dots = {"rods.mass": [6.0, 6.0, 6.0], "gravity": heavier["gravity"]}
+    with_dots = vm.simulate_batch(rod(), vm.fully_implicit(2), params=dots, macro_dt=0.01, num_steps=3)
     assert largest_difference(with_dots.q_f[0], batch.q_f[1]) == 0
     with pytest.raises(ValueError, match=r"no parameter 'rods.maas'. Did you mean rods.mass. There are gravity"):
-        simulate_batch(rod(), fully_implicit(2), params={"rods": {"maas": [1.0]}}, macro_dt=0.01, num_steps=3)
+        vm.simulate_batch(rod(), vm.fully_implicit(2), params={"rods": {"maas": [1.0]}}, macro_dt=0.01, num_steps=3)

@@ -9,10 +9,6 @@ import vmri_jax as vm
 from vmri_jax.running import engine, loops
 
 
-def slow_spring(q_s, q_f, params):
-    return params * q_s @ q_s / 2
-
-
 def fast_spring(q_f, params):
     return params * q_f @ q_f / 2
 
@@ -35,27 +31,13 @@ def on_a_rod(gravity, length):
 
 
 ONE = jnp.ones(())
-CASES = {  # system of a parameter, positions, scheme
-    "no fast part": (
-        lambda k: vm.System(vm.ConstantMass([1.0], []), slow_spring, params=k),
-        ([1.0], []),
-        vm.fully_explicit(1),
-    ),
-    "no slow part": (
-        lambda k: vm.System(vm.ConstantMass([], [1.0]), fast_potential=fast_spring, params=k),
-        ([], [1.0]),
-        vm.fully_explicit(1),
-    ),
-    "solved": (
-        lambda k: vm.System(vm.ConstantMass([1.0], []), slow_spring, params=k),
-        ([1.0], []),
-        vm.fully_implicit(1),
-    ),
-    "T(q, v)": (
-        lambda k: vm.System(bead, fast_potential=fast_spring, params=k),
-        ([], [0.5]),
-        vm.fully_implicit(1),
-    ),
+SLOW = vm.System(vm.ConstantMass([1.0], []), lambda q_s, q_f, params: params * q_s @ q_s / 2)
+FAST = vm.System(vm.ConstantMass([], [1.0]), fast_potential=fast_spring)
+CASES = {  # system, positions, scheme
+    "no fast part": (SLOW, ([1.0], []), vm.fully_explicit(1)),
+    "no slow part": (FAST, ([], [1.0]), vm.fully_explicit(1)),
+    "solved": (SLOW, ([1.0], []), vm.fully_implicit(1)),
+    "T(q, v)": (vm.System(bead, fast_potential=fast_spring), ([], [0.5]), vm.fully_implicit(1)),
 }
 MASSES = vm.Solver("masses")
 ONE_MATRIX = ("T(q, v)",)
@@ -89,9 +71,12 @@ def last_position(system, start, scheme, solver=None):
 @pytest.mark.parametrize("name", CASES)
 def test_gradients_of_small_systems(name):
     system, (q_s, q_f), scheme = CASES[name]
-    start = vm.Problem(system(1.0 * ONE), q_s, q_f).state()
-    solver = MASSES if name in ONE_MATRIX else None
-    assert_derivative(jax.jit(jax.value_and_grad(lambda k: last_position(system(k), start, scheme, solver))))
+    start, solver = vm.Problem(system.replace(params=ONE), q_s, q_f).state(), MASSES if name in ONE_MATRIX else None
+
+    def position(k):
+        return last_position(system.replace(params=k), start, scheme, solver)
+
+    assert_derivative(jax.jit(jax.value_and_grad(position)))
 
 
 @pytest.mark.parametrize("project", [False, True])

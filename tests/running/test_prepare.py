@@ -9,18 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import vmri_jax as vm
 from tests.support import largest_difference
-from vmri_jax import (
-    Result,
-    Save,
-    SimulationError,
-    State,
-    explicit_slow,
-    fully_explicit,
-    fully_implicit,
-    prepare,
-    simulate,
-)
 
 CALLS = Counter()
 STEPS = {"macro_dt": 0.03, "num_steps": 8, "save": 2}
@@ -31,42 +21,32 @@ def watched(q_f, params):
     return params["omega"] ** 2 / 2 * jnp.sum(q_f**2)
 
 
-def moved(state: State) -> State:
-    return State(state.t, state.q_s, state.q_f, 1.5 * state.p_s, state.p_f)
+def moved(state: vm.State) -> vm.State:
+    return vm.State(state.t, state.q_s, state.q_f, 1.5 * state.p_s, state.p_f)
 
 
 def test_it_runs_what_simulate_runs(fpu):
-    steps: Any = STEPS | {"save": Save(2, micro=True)}
-    run = prepare(fpu.system, explicit_slow(3), fpu.state(), **steps)
-    expected = simulate(fpu.system, explicit_slow(3), fpu.state(), **steps)
+    steps: Any = STEPS | {"save": vm.Save(2, micro=True)}
+    run = vm.prepare(fpu.system, vm.explicit_slow(3), fpu.state(), **steps)
+    expected = vm.simulate(fpu.system, vm.explicit_slow(3), fpu.state(), **steps)
     for name in ("t", "q_s", "q_f", "p_s", "p_f", "energy", "t_micro", "q_f_micro"):
         assert np.array_equal(getattr(run(), name), getattr(expected, name)), name
 
 
 def test_numbers_change_without_compiling_again(fpu):
     system = fpu.system.replace(fast_potential=watched)
-    run = prepare(system, fully_implicit(3), fpu.state(), **STEPS)
+    run = vm.prepare(system, vm.fully_implicit(3), fpu.state(), **STEPS)
     params = {"omega": jnp.asarray(30.0)}
     CALLS.clear()
     changed = run(moved(fpu.state()), macro_dt=0.01, params=params, num_steps=20)
     assert Counter() == CALLS
-    expected = simulate(
-        system.replace(params=params), fully_implicit(3), moved(fpu.state()), macro_dt=0.01, num_steps=20, save=5
+    expected = vm.simulate(
+        system.replace(params=params), vm.fully_implicit(3), moved(fpu.state()), macro_dt=0.01, num_steps=20, save=5
     )
     assert Counter() == CALLS  # the same program
     assert largest_difference(changed.q_f, expected.q_f) == 0
     assert largest_difference(changed.t, expected.t) == 0
     assert largest_difference(changed.q_f, run().q_f) > 1e-3
-
-
-def test_failures_are_raised_or_in_the_trajectory(fpu):
-    run = prepare(fpu.system, fully_explicit(3), fpu.state(), **STEPS)
-    bad = State(fpu.state().t, 1e200 * fpu.state().q_s, *(getattr(fpu.state(), name) for name in ("q_f", "p_s", "p_f")))
-    trajectory = run(bad, throw=False)
-    assert trajectory.result == Result.NON_FINITE
-    assert trajectory.failed_at == 0
-    with pytest.raises(SimulationError, match="macro step 0"):
-        run(bad)
 
 
 STEPS_TAKEN = Counter()
@@ -80,25 +60,28 @@ def counted(q_f, params):
 def test_after_a_failure_no_step_is_taken(fpu):
     """The first of 40 steps fails: the potential is evaluated for the energies of the nodes and in that step, no more."""
     system, state = fpu.system.replace(fast_potential=counted), fpu.state()
-    run = prepare(system, fully_explicit(1), state, macro_dt=0.01, num_steps=40)
+    run = vm.prepare(system, vm.fully_explicit(1), state, macro_dt=0.01, num_steps=40)
     jax.effects_barrier()
     STEPS_TAKEN.clear()
-    trajectory = run(State(state.t, 1e200 * state.q_s, state.q_f, state.p_s, state.p_f), throw=False)
+    bad = vm.State(state.t, 1e200 * state.q_s, state.q_f, state.p_s, state.p_f)
+    trajectory = run(bad, throw=False)
     jax.effects_barrier()
     assert trajectory.failed_at == 0
+    assert trajectory.result == vm.Result.NON_FINITE
     assert 0 < STEPS_TAKEN["W"] <= 45  # 42, with the energies of 41 nodes; 82 if all steps were taken
     assert np.allclose(trajectory.t, 0.01 * np.arange(41), rtol=1e-15, atol=0)
+    with pytest.raises(vm.SimulationError, match="macro step 0"):
+        run(bad)
 
 
 def test_a_start_off_the_constraints_has_failed(tsp):
-    run = prepare(tsp.system, fully_explicit(2), tsp.state(), macro_dt=0.01, num_steps=2)
-    state = tsp.state()
-    trajectory = run(State(state.t, state.q_s, 1.01 * state.q_f, state.p_s, state.p_f), throw=False)
-    assert trajectory.result == Result.CONSTRAINT_VIOLATED
+    steps, state = {"macro_dt": 0.01, "num_steps": 2, "solver": vm.Solver("masses")}, tsp.state()
+    off = vm.State(state.t, state.q_s, 1.01 * state.q_f, state.p_s, state.p_f)
+    trajectory = vm.prepare(tsp.system, vm.fully_explicit(2), state, **steps)(off, throw=False)
+    assert trajectory.result == vm.Result.CONSTRAINT_VIOLATED
     assert np.isnan(trajectory.q_f).all()
-    off = State(state.t, state.q_s, 1.01 * state.q_f, state.p_s, state.p_f)
     with pytest.raises(ValueError, match="simulate: the positions of the state violate constraint, row 0"):
-        simulate(tsp.system, fully_explicit(2), off, macro_dt=0.01, num_steps=2)
+        vm.simulate(tsp.system, vm.fully_explicit(2), off, **steps)
 
 
 @pytest.mark.parametrize(
@@ -109,26 +92,21 @@ def test_a_start_off_the_constraints_has_failed(tsp):
         ({"macro_dt": -0.01}, "run: macro_dt is -0.01; it must be a positive number"),
         ({"macro_dt": [0.01, 0.02]}, r"run: macro_dt has shape \(2,\)"),
         ({"state": 0.02}, "run: state is float; give a State"),
-        ({"state": State(np.nan, *4 * [np.zeros(3)])}, "run: the t of state is nan; it must be finite"),
+        ({"state": vm.State(np.nan, *4 * [np.zeros(3)])}, "run: the t of state is nan; it must be finite"),
         ({"params": {"omega": np.ones(2)}}, "give the pytree of system.params"),
-        ({"state": State(0.0, *4 * [np.zeros(2)])}, "the run was prepared for"),
+        ({"state": vm.State(0.0, *4 * [np.zeros(2)])}, "the run was prepared for"),
     ],
 )
 def test_bad_changes_are_refused(fpu, changes, message):
-    run = prepare(fpu.system, fully_explicit(3), fpu.state(), **STEPS)
+    run = vm.prepare(fpu.system, vm.fully_explicit(3), fpu.state(), **STEPS)
     with pytest.raises(ValueError, match=message):
         run(**changes)
 
 
-def test_tracers_are_refused(fpu):
+def test_tracers_and_short_floats_are_refused(fpu):
     with pytest.raises(ValueError, match="prepare: arguments are tracers"):
-        jax.jit(lambda state: prepare(fpu.system, fully_explicit(3), state, **STEPS)().q_f)(fpu.state())
-
-
-def test_short_floats_are_refused(fpu):
-    run = prepare(
-        fpu.system.replace(fast_potential=watched, params={"omega": 30.0}), fully_implicit(3), fpu.state(), **STEPS
-    )
+        jax.jit(lambda state: vm.prepare(fpu.system, vm.fully_explicit(3), state, **STEPS)().q_f)(fpu.state())
+    run = vm.prepare(fpu.system.replace(params={"omega": 30.0}), vm.fully_explicit(3), fpu.state(), **STEPS)
     with pytest.raises(ValueError, match=r"params\['omega'\] has dtype float32; give float64"):
         run(params={"omega": np.float32(30.0)})
     short = jax.tree.map(lambda a: np.asarray(a, dtype=np.float32), fpu.state())

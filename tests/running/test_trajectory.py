@@ -2,6 +2,7 @@
 
 import errno
 from dataclasses import replace
+from typing import Any
 
 import equinox as eqx
 import numpy as np
@@ -9,25 +10,34 @@ import pytest
 
 import vmri_jax as vm
 from tests.support import joined
-from vmri_jax import Result, Save, State, Trajectory, explicit_slow, simulate
 
+SCHEME = vm.explicit_slow(3)
 FIELDS = ("t", "q_s", "q_f", "p_s", "p_f", "energy", "constraint_residual")
 
 
 @pytest.fixture(scope="module")
 def trajectory(tsp):
-    return simulate(tsp.system, explicit_slow(3), tsp.state(), macro_dt=0.02, num_steps=12, save=Save(3, micro=True))
+    return vm.simulate(tsp.system, SCHEME, tsp.state(), macro_dt=0.02, num_steps=12, save=vm.Save(3, micro=True))
 
 
-def test_save_and_load_keep_everything(trajectory, tmp_path):
+def test_save_and_load_keep_everything(tsp, trajectory, tmp_path):
     trajectory.save(tmp_path / "run.npz")
-    loaded = Trajectory.load(tmp_path / "run.npz")
+    loaded = vm.Trajectory.load(tmp_path / "run.npz")
     pairs = [(getattr(trajectory, name), getattr(loaded, name)) for name in (*FIELDS, "t_micro", "q_f_micro", "result")]
     for a, b in [*pairs, *zip(trajectory.info, loaded.info, strict=True)]:
         assert np.asarray(a).dtype == np.asarray(b).dtype
         assert np.array_equal(a, b)
     assert loaded.success
-    assert isinstance(loaded.final_state, State)
+    assert isinstance(loaded.final_state, vm.State)
+    with np.load(tmp_path / "run.npz", allow_pickle=False) as data:
+        assert set(data.files) >= {*FIELDS, "iterations", "residual"}
+        assert all(data[name].dtype != object for name in data.files)
+    again = vm.simulate(tsp.system, SCHEME, loaded.final_state, macro_dt=0.02, num_steps=12, save=3)
+    assert float(again.t[0]) == pytest.approx(0.24)
+    assert np.array_equal(again.q_f[0], trajectory.q_f[-1])
+    assert float(again.constraint_residual.max()) < 1e-12
+    again.save(tmp_path / "again.npz")
+    assert vm.Trajectory.load(tmp_path / "again.npz").q_f_micro is None
 
 
 def test_a_file_is_not_lost_to_a_full_disk(trajectory, tmp_path, monkeypatch):
@@ -39,79 +49,34 @@ def test_a_file_is_not_lost_to_a_full_disk(trajectory, tmp_path, monkeypatch):
     monkeypatch.setattr(np, "savez_compressed", full)
     with pytest.raises(OSError, match="No space left"):
         trajectory.save(tmp_path / "run.npz")
-    assert Trajectory.load(tmp_path / "run.npz").t.shape == (5,)
+    assert vm.Trajectory.load(tmp_path / "run.npz").t.shape == (5,)
     assert [path.name for path in tmp_path.iterdir()] == ["run.npz"]
 
 
-def test_a_run_without_micro_nodes_loads_without_them(tsp, tmp_path):
-    run = simulate(tsp.system, explicit_slow(3), tsp.state(), macro_dt=0.02, num_steps=2)
-    run.save(tmp_path / "run.npz")
-    assert Trajectory.load(tmp_path / "run.npz").q_f_micro is None
-
-
-def test_files_hold_no_pickles(trajectory, tmp_path):
-    trajectory.save(tmp_path / "run.npz")
-    with np.load(tmp_path / "run.npz", allow_pickle=False) as data:
-        assert set(data.files) >= {*FIELDS, "iterations", "residual"}
-        assert all(data[name].dtype != object for name in data.files)
-
-
-def test_a_loaded_run_is_resumed(tsp, trajectory, tmp_path):
-    trajectory.save(tmp_path / "run.npz")
-    state = Trajectory.load(tmp_path / "run.npz").final_state
-    resumed = simulate(tsp.system, explicit_slow(3), state, macro_dt=0.02, num_steps=12, save=Save(3, micro=True))
-    assert float(resumed.t[0]) == pytest.approx(0.24)
-    assert np.array_equal(resumed.q_f[0], trajectory.q_f[-1])
-    assert float(resumed.constraint_residual.max()) < 1e-12
-
-
-def test_missing_file(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"nowhere.npz does not exist; give the .npz file of a saved"):
-        Trajectory.load(tmp_path / "nowhere.npz")
-
-
-def test_foreign_npz_file(tmp_path):
-    np.savez(tmp_path / "foreign.npz", t=np.arange(3.0))
-    with pytest.raises(
-        ValueError, match=r"foreign.npz is a .npz file but no trajectory of Trajectory.save of this version"
-    ):
-        Trajectory.load(tmp_path / "foreign.npz")
-
-
-def test_something_that_is_no_npz_file(tmp_path):
-    (tmp_path / "text.npz").write_text("t q_s q_f")
-    with pytest.raises(ValueError, match=r"text.npz cannot be read as a .npz file"):
-        Trajectory.load(tmp_path / "text.npz")
-
-
-@pytest.mark.parametrize("part", [0.3, 0.9])
-def test_truncated_file(trajectory, tmp_path, part):
+def test_files_that_are_no_trajectories(trajectory, tmp_path):
     path = tmp_path / "run.npz"
+
+    def refused(message, error: type[Exception] = ValueError):
+        with pytest.raises(error, match=message):
+            vm.Trajectory.load(path)
+
+    refused(r"run.npz does not exist; give the .npz file of a saved", FileNotFoundError)
+    np.savez(path, t=np.arange(3.0))
+    refused(r"run.npz is a .npz file but no trajectory of Trajectory.save of this version")
+    path.write_text("t q_s q_f")
+    refused(r"run.npz cannot be read as a .npz file")
     trajectory.save(path)
     whole = path.read_bytes()
-    path.write_bytes(whole[: int(part * len(whole))])
-    with pytest.raises(ValueError, match=r"run.npz cannot be read as a .npz file .*damaged"):
-        Trajectory.load(path)
-
-
-def test_damaged_settings(trajectory, tmp_path):
-    path = tmp_path / "run.npz"
-    trajectory.save(path)
     with np.load(path) as data:
-        arrays = {name: data[name] for name in data.files}
-    np.savez(path, **arrays, settings=np.array("{}"))
-    with pytest.raises(ValueError, match=r"run.npz is a damaged trajectory: no names or settings"):
-        Trajectory.load(path)
-
-
-def test_trajectory_with_a_field_missing(trajectory, tmp_path):
-    path = tmp_path / "run.npz"
-    trajectory.save(path)
-    with np.load(path) as data:
-        arrays = {name: data[name] for name in data.files if name != "p_f"}
-    np.savez(path, **arrays)
-    with pytest.raises(ValueError, match=r"run.npz"):
-        Trajectory.load(path)
+        arrays: dict[str, Any] = {name: data[name] for name in data.files}
+    for part in (0.3, 0.9):
+        path.write_bytes(whole[: int(part * len(whole))])
+        refused(r"run.npz cannot be read as a .npz file .*damaged")
+    settings: Any = np.array("{}")
+    np.savez(path, **arrays | {"settings": settings})
+    refused(r"run.npz is a damaged trajectory: no names or settings")
+    np.savez(path, **{name: array for name, array in arrays.items() if name != "p_f"})
+    refused(r"run.npz")
 
 
 def test_xarray_dataset(trajectory):
@@ -129,9 +94,9 @@ def test_xarray_dataset(trajectory):
 @pytest.mark.parametrize("at", [0, 1])
 def test_the_status_of_all_pieces(trajectory, at):
     pieces = [trajectory, trajectory]
-    roundoff = np.asarray(int(Result.CONVERGED_AT_ROUNDOFF))
+    roundoff = np.asarray(int(vm.Result.CONVERGED_AT_ROUNDOFF))
     pieces[at] = eqx.tree_at(lambda piece: piece.result, trajectory, roundoff)
-    assert int(joined(pieces).result) == Result.CONVERGED_AT_ROUNDOFF
+    assert int(joined(pieces).result) == vm.Result.CONVERGED_AT_ROUNDOFF
 
 
 def test_a_run_refuses_a_system_with_other_parameters(tmp_path):

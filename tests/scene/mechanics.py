@@ -1,6 +1,7 @@
 """The mechanics of a scene as values of functions, which scenes of the same bodies share whatever their coordinates are."""
 
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -47,9 +48,9 @@ def values(system, t, q_s, q_f, v_s, v_f):
     return system.kinetic_energy(q_s, q_f, v_s, v_f), potential, power, system.constraints(t, q_s, q_f)
 
 
+@partial(jax.jit, static_argnums=0)
 def _of_bodies(kinematics, joints, q_s, q_f, v_s, v_f):
-    positions = jax.jit(kinematics.__call__)(q_s, q_f, joints)
-    return *positions, *jax.jit(kinematics.velocities)(q_s, q_f, v_s, v_f, joints)
+    return *kinematics(q_s, q_f, joints), *kinematics.velocities(q_s, q_f, v_s, v_f, joints)
 
 
 def by_directors(scene: Scene, bodies: dict) -> tuple[Scene, tuple]:

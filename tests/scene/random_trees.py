@@ -4,32 +4,15 @@ from typing import Any
 
 import numpy as np
 
-from vmri_jax.scene import (
-    Box,
-    Cylindrical,
-    Effect,
-    Fixed,
-    Gravity,
-    JointDamper,
-    JointSpring,
-    Planar,
-    Prismatic,
-    Revolute,
-    RigidBody,
-    Scene,
-    Screw,
-    Spherical,
-    Spring,
-    Universal,
-)
+from vmri_jax import scene as sc
 
-JOINTS = (Revolute, Prismatic, Cylindrical, Universal, Fixed, Spherical, Screw, Planar)
+JOINTS = (sc.Revolute, sc.Prismatic, sc.Cylindrical, sc.Universal, sc.Fixed, sc.Spherical, sc.Screw, sc.Planar)
 BODIES = 4
 FREEDOMS = 8
 """Fewest freedoms of the joints of a ring: six close it, and two more let it move and let one joint start elsewhere."""
 
 
-def random_scene(seed: int) -> tuple[Scene, dict[str, tuple[float, float]]]:
+def random_scene(seed: int) -> tuple[sc.Scene, dict[str, tuple[float, float]]]:
     """A scene in joint coordinates at rest, and random starts of all its freedoms (value, rate) by joint and freedom.
 
     Args:
@@ -41,19 +24,19 @@ def random_scene(seed: int) -> tuple[Scene, dict[str, tuple[float, float]]]:
     for i in range(BODIES):
         name, place = f"body {i}", random.normal(size=3)
         pace = "fast" if i and random.random() < 0.5 else "slow"
-        shape = Box(tuple(random.uniform(0.5, 1.5, size=3)))
-        bodies.append(RigidBody(name, random.uniform(0.5, 2.0), shape, place, random.normal(size=3), pace=pace))
+        shape = sc.Box(tuple(random.uniform(0.5, 1.5, size=3)))
+        bodies.append(sc.RigidBody(name, random.uniform(0.5, 2.0), shape, place, random.normal(size=3), pace=pace))
         if names:
             parent, kind = random.choice(names), JOINTS[random.integers(len(JOINTS))]
             pair = (parent, name) if random.random() < 0.5 else (name, parent)
             effects += _on_joint(kind, pair, f"joint {i}", random, starts)
         names.append(name)
     ends = ("body 2", random.normal(size=3) / 5), ("body 3", random.normal(size=3) / 5)
-    effects += [Gravity([0.3, 0.2, -1.0]), Spring(ends, 3.0, 0.4)]
-    return Scene(bodies, effects, coordinates="joint"), starts
+    effects += [sc.Gravity([0.3, 0.2, -1.0]), sc.Spring(ends, 3.0, 0.4)]
+    return sc.Scene(bodies, effects, coordinates="joint"), starts
 
 
-def random_ring(seed: int) -> tuple[Scene, dict[str, dict[str, tuple[float, float]]]]:
+def random_ring(seed: int) -> tuple[sc.Scene, dict[str, dict[str, tuple[float, float]]]]:
     """As `random_scene`, of bodies in one closed loop, from the ground back to the ground or from a free body back to it.
 
     Args:
@@ -66,29 +49,30 @@ def random_ring(seed: int) -> tuple[Scene, dict[str, dict[str, tuple[float, floa
         kinds = [JOINTS[i] for i in random.integers(len(JOINTS), size=len(names))]
     bodies, effects, starts = [], [], {}
     for name in names[-BODIES:]:
-        shape = Box(tuple(random.uniform(0.5, 1.5, size=3)))
-        bodies.append(RigidBody(name, random.uniform(0.5, 2.0), shape, random.normal(size=3), random.normal(size=3)))
+        shape = sc.Box(tuple(random.uniform(0.5, 1.5, size=3)))
+        bodies.append(sc.RigidBody(name, random.uniform(0.5, 2.0), shape, random.normal(size=3), random.normal(size=3)))
     for i, kind in enumerate(kinds):
         pair = names[i], names[(i + 1) % len(names)]
         effects += _on_joint(kind, pair[:: random.choice((-1, 1))], f"joint {i}", random, starts)
-    return Scene(bodies, [Gravity([0.3, 0.2, -1.0]), *effects], coordinates="joint"), starts
+    return sc.Scene(bodies, [sc.Gravity([0.3, 0.2, -1.0]), *effects], coordinates="joint"), starts
 
 
-def _on_joint(kind, pair, name: str, random, starts) -> list[Effect]:
+def _on_joint(kind, pair, name: str, random, starts) -> list[sc.Effect]:
     """A joint, with a spring and a damper in every freedom."""
     axis = random.normal(size=3)
     second = np.cross(axis, random.normal(size=3))
     axes: dict[str, Any] = (
         {}
-        if kind is Spherical
-        else {"axis": axis} | ({"second": second} if kind is Universal else {"pitch": 0.5} if kind is Screw else {})
+        if kind is sc.Spherical
+        else {"axis": axis}
+        | ({"second": second} if kind is sc.Universal else {"pitch": 0.5} if kind is sc.Screw else {})
     )
     joint = kind(pair, at=random.normal(size=3), name=name, **axes)
-    found: list[Effect] = [joint]
+    found: list[sc.Effect] = [joint]
     for freedom in joint.freedoms if joint.carries else ():
         label = f"{name} {freedom}"
         neutral = random.normal() / 5
-        found.append(JointSpring(name, 2.0, neutral, of=freedom, name=f"{label} spring"))
-        found.append(JointDamper(name, 0.1, of=freedom, name=f"{label} damper"))
+        found.append(sc.JointSpring(name, 2.0, neutral, of=freedom, name=f"{label} spring"))
+        found.append(sc.JointDamper(name, 0.1, of=freedom, name=f"{label} damper"))
         starts.setdefault(name, {})[freedom] = (random.normal() / 4, random.normal() / 4)
     return found

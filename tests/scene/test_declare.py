@@ -8,20 +8,8 @@ import numpy as np
 import pytest
 
 from vmri_jax import Refused, fully_implicit, initial_state, simulate, simulate_batch
+from vmri_jax import scene as sc
 from vmri_jax.mechanics.slots import free, leaves_by_name
-from vmri_jax.scene import (
-    Body,
-    Coulomb,
-    Effect,
-    Gravity,
-    JointSpring,
-    NBodyGravity,
-    PlaneContact,
-    RayleighDamping,
-    Revolute,
-    RigidBody,
-    Scene,
-)
 from vmri_jax.scene.declare import array, common, names, number, positive, vector
 
 
@@ -31,7 +19,7 @@ def turned(q, params=None):
     return jnp.arctan2(q[..., 1], q[..., 0])
 
 
-class TorsionSpring(Effect):
+class TorsionSpring(sc.Effect):
     """A spring that turns pointers in the plane back to an angle, ``V = sum k/2 (phi - phi_0)^2``."""
 
     bodies: Any = names()
@@ -48,12 +36,12 @@ class TorsionSpring(Effect):
         return jnp.sum(params["stiffness"] / 2 * (turned(q) - params["angle"]) ** 2)
 
 
-POINTERS = [Body("a", 1.0, [1.0, 0.0], [0.0, 0.3], pace="slow"), Body("b", 1.0, [0.0, 2.0], pace="slow")]
+POINTERS = [sc.Body("a", 1.0, [1.0, 0.0], [0.0, 0.3], pace="slow"), sc.Body("b", 1.0, [0.0, 2.0], pace="slow")]
 
 
 @pytest.mark.compiles
 def test_one_class_is_enough():
-    scene = Scene(POINTERS, [TorsionSpring(["a", "b"], [1.0, 4.0])])
+    scene = sc.Scene(POINTERS, [TorsionSpring(["a", "b"], [1.0, 4.0])])
     assert np.allclose(scene.params["torsion_springs"]["angle"], [0.0, np.pi / 2])
     q = jnp.array([1.0, 1.0, 0.0, 2.0])
     potential = scene.system().slow_potential
@@ -71,16 +59,16 @@ def test_one_class_is_enough():
         (POINTERS, TorsionSpring("a", [1.0, 2.0]), r"stiffness has shape \(2,\); give one number"),
         (POINTERS, TorsionSpring("c", 1.0), "there is no body 'c'"),
         (POINTERS, TorsionSpring("a", 1.0, np.inf), "torsion_springs: angle is inf, which is not finite"),
-        ([Body("a", 1.0, np.ones(3))], TorsionSpring("a", 1.0), "a has 3 coordinates; .* points of dimension 2"),
+        ([sc.Body("a", 1.0, np.ones(3))], TorsionSpring("a", 1.0), "a has 3 coordinates; .* points of dimension 2"),
         (POINTERS, TorsionSpring([], 1.0), r"torsion_springs: bodies is \[\]; give the name of a body"),
     ],
 )
 def test_declarations_are_checked(bodies, effect, message):
     with pytest.raises(ValueError, match=message):
-        Scene(bodies, [effect])
+        sc.Scene(bodies, [effect])
 
 
-class Everything(Effect):
+class Everything(sc.Effect):
     """One field of each kind."""
 
     between: Any = names(2, pairs=True, default=None)
@@ -98,7 +86,7 @@ class Everything(Effect):
         return jnp.zeros(())
 
 
-class Wind(Effect):
+class Wind(sc.Effect):
     """A vector for all bodies."""
 
     bodies: Any = names(default=None)
@@ -113,43 +101,37 @@ class Wind(Effect):
 
 
 def test_kinds_of_fields():
-    bodies = [*POINTERS, Body("c", 3.0, [5.0, 5.0], pace="slow")]
-    params = Scene(bodies, [Everything(), Wind()]).params
+    bodies = [*POINTERS, sc.Body("c", 3.0, [5.0, 5.0], pace="slow")]
+    params = sc.Scene(bodies, [Everything(), Wind()]).params
     shapes = {name: np.shape(value) for name, value in params["everything"].items()}
     assert shapes == {"free": (), "radius": (), "line": (3, 2), "table": (2, 2), "mass_a": (3,), "mass_b": (3,)}
     assert params["everything"]["mass_b"].tolist() == [1.0, 3.0, 3.0]
     assert params["wind"]["direction"].shape == (2,)
     with pytest.raises(ValueError, match=r"everything: radius is -1.0; it must be at least zero"):
-        Scene(bodies, [Everything(radius=-1.0)])
+        sc.Scene(bodies, [Everything(radius=-1.0)])
     with pytest.raises(ValueError, match=r"everything: line has shape \(3,\); its bodies have dimension 2"):
-        Scene(bodies, [Everything(line=np.ones(3))])
+        sc.Scene(bodies, [Everything(line=np.ones(3))])
     with pytest.raises(ValueError, match=r"wind: direction has shape \(3,\), a has dimension 2; they must agree"):
-        Scene(bodies, [Wind(direction=np.ones(3))])
+        sc.Scene(bodies, [Wind(direction=np.ones(3))])
     with pytest.raises(ValueError, match="everything: between is \\('a',\\); give at least two bodies"):
-        Scene(bodies, [Everything(("a",))])
+        sc.Scene(bodies, [Everything(("a",))])
 
 
 def test_incomplete_classes_of_effects_say_what_they_lack():
     def function(q, params):
         return jnp.sum((q[0] - q[1]) ** 2)
 
-    body = {
-        "kind": "potential",
-        "function": staticmethod(function),
-        "pairs": names(2),
-        "__annotations__": {"pairs": Any},
-    }
+    alone = {"kind": "potential", "function": staticmethod(function)}
+    body = {**alone, "pairs": names(2), "__annotations__": {"pairs": Any}}
     classes = {
-        "has no kind; write kind = one of 'kinetic'": type("Kindless", (Effect,), {**body, "kind": None}),
-        "has no field with names of bodies": type(
-            "Alone", (Effect,), {name: body[name] for name in ("kind", "function")}
-        ),
-        "function without @staticmethod": type("Bound", (Effect,), {**body, "function": function}),
+        "has no kind; write kind = one of 'kinetic'": type("Kindless", (sc.Effect,), {**body, "kind": None}),
+        "has no field with names of bodies": type("Alone", (sc.Effect,), alone),
+        "function without @staticmethod": type("Bound", (sc.Effect,), {**body, "function": function}),
     }
     for message, cls in classes.items():
         with pytest.raises(TypeError, match=f"the class of effects {cls.__name__} .*{message}"):
             cls(("a", "b"))
-    magnets: Any = type("Magnets", (Effect,), dict(body))
+    magnets: Any = type("Magnets", (sc.Effect,), dict(body))
     assert magnets(("a", "b")).name == "magnets"
 
 
@@ -171,18 +153,18 @@ HELD = {
 @pytest.mark.parametrize("coordinates", HELD)
 def test_copies_of_the_numbers_of_bodies_are_not_changed_alone(coordinates):
     bodies = [
-        RigidBody("bar", 2.0, [1.0, 1.0, 1.0], [0.0, 0.0, 0.0]),
-        *(Body(name, 1.0, [x, 0.0, 0.0]) for name, x in (("a", 1.0), ("b", 2.0))),
+        sc.RigidBody("bar", 2.0, [1.0, 1.0, 1.0], [0.0, 0.0, 0.0]),
+        *(sc.Body(name, 1.0, [x, 0.0, 0.0]) for name, x in (("a", 1.0), ("b", 2.0))),
     ]
     effects = [
-        Revolute(("ground", "bar"), at=[0, 0, 0], name="hinge"),
-        JointSpring("hinge", 3.0),
-        Gravity(),
-        NBodyGravity(1.0, ["a", "b"]),
-        Coulomb({"a": 1.0, "b": 2.0}),
-        RayleighDamping(mass=0.1),
+        sc.Revolute(("ground", "bar"), at=[0, 0, 0], name="hinge"),
+        sc.JointSpring("hinge", 3.0),
+        sc.Gravity(),
+        sc.NBodyGravity(1.0, ["a", "b"]),
+        sc.Coulomb({"a": 1.0, "b": 2.0}),
+        sc.RayleighDamping(mass=0.1),
     ]
-    problem = Scene(bodies, effects, coordinates=coordinates).problem()
+    problem = sc.Scene(bodies, effects, coordinates=coordinates).problem()
     system, params = problem.system, problem.system.params
     names_of, _ = leaves_by_name(params)
     copies = {f"{name}.{key}" for name, keys in (COPIES | HELD[coordinates]).items() for key in keys}
@@ -213,8 +195,8 @@ def test_copies_of_the_numbers_of_bodies_are_not_changed_alone(coordinates):
 
 @pytest.mark.compiles
 def test_the_length_of_a_normal_changes_nothing():
-    contact: Any = PlaneContact(point=[0.0, 0.0], normal=[0.0, 2.0], stiffness=1e3, smoothing=0.1)
-    system: Any = Scene([Body("a", 1.0, [0.3, 0.05], pace="slow")], [contact]).system()
+    contact: Any = sc.PlaneContact(point=[0.0, 0.0], normal=[0.0, 2.0], stiffness=1e3, smoothing=0.1)
+    system: Any = sc.Scene([sc.Body("a", 1.0, [0.3, 0.05], pace="slow")], [contact]).system()
     q, none = jnp.array([0.3, 0.05]), jnp.zeros(0)
     depth = 0.1 * np.log1p(np.exp(-0.5))
     for normal in ([0.0, 2.0], [0.0, 6.0]):

@@ -13,27 +13,12 @@ import pytest
 import vmri_jax as vm
 from tests.scene.mechanics import assert_mechanics_as_by_directors, mechanics
 from tests.scene.random_trees import random_scene
+from vmri_jax import scene as sc
 from vmri_jax.animation.drawing import Drawing
 from vmri_jax.animation.motion import motion as motion_of
 from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.projection import closed_masses
-from vmri_jax.scene import (
-    Ball,
-    Box,
-    Controlled,
-    Cylindrical,
-    Gravity,
-    JointDrive,
-    JointLimit,
-    JointMotion,
-    JointSpring,
-    Revolute,
-    RigidBody,
-    RotorInertia,
-    Scene,
-    angular_momentum,
-    trees,
-)
+from vmri_jax.scene import trees
 from vmri_jax.scene.body_motions import accelerations
 
 DRAWN = (0, 6, 11)
@@ -98,13 +83,13 @@ DRIFT = np.array([0.1, 0.0, 0.0])
 def satellite(coordinates: Any = "joint", stiffness=20.0, along=0.0, rate: Any = "auto"):
     """A hub that floats, slow, with a panel on a hinge, fast."""
     place = np.array([0.1, 0.9, 0.0])
-    hub = RigidBody("hub", 5.0, Box((1, 1, 1)), [0, 0, 0], spin=SPIN, velocity=DRIFT, pace="slow")
-    panel = RigidBody(
-        "panel", 1.0, Box((0.4, 0.8, 0.03)), place, spin=SPIN, velocity=np.cross(SPIN, place) + DRIFT, pace="fast"
+    hub = sc.RigidBody("hub", 5.0, sc.Box((1, 1, 1)), [0, 0, 0], spin=SPIN, velocity=DRIFT, pace="slow")
+    panel = sc.RigidBody(
+        "panel", 1.0, sc.Box((0.4, 0.8, 0.03)), place, spin=SPIN, velocity=np.cross(SPIN, place) + DRIFT, pace="fast"
     )
-    hinge = Revolute(("hub", "panel"), at=np.array([0, 0.5, 0]) + along * np.array([0, 0.1, 0]), axis=[1, 0, 0.2])
-    effects = [replace(hinge, name="hinge"), JointSpring("hinge", stiffness, 0.3, rate=rate)]
-    return Scene([hub, panel], effects, coordinates=coordinates)
+    hinge = sc.Revolute(("hub", "panel"), at=np.array([0, 0.5, 0]) + along * np.array([0, 0.1, 0]), axis=[1, 0, 0.2])
+    effects = [replace(hinge, name="hinge"), sc.JointSpring("hinge", stiffness, 0.3, rate=rate)]
+    return sc.Scene([hub, panel], effects, coordinates=coordinates)
 
 
 @pytest.fixture(scope="module")
@@ -128,7 +113,7 @@ def test_a_floating_root_keeps_all_momenta(run):
     for name in ("hub", "panel"):
         assert run.position(name).shape == run.velocity(name).shape == run.momentum(name).shape == (21, 12)
     momentum = run.momentum("hub")[:, :3] + run.momentum("panel")[:, :3]
-    turning, more = (angular_momentum(run.position(name), run.momentum(name)) for name in ("hub", "panel"))
+    turning, more = (sc.angular_momentum(run.position(name), run.momentum(name)) for name in ("hub", "panel"))
     turning = turning + more
     assert np.abs(momentum - momentum[0]).max() < 1e-13  # of 0.6
     assert np.abs(turning - turning[0]).max() < 1e-13  # of 0.4
@@ -152,9 +137,9 @@ def test_reaction_forces_are_those_of_the_rows(run):
 
 def test_reaction_forces_of_a_joint_with_a_rotor():
     """A rotor adds to the momenta of directors: ``M v`` of the body alone is the momentum of a slower motion, with other forces."""
-    arm = RigidBody("arm", 2.0, [0.2, 0.3, 0.4], [0.5, 0.0, 0.0])
-    hinge = Revolute(("ground", "arm"), at=[0.0, 0.0, 0.0], axis=[0.0, 0.0, 1.0], name="hinge")
-    scene = Scene([arm], [hinge, RotorInertia("hinge", 3.0)], coordinates="joint").with_rates({"hinge": 2.0})
+    arm = sc.RigidBody("arm", 2.0, [0.2, 0.3, 0.4], [0.5, 0.0, 0.0])
+    hinge = sc.Revolute(("ground", "arm"), at=[0.0, 0.0, 0.0], axis=[0.0, 0.0, 1.0], name="hinge")
+    scene = sc.Scene([arm], [hinge, sc.RotorInertia("hinge", 3.0)], coordinates="joint").with_rates({"hinge": 2.0})
     run = vm.simulate(scene, vm.fully_implicit(1), macro_dt=0.1, num_steps=3)
     twin = scene.by_directors(run)
     np.testing.assert_allclose(twin.velocity("arm"), run.velocity("arm"), atol=1e-12)
@@ -230,19 +215,19 @@ def angle(t, params):
 
 def test_what_acts_in_a_joint_acts_on_its_coordinate():
     bodies = [
-        RigidBody("arm", 2.0, Ball(0.3), [1, 0, 0], pace="slow"),
-        RigidBody("sleeve", 1.0, Ball(0.2), [1, 0.5, 0], pace="fast"),
+        sc.RigidBody("arm", 2.0, sc.Ball(0.3), [1, 0, 0], pace="slow"),
+        sc.RigidBody("sleeve", 1.0, sc.Ball(0.2), [1, 0.5, 0], pace="fast"),
     ]
     effects = [
-        Gravity([0, 0, -1.0]),
-        Revolute(("ground", "arm"), at=[0, 0, 0], axis=[0, 1, 0], name="hinge"),
-        Cylindrical(("sleeve", "arm"), at=[1, 0.2, 0], axis=[0, 1, 0], name="guide"),
-        JointDrive("hinge", torque, {"size": 0.3}),
-        JointLimit("guide", -0.1, 0.1, stiffness=50.0, smoothing=0.01, of="slide"),
-        JointMotion("guide", angle, {"size": 0.5}, of="turn"),
-        Controlled("hinge", "torque"),
+        sc.Gravity([0, 0, -1.0]),
+        sc.Revolute(("ground", "arm"), at=[0, 0, 0], axis=[0, 1, 0], name="hinge"),
+        sc.Cylindrical(("sleeve", "arm"), at=[1, 0.2, 0], axis=[0, 1, 0], name="guide"),
+        sc.JointDrive("hinge", torque, {"size": 0.3}),
+        sc.JointLimit("guide", -0.1, 0.1, stiffness=50.0, smoothing=0.01, of="slide"),
+        sc.JointMotion("guide", angle, {"size": 0.5}, of="turn"),
+        sc.Controlled("hinge", "torque"),
     ]
-    scene = Scene(bodies, effects, coordinates="joint").with_joints({"guide": {"slide": 0.12}})
+    scene = sc.Scene(bodies, effects, coordinates="joint").with_joints({"guide": {"slide": 0.12}})
     q_s, q_f, *_ = scene.start
     assert [q_s.tolist(), q_f.tolist()] == [[0.0], [0.0, 0.12]]
     system = scene.system()
@@ -253,19 +238,21 @@ def test_what_acts_in_a_joint_acts_on_its_coordinate():
     assert_mechanics_as_by_directors(scene, t=0.7)
 
 
-def four_bar(coordinates: Any = "joint", second: Any = Revolute):
+def four_bar(coordinates: Any = "joint", second: Any = sc.Revolute):
     """A crank, a rod and a rocker between hinges, in a plane."""
     pins = np.array([[0, 0, 0], [0.3, 0.95, 0], [2, 1.5, 0], [2, 0, 0]])
     names, bodies, effects = ("ground", "crank", "rod", "rocker", "ground"), [], []
     for name, start, end in zip(names[1:], pins[:-1], pins[1:], strict=False):
         way = end - start
-        shape = Box((float(np.linalg.norm(way)), 0.1, 0.1))
+        shape = sc.Box((float(np.linalg.norm(way)), 0.1, 0.1))
         turn = [0, 0, np.arctan2(way[1], way[0])]
-        bodies.append(RigidBody(name, 1.0, shape, (start + end) / 2, rotation=turn, pace="slow"))
+        bodies.append(sc.RigidBody(name, 1.0, shape, (start + end) / 2, rotation=turn, pace="slow"))
     for i, pin in enumerate(pins):
-        joint = second if i == 1 else Revolute
+        joint = second if i == 1 else sc.Revolute
         effects.append(joint(names[i : i + 2], at=pin, axis=[0, 0, 1], name=f"pin {i}"))
-    return Scene(bodies, [Gravity([0, -9.81, 0]), *effects], coordinates=coordinates, redundant="drop", project=True)
+    return sc.Scene(
+        bodies, [sc.Gravity([0, -9.81, 0]), *effects], coordinates=coordinates, redundant="drop", project=True
+    )
 
 
 def test_a_loop_is_cut_at_one_joint():
@@ -284,15 +271,15 @@ def test_deep_trees_keep_directors_where_the_scene_chooses(monkeypatch):
     """A chain of three bars that hangs on the ground, beside a single one."""
     monkeypatch.setattr(trees, "LONGEST", 2)
     names = ["ground", "first", "second", "third"]
-    bars = [RigidBody(name, 1.0, Box((0.1, 0.1, 1)), [0, 0, -0.5 - i]) for i, name in enumerate(names[1:])]
-    pins = [Revolute(pair, [0, 0, -i], axis=[0, 1, 0], name=f"pin {i}") for i, pair in enumerate(pairwise(names))]
-    alone = RigidBody("alone", 1.0, Box((0.1, 0.1, 1)), [2, 0, -0.5])
-    pin = Revolute(("ground", "alone"), [2, 0, 0], axis=[0, 1, 0], name="pin")
-    scene = Scene([*bars, alone], [*pins, pin], coordinates="auto")
+    bars = [sc.RigidBody(name, 1.0, sc.Box((0.1, 0.1, 1)), [0, 0, -0.5 - i]) for i, name in enumerate(names[1:])]
+    pins = [sc.Revolute(pair, [0, 0, -i], axis=[0, 1, 0], name=f"pin {i}") for i, pair in enumerate(pairwise(names))]
+    alone = sc.RigidBody("alone", 1.0, sc.Box((0.1, 0.1, 1)), [2, 0, -0.5])
+    pin = sc.Revolute(("ground", "alone"), [2, 0, 0], axis=[0, 1, 0], name="pin")
+    scene = sc.Scene([*bars, alone], [*pins, pin], coordinates="auto")
     assert [branch.child for branch in scene.branches] == ["alone"]
     assert scene.start[0].size == 3 * 12 + 1
     monkeypatch.setattr(trees, "LONGEST", 3)
-    assert Scene([*bars, alone], [*pins, pin], coordinates="auto").start[0].size == 4
+    assert sc.Scene([*bars, alone], [*pins, pin], coordinates="auto").start[0].size == 4
 
 
 def test_joints_of_a_loop_follow_those_that_are_named():
@@ -312,4 +299,4 @@ def test_joints_of_a_loop_follow_those_that_are_named():
 
 def test_of_a_loop_the_joint_with_the_fewest_rows_is_cut():
     assert {branch.joint.name for branch in four_bar().branches} == {"pin 0", "pin 1", "pin 3"}
-    assert {branch.joint.name for branch in four_bar(second=Cylindrical).branches} == {"pin 0", "pin 2", "pin 3"}
+    assert {branch.joint.name for branch in four_bar(second=sc.Cylindrical).branches} == {"pin 0", "pin 2", "pin 3"}

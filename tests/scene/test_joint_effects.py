@@ -6,19 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from vmri_jax.scene import (
-    Cylinder,
-    Gravity,
-    JointDamper,
-    JointDrive,
-    JointLimit,
-    JointMotion,
-    JointSpring,
-    RayleighDamping,
-    Revolute,
-    RigidBody,
-    Scene,
-)
+from vmri_jax import scene as sc
 from vmri_jax.scene.body_motions import accelerations, state_of
 from vmri_jax.scene.rows import ConstraintRows
 
@@ -38,10 +26,10 @@ def swing(t, params):
 
 
 EFFECTS = {  # the effect in the hinge of this name, and the torque about the hinge at TIME, ANGLE and RATE
-    "spring": (JointSpring("spring", 30.0, 0.1), -30.0 * (ANGLE - 0.1)),
-    "drive": (JointDrive("drive", torque, {"size": 3.0}), 3.0 * TIME),
-    "damper": (JointDamper("damper", 2.0), -2.0 * RATE),
-    "limit": (JointLimit("limit", -0.2, 0.3, stiffness=2000.0, smoothing=0.002), -2000.0 * (ANGLE - 0.3)),
+    "spring": (sc.JointSpring("spring", 30.0, 0.1), -30.0 * (ANGLE - 0.1)),
+    "drive": (sc.JointDrive("drive", torque, {"size": 3.0}), 3.0 * TIME),
+    "damper": (sc.JointDamper("damper", 2.0), -2.0 * RATE),
+    "limit": (sc.JointLimit("limit", -0.2, 0.3, stiffness=2000.0, smoothing=0.002), -2000.0 * (ANGLE - 0.3)),
 }
 
 
@@ -50,10 +38,10 @@ def bars(turned=0.0, spin=0.0):
     names, tilt = (*EFFECTS, "free", "motion"), TILT + turned
     out = np.array([np.sin(tilt), 0.0, -np.cos(tilt)])
     bodies = [
-        RigidBody(
+        sc.RigidBody(
             f"bar {name}",
             MASS,
-            Cylinder(0.1, 1.0),
+            sc.Cylinder(0.1, 1.0),
             LENGTH * out + 3.0 * i * Y,
             [0.0, -tilt, 0.0],
             spin=-spin * Y,
@@ -62,17 +50,17 @@ def bars(turned=0.0, spin=0.0):
         )
         for i, name in enumerate(names)
     ]
-    hinges = [Revolute(("ground", f"bar {name}"), 3.0 * i * Y, -Y, name=name) for i, name in enumerate(names)]
-    return bodies, [*hinges, Gravity(), *(effect for effect, _ in EFFECTS.values())]
+    hinges = [sc.Revolute(("ground", f"bar {name}"), 3.0 * i * Y, -Y, name=name) for i, name in enumerate(names)]
+    return bodies, [*hinges, sc.Gravity(), *(effect for effect, _ in EFFECTS.values())]
 
 
 def test_hinged_bars_obey_the_equation_of_the_compound_pendulum():
     """``I x'' = -m g l sin(tilt + x) + torque`` for slow and fast bars; the bar whose motion is given has the acceleration of this motion."""
     bodies, effects = bars()
     moved, same = bars(ANGLE, RATE)
-    given = JointMotion("motion", swing, {"far": 0.4})  # 0.4 t^2: at TIME the angle and rate of all bars
-    scene = Scene(bodies, [*effects, given], coordinates="directors")
-    state = state_of(Scene(moved, same, coordinates="directors"))
+    given = sc.JointMotion("motion", swing, {"far": 0.4})  # 0.4 t^2: at TIME the angle and rate of all bars
+    scene = sc.Scene(bodies, [*effects, given], coordinates="directors")
+    state = state_of(sc.Scene(moved, same, coordinates="directors"))
     seen = accelerations(scene, replace(state, t=jnp.asarray(TIME)))
     acceleration = {}
     for body, (q, _, a) in seen.items():  # sum d_i x d_i'' / 2, about -y
@@ -86,33 +74,38 @@ def test_hinged_bars_obey_the_equation_of_the_compound_pendulum():
 def test_a_given_motion_starts_where_the_joint_does():
     bodies, effects = bars()
     with pytest.raises(ValueError, match=r"joint_motion: path\(0\)"):
-        Scene(bodies, [*effects, JointMotion("motion", lambda t, params: 1.0 + t)])
+        sc.Scene(bodies, [*effects, sc.JointMotion("motion", lambda t, params: 1.0 + t)])
     with pytest.raises(ValueError, match=r"joint_motion: path returns shape \(2,\); it must return a number"):
-        Scene(bodies, [*effects, JointMotion("motion", lambda t, params: t * jnp.ones(2))])
+        sc.Scene(bodies, [*effects, sc.JointMotion("motion", lambda t, params: t * jnp.ones(2))])
     with pytest.raises(ValueError, match=r"pulse: history returns \(shape \(\)\); it must return"):
-        Scene(bodies, [*effects, JointDrive("motion", lambda t, params: (t,), name="pulse")])
+        sc.Scene(bodies, [*effects, sc.JointDrive("motion", lambda t, params: (t,), name="pulse")])
 
 
 def test_a_list_of_joints_is_refused():
     bodies, effects = bars()
     with pytest.raises(TypeError, match=r"joint_springs: joint is \['spring', 'free'\]"):
-        Scene(bodies, [*effects[:-4], JointSpring(["spring", "free"], 1.0)]).system()
+        sc.Scene(bodies, [*effects[:-4], sc.JointSpring(["spring", "free"], 1.0)]).system()
 
 
 def test_rayleigh_damping_of_a_spring_in_a_joint():
-    bar, hinge = RigidBody("bar", 2.0, [1.0, 1.0, 1.0], [0.0, 0.0, 0.0]), Revolute(("ground", "bar"), at=[0, 0, 0])
-    effects = [hinge, JointSpring(hinge.name, 3.0), RayleighDamping(stiffness=0.02)]
-    system, none = Scene([bar], effects, coordinates="joint").system(), jnp.zeros(0)
+    bar, hinge = (
+        sc.RigidBody("bar", 2.0, [1.0, 1.0, 1.0], [0.0, 0.0, 0.0]),
+        sc.Revolute(("ground", "bar"), at=[0, 0, 0]),
+    )
+    effects = [hinge, sc.JointSpring(hinge.name, 3.0), sc.RayleighDamping(stiffness=0.02)]
+    system, none = sc.Scene([bar], effects, coordinates="joint").system(), jnp.zeros(0)
     assert float(system.forces(0.0, jnp.array([0.4]), none, jnp.array([2.0]), none)[0][0]) == pytest.approx(-0.12)
 
 
 def test_motions_of_pairs_with_and_without_coordinates_have_the_names_of_their_pairs():
     """The pair of b closes a loop, and its angle comes from directors: its row is a term of its own, after those of the other pairs."""
-    bodies = [RigidBody(name, 1.0, [1.0, 1.0, 1.0], [x, 1.0, 0.0]) for name, x in (("a", 0.0), ("b", 1.0), ("e", 5.0))]
-    hinges = Revolute([("ground", name) for name in "abe"], [[0, 0, 0], [1, 0, 0], [5, 0, 0]], name="hinges")
-    pin = Revolute(("a", "b"), [0.5, 2.0, 0.0], name="pin")
-    effects = [hinges, pin, JointSpring("pin", 1.0), JointMotion("hinges", lambda t, params: 0.0 * t)]
-    sorting = Scene(bodies, effects, coordinates="joint", redundant="drop").sorting
+    bodies = [
+        sc.RigidBody(name, 1.0, [1.0, 1.0, 1.0], [x, 1.0, 0.0]) for name, x in (("a", 0.0), ("b", 1.0), ("e", 5.0))
+    ]
+    hinges = sc.Revolute([("ground", name) for name in "abe"], [[0, 0, 0], [1, 0, 0], [5, 0, 0]], name="hinges")
+    pin = sc.Revolute(("a", "b"), [0.5, 2.0, 0.0], name="pin")
+    effects = [hinges, pin, sc.JointSpring("pin", 1.0), sc.JointMotion("hinges", lambda t, params: 0.0 * t)]
+    sorting = sc.Scene(bodies, effects, coordinates="joint", redundant="drop").sorting
     rows, numbers = ConstraintRows(sorting), sorting.layout.numbers
     touched = {
         row.name: [name for name in ("hinges ground-a", "hinges ground-e", "pin") if np.any(gradient[numbers[name]])]

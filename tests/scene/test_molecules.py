@@ -7,50 +7,37 @@ import numpy as np
 import pytest
 
 import vmri_jax as vm
+from vmri_jax import scene as sc
 from vmri_jax.mechanics.invariants import potential_energy
-from vmri_jax.scene import (
-    Anchor,
-    Angle,
-    Body,
-    Coulomb,
-    Guide,
-    LennardJones,
-    Potential,
-    RigidLink,
-    Scene,
-    Spring,
-    Torsion,
-    within_bonds,
-)
 
 CHAIN = ["a", "b", "c", "d"]
 PLACES = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 0.6, 0.8]])
-BODIES = [Body(name, 1.0, place, pace="slow") for name, place in zip(CHAIN, PLACES, strict=True)]
+BODIES = [sc.Body(name, 1.0, place, pace="slow") for name, place in zip(CHAIN, PLACES, strict=True)]
 BONDS = list(itertools.pairwise(CHAIN))
 
 
 def energy(*effects) -> float:
-    scene = Scene(BODIES, effects)
+    scene = sc.Scene(BODIES, effects)
     q_s, q_f, *_ = scene.start
     return float(potential_energy(scene.system(), q_s, q_f))
 
 
 def test_a_negative_torsion_has_its_maximum_where_others_have_their_minimum():
-    plus, minus = (energy(Torsion(tuple(CHAIN), sign * 2.0, angle=0.3, multiplicity=2)) for sign in (1, -1))
+    plus, minus = (energy(sc.Torsion(tuple(CHAIN), sign * 2.0, angle=0.3, multiplicity=2)) for sign in (1, -1))
     assert minus == pytest.approx(-plus, rel=1e-14)
-    moved = energy(Torsion(tuple(CHAIN), 2.0, angle=0.3 + np.pi / 2, multiplicity=2))
+    moved = energy(sc.Torsion(tuple(CHAIN), 2.0, angle=0.3 + np.pi / 2, multiplicity=2))
     assert minus == pytest.approx(moved - 4.0, rel=1e-12)
 
 
 def test_pairs_within_so_many_bonds():
-    assert within_bonds(BONDS, 1) == BONDS
-    assert within_bonds(BONDS, 2) == [("a", "b"), ("a", "c"), ("b", "c"), ("b", "d"), ("c", "d")]
-    assert within_bonds(BONDS) == list(itertools.combinations(CHAIN, 2))
-    assert within_bonds([*BONDS, ("d", "a")], 2) == list(itertools.combinations(CHAIN, 2))  # a ring
+    assert sc.within_bonds(BONDS, 1) == BONDS
+    assert sc.within_bonds(BONDS, 2) == [("a", "b"), ("a", "c"), ("b", "c"), ("b", "d"), ("c", "d")]
+    assert sc.within_bonds(BONDS) == list(itertools.combinations(CHAIN, 2))
+    assert sc.within_bonds([*BONDS, ("d", "a")], 2) == list(itertools.combinations(CHAIN, 2))  # a ring
 
 
 @pytest.mark.parametrize(
-    "make", [lambda **k: LennardJones(0.3, 0.8, **k), lambda **k: Coulomb(dict.fromkeys(CHAIN, 0.5), 1.0, **k)]
+    "make", [lambda **k: sc.LennardJones(0.3, 0.8, **k), lambda **k: sc.Coulomb(dict.fromkeys(CHAIN, 0.5), 1.0, **k)]
 )
 def test_pairs_that_are_left_out(make):
     left = make(between=[("a", "d"), ("a", "c")])
@@ -58,17 +45,17 @@ def test_pairs_that_are_left_out(make):
     for exclude, message in (
         (["ab"], "'ab' is in exclude; give pairs of names"),
         ([("a", "e")], "exclude: there is no body 'e'"),
-        (within_bonds(BONDS), "exclude leaves no pair"),
+        (sc.within_bonds(BONDS), "exclude leaves no pair"),
     ):
         with pytest.raises(ValueError, match=message):
-            Scene(BODIES, [make(exclude=exclude)])
+            sc.Scene(BODIES, [make(exclude=exclude)])
 
 
-def molecule(**torsion) -> Scene:
+def molecule(**torsion) -> sc.Scene:
     """Bonds of 45, angles of 18 and torsion of 10 rad/s: no gap of a factor 3."""
-    bodies = [Body(name, 1.0, place) for name, place in zip(CHAIN, PLACES, strict=True)]
-    angles = Angle(list(zip(CHAIN, CHAIN[1:], CHAIN[2:], strict=False)), 80.0)
-    return Scene(bodies, [Spring(BONDS, 1000.0), angles, Torsion(tuple(CHAIN), 30.0, **torsion)])
+    bodies = [sc.Body(name, 1.0, place) for name, place in zip(CHAIN, PLACES, strict=True)]
+    angles = sc.Angle(list(zip(CHAIN, CHAIN[1:], CHAIN[2:], strict=False)), 80.0)
+    return sc.Scene(bodies, [sc.Spring(BONDS, 1000.0), angles, sc.Torsion(tuple(CHAIN), 30.0, **torsion)])
 
 
 def test_what_is_declared_slow_is_a_side_of_the_border():
@@ -83,18 +70,18 @@ def test_what_is_declared_slow_is_a_side_of_the_border():
 
 
 def test_terms_between_the_same_bodies_stay_together():
-    bodies = [Body(name, 1.0, place, pace="fast") for name, place in zip(CHAIN, PLACES, strict=True)]
-    torsion = Torsion([tuple(CHAIN)] * 2, [0.01, 30.0], multiplicity=[1, 3])
-    scene = Scene(bodies, [Spring(BONDS, 3000.0), torsion, Spring(("a", "d"), 1e-3, name="soft")])
+    bodies = [sc.Body(name, 1.0, place, pace="fast") for name, place in zip(CHAIN, PLACES, strict=True)]
+    torsion = sc.Torsion([tuple(CHAIN)] * 2, [0.01, 30.0], multiplicity=[1, 3])
+    scene = sc.Scene(bodies, [sc.Spring(BONDS, 3000.0), torsion, sc.Spring(("a", "d"), 1e-3, name="soft")])
     assert len([part for part in scene.sorting.placed if part.effect.name == "torsion"]) == 1
 
 
 def test_places_are_moved_onto_lengths_that_are_given():
-    bodies = [Body(name, 1.0, place + 1e-4, pace="fast") for name, place in zip(CHAIN, PLACES, strict=True)]
-    effects = [RigidLink(BONDS, 1.001, name="bonds"), Anchor("a", [0.0, 2.0, 0.0], 1.0, name="hook")]
+    bodies = [sc.Body(name, 1.0, place + 1e-4, pace="fast") for name, place in zip(CHAIN, PLACES, strict=True)]
+    effects = [sc.RigidLink(BONDS, 1.001, name="bonds"), sc.Anchor("a", [0.0, 2.0, 0.0], 1.0, name="hook")]
     with pytest.raises(ValueError, match=r"length of a-b is 1.001; it starts as 1; .*project=True"):
-        Scene(bodies, effects)
-    state = Scene(bodies, effects, project=True).state()
+        sc.Scene(bodies, effects)
+    state = sc.Scene(bodies, effects, project=True).state()
     places = np.asarray(state.q_f).reshape(4, 3)
     np.testing.assert_allclose(np.linalg.norm(np.diff(places, axis=0), axis=1), 1.001, rtol=1e-12)
     assert np.linalg.norm(places[0] - [0.0, 2.0, 0.0]) == pytest.approx(1.0, rel=1e-12)
@@ -105,10 +92,10 @@ def path(t, params):
 
 
 def test_a_guided_body_is_moved_onto_its_path():
-    bodies = [Body("a", 1.0, PLACES[0], pace="fast"), *BODIES[1:]]
+    bodies = [sc.Body("a", 1.0, PLACES[0], pace="fast"), *BODIES[1:]]
     with pytest.raises(ValueError, match="it must start there"):
-        Scene(bodies, [Guide("a", path)])
-    state = Scene(bodies, [Guide("a", path)], project=True).state()
+        sc.Scene(bodies, [sc.Guide("a", path)])
+    state = sc.Scene(bodies, [sc.Guide("a", path)], project=True).state()
     np.testing.assert_allclose(state.q_f, [0.1, 1.0, 0.0], atol=1e-12)
 
 
@@ -118,15 +105,15 @@ def numpy_potential(q, params):
 
 def test_custom_functions_are_tried_when_the_scene_is_made():
     with pytest.raises(ValueError, match=r"numpy_potential: function cannot be traced, line \d+ of test_molecules.py"):
-        Scene(BODIES, [Potential(numpy_potential, "a", {"k": 2.0})])
+        sc.Scene(BODIES, [sc.Potential(numpy_potential, "a", {"k": 2.0})])
     with pytest.raises(ValueError, match=r"pull: bodies is .*for several tuples of bodies write"):
-        Scene(BODIES, [Potential(numpy_potential, [("a", "b"), ("c", "d")], name="pull")])
+        sc.Scene(BODIES, [sc.Potential(numpy_potential, [("a", "b"), ("c", "d")], name="pull")])
 
 
 def test_a_run_that_loses_its_energy_is_told_about():
-    scene = Scene(
-        [Body("slow", 100.0, 0.0, pace="slow"), Body("fast", 1.0, 1.2, pace="fast")],
-        [Spring(("slow", "fast"), 100.0, 1.0)],
+    scene = sc.Scene(
+        [sc.Body("slow", 100.0, 0.0, pace="slow"), sc.Body("fast", 1.0, 1.2, pace="fast")],
+        [sc.Spring(("slow", "fast"), 100.0, 1.0)],
     )
     run = vm.simulate(scene, vm.fully_explicit(1), macro_dt=0.05, num_steps=200)
     assert run.success

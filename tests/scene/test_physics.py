@@ -6,19 +6,8 @@ import numpy as np
 import pytest
 
 from vmri_jax import fully_implicit, simulate
+from vmri_jax import scene as sc
 from vmri_jax.mechanics.motion import motion
-from vmri_jax.scene import (
-    Body,
-    Gravity,
-    HarmonicDrive,
-    LinearDamping,
-    MagneticField,
-    MovingAnchor,
-    PlaneContact,
-    QuadraticDrag,
-    Scene,
-    SpringAnchor,
-)
 
 STIFFNESS, DAMPING, DRIVE, PHASE, FORCE, G, DRAG = 9.0, 0.6, 2.0, 0.7, 1.5, 9.81, 0.3
 CONTACT, SMOOTHING = 200.0, 0.1
@@ -28,22 +17,22 @@ def wave(t, params):
     return FORCE / STIFFNESS * jnp.cos(params["frequency"] * t)[None]
 
 
-SCENE = Scene(
+SCENE = sc.Scene(
     [
-        Body("damped", 1.0, 1.0, pace="fast"),
-        Body("driven", 1.0, 1.0, pace="slow"),
-        Body("pulled", 1.0, 1.0, pace="fast"),
-        Body("falling", 1.0, 1.0, pace="slow"),
-        Body("bouncing", 1.0, 1.0, pace="fast"),
+        sc.Body("damped", 1.0, 1.0, pace="fast"),
+        sc.Body("driven", 1.0, 1.0, pace="slow"),
+        sc.Body("pulled", 1.0, 1.0, pace="fast"),
+        sc.Body("falling", 1.0, 1.0, pace="slow"),
+        sc.Body("bouncing", 1.0, 1.0, pace="fast"),
     ],
     [
-        SpringAnchor(["damped", "driven"], 0.0, STIFFNESS),
-        LinearDamping(DAMPING, "damped"),
-        HarmonicDrive("driven", FORCE, DRIVE, PHASE),
-        MovingAnchor("pulled", wave, STIFFNESS, params={"frequency": DRIVE}),
-        Gravity(G, ["falling", "bouncing"]),
-        QuadraticDrag(DRAG, "falling"),
-        PlaneContact(point=0.0, normal=1.0, stiffness=CONTACT, smoothing=SMOOTHING, bodies="bouncing"),
+        sc.SpringAnchor(["damped", "driven"], 0.0, STIFFNESS),
+        sc.LinearDamping(DAMPING, "damped"),
+        sc.HarmonicDrive("driven", FORCE, DRIVE, PHASE),
+        sc.MovingAnchor("pulled", wave, STIFFNESS, params={"frequency": DRIVE}),
+        sc.Gravity(G, ["falling", "bouncing"]),
+        sc.QuadraticDrag(DRAG, "falling"),
+        sc.PlaneContact(point=0.0, normal=1.0, stiffness=CONTACT, smoothing=SMOOTHING, bodies="bouncing"),
     ],
 )
 LAWS = {
@@ -79,7 +68,9 @@ def test_linear_damping_contracts_exactly():
 
     A = m / H + c / 2, A' = m / H - c / 2, B = H k / 4, and d = exp(-c H / m) + O(H^3).
     """
-    scene = Scene([Body("body", 1.0, 1.0, pace="slow")], [SpringAnchor("body", 0.0, STIFFNESS), LinearDamping(DAMPING)])
+    scene = sc.Scene(
+        [sc.Body("body", 1.0, 1.0, pace="slow")], [sc.SpringAnchor("body", 0.0, STIFFNESS), sc.LinearDamping(DAMPING)]
+    )
     H = 0.1
     trajectory = simulate(scene.system(), fully_implicit(1), scene.state(), macro_dt=H, num_steps=100)
     A, B, C = 1 / H + DAMPING / 2, H * STIFFNESS / 4, 1 / H - DAMPING / 2
@@ -99,7 +90,9 @@ def test_cyclotron_motion():
     """A circle of radius m v / (Q B) at the frequency Q B / m."""
     mass, charge, field, speed = 2.0, 3.0, 0.5, 1.2
     w, radius = charge * field / mass, mass * speed / (charge * field)
-    scene = Scene([Body("ion", mass, [radius, 0.0], [0.0, -speed], pace="slow")], [MagneticField(field, charge)])
+    scene = sc.Scene(
+        [sc.Body("ion", mass, [radius, 0.0], [0.0, -speed], pace="slow")], [sc.MagneticField(field, charge)]
+    )
     moved = jax.jit(motion)(scene.system(), scene.state())
     np.testing.assert_allclose(moved.v_s, [0.0, -speed], atol=1e-15)
     np.testing.assert_allclose(moved.a_s, [-(w**2) * radius, 0.0], rtol=1e-13, atol=1e-15)

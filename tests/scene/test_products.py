@@ -5,20 +5,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from vmri_jax.scene import (
-    Body,
-    Cylindrical,
-    Fixed,
-    Planar,
-    Prismatic,
-    Revolute,
-    RigidBody,
-    RigidLink,
-    Scene,
-    Screw,
-    Spherical,
-    Universal,
-)
+from vmri_jax import scene as sc
 from vmri_jax.scene.effects.joint_base import Joint
 from vmri_jax.scene.rows import ConstraintRows
 from vmri_jax.scene.terms import place, split
@@ -27,22 +14,22 @@ RANDOM = np.random.default_rng(0)
 X, Y, Z = np.eye(3)
 AT, TOP = [0.6, 0.1, 0.2], np.array([0.0, 0.0, 2.0])
 BODIES = [
-    *(RigidBody(name, 1.0, [1.0, 2.0, 2.5], RANDOM.normal(size=3), RANDOM.normal(size=3)) for name in "abcdefgh"),
-    RigidBody("plate", 1.0, [1.0, 1.0, 2.0], Z),
-    Body("point", 1.0, TOP),
+    *(sc.RigidBody(name, 1.0, [1.0, 2.0, 2.5], RANDOM.normal(size=3), RANDOM.normal(size=3)) for name in "abcdefgh"),
+    sc.RigidBody("plate", 1.0, [1.0, 1.0, 2.0], Z),
+    sc.Body("point", 1.0, TOP),
 ]
 JOINTS = [
-    Revolute([("a", "b"), ("ground", "c"), ("d", "ground")], AT, [1.0, 2.0, 3.0]),
-    Universal(("b", "c"), AT, X, Y),
-    Fixed(("d", "e"), AT),
-    Cylindrical(("ground", "e"), AT, Y),
-    Prismatic(("f", "e"), AT, [0.0, 1.0, 1.0]),
-    Screw([("f", "g"), ("ground", "g")], AT, Y, 0.7),
-    Planar(("g", "h"), AT, Y),
-    Spherical([("h", "point"), ("plate", "h")], [TOP, Z]),
-    RigidLink((("plate", [0.1, 0.2, 0.0]), "point")),
+    sc.Revolute([("a", "b"), ("ground", "c"), ("d", "ground")], AT, [1.0, 2.0, 3.0]),
+    sc.Universal(("b", "c"), AT, X, Y),
+    sc.Fixed(("d", "e"), AT),
+    sc.Cylindrical(("ground", "e"), AT, Y),
+    sc.Prismatic(("f", "e"), AT, [0.0, 1.0, 1.0]),
+    sc.Screw([("f", "g"), ("ground", "g")], AT, Y, 0.7),
+    sc.Planar(("g", "h"), AT, Y),
+    sc.Spherical([("h", "point"), ("plate", "h")], [TOP, Z]),
+    sc.RigidLink((("plate", [0.1, 0.2, 0.0]), "point")),
 ]
-SCENE = Scene(BODIES, JOINTS, coordinates="directors", redundant="drop")
+SCENE = sc.Scene(BODIES, JOINTS, coordinates="directors", redundant="drop")
 """Each joint has a pair with another kind of body, or with the ground."""
 ROWS: Any = ConstraintRows.of(SCENE.sorting)
 Q = RANDOM.normal(size=ROWS.sorting.positions.size)
@@ -63,9 +50,9 @@ def test_rows_are_the_products_of_the_table():
             if joint.triads is not None:
                 vectors |= zip(("m", "m'", "n"), of_a[1:] @ split(q[0])[1], strict=True)
                 vectors |= zip(("e", "e'", "f"), of_b[1:] @ split(q[1])[1], strict=True)
-            rows = Cylindrical.rows if isinstance(joint, Screw) else joint.rows
+            rows = sc.Cylindrical.rows if isinstance(joint, sc.Screw) else joint.rows
             expected += [vectors[u] @ vectors[v] for u, v in rows]
-            if isinstance(joint, Screw):
+            if isinstance(joint, sc.Screw):
                 angle = 2 * np.pi * vectors["n"] @ vectors["D"] / 0.7
                 expected.append(
                     vectors["m'"] @ vectors["e"] * np.cos(angle) - vectors["m"] @ vectors["e"] * np.sin(angle)

@@ -7,23 +7,9 @@ from scipy.special import ellipj
 
 import vmri_jax as vm
 from tests.scene.mechanics import mechanics
-from vmri_jax.scene import (
-    Ball,
-    Body,
-    Box,
-    ConstantForce,
-    Constraint,
-    Cylinder,
-    Gravity,
-    LinearDamping,
-    NBodyGravity,
-    RigidBody,
-    RigidLink,
-    Rod,
-    Scene,
-    Spherical,
-    Spring,
-)
+from tests.support import set_up
+from vmri_jax import scene as sc
+from vmri_jax.accuracy.companions import resting
 from vmri_jax.scene.rigid import angular_momentum, angular_velocity, matrix_of, quaternion, rotation
 
 MOMENTS = np.array([1.0, 2.0, 2.5])
@@ -49,7 +35,7 @@ def free_motion(t):
 
 @pytest.mark.parametrize("degree", [*(pytest.param(degree, marks=pytest.mark.full) for degree in (1, 2)), 3])
 def test_a_free_body_turns_as_jacobi_says_with_order_2_degree(degree):
-    scene = Scene([RigidBody("hub", 1.0, MOMENTS, np.zeros(3), spin=SPIN)])
+    scene = sc.Scene([sc.RigidBody("hub", 1.0, MOMENTS, np.zeros(3), spin=SPIN)])
     errors = []
     for steps in (20, 40):
         scheme = vm.galerkin(num_micro=1, degree=degree)
@@ -60,8 +46,8 @@ def test_a_free_body_turns_as_jacobi_says_with_order_2_degree(degree):
 
 
 def test_a_free_body_keeps_energy_and_angular_momentum():
-    body = RigidBody("hub", 2.0, MOMENTS, [1.0, 0.0, 0.5], [0.1, 0.2, 0.3], [0.1, 0.4, 0.0], SPIN, pace="fast")
-    run = vm.simulate(Scene([body]), ONE, macro_dt=0.05, num_steps=1000)
+    body = sc.RigidBody("hub", 2.0, MOMENTS, [1.0, 0.0, 0.5], [0.1, 0.2, 0.3], [0.1, 0.4, 0.0], SPIN, pace="fast")
+    run = vm.simulate(sc.Scene([body]), ONE, macro_dt=0.05, num_steps=1000)
     momenta = angular_momentum(run.position("hub"), run.momentum("hub"))
     inertia = body.rotation @ np.diag(MOMENTS) @ body.rotation.T
     np.testing.assert_allclose(momenta[0], inertia @ SPIN + 2.0 * np.cross(body.position, body.velocity), atol=1e-14)
@@ -80,10 +66,10 @@ def test_a_steady_top_precesses_without_nutation_to_second_order():
     spin = mass * 9.81 * length / (along * precession) + (about - along) / along * precession * np.cos(tilt)
     axis = np.array([np.sin(tilt), 0.0, np.cos(tilt)])
     omega = spin * axis + np.array([0.0, 0.0, precession])
-    top = RigidBody(
+    top = sc.RigidBody(
         "top", mass, [across, across, along], length * axis, [0.0, tilt, 0.0], np.cross(omega, length * axis), omega
     )
-    scene = Scene([top], [Gravity(), Spherical(("ground", "top"), [0.0, 0.0, 0.0])])
+    scene = sc.Scene([top], [sc.Gravity(), sc.Spherical(("ground", "top"), [0.0, 0.0, 0.0])])
     nutation, late = [], []
     for steps in (100, 200):
         run = vm.simulate(scene, ONE, macro_dt=2.0 / steps, num_steps=steps, save=steps // 100)
@@ -98,16 +84,16 @@ def test_a_steady_top_precesses_without_nutation_to_second_order():
 @pytest.mark.parametrize(
     ("shape", "seen"),
     [
-        (Box((1.0, 2.0, 3.0)), [1.0, 1.0, 1.0]),
-        (Box((1.0, 2.0, 0.0)), [1.0, 1.0, 1.0]),
-        (Rod(2.0), [1.0, 1.0, 0.0]),  # along z
+        (sc.Box((1.0, 2.0, 3.0)), [1.0, 1.0, 1.0]),
+        (sc.Box((1.0, 2.0, 0.0)), [1.0, 1.0, 1.0]),
+        (sc.Rod(2.0), [1.0, 1.0, 0.0]),  # along z
     ],
 )
 def test_angular_velocity_of_three_two_and_one_directors(shape, seen):
     """A rod has no spin about itself."""
     spin = np.array([0.3, -0.5, 0.7])
-    body = RigidBody("body", 3.0, shape, np.ones(3), spin=spin)
-    problem = Scene([body]).problem()
+    body = sc.RigidBody("body", 3.0, shape, np.ones(3), spin=spin)
+    problem = sc.Scene([body]).problem()
     q, v = (np.concatenate([problem.q_s, problem.q_f]), np.concatenate([problem.v_s, problem.v_f]))
     np.testing.assert_allclose(angular_velocity(q, v), spin * seen, atol=1e-14)
 
@@ -115,26 +101,26 @@ def test_angular_velocity_of_three_two_and_one_directors(shape, seen):
 @pytest.mark.parametrize(
     ("shape", "moments"),
     [
-        (Box((1.0, 2.0, 3.0)), [13 / 6, 10 / 6, 5 / 6]),
-        (Cylinder(0.5, 2.0), [0.79166667, 0.79166667, 0.25]),
-        (Ball(0.5), [0.2, 0.2, 0.2]),
-        (Rod(2.0), [2 / 3, 2 / 3, 0.0]),
+        (sc.Box((1.0, 2.0, 3.0)), [13 / 6, 10 / 6, 5 / 6]),
+        (sc.Cylinder(0.5, 2.0), [0.79166667, 0.79166667, 0.25]),
+        (sc.Ball(0.5), [0.2, 0.2, 0.2]),
+        (sc.Rod(2.0), [2 / 3, 2 / 3, 0.0]),
     ],
 )
 def test_moments_of_shapes(shape, moments):
-    body = RigidBody("hub", 2.0, shape, np.zeros(3))
+    body = sc.RigidBody("hub", 2.0, shape, np.zeros(3))
     np.testing.assert_allclose(body.moments, moments, rtol=1e-7)
     assert body.shape is shape
 
 
 def test_bodies_without_width_have_fewer_axes():
-    rod = RigidBody("rod", 3.0, Rod(2.0), np.zeros(3), [0.0, np.pi / 2, 0.0], spin=[0.0, 0.7, 0.0])
-    plate = RigidBody("plate", 3.0, Box((1.0, 2.0, 0.0)), np.zeros(3))
-    assert (rod.size, plate.size, RigidBody("box", 3.0, Box((1.0, 2.0, 0.5)), np.zeros(3)).size) == (6, 9, 12)
+    rod = sc.RigidBody("rod", 3.0, sc.Rod(2.0), np.zeros(3), [0.0, np.pi / 2, 0.0], spin=[0.0, 0.7, 0.0])
+    plate = sc.RigidBody("plate", 3.0, sc.Box((1.0, 2.0, 0.0)), np.zeros(3))
+    assert (rod.size, plate.size, sc.RigidBody("box", 3.0, sc.Box((1.0, 2.0, 0.5)), np.zeros(3)).size) == (6, 9, 12)
     np.testing.assert_allclose(rod.masses, [3, 3, 3, 1, 1, 1])
     np.testing.assert_allclose(rod.coordinates[3:], [1, 0, 0], atol=1e-15)
     np.testing.assert_allclose(rod.rates[3:], [0, 0, -0.7], atol=1e-15)
-    scene = Scene([rod, plate])
+    scene = sc.Scene([rod, plate])
     assert scene.names.slow_constraint == {"rigid rod": 1, "rigid plate": 3}
     assert mechanics(scene).kinetic == pytest.approx(3.0 * 2.0**2 / 12 * 0.7**2 / 2)
 
@@ -142,15 +128,15 @@ def test_bodies_without_width_have_fewer_axes():
 def test_a_matrix_of_inertia_is_turned_into_principal_axes():
     turned = matrix_of(np.array([0.3, -0.2, 0.5]))
     at = [0.2, 0.3, -0.4]
-    given = RigidBody("hub", 2.0, turned @ np.diag(MOMENTS) @ turned.T, np.zeros(3), spin=SPIN)
-    principal = RigidBody("hub", 2.0, MOMENTS, np.zeros(3), turned, spin=SPIN)
+    given = sc.RigidBody("hub", 2.0, turned @ np.diag(MOMENTS) @ turned.T, np.zeros(3), spin=SPIN)
+    principal = sc.RigidBody("hub", 2.0, MOMENTS, np.zeros(3), turned, spin=SPIN)
     np.testing.assert_allclose(given.moments, MOMENTS)
-    weight = Body("weight", 1.0, [2.0, 2.0, 2.0])
+    weight = sc.Body("weight", 1.0, [2.0, 2.0, 2.0])
     energies = []
     for body, point in ((given, at), (principal, np.asarray(turned).T @ at)):
-        spring = Spring((("hub", point), "weight"), 3.0, length=1.0)
+        spring = sc.Spring((("hub", point), "weight"), 3.0, length=1.0)
         np.testing.assert_allclose(body.point(np.asarray(point)).position, at, atol=1e-15)
-        energies.append(mechanics(Scene([body, weight], [spring]))[1:3])
+        energies.append(mechanics(sc.Scene([body, weight], [spring]))[1:3])
     assert np.all(np.asarray(energies) > 1.0)
     np.testing.assert_allclose(energies[0], energies[1], rtol=1e-12)
 
@@ -161,7 +147,7 @@ def test_rotations_are_given_as_people_have_them():
     w_xyz = np.concatenate([[np.cos(angle / 2)], np.sin(angle / 2) * vector / angle])
     matrix = matrix_of(vector)
     for given in (vector, w_xyz, matrix):
-        body = RigidBody("hub", 1.0, MOMENTS, np.zeros(3), given)
+        body = sc.RigidBody("hub", 1.0, MOMENTS, np.zeros(3), given)
         np.testing.assert_allclose(body.rotation, matrix, atol=1e-14)
         np.testing.assert_allclose(quaternion(body.coordinates), w_xyz, atol=1e-14)
     np.testing.assert_allclose(matrix_of(jnp.asarray(vector)), matrix, atol=1e-14)
@@ -179,37 +165,40 @@ def pinned(q, params):
 
 def test_an_effect_on_a_point_of_a_body_is_that_on_its_coordinates():
     """The point is linear in the coordinates, so both are the same to round-off; forces are its transpose."""
-    hub = RigidBody("hub", 2.0, MOMENTS, np.zeros(3), spin=SPIN)
-    weight = Body("weight", 1.0, [1.0, 1.0, 0.0], pace="fast")
-    by_point = Scene([hub, weight], [RigidLink((("hub", [0.5, 0.0, 0.0]), "weight")), Gravity(1.0)], project=True)
-    by_hand = Scene([hub, weight], [Constraint(pinned, ("hub", "weight")), Gravity(1.0)], project=True)
+    hub = sc.RigidBody("hub", 2.0, MOMENTS, np.zeros(3), spin=SPIN)
+    weight = sc.Body("weight", 1.0, [1.0, 1.0, 0.0], pace="fast")
+    by_point = sc.Scene(
+        [hub, weight], [sc.RigidLink((("hub", [0.5, 0.0, 0.0]), "weight")), sc.Gravity(1.0)], project=True
+    )
+    by_hand = sc.Scene([hub, weight], [sc.Constraint(pinned, ("hub", "weight")), sc.Gravity(1.0)], project=True)
     random = np.random.default_rng(0)
     start = [random.normal(size=x.shape) for x in by_point.start]
     ours, theirs = (mechanics(scene, start) for scene in (by_point, by_hand))
     np.testing.assert_allclose(np.sort(ours.rows), np.sort(theirs.rows), atol=1e-14)
     assert ours.potential == pytest.approx(theirs.potential, rel=1e-14)
 
-    pushed = Scene([hub], [ConstantForce(("hub", [0.5, 0.0, 0.0]), [0.0, 3.0, 0.0])])
+    pushed = sc.Scene([hub], [sc.ConstantForce(("hub", [0.5, 0.0, 0.0]), [0.0, 3.0, 0.0])])
     system, (q_s, q_f, v_s, v_f) = pushed.system(), pushed.start
     force, _ = system.forces(0.0, q_s, q_f, v_s, v_f)
     np.testing.assert_allclose(force, [0, 3, 0, 0, 1.5, 0, 0, 0, 0, 0, 0, 0])
 
 
 def test_points_of_the_ground_stay_where_they_are():
-    hub = RigidBody("hub", 2.0, MOMENTS, np.zeros(3))
-    scene = Scene(
-        [hub], [Spring((("hub", [0.5, 0, 0]), ("ground", [2.0, 0, 0])), 7.0, 1.0), Gravity(), LinearDamping(0.1)]
+    hub = sc.RigidBody("hub", 2.0, MOMENTS, np.zeros(3))
+    scene = sc.Scene(
+        [hub],
+        [sc.Spring((("hub", [0.5, 0, 0]), ("ground", [2.0, 0, 0])), 7.0, 1.0), sc.Gravity(), sc.LinearDamping(0.1)],
     )
     assert slow_energy(scene) == pytest.approx(7.0 * 0.5**2 / 2)
-    plane = Scene([Body("bob", 1.0, [1.0, 0.0])], [Spring(("bob", ("ground", [0.0, 0.0])), 2.0)])
+    plane = sc.Scene([sc.Body("bob", 1.0, [1.0, 0.0])], [sc.Spring(("bob", ("ground", [0.0, 0.0])), 2.0)])
     assert plane.drawing()["anchors"] == [{"body": "bob", "point": [0.0, 0.0], "kind": "spring"}]
 
 
 def test_many_bodies_are_taken_by_slices():
     """Centres of bodies that follow one another, also between other bodies, are where they should be."""
-    bodies: list = [RigidBody(f"b{i}", 1.0 + i, MOMENTS, [i, 2.0 * i, -i]) for i in range(4)]
-    bodies.insert(2, Body("point", 5.0, [7.0, 0.0, 1.0]))
-    scene = Scene(bodies, [Gravity(2.0)])
+    bodies: list = [sc.RigidBody(f"b{i}", 1.0 + i, MOMENTS, [i, 2.0 * i, -i]) for i in range(4)]
+    bodies.insert(2, sc.Body("point", 5.0, [7.0, 0.0, 1.0]))
+    scene = sc.Scene(bodies, [sc.Gravity(2.0)])
     heights = [body.point().position[2] * body.mass for body in bodies]
     assert slow_energy(scene) == pytest.approx(2.0 * sum(heights))
 
@@ -235,14 +224,14 @@ BAD = [
 def test_bodies_that_cannot_be(changes, message):
     arguments = {"name": "hub", "mass": 1.0, "inertia": MOMENTS, "position": np.zeros(3)} | changes
     with pytest.raises(ValueError, match=message):
-        RigidBody(**arguments)
+        sc.RigidBody(**arguments)
 
 
 def test_points_that_cannot_be():
     hub, rod, ball = (
-        RigidBody("hub", 1.0, MOMENTS, np.zeros(3)),
-        RigidBody("rod", 1.0, Rod(1.0), np.ones(3)),
-        Body("ball", 1.0, [2, 2, 2]),
+        sc.RigidBody("hub", 1.0, MOMENTS, np.zeros(3)),
+        sc.RigidBody("rod", 1.0, sc.Rod(1.0), np.ones(3)),
+        sc.Body("ball", 1.0, [2, 2, 2]),
     )
     for between, message in [
         ((("ball", [1.0, 0, 0]), "hub"), "springs: ball is no rigid body, so that no point is fixed in it"),
@@ -253,20 +242,20 @@ def test_points_that_cannot_be():
         ((("hubb", [0, 0, 0]), "ball"), "no body 'hubb'.*hub"),
     ]:
         with pytest.raises(ValueError, match=message):
-            Scene([hub, rod, ball], [Spring(between, 1.0)])
+            sc.Scene([hub, rod, ball], [sc.Spring(between, 1.0)])
     with pytest.raises(ValueError, match=r"hub \(1, 0, 0\) has no mass; this effect needs the mass of a whole body"):
-        Scene([hub, ball], [NBodyGravity(1.0, (("hub", [1.0, 0, 0]), "ball"))])
+        sc.Scene([hub, ball], [sc.NBodyGravity(1.0, (("hub", [1.0, 0, 0]), "ball"))])
 
 
 def test_coordinates_are_called_by_centre_and_directors():
-    hub = RigidBody("hub", 2.0, MOMENTS, [0.0, 0.0, 1.0], pace="slow")
-    scene = Scene([hub, RigidBody("bar", 1.0, Rod(1.0), [1.0, 0.0, 0.0], pace="fast")])
+    hub = sc.RigidBody("hub", 2.0, MOMENTS, [0.0, 0.0, 1.0], pace="slow")
+    scene = sc.Scene([hub, sc.RigidBody("bar", 1.0, sc.Rod(1.0), [1.0, 0.0, 0.0], pace="fast")])
     names = scene.names
     directors = [f"hub d{i} {axis}" for i in (1, 2, 3) for axis in "xyz"]
     assert names.slow_coordinates == ["hub x", "hub y", "hub z", *directors]
     assert names.fast_coordinates == ["bar x", "bar y", "bar z", "bar d1 x", "bar d1 y", "bar d1 z"]
     assert [names.positions(part) for part in ("s", "f")] == [[0, 1, 2], [0, 1, 2]]
-    run = vm.simulate(scene, vm.fully_explicit(1), macro_dt=0.1, num_steps=2)
+    run = resting(set_up(scene, vm.fully_explicit(1), 0.1, 2))
     panel = run.plot().axes[0]
     np.testing.assert_array_equal(panel.lines[2].get_ydata(), run.position("hub")[:, 2])
     assert len(panel.lines) == 3

@@ -8,21 +8,7 @@ import numpy as np
 import pytest
 
 from vmri_jax import fully_implicit
-from vmri_jax.scene import (
-    Body,
-    Box,
-    Coulomb,
-    Gravity,
-    Kinetic,
-    MagneticField,
-    PlaneContact,
-    Potential,
-    Revolute,
-    RigidBody,
-    RigidLink,
-    Scene,
-    Spring,
-)
+from vmri_jax import scene as sc
 from vmri_jax.scene.rates import measure
 
 
@@ -36,13 +22,13 @@ def frequency(scene, name) -> np.ndarray:
     return measure(scene.by_name, effects)[name].frequency
 
 
-IONS = Scene(
+IONS = sc.Scene(
     [
-        Body("heavy", 20.0, [1.2, 0.0, 0.6], [0.0, -0.3, 0.0]),
-        Body("light", 1.0, [0.5, 0.8, 0.4], [4.0, 0.0, 0.5]),
-        Body("neutral", 1.0, [-0.5, -0.8, -0.8]),
+        sc.Body("heavy", 20.0, [1.2, 0.0, 0.6], [0.0, -0.3, 0.0]),
+        sc.Body("light", 1.0, [0.5, 0.8, 0.4], [4.0, 0.0, 0.5]),
+        sc.Body("neutral", 1.0, [-0.5, -0.8, -0.8]),
     ],
-    [MagneticField([0.0, 57.0, 76.0], [-2.0, 1.0], ["heavy", "light"])],
+    [sc.MagneticField([0.0, 57.0, 76.0], [-2.0, 1.0], ["heavy", "light"])],
 )
 
 
@@ -53,25 +39,27 @@ def test_charges_that_gyrate_fast_are_fast():
     why = {row.name: row.why for row in IONS.explain(fully_implicit(2), measure=False).rows}
     assert why["light"] == "fast: touched by magnetic_field, 95 rad/s, above 30"
     assert paces(IONS.replace("magnetic_field", charge=[-20.0, 1.0])) == dict.fromkeys(IONS.by_name, "slow")
-    flat = [Body(name, m, [1.0, i]) for i, (name, m) in enumerate({"a": 1.0, "b": 2.0, "c": 40.0}.items())]
-    assert paces(Scene(flat, [MagneticField(-8.0, 1.0)])) == {"a": "fast", "b": "fast", "c": "slow"}
+    flat = [sc.Body(name, m, [1.0, i]) for i, (name, m) in enumerate({"a": 1.0, "b": 2.0, "c": 40.0}.items())]
+    assert paces(sc.Scene(flat, [sc.MagneticField(-8.0, 1.0)])) == {"a": "fast", "b": "fast", "c": "slow"}
 
 
 def test_a_contact_acts_on_the_mass_of_a_small_body_and_not_on_its_inertia():
-    ball = RigidBody("ball", 2.0, (1e-4, 1e-4, 1e-4), [0.0, 0.0, 1.0])
-    scene = Scene([ball], [PlaneContact(point=[0, 0, 0], normal=[0, 0, 1], stiffness=800.0, smoothing=0.01), Gravity()])
+    ball = sc.RigidBody("ball", 2.0, (1e-4, 1e-4, 1e-4), [0.0, 0.0, 1.0])
+    scene = sc.Scene(
+        [ball], [sc.PlaneContact(point=[0, 0, 0], normal=[0, 0, 1], stiffness=800.0, smoothing=0.01), sc.Gravity()]
+    )
     assert frequency(scene, "plane_contact") == pytest.approx(np.sqrt(800.0 / 2.0))
 
 
 @pytest.mark.parametrize("far", [1.0, 100.0])
 def test_angular_accelerations_count_without_the_size_of_the_scene(far):
     """A falling potential of the turn makes a wheel turn with T / J = 30 rad/s^2."""
-    wheel = RigidBody("wheel", 1.0, (0.1, 0.1, 0.2), [0.0, 0.0, 0.0])
+    wheel = sc.RigidBody("wheel", 1.0, (0.1, 0.1, 0.2), [0.0, 0.0, 0.0])
 
     def turn(q, params):
         return -6.0 * q[0][4]  # the x axis leans towards y, at the rate of the turn about z
 
-    scene = Scene([wheel, Body("stone", 1.0, [far, 0.0, 0.0])], [Potential(turn, "wheel"), Gravity()])
+    scene = sc.Scene([wheel, sc.Body("stone", 1.0, [far, 0.0, 0.0])], [sc.Potential(turn, "wheel"), sc.Gravity()])
     effects = [effect for effect in scene.bound if effect.kind == "potential"]
     rates = measure(scene.by_name, effects)
     assert rates["turn"].rate == pytest.approx(np.sqrt(30.0))
@@ -80,16 +68,16 @@ def test_angular_accelerations_count_without_the_size_of_the_scene(far):
 
 def test_gyration_and_stiffness_share_the_border():
     """A spring of 10 rad/s is stiff beside gravity alone; beside a gyration of 1000 rad/s it is not."""
-    bodies = [Body("ion", 1.0, [0.0, 0.0]), Body("a", 1.0, [5.0, 0.0]), Body("b", 1.0, [6.0, 0.0])]
-    scene = Scene(bodies, [Gravity(), Spring(("a", "b"), 50.0), MagneticField(1000.0, 1.0, "ion")])
+    bodies = [sc.Body("ion", 1.0, [0.0, 0.0]), sc.Body("a", 1.0, [5.0, 0.0]), sc.Body("b", 1.0, [6.0, 0.0])]
+    scene = sc.Scene(bodies, [sc.Gravity(), sc.Spring(("a", "b"), 50.0), sc.MagneticField(1000.0, 1.0, "ion")])
     assert paces(scene) == {"ion": "fast", "a": "slow", "b": "slow"}
     assert paces(scene.without("magnetic_field")) == {"ion": "slow", "a": "fast", "b": "fast"}
 
 
 def test_the_reason_of_a_slow_body_names_a_stiff_spring_that_is_part_of_v():
     """A spring of 300 rad/s to a body with the pace "slow" leaves the other body slow; its reason does not say that none touches it."""
-    bodies = [Body("a", 1.0, [0.0, 0.0], pace="slow"), Body("b", 1.0, [1.0, 0.0])]
-    scene = Scene(bodies, [Gravity(), Spring(("a", "b"), 4.5e4)])
+    bodies = [sc.Body("a", 1.0, [0.0, 0.0], pace="slow"), sc.Body("b", 1.0, [1.0, 0.0])]
+    scene = sc.Scene(bodies, [sc.Gravity(), sc.Spring(("a", "b"), 4.5e4)])
     pace = scene.sorting.paces["b"]
     assert pace.value == "slow"
     assert pace.reason.startswith("springs, 300 rad/s, above ")
@@ -97,15 +85,15 @@ def test_the_reason_of_a_slow_body_names_a_stiff_spring_that_is_part_of_v():
 
 
 def test_the_reason_of_a_slow_body_names_a_stiff_spring_between_bodies_that_it_carries():
-    box = Box((0.2, 0.2, 0.2))
+    box = sc.Box((0.2, 0.2, 0.2))
     bodies = [
-        RigidBody("hub", 100.0, box, [0.0, 0.0, 0.0]),
-        *(RigidBody(b, 1.0, box, [x, 0.0, 0.0]) for b, x in SIDES.items()),
+        sc.RigidBody("hub", 100.0, box, [0.0, 0.0, 0.0]),
+        *(sc.RigidBody(b, 1.0, box, [x, 0.0, 0.0]) for b, x in SIDES.items()),
     ]
     hinges = [
-        Revolute(("hub", b), axis=[0.0, 0.0, 1.0], at=[x / 2, 0.0, 0.0], name=f"to {b}") for b, x in SIDES.items()
+        sc.Revolute(("hub", b), axis=[0.0, 0.0, 1.0], at=[x / 2, 0.0, 0.0], name=f"to {b}") for b, x in SIDES.items()
     ]
-    scene = Scene(bodies, [Gravity(), *hinges, Spring(("left", "right"), 4.5e4)], coordinates="joint")
+    scene = sc.Scene(bodies, [sc.Gravity(), *hinges, sc.Spring(("left", "right"), 4.5e4)], coordinates="joint")
     assert paces(scene) == {"hub": "slow", "left": "fast", "right": "fast"}
     assert re.fullmatch(
         r"springs, 3\d\d rad/s, above [\d.]+, acts between bodies that it carries", scene.sorting.paces["hub"].reason
@@ -135,9 +123,14 @@ def coupled(q, v, params):
 
 def test_custom_kinetic_effects():
     """M^-1 (A^T - A) has eigenvalues +- 2 i w / sqrt(m_a m_b); gauge terms do not count."""
-    bodies = [Body("a", 4.0, [1.0], [2.0]), Body("b", 1.0, [3.0], [-1.0]), Body("c", 1.0, [9.0]), Body("d", 1.0, [8.0])]
-    effects = [Kinetic(coupled, ("a", "b"), {"w": 30.0, "gauge": 500.0}), Spring(("c", "d"), 1.0)]
-    scene = Scene(bodies, effects)
+    bodies = [
+        sc.Body("a", 4.0, [1.0], [2.0]),
+        sc.Body("b", 1.0, [3.0], [-1.0]),
+        sc.Body("c", 1.0, [9.0]),
+        sc.Body("d", 1.0, [8.0]),
+    ]
+    effects = [sc.Kinetic(coupled, ("a", "b"), {"w": 30.0, "gauge": 500.0}), sc.Spring(("c", "d"), 1.0)]
+    scene = sc.Scene(bodies, effects)
     assert frequency(scene, "coupled") == pytest.approx([30.0], rel=1e-9)
     assert paces(scene) == {"a": "fast", "b": "fast", "c": "slow", "d": "slow"}
     assert paces(scene.replace("a", pace="slow"))["b"] == "fast"  # it is on the micro grid whatever a is
@@ -151,7 +144,9 @@ def gradient_field(q, v, params):
 
 def test_velocity_dependent_forces_have_stiffness():
     """Where the field is zero and v_y = u there is no gyration, but ``m x'' = Q u B' x``."""
-    scene = Scene([Body("ion", 2.0, [0.0, 0.0], [0.0, -9.0])], [Kinetic(gradient_field, "ion", {"gradient": 8.0})])
+    scene = sc.Scene(
+        [sc.Body("ion", 2.0, [0.0, 0.0], [0.0, -9.0])], [sc.Kinetic(gradient_field, "ion", {"gradient": 8.0})]
+    )
     assert frequency(scene, "gradient_field") == pytest.approx([np.sqrt(9.0 * 8.0 / 2.0)], rel=1e-12)
 
 
@@ -161,8 +156,8 @@ def added_mass(q, v, params):
 
 def test_kinetic_effects_are_part_of_the_mass():
     """An added mass m on the relative velocity of a spring's ends: ``w^2 = k / (1/2 + m)``."""
-    bodies = [Body("a", 1.0, [0.0]), Body("b", 1.0, [1.0])]
-    scene = Scene(bodies, [Spring(("a", "b"), 56.0), Kinetic(added_mass, ("b", "a"), {"mass": 3.0})])
+    bodies = [sc.Body("a", 1.0, [0.0]), sc.Body("b", 1.0, [1.0])]
+    scene = sc.Scene(bodies, [sc.Spring(("a", "b"), 56.0), sc.Kinetic(added_mass, ("b", "a"), {"mass": 3.0})])
     assert frequency(scene, "springs") == pytest.approx([4.0], rel=1e-12)
     assert frequency(scene, "added_mass") == [0.0]
     with pytest.raises(ValueError, match=r"springs: the kinetic energy of a, b is not positive at the start"):
@@ -175,34 +170,29 @@ def norm_of(q, v, params):
 
 def test_kinetic_effects_that_are_not_smooth():
     with pytest.raises(ValueError, match="norm_of: its energy between neutral has no finite derivatives at the start"):
-        Scene(IONS.bodies, [Kinetic(norm_of, "neutral", {"f": 1.0})])
+        sc.Scene(IONS.bodies, [sc.Kinetic(norm_of, "neutral", {"f": 1.0})])
 
 
 CHAIN = [
-    Body(name, 1.0, [float(i), 0.0], pace="slow" if name in "abcde" else "fast") for i, name in enumerate("abcdefgh")
+    sc.Body(name, 1.0, [float(i), 0.0], pace="slow" if name in "abcde" else "fast") for i, name in enumerate("abcdefgh")
 ]
 
 
 def reasons(*effects) -> dict:
-    return {(p.effect.name, p.home): p.reason for p in Scene(CHAIN, effects).sorting.placed}
+    return {(p.effect.name, p.home): p.reason for p in sc.Scene(CHAIN, effects).sorting.placed}
 
 
 def test_all_reasons_are_given():
     found = reasons(
-        Spring([("a", "f"), ("f", "g"), ("a", "g"), ("g", "h"), ("f", "h")], [1.0, 1e4, 1.0, 1e4, 1.0]),
-        Gravity(name="weight"),
-        RigidLink([("a", "b"), ("b", "c"), ("e", "f")]),
+        sc.Spring([("a", "f"), ("f", "g"), ("a", "g"), ("g", "h"), ("f", "h")], [1.0, 1e4, 1.0, 1e4, 1.0]),
+        sc.Gravity(name="weight"),
+        sc.RigidLink([("a", "b"), ("b", "c"), ("e", "f")]),
     )
+    soft = "between fast bodies but soft, below 14.1 rad/s"
     assert found == {
-        (
-            "springs",
-            "slow_potential",
-        ): "touches a, which is slow (2); between fast bodies but soft, below 14.1 rad/s (1)",
+        ("springs", "slow_potential"): f"touches a, which is slow (2); {soft} (1)",
         ("springs", "fast_potential"): "between fast bodies and stiff, above 14.1 rad/s",
-        (
-            "weight",
-            "slow_potential",
-        ): "touches a, b, c and 2 more, which are slow (5); between fast bodies but soft, below 14.1 rad/s (3)",
+        ("weight", "slow_potential"): f"touches a, b, c and 2 more, which are slow (5); {soft} (3)",
         ("links", "slow_constraint"): "between slow bodies",
         ("links", "constraint"): "touches a fast body",
     }
@@ -213,7 +203,7 @@ def well(q, params):
 
 
 def test_a_single_element_has_one_reason():
-    found = reasons(Potential(well, ("a", "b", "f"), {"k": 1.0}), Coulomb({"g": 1.0, "h": 1.0}, 1.0, rate="slow"))
+    found = reasons(sc.Potential(well, ("a", "b", "f"), {"k": 1.0}), sc.Coulomb({"g": 1.0, "h": 1.0}, 1.0, rate="slow"))
     assert found["well", "slow_potential"] == "touches a, b, which are slow"
     assert found["coulomb", "slow_potential"] == "as given"
 
@@ -221,8 +211,8 @@ def test_a_single_element_has_one_reason():
 def test_a_stiff_spring_is_fast_however_slow_a_declared_fast_one_is():
     """A spring of 10 rad/s that is declared fast, beside one of 1e4 rad/s, more than a thousand times as fast."""
     bodies = [
-        Body(name, 1.0, place)
+        sc.Body(name, 1.0, place)
         for name, place in zip("abcd", ([0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]), strict=True)
     ]
-    springs = [Spring(("a", "b"), 50.0, rate="fast", name="soft"), Spring(("c", "d"), 6e7, name="stiff")]
-    assert set(paces(Scene(bodies, [Gravity(), *springs])).values()) == {"fast"}
+    springs = [sc.Spring(("a", "b"), 50.0, rate="fast", name="soft"), sc.Spring(("c", "d"), 6e7, name="stiff")]
+    assert set(paces(sc.Scene(bodies, [sc.Gravity(), *springs])).values()) == {"fast"}

@@ -9,26 +9,17 @@ import pytest
 
 import vmri_jax as vm
 from tests.scene.effect_scenes import BASE, EFFECTS
+from vmri_jax import scene as sc
 from vmri_jax.mechanics.invariants import potential_energy
-from vmri_jax.scene import (
-    Body,
-    Gravity,
-    JointSpring,
-    MagneticField,
-    PlaneContact,
-    Revolute,
-    RigidBody,
-    Scene,
-    Spring,
-    SpringAnchor,
-)
 
 
-def bouncing(x) -> Scene:
+def bouncing(x) -> sc.Scene:
     """A number in masses, places, radii and stiffnesses."""
-    ball = Body("ball", 2.0 * x, [1.0, x], [x, 0.0], pace="fast", radius=x)
-    ground = PlaneContact(point=[0.0, x - 3], normal=[0.0, 1.0], stiffness=x, smoothing=0.1, radius=x, rate="fast")
-    return Scene([ball], [Gravity([0.0, -x], rate="slow"), SpringAnchor("ball", [x, 3.0], x, rate="fast"), ground])
+    ball = sc.Body("ball", 2.0 * x, [1.0, x], [x, 0.0], pace="fast", radius=x)
+    ground = sc.PlaneContact(point=[0.0, x - 3], normal=[0.0, 1.0], stiffness=x, smoothing=0.1, radius=x, rate="fast")
+    return sc.Scene(
+        [ball], [sc.Gravity([0.0, -x], rate="slow"), sc.SpringAnchor("ball", [x, 3.0], x, rate="fast"), ground]
+    )
 
 
 @pytest.mark.parametrize("transform", [jax.jit, jax.grad, lambda f: lambda x: jax.vmap(f)(x[None])[0]])
@@ -47,12 +38,14 @@ def test_traced_scenes_have_a_start(transform):
     assert bouncing(x).drawing()["bodies"][0]["radius"] == pytest.approx(0.7)
 
 
-def swinging(x) -> Scene:
+def swinging(x) -> sc.Scene:
     """A number in mass, inertia, place, rotation, spin, joint and spring of a rigid body."""
     moments, up = np.array([1.0, 2.0, 2.5]), np.array([0.0, 0.0, 1.0])
-    bar = RigidBody("bar", 2.0 * x, x * moments, x * up, x * np.array([0.1, 0.3, 0.2]), spin=x * up, pace="slow")
-    hinge = Revolute(("ground", ("bar", x * -up)), axis=x * np.array([0.1, 1.0, 0.2]), name="hinge")
-    return Scene([bar], [hinge, JointSpring("hinge", x, 0.1 * x, rate="slow")], project=True, coordinates="directors")
+    bar = sc.RigidBody("bar", 2.0 * x, x * moments, x * up, x * np.array([0.1, 0.3, 0.2]), spin=x * up, pace="slow")
+    hinge = sc.Revolute(("ground", ("bar", x * -up)), axis=x * np.array([0.1, 1.0, 0.2]), name="hinge")
+    return sc.Scene(
+        [bar], [hinge, sc.JointSpring("hinge", x, 0.1 * x, rate="slow")], project=True, coordinates="directors"
+    )
 
 
 def test_scenes_of_rigid_bodies_may_be_traced():
@@ -80,7 +73,7 @@ def test_every_effect_may_be_traced(effect):
 
     def scene(x):
         effects = [(gravity, "slow"), (effect, "slow"), (spring, "fast")]
-        return Scene([scaled(b, x) for b in BASE.bodies], [scaled(e, x, rate=rate) for e, rate in effects])
+        return sc.Scene([scaled(b, x) for b in BASE.bodies], [scaled(e, x, rate=rate) for e, rate in effects])
 
     def state(x):
         problem = scene(x).problem()
@@ -97,20 +90,23 @@ def test_traced_numbers_decide_nothing(what):
         one, ones = (
             dict.fromkeys(["mass", "position", "velocity", "field"], n) | {what: x * n} for n in (1.0, np.ones(3))
         )
-        light = Body("light", one["mass"], ones["position"], ones["velocity"])
-        return Scene([light], [MagneticField(ones["field"], 1.0)]).state().p_s.sum()
+        light = sc.Body("light", one["mass"], ones["position"], ones["velocity"])
+        return sc.Scene([light], [sc.MagneticField(ones["field"], 1.0)]).state().p_s.sum()
 
     with pytest.raises(ValueError, match=r"whether light is slow or fast depends on numbers that jax\.jit"):
         jax.grad(momentum)(1.0)
 
 
 def test_names_hold_in_a_trace():
-    """A scene made of traced numbers is simulated, and its run asked by name; what needs numbers says so."""
+    """A scene made of traced numbers is simulated, and its run asked by name and differentiated; what needs numbers says so.
+
+    `test_joint_motions` has derivatives of starts, forces and energies by lengths, masses and stiffnesses.
+    """
     refused = []
 
     def end(stiffness):
-        pulled = Body("pulled", 2.0, [1.0, 0.0], pace="slow")
-        scene = Scene([pulled], [SpringAnchor("pulled", [0.0, 0.0], stiffness, length=0.5)])
+        pulled = sc.Body("pulled", 2.0, [1.0, 0.0], pace="slow")
+        scene = sc.Scene([pulled], [sc.SpringAnchor("pulled", [0.0, 0.0], stiffness, length=0.5)])
         run = vm.simulate(scene, vm.fully_explicit(1), macro_dt=0.1, num_steps=3)
         if isinstance(stiffness, jax.core.Tracer):  # pyright: ignore[reportAttributeAccessIssue]
             with pytest.raises(ValueError, match=r"work: the run is traced by JAX.*run.of\(problem\).work"):
@@ -123,21 +119,3 @@ def test_names_hold_in_a_trace():
     lanes = jax.jit(jax.vmap(end))(np.array([2.99, 3.01]))
     assert np.allclose(lanes, [end(2.99), end(3.01)], rtol=1e-14, atol=0)
     assert refused
-
-
-def test_a_run_by_lengths_and_masses_has_a_derivative():
-    """Four slow coordinates and no fast one: a joint and a point."""
-
-    def end(numbers):
-        length, mass, stiffness = numbers
-        center = jnp.stack([length / 2, 0.0 * length, 0.0 * length])
-        bar = RigidBody("bar", mass, jnp.stack([mass, mass, mass / 2]), center, pace="slow")
-        weight = Body("weight", 2 * mass, 2 * center - jnp.array([0.0, 0.0, 0.4]), pace="slow")
-        hinge = Revolute(("ground", "bar"), at=[0, 0, 0], axis=[0, 1.0, 0], name="hinge")
-        springs = JointSpring("hinge", stiffness, 0.2), Spring((("bar", center), "weight"), stiffness, 0.4)
-        scene = Scene([bar, weight], [hinge, *springs, Gravity()], coordinates="joint")
-        return vm.simulate(scene, vm.fully_implicit(1), macro_dt=0.02, num_steps=5).position("bar")[-1, 2]
-
-    program, at, step = jax.jit(jax.value_and_grad(end)), np.array([0.8, 1.2, 30.0]), 1e-5
-    slopes = [(program(at + change)[0] - program(at - change)[0]) / (2 * step) for change in step * np.eye(3)]
-    assert np.allclose(program(at)[1], slopes, rtol=1e-6, atol=1e-9)

@@ -13,22 +13,8 @@ import pytest
 
 import vmri_jax as vm
 from tests.support import until_failure
-from vmri_jax.scene import (
-    Box,
-    Controlled,
-    Gear,
-    JointCoupling,
-    JointDamper,
-    JointDrive,
-    JointLimit,
-    JointMotion,
-    JointSpring,
-    Revolute,
-    RigidBody,
-    RotorInertia,
-    Scene,
-    trees,
-)
+from vmri_jax import scene as sc
+from vmri_jax.scene import trees
 from vmri_jax.scene.binding import bound
 from vmri_jax.scene.effects.joint_base import REACH, OfFreedoms
 from vmri_jax.scene.joint_coordinates import at_start
@@ -42,24 +28,20 @@ def torque(t, params):
     return 3.0 * jnp.ones_like(t)
 
 
-def path(t, params):
-    return 2.0 * t
-
-
 def same(x, params):
     return x[0] - x[1]
 
 
 EFFECTS: dict[str, tuple[Any, bool]] = {
-    "spring": (lambda name: JointSpring(name, 2.0, 0.3), True),
-    "limit": (lambda name: JointLimit(name, -0.5, 0.4, stiffness=50.0, smoothing=0.02), True),
-    "gear": (lambda name: Gear([name, "other"], [1.0, -2.0]), True),
-    "coupling": (lambda name: JointCoupling([name, "other"], same), True),
-    "damper": (lambda name: JointDamper(name, 0.7), False),
-    "rotor": (lambda name: RotorInertia(name, 1.5), False),
-    "drive": (lambda name: JointDrive(name, torque), False),
-    "motion": (lambda name: JointMotion(name, path), False),
-    "control": (lambda name: Controlled(name, "torque"), False),
+    "spring": (lambda name: sc.JointSpring(name, 2.0, 0.3), True),
+    "limit": (lambda name: sc.JointLimit(name, -0.5, 0.4, stiffness=50.0, smoothing=0.02), True),
+    "gear": (lambda name: sc.Gear([name, "other"], [1.0, -2.0]), True),
+    "coupling": (lambda name: sc.JointCoupling([name, "other"], same), True),
+    "damper": (lambda name: sc.JointDamper(name, 0.7), False),
+    "rotor": (lambda name: sc.RotorInertia(name, 1.5), False),
+    "drive": (lambda name: sc.JointDrive(name, torque), False),
+    "motion": (lambda name: sc.JointMotion(name, lambda t, params: 2.0 * t), False),
+    "control": (lambda name: sc.Controlled(name, "torque"), False),
 }
 """Every effect in a joint, and whether it counts whole turns of the angle."""
 
@@ -77,14 +59,14 @@ def all_subclasses(of):
 def wheels(*effects, coordinates: Any = "auto", spin=(0.0, 0.0)):
     """Two wheels of unit inertia on hinges."""
     bodies = [
-        RigidBody(name, 1.0, [1.0] * 3, [x, 0, 0], spin=rate * Z)
+        sc.RigidBody(name, 1.0, [1.0] * 3, [x, 0, 0], spin=rate * Z)
         for name, x, rate in zip(("wheel", "second"), (0.0, 3.0), spin, strict=True)
     ]
     hinges = [
-        Revolute(("ground", name), [x, 0, 0], Z, name=joint)
+        sc.Revolute(("ground", name), [x, 0, 0], Z, name=joint)
         for name, x, joint in (("wheel", 0.0, "hinge"), ("second", 3.0, "other"))
     ]
-    return Scene(bodies, [*hinges, *effects], coordinates=coordinates)
+    return sc.Scene(bodies, [*hinges, *effects], coordinates=coordinates)
 
 
 @jax.jit
@@ -149,8 +131,8 @@ HINGES = ("hA", "hB", "hC", "hD")
 
 def rod(name, start, end):
     way = end - start
-    shape = Box((float(np.linalg.norm(way)), 0.05, 0.05))
-    return RigidBody(name, 1.0, shape, (start + end) / 2, [0.0, 0.0, np.arctan2(way[1], way[0])])
+    shape = sc.Box((float(np.linalg.norm(way)), 0.05, 0.05))
+    return sc.RigidBody(name, 1.0, shape, (start + end) / 2, [0.0, 0.0, np.arctan2(way[1], way[0])])
 
 
 def crank_rocker(*effects, order: Sequence[int] = range(4), names=HINGES, coordinates: Any = "auto"):
@@ -161,10 +143,10 @@ def crank_rocker(*effects, order: Sequence[int] = range(4), names=HINGES, coordi
     along = (COUPLER**2 - ROCKER**2 + length**2) / 2 / length
     c = b + along * way / length + np.sqrt(COUPLER**2 - along**2) * np.array([-way[1], way[0], 0.0]) / length
     pairs = ("ground", "crank"), ("crank", "coupler"), ("coupler", "rocker"), ("ground", "rocker")
-    joints = [Revolute(pair, p, Z, name=name) for pair, p, name in zip(pairs, (a, b, c, d), names, strict=True)]
+    joints = [sc.Revolute(pair, p, Z, name=name) for pair, p, name in zip(pairs, (a, b, c, d), names, strict=True)]
     bodies = [rod("crank", a, b), rod("coupler", b, c), rod("rocker", c, d)]
     listed = [joints[i] for i in order]
-    return Scene(bodies, [*listed, *effects], redundant="drop", coordinates=coordinates)
+    return sc.Scene(bodies, [*listed, *effects], redundant="drop", coordinates=coordinates)
 
 
 def cut(scene):
@@ -187,14 +169,14 @@ def test_a_joint_with_an_effect_is_not_cut_in_any_order(name):
 
 def test_turns_go_before_other_effects():
     """Where every joint has an effect, the joint with the drive alone is cut."""
-    springs = [JointSpring(h, 0.2, name=f"spring {h}") for h in ("hA", "hB", "hD")]
-    assert cut(crank_rocker(*springs, JointDrive("hC", torque))) == {"hC"}
-    assert cut(crank_rocker(JointSpring("hC", 0.2), order=(3, 1, 0, 2))) != {"hC"}
+    springs = [sc.JointSpring(h, 0.2, name=f"spring {h}") for h in ("hA", "hB", "hD")]
+    assert cut(crank_rocker(*springs, sc.JointDrive("hC", torque))) == {"hC"}
+    assert cut(crank_rocker(sc.JointSpring("hC", 0.2), order=(3, 1, 0, 2))) != {"hC"}
 
 
 def test_a_spring_in_a_loop_counts_its_turns():
     """The angle of the crank at the end is that of DOP853 with one angle."""
-    scene = crank_rocker(JointSpring("hB", 0.2), order=(1, 2, 3, 0), coordinates="joint").with_rates({"hA": 12.0})
+    scene = crank_rocker(sc.JointSpring("hB", 0.2), order=(1, 2, 3, 0), coordinates="joint").with_rates({"hA": 12.0})
     run = vm.simulate(scene, ONE, macro_dt=0.002, t_end=3.0)
     assert np.abs(run.constraint_residual).max() < 1e-12
     assert scene.joint_motion(run, "hA")[-1] == pytest.approx(12.186, abs=1e-3)  # measured 12.18589
@@ -206,19 +188,19 @@ def test_starts_of_loops_count_the_turns_of_all_joints():
     scene = crank_rocker(coordinates="joint").with_joints({"hA": 7.0})
     (closed,) = cut(scene)
     x = dict(zip(scene.names.slow, np.asarray(scene.start[0]), strict=True))
-    (joint,) = (e for e in scene.bound if e.name == closed and isinstance(e, Revolute))
+    (joint,) = (e for e in scene.bound if e.name == closed and isinstance(e, sc.Revolute))
     x[closed] = at_start(scene.sorting, joint, 0, "turn")
     assert x["hA"] == 7.0
     assert x["hA"] + x["hB"] + x["hC"] == pytest.approx(x["hD"], abs=1e-9)
     assert max(abs(x["hB"]), abs(x["hC"])) > 5.0
     names = ("hA", "pin", "hC", "hD")  # equal joints are cut by name: here the one that turns with the crank
-    sprung = crank_rocker(*(JointSpring(hinge, 0.2, name=f"spring {hinge}") for hinge in names), names=names)
+    sprung = crank_rocker(*(sc.JointSpring(hinge, 0.2, name=f"spring {hinge}") for hinge in names), names=names)
     with pytest.raises(ValueError, match=r"spring pin: the start is -[67].*angle of pin comes .*leave one of these"):
         sprung.with_joints({"hA": 7.0})
 
 
 def test_gears_start_with_their_turns():
-    geared = wheels(Gear(["hinge", "other"], [1.0, -4.0])).with_joints({"hinge": 7.0})
+    geared = wheels(sc.Gear(["hinge", "other"], [1.0, -4.0])).with_joints({"hinge": 7.0})
     np.testing.assert_allclose(geared.start[0], [7.0, 1.75], atol=1e-12)
 
 
@@ -226,7 +208,7 @@ STEPS = {"macro_dt": 0.01, "num_steps": 500, "save": 5}
 
 
 def sprung(stiffness):
-    return JointSpring("hinge", stiffness), JointLimit("other", -4.15, 4.15, stiffness=500.0, smoothing=0.02)
+    return sc.JointSpring("hinge", stiffness), sc.JointLimit("other", -4.15, 4.15, stiffness=500.0, smoothing=0.02)
 
 
 def test_springs_and_limits_beyond_half_a_turn():
@@ -241,12 +223,12 @@ def test_springs_and_limits_beyond_half_a_turn():
     with pytest.raises(ValueError, match=r'joint_limits: lower is -4.15; the angle of other.*coordinates="joint"'):
         wheels(*effects, coordinates="directors")
     with pytest.raises(ValueError, match=r"joint_springs: neutral is 7.0; the angle of hinge comes from directors"):
-        wheels(JointSpring("hinge", 2.0, 7.0), coordinates="directors")
+        wheels(sc.JointSpring("hinge", 2.0, 7.0), coordinates="directors")
 
 
 def test_runs_by_directors():
     """A spring ends a run before half a turn. Where nothing counts them, turns are counted from node to node, here of a motion that is put in."""
-    scene = wheels(JointSpring("hinge", 2.0), coordinates="directors", spin=(8.0, 0.0))
+    scene = wheels(sc.JointSpring("hinge", 2.0), coordinates="directors", spin=(8.0, 0.0))
     run = until_failure(scene, ONE, macro_dt=0.01, num_steps=100, solver=vm.Solver("masses"))
     assert Result(int(run.result)) == Result.NON_FINITE
     assert 'coordinates="joint"' in str(run.result)
@@ -273,5 +255,5 @@ def test_turns_are_coordinates():
 
 
 def test_dense_loops_keep_the_angles_that_effects_need():
-    assert [branch.joint.name for branch in crank_rocker(JointSpring("hB", 0.2)).branches] == ["hB"]
-    assert crank_rocker(JointDrive("hB", torque)).branches == ()
+    assert [branch.joint.name for branch in crank_rocker(sc.JointSpring("hB", 0.2)).branches] == ["hB"]
+    assert crank_rocker(sc.JointDrive("hB", torque)).branches == ()

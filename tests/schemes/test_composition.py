@@ -153,17 +153,17 @@ def test_describe_counts_stages():
 
 
 @pytest.mark.parametrize(
-    ("arguments", "error", "words"),
+    ("arguments", "words"),
     [
-        ((fully_explicit(3), "yoshida5"), ValueError, "there are yoshida4"),
-        ((fully_explicit(3, 0.0), "yoshida4"), ValueError, "not symmetric"),
-        ((galerkin(3, 2), "yoshida4"), ValueError, "order 4"),
-        ((fully_explicit(3), (0.5, 0.4)), ValueError, "sum to 0.9"),
-        ((fully_explicit(3), (0.5, 0.0, 0.5)), ValueError, "none zero"),
-        ((fully_explicit(3), ()), ValueError, "shape"),
-        ((3, "yoshida4"), TypeError, "give a Scheme"),
+        ((fully_explicit(3), "yoshida5"), "there are yoshida4"),
+        ((fully_explicit(3, 0.0), "yoshida4"), "not symmetric"),
+        ((galerkin(3, 2), "yoshida4"), "order 4"),
+        ((fully_explicit(3), (0.5, 0.4)), "sum to 0.9"),
+        ((fully_explicit(3), (0.5, 0.0, 0.5)), "none zero"),
+        ((fully_explicit(3), ()), "shape"),
+        ((3, "yoshida4"), "give a Scheme"),
     ],
 )
-def test_refuses(arguments, error, words):
-    with pytest.raises(error, match=words):
+def test_refuses(arguments, words):
+    with pytest.raises(vm.Refused, match=words):
         compose(*arguments)

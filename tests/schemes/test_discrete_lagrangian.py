@@ -1,23 +1,15 @@
 """The discrete Lagrangian against loops written by hand, and where each term is evaluated."""
 
 from collections import Counter
+from itertools import pairwise
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import vmri_jax as vm
 from tests.user_systems import bent_system
-from vmri_jax import (
-    discrete_lagrangian,
-    discrete_legendre,
-    explicit_slow,
-    fully_explicit,
-    fully_implicit,
-    galerkin,
-    quadrature,
-    simulate,
-)
 from vmri_jax.schemes.path import control_nodes, lagrange_basis, lagrange_derivative
 
 N, H = 4, 0.3
@@ -28,63 +20,29 @@ def control_points(degree, n_s=3, n_f=3):
     return rng.normal(size=(degree + 1, n_s)), rng.normal(size=(N * degree + 1, n_f))
 
 
-def linear_path_action(system, s, f, potentials):
-    """L_d of the reference schemes: slow linear over the macro step, fast linear between micro nodes."""
-    kinetic = (np.sum((s[1] - s[0]) ** 2) / H + np.sum((f[1:] - f[:-1]) ** 2) * N / H) / 2  # unit masses
-    return kinetic - potentials(system)
+ALPHA = 0.3
 
 
-def fully_implicit_potentials(s, f):
-    def total(system):
-        value = 0.0
-        for m in range(N):
-            theta = (m + 0.5) / N
-            middle = (f[m] + f[m + 1]) / 2
-            value += H / N * system.slow_potential((1 - theta) * s[0] + theta * s[1], middle, system.params)
-            value += H / N * system.fast_potential(middle, system.params)
-        return value
-
-    return total
-
-
-def explicit_slow_potentials(s, f, alpha):
-    def total(system):
-        def V(k):
-            return system.slow_potential(s[k], f[k], system.params)
-
-        value = H * (alpha * V(0) + (1 - alpha) * V(-1))
-        return value + sum(H / N * system.fast_potential((f[m] + f[m + 1]) / 2, system.params) for m in range(N))
-
-    return total
-
-
-def fully_explicit_potentials(s, f, alpha):
-    def total(system):
-        def V(k):
-            return system.slow_potential(s[k], f[k], system.params)
-
-        def W(m):
-            return system.fast_potential(f[m], system.params)
-
-        value = H * (alpha * V(0) + (1 - alpha) * V(-1))
-        return value + sum(H / N * (alpha * W(m) + (1 - alpha) * W(m + 1)) for m in range(N))
-
-    return total
-
-
-@pytest.mark.parametrize(
-    ("scheme", "potentials"),
-    [
-        (fully_implicit(N), fully_implicit_potentials),
-        (explicit_slow(N, 0.3), lambda s, f: explicit_slow_potentials(s, f, 0.3)),
-        (fully_explicit(N, 0.3), lambda s, f: fully_explicit_potentials(s, f, 0.3)),
-    ],
-    ids=["fully implicit", "explicit slow", "fully explicit"],
-)
-def test_reference_schemes_are_the_formulas_of_the_paper(fpu, scheme, potentials):
+@pytest.mark.parametrize("make", [vm.fully_implicit, vm.explicit_slow, vm.fully_explicit])
+def test_reference_schemes_are_the_formulas_of_the_paper(fpu, make):
+    """Slow linear over the macro step, fast linear between micro nodes."""
     s, f = control_points(1)
-    expected = linear_path_action(fpu.system, s, f, potentials(s, f))
-    assert float(discrete_lagrangian(fpu.system, scheme)(s, f, H)) == pytest.approx(float(expected), rel=1e-14)
+    system, middle, theta = fpu.system, (f[1:] + f[:-1]) / 2, (np.arange(N)[:, None] + 0.5) / N
+
+    def V(q_s, q_f):
+        return float(system.slow_potential(q_s, q_f, system.params))
+
+    def W(q_f):
+        return float(system.fast_potential(q_f, system.params))
+
+    kicks = ALPHA * V(s[0], f[0]) + (1 - ALPHA) * V(s[1], f[-1])
+    slow = np.mean(list(map(V, (1 - theta) * s[0] + theta * s[1], middle))) if make is vm.fully_implicit else kicks
+    ends = np.mean([ALPHA * W(a) + (1 - ALPHA) * W(b) for a, b in pairwise(f)])
+    fast = ends if make is vm.fully_explicit else np.mean(list(map(W, middle)))
+    kinetic = (np.sum((s[1] - s[0]) ** 2) / H + np.sum((f[1:] - f[:-1]) ** 2) * N / H) / 2  # unit masses
+    scheme = make(N) if make is vm.fully_implicit else make(N, ALPHA)
+    value = float(vm.discrete_lagrangian(system, scheme)(s, f, H))
+    assert value == pytest.approx(kinetic - H * (slow + fast), rel=1e-14)
 
 
 def galerkin_action(system, s, f, degree, rule):
@@ -108,19 +66,19 @@ def galerkin_action(system, s, f, degree, rule):
 
 @pytest.mark.parametrize("name", ["gauss", "lobatto"])
 def test_degree_two_is_a_sum_over_nodes(fpu, name):
-    rule = quadrature.gauss(2) if name == "gauss" else quadrature.lobatto(3)
+    rule = vm.quadrature.gauss(2) if name == "gauss" else vm.quadrature.lobatto(3)
     s, f = control_points(2)
     for system in (fpu.system, bent_system()):
         expected = galerkin_action(system, s, f, 2, rule)
-        value = float(jax.jit(discrete_lagrangian(system, galerkin(N, 2, name)))(s, f, H))
+        value = float(jax.jit(vm.discrete_lagrangian(system, vm.galerkin(N, 2, name)))(s, f, H))
         assert value == pytest.approx(float(expected), rel=1e-13)
 
 
-@pytest.mark.parametrize("scheme", [explicit_slow(N, 0.3), galerkin(N, 2)], ids=["explicit slow", "gauss 2"])
+@pytest.mark.parametrize("scheme", [vm.explicit_slow(N, 0.3), vm.galerkin(N, 2)], ids=["explicit slow", "gauss 2"])
 def test_discrete_legendre_transforms_are_slot_derivatives(fpu, scheme):
     s, f = control_points(scheme.degree)
-    L_d = jax.jit(discrete_lagrangian(fpu.system, scheme))
-    start, end = jax.jit(discrete_legendre(fpu.system, scheme))(s, f, H)
+    L_d = jax.jit(vm.discrete_lagrangian(fpu.system, scheme))
+    start, end = jax.jit(vm.discrete_legendre(fpu.system, scheme))(s, f, H)
     eps = 1e-5
     for (p_s, p_f), k, sign in ((start, 0, -1), (end, -1, 1)):
         for p, slot in ((p_s, s), (p_f, f)):
@@ -140,10 +98,8 @@ def test_straight_motion_has_its_own_momentum(fpu):
     v_s, v_f = np.array([1.0, -2.0, 0.5]), np.array([0.3, 0.2, -1.0])
     for degree in (1, 2, 3):
         fast_times = np.array([(m + c) / N for m in range(N) for c in control_nodes(degree)[bool(m) :]])
-        transforms = discrete_legendre(free, galerkin(N, degree))(
-            H * control_nodes(degree)[:, None] * v_s, H * fast_times[:, None] * v_f, H
-        )
-        for p_s, p_f in transforms:
+        path = H * control_nodes(degree)[:, None] * v_s, H * fast_times[:, None] * v_f
+        for p_s, p_f in jax.jit(vm.discrete_legendre(free, vm.galerkin(N, degree)))(*path, H):
             assert np.allclose(p_s, v_s, rtol=0, atol=1e-13)
             assert np.allclose(p_f, v_f, rtol=0, atol=1e-13)
 
@@ -151,56 +107,47 @@ def test_straight_motion_has_its_own_momentum(fpu):
 EVALUATIONS = Counter()
 
 
-def counted(name, function):
-    """The function, counting every evaluation at run time (each lane of a vmap once)."""
+@pytest.fixture
+def counted(fpu):
+    """The chain, whose potentials count every evaluation at run time (each lane of a vmap once)."""
 
-    def call(*args):
-        jax.debug.callback(lambda _: EVALUATIONS.update([name]), jnp.sum(args[0]))
-        return function(*args)
+    def counting(name, function):
+        def call(*args):
+            jax.debug.callback(lambda _: EVALUATIONS.update([name]), jnp.sum(args[0]))
+            return function(*args)
 
-    return call
+        return call
+
+    V, W = counting("V", fpu.system.slow_potential), counting("W", fpu.system.fast_potential)
+    return fpu.system.replace(slow_potential=V, fast_potential=W)
 
 
 @pytest.mark.parametrize("alpha", [0.5, 0.0])
-def test_explicit_chain_evaluates_v_once_and_w_num_micro_times_per_macro_step(fpu, alpha):
-    num_micro = 7
-    system = fpu.system.replace(
-        slow_potential=counted("V", fpu.system.slow_potential), fast_potential=counted("W", fpu.system.fast_potential)
-    )
+def test_explicit_chain_evaluates_v_once_and_w_num_micro_times_per_macro_step(fpu, counted, alpha):
     counts = []
-    for num_steps in (10, 25):
+    for n in (10, 25):
         EVALUATIONS.clear()
-        run = simulate(
-            system,
-            fully_explicit(num_micro, alpha),
-            fpu.state(),
-            macro_dt=0.01,
-            num_steps=num_steps,
-            save=num_steps,
-        )
+        run = vm.simulate(counted, vm.fully_explicit(7, alpha), fpu.state(), macro_dt=0.01, num_steps=n, save=n)
         jax.effects_barrier()
         counts.append(EVALUATIONS.copy())
     assert counts[1]["V"] - counts[0]["V"] == 15
-    assert counts[1]["W"] - counts[0]["W"] == 15 * num_micro
-    assert int(jnp.max(run.info.iterations)) == 0
+    assert counts[1]["W"] - counts[0]["W"] == 15 * 7
+    assert np.max(run.info.iterations) == 0
 
 
 @pytest.mark.parametrize(
     ("scheme", "v_nodes", "w_nodes"),
     [
-        (fully_implicit(N), N, N),
-        (explicit_slow(N), 2, N),
-        (fully_explicit(N), 2, N + 1),
-        (galerkin(N, 2), 2 * N, 2 * N),
-        (galerkin(N, 2, "lobatto"), 2 * N + 1, 2 * N + 1),
+        (vm.fully_implicit(N), N, N),
+        (vm.explicit_slow(N), 2, N),
+        (vm.fully_explicit(N), 2, N + 1),
+        (vm.galerkin(N, 2), 2 * N, 2 * N),
+        (vm.galerkin(N, 2, "lobatto"), 2 * N + 1, 2 * N + 1),
     ],
     ids=["fully implicit", "explicit slow", "fully explicit", "gauss 2", "lobatto 2"],
 )
-def test_each_term_is_evaluated_at_its_own_nodes_only(fpu, scheme, v_nodes, w_nodes):
-    system = fpu.system.replace(
-        slow_potential=counted("V", fpu.system.slow_potential), fast_potential=counted("W", fpu.system.fast_potential)
-    )
+def test_each_term_is_evaluated_at_its_own_nodes_only(counted, scheme, v_nodes, w_nodes):
     EVALUATIONS.clear()
-    jax.block_until_ready(discrete_lagrangian(system, scheme)(*control_points(scheme.degree), H))
+    jax.block_until_ready(vm.discrete_lagrangian(counted, scheme)(*control_points(scheme.degree), H))
     jax.effects_barrier()
     assert Counter(V=v_nodes, W=w_nodes) == EVALUATIONS

@@ -10,11 +10,7 @@ from tests.stability.driven_systems import NONE, SYSTEMS, mathieu
 from vmri_jax.hard_cases.cases import resolved
 from vmri_jax.stability.drive import drive_period, driven_motion
 
-QUICK = (
-    "Paul trap, q = 0.25, 2 steps",
-    "Mathieu, first tongue",
-    "moon on its orbit",
-)
+QUICK = ("Paul trap, q = 0.25, 2 steps", "Mathieu, first tongue", "moon on its orbit")
 
 
 @pytest.mark.parametrize(

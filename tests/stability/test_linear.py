@@ -5,18 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import vmri_jax as vm
 from tests import user_systems
 from tests.stability.systems import double_pendulum, hanging
-from vmri_jax import (
-    ConstantMass,
-    State,
-    System,
-    explicit_slow,
-    fully_explicit,
-    fully_implicit,
-    initial_state,
-    textbook,
-)
 from vmri_jax.diagnostics import linearise
 from vmri_jax.mechanics.arrays import QUICK
 from vmri_jax.stability import advise, linear_model, multipliers
@@ -28,22 +19,18 @@ def step_matrix(system, scheme, state, macro_dt, motions):
     z = jnp.concatenate([state.q_s, state.q_f, state.p_s, state.p_f])
 
     def step(coordinates):
-        start = State(state.t, *jnp.split(z + motions.embed @ coordinates, (n_s, n, n + n_s)))
-        end = textbook.step(system, scheme, start, macro_dt)
+        start = vm.State(state.t, *jnp.split(z + motions.embed @ coordinates, (n_s, n, n + n_s)))
+        end = vm.textbook.step(system, scheme, start, macro_dt)
         return motions.read @ jnp.concatenate([end.q_s, end.q_f, end.p_s, end.p_f])
 
     return np.asarray(jax.jit(jax.jacfwd(step), compiler_options=QUICK)(jnp.zeros(motions.embed.shape[1])))
 
 
-def damping(t, q_s, q_f, v_s, v_f, params):
-    return -3.0 * v_s, -2e-5 * v_f + 0.01 * q_f
-
-
 def swinging_with_damping():
     problem = user_systems.double_pendulum()  # in angles, at rest below: a kinetic function with coupled masses
     zero = jnp.zeros(1)
-    system = problem.system.replace(force=damping)
-    return system, initial_state(system, zero, zero, zero, zero)
+    system = problem.system.replace(force=lambda t, q_s, q_f, v_s, v_f, params: (-3.0 * v_s, -2e-5 * v_f + 0.01 * q_f))
+    return system, vm.initial_state(system, zero, zero, zero, zero)
 
 
 def hanging_under_tension():
@@ -52,7 +39,7 @@ def hanging_under_tension():
 
 
 @pytest.mark.parametrize(
-    ("case", "scheme"), [(hanging_under_tension, explicit_slow(2)), (swinging_with_damping, fully_implicit(2))]
+    ("case", "scheme"), [(hanging_under_tension, vm.explicit_slow(2)), (swinging_with_damping, vm.fully_implicit(2))]
 )
 def test_the_step_of_the_expansion_is_the_derivative_of_the_step(case, scheme):
     system, state = case()
@@ -72,18 +59,18 @@ def test_constraint_forces_stiffen_a_pendulum():
     def gravity(q_s, q_f, params):
         return 3 * 9.81 * q_f[1]
 
-    system = System(ConstantMass([], [3.0, 3.0]), gravity, constraint=rod)
+    system = vm.System(vm.ConstantMass([], [3.0, 3.0]), gravity, constraint=rod)
     none = jnp.zeros(0)
     for side in (-1.0, 1.0):
-        motions = linearise(system, initial_state(system, none, [0.0, 2.0 * side], none, [0.0, 0.0]))
+        motions = linearise(system, vm.initial_state(system, none, [0.0, 2.0 * side], none, [0.0, 0.0]))
         assert motions.stiffness == pytest.approx(-side * 9.81 / 2)
         assert motions.hessians["slow"] == pytest.approx(-side * 9.81 / 2)
         assert motions.growing == pytest.approx([np.sqrt(9.81 / 2)] if side > 0 else [])
-    found = multipliers(motions, fully_explicit(1), [0.05])  # of the standing pendulum
+    found = multipliers(motions, vm.fully_explicit(1), [0.05])  # of the standing pendulum
     assert found.growing.sum() == 1
     assert np.abs(found.values[found.growing]) == pytest.approx(np.exp(0.05 * motions.growing), rel=1e-3)
     assert found.radius[0] < 1
-    spinning = linearise(system, initial_state(system, none, [0.0, -2.0], none, [4.0, 0.0]))
+    spinning = linearise(system, vm.initial_state(system, none, [0.0, -2.0], none, [4.0, 0.0]))
     assert spinning.stiffness == pytest.approx(9.81 / 2 + 4.0**2 / 2**2)  # and the centripetal force
 
 
@@ -109,34 +96,26 @@ def test_multipliers_of_the_impulse_method():
 
     verlet = kick(fast, h / 2) @ np.block([[one, h * one], [zero, one]]) @ kick(fast, h / 2)
     step = kick(slow, n * h / 2) @ np.linalg.matrix_power(verlet, n) @ kick(slow, n * h / 2)
-    found = multipliers(motions, fully_explicit(n), [n * h])
+    found = multipliers(motions, vm.fully_explicit(n), [n * h])
     expected = np.linalg.eigvals(step)
     assert np.sort_complex(found.values[0]) == pytest.approx(np.sort_complex(expected), abs=1e-13)
     assert found.radius[0] == pytest.approx(np.abs(expected).max(), abs=1e-13)
 
 
-def corner(q_s, q_f, params):
-    return jnp.linalg.norm(q_s)
-
-
 def test_no_second_derivative():
     one = jnp.zeros(1)
-    system = System(ConstantMass([1.0], [1.0]), corner)
+    system = vm.System(vm.ConstantMass([1.0], [1.0]), lambda q_s, q_f, params: jnp.linalg.norm(q_s))
     with pytest.raises(ValueError, match=r"expansion of .*slow.* is not finite"):
-        linearise(system, State(0.0, one, one, one, one))
-
-
-def fixed(q_s, params):
-    return q_s - 1.0
+        linearise(system, vm.State(0.0, one, one, one, one))
 
 
 def test_nothing_moves():
     one, none = jnp.ones(1), jnp.zeros(0)
     with pytest.raises(ValueError, match="the constraints leave none of the 1 coordinates free"):
         advise(
-            System(ConstantMass([1.0], []), slow_constraint=fixed),
-            fully_implicit(1),
-            State(0.0, one, none, 0 * one, none),
+            vm.System(vm.ConstantMass([1.0], []), slow_constraint=lambda q_s, params: q_s - 1.0),
+            vm.fully_implicit(1),
+            vm.State(0.0, one, none, 0 * one, none),
             macro_dt=0.1,
         )
     with pytest.raises(TypeError, match="linearise: a System has no start; give a State"):

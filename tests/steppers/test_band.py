@@ -47,17 +47,12 @@ def test_a_band_takes_the_same_steps(scheme, monkeypatch):
     assert 0 < np.abs(full - band).max() < 1e-12  # other programs differ by round-off
 
 
-def test_a_chain_is_a_band_of_its_neighbours():
+def test_a_chain_is_a_band_of_its_neighbours_and_a_dense_mass_leaves_no_zeros():
     problem = chain(200)
     rows = constraint_pattern.all_rows(problem.system, problem.q_s, problem.q_f)
     assert isinstance(rows, Band)
     assert rows.width == 1
-
-
-def test_a_dense_mass_leaves_no_zeros():
-    problem = chain(200)
-    mass = np.eye(400) + 0.001
-    system = problem.system.replace(kinetic=vm.ConstantMass(np.zeros(0), mass))
+    system = problem.system.replace(kinetic=vm.ConstantMass(np.zeros(0), np.eye(400) + 0.001))
     assert isinstance(constraint_pattern.all_rows(system, problem.q_s, problem.q_f), Full)
 
 

@@ -82,14 +82,10 @@ def test_composed_it_is_of_order_four(fpu):
     assert np.log2(errors[0] / errors[1]) == pytest.approx(4, abs=0.3)
 
 
-def stretch(q_f, params):
-    return 400 * (q_f[1] + 0.5) ** 2
-
-
 def test_with_constraints_every_method_makes_the_same_step():
     """Masses take the correction as kicks between micro intervals, exact matrices as nodes of the macro interval."""
     problem = cart()
-    system = problem.system.replace(fast_potential=stretch)
+    system = problem.system.replace(fast_potential=lambda q_f, params: 400 * (q_f[1] + 0.5) ** 2)
 
     def run(scheme, matrix):
         return vm.simulate(system, scheme, problem.state(), macro_dt=0.02, num_steps=20, solver=vm.Solver(matrix))

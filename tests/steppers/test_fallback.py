@@ -11,21 +11,6 @@ from jax.extend.core import jaxprs_in_params
 import vmri_jax as vm
 from tests.support import largest_difference, until_failure
 from tests.user_systems import double_pendulum, two_oscillators
-from vmri_jax import (
-    Method,
-    Result,
-    Scheme,
-    explicit_slow,
-    fully_explicit,
-    fully_implicit,
-    galerkin,
-    macro,
-    micro,
-    plan,
-    prepare,
-    quadrature,
-    simulate,
-)
 from vmri_jax.running import progress
 from vmri_jax.steppers.solver import Solver
 
@@ -37,24 +22,24 @@ def drag(t, q_s, q_f, v_s, v_f, params):
 def test_a_plan_says_how_a_step_is_solved(fpu, tsp):
     """Only kicks by V let slow and fast variables go their own ways, a force couples them; a term inside the macro interval needs the whole
     equations with exact matrices, a kinetic energy that is a function the matrices of its masses."""
-    rule = micro(quadrature.midpoint)
-    inside = Scheme(4, kinetic=rule, slow=macro(quadrature.gauss(2)), fast=rule)
+    rule = vm.micro(vm.quadrature.midpoint)
+    inside = vm.Scheme(4, kinetic=rule, slow=vm.macro(vm.quadrature.gauss(2)), fast=rule)
     forced, whole = fpu.system.replace(force=drag), "exact: micro intervals in order with exact matrices"
-    assert str(plan(fpu, fully_implicit(4))).startswith("masses: passes")
-    assert "masses:" not in str(plan(fpu, explicit_slow(4)))
-    assert "masses:" in str(plan(forced, explicit_slow(4), fpu.state()))
-    assert str(plan(fpu, inside)).startswith(whole)
-    assert str(plan(double_pendulum(), fully_implicit(3))).startswith(
+    assert str(vm.plan(fpu, vm.fully_implicit(4))).startswith("masses: passes")
+    assert "masses:" not in str(vm.plan(fpu, vm.explicit_slow(4)))
+    assert "masses:" in str(vm.plan(forced, vm.explicit_slow(4), fpu.state()))
+    assert str(vm.plan(fpu, inside)).startswith(whole)
+    assert str(vm.plan(double_pendulum(), vm.fully_implicit(3))).startswith(
         "masses: micro intervals in order with matrices of the masses"
     )
-    assert str(plan(double_pendulum(), fully_implicit(3), solver=Solver("exact"))).startswith(whole)
+    assert str(vm.plan(double_pendulum(), vm.fully_implicit(3), solver=Solver("exact"))).startswith(whole)
     with pytest.raises(ValueError, match="the matrix 'masses' needs a ConstantMass, and potentials"):
-        plan(fpu, inside, solver=Solver("masses"))
+        vm.plan(fpu, inside, solver=Solver("masses"))
     with pytest.raises(ValueError, match=r"the matrix 'modes' needs .* here num_micro = 4, degree = 1"):
-        plan(fpu, fully_implicit(4), solver=Solver("modes"))
-    assert plan(fpu, fully_implicit(4)).first.matrix == "masses"
-    assert plan(tsp, galerkin(1, 3)).first.matrix == "modes"
-    assert plan(fpu, inside).first.matrix == "auto"
+        vm.plan(fpu, vm.fully_implicit(4), solver=Solver("modes"))
+    assert vm.plan(fpu, vm.fully_implicit(4)).first.matrix == "masses"
+    assert vm.plan(tsp, vm.galerkin(1, 3)).first.matrix == "modes"
+    assert vm.plan(fpu, inside).first.matrix == "auto"
 
 
 def test_auto_falls_back_where_the_march_does_not_converge():
@@ -63,19 +48,19 @@ def test_auto_falls_back_where_the_march_does_not_converge():
 
     def go(state, solver):
         step = {"macro_dt": 40.0, "num_steps": 3, "solver": solver}
-        return until_failure(problem.system, fully_implicit(20), state, **step)
+        return until_failure(problem.system, vm.fully_implicit(20), state, **step)
 
     state = problem.state()
     march, run, exact = (go(state, n) for n in (Solver("masses", max_iterations=6), solver, Solver("exact")))
-    assert int(march.result) == Result.STAGNATED
+    assert int(march.result) == vm.Result.STAGNATED
     assert int(march.failed_at) == 0
     assert run.success
-    assert np.all(run.info.method == Method.EXACT)
+    assert np.all(run.info.method == vm.Method.EXACT)
     for name in ("q_s", "q_f", "p_s", "p_f"):
         found, expected = getattr(run, name)[1], getattr(exact, name)[1]
         assert largest_difference(found, expected) / np.abs(expected).max() < 1e-12
     inside = jax.jit(lambda state: go(state, solver))(state)
-    assert int(inside.info.method.max()) == Method.EXACT
+    assert int(inside.info.method.max()) == vm.Method.EXACT
     assert largest_difference(inside.q_f, run.q_f) < 1e-11
 
 
@@ -93,7 +78,7 @@ def test_the_fallback_stays_out_of_the_loop_in_a_compiled_function(tsp):
                 yield from loops_around(part, name, inside)
 
     def run(state):
-        return simulate(tsp.system, fully_explicit(5), state, macro_dt=0.001, num_steps=5).q_f
+        return vm.simulate(tsp.system, vm.fully_explicit(5), state, macro_dt=0.001, num_steps=5).q_f
 
     found = list(loops_around(jax.make_jaxpr(run)(tsp.state()).jaxpr, "svd"))
     assert found
@@ -105,16 +90,16 @@ def test_a_run_that_fails_late_is_made_again_with_exact_matrices(tsp, capsys, mo
     monkeypatch.setattr(progress, "SECONDS_BETWEEN_LINES", 0.0)
     step = {"macro_dt": 0.2, "num_steps": 20}
     march, exact = (
-        until_failure(tsp, fully_implicit(10), solver=Solver(matrix, max_iterations=40), **step)
+        until_failure(tsp, vm.fully_implicit(10), solver=Solver(matrix, max_iterations=40), **step)
         for matrix in ("masses", "exact")
     )
     assert 2 <= int(march.failed_at) < 20
-    prepared = prepare(tsp, fully_implicit(10), solver=Solver(max_iterations=40), **step)
+    prepared = vm.prepare(tsp, vm.fully_implicit(10), solver=Solver(max_iterations=40), **step)
     run = prepared()
     line = "a step was not solved: computing its part of the run again with exact matrices"
     assert line in capsys.readouterr().err
     assert run.success
-    assert np.all(run.info.method == Method.EXACT)
+    assert np.all(run.info.method == vm.Method.EXACT)
     assert largest_difference(run.q_f, exact.q_f) == 0.0
     prepared.timed()()
 
@@ -123,8 +108,8 @@ def test_a_run_that_fails_late_is_made_again_with_exact_matrices(tsp, capsys, mo
 def test_no_library_call_in_a_compiled_run(tsp):
     """The loop over macro steps of a small constrained system has no call out of it."""
     run = jax.jit(
-        lambda state: simulate(
-            tsp.system, fully_explicit(5), state, macro_dt=0.001, num_steps=5, solver=Solver("masses")
+        lambda state: vm.simulate(
+            tsp.system, vm.fully_explicit(5), state, macro_dt=0.001, num_steps=5, solver=Solver("masses")
         )
     )
     text = str(run.lower(tsp.state()).compile().as_text())

@@ -5,22 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import vmri_jax as vm
 from tests.support import NAMES, area_change, compiled_step, largest_difference, relative_difference, step_matrix
 from tests.user_systems import two_oscillators
-from vmri_jax import (
-    ConstantMass,
-    Scheme,
-    State,
-    System,
-    compose,
-    discrete_lagrangian,
-    explicit_slow,
-    initial_state,
-    macro,
-    micro,
-    mollified_impulse,
-    simulate,
-)
 from vmri_jax.diagnostics import constraint_residual, fit_order, momentum_map
 from vmri_jax.schemes.quadrature import midpoint, mollified, trapezoidal
 from vmri_jax.steppers.solver import Solver
@@ -30,7 +17,7 @@ from vmri_jax.steppers.solver import Solver
 def test_average_of_a_vibration(fast):
     """``a(q) = sin(N theta) cot(theta / 2) / (2 N) q`` for the phase theta of a micro step: zero at ``N theta = k pi``."""
     system, n, h = two_oscillators().system, 10, 0.013
-    scheme = Scheme(n, kinetic=micro(midpoint), slow=mollified(macro(trapezoidal)), fast=micro(fast))
+    scheme = vm.Scheme(n, kinetic=vm.micro(midpoint), slow=mollified(vm.macro(trapezoidal)), fast=vm.micro(fast))
     theta = 2 * np.arctan(50.0 * h / 2) if fast is midpoint else 2 * np.arcsin(50.0 * h / 2)
     slope = step_matrix(system, scheme, n * h)[0, 1]  # H^2 / 2 kappa a'(q): the kick of V in the end's slow position
     average = 2 * float(slope) / (25.0 * (n * h) ** 2)
@@ -48,7 +35,7 @@ def test_first_resonance_is_gone(shift):
     """Just below ``num_micro theta = pi`` impulses by V excite the fast vibration, unless V is mollified."""
     n = 10
     macro_dt = 2 * n / 50.0 * np.tan(np.pi / (2 * n)) * (1 + shift)
-    plain, filtered = (spectral_radius(make(n), macro_dt) for make in (explicit_slow, mollified_impulse))
+    plain, filtered = (spectral_radius(make(n), macro_dt) for make in (vm.explicit_slow, vm.mollified_impulse))
     assert (plain > 1 + 1e-3) == (shift in (-0.005, -0.002)), plain
     assert filtered < 1 + 1e-9
 
@@ -65,7 +52,7 @@ def hardened():
 
     def end(scheme, macro_dt, num_steps, state=None):
         start = state or problem.state()
-        run = simulate(system, scheme, start, macro_dt=macro_dt, num_steps=num_steps, save=num_steps)
+        run = vm.simulate(system, scheme, start, macro_dt=macro_dt, num_steps=num_steps, save=num_steps)
         return run.final_state
 
     return end
@@ -73,7 +60,7 @@ def hardened():
 
 def test_order(hardened):
     steps = np.array([50, 100, 200, 400])
-    ends = [hardened(mollified_impulse(4), 0.5 / n, n) for n in (*steps, 3200)]
+    ends = [hardened(vm.mollified_impulse(4), 0.5 / n, n) for n in (*steps, 3200)]
     for name in NAMES:
         errors = [largest_difference(getattr(end, name), getattr(ends[-1], name)) for end in ends[:-1]]
         assert fit_order(0.5 / steps, errors).order == pytest.approx(2.0, abs=0.2)
@@ -81,8 +68,8 @@ def test_order(hardened):
 
 def test_composition_averages_over_each_stage(hardened):
     """The average depends on the length of a stage: kicks are not handed from stage to stage."""
-    scheme, h, c = mollified_impulse(4), 0.02, (0.5, 0.2, 0.3)
-    composed, state = hardened(compose(scheme, c), h, 1), None
+    scheme, h, c = vm.mollified_impulse(4), 0.02, (0.5, 0.2, 0.3)
+    composed, state = hardened(vm.compose(scheme, c), h, 1), None
     for part in c:
         state = hardened(scheme, part * h, 1, state)
     for a, b in zip(jax.tree.leaves(composed), jax.tree.leaves(state), strict=True):
@@ -102,19 +89,19 @@ def rod(q_s, q_f, params):
     return jnp.sum((q_f - q_s) ** 2, keepdims=True) / 2 - 0.5
 
 
-DUMBBELL = System(ConstantMass([5.0, 5.0], [1.0, 1.0]), attraction, spring, rod)
+DUMBBELL = vm.System(vm.ConstantMass([5.0, 5.0], [1.0, 1.0]), attraction, spring, rod)
 """Nothing of it changes under rotations."""
 
 
-def dumbbell_start(x=(0.0,) * 6) -> State:
+def dumbbell_start(x=(0.0,) * 6) -> vm.State:
     """Near (0.4, 0) and (0.4, 1), with the spring stretched; x are changes of place, angle and velocities."""
     q_s, v_s = np.array([0.4, 0.0]) + x[:2], np.array([0.0, 0.5]) + x[2:4]
     along = np.array([np.sin(x[4]), np.cos(x[4])])
-    return initial_state(DUMBBELL, q_s, q_s + along, v_s, v_s + (2.0 + x[5]) * np.array([along[1], -along[0]]))
+    return vm.initial_state(DUMBBELL, q_s, q_s + along, v_s, v_s + (2.0 + x[5]) * np.array([along[1], -along[0]]))
 
 
-def dumbbell_step(start: State, matrix: str = "masses") -> State:
-    return compiled_step(DUMBBELL, mollified_impulse(2), start, 0.02, Solver(matrix))[0]
+def dumbbell_step(start: vm.State, matrix: str = "masses") -> vm.State:
+    return compiled_step(DUMBBELL, vm.mollified_impulse(2), start, 0.02, Solver(matrix))[0]
 
 
 def test_structure_with_constraints():
@@ -145,7 +132,7 @@ def test_average_of_a_nonlinear_vibration_by_all_methods():
 
 
 def test_evaluations_are_stated():
-    assert mollified_impulse(8).describe().fast_evaluations == 2 * explicit_slow(8).describe().fast_evaluations
+    assert vm.mollified_impulse(8).describe().fast_evaluations == 2 * vm.explicit_slow(8).describe().fast_evaluations
 
 
 def kinetic(q_s, q_f, v_s, v_f, params):
@@ -154,12 +141,12 @@ def kinetic(q_s, q_f, v_s, v_f, params):
 
 def test_bad_input():
     with pytest.raises(ValueError, match="give kicks at the macro nodes"):
-        mollified(micro(trapezoidal))
+        mollified(vm.micro(trapezoidal))
     with pytest.raises(ValueError, match="only kicks of the slow potential"):
-        Scheme(2, kinetic=micro(midpoint), slow=macro(trapezoidal), fast=mollified(macro(trapezoidal)))
+        vm.Scheme(2, kinetic=vm.micro(midpoint), slow=vm.macro(trapezoidal), fast=mollified(vm.macro(trapezoidal)))
     with pytest.raises(ValueError, match="mollified"):
-        discrete_lagrangian(two_oscillators().system, mollified_impulse(2))
+        vm.discrete_lagrangian(two_oscillators().system, vm.mollified_impulse(2))
     system = two_oscillators().system.replace(kinetic=kinetic)
-    state = initial_state(system, [0.0], [0.1], [0.0], [0.0])
+    state = vm.initial_state(system, [0.0], [0.1], [0.0], [0.0])
     with pytest.raises(ValueError, match="needs a System whose kinetic is a ConstantMass"):
-        simulate(system, mollified_impulse(2), state, macro_dt=0.1, num_steps=1)
+        vm.simulate(system, vm.mollified_impulse(2), state, macro_dt=0.1, num_steps=1)

@@ -7,19 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import vmri_jax as vm
 from tests.support import compiled_step, largest_difference
-from vmri_jax import (
-    ConstantMass,
-    Problem,
-    Result,
-    State,
-    System,
-    fully_implicit,
-    initial_state,
-    kernels,
-    simulate,
-    simulate_batch,
-)
+from vmri_jax import kernels
 from vmri_jax.steppers.marched import PLAIN_PASSES
 from vmri_jax.steppers.solver import Solver
 
@@ -29,36 +19,31 @@ EXACT = Solver("exact")
 def step(problem, scheme, macro_dt, solver=EXACT, state=None):
     state = problem.state() if state is None else state
     state, info = compiled_step(problem.system, scheme, state, macro_dt, solver)
-    return state, info, Result(int(info.result))
+    return state, info, vm.Result(int(info.result))
 
 
 def test_a_plain_step_converges(fpu):
-    _, info, result = step(fpu, fully_implicit(20), 0.05)
-    assert result is Result.CONVERGED
+    _, info, result = step(fpu, vm.fully_implicit(20), 0.05)
+    assert result is vm.Result.CONVERGED
     assert result.success
     assert 1 <= int(info.iterations) <= 4
     assert float(info.residual) < 1e-13
+    start = fpu.state()
+    bad = vm.State(start.t, start.q_s, start.q_f * np.nan, start.p_s, start.p_f)
+    assert step(fpu, vm.fully_implicit(20), 0.05, state=bad)[2] is vm.Result.NON_FINITE
 
 
 def test_too_few_iterations_stagnate(fpu):
-    _, info, result = step(fpu, fully_implicit(20), 0.05, Solver("exact", max_iterations=1))
-    assert result is Result.STAGNATED
+    _, info, result = step(fpu, vm.fully_implicit(20), 0.05, Solver("exact", max_iterations=1))
+    assert result is vm.Result.STAGNATED
     assert not result.success
     assert int(info.iterations) == 1
     assert "max_iterations" in result.message
 
 
-def test_nan_is_reported(fpu):
-    start = fpu.state()
-    _, _, result = step(
-        fpu, fully_implicit(20), 0.05, state=State(start.t, start.q_s, start.q_f * jnp.nan, 0.0 * start.p_s, start.p_f)
-    )
-    assert result is Result.NON_FINITE
-
-
 def test_a_tolerance_below_roundoff_ends_at_the_floor(fpu):
-    _, info, result = step(fpu, fully_implicit(20), 0.05, Solver("exact", tolerance=1e-30))
-    assert result is Result.CONVERGED_AT_ROUNDOFF or result is Result.CONVERGED
+    _, info, result = step(fpu, vm.fully_implicit(20), 0.05, Solver("exact", tolerance=1e-30))
+    assert result is vm.Result.CONVERGED_AT_ROUNDOFF or result is vm.Result.CONVERGED
     assert int(info.iterations) < 10
     assert float(info.residual) < 1e-13
 
@@ -67,21 +52,21 @@ def test_a_tolerance_below_roundoff_ends_at_the_floor(fpu):
 def test_iterations_of_the_pendulum(tsp, macro_dt, most):
     state = tsp.state()
     for _ in range(2):
-        run = simulate(tsp.system, fully_implicit(10), state, macro_dt=macro_dt, num_steps=60, solver=EXACT)
+        run = vm.simulate(tsp.system, vm.fully_implicit(10), state, macro_dt=macro_dt, num_steps=60, solver=EXACT)
         assert int(run.info.iterations.max()) <= most
         state = run.final_state
 
 
 def test_iterations_of_a_large_macro_step(fpu):
-    run = simulate(fpu.system, fully_implicit(100), fpu.state(), macro_dt=1.0, num_steps=20, solver=EXACT)
+    run = vm.simulate(fpu.system, vm.fully_implicit(100), fpu.state(), macro_dt=1.0, num_steps=20, solver=EXACT)
     assert int(run.info.iterations.max()) <= 14  # measured 12
 
 
 def test_a_looser_tolerance_needs_fewer_iterations_and_is_as_accurate_as_asked(fpu):
-    scheme = fully_implicit(20)
+    scheme = vm.fully_implicit(20)
     exact, info, _ = step(fpu, scheme, 0.5)
     loose, loose_info, result = step(fpu, scheme, 0.5, Solver("exact", tolerance=1e-4))
-    assert result is Result.CONVERGED
+    assert result is vm.Result.CONVERGED
     assert int(loose_info.iterations) < int(info.iterations)
     assert 1e-15 < largest_difference(loose.q_s, exact.q_s) < 1e-4
 
@@ -90,36 +75,26 @@ def test_a_looser_tolerance_needs_fewer_iterations_and_is_as_accurate_as_asked(f
     ("arguments", "message"),
     [
         ({"tolerance": 0.0}, "tolerance is 0.0; it must be positive"),
+        ({"tolerance": "small"}, "tolerance is 'small'; give a real number"),
         ({"max_iterations": 0}, "max_iterations is 0; it must be positive"),
+        ({"max_iterations": None}, "max_iterations"),
         ({"matrix": "sparse"}, "matrix is 'sparse'; it must be one of auto, masses, modes, exact, null_space"),
         ({"matrix": "exact", "stepper": print}, "matrix is 'exact' beside a stepper"),
     ],
 )
 def test_bad_options_are_refused(arguments, message):
-    with pytest.raises(ValueError, match=message):
-        Solver(**arguments)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"tolerance": "small"}, "tolerance is 'small'; give a real number"),
-        ({"max_iterations": None}, "max_iterations"),
-    ],
-)
-def test_options_that_are_no_numbers_are_refused(arguments, message):
-    with pytest.raises(TypeError, match=message):
+    with pytest.raises(vm.Refused, match=message):
         Solver(**arguments)
 
 
 def test_every_status_has_a_message():
-    assert all(len(result.message) > 40 and result.message.endswith(".") for result in Result)
-    assert [result.success for result in Result] == [True, True] + [False] * (len(Result) - 2)
+    assert all(len(result.message) > 40 and result.message.endswith(".") for result in vm.Result)
+    assert [result.success for result in vm.Result] == [True, True] + [False] * (len(vm.Result) - 2)
 
 
 def test_huge_steps_end_at_the_solution_that_is_meant(tsp):
     """Plain Newton from straight motion ends at another solution in one of these steps, of 70 times the energy."""
-    run = simulate(tsp.system, fully_implicit(10), tsp.state(), macro_dt=0.2, num_steps=60, solver=EXACT)
+    run = vm.simulate(tsp.system, vm.fully_implicit(10), tsp.state(), macro_dt=0.2, num_steps=60, solver=EXACT)
     assert float(jnp.abs(run.energy - run.energy[0]).max()) < 200.0  # measured 145, of 12 000 that are exchanged
     assert float(run.constraint_residual.max()) < 1e-11
 
@@ -133,7 +108,7 @@ def test_continuation_finds_the_solution_that_plain_newton_misses(tsp):
     starts = [replace(state, p_s=(1 + 1e-3 * k) * state.p_s, p_f=(1 + 1e-3 * k) * state.p_f) for k in range(16)]
     states = jax.tree.map(lambda *a: jnp.stack(list(map(jnp.asarray, a))), *starts)
     sizes = {"macro_dt": 0.4, "num_steps": 40, "solver": EXACT}
-    run = simulate_batch(tsp.system, fully_implicit(10), states, **sizes, warn=False)
+    run = vm.simulate_batch(tsp.system, vm.fully_implicit(10), states, **sizes, warn=False)
     ended = run.failed_at < 0
     assert int(ended.sum()) >= 6  # measured 10 and 11
     if kernels.CONTRACTION > 0:  # with exact matrices in every pass nothing is missed
@@ -152,34 +127,30 @@ def hill(q_f, params):
 
 
 def test_contradicting_constraints_are_violated():
-    system = System(ConstantMass([1.0], [1.0, 1.0]), constraint=on_two_circles)
+    system = vm.System(vm.ConstantMass([1.0], [1.0, 1.0]), constraint=on_two_circles)
     one, zero = jnp.ones(1), jnp.zeros(1)
-    state = State(jnp.zeros(()), zero, jnp.array([1.0, 0.0]), one, jnp.array([0.0, 0.5]))
-    _, info = compiled_step(system, fully_implicit(2), state, 0.1, EXACT)
-    assert Result(int(info.result)) is Result.CONSTRAINT_VIOLATED
+    state = vm.State(jnp.zeros(()), zero, jnp.array([1.0, 0.0]), one, jnp.array([0.0, 0.5]))
+    _, info = compiled_step(system, vm.fully_implicit(2), state, 0.1, EXACT)
+    assert vm.Result(int(info.result)) is vm.Result.CONSTRAINT_VIOLATED
 
 
 def test_a_curvature_that_cancels_the_mass_is_singular():
     """``m - h^2 k / 4 = 0`` for the midpoint rule on a hill of curvature k."""
-    system = System(ConstantMass([1.0], [1.0]), fast_potential=hill, params=jnp.array(4.0))
-    state = initial_state(system, [0.0], [0.3], [0.0], [0.1])
-    _, info = compiled_step(system, fully_implicit(1), state, 1.0, EXACT)
-    assert Result(int(info.result)) is Result.SINGULAR
+    system = vm.System(vm.ConstantMass([1.0], [1.0]), fast_potential=hill, params=jnp.array(4.0))
+    state = vm.initial_state(system, [0.0], [0.3], [0.0], [0.1])
+    _, info = compiled_step(system, vm.fully_implicit(1), state, 1.0, EXACT)
+    assert vm.Result(int(info.result)) is vm.Result.SINGULAR
 
 
 def pair(q_s, q_f, params):
     return jnp.sum((q_f - q_s) ** 4) / 2
 
 
-def stiff_pair(q_f, params):
-    return 50 * jnp.sum(q_f**2)
-
-
 def test_slow_variable_that_only_sees_round_off():
     """A symmetric pair leaves its centre at rest but for round-off: no size of its own to converge relative to."""
-    system = System(ConstantMass([1.0], [1.0, 1.0]), pair, stiff_pair)
-    state = initial_state(system, [0.0], [0.3, -0.3], [0.0], [0.0, 0.0])
-    run = simulate(system, fully_implicit(4), state, macro_dt=0.1, num_steps=200, solver=EXACT)
+    system = vm.System(vm.ConstantMass([1.0], [1.0, 1.0]), pair, lambda q_f, params: 50 * jnp.sum(q_f**2))
+    state = vm.initial_state(system, [0.0], [0.3, -0.3], [0.0], [0.0, 0.0])
+    run = vm.simulate(system, vm.fully_implicit(4), state, macro_dt=0.1, num_steps=200, solver=EXACT)
     assert int(run.info.iterations.max()) <= 4
     assert float(jnp.abs(run.q_s).max()) < 1e-15  # measured 1e-17
 
@@ -195,6 +166,6 @@ def test_round_off_of_coupled_masses_ends_the_iteration():
     def weight(q_f, params):
         return 9.81 * jnp.sum(masses[0] * q_f)
 
-    problem = Problem(System(kinetic, fast_potential=weight), q_s=[], q_f=np.zeros(60))
-    run = simulate(problem, fully_implicit(1), macro_dt=1e-3, num_steps=3)
+    problem = vm.Problem(vm.System(kinetic, fast_potential=weight), q_s=[], q_f=np.zeros(60))
+    run = vm.simulate(problem, vm.fully_implicit(1), macro_dt=1e-3, num_steps=3)
     assert np.max(run.info.residual) < 1e-14

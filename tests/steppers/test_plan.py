@@ -5,18 +5,7 @@ from typing import Any
 import jax.numpy as jnp
 import pytest
 
-from vmri_jax import (
-    compose,
-    explicit_slow,
-    fully_explicit,
-    fully_implicit,
-    galerkin,
-    micro,
-    mollified_impulse,
-    plan,
-    quadrature,
-    takahashi_imada,
-)
+import vmri_jax as vm
 from vmri_jax.steppers.decoupled import Joined
 
 FPU_EXPLICIT = """\
@@ -38,11 +27,11 @@ a step:
 
 
 def test_a_plan_describes_what_the_scheme_does_with_the_system(fpu):
-    assert plan(fpu.system, fully_explicit(5, alpha=0.3), fpu.state()).describe() == FPU_EXPLICIT
+    assert vm.plan(fpu.system, vm.fully_explicit(5, alpha=0.3), fpu.state()).describe() == FPU_EXPLICIT
 
 
 def test_only_terms_of_the_system_are_described(tsp):
-    rows = plan(tsp.system, compose(explicit_slow(4), "yoshida4"), tsp.state()).describe().splitlines()
+    rows = vm.plan(tsp.system, vm.compose(vm.explicit_slow(4), "yoshida4"), tsp.state()).describe().splitlines()
     step = rows.index("a step:")
     assert [row.split()[0] for row in rows[2:step]] == ["T", "V", "W", "g", "g_s", "gradients", "gradients", "solves"]
     assert rows[step + 1] == "  composition of 3 stages, each:"
@@ -51,14 +40,14 @@ def test_only_terms_of_the_system_are_described(tsp):
 @pytest.mark.parametrize(
     ("scheme", "words"),
     [
-        (explicit_slow(5), "trapezoidal rule on the macro interval"),
-        (explicit_slow(5, 1.0), "rule of nodes 0, 1 with weights 1, 0 on the macro interval"),
-        (mollified_impulse(5), "trapezoidal rule on the macro interval, at averaged fast positions"),
-        (takahashi_imada(5), "trapezoidal rule on the macro interval, corrected by its gradient"),
-        (galerkin(5, 3), "Gauss rule of 3 nodes on every micro interval"),
-        (galerkin(5, 3, "lobatto"), "Lobatto rule of 4 nodes on every micro interval"),
-        (galerkin(5, 2, quadrature.radau(2)), "Radau rule of 2 nodes with the right end on every micro interval"),
-        (galerkin(5, 2, quadrature.simpson), "Simpson's rule on every micro interval"),
+        (vm.explicit_slow(5), "trapezoidal rule on the macro interval"),
+        (vm.explicit_slow(5, 1.0), "rule of nodes 0, 1 with weights 1, 0 on the macro interval"),
+        (vm.mollified_impulse(5), "trapezoidal rule on the macro interval, at averaged fast positions"),
+        (vm.takahashi_imada(5), "trapezoidal rule on the macro interval, corrected by its gradient"),
+        (vm.galerkin(5, 3), "Gauss rule of 3 nodes on every micro interval"),
+        (vm.galerkin(5, 3, "lobatto"), "Lobatto rule of 4 nodes on every micro interval"),
+        (vm.galerkin(5, 2, vm.quadrature.radau(2)), "Radau rule of 2 nodes with the right end on every micro interval"),
+        (vm.galerkin(5, 2, vm.quadrature.simpson), "Simpson's rule on every micro interval"),
     ],
 )
 def test_rules_in_words(scheme, words):
@@ -93,16 +82,16 @@ def bends(q_s, q_f, params):
 
 
 def test_a_plan_of_three_rates(fpu):
-    scheme = fully_explicit(32).with_potentials(bends=micro(quadrature.trapezoidal, every=8))
-    described = plan(fpu.system.replace(potentials={"bends": bends}), scheme, fpu.state()).describe()
+    scheme = vm.fully_explicit(32).with_potentials(bends=vm.micro(vm.quadrature.trapezoidal, every=8))
+    described = vm.plan(fpu.system.replace(potentials={"bends": bends}), scheme, fpu.state()).describe()
     assert described == THREE_RATES
 
 
 def test_a_mollified_scheme_refuses_potentials_on_the_micro_grid(fpu):
     with pytest.raises(ValueError, match=r"mollified, .* the potentials bends are on the micro grid"):
-        plan(
+        vm.plan(
             fpu.system.replace(potentials={"bends": bends}),
-            mollified_impulse(4).with_potentials(bends=micro(quadrature.midpoint)),
+            vm.mollified_impulse(4).with_potentials(bends=vm.micro(vm.quadrature.midpoint)),
             fpu.state(),
         )
 
@@ -110,9 +99,9 @@ def test_a_mollified_scheme_refuses_potentials_on_the_micro_grid(fpu):
 def test_slow_variables_are_joined_where_the_matrices_are_no_larger(fpu, tsp, sam):
     """Modes leave out the curvature of slow variables; an iteration with a diagonal or a kept matrix of the fast variables keeps to it."""
     steppers: dict[Any, Any] = {
-        (name, scheme.degree): plan(problem, scheme).stepper
+        (name, scheme.degree): vm.plan(problem, scheme).stepper
         for name, problem in (("fpu", fpu), ("tsp", tsp), ("sam", sam))
-        for scheme in (fully_implicit(1), galerkin(1, 3))
+        for scheme in (vm.fully_implicit(1), vm.galerkin(1, 3))
     }
     joined = {key for key, stepper in steppers.items() if isinstance(stepper.inner, Joined)}
     assert joined == {("tsp", 1), ("fpu", 3), ("tsp", 3), ("sam", 3)}

@@ -5,20 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import vmri_jax as vm
 from tests.stability.systems import swinging
 from tests.support import compiled_step, largest_difference, without_fallback
 from tests.user_systems import two_oscillators
-from vmri_jax import (
-    Scheme,
-    discrete_legendre,
-    explicit_slow,
-    fully_explicit,
-    fully_implicit,
-    galerkin,
-    macro,
-    micro,
-    quadrature,
-)
 
 
 def step(problem, scheme, macro_dt):
@@ -32,8 +22,11 @@ def only_slow(q_s, q_f, params):
 def test_split_and_coupled_routes_agree():
     """An implicit V of q_s alone is split off; made to look coupled, the same step is solved at once."""
     problem = two_oscillators()
-    scheme = Scheme(
-        4, kinetic=micro(quadrature.midpoint), slow=macro(quadrature.midpoint), fast=micro(quadrature.midpoint)
+    scheme = vm.Scheme(
+        4,
+        kinetic=vm.micro(vm.quadrature.midpoint),
+        slow=vm.macro(vm.quadrature.midpoint),
+        fast=vm.micro(vm.quadrature.midpoint),
     )
     separate = problem.system.replace(slow_potential=only_slow)
     together = problem.system.replace(slow_potential=lambda q_s, q_f, params: only_slow(q_s, q_f, params) + 0 * q_f[0])
@@ -44,14 +37,14 @@ def test_split_and_coupled_routes_agree():
         assert largest_difference(getattr(a[0], name), getattr(b[0], name)) < 1e-13
 
 
-@pytest.mark.parametrize("scheme", [fully_implicit(3), explicit_slow(3, 0.2), fully_explicit(3, 0.9)])
+@pytest.mark.parametrize("scheme", [vm.fully_implicit(3), vm.explicit_slow(3, 0.2), vm.fully_explicit(3, 0.9)])
 def test_the_step_is_the_discrete_legendre_transform(fpu, scheme):
     """The control points of the step have the start's momenta at one end and the new ones at the other."""
     start = fpu.state()
     end, info = step(fpu, scheme, 0.05)
     slow = np.stack([start.q_s, end.q_s])
     fast = np.concatenate([np.asarray(start.q_f)[None], info.q_f_micro])
-    (p_s, p_f), (p_s_end, p_f_end) = jax.jit(discrete_legendre(fpu.system, scheme))(slow, fast, 0.05)
+    (p_s, p_f), (p_s_end, p_f_end) = jax.jit(vm.discrete_legendre(fpu.system, scheme))(slow, fast, 0.05)
     for a, b in ((p_s, start.p_s), (p_f, start.p_f), (p_s_end, end.p_s), (p_f_end, end.p_f)):
         assert largest_difference(a, b) < 1e-12  # measured 1e-14
     assert np.array_equal(info.q_f_micro[-1], end.q_f)
@@ -63,7 +56,7 @@ def test_constraints_hold_at_every_micro_node(degree):
     """Of a double pendulum whose first rod is slow."""
     problem = swinging()
     system, start = problem.system, problem.state()
-    end, info = step(problem, galerkin(3, degree), 0.03)
+    end, info = step(problem, vm.galerkin(3, degree), 0.03)
     if degree == 1:  # the slow path is linear
         for m in range(3):
             q_s = start.q_s + (m + 1) / 3 * (end.q_s - start.q_s)
@@ -80,8 +73,8 @@ def test_small_steps_lose_no_digits(fpu):
     """Relative accuracy of the momenta does not suffer from a tiny step: velocities come from increments."""
     start = fpu.state()
     for macro_dt in (1e-6, 1e-9):
-        end, _ = step(fpu, fully_implicit(3), macro_dt)
+        end, _ = step(fpu, vm.fully_implicit(3), macro_dt)
         drift = macro_dt * 2500 / 50  # omega^2 f_1, the largest force
         assert 0.9 * drift < largest_difference(end.p_f, start.p_f) < 1.1 * drift
-        explicit, _ = step(fpu, fully_explicit(3), macro_dt)
+        explicit, _ = step(fpu, vm.fully_explicit(3), macro_dt)
         assert largest_difference(end.p_f, explicit.p_f) < 1e-13 + macro_dt**2 * 2500

@@ -1,14 +1,18 @@
-"""Convergence studies: orders, rows, failures, and what is refused."""
+"""Convergence studies: orders, rows, failures, executors, Ctrl-C, and what is refused."""
 
 import csv
 import dataclasses
+import pickle
+from concurrent.futures import Executor, Future
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import vmri_jax as vm
-from vmri_jax.study import ReferenceSolution, convergence_study, reference_solution
+from vmri_jax.executors.executor import in_worker
+from vmri_jax.stability import stability_map
+from vmri_jax.study import ConvergenceStudy, ReferenceSolution, convergence_study, reference_solution
 
 OMEGA = 20.0
 
@@ -50,9 +54,14 @@ def test_the_reference_knows_its_own_error(reference):
 
 
 @pytest.mark.parametrize(("scheme", "order"), [("first order", 1), ("second order", 2)])
-@pytest.mark.parametrize("quantity", ["q", "p"])
-def test_orders(study, scheme, order, quantity):
-    assert study.order(scheme, quantity) == pytest.approx(order, abs=0.1)
+def test_orders(study, scheme, order):
+    for quantity in ("q", "p"):
+        assert study.order(scheme, quantity) == pytest.approx(order, abs=0.1)
+    fit = study.fit(scheme)
+    assert fit.points == 3
+    assert abs(fit.order - order) <= fit.half_width + 0.05
+    energy = [row.energy_error for row in study.rows if row.scheme == scheme]
+    assert energy[0] / energy[2] == pytest.approx(4**order, rel=0.3)
 
 
 def test_errors_are_the_largest_over_nodes_and_coordinates(study, reference):
@@ -92,19 +101,58 @@ def test_errors_near_the_reference_are_not_fitted(study):
     assert coarse.usable("second order")[0].tolist() == macro_dt[:2].tolist()
 
 
+SCHEMES = {"explicit": vm.fully_explicit(4)}
+
+
 def test_progress_hears_of_every_run(reference):
     heard = []
-    convergence_study(
-        PROBLEM,
-        {"explicit": vm.fully_explicit(4)},
-        STEPS,
-        1.0,
-        num_saves=5,
-        reference=reference,
-        progress=lambda *news: heard.append(news),
-    )
+    how = {"num_saves": 5, "reference": reference}
+    convergence_study(PROBLEM, SCHEMES, STEPS, 1.0, **how, progress=lambda *news: heard.append(news))
     assert heard[0] == ("explicit, H = 0.02", 0, 3)
     assert heard[-1] == ("done", 3, 3)
+
+
+@pytest.mark.parametrize(("words", "rows"), [("H = 0.005", 2), ("measuring times", 3)])
+def test_ctrl_c_keeps_the_rows(reference, words, rows):
+    def progress(what, done, total):
+        if words in what:
+            raise KeyboardInterrupt
+
+    how = {"num_saves": 5, "reference": reference, "repeats": 1, "progress": progress}
+    with pytest.raises(vm.Interrupted, match=f"interrupted after {rows} runs") as caught:
+        convergence_study(PROBLEM, SCHEMES, STEPS, 1.0, **how)
+    study = caught.value.done
+    assert isinstance(study, ConvergenceStudy)
+    assert [row.macro_dt for row in study.rows] == list(STEPS[:rows])
+    assert study.order("explicit") == pytest.approx(2.0, abs=0.1)
+
+
+class Travelling(Executor):
+    """Tasks and results travel as bytes, as to a worker and back, but the worker is this process: programs are compiled once."""
+
+    def submit(self, fn, /, *args, **kwargs) -> Future:
+        fn, args, kwargs = pickle.loads(pickle.dumps((fn, args, kwargs)))
+        future: Future = Future()
+        future.set_result(pickle.loads(pickle.dumps(fn(*args, **kwargs))))
+        return future
+
+
+def test_executors_have_the_results_of_this_process(reference, monkeypatch):
+    """`tests/ensembles/test_workers.py` has a cluster."""
+    monkeypatch.setattr(
+        f"{in_worker.__module__}._prepare", lambda process: None
+    )  # this process has its settings already
+    how = {"num_saves": 5, "reference": reference}
+    here, there = (convergence_study(PROBLEM, SCHEMES, STEPS, 1.0, **how, executor=e) for e in (None, Travelling()))
+    assert here.to_pandas().equals(there.to_pandas())
+    timed = convergence_study(PROBLEM, SCHEMES, STEPS, 1.0, **how, executor=Travelling(), repeats=1)
+    assert all(row.seconds > 0 for row in timed.rows)
+    schemes, grid = {n: vm.fully_explicit(n) for n in (2, 5)}, np.linspace(0.5, 2.0, 12) * np.pi
+    here, there = (stability_map(vm.stability.linear_model(), schemes, grid, executor=e) for e in (None, Travelling()))
+    assert np.allclose(here.radius, there.radius, rtol=0, atol=1e-12)
+    assert here.rows == there.rows
+    assert here.unstable == there.unstable
+    assert here.unstable[0]
 
 
 @pytest.mark.parametrize(
@@ -119,7 +167,7 @@ def test_progress_hears_of_every_run(reference):
     ],
 )
 def test_bad_input(reference, changes, message):
-    arguments = {"schemes": {"explicit": vm.fully_explicit(4)}, "macro_dt": STEPS, "reference": reference} | changes
+    arguments = {"schemes": SCHEMES, "macro_dt": STEPS, "reference": reference} | changes
     with pytest.raises(ValueError, match=message):
         convergence_study(PROBLEM, t_end=1.0, num_saves=5, **arguments)
 
@@ -127,24 +175,6 @@ def test_bad_input(reference, changes, message):
 def test_asking_for_a_scheme_that_was_not_run(study):
     with pytest.raises(ValueError, match=r"no scheme 'third order'.*first order, second order"):
         study.order("third order")
-
-
-def test_energy_and_confidence(reference):
-    free = dataclasses.replace(
-        PROBLEM,
-        system=vm.System(vm.ConstantMass(jnp.ones(3), jnp.ones(3)), lambda q_s, q_f, _: jnp.sum((q_s - q_f) ** 4)),
-        q_s=jnp.ones(3),
-        q_f=jnp.zeros(3),
-        v_s=jnp.arange(3.0),
-        v_f=jnp.ones(3),
-    )
-    schemes = {"impulse": vm.fully_explicit(2)}
-    study = convergence_study(free, schemes, (0.05, 0.025, 0.0125), 1.0, num_saves=10)
-    errors = [row.energy_error for row in study.rows]
-    assert errors[0] / errors[2] == pytest.approx(16, rel=0.3)
-    fit = study.fit("impulse")
-    assert fit.points == 3
-    assert abs(fit.order - 2) <= fit.half_width + 0.05
 
 
 def test_cases_side_by_side():

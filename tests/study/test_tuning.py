@@ -1,6 +1,7 @@
-"""The search for the cheapest setting: what it promises, what it refuses, what it keeps when it fails; and the page of cost."""
+"""The search for the cheapest setting: what it promises, refuses, and keeps when it fails; the page of cost, and prices of functions."""
 
 import dataclasses
+from importlib import import_module
 from itertools import pairwise
 
 import jax.numpy as jnp
@@ -9,12 +10,22 @@ import pytest
 
 import vmri_jax as vm
 from tests.accuracy.test_drives import GAUSS, LENGTH, motion, oscillator
+from tests.small_systems import no_constraint
 from tests.study.test_convergence import PROBLEM
 from vmri_jax.accuracy import search
 from vmri_jax.accuracy.families import by_promise
 from vmri_jax.running.interrupts import Interrupted
-from vmri_jax.study import cost_report, families, reference_solution, tune
-from vmri_jax.study.tuning import NothingReached, default_t_end
+from vmri_jax.study import (
+    ReferenceSolution,
+    Row,
+    WorkPrecision,
+    convergence_study,
+    cost_report,
+    families,
+    reference_solution,
+    tune,
+)
+from vmri_jax.study.tuning import NothingReached, bound_of, default_t_end, prices
 
 SHORT_MENU = [family for family in families() if family.name in ("fully explicit", "fully explicit, suzuki4")]
 
@@ -110,16 +121,57 @@ def test_a_system_that_fails_at_every_step_says_so(monkeypatch):
         tune(dataclasses.replace(PROBLEM, system=system), 1e-4, 0.1, menu=SHORT_MENU[:1])
 
 
-def test_ctrl_c_keeps_the_runs(monkeypatch):
+def test_ctrl_c_keeps_the_runs(monkeypatch, tmp_path):
+    def drawing(*_):
+        raise KeyboardInterrupt
+
     def stopped(self, trials):
         if len(self.seconds) == 1:
             raise KeyboardInterrupt
         self.seconds[trials[0].family.expression] = 1.0
 
+    monkeypatch.setattr(import_module("vmri_jax.study.tuning"), "_write", drawing)
+    with pytest.raises(Interrupted) as caught:
+        cost_report(PROBLEM, "spring", tmp_path, t_end=1.0, errors=[1e-3], menu=SHORT_MENU[:1])
+    assert caught.value.done.rows
     monkeypatch.setattr(search.Search, "measure", stopped)
     with pytest.raises(Interrupted, match="interrupted after") as caught:
         tune(PROBLEM, 1e-3, 1.0, menu=SHORT_MENU)
     assert len(caught.value.done.rows) >= 2
+
+
+EXACT = ReferenceSolution(np.zeros((2, 4)), np.zeros((2, 4)))
+ROW = Row("kicks", 5, 2, 4, 0.1, 1e-3, seconds=2.0, slow_evaluations=4, fast_evaluations=20)
+
+
+def test_bound_is_the_time_of_the_gradients():
+    assert bound_of({"V": 0.1, "W": 0.01}, [ROW]) == ((pytest.approx(4 * 0.1 + 20 * 0.01), 1e-3),)
+    assert bound_of({"V": 9.0, "W": 1.0}, [ROW]) == ((2.0, 1e-3),)  # of the run, where a loop of its own is slower
+
+
+def quartic(q_s, q_f, params):
+    return jnp.sum(q_f**4)
+
+
+def test_tables_list_further_potentials(tmp_path):
+    problem = no_constraint()
+    problem = dataclasses.replace(problem, system=problem.system.replace(potentials={"bends": quartic, 4: quartic}))
+    stage = vm.fully_explicit(8).with_potentials(bends=vm.micro(vm.quadrature.trapezoidal, every=2))
+    schemes = {"kicks": stage, "composed": vm.compose(stage, "suzuki4")}
+    study = convergence_study(problem, schemes, [0.1], 1.0, num_saves=1, reference=EXACT).work()
+    one, five = study.rows
+    passes = one.fast_evaluations / (10 * 8)
+    assert one.evaluations == {"bends": passes * 10 * 4, 4: passes * 10 * 2}
+    assert five.stages == 5
+    assert "bends" in str(study)
+    assert "V_4" in str(study)
+    assert "further gradients" not in str(WorkPrecision((ROW,), EXACT))
+    study.to_csv(tmp_path / "runs.csv")
+    assert "evaluations of bends" in (tmp_path / "runs.csv").read_text()
+    price = prices(problem)
+    assert set(price) == {"V", "W", "bends", 4}
+    ((seconds, _),) = bound_of(price, [dataclasses.replace(one, seconds=np.inf)])
+    assert seconds > one.evaluations["bends"] * price["bends"] > 0
 
 
 def test_cost_report(tmp_path):
@@ -143,3 +195,6 @@ def test_cost_report(tmp_path):
     assert default_t_end(PROBLEM) == pytest.approx(30 * 2 * np.pi / 20, rel=0.1)
     with pytest.raises(ValueError, match="each of errors is -1"):
         cost_report(PROBLEM, "spring", tmp_path, t_end=1.0, errors=(-1.0,))
+    at_rest = vm.Problem(vm.System(vm.ConstantMass([1.0], [])), [1.0], [])
+    with pytest.raises(ValueError, match=r"positions move by 0\.0e\+00.*at rest"):
+        cost_report(at_rest, "mass", tmp_path, t_end=1.0, menu=SHORT_MENU[:1])

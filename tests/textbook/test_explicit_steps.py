@@ -1,6 +1,7 @@
 """Explicit steps, linear ones, and slow and fast variables that go their own ways, against the textbook."""
 
 from random import Random
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,33 +13,20 @@ from tests.textbook.residual import residual
 from tests.verification import random_systems as rs
 from vmri_jax import Method, textbook
 
+HELD: Any = {"constraint": "anchored", "slow_constraint": "sphere"}
+ROD: Any = {"constraint": "rod", "moving": True}
+EXPLICIT = rs.Structure(2, 1, 2, **SPRINGS, scheme="fully explicit", num_micro=5)
+LINEAR = rs.Structure(2, 1, 2, "matrix", "harmonic", "harmonic", scheme="explicit slow", num_micro=3)
+COMPOSED = rs.Structure(2, 1, 1, **SPRINGS, **ROD, scheme="fully explicit", num_micro=2, composition="yoshida4")
 STRUCTURES = {
-    "explicit": (Method.EXPLICIT, rs.Structure(2, 1, 2, **SPRINGS, scheme="fully explicit", num_micro=5)),
+    "explicit": (Method.EXPLICIT, EXPLICIT),
     "corrected kicks": (Method.EXPLICIT, rs.Structure(2, 1, 1, **SPRINGS, scheme="takahashi imada", num_micro=2)),
-    "linear": (
-        Method.LINEAR,
-        rs.Structure(2, 1, 2, "matrix", "harmonic", "harmonic", scheme="explicit slow", num_micro=3),
-    ),
+    "linear": (Method.LINEAR, LINEAR),
     "slow and fast apart": (
         Method.MASSES,
-        rs.Structure(
-            2, 1, 2, **SPRINGS, constraint="anchored", slow_constraint="sphere", scheme="explicit slow", num_micro=3
-        ),
+        rs.Structure(2, 1, 2, **SPRINGS, **HELD, scheme="explicit slow", num_micro=3),
     ),
-    "composition": (
-        Method.MASSES,
-        rs.Structure(
-            2,
-            1,
-            1,
-            **SPRINGS,
-            constraint="rod",
-            moving=True,
-            scheme="fully explicit",
-            num_micro=2,
-            composition="yoshida4",
-        ),
-    ),
+    "composition": (Method.MASSES, COMPOSED),
 }
 
 

@@ -1,6 +1,7 @@
 """Steps whose unknowns are solved for at once, against the textbook."""
 
 from random import Random
+from typing import Any
 
 import pytest
 
@@ -8,45 +9,16 @@ from tests.textbook.agreement import SPRINGS, agrees, assert_agrees
 from tests.verification import random_systems as rs
 from vmri_jax import Method
 
+HELD: Any = {**SPRINGS, "constraint": "rod", "moving": True, "slow_constraint": "norm"}
+EXACT = rs.Structure(1, 2, 2, **SPRINGS, force="drag", scheme="gauss", num_micro=3, degree=3, method="exact")
+NULL_SPACE = rs.Structure(2, 1, 2, "matrix", **HELD, scheme="gauss", num_micro=2, method="null_space")
+OWN: Any = {"force": "drive", "scheme": "mixed", "num_micro": 2, "degree": 2, "method": "dense"}
 STRUCTURES = {
-    "exact": (
-        Method.EXACT,
-        rs.Structure(1, 2, 2, **SPRINGS, force="drag", scheme="gauss", num_micro=3, degree=3, method="exact"),
-    ),
-    "kinetic function and all else": (
-        Method.MASSES,
-        rs.Structure(
-            2, 1, 1, "bent", **SPRINGS, constraint="rod", moving=True, slow_constraint="norm", force="drag", num_micro=2
-        ),
-    ),
-    "kinetic function and all else, joined": (
-        Method.MASSES,
-        rs.Structure(
-            2, 1, 1, "bent", **SPRINGS, constraint="rod", moving=True, slow_constraint="norm", force="drag", num_micro=1
-        ),
-    ),
-    "null space": (
-        Method.NULL_SPACE,
-        rs.Structure(
-            2,
-            1,
-            2,
-            "matrix",
-            **SPRINGS,
-            constraint="rod",
-            moving=True,
-            slow_constraint="norm",
-            scheme="gauss",
-            num_micro=2,
-            method="null_space",
-        ),
-    ),
-    "own rules": (
-        Method.EXACT,
-        rs.Structure(
-            1, 1, 2, "coupled", **SPRINGS, force="drive", scheme="mixed", num_micro=2, degree=2, method="dense"
-        ),
-    ),
+    "exact": (Method.EXACT, EXACT),
+    "kinetic function and all else": (Method.MASSES, rs.Structure(2, 1, 1, "bent", **HELD, force="drag", num_micro=2)),
+    "the same, joined": (Method.MASSES, rs.Structure(2, 1, 1, "bent", **HELD, force="drag", num_micro=1)),
+    "null space": (Method.NULL_SPACE, NULL_SPACE),
+    "own rules": (Method.EXACT, rs.Structure(1, 1, 2, "coupled", **SPRINGS, **OWN)),
 }
 
 

@@ -1,10 +1,15 @@
-"""Every system through the studies of accuracy and cost; `tune` and `cost_report` are run by the commands `tune` and `cost`."""
+"""Every system through the studies of accuracy and cost, what linearises it, and the hard cases of `vmri check`.
+
+`tune`, `cost_report`, `advise` and `stability_map` are run by the commands `tune`, `cost`, `advise` and `stability`.
+"""
 
 import numpy as np
 import pytest
 
+from tests.small_systems import SYSTEMS
 from tests.tools.table import MACRO_DT, SCHEME, T_END, Cell, cells, check
-from vmri_jax import plots, study
+from vmri_jax import diagnostics, plots, stability, study
+from vmri_jax.hard_cases import cases_for, run_cases
 
 
 def reference_solution(cell: Cell) -> None:
@@ -32,10 +37,38 @@ def work_and_precision(cell: Cell) -> None:
         plots.save(rows.plot(work=work), cell.folder / "work.png")
 
 
-TOOLS = {tool.__name__: tool for tool in (reference_solution, convergence_study, work_and_precision)}
+def monodromy(cell: Cell) -> None:
+    product = stability.monodromy(cell.moving, SCHEME, macro_dt=MACRO_DT, num_steps=2)
+    assert str(product)
+
+
+def linearise(cell: Cell) -> None:
+    linear = diagnostics.linearise(cell.moving)
+    assert str(linear)
+    assert np.isfinite(linear.frequencies).all()
+    assert (np.diff(linear.frequencies) <= 0).all()
+    assert linear.kinetic_shares.sum(axis=0) == pytest.approx(1.0)
+
+
+def two_cases(cell: Cell) -> None:
+    """Tiny steps and reductions, which compile little."""
+    report = run_cases(cases_for(cell.moving), (6, 9))
+    assert report.passed, str(report)
+
+
+def all_cases(cell: Cell) -> None:
+    report = run_cases(cases_for(cell.moving))
+    assert report.passed, str(report)
+    assert (cell.folder / "cases.csv") in report.write(cell.folder)
+
+
+OF_STUDIES = reference_solution, convergence_study, work_and_precision
+TOOLS = {tool.__name__: tool for tool in (*OF_STUDIES, monodromy, linearise, two_cases, all_cases)}
 REFUSED = {}
+FULL = {("all_cases", system) for system in SYSTEMS}
+"""A minute of processor time each: ten programs are compiled, of which the batch with a lane that fails takes a third."""
 
 
-@cells(TOOLS)
+@cells(TOOLS, FULL)
 def test_cell(tool: str, system: str, tmp_path, monkeypatch: pytest.MonkeyPatch):
     check(TOOLS, REFUSED, tool, Cell(system, tmp_path, monkeypatch))

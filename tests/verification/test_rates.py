@@ -229,6 +229,8 @@ TWO = vm.System(MASSES, soft, stiff)
 FREE = jnp.array([0.1, 0.2]), jnp.array([0.05, -0.02]), jnp.array([1.0, 0.0]), jnp.array([0.5, 1.0])
 HELD = jnp.array([0.0, 0.0]), jnp.array([0.6, -0.8]), jnp.array([1.0, 0.0]), jnp.array([1.8, 0.6])
 EXPLICIT, IMPLICIT, KICKS = vm.fully_explicit(6), vm.explicit_slow(6), vm.micro(trapezoidal)
+HALF, EVERY_SECOND, MACRO = vm.micro(midpoint), vm.micro(trapezoidal, every=2), vm.macro(trapezoidal)
+BOTH = vm.Scheme(6, kinetic=HALF, slow=EVERY_SECOND, fast=EVERY_SECOND)
 PLACEMENTS = {
     "no chain of rates": (TWO.replace(potentials={2: middle, 3: hinge}), EXPLICIT, FREE),
     "another rule": (
@@ -237,26 +239,15 @@ PLACEMENTS = {
         FREE,
     ),
     "slow and fast, on the micro grid": (TWO.replace(potentials={"fast": hinge}), IMPLICIT, FREE),
-    "V between the grids": (
-        TWO,
-        vm.Scheme(6, kinetic=vm.micro(midpoint), slow=vm.micro(trapezoidal, every=2), fast=vm.micro(midpoint)),
-        FREE,
-    ),
+    "V between the grids": (TWO, vm.Scheme(6, kinetic=HALF, slow=EVERY_SECOND, fast=HALF), FREE),
     "W between the grids": (
         TWO.replace(potentials={"a": middle}),
-        vm.Scheme(
-            6, kinetic=vm.micro(midpoint), slow=vm.macro(trapezoidal), fast=vm.micro(trapezoidal, every=2)
-        ).with_potentials(a=KICKS),
+        vm.Scheme(6, kinetic=HALF, slow=MACRO, fast=EVERY_SECOND).with_potentials(a=KICKS),
         FREE,
     ),
     "V, W and more of fast variables between the grids": (
         TWO.replace(slow_potential=middle, potentials={"slow": quartic, "V beside slow": middle}),
-        vm.Scheme(
-            6,
-            kinetic=vm.micro(midpoint),
-            slow=vm.micro(trapezoidal, every=2),
-            fast=vm.micro(trapezoidal, every=2),
-        ).with_potentials(**{name: vm.micro(trapezoidal, every=2) for name in ("slow", "V beside slow")}),
+        BOTH.with_potentials(**dict.fromkeys(("slow", "V beside slow"), EVERY_SECOND)),
         FREE,
     ),
     "of slow variables alone": (
@@ -282,10 +273,7 @@ ALIKE = ("another rule", "degree 2", "kinetic function", "W between the grids", 
 """For --full: rules and kinetic functions are in `tests/textbook`, W between the grids is beside V there, and `hinge` is on other grids."""
 
 
-@pytest.mark.parametrize(
-    "name",
-    [pytest.param(n, marks=pytest.mark.full if n in ALIKE else ()) for n in PLACEMENTS],
-)
+@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.full if n in ALIKE else ()) for n in PLACEMENTS])
 def test_every_placement_is_that_of_the_textbook(name):
     system, scheme, start = PLACEMENTS[name]
     state = vm.initial_state(system, *start)

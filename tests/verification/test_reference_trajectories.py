@@ -24,15 +24,12 @@ RUNS = [(name, method) for name in sorted(CASES) for method in ("auto", "dense",
 DENSE = ("sam_explicit_slow_a05_p4",)
 """Case that the dense method solves also without --full, with constraints of both kinds; `tests/textbook` and `tests/steppers/test_march.py` have it on
 other systems."""
-SCHEMES = ("fully_implicit_a05", "explicit_slow_a05", "fully_explicit_a025")
-"""Schemes of which every system is solved without --full; others differ in the weights of their rules or in num_micro."""
-OTHERS = ("tsp_explicit_slow_a10_p5", "tsp_fully_implicit_p1")
+OFTEN = ("fpu_fully_explicit_a025_p5", "tsp_fully_implicit_a05_p5", "tsp_explicit_slow_a10_p5", *DENSE)
+"""Cases that are solved without --full: each system and each scheme. `tests/textbook` has all other pairs on systems of its own."""
 
 
 def is_long(name, method) -> bool:
-    if method == "auto":
-        return name not in OTHERS and not any(scheme in name for scheme in SCHEMES)
-    return method != "dense" or name not in DENSE
+    return name not in {"auto": OFTEN, "dense": DENSE}.get(method, ())
 
 
 @pytest.mark.parametrize(
@@ -55,6 +52,5 @@ def test_trajectory_equals_the_reference(name, method):
     )
     differences = {k: relative_difference(getattr(run, k), expected[k]) for k in ("q_s", "q_f", "p_s", "p_f")}
     # stored micro nodes of a step include its start, ours do not
-
     differences["q_f_micro"] = relative_difference(run.q_f_micro, expected["q_f_micro"][:, 1:])
     assert max(differences.values()) < 4e-11  # measured 4.4e-12 (fast momenta of SAM), 1e-9 wanted

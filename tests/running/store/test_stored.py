@@ -33,6 +33,18 @@ def test_parts_are_those_of_the_whole(uninterrupted):
     assert uninterrupted[12:].q_f.shape[0] == 1
     assert isinstance(uninterrupted.final_state, State)
     assert np.array_equal(uninterrupted.final_state.q_f, whole.q_f[-1])
+    for run in (uninterrupted, whole):
+        assert isinstance(run[3], State)
+        assert np.array_equal(run[3].q_f, whole.q_f[3])
+        assert float(run[-1].t) == float(whole.t[-1])
+        with pytest.raises(IndexError, match="there is no node 13; it has 13 nodes, counted from 0"):
+            run[13]
+    for index, message in (("q_s", "the index is 'q_s'; give the number"), (slice(None, None, -1), "taken forwards")):
+        with pytest.raises((ValueError, TypeError), match=message):
+            uninterrupted[index]
+    with pytest.raises(ValueError, match=r"no nodes 13:13:1; it has 13"):
+        uninterrupted[20:]
+    assert not list(uninterrupted.path.parent.glob("**/*.partial"))
 
 
 @pytest.mark.parametrize(("first", "stop", "stride"), [(0, 13, 3), (0, 13, 5), (2, 12, 4), (1, 2, 7)])
@@ -47,25 +59,6 @@ def test_every_nth_node(uninterrupted, first, stop, stride):
     ends = np.array(nodes[1:], dtype=int)
     assert np.array_equal(part.q_f_micro, whole.q_f_micro[ends - 1])
     assert np.array_equal(np.asarray(part.q_f_micro)[:, -1], whole.q_f[ends])
-
-
-def test_single_nodes_are_states(uninterrupted):
-    whole = uninterrupted.load()
-    for run in (uninterrupted, whole):
-        assert isinstance(run[3], State)
-        assert np.array_equal(run[3].q_f, whole.q_f[3])
-        assert float(run[-1].t) == float(whole.t[-1])
-        with pytest.raises(IndexError, match="there is no node 13; it has 13 nodes, counted from 0"):
-            run[13]
-
-
-def test_what_can_not_be_taken(uninterrupted):
-    with pytest.raises(TypeError, match=r"the index is 'q_s'; give the number of a node, or a slice"):
-        uninterrupted["q_s"]
-    with pytest.raises(ValueError, match=r"no nodes 13:13:1; it has 13"):
-        uninterrupted[20:]
-    with pytest.raises(ValueError, match=r"taken forwards"):
-        uninterrupted[::-1]
 
 
 def test_a_store_that_has_just_begun(run, tmp_path, monkeypatch):
@@ -110,18 +103,19 @@ def test_xarray_opens_it(uninterrupted):
     assert np.array_equal(data["t"], uninterrupted.load().t)
 
 
-def test_no_file_is_left_over(uninterrupted):
-    assert not list(uninterrupted.path.parent.glob("**/*.partial"))
+def test_places_without_a_stored_run(copy, tmp_path):
+    def refused(path, message, error: type[Exception] = ValueError):
+        with pytest.raises(error, match=message):
+            StoredTrajectory(path)
 
-
-def test_missing_store(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"nowhere.zarr does not exist; give the folder of a stored run"):
-        StoredTrajectory(tmp_path / "nowhere.zarr")
-
-
-def test_folder_of_something_else(tmp_path):
-    with pytest.raises(ValueError, match=r"is not a stored run"):
-        StoredTrajectory(tmp_path)
+    refused(tmp_path / "no.zarr", r"no.zarr does not exist; give the folder of a stored run", FileNotFoundError)
+    refused(tmp_path, r"is not a stored run")
+    layout.change_attributes(copy, kind="ensemble")
+    refused(copy, r"is not a stored run but a stored ensemble")
+    layout.change_attributes(copy, format="vmri_jax trajectory store 2", made_with={"vmri_jax": "0.1.0"})
+    refused(copy, r"format 'vmri_jax trajectory store 2'.* read it with vmri_jax 0\.1\.0")
+    (copy / "zarr.json").write_text((copy / "zarr.json").read_text()[:100])
+    refused(copy, r"copy.zarr is not a stored run")
 
 
 @pytest.mark.parametrize("part", [0.0, 0.5, 0.99])
@@ -145,21 +139,3 @@ def test_damaged_and_missing_chunks(copy, uninterrupted):
     with pytest.raises(ValueError, match=r"q_f cannot be read \(chunk 1 is missing\); the store is damaged"):
         stored[6:8]
     assert_identical(stored[9:], uninterrupted[9:])
-
-
-def test_truncated_attributes(copy):
-    (copy / "zarr.json").write_text((copy / "zarr.json").read_text()[:100])
-    with pytest.raises(ValueError, match=r"copy.zarr is not a stored run"):
-        StoredTrajectory(copy)
-
-
-def test_a_store_of_an_older_version_names_the_version_that_reads_it(copy):
-    layout.change_attributes(copy, format="vmri_jax trajectory store 2", made_with={"vmri_jax": "0.1.0"})
-    with pytest.raises(ValueError, match=r"format 'vmri_jax trajectory store 2'.* read it with vmri_jax 0\.1\.0"):
-        StoredTrajectory(copy)
-
-
-def test_another_kind_of_store(copy):
-    layout.change_attributes(copy, kind="ensemble")
-    with pytest.raises(ValueError, match=r"is not a stored run but a stored ensemble"):
-        StoredTrajectory(copy)
