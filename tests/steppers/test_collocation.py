@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import vmri_jax as vm
-from tests.support import compiled_step, largest_difference, phase
+from tests.support import largest_difference, phase
 from tests.user_systems import FULL_MASS, lifted, sphere
 from vmri_jax.schemes.path import control_nodes
 from vmri_jax.steppers.solver import Solver
@@ -101,7 +101,8 @@ def test_potentials_are_taken_at_the_nodes_of_their_rule_alone(scheme):
     system = vm.System(mass, fast_potential=lambda q_f, params: 1e-3 * jnp.sum(jnp.sqrt(q_f)))
     none, one, h = jnp.zeros(0), jnp.ones(2), 0.1
     state = vm.State(jnp.zeros(()), none, one, none, -1.05 / h * one)
-    end, info = compiled_step(system, scheme, state, h, Solver("modes"))
+    planned = vm.plan(system, scheme, state, Solver("modes"))
+    end, info, _ = jax.jit(lambda state: planned.step(state, planned.init(state, h), h))(state)
     assert np.all(np.asarray(end.q_f) < 0)
     assert vm.Result(int(info.result)).success or scheme.fast.rule.nodes[-1] == 1.0  # there is no momentum there
 
