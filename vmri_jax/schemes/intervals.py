@@ -283,9 +283,7 @@ class Intervals:
             slow: (r, n_v) increments of the slow path that are seen.
         """
         path = self.path(arriving, slow, x.fast)
-        d = jax.grad(lambda path, held: self._action(path, held, m) - self._constraint_work(path, x.multiplier, m))(
-            path, path
-        )
+        d = jax.tree.map(jnp.subtract, self.gradient(m, path), self.constraint_impulses(m, path)(x.multiplier))
         rows = self.rows(self.with_inertia(d, x.fast), arriving.p_f)
         residual = IntervalUnknowns(rows, self.constraints(path, m, slice(1, None)))
         return residual, self.handed_on(arriving, d, x.fast[-1])
@@ -304,12 +302,6 @@ class Intervals:
         for nodes in self._force_nodes:
             total += _where_there_are_nodes(nodes, m, partial(self._virtual_work, nodes, m), path, held)
         return self.equations.micro_dt * total
-
-    def _constraint_work(self, path: IntervalPath, mu, m):
-        """``sum_j mu_j . g`` at the control nodes 0..r-1."""
-        if self.equations.system.constraint is None:
-            return 0.0
-        return jnp.sum(mu * self.constraints(path, m, slice(0, -1)))
 
     def _of_term(self, term: TermOnNodes, nodes: IntervalNodes, m, path: IntervalPath):
         equations = self.equations
