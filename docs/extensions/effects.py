@@ -9,7 +9,6 @@ from tests.scene.effect_scenes import BASE, EFFECTS, RIGID, RIGID_EFFECTS, scene
 from vmri_jax import fully_implicit, plots, scene
 from vmri_jax.accuracy.companions import resting
 from vmri_jax.animation import motion, plot_strip
-from vmri_jax.running.arguments import Steps
 from vmri_jax.running.origin import Origin
 from vmri_jax.running.simulation import simulation
 
@@ -56,7 +55,7 @@ def _entry(cls: type[scene.Effect], folder: Path) -> str:
     if shown is not None and shown.bound[1].drawing():
         image = f".. image:: effects/{path.name}\n   :width: 45%\n   :alt: {cls.__name__} in a small scene\n\n"
         if not path.exists():
-            run = resting(simulation(shown, fully_implicit(1), None, None, Steps(0.01, num_steps=2)))
+            run = resting(simulation(shown, fully_implicit(1), None, None, 0.01, num_steps=2))
             run = replace(run, origin=Origin())  # without its system, whose energy a resting run does not have
             plots.save(plot_strip(motion(run, shown), 1), path)
     return f"{title}{image}.. autoclass:: {cls.__name__}\n   :no-index:\n"
