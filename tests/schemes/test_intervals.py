@@ -53,7 +53,7 @@ def test_intervals_add_up_to_the_step(name):
     ],
 )
 def test_functions_are_evaluated_at_the_nodes_of_the_rule_alone(placed, num_micro):
-    """In each interval at each of its nodes, once, with its weight; where intervals meet also at the start of the step, with the weight 0."""
+    """In each interval at each of its nodes, once, with its weight."""
     _, inside, _ = position_nodes(placed, num_micro, 1)
     expected = sorted(
         (m, (m + group.c) / num_micro, float(weight))
@@ -65,6 +65,5 @@ def test_functions_are_evaluated_at_the_nodes_of_the_rule_alone(placed, num_micr
         for nodes in IntervalNodes.of(inside)
         for m in np.flatnonzero(nodes.has_nodes)
         for theta, weight in zip(nodes.theta[m], np.asarray(nodes.weights)[min(m, len(nodes.weights) - 1)], strict=True)
-        if weight != 0 or theta != 0
     )
     np.testing.assert_allclose(np.array(found), np.array(expected), atol=1e-15)

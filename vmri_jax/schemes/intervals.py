@@ -83,12 +83,12 @@ class IntervalNodes:
     def __init__(self, groups: list[list[NodeGroup]], num_micro: int, degree: int):
         n = num_micro
         c = np.zeros((n, len(groups)))
-        self.has_nodes = np.full(n, all(_meet(row, n) for row in groups))
+        self.has_nodes = np.zeros(n, bool)
         for k, row in enumerate(groups):
             for group in row:
                 c[np.array(group.intervals), k] = group.c
                 self.has_nodes[np.array(group.intervals)] = True
-        if all(len(row) == 1 and row[0].size == n for row in groups):
+        if self.has_nodes.all() and all(len(row) == 1 for row in groups):
             self.weights = jnp.stack([row[0].weights[0] for row in groups])[None]  # of all intervals
         else:
             self.weights = jnp.stack(
@@ -151,12 +151,6 @@ def with_unseen(values, name: str, equations: StepEquations, seen: Entries):
     return seen.put(values, jnp.broadcast_to(at_rest, (len(values), at_rest.size)))
 
 
-def _meet(row: list[NodeGroup], num_micro: int) -> bool:
-    """Whether a row has the nodes where intervals meet, at the start of all but the first one. There functions are evaluated with the weight 0, without a
-    branch, at the start of the macro step, where the same rule has a node of the step before."""
-    return all(group.c == 0 and group.size == num_micro - 1 for group in row)
-
-
 def _padded(group: NodeGroup, num_micro: int):
     """(num_micro,) weights of a group of nodes, 0 in intervals without a node of the group."""
     if group.step > 1:
@@ -168,7 +162,7 @@ def of_interval(table, m):
     """The rows of a table for interval m; a constant, without a lookup, if the rows of all intervals are equal."""
     if len(table) == 1 or (isinstance(table, np.ndarray) and np.ptp(table, axis=0).max(initial=0.0) == 0.0):
         return table[0]
-    return jnp.asarray(table).at[m].get(mode="promise_in_bounds")
+    return jnp.asarray(table)[m]
 
 
 class Intervals:

@@ -45,11 +45,6 @@ PATHS = 3
 """Random paths on which the entries of K are looked for; fewer of them miss entries that are zero by chance, or in a part of the positions."""
 
 
-def weighted_sum(weights, increments):
-    """``sum_i weights_i increments_i`` over the last axis of weights and the first of increments."""
-    return jnp.sum(weights[..., None] * increments, axis=-2)
-
-
 def constant_mass(system: System) -> ConstantMass:
     """The kinetic energy of a system of constant masses, with its type."""
     assert isinstance(system.kinetic, ConstantMass)
@@ -187,7 +182,8 @@ def _touched(parts: tuple[System, Scheme], numbers, fast):
     system, scheme = parts
     start = State(jnp.zeros(()), *numbers)
     intervals = Intervals(StepEquations.of(system, scheme, start, jnp.asarray(float(scheme.num_micro))))
-    path = intervals.path(intervals.start(), intervals.start().slow, fast)
+    arriving = intervals.start()
+    path = intervals.path(arriving, arriving.slow, fast)
     times_k = jax.linearize(partial(_rows, intervals, path), fast)[1]
 
     def column(i):

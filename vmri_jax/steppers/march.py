@@ -131,10 +131,8 @@ class MarchEquations:
 
     def start(self) -> Handed:
         """The fast position and momentum at the start of the step; no interval has pushed the slow path yet."""
-        equations = self.equations
-        return Handed(
-            equations.q_f, jnp.concatenate([equations.micro_dt * equations.p_f, jnp.zeros(self.n_v + self.num_seen)])
-        )
+        start = self.intervals.start()
+        return Handed(start.q_f, _gradients(start))
 
     def no_matrices(self) -> Matrices:
         """Matrices of zeros, for their shapes."""

@@ -21,7 +21,7 @@ from vmri_jax.kernels import max_abs
 from vmri_jax.kernels.band import Full, Sparsity
 from vmri_jax.schemes.equations import StepEquations, Unknowns
 from vmri_jax.steppers.accept import Accepted
-from vmri_jax.steppers.interval import constant_mass, weighted_sum
+from vmri_jax.steppers.interval import constant_mass
 from vmri_jax.steppers.results import RUNNING, Method
 from vmri_jax.steppers.solved import Solution, StepSolver, status_of
 from vmri_jax.steppers.solver import Solver, iterated
@@ -68,7 +68,7 @@ class Rattle(StepSolver):
         columns = move_by(forces)
         # mu -> G_0^T mu and mu -> M^-1 G_0^T mu. A full pattern has all rows of G_0 at hand; else one product by reverse mode is cheaper.
         if isinstance(self.sparsity, Full):
-            force, move = partial(weighted_sum, increments=forces), partial(weighted_sum, increments=columns)
+            force, move = partial(_weighted_sum, increments=forces), partial(_weighted_sum, increments=columns)
         else:
             force, move = (lambda mu: pull(mu)[0]), (lambda mu: move_by(pull(mu)[0]))
         scale = equations.multiplier_scales()[0].reshape(())
@@ -105,3 +105,8 @@ class Rattle(StepSolver):
 
     def describe(self) -> list[str]:
         return ["masses: drift along the constraints (RATTLE), Newton's iteration on the multipliers"]
+
+
+def _weighted_sum(weights, increments):
+    """``sum_i weights_i increments_i`` over the last axis of weights and the first of increments."""
+    return jnp.sum(weights[..., None] * increments, axis=-2)
