@@ -69,7 +69,7 @@ def test_programs_with_figures(call, picture, tmp_path):
     assert (tmp_path / picture).stat().st_size > 10_000
 
 
-SHOWN = {  # words of programs of a page, which run one after the other in one namespace, each with what it prints below it
+SHOWN = {  # a phrase from each program of a page, with the output that the page prints below it; the programs share a namespace
     "how_to/systems.md": ("", 'q_f["radius"]'),
     "how_to/steppers.md": ("class Rotation",),
     "coming_from/index.md": ("25.0 * q_s[",),

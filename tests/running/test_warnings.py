@@ -136,7 +136,7 @@ BEYOND_A_POLE = (by_prepare, by_batch, by_ensemble, by_trace)
 AS_SIMULATE = (by_prepare, by_trace)
 """Roads to which a force is nothing of its own, where another road has its nodes or lanes."""
 ROADS = (by_simulate, by_prepare, by_stream, by_batch, by_ensemble, by_trace)
-"""Lanes with parameters of their own are those of ensembles."""
+"""Ensembles have lanes with parameters of their own, and serve as that road."""
 
 
 @pytest.mark.parametrize(

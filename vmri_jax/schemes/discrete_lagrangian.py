@@ -163,11 +163,6 @@ class Sum:
         return next(term for term in self.terms if isinstance(term, QuadraticKinetic))
 
     @property
-    def potentials(self) -> "Sum":
-        """The terms without the kinetic energy of constant masses."""
-        return Sum(tuple(term for term in self.terms if not isinstance(term, QuadraticKinetic)))
-
-    @property
     def kicks(self) -> tuple[TermOnNodes, ...]:
         """The terms that have nodes at the ends of the macro interval."""
         return tuple(term for term in self.terms if term.start is not None or term.end is not None)

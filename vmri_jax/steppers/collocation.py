@@ -32,7 +32,7 @@ from vmri_jax.schemes.discrete_lagrangian import TermOnNodes, lagrangian
 from vmri_jax.schemes.equations import StepEquations, Unknowns
 from vmri_jax.schemes.path import control_nodes, lagrange_basis
 from vmri_jax.steppers.accept import Accepted, expected
-from vmri_jax.steppers.interval import constant_mass
+from vmri_jax.steppers.interval import constant_mass, implicit_terms
 from vmri_jax.steppers.results import RUNNING, Method
 from vmri_jax.steppers.solved import Solution, StepSolver, status_of
 from vmri_jax.steppers.solver import Solver, iterated, only_if
@@ -51,9 +51,8 @@ class IntervalEquations:
         self.system, self.h, self.r = equations.system, equations.macro_dt, equations.scheme.degree
         self.q_s, self.q, self.p = equations.q_s, equations.q_f, equations.p_f
         self.times = equations.t + self.h * control_nodes(self.r)
-        terms = lagrangian(self.system, equations.scheme)
-        self.form = terms.kinetic.fast_form[1:]
-        self.potentials = [term for term in terms.potentials.terms if term.inside.groups]
+        self.form = lagrangian(self.system, equations.scheme).kinetic.fast_form[1:]
+        self.potentials = implicit_terms(self.system, equations.scheme)
         self.mass = constant_mass(self.system).fast_mass
         self.inverse_mass = self.mass.inverse()
         self.num_slow = num_slow

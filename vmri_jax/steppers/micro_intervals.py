@@ -110,7 +110,7 @@ class MicroSweep(NamedTuple):
         d, change = jax.linearize(lambda x: intervals.gradient(m, path._replace(fast=x)), x)
         d = jax.tree.map(jnp.subtract, d, pull(mu))
         dx = -solve(intervals.rows(intervals.with_inertia(d, x), arriving.p_f))
-        if self.structure.is_explicit:
+        if self.structure.is_explicit:  # the correction is that of the multipliers, below
             x, dx = dx, x
         if mu.size:
             g, push = jax.linearize(lambda x: intervals.constraints(path._replace(fast=x), m, slice(1, None)), x + dx)

@@ -31,7 +31,7 @@ from vmri_jax.mechanics.structure import depends_on
 from vmri_jax.mechanics.system import System
 from vmri_jax.refusals import Refused
 from vmri_jax.schemes.composition import Composition, stage_scheme
-from vmri_jax.schemes.discrete_lagrangian import Placed, TermOnNodes, lagrangian, placed_potentials
+from vmri_jax.schemes.discrete_lagrangian import Placed, lagrangian, placed_potentials
 from vmri_jax.schemes.quadrature import macro
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.collocation import Collocation
@@ -170,9 +170,8 @@ def _between_kicks(system: System, scheme: Scheme, solver: Solver, q_s, q_f, num
     if solver.stepper is not None:
         custom = solver.stepper.called(system, scheme)
         return Solved(system, scheme, custom, rows)
-    interval = cache(
-        partial(Interval.of, system, scheme, q_s, q_f)
-    )  # the structure of a micro interval, where it is needed
+    # the structure of a micro interval, found where it is needed, once
+    interval = cache(partial(Interval.of, system, scheme, q_s, q_f))
     if q_s.size and _joins(system, scheme, solver, interval, q_s.size, q_f.size):
         (n_g, _), q = system.num_constraints(q_s, q_f), jnp.concatenate([q_s, q_f])
         num_slow = q_s.size if q_f.size else 0  # of slow variables alone the Hessian has all
@@ -252,13 +251,8 @@ def _can_be_nested(system: System, scheme: Scheme) -> bool:
 
 def _is_drift(system: System, scheme: Scheme) -> bool:
     """Whether, apart from kicks, a single micro interval has kinetic energy of constant masses and constraints alone."""
-    terms = lagrangian(system, scheme).terms
-    return (
-        scheme.num_micro == scheme.degree == 1
-        and system.has_constant_mass
-        and system.force is None
-        and not any(term.inside.groups for term in terms if isinstance(term, TermOnNodes))
-    )
+    is_free = system.has_constant_mass and system.force is None and not implicit_terms(system, scheme)
+    return scheme.num_micro == scheme.degree == 1 and is_free
 
 
 def _is_linear(system: System, scheme: Scheme, interval: Interval, q_s) -> bool:
