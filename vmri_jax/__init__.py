@@ -71,7 +71,6 @@ from vmri_jax.running.store import StoredTrajectory, stream
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes import quadrature
 from vmri_jax.schemes.composition import Composition, compose
-from vmri_jax.schemes.discrete_lagrangian import discrete_lagrangian, discrete_legendre
 from vmri_jax.schemes.quadrature import macro, micro
 from vmri_jax.schemes.scheme import (
     Scheme,
@@ -86,6 +85,7 @@ from vmri_jax.steppers.plan import Plan, plan
 from vmri_jax.steppers.results import Method, Result, SimulationError
 from vmri_jax.steppers.solver import Solver
 from vmri_jax.steppers.stepper import StepInfo
+from vmri_jax.textbook import discrete_lagrangian, discrete_legendre
 
 from vmri_jax import systems  # isort: skip  (last: its modules use the names imported above)
 

@@ -30,9 +30,10 @@ from jax.flatten_util import ravel_pytree
 from numpy.polynomial import Polynomial
 
 from vmri_jax.mechanics.state import State
-from vmri_jax.mechanics.system import ConstantMass, System
+from vmri_jax.mechanics.system import System
 from vmri_jax.refusals import Refused
 from vmri_jax.schemes.composition import Composition
+from vmri_jax.schemes.path import velocity_nodes
 from vmri_jax.schemes.quadrature import NODE_TOLERANCE, PlacedRule, macro
 from vmri_jax.schemes.scheme import Scheme
 
@@ -107,29 +108,56 @@ def sample(scheme: Scheme, placed: PlacedRule, slow, fast, macro_dt) -> Samples:
     )
 
 
-def discrete_lagrangian(system: System, scheme: Scheme, slow, fast, macro_dt):
-    """The discrete Lagrangian ``L_d = sum H w_i (T - V - W - sum_j V_j)`` of a macro step.
+def discrete_lagrangian(system: System, scheme: Scheme) -> Callable:
+    """The discrete Lagrangian ``L_d = sum H w_i (T - V - W - sum_j V_j)`` of a macro step, ``L_d(slow, fast, macro_dt) -> ()``.
 
-    Args:
-        slow: (r + 1, n_s) slow control points.
-        fast: (num_micro r + 1, n_f) fast control points, shared ones once.
-        macro_dt: length H of the step.
+    Arguments of L_d: (r + 1, n_s) slow and (num_micro r + 1, n_f) fast control points, shared ones once, and the length H of the step. Its
+    derivatives by the control points are ``jax.grad(L_d, argnums=(0, 1))``; the first and the last of them are the `discrete_legendre` transforms.
+
+    Raises:
+        ValueError: mollified kicks, corrected kicks without a ConstantMass, velocities on the border of two micro intervals; of L_d, other numbers
+            of control points.
     """
+    check("discrete_lagrangian", system, scheme)
 
-    def action(placed, term):
-        path = sample(scheme, placed, slow, fast, macro_dt)
-        return macro_dt * jnp.sum(path.weights * jax.vmap(term)(path.q_s, path.q_f, path.v_s, path.v_f))
+    def L_d(slow, fast, macro_dt):
+        expected = (scheme.degree + 1, scheme.num_micro * scheme.degree + 1)
+        if (slow.shape[0], fast.shape[0]) != expected:
+            raise Refused(
+                f"L_d: got {slow.shape[0]} slow and {fast.shape[0]} fast control points; this scheme has {expected[0]} "
+                f"and {expected[1]}."
+            )
 
-    slow_potential, fast_potential = potentials(system, scheme, macro_dt)
-    T, T_s = system.kinetic, system.slow_kinetic
-    kinetic = action(scheme.kinetic, lambda q_s, q_f, v_s, v_f: T(q_s, q_f, v_s, v_f, system.params))
-    if T_s is not None:  # has a rule on the macro grid
-        kinetic += action(macro(scheme.kinetic.rule), lambda q_s, q_f, v_s, v_f: T_s(q_s, v_s, system.params))
-    L_d = kinetic - action(scheme.slow, lambda q_s, q_f, v_s, v_f: slow_potential(q_s, q_f))
-    L_d -= action(scheme.fast, lambda q_s, q_f, v_s, v_f: fast_potential(q_s, q_f))
-    for name, V in system.potentials:
-        L_d -= action(scheme.rule_of(name), lambda q_s, q_f, v_s, v_f, V=V: V(q_s, q_f, system.params))
+        def action(placed, term):
+            path = sample(scheme, placed, slow, fast, macro_dt)
+            return macro_dt * jnp.sum(path.weights * jax.vmap(term)(path.q_s, path.q_f, path.v_s, path.v_f))
+
+        slow_potential, fast_potential = potentials(system, scheme, macro_dt)
+        T, T_s = system.kinetic, system.slow_kinetic
+        total = action(scheme.kinetic, lambda q_s, q_f, v_s, v_f: T(q_s, q_f, v_s, v_f, system.params))
+        if T_s is not None:  # has a rule on the macro grid
+            total += action(macro(scheme.kinetic.rule), lambda q_s, q_f, v_s, v_f: T_s(q_s, v_s, system.params))
+        total -= action(scheme.slow, lambda q_s, q_f, v_s, v_f: slow_potential(q_s, q_f))
+        total -= action(scheme.fast, lambda q_s, q_f, v_s, v_f: fast_potential(q_s, q_f))
+        for name, V in system.potentials:
+            total -= action(scheme.rule_of(name), lambda q_s, q_f, v_s, v_f, V=V: V(q_s, q_f, system.params))
+        return total
+
     return L_d
+
+
+def discrete_legendre(system: System, scheme: Scheme) -> Callable:
+    """Discrete Legendre transforms ``(slow, fast, macro_dt) -> ((p_s, p_f) at the start, (p_s, p_f) at the end)``.
+
+    ``p = -D_first L_d`` and ``p+ = D_last L_d`` (without constraint forces). Arguments as of `discrete_lagrangian`.
+    """
+    slots = jax.grad(discrete_lagrangian(system, scheme), argnums=(0, 1))
+
+    def transforms(slow, fast, macro_dt):
+        d_slow, d_fast = slots(slow, fast, macro_dt)
+        return (-d_slow[0], -d_fast[0]), (d_slow[-1], d_fast[-1])
+
+    return transforms
 
 
 def potentials(system: System, scheme: Scheme, macro_dt) -> tuple[Callable, Callable]:
@@ -244,7 +272,8 @@ def step(system: System, scheme: Scheme | Composition, state: State, macro_dt) -
     if isinstance(scheme, Composition):
         stages = macro_dt * jnp.asarray(scheme.coefficients)
         return jax.lax.scan(lambda state, dt: (step(system, scheme.scheme, state, dt), None), state, stages)[0]
-    check(system, scheme)
+    check("textbook.step", system, scheme)
+    L_d = discrete_lagrangian(system, scheme)
     n, r, t = scheme.num_micro, scheme.degree, state.t
     micro_dt = macro_dt / n
 
@@ -255,8 +284,7 @@ def step(system: System, scheme: Scheme | Composition, state: State, macro_dt) -
         """A times h: Newton's matrix then has entries of the size of masses and constraint Jacobians at every step size."""
         slow, fast = path
         g, g_slow = constraints(system, scheme, slow, fast, t, macro_dt)
-        free = discrete_lagrangian(system, scheme, slow, fast, macro_dt)
-        free += virtual_work(system, scheme, path, along, t, macro_dt)
+        free = L_d(slow, fast, macro_dt) + virtual_work(system, scheme, path, along, t, macro_dt)
         return micro_dt * free - jnp.sum(x.multiplier * g[:-1]) - jnp.sum(x.slow_multiplier * g_slow[:-1])
 
     def slots(x: Unknowns):
@@ -283,17 +311,17 @@ def step(system: System, scheme: Scheme | Composition, state: State, macro_dt) -
     return project(system, end, v_s, v_f)[0]
 
 
-def check(system: System, scheme: Scheme) -> None:
-    """Refuse schemes that this page leaves out."""
+def check(caller: str, system: System, scheme: Scheme) -> None:
+    """Refuse schemes that this page leaves out, or that have no meaning."""
     if scheme.slow.mollified:
         raise Refused(
-            "textbook.step: the slow potential of this scheme is mollified, which the textbook leaves out; "
+            f"{caller}: the slow potential of this scheme is mollified, it depends on more than the control points of a step; "
             "take macro_step or simulate, or a scheme without mollified kicks, e.g. explicit_slow(num_micro)."
         )
-    if (scheme.slow.gradient_corrected or scheme.fast.gradient_corrected) and not isinstance(
-        system.kinetic, ConstantMass
-    ):
-        raise Refused("textbook.step: corrected kicks need a System whose kinetic is a ConstantMass.")
+    if (scheme.slow.gradient_corrected or scheme.fast.gradient_corrected) and not system.has_constant_mass:
+        raise Refused(f"{caller}: corrected kicks need a System whose kinetic is a ConstantMass.")
+    if system.force is not None:
+        velocity_nodes(scheme.force, scheme.num_micro, scheme.degree)  # raises
 
 
 def simulate(system: System, scheme: Scheme | Composition, state: State, macro_dt, num_steps: int) -> State:

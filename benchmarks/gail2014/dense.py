@@ -18,6 +18,7 @@ from jaxtyping import Array, Float, Int
 import vmri_jax as vm
 from vmri_jax.kernels import max_abs
 from vmri_jax.schemes.equations import StepEquations, Unknowns
+from vmri_jax.schemes.intervals import Intervals
 from vmri_jax.steppers.accept import Accepted, Weights
 from vmri_jax.steppers.continuation import solve_in_parts, with_dependent_constraints
 from vmri_jax.steppers.results import RUNNING
@@ -48,7 +49,7 @@ def _made(settings: vm.Solver, system: vm.System, scheme: vm.Scheme) -> "Dense":
 def newton_direction(equations: StepEquations, x: Unknowns, residual: Unknowns) -> Unknowns:
     """``-(dR/dx)^-1 residual``."""
     (flat, unravel), (rows, by_name) = ravel_pytree(x), ravel_pytree(residual)
-    matrix = jax.jacfwd(lambda z: ravel_pytree(equations.residual(unravel(z)))[0])(flat)
+    matrix = jax.jacfwd(lambda z: ravel_pytree(Intervals(equations).residual(unravel(z))[0])[0])(flat)
     return by_name(-jax.scipy.linalg.lu_solve(jax.scipy.linalg.lu_factor(matrix), rows))
 
 
@@ -71,9 +72,8 @@ class Dense(StepSolver):
         most = self.settings.max_iterations
         done = solve_in_parts(equations, guess, guess, self._iterate, most, PLAIN_ITERATIONS)
         x, weights = done.solution, Weights.of(equations)
-        residual, (p_s, p_f) = equations.evaluate(x)
+        residual, end = Intervals(equations).residual(x)
         rows = jnp.maximum(*weights.of_momenta().largest(residual.slow, residual.fast))
-        end = equations.q_f + x.fast[:, -1].sum(0), p_s, p_f
         how = done.result, vm.Method.EXACT, done.iterations
         status = status_of(equations, *how, rows=rows, end=end, weights=weights)
         return Solution(x, end, with_dependent_constraints(equations, status)), memory
@@ -89,7 +89,7 @@ class Dense(StepSolver):
         accepted = Accepted.of(equations, self.settings, weights)
 
         def iterate(last: Iterate) -> Iterate:
-            residual = equations.residual(last.x)
+            residual, _ = Intervals(equations).residual(last.x)
             d = newton_direction(equations, last.x, residual)
             x = jax.tree.map(jnp.add, last.x, d)
             changes, motions, iterations = *(weights.largest(a.slow, a.fast) for a in (d, x)), last.iterations + 1

@@ -133,21 +133,3 @@ def test_explicit_chain_evaluates_v_once_and_w_num_micro_times_per_macro_step(fp
     assert counts[1]["V"] - counts[0]["V"] == 15
     assert counts[1]["W"] - counts[0]["W"] == 15 * 7
     assert np.max(run.info.iterations) == 0
-
-
-@pytest.mark.parametrize(
-    ("scheme", "v_nodes", "w_nodes"),
-    [
-        (vm.fully_implicit(N), N, N),
-        (vm.explicit_slow(N), 2, N),
-        (vm.fully_explicit(N), 2, N + 1),
-        (vm.galerkin(N, 2), 2 * N, 2 * N),
-        (vm.galerkin(N, 2, "lobatto"), 2 * N + 1, 2 * N + 1),
-    ],
-    ids=["fully implicit", "explicit slow", "fully explicit", "gauss 2", "lobatto 2"],
-)
-def test_each_term_is_evaluated_at_its_own_nodes_only(counted, scheme, v_nodes, w_nodes):
-    EVALUATIONS.clear()
-    jax.block_until_ready(vm.discrete_lagrangian(counted, scheme)(*control_points(scheme.degree), H))
-    jax.effects_barrier()
-    assert Counter(V=v_nodes, W=w_nodes) == EVALUATIONS

@@ -1,4 +1,4 @@
-"""The equations cut into micro intervals are those of the whole step, at the nodes of the rules and nowhere else."""
+"""The equations cut into micro intervals are those of the whole step in the textbook, at the nodes of the rules and nowhere else."""
 
 import jax
 import jax.numpy as jnp
@@ -6,37 +6,92 @@ import numpy as np
 import pytest
 
 from tests.steppers.test_linearization import SCHEMES, equations_and_unknowns
-from vmri_jax import quadrature
-from vmri_jax.schemes.intervals import Arriving, IntervalNodes, Intervals, IntervalUnknowns
-from vmri_jax.schemes.path import position_nodes
-from vmri_jax.schemes.quadrature import macro, micro
+from tests.user_systems import bent_system
+from vmri_jax import galerkin, quadrature, textbook
+from vmri_jax.mechanics.rows import Entries
+from vmri_jax.schemes.discrete_lagrangian import lagrangian
+from vmri_jax.schemes.equations import StepEquations, Unknowns
+from vmri_jax.schemes.intervals import IntervalNodes, IntervalPath, Intervals
+from vmri_jax.schemes.path import lagrange_basis, lagrange_derivative, position_nodes, velocity_nodes
+from vmri_jax.schemes.quadrature import gauss, macro, micro, radau, simpson
+
+T, H = 0.7, 0.3
+
+
+def control_points(equations, x: Unknowns):
+    """Slow (r + 1, n_s) and fast (num_micro r + 1, n_f) control points of a step."""
+    ends = equations.q_f + jnp.cumsum(x.fast[:, -1], axis=0)
+    starts = jnp.concatenate([equations.q_f[None], ends[:-1]])
+    fast = jnp.concatenate([equations.q_f[None], (starts[:, None] + x.fast).reshape(-1, equations.q_f.size)])
+    return jnp.concatenate([equations.q_s[None], equations.q_s + x.slow]), fast
 
 
 @jax.jit
 def whole_and_cut(equations, x):
-    """The equations of the step, and rows, arrival and slow equations of its intervals: one program, not hundreds of operations."""
-    intervals, rows = Intervals(equations), []
-    arriving = Arriving(equations.q_f, equations.micro_dt * equations.p_f, jnp.zeros(x.slow.shape[1]), 0.0 * x.slow)
-    for m in range(equations.scheme.num_micro):
-        residual, arriving = intervals.evaluate(m, IntervalUnknowns(x.fast[m], x.multiplier[m]), arriving, x.slow)
-        rows.append(residual)
-    impulses = intervals.slow_impulses(x.slow, x.slow_multiplier)
-    slow, p_s = intervals.slow_rows(x.slow, impulses, arriving)
-    return equations.evaluate(x), rows, arriving, ((slow, intervals.slow_constraints(x.slow)), p_s)
+    """The equations of the step from the textbook's action without kicks, with the momenta at its end, and those of its intervals."""
+    system, scheme, t, H = equations.system, equations.scheme, equations.t, equations.macro_dt
+    path, h, n = control_points(equations, x), equations.micro_dt, equations.scheme.num_micro
+
+    def action(path, along):
+        free = textbook.discrete_lagrangian(system, scheme)(*path, H)
+        free += textbook.virtual_work(system, scheme, path, along, t, H)
+        g, g_slow = textbook.constraints(system, scheme, *path, t, H)
+        of_multipliers = jnp.sum(x.multiplier.reshape(g[:-1].shape) * g[:-1])
+        return h * free - of_multipliers - jnp.sum(x.slow_multiplier * g_slow[:-1]) / n
+
+    slots = list(jax.grad(action)(path, path))
+    for term in lagrangian(system, scheme).kicks:
+        for weight, k in ((term.start, 0), (term.end, -1)):
+            if weight is not None:
+                impulses = term.gradient(*(points[k] for points in path))
+                slots = [
+                    d.at[k].add(-h * term.times_step(H) * weight * dp) for d, dp in zip(slots, impulses, strict=True)
+                ]
+    g, g_slow = textbook.constraints(system, scheme, *path, t, H)
+    rows = [d.at[0].add(h * p)[:-1] for d, p in zip(slots, (equations.p_s, equations.p_f), strict=True)]
+    expected = Unknowns(rows[0], g_slow[1:], rows[1].reshape(x.fast.shape), g[1:].reshape(x.multiplier.shape))
+    return expected, [d[-1] / h for d in slots], Intervals(equations).residual(x)
 
 
 @pytest.mark.parametrize("name", SCHEMES)
-def test_intervals_add_up_to_the_step(name):
+def test_intervals_add_up_to_the_step_of_the_textbook(name):
     equations, x = equations_and_unknowns(SCHEMES[name])
-    (expected, (p_s, p_f)), rows, arriving, ((slow, g_slow), p_end) = whole_and_cut(equations, x)
+    expected, (p_s, p_f), (found, (q_f, p_s_end, p_f_end)) = whole_and_cut(equations, x)
     # an interval hands on the momentum at the start plus all impulses: away from the solution it differs by the rows that are left
     left = jnp.cumsum(expected.fast.sum(1), axis=0)
-    fast = expected.fast.at[1:, 0].add(left[:-1])
-    found = jnp.stack([r.fast for r in rows]), jnp.stack([r.multiplier for r in rows]), slow, g_slow
-    for a, b in zip(found, (fast, expected.multiplier, expected.slow, expected.slow_multiplier), strict=True):
-        np.testing.assert_allclose(a, b, atol=1e-13)  # measured 4e-15
-    np.testing.assert_allclose(arriving.p_f, equations.micro_dt * p_f + left[-1], atol=1e-12)
-    np.testing.assert_allclose(p_end, p_s + slow.sum(0) / equations.micro_dt, atol=1e-12)
+    expected = expected._replace(fast=expected.fast.at[1:, 0].add(left[:-1]))
+    for a, b in zip(found, expected, strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-13)  # measured 8e-15
+    np.testing.assert_allclose(q_f, control_points(equations, x)[1][-1], atol=1e-14)
+    np.testing.assert_allclose(p_f_end, p_f + left[-1] / equations.micro_dt, atol=1e-12)
+    np.testing.assert_allclose(p_s_end, p_s + expected.slow.sum(0) / equations.micro_dt, atol=1e-12)
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3])
+@pytest.mark.parametrize("num_micro", [1, 2, 5])
+@pytest.mark.parametrize("placed", [micro(gauss(2)), micro(radau(2)), micro(simpson), macro(gauss(2)), macro(gauss(4))])
+def test_intervals_sample_the_path_at_the_nodes_of_the_rule(degree, num_micro, placed):
+    rng = np.random.default_rng(degree + 10 * num_micro)
+    slow, fast = rng.normal(size=(degree + 1, 2)), rng.normal(size=(num_micro * degree + 1, 3))
+    scheme, state = galerkin(num_micro, degree), (T, slow[0], fast[0], slow[0], fast[0])
+    equations, count = StepEquations(bent_system(), scheme, *state, H), 0
+    for nodes in IntervalNodes.of(velocity_nodes(placed, num_micro, degree)):
+        for m in np.flatnonzero(nodes.has_nodes):
+            points = fast[m * degree : (m + 1) * degree + 1]
+            path = IntervalPath(slow[0], slow[1:] - slow[0], points[0], points[1:] - points[0])
+            sampled = nodes.sample(path, equations, Entries.of([True] * 2), int(m), ("t", "q_s", "q_f", "v_s", "v_f"))
+            theta, c = nodes.theta[m], nodes.c[m]
+            expected = (
+                T + theta * H,
+                lagrange_basis(degree, theta) @ slow,
+                lagrange_basis(degree, c) @ points,
+                lagrange_derivative(degree, theta) @ slow / H,
+                lagrange_derivative(degree, c) @ points * num_micro / H,
+            )
+            for got, value in zip(sampled, expected, strict=True):
+                np.testing.assert_allclose(got, value, rtol=1e-12, atol=1e-12)
+            count += len(theta)
+    assert count == len(placed.rule.nodes) * (num_micro if placed.grid == "micro" else 1)
 
 
 @pytest.mark.parametrize("num_micro", [1, 2, 3, 4, 5])

@@ -13,6 +13,7 @@ from tests.support import relative_difference
 from tests.user_systems import bent_system
 from vmri_jax import Scheme, explicit_slow, fully_explicit, fully_implicit, galerkin, macro, micro, quadrature
 from vmri_jax.schemes.equations import StepEquations
+from vmri_jax.schemes.intervals import Intervals
 from vmri_jax.steppers.march import MarchEquations, inverse_with_multipliers, linearised_pass, solve
 from vmri_jax.steppers.newton.null_space import inverse_without_multipliers
 
@@ -56,7 +57,7 @@ def test_all_take_the_direction_of_the_derivative_of_the_residual(name):
 
     @jax.jit
     def directions(x):
-        residual = equations.residual(x)
+        residual, _ = Intervals(equations).residual(x)
         found = {"dense": ravel_pytree(newton_direction(equations, x, residual))[0]}
         for inverted in (inverse_with_multipliers, inverse_without_multipliers):
             march = MarchEquations(equations, inverted)

@@ -13,7 +13,7 @@ def _equations(system, scheme, slow, fast, t, macro_dt):
     """Derivatives of ``L_d`` and the work of forces by all control points, and constraints at them with their Jacobian."""
 
     def action(path):
-        free = textbook.discrete_lagrangian(system, scheme, path[0], path[1], macro_dt)
+        free = textbook.discrete_lagrangian(system, scheme)(*path, macro_dt)
         return free + textbook.virtual_work(system, scheme, path, (slow, fast), t, macro_dt)
 
     def constraints(path):

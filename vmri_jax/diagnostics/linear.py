@@ -14,6 +14,7 @@ from vmri_jax.running.arguments import check_run
 from vmri_jax.running.macro_step import macro_step
 from vmri_jax.schemes.composition import SchemeLike
 from vmri_jax.schemes.equations import StepEquations
+from vmri_jax.schemes.intervals import Intervals
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.solver import Solver
 
@@ -72,7 +73,8 @@ def step_condition(system: Movable, scheme: Scheme, state: State | None = None, 
 def newton_matrix(system: System, scheme: Scheme, state: State, macro_dt):
     """The dense Newton matrix of a macro step in the first iteration, which starts from straight motion."""
     equations = StepEquations.of(system, scheme, state, macro_dt)
+    intervals = Intervals(equations)
     v_s, v_f = velocity(system, state.q_s, state.q_f, state.p_s, state.p_f)
     n_g, n_gs = system.num_constraints(state.q_s, state.q_f)
     x, unravel = ravel_pytree(equations.guess(v_s, v_f, jnp.zeros(n_g), jnp.zeros(n_gs)))
-    return jax.jacfwd(lambda x: ravel_pytree(equations.residual(unravel(x)))[0])(x)
+    return jax.jacfwd(lambda x: ravel_pytree(intervals.residual(unravel(x))[0])[0])(x)

@@ -35,6 +35,7 @@ from vmri_jax.steppers.kicked import kicked
 from vmri_jax.steppers.marched import Marched
 from vmri_jax.steppers.results import Result
 from vmri_jax.steppers.solver import Solver
+from vmri_jax.textbook import discrete_lagrangian
 
 BLOCKS = 20
 """Parts of a run to whose means the drift is fitted; with more parts neighbouring means are correlated, with fewer the standard error of the
@@ -158,11 +159,11 @@ def _actions(system: System, scheme: SchemeLike, nodes: State, macro_dt):
 
 def _stage(system: System, scheme: Scheme, state: State, macro_dt):
     """A step with all its control points: the state at its end, its discrete Lagrangian and its `Result`."""
-    terms = lagrangian(system, scheme)
+    kicks = lagrangian(system, scheme).kicks
 
     def with_kicks(state: State, **ends: float) -> State:
-        gradients = [term.gradient(state.q_s, state.q_f) for term in terms.kicks]
-        return kicked(state, terms.kicks, gradients, macro_dt, **ends)
+        gradients = [term.gradient(state.q_s, state.q_f) for term in kicks]
+        return kicked(state, kicks, gradients, macro_dt, **ends)
 
     start = with_kicks(state, start=1.0)
     equations = StepEquations.of(system, scheme, start, macro_dt)
@@ -173,7 +174,13 @@ def _stage(system: System, scheme: Scheme, state: State, macro_dt):
     solution, _ = solver.solve(replace(equations, masses=masses), guess, solver.init(equations))
     q_s, (q_f, p_s, p_f) = state.q_s + solution.x.slow[-1], solution.end
     end = with_kicks(State(state.t + macro_dt, q_s, q_f, p_s, p_f), end=1.0)
-    return end, terms(equations.path(solution.x)), solution.status.result
+    slow, fast = solution.x.slow, solution.x.fast
+    starts = jnp.concatenate([state.q_f[None], state.q_f + jnp.cumsum(fast[:, -1], axis=0)])  # of the micro intervals
+    points = (starts[:-1, None] + fast).reshape(-1, state.q_f.size)
+    slow, fast = (
+        jnp.concatenate([start[None], a]) for start, a in ((state.q_s, state.q_s + slow), (state.q_f, points))
+    )
+    return end, discrete_lagrangian(system, scheme)(slow, fast, macro_dt), solution.status.result
 
 
 def _energy(q, p, actions, macro_dt, k: int):

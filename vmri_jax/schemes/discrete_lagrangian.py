@@ -27,21 +27,14 @@ from vmri_jax.kernels import matmul
 from vmri_jax.mechanics.system import ConstantMass, System
 from vmri_jax.mechanics.terms import Term
 from vmri_jax.refusals import Refused
-from vmri_jax.schemes.path import (
-    Nodes,
-    Path,
-    lagrange_derivative,
-    position_nodes,
-    slow_velocity_nodes,
-    velocity_nodes,
-)
+from vmri_jax.schemes.path import Nodes, lagrange_derivative, position_nodes, slow_velocity_nodes, velocity_nodes
 from vmri_jax.schemes.quadrature import PlacedRule
 from vmri_jax.schemes.scheme import Scheme
 
 
 @dataclass(frozen=True)
 class TermOnNodes:
-    """An integrand on its nodes: ``path -> H^(1 + power) sum_i w_i integrand(path at theta_i)``.
+    """An integrand on its nodes: ``H^(1 + power) sum_i w_i integrand(path at theta_i)``.
 
     integrand, arguments: function of the path, and the names of its arguments, e.g. ``("q_s", "q_f")``.
     inside: nodes inside the macro interval.
@@ -68,25 +61,6 @@ class TermOnNodes:
     def times_step(self, macro_dt):
         """The factor ``H^(1 + power)`` of the weights."""
         return macro_dt ** (1 + self.power)
-
-    def __call__(self, path: Path):
-        return self.at_nodes_inside(path) + self.at_ends(path)
-
-    def at_nodes_inside(self, path: Path):
-        """The sum over the nodes inside the macro interval: its gradient stands in the equations that a step solves."""
-        if not self.inside.groups:
-            return jnp.zeros(())
-        values = jax.vmap(self.integrand)(*self.inside.sample(path, self.arguments).values())
-        return self.sign * self.times_step(path.macro_dt) * jnp.sum(self.inside.weights * values)
-
-    def at_ends(self, path: Path):
-        """The part of the sum at theta = 0 and theta = 1."""
-        q_s, q_f = path.slow_control_points(), path.control_points()[1]
-        total = jnp.zeros(())
-        for weight, k in ((self.start, 0), (self.end, -1)):
-            if weight is not None:
-                total += weight * self.integrand(*({"q_s": q_s[k], "q_f": q_f[k]}[a] for a in self.arguments))
-        return self.sign * self.times_step(path.macro_dt) * total
 
     def gradient(self, q_s, q_f):
         """``(d/dq_s, d/dq_f)`` of the signed integrand at one configuration, for kicks."""
@@ -137,25 +111,12 @@ class QuadraticKinetic:
         """The derivatives ``sum_j k_ij M Delta_j`` by the fast increments (..., r, n_f), times h."""
         return matmul(self.fast_form[1:, 1:], self.mass.fast_mass.times(fast))
 
-    def __call__(self, path: Path):
-        slow, fast = self.slow_rows(path.slow), self.fast_rows(path.fast)
-        return (jnp.sum(path.slow * slow) + self.nodes.num_micro * jnp.sum(path.fast * fast)) / (2 * path.macro_dt)
-
-    at_nodes_inside = __call__
-
 
 @dataclass(frozen=True)
 class Sum:
-    """A sum of terms, itself a function of the path."""
+    """A sum of terms."""
 
     terms: tuple[Any, ...]  # of TermOnNodes and QuadraticKinetic
-
-    def __call__(self, path: Path):
-        return sum((term(path) for term in self.terms), jnp.zeros(()))
-
-    def at_nodes_inside(self, path: Path):
-        """The sum without the nodes at the ends of the macro interval."""
-        return sum((term.at_nodes_inside(path) for term in self.terms), jnp.zeros(()))
 
     @property
     def kinetic(self) -> QuadraticKinetic:
@@ -243,44 +204,3 @@ def _on_position_nodes(function, arguments, placed, scheme, system, name: str, *
     start, inside, end = position_nodes(placed, scheme.num_micro, scheme.degree)
     fields |= {"grid": placed.grid, "every": placed.every, "mollified": placed.mollified, "name": name}
     return TermOnNodes(lambda *q: function(*q, system.params), arguments, inside, start, end, **fields)
-
-
-def discrete_lagrangian(system: System, scheme: Scheme) -> Callable:
-    """The discrete Lagrangian ``L_d(slow, fast, macro_dt) -> ()`` as a function of absolute control points.
-
-    Args:
-        slow: (r + 1, n_s) slow control points of the macro interval.
-        fast: (num_micro r + 1, n_f) fast control points, shared ones once.
-        macro_dt: length H of the macro interval.
-
-    Its derivatives with respect to the control points are ``jax.grad(L_d, argnums=(0, 1))``; the discrete Legendre transforms are the first and
-    the last of these, see `discrete_legendre`.
-    """
-    if scheme.slow.mollified:
-        raise Refused("discrete_lagrangian: a mollified potential depends on more than the control points of a step.")
-    terms = lagrangian(system, scheme)
-
-    def L_d(slow, fast, macro_dt):
-        expected = (scheme.degree + 1, scheme.num_micro * scheme.degree + 1)
-        if (slow.shape[0], fast.shape[0]) != expected:
-            raise Refused(
-                f"L_d: got {slow.shape[0]} slow and {fast.shape[0]} fast control points; this scheme has {expected[0]} "
-                f"and {expected[1]}."
-            )
-        return terms(Path.from_control_points(slow, fast, 0.0, macro_dt))
-
-    return L_d
-
-
-def discrete_legendre(system: System, scheme: Scheme) -> Callable:
-    """Discrete Legendre transforms ``(slow, fast, macro_dt) -> ((p_s, p_f) at the start, (p_s, p_f) at the end)``.
-
-    ``p = -D_first L_d`` and ``p+ = D_last L_d`` (without constraint forces). Arguments as of `discrete_lagrangian`.
-    """
-    slots = jax.grad(discrete_lagrangian(system, scheme), argnums=(0, 1))
-
-    def transforms(slow, fast, macro_dt):
-        d_slow, d_fast = slots(slow, fast, macro_dt)
-        return (-d_slow[0], -d_fast[0]), (d_slow[-1], d_fast[-1])
-
-    return transforms

@@ -22,7 +22,6 @@ n = num_micro, the weight of the constraint rule over n, summed over both interv
 from typing import NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
@@ -31,8 +30,7 @@ from vmri_jax.mechanics.arrays import Number, Numbers
 from vmri_jax.mechanics.masses import ConstantMass
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
-from vmri_jax.schemes.discrete_lagrangian import lagrangian
-from vmri_jax.schemes.path import Nodes, Path, control_nodes, lagrange_basis, velocity_nodes
+from vmri_jax.schemes.path import Nodes, control_nodes, lagrange_basis, velocity_nodes
 from vmri_jax.schemes.scheme import Scheme
 
 LEAST_SUM = 0.2
@@ -58,10 +56,9 @@ class Unknowns(NamedTuple):
 
 
 class StepEquations(eqx.Module):
-    """The nonlinear equations of one macro step, from positions and momenta after the kicks at its start.
+    """The data of the nonlinear equations of one macro step, from positions and momenta after the kicks at its start.
 
-    Arguments of the methods: x, the `Unknowns`; `path`, which is varied; `held`, the same path as a constant, along which forces are
-    evaluated.
+    `vmri_jax.schemes.intervals.Intervals` evaluates them.
 
     before: length of the step before, whose momenta are off the hidden constraints; 0 for momenta on them.
     masses: mass matrix ``d2T/dv2`` (n, n) at the start of the step, of a kinetic energy that is a function; solvers need it.
@@ -99,65 +96,6 @@ class StepEquations(eqx.Module):
             return self.system.kinetic.diagonal
         assert self.masses is not None
         return tuple(jnp.split(jnp.diagonal(self.masses), [self.q_s.size]))
-
-    def path(self, x: Unknowns) -> Path:
-        """The path of the unknowns: fast starts are the running sums of the increments over whole intervals."""
-        return Path(self.t, self.macro_dt, self.q_s, x.slow, self.q_f + sum_before(x.fast[:, -1]), x.fast)
-
-    def action(self, path: Path, held: Path, x: Unknowns):
-        """Augmented action times h, with the virtual work of forces along `held` on displacements of `path`."""
-        energies = lagrangian(self.system, self.scheme).at_nodes_inside(path)
-        return self.micro_dt * (energies + self.virtual_work(path, held)) - self.constraint_work(path, x)
-
-    def virtual_work(self, path: Path, held: Path):
-        """Lagrange-d'Alembert: ``H sum_i w_i F(t_i, q_i, v_i) . Q_i``, with q_i and v_i on the path `held`, which is not varied, and Q_i on `path`."""
-        if self.system.force is None:
-            return 0.0
-        nodes = self.force_nodes
-        f_s, f_f = jax.vmap(self.system.forces)(*nodes.sample(held, ("t", "q_s", "q_f", "v_s", "v_f")).values())
-        q_s, q_f = nodes.sample(path, ("q_s", "q_f")).values()
-        return self.macro_dt * jnp.sum(nodes.weights * (jnp.sum(f_s * q_s, axis=1) + jnp.sum(f_f * q_f, axis=1)))
-
-    def constraint_work(self, path: Path, x: Unknowns):
-        """``sum mu . g + sum nu . g_s / num_micro`` at all control nodes but the last."""
-        q_s, q_f = path.control_points()
-        g = jax.vmap(self.system.g)(path.control_times()[:-1], q_s[:-1], q_f[:-1])
-        g_slow = jax.vmap(self.system.g_slow)(path.slow_control_times()[:-1], path.slow_control_points()[:-1])
-        return jnp.sum(x.multiplier.reshape(g.shape) * g) + jnp.sum(x.slow_multiplier * g_slow) / self.scheme.num_micro
-
-    def slots(self, x: Unknowns):
-        """``h D_{S_i} A`` (r + 1, n_s) and, per micro interval, ``h D_{F_j} A`` (num_micro, r + 1, n_f)."""
-        path = self.path(x)
-        d = jax.grad(self.action)(path, path, x)
-        # control point X_j = X_0 + Delta_j: D_{X_j} = d/dDelta_j, and D_{X_0} = d/dX_0 at fixed control points = d_start - sum_j d/dDelta_j
-        slow = jnp.concatenate([(d.slow_start - d.slow.sum(0))[None], d.slow])
-        fast = jnp.concatenate([(d.fast_start - d.fast.sum(1))[:, None], d.fast], axis=1)
-        return slow, fast
-
-    def evaluate(self, x: Unknowns):
-        """Residual of the equations (times h in the momentum rows), and momenta ``D_last A`` at the end of the step."""
-        slow, fast = self.slots(x)
-        g, g_slow = self.constraints(x)
-        # momentum that arrives at each micro interval, times h: p_f, then D_last of the interval before
-        incoming = jnp.concatenate([self.micro_dt * self.p_f[None], fast[:-1, -1]])
-        residual = Unknowns(
-            slow=slow[:-1].at[0].add(self.micro_dt * self.p_s),
-            slow_multiplier=g_slow,
-            fast=fast[:, :-1].at[:, 0].add(incoming),
-            multiplier=g.reshape(x.multiplier.shape),
-        )
-        return residual, (slow[-1] / self.micro_dt, fast[-1, -1] / self.micro_dt)
-
-    def constraints(self, x: Unknowns):
-        """Values of g (num_micro r, n_g) and of g_s (r, n_gs) at all control nodes but the first."""
-        path = self.path(x)
-        q_s, q_f = path.control_points()
-        g = jax.vmap(self.system.g)(path.control_times()[1:], q_s[1:], q_f[1:])
-        return g, jax.vmap(self.system.g_slow)(path.slow_control_times()[1:], path.slow_control_points()[1:])
-
-    def residual(self, x: Unknowns) -> Unknowns:
-        """Left-hand sides of the equations at x."""
-        return self.evaluate(x)[0]
 
     def guess(self, v_s, v_f, multiplier, slow_multiplier) -> Unknowns:
         """Straight motion at these velocities, with these (physical) multipliers at all nodes."""
@@ -200,11 +138,6 @@ class StepEquations(eqx.Module):
             jnp.where(cancels, before, mu / jnp.where(cancels, 1.0, scale))
             for mu, scale, before in zip(scaled, self.multiplier_scales(), last, strict=True)
         )
-
-
-def sum_before(increments):
-    """Running sum of increments over the intervals before each one."""
-    return jnp.concatenate([jnp.zeros_like(increments[:1]), jnp.cumsum(increments[:-1], axis=0)])
 
 
 def slow_basis_at_control_nodes(num_micro: int, degree: int) -> np.ndarray:

@@ -17,7 +17,8 @@ for the fast increments and the scaled multipliers mu. It hands on ``F_r`` and `
 
 Terms of slow variables alone, such as `System.slow_kinetic`, belong to no interval: they enter the slow equations once.
 
-These are the equations of `vmri_jax.schemes.equations`, in the order in which a march over the intervals meets them.
+These are the equations of `vmri_jax.schemes.equations`, in the order in which a march over the intervals meets them. All solvers and all
+derivatives of steps have them from here; `vmri_jax.textbook` has those of the whole step, to compare with.
 """
 
 from collections.abc import Callable
@@ -35,8 +36,8 @@ from vmri_jax.kernels import matmul, matvec
 from vmri_jax.mechanics.rows import Entries
 from vmri_jax.mechanics.structure import entries_seen
 from vmri_jax.schemes.discrete_lagrangian import QuadraticKinetic, TermOnNodes, lagrangian
-from vmri_jax.schemes.equations import StepEquations, slow_basis_at_control_nodes
-from vmri_jax.schemes.path import NodeGroup, Nodes, Path, control_nodes, lagrange_basis, lagrange_derivative
+from vmri_jax.schemes.equations import StepEquations, Unknowns, slow_basis_at_control_nodes
+from vmri_jax.schemes.path import NodeGroup, Nodes, control_nodes, lagrange_basis, lagrange_derivative
 
 
 class IntervalPath(NamedTuple):
@@ -282,6 +283,20 @@ class Intervals:
         residual = IntervalUnknowns(rows, self.constraints(path, m, slice(1, None)))
         return residual, self.handed_on(arriving, d, x.fast[-1])
 
+    def residual(self, x: Unknowns) -> tuple[Unknowns, tuple[Any, Any, Any]]:
+        """Residual of all equations of the step, and fast position, slow and fast momentum at its end."""
+
+        def interval(arriving, of_interval):
+            m, *unknowns = of_interval
+            residual, on = self.evaluate(m, IntervalUnknowns(*unknowns), arriving, self.seen.take(x.slow))
+            return on, residual
+
+        intervals = jnp.arange(len(x.fast)), x.fast, x.multiplier
+        end, (fast, g) = jax.lax.scan(interval, self.start(), intervals)
+        slow, p_s = self.slow_rows(x.slow, self.slow_impulses(x.slow, x.slow_multiplier), end)
+        end = end.q_f, p_s, end.p_f / self.equations.micro_dt
+        return Unknowns(slow, self.slow_constraints(x.slow), fast, g), end
+
     def impulses(self, m, x: IntervalUnknowns, arriving: Arriving, slow, multiplier) -> Arriving:
         """Change of the quantities that interval m hands on if `multiplier` is added to its multipliers."""
         d = self.constraint_impulses(m, self.path(arriving, slow, x.fast))(-multiplier)
@@ -304,10 +319,15 @@ class Intervals:
 
     def _slow_action(self, slow_start, slow):
         """h times the action of the terms of slow variables alone, ``h H sum_i w_i T_s(S(c_i H), S'(c_i H))``."""
-        equations = self.equations
-        none = jnp.zeros((equations.scheme.num_micro, 0))
-        path = Path(equations.t, equations.macro_dt, slow_start, slow, none, none[:, None])
-        return equations.micro_dt * sum(term.at_nodes_inside(path) for term in self._slow_terms)
+        equations, total = self.equations, jnp.zeros(())
+        for term in self._slow_terms:
+            nodes, r = term.inside, equations.scheme.degree
+            theta = np.concatenate([nodes.theta(group) for group in nodes.groups])
+            moved, slopes = (matmul(basis(r, theta)[:, 1:], slow) for basis in (lagrange_basis, lagrange_derivative))
+            path = {"q_s": slow_start + moved, "v_s": slopes / equations.macro_dt}
+            values = jax.vmap(term.integrand)(*(path[name] for name in term.arguments))
+            total += term.sign * term.times_step(equations.macro_dt) * jnp.sum(nodes.weights * values)
+        return equations.micro_dt * total
 
     def _virtual_work(self, nodes: IntervalNodes, m, path: IntervalPath, held: IntervalPath):
         """``H sum_i w_i F(t_i, q_i, v_i) . q_i``."""

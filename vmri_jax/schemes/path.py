@@ -7,18 +7,14 @@ velocities ``sum_j l_j'(c) Delta_j / dt`` come from increments directly, never f
 two nearly equal positions: momenta keep full relative precision however small the step.
 """
 
-from collections.abc import Iterable
 from dataclasses import dataclass
-from itertools import groupby
 from typing import Any
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from vmri_jax.kernels import matmul
-from vmri_jax.mechanics.arrays import Number, Numbers
+from vmri_jax.mechanics.arrays import Numbers
 from vmri_jax.refusals import Refused
 from vmri_jax.schemes.quadrature import NODE_TOLERANCE, PlacedRule, Rule, lobatto
 
@@ -51,64 +47,6 @@ def lagrange_derivative(degree: int, theta) -> np.ndarray:
         ]
         columns.append(sum(products))
     return np.stack(columns, axis=-1)
-
-
-class Path(eqx.Module):
-    """Piecewise polynomial path over one macro interval of length ``macro_dt`` that starts at time ``t``.
-
-    Args:
-        t, macro_dt: start and length of the interval.
-        slow_start: slow position at the start.
-        slow: increments of the slow control points 1..r from the start.
-        fast_start: fast position at the start of each micro interval.
-        fast: increments of the fast control points from the start of their interval.
-    """
-
-    t: Number
-    macro_dt: Number
-    slow_start: Float[Numbers, "n_s"]
-    slow: Float[Numbers, "r n_s"]
-    fast_start: Float[Numbers, "num_micro n_f"]
-    fast: Float[Numbers, "num_micro r n_f"]
-
-    @classmethod
-    def from_control_points(cls, slow, fast, t, macro_dt) -> "Path":
-        """Path through slow control points (r + 1, n_s) and fast ones (num_micro r + 1, n_f)."""
-        degree = slow.shape[0] - 1
-        starts = fast[:-1:degree]
-        ends = fast[1:].reshape(starts.shape[0], degree, fast.shape[1])
-        return cls(t, macro_dt, slow[0], slow[1:] - slow[0], starts, ends - starts[:, None])
-
-    @property
-    def degree(self) -> int:
-        """Polynomial degree r."""
-        return self.slow.shape[0]
-
-    @property
-    def num_micro(self) -> int:
-        """Micro intervals."""
-        return self.fast.shape[0]
-
-    def control_points(self):
-        """Slow and fast positions at the num_micro r + 1 micro control nodes, first to last."""
-        n, r = self.num_micro, self.degree
-        theta = (np.arange(n)[:, None] + control_nodes(r)[None, 1:]).reshape(-1) / n
-        slow = self.slow_start + matmul(lagrange_basis(r, np.concatenate([[0.0], theta]))[:, 1:], self.slow)
-        fast = (self.fast_start[:, None] + self.fast).reshape(n * r, -1)
-        return slow, jnp.concatenate([self.fast_start[:1], fast])
-
-    def control_times(self):
-        """Times of the num_micro r + 1 micro control nodes."""
-        theta = (np.arange(self.num_micro)[:, None] + control_nodes(self.degree)[None, :-1]).reshape(-1)
-        return self.t + self.macro_dt * np.append(theta / self.num_micro, 1.0)
-
-    def slow_control_times(self):
-        """Times of the r + 1 macro control nodes."""
-        return self.t + self.macro_dt * control_nodes(self.degree)
-
-    def slow_control_points(self):
-        """Slow positions at the r + 1 macro control nodes."""
-        return jnp.concatenate([self.slow_start[None], self.slow_start + self.slow])
 
 
 @dataclass(frozen=True)
@@ -152,26 +90,6 @@ class Nodes:
     def theta(self, group: NodeGroup) -> np.ndarray:
         """Positions of a group's nodes on the macro interval."""
         return (np.array(group.intervals) + group.c) / self.num_micro
-
-    def sample(self, path: Path, names: Iterable[str]) -> dict:
-        """Values of the path at all k nodes, group after group, by name: times ``t`` (k,), ``q_s``, ``q_f``, ``v_s``, ``v_f`` (k, n)."""
-        together = [tuple(groups) for _, groups in groupby(self.groups, key=lambda g: g.intervals)]
-        return {name: jnp.concatenate([self._at(groups, path, name) for groups in together]) for name in names}
-
-    def _at(self, groups: tuple[NodeGroup, ...], path: Path, name: str):
-        """One quantity of `sample` at groups on the same micro intervals."""
-        theta, c = np.concatenate([self.theta(g) for g in groups]), np.array([g.c for g in groups])
-        if name == "t":
-            return path.t + path.macro_dt * theta
-        velocity = name[0] == "v"
-        basis = lagrange_derivative if velocity else lagrange_basis
-        if name[2] == "s":
-            moved = matmul(basis(self.degree, theta)[:, 1:], path.slow)
-            return moved / path.macro_dt if velocity else path.slow_start + moved
-        inside = slice(groups[0].first, groups[0].stop, groups[0].step)
-        moved = jnp.swapaxes(matmul(basis(self.degree, c)[:, 1:], path.fast[inside]), 0, 1)
-        q_f = moved / (path.macro_dt / self.num_micro) if velocity else path.fast_start[inside] + moved
-        return q_f.reshape(len(theta), path.fast.shape[-1])
 
 
 def velocity_nodes(placed: PlacedRule, num_micro: int, degree: int) -> Nodes:

@@ -123,7 +123,7 @@ class Solved(Stepper):
         x, (q_f, p_s, p_f) = differentiable(equations, *root)
 
         lambdas = equations.multipliers(x, memory.multiplier, memory.slow_multiplier)
-        q_f_micro = jnp.concatenate([equations.path(x).fast_start[1:], q_f[None]])
+        q_f_micro = jnp.concatenate([equations.q_f + jnp.cumsum(x.fast[:-1, -1], axis=0), q_f[None]])
         info = StepInfo(*StepStatus(*status), q_f_micro, *lambdas)
         end = State(state.t + macro_dt, state.q_s + x.slow[-1], q_f, p_s, p_f)
         last_dt = jnp.asarray(macro_dt, dtype=float)

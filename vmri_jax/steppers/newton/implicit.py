@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
 from vmri_jax.schemes.equations import StepEquations, Unknowns
+from vmri_jax.schemes.intervals import Intervals
 from vmri_jax.steppers.march import MarchEquations, linearised_pass, solve
 
 
@@ -21,11 +22,6 @@ def _direction(equations: StepEquations, x: Unknowns):
     matrices, _, by_positions = linearised_pass(march, z, x_flat, x_flat[-1], from_last=False, corrects=False)
     factors = jax.lax.stop_gradient((matrices, by_positions))
     return lambda residual: march.by_name(*solve(march, factors, *march.flat(residual)))
-
-
-def _end(equations: StepEquations, x: Unknowns):
-    """Fast position and momenta at the end of the step."""
-    return equations.q_f + x.fast[:, -1].sum(0), *equations.evaluate(x)[1]
 
 
 def _with_derivative_of(values, others):
@@ -68,19 +64,21 @@ def _implicit_derivative(primals, tangents):
     # For second derivatives: a Newton step x - (dR/dx)^-1 R at the root changes nothing, but makes x a function of the equations with the
     # right first derivative. A recursive call of `differentiable` would not do: for reverse mode JAX evaluates the first derivative in part,
     # and this partial evaluation drops the rules of custom derivatives.
-    residual = equations.residual(root)
+    residual, _ = Intervals(equations).residual(root)
     unknown_beyond = _no_third_derivative(residual)
     newton = jax.tree.map(lambda a, step: a + step + unknown_beyond, root, direction(residual))
     x = _with_derivative_of(root, newton)
-    _, change = jax.jvp(lambda e: e.residual(x), (equations,), (tangents[0],))
+    (_, end_of_x), push = jax.linearize(lambda e, x: Intervals(e).residual(x), equations, x)
+    change, _ = push(tangents[0], jax.tree.map(jnp.zeros_like, x))
 
     # dR/dx dx = -dR/de de. `custom_linear_solve` differentiates dx through `product`, that is through dR/dx at x; its own solves take the
     # factors of `direction`, computed once.
     rows, by_name = ravel_pytree(jax.tree.map(jnp.negative, change))
+    none = jax.tree.map(jnp.zeros_like, tangents[0])
 
     def product(dx):
         """``dR/dx dx``."""
-        return ravel_pytree(jax.jvp(equations.residual, (x,), (by_name(dx),))[1])[0]
+        return ravel_pytree(push(none, by_name(dx))[0])[0]
 
     def solved(_, rows):
         """``(dR/dx)^-1`` times the rows."""
@@ -90,5 +88,5 @@ def _implicit_derivative(primals, tangents):
         return jax.linear_transpose(partial(solved, None), rows)(rows)[0]
 
     dx = by_name(jax.lax.custom_linear_solve(product, rows, solved, solved_transposed))
-    end_of_x, d_end = jax.jvp(_end, (equations, x), (tangents[0], dx))
+    _, d_end = push(tangents[0], dx)
     return (x, _with_derivative_of(end, end_of_x)), (dx, d_end)
