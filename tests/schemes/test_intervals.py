@@ -110,11 +110,7 @@ def test_intervals_sample_the_path_at_the_nodes_of_the_rule(degree, num_micro, p
 def test_functions_are_evaluated_at_the_nodes_of_the_rule_alone(placed, num_micro):
     """In each interval at each of its nodes, once, with its weight."""
     _, inside, _ = position_nodes(placed, num_micro, 1)
-    expected = sorted(
-        (m, (m + group.c) / num_micro, float(weight))
-        for group in inside.groups
-        for m, weight in zip(range(group.first, group.stop), np.asarray(group.weights), strict=True)
-    )
+    expected = sorted(zip(inside.interval, inside.theta, np.asarray(inside.weights), strict=True))
     found = sorted(
         (m, float(theta), float(weight))
         for nodes in IntervalNodes.of(inside)

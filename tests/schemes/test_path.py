@@ -34,14 +34,15 @@ def test_polynomials_of_the_degree_are_interpolated(degree, coefficients, x):
 @pytest.mark.parametrize("placed", [micro(gauss(2)), micro(radau(2)), micro(simpson), macro(gauss(2)), macro(gauss(4))])
 def test_velocity_nodes_are_the_composite_rule(num_micro, placed):
     nodes = velocity_nodes(placed, num_micro, 2)
-    thetas = np.concatenate([nodes.theta(g) for g in nodes.groups])
     composite = placed.composite(num_micro)  # velocity nodes do not merge
     for power in range(4):
-        assert nodes.weights @ thetas**power == pytest.approx(composite(lambda x, power=power: x**power), abs=1e-13)
+        assert nodes.weights @ nodes.theta**power == pytest.approx(
+            composite(lambda x, power=power: x**power), abs=1e-13
+        )
 
 
 def test_velocities_on_the_border_of_two_micro_intervals_are_refused():
-    assert len(velocity_nodes(macro(midpoint), 3, 1).groups) == 1
+    assert len(velocity_nodes(macro(midpoint), 3, 1).theta) == 1
     with pytest.raises(ValueError, match=r"node 0.5 falls on the border of two of the 2 micro"):
         velocity_nodes(macro(midpoint), 2, 1)
 
@@ -55,8 +56,7 @@ RULES = [left, right, midpoint, affine(0.3), simpson, gauss(2), gauss(3), lobatt
 def test_position_nodes_are_the_merged_composite_rule(num_micro, place, rule):
     start, inside, end = position_nodes(place(rule), num_micro, 2)
     nodes = [] if start is None else [(0.0, start)]
-    for group in inside.groups:
-        nodes += zip(inside.theta(group), np.asarray(group.weights), strict=True)
+    nodes += zip(inside.theta, np.asarray(inside.weights), strict=True)
     nodes = sorted(nodes + ([] if end is None else [(1.0, end)]))
     composite = place(rule).composite(num_micro)
     assert np.allclose([theta for theta, _ in nodes], composite.nodes, rtol=0, atol=1e-14)
@@ -66,7 +66,7 @@ def test_position_nodes_are_the_merged_composite_rule(num_micro, place, rule):
 
 def test_ends_are_kept_apart_only_where_the_rule_has_them():
     start, inside, end = position_nodes(macro(affine(0.25)), 7, 1)
-    assert (start, inside.groups, end) == (0.25, (), 0.75)
+    assert (start, len(inside.theta), end) == (0.25, 0, 0.75)
     start, inside, end = position_nodes(micro(midpoint), 7, 1)
     assert (start, end) == (None, None)
-    assert [g.size for g in inside.groups] == [7]
+    assert len(inside.theta) == 7

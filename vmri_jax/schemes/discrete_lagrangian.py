@@ -21,7 +21,6 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from vmri_jax.kernels import matmul
 from vmri_jax.mechanics.system import ConstantMass, System
@@ -88,16 +87,13 @@ class QuadraticKinetic:
     @property
     def slow_form(self):
         """(r + 1, r + 1) matrix k of the macro interval."""
-        theta = np.concatenate([self.nodes.theta(g) for g in self.nodes.groups])
-        return self._form(theta, self.nodes.weights)
+        return self._form(self.nodes.theta, self.nodes.weights)
 
     @property
     def fast_form(self):
         """(r + 1, r + 1) matrix k of a micro interval."""
-        groups = self.nodes.groups
-        return self._form(
-            np.array([g.c for g in groups]), jnp.stack([g.weights[0] for g in groups]) * self.nodes.num_micro
-        )
+        first = self.nodes.interval == 0
+        return self._form(self.nodes.c[first], self.nodes.num_micro * self.nodes.weights[first])
 
     def _form(self, theta, weights):
         slopes = lagrange_derivative(self.nodes.degree, theta)

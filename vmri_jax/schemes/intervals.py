@@ -37,7 +37,7 @@ from vmri_jax.mechanics.rows import Entries
 from vmri_jax.mechanics.structure import entries_seen
 from vmri_jax.schemes.discrete_lagrangian import QuadraticKinetic, TermOnNodes, lagrangian
 from vmri_jax.schemes.equations import StepEquations, Unknowns, slow_basis_at_control_nodes
-from vmri_jax.schemes.path import NodeGroup, Nodes, control_nodes, lagrange_basis, lagrange_derivative
+from vmri_jax.schemes.path import Nodes, control_nodes, lagrange_basis, lagrange_derivative
 
 
 class IntervalPath(NamedTuple):
@@ -77,51 +77,42 @@ class IntervalNodes:
     """Quadrature nodes of a term, the same number in every micro interval that has nodes.
 
     Args:
-        groups: rows of groups of nodes; the groups of a row lie in different intervals, so that a row has at most one node per interval.
-        num_micro, degree: of the scheme.
+        nodes: of the term.
+        rows: numbers of some of them; a row has at most one node in each interval.
     """
 
-    def __init__(self, groups: list[list[NodeGroup]], num_micro: int, degree: int):
-        n = num_micro
-        c = np.zeros((n, len(groups)))
-        self.has_nodes = np.zeros(n, bool)
-        for k, row in enumerate(groups):
-            for group in row:
-                c[np.array(group.intervals), k] = group.c
-                self.has_nodes[np.array(group.intervals)] = True
-        if self.has_nodes.all() and all(len(row) == 1 for row in groups):
-            self.weights = jnp.stack([row[0].weights[0] for row in groups])[None]  # of all intervals
+    def __init__(self, nodes: Nodes, rows: list[np.ndarray]):
+        n, r = nodes.num_micro, nodes.degree
+        c, of = np.zeros((n, len(rows))), np.full((n, len(rows)), -1)
+        for k, row in enumerate(rows):
+            c[nodes.interval[row], k], of[nodes.interval[row], k] = nodes.c[row], nodes.of[row]
+        self.has_nodes = (of >= 0).any(axis=1)
+        if (of == of[0]).all():
+            self.weights = nodes.distinct[of[:1]]  # of all intervals
         else:
-            self.weights = jnp.stack(
-                [sum((_padded(group, n) for group in row), jnp.zeros(n)) for row in groups], axis=1
-            )
+            self.weights = jnp.append(nodes.distinct, 0.0)[of]
         self.c, self.theta = c, (np.arange(n)[:, None] + c) / n
         self.tables = {
-            "q_s": lagrange_basis(degree, self.theta)[..., 1:],
-            "v_s": lagrange_derivative(degree, self.theta)[..., 1:],
-            "q_f": lagrange_basis(degree, c)[..., 1:],
-            "v_f": lagrange_derivative(degree, c)[..., 1:],
+            "q_s": lagrange_basis(r, self.theta)[..., 1:],
+            "v_s": lagrange_derivative(r, self.theta)[..., 1:],
+            "q_f": lagrange_basis(r, c)[..., 1:],
+            "v_f": lagrange_derivative(r, c)[..., 1:],
         }
 
     @classmethod
     def of(cls, nodes: Nodes) -> "list[IntervalNodes]":
-        """The nodes of a rule: one entry for all rows of groups with a node in every interval, and one for each other row.
+        """The nodes of a rule: one entry for all rows with a node in every interval, and one for each other row.
 
         So functions are evaluated at the nodes of their rule alone: a potential may not be defined elsewhere, and a rule on the macro step
         has no node in most intervals.
         """
-        rows: list[list[NodeGroup]] = []
-        for group in nodes.groups:
-            apart = (row for row in rows if not any(set(g.intervals) & set(group.intervals) for g in row))
-            row = next(apart, None)
-            if row is None:
-                rows.append([group])
-            else:
-                row.append(group)
-        everywhere = [row for row in rows if sum(group.size for group in row) == nodes.num_micro]
+        # row k has the nodes that are the k-th of their interval
+        k = [np.sum(nodes.interval[:i] == m) for i, m in enumerate(nodes.interval)]
+        rows = [np.flatnonzero(np.equal(k, number)) for number in range(max(k, default=-1) + 1)]
+        everywhere = [row for row in rows if len(row) == nodes.num_micro]
         parts = [everywhere] if everywhere else []
-        parts += [[row] for row in rows if row not in everywhere]
-        return [cls(part, nodes.num_micro, nodes.degree) for part in parts]
+        parts += [[row] for row in rows if len(row) < nodes.num_micro]
+        return [cls(nodes, part) for part in parts]
 
     def sample(self, path: IntervalPath, equations: StepEquations, seen: Entries, m, names: tuple[str, ...]) -> list:
         """Values of the path at the k nodes of interval m, by name: times ``t`` (k,), ``q_s``, ``q_f``, ``v_s``, ``v_f`` (k, n).
@@ -152,13 +143,6 @@ def with_unseen(values, name: str, equations: StepEquations, seen: Entries):
     return seen.put(values, jnp.broadcast_to(at_rest, (len(values), at_rest.size)))
 
 
-def _padded(group: NodeGroup, num_micro: int):
-    """(num_micro,) weights of a group of nodes, 0 in intervals without a node of the group."""
-    if group.step > 1:
-        return jnp.zeros(num_micro).at[np.array(group.intervals)].set(group.weights)
-    return jnp.pad(jnp.asarray(group.weights), (group.first, num_micro - group.stop))
-
-
 def of_interval(table, m):
     """The rows of a table for interval m; a constant, without a lookup, if the rows of all intervals are equal."""
     if len(table) == 1 or (isinstance(table, np.ndarray) and np.ptp(table, axis=0).max(initial=0.0) == 0.0):
@@ -181,7 +165,7 @@ class Intervals:
         self.equations = equations
         terms = lagrangian(equations.system, equations.scheme).terms
         self.kinetic = next((term for term in terms if isinstance(term, QuadraticKinetic)), None)
-        inner = [term for term in terms if isinstance(term, TermOnNodes) and term.inside.groups]
+        inner = [term for term in terms if isinstance(term, TermOnNodes) and len(term.inside.c)]
         of_slow = [all(name.endswith("_s") for name in term.arguments) for term in inner]
         self._slow_terms = [term for term, alone in zip(inner, of_slow, strict=True) if alone]
         of_fast = (term for term, alone in zip(inner, of_slow, strict=True) if not alone)
@@ -321,9 +305,8 @@ class Intervals:
         """h times the action of the terms of slow variables alone, ``h H sum_i w_i T_s(S(c_i H), S'(c_i H))``."""
         equations, total = self.equations, jnp.zeros(())
         for term in self._slow_terms:
-            nodes, r = term.inside, equations.scheme.degree
-            theta = np.concatenate([nodes.theta(group) for group in nodes.groups])
-            moved, slopes = (matmul(basis(r, theta)[:, 1:], slow) for basis in (lagrange_basis, lagrange_derivative))
+            nodes, bases = term.inside, (lagrange_basis, lagrange_derivative)
+            moved, slopes = (matmul(basis(nodes.degree, nodes.theta)[:, 1:], slow) for basis in bases)
             path = {"q_s": slow_start + moved, "v_s": slopes / equations.macro_dt}
             values = jax.vmap(term.integrand)(*(path[name] for name in term.arguments))
             total += term.sign * term.times_step(equations.macro_dt) * jnp.sum(nodes.weights * values)

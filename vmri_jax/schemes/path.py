@@ -12,11 +12,11 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from vmri_jax.mechanics.arrays import Numbers
 from vmri_jax.refusals import Refused
-from vmri_jax.schemes.quadrature import NODE_TOLERANCE, PlacedRule, Rule, lobatto
+from vmri_jax.schemes.quadrature import NODE_TOLERANCE, PlacedRule, lobatto, macro
 
 
 def control_nodes(degree: int) -> np.ndarray:
@@ -50,46 +50,30 @@ def lagrange_derivative(degree: int, theta) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class NodeGroup:
-    """Nodes at the local coordinate ``c`` of every `step`-th of the micro intervals ``first <= m < stop``."""
-
-    c: float
-    first: int
-    stop: int
-    weights: Float[Numbers, "size"]
-    step: int = 1
-
-    @property
-    def intervals(self) -> range:
-        """Numbers of the micro intervals."""
-        return range(self.first, self.stop, self.step)
-
-    @property
-    def size(self) -> int:
-        """Number of nodes."""
-        return len(self.intervals)
-
-
-@dataclass(frozen=True)
 class Nodes:
-    """Quadrature nodes of one term on the macro interval, sorted into groups of equal local coordinate.
+    """The k quadrature nodes of one term on the macro interval.
 
-    A group is a slice of the micro intervals, so that sampling and its transpose are slices and pads of cost O(num_micro), without
-    gather or scatter.
+    interval, c: (k,) micro interval of each node, and its local coordinate there.
+    of: (k,) number of its weight.
+    distinct: the weights; the copies of a node have one.
     """
 
-    groups: tuple[NodeGroup, ...]
+    interval: Int[np.ndarray, "k"]
+    c: Float[np.ndarray, "k"]
+    of: Int[np.ndarray, "k"]
+    distinct: Float[Numbers, "w"]
     num_micro: int
     degree: int
 
     @property
     def weights(self):
-        """Weights of all nodes, group after group."""
-        return jnp.concatenate([jnp.asarray(g.weights) for g in self.groups])
+        """(k,) weights."""
+        return self.distinct[self.of]
 
-    def theta(self, group: NodeGroup) -> np.ndarray:
-        """Positions of a group's nodes on the macro interval."""
-        return (np.array(group.intervals) + group.c) / self.num_micro
+    @property
+    def theta(self) -> np.ndarray:
+        """(k,) places on the macro interval."""
+        return (self.interval + self.c) / self.num_micro
 
 
 def velocity_nodes(placed: PlacedRule, num_micro: int, degree: int) -> Nodes:
@@ -98,20 +82,19 @@ def velocity_nodes(placed: PlacedRule, num_micro: int, degree: int) -> Nodes:
     Raises:
         ValueError: a macro rule with a node on the border of two micro intervals.
     """
-    groups = tuple(_group(placed, i, num_micro) for i in range(len(placed.rule.nodes)))
-    for g in groups:
-        if g.c == 0.0 and g.first > 0:
-            raise Refused(
-                f"macro rule: node {g.first / num_micro} falls on the border of two of the {num_micro} micro intervals, "
-                "where the velocity is not defined; place this term with micro(...) or choose another rule."
-            )
-    return Nodes(groups, num_micro, degree)
+    nodes = _nodes(placed, num_micro, degree, range(len(placed.rule.nodes)))
+    between = (nodes.c == 0.0) & (nodes.interval > 0)
+    if placed.grid == "macro" and between.any():
+        raise Refused(
+            f"macro rule: node {nodes.theta[between.argmax()]} falls on the border of two of the {num_micro} micro intervals, "
+            "where the velocity is not defined; place this term with micro(...) or choose another rule."
+        )
+    return nodes
 
 
 def slow_velocity_nodes(placed: PlacedRule, num_micro: int, degree: int) -> Nodes:
     """Nodes of a term that depends on slow positions and velocities alone: the nodes of the rule, once on the macro interval."""
-    groups = (_on_one_interval(placed.rule, i, num_micro) for i in range(len(placed.rule.nodes)))
-    return Nodes(tuple(groups), num_micro, degree)
+    return _nodes(macro(placed.rule), num_micro, degree, range(len(placed.rule.nodes)))
 
 
 def position_nodes(placed: PlacedRule, num_micro: int, degree: int) -> tuple[Any, Nodes, Any]:
@@ -125,25 +108,24 @@ def position_nodes(placed: PlacedRule, num_micro: int, degree: int) -> tuple[Any
     has_start, has_end = rule.nodes[0] <= NODE_TOLERANCE, rule.nodes[-1] >= 1 - NODE_TOLERANCE
     start = rule.weights[0] / size if has_start else None
     end = rule.weights[-1] / size if has_end else None
-    groups = [_group(placed, i, num_micro) for i in range(has_start, len(rule.nodes) - has_end)]
-    if size > 1 and (has_start or has_end):
-        meeting = sum(w for w in (start, end) if w is not None)
-        groups.insert(0, NodeGroup(0.0, every, num_micro, jnp.full(size - 1, meeting), every))
-    return start, Nodes(tuple(groups), num_micro, degree), end
+    inside = range(has_start, len(rule.nodes) - has_end)
+    meets = range(every, num_micro, every) if size > 1 and (has_start or has_end) else range(0)
+    meeting = sum((w for w in (start, end) if w is not None), jnp.zeros(()))
+    return start, _nodes(placed, num_micro, degree, inside, meets, meeting), end
 
 
-def _group(placed: PlacedRule, i: int, num_micro: int) -> NodeGroup:
-    """Node i of the rule, in each of its copies."""
-    if placed.grid == "macro":
-        return _on_one_interval(placed.rule, i, num_micro)
-    copies = placed.copies(num_micro)
-    m, c = _interval_of(placed.rule.nodes[i], placed.every)
-    return NodeGroup(c, m, num_micro, jnp.full(copies, placed.rule.weights[i] / copies), placed.every)
-
-
-def _on_one_interval(rule: Rule, i: int, num_micro: int) -> NodeGroup:
-    m, c = _interval_of(rule.nodes[i], num_micro)
-    return NodeGroup(c, m, m + 1, rule.weights[i : i + 1])
+def _nodes(
+    placed: PlacedRule, num_micro: int, degree: int, numbers, meets: range = range(0), meeting: Any = 0.0
+) -> Nodes:
+    """Some nodes of a rule, in each of its copies, after nodes of one weight at the starts of some micro intervals."""
+    copies, on_macro = placed.copies(num_micro), placed.grid == "macro"
+    starts = np.zeros(1, int) if on_macro else placed.every * np.arange(copies)
+    at = [_interval_of(placed.rule.nodes[i], num_micro if on_macro else placed.every) for i in numbers]
+    interval = np.concatenate([np.array(meets, int), *(starts + m for m, _ in at)])
+    c = np.concatenate([np.zeros(len(meets)), *(np.full(len(starts), c) for _, c in at)])
+    of = np.repeat(np.arange(1 + len(at)), [len(meets)] + [len(starts)] * len(at))
+    weights = jnp.stack([meeting, *(placed.rule.weights[i] / copies for i in numbers)])
+    return Nodes(interval, c, of, weights, num_micro, degree)
 
 
 def _interval_of(node: float, count: int) -> tuple[int, float]:

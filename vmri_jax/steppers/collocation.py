@@ -111,7 +111,7 @@ class IntervalEquations:
         first = -jnp.sum(mu[:, :1] * self.at_start, axis=0)
         # forces of the potentials, h^2 sum_k w_k l_j(c_k) (-dW/dq)(q(c_k)), at node j
         for term in self.potentials:
-            theta = np.concatenate([term.inside.theta(group) for group in term.inside.groups])
+            theta = term.inside.theta
             basis, weights = lagrange_basis(self.r, theta), self.h**2 * term.inside.weights
             gradient = jax.grad(partial(self.of_term, term))
             before, k = int(np.argmax(basis[0, 1:])), len(theta)

@@ -54,7 +54,7 @@ def constant_mass(system: System) -> ConstantMass:
 def implicit_terms(system: System, scheme: Scheme) -> list[TermOnNodes]:
     """The potentials with nodes inside micro intervals, whose gradients depend on the fast unknowns."""
     terms = [term for term in lagrangian(system, scheme).terms if isinstance(term, TermOnNodes)]
-    return [term for term in terms if any(group.c > 0 for group in term.inside.groups)]
+    return [term for term in terms if np.any(term.inside.c > 0)]
 
 
 def _of_fast(term: TermOnNodes, q_s, q_f):

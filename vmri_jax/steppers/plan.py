@@ -156,7 +156,7 @@ def _whole_step(system: System, scheme: Scheme, solver: Solver, q_s, q_f) -> Kic
         between = _decoupled(system, scheme, solver, q_s, q_f, parts)
         # Kicks of terms at the macro nodes alone stay here. All other terms, on the micro grid or with further nodes inside, belong to the
         # slow or the fast part, with their kicks.
-        kicks = tuple(term for term in kicks if term.grid == "macro" and not term.inside.groups)
+        kicks = tuple(term for term in kicks if term.grid == "macro" and not len(term.inside.c))
         return Kicked(kicks, between, average)
     return Kicked(kicks, _between_kicks(system, scheme, solver, q_s, q_f), average)
 
