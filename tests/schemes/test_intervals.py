@@ -33,9 +33,10 @@ def whole_and_cut(equations, x):
     path, h, n = control_points(equations, x), equations.micro_dt, equations.scheme.num_micro
 
     def action(path, along):
-        free = textbook.discrete_lagrangian(system, scheme)(*path, H)
+        slow, fast = path
+        free = textbook.discrete_lagrangian(system, scheme)(slow, fast, H)
         free += textbook.virtual_work(system, scheme, path, along, t, H)
-        g, g_slow = textbook.constraints(system, scheme, *path, t, H)
+        g, g_slow = textbook.constraints(system, scheme, slow, fast, t, H)
         of_multipliers = jnp.sum(x.multiplier.reshape(g[:-1].shape) * g[:-1])
         return h * free - of_multipliers - jnp.sum(x.slow_multiplier * g_slow[:-1]) / n
 
