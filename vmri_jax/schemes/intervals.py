@@ -268,7 +268,7 @@ class Intervals:
         return residual, self.handed_on(arriving, d, x.fast[-1])
 
     def residual(self, x: Unknowns) -> tuple[Unknowns, tuple[Any, Any, Any]]:
-        """Residual of all equations of the step, and fast position, slow and fast momentum at its end."""
+        """Residual of all equations of the step, and fast position, slow and fast momentum at its end, from the momenta at its start and all impulses."""
 
         def interval(arriving, of_interval):
             m, *unknowns = of_interval
@@ -278,6 +278,8 @@ class Intervals:
         intervals = jnp.arange(len(x.fast)), x.fast, x.multiplier
         end, (fast, g) = jax.lax.scan(interval, self.start(), intervals)
         slow, p_s = self.slow_rows(x.slow, self.slow_impulses(x.slow, x.slow_multiplier), end)
+        # intervals hand on the momentum at the start plus all impulses: D_{F_r} A plus their rows, which are zero at the solution alone
+        fast = fast.at[1:, 0].add(-fast[:-1].sum(axis=1))
         end = end.q_f, p_s, end.p_f / self.equations.micro_dt
         return Unknowns(slow, self.slow_constraints(x.slow), fast, g), end
 

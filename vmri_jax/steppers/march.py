@@ -380,6 +380,8 @@ def solve(march: MarchEquations, factors: tuple[Matrices, list], rows_z, rows_x)
         on_left = (rows + matvec(by_position, arriving.position)).at[:n_f].add(arriving.gradients[:n_f])
         dx = -matvec(inverse, on_left)
         gradients = arriving.gradients + matvec(hands_on, dx) + matvec(hands_on_by_position, arriving.position)
+        # the momentum h D_{F_r} A is the sum of all impulses less the fast rows of the interval, whose change is -rows
+        gradients = gradients.at[:n_f].add(rows[: march.num_fast].reshape(march.r, n_f).sum(0))
         return Handed(arriving.position + march.last_increment(dx), gradients), dx
 
     intervals = rows_x, matrices.inverse, matrices.hands_on, *by_positions

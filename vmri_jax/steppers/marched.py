@@ -221,7 +221,9 @@ class Marched(StepSolver):
         rows = passed.worst.rows * jnp.minimum(shrinks, 1.0)
         method = Method[self.newton.matrix.upper()]
         status = status_of(equations, result, method, passes, rows=rows, end=end, weights=march.weights)
-        return Solution(x, end, with_dependent_constraints(equations, status))
+        if self.is_exact:  # else the fallback names the cause
+            status = with_dependent_constraints(equations, status)
+        return Solution(x, end, status)
 
     def _learned(self, march: MarchEquations, memory: MarchMemory, done: Progress) -> MarchMemory:
         passed = done.passed
