@@ -168,6 +168,7 @@ def potentials(system: System, scheme: Scheme, macro_dt) -> tuple[Callable, Call
     where the mixed term appears only if both rules are corrected.
     """
     micro_dt = macro_dt / scheme.num_micro
+    mass: Any = system.kinetic
 
     def V(q_s, q_f):
         return system.slow_potential(q_s, q_f, system.params) if system.slow_potential else 0.0 * jnp.sum(q_s)
@@ -177,7 +178,7 @@ def potentials(system: System, scheme: Scheme, macro_dt) -> tuple[Callable, Call
 
     def product(A, B, q_s, q_f):
         a, b = (jax.grad(potential, argnums=(0, 1))(q_s, q_f) for potential in (A, B))
-        return sum(jnp.sum(x * y) for x, y in zip(a, system.kinetic.velocity(*b), strict=True))  # pyright: ignore[reportAttributeAccessIssue]
+        return sum(jnp.sum(x * y) for x, y in zip(a, mass.velocity(*b), strict=True))
 
     def corrected_V(q_s, q_f):
         mixed = micro_dt**2 / 12 * product(V, W, q_s, q_f) if scheme.fast.gradient_corrected else 0.0

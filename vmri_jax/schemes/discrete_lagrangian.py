@@ -161,19 +161,21 @@ def _corrections(system: System, scheme: Scheme) -> list[TermOnNodes]:
         return []
     if not isinstance(system.kinetic, ConstantMass):
         raise Refused("Scheme: corrected kicks need a System whose kinetic is a ConstantMass.")
-    slow_potential, fast_potential, mass = system.slow_potential, system.fast_potential, system.kinetic
+    slow_potential: Any = system.slow_potential
+    fast_potential: Any = system.fast_potential
+    mass = system.kinetic
     both = scheme.fast.gradient_corrected and fast_potential is not None
 
     def fast(q_f, params):
-        d = jax.grad(fast_potential)(q_f, params)  # pyright: ignore[reportArgumentType]
+        d = jax.grad(fast_potential)(q_f, params)
         return jnp.sum(d * mass.velocity(jnp.zeros(mass.slow.shape[-1]), d)[1]) / (24 * scheme.num_micro**2)
 
     def slow(q_s, q_f, params):
-        d = jax.grad(slow_potential, (0, 1))(q_s, q_f, params)  # pyright: ignore[reportArgumentType]
+        d = jax.grad(slow_potential, (0, 1))(q_s, q_f, params)
         v_s, v_f = mass.velocity(*d)
         total = (jnp.sum(d[0] * v_s) + jnp.sum(d[1] * v_f)) / 24
         if both:
-            total += jnp.sum(v_f * jax.grad(fast_potential)(q_f, params)) / (12 * scheme.num_micro**2)  # pyright: ignore[reportArgumentType]
+            total += jnp.sum(v_f * jax.grad(fast_potential)(q_f, params)) / (12 * scheme.num_micro**2)
         return total
 
     corrections = []

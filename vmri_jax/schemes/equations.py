@@ -113,7 +113,9 @@ class StepEquations(eqx.Module):
 
         With the weights w_0..w_r of the constraint rule on its unit interval, and H_before, the factors of g are
 
-            h^2 (w_0 + (H_before / H) w_r)  at the start of the step    h^2 (w_0 + w_r)  where micro intervals meet    h^2 w_j  inside
+            h^2 (w_0 + (H_before / H) w_r)  at the start of the step
+            h^2 (w_0 + w_r)                 where micro intervals meet
+            h^2 w_j                         inside
 
         and, with the weights of the slow constraint rule, those of g_s are ``H^2 (w_0 + (H_before / H) w_r)`` at S_0 and ``H^2 w_i`` at S_i:
         the constraint force that the step before has left out at the common node belongs to this step.

@@ -75,8 +75,8 @@ def solve_in_parts(
         equations: of the step.
         guess: straight motion, from which attempts start until a part is solved; then they start from its scaled solution.
         solution: any pytree of the type of solutions.
-        iterate: ``(equations of the part, guess, most iterations, whether it is the first attempt) -> (solution, its unknowns,
-            Result, iterations)``.
+        iterate: function of the equations of the part, a guess, the most iterations, and whether this is the first attempt; returns
+            a solution, its unknowns, `Result` and the number of iterations.
         max_iterations: of all attempts together.
         plain_iterations: of each of the first two attempts. An attempt that needs more is far from the guess, and might end at another
             solution than the physical one.

@@ -11,7 +11,8 @@ therefore
 S is the inverse of ``G K^-1 G^T`` of the first interval, in the fast variables (`vmri_jax.steppers.micro_intervals`). With
 ``G_s = dg/dq_s`` at the start of the macro step, the nodes c_j of the first interval and the basis l_i of the slow path,
 
-    G_0 = l_i(c_j) G_s  for i, j = 0..r-1, where multipliers act        G_1 = l_i(c_j) G_s  for i, j = 1..r, where constraints hold
+    G_0 = l_i(c_j) G_s  for i, j = 0..r-1, where multipliers act
+    G_1 = l_i(c_j) G_s  for i, j = 1..r, where constraints hold
 
 For r = 1 and explicit fast equations (``K = -M_f``) the matrix is ``-(M_s + G_s^T (G_f M_f^-1 G_f^T)^-1 G_s) / n``: the second term is the
 inertia of the fast masses that constraints tie to the slow variables.

@@ -1,11 +1,14 @@
 """`Solver`: how the implicit equations of a step are solved. All matrices lead to the same solution, up to the tolerance.
 
-| matrix | Newton matrix |
-|---|---|
-| "masses" | approximate: masses, W'' and constraints. Passes over the slow path; in each pass every micro interval takes one Newton step with a small matrix, the fewest operations. A single drift along the constraints between kicks is solved for its multipliers alone (RATTLE). With a kinetic energy T that is a function: the exact matrix, but for ``v^T M v / 2`` in place of T, ``M = d2T/dv2`` at the start of the step |
-| "modes" | approximate, for a single interval of higher degree (``galerkin(1, degree)``): all variables at once, in modes of time |
-| "exact" | exact, by elimination of the micro intervals in order; kept over passes and steps while corrections shrink |
-| "null_space" | as "exact", in coordinates of the free motions: no multipliers among the unknowns |
+The Newton matrices:
+
+* "masses": approximate, masses, W'' and constraints. Passes over the slow path; in each pass every micro interval takes one Newton step with
+  a small matrix, the fewest operations. A single drift along the constraints between kicks is solved for its multipliers alone (RATTLE).
+  With a kinetic energy T that is a function: the exact matrix, but for ``v^T M v / 2`` in place of T, ``M = d2T/dv2`` at the start of the step.
+* "modes": approximate, for a single interval of higher degree (``galerkin(1, degree)``): all variables at once, in modes of time.
+* "exact": exact, by elimination of the micro intervals in order; kept over passes and steps while corrections shrink. Where constraints are
+  dependent, it names them as the cause of a failure.
+* "null_space": as "exact", in coordinates of the free motions: no multipliers among the unknowns.
 
 "masses" needs a kinetic energy that is a function, or every term in single micro intervals, or as kicks at the macro nodes or at every k-th micro
 node; "modes" needs constant masses and no forces. "auto" takes the first matrix that the structure allows: "modes" with at most 24 variables in an interval,
