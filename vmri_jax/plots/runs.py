@@ -233,7 +233,7 @@ def _energy_balance(above: Axes, below: Axes, trajectory: SavedRun, theme: Theme
     below.axhspan(-work.uncertainty, work.uncertainty, color=theme.faint, label="not resolved\nby the nodes")
     below.set_ylabel("energy balance")
     if trajectory.micro is None:
-        terms = "a scheme with kicks adds terms of $H^2$, a drift among them; Save(micro=True) avoids them"
+        terms = "at macro nodes forces have terms of $H^2$, a drift among them; fewer with Save(micro=True)"
         below.set_title(terms, fontsize=7.5)
     legend_beside(below, size=7.5)
     _not_below_roundoff(below.yaxis, energy)

@@ -17,7 +17,7 @@ not grow with the number of micro steps.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -161,9 +161,8 @@ def _corrections(system: System, scheme: Scheme) -> list[TermOnNodes]:
         return []
     if not isinstance(system.kinetic, ConstantMass):
         raise Refused("Scheme: corrected kicks need a System whose kinetic is a ConstantMass.")
-    slow_potential: Any = system.slow_potential
-    fast_potential: Any = system.fast_potential
-    mass = system.kinetic
+    mass, potentials = system.kinetic, (system.slow_potential, system.fast_potential)
+    slow_potential, fast_potential = cast(tuple[Callable, Callable], potentials)
     both = scheme.fast.gradient_corrected and fast_potential is not None
 
     def fast(q_f, params):
