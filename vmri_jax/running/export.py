@@ -172,7 +172,7 @@ def extra(package: str, caller: str, name: str = "xarray"):
 def summary_of(run: SavedRun) -> tuple[str, dict[str, str]]:
     """Title and lines of the summary of a run, or of a batch of runs, of concrete values."""
     t, energy, residual = (np.asarray(a) for a in (run.t, run.energy, run.constraint_residual))
-    lanes = t.shape[:-1]
+    lanes, (position, velocity) = t.shape[:-1], np.nanmax(residual.reshape(-1, 2), axis=0, initial=0.0)
     batch = f" of a batch of {' x '.join(map(str, lanes))} runs" if lanes else ""
     times = f" from t = {np.nanmin(t):.6g} to {np.nanmax(t):.6g}" if np.isfinite(t).any() else ""
     return f"Trajectory{batch}: {t.shape[-1]} saved nodes{times}", {
@@ -181,7 +181,9 @@ def summary_of(run: SavedRun) -> tuple[str, dict[str, str]]:
         "energy": energy_in_words(energy, run.keeps_energy),
         "chosen": "" if run.settings is None else str(run.settings),
         "error": "" if run.error is None else run.error.in_words(),
-        "constraints": _constraints(residual.reshape(-1, residual.shape[-1])),
+        "constraints": f"kept to {position:.1e} in positions, {velocity:.1e} in velocities"
+        if position or velocity
+        else "",
         "solver": run.info.in_words(),
         "micro nodes": "" if run.t_micro is None else f"t_micro and q_f_micro, {run.t_micro.shape[-1]} per saved node",
     }
@@ -216,10 +218,3 @@ def energy_in_words(energy: np.ndarray, kept: bool | None) -> str:
         return f"{start[0]:.6g} at the start, {last[-1] if last.size else np.nan:.6g} at the end; run.work() says why"
     relative = f", {largest / abs(start[0]):.1e} of it" if abs(start[0]) > np.finfo(float).eps * largest else ""
     return f"{start[0]:.6g} at the start, changed by at most {largest:.2e}{relative}"
-
-
-def _constraints(residual: np.ndarray) -> str:
-    if not np.nanmax(residual, initial=0.0) > 0:
-        return ""
-    position, velocity = np.nanmax(residual, axis=0, initial=0.0)
-    return f"kept to {position:.1e} in positions, {velocity:.1e} in velocities"

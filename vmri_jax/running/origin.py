@@ -13,7 +13,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.mechanics.arrays import is_concrete, library, of_one_type
-from vmri_jax.mechanics.checks import check_system
 from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.rows import Part
 from vmri_jax.mechanics.state import HasProblem, Problem, opened
@@ -128,13 +127,6 @@ class Origin:
     def shaped(self, part: Part, vectors) -> Any:
         """Vectors (..., n) in the form in which the user gave the start: vectors, or a dictionary of arrays by name."""
         return vectors if self.names is None else self.names.shaped(part, vectors)
-
-    def check(self, n_s: int, n_f: int) -> None:
-        """Refuse a system whose numbers of coordinates differ from the run."""
-        try:
-            check_system(self.system(), np.zeros(n_s), np.zeros(n_f))
-        except ValueError as error:
-            raise Refused(f"of: the run has {n_s} slow and {n_f} fast coordinates. {error}") from None
 
     def __getstate__(self) -> dict:
         """All fields for pickle; without the system if Python cannot pickle one of its functions, such as a lambda."""

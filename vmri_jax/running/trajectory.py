@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from vmri_jax.mechanics.arrays import Numbers, is_concrete, is_known
+from vmri_jax.mechanics.checks import check_system
 from vmri_jax.mechanics.invariants import energy_parts
 from vmri_jax.mechanics.state import HasProblem, Problem, State
 from vmri_jax.mechanics.summary import has_values, summary
@@ -171,7 +172,11 @@ class Trajectory(Exports):
     def _with_origin(self, moving: System | Problem | HasProblem) -> "Trajectory":
         """The same states with an origin of as many coordinates, and all lanes of a batch with the same one."""
         origin = replace(Origin.of(moving), settings=self.settings)
-        origin.check(self.states.q_s.shape[-1], self.states.q_f.shape[-1])
+        n_s, n_f = self.states.q_s.shape[-1], self.states.q_f.shape[-1]
+        try:
+            check_system(origin.system(), np.zeros(n_s), np.zeros(n_f))
+        except ValueError as error:
+            raise Refused(f"of: the run has {n_s} slow and {n_f} fast coordinates. {error}") from None
         return replace(self, origin=origin.repeated(np.shape(self.t)[:-1]))
 
     def _check_energy(self) -> None:
