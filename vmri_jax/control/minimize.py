@@ -11,8 +11,7 @@ from jaxtyping import Float
 
 from vmri_jax.accuracy.simulate import simulate
 from vmri_jax.control import bounded
-from vmri_jax.control.search import Point, line_search, rolled, update
-from vmri_jax.control.transcription import Transcription, held
+from vmri_jax.control.transcription import Point, Transcription, held, line_search, rolled, update
 from vmri_jax.diagnostics.linear import phase_vector
 from vmri_jax.mechanics.arrays import real_array, whole_number
 from vmri_jax.mechanics.by_name import ByName
