@@ -63,11 +63,12 @@ from vmri_jax.running.arguments import Save
 from vmri_jax.running.interrupts import Interrupted
 from vmri_jax.running.macro_step import macro_step
 from vmri_jax.running.observables import LostEnergyWarning, SingularCoordinatesWarning
+from vmri_jax.running.origin import Settings
 from vmri_jax.running.prepare import prepare
 from vmri_jax.running.run_error import RunError
-from vmri_jax.running.settings import Settings
 from vmri_jax.running.simulation import Simulation
-from vmri_jax.running.store import StoredTrajectory, stream
+from vmri_jax.running.store.stored import StoredTrajectory
+from vmri_jax.running.store.stream import stream
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes import quadrature
 from vmri_jax.schemes.composition import Composition, compose

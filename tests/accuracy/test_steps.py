@@ -12,7 +12,8 @@ import pytest
 import vmri_jax as vm
 from tests.small_systems import SYSTEMS, no_constraint
 from vmri_jax.accuracy import search
-from vmri_jax.accuracy.families import Trial, of_order_2
+from vmri_jax.accuracy.companions import Trial
+from vmri_jax.accuracy.families import of_order_2
 from vmri_jax.schemes.composition import stage_scheme
 from vmri_jax.stability import linear_model
 from vmri_jax.study import reference_solution

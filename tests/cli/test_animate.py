@@ -11,8 +11,8 @@ from PIL import Image
 
 import vmri_jax as vm
 from tests.animation.support import PENDULUM, reference_run, swinging
-from vmri_jax.running.store import stream
 from vmri_jax.running.store.layout import change_attributes
+from vmri_jax.running.store.stream import stream
 
 RUN = swinging()
 

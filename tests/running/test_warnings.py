@@ -2,6 +2,7 @@
 
 import warnings
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import jax
@@ -11,7 +12,6 @@ import pytest
 
 import vmri_jax as vm
 from vmri_jax.running.engine import Cursor, _interval
-from vmri_jax.running.loops import plain
 from vmri_jax.running.origin import _at_all
 from vmri_jax.scene import Body, Scene, SpringAnchor
 
@@ -193,6 +193,7 @@ def test_lanes_and_runs_that_are_asked_afterwards():
     moving, scheme, macro_dt, num_steps, kind = CAUSES["pole"]
     run = vm.simulate(moving, scheme, macro_dt=macro_dt, num_steps=num_steps)
     for asked, said in ((run, ""), (jax.tree.map(lambda a: jnp.stack([a, a]), run), "in 2 of 2 lanes")):
+        assert asked[:1].concerns() == []  # a single node, which has no step
         [concern] = asked.concerns()
         assert type(concern) is kind
         assert said in str(concern)
@@ -242,7 +243,7 @@ def test_the_steps_have_no_energy_and_one_program_serves_all_lengths():
     prepared = vm.prepare(moving, EXPLICIT, macro_dt=0.1, num_steps=5)
     program: Any = prepared._pieces.program
     assert program._cache_size() == 1
-    stepper, interval = prepared.plan, _interval(prepared.plan, prepared, plain)
+    stepper, interval = prepared.plan, _interval(prepared.plan, prepared, partial(jax.lax.fori_loop, 0))
     cursor = Cursor.at_start(prepared.state, stepper.init(prepared.state, prepared.macro_dt))
     steps = str(jax.jit(interval).lower(cursor, 5).compile().as_text())
     whole = str(prepared.compiled().as_text())

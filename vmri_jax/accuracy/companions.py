@@ -29,10 +29,11 @@ import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
+from vmri_jax.accuracy.families import Family
 from vmri_jax.mechanics.arrays import of_one_type
 from vmri_jax.mechanics.driving import Events
 from vmri_jax.refusals import Refused
@@ -74,11 +75,12 @@ class UncertifiedWarning(UserWarning):
 
 
 @dataclass(frozen=True)
-class Compared:
+class Trial:
     """A run, or a lane of a batch, beside its companion with half the macro step.
 
     errors: (k, n_s + n_f) of the positions; NaN after a failure of the run or of this companion, infinite if a further companion fails.
     drives: events that the steps have to see.
+    family: the family that a search took the scheme from; None of other runs.
     """
 
     run: Simulation
@@ -86,6 +88,7 @@ class Compared:
     halved: Trajectory
     errors: np.ndarray
     drives: Events
+    family: Family = None  # pyright: ignore[reportAssignmentType] (every trial of a search has one)
 
     @classmethod
     def of(
@@ -95,17 +98,17 @@ class Compared:
         drives: Events,
         companion_of: Callable[..., Trajectory],
         accuracy: float = 0.0,
-        **more: Any,
-    ) -> Self:
+        family: Any = None,
+    ) -> "Trial":
         """A run with its errors, from the companion ``companion_of(2)``, and from further ones, ``companion_of(parts, whole)``, if the system is
-        driven or its errors are below `DOUBTED` of the accuracy; `more` are fields of a subclass."""
+        driven or its errors are below `DOUBTED` of the accuracy."""
         halved, order, trajectory = companion_of(2), 1 if drives.jump else run.order, saved.trajectory(run)
         errors = extrapolated(order, trajectory, halved)
         has_failed = max(int(saved.failed_at), int(halved.failed_at)) >= 0
         is_believed = not drives.names and np.abs(errors).max(initial=0.0) > DOUBTED * accuracy
         if not (has_failed or is_believed):
             errors = _with_further_companions(run, trajectory, errors, drives, companion_of, order)
-        return cls(run, saved, halved, errors, drives, **more)
+        return cls(run, saved, halved, errors, drives, family)
 
     @cached_property
     def trajectory(self) -> Trajectory:
@@ -116,40 +119,44 @@ class Compared:
     def concerns(self) -> list[LostEnergyWarning]:
         """What is wrong with its motion."""
         run = self.run
-        return concerns(self.saved.table, self.trajectory.t, run.system, run.macro_dt, run.save_every)
+        return concerns(run.table(self.saved), self.trajectory.t, run.system, run.macro_dt, run.save_every)
 
     @cached_property
     def error(self) -> float:
         """The largest error; infinite unless all errors are certified."""
         return run_error(self).largest
 
+    def steps_for(self, error: float, order: float | None = None) -> int:
+        """Macro steps for this error, ``n (e / error)^(1 / p)``, with the order of the scheme if None is given."""
+        return max(1, int(np.ceil(self.run.num_steps * (self.error / error) ** (1 / (order or self.run.order)))))
 
-def told_error(compared: Compared, of: Callable | None = None, shares: bool = False) -> Any:
+
+def told_error(trial: Trial, of: Callable | None = None, shares: bool = False) -> Any:
     """The `RunError` of a run without a failed step, None if its companion fails; warns if the error is not certified over the whole run."""
-    halved, error = compared.halved, None
+    halved, error = trial.halved, None
     if int(halved.failed_at) >= 0:
-        failed = float(halved.t[0]) + int(halved.failed_at) * float(compared.run.macro_dt) / 2
+        failed = float(halved.t[0]) + int(halved.failed_at) * float(trial.run.macro_dt) / 2
         reason = f"the error is not known; the same run with half the macro step failed at t = {failed:.4g}."
     else:
-        error = run_error(compared, of, shares)
-        reason = "" if error.is_certified else _uncertified(error, compared)
+        error = run_error(trial, of, shares)
+        reason = "" if error.is_certified else _uncertified(error, trial)
     if reason:
         warnings.warn(f"simulate: {reason}", UncertifiedWarning, stacklevel=3)
     return error
 
 
-def run_error(compared: Compared, of: Callable | None = None, shares: bool = False) -> RunError:
+def run_error(trial: Trial, of: Callable | None = None, shares: bool = False) -> RunError:
     """The error of a run, NaN where it is not certified."""
-    run, trajectory, total = compared.run, compared.trajectory, compared.errors
+    run, trajectory, total = trial.run, trial.trajectory, trial.errors
     fast = np.full_like(total, np.nan)
     if shares:
         twice = run.scheme.with_num_micro(2 * stage_scheme(run.scheme).num_micro)
         fast = extrapolated(run.order, trajectory, companion(replace(run, scheme=of_one_type(twice)), 1))
     certified, growth = certified_nodes(trajectory, total)
-    certified[1:] &= np.asarray(trajectory.t)[1:] <= first_unseen(run, compared.drives)
+    certified[1:] &= np.asarray(trajectory.t)[1:] <= first_unseen(run, trial.drives)
     until = np.asarray(trajectory.t)[certified][-1]
     total, slow, fast = (np.where(certified[:, None], a, np.nan) for a in (total, total - fast, fast))
-    of_error = None if of is None else _of_error(of, compared, certified)
+    of_error = None if of is None else _of_error(of, trial, certified)
     q_s, q_f = np.split(total, [trajectory.states.q_s.shape[-1]], axis=1)
     shares_at_nodes = largest_of(slow), largest_of(fast)
     return RunError(q_s, q_f, *shares_at_nodes, of_error, np.asarray(until), np.asarray(growth))
@@ -205,11 +212,11 @@ def first_unseen(run: Simulation, drives: Events) -> float:
     return float(starts.min(initial=np.inf))
 
 
-def _of_error(of: Callable, compared: Compared, certified: np.ndarray) -> np.ndarray:
+def _of_error(of: Callable, trial: Trial, certified: np.ndarray) -> np.ndarray:
     """Error of a function of the run: NaN at nodes that are not certified; of a function without a value for each node
     NaN unless all nodes are certified."""
-    values, halved_values = (np.asarray(of(run)) for run in (compared.trajectory, compared.halved))
-    error = ratio(compared.run.order) * (values - halved_values)
+    values, halved_values = (np.asarray(of(run)) for run in (trial.trajectory, trial.halved))
+    error = ratio(trial.run.order) * (values - halved_values)
     has_node_values = error.shape[:1] == certified.shape
     shown = certified.reshape(-1, *(1,) * (error.ndim - 1)) if has_node_values else certified.all()
     return np.where(shown, error, np.nan)
@@ -247,8 +254,8 @@ def resting(run: Simulation) -> Trajectory:
     run = replace(run, save=Save())
     _, *phase = vars(run.state).values()
     row = np.concatenate([*phase, np.zeros(run.width - sum(map(len, phase)))])
-    rows, status = np.tile(row, (run.num_saves + 1, 1)), (np.asarray(int(Result.CONVERGED)), np.asarray(-1))
-    return Saved.of(rows, run.columns, *status).trajectory(run)
+    saved = Saved(np.tile(row, (run.num_saves + 1, 1)), np.asarray(int(Result.CONVERGED)), np.asarray(-1))
+    return saved.trajectory(run)
 
 
 def companion(run: Simulation, parts: int, whole: int = 1) -> Trajectory:
@@ -274,25 +281,25 @@ def positions(trajectory: Trajectory) -> np.ndarray:
     return np.concatenate([trajectory.states.q_s, trajectory.states.q_f], axis=1)
 
 
-def _is_chaotic(error: RunError, compared: Compared) -> bool:
+def _is_chaotic(error: RunError, trial: Trial) -> bool:
     """Whether small differences grow like exp(L t) by the motion itself, and not by large steps: between two runs with
     a half and a quarter of the macro step. Driven motions, which may be pumped, are left out."""
-    trajectory = compared.trajectory
-    if not (float(error.growth) > CHAOTIC_GROWTH and trajectory.keeps_energy) or compared.concerns:
+    trajectory = trial.trajectory
+    if not (float(error.growth) > CHAOTIC_GROWTH and trajectory.keeps_energy) or trial.concerns:
         return False
-    quartered = companion(compared.run, 4)
-    envelope = np.maximum.accumulate(largest_of(positions(compared.halved) - positions(quartered)))
+    quartered = companion(trial.run, 4)
+    envelope = np.maximum.accumulate(largest_of(positions(trial.halved) - positions(quartered)))
     t = np.asarray(trajectory.t)
     half, last = np.searchsorted(t, [(t[0] + error.certified_until) / 2, error.certified_until])
     return bool(envelope[last] > CHAOTIC_GROWTH * envelope[half])  # False for NaN, where a companion failed
 
 
-def _uncertified(error: RunError, compared: Compared) -> str:
+def _uncertified(error: RunError, trial: Trial) -> str:
     """The reason why an error is not certified, and advice."""
-    trajectory, drives, macro_dt = compared.trajectory, compared.drives, float(compared.run.macro_dt)
-    unseen = first_unseen(compared.run, drives)
+    trajectory, drives, macro_dt = trial.trajectory, trial.drives, float(trial.run.macro_dt)
+    unseen = first_unseen(trial.run, drives)
     if unseen <= trajectory.t[-1]:
-        step = drives.shortest / (NODES_OF_EVENT * node_distance(compared.run.scheme, drives))
+        step = drives.shortest / (NODES_OF_EVENT * node_distance(trial.run.scheme, drives))
         return (
             f"from t = {unseen:.4g} on no error is certified: {' and '.join(drives.names)} of the system changes and changes back within "
             f"{drives.shortest:.2g}, which steps of {macro_dt:.4g} see too seldom or not at all; take macro_dt = {step:.2g} or less, or accuracy="
@@ -300,12 +307,12 @@ def _uncertified(error: RunError, compared: Compared) -> str:
     t, energy = float(error.certified_until), np.asarray(trajectory.energy)
     change = np.abs(energy - energy[0]).max()
     kept = f" The energy has changed by at most {change:.1e}." if trajectory.keeps_energy else ""
-    if _is_chaotic(error, compared):
+    if _is_chaotic(error, trial):
         return (
             f"the motion is chaotic, small errors have grown {float(error.growth):.0f} times in the second half of the time until t = {t:.4g}: "
             f"from there on an error of positions means nothing.{kept}"
         )
-    reasons = [f" {concern}" for concern in compared.concerns if isinstance(concern, SingularCoordinatesWarning)]
+    reasons = [f" {concern}" for concern in trial.concerns if isinstance(concern, SingularCoordinatesWarning)]
     advice = "".join(reasons) or " Take smaller steps, or a scheme of higher order."
     return (
         f"from t = {t:.4g} on positions are wrong by more than {LARGEST_CERTIFIED:.0%} of the extent of the motion, and no error is "

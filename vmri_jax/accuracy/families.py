@@ -1,4 +1,4 @@
-"""The schemes that a search may choose from, families that differ only in num_micro; trials of them, and the seconds of their steps."""
+"""The schemes that a search may choose from, families that differ only in num_micro; and the seconds of their steps."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -7,7 +7,6 @@ from functools import partial
 
 import numpy as np
 
-from vmri_jax.accuracy.companions import Compared
 from vmri_jax.mechanics.masses import ConstantMass
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.simulation import Simulation
@@ -135,17 +134,6 @@ def by_promise(menu: Sequence[Family], digits: float) -> list[Family]:
 def unit_of(system: System, scheme: SchemeLike) -> int:
     """The number whose multiples are allowed as num_micro: least common multiple of k of rules on every k-th node."""
     return math.lcm(stage_scheme(scheme).unit, *(name for name, _ in system.potentials if isinstance(name, int)))
-
-
-@dataclass(frozen=True)
-class Trial(Compared):
-    """A run of a scheme of a family, its companion and its errors."""
-
-    family: Family
-
-    def steps_for(self, error: float, order: float | None = None) -> int:
-        """Macro steps for this error, ``n (e / error)^(1 / p)``, with the order of the scheme if None is given."""
-        return max(1, int(np.ceil(self.run.num_steps * (self.error / error) ** (1 / (order or self.run.order)))))
 
 
 def seconds_of_steps(*runs: Simulation) -> np.ndarray:

@@ -26,13 +26,14 @@ import numpy as np
 
 from vmri_jax.accuracy.companions import (
     FEWEST_DIVIDED,
+    Trial,
     check_function_of_run,
     companion,
     extent_of,
     extrapolated,
     fewest_steps,
 )
-from vmri_jax.accuracy.families import LEAST_TIME, Family, Trial, seconds_of_steps, unit_of
+from vmri_jax.accuracy.families import LEAST_TIME, Family, seconds_of_steps, unit_of
 from vmri_jax.mechanics.checks import check_number
 from vmri_jax.mechanics.driving import Events, events
 from vmri_jax.mechanics.invariants import velocity
@@ -40,10 +41,10 @@ from vmri_jax.mechanics.linearisation import Linearisation, linearise
 from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.refusals import Refused
 from vmri_jax.running.arguments import refuse_tracers
+from vmri_jax.running.origin import Settings
 from vmri_jax.running.progress import Progress, silent
 from vmri_jax.running.run_error import largest_of
 from vmri_jax.running.saved import check_memory
-from vmri_jax.running.settings import Settings
 from vmri_jax.running.simulation import Simulation, simulation
 from vmri_jax.running.timing import stopwatch
 from vmri_jax.schemes.composition import SchemeLike, stage_lengths, stage_scheme
@@ -218,7 +219,7 @@ class Search:
         most_seconds: float = np.inf,
     ) -> Trial:
         """The first trial with a certified error, of 1, 2, 4, ... times the macro steps; the last trial if the search
-        runs out of steps, or of time, `most_seconds`. With an accuracy its errors look at events, see `Compared.of`."""
+        runs out of steps, or of time, `most_seconds`. With an accuracy its errors look at events, see `Trial.of`."""
         most = MOST_TRIAL_SECONDS
         while True:
             run = replace(self.run(family, num_steps), may_fall_back=self.falls_back)
@@ -227,7 +228,7 @@ class Search:
             self.num_trials += 1
             elapsed = stopwatch()
             runs = run, run.in_pieces(), Events() if accuracy is None else self.drives, partial(companion, run)
-            trial = Trial.of(*runs, accuracy or 0.0, family=family)
+            trial = Trial.of(*runs, accuracy or 0.0, family)
             self.note(trial)
             # The seconds of the first trial include compiling, which later trials do not repeat.
             is_late = elapsed() > most and run.num_steps > FEWEST_STEPS

@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 from vmri_jax.accuracy.companions import (
-    Compared,
+    Trial,
     UncertifiedWarning,
     check_function_of_run,
     companion,
@@ -19,7 +19,7 @@ from vmri_jax.accuracy.companions import (
     run_error,
     told_error,
 )
-from vmri_jax.accuracy.families import Trial, for_system, of_scheme, two_families
+from vmri_jax.accuracy.families import for_system, of_scheme, two_families
 from vmri_jax.accuracy.search import MOST_COORDINATES, Search
 from vmri_jax.mechanics.arrays import is_concrete
 from vmri_jax.mechanics.checks import check_flags, check_system, check_type
@@ -128,8 +128,8 @@ def simulate(
     if not error:
         return trajectory
     drives = events(run.system, run.state, float(trajectory.t[-1]))
-    compared = Compared.of(run, saved, drives, partial(companion, run))
-    return replace(trajectory, error=told_error(compared, of, error == "shares"))
+    trial = Trial.of(run, saved, drives, partial(companion, run))
+    return replace(trajectory, error=told_error(trial, of, error == "shares"))
 
 
 def _with_accuracy(search: Search, scheme: SchemeLike | None, accuracy: float) -> Trial:
@@ -247,7 +247,7 @@ def _errors(runs: Simulation, computed: Callable[[Simulation], Saved], saved: Sa
         run, of_lane = lane(runs, i), jax.tree.map(lambda a: a[i], saved)
         t_end = float(run.state.t + run.num_steps * run.macro_dt)
         drives = events(run.system, run.state, t_end) if is_driven else Events()
-        return run_error(Compared.of(run, of_lane, drives, lambda *counts: companions(*counts).lane(i)))
+        return run_error(Trial.of(run, of_lane, drives, lambda *counts: companions(*counts).lane(i)))
 
     is_driven = driven(lane(runs, 0).system, lane(runs, 0).state)
     return jax.tree.map(lambda *arrays: np.stack(arrays), *map(error, range(len(runs.macro_dt))))

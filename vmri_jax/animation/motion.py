@@ -127,7 +127,7 @@ def motion(
     t, q_s, q_f = t[:count], q_s[:count], q_f[:count]
     v_s, v_f = map(np.asarray, run.velocities) if run.origin.knows_system else _differences(t, q_s, q_f)
     all_nodes = Nodes(t, q_s, q_f, v_s, v_f)
-    if run.micro is not None and not why_not(t, run.micro.t):
+    if run.micro is not None and not why_not(t, run.micro):
         all_nodes = with_micro_nodes(all_nodes, *run.micro)
         if not run.origin.knows_system:  # differences between macro nodes miss the fast motion
             all_nodes = all_nodes._replace(v_f=CubicSpline(all_nodes.t, all_nodes.q_f)(all_nodes.t, 1))

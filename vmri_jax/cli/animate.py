@@ -18,7 +18,7 @@ from vmri_jax.animation.vtk import write_vtk
 from vmri_jax.catalogue import SYSTEMS, find_problem
 from vmri_jax.cli.common import PICTURES, check_target, console
 from vmri_jax.running.progress import progress_shown
-from vmri_jax.running.store import StoredTrajectory
+from vmri_jax.running.store.stored import StoredTrajectory
 from vmri_jax.running.trajectory import Trajectory
 
 MOST_VTK_NODES = 500

@@ -21,9 +21,10 @@ from vmri_jax.cli import common
 from vmri_jax.cli.common import PICTURES, check_target, console, print_failure, print_named
 from vmri_jax.refusals import Refused
 from vmri_jax.running.arguments import Save, nothing_fast
+from vmri_jax.running.export import summary_of
 from vmri_jax.running.interrupts import Interrupted
-from vmri_jax.running.store import StoredTrajectory, stream
-from vmri_jax.running.summaries import summary_of
+from vmri_jax.running.store.stored import StoredTrajectory
+from vmri_jax.running.store.stream import stream
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.steppers.results import SimulationError
 from vmri_jax.steppers.solver import Solver

@@ -11,8 +11,7 @@ from jaxtyping import Float
 
 from vmri_jax.accuracy.simulate import simulate
 from vmri_jax.control import bounded
-from vmri_jax.control.search import Point, line_search, rolled, update
-from vmri_jax.control.transcription import Transcription, held
+from vmri_jax.control.transcription import Point, Transcription, held, line_search, rolled, update
 from vmri_jax.diagnostics.linear import phase_vector
 from vmri_jax.mechanics.arrays import real_array, whole_number
 from vmri_jax.mechanics.by_name import ByName
@@ -30,6 +29,9 @@ from vmri_jax.schemes.quadrature import NODE_TOLERANCE
 from vmri_jax.steppers.plan import plan
 from vmri_jax.steppers.results import SimulationError
 from vmri_jax.steppers.solver import Solver
+
+NO_AIMS: dict[str, Callable] = {"final_cost": lambda state: jnp.zeros(()), "goal": lambda state: jnp.zeros(0)}
+"""The final cost and the goal of a problem without them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,7 +235,7 @@ def transcribed(
         dimensions, words = (0, "a number") if name in ("cost", "final_cost") else (1, "a vector, (n,)")
         if getattr(value, "ndim", None) != dimensions:
             raise Refused(f"minimize: {name} has {describe(value)}; it must be {words}.")
-    functions = {"final_cost": free, "goal": unaimed, **aims}
+    functions = {**NO_AIMS, **aims}
     return Transcription(
         system.replace(params=params),
         state,
@@ -266,16 +268,6 @@ def _check_durations(scheme: SchemeLike, grid: str, parts: int) -> None:
             "by its duration, or lie in intervals of other controls. Take a scheme that is no composition, with its "
             "force rule on the micro grid; or grid='macro' and the composition 'suzuki4', whose nodes stay inside."
         )
-
-
-def free(state):
-    """The final cost of a problem without one."""
-    return jnp.zeros(())
-
-
-def unaimed(state):
-    """The goal of a problem without one: no equations."""
-    return jnp.zeros(0)
 
 
 def _bounds(bounds, num_controls: int) -> tuple[np.ndarray, np.ndarray]:

@@ -1,4 +1,4 @@
-"""Discrete mechanics and optimal control: stages of a controlled motion, and their derivatives.
+"""Discrete mechanics and optimal control: stages of a controlled motion, their derivatives, an iteration of the search.
 
 A stage is a macro step of the scheme, ``z_{k+1} = Phi(z_k, u_k)`` with ``z = (q_s, q_f, p_s, p_f)``; its discrete
 forced equations are the constraints of the optimisation. Controls are constant over macro or micro intervals.
@@ -9,7 +9,7 @@ Lishkova, S. Ober-Bloebaum, M. Cannon, S. Leyendecker, IFAC-PapersOnLine 53 (202
 """
 
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -17,8 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from vmri_jax.control import bounded, riccati
 from vmri_jax.control.bounded import Limits
-from vmri_jax.control.riccati import Final, Stages
 from vmri_jax.diagnostics.linear import phase_step, phase_vector, state_of, with_slopes
 from vmri_jax.mechanics.arrays import Numbers
 from vmri_jax.mechanics.by_name import ByName
@@ -35,6 +35,11 @@ CONTROL = "vmri_jax.control"
 BORDER_WIDTH = 1e-6
 """Half the width of the border between two controls, relative to the duration of a control: within it a time counts as
 the border, so that round-off of a node's time does not choose a control. A larger one mixes controls at micro nodes."""
+
+SHORTEST_PART = 2.0**-10
+"""Smallest part of an update that the line search tries, after ten halvings; a larger one gives up earlier."""
+SUFFICIENT_DECREASE = 1e-4
+"""Armijo's constant: the merit decreases by at least this part of the prediction; a larger one refuses more."""
 
 
 class Transcription(eqx.Module):
@@ -147,7 +152,7 @@ class Transcription(eqx.Module):
         return Limits(C, D.reshape(*D.shape[:2], u[0].size), self.over(z, u), lower, upper)
 
     @eqx.filter_jit
-    def linearised(self, z, u) -> tuple[Stages, Final]:
+    def linearised(self, z, u) -> tuple[riccati.Stages, riccati.Final]:
         """The linear-quadratic problem at nodes z (N, n) and controls u (N, parts, m)."""
         count, n = len(u), z.shape[1]
         flat = u.reshape(count, -1)
@@ -170,7 +175,7 @@ class Transcription(eqx.Module):
             c = reached - z_next
             shift = jnp.concatenate([jnp.zeros(x.size), c])
             A, B = slopes[:n].T, slopes[n:].T
-            return Stages(along @ hessian @ along.T, along @ (gradient + hessian @ shift), A, B, c)
+            return riccati.Stages(along @ hessian @ along.T, along @ (gradient + hessian @ shift), A, B, c)
 
         stages = jax.vmap(stage)(self.before(z), flat, z, jnp.arange(count))
 
@@ -179,7 +184,7 @@ class Transcription(eqx.Module):
 
         goal, final_cost = of_end(self.goal), of_end(self.final_cost)
         S, s = convex(jax.hessian(final_cost)(z[-1])), jax.grad(final_cost)(z[-1])
-        return stages, Final(S, s, jax.jacfwd(goal)(z[-1]), goal(z[-1]))
+        return stages, riccati.Final(S, s, jax.jacfwd(goal)(z[-1]), goal(z[-1]))
 
 
 def _forces(system_force: Callable | None, actuate: Callable) -> Callable:
@@ -211,3 +216,103 @@ def convex(hessian):
     """A symmetric matrix with its negative eigenvalues set to zero: the quadratic problem then has a minimum."""
     values, vectors = jnp.linalg.eigh(hessian)
     return (vectors * jnp.maximum(values, 0.0)) @ vectors.T
+
+
+class Point(NamedTuple):
+    """A point of the search.
+
+    z, u: nodes after the first one, and controls.
+    gaps: end of each step minus the next node.
+    goal: values of the goal, zero where it is reached.
+    """
+
+    z: Float[Numbers, "N n"]
+    u: Float[Numbers, "N parts m"]
+    gaps: Float[Numbers, "N n"]
+    goal: Float[Numbers, "e"]
+
+
+@eqx.filter_jit
+def measured(setup: Transcription, point: Point):
+    """Cost, sum of all violations, largest node and control, and largest value of a limit."""
+    over = setup.over(point.z, point.u)
+    violation = sum(jnp.sum(jnp.abs(x)) for x in (point.gaps, point.goal, jnp.maximum(over, 0.0)))
+    sizes = (jnp.maximum(jnp.max(jnp.abs(a)), jnp.finfo(float).tiny) for a in (point.z, point.u))
+    return setup.total(point.z, point.u), violation, *sizes, jnp.max(over, initial=0.0)
+
+
+@eqx.filter_jit
+def slope(setup: Transcription, point: Point, dz, du):
+    """Change of the cost along an update."""
+    return jax.jvp(setup.total, (point.z, point.u), (dz, du))[1]
+
+
+def update(setup: Transcription, point: Point) -> tuple[riccati.Solution, float, riccati.Stages, riccati.Final]:
+    """The solution of the linear-quadratic problem at a point, the largest absolute multiplier, and the problem."""
+    stages, final = setup.linearised(point.z, point.u)
+    limits = setup.limited(point.z, point.u) if setup.bounded else None
+    for name, part in (("cost, the steps or the goal", (stages, final)), ("limits", limits and limits[:3])):
+        if not all(np.isfinite(a).all() for a in jax.tree.leaves(part)):
+            elsewhere = (
+                "Start from other controls, or change these functions there: no root or logarithm of zero or less."
+            )
+            raise bounded.Unsolved(f"minimize: values or derivatives of {name} are not finite. {elsewhere}")
+    if limits is not None:
+        change, steepest = bounded.solve(stages, final, limits)
+        return change, steepest, stages, final
+    change = riccati.solve(stages, final)
+    if not all(np.isfinite(a).all() for a in change):
+        lacking = "the second derivative of cost in u is not positive: without it controls have no least cost"
+        raise bounded.Unsolved(f"minimize: {lacking}. Add a small multiple of u @ u, or give bounds.")
+    return change, float(np.abs(change.nu).max(initial=0.0)), stages, final
+
+
+def line_search(setup: Transcription, point: Point, change: riccati.Solution, rho: float) -> tuple[Point, dict]:
+    """The first point along an update with a sufficient decrease of the merit, and its entry in the history.
+
+    The merit is ``cost + rho (sum |gaps| + sum |goal| + sum max(limits, 0))``. The update is halved until one of two
+    trials is accepted: nodes and controls updated alike, which unstable motions need; and the motion of the updated
+    controls, without gaps, which suits bodies that turn far. The point stays, ``part`` 0, if no part is accepted.
+    """
+    dz, du = change.dz, jnp.reshape(change.du, point.u.shape)
+    cost, violation, size_z, size_u, _ = measured(setup, point)
+    before = float(cost + rho * violation)
+    # The whole update fulfils the linearised conditions: along it the violation decreases at the rate of its size.
+    expected = float(slope(setup, point, dz, du) - rho * violation)
+    part, accepted = 1.0, None
+    while accepted is None and part >= SHORTEST_PART:
+        z, u = point.z + part * dz, point.u + part * du
+        # the last term allows for round-off: near the optimum the merit changes by less
+        allowed = before + SUFFICIENT_DECREASE * part * min(expected, 0.0) + 1e-12 * (abs(cost) + rho * violation)
+        ends, _ = setup.steps(z, u, jnp.asarray(False))  # NaN where a step fails
+        trials = [_with_goal(setup, z, u, ends - z)]
+        motion, _ = rolled(setup, u)
+        trials.append(_with_goal(setup, motion, u, jnp.zeros_like(motion)))
+        measures = [measured(setup, trial) for trial in trials]
+        merits = [float(cost + rho * violation) for cost, violation, *_ in measures]
+        best = int(np.nanargmin([*merits, np.inf]))  # a motion that fails has the merit NaN
+        if best < len(trials) and merits[best] <= allowed:
+            accepted = trials[best]
+        else:
+            part /= 2
+    if accepted is None:
+        part, accepted = 0.0, point
+    cost, _, size_z, size_u, over = measured(setup, accepted)
+    record = {
+        "cost": cost,
+        "gap": np.abs(accepted.gaps).max() / size_z,
+        "miss": np.abs(accepted.goal).max(initial=0.0),
+        "over": over,
+        "update": max(np.abs(dz).max() / size_z, np.abs(du).max() / size_u),
+        "part": part,
+    }
+    return accepted, {name: float(value) for name, value in record.items()}
+
+
+def rolled(setup: Transcription, u):
+    """Nodes of the motion with controls u, NaN from the first failed step on, and the `StepStatus` of the steps."""
+    return setup.steps(jnp.zeros((len(u), setup.z_start.size)), u, jnp.asarray(True))
+
+
+def _with_goal(setup: Transcription, z, u, gaps) -> Point:
+    return Point(z, u, gaps, setup.goal(setup.state(z[-1], len(z))))

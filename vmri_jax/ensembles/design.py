@@ -268,9 +268,8 @@ def unique_rows(rows: Rows) -> tuple[Rows, np.ndarray]:
     """The distinct rows, and for each row the number of the distinct row that it equals."""
     if not rows:
         return {}, np.zeros(0, dtype=int)
-    codes = [np.unique(values, return_inverse=True)[1] for values in rows.values()]
-    _, first, inverse = np.unique(np.stack(codes, axis=1), axis=0, return_index=True, return_inverse=True)
-    return {name: values[first] for name, values in rows.items()}, inverse.ravel()
+    _, first, inverse = np.unique(np.rec.fromarrays(list(rows.values())), return_index=True, return_inverse=True)
+    return {name: values[first] for name, values in rows.items()}, inverse
 
 
 @lru_cache(maxsize=2)

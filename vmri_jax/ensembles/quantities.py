@@ -60,20 +60,18 @@ def _iterations(run: Trajectory) -> dict[str, Kept]:
 
 
 def _extremes(run: Trajectory) -> dict[str, Kept]:
-    extremes = {}
-    for name, dimension in (("q_s", "slow"), ("q_f", "fast")):
-        q = getattr(run.states, name)
-        extremes[f"min_{name}"] = Kept(jnp.min(q, axis=0), (dimension,), "smallest positions")
-        extremes[f"max_{name}"] = Kept(jnp.max(q, axis=0), (dimension,), "largest positions")
-    return extremes
+    kinds = (("min", jnp.min, "smallest positions"), ("max", jnp.max, "largest positions"))
+    return {
+        f"{kind}_{name}": Kept(function(getattr(run.states, name), axis=0), DIMENSIONS[name][1:], words)
+        for name in ("q_s", "q_f")
+        for kind, function, words in kinds
+    }
 
 
 def _quantiles(run: Trajectory) -> dict[str, Kept]:
-    words, quantiles = "quantiles of the positions over the saved nodes", {}
-    for name, dimension in (("q_s", "slow"), ("q_f", "fast")):
-        values = jnp.quantile(getattr(run.states, name), jnp.array(LEVELS), axis=0)
-        quantiles[f"quantiles_{name}"] = Kept(values, ("quantile", dimension), words)
-    return quantiles
+    values = {name: jnp.quantile(getattr(run.states, name), jnp.array(LEVELS), axis=0) for name in ("q_s", "q_f")}
+    words, axes = "quantiles of the positions over the saved nodes", {name: DIMENSIONS[name][1:] for name in values}
+    return {f"quantiles_{name}": Kept(array, ("quantile", *axes[name]), words) for name, array in values.items()}
 
 
 QUANTITIES = {

@@ -1,6 +1,7 @@
 """Identification: parameters of a system from measurements of its motion, with what is known about them afterwards."""
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import cast
 
@@ -230,8 +231,9 @@ class _Search:
         stiffness makes up for it. Neither the misses nor the covariance show this error.
         """
         point = (u, z), (self.shooting.values, GAP_WEIGHTS[-1])
-        runs = self.shooting, self.shooting.with_half_steps()
-        coarse, fine = (jax.jit(partial(self.residual, shooting=shooting))(*point) for shooting in runs)
+        runs = self.shooting
+        halved = replace(runs, macro_dt=runs.macro_dt / 2, steps=[2 * steps for steps in runs.steps])
+        coarse, fine = (jax.jit(partial(self.residual, shooting=shooting))(*point) for shooting in (runs, halved))
         difference = np.concatenate([np.ravel(b - a) for a, b in zip(coarse, fine, strict=True)])
         jacobian = np.asarray(without_starts(*jacobians))
         size = np.linalg.norm(jacobian, axis=0)

@@ -8,7 +8,7 @@ Source: H. G. Bock, Recent advances in parameter identification techniques for O
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from math import gcd
 
@@ -78,10 +78,6 @@ class Shooting:
         """(m,) standard deviations of the values; 1 where they are not known."""
         sigmas = [np.ones_like(m.values) if m.sigma is None else m.sigma for m in self.data]
         return np.concatenate([s[np.isfinite(m.values)] for s, m in zip(sigmas, self.data, strict=True)])
-
-    def with_half_steps(self) -> "Shooting":
-        """The same runs with macro steps of half the length."""
-        return replace(self, macro_dt=self.macro_dt / 2, steps=[2 * steps for steps in self.steps])
 
     @property
     def knows_sigma(self) -> bool:

@@ -147,21 +147,14 @@ def run_cases(
             tell(f"{case.number} {case.title}", k, len(chosen))
             start = time.perf_counter()
             try:
-                outcome = _outcome(case, full)
+                outcome = Outcome(case.does_not_apply, None) if case.does_not_apply else case.run(full)
             except KeyboardInterrupt:
                 raise Interrupted(Report(tuple(rows)), len(rows), len(chosen), "cases") from None
+            except Exception as error:  # the user's functions may raise anything, and the other cases still run
+                outcome = Outcome(f"raised {type(error).__name__}: {error}", False)
             rows.append(replace(outcome, case=case, seconds=time.perf_counter() - start))
         tell("done", len(chosen), len(chosen))
     return Report(tuple(rows))
-
-
-def _outcome(case: Case, full: bool) -> Outcome:
-    if case.does_not_apply:
-        return Outcome(case.does_not_apply, None)
-    try:
-        return case.run(full)
-    except Exception as error:  # the user's functions may raise anything, and the other cases still run
-        return Outcome(f"raised {type(error).__name__}: {error}", False)
 
 
 def draw_energy(runs: Mapping[str, Trajectory]) -> Figure:

@@ -232,9 +232,6 @@ class Resolved:
             {"failed": len(failed), "apart": apart},
         )
 
-    def derivatives(self, full: bool) -> Outcome:
-        return derivatives(self.problem, self.scheme, self.macro_dt)
-
     def single_precision(self, full: bool) -> Outcome:
         """Whether the messages have the line that mends a run with the 64-bit mode off, and a start in float32."""
         problem, steps = self.problem, {"macro_dt": self.macro_dt, "num_steps": 1}
@@ -309,7 +306,7 @@ def cases_for(problem: Problem | HasProblem) -> tuple[Case, ...]:
         ("textbook", f"{step}; fully_explicit, {single}", "steps of vmri_jax.textbook to 1e-10", cases.textbook),
         ("float32", "64-bit mode off, and float32 data", "refused with the one-line fix", cases.single_precision),
         ("one bad lane in a batch", step, LANE_CRITERION, cases.bad_lane),
-        ("derivatives", step, DERIVATIVE_CRITERION, cases.derivatives),
+        ("derivatives", step, DERIVATIVE_CRITERION, lambda _: derivatives(problem, cases.scheme, cases.macro_dt)),
     ]
     return tuple(
         Case(number, title, setup, criterion, run, "".join(reason))

@@ -6,8 +6,7 @@ notebook shows it when it is the value of a cell. Colours follow Okabe and Ito, 
 
 from vmri_jax.plots.ensembles import plot_ensemble
 from vmri_jax.plots.runs import plot_forces, plot_trajectory
-from vmri_jax.plots.searches import plot_control, plot_fit
-from vmri_jax.plots.studies import plot_convergence, plot_work_precision
+from vmri_jax.plots.studies import plot_control, plot_convergence, plot_fit, plot_work_precision
 from vmri_jax.plots.theme import (
     DARK,
     LIGHT,

@@ -1,4 +1,4 @@
-"""Figures of studies: convergence, and error against work."""
+"""Figures of studies and searches: errors against steps and work; controls, motion and iterations; misses of a fit."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -6,19 +6,27 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import EngFormatter
+from scipy import stats
 
+from vmri_jax.plots.runs import coordinates, limit_times, position_panels
 from vmri_jax.plots.theme import (
     LIGHT,
+    ROUNDOFF_FLOOR,
     NotebookFigure,
     Theme,
     curve_look,
     legend_below,
+    legend_beside,
     log_ticks,
-    mark_reference,
     new_figure,
     positive,
 )
 from vmri_jax.refusals import Refused
+
+DEVIATIONS_OF_95_PERCENT = 1.96
+"""Half width of the interval that holds 95 % of a normal distribution, in standard deviations."""
+MEANING = {"update": "update", "gap": "gaps of steps", "miss": "goal missed by", "over": "limits exceeded by"}
+"""Names in the legend, by the keys in the history of an optimisation."""
 
 
 def plot_convergence(study: Any, orders: Sequence[int] = (), title: str = "", theme: Theme = LIGHT) -> NotebookFigure:
@@ -112,7 +120,10 @@ def plot_work_precision(
             axes.loglog(x, y, "o", label="chosen", **look)
         axes.set(xlabel=WORK[work], ylabel="largest error of a position")
         axes.set_ylim(top=30 * np.nanmax(errors, initial=0.0) or None)
-        mark_reference(axes, study.known_to, theme)
+        if study.known_to > axes.get_ylim()[0]:
+            axes.axhline(study.known_to, color=theme.ink, linewidth=0.8, linestyle=":")
+            above: dict[str, Any] = {"ha": "right", "va": "bottom", "fontsize": 7.5}
+            axes.text(0.995, study.known_to, "error of the reference ", transform=axes.get_yaxis_transform(), **above)
         log_ticks(axes.xaxis, [getattr(row, work) for scheme in study.schemes for row in study.curve(scheme)])
         if work == "seconds":
             axes.xaxis.set_major_formatter(EngFormatter("s"))
@@ -138,3 +149,77 @@ def _guide_triangle(axes: Axes, study: Any, quantity: str, order: int, theme: Th
     axes.fill([left, right, right], [bottom, bottom, top], facecolor=theme.faint, edgecolor="none", zorder=1)
     beside: dict[str, Any] = {"textcoords": "offset points", "va": "center", "fontsize": 8.5}
     axes.annotate(f"{order}", (right, (bottom * top) ** 0.5), (4, 0), **beside)
+
+
+def plot_control(optimum: Any, *, title: str = "", theme: Theme = LIGHT) -> NotebookFigure:
+    """Controls with their bounds, slow and fast positions against time, and update, gaps and misses of every iteration.
+
+    Args:
+        optimum: result of `vmri_jax.control.minimize`.
+        title: title above the panels.
+        theme: colours.
+    """
+    t, panels = np.asarray(optimum.trajectory.t), position_panels(optimum.trajectory)
+    with new_figure(7.2, 0.6 + 1.85 * (2 + len(panels)), title, theme) as figure:
+        above, *middle, below = figure.subplots(2 + len(panels))
+        edges = np.append(optimum.t.ravel(), t[-1])
+        controls = optimum.controls.reshape(len(edges) - 1, -1)
+        for number, (column, label) in enumerate(zip(controls.T, optimum.labels, strict=True)):
+            color = theme.curves[number % len(theme.curves)]
+            above.stairs(column, edges, baseline=None, color=color, linewidth=1.4, label=label)
+            for bound in (side[number] for side in optimum.bounds if np.isfinite(side[number])):
+                above.axhline(bound, color=color, linewidth=0.8, linestyle=":")
+        above.set(ylabel="controls $u$")
+        limit_times(above, t)
+        legend_beside(above)
+        for axes, (values, labels, quantity, _) in zip(middle, panels, strict=True):
+            coordinates(axes, t, values, labels, quantity, theme)
+        (middle or [above])[-1].set_xlabel("time $t$")
+        for name, color in zip(("update", "gap", "miss", "over"), theme.curves, strict=False):
+            values = np.array([iteration[name] for iteration in optimum.history])
+            if np.any(values > 0):
+                numbers = 1 + np.arange(len(values))
+                below.semilogy(numbers, np.maximum(values, ROUNDOFF_FLOOR), ".-", color=color, label=MEANING[name])
+        count = len(optimum.history)
+        below.set(xlabel="iteration", ylabel="remaining error", xticks=1 + np.arange(0, count, 1 + count // 12))
+        legend_beside(below)
+        figure.align_ylabels()
+    return figure
+
+
+def plot_fit(fit: Any, *, title: str = "", theme: Theme = LIGHT) -> NotebookFigure:
+    """Residuals against time, their distribution, and the correlations of several parameters.
+
+    Args:
+        fit: result of `vmri_jax.fit`.
+        title: title above the panels.
+        theme: colours.
+    """
+    with new_figure(11, 3.6, title, theme) as figure:
+        widths = [2, 1, 1.2] if len(fit.labels) > 1 else [2, 1]
+        over_time, spread, *correlations = figure.subplots(1, len(widths), width_ratios=widths)
+        first = 0
+        for number, m in enumerate(fit.shooting.data):
+            is_number = np.isfinite(m.values)
+            misses = np.full(m.values.shape, np.nan)
+            misses[is_number] = fit.residuals[first : first + is_number.sum()]
+            first += int(is_number.sum())
+            over_time.plot(m.t, misses, ".", markersize=2, color=f"C{number}")
+        over_time.axhspan(-DEVIATIONS_OF_95_PERCENT, DEVIATIONS_OF_95_PERCENT, alpha=0.12)
+        over_time.set(xlabel="t", ylabel="miss / sigma", title="misses, and where 95 % of them belong")
+
+        width = max(4.0, float(np.abs(fit.residuals).max()))
+        x = np.linspace(-width, width, 200)
+        spread.hist(fit.residuals, bins=40, range=(-width, width), density=True, alpha=0.6)
+        spread.plot(x, stats.norm.pdf(x))
+        spread.set(xlabel="miss / sigma", title="their distribution", yticks=[])
+
+        for correlation in correlations:
+            errors = np.sqrt(np.diag(fit.covariance))
+            image = correlation.imshow(fit.covariance / np.outer(errors, errors), vmin=-1, vmax=1, cmap="RdBu")
+            correlation.set_xticks(range(len(fit.labels)), fit.labels, rotation=45, ha="right")
+            correlation.set_yticks(range(len(fit.labels)), fit.labels)
+            correlation.set_title("correlations")
+            correlation.grid(False)
+            figure.colorbar(image, ax=correlation)
+    return figure

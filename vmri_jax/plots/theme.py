@@ -193,14 +193,6 @@ def legend_beside(axes: Axes, title: str | None = None, size: float = LEGEND_SIZ
     axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), title=title, **look)
 
 
-def mark_reference(axes: Axes, error: float, theme: Theme) -> None:
-    """Draw a line at the error of the reference solution if it lies within the axes."""
-    if error > axes.get_ylim()[0]:
-        axes.axhline(error, color=theme.ink, linewidth=0.8, linestyle=":")
-        above = {"ha": "right", "va": "bottom", "fontsize": 7.5, "transform": axes.get_yaxis_transform()}
-        axes.text(0.995, error, "error of the reference ", **above)
-
-
 def positive(values: Any) -> np.ndarray:
     """Values for a logarithmic axis: values that are not positive become NaN, which is not drawn."""
     values = np.asarray(values, dtype=float)

@@ -68,8 +68,7 @@ def _in_chunks(run: Simulation, leaves: list, lanes: np.ndarray, width: int, dev
         chosen = lanes[np.minimum(np.arange(start, start + width), len(lanes) - 1)]
         chunks.append(program([a[0] if is_repeated(a) else a[chosen] for a in leaves], run.save_every))
     rows, status = jax.tree.map(lambda *parts: np.concatenate(parts)[: len(lanes)], *chunks)
-    saved = Saved.of(rows[:, : run.num_saves + 1], run.columns, *np.moveaxis(status, -1, 0).copy())
-    return saved.marked(run.save_every)
+    return Saved(rows[:, : run.num_saves + 1], *status.T.copy()).marked(run)
 
 
 def batch(
@@ -85,7 +84,11 @@ def batch(
 ) -> tuple[Simulation, Callable[[Simulation], Saved]]:
     """The runs with these arguments of `simulate_batch`, and the function that computes them; bad arguments raise."""
     refuse_tracers("simulate_batch", (states, macro_dt, params), ", or take jax.vmap of simulate")
-    _check_devices(devices, chunk)
+    if not 1 <= devices <= jax.device_count():
+        advice = f"call vm.configure(devices={devices}) before JAX starts"
+        raise Refused(f"simulate_batch: devices is {devices}, but JAX has {jax.device_count()}; {advice}.")
+    if chunk is not None:
+        whole_number("simulate_batch: chunk", chunk, otherwise=", or None")
     problem: Any = opened(moving)
     system, start = start_of("simulate_batch", problem, states)
     check_step_size(macro_dt, "simulate_batch", ndim=None)
@@ -169,14 +172,6 @@ def _with_lanes(all_params, params, start: State, macro_dt) -> tuple[Any, State,
     new_params = jax.tree.unflatten(structure, of_params)
     check_computed(all_params, new_params)
     return new_params, State(t, q_s, q_f, p_s, p_f), steps
-
-
-def _check_devices(devices, chunk) -> None:
-    if not 1 <= devices <= jax.device_count():
-        advice = f"call vm.configure(devices={devices}) before JAX starts"
-        raise Refused(f"simulate_batch: devices is {devices}, but JAX has {jax.device_count()}; {advice}.")
-    if chunk is not None:
-        whole_number("simulate_batch: chunk", chunk, otherwise=", or None")
 
 
 def lanes_at_once(run: Simulation) -> int:

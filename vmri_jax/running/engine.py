@@ -13,7 +13,7 @@ runs: for a step (`macro_step`), a run or a piece of it, the lanes of a batch, a
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, partial
 from typing import Any, NamedTuple
 
@@ -71,7 +71,7 @@ class Engine:
         return jax.jit(self.steps, compiler_options=options_of_runs())
 
     def steps(self, leaves: list, save_every, saves=None, cursor: Cursor | None = None, is_first: Any = True):
-        """The first `saves` saved intervals: an array of `Saved` rows, longer than them by a part of a block, and the cursor after them.
+        """The first `saves` saved intervals: rows of `Saved`, more of them by a part of a block, and the cursor after them.
 
         `saves` None: all intervals, failed or not. The end of the loop then depends on no lane of a batch, and
         `jax.vmap` need not select between old and new values in every lane.
@@ -84,7 +84,7 @@ class Engine:
         memory = stepper.init(begin.state, run.macro_dt)
         if cursor is not None:
             memory = jax.tree.map(partial(jnp.where, is_first), memory, cursor.memory)
-        interval = _interval(stepper, run, loops.plain)
+        interval = _interval(stepper, run, partial(jax.lax.fori_loop, 0))
 
         def goes_on(loop):
             number, cursor, _ = loop
@@ -114,8 +114,7 @@ class Engine:
 
         def block(i, rows):
             number = jnp.minimum(i * self._block + jnp.arange(self._block), saves)  # beyond it there may be no state
-            saved = _as_saved(run, Saved.of(rows[number], run.columns, 0, -1), step + number * save_every)
-            row = jnp.concatenate(saved[: len(run.columns)], axis=-1)
+            row = _as_saved(run, rows[number], step + number * save_every)
             return jax.lax.dynamic_update_slice(rows, row, (i * self._block, 0))
 
         return jax.lax.fori_loop(0, saves // self._block + 1, block, rows)
@@ -138,7 +137,7 @@ class Engine:
             cursor = Cursor.at_start(run.state, stepper.init(run.state, run.macro_dt))
             cursor, rows = loops.scan(save, jax.tree.map(jnp.asarray, cursor), self.num_saves, in_parts, save_every)
             first = _row(run.state, *_nothing(run))
-            return Saved.of(jnp.concatenate([first[None], rows]), run.columns, cursor.result, cursor.failed_at)
+            return Saved(jnp.concatenate([first[None], rows]), cursor.result, cursor.failed_at)
 
         return jax.jit(by_scan, static_argnums=1)
 
@@ -148,7 +147,8 @@ class Engine:
 
         def observed(leaves: list, saved: Saved, save_every) -> Saved:
             run: Any = jax.tree.unflatten(self.structure, leaves)
-            return _as_saved(run, saved, jnp.arange(self.num_saves + 1) * save_every).marked(save_every)
+            rows = _as_saved(run, saved.rows, jnp.arange(self.num_saves + 1) * save_every)
+            return saved._replace(rows=rows).marked(replace(run, save_every=save_every))
 
         return jax.jit(observed)  # else JAX would compile the operations of a gradient outside of jit one by one
 
@@ -170,15 +170,16 @@ def blank_memory(engine: Engine, shapes: tuple):
     return jax.device_put(jax.tree.map(lambda a: np.zeros(a.shape, a.dtype), blank))
 
 
-def _as_saved(run, saved: Saved, steps) -> Saved:
-    """Nodes after these numbers of macro steps, with projected momenta, and with their `Observables`."""
+def _as_saved(run, rows, steps):
+    """The rows of nodes after these numbers of macro steps, with projected momenta, and with their `Observables`."""
+    *phase, info, micro = (rows[:, column] for column in run.columns[:-1])
 
     def node(t, *phase):
         state, table = observed(run.system, State(t, *phase), run.solver.tolerance)
-        return state.p_s, state.p_f, table
+        return *list(vars(state).values())[1:], table
 
-    p_s, p_f, table = jax.vmap(node)(run.state.t + steps * run.macro_dt, *saved[:4])
-    return saved._replace(p_s=p_s, p_f=p_f, table=table)
+    *phase, table = jax.vmap(node)(run.state.t + steps * run.macro_dt, *phase)
+    return jnp.concatenate([*phase, info, micro, table], axis=1)
 
 
 def _row(state: State, worst: StepStatus, micro) -> Float[Numbers, "numbers"]:

@@ -1,14 +1,17 @@
-"""Export of a run to other programs: tables of named columns, CSV, pandas, Parquet, xarray."""
+"""A run for readers and for other programs: a summary in a few lines; tables of named columns, CSV, pandas, Parquet, xarray."""
 
 import csv
 import importlib
 import io
 import json
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from vmri_jax.mechanics.names import Names
+from vmri_jax.mechanics.summary import coordinates, listed
 from vmri_jax.refusals import NotInstalled, Refused
 from vmri_jax.running.files import replaced
 from vmri_jax.running.origin import SavedRun
@@ -66,6 +69,10 @@ def rows_of(run: SavedRun) -> dict[str, np.ndarray]:
 class Exports(Quantities):
     """Methods that export a run, with the names of bodies and coordinates."""
 
+    result: Any
+    failed_at: Any
+    error: Any
+
     def columns(self) -> dict[str, np.ndarray]:
         """Columns (k,) by name: time, coordinates by their names, velocities "v ..." if the system is known, momenta "p ...",
         energy, constraint residuals, and the work of the solver since the previous node.
@@ -73,14 +80,13 @@ class Exports(Quantities):
         Raises:
             ValueError: this is a batch.
         """
-        run = self.whole()
-        names = run.names
-        if np.ndim(run.t) != 1:
+        names = self.names
+        if np.ndim(self.energy) != 1:
             raise Refused("columns: this is a batch of runs; take one of them, run.lane(i).")
-        rows = rows_of(run)
+        rows = rows_of(self)
         parts = [("", rows["q_s"], rows["q_f"]), ("p ", rows["p_s"], rows["p_f"])]
-        if run.origin.knows_system:
-            v_s, v_f = map(np.asarray, run.velocities)
+        if self.origin.knows_system:
+            v_s, v_f = map(np.asarray, self.velocities)
             parts.insert(1, ("v ", v_s, v_f))
         columns = {"t": rows["t"]}
         for letter, slow, fast in parts:
@@ -88,9 +94,9 @@ class Exports(Quantities):
             columns |= {letter + name: column for name, column in zip(labels, [*slow.T, *fast.T], strict=True)}
         position, velocity = rows["constraint_residual"].T
         columns |= {"energy": rows["energy"], "constraint residual": position, "constraint rate": velocity}
-        if run.error is not None:
+        if self.error is not None:
             shares = {"slow share": rows["error_slow"], "fast share": rows["error_fast"]}
-            columns |= {"error": run.error.positions} | {f"error, {name}": share for name, share in shares.items()}
+            columns |= {"error": self.error.positions} | {f"error, {name}": share for name, share in shares.items()}
         return columns | {name: rows[name] for name in INFO}
 
     def to_csv(self, path) -> None:
@@ -134,8 +140,7 @@ class Exports(Quantities):
             ImportError: xarray is not installed.
         """
         xarray = extra("xarray", "to_xarray")
-        run = self.whole()
-        names, rows = run.names, rows_of(run)
+        names, rows = self.names, rows_of(self)
         lanes = ("lane",) * (rows["t"].ndim - 1)
         data = {name: ((*lanes, *DIMENSIONS[name]), array) for name, array in rows.items() if name != "t"}
         coordinates = {
@@ -148,11 +153,11 @@ class Exports(Quantities):
         if lanes and np.any(rows["t"] != rows["t"][0]):
             coordinates["t"] = ("t", np.arange(rows["t"].shape[1]))
             data["time"] = (("lane", "t"), rows["t"])
-        result, failed_at = np.asarray(run.result), np.asarray(run.failed_at)
+        result, failed_at = np.asarray(self.result), np.asarray(self.failed_at)
         status = (result, failed_at) if lanes else (Result(int(result)).name, int(failed_at))
         attributes: dict[str, Any] = dict(zip(STATUS, status, strict=True))
-        if run.origin.names is not None:
-            attributes["names"] = json.dumps(run.origin.names.to_dict())
+        if self.origin.names is not None:
+            attributes["names"] = json.dumps(self.origin.names.to_dict())
         return xarray.Dataset(data, coords=coordinates, attrs=attributes)
 
 
@@ -162,3 +167,54 @@ def extra(package: str, caller: str, name: str = "xarray"):
         return importlib.import_module(package)
     except ImportError as error:
         raise NotInstalled(f"{caller} needs {package}; install it with pip install 'vmri_jax[{name}]'.") from error
+
+
+def summary_of(run: SavedRun) -> tuple[str, dict[str, str]]:
+    """Title and lines of the summary of a run, or of a batch of runs, of concrete values."""
+    t, energy, residual = (np.asarray(a) for a in (run.t, run.energy, run.constraint_residual))
+    lanes, (position, velocity) = t.shape[:-1], np.nanmax(residual.reshape(-1, 2), axis=0, initial=0.0)
+    batch = f" of a batch of {' x '.join(map(str, lanes))} runs" if lanes else ""
+    times = f" from t = {np.nanmin(t):.6g} to {np.nanmax(t):.6g}" if np.isfinite(t).any() else ""
+    return f"Trajectory{batch}: {t.shape[-1]} saved nodes{times}", {
+        "status": statuses(np.asarray(run.result), np.asarray(run.failed_at)),
+        **named_coordinates(run.origin.names, run),
+        "energy": energy_in_words(energy, run.keeps_energy),
+        "chosen": "" if run.settings is None else str(run.settings),
+        "error": "" if run.error is None else run.error.in_words(),
+        "constraints": f"kept to {position:.1e} in positions, {velocity:.1e} in velocities"
+        if position or velocity
+        else "",
+        "solver": run.info.in_words(),
+        "micro nodes": "" if run.t_micro is None else f"t_micro and q_f_micro, {run.t_micro.shape[-1]} per saved node",
+    }
+
+
+def named_coordinates(names: Names | None, run: SavedRun) -> dict[str, str]:
+    """Lines on the slow and the fast coordinates of a run, with their names or else with plain names."""
+    names = (names or Names()).of_coordinates(run.states.q_s.shape[-1], run.states.q_f.shape[-1])
+    return {"slow": coordinates(names.slow_coordinates), "fast": coordinates(names.fast_coordinates)}
+
+
+def statuses(result: np.ndarray, failed_at: np.ndarray) -> str:
+    """The status of a run by name; of a batch the number of runs of each status, and the numbers of the failed lanes."""
+    if not result.ndim:
+        failure = "" if failed_at < 0 else f" at macro step {failed_at}; all saved nodes after it are NaN"
+        return f"{Result(int(result)).name}{failure}"
+    counts = Counter(Result(int(r)).name for r in result.ravel())
+    failed = [str(i) for i in np.flatnonzero(failed_at.ravel() >= 0)]
+    lanes = f"; failed: run.lane(i) for i = {listed(failed)}" if failed else ""
+    return ", ".join(f"{count} {name}" for name, count in counts.most_common()) + lanes
+
+
+def energy_in_words(energy: np.ndarray, kept: bool | None) -> str:
+    """Energy (..., k) at the start and its change; of a batch the largest change. `kept` is None without a system."""
+    start = energy[..., :1]
+    change = np.abs(energy - start)
+    largest = float(np.nanmax(change, initial=0.0))
+    if energy.ndim > 1:
+        return f"changed by at most {largest:.2e} in a run"
+    if kept is False:
+        last = energy[np.isfinite(energy)]
+        return f"{start[0]:.6g} at the start, {last[-1] if last.size else np.nan:.6g} at the end; run.work() says why"
+    relative = f", {largest / abs(start[0]):.1e} of it" if abs(start[0]) > np.finfo(float).eps * largest else ""
+    return f"{start[0]:.6g} at the start, changed by at most {largest:.2e}{relative}"

@@ -56,12 +56,6 @@ def explained(path: Path, advice: str) -> Iterator[None]:
         raise OSError(error.errno, f"{path} cannot be written: {error.strerror or error}. {advice}") from error
 
 
-def clear_partial(path: Path) -> None:
-    """Remove the partial files that an interrupted `replaced` left in a folder."""
-    for file in path.rglob("*.partial"):
-        file.unlink()
-
-
 def check_place(path: Path) -> None:
     """Refuse a path where no file can be: FileNotFoundError without its folder, IsADirectoryError for a folder."""
     if not path.parent.is_dir():

@@ -1,4 +1,4 @@
-"""Loops of steps: the plain loop of JAX, and loops whose derivatives in reverse mode need little memory."""
+"""Loops of steps whose derivatives in reverse mode need little memory."""
 
 from collections.abc import Callable
 from functools import partial
@@ -16,13 +16,9 @@ MOST_UNDIVIDED = 100
 """Most turns of a loop that the adjoint in parts does not divide. A larger value takes more memory, and fewer loops compute states again."""
 
 
-def plain(count, step: Callable, carry):
-    """``carry = step(i, carry)`` for i from 0 to count - 1; `count` may be traced, and reverse mode has no derivative of it."""
-    return jax.lax.fori_loop(0, count, step, carry)
-
-
 def differentiable(count: int, step: Callable, carry, in_parts: bool):
-    """As `plain`, with derivatives in reverse mode, which keep the solutions of equations, and compute everything else again.
+    """``carry = step(i, carry)`` for i from 0 to count - 1, whose derivatives in reverse mode keep the solutions of equations, and compute everything
+    else again.
 
     `Solved` gives the solution of a step and its status the name `ROOT`; the steps of any other stepper are computed again.
 

@@ -11,8 +11,7 @@ from vmri_jax.mechanics.state import A_SYSTEM, State
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.arguments import check_run
 from vmri_jax.running.engine import solved_again, unsolved
-from vmri_jax.running.observables import Observables, observed
-from vmri_jax.running.saved import fault, is_right
+from vmri_jax.running.observables import Observables, fault, is_right, observed
 from vmri_jax.schemes.composition import SchemeLike
 from vmri_jax.steppers.plan import plan
 from vmri_jax.steppers.results import Result

@@ -23,13 +23,13 @@ class Nodes(NamedTuple):
     v_f: np.ndarray
 
 
-def why_not(t, t_micro) -> str:
-    """The reason why micro nodes (k - 1, num_micro), or None, do not refine macro nodes (k,); empty if they do."""
+def why_not(t, micro) -> str:
+    """The reason why `MicroNodes`, or None, do not refine macro nodes (k,); empty if they do."""
     if np.ndim(t) != 1:
         return "it is a batch; take one lane of it"
-    if t_micro is None:
+    if micro is None:
         return "it kept none; simulate with save=vm.Save(micro=True)"
-    t, t_micro = np.asarray(t, dtype=float), np.asarray(t_micro, dtype=float)
+    t, t_micro = np.asarray(t, dtype=float), np.asarray(micro.t, dtype=float)
     if len(t) < 2:
         return "it has a single node"
     if np.any(np.diff(np.append(t[:1], t_micro)) <= 0):

@@ -11,12 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from vmri_jax.mechanics.arrays import Numbers
+from vmri_jax.mechanics.arrays import Numbers, library
 from vmri_jax.mechanics.constraints import are_kept, residual_of, rows_at, weights_of
 from vmri_jax.mechanics.invariants import energy_parts
 from vmri_jax.mechanics.projection import project_momentum
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
+from vmri_jax.steppers.results import Result
 
 
 class LostEnergyWarning(UserWarning):
@@ -113,6 +114,23 @@ def observed(system: System, state: State, tolerance: Any = 0.0) -> tuple[State,
 def observables(system: System, state: State):
     """The `Observables` of a saved state, as an array (9,)."""
     return observed(system, state)[1]
+
+
+def is_right(now: Observables) -> Any:
+    """Whether nodes may be right.
+
+    A node may be wrong although its steps succeeded, for four reasons: the energy is not finite although its gradient is (a logarithm beyond
+    its pole); a lane of a batch started off its constraints; the rows of ``system.implied``, redundant constraints that the solver leaves
+    out, are violated; or a stepper of the user leaves the constraints.
+    """
+    return library(now.energy).isfinite(now.energy) & (now.solved > 0) & (now.implied > 0)
+
+
+def fault(now: Observables) -> Any:
+    """The `Result` of nodes that are not right; if the solved rows are kept, the implied rows are to blame."""
+    module = library(now.energy)
+    violated = module.where(now.solved > 0, int(Result.NOT_IMPLIED), int(Result.CONSTRAINT_VIOLATED))
+    return module.where(module.isfinite(now.energy), violated, int(Result.NON_FINITE))
 
 
 def concerns(table: np.ndarray, t, system: System, macro_dt, save_every: int) -> list[LostEnergyWarning]:

@@ -1,9 +1,10 @@
-"""The origin of a run, its system and names; and the evaluation of functions of system and state at all nodes of a run."""
+"""The origin of a run: its system and names, and the settings that were chosen for an accuracy; and the evaluation of functions of system and state at all nodes of a run."""
 
 import math
 import pickle
+import shlex
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache, partial
 from typing import Any, TypeAlias
 
@@ -12,14 +13,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.mechanics.arrays import is_concrete, library, of_one_type
-from vmri_jax.mechanics.checks import check_system
 from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.rows import Part
 from vmri_jax.mechanics.state import HasProblem, Problem, opened
 from vmri_jax.mechanics.system import System
 from vmri_jax.refusals import Refused
 from vmri_jax.running.progress import Working
-from vmri_jax.running.settings import Settings
+from vmri_jax.schemes.composition import SchemeLike, stage_scheme
+from vmri_jax.schemes.plain_data import from_plain, to_plain
 
 SavedRun: TypeAlias = Any
 """A `vmri_jax.Trajectory` in annotations of modules that its own module imports."""
@@ -27,6 +28,54 @@ SavedRun: TypeAlias = Any
 NODES_PER_CALL = 64
 """Nodes of a call, evaluated side by side. With a larger value runs of a few nodes take longer; with a smaller one long runs take more calls of some
 20 microseconds each."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """The arguments of `vmri_jax.simulate` that repeat a run from the same start: ``vm.simulate(problem, **run.settings.arguments)``.
+
+    Attributes:
+        scheme: the scheme or composition.
+        python: the Python expression of the scheme.
+        options: the options of the scheme on the command line; empty for a scheme of the user.
+        macro_dt: macro step H.
+        num_steps: macro steps of the run.
+        save_every: macro steps from one saved node to the next.
+        gain: computing time with one micro step per macro step, divided by the time with the chosen number, for the same error; computed
+            from the prices and error shares of the trial runs.
+    """
+
+    scheme: SchemeLike = field(compare=False)  # `python` and the numbers identify it
+    python: str
+    options: str
+    macro_dt: float
+    num_steps: int
+    save_every: int
+    gain: float = 1.0
+
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """Arguments of `vmri_jax.simulate` by name."""
+        steps = {"macro_dt": self.macro_dt, "num_steps": self.num_steps, "save": self.save_every}
+        return {"scheme": self.scheme, **steps}
+
+    def command(self, system: str) -> str:
+        """The command line that repeats the run of a system; without the scheme's options if the scheme is the user's."""
+        steps = f"--macro-dt {self.macro_dt!r} --steps {self.num_steps} --save-every {self.save_every}"
+        num_micro = stage_scheme(self.scheme).num_micro
+        return f"vmri simulate {shlex.quote(system)} {self.options} --num-micro {num_micro} {steps}"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data for JSON."""
+        return {**vars(self), "scheme": to_plain(self.scheme)}
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any]) -> "Settings":
+        """The inverse of `to_dict`, also after a round trip through JSON."""
+        return cls(**{**data, "scheme": from_plain(data["scheme"])})
+
+    def __str__(self) -> str:
+        return f"{self.python}, macro_dt={self.macro_dt!r}, num_steps={self.num_steps}, save={self.save_every}"
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=["simulated"], meta_fields=["names", "settings"])
@@ -47,12 +96,11 @@ class Origin:
     @classmethod
     def of(cls, moving: System | Problem | HasProblem) -> "Origin":
         """The origin of runs of a system, a problem or a scene."""
-        names = names_of(moving)
         system = opened(moving)
         system = system.system if isinstance(system, Problem) else system
         if not isinstance(system, System):
             raise Refused(f"of: got {type(moving).__name__}; give the vmri_jax.System, Problem or Scene of the run.")
-        return cls(names, system)
+        return cls(getattr(moving, "names", None), system)
 
     @classmethod
     def from_file(cls, names: dict | None, settings: dict | None = None) -> "Origin":
@@ -80,13 +128,6 @@ class Origin:
         """Vectors (..., n) in the form in which the user gave the start: vectors, or a dictionary of arrays by name."""
         return vectors if self.names is None else self.names.shaped(part, vectors)
 
-    def check(self, n_s: int, n_f: int) -> None:
-        """Refuse a system whose numbers of coordinates differ from the run."""
-        try:
-            check_system(self.system(), np.zeros(n_s), np.zeros(n_f))
-        except ValueError as error:
-            raise Refused(f"of: the run has {n_s} slow and {n_f} fast coordinates. {error}") from None
-
     def __getstate__(self) -> dict:
         """All fields for pickle; without the system if Python cannot pickle one of its functions, such as a lambda."""
         state = dict(vars(self))
@@ -99,11 +140,6 @@ class Origin:
 
 UNKNOWN = Origin()
 """The origin of a run whose system and names are unknown."""
-
-
-def names_of(moving: Any) -> Names | None:
-    """The names of a problem or a scene; None for a system."""
-    return getattr(moving, "names", None)
 
 
 def at_nodes(function, origin: Origin, nodes, *static):

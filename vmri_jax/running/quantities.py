@@ -1,7 +1,6 @@
 """Quantities computed from the positions and momenta of a run: velocities, multipliers, reaction forces, work, by name."""
 
-from abc import ABC, abstractmethod
-from typing import Any, NamedTuple, overload
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -60,68 +59,31 @@ class Work(NamedTuple):
         )
 
 
-class Quantities(ABC):
-    """Quantities of a `Trajectory` or a `StoredTrajectory`, by the names of bodies and constraints.
+class Quantities:
+    """Quantities of a `Trajectory`, by the names of bodies and constraints.
 
     Velocities, multipliers and work need the system: ``run.of(problem)`` gives it to a run that was read from a file.
     """
 
-    @abstractmethod
-    def whole(self) -> SavedRun:
-        """All saved nodes."""
-
-    @property
-    @abstractmethod
-    def origin(self) -> Origin:
-        """System, parameters and names of the run, as far as they are known."""
-
-    @abstractmethod
-    def __len__(self) -> int:
-        """Number of saved nodes."""
-
-    @abstractmethod
-    def _node(self, number: int) -> State: ...
-
-    @abstractmethod
-    def _part(self, first: int, last: int, stride: int) -> SavedRun: ...
-
-    @overload
-    def __getitem__(self, nodes: int) -> State: ...
-    @overload
-    def __getitem__(self, nodes: slice) -> SavedRun: ...
-    def __getitem__(self, nodes):
-        kind, count = type(self).__name__, len(self)
-        if isinstance(nodes, int | np.integer):
-            if not -count <= nodes < count:
-                raise IndexError(f"{kind}: there is no node {nodes}; it has {count} nodes, counted from 0.")
-            return self._node(int(nodes) % count)
-        if not isinstance(nodes, slice):
-            raise Refused(f"{kind}: the index is {nodes!r}; give the number of a node, or a slice as in run[:100].")
-        first, stop, stride = nodes.indices(count)
-        if stride < 1 or first >= stop:
-            raise Refused(f"{kind}: no nodes {first}:{stop}:{stride}; it has {count}, and they are taken forwards.")
-        return self._part(first, first + (stop - 1 - first) // stride * stride, stride)
-
-    @property
-    def final_state(self) -> State:
-        """`State` at the last saved node (of every run, in a batch)."""
-        return self[-1]
+    states: State
+    energy: Any
+    micro: Any
+    origin: Origin
 
     @property
     def names(self) -> Names:
         """Names of bodies, coordinates and constraints, plain ones where none are known."""
-        run, origin = self.whole(), self.origin
-        n_s, n_f = run.states.q_s.shape[-1], run.states.q_f.shape[-1]
-        names = origin.names or Names()
-        if not origin.knows_system:
+        n_s, n_f = self.states.q_s.shape[-1], self.states.q_f.shape[-1]
+        names = self.origin.names or Names()
+        if not self.origin.knows_system:
             return names.of_coordinates(n_s, n_f)
-        return names.of(origin.system(np.ndim(run.t) - 1), n_s, n_f)
+        return names.of(self.origin.system(np.ndim(self.energy) - 1), n_s, n_f)
 
     @property
     def keeps_energy(self) -> bool | None:
         """Whether the energy of the system is constant; None if the system is not known."""
-        origin = self.origin
-        return origin.simulated.keeps_energy if origin.simulated is not None else None
+        system = self.origin.simulated
+        return None if system is None else system.keeps_energy
 
     @property
     def v_s(self) -> Any:
@@ -136,8 +98,7 @@ class Quantities(ABC):
     @property
     def velocities(self) -> Any:
         """Vectors (..., k, n_s) and (..., k, n_f) of all velocities."""
-        run = self.whole()
-        return at_nodes(_velocity, run.origin, run.states)
+        return at_nodes(_velocity, self.origin, self.states)
 
     def position(self, body: str):
         """Positions (..., k, size) of a body, or of a coordinate that has a name.
@@ -148,18 +109,16 @@ class Quantities(ABC):
         Raises:
             ValueError: no body of this name.
         """
-        run = self.whole()
-        return self._of_body("position", body, body in run.names.carried, (run.states.q_s, run.states.q_f))
+        return self._of_body("position", body, body in self.names.carried, (self.states.q_s, self.states.q_f))
 
     def momentum(self, body: str):
         """Momenta of a body at the saved nodes, (..., k, size); for a rigid body in joint coordinates its own ``M v``, without bodies that it carries.
 
         Args, Raises: as of `position`.
         """
-        run = self.whole()
         # The coordinate p of a root includes all bodies that it carries.
-        in_joints = run.names.kinematics is not None and body in (*run.names.rigid, *run.names.carried)
-        return self._of_body("momentum", body, in_joints, (run.states.p_s, run.states.p_f))
+        in_joints = self.names.kinematics is not None and body in (*self.names.rigid, *self.names.carried)
+        return self._of_body("momentum", body, in_joints, (self.states.p_s, self.states.p_f))
 
     def velocity(self, body: str):
         """Velocities (..., k, size) of a body, or of a coordinate that has a name.
@@ -171,10 +130,9 @@ class Quantities(ABC):
 
     def _of_body(self, kind: str, body: str, in_joints: bool, values: Any):
         """(..., k, size) of a body: a part of the `values` (slow, fast) of all coordinates, or of `_of_bodies`."""
-        run = self.whole()
         if in_joints:
-            values = at_nodes(_of_bodies, run.origin, run.states, run.names.kinematics, kind)
-        part, start, size = run.names.place_of(body)
+            values = at_nodes(_of_bodies, self.origin, self.states, self.names.kinematics, kind)
+        part, start, size = self.names.place_of(body)
         return values[part == "f"][..., start : start + size]
 
     def multipliers(self, micro: bool = False) -> dict:
@@ -190,9 +148,9 @@ class Quantities(ABC):
         Raises:
             ValueError: the run does not know its system, or did not keep the micro nodes.
         """
-        run = _concrete("multipliers", self.whole())
-        values = at_nodes(_multipliers, run.origin, _states(run, micro))
-        return {name: _shaped(run, values[..., rows], micro) for name, rows in run.names.rows.items()}
+        self._check_concrete("multipliers")
+        values = at_nodes(_multipliers, self.origin, _states(self, micro))
+        return {name: _shaped(self, values[..., rows], micro) for name, rows in self.names.rows.items()}
 
     def reaction_forces(self, constraint: str | None = None, micro: bool = False) -> dict:
         """Forces ``-G^T lambda`` of a constraint on the bodies that it touches, (..., k, size) for each of them by name.
@@ -205,27 +163,27 @@ class Quantities(ABC):
         Raises:
             ValueError: no constraint of this name, or no constraint at all; see also `multipliers`.
         """
-        run = _concrete("reaction_forces", self.whole())
-        names = run.names
+        self._check_concrete("reaction_forces")
+        names = self.names
         rows = {name: list(rows) for name, rows in names.rows.items() if constraint in (None, name)}
         if not rows:
             hint = " Joints that carry bodies have no rows; scene.by_directors(run) gives the run that has."
             known = "" if constraint is None else unknown("constraint", constraint, names.rows)
             missing = known or "the system has no constraints."
             raise Refused(f"reaction_forces: {missing}{hint if names.carried else ''}")
-        states = _states(run, micro)
+        states = _states(self, micro)
         chosen = np.zeros((len(rows), sum(map(len, names.rows.values()))), dtype=bool)
         for of_constraint, numbers in zip(chosen, rows.values(), strict=True):
             of_constraint[numbers] = True
         chosen = np.broadcast_to(chosen, (*np.shape(states.t), *chosen.shape))  # at every node
-        forces, touched = at_nodes(_reaction_forces, run.origin, (states, chosen))
-        first = {"s": 0, "f": run.states.q_s.shape[-1]}
+        forces, touched = at_nodes(_reaction_forces, self.origin, (states, chosen))
+        first = {"s": 0, "f": self.states.q_s.shape[-1]}
         by_constraint: dict[str, dict] = {name: {} for name in rows}
         for body, (part, start, size) in names.bodies.items():
             columns = slice(first[part] + start, first[part] + start + size)
             for i, by_body in enumerate(by_constraint.values()):
                 if touched[..., i, columns].any():
-                    by_body[body] = _shaped(run, forces[..., i, columns], micro)
+                    by_body[body] = _shaped(self, forces[..., i, columns], micro)
         return by_constraint if constraint is None else by_constraint[constraint]
 
     def work(self) -> Work:
@@ -240,19 +198,19 @@ class Quantities(ABC):
         # here: its import takes a fifth of a second
         from scipy.integrate import cumulative_simpson, cumulative_trapezoid
 
-        run = _concrete("work", self.whole())
-        if np.ndim(run.t) != 1:
+        self._check_concrete("work")
+        if np.ndim(self.energy) != 1:
             raise Refused("work: the run is a batch; take one lane of it, run.lane(i).")
-        micro = why_not(run.t, run.t_micro) == "" and bool(np.isfinite(run.energy[1]))
-        states = _states(run, micro, with_start=True)
-        power = at_nodes(powers, run.origin, states)  # (m, 2): F . v and lambda . dg/dt
-        t, stride = np.asarray(states.t), run.t_micro.shape[1] if micro else 1
+        micro = why_not(self.states.t, self.micro) == "" and bool(np.isfinite(self.energy[1]))
+        states = _states(self, micro, with_start=True)
+        power = at_nodes(powers, self.origin, states)  # (m, 2): F . v and lambda . dg/dt
+        t, stride = np.asarray(states.t), self.micro.t.shape[1] if micro else 1
         trapezoidal = cumulative_trapezoid(power, t, axis=0, initial=0.0)
         simpson = cumulative_simpson(power, x=t, axis=0, initial=0.0) if len(t) > 2 else trapezoidal
         difference = np.nanmax(np.abs(simpson - trapezoidal), initial=0.0)
         uncertainty = float(max(difference, *(_deviation_of_integral(t, values) for values in power.T)))
         forces, constraints = simpson[::stride].T
-        energy = np.asarray(run.energy)
+        energy = np.asarray(self.energy)
         return Work(forces, constraints, energy - energy[0] - forces - constraints, uncertainty)
 
     def concerns(self) -> list[LostEnergyWarning]:
@@ -263,31 +221,29 @@ class Quantities(ABC):
         Raises:
             ValueError: the run does not know its system.
         """
-        run = _concrete("concerns", self.whole())
-        table, t = at_nodes(observables, run.origin, run.states), np.asarray(run.t)
-        return concerns(table, t, run.origin.system(t.ndim - 1), np.mean(np.diff(t), axis=-1), 1)
+        self._check_concrete("concerns")
+        table, t = at_nodes(observables, self.origin, self.states), np.asarray(self.states.t)
+        return concerns(table, t, self.origin.system(t.ndim - 1), np.ptp(t, axis=-1) / max(t.shape[-1] - 1, 1), 1)
+
+    def _check_concrete(self, method: str) -> None:
+        """Refuse a run whose numbers are tracers of a transformation."""
+        if not is_concrete(self.energy):
+            raise Refused(
+                f"{method}: the run is traced by JAX, inside of jit, grad or vmap. Return the run and ask outside, "
+                f"run.of(problem).{method}(...); of one state, vmri_jax.mechanics.motion.motion(system, run[-1]) can be traced."
+            )
 
     def plot(self, title: str = ""):
         """Positions, energy and constraints against time, a matplotlib `Figure` with a title; more in `vmri_jax.plots`."""
         from vmri_jax.plots import plot_trajectory  # here: its import takes half a second
 
-        return plot_trajectory(self.whole(), title)
+        return plot_trajectory(self, title)
 
     def plot_forces(self, title: str = ""):
         """Reaction forces of all constraints against time, a `Figure` with a title, see `vmri_jax.plots.plot_forces`."""
         from vmri_jax.plots import plot_forces
 
-        return plot_forces(self.whole(), title)
-
-
-def _concrete(method: str, run: SavedRun) -> SavedRun:
-    """The run; refused by `method` if its numbers are tracers of a transformation."""
-    if not is_concrete(run.energy):
-        raise Refused(
-            f"{method}: the run is traced by JAX, inside of jit, grad or vmap. Return the run and ask outside, "
-            f"run.of(problem).{method}(...); of one state, vmri_jax.mechanics.motion.motion(system, run[-1]) can be traced."
-        )
-    return run
+        return plot_forces(self, title)
 
 
 def _of_bodies(system: System, state: State, kinematics: Kinematics, kind: str):
@@ -310,7 +266,7 @@ def _states(run: SavedRun, micro: bool, with_start: bool = False) -> State:
     check_flags(micro=micro)
     if not micro:
         return run.states
-    reason = why_not(run.t, run.t_micro)
+    reason = why_not(run.states.t, run.micro)
     if reason:
         raise Refused(f"micro nodes: they do not fill all intervals of the run: {reason}.")
     nodes = _all_nodes(run)
@@ -321,19 +277,19 @@ def _states(run: SavedRun, micro: bool, with_start: bool = False) -> State:
 
 def _all_nodes(run: SavedRun) -> Nodes:
     """Times, positions and velocities at all nodes, macro and micro, in order; NaN after a failure."""
-    nodes = Nodes(*(np.asarray(a) for a in (run.t, run.states.q_s, run.states.q_f, *run.velocities)))
+    nodes = Nodes(*(np.asarray(a) for a in (run.states.t, run.states.q_s, run.states.q_f, *run.velocities)))
     finite = np.isfinite(np.column_stack(nodes)).all(axis=1)
     count = len(nodes.t) if np.all(finite) else int(np.argmin(finite))
     if count < 2:
         raise Refused("micro nodes: the run failed in its first step; there are none.")
     macro_nodes = Nodes(*(a[:count] for a in nodes))  # splines take finite values only
-    all_nodes = with_micro_nodes(macro_nodes, run.t_micro[: count - 1], run.micro.q_f[: count - 1])
-    missing = (len(nodes.t) - count) * run.t_micro.shape[1]
+    all_nodes = with_micro_nodes(macro_nodes, run.micro.t[: count - 1], run.micro.q_f[: count - 1])
+    missing = (len(nodes.t) - count) * run.micro.t.shape[1]
     return Nodes(*(np.pad(a, [(0, missing)] + [(0, 0)] * (a.ndim - 1), constant_values=np.nan) for a in all_nodes))
 
 
 def _shaped(run: SavedRun, values: np.ndarray, micro: bool) -> np.ndarray:
-    return values.reshape(*np.shape(run.t_micro), -1) if micro else values
+    return values.reshape(*np.shape(run.micro.t), -1) if micro else values
 
 
 def _deviation_of_integral(t: np.ndarray, power: np.ndarray) -> float:

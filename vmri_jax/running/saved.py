@@ -1,4 +1,4 @@
-"""Saved nodes of a run: the columns of their numbers, and the status of the run.
+"""Saved nodes of a run: rows of numbers with the same columns, and the status of the run.
 
 A program writes the numbers of a node as one row into one array: XLA on CPU would take longer for one write into each column.
 """
@@ -8,14 +8,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import psutil
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
 from vmri_jax.mechanics.arrays import Numbers, is_concrete, library
 from vmri_jax.mechanics.state import State
 from vmri_jax.refusals import Refused
-from vmri_jax.running.observables import Observables
+from vmri_jax.running.observables import Observables, fault, is_right
 from vmri_jax.running.trajectory import MicroNodes, RunInfo, Trajectory, status
-from vmri_jax.steppers.results import Result
 
 BYTES_PER_NUMBER = 8
 UNCHECKED_BYTES = 100e6
@@ -23,15 +22,8 @@ UNCHECKED_BYTES = 100e6
 larger value more runs may fill a small machine."""
 
 
-def columns_of(state: State, num_micro: int) -> tuple[slice, ...]:
-    """The columns of a row, in the order of `Saved`, of nodes shaped like a state, or like the states of a batch, with `num_micro` saved micro nodes."""
-    n_s, n_f = state.q_s.shape[-1], state.q_f.shape[-1]
-    sizes = n_s, n_f, n_s, n_f, len(RunInfo._fields), num_micro * n_f, len(Observables._fields)
-    return tuple(slice(*ends) for ends in pairwise(accumulate(sizes, initial=0)))
-
-
-class Saved(NamedTuple):
-    """Nodes of a run, (k, ...) each, and its status, of JAX or NumPy; in a batch with lanes.
+class Columns(NamedTuple):
+    """The columns of a row.
 
     q_s, q_f, p_s, p_f: positions and momenta, as of a `State`.
     info: `RunInfo` of the steps since the node before.
@@ -39,48 +31,54 @@ class Saved(NamedTuple):
     table: `Observables` of the state.
     """
 
-    q_s: Any
-    q_f: Any
-    p_s: Any
-    p_f: Any
-    info: Any
-    micro: Any
-    table: Any
+    q_s: slice
+    q_f: slice
+    p_s: slice
+    p_f: slice
+    info: slice
+    micro: slice
+    table: slice
+
+    @classmethod
+    def of(cls, state: State, num_micro: int) -> "Columns":
+        """The columns of nodes shaped like a state, or like the states of a batch, with `num_micro` saved micro nodes."""
+        n_s, n_f = state.q_s.shape[-1], state.q_f.shape[-1]
+        sizes = n_s, n_f, n_s, n_f, len(RunInfo._fields), num_micro * n_f, len(Observables._fields)
+        return cls(*(slice(*ends) for ends in pairwise(accumulate(sizes, initial=0))))
+
+
+class Saved(NamedTuple):
+    """Nodes of a run, a row for each, and its status; of JAX or NumPy; in a batch with lanes."""
+
+    rows: Float[Numbers, "k width"]
     result: Int[Numbers, ""]
     failed_at: Int[Numbers, ""]
 
-    @classmethod
-    def of(cls, rows, columns: tuple[slice, ...], result, failed_at) -> "Saved":
-        """Rows of a program, column by column, with the status of their run."""
-        return cls._make([*(rows[..., column] for column in columns), result, failed_at])
-
-    def marked(self, save_every: int, step: int = 0) -> "Saved":
-        """The nodes, NaN from a failure on; a node that cannot be right, see `is_right`, is a failure, of the last step before it.
+    def marked(self, run: Any, step: int = 0) -> "Saved":
+        """The nodes of a `Simulation`, NaN from a failure on; a node that cannot be right, see `is_right`, is a failure, of the last step before it.
 
         Nodes after a failed step may have any numbers. There are `step` macro steps before the first node.
         """
-        *columns, result, failed_at = self
-        module, now = library(self), Observables.of(self.table)
+        rows, result, failed_at = self
+        module, now = library(rows), Observables.of(rows[..., run.columns.table])
         right = is_right(now)
         # a prepared run is called many times, and an operation of JAX takes as long as many steps
         if module is np and right.all() and (failed_at < 0).all():
             return self
-        node, num_nodes = right.argmin(axis=-1), right.shape[-1]
-        after_step = module.where(failed_at < 0, num_nodes, (failed_at - step) // save_every + 1)
+        node, number = right.argmin(axis=-1), np.arange(right.shape[-1])[:, None]
+        after_step = module.where(failed_at < 0, len(number), (failed_at - step) // run.save_every + 1)
         breaks = ~right.all(axis=-1) & (node < after_step)
         cause = module.take_along_axis(fault(now), node[..., None], -1)[..., 0]
-        number = np.arange(num_nodes)[:, None]
         lost = number >= module.where(breaks, node, after_step)[..., None, None]
-        unreached = number > module.where(breaks, num_nodes, after_step)[..., None, None]
-        marks = [(unreached, 0.0) if column is self.info else (lost, np.nan) for column in columns]
-        columns = (module.where(*mark, column) for mark, column in zip(marks, columns, strict=True))
-        failed_here = step + module.maximum(node * save_every - 1, 0)
-        result, failed_at = module.where(breaks, cause, result), module.where(breaks, failed_here, failed_at)
-        return Saved._make([*columns, result, failed_at])
+        unreached = number > module.where(breaks, len(number), after_step)[..., None, None]
+        is_info = np.isin(np.arange(rows.shape[-1]), np.r_[run.columns.info])
+        rows = module.where(module.where(is_info, unreached, lost), np.where(is_info, 0.0, np.nan), rows)
+        failed_here = step + module.maximum(node * run.save_every - 1, 0)
+        return Saved(rows, module.where(breaks, cause, result), module.where(breaks, failed_here, failed_at))
 
     def trajectory(self, run: Any, step: int = 0) -> Trajectory:
         """The nodes as a trajectory of a `Simulation`, in a batch one whose arrays have an axis of lanes, after a number of macro steps."""
-        *phase, info, q_f_micro, table, result, failed_at = self
+        *phase, info, q_f_micro, table = (self.rows[..., column] for column in run.columns)
         t_start, macro_dt = (np.asarray(a) if is_concrete(a) else a for a in (run.state.t, run.macro_dt))
         t = t_start[..., None] + (step + np.arange(table.shape[-2]) * run.save_every) * macro_dt[..., None]
         states, micro = State(t, *phase), None
@@ -91,33 +89,16 @@ class Saved(NamedTuple):
             micro = MicroNodes(t[..., 1:, None] - before_end, q_f_micro[..., 1:, :].reshape(shape))
         info = RunInfo(method.astype(int), iterations.astype(int), residual)
         return Trajectory(
-            states, table[..., 0], table[..., 1:3], info, status(result), failed_at, micro, origin=run.origin
+            states, table[..., 0], table[..., 1:3], info, status(self.result), self.failed_at, micro, origin=run.origin
         )
-
-
-def is_right(now: Observables) -> Any:
-    """Whether nodes may be right.
-
-    A node may be wrong although its steps succeeded, for four reasons: the energy is not finite although its gradient is (a logarithm beyond
-    its pole); a lane of a batch started off its constraints; the rows of ``system.implied``, redundant constraints that the solver leaves
-    out, are violated; or a stepper of the user leaves the constraints.
-    """
-    return library(now.energy).isfinite(now.energy) & (now.solved > 0) & (now.implied > 0)
-
-
-def fault(now: Observables) -> Any:
-    """The `Result` of nodes that are not right; if the solved rows are kept, the implied rows are to blame."""
-    module = library(now.energy)
-    violated = module.where(now.solved > 0, int(Result.NOT_IMPLIED), int(Result.CONSTRAINT_VIOLATED))
-    return module.where(module.isfinite(now.energy), violated, int(Result.NON_FINITE))
 
 
 def joined(pieces: list[Saved]) -> Saved:
     """Consecutive pieces as one; each starts with the last node of the piece before, and has the worst status of all before it."""
-    *columns, results, failures = zip(*pieces, strict=True)
-    parts = [[part[min(i, 1) :] for i, part in enumerate(column)] for column in columns]
-    whole = (part[0] if len(part) == 1 else np.concatenate(part) for part in parts)
-    return Saved._make([*whole, results[-1], failures[-1]])
+    if len(pieces) == 1:
+        return pieces[0]
+    rows = [piece.rows[min(i, 1) :] for i, piece in enumerate(pieces)]
+    return pieces[-1]._replace(rows=np.concatenate(rows))
 
 
 def check_memory(caller: str, run: Any, lanes: int = 1, num_saves: int | None = None) -> None:

@@ -35,9 +35,9 @@ from vmri_jax.running.engine import FALLING_BACK, Cursor, Engine, blank_memory, 
 from vmri_jax.running.failures import simulation_error
 from vmri_jax.running.interrupts import Interrupted, interrupts_noted
 from vmri_jax.running.observables import concerns
-from vmri_jax.running.origin import Origin, names_of
+from vmri_jax.running.origin import Origin
 from vmri_jax.running.progress import Working, progress_to
-from vmri_jax.running.saved import Saved, columns_of, joined
+from vmri_jax.running.saved import Columns, Saved, joined
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes.composition import SchemeLike
 from vmri_jax.steppers.plan import Plan, plan, with_rules_for
@@ -164,8 +164,7 @@ class Simulation:
     def _whole(self) -> Saved:
         """The run by one program, without the fallback."""
         rows, status = map(np.asarray, self.engine.program(self.leaves, self.save_every, self.num_saves))
-        saved = Saved.of(rows[: self.num_saves + 1], self.columns, status[..., 0], status[..., 1])
-        return saved.marked(self.save_every)
+        return Saved(rows[: self.num_saves + 1], *status).marked(self)
 
     def traced(self) -> Trajectory:
         """All steps of a run, some of whose arrays are tracers."""
@@ -187,17 +186,21 @@ class Simulation:
         motion; raises the `SimulationError` of a run with a failed step if `throw` is true."""
         trajectory = saved.trajectory(self)
         if not is_told:
-            self.tell_of_start(caller, saved)
-        self.warn(caller, saved.table, trajectory.states.t)
+            self.tell_of_start(caller, trajectory)
+        self.warn(caller, self.table(saved), trajectory.states.t)
         if throw and trajectory.failed_at >= 0:
             raise simulation_error(self, trajectory)
         return trajectory
 
-    def tell_of_start(self, caller: str, saved: Saved) -> None:
+    def table(self, saved: Saved) -> np.ndarray:
+        """The `Observables` of its nodes."""
+        return saved.rows[..., self.columns.table]
+
+    def tell_of_start(self, caller: str, trajectory: Trajectory) -> None:
         """Warn about momenta of the start that are off the hidden constraints: the run takes their projection, which its first node has."""
         if not self.system.is_constrained:
             return
-        given, taken = (np.concatenate([a.p_s, a.p_f], axis=-1) for a in (self.state, saved))
+        given, taken = (np.concatenate([a.p_s, a.p_f], axis=-1) for a in (self.state, trajectory.states))
         change, size = (np.max(np.abs(p), initial=0.0) for p in (taken[..., 0, :] - given, given))
         if change > REPORTED_VIOLATION * size:
             warnings.warn(
@@ -232,14 +235,14 @@ class Simulation:
         return self.num_steps // self.save_every
 
     @cached_property
-    def columns(self) -> tuple[slice, ...]:
+    def columns(self) -> Columns:
         """The columns of its saved nodes."""
-        return columns_of(self.state, self.scheme.num_micro if self.save.micro else 0)
+        return Columns.of(self.state, self.scheme.num_micro if self.save.micro else 0)
 
     @property
     def width(self) -> int:
         """Numbers of a saved node."""
-        return self.columns[-1].stop
+        return self.columns.table.stop
 
     @cached_property
     def plan(self) -> Plan:
@@ -312,8 +315,7 @@ class Simulation:
             cursor = cursor._replace(memory=self.blank_memory)
         rows, cursor = self._pieces.program(self.leaves, self.save_every, saves, cursor, is_first)
         nodes = np.array(np.asarray(rows)[: saves + 1])  # a copy, which holds no memory of a whole piece
-        saved = Saved.of(nodes, self.columns, np.asarray(cursor.result), np.asarray(cursor.failed_at))
-        saved = saved.marked(self.save_every, step)
+        saved = Saved(nodes, np.asarray(cursor.result), np.asarray(cursor.failed_at)).marked(self, step)
         reached = np.asarray(step + saves * self.save_every)
         return saved, cursor._replace(step=reached, result=saved.result, failed_at=saved.failed_at)
 
@@ -326,7 +328,7 @@ class Simulation:
 
     def _method(self, saved: Saved):
         """The largest `Method` of the steps."""
-        return saved.info[..., 0].max(axis=-1)
+        return saved.rows[..., self.columns.info.start].max(axis=-1)
 
     def in_pieces(self) -> Saved:
         """The nodes of the whole run; with a progress bar Ctrl-C raises `Interrupted` with the trajectory computed so far."""
@@ -369,7 +371,7 @@ def simulation(
         warnings.warn(f"simulate: {advice}", stacklevel=3)
     chosen_solver, scheme, system = of_one_type((solver or Solver(), scheme, system))
     motion = (_float(macro_dt), _with_arrays(state), chosen_solver, scheme, system)
-    return Simulation(*motion, num_steps, save_every, Save.of(save), names_of(problem), of_problem)
+    return Simulation(*motion, num_steps, save_every, Save.of(save), getattr(problem, "names", None), of_problem)
 
 
 def _with_arrays(state: State) -> State:

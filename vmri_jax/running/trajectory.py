@@ -4,7 +4,7 @@ import json
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path as FilePath
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, overload
 
 import equinox as eqx
 import jax
@@ -13,19 +13,18 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from vmri_jax.mechanics.arrays import Numbers, is_concrete, is_known
+from vmri_jax.mechanics.checks import check_system
 from vmri_jax.mechanics.invariants import energy_parts
 from vmri_jax.mechanics.state import HasProblem, Problem, State
 from vmri_jax.mechanics.summary import has_values, summary
 from vmri_jax.mechanics.system import System
 from vmri_jax.refusals import Refused
-from vmri_jax.running.export import INFO, MICRO, NODES, STATUS, Exports, named_arrays
+from vmri_jax.running.export import INFO, MICRO, NODES, STATUS, Exports, named_arrays, summary_of
 from vmri_jax.running.files import replaced
 from vmri_jax.running.micro_nodes import Nodes
-from vmri_jax.running.origin import UNKNOWN, Origin, SavedRun, at_nodes
+from vmri_jax.running.origin import UNKNOWN, Origin, SavedRun, Settings, at_nodes
 from vmri_jax.running.quantities import momenta_at
 from vmri_jax.running.run_error import RunError
-from vmri_jax.running.settings import Settings
-from vmri_jax.running.summaries import summary_of
 from vmri_jax.steppers.results import Method, Result, Status
 
 FORMAT = "vmri_jax trajectory 3"
@@ -173,7 +172,11 @@ class Trajectory(Exports):
     def _with_origin(self, moving: System | Problem | HasProblem) -> "Trajectory":
         """The same states with an origin of as many coordinates, and all lanes of a batch with the same one."""
         origin = replace(Origin.of(moving), settings=self.settings)
-        origin.check(self.states.q_s.shape[-1], self.states.q_f.shape[-1])
+        n_s, n_f = self.states.q_s.shape[-1], self.states.q_f.shape[-1]
+        try:
+            check_system(origin.system(), np.zeros(n_s), np.zeros(n_f))
+        except ValueError as error:
+            raise Refused(f"of: the run has {n_s} slow and {n_f} fast coordinates. {error}") from None
         return replace(self, origin=origin.repeated(np.shape(self.t)[:-1]))
 
     def _check_energy(self) -> None:
@@ -193,26 +196,27 @@ class Trajectory(Exports):
         """The same run with other arrays, named as in a file written by `save`: ``run.with_arrays(q_f=..., energy=...)``."""
         return from_named_arrays(named_arrays(self) | arrays, self.origin)
 
-    def whole(self) -> "Trajectory":
-        return self
-
     def __len__(self) -> int:
         return np.shape(self.t)[-1]
 
-    def _node(self, number: int) -> State:
-        lanes = (slice(None),) * (np.ndim(self.t) - 1)
-        return jax.tree.map(lambda a: a[*lanes, number], self.states)
-
-    def _part(self, first: int, last: int, stride: int) -> "Trajectory":
+    @overload
+    def __getitem__(self, nodes: int) -> State: ...
+    @overload
+    def __getitem__(self, nodes: slice) -> "Trajectory": ...
+    def __getitem__(self, nodes):
+        chosen, lanes = chosen_nodes(self, nodes), (slice(None),) * (np.ndim(self.t) - 1)
+        if isinstance(chosen, int):
+            return jax.tree.map(lambda a: a[*lanes, chosen], self.states)
         if not is_concrete(self.energy):
             raise Refused("Trajectory: the run is traced by JAX; take slices of its arrays, run.q_s[a:b].")
-        arrays, lanes = named_arrays(self), (slice(None),) * (np.ndim(self.t) - 1)
+        arrays = named_arrays(self)
+        part = part_of(self, lambda name, rows: np.asarray(arrays[name])[*lanes, rows], chosen, self.micro is not None)
+        return part if self.error is None else replace(part, error=self.error.part(nodes))
 
-        def rows(name: str, chosen: slice):
-            return np.asarray(arrays[name])[*lanes, chosen]
-
-        part = part_of(self, rows, (first, last, stride), self.micro is not None)
-        return part if self.error is None else replace(part, error=self.error.part(slice(first, last + 1, stride)))
+    @property
+    def final_state(self) -> State:
+        """`State` at the last saved node (of every run, in a batch)."""
+        return self[-1]
 
     def lane(self, i: int) -> "Trajectory":
         """One run of a batch.
@@ -328,6 +332,21 @@ def from_named_arrays(arrays: dict, origin: Origin = UNKNOWN) -> Trajectory:
     return Trajectory(
         states, info=info, failed_at=arrays["failed_at"], micro=micro, error=error, origin=origin, **fields
     )
+
+
+def chosen_nodes(run: SavedRun, nodes: Any) -> int | tuple[int, int, int]:
+    """The number of a node of a run for an index, or the first, the last and the stride of its nodes for a slice."""
+    kind, count = type(run).__name__, len(run)
+    if isinstance(nodes, int | np.integer):
+        if not -count <= nodes < count:
+            raise IndexError(f"{kind}: there is no node {nodes}; it has {count} nodes, counted from 0.")
+        return int(nodes) % count
+    if not isinstance(nodes, slice):
+        raise Refused(f"{kind}: the index is {nodes!r}; give the number of a node, or a slice as in run[:100].")
+    first, stop, stride = nodes.indices(count)
+    if stride < 1 or first >= stop:
+        raise Refused(f"{kind}: no nodes {first}:{stop}:{stride}; it has {count}, and they are taken forwards.")
+    return first, first + (stop - 1 - first) // stride * stride, stride
 
 
 def part_of(run: SavedRun, rows: Callable[[str, slice], np.ndarray], nodes: tuple, has_micro: bool) -> Trajectory:

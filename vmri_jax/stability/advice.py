@@ -11,7 +11,6 @@ from vmri_jax.mechanics.linearisation import Linearisation, linearise
 from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.mechanics.terms import label
 from vmri_jax.running.arguments import check_step_size
-from vmri_jax.running.origin import names_of
 from vmri_jax.schemes.composition import Composition, SchemeLike, stage_lengths, stage_scheme
 from vmri_jax.stability.drive import LEAST_STEPS, drive_period, driven_motion, growth_of_run, in_words, periods_of_run
 from vmri_jax.stability.map import Window, measure
@@ -160,7 +159,7 @@ def advise(
         ValueError: a macro step that is not positive; second derivatives that are not finite at the state.
         TypeError: scheme is not a scheme.
     """
-    names = names_of(system)
+    names = getattr(system, "names", None)  # of a problem or a scene
     system, state = start_of("advise", system, state)
     check_type("advise: scheme", scheme, SchemeLike, "a Scheme, e.g. fully_implicit(num_micro=10)")
     check_step_size(macro_dt, "advise")

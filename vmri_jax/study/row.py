@@ -8,6 +8,7 @@ from operator import attrgetter
 from typing import Any
 
 import numpy as np
+from matplotlib.ticker import EngFormatter
 
 from vmri_jax import plots
 from vmri_jax.accuracy.companions import fewest_steps
@@ -17,9 +18,9 @@ from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
 from vmri_jax.mechanics.system import System
 from vmri_jax.mechanics.terms import label
 from vmri_jax.running.failures import simulation_error
+from vmri_jax.running.origin import Settings
 from vmri_jax.running.prepare import prepare
 from vmri_jax.running.progress import shows_progress
-from vmri_jax.running.settings import Settings
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes.composition import SchemeLike, stage_scheme
 from vmri_jax.schemes.scheme import galerkin
@@ -237,12 +238,7 @@ def row_of(
 
 def duration(seconds: float) -> str:
     """A time with its unit: 12 µs, 3.4 ms, 1.2 s; empty for NaN."""
-    if np.isnan(seconds):
-        return ""
-    for unit, size in (("s", 1.0), ("ms", 1e-3), ("µs", 1e-6)):
-        if seconds >= size:
-            return f"{seconds / size:.3g} {unit}"
-    return f"{seconds / 1e-6:.2g} µs"
+    return "" if np.isnan(seconds) else EngFormatter("s")(float(f"{seconds:.3g}"))
 
 
 @dataclass(frozen=True, repr=False)

@@ -14,7 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax import plots
-from vmri_jax.accuracy.families import Family, Trial, by_promise, families, for_system
+from vmri_jax.accuracy.companions import Trial
+from vmri_jax.accuracy.families import Family, by_promise, families, for_system
 from vmri_jax.accuracy.search import Search
 from vmri_jax.mechanics.linearisation import linearise
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of

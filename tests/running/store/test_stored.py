@@ -1,9 +1,11 @@
 """Reading a store: parts of it, how far it is, and damage."""
 
 import itertools
+import pickle
 import shutil
 import warnings
 
+import jax
 import numpy as np
 import pytest
 import xarray
@@ -45,6 +47,18 @@ def test_parts_are_those_of_the_whole(uninterrupted):
     with pytest.raises(ValueError, match=r"no nodes 13:13:1; it has 13"):
         uninterrupted[20:]
     assert not list(uninterrupted.path.parent.glob("**/*.partial"))
+
+
+def test_a_store_has_what_its_trajectory_has(uninterrupted):
+    whole = uninterrupted.load()
+    for name in ("states", "energy", "t", "q_f", "micro", "v_f"):
+        for ours, theirs in zip(*(jax.tree.leaves(getattr(run, name)) for run in (uninterrupted, whole)), strict=True):
+            assert np.array_equal(ours, theirs), name
+    assert set(dir(whole)) <= set(dir(uninterrupted))
+    assert uninterrupted.names.slow_coordinates == whole.names.slow_coordinates
+    assert pickle.loads(pickle.dumps(uninterrupted))[3].q_f.tolist() == whole[3].q_f.tolist()
+    with pytest.raises(AttributeError, match="StoredTrajectory has no attribute 'q_x'"):
+        uninterrupted.q_x  # noqa: B018 (the attribute is what is tested)
 
 
 @pytest.mark.parametrize(("first", "stop", "stride"), [(0, 13, 3), (0, 13, 5), (2, 12, 4), (1, 2, 7)])

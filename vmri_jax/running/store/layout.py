@@ -28,7 +28,7 @@ import numpy as np
 from vmri_jax.mechanics.checks import check_flags
 from vmri_jax.refusals import Refused
 from vmri_jax.running.export import FILL
-from vmri_jax.running.files import check_writable, clear_partial, explained, made_beside, replaced, synchronize
+from vmri_jax.running.files import check_writable, explained, made_beside, replaced, synchronize
 from vmri_jax.steppers.results import Result
 
 FORMAT = "vmri_jax store 4"
@@ -94,7 +94,8 @@ def writing(
         with explained(path, "Give another place."):
             _create(path, attributes, arrays, **design)
     with locked(path):
-        clear_partial(path)
+        for file in path.rglob("*.partial"):  # of a `replaced` that was killed
+            file.unlink()
         yield
 
 

@@ -4,26 +4,27 @@ import io
 import zipfile
 from copy import copy
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, overload
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.state import HasProblem, Problem, State
 from vmri_jax.mechanics.summary import summary
 from vmri_jax.mechanics.system import System
 from vmri_jax.refusals import Refused
 from vmri_jax.running.engine import Cursor
-from vmri_jax.running.export import NODES, Exports
+from vmri_jax.running.export import NODES, named_coordinates
 from vmri_jax.running.origin import UNKNOWN, Origin
 from vmri_jax.running.simulation import Simulation
 from vmri_jax.running.store import layout
 from vmri_jax.running.store.layout import chunk_file, read_attributes
-from vmri_jax.running.summaries import named_coordinates
-from vmri_jax.running.trajectory import Trajectory, part_of
+from vmri_jax.running.trajectory import Trajectory, chosen_nodes, part_of
 from vmri_jax.steppers.results import Result
+
+OF_ONE_NODE = {"names": slice(1), "keeps_energy": slice(1), "final_state": slice(-1, None)}
+"""Properties of a run that its first or its last node has."""
 
 
 class Record(NamedTuple):
@@ -74,13 +75,13 @@ class Record(NamedTuple):
         return Cursor(state, memory, *map(np.asarray, (self.step, self.result, self.failed_at))), run
 
 
-class StoredTrajectory(Exports):
+class StoredTrajectory:
     """A trajectory on disk, written by `stream`; it reads only the nodes that are requested.
 
     ``len(stored)`` is the number of saved nodes, including the start (0 before the first chunk is complete); ``stored[i]`` is
     the `State` at a node, ``stored[a:b]`` and ``stored[a:b:n]`` are a `Trajectory` of these nodes, ``stored.load()`` is the `Trajectory` of
-    all nodes. Its `Quantities` cover all nodes. Length and status are from the moment when the store was opened: open it again to
-    follow a running simulation. `xarray.open_zarr` reads its folder, too.
+    all nodes. It has all fields, properties and methods of a `Trajectory`, which read all nodes. Length and status are from the moment
+    when the store was opened: open it again to follow a running simulation. `xarray.open_zarr` reads its folder, too.
 
     Args:
         path: folder of the store.
@@ -144,9 +145,14 @@ class StoredTrajectory(Exports):
         """Whether all steps are done, without a failure."""
         return self.success and self.step == self.num_steps
 
-    @property
-    def names(self) -> Names:
-        return self[:1].names
+    def __getattr__(self, name: str) -> Any:
+        """A field, property or method of the `Trajectory` of all nodes, or of one node if that suffices."""
+        if name.startswith("_") or not (hasattr(Trajectory, name) or name in Trajectory.__dataclass_fields__):
+            raise AttributeError(f"StoredTrajectory has no attribute {name!r}")
+        return getattr(self[OF_ONE_NODE.get(name, slice(None))], name)
+
+    def __dir__(self) -> list[str]:
+        return sorted({*super().__dir__(), *dir(Trajectory), *Trajectory.__dataclass_fields__})
 
     def load(self) -> Trajectory:
         """All saved nodes.
@@ -156,16 +162,18 @@ class StoredTrajectory(Exports):
         """
         return self[:]
 
-    whole = load
-
     def __len__(self) -> int:
         return self.record.saved + 1 if self.record.saved else 0
 
-    def _node(self, number: int) -> State:
-        return self[number : number + 1][0]
-
-    def _part(self, first: int, last: int, stride: int) -> Trajectory:
-        return part_of(self, self._rows, (first, last, stride), self.attributes["save_micro"])
+    @overload
+    def __getitem__(self, nodes: int) -> State: ...
+    @overload
+    def __getitem__(self, nodes: slice) -> Trajectory: ...
+    def __getitem__(self, nodes):
+        chosen = chosen_nodes(self, nodes)
+        if isinstance(chosen, int):
+            return self[chosen : chosen + 1][0]
+        return part_of(self, self._rows, chosen, self.attributes["save_micro"])
 
     def chunks(self):
         """The trajectory in pieces of a chunk each; a piece starts with the last node of the previous piece."""
