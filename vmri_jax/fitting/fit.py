@@ -1,6 +1,7 @@
 """Identification: parameters of a system from measurements of its motion, with what is known about them afterwards."""
 
 from collections.abc import Callable, Mapping, Sequence
+from copy import copy
 from dataclasses import replace
 from functools import partial
 from typing import cast
@@ -35,6 +36,9 @@ beside the standard errors of the parameters."""
 FAILED_MISS = 1e6
 """Miss of a value, in standard deviations, that a failed run counts as: far above the misses of runs that work, so that
 the search turns back. Squares of much larger values would drown the others in round-off."""
+REFITS_AT_ONCE = 50
+"""Fits of a bootstrap side by side. With more of them all wait longer for the slowest; with fewer, vector instructions
+are left unused."""
 NUM_PHASES = 4
 """Number of phases that the display of a long fit tells apart."""
 
@@ -145,11 +149,14 @@ def _check(data: list, segments: int, starts: int, max_steps: int) -> None:
 
 
 class _Search:
-    """The search of a fit; its programs are compiled once and run for several starts and several sets of values."""
+    """The search of a fit; its programs are compiled once and run for several starts and several sets of values.
+
+    Numbers of the unknowns, standard deviations and units are arguments of the programs: with others a program in the
+    cache on disk serves.
+    """
 
     def __init__(self, shooting: Shooting, max_steps: int):
         self.shooting, self.max_steps = shooting, max_steps
-        self.compiled_jacobian = jax.jit(self.jacobian)
         self.size = shooting.unknowns.size
         self.count = len(shooting.values)
         if self.count < self.size + (not shooting.knows_sigma):
@@ -158,6 +165,22 @@ class _Search:
         u_start = np.zeros(self.size)
         self.part_starts = shooting.starts(u_start)
         self.scale = shooting.sizes(u_start, self.part_starts)
+        self.compiled_jacobian = self.compiled(_Search.jacobian)
+
+    def compiled(self, function: Callable) -> Callable:
+        """``function(search, ...)`` as a compiled function of all but the search."""
+
+        @jax.jit
+        def program(numbers, *arguments):
+            (unknowns, sigma, macro_dt), scale = numbers
+            search = copy(self)
+            search.shooting, search.scale = copy(self.shooting), scale
+            unknowns = Unknowns({name: Unknown.of(values) for name, values in unknowns.items()})
+            vars(search.shooting).update(unknowns=unknowns, sigma=sigma, macro_dt=macro_dt)
+            return function(search, *arguments)
+
+        unknowns = {name: unknown.numbers for name, unknown in self.shooting.unknowns.unknowns.items()}
+        return partial(program, ((unknowns, self.shooting.sigma, self.shooting.macro_dt), self.scale))
 
     def residual(self, x, args, shooting: Shooting | None = None):
         """Misses of all values in standard deviations, and weighted gaps between the parts, at x = (u, z): search
@@ -214,7 +237,7 @@ class _Search:
         """The `Fit` of the best search; each row of u starts one."""
         tell(f"compiling the search, then at most {self.max_steps} iterations", 2, NUM_PHASES)
         z = np.broadcast_to(self.part_starts / self.scale, (len(u), *self.part_starts.shape))
-        solve = jax.jit(jax.vmap(self.solve, (0, 0, None)))
+        solve = self.compiled(jax.vmap(_Search.solve, (None, 0, 0, None)))
         ends = [np.asarray(a) for a in solve(u, z, self.shooting.values)]
         squares = np.sum(ends[2] ** 2, axis=1)  # of the misses
         u, z, misses, iterations, good, gap = (a[np.argmin(squares)] for a in ends)
@@ -242,13 +265,19 @@ class _Search:
 
     def again(self, u, z, values):
         """Parameters (k, p) and covariances (k, p, p) of fits to other values (k, m), which start at the end u, z."""
-        unknowns = self.shooting.unknowns
 
-        @jax.jit
-        def refit(values):
-            u_end, z_end, *_ = self.solve(u, z, values)
-            jacobian = without_starts(*self.jacobian(u_end, z_end, values))
+        def refit(search, u, z, values):
+            u_end, z_end, *_ = search.solve(u, z, values)
+            jacobian = without_starts(*search.jacobian(u_end, z_end, values))
             covariance = jnp.linalg.pinv(jacobian.T @ jacobian, hermitian=True)
+            unknowns = search.shooting.unknowns
             return unknowns.vector(unknowns.at(u_end)), covariance
 
-        return jax.lax.map(refit, values, batch_size=50)
+        refits, parts = self.compiled(jax.vmap(refit, (None, None, None, 0))), -(-len(values) // REFITS_AT_ONCE)
+        size = -(-len(values) // parts)
+        padded, fits = np.resize(values, (parts * size, values.shape[1])), []  # one program for all parts
+        with Working("bootstrap") as tell:
+            for i, part in enumerate(np.split(padded, parts)):
+                tell(f"fits {i * size + 1} to {min((i + 1) * size, len(values))} of {len(values)}", i, parts)
+                fits.append([np.asarray(a) for a in refits(u, z, part)])
+        return tuple(np.concatenate(arrays)[: len(values)] for arrays in zip(*fits, strict=True))

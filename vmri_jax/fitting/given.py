@@ -156,17 +156,30 @@ class Unknown:
         if self.scale is not None and not np.all(self.scale > 0):
             raise Refused(f"Unknown: scale is {self.scale}; it must be positive.")
 
+    @property
+    def numbers(self) -> tuple:
+        """Start, bounds and scale."""
+        return self.start, self.lower, self.upper, self.scale
+
+    @classmethod
+    def of(cls, numbers: tuple) -> "Unknown":
+        """The unknown with these `numbers`, which JAX may trace."""
+        unknown = object.__new__(cls)
+        for name, value in zip(("start", "lower", "upper", "scale"), numbers, strict=True):
+            object.__setattr__(unknown, name, value)
+        return unknown
+
     def at(self, u):
         """The parameter for a search variable of the same shape; 0 is the start."""
         if self.lower is None and self.upper is None:
-            size = np.where(self.start == 0, 1.0, np.abs(self.start))
+            size = jnp.where(self.start == 0, 1.0, jnp.abs(self.start))
             return self.start + (size if self.scale is None else self.scale) * u
         if self.upper is None:
             return self.lower + (self.start - self.lower) * jnp.exp(u)
         if self.lower is None:
             return self.upper - (self.upper - self.start) * jnp.exp(u)
         part = (self.start - self.lower) / (self.upper - self.lower)
-        return self.lower + (self.upper - self.lower) * jax.nn.sigmoid(np.log(part / (1 - part)) + u)
+        return self.lower + (self.upper - self.lower) * jax.nn.sigmoid(jnp.log(part / (1 - part)) + u)
 
 
 class Unknowns:
