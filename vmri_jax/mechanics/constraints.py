@@ -25,8 +25,8 @@ from vmri_jax.mechanics.by_name import constraint_sizes
 from vmri_jax.mechanics.functions import Rheonomic
 from vmri_jax.mechanics.masses import correlation
 from vmri_jax.mechanics.projection import mass_and_momentum, time_rates
+from vmri_jax.mechanics.structure import sizes_of_terms
 from vmri_jax.mechanics.system import System
-from vmri_jax.mechanics.terms_of_rows import sizes_of_terms
 from vmri_jax.refusals import Refused
 
 START = 1e-9
