@@ -17,7 +17,7 @@ from vmri_jax.mechanics.arrays import check_precision, is_concrete, real_array
 from vmri_jax.mechanics.arrays import require_x64 as require_x64
 from vmri_jax.mechanics.functions import TracedOnce, traced_once
 from vmri_jax.mechanics.masses import ConstantMass
-from vmri_jax.mechanics.order import order_of, ordered
+from vmri_jax.mechanics.order import order_of
 from vmri_jax.mechanics.surroundings import name_of
 from vmri_jax.mechanics.system import System
 from vmri_jax.refusals import Refused
@@ -121,9 +121,7 @@ def shape_of(name: str, function: Callable, *args):
     Raises:
         ValueError: the function cannot be traced, differentiated, or evaluated.
     """
-
-    has_order = isinstance(function, TracedOnce | ConstantMass)  # the order of its system
-    called: Any = function if has_order else ordered(function, order_of(args[-1]))
+    called: Any = function if isinstance(function, ConstantMass) else traced_once(function, order_of(args[-1]))
 
     def differentiated_twice(*args):
         *moving, params = args
@@ -155,9 +153,7 @@ def shape_of(name: str, function: Callable, *args):
         ) from error
     if not isinstance(function, ConstantMass):
         leaves, structure = jax.tree.flatten(args)
-        fault = _fault(
-            traced_once(called), structure, tuple((np.shape(leaf), jnp.result_type(leaf)) for leaf in leaves)
-        )
+        fault = _fault(called, structure, tuple((np.shape(leaf), jnp.result_type(leaf)) for leaf in leaves))
         if fault:
             raise Refused(f"{name} {fault}.")
     return shape

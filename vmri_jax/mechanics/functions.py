@@ -9,7 +9,7 @@ from functools import lru_cache, partial, wraps
 
 import jax
 
-from vmri_jax.mechanics.order import Order, ordered
+from vmri_jax.mechanics.order import Order, in_order
 from vmri_jax.mechanics.surroundings import Surroundings, innermost, name_of
 from vmri_jax.refusals import Refused
 
@@ -36,17 +36,19 @@ TIME_AND_VELOCITIES = ("t", "v_s", "v_f")
 class TracedOnce:
     """A function of arrays that JAX traces once per process, for given shapes of its arguments and for what it reads from around it.
 
-    Later programs inline the traced operations, as if they had called the function. Two instances are equal if the codes of their functions
-    and their surroundings are. A pytree node without arrays, whose structure is what the function reads.
+    Later programs inline the traced operations, as if they had called the function. Two instances are equal if the codes of their functions,
+    their surroundings and their orders are. A pytree node without arrays, whose structure is what the function reads.
 
     Args:
         function: of the user.
         seen: key of its `Surroundings` when a run was made; None for what the function reads now. With `seen` new traces after a change are
             refused: they would mix old and new numbers.
+        order: in which the function gets the dictionaries in its last argument, the params; None for the order in which they come.
     """
 
     function: Callable
     seen: Hashable = None
+    order: Order | None = None
 
     def __call__(self, *arguments):
         return _traced(self if self.seen is not None else self.now())(*arguments)
@@ -59,6 +61,9 @@ class TracedOnce:
                 f"{name_of(self)} reads something else from around it than when its run was made. Make the run again; what varies is better "
                 "handed over in params."
             )
+        if self.order is not None:
+            *others, params = arguments
+            arguments = *others, in_order(params, self.order)
         value = self.function(*arguments)
         around.before(Surroundings(self.function))
         return value
@@ -68,7 +73,7 @@ class TracedOnce:
         last = vars(self).get("last")
         if last is None or not last[0].hold():
             around = Surroundings(self.function)
-            last = vars(self)["last"] = around, TracedOnce(self.function, around.key)
+            last = vars(self)["last"] = around, TracedOnce(self.function, around.key, self.order)
         return last[1]
 
     @property
@@ -78,7 +83,7 @@ class TracedOnce:
 
     @property
     def _key(self) -> Hashable:
-        return self.now().seen if self.seen is None else self.seen
+        return self.now().seen if self.seen is None else self.seen, self.order
 
     def __eq__(self, other) -> bool:
         return isinstance(other, TracedOnce) and self._key == other._key
@@ -90,7 +95,7 @@ class TracedOnce:
         return repr(self.function)
 
     def __reduce__(self):  # code cannot be pickled; another process reads what is there
-        return TracedOnce, (self.function,)
+        return TracedOnce, (self.function, None, self.order)
 
     def tree_flatten(self):
         """No arrays; the structure is what the function reads, and whether it keeps that."""
@@ -100,7 +105,7 @@ class TracedOnce:
     def tree_unflatten(cls, structure, _):
         """The inverse of `tree_flatten`."""
         reads_now, function = structure
-        return cls(function.function) if reads_now else function
+        return cls(function.function, order=function.order) if reads_now else function
 
 
 class CompiledAgainWarning(UserWarning):
@@ -141,9 +146,9 @@ _made: Counter = Counter()
 
 def traced_once(function: Callable, order: Order | None = None) -> TracedOnce:
     """`function` as `TracedOnce`, with an order of its params; one that has an order keeps it."""
-    inner = function.function if isinstance(function, TracedOnce) else function
-    within = ordered(inner, order)
-    return function if isinstance(function, TracedOnce) and within is inner else TracedOnce(within)
+    if not isinstance(function, TracedOnce):
+        return TracedOnce(function, order=order)
+    return function if order is None or function.order else TracedOnce(function.function, order=order)
 
 
 def check_arguments(place: str, function: Callable, arguments: str, instead: str = "") -> None:

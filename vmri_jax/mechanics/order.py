@@ -5,8 +5,6 @@ the order of writing, ``zip(params["k"].values(), q_f.values())``. So the order 
 back into its order before a function is called, while JAX traces.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import jax
@@ -22,23 +20,6 @@ class Order(NamedTuple):
 
     names: tuple[Any, ...] | None
     parts: tuple["Order | None", ...]
-
-
-@dataclass(frozen=True)
-class InOrder:
-    """A function that gets its last argument, the params, with dictionaries in an order; compared by function and order."""
-
-    function: Callable
-    order: Order
-
-    def __call__(self, *arguments):
-        *others, params = arguments
-        return self.function(*others, in_order(params, self.order))
-
-
-def ordered(function: Callable, order: Order | None) -> Callable:
-    """The function as `InOrder`; itself without an order, or if it has one."""
-    return function if order is None or isinstance(function, InOrder) else InOrder(function, order)
 
 
 def order_of(tree: Any) -> Order | None:
