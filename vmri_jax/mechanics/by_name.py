@@ -7,6 +7,7 @@ code behind the problem handles dictionaries.
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
