@@ -43,6 +43,11 @@ def _is_traced(leaf) -> bool:
     return isinstance(leaf, jax.core.Tracer)  # pyright: ignore[reportAttributeAccessIssue]
 
 
+def numbers_of(tree):
+    """The arrays of a pytree by NumPy; tracers unchanged."""
+    return jax.device_get(tree) if is_concrete(tree) else tree
+
+
 class Known:
     """A pytree of concrete numbers as an argument of cached functions: equal to every other one of the same structure and numbers."""
 

@@ -17,10 +17,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
-from scipy.linalg import block_diag
 
 from vmri_jax.kernels import matvec, max_abs
-from vmri_jax.mechanics.arrays import Numbers, is_known, library, quickly_compiled
+from vmri_jax.mechanics.arrays import Numbers, is_known, library, numbers_of, quickly_compiled
 from vmri_jax.mechanics.by_name import constraint_sizes
 from vmri_jax.mechanics.functions import Rheonomic
 from vmri_jax.mechanics.masses import correlation
@@ -149,14 +148,6 @@ def weights_of(masses):
     return xp.sqrt(xp.where(masses > 0, masses, 1.0))
 
 
-def weights_at(system: System, q_s, q_f):
-    """(n,) the weights w at positions."""
-    if system.has_constant_mass:
-        return weights_of(jnp.concatenate(system.kinetic.diagonal))
-    masses, _ = mass_and_momentum(system, q_s, q_f, jnp.zeros_like(q_s), jnp.zeros_like(q_f))
-    return weights_of(jnp.diagonal(masses))
-
-
 def are_kept(rows: Rows, solved: int, tolerance):
     """Whether a state of a run keeps the rows that are solved for, and the implied ones.
 
@@ -171,43 +162,29 @@ def are_kept(rows: Rows, solved: int, tolerance):
 
 
 class Configuration(NamedTuple):
-    """The `Rows` at a configuration, and of the rows that are solved for the Jacobian G, and dg/dt."""
+    """The `Rows` at a configuration, the mass matrix, and of the rows that are solved for the values g, the Jacobian G, and dg/dt."""
 
     rows: Rows
-    jacobian: np.ndarray
-    rates: np.ndarray
-
-    @property
-    def solved(self) -> tuple[np.ndarray, np.ndarray]:
-        """g and G."""
-        return self.rows.values[: len(self.rates)], self.jacobian
+    mass: Any
+    values: Any
+    jacobian: Any
+    rates: Any
 
 
-def configuration(system: System, t, q_s, q_f) -> Configuration:
-    """The `Configuration` at numbers: one program for the projection of a start, its momenta, and its checks."""
-    weights = weights_of(np.diagonal(known_mass(system, q_s, q_f)))
-    rows, rates = jax.device_get(_rows_and_rates(system, t, q_s, q_f, weights))
-    return Configuration(rows, rows.gradients[: len(rates)] * weights, rates)
+def configuration(system: System, t, q_s, q_f, mass=None) -> Configuration:
+    """The `Configuration`, with the mass matrix at rest unless it is given: of numbers, one program for the projection of a start, its momenta,
+    and its checks."""
+    if mass is None:
+        mass, _ = mass_and_momentum(system, q_s, q_f, np.zeros(np.shape(q_s)), np.zeros(np.shape(q_f)))
+    weights = weights_of(mass.diagonal())
+    rows, rates = numbers_of(_rows_and_rates(system, t, q_s, q_f, weights))
+    solved = len(rates)
+    return Configuration(rows, mass, rows.values[:solved], rows.gradients[:solved] * weights, rates)
 
 
 @quickly_compiled
 def _rows_and_rates(system, t, q_s, q_f, weights):
     return rows_at(system, t, q_s, q_f, weights), time_rates(system, t, q_s, q_f)
-
-
-def known_mass(system: System, q_s, q_f) -> np.ndarray:
-    """Mass matrix (n, n) at rest, of numbers."""
-    return known_mass_and_momentum(system, q_s, q_f, np.zeros(np.shape(q_s)), np.zeros(np.shape(q_f)))[0]
-
-
-def known_mass_and_momentum(system: System, q_s, q_f, v_s, v_f) -> tuple[np.ndarray, np.ndarray]:
-    """Mass matrix ``d2T/dv2`` (n, n) and momentum ``dT/dv`` (n,) of numbers; constant masses need no program."""
-    if system.has_constant_mass:
-        masses = map(np.asarray, (system.kinetic.slow, system.kinetic.fast))
-        mass = np.asarray(block_diag(*(np.diag(mass) if mass.ndim == 1 else mass for mass in masses if mass.size)))
-        return mass, mass @ np.concatenate([v_s, v_f])
-    mass, momentum = _mass_and_momentum(system, q_s, q_f, v_s, v_f)
-    return np.asarray(mass), np.asarray(momentum)
 
 
 def check_mass(system: System, q_s, q_f) -> None:
@@ -224,7 +201,7 @@ def check_mass(system: System, q_s, q_f) -> None:
     with nullcontext() if is_known(()) else jax.ensure_compile_time_eval():
         random = np.random.default_rng(0)
         velocities = (SPEED * random.normal(size=np.size(q)) for q in (q_s, q_f))
-        mass, _ = known_mass_and_momentum(system, q_s, q_f, *velocities)
+        mass, _ = mass_and_momentum(system, q_s, q_f, *velocities)
     if not np.isfinite(mass).all():
         raise Refused("System: the mass matrix d2T/dv2 of kinetic is not finite at these positions (a norm at zero?).")
     values, vectors = np.linalg.eigh(correlation(mass))
@@ -240,9 +217,6 @@ def check_mass(system: System, q_s, q_f) -> None:
             f"(with a diagonal of ones, its eigenvalues go from {values[0]:.3g} to {values[-1]:.3g}). Give every coordinate a mass, one that "
             "constraints move too."
         )
-
-
-_mass_and_momentum = quickly_compiled(mass_and_momentum)
 
 
 def check_constraints(
@@ -271,9 +245,8 @@ def check_constraints(
         return _rows_in_words(getattr(system, name), rows, *arguments, system.params)
 
     n_s, (n_g, n_gs) = np.size(state.q_s), system.num_constraints(state.q_s, state.q_f)
-    rows = configuration(system, state.t, state.q_s, state.q_f).rows
-    weights = weights_of(np.diagonal(known_mass(system, state.q_s, state.q_f)))
-    solved = rows.values[: n_g + n_gs]
+    rows, mass, solved, *_ = configuration(system, state.t, state.q_s, state.q_f)
+    weights = weights_of(mass.diagonal())
     if not np.isfinite(solved).all():
         raise Refused(f"{place}: the constraints are {solved} there, which is not finite.")
     if not (np.isfinite(rows.gradients).all()):
