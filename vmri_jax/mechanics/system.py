@@ -127,8 +127,7 @@ class System(eqx.Module):
             )
         if not callable(kinetic):
             raise Refused(
-                f"System: kinetic is {kinetic!r}; give ConstantMass(slow, fast) or a function "
-                "kinetic(q_s, q_f, v_s, v_f, params)."
+                f"System: kinetic is {kinetic!r}; give ConstantMass(slow, fast) or a function kinetic(q_s, q_f, v_s, v_f, params)."
             )
         self.kinetic = kinetic if isinstance(kinetic, ConstantMass) else _checked("kinetic", kinetic, order)
         self.params = params
@@ -266,22 +265,44 @@ class System(eqx.Module):
         return jax.eval_shape(self.g, t, q_s, q_f).shape[0], jax.eval_shape(self.g_slow, t, q_s).shape[0]
 
 
-def _checked(name: str, function, order: Order | None):
-    """The function as `TracedOnce` or `Rheonomic`, after checks; None for None. `order` is of the params."""
-    if function is None:
+def _checked(name: str, function, order: Order | None, place: str = "") -> Any:
+    """A function as `TracedOnce` or `Rheonomic`, after checks of its hash and of the arguments of its `Kind`; None for no function.
+
+    Args:
+        name: its field.
+        order: of the params.
+        place: of the function in messages, if it is not its field.
+    """
+    kind, place = KINDS[name], f"System: {place or name}"
+    holds = kind.kind in ("constraint", "implied")
+    if function is None and name != "potentials":
         return None
-    if isinstance(function, Rheonomic) and KINDS[name].kind in ("constraint", "implied"):
-        _check_function(name, function.function, "t, ")
-        return Rheonomic(traced_once(function.function, order))
-    if isinstance(function, ConstantMass):
-        raise Refused(f"System: {name} is a ConstantMass; masses come first, System(ConstantMass(slow, fast), V, W).")
-    if not callable(function):
-        raise Refused(f"System: {name} is {function!r}; it must be a function or None.")
-    _check_function(name, function)
-    return traced_once(function, order)
+    if isinstance(function, Rheonomic) and holds:
+        inner, call = function.function, f"t, {kind.call}"
+    else:
+        inner, call = function, kind.call
+    if isinstance(inner, ConstantMass):
+        raise Refused(f"{place} is a ConstantMass; masses come first, System(ConstantMass(slow, fast), V, W).")
+    if not callable(inner):
+        raise Refused(
+            f"{place} is {function!r}; it must be a function of ({call}){', or None' * (name != 'potentials')}."
+        )
+    try:
+        hash(inner)
+    except TypeError:
+        raise Refused(
+            f"{place} is {inner!r}, which has no hash: programs are compiled once per function. Give a plain function, with what varies in "
+            "params."
+        ) from None
+    instead = "" if name == "force" else NO_VELOCITY if holds else NO_TIME
+    if name == "fast_potential" and "q_s" in getattr(getattr(inner, "__code__", None), "co_varnames", ()):
+        instead = FAST_ALONE
+    check_arguments(place, inner, call, instead.format(**_INSTEAD))
+    traced = traced_once(inner, order)
+    return traced if inner is function else Rheonomic(traced)
 
 
-def _named_potentials(potentials, order: Order | None) -> "Potentials":
+def _named_potentials(potentials, order: Order | None) -> Potentials:
     """Pairs of a name and a function, from a mapping or from pairs."""
     try:
         named = dict(potentials)
@@ -289,7 +310,7 @@ def _named_potentials(potentials, order: Order | None) -> "Potentials":
         raise Refused(
             f"System: potentials is {potentials!r}; give functions by name, e.g. potentials={{'bends': V_1, 'bonds': V_2}}."
         ) from None
-    for name, function in named.items():
+    for name in named:
         if isinstance(name, bool) or not isinstance(name, str | int) or (isinstance(name, int) and name < 1):
             raise Refused(
                 f"System: potentials has the name {name!r}; give a text, or a whole number k of at least 1 for a potential on every k-th "
@@ -300,23 +321,5 @@ def _named_potentials(potentials, order: Order | None) -> "Potentials":
                 f"System: potentials has the name {name!r}, which is the name of another term: one of {', '.join(RESERVED)}, or V_k of the "
                 "potential k. Take another name."
             )
-        if function is None or isinstance(function, ConstantMass) or not callable(function):
-            raise Refused(f"System: potentials[{name!r}] is {function!r}; it must be a function of (q_s, q_f, params).")
-        _check_function("potentials", function)
-    return Potentials((name, traced_once(function, order)) for name, function in named.items())
-
-
-def _check_function(name: str, function, before: str = "") -> None:
-    """Refuse a function without a hash, or whose arguments are not `before` and then the arguments of its `Kind`."""
-    try:
-        hash(function)
-    except TypeError:
-        raise Refused(
-            f"System: {name} is {function!r}, which has no hash: programs are compiled once per function. Give a plain "
-            "function, with what varies in params."
-        ) from None
-    holonomic = KINDS[name].kind in ("constraint", "implied")
-    instead = "" if name == "force" else NO_VELOCITY if holonomic else NO_TIME
-    if name == "fast_potential" and "q_s" in getattr(getattr(function, "__code__", None), "co_varnames", ()):
-        instead = FAST_ALONE
-    check_arguments(f"System: {name}", function, before + KINDS[name].call, instead.format(**_INSTEAD))
+    places = {name: f"potentials[{name!r}]" for name in named}
+    return Potentials((name, _checked("potentials", named[name], order, place)) for name, place in places.items())
