@@ -266,27 +266,17 @@ class System(eqx.Module):
 
 
 def _checked(name: str, function, order: Order | None, place: str = "") -> Any:
-    """A function as `TracedOnce` or `Rheonomic`, after checks of its hash and of the arguments of its `Kind`; None for no function.
-
-    Args:
-        name: its field.
-        order: of the params.
-        place: of the function in messages, if it is not its field.
-    """
+    """The function of a field as `TracedOnce` or `Rheonomic`, after checks; None for no function. `order` is of the params, `place` for messages."""
     kind, place = KINDS[name], f"System: {place or name}"
-    holds = kind.kind in ("constraint", "implied")
     if function is None and name != "potentials":
         return None
-    if isinstance(function, Rheonomic) and holds:
-        inner, call = function.function, f"t, {kind.call}"
-    else:
-        inner, call = function, kind.call
+    holds = kind.kind in ("constraint", "implied")
+    moves = holds and isinstance(function, Rheonomic)
+    inner, call = (function.function, f"t, {kind.call}") if moves else (function, kind.call)
     if isinstance(inner, ConstantMass):
         raise Refused(f"{place} is a ConstantMass; masses come first, System(ConstantMass(slow, fast), V, W).")
     if not callable(inner):
-        raise Refused(
-            f"{place} is {function!r}; it must be a function of ({call}){', or None' * (name != 'potentials')}."
-        )
+        raise Refused(f"{place} is {function!r}; it must be a function{' or None' * (name != 'potentials')}.")
     try:
         hash(inner)
     except TypeError:
@@ -299,7 +289,7 @@ def _checked(name: str, function, order: Order | None, place: str = "") -> Any:
         instead = FAST_ALONE
     check_arguments(place, inner, call, instead.format(**_INSTEAD))
     traced = traced_once(inner, order)
-    return traced if inner is function else Rheonomic(traced)
+    return Rheonomic(traced) if moves else traced
 
 
 def _named_potentials(potentials, order: Order | None) -> Potentials:
