@@ -265,7 +265,7 @@ class System(eqx.Module):
         return jax.eval_shape(self.g, t, q_s, q_f).shape[0], jax.eval_shape(self.g_slow, t, q_s).shape[0]
 
 
-def _checked(name: str, function, order: Order | None, place: str = "") -> Any:
+def _checked(name: str, function: Any, order: Order | None, place: str = "") -> Any:
     """The function of a field as `TracedOnce` or `Rheonomic`, after checks; None for no function. `order` is of the params, `place` for messages."""
     kind, place = KINDS[name], f"System: {place or name}"
     if function is None and name != "potentials":
