@@ -245,7 +245,7 @@ class Unhashable:
 @pytest.mark.parametrize("make", [vm.fully_implicit, vm.explicit_slow, lambda n: vm.galerkin(n, 2)])
 def test_bad_num_micro(make):
     for bad in (0, -3):
-        with pytest.raises(ValueError, match=f"num_micro is {bad}; it must be at least 1"):
+        with pytest.raises(ValueError, match=f"num_micro is {bad}; it must be an integer of at least 1"):
             make(bad)
     for bad in (2.0, "5", True, None):
         with pytest.raises(TypeError, match=f"num_micro is {bad!r}; it must be an integer"):

@@ -54,10 +54,11 @@ def check_flags(**flags) -> None:
             raise Refused(f"{name} is {value!r}; it must be True or False.")
 
 
-def check_type(name: str, value, kind: type | UnionType, example: str) -> None:
-    """Refuse objects of another class; `example` in the message names a right object."""
+def check_type(name: str, value, kind: type | UnionType, example: str) -> Any:
+    """The value; objects of another class are refused, and `example` in the message names a right object."""
     if not isinstance(value, kind):
         raise Refused(f"{name} is {type(value).__name__}; give {example}.")
+    return value
 
 
 def check_params(params) -> None:

@@ -271,8 +271,9 @@ def _checked(name: str, function: Any, order: Order | None, place: str = "") -> 
     if function is None and name != "potentials":
         return None
     holds = kind.kind in ("constraint", "implied")
-    moves = holds and isinstance(function, Rheonomic)
-    inner, call = (function.function, f"t, {kind.call}") if moves else (function, kind.call)
+    inner, call, moves = function, kind.call, False
+    if isinstance(function, Rheonomic) and holds:
+        inner, call, moves = function.function, f"t, {call}", True
     if isinstance(inner, ConstantMass):
         raise Refused(f"{place} is a ConstantMass; masses come first, System(ConstantMass(slow, fast), V, W).")
     if not callable(inner):

@@ -24,7 +24,7 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
-from vmri_jax.mechanics.arrays import is_concrete
+from vmri_jax.mechanics.arrays import is_concrete, whole_number
 from vmri_jax.mechanics.system import RATE_OF
 from vmri_jax.mechanics.terms import label
 from vmri_jax.refusals import Refused
@@ -82,8 +82,8 @@ class Scheme(eqx.Module):
     potentials: dict[Any, PlacedRule] = eqx.field(default_factory=dict)
 
     def __post_init__(self):
-        self.num_micro = _positive_integer("num_micro", self.num_micro)
-        self.degree = _positive_integer("degree", self.degree)
+        self.num_micro = whole_number("Scheme: num_micro", self.num_micro)
+        self.degree = whole_number("Scheme: degree", self.degree)
         at_control_nodes = lobatto(self.degree + 1)
         self.force = self.kinetic if self.force is None else self.force
         self.constraint = micro(at_control_nodes) if self.constraint is None else self.constraint
@@ -110,15 +110,14 @@ class Scheme(eqx.Module):
                 "Scheme: the kinetic rule must be placed with micro(...); each micro interval has a velocity."
             )
         _check_kinetic(self.kinetic.rule, self.degree)
-        filtered = [name for name in ("kinetic", "fast", "force", "constraint") if getattr(self, name).mollified]
-        if filtered or (self.slow.mollified and self.fast.grid != "micro"):
-            raise Refused(
-                f"Scheme: {filtered or 'slow'} is mollified; only kicks of the slow potential can be, along fast motion on the "
-                "micro grid: slow=mollified(macro(...)) with fast=micro(...)."
-            )
         grids = {"slow": "macro", "fast": "micro"}
-        for name in ("kinetic", "slow", "fast", "force", "constraint"):
+        for name in RULES.values():
             placed = getattr(self, name)
+            if placed.mollified and (name != "slow" or self.fast.grid != "micro"):
+                raise Refused(
+                    f"Scheme: {name} is mollified; only kicks of the slow potential can be, along fast motion on the micro grid: "
+                    "slow=mollified(macro(...)) with fast=micro(...)."
+                )
             if placed.gradient_corrected and (placed.grid != grids.get(name) or self.degree > 1):
                 raise Refused(
                     f"Scheme: {name} on the {placed.grid} grid, degree {self.degree}, is corrected; only kicks of a path of degree 1 "
@@ -256,14 +255,6 @@ def _on_grid(name: str, placed: PlacedRule, num_micro: int) -> PlacedRule:
     return PlacedRule(placed.rule, "macro") if placed.every == num_micro > 1 else placed
 
 
-def _positive_integer(name: str, value) -> int:
-    if isinstance(value, bool) or not isinstance(value, int | np.integer):
-        raise Refused(f"Scheme: {name} is {value!r}; it must be an integer of at least 1.")
-    if value < 1:
-        raise Refused(f"Scheme: {name} is {value}; it must be at least 1.")
-    return int(value)
-
-
 def _check_kinetic(rule: Rule, degree: int) -> None:
     """Refuse rules by which a motion of the path has no positive kinetic energy: ``sum_i w_i l_j'(c_i) l_k'(c_i)`` is not positive definite."""
     slopes = lagrange_derivative(degree, np.array(rule.nodes))[:, 1:]
@@ -375,7 +366,7 @@ def galerkin(num_micro: int, degree: int, rule: Rule | str = "gauss") -> Scheme:
         degree: r, of the polynomials.
         rule: "gauss", "lobatto", or any `Rule`.
     """
-    degree = _positive_integer("degree", degree)
+    whole_number("galerkin: degree", degree)
     if isinstance(rule, str):
         if rule not in ("gauss", "lobatto"):
             raise Refused(f"galerkin: rule is {rule!r}; it must be 'gauss', 'lobatto' or a Rule.")
