@@ -258,7 +258,7 @@ HALF = vm.micro(vm.quadrature.midpoint)
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"degree": 0}, "degree is 0; it must be at least 1"),
+        ({"degree": 0}, "degree is 0; it must be an integer of at least 1"),
         ({"degree": 1.5}, "degree is 1.5; it must be an integer"),
         ({"slow": vm.macro(2 * vm.quadrature.left)}, "weights of the slow rule sum to 2; they must sum to 1"),
         ({"fast": vm.quadrature.left}, r"fast is a bare rule; say on which grid .* macro\(rule\) or micro"),

@@ -127,7 +127,7 @@ def discrete_lagrangian(system: System, scheme: Scheme, slow, fast, macro_dt):
         kinetic += action(macro(scheme.kinetic.rule), lambda q_s, q_f, v_s, v_f: T_s(q_s, v_s, system.params))
     L_d = kinetic - action(scheme.slow, lambda q_s, q_f, v_s, v_f: slow_potential(q_s, q_f))
     L_d -= action(scheme.fast, lambda q_s, q_f, v_s, v_f: fast_potential(q_s, q_f))
-    for name, V in system.potentials:
+    for name, V in system.potentials.items():
         L_d -= action(scheme.rule_of(name), lambda q_s, q_f, v_s, v_f, V=V: V(q_s, q_f, system.params))
     return L_d
 

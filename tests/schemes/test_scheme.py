@@ -87,9 +87,10 @@ def test_potentials_have_rules_by_name():
     assert scheme.with_potentials(c=micro(quadrature.left)).order == 1
     assert not scheme.with_potentials(c=micro(quadrature.left)).is_symmetric
     base = fully_explicit(4)
-    second = {2: micro(kicks, every=2)}
+    second = {2: micro(kicks, every=2), "a": micro(kicks)}
     rates = Scheme(4, kinetic=base.kinetic, slow=base.slow, fast=base.fast, potentials=second)
     assert "V_2" in str(rates.describe())
+    assert list(jax.tree.map(np.asarray, rates).potentials) == [2, "a"]
 
 
 @pytest.mark.parametrize(

@@ -23,7 +23,7 @@ from vmri_jax.mechanics.order import Order, order_of
 from vmri_jax.mechanics.slots import check_computed
 from vmri_jax.mechanics.summary import numbers, parameters, summary
 from vmri_jax.mechanics.surroundings import name_of
-from vmri_jax.mechanics.terms import KINDS, Term, label
+from vmri_jax.mechanics.terms import KINDS, Named, Term, label
 from vmri_jax.refusals import Refused
 
 RESERVED = ("kinetic", "path", "order", "solves", *(kind.symbol for kind in KINDS.values() if kind.symbol))
@@ -39,17 +39,6 @@ _INSTEAD = {
     "force": "force(t, q_s, q_f, v_s, v_f, params) -> (F_s, F_f)",
     "moving": "Rheonomic(function), whose function gets t first",
 }
-
-
-class Potentials(tuple[tuple[str | int, TracedOnce], ...]):
-    """Pairs of a name and a function; as a pytree the names are structure."""
-
-
-jax.tree_util.register_pytree_node(
-    Potentials,
-    lambda potentials: ([function for _, function in potentials], tuple(name for name, _ in potentials)),
-    lambda names, functions: Potentials(zip(names, functions, strict=True)),
-)
 
 
 class System(eqx.Module):
@@ -75,7 +64,7 @@ class System(eqx.Module):
         potentials: further potentials ``V_i(q_s, q_f, params) -> ()`` by name, each with a rate of its own: a scheme has a rule for each
             name, see `vmri_jax.Scheme.with_potentials`. The names "slow" and "fast" have the rules of V and of W unless the scheme says
             otherwise, so that ``{"fast": V_1}`` is a potential on the micro grid that may join slow and fast variables. The name k, a
-            whole number, has the trapezoidal rule on every k-th micro node. Kept as pairs of a name and a function.
+            whole number, has the trapezoidal rule on every k-th micro node.
 
     A run uses what its functions read from around them when it is made: globals, helpers, closures, attributes, see
     `vmri_jax.mechanics.surroundings`. Functions with the same code and surroundings are the same; for others everything is compiled again, so
@@ -92,7 +81,7 @@ class System(eqx.Module):
     params: Any = None
     implied: TracedOnce | Rheonomic | None = None
     slow_kinetic: TracedOnce | None = None
-    potentials: Potentials = Potentials()
+    potentials: Named[TracedOnce] = eqx.field(default_factory=Named)
 
     def __init__(  # Equinox flattens the arguments of a generated one, and potentials may have names of two types
         self,
@@ -141,8 +130,8 @@ class System(eqx.Module):
         """The terms that the system has, see `vmri_jax.mechanics.terms`."""
         terms = []
         for field in KINDS:
-            functions = self.potentials if field == "potentials" else [("", getattr(self, field))]
-            terms += [Term.of(field, function, name) for name, function in functions if function is not None]
+            functions = self.potentials if field == "potentials" else {"": getattr(self, field)}
+            terms += [Term.of(field, function, name) for name, function in functions.items() if function is not None]
         return tuple(terms)
 
     def of_kind(self, kind: str) -> tuple[Term, ...]:
@@ -293,8 +282,8 @@ def _checked(name: str, function: Any, order: Order | None, place: str = "") -> 
     return Rheonomic(traced) if moves else traced
 
 
-def _named_potentials(potentials, order: Order | None) -> Potentials:
-    """Pairs of a name and a function, from a mapping or from pairs."""
+def _named_potentials(potentials, order: Order | None) -> Named:
+    """Functions by name, from a mapping or from pairs."""
     try:
         named = dict(potentials)
     except (TypeError, ValueError):
@@ -313,4 +302,4 @@ def _named_potentials(potentials, order: Order | None) -> Potentials:
                 "potential k. Take another name."
             )
     places = {name: f"potentials[{name!r}]" for name in named}
-    return Potentials((name, _checked("potentials", named[name], order, place)) for name, place in places.items())
+    return Named({name: _checked("potentials", named[name], order, place) for name, place in places.items()})

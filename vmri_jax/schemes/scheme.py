@@ -18,7 +18,8 @@ of order 1, each the adjoint of the other. Any other alpha also has order 1. alp
 """
 
 import math
-from dataclasses import KW_ONLY, replace
+from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -26,7 +27,7 @@ import numpy as np
 
 from vmri_jax.mechanics.arrays import is_concrete, whole_number
 from vmri_jax.mechanics.system import RATE_OF
-from vmri_jax.mechanics.terms import label
+from vmri_jax.mechanics.terms import Named, label
 from vmri_jax.refusals import Refused
 from vmri_jax.schemes.description import RULES, Description, printed
 from vmri_jax.schemes.path import control_nodes, lagrange_derivative
@@ -71,23 +72,34 @@ class Scheme(eqx.Module):
     """
 
     num_micro: int = eqx.field(static=True)
-    degree: int = eqx.field(static=True, default=1)
-    _: KW_ONLY
+    degree: int = eqx.field(static=True)
     kinetic: PlacedRule
     slow: PlacedRule
     fast: PlacedRule
-    constraint: PlacedRule = eqx.field(default=None)
-    slow_constraint: PlacedRule = eqx.field(default=None)
-    force: PlacedRule = eqx.field(default=None)
-    potentials: dict[Any, PlacedRule] = eqx.field(default_factory=dict)
+    constraint: PlacedRule
+    slow_constraint: PlacedRule
+    force: PlacedRule
+    potentials: Named[PlacedRule]
 
-    def __post_init__(self):
-        self.num_micro = whole_number("Scheme: num_micro", self.num_micro)
-        self.degree = whole_number("Scheme: degree", self.degree)
+    def __init__(  # Equinox flattens the arguments of a generated one, and potentials may have names of two types
+        self,
+        num_micro: int,
+        degree: int = 1,
+        *,
+        kinetic: PlacedRule,
+        slow: PlacedRule,
+        fast: PlacedRule,
+        constraint: PlacedRule | None = None,
+        slow_constraint: PlacedRule | None = None,
+        force: PlacedRule | None = None,
+        potentials: Mapping[Any, PlacedRule] | None = None,
+    ):
+        self.num_micro = whole_number("Scheme: num_micro", num_micro)
+        self.degree = whole_number("Scheme: degree", degree)
         at_control_nodes = lobatto(self.degree + 1)
-        self.force = self.kinetic if self.force is None else self.force
-        self.constraint = micro(at_control_nodes) if self.constraint is None else self.constraint
-        self.slow_constraint = macro(at_control_nodes) if self.slow_constraint is None else self.slow_constraint
+        self.kinetic, self.slow, self.fast, self.force = kinetic, slow, fast, kinetic if force is None else force
+        self.constraint = micro(at_control_nodes) if constraint is None else constraint
+        self.slow_constraint = macro(at_control_nodes) if slow_constraint is None else slow_constraint
         for name in RULES.values():
             _check_placed(name, getattr(self, name))
             if getattr(self, name).every > 1 and name not in ("slow", "fast"):
@@ -96,7 +108,7 @@ class Scheme(eqx.Module):
                     "with_potentials(...). Take micro(rule) or macro(rule)."
                 )
         self.slow, self.fast = (_on_grid(name, getattr(self, name), self.num_micro) for name in ("slow", "fast"))
-        self.potentials = dict(self.potentials)
+        self.potentials = Named(potentials or {})
         for name, placed in self.potentials.items():
             _check_placed(name, placed)
             if placed.mollified or placed.gradient_corrected:
@@ -244,7 +256,7 @@ class Scheme(eqx.Module):
         return Description(self.order, self.is_symmetric, rules, 1, self.num_micro, self.degree, *costs)
 
 
-def _on_grid(name: str, placed: PlacedRule, num_micro: int) -> PlacedRule:
+def _on_grid(name: str | int, placed: PlacedRule, num_micro: int) -> PlacedRule:
     """The placed rule, moved to the macro grid if one copy of it spans the macro interval."""
     if placed.every > 1 and num_micro % placed.every:
         divisors = [k for k in range(1, num_micro + 1) if num_micro % k == 0]
@@ -266,7 +278,7 @@ def _check_kinetic(rule: Rule, degree: int) -> None:
         )
 
 
-def _check_placed(name: str, placed) -> None:
+def _check_placed(name: str | int, placed) -> None:
     if isinstance(placed, Rule):
         raise Refused(f"Scheme: {name} is a bare rule; say on which grid it lives, macro(rule) or micro(rule).")
     if not isinstance(placed, PlacedRule):
