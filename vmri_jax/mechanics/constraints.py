@@ -26,6 +26,7 @@ from vmri_jax.mechanics.masses import correlation
 from vmri_jax.mechanics.projection import mass_and_momentum, time_rates
 from vmri_jax.mechanics.structure import sizes_of_terms
 from vmri_jax.mechanics.system import System
+from vmri_jax.mechanics.terms import Term
 from vmri_jax.refusals import Refused
 
 START = 1e-9
@@ -239,69 +240,100 @@ def check_constraints(
     """
     if not system.is_constrained:
         return
-
-    def in_words(rows, name: str) -> str:
-        arguments = (state.q_s,) if name == "slow_constraint" else (state.q_s, state.q_f)
-        return _rows_in_words(getattr(system, name), rows, *arguments, system.params)
-
-    n_s, (n_g, n_gs) = np.size(state.q_s), system.num_constraints(state.q_s, state.q_f)
-    rows, mass, solved, *_ = configuration(system, state.t, state.q_s, state.q_f)
+    held, (rows, mass, solved, *_) = _held(system, state), configuration(system, state.t, state.q_s, state.q_f)
     weights = weights_of(mass.diagonal())
     if not np.isfinite(solved).all():
         raise Refused(f"{place}: the constraints are {solved} there, which is not finite.")
-    if not (np.isfinite(rows.gradients).all()):
+    if not np.isfinite(rows.gradients).all():
         raise Refused("System: the Jacobian of the constraints is not finite at these positions (a norm at zero?).")
-
-    def gradients(rows: Rows):
-        """dg/dq_s, dg/dq_f and dg_slow/dq_s over the weights."""
-        return rows.gradients[:n_g, :n_s], rows.gradients[:n_g, n_s:], rows.gradients[n_g : n_g + n_gs, :n_s]
-
-    slow, fast, alone = gradients(rows)
-    allowed = rows.allowed(tolerance)[: n_g + n_gs]
+    allowed = rows.allowed(tolerance)[: len(solved)]
     violated = np.abs(solved) > allowed
     if violated.any():
-        _check_gradients(system, state, rows, weights, in_words)  # of a square, which no start fulfils to round-off
+        _check_gradients(system, state, held, rows, weights)  # of a square, which no start fulfils to round-off
         worst = int(np.argmax(np.abs(solved) / np.where(violated, allowed, np.inf)))
-        row = in_words([worst], "constraint") if worst < n_g else in_words([worst - n_g], "slow_constraint")
+        [part] = [part for part in held if part.rows.start <= worst < part.rows.stop]
         raise Refused(
-            f"{place} violate {'constraint' if worst < n_g else 'slow_constraint'}, row {row.strip('[]')}, by {abs(solved[worst]):.3e} (allowed: "
+            f"{place} violate {part.term.field}, row {part.in_words([worst - part.rows.start]).strip('[]')}, by {abs(solved[worst]):.3e} (allowed: "
             f"{allowed[worst]:.0e}, {tolerance:.0e} of its size, and round-off); {advice}"
         )
-    _check_implied(rows, n_g + n_gs, place)
-
-    size = np.linalg.norm(np.concatenate([slow, fast], axis=1), axis=1)
-    slow_only = np.flatnonzero((size > 0) & (np.linalg.norm(fast, axis=1) <= LEAST_FAST_PART * size))
-    if slow_only.size:
-        raise Refused(
-            f"System: row(s) {in_words(slow_only, 'constraint')} of constraint do not depend on the fast variables q_f. {MICRO_GRID} "
-            "Give them as System(slow_constraint=...), a function of (q_s, params), which is held at the macro nodes; or make the "
-            "variables that they hold fast."
-        )
-    _check_counts(fast, alone)
-    _check_gradients(system, state, rows, weights, in_words)
-    if any(dependent for _, dependent in map(rank_of, (alone, fast))):
+    _check_implied(rows, len(solved), place)
+    for part in held:
+        every, own = rows.gradients[part.rows], rows.gradients[part.rows, part.variables]
+        size = np.linalg.norm(every, axis=1)
+        of_others = np.flatnonzero((size > 0) & (np.linalg.norm(own, axis=1) <= LEAST_FAST_PART * size))
+        if of_others.size:
+            raise Refused(
+                f"System: row(s) {part.in_words(of_others)} of constraint do not depend on the fast variables q_f. {MICRO_GRID} Give them as "
+                "System(slow_constraint=...), a function of (q_s, params), which is held at the macro nodes; or make the variables that "
+                "they hold fast."
+            )
+        (values, variables), pace = own.shape, part.pace
+        if values > variables:
+            raise Refused(
+                f"System: {part.term.field} returns {values} values for {variables} {pace} variables; at most {variables} can be satisfied."
+                f"{part.grid} Remove rows, or make the variables that they hold {pace}."
+            )
+    _check_gradients(system, state, held, rows, weights)
+    if any(rank_of(rows.gradients[part.rows, part.variables])[1] for part in held):
         # At a singular configuration (a linkage folded flat) rows are dependent there and nowhere else, and runs pass it: only rows that are
         # dependent at a generic configuration nearby are refused.
         rows = configuration(system, state.t, *_nearby(state, rows, weights)).rows
-        _, fast, alone = gradients(rows)
-        _check_rank("slow_constraint", alone, "slow variables.", in_words)
-        _check_rank("constraint", fast, f"fast variables. {MICRO_GRID}", in_words)
+        for part in held:
+            jacobian = rows.gradients[part.rows, part.variables]
+            rank, dependent = rank_of(jacobian)
+            if dependent:
+                raise Refused(
+                    f"System: rows {part.in_words(dependent)} of {part.term.field} depend on each other: {len(jacobian)} rows have rank {rank} in "
+                    f"the {part.pace} variables.{part.grid} Remove redundant ones of these rows, or make the variables they need fast."
+                )
 
 
-def _check_gradients(system: System, state, rows: Rows, weights, in_words) -> None:
+class Held(NamedTuple):
+    """A constraint at a state.
+
+    values: t, q_s and q_f by name, and the params.
+    rows: its rows among those that are solved for.
+    variables: the coordinates among (q_s, q_f) that can satisfy it: those of its pace.
+    grid: its grid in messages.
+    """
+
+    term: Term
+    values: dict[str, Any]
+    rows: slice
+    variables: slice
+    pace: str
+    grid: str
+
+    def in_words(self, rows) -> str:
+        """Numbers of some of its rows, with the names of rows that the constraint returns by name: ``[0, 2]`` or ``0 (rope), 2 (rail)``."""
+        sizes = constraint_sizes(self.term.function, *self.term.of_arguments(self.values), self.values["params"])
+        names = [name for name, size in sizes.items() for _ in range(size)]
+        return ", ".join(f"{row} ({names[row]})" for row in rows) if names else str(list(map(int, rows)))
+
+
+def _held(system: System, state) -> list[Held]:
+    n_s, (n_g, n_gs) = np.size(state.q_s), system.num_constraints(state.q_s, state.q_f)
+    parts = {
+        "constraint": (slice(0, n_g), slice(n_s, None), "fast", f" {MICRO_GRID}"),
+        "slow_constraint": (slice(n_g, n_g + n_gs), slice(0, n_s), "slow", ""),
+    }
+    values = {"t": state.t, "q_s": state.q_s, "q_f": state.q_f, "params": system.params}
+    return [Held(term, values, *parts[term.field]) for term in system.of_kind("constraint")]
+
+
+def _check_gradients(system: System, state, held: list[Held], rows: Rows, weights) -> None:
     """Refuse rows whose gradient is zero at the state, but not at a generic configuration `NEARBY` relative to its positions."""
-    q, n_s = np.concatenate([state.q_s, state.q_f]), np.size(state.q_s)
-    n_g, n_gs = system.num_constraints(state.q_s, state.q_f)
+    q = np.concatenate([state.q_s, state.q_f])
     change = NEARBY * np.abs(weights * q).max() * np.random.default_rng(0).normal(size=q.size) / weights
-    nearby = configuration(system, state.t, *np.split(q + change, [n_s])).rows
+    nearby = configuration(system, state.t, *np.split(q + change, [np.size(state.q_s)])).rows
     size, size_nearby = (np.linalg.norm(a.gradients, axis=1) for a in (rows, nearby))
     vanishes = (size_nearby > 0) & (size <= VANISHING_GRADIENT * size_nearby)
-    parts = {"constraint": vanishes[:n_g], "slow_constraint": vanishes[n_g : n_g + n_gs]}
-    for name, rows_of_name in parts.items():
-        if rows_of_name.any():
+    for part in held:
+        if vanishes[part.rows].any():
             raise Refused(
-                f"System: the gradient of row(s) {in_words(np.flatnonzero(rows_of_name), name)} of {name} vanishes at these positions, and no force "
-                "along it can hold the constraint. A square, (|x| - L)**2, has such a gradient wherever it is 0: take its root, |x| - L."
+                f"System: the gradient of row(s) {part.in_words(np.flatnonzero(vanishes[part.rows]))} of {part.term.field} vanishes at these "
+                "positions, and no force along it can hold the constraint. A square, (|x| - L)**2, has such a gradient wherever it is 0: take "
+                "its root, |x| - L."
             )
 
 
@@ -312,39 +344,6 @@ def _check_implied(rows: Rows, solved: int, place: str) -> None:
         raise Refused(
             f"System: implied does not follow from the constraints: {place} keep these, and row(s) {opened.tolist()} of implied are "
             f"{values[opened]} there (allowed: {allowed[opened]}). Take parameters for which they follow, or hold them as constraint."
-        )
-
-
-def _check_counts(fast, alone) -> None:
-    (n_g, n_f), (n_gs, n_s) = fast.shape, alone.shape
-    if n_gs > n_s:
-        raise Refused(
-            f"System: slow_constraint returns {n_gs} values for {n_s} slow variables; at most {n_s} can be satisfied."
-        )
-    if n_g > n_f:
-        raise Refused(
-            f"System: constraint returns {n_g} values for {n_f} fast variables; at most {n_f} can be satisfied. {MICRO_GRID} "
-            "Remove rows, or make the variables that they hold fast."
-        )
-
-
-def _rows_in_words(constraint, rows, *arguments) -> str:
-    """Numbers of the rows of a constraint, with the names of rows that the constraint returns by name: ``[0, 2]`` or ``0 (rope), 2 (rail)``."""
-    if isinstance(constraint, Rheonomic):
-        constraint, arguments = constraint.function, (0.0, *arguments)
-    sizes = constraint_sizes(constraint, *arguments)
-    if not sizes:
-        return str([int(row) for row in rows])
-    names = [name for name, size in sizes.items() for _ in range(size)]
-    return ", ".join(f"{row} ({names[row]})" for row in rows)
-
-
-def _check_rank(name: str, jacobian, of: str, in_words) -> None:
-    rank, dependent = rank_of(jacobian)
-    if dependent:
-        raise Refused(
-            f"System: rows {in_words(dependent, name)} of {name} depend on each other: {len(jacobian)} rows have rank {rank} in the {of} Remove "
-            "redundant ones of these rows, or make the variables they need fast."
         )
 
 
