@@ -12,9 +12,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from vmri_jax.mechanics.functions import TracedOnce
+from vmri_jax.mechanics.functions import TracedOnce, in_order
 from vmri_jax.mechanics.masses import ConstantMass
-from vmri_jax.mechanics.order import in_order
 from vmri_jax.mechanics.slots import Slots
 from vmri_jax.mechanics.system import System
 from vmri_jax.mechanics.terms import Term

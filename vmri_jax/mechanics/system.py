@@ -13,13 +13,14 @@ import numpy as np
 from vmri_jax.mechanics.functions import (
     NO_TIME,
     NO_VELOCITY,
+    Order,
     Rheonomic,
     TracedOnce,
     check_arguments,
+    order_of,
     traced_once,
 )
 from vmri_jax.mechanics.masses import ConstantMass
-from vmri_jax.mechanics.order import Order, order_of
 from vmri_jax.mechanics.slots import check_computed
 from vmri_jax.mechanics.summary import numbers, parameters, summary
 from vmri_jax.mechanics.surroundings import name_of
