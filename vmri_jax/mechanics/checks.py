@@ -14,7 +14,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.mechanics.arrays import check_precision, is_concrete, real_array
-from vmri_jax.mechanics.arrays import require_x64 as require_x64
 from vmri_jax.mechanics.functions import TracedOnce, order_of, traced_once
 from vmri_jax.mechanics.masses import ConstantMass
 from vmri_jax.mechanics.surroundings import name_of

@@ -62,12 +62,17 @@ MICRO_GRID = (
 )
 
 
-def rank_of(rows) -> tuple[int, list[int]]:
-    """Rank of a matrix (k, n), with each row scaled to length one, and the indices of the rows in a linear dependence."""
+def decomposed(rows) -> tuple[np.ndarray, int, np.ndarray]:
+    """U (k, k), the rank, and V^T (n, n) of the singular values of a matrix (k, n) with each row scaled to length one."""
     rows = np.asarray(rows)
     size = np.linalg.norm(rows, axis=1, keepdims=True)
-    left, values, _ = np.linalg.svd(rows / np.where(size > 0, size, 1))
-    rank = int(np.count_nonzero(values > RANK))
+    left, values, right = np.linalg.svd(rows / np.where(size > 0, size, 1))
+    return left, int(np.count_nonzero(values > RANK)), right
+
+
+def rank_of(rows) -> tuple[int, list[int]]:
+    """Rank of a matrix (k, n), with each row scaled to length one, and the indices of the rows in a linear dependence."""
+    left, rank, _ = decomposed(rows)
     return rank, np.flatnonzero(np.linalg.norm(left[:, rank:], axis=1) > LEAST_COEFFICIENT).tolist()
 
 

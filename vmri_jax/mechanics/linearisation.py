@@ -18,7 +18,7 @@ import numpy as np
 
 from vmri_jax.kernels.saddle import least_norm
 from vmri_jax.mechanics.arrays import QUICK
-from vmri_jax.mechanics.constraints import RANK
+from vmri_jax.mechanics.constraints import decomposed
 from vmri_jax.mechanics.driving import driven
 from vmri_jax.mechanics.motion import motion
 from vmri_jax.mechanics.names import Names
@@ -256,9 +256,8 @@ def linearise(system: Movable, state: State | None = None, names: Names | None =
 
 def tangents(rows: np.ndarray) -> np.ndarray:
     """Orthonormal basis (n, k), one vector per column, of the space orthogonal to rows (m, n); dependent rows count once."""
-    lengths = np.linalg.norm(rows, axis=1, keepdims=True)
-    _, sizes, directions = np.linalg.svd(rows / np.where(lengths > 0, lengths, 1.0))
-    return directions[np.count_nonzero(sizes > RANK) :].T
+    _, rank, directions = decomposed(rows)
+    return directions[rank:].T
 
 
 def mass_orthonormal(mass: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:
