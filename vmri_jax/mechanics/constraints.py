@@ -21,7 +21,6 @@ from jaxtyping import Float
 from vmri_jax.kernels import matvec, max_abs
 from vmri_jax.mechanics.arrays import Numbers, is_known, library, numbers_of, quickly_compiled
 from vmri_jax.mechanics.by_name import constraint_sizes
-from vmri_jax.mechanics.functions import Rheonomic
 from vmri_jax.mechanics.masses import correlation
 from vmri_jax.mechanics.projection import mass_and_momentum, time_rates
 from vmri_jax.mechanics.structure import sizes_of_terms
@@ -143,7 +142,7 @@ def _values(system: System, *configuration):
 def residual_of(rows: Rows, system: System, state, weighted_velocity):
     """Largest ``|g|`` and largest ``|G v + dg/dt|``, shape (2,), from the rows at a state, and w v (n,) with their weights."""
     rates, t = matvec(rows.gradients, weighted_velocity), state.t
-    if system.is_rheonomic or isinstance(system.implied, Rheonomic):
+    if any(term.moves for term in system.terms):
         rates += jax.jvp(lambda t: _values(system, t, state.q_s, state.q_f), (t,), (jnp.ones_like(t),))[1]
     return jnp.stack([max_abs(rows.values), max_abs(rates)])
 

@@ -290,14 +290,13 @@ class Problem:
 
     def __repr__(self) -> str:
         names = (self.names or Names()).of_coordinates(np.shape(self.q_s)[-1], np.shape(self.q_f)[-1])
-        constraints = [f"{name} ({size})" for name, size in {**names.constraint, **names.slow_constraint}.items()]
         return summary(
             "Problem",
             {
                 "slow": coordinates(names.slow_coordinates),
                 "fast": coordinates(names.fast_coordinates),
                 **self.system.in_words(),
-                "rows of constraints": listed(constraints),
+                "rows of constraints": listed([f"{name} ({len(rows)})" for name, rows in names.rows.items()]),
                 "start": f"t = {numbers(self.t)}",
                 **{name: numbers(getattr(self, name)) for name in ("q_s", "q_f", "v_s", "v_f")},
             },
