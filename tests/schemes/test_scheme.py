@@ -117,7 +117,7 @@ def test_potentials_have_rules_by_name():
         ),
         (
             lambda: fully_explicit(8).with_potentials(bends=quadrature.gradient_corrected(KICKS)),
-            "bends is corrected; only the rules of V and W can be",
+            "bends on the micro grid, degree 1, is corrected; only kicks of V and W",
         ),
     ],
 )

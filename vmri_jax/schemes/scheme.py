@@ -46,6 +46,9 @@ from vmri_jax.schemes.quadrature import (
     trapezoidal,
 )
 
+GRIDS = {"slow": "macro", "fast": "micro"}
+"""The grids on which kicks of V and W may be corrected."""
+
 
 class Scheme(eqx.Module):
     """Variational multirate scheme: the degree of the path and the rule of every term.
@@ -97,42 +100,40 @@ class Scheme(eqx.Module):
         self.num_micro = whole_number("Scheme: num_micro", num_micro)
         self.degree = whole_number("Scheme: degree", degree)
         at_control_nodes = lobatto(self.degree + 1)
-        self.kinetic, self.slow, self.fast, self.force = kinetic, slow, fast, kinetic if force is None else force
-        self.constraint = micro(at_control_nodes) if constraint is None else constraint
-        self.slow_constraint = macro(at_control_nodes) if slow_constraint is None else slow_constraint
-        for name in RULES.values():
-            _check_placed(name, getattr(self, name))
-            if getattr(self, name).every > 1 and name not in ("slow", "fast"):
+        rules = {
+            "kinetic": kinetic,
+            "slow": slow,
+            "fast": fast,
+            "force": kinetic if force is None else force,
+            "constraint": micro(at_control_nodes) if constraint is None else constraint,
+            "slow_constraint": macro(at_control_nodes) if slow_constraint is None else slow_constraint,
+        }
+        further = dict(potentials or {})
+        for name, placed in [*rules.items(), *further.items()]:
+            _check_placed(name, placed)
+        for name, placed in rules.items():
+            if placed.every > 1 and name not in GRIDS:
                 raise Refused(
-                    f"Scheme: {name} is placed with every={getattr(self, name).every}; only potentials can be: slow, fast, and those of "
+                    f"Scheme: {name} is placed with every={placed.every}; only potentials can be: slow, fast, and those of "
                     "with_potentials(...). Take micro(rule) or macro(rule)."
                 )
-        self.slow, self.fast = (_on_grid(name, getattr(self, name), self.num_micro) for name in ("slow", "fast"))
-        self.potentials = Named(potentials or {})
-        for name, placed in self.potentials.items():
-            _check_placed(name, placed)
-            if placed.mollified or placed.gradient_corrected:
-                how = "mollified" if placed.mollified else "corrected"
-                raise Refused(
-                    f"Scheme: {name} is {how}; only the rules of V and W can be. Give micro(rule) or macro(rule)."
-                )
-            self.potentials[name] = _on_grid(name, placed, self.num_micro)
+            setattr(self, name, _on_grid(name, placed, self.num_micro))
+        self.potentials = Named({name: _on_grid(name, placed, self.num_micro) for name, placed in further.items()})
         if self.kinetic.grid != "micro":
             raise Refused(
                 "Scheme: the kinetic rule must be placed with micro(...); each micro interval has a velocity."
             )
         _check_kinetic(self.kinetic.rule, self.degree)
-        grids = {"slow": "macro", "fast": "micro"}
-        for name in RULES.values():
-            placed = getattr(self, name)
-            if placed.mollified and (name != "slow" or self.fast.grid != "micro"):
+        of_fields = [(name, name, placed) for name, placed in rules.items()]
+        for field, name, placed in [*of_fields, *(("", name, placed) for name, placed in further.items())]:
+            if placed.mollified and (field != "slow" or self.fast.grid != "micro"):
                 raise Refused(
                     f"Scheme: {name} is mollified; only kicks of the slow potential can be, along fast motion on the micro grid: "
                     "slow=mollified(macro(...)) with fast=micro(...)."
                 )
-            if placed.gradient_corrected and (placed.grid != grids.get(name) or self.degree > 1):
+            if placed.gradient_corrected and (placed.grid != GRIDS.get(field) or self.degree > 1):
                 raise Refused(
-                    f"Scheme: {name} on the {placed.grid} grid, degree {self.degree}, is corrected; only kicks of a path of degree 1 "
+                    f"Scheme: {name} on the {placed.grid} grid, degree {self.degree}, is corrected; only kicks of V and W, of a path of degree 1, "
                     "can be: slow=gradient_corrected(macro(...)), fast=gradient_corrected(micro(...))."
                 )
         for name, grid in (("constraint", "micro"), ("slow_constraint", "macro")):
