@@ -262,16 +262,16 @@ def check_constraints(
         )
     _check_implied(rows, len(solved), place)
     for part in held:
-        every, own = rows.gradients[part.rows], rows.gradients[part.rows, part.variables]
-        size = np.linalg.norm(every, axis=1)
-        of_others = np.flatnonzero((size > 0) & (np.linalg.norm(own, axis=1) <= LEAST_FAST_PART * size))
-        if of_others.size:
+        by_all, by_variables = rows.gradients[part.rows], rows.gradients[part.rows, part.variables]
+        size = np.linalg.norm(by_all, axis=1)
+        slow_only = np.flatnonzero((size > 0) & (np.linalg.norm(by_variables, axis=1) <= LEAST_FAST_PART * size))
+        if slow_only.size:
             raise Refused(
-                f"System: row(s) {part.in_words(of_others)} of constraint do not depend on the fast variables q_f. {MICRO_GRID} Give them as "
+                f"System: row(s) {part.in_words(slow_only)} of constraint do not depend on the fast variables q_f. {MICRO_GRID} Give them as "
                 "System(slow_constraint=...), a function of (q_s, params), which is held at the macro nodes; or make the variables that "
                 "they hold fast."
             )
-        (values, variables), pace = own.shape, part.pace
+        (values, variables), pace = by_variables.shape, part.pace
         if values > variables:
             raise Refused(
                 f"System: {part.term.field} returns {values} values for {variables} {pace} variables; at most {variables} can be satisfied."
@@ -298,7 +298,8 @@ class Held(NamedTuple):
     values: t, q_s and q_f by name, and the params.
     rows: its rows among those that are solved for.
     variables: the coordinates among (q_s, q_f) that can satisfy it: those of its pace.
-    grid: its grid in messages.
+    pace: "slow" or "fast".
+    grid: its grid in messages, with a space before; empty for the macro grid.
     """
 
     term: Term
@@ -316,6 +317,7 @@ class Held(NamedTuple):
 
 
 def _held(system: System, state) -> list[Held]:
+    """The constraints of a system at a state."""
     n_s, (n_g, n_gs) = np.size(state.q_s), system.num_constraints(state.q_s, state.q_f)
     parts = {
         "constraint": (slice(0, n_g), slice(n_s, None), "fast", f" {MICRO_GRID}"),

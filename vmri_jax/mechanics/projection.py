@@ -47,6 +47,7 @@ def mass_and_momentum(system: System, q_s, q_f, v_s, v_f):
 
 
 def _masses_of_function(system: System, q_s, q_f, v):
+    """`mass_and_momentum` of a T that is a function, as a part of a program."""
     masses = closed_masses(system.of_kind("kinetic"), q_s, q_f, system.params)
     if masses is not None:
         return masses, matvec(masses, v)
