@@ -245,7 +245,7 @@ class Unhashable:
 @pytest.mark.parametrize("make", [vm.fully_implicit, vm.explicit_slow, lambda n: vm.galerkin(n, 2)])
 def test_bad_num_micro(make):
     for bad in (0, -3):
-        with pytest.raises(ValueError, match=f"num_micro is {bad}; it must be at least 1"):
+        with pytest.raises(ValueError, match=f"num_micro is {bad}; it must be an integer of at least 1"):
             make(bad)
     for bad in (2.0, "5", True, None):
         with pytest.raises(TypeError, match=f"num_micro is {bad!r}; it must be an integer"):
@@ -258,7 +258,7 @@ HALF = vm.micro(vm.quadrature.midpoint)
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"degree": 0}, "degree is 0; it must be at least 1"),
+        ({"degree": 0}, "degree is 0; it must be an integer of at least 1"),
         ({"degree": 1.5}, "degree is 1.5; it must be an integer"),
         ({"slow": vm.macro(2 * vm.quadrature.left)}, "weights of the slow rule sum to 2; they must sum to 1"),
         ({"fast": vm.quadrature.left}, r"fast is a bare rule; say on which grid .* macro\(rule\) or micro"),

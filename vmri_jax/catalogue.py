@@ -78,21 +78,19 @@ def find_scene_or_problem(name: str) -> Scene | Problem:
     """
     if name in SYSTEMS:
         return SYSTEMS[name]()
-    file_name, colon, attribute = name.partition(":")
+    where, colon, attribute = name.partition(":")
     if Path(name).suffix.lower() in MODELS:
         try:
             return Scene.from_mujoco(name)
         except ImportError as error:
             raise Refused(str(error)) from error
-    if not file_name.endswith(".py"):
-        if not colon or not all(part.isidentifier() for part in file_name.split(".")):
-            raise Refused(
-                f"{unknown('system', name, SYSTEMS)} Your own: my_file.py:my_problem, or "
-                "my_package.my_module:my_problem."
-            )
-        return _problem_in(_import(file_name), file_name, attribute)
-    module = _run_file(file_name)
-    return _problem_in(module, str(Path(file_name)), attribute or _only_name(module, file_name))
+    is_module = colon and all(part.isidentifier() for part in where.split("."))
+    if not (is_module or where.endswith(".py")):
+        raise Refused(
+            f"{unknown('system', name, SYSTEMS)} Your own: my_file.py:my_problem, or my_package.my_module:my_problem."
+        )
+    module = _module(where)
+    return _problem_in(module, str(Path(where)), attribute or _only_name(module, where))
 
 
 def _only_name(module, file_name: str) -> str:
@@ -166,8 +164,10 @@ def _run_file(file_name: str):
     return module
 
 
-def _import(name: str):
-    """A module of a package that is installed."""
+def _module(name: str):
+    """The module of a file of the user, or of a package that is installed."""
+    if name.endswith(".py"):
+        return _run_file(name)
     try:
         return importlib.import_module(name)
     except ImportError as error:
@@ -184,8 +184,7 @@ def imported(name: str):
         ValueError: the file or package does not exist, or does not have the name.
     """
     where, _, attribute = name.partition(":")
-    module = _run_file(where) if where.endswith(".py") else _import(where)
-    return _attribute(module, where, attribute)
+    return _attribute(_module(where), where, attribute)
 
 
 def _attribute(module, where: str, attribute: str):

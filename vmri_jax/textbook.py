@@ -139,7 +139,7 @@ def discrete_lagrangian(system: System, scheme: Scheme) -> Callable:
             total += action(macro(scheme.kinetic.rule), lambda q_s, q_f, v_s, v_f: T_s(q_s, v_s, system.params))
         total -= action(scheme.slow, lambda q_s, q_f, v_s, v_f: slow_potential(q_s, q_f))
         total -= action(scheme.fast, lambda q_s, q_f, v_s, v_f: fast_potential(q_s, q_f))
-        for name, V in system.potentials:
+        for name, V in system.potentials.items():
             total -= action(scheme.rule_of(name), lambda q_s, q_f, v_s, v_f, V=V: V(q_s, q_f, system.params))
         return total
 

@@ -59,7 +59,7 @@ def test_three_rates_are_the_same_system(problem):
 
     ours, theirs = force(split.system), force(one.system)
     np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-13 * float(jnp.abs(theirs).max()) + 1e-12)
-    assert split.system.potentials[0][0] == systems.MIDDLE
+    assert [*split.system.potentials] == [systems.MIDDLE]
 
 
 # --- molecules and network -------------------------------------------------------------------------------------------

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import vmri_jax as vm
-from vmri_jax.mechanics.order import in_order, order_of
+from vmri_jax.mechanics.functions import in_order, order_of
 from vmri_jax.scene import Body, Drive, Potential, Scene
 
 MASSES = np.array([1.0, 4.0, 9.0])

@@ -127,6 +127,8 @@ def test_a_problem_says_its_coordinates_terms_and_start(tsp):
     ]
     assert "constraint g function second_rod" in lines
     assert "rows of constraints rod 2 (1), rod 1 (1)" in lines
+    rods = dataclasses.replace(tsp.names, constraint={"rods": 1}, slow_constraint={"rods": 1})
+    assert "rows of constraints rods (2)" in lines_of(dataclasses.replace(tsp, names=rods))
     assert "q_f 10, 2, 0, 10, 2, 3" in lines
     assert lines_of(tsp.system) == ["System", *lines[3:9]]
 

@@ -64,7 +64,7 @@ def values(scene: sc.Scene, system, params):
     random = np.random.default_rng(0)
     q_s, q_f, v_s, v_f = (np.asarray(x) + 0.1 * random.normal(size=np.shape(x)) for x in scene.start)
     system = system.replace(params=params)
-    potentials = system.slow_potential(q_s, q_f, params), *(f(q_s, q_f, params) for _, f in system.potentials)
+    potentials = system.slow_potential(q_s, q_f, params), *(f(q_s, q_f, params) for f in system.potentials.values())
     return potentials, system.constraints(0.0, q_s, q_f), system.forces(0.0, q_s, q_f, v_s, v_f)
 
 

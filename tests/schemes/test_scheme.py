@@ -87,9 +87,10 @@ def test_potentials_have_rules_by_name():
     assert scheme.with_potentials(c=micro(quadrature.left)).order == 1
     assert not scheme.with_potentials(c=micro(quadrature.left)).is_symmetric
     base = fully_explicit(4)
-    second = {2: micro(kicks, every=2)}
+    second = {2: micro(kicks, every=2), "a": micro(kicks)}
     rates = Scheme(4, kinetic=base.kinetic, slow=base.slow, fast=base.fast, potentials=second)
     assert "V_2" in str(rates.describe())
+    assert list(jax.tree.map(np.asarray, rates).potentials) == [2, "a"]
 
 
 @pytest.mark.parametrize(
@@ -116,7 +117,7 @@ def test_potentials_have_rules_by_name():
         ),
         (
             lambda: fully_explicit(8).with_potentials(bends=quadrature.gradient_corrected(KICKS)),
-            "bends is corrected; only the rules of V and W can be",
+            "bends on the micro grid, degree 1, is corrected; only kicks of V and W",
         ),
     ],
 )

@@ -133,7 +133,7 @@ def by_promise(menu: Sequence[Family], digits: float) -> list[Family]:
 
 def unit_of(system: System, scheme: SchemeLike) -> int:
     """The number whose multiples are allowed as num_micro: least common multiple of k of rules on every k-th node."""
-    return math.lcm(stage_scheme(scheme).unit, *(name for name, _ in system.potentials if isinstance(name, int)))
+    return math.lcm(stage_scheme(scheme).unit, *(name for name in system.potentials if isinstance(name, int)))
 
 
 def seconds_of_steps(*runs: Simulation) -> np.ndarray:

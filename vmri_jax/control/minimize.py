@@ -16,9 +16,8 @@ from vmri_jax.diagnostics.linear import phase_vector
 from vmri_jax.mechanics.arrays import real_array, whole_number
 from vmri_jax.mechanics.by_name import ByName
 from vmri_jax.mechanics.checks import check_number, check_type, describe
-from vmri_jax.mechanics.functions import check_arguments, traced_once
+from vmri_jax.mechanics.functions import check_arguments, order_of, traced_once
 from vmri_jax.mechanics.names import Names
-from vmri_jax.mechanics.order import order_of
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of, start_of
 from vmri_jax.refusals import Refused
 from vmri_jax.running.prepare import prepare

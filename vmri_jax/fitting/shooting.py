@@ -18,8 +18,8 @@ import numpy as np
 
 from vmri_jax.accuracy.simulate import simulate
 from vmri_jax.fitting.given import Measured, Unknowns
-from vmri_jax.mechanics.constraints import known_mass
 from vmri_jax.mechanics.invariants import velocity
+from vmri_jax.mechanics.projection import mass_and_momentum
 from vmri_jax.mechanics.state import Problem, State, initial_state
 from vmri_jax.running.arguments import Save
 from vmri_jax.schemes.composition import SchemeLike
@@ -102,7 +102,7 @@ class Shooting:
         """(2 n,) units of the starts of the parts in a search: the largest value of each coordinate at all starts, or
         SMALLEST_SIZE of its bound for a coordinate that hardly moves. The units of coordinates and masses cancel."""
         problem, phases = self.model(self.unknowns.at(u)), np.concatenate([np.asarray(self.start(u))[None], starts])
-        mass = known_mass(problem.system, problem.q_s, problem.q_f)
+        mass, _ = mass_and_momentum(problem.system, problem.q_s, problem.q_f, 0 * problem.v_s, 0 * problem.v_f)
         v = phases[:, len(mass) :]
         # |v_i| <= sqrt((M^-1)_ii v^T M v), and in the time of a part q_i changes by this velocity times the time
         fastest = np.sqrt(np.diag(np.linalg.inv(mass)) * np.max(np.sum(v @ mass * v, axis=1)))

@@ -27,9 +27,10 @@ from vmri_jax.hard_cases.measures import (
     run,
     status,
 )
-from vmri_jax.mechanics.constraints import known_mass, rows_at, weights_at
+from vmri_jax.mechanics.constraints import configuration
 from vmri_jax.mechanics.linearisation import linearise
 from vmri_jax.mechanics.motion import motion
+from vmri_jax.mechanics.projection import mass_and_momentum
 from vmri_jax.mechanics.state import HasProblem, Problem, State, initial_state, problem_of
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.progress import ShowsProgress, Working
@@ -107,7 +108,7 @@ class Resolved:
         @jax.jit
         @jax.vmap
         def rows_of(t, q_s, q_f):
-            return rows_at(system, t, q_s, q_f, weights_at(system, q_s, q_f))
+            return configuration(system, t, q_s, q_f).rows
 
         rows = rows_of(nodes.t, nodes.q_s, nodes.q_f)
         part = float(np.max(np.abs(rows.values) / rows.sizes))
@@ -204,7 +205,8 @@ class Resolved:
         oracle = simulated(system, scheme, state, macro_dt, num_steps=steps)
         runs = run(self.problem, scheme, macro_dt, steps).states, oracle
         (q, p), (q_oracle, p_oracle) = (np.split(np.asarray(phase_vector(states)), 2, axis=1) for states in runs)
-        size = float(np.abs(known_mass(system, state.q_s, state.q_f)).max())
+        mass, _ = mass_and_momentum(system, state.q_s, state.q_f, 0 * state.p_s, 0 * state.p_f)
+        size = float(np.abs(mass).max())
         largest_q, largest_p = (max(np.abs(a).max(), 1e-300) for a in (q_oracle, p_oracle))
         round_off = steps * ROUND_OFF * size * largest_q * scheme.num_micro / macro_dt
         return max(difference(q, q_oracle) / largest_q, max(difference(p, p_oracle) - round_off, 0.0) / largest_p)

@@ -43,6 +43,11 @@ def _is_traced(leaf) -> bool:
     return isinstance(leaf, jax.core.Tracer)  # pyright: ignore[reportAttributeAccessIssue]
 
 
+def numbers_of(tree):
+    """The arrays of a pytree by NumPy; tracers unchanged."""
+    return jax.device_get(tree) if is_concrete(tree) else tree
+
+
 class Known:
     """A pytree of concrete numbers as an argument of cached functions: equal to every other one of the same structure and numbers."""
 
@@ -116,12 +121,6 @@ def require_x64() -> None:
         )
 
 
-def is_short(value) -> bool:
-    """Whether a value is an array of floats with less than 64 bits each."""
-    dtype = getattr(value, "dtype", None)
-    return dtype is not None and jnp.issubdtype(dtype, jnp.inexact) and jnp.finfo(dtype).bits < 64
-
-
 def check_precision(name: str, value) -> None:
     """Refuse floats of less than 64 bits, also in lists: conversion to float64 does not restore their lost digits.
 
@@ -129,10 +128,11 @@ def check_precision(name: str, value) -> None:
         ValueError: 64-bit mode is off, so that all JAX arrays are short; or this array is short.
     """
     for leaf in jax.tree.leaves(value):
-        if is_short(leaf):
+        dtype = getattr(leaf, "dtype", None)
+        if dtype is not None and jnp.issubdtype(dtype, jnp.inexact) and jnp.finfo(dtype).bits < 64:
             if isinstance(leaf, jax.Array):
                 require_x64()
-            raise Refused(f"{name} has dtype {leaf.dtype}; {ADVICE}.")
+            raise Refused(f"{name} has dtype {dtype}; {ADVICE}.")
 
 
 def real_array(name: str, value, ndim: int | None = None):
@@ -153,9 +153,9 @@ def real_array(name: str, value, ndim: int | None = None):
     elif isinstance(value, float):
         array = np.asarray(value)
     else:
-        if is_concrete(value) and not (is_short(value) or _is_real(value)):
-            raise Refused(f"{name} is {value!r}; {advice}.")
         check_precision(name, value)
+        if is_concrete(value) and not _is_real(value):
+            raise Refused(f"{name} is {value!r}; {advice}.")
         is_jax = isinstance(value, jax.Array) or not is_concrete(value)
         array = (jnp if is_jax else np).asarray(value, dtype=float)
     if ndim is not None and array.ndim != ndim:

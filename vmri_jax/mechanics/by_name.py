@@ -12,9 +12,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from vmri_jax.mechanics.functions import TracedOnce, traced_once
+from vmri_jax.mechanics.functions import TracedOnce, in_order
 from vmri_jax.mechanics.masses import ConstantMass
-from vmri_jax.mechanics.order import InOrder, Order, in_order
 from vmri_jax.mechanics.slots import Slots
 from vmri_jax.mechanics.system import System
 from vmri_jax.mechanics.terms import Term
@@ -72,35 +71,29 @@ def flat_system(system: System, slow: Slots | None, fast: Slots | None) -> Syste
     """
 
     def flat(term: Term):
-        masses = term.function
-        if isinstance(masses, ConstantMass):
-            return ConstantMass(_flat_mass("slow", masses.slow, slow), _flat_mass("fast", masses.fast, fast))
-        inner, order = _inner(masses)
-        wrapped = inner if isinstance(inner, ByName) else ByName(inner, (*term.arguments, "params"), slow, fast)
-        return traced_once(wrapped, order)
+        function = term.function
+        if isinstance(function, ConstantMass):
+            return ConstantMass(_flat_mass("slow", function.slow, slow), _flat_mass("fast", function.fast, fast))
+        if isinstance(function.function, ByName):
+            return function
+        return TracedOnce(ByName(function.function, (*term.arguments, "params"), slow, fast), order=function.order)
 
     return system.mapped(flat)
 
 
-def constraint_sizes(function: Callable | None, *arguments) -> dict[str, int]:
+def constraint_sizes(function: Any, *arguments) -> dict[str, int]:
     """Names and numbers of rows of a constraint that returns its rows by name; empty for other constraints."""
-    inner, order = _inner(function)
     sizes: dict[str, int] = {}
 
     def note_sizes(*arguments):
-        value = inner.by_name(*arguments[:-1], in_order(arguments[-1], order))
+        *others, params = arguments
+        value = function.function.by_name(*others, in_order(params, function.order))
         sizes.update({name: jnp.size(rows) for name, rows in value.items()} if isinstance(value, Mapping) else {})
         return ()
 
-    if isinstance(inner, ByName):
+    if isinstance(getattr(function, "function", None), ByName):
         jax.eval_shape(note_sizes, *arguments)
     return sizes
-
-
-def _inner(function) -> tuple[Any, Order | None]:
-    """The function in a `TracedOnce`, and the order of its params."""
-    inner = function.function if isinstance(function, TracedOnce) else function
-    return (inner.function, inner.order) if isinstance(inner, InOrder) else (inner, None)
 
 
 def _flat_mass(name: str, mass, slots: Slots | None):

@@ -14,10 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.mechanics.arrays import check_precision, is_concrete, real_array
-from vmri_jax.mechanics.arrays import require_x64 as require_x64
-from vmri_jax.mechanics.functions import TracedOnce, traced_once
+from vmri_jax.mechanics.functions import TracedOnce, order_of, traced_once
 from vmri_jax.mechanics.masses import ConstantMass
-from vmri_jax.mechanics.order import order_of, ordered
 from vmri_jax.mechanics.surroundings import name_of
 from vmri_jax.mechanics.system import System
 from vmri_jax.refusals import Refused
@@ -54,10 +52,11 @@ def check_flags(**flags) -> None:
             raise Refused(f"{name} is {value!r}; it must be True or False.")
 
 
-def check_type(name: str, value, kind: type | UnionType, example: str) -> None:
-    """Refuse objects of another class; `example` in the message names a right object."""
+def check_type(name: str, value, kind: type | UnionType, example: str) -> Any:
+    """The value; objects of another class are refused, and `example` in the message names a right object."""
     if not isinstance(value, kind):
         raise Refused(f"{name} is {type(value).__name__}; give {example}.")
+    return value
 
 
 def check_params(params) -> None:
@@ -121,9 +120,7 @@ def shape_of(name: str, function: Callable, *args):
     Raises:
         ValueError: the function cannot be traced, differentiated, or evaluated.
     """
-
-    has_order = isinstance(function, TracedOnce | ConstantMass)  # the order of its system
-    called: Any = function if has_order else ordered(function, order_of(args[-1]))
+    called: Any = function if isinstance(function, ConstantMass) else traced_once(function, order_of(args[-1]))
 
     def differentiated_twice(*args):
         *moving, params = args
@@ -155,9 +152,7 @@ def shape_of(name: str, function: Callable, *args):
         ) from error
     if not isinstance(function, ConstantMass):
         leaves, structure = jax.tree.flatten(args)
-        fault = _fault(
-            traced_once(called), structure, tuple((np.shape(leaf), jnp.result_type(leaf)) for leaf in leaves)
-        )
+        fault = _fault(called, structure, tuple((np.shape(leaf), jnp.result_type(leaf)) for leaf in leaves))
         if fault:
             raise Refused(f"{name} {fault}.")
     return shape

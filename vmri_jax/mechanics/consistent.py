@@ -5,7 +5,7 @@ Jacobians: a program of its own for every step of the start would take seconds t
 """
 
 from contextlib import suppress
-from typing import Any, NamedTuple
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -13,8 +13,8 @@ import numpy as np
 
 from vmri_jax.kernels.saddle import least_norm, regularized
 from vmri_jax.mechanics.arrays import is_known, library, quickly_compiled
-from vmri_jax.mechanics.constraints import configuration, known_mass, known_mass_and_momentum
-from vmri_jax.mechanics.projection import legendre, project_momentum
+from vmri_jax.mechanics.constraints import configuration
+from vmri_jax.mechanics.projection import legendre, mass_and_momentum, project_momentum
 from vmri_jax.mechanics.structure import has_constant_hessian
 from vmri_jax.mechanics.system import System
 
@@ -24,32 +24,21 @@ PROJECTION_STEPS = 20
 
 def project_positions(system: System, t, q_s, q_f):
     """Positions moved onto the constraints at a time, along ``M^-1 G^T`` of the start: to first order the nearest point in the mass metric."""
-    n_s, q0 = q_s.shape[0], library(q_s, q_f).concatenate([q_s, q_f])
-    known = is_known((system, t, q0))
-
-    def constraints(q):
-        return system.constraints(t, q[:n_s], q[n_s:])
-
-    def values_and_jacobian(q):
-        if known:
-            return configuration(system, t, q[:n_s], q[n_s:]).solved
-        return constraints(q), jax.jacrev(constraints)(q)
-
+    n_s, q = q_s.shape[0], library(q_s, q_f).concatenate([q_s, q_f])
+    start = configuration(system, t, q_s, q_f)
+    xp = library(start)
     # D = M^-1 G^T at the start, with rows of coordinates over the square roots of masses: all have the same unit
-    mass = known_mass(system, q_s, q_f) if known else _mass_at_rest(system, q_s, q_f)
-    jacobian, xp = values_and_jacobian(q0)[1], library(mass, q0)
-    root = xp.sqrt(xp.diagonal(mass))
-    directions = xp.linalg.solve(mass / (root[:, None] * root), (jacobian / root).T) / root[:, None]
+    root = xp.sqrt(start.mass.diagonal())
+    directions = xp.linalg.solve(start.mass / (root[:, None] * root), (start.jacobian / root).T) / root[:, None]
 
     # q <- q - D (G D)^+ g
     def corrected(_, q):
-        values, jacobian = values_and_jacobian(q)
-        return q - directions @ least_norm(jacobian @ directions, values)
+        here = configuration(system, t, q[:n_s], q[n_s:], start.mass)
+        return q - directions @ least_norm(here.jacobian @ directions, here.values)
 
-    if not known:
-        q = jax.lax.fori_loop(0, PROJECTION_STEPS, corrected, q0)  # a loop, since its body is compiled once
+    if xp is jnp:
+        q = jax.lax.fori_loop(0, PROJECTION_STEPS, corrected, q)  # a loop, since its body is compiled once
         return q[:n_s], q[n_s:]
-    q = q0
     with (
         np.errstate(all="ignore"),
         suppress(np.linalg.LinAlgError),
@@ -81,39 +70,24 @@ def consistent_momenta(system: System, t, q_s, q_f, v_s, v_f):
     return projected_p[:n_s], projected_p[n_s:], xp.sqrt(xp.clip(part, 0.0, 1.0))
 
 
-def _mass_at_rest(system: System, q_s, q_f):
-    def momentum(v):
-        return jnp.concatenate(legendre(system, q_s, q_f, v[: q_s.size], v[q_s.size :]))
-
-    return jax.jacfwd(momentum)(jnp.zeros(q_s.size + q_f.size))
-
-
-class At(NamedTuple):
-    """Time, positions and momenta, as of a `State`."""
-
-    t: Any
-    q_s: Any
-    q_f: Any
-    p_s: Any
-    p_f: Any
-
-
 @quickly_compiled
 def _momenta(system, t, q_s, q_f, v_s, v_f):
     """p = dT/dv, and p and v after the projection onto the hidden constraints."""
     momenta = legendre(system, q_s, q_f, v_s, v_f)
-    p_s, p_f, *velocities, _ = project_momentum(system, At(t, q_s, q_f, *momenta), (v_s, v_f))
+    p_s, p_f, *velocities, _ = project_momentum(
+        system, SimpleNamespace(t=t, q_s=q_s, q_f=q_f, p_s=momenta[0], p_f=momenta[1]), (v_s, v_f)
+    )
     return tuple(jnp.concatenate(a) for a in (momenta, (p_s, p_f), velocities))
 
 
 def _momenta_of_numbers(system, t, q_s, q_f, v_s, v_f):
     """`_momenta` by NumPy, of a T that is quadratic in v: a program would take seconds to compile."""
     v = np.concatenate([v_s, v_f])
-    mass, p = known_mass_and_momentum(system, q_s, q_f, v_s, v_f)
+    mass, p = mass_and_momentum(system, q_s, q_f, v_s, v_f)
     if not system.is_constrained:
         return p, p, v
     # G M^-1 G^T mu = G v + dg/dt
-    _, jacobian, rates = configuration(system, t, q_s, q_f)
+    *_, jacobian, rates = configuration(system, t, q_s, q_f, mass)
     directions = np.linalg.solve(mass, jacobian.T)
     try:
         mu = np.linalg.solve(regularized(jacobian @ directions), jacobian @ v + rates)

@@ -17,16 +17,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
-from scipy.linalg import block_diag
 
 from vmri_jax.kernels import matvec, max_abs
-from vmri_jax.mechanics.arrays import Numbers, is_known, library, quickly_compiled
+from vmri_jax.mechanics.arrays import Numbers, is_known, library, numbers_of, quickly_compiled
 from vmri_jax.mechanics.by_name import constraint_sizes
-from vmri_jax.mechanics.functions import Rheonomic
 from vmri_jax.mechanics.masses import correlation
 from vmri_jax.mechanics.projection import mass_and_momentum, time_rates
+from vmri_jax.mechanics.structure import sizes_of_terms
 from vmri_jax.mechanics.system import System
-from vmri_jax.mechanics.terms_of_rows import sizes_of_terms
+from vmri_jax.mechanics.terms import Term
 from vmri_jax.refusals import Refused
 
 START = 1e-9
@@ -62,12 +61,17 @@ MICRO_GRID = (
 )
 
 
-def rank_of(rows) -> tuple[int, list[int]]:
-    """Rank of a matrix (k, n), with each row scaled to length one, and the indices of the rows in a linear dependence."""
+def decomposed(rows) -> tuple[np.ndarray, int, np.ndarray]:
+    """U (k, k), the rank, and V^T (n, n) of the singular values of a matrix (k, n) with each row scaled to length one."""
     rows = np.asarray(rows)
     size = np.linalg.norm(rows, axis=1, keepdims=True)
-    left, values, _ = np.linalg.svd(rows / np.where(size > 0, size, 1))
-    rank = int(np.count_nonzero(values > RANK))
+    left, values, right = np.linalg.svd(rows / np.where(size > 0, size, 1))
+    return left, int(np.count_nonzero(values > RANK)), right
+
+
+def rank_of(rows) -> tuple[int, list[int]]:
+    """Rank of a matrix (k, n), with each row scaled to length one, and the indices of the rows in a linear dependence."""
+    left, rank, _ = decomposed(rows)
     return rank, np.flatnonzero(np.linalg.norm(left[:, rank:], axis=1) > LEAST_COEFFICIENT).tolist()
 
 
@@ -138,7 +142,7 @@ def _values(system: System, *configuration):
 def residual_of(rows: Rows, system: System, state, weighted_velocity):
     """Largest ``|g|`` and largest ``|G v + dg/dt|``, shape (2,), from the rows at a state, and w v (n,) with their weights."""
     rates, t = matvec(rows.gradients, weighted_velocity), state.t
-    if system.is_rheonomic or isinstance(system.implied, Rheonomic):
+    if any(term.moves for term in system.terms):
         rates += jax.jvp(lambda t: _values(system, t, state.q_s, state.q_f), (t,), (jnp.ones_like(t),))[1]
     return jnp.stack([max_abs(rows.values), max_abs(rates)])
 
@@ -147,14 +151,6 @@ def weights_of(masses):
     """(n,) the weights w: square roots of masses, 1 for a coordinate without a mass."""
     xp = library(masses)
     return xp.sqrt(xp.where(masses > 0, masses, 1.0))
-
-
-def weights_at(system: System, q_s, q_f):
-    """(n,) the weights w at positions."""
-    if system.has_constant_mass:
-        return weights_of(jnp.concatenate(system.kinetic.diagonal))
-    masses, _ = mass_and_momentum(system, q_s, q_f, jnp.zeros_like(q_s), jnp.zeros_like(q_f))
-    return weights_of(jnp.diagonal(masses))
 
 
 def are_kept(rows: Rows, solved: int, tolerance):
@@ -171,43 +167,29 @@ def are_kept(rows: Rows, solved: int, tolerance):
 
 
 class Configuration(NamedTuple):
-    """The `Rows` at a configuration, and of the rows that are solved for the Jacobian G, and dg/dt."""
+    """The `Rows` at a configuration, the mass matrix, and of the rows that are solved for the values g, the Jacobian G, and dg/dt."""
 
     rows: Rows
-    jacobian: np.ndarray
-    rates: np.ndarray
-
-    @property
-    def solved(self) -> tuple[np.ndarray, np.ndarray]:
-        """g and G."""
-        return self.rows.values[: len(self.rates)], self.jacobian
+    mass: Any
+    values: Any
+    jacobian: Any
+    rates: Any
 
 
-def configuration(system: System, t, q_s, q_f) -> Configuration:
-    """The `Configuration` at numbers: one program for the projection of a start, its momenta, and its checks."""
-    weights = weights_of(np.diagonal(known_mass(system, q_s, q_f)))
-    rows, rates = jax.device_get(_rows_and_rates(system, t, q_s, q_f, weights))
-    return Configuration(rows, rows.gradients[: len(rates)] * weights, rates)
+def configuration(system: System, t, q_s, q_f, mass=None) -> Configuration:
+    """The `Configuration`, with the mass matrix at rest unless it is given: of numbers, one program for the projection of a start, its momenta,
+    and its checks."""
+    if mass is None:
+        mass, _ = mass_and_momentum(system, q_s, q_f, np.zeros(np.shape(q_s)), np.zeros(np.shape(q_f)))
+    weights = weights_of(mass.diagonal())
+    rows, rates = numbers_of(_rows_and_rates(system, t, q_s, q_f, weights))
+    solved = len(rates)
+    return Configuration(rows, mass, rows.values[:solved], rows.gradients[:solved] * weights, rates)
 
 
 @quickly_compiled
 def _rows_and_rates(system, t, q_s, q_f, weights):
     return rows_at(system, t, q_s, q_f, weights), time_rates(system, t, q_s, q_f)
-
-
-def known_mass(system: System, q_s, q_f) -> np.ndarray:
-    """Mass matrix (n, n) at rest, of numbers."""
-    return known_mass_and_momentum(system, q_s, q_f, np.zeros(np.shape(q_s)), np.zeros(np.shape(q_f)))[0]
-
-
-def known_mass_and_momentum(system: System, q_s, q_f, v_s, v_f) -> tuple[np.ndarray, np.ndarray]:
-    """Mass matrix ``d2T/dv2`` (n, n) and momentum ``dT/dv`` (n,) of numbers; constant masses need no program."""
-    if system.has_constant_mass:
-        masses = map(np.asarray, (system.kinetic.slow, system.kinetic.fast))
-        mass = np.asarray(block_diag(*(np.diag(mass) if mass.ndim == 1 else mass for mass in masses if mass.size)))
-        return mass, mass @ np.concatenate([v_s, v_f])
-    mass, momentum = _mass_and_momentum(system, q_s, q_f, v_s, v_f)
-    return np.asarray(mass), np.asarray(momentum)
 
 
 def check_mass(system: System, q_s, q_f) -> None:
@@ -224,7 +206,7 @@ def check_mass(system: System, q_s, q_f) -> None:
     with nullcontext() if is_known(()) else jax.ensure_compile_time_eval():
         random = np.random.default_rng(0)
         velocities = (SPEED * random.normal(size=np.size(q)) for q in (q_s, q_f))
-        mass, _ = known_mass_and_momentum(system, q_s, q_f, *velocities)
+        mass, _ = mass_and_momentum(system, q_s, q_f, *velocities)
     if not np.isfinite(mass).all():
         raise Refused("System: the mass matrix d2T/dv2 of kinetic is not finite at these positions (a norm at zero?).")
     values, vectors = np.linalg.eigh(correlation(mass))
@@ -240,9 +222,6 @@ def check_mass(system: System, q_s, q_f) -> None:
             f"(with a diagonal of ones, its eigenvalues go from {values[0]:.3g} to {values[-1]:.3g}). Give every coordinate a mass, one that "
             "constraints move too."
         )
-
-
-_mass_and_momentum = quickly_compiled(mass_and_momentum)
 
 
 def check_constraints(
@@ -265,70 +244,102 @@ def check_constraints(
     """
     if not system.is_constrained:
         return
-
-    def in_words(rows, name: str) -> str:
-        arguments = (state.q_s,) if name == "slow_constraint" else (state.q_s, state.q_f)
-        return _rows_in_words(getattr(system, name), rows, *arguments, system.params)
-
-    n_s, (n_g, n_gs) = np.size(state.q_s), system.num_constraints(state.q_s, state.q_f)
-    rows = configuration(system, state.t, state.q_s, state.q_f).rows
-    weights = weights_of(np.diagonal(known_mass(system, state.q_s, state.q_f)))
-    solved = rows.values[: n_g + n_gs]
+    held, (rows, mass, solved, *_) = _held(system, state), configuration(system, state.t, state.q_s, state.q_f)
+    weights = weights_of(mass.diagonal())
     if not np.isfinite(solved).all():
         raise Refused(f"{place}: the constraints are {solved} there, which is not finite.")
-    if not (np.isfinite(rows.gradients).all()):
+    if not np.isfinite(rows.gradients).all():
         raise Refused("System: the Jacobian of the constraints is not finite at these positions (a norm at zero?).")
-
-    def gradients(rows: Rows):
-        """dg/dq_s, dg/dq_f and dg_slow/dq_s over the weights."""
-        return rows.gradients[:n_g, :n_s], rows.gradients[:n_g, n_s:], rows.gradients[n_g : n_g + n_gs, :n_s]
-
-    slow, fast, alone = gradients(rows)
-    allowed = rows.allowed(tolerance)[: n_g + n_gs]
+    allowed = rows.allowed(tolerance)[: len(solved)]
     violated = np.abs(solved) > allowed
     if violated.any():
-        _check_gradients(system, state, rows, weights, in_words)  # of a square, which no start fulfils to round-off
+        _check_gradients(system, state, held, rows, weights)  # of a square, which no start fulfils to round-off
         worst = int(np.argmax(np.abs(solved) / np.where(violated, allowed, np.inf)))
-        row = in_words([worst], "constraint") if worst < n_g else in_words([worst - n_g], "slow_constraint")
+        [part] = [part for part in held if part.rows.start <= worst < part.rows.stop]
         raise Refused(
-            f"{place} violate {'constraint' if worst < n_g else 'slow_constraint'}, row {row.strip('[]')}, by {abs(solved[worst]):.3e} (allowed: "
+            f"{place} violate {part.term.field}, row {part.in_words([worst - part.rows.start]).strip('[]')}, by {abs(solved[worst]):.3e} (allowed: "
             f"{allowed[worst]:.0e}, {tolerance:.0e} of its size, and round-off); {advice}"
         )
-    _check_implied(rows, n_g + n_gs, place)
-
-    size = np.linalg.norm(np.concatenate([slow, fast], axis=1), axis=1)
-    slow_only = np.flatnonzero((size > 0) & (np.linalg.norm(fast, axis=1) <= LEAST_FAST_PART * size))
-    if slow_only.size:
-        raise Refused(
-            f"System: row(s) {in_words(slow_only, 'constraint')} of constraint do not depend on the fast variables q_f. {MICRO_GRID} "
-            "Give them as System(slow_constraint=...), a function of (q_s, params), which is held at the macro nodes; or make the "
-            "variables that they hold fast."
-        )
-    _check_counts(fast, alone)
-    _check_gradients(system, state, rows, weights, in_words)
-    if any(dependent for _, dependent in map(rank_of, (alone, fast))):
+    _check_implied(rows, len(solved), place)
+    for part in held:
+        by_all, by_variables = rows.gradients[part.rows], rows.gradients[part.rows, part.variables]
+        size = np.linalg.norm(by_all, axis=1)
+        slow_only = np.flatnonzero((size > 0) & (np.linalg.norm(by_variables, axis=1) <= LEAST_FAST_PART * size))
+        if slow_only.size:
+            raise Refused(
+                f"System: row(s) {part.in_words(slow_only)} of constraint do not depend on the fast variables q_f. {MICRO_GRID} Give them as "
+                "System(slow_constraint=...), a function of (q_s, params), which is held at the macro nodes; or make the variables that "
+                "they hold fast."
+            )
+        (values, variables), pace = by_variables.shape, part.pace
+        if values > variables:
+            raise Refused(
+                f"System: {part.term.field} returns {values} values for {variables} {pace} variables; at most {variables} can be satisfied."
+                f"{part.grid} Remove rows, or make the variables that they hold {pace}."
+            )
+    _check_gradients(system, state, held, rows, weights)
+    if any(rank_of(rows.gradients[part.rows, part.variables])[1] for part in held):
         # At a singular configuration (a linkage folded flat) rows are dependent there and nowhere else, and runs pass it: only rows that are
         # dependent at a generic configuration nearby are refused.
         rows = configuration(system, state.t, *_nearby(state, rows, weights)).rows
-        _, fast, alone = gradients(rows)
-        _check_rank("slow_constraint", alone, "slow variables.", in_words)
-        _check_rank("constraint", fast, f"fast variables. {MICRO_GRID}", in_words)
+        for part in held:
+            jacobian = rows.gradients[part.rows, part.variables]
+            rank, dependent = rank_of(jacobian)
+            if dependent:
+                raise Refused(
+                    f"System: rows {part.in_words(dependent)} of {part.term.field} depend on each other: {len(jacobian)} rows have rank {rank} in "
+                    f"the {part.pace} variables.{part.grid} Remove redundant ones of these rows, or make the variables they need fast."
+                )
 
 
-def _check_gradients(system: System, state, rows: Rows, weights, in_words) -> None:
+class Held(NamedTuple):
+    """A constraint at a state.
+
+    values: t, q_s and q_f by name, and the params.
+    rows: its rows among those that are solved for.
+    variables: the coordinates among (q_s, q_f) that can satisfy it: those of its pace.
+    pace: "slow" or "fast".
+    grid: its grid in messages, with a space before; empty for the macro grid.
+    """
+
+    term: Term
+    values: dict[str, Any]
+    rows: slice
+    variables: slice
+    pace: str
+    grid: str
+
+    def in_words(self, rows) -> str:
+        """Numbers of some of its rows, with the names of rows that the constraint returns by name: ``[0, 2]`` or ``0 (rope), 2 (rail)``."""
+        sizes = constraint_sizes(self.term.function, *self.term.of_arguments(self.values), self.values["params"])
+        names = [name for name, size in sizes.items() for _ in range(size)]
+        return ", ".join(f"{row} ({names[row]})" for row in rows) if names else str(list(map(int, rows)))
+
+
+def _held(system: System, state) -> list[Held]:
+    """The constraints of a system at a state."""
+    n_s, (n_g, n_gs) = np.size(state.q_s), system.num_constraints(state.q_s, state.q_f)
+    parts = {
+        "constraint": (slice(0, n_g), slice(n_s, None), "fast", f" {MICRO_GRID}"),
+        "slow_constraint": (slice(n_g, n_g + n_gs), slice(0, n_s), "slow", ""),
+    }
+    values = {"t": state.t, "q_s": state.q_s, "q_f": state.q_f, "params": system.params}
+    return [Held(term, values, *parts[term.field]) for term in system.of_kind("constraint")]
+
+
+def _check_gradients(system: System, state, held: list[Held], rows: Rows, weights) -> None:
     """Refuse rows whose gradient is zero at the state, but not at a generic configuration `NEARBY` relative to its positions."""
-    q, n_s = np.concatenate([state.q_s, state.q_f]), np.size(state.q_s)
-    n_g, n_gs = system.num_constraints(state.q_s, state.q_f)
+    q = np.concatenate([state.q_s, state.q_f])
     change = NEARBY * np.abs(weights * q).max() * np.random.default_rng(0).normal(size=q.size) / weights
-    nearby = configuration(system, state.t, *np.split(q + change, [n_s])).rows
+    nearby = configuration(system, state.t, *np.split(q + change, [np.size(state.q_s)])).rows
     size, size_nearby = (np.linalg.norm(a.gradients, axis=1) for a in (rows, nearby))
     vanishes = (size_nearby > 0) & (size <= VANISHING_GRADIENT * size_nearby)
-    parts = {"constraint": vanishes[:n_g], "slow_constraint": vanishes[n_g : n_g + n_gs]}
-    for name, rows_of_name in parts.items():
-        if rows_of_name.any():
+    for part in held:
+        if vanishes[part.rows].any():
             raise Refused(
-                f"System: the gradient of row(s) {in_words(np.flatnonzero(rows_of_name), name)} of {name} vanishes at these positions, and no force "
-                "along it can hold the constraint. A square, (|x| - L)**2, has such a gradient wherever it is 0: take its root, |x| - L."
+                f"System: the gradient of row(s) {part.in_words(np.flatnonzero(vanishes[part.rows]))} of {part.term.field} vanishes at these "
+                "positions, and no force along it can hold the constraint. A square, (|x| - L)**2, has such a gradient wherever it is 0: take "
+                "its root, |x| - L."
             )
 
 
@@ -339,39 +350,6 @@ def _check_implied(rows: Rows, solved: int, place: str) -> None:
         raise Refused(
             f"System: implied does not follow from the constraints: {place} keep these, and row(s) {opened.tolist()} of implied are "
             f"{values[opened]} there (allowed: {allowed[opened]}). Take parameters for which they follow, or hold them as constraint."
-        )
-
-
-def _check_counts(fast, alone) -> None:
-    (n_g, n_f), (n_gs, n_s) = fast.shape, alone.shape
-    if n_gs > n_s:
-        raise Refused(
-            f"System: slow_constraint returns {n_gs} values for {n_s} slow variables; at most {n_s} can be satisfied."
-        )
-    if n_g > n_f:
-        raise Refused(
-            f"System: constraint returns {n_g} values for {n_f} fast variables; at most {n_f} can be satisfied. {MICRO_GRID} "
-            "Remove rows, or make the variables that they hold fast."
-        )
-
-
-def _rows_in_words(constraint, rows, *arguments) -> str:
-    """Numbers of the rows of a constraint, with the names of rows that the constraint returns by name: ``[0, 2]`` or ``0 (rope), 2 (rail)``."""
-    if isinstance(constraint, Rheonomic):
-        constraint, arguments = constraint.function, (0.0, *arguments)
-    sizes = constraint_sizes(constraint, *arguments)
-    if not sizes:
-        return str([int(row) for row in rows])
-    names = [name for name, size in sizes.items() for _ in range(size)]
-    return ", ".join(f"{row} ({names[row]})" for row in rows)
-
-
-def _check_rank(name: str, jacobian, of: str, in_words) -> None:
-    rank, dependent = rank_of(jacobian)
-    if dependent:
-        raise Refused(
-            f"System: rows {in_words(dependent, name)} of {name} depend on each other: {len(jacobian)} rows have rank {rank} in the {of} Remove "
-            "redundant ones of these rows, or make the variables they need fast."
         )
 
 

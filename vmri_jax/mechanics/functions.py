@@ -1,4 +1,9 @@
-"""Functions of the user: checks of their arguments, and tracing once for all programs that contain them."""
+"""Functions of the user: checks of their arguments, the order of their params, and tracing once for all programs that contain them.
+
+JAX sorts the names of a dictionary whenever it takes a pytree apart: in jit, grad and vmap, and in ``jax.tree.map``. Functions of the user may rely on
+the order of writing, ``zip(params["k"].values(), q_f.values())``. So the order is kept with the functions, and every dictionary is put
+back into its order before a function is called, while JAX traces.
+"""
 
 import dataclasses
 import inspect
@@ -6,10 +11,10 @@ import warnings
 from collections import Counter
 from collections.abc import Callable, Hashable
 from functools import lru_cache, partial, wraps
+from typing import Any, NamedTuple
 
 import jax
 
-from vmri_jax.mechanics.order import Order, ordered
 from vmri_jax.mechanics.surroundings import Surroundings, innermost, name_of
 from vmri_jax.refusals import Refused
 
@@ -31,22 +36,65 @@ TIME_AND_VELOCITIES = ("t", "v_s", "v_f")
 """Names of arguments that only forces, kinetic energies and `Rheonomic` constraints get."""
 
 
+class Order(NamedTuple):
+    """Names in a dictionary in the order of writing, and orders of its entries.
+
+    Args:
+        names: keys of the dictionary; None for a list, a tuple or another node of a pytree.
+        parts: order of each entry, None for an entry without dictionaries.
+    """
+
+    names: tuple[Any, ...] | None
+    parts: tuple["Order | None", ...]
+
+
+def order_of(tree: Any) -> Order | None:
+    """The order of all dictionaries in a pytree; None if there is only one order."""
+    if isinstance(tree, dict):
+        parts = tuple(map(order_of, tree.values()))
+        return Order(tuple(tree), parts) if len(tree) > 1 or any(parts) else None
+    parts = tuple(None if child is tree else order_of(child) for child in _children(tree)[0])
+    return Order(None, parts) if any(parts) else None
+
+
+def in_order(tree: Any, order: Order | None) -> Any:
+    """The pytree with its dictionaries in an order; names that the order does not know come last."""
+    if order is None:
+        return tree
+    if order.names is not None and isinstance(tree, dict):
+        parts, ordered = dict(zip(order.names, order.parts, strict=True)), tree.copy()
+        for name in [*(name for name in parts if name in tree), *(name for name in tree if name not in parts)]:
+            ordered[name] = in_order(ordered.pop(name), parts.get(name))  # moved to the end
+        return ordered
+    children, structure = _children(tree)
+    if order.names is not None or len(children) != len(order.parts):
+        return tree
+    return jax.tree.unflatten(structure, map(in_order, children, order.parts))
+
+
+def _children(tree: Any) -> tuple[list, Any]:
+    """The entries of the outermost node of a pytree, and the structure of this node."""
+    return jax.tree.flatten(tree, is_leaf=lambda node: node is not tree)
+
+
 @jax.tree_util.register_pytree_node_class
 @dataclasses.dataclass(frozen=True, eq=False)
 class TracedOnce:
     """A function of arrays that JAX traces once per process, for given shapes of its arguments and for what it reads from around it.
 
-    Later programs inline the traced operations, as if they had called the function. Two instances are equal if the codes of their functions
-    and their surroundings are. A pytree node without arrays, whose structure is what the function reads.
+    Later programs inline the traced operations, as if they had called the function. Two instances are equal if the codes of their functions,
+    their surroundings and their orders are. A pytree node without arrays, whose structure is what the function reads.
 
     Args:
         function: of the user.
         seen: key of its `Surroundings` when a run was made; None for what the function reads now. With `seen` new traces after a change are
             refused: they would mix old and new numbers.
+        order: in which the function gets the dictionaries in its last argument, the params; None for the order in which they come.
     """
 
     function: Callable
     seen: Hashable = None
+    order: Order | None = None
 
     def __call__(self, *arguments):
         return _traced(self if self.seen is not None else self.now())(*arguments)
@@ -59,6 +107,9 @@ class TracedOnce:
                 f"{name_of(self)} reads something else from around it than when its run was made. Make the run again; what varies is better "
                 "handed over in params."
             )
+        if self.order is not None:
+            *others, params = arguments
+            arguments = *others, in_order(params, self.order)
         value = self.function(*arguments)
         around.before(Surroundings(self.function))
         return value
@@ -68,7 +119,7 @@ class TracedOnce:
         last = vars(self).get("last")
         if last is None or not last[0].hold():
             around = Surroundings(self.function)
-            last = vars(self)["last"] = around, TracedOnce(self.function, around.key)
+            last = vars(self)["last"] = around, TracedOnce(self.function, around.key, self.order)
         return last[1]
 
     @property
@@ -78,7 +129,7 @@ class TracedOnce:
 
     @property
     def _key(self) -> Hashable:
-        return self.now().seen if self.seen is None else self.seen
+        return self.now().seen if self.seen is None else self.seen, self.order
 
     def __eq__(self, other) -> bool:
         return isinstance(other, TracedOnce) and self._key == other._key
@@ -90,7 +141,7 @@ class TracedOnce:
         return repr(self.function)
 
     def __reduce__(self):  # code cannot be pickled; another process reads what is there
-        return TracedOnce, (self.function,)
+        return TracedOnce, (self.function, None, self.order)
 
     def tree_flatten(self):
         """No arrays; the structure is what the function reads, and whether it keeps that."""
@@ -100,7 +151,7 @@ class TracedOnce:
     def tree_unflatten(cls, structure, _):
         """The inverse of `tree_flatten`."""
         reads_now, function = structure
-        return cls(function.function) if reads_now else function
+        return cls(function.function, order=function.order) if reads_now else function
 
 
 class CompiledAgainWarning(UserWarning):
@@ -141,9 +192,9 @@ _made: Counter = Counter()
 
 def traced_once(function: Callable, order: Order | None = None) -> TracedOnce:
     """`function` as `TracedOnce`, with an order of its params; one that has an order keeps it."""
-    inner = function.function if isinstance(function, TracedOnce) else function
-    within = ordered(inner, order)
-    return function if isinstance(function, TracedOnce) and within is inner else TracedOnce(within)
+    if not isinstance(function, TracedOnce):
+        return TracedOnce(function, order=order)
+    return function if order is None or function.order else TracedOnce(function.function, order=order)
 
 
 def check_arguments(place: str, function: Callable, arguments: str, instead: str = "") -> None:

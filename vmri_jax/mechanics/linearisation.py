@@ -9,7 +9,6 @@ At an equilibrium the expansion is the linearised system. Elsewhere it describes
 at rest. In both cases it is a `System`, to which every scheme applies unchanged.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
@@ -19,12 +18,13 @@ import numpy as np
 
 from vmri_jax.kernels.saddle import least_norm
 from vmri_jax.mechanics.arrays import QUICK
-from vmri_jax.mechanics.constraints import RANK
+from vmri_jax.mechanics.constraints import decomposed
 from vmri_jax.mechanics.driving import driven
 from vmri_jax.mechanics.motion import motion
 from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.state import Movable, State, opened, start_of
 from vmri_jax.mechanics.system import System
+from vmri_jax.mechanics.terms import Term
 from vmri_jax.refusals import Refused
 
 LEAST_GROWTH = 1e-6
@@ -230,7 +230,7 @@ def linearise(system: Movable, state: State | None = None, names: Names | None =
     N = mass_orthonormal(mass, G)
     # lambda . g'', the stiffness of the constraint forces
     bending, slow_bending = (np.tensordot(x, curvature, 1) for x in (multipliers, slow_multipliers))
-    hessians = {name: terms[name][1] for name in _potentials(system)}
+    hessians = {name: terms[name][1] for name in ("slow", "fast", *map(_key, system.of_kind("potential")))}
     potentials = sum(hessians.values())
     hessians |= {"slow": hessians["slow"] + slow_bending, "force": -force_q}
     linear = Linearisation(
@@ -256,9 +256,8 @@ def linearise(system: Movable, state: State | None = None, names: Names | None =
 
 def tangents(rows: np.ndarray) -> np.ndarray:
     """Orthonormal basis (n, k), one vector per column, of the space orthogonal to rows (m, n); dependent rows count once."""
-    lengths = np.linalg.norm(rows, axis=1, keepdims=True)
-    _, sizes, directions = np.linalg.svd(rows / np.where(lengths > 0, lengths, 1.0))
-    return directions[np.count_nonzero(sizes > RANK) :].T
+    _, rank, directions = decomposed(rows)
+    return directions[rank:].T
 
 
 def mass_orthonormal(mass: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:
@@ -272,14 +271,9 @@ def mass_orthonormal(mass: np.ndarray, rows: np.ndarray | None = None) -> np.nda
     return np.linalg.solve(np.linalg.cholesky(T.T @ mass @ T), T.T).T
 
 
-def _potentials(system: System) -> dict[str, Callable]:
-    """V, W and the further potentials as functions of (q_s, q_f, params), by their keys among the terms; zero without V or W."""
-    V, W = system.slow_potential, system.fast_potential
-    return {
-        "slow": lambda q_s, q_f, params: jnp.zeros(()) if V is None else V(q_s, q_f, params),
-        "fast": lambda q_s, q_f, params: jnp.zeros(()) if W is None else W(q_f, params),
-        **{f"potential {name}": function for name, function in system.potentials},
-    }
+def _key(term: Term) -> str:
+    """The key of a term: "slow" and "fast" of V and W, "potential " and the name of a further potential, else its field."""
+    return f"potential {term.name}" if term.field == "potentials" else term.field.removesuffix("_potential")
 
 
 @partial(jax.jit, compiler_options=QUICK)
@@ -307,8 +301,9 @@ def _expansion(system: System, state: State) -> dict[str, tuple]:
         "constraint": second_order(lambda q: system.constraints(state.t, q[:n_s], q[n_s:]), q),
         "force": jax.jacfwd(force, argnums=(0, 1))(q, v),
     }
-    for name, potential in _potentials(system).items():
-        terms[name] = second_order(lambda q, V=potential: V(q[:n_s], q[n_s:], system.params), q)
+    terms["slow"] = terms["fast"] = jnp.zeros_like(q), jnp.zeros((q.size, q.size))  # without V or W
+    for term in system.of_kind("potential"):
+        terms[_key(term)] = second_order(lambda q, V=term: V(system.params, q_s=q[:n_s], q_f=q[n_s:]), q)
     # lambda = (G M^-1 G^T)^+ G M^-1 f of the force f = -dV/dq alone
     G = terms["constraint"][0]
     responses = jnp.linalg.solve(terms["kinetic"][1][q.size :, q.size :], G.T)
@@ -323,27 +318,23 @@ def _expanded_system(system: System, state: State, terms: dict) -> System:
     *_, multipliers, slow_multipliers = terms["motion"]
     constant_force = G.T @ (multipliers - slow_multipliers)  # balances the constraint forces that V does not
     has_constant_force = np.any(np.abs(constant_force) > 1e-12 * (np.abs(G.T) @ np.abs(multipliers)))
-    potentials = {
-        name: (np.zeros(len(slope)), hessian) for name in _potentials(system) for slope, hessian in [terms[name]]
-    }
+    expanded = {term: _Quadratic(_key(term)) for term in system.terms if term.kind in ("potential", "constraint")}
+    further = [term for term in expanded if term.field == "potentials"]
     return System(
         system.kinetic if system.has_constant_mass else _Quadratic("kinetic"),
-        None if system.slow_potential is None else _Quadratic("slow"),
-        None if system.fast_potential is None else _Quadratic("fast"),
-        None if system.constraint is None else _Quadratic("constraint"),
-        None if system.slow_constraint is None else _Quadratic("slow_constraint"),
-        _force if has_constant_force or force_q.any() or force_v.any() else None,
+        force=_force if has_constant_force or force_q.any() or force_v.any() else None,
         params={
-            **potentials,
+            **{_key(term): (np.zeros(len(G.T)), terms[_key(term)][1]) for term in further},
             "kinetic": (np.zeros(len(kinetic)), kinetic),
-            "slow": (-G.T @ slow_multipliers, potentials["slow"][1]),
-            "fast": (np.zeros(state.q_f.size), potentials["fast"][1][n_s:, n_s:]),
+            "slow": (-G.T @ slow_multipliers, terms["slow"][1]),
+            "fast": (np.zeros(state.q_f.size), terms["fast"][1][n_s:, n_s:]),
             "constraint": (G[:n_g], curvature[:n_g]),
             "slow_constraint": (G[n_g:, :n_s], curvature[n_g:, :n_s, :n_s]),
             "force": force_q,
             "other_force": (constant_force, force_v),
         },
-        potentials=[(name, _Quadratic(f"potential {name}")) for name, _ in system.potentials],
+        potentials=[(term.name, expanded[term]) for term in further],
+        **{term.field: function for term, function in expanded.items() if term not in further},
     )
 
 

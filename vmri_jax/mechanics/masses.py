@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from vmri_jax import kernels
-from vmri_jax.mechanics.arrays import Numbers, is_concrete, real_array
+from vmri_jax.mechanics.arrays import Numbers, is_concrete, library, real_array
 from vmri_jax.refusals import Refused
 
 
@@ -82,6 +82,14 @@ class ConstantMass(eqx.Module):
     def diagonal(self):
         """The diagonals (n_s,) of M_s and (n_f,) of M_f."""
         return tuple(mass if mass.ndim == 1 else jnp.diagonal(mass) for mass in (self.slow, self.fast))
+
+    @property
+    def matrix(self):
+        """The mass matrix (n_s + n_f, n_s + n_f), of NumPy if the masses are known."""
+        xp = library(self)
+        slow, fast = (mass if mass.ndim == 2 else xp.diag(mass) for mass in (self.slow, self.fast))
+        corner = xp.zeros((len(slow), len(fast)))
+        return xp.block([[slow, corner], [corner.T, fast]])
 
     def __call__(self, q_s, q_f, v_s, v_f, params):
         p_s, p_f = self.momentum(v_s, v_f)

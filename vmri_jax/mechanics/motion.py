@@ -16,8 +16,7 @@ import jax
 import jax.numpy as jnp
 
 from vmri_jax.kernels.saddle import least_norm
-from vmri_jax.mechanics.invariants import lagrangian, velocity
-from vmri_jax.mechanics.projection import mass_and_momentum
+from vmri_jax.mechanics.invariants import lagrangian, velocity, velocity_and_masses
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
 
@@ -46,7 +45,8 @@ def force_of(lagrangian, q, v):
 def motion(system: System, state: State) -> Motion:
     """Velocities, accelerations and multipliers of a state; of dependent constraints the least multipliers."""
     n_s = state.q_s.size
-    v_s, v_f = velocity(system, state.q_s, state.q_f, state.p_s, state.p_f)
+    (v_s, v_f), mass = velocity_and_masses(system, state.q_s, state.q_f, state.p_s, state.p_f)
+    mass = system.kinetic.matrix if mass is None else mass
     q, v = jnp.append(state.q_s, state.q_f), jnp.append(v_s, v_f)
 
     def constraints(t, q):
@@ -58,7 +58,6 @@ def motion(system: System, state: State) -> Motion:
 
     t = jnp.asarray(state.t)
     of_motion = partial(lagrangian, system, n_s)
-    mass, _ = mass_and_momentum(system, state.q_s, state.q_f, v_s, v_f)
     forces = force_of(of_motion, q, v)
     if system.force is not None:
         forces += jnp.concatenate(system.forces(t, state.q_s, state.q_f, v_s, v_f))

@@ -11,7 +11,7 @@ from vmri_jax import kernels
 from vmri_jax.kernels import matmul, matvec
 from vmri_jax.kernels.band import Full, Sparsity
 from vmri_jax.kernels.saddle import saddle
-from vmri_jax.mechanics.arrays import quickly_compiled
+from vmri_jax.mechanics.arrays import library, numbers_of, quickly_compiled
 from vmri_jax.mechanics.constraint_pattern import all_rows
 from vmri_jax.mechanics.masses import WithMassMatrix
 from vmri_jax.mechanics.structure import has_constant_hessian
@@ -38,13 +38,25 @@ def legendre(system: System, q_s, q_f, v_s, v_f):
 
 
 def mass_and_momentum(system: System, q_s, q_f, v_s, v_f):
-    """Mass matrix ``d2T/dv2`` (n, n) and momentum ``dT/dv`` (n,)."""
-    n_s, masses = v_s.size, closed_masses(system.of_kind("kinetic"), q_s, q_f, system.params)
+    """Mass matrix ``d2T/dv2`` (n, n) and momentum ``dT/dv`` (n,): of known numbers by NumPy, and for constant masses without a program."""
+    v = library(v_s, v_f).concatenate([v_s, v_f])
+    if system.has_constant_mass:
+        mass = system.kinetic.matrix
+        return mass, mass @ v
+    return numbers_of(_program_of_masses(system, q_s, q_f, v))
+
+
+def _masses_of_function(system: System, q_s, q_f, v):
+    """`mass_and_momentum` of a T that is a function, as a part of a program."""
+    masses = closed_masses(system.of_kind("kinetic"), q_s, q_f, system.params)
     if masses is not None:
-        return masses, matvec(masses, jnp.append(v_s, v_f))
-    momentum = jax.grad(lambda v: system.kinetic_energy(q_s, q_f, v[:n_s], v[n_s:]))
-    p, times_mass = jax.linearize(momentum, jnp.append(v_s, v_f))
+        return masses, matvec(masses, v)
+    momentum = jax.grad(lambda v: system.kinetic_energy(q_s, q_f, v[: q_s.size], v[q_s.size :]))
+    p, times_mass = jax.linearize(momentum, v)
     return jax.vmap(times_mass)(jnp.eye(p.size)), p
+
+
+_program_of_masses = quickly_compiled(_masses_of_function)
 
 
 def have_closed_masses(energies: Iterable[Term]) -> bool:
@@ -120,7 +132,7 @@ def _with_masses(system: System, state, guess):
         guess = v if guess is None else jnp.concatenate(guess)
         v, impulse = _velocity_and_impulse(system, q_s, q_f, constraints, p, guess)
     if masses is None:
-        masses, gradient = mass_and_momentum(system, q_s, q_f, v[:n_s], v[n_s:])
+        masses, gradient = _masses_of_function(system, q_s, q_f, v)
     if is_quadratic:
         v, impulse = _by_one_solve(masses, p - gradient, *constraints)  # p = M v + dT/dv(0)
     momenta = state.p_s, state.p_f

@@ -290,14 +290,13 @@ class Problem:
 
     def __repr__(self) -> str:
         names = (self.names or Names()).of_coordinates(np.shape(self.q_s)[-1], np.shape(self.q_f)[-1])
-        constraints = [f"{name} ({size})" for name, size in {**names.constraint, **names.slow_constraint}.items()]
         return summary(
             "Problem",
             {
                 "slow": coordinates(names.slow_coordinates),
                 "fast": coordinates(names.fast_coordinates),
                 **self.system.in_words(),
-                "rows of constraints": listed(constraints),
+                "rows of constraints": listed([f"{name} ({len(rows)})" for name, rows in names.rows.items()]),
                 "start": f"t = {numbers(self.t)}",
                 **{name: numbers(getattr(self, name)) for name in ("q_s", "q_f", "v_s", "v_f")},
             },
@@ -330,13 +329,8 @@ def problem_of(caller: str, movable: Problem | HasProblem) -> Problem:
         TypeError: an argument that is neither.
     """
     require_x64()
-    problem = opened(movable)
-    if not isinstance(problem, Problem):
-        raise Refused(
-            f"{caller}: problem is {type(problem).__name__}; give a vmri_jax.Problem or a Scene. A System needs a start: "
-            "Problem(system, q_s, q_f, v_s, v_f)."
-        )
-    return problem
+    example = "a vmri_jax.Problem or a Scene. A System needs a start: Problem(system, q_s, q_f, v_s, v_f)"
+    return check_type(f"{caller}: problem", opened(movable), Problem, example)
 
 
 def start_of(caller: str, system, state=None) -> tuple[System, State]:
@@ -353,13 +347,8 @@ def start_of(caller: str, system, state=None) -> tuple[System, State]:
     system = opened(system)
     if isinstance(system, Problem):
         system, state = system.system, system.state() if state is None else state
-    if not isinstance(system, System):
-        raise Refused(
-            f"{caller}: system is {type(system).__name__}; give a vmri_jax.Problem or a Scene, or a System and a State."
-        )
-    if not isinstance(state, State):
-        got = "a System has no start" if state is None else f"state is {type(state).__name__}"
-        raise Refused(
-            f"{caller}: {got}; give a State, e.g. from initial_state(...), or a Problem(system, q_s, q_f, v_s, v_f) alone."
-        )
-    return system, state
+    check_type(f"{caller}: system", system, System, "a vmri_jax.Problem or a Scene, or a System and a State")
+    example = "a State, e.g. from initial_state(...), or a Problem(system, q_s, q_f, v_s, v_f) alone"
+    if state is None:
+        raise Refused(f"{caller}: a System has no start; give {example}.")
+    return system, check_type(f"{caller}: state", state, State, example)

@@ -1,31 +1,62 @@
-"""Structure of functions from their jaxprs: dependence of outputs on inputs, and the structure of Hessians.
+"""Properties of functions from their jaxprs: dependence of outputs on inputs, the structure of Hessians, and the sizes of terms that cancel.
 
-The answers are structural and conservative. "Independent", "constant" and "diagonal" are certain; "dependent" may be wrong (``0 * x``
+The answers on structure are conservative. "Independent", "constant" and "diagonal" are certain; "dependent" may be wrong (``0 * x``
 depends on x). Outputs of an operation that is unknown here depend on all its inputs, and nothing is known about functions with effects.
 
 Derivatives at random points would also show zeros of a Hessian, but no zeros of functions with `where`, and to compile them takes 0.3 s of
 processor time for each question, thirty times as long as to trace the function.
+
+The sizes of the terms that cancel in a function are ``|d| + L`` for the constraint ``|d| - L``. The jaxpr is evaluated once more with a size for every
+number: the sizes of a sum are added, a rearrangement, and a product with a number that does not depend on the arguments, take the size
+along, and every other operation starts from the modulus of its value.
 """
 
 from collections.abc import Callable
+from functools import reduce
 from itertools import pairwise
-from typing import Any
+from operator import add
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.interpreters.partial_eval import dce_jaxpr
 
 ENTRY_BY_ENTRY = frozenset(["add", "add_any", "convert_element_type", "copy", "div", "mul", "neg", "select_n", "sub"])
 """Linear operations whose entry i depends on the entries i of their inputs alone."""
+# fmt: off
+SUMS = frozenset(["add", "add_any", "sub"])
+TAKES_SIZES_ALONG = frozenset([
+    "broadcast_in_dim", "concatenate", "convert_element_type", "copy", "cumsum", "dynamic_slice", "dynamic_update_slice", "gather", "neg",
+    "pad", "reduce_sum", "reshape", "rev", "scatter", "scatter-add", "select_n", "slice", "split", "squeeze", "stack", "transpose", "unstack",
+])
+PRODUCTS = frozenset(["mul", "div", "dot_general"])
+# fmt: on
 CALLS = ("jit", "pjit", "closed_call", "core_call", "custom_jvp_call", "custom_vjp_call", "remat", "checkpoint")
 
 
-def called(eqn) -> tuple[Any, Any] | None:
-    """(jaxpr, consts) of the function that an equation of a jaxpr calls, None if the equation is no call."""
-    inner = eqn.params.get("jaxpr") or eqn.params.get("call_jaxpr")
-    if eqn.primitive.name not in CALLS or inner is None:
-        return None
-    return getattr(inner, "jaxpr", inner), getattr(inner, "consts", ())
+def interpreted(jaxpr, inputs: list, rule: Callable, constant: Callable) -> list:
+    """The outputs of a jaxpr under another meaning of its numbers.
+
+    Args:
+        jaxpr: its calls of functions are entered.
+        inputs: meanings of its constants and of its arguments.
+        rule: ``rule(eqn, meanings of the inputs)`` are the meanings of the outputs of an operation.
+        constant: the meaning of a number that the jaxpr itself has.
+    """
+    known = dict(zip([*jaxpr.constvars, *jaxpr.invars], inputs, strict=True))
+
+    def meaning(v):
+        return constant(v.val) if hasattr(v, "val") else known[v]
+
+    for eqn in jaxpr.eqns:
+        parts, inner = list(map(meaning, eqn.invars)), eqn.params.get("jaxpr") or eqn.params.get("call_jaxpr")
+        if eqn.primitive.name not in CALLS or inner is None:
+            outputs = rule(eqn, parts)
+        else:
+            constants = map(constant, getattr(inner, "consts", ()))
+            outputs = interpreted(getattr(inner, "jaxpr", inner), [*constants, *parts], rule, constant)
+        known.update(zip(eqn.outvars, outputs, strict=True))
+    return list(map(meaning, jaxpr.outvars))
 
 
 def depends_on(function: Callable, *args) -> tuple[bool, ...]:
@@ -40,12 +71,8 @@ def depends_on(function: Callable, *args) -> tuple[bool, ...]:
 
 def entries_seen(function: Callable, q) -> np.ndarray:
     """(n,) whether the outputs of ``function(q)`` can depend on each entry of the vector q."""
-    jaxpr, n, used = _kept(function, q), q.size, []
-    if jaxpr is None:
-        return np.ones(n, bool)
-    used += _combinations(n, jaxpr, [np.eye(n)], used)
-    marks = [a.any(axis=tuple(range(a.ndim - 1))) for a in used if a is not None]
-    return np.any([np.zeros(n, bool), *marks], axis=0)
+    used = _combinations(_kept(function, q), [np.eye(q.size)])
+    return np.any([np.zeros(q.size, bool), *(a.any(axis=tuple(range(a.ndim - 1))) for a in used)], axis=0)
 
 
 def has_constant_hessian(function: Callable, *args) -> bool:
@@ -63,20 +90,16 @@ def has_diagonal_hessian(function: Callable, q) -> bool:
 
     The product of the Hessian with a vector is linear in the vector, and of the linear operations few act entry by entry.
     """
-    jaxpr = _kept(_times_hessian(function), q, q)
-    return jaxpr is not None and not _mixes(jaxpr, [False, True])
+    jaxpr, mixes = _kept(_times_hessian(function), q, q), []
 
+    def depends(eqn, marked):
+        mixes.append(any(marked) and eqn.primitive.name not in ENTRY_BY_ENTRY)
+        return [any(marked)] * len(eqn.outvars)
 
-def _mixes(jaxpr, marked: list[bool]) -> bool:
-    """Whether an operation of a jaxpr takes different entries of the marked inputs together."""
-    depends = {id(v) for v, is_marked in zip(jaxpr.invars, marked, strict=True) if is_marked}
-    for eqn in jaxpr.eqns:
-        marked, inner = [id(v) in depends for v in eqn.invars], called(eqn)
-        if any(marked):
-            if eqn.primitive.name not in ENTRY_BY_ENTRY if inner is None else _mixes(inner[0], marked):
-                return True
-            depends.update(map(id, eqn.outvars))
-    return False
+    if jaxpr is None:
+        return False
+    interpreted(jaxpr, [False] * len(jaxpr.constvars) + [False, True], depends, lambda _: False)
+    return not any(mixes)
 
 
 def _kept(function: Callable, *args):
@@ -97,12 +120,9 @@ def curved_directions(function: Callable, q) -> np.ndarray:
     product of the Hessian with a vector: linear combinations of its entries with known coefficients are followed up to the first operation
     that is not linear in this sense.
     """
-    jaxpr, n, used = _kept(_times_hessian(function), q, q), q.size, []
-    if jaxpr is None:
-        return np.eye(n)
-    used += _combinations(n, jaxpr, [np.zeros((n, n)), np.eye(n)], used)
-    rows = [np.zeros((1, n)), *(a.reshape(-1, n) for a in used if a is not None)]
-    return _independent(np.unique(np.concatenate(rows), axis=0))
+    n = q.size
+    used = _combinations(_kept(_times_hessian(function), q, q), [np.zeros((n, n)), np.eye(n)])
+    return _independent(np.unique(np.concatenate([np.zeros((1, n)), *(a.reshape(-1, n) for a in used)]), axis=0))
 
 
 def _independent(rows: np.ndarray) -> np.ndarray:
@@ -115,26 +135,31 @@ def _independent(rows: np.ndarray) -> np.ndarray:
     return np.eye(rows.shape[1])[entries] if len(kept) == entries.sum() else kept
 
 
-def _combinations(n: int, jaxpr, inputs: list, used: list) -> list:
-    """The outputs of a jaxpr as linear combinations of n numbers: coefficients (..., n), None for an output that is no known combination.
+def _combinations(jaxpr, inputs: list[np.ndarray]) -> list[np.ndarray]:
+    """Coefficients (..., n) of the linear combinations of n numbers that a jaxpr returns, or takes into an operation that is not in `_LINEAR`.
 
-    `inputs` are coefficients or None; `used` gets the combinations that enter any operation that is not in `_LINEAR`.
+    `inputs` are the coefficients of its arguments. A jaxpr that is not known, None, may take every number alone.
     """
-    known = dict(zip(map(id, jaxpr.invars), inputs, strict=True))
-    for eqn in jaxpr.eqns:
-        parts = [known.get(id(v), np.zeros((*v.aval.shape, n))) for v in eqn.invars]
-        inner, linear = called(eqn), _LINEAR.get(eqn.primitive.name)
-        if not any(a is None or a.any() for a in parts):
-            continue
-        if inner is not None:
-            outputs = _combinations(n, inner[0], parts, used)
-        elif linear is not None and all(a is not None for a in parts):
-            outputs = linear(eqn, *parts)
-        else:
-            used += parts
-            outputs = [None] * len(eqn.outvars)
-        known.update(zip(map(id, eqn.outvars), outputs if isinstance(outputs, list) else [outputs], strict=True))
-    return [known.get(id(v), np.zeros((*v.aval.shape, n))) for v in jaxpr.outvars]
+    n, used = inputs[0].shape[-1], []
+    if jaxpr is None:
+        return [np.eye(n)]
+
+    def zeros(shape):
+        return np.zeros((*shape, n))
+
+    def combined(eqn, parts):
+        linear = _LINEAR.get(eqn.primitive.name)
+        if all(a is not None and not a.any() for a in parts):
+            return [zeros(v.aval.shape) for v in eqn.outvars]
+        if linear is None or any(a is None for a in parts):
+            used.extend(parts)
+            return [None] * len(eqn.outvars)
+        outputs = linear(eqn, *parts)
+        return outputs if isinstance(outputs, list) else [outputs]
+
+    inputs = [*(zeros(v.aval.shape) for v in jaxpr.constvars), *inputs]
+    used += interpreted(jaxpr, inputs, combined, lambda value: zeros(np.shape(value)))
+    return [a for a in used if a is not None]
 
 
 def _shape(eqn) -> tuple[int, ...]:
@@ -179,3 +204,40 @@ _LINEAR = {
     "transpose": lambda eqn, a: a.transpose(*eqn.params["permutation"], a.ndim - 1),
     "concatenate": lambda eqn, *parts: np.concatenate(parts, axis=eqn.params["dimension"]),
 }
+
+
+def sizes_of_terms(function: Callable, *args):
+    """The sizes of the terms in every value of ``function(*args)``, in the units of the values."""
+    closed = jax.make_jaxpr(function)(*args)
+    # numbers are pairs (value, size); the size is None for a number that does not depend on the arguments
+    numbers = [*((a, None) for a in closed.consts), *((a, jnp.abs(a)) for a in jax.tree.leaves(args))]
+    outputs = interpreted(closed.jaxpr, numbers, _sized, lambda value: (value, None))
+    return jax.tree.unflatten(jax.tree.structure(jax.eval_shape(function, *args)), map(_size, outputs))
+
+
+def _sized(eqn, numbers) -> list:
+    """The outputs of an operation as pairs (value, size)."""
+    name, depends = eqn.primitive.name, [size is not None for _, size in numbers]
+    values = _applied(eqn, [value for value, _ in numbers])
+    is_multiple = name in PRODUCTS and sum(depends) == 1 and not (name == "div" and depends[1])
+    if not any(depends):
+        sizes = [None] * len(values)
+    elif name in SUMS or name == "neg":
+        sizes = [reduce(add, map(_size, numbers))]
+    elif is_multiple or name in TAKES_SIZES_ALONG:
+        sizes = _applied(eqn, list(map(_size, numbers)))
+    else:
+        sizes = map(jnp.abs, values)
+    return list(zip(values, sizes, strict=True))
+
+
+def _applied(eqn, values) -> list:
+    outputs = eqn.primitive.bind(*values, **eqn.params)
+    return outputs if eqn.primitive.multiple_results else [outputs]
+
+
+def _size(number):
+    value, size = number
+    if size is not None:
+        return size
+    return jnp.abs(value) if jnp.issubdtype(jnp.result_type(value), jnp.floating) else value

@@ -211,7 +211,7 @@ def name_of(function) -> str:
 
 
 def innermost(function) -> Any:
-    """The function as the user wrote it, out of `TracedOnce`, `Rheonomic`, `InOrder` and `ByName`."""
+    """The function as the user wrote it, out of `TracedOnce`, `Rheonomic` and `ByName`."""
     while hasattr(function, "function"):
         function = function.function
     return function

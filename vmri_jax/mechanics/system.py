@@ -13,17 +13,18 @@ import numpy as np
 from vmri_jax.mechanics.functions import (
     NO_TIME,
     NO_VELOCITY,
+    Order,
     Rheonomic,
     TracedOnce,
     check_arguments,
+    order_of,
     traced_once,
 )
 from vmri_jax.mechanics.masses import ConstantMass
-from vmri_jax.mechanics.order import Order, order_of
 from vmri_jax.mechanics.slots import check_computed
 from vmri_jax.mechanics.summary import numbers, parameters, summary
 from vmri_jax.mechanics.surroundings import name_of
-from vmri_jax.mechanics.terms import KINDS, Term, label
+from vmri_jax.mechanics.terms import KINDS, Named, Term, label
 from vmri_jax.refusals import Refused
 
 RESERVED = ("kinetic", "path", "order", "solves", *(kind.symbol for kind in KINDS.values() if kind.symbol))
@@ -39,17 +40,6 @@ _INSTEAD = {
     "force": "force(t, q_s, q_f, v_s, v_f, params) -> (F_s, F_f)",
     "moving": "Rheonomic(function), whose function gets t first",
 }
-
-
-class Potentials(tuple[tuple[str | int, TracedOnce], ...]):
-    """Pairs of a name and a function; as a pytree the names are structure."""
-
-
-jax.tree_util.register_pytree_node(
-    Potentials,
-    lambda potentials: ([function for _, function in potentials], tuple(name for name, _ in potentials)),
-    lambda names, functions: Potentials(zip(names, functions, strict=True)),
-)
 
 
 class System(eqx.Module):
@@ -75,7 +65,7 @@ class System(eqx.Module):
         potentials: further potentials ``V_i(q_s, q_f, params) -> ()`` by name, each with a rate of its own: a scheme has a rule for each
             name, see `vmri_jax.Scheme.with_potentials`. The names "slow" and "fast" have the rules of V and of W unless the scheme says
             otherwise, so that ``{"fast": V_1}`` is a potential on the micro grid that may join slow and fast variables. The name k, a
-            whole number, has the trapezoidal rule on every k-th micro node. Kept as pairs of a name and a function.
+            whole number, has the trapezoidal rule on every k-th micro node.
 
     A run uses what its functions read from around them when it is made: globals, helpers, closures, attributes, see
     `vmri_jax.mechanics.surroundings`. Functions with the same code and surroundings are the same; for others everything is compiled again, so
@@ -92,7 +82,7 @@ class System(eqx.Module):
     params: Any = None
     implied: TracedOnce | Rheonomic | None = None
     slow_kinetic: TracedOnce | None = None
-    potentials: Potentials = Potentials()
+    potentials: Named[TracedOnce] = eqx.field(default_factory=Named)
 
     def __init__(  # Equinox flattens the arguments of a generated one, and potentials may have names of two types
         self,
@@ -127,8 +117,7 @@ class System(eqx.Module):
             )
         if not callable(kinetic):
             raise Refused(
-                f"System: kinetic is {kinetic!r}; give ConstantMass(slow, fast) or a function "
-                "kinetic(q_s, q_f, v_s, v_f, params)."
+                f"System: kinetic is {kinetic!r}; give ConstantMass(slow, fast) or a function kinetic(q_s, q_f, v_s, v_f, params)."
             )
         self.kinetic = kinetic if isinstance(kinetic, ConstantMass) else _checked("kinetic", kinetic, order)
         self.params = params
@@ -142,8 +131,8 @@ class System(eqx.Module):
         """The terms that the system has, see `vmri_jax.mechanics.terms`."""
         terms = []
         for field in KINDS:
-            functions = self.potentials if field == "potentials" else [("", getattr(self, field))]
-            terms += [Term.of(field, function, name) for name, function in functions if function is not None]
+            functions = self.potentials if field == "potentials" else {"": getattr(self, field)}
+            terms += [Term.of(field, function, name) for name, function in functions.items() if function is not None]
         return tuple(terms)
 
     def of_kind(self, kind: str) -> tuple[Term, ...]:
@@ -266,30 +255,43 @@ class System(eqx.Module):
         return jax.eval_shape(self.g, t, q_s, q_f).shape[0], jax.eval_shape(self.g_slow, t, q_s).shape[0]
 
 
-def _checked(name: str, function, order: Order | None):
-    """The function as `TracedOnce` or `Rheonomic`, after checks; None for None. `order` is of the params."""
-    if function is None:
+def _checked(name: str, function: Any, order: Order | None, place: str = "") -> Any:
+    """The function of a field as `TracedOnce` or `Rheonomic`, after checks; None for no function. `order` is of the params, `place` for messages."""
+    kind, place = KINDS[name], f"System: {place or name}"
+    if function is None and name != "potentials":
         return None
-    if isinstance(function, Rheonomic) and KINDS[name].kind in ("constraint", "implied"):
-        _check_function(name, function.function, "t, ")
-        return Rheonomic(traced_once(function.function, order))
-    if isinstance(function, ConstantMass):
-        raise Refused(f"System: {name} is a ConstantMass; masses come first, System(ConstantMass(slow, fast), V, W).")
-    if not callable(function):
-        raise Refused(f"System: {name} is {function!r}; it must be a function or None.")
-    _check_function(name, function)
-    return traced_once(function, order)
+    holds = kind.kind in ("constraint", "implied")
+    inner, call, moves = function, kind.call, False
+    if isinstance(function, Rheonomic) and holds:
+        inner, call, moves = function.function, f"t, {call}", True
+    if isinstance(inner, ConstantMass):
+        raise Refused(f"{place} is a ConstantMass; masses come first, System(ConstantMass(slow, fast), V, W).")
+    if not callable(inner):
+        raise Refused(f"{place} is {function!r}; it must be a function{' or None' * (name != 'potentials')}.")
+    try:
+        hash(inner)
+    except TypeError:
+        raise Refused(
+            f"{place} is {inner!r}, which has no hash: programs are compiled once per function. Give a plain function, with what varies in "
+            "params."
+        ) from None
+    instead = "" if name == "force" else NO_VELOCITY if holds else NO_TIME
+    if name == "fast_potential" and "q_s" in getattr(getattr(inner, "__code__", None), "co_varnames", ()):
+        instead = FAST_ALONE
+    check_arguments(place, inner, call, instead.format(**_INSTEAD))
+    traced = traced_once(inner, order)
+    return Rheonomic(traced) if moves else traced
 
 
-def _named_potentials(potentials, order: Order | None) -> "Potentials":
-    """Pairs of a name and a function, from a mapping or from pairs."""
+def _named_potentials(potentials, order: Order | None) -> Named:
+    """Functions by name, from a mapping or from pairs."""
     try:
         named = dict(potentials)
     except (TypeError, ValueError):
         raise Refused(
             f"System: potentials is {potentials!r}; give functions by name, e.g. potentials={{'bends': V_1, 'bonds': V_2}}."
         ) from None
-    for name, function in named.items():
+    for name in named:
         if isinstance(name, bool) or not isinstance(name, str | int) or (isinstance(name, int) and name < 1):
             raise Refused(
                 f"System: potentials has the name {name!r}; give a text, or a whole number k of at least 1 for a potential on every k-th "
@@ -300,23 +302,5 @@ def _named_potentials(potentials, order: Order | None) -> "Potentials":
                 f"System: potentials has the name {name!r}, which is the name of another term: one of {', '.join(RESERVED)}, or V_k of the "
                 "potential k. Take another name."
             )
-        if function is None or isinstance(function, ConstantMass) or not callable(function):
-            raise Refused(f"System: potentials[{name!r}] is {function!r}; it must be a function of (q_s, q_f, params).")
-        _check_function("potentials", function)
-    return Potentials((name, traced_once(function, order)) for name, function in named.items())
-
-
-def _check_function(name: str, function, before: str = "") -> None:
-    """Refuse a function without a hash, or whose arguments are not `before` and then the arguments of its `Kind`."""
-    try:
-        hash(function)
-    except TypeError:
-        raise Refused(
-            f"System: {name} is {function!r}, which has no hash: programs are compiled once per function. Give a plain "
-            "function, with what varies in params."
-        ) from None
-    holonomic = KINDS[name].kind in ("constraint", "implied")
-    instead = "" if name == "force" else NO_VELOCITY if holonomic else NO_TIME
-    if name == "fast_potential" and "q_s" in getattr(getattr(function, "__code__", None), "co_varnames", ()):
-        instead = FAST_ALONE
-    check_arguments(f"System: {name}", function, before + KINDS[name].call, instead.format(**_INSTEAD))
+    places = {name: f"potentials[{name!r}]" for name in named}
+    return Named({name: _checked("potentials", named[name], order, place) for name, place in places.items()})

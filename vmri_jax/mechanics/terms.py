@@ -16,11 +16,25 @@ A constraint or implied row that is `Rheonomic` gets t before the other argument
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
+
+import jax
 
 from vmri_jax.mechanics.functions import Rheonomic
 
 POSITIONS, VELOCITIES = ("q_s", "q_f"), ("v_s", "v_f")
+Value = TypeVar("Value")
+
+
+class Named(dict[str | int, Value]):
+    """Values of further potentials by name; as a pytree the names are structure: JAX cannot sort texts and numbers."""
+
+
+jax.tree_util.register_pytree_node(
+    Named,
+    lambda named: (list(named.values()), tuple(named)),
+    lambda names, values: Named(zip(names, values, strict=True)),
+)
 
 
 class Kind(NamedTuple):

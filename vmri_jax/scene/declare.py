@@ -17,7 +17,7 @@ import jax
 import numpy as np
 
 from vmri_jax.mechanics.arrays import is_concrete, library, real_array
-from vmri_jax.mechanics.order import in_order, order_of
+from vmri_jax.mechanics.functions import in_order, order_of
 from vmri_jax.refusals import Refused
 from vmri_jax.scene.body import Bodies, Frame, Point, entry, is_entry
 

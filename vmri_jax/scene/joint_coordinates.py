@@ -14,7 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.mechanics.arrays import is_concrete
-from vmri_jax.mechanics.constraints import RANK, configuration, known_mass_and_momentum
+from vmri_jax.mechanics.constraints import RANK, configuration
+from vmri_jax.mechanics.projection import mass_and_momentum
 from vmri_jax.mechanics.system import System
 from vmri_jax.refusals import Refused
 from vmri_jax.scene.binding import Key
@@ -63,7 +64,7 @@ def with_rates(
         rows.append(np.asarray(jax.jacfwd(freedoms)(jnp.asarray(bodies))) @ of_bodies)
         values.append(np.broadcast_to(numbers, (len(pairs),)))
     c, b = np.concatenate(rows), np.concatenate(values)
-    root = np.linalg.cholesky(known_mass_and_momentum(system, *start)[0])  # M = R R^T
+    root = np.linalg.cholesky(mass_and_momentum(system, *start)[0])  # M = R R^T
     # rows of C R^-T and b in units of their lengths: all have the unit of R^T v, whose squared length is twice the kinetic energy
     c_by_root = np.linalg.solve(root, c.T).T
     lengths = np.linalg.norm(c_by_root, axis=1)

@@ -9,8 +9,7 @@ from typing import Any, Literal
 import jax
 import numpy as np
 
-from vmri_jax.mechanics.arrays import is_concrete
-from vmri_jax.mechanics.checks import require_x64
+from vmri_jax.mechanics.arrays import is_concrete, require_x64
 from vmri_jax.mechanics.names import Names, unknown
 from vmri_jax.mechanics.rows import Place
 from vmri_jax.mechanics.state import Problem, State, initial_state, tell_of_velocities

@@ -18,15 +18,16 @@ of order 1, each the adjoint of the other. Any other alpha also has order 1. alp
 """
 
 import math
-from dataclasses import KW_ONLY, replace
+from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
 import numpy as np
 
-from vmri_jax.mechanics.arrays import is_concrete
+from vmri_jax.mechanics.arrays import is_concrete, whole_number
 from vmri_jax.mechanics.system import RATE_OF
-from vmri_jax.mechanics.terms import label
+from vmri_jax.mechanics.terms import Named, label
 from vmri_jax.refusals import Refused
 from vmri_jax.schemes.description import RULES, Description, printed
 from vmri_jax.schemes.path import control_nodes, lagrange_derivative
@@ -44,6 +45,9 @@ from vmri_jax.schemes.quadrature import (
     mollified,
     trapezoidal,
 )
+
+GRIDS = {"slow": "macro", "fast": "micro"}
+"""The grids on which kicks of V and W may be corrected."""
 
 
 class Scheme(eqx.Module):
@@ -71,57 +75,65 @@ class Scheme(eqx.Module):
     """
 
     num_micro: int = eqx.field(static=True)
-    degree: int = eqx.field(static=True, default=1)
-    _: KW_ONLY
+    degree: int = eqx.field(static=True)
     kinetic: PlacedRule
     slow: PlacedRule
     fast: PlacedRule
-    constraint: PlacedRule = eqx.field(default=None)
-    slow_constraint: PlacedRule = eqx.field(default=None)
-    force: PlacedRule = eqx.field(default=None)
-    potentials: dict[Any, PlacedRule] = eqx.field(default_factory=dict)
+    constraint: PlacedRule
+    slow_constraint: PlacedRule
+    force: PlacedRule
+    potentials: Named[PlacedRule]
 
-    def __post_init__(self):
-        self.num_micro = _positive_integer("num_micro", self.num_micro)
-        self.degree = _positive_integer("degree", self.degree)
+    def __init__(  # Equinox flattens the arguments of a generated one, and potentials may have names of two types
+        self,
+        num_micro: int,
+        degree: int = 1,
+        *,
+        kinetic: PlacedRule,
+        slow: PlacedRule,
+        fast: PlacedRule,
+        constraint: PlacedRule | None = None,
+        slow_constraint: PlacedRule | None = None,
+        force: PlacedRule | None = None,
+        potentials: Mapping[Any, PlacedRule] | None = None,
+    ):
+        self.num_micro = whole_number("Scheme: num_micro", num_micro)
+        self.degree = whole_number("Scheme: degree", degree)
         at_control_nodes = lobatto(self.degree + 1)
-        self.force = self.kinetic if self.force is None else self.force
-        self.constraint = micro(at_control_nodes) if self.constraint is None else self.constraint
-        self.slow_constraint = macro(at_control_nodes) if self.slow_constraint is None else self.slow_constraint
-        for name in RULES.values():
-            _check_placed(name, getattr(self, name))
-            if getattr(self, name).every > 1 and name not in ("slow", "fast"):
+        rules = {
+            "kinetic": kinetic,
+            "slow": slow,
+            "fast": fast,
+            "force": kinetic if force is None else force,
+            "constraint": micro(at_control_nodes) if constraint is None else constraint,
+            "slow_constraint": macro(at_control_nodes) if slow_constraint is None else slow_constraint,
+        }
+        further = dict(potentials or {})
+        for name, placed in [*rules.items(), *further.items()]:
+            _check_placed(name, placed)
+        for name, placed in rules.items():
+            if placed.every > 1 and name not in GRIDS:
                 raise Refused(
-                    f"Scheme: {name} is placed with every={getattr(self, name).every}; only potentials can be: slow, fast, and those of "
+                    f"Scheme: {name} is placed with every={placed.every}; only potentials can be: slow, fast, and those of "
                     "with_potentials(...). Take micro(rule) or macro(rule)."
                 )
-        self.slow, self.fast = (_on_grid(name, getattr(self, name), self.num_micro) for name in ("slow", "fast"))
-        self.potentials = dict(self.potentials)
-        for name, placed in self.potentials.items():
-            _check_placed(name, placed)
-            if placed.mollified or placed.gradient_corrected:
-                how = "mollified" if placed.mollified else "corrected"
-                raise Refused(
-                    f"Scheme: {name} is {how}; only the rules of V and W can be. Give micro(rule) or macro(rule)."
-                )
-            self.potentials[name] = _on_grid(name, placed, self.num_micro)
+            setattr(self, name, _on_grid(name, placed, self.num_micro))
+        self.potentials = Named({name: _on_grid(name, placed, self.num_micro) for name, placed in further.items()})
         if self.kinetic.grid != "micro":
             raise Refused(
                 "Scheme: the kinetic rule must be placed with micro(...); each micro interval has a velocity."
             )
         _check_kinetic(self.kinetic.rule, self.degree)
-        filtered = [name for name in ("kinetic", "fast", "force", "constraint") if getattr(self, name).mollified]
-        if filtered or (self.slow.mollified and self.fast.grid != "micro"):
-            raise Refused(
-                f"Scheme: {filtered or 'slow'} is mollified; only kicks of the slow potential can be, along fast motion on the "
-                "micro grid: slow=mollified(macro(...)) with fast=micro(...)."
-            )
-        grids = {"slow": "macro", "fast": "micro"}
-        for name in ("kinetic", "slow", "fast", "force", "constraint"):
-            placed = getattr(self, name)
-            if placed.gradient_corrected and (placed.grid != grids.get(name) or self.degree > 1):
+        of_fields = [(name, name, placed) for name, placed in rules.items()]
+        for field, name, placed in [*of_fields, *(("", name, placed) for name, placed in further.items())]:
+            if placed.mollified and (field != "slow" or self.fast.grid != "micro"):
                 raise Refused(
-                    f"Scheme: {name} on the {placed.grid} grid, degree {self.degree}, is corrected; only kicks of a path of degree 1 "
+                    f"Scheme: {name} is mollified; only kicks of the slow potential can be, along fast motion on the micro grid: "
+                    "slow=mollified(macro(...)) with fast=micro(...)."
+                )
+            if placed.gradient_corrected and (placed.grid != GRIDS.get(field) or self.degree > 1):
+                raise Refused(
+                    f"Scheme: {name} on the {placed.grid} grid, degree {self.degree}, is corrected; only kicks of V and W, of a path of degree 1, "
                     "can be: slow=gradient_corrected(macro(...)), fast=gradient_corrected(micro(...))."
                 )
         for name, grid in (("constraint", "micro"), ("slow_constraint", "macro")):
@@ -245,7 +257,7 @@ class Scheme(eqx.Module):
         return Description(self.order, self.is_symmetric, rules, 1, self.num_micro, self.degree, *costs)
 
 
-def _on_grid(name: str, placed: PlacedRule, num_micro: int) -> PlacedRule:
+def _on_grid(name: str | int, placed: PlacedRule, num_micro: int) -> PlacedRule:
     """The placed rule, moved to the macro grid if one copy of it spans the macro interval."""
     if placed.every > 1 and num_micro % placed.every:
         divisors = [k for k in range(1, num_micro + 1) if num_micro % k == 0]
@@ -254,14 +266,6 @@ def _on_grid(name: str, placed: PlacedRule, num_micro: int) -> PlacedRule:
             f"the next macro step. Take one of {divisors}, or another num_micro."
         )
     return PlacedRule(placed.rule, "macro") if placed.every == num_micro > 1 else placed
-
-
-def _positive_integer(name: str, value) -> int:
-    if isinstance(value, bool) or not isinstance(value, int | np.integer):
-        raise Refused(f"Scheme: {name} is {value!r}; it must be an integer of at least 1.")
-    if value < 1:
-        raise Refused(f"Scheme: {name} is {value}; it must be at least 1.")
-    return int(value)
 
 
 def _check_kinetic(rule: Rule, degree: int) -> None:
@@ -275,7 +279,7 @@ def _check_kinetic(rule: Rule, degree: int) -> None:
         )
 
 
-def _check_placed(name: str, placed) -> None:
+def _check_placed(name: str | int, placed) -> None:
     if isinstance(placed, Rule):
         raise Refused(f"Scheme: {name} is a bare rule; say on which grid it lives, macro(rule) or micro(rule).")
     if not isinstance(placed, PlacedRule):
@@ -375,7 +379,7 @@ def galerkin(num_micro: int, degree: int, rule: Rule | str = "gauss") -> Scheme:
         degree: r, of the polynomials.
         rule: "gauss", "lobatto", or any `Rule`.
     """
-    degree = _positive_integer("degree", degree)
+    whole_number("galerkin: degree", degree)
     if isinstance(rule, str):
         if rule not in ("gauss", "lobatto"):
             raise Refused(f"galerkin: rule is {rule!r}; it must be 'gauss', 'lobatto' or a Rule.")

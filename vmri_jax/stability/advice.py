@@ -288,7 +288,7 @@ def _stability_limit(linear: Linearisation, scheme: SchemeLike, macro_dt: float)
     ]
     if linear.hessians["force"].any():
         cases.append(("force", "force", "the micro step", micro_dt, np.inf))
-    for name, _ in linear.system.potentials:
+    for name in linear.system.potentials:
         placed, words = stage.rule_of(name), f"further {name}" if name in ("fast", "slow") else label(name)
         span = stage.num_micro if placed.grid == "macro" else placed.every
         step_name = f"the step of {span} micro intervals"

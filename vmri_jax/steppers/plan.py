@@ -325,7 +325,7 @@ def _average(system: System, scheme: Scheme, solver: Solver) -> Callable | None:
     """The filter of a mollified slow potential, None if the slow potential is not mollified."""
     if not scheme.slow.mollified:
         return None
-    on_micro_grid = [str(name) for name, _ in system.potentials if not scheme.rule_of(name).only_kicks]
+    on_micro_grid = [str(name) for name in system.potentials if not scheme.rule_of(name).only_kicks]
     if scheme.fast.every > 1 or on_micro_grid:
         every = f"W has nodes on every {scheme.fast.every}th micro node" if scheme.fast.every > 1 else ""
         others = every or f"the potentials {', '.join(on_micro_grid)} are on the micro grid"

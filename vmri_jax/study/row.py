@@ -212,7 +212,7 @@ def row_of(
     method = Method(int(np.max(run.info.method)))
     solves = cost.constrained_solves if system.is_constrained else cost.solves
     evaluations = num_steps * float(passes.mean())
-    stage, further = stage_scheme(scheme), dict(system.potentials)
+    stage, further = stage_scheme(scheme), system.potentials
     energy = np.asarray(run.energy)
     energy_error = energy - (energy[0] if energies is None else energies)
     return Row(

@@ -15,7 +15,7 @@ from vmri_jax.mechanics.checks import digest, operations
 from vmri_jax.mechanics.functions import TracedOnce
 from vmri_jax.mechanics.masses import ConstantMass
 from vmri_jax.mechanics.state import State
-from vmri_jax.mechanics.system import Potentials
+from vmri_jax.mechanics.terms import Named
 from vmri_jax.refusals import Refused
 from vmri_jax.running.simulation import Simulation
 
@@ -87,10 +87,10 @@ def describe(name: str, value) -> dict[str, str]:
     """All leaves of a value as text, by the path to each leaf, which begins with `name`."""
     if dataclasses.is_dataclass(value) and not isinstance(value, TracedOnce):
         parts = {f"{name}.{field.name}": getattr(value, field.name) for field in dataclasses.fields(value)}
-    elif isinstance(value, dict) and any(map(dataclasses.is_dataclass, value.values())):  # rules of potentials
+    elif isinstance(value, Named) and not any(isinstance(part, TracedOnce) for part in value.values()):  # rules
         parts = {f"{name}[{key!r}]": part for key, part in value.items()}
     else:
-        value = tuple(value) if isinstance(value, Potentials) else value  # with its names
+        value = tuple(value.items()) if isinstance(value, Named) else value  # functions, with their names
         leaves, _ = jax.tree_util.tree_flatten_with_path(value, is_leaf=lambda leaf: isinstance(leaf, TracedOnce))
         return {name + jax.tree_util.keystr(path): _text(leaf) for path, leaf in leaves}
     return {key: text for name, part in parts.items() for key, text in describe(name, part).items()}
