@@ -371,8 +371,7 @@ def rows_of(placed: Sequence[Placed], layout: Layout) -> list[Row]:
         effect, number = part.effect, 0
         for group in effect.groups(part.elements, layout) if part.home in HOMES else ():
             # all elements of a group have as many rows
-            t, one = (np.zeros(()),) if effect.timed else (), group[:1]
-            size = jax.eval_shape(effect.called, *t, effect.positions(one), effect.params_of(one)).size
+            size = jax.eval_shape(effect.called, *effect.arguments_at_start(group[:1])).size
             for element in group:
                 named = f"{effect.name} {'-'.join(map(label_of, effect.elements[element]))}"
                 label = effect.name if len(effect.elements) == 1 else named
