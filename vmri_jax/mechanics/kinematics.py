@@ -58,10 +58,12 @@ class Link(NamedTuple):
 
     place: of the coordinate in q_s or q_f.
     parent: number of the link before it on the way from the root; -1 for the first one.
+    turns: whether it turns bodies; else it moves them along its axis alone.
     """
 
     place: Place
     parent: int
+    turns: bool = True
 
 
 class Carried(NamedTuple):
@@ -128,9 +130,14 @@ class Kinematics:
     def _against_roots(self, q_s, q_f, joints: dict[str, Any]):
         """A (bodies, 4, 3) and J (links, 4, 3), in the axes of the roots."""
         link, body = self.first
-        constants = [joints[name][link : link + len(self.links)] for name in ("turn", "slide")]
+        turn, slide = (joints[name][link : link + len(self.links)] for name in ("turn", "slide"))
+        zero = joints["zero"][body : body + len(self.bodies)]
         x = Rows.of([link.place for link in self.links]).take(q_s, q_f).reshape(-1) if self.links else jnp.zeros(0)
-        return placed(self, x, *constants, joints["zero"][body : body + len(self.bodies)])
+        if any(link.turns for link in self.links):
+            return placed(self, x, turn, slide, zero)
+        # shifts alone add up, which JAX differentiates as well: A_b = Z_b + sum of x_i S_i over the links before b, J_i = S_i
+        shifts = matmul(self.before[: len(self.bodies)], x[:, None] * slide)
+        return zero + _pad(shifts[:, None]), _pad(slide[:, None])
 
     def mass_matrix(self, q_s, q_f, joints: dict[str, Any], masses: Sequence[Any]):
         """``(dQ/dq)^T m dQ/dq`` (n, n), in which the bodies behind a coordinate move as one, composite body.
@@ -176,7 +183,7 @@ class Kinematics:
         """The inverse of `dataclasses.asdict`, also after a round trip through JSON."""
         return cls(
             tuple(Place(*root) for root in data["roots"]),
-            tuple(Link(Place(*place), parent) for place, parent in data["links"]),
+            tuple(Link(Place(*place), *others) for place, *others in data["links"]),
             tuple(Carried(*body) for body in data["bodies"]),
             tuple(data["sizes"]),
             tuple(data["first"]),

@@ -221,7 +221,7 @@ def _kinematics(branches: Sequence[Branch], places, freedoms, sizes) -> tuple[Ki
         numbers[branch.child] = numbers[branch.parent]
         last = lasts.get(branch.parent, -1)
         for number, key in enumerate(branch.way, firsts[branch.child]):
-            links[number], last = Link(freedoms[key], last), number
+            links[number], last = Link(freedoms[key], last, key[2] in ANGLES), number
         lasts[branch.child] = last
     carried = (Carried("f" if b.child in fast else "s", numbers[b.child], lasts[b.child]) for b in ordered)
     roots = tuple(places[name] for name in numbers if name in places)
