@@ -2,12 +2,13 @@
 
 A body hangs on the root of its tree, or on the ground, by a chain of links, each with a coordinate x that turns all
 bodies behind the link about an axis, moves them along the axis, or both. At x = 0 all bodies have known places. Motions
-are rows (r, M) of a vector and a matrix (4, 3) in the axes of the root: a point y goes to ``r + y M``. Rates of motions
-are twists (m, K), rows of the same kind: the point y has the velocity ``m + y K = m + k x y``.
+are matrices (4, 4), ``(1, r; 0, M)`` with a vector r and a matrix M in the axes of the root: they act on rows (1, y),
+and a point y goes to ``r + y M``. Rates of motions are twists ``(0, m; 0, K)``: the point y has the velocity ``m + y K =
+m + k x y``.
 
     E_i = exp(x_i Y_i) E_parent      exp(x Y) = 1 + sin x T + (1 - cos x) T T + x S      Y = T + S, turn T and slide S
     A_b = Z_b E_b                    origin and axes of body b, of Z_b at x = 0, moved by the last link of b
-    phi_b, D_b = A_b (phi, D)        in space, by centre phi and directors D of the root, which need not be orthonormal
+    (phi_b, D_b) = A_b (phi, D)      in space, by centre phi and directors D of the root, which need not be orthonormal
 
 A coordinate x_i moves all bodies behind it by the twist ``J_i = E_i^-1 Y_i E_i``. So positions and twists have
 derivatives in closed form,
@@ -15,7 +16,7 @@ derivatives in closed form,
     dA_b = A_b W_b      dJ_i = J_i W_i - W_i J_i      W = sum of J_j dx_j over the links j before
 
 W_i without link i itself. `placed` gives these derivatives to JAX: velocities, kinetic energies, forces and all their
-derivatives consist of sums over trees and of products of (4, 3) rows, and never differentiate the chains of motions.
+derivatives consist of sums over trees and of products of matrices, and never differentiate the chains of motions.
 
 A joint of several coordinates is a chain of links. Bodies without a joint, the roots, have their centres and directors
 among the coordinates.
@@ -49,8 +50,8 @@ SIZE = 12
 LARGEST_MATRIX = 16
 """Most links whose sums are products with a matrix: their time grows with the square of the number of links. A smaller
 number makes the programs of small trees larger."""
-UNMOVED = np.concatenate([np.zeros((1, 3)), np.eye(3)])
-"""(4, 3) the motion of nothing; centre and directors of the ground."""
+UNMOVED = np.eye(4)[:, 1:]
+"""(4, 3) centre and directors of the ground."""
 
 
 class Link(NamedTuple):
@@ -117,18 +118,18 @@ class Kinematics:
 
         Args:
             q_s, q_f: coordinates.
-            joints: the constants in the axes of the roots: "turn" T (n, 4, 3) and "slide", the first row of S (n, 3),
-                of all links, "zero" Z (n, 4, 3) of all bodies.
+            joints: the constants in the axes of the roots: "turn" T and "slide" S (n, 4, 4) of all links, "zero" Z
+                (n, 4, 4) of all bodies.
         """
         if not self.bodies:
             return q_s, q_f
         frames, _ = self._against_roots(q_s, q_f, joints)
         slow, roots = sum(body.part == "s" for body in self.bodies), [body.root for body in self.bodies]
-        frames = after(frames, self._roots(q_s, q_f, roots)) if set(roots) != {GROUND} else frames
+        frames = matmul(frames, self._roots(q_s, q_f, roots)) if set(roots) != {GROUND} else frames[:, :, 1:]
         return jnp.concatenate([q_s, frames[:slow].reshape(-1)]), jnp.concatenate([q_f, frames[slow:].reshape(-1)])
 
     def _against_roots(self, q_s, q_f, joints: dict[str, Any]):
-        """A (bodies, 4, 3) and J (links, 4, 3), in the axes of the roots."""
+        """A (bodies, 4, 4) and J (links, 4, 4), in the axes of the roots."""
         link, body = self.first
         turn, slide = (joints[name][link : link + len(self.links)] for name in ("turn", "slide"))
         zero = joints["zero"][body : body + len(self.bodies)]
@@ -136,14 +137,12 @@ class Kinematics:
         if any(link.turns for link in self.links):
             return placed(self, x, turn, slide, zero)
         # shifts alone add up, which JAX differentiates as well: A_b = Z_b + sum of x_i S_i over the links before b, J_i = S_i
-        shifts = matmul(self.before[: len(self.bodies)], x[:, None] * slide)
-        return zero + _pad(shifts[:, None]), _pad(slide[:, None])
+        return zero + self.summed(x[:, None, None] * slide)[0], slide
 
     def mass_matrix(self, q_s, q_f, joints: dict[str, Any], masses: Sequence[Any]):
         """``(dQ/dq)^T m dQ/dq`` (n, n), in which the bodies behind a coordinate move as one, composite body.
 
-        A body b on joints has the rates ``A_b sum_i K_i v_i`` over the coordinates i on the way to it, with the column (1, 0, 0, 0) before those
-        of A_b. A link has ``K_i = J_i D``, a coordinate of a root a unit row. With the masses ``G_j = sum_b A_b^T m_b A_b`` of the bodies b
+        A body b on joints has the rates ``A_b sum_i K_i v_i`` over the coordinates i on the way to it. A link has ``K_i = J_i D``, a coordinate of a root a unit row. With the masses ``G_j = sum_b A_b^T m_b A_b`` of the bodies b
         behind a coordinate j,
 
             M_ij = M_ji = tr(K_i^T G_j K_j)    for i on the way to j.
@@ -162,10 +161,10 @@ class Kinematics:
         frames, twists = self._against_roots(q_s, q_f, joints)
         links, roots, behind, on_way = self._tables
         # G_b = A_b^T m_b A_b
-        rows = jnp.concatenate([jnp.broadcast_to(np.eye(4)[:, :1], (len(frames), 4, 1)), frames], axis=2)
         of_rows = jnp.concatenate(of_bodies).reshape(-1, 4, 3)[:, :, :1]
-        of_frames = matmul(jnp.swapaxes(rows, 1, 2), of_rows * rows).reshape(-1, 16)
+        of_frames = matmul(jnp.swapaxes(frames, 1, 2), of_rows * frames).reshape(-1, 16)
         # K_i, then tr(K_i^T G_j K_j)
+        twists = twists[:, :, 1:]
         if set(self._owners) - {GROUND}:
             twists = matmul(twists, self._roots(q_s, q_f, self._owners)[:, 1:])
         columns = (matmul(links, twists.reshape(-1, SIZE)) if self.links else 0.0) + roots
@@ -219,12 +218,12 @@ class Kinematics:
             parents = np.append(parents, -1)[parents]
 
     def summed(self, of_links):
-        """Sums of (n, 4, 3) of the links before each body (bodies, 4, 3), and of the links before each link (n, 4, 3).
+        """Sums of (n, 4, 4) of the links before each body (bodies, 4, 4), and of the links before each link (n, 4, 4).
 
         By a product with the matrix `before`, whose program is small; beyond `LARGEST_MATRIX` links over 1, 2, 4, ...
         links at once, so that the time grows nearly in proportion to the number of links.
         """
-        rows = of_links.reshape(-1, SIZE)
+        rows = of_links.reshape(-1, 16)
         if len(self.links) <= LARGEST_MATRIX:
             # without deep links the lower part is zero
             sums = matmul(self.before if self.is_deep else self.before[: len(self.bodies)], rows)
@@ -232,7 +231,7 @@ class Kinematics:
             for parents in self.jumps():
                 rows = rows + _taken(rows, parents)
             sums = _taken(rows, self.lasts)
-        return jnp.split(sums.reshape(-1, 4, 3), [len(self.bodies)])
+        return jnp.split(sums.reshape(-1, 4, 4), [len(self.bodies)])
 
     def _roots(self, q_s, q_f, numbers: Sequence[int]):
         """(k, 4, 3) centre and directors of roots by their numbers (k,); (1, 4, 3) if all are the same."""
@@ -266,22 +265,23 @@ class Kinematics:
 
 
 def _placed(tree: Kinematics, x, turn, slide, zero):
-    """A (bodies, 4, 3) and J (links, 4, 3).
+    """A (bodies, 4, 4) and J (links, 4, 4).
 
     Args:
         x: (n,) coordinates of the links.
-        turn, slide, zero: T (n, 4, 3), the first row of S (n, 3), and Z (bodies, 4, 3).
+        turn, slide, zero: T (n, 4, 4), S (n, 4, 4), and Z (bodies, 4, 4).
     """
-    sine, versine = jnp.sin(x)[:, None, None], (1 - jnp.cos(x))[:, None, None]
-    motions = UNMOVED + sine * turn + versine * matmul(turn, turn[:, 1:]) + _pad((x[:, None] * slide)[:, None])
+    sine, versine, way = (values[:, None, None] for values in (jnp.sin(x), 1 - jnp.cos(x), x))
+    motions = np.eye(4) + sine * turn + versine * matmul(turn, turn) + way * slide
     for parents in tree.jumps():
-        motions = after(motions, _with_unmoved(motions)[parents])  # after k turns, motions of the last 2^k links
-    twists = turn + _pad(slide[:, None])
+        motions = matmul(motions, _with_unmoved(motions)[parents])  # after k turns, motions of the last 2^k links
+    twists = turn + slide
     if tree.is_deep:  # else E_i = exp(x_i Y_i), which leaves its own Y_i as it is
-        twists = matmul(twists, motions[:, 1:])
-        turning = matmul(jnp.swapaxes(motions[:, 1:], 1, 2), twists[:, 1:])
-        twists = jnp.concatenate([twists[:, :1] - matmul(motions[:, :1], turning), turning], axis=1)
-    return after(zero, _with_unmoved(motions)[tree.lasts[: len(tree.bodies)]]), twists
+        # E^-1 = (1, -r M^T; 0, M^T)
+        twists = matmul(twists, motions)
+        turning = matmul(jnp.swapaxes(motions[:, 1:, 1:], 1, 2), twists[:, 1:])
+        twists = jnp.concatenate([twists[:, :1] - matmul(motions[:, :1, 1:], turning), turning], axis=1)
+    return matmul(zero, _with_unmoved(motions)[tree.lasts[: len(tree.bodies)]]), twists
 
 
 placed = jax.custom_jvp(_placed, nondiff_argnums=(0,))
@@ -295,9 +295,9 @@ def _change(tree: Kinematics, arguments, tangents):
     d_frames, d_twists = jnp.zeros_like(frames), jnp.zeros_like(twists)
     if not isinstance(dx, SymbolicZero):
         of_bodies, of_links = tree.summed(dx[:, None, None] * twists)
-        d_frames = after(frames, of_bodies)
+        d_frames = matmul(frames, of_bodies)
         if tree.is_deep:
-            d_twists = matmul(twists, of_links[:, 1:]) - matmul(of_links, twists[:, 1:])
+            d_twists = matmul(twists, of_links) - matmul(of_links, twists)
     if not all(isinstance(change, SymbolicZero) for change in changes):
         changes = [
             jnp.zeros_like(c) if isinstance(change, SymbolicZero) else change
@@ -306,16 +306,6 @@ def _change(tree: Kinematics, arguments, tangents):
         by_constants = jax.jvp(partial(_placed, tree, x), constants, changes)[1]
         d_frames, d_twists = d_frames + by_constants[0], d_twists + by_constants[1]
     return (frames, twists), (d_frames, d_twists)
-
-
-def after(rows, bodies):
-    """Origins and axes of frames with the relative rows (r, M), in bodies with the rows (s, D): ``(s + r D, M D)``.
-
-    Args:
-        rows: (n, 4, 3) of the frames.
-        bodies: (n, 4, 3).
-    """
-    return matmul(rows, bodies[:, 1:]) + _pad(bodies[:, :1])
 
 
 def _taken(rows, numbers):
@@ -329,11 +319,6 @@ def _taken(rows, numbers):
     return jnp.concatenate(pieces)
 
 
-def _pad(first):
-    """(n, 4, 3) rows of which only the first one (n, 1, 3) is not zero."""
-    return jnp.pad(first, ((0, 0), (0, 3), (0, 0)))
-
-
 def _with_unmoved(motions):
-    """Motions (n, 4, 3), and the motion of nothing as the last one, number -1."""
-    return jnp.concatenate([motions, UNMOVED[None]])
+    """Motions (n, 4, 4), and the motion of nothing as the last one, number -1."""
+    return jnp.concatenate([motions, np.eye(4)[None]])
