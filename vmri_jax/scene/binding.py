@@ -302,16 +302,16 @@ class Bindable(Declared, ABC):
         roles = zip(POINTS, zip(*(self.attached[i] for i in group), strict=True), strict=False)
         return self._term([self._role(*role, layout.bodies) for role in roles], group)
 
-    def _term(self, roles: Iterable[Role], group: Sequence[int], through: Any = None) -> EffectTerm:
-        """Some elements as a term."""
+    def _term(
+        self, roles: Iterable[Role], group: Sequence[int], through: Any = None, unused: Sequence[str] = ()
+    ) -> EffectTerm:
+        """Some elements as a term, whose function does not use the parameters `unused`."""
         select = None if len(group) == len(self.elements) else tuple(group)
-        split, sources = self.split_of(self.parameters), (Source(self.name, len(group), select),)
-        function = self.called
+        split = tuple(name for name in self.split_of(self.parameters) if name not in unused)
         # A function of the user may be right for a single element alone; no parameter may be common to all elements.
-        is_joined = is_of_package(function) and len(split) == len(self.parameters)
-        return EffectTerm(
-            sources, function, self.arguments, tuple((role,) for role in roles), split, is_joined, through
-        )
+        is_joined = is_of_package(self.called) and not self.parameters.keys() - {*split, *unused}
+        sources, of_kinds = (Source(self.name, len(group), select),), tuple((role,) for role in roles)
+        return EffectTerm(sources, self.called, self.arguments, of_kinds, split, is_joined, through)
 
     def _role(self, parameter: str, names: Sequence[str], places: Mapping[str, Place]) -> Role:
         """The map from q_s and q_f to the coordinates of the bodies of a role, all of the same kind, or to points in them, which are a parameter."""

@@ -331,7 +331,9 @@ class OfFreedoms(Effect):
             freedoms.append(self.by_directors(keys[0][2]))
             for role in (2 * j, 2 * j + 1):
                 roles.append(self._role("", [self.attached[i][role] for i in group], layout.bodies))
-        return self._term(roles, group, Applied(freedoms_of, (tuple(freedoms),)))
+        # freedoms that are coordinates need no numbers of joints
+        unused = self.derived if set(freedoms) == {coordinate} else ()
+        return self._term(roles, group, Applied(freedoms_of, (tuple(freedoms),)), unused)
 
     def check_bodies(self):
         """Nothing: the joints check their bodies themselves."""
