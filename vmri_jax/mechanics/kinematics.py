@@ -36,6 +36,7 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 
 from vmri_jax.kernels import matmul
+from vmri_jax.mechanics.arrays import is_concrete, library
 from vmri_jax.mechanics.rows import Part, Place, Rows
 from vmri_jax.mechanics.slots import Computed
 
@@ -125,25 +126,51 @@ class Kinematics:
             return q_s, q_f
         frames, _ = self._against_roots(q_s, q_f, joints)
         slow, roots = sum(body.part == "s" for body in self.bodies), [body.root for body in self.bodies]
-        frames = matmul(frames, self._roots(q_s, q_f, roots)) if set(roots) != {GROUND} else frames[:, :, 1:]
-        return jnp.concatenate([q_s, frames[:slow].reshape(-1)]), jnp.concatenate([q_f, frames[slow:].reshape(-1)])
+        frames = product(frames, self._roots(q_s, q_f, roots)) if set(roots) != {GROUND} else frames[:, :, 1:]
+        parts = (q_s, frames[:slow].reshape(-1)), (q_f, frames[slow:].reshape(-1))
+        q_slow, q_fast = (library(part).concatenate(part) for part in parts)
+        return q_slow, q_fast
 
     def _against_roots(self, q_s, q_f, joints: dict[str, Any]):
         """A (bodies, 4, 4) and J (links, 4, 4), in the axes of the roots."""
         link, body = self.first
         turn, slide = (joints[name][link : link + len(self.links)] for name in ("turn", "slide"))
         zero = joints["zero"][body : body + len(self.bodies)]
-        x = Rows.of([link.place for link in self.links]).take(q_s, q_f).reshape(-1) if self.links else jnp.zeros(0)
+        x = Rows.of([link.place for link in self.links]).take(q_s, q_f).reshape(-1) if self.links else np.zeros(0)
         if any(link.turns for link in self.links):
-            return placed(self, x, turn, slide, zero)
+            return (_placed if is_concrete((x, joints)) else placed)(self, x, turn, slide, zero)
         # shifts alone add up, which JAX differentiates as well: A_b = Z_b + sum of x_i S_i over the links before b, J_i = S_i
         return zero + self.summed(x[:, None, None] * slide)[0], slide
+
+    def _motions(self, q_s, q_f, joints: dict[str, Any]):
+        """A (bodies, 4, 4), and K (n, 4, 3) of all coordinates.
+
+        A body b on joints has the rates ``A_b sum_i K_i v_i`` over the coordinates i on the way to it. A link has ``K_i = J_i D``, a coordinate of
+        a root a unit row.
+        """
+        frames, twists = self._against_roots(q_s, q_f, joints)
+        links, roots, *_ = self._tables
+        twists = twists[:, :, 1:]
+        if set(self._owners) - {GROUND}:
+            twists = product(twists, self._roots(q_s, q_f, self._owners)[:, 1:])
+        columns = (product(links, twists.reshape(-1, SIZE)) if self.links else 0.0) + roots
+        return frames, columns.reshape(-1, 4, 3)
+
+    def with_jacobian(self, q_s, q_f, joints: dict[str, Any]):
+        """Q = (Q_s, Q_f) as one vector, and its Jacobian dQ/dq; of NumPy unless a number is traced."""
+        bodies = self(q_s, q_f, joints)
+        xp, n, (n_s, _) = library(q_s, q_f, joints), sum(self.sizes), self.sizes
+        frames, columns = self._motions(q_s, q_f, joints)
+        # A_b K_i if b is behind i, else zero
+        of_bodies = product(frames[:, None], columns[None]) * self._tables[2].T[:, :, None, None]
+        rows = xp.moveaxis(of_bodies, 1, -1).reshape(-1, n)
+        end = bodies[0].size - n_s
+        return xp.concatenate(bodies), xp.concatenate([np.eye(n)[:n_s], rows[:end], np.eye(n)[n_s:], rows[end:]])
 
     def mass_matrix(self, q_s, q_f, joints: dict[str, Any], masses: Sequence[Any]):
         """``(dQ/dq)^T m dQ/dq`` (n, n), in which the bodies behind a coordinate move as one, composite body.
 
-        A body b on joints has the rates ``A_b sum_i K_i v_i`` over the coordinates i on the way to it. A link has ``K_i = J_i D``, a coordinate of a root a unit row. With the masses ``G_j = sum_b A_b^T m_b A_b`` of the bodies b
-        behind a coordinate j,
+        With the masses ``G_j = sum_b A_b^T m_b A_b`` of the bodies b behind a coordinate j, and K of `_motions`,
 
             M_ij = M_ji = tr(K_i^T G_j K_j)    for i on the way to j.
 
@@ -158,19 +185,13 @@ class Kinematics:
         of_coordinates = jnp.diag(jnp.concatenate(own))
         if not self.bodies:
             return of_coordinates
-        frames, twists = self._against_roots(q_s, q_f, joints)
-        links, roots, behind, on_way = self._tables
-        # G_b = A_b^T m_b A_b
+        frames, columns = self._motions(q_s, q_f, joints)
+        *_, behind, on_way = self._tables
         of_rows = jnp.concatenate(of_bodies).reshape(-1, 4, 3)[:, :, :1]
         of_frames = matmul(jnp.swapaxes(frames, 1, 2), of_rows * frames).reshape(-1, 16)
-        # K_i, then tr(K_i^T G_j K_j)
-        twists = twists[:, :, 1:]
-        if set(self._owners) - {GROUND}:
-            twists = matmul(twists, self._roots(q_s, q_f, self._owners)[:, 1:])
-        columns = (matmul(links, twists.reshape(-1, SIZE)) if self.links else 0.0) + roots
         composite = matmul(behind, of_frames).reshape(n, 4, 4)
-        momenta = matmul(composite, columns.reshape(n, 4, 3)).reshape(n, SIZE)
-        half = matmul(columns, momenta.T) * on_way
+        momenta = matmul(composite, columns).reshape(n, SIZE)
+        half = matmul(columns.reshape(n, SIZE), momenta.T) * on_way
         return half + half.T + of_coordinates
 
     def velocities(self, q_s, q_f, v_s, v_f, joints: dict[str, Any]):
@@ -226,20 +247,20 @@ class Kinematics:
         rows = of_links.reshape(-1, 16)
         if len(self.links) <= LARGEST_MATRIX:
             # without deep links the lower part is zero
-            sums = matmul(self.before if self.is_deep else self.before[: len(self.bodies)], rows)
+            sums = product(self.before if self.is_deep else self.before[: len(self.bodies)], rows)
         else:
             for parents in self.jumps():
                 rows = rows + _taken(rows, parents)
             sums = _taken(rows, self.lasts)
-        return jnp.split(sums.reshape(-1, 4, 4), [len(self.bodies)])
+        return library(sums).split(sums.reshape(-1, 4, 4), [len(self.bodies)])
 
     def _roots(self, q_s, q_f, numbers: Sequence[int]):
         """(k, 4, 3) centre and directors of roots by their numbers (k,); (1, 4, 3) if all are the same."""
         roots = [(q_s if part == "s" else q_f)[start : start + size] for part, start, size in self.roots]
         if len(set(numbers)) == 1:
             return roots[numbers[0]].reshape(1, 4, 3)
-        chosen = np.array(numbers)[:, None] == [*range(len(roots)), GROUND]
-        return matmul(chosen.astype(float), jnp.stack([*roots, UNMOVED.ravel()])).reshape(-1, 4, 3)
+        chosen, roots = np.array(numbers)[:, None] == [*range(len(roots)), GROUND], [*roots, UNMOVED.ravel()]
+        return product(chosen.astype(float), library(roots).stack(roots)).reshape(-1, 4, 3)
 
     @cached_property
     def _owners(self) -> list[int]:
@@ -271,17 +292,18 @@ def _placed(tree: Kinematics, x, turn, slide, zero):
         x: (n,) coordinates of the links.
         turn, slide, zero: T (n, 4, 4), S (n, 4, 4), and Z (bodies, 4, 4).
     """
-    sine, versine, way = (values[:, None, None] for values in (jnp.sin(x), 1 - jnp.cos(x), x))
-    motions = np.eye(4) + sine * turn + versine * matmul(turn, turn) + way * slide
+    xp = library(x, turn, slide, zero)
+    sine, versine, way = (values[:, None, None] for values in (xp.sin(x), 1 - xp.cos(x), x))
+    motions = np.eye(4) + sine * turn + versine * product(turn, turn) + way * slide
     for parents in tree.jumps():
-        motions = matmul(motions, _with_unmoved(motions)[parents])  # after k turns, motions of the last 2^k links
+        motions = product(motions, _with_unmoved(motions)[parents])  # after k turns, motions of the last 2^k links
     twists = turn + slide
     if tree.is_deep:  # else E_i = exp(x_i Y_i), which leaves its own Y_i as it is
         # E^-1 = (1, -r M^T; 0, M^T)
-        twists = matmul(twists, motions)
-        turning = matmul(jnp.swapaxes(motions[:, 1:, 1:], 1, 2), twists[:, 1:])
-        twists = jnp.concatenate([twists[:, :1] - matmul(motions[:, :1, 1:], turning), turning], axis=1)
-    return matmul(zero, _with_unmoved(motions)[tree.lasts[: len(tree.bodies)]]), twists
+        twists = product(twists, motions)
+        turning = product(xp.swapaxes(motions[:, 1:, 1:], 1, 2), twists[:, 1:])
+        twists = xp.concatenate([twists[:, :1] - product(motions[:, :1, 1:], turning), turning], axis=1)
+    return product(zero, _with_unmoved(motions)[tree.lasts[: len(tree.bodies)]]), twists
 
 
 placed = jax.custom_jvp(_placed, nondiff_argnums=(0,))
@@ -313,12 +335,17 @@ def _taken(rows, numbers):
     follows = [b - a == (a >= 0) for a, b in pairwise(numbers)]
     ends = [0, *(i for i, goes_on in enumerate(follows, 1) if not goes_on), len(numbers)]
     pieces = [
-        rows[numbers[i] : numbers[i] + j - i] if numbers[i] >= 0 else jnp.zeros((j - i, rows.shape[1]))
+        rows[numbers[i] : numbers[i] + j - i] if numbers[i] >= 0 else np.zeros((j - i, rows.shape[1]))
         for i, j in pairwise(ends)
     ]
-    return jnp.concatenate(pieces)
+    return library(pieces).concatenate(pieces)
+
+
+def product(a, b):
+    """``a @ b``, of NumPy unless an entry is traced."""
+    return a @ b if is_concrete((a, b)) else matmul(a, b)
 
 
 def _with_unmoved(motions):
     """Motions (n, 4, 4), and the motion of nothing as the last one, number -1."""
-    return jnp.concatenate([motions, np.eye(4)[None]])
+    return library(motions).concatenate([motions, np.eye(4)[None]])
