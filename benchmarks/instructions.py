@@ -83,7 +83,7 @@ PROGRAMS: dict[str, Program] = {
     "TSP, fully_implicit(5), exact matrices": Program(TSP, vm.fully_implicit(5), 5230, "exact"),
     "SAM, fully_implicit(5)": Program(SAM, vm.fully_implicit(5), 4810),
     "SAM, fully_implicit(5), exact matrices": Program(SAM, vm.fully_implicit(5), 7020, "exact"),
-    "satellite in joint coordinates, fully_explicit(5)": Program(SATELLITE, vm.fully_explicit(5), 6930),
+    "satellite in joint coordinates, fully_explicit(5)": Program(SATELLITE, vm.fully_explicit(5), 6630),
     "squeezer by directors, fully_implicit(1)": Program(SQUEEZER, vm.fully_implicit(1), 3820),
     "engine by directors, explicit_slow(5)": Program(ENGINE, vm.explicit_slow(5), 7360),
     "gradient: double pendulum, fully_implicit(1)": Program(

@@ -32,8 +32,10 @@ def energy(of_tree, kinds, weights, x, v, joints):
     (axis, point, zero), (turns, ways) = joints, kinds
     axis = axis / jnp.linalg.norm(axis, axis=1, keepdims=True)
     arms = jnp.concatenate([-point[:, None], jnp.broadcast_to(jnp.eye(3), (LINKS, 3, 3))], axis=1)
-    turn, slide = turns[:, None, None] * jnp.cross(axis[:, None], arms), ways[:, None] * axis
-    frames, rates = jax.jvp(lambda x: of_tree(x, turn, slide, zero)[0], (x,), (v,))
+    turn, slide = turns[:, None, None] * jnp.cross(axis[:, None], arms), ways[:, None, None] * axis[:, None]
+    turn, slide, zero = (jnp.pad(x, ((0, 0), (0, 4 - x.shape[1]), (1, 0))) for x in (turn, slide, zero))
+    zero += np.diag([1.0, 0, 0, 0])
+    frames, rates = (rows[..., 1:] for rows in jax.jvp(lambda x: of_tree(x, turn, slide, zero)[0], (x,), (v,)))
     return jnp.sum(weights[0] ** 2 * rates**2) / 2 + jnp.sum(weights[1] * frames)
 
 

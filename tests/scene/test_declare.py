@@ -140,7 +140,7 @@ COPIES = {
     "nbody_gravity": {"mass_a", "mass_b"},
     "coulomb": {"charge_a", "charge_b"},
     "rayleigh_damping": {"mass_of"},
-    "joint_springs": {"of_a", "of_b"},
+    "joint_springs": {"factors", "offsets"},
 }
 """Numbers of bodies, charges and joints that effects have in their params."""
 HELD = {

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from tests.scene.body_motions import accelerations, state_of
 from tests.scene.mechanics import assert_mechanics_as_by_directors, assert_same_mechanics, by_directors, mechanics
 from vmri_jax import scene as sc
-from vmri_jax.scene.body_motions import accelerations, state_of
 from vmri_jax.scene.effects.joint_base import AXES_OF
 
 PLATE = sc.RigidBody("plate", 1.5, sc.Box((0.4, 0.6, 0.2)), [0.3, 0.2, 0.1])

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import vmri_jax as vm
+from tests.scene.body_motions import accelerations
 from tests.scene.mechanics import assert_mechanics_as_by_directors, mechanics
 from tests.scene.random_trees import random_scene
 from vmri_jax import scene as sc
@@ -19,7 +20,6 @@ from vmri_jax.animation.motion import motion as motion_of
 from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.projection import closed_masses
 from vmri_jax.scene import trees
-from vmri_jax.scene.body_motions import accelerations
 
 DRAWN = (0, 6, 11)
 """Seeds whose scenes have all kinds of joints between them, from the first body to the second and back."""

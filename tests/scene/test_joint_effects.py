@@ -6,8 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from tests.scene.body_motions import accelerations, state_of
 from vmri_jax import scene as sc
-from vmri_jax.scene.body_motions import accelerations, state_of
 from vmri_jax.scene.rows import ConstraintRows
 
 Y = np.array([0.0, 1.0, 0.0])

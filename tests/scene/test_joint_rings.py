@@ -6,11 +6,11 @@ import jax
 import numpy as np
 import pytest
 
+from tests.scene.body_motions import accelerations, state_of
 from tests.scene.mechanics import state_by_directors
 from tests.scene.random_trees import random_ring
 from vmri_jax.mechanics.motion import reaction_forces
 from vmri_jax.scene import Box, Gravity, Prismatic, Revolute, RigidBody, Scene
-from vmri_jax.scene.body_motions import accelerations, state_of
 
 X, _, Z = np.eye(3)
 GROUNDED = 3

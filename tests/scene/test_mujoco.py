@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.scene.body_motions import accelerations as motions
+from tests.scene.body_motions import state_of
 from tests.scene.mechanics import mechanics
 from tests.scene.mujoco_model_fields import IDLE, READ, REFUSED_FIELDS
 from vmri_jax.scene import Fixed, Scene, Spherical
-from vmri_jax.scene.body_motions import accelerations as motions
-from vmri_jax.scene.body_motions import state_of
 from vmri_jax.scene.mujoco_model import REFUSED, Compiled
 
 mujoco = pytest.importorskip("mujoco")

@@ -1,12 +1,13 @@
 """Sparsity of ``G M^-1 G^T``, from the coordinates that constraints share; it is determined once, before a run."""
 
-import equinox as eqx
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.kernels.band import Full, Sparsity, sparsity
-from vmri_jax.mechanics.arrays import is_concrete
+from vmri_jax.mechanics.arrays import is_concrete, quickly_compiled
 from vmri_jax.mechanics.masses import ConstantMass
 from vmri_jax.mechanics.system import System
 
@@ -53,7 +54,7 @@ def _shared(system: System, n_s: int, n_f: int, nodes: int | None = None) -> Spa
     return sparsity(rows @ rows.T > 0, nodes or 1)
 
 
-@eqx.filter_jit
+@partial(quickly_compiled, static_argnames=("n_s", "slow_too"))
 def _touched(system: System, n_s: int, q, moves, slow_too: bool):
     """(k, m) whether each of m constraints changes to first order with each of the moves (k, n), and (m,) whether it is finite."""
 

@@ -2,12 +2,13 @@
 
 A body hangs on the root of its tree, or on the ground, by a chain of links, each with a coordinate x that turns all
 bodies behind the link about an axis, moves them along the axis, or both. At x = 0 all bodies have known places. Motions
-are rows (r, M) of a vector and a matrix (4, 3) in the axes of the root: a point y goes to ``r + y M``. Rates of motions
-are twists (m, K), rows of the same kind: the point y has the velocity ``m + y K = m + k x y``.
+are matrices (4, 4), ``(1, r; 0, M)`` with a vector r and a matrix M in the axes of the root: they act on rows (1, y),
+and a point y goes to ``r + y M``. Rates of motions are twists ``(0, m; 0, K)``: the point y has the velocity ``m + y K =
+m + k x y``.
 
     E_i = exp(x_i Y_i) E_parent      exp(x Y) = 1 + sin x T + (1 - cos x) T T + x S      Y = T + S, turn T and slide S
     A_b = Z_b E_b                    origin and axes of body b, of Z_b at x = 0, moved by the last link of b
-    phi_b, D_b = A_b (phi, D)        in space, by centre phi and directors D of the root, which need not be orthonormal
+    (phi_b, D_b) = A_b (phi, D)      in space, by centre phi and directors D of the root, which need not be orthonormal
 
 A coordinate x_i moves all bodies behind it by the twist ``J_i = E_i^-1 Y_i E_i``. So positions and twists have
 derivatives in closed form,
@@ -15,7 +16,7 @@ derivatives in closed form,
     dA_b = A_b W_b      dJ_i = J_i W_i - W_i J_i      W = sum of J_j dx_j over the links j before
 
 W_i without link i itself. `placed` gives these derivatives to JAX: velocities, kinetic energies, forces and all their
-derivatives consist of sums over trees and of products of (4, 3) rows, and never differentiate the chains of motions.
+derivatives consist of sums over trees and of products of matrices, and never differentiate the chains of motions.
 
 A joint of several coordinates is a chain of links. Bodies without a joint, the roots, have their centres and directors
 among the coordinates.
@@ -35,6 +36,7 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 
 from vmri_jax.kernels import matmul
+from vmri_jax.mechanics.arrays import is_concrete, library
 from vmri_jax.mechanics.rows import Part, Place, Rows
 from vmri_jax.mechanics.slots import Computed
 
@@ -49,8 +51,8 @@ SIZE = 12
 LARGEST_MATRIX = 16
 """Most links whose sums are products with a matrix: their time grows with the square of the number of links. A smaller
 number makes the programs of small trees larger."""
-UNMOVED = np.concatenate([np.zeros((1, 3)), np.eye(3)])
-"""(4, 3) the motion of nothing; centre and directors of the ground."""
+UNMOVED = np.eye(4)[:, 1:]
+"""(4, 3) centre and directors of the ground."""
 
 
 class Link(NamedTuple):
@@ -58,10 +60,12 @@ class Link(NamedTuple):
 
     place: of the coordinate in q_s or q_f.
     parent: number of the link before it on the way from the root; -1 for the first one.
+    turns: whether it turns bodies; else it moves them along its axis alone.
     """
 
     place: Place
     parent: int
+    turns: bool = True
 
 
 class Carried(NamedTuple):
@@ -115,29 +119,58 @@ class Kinematics:
 
         Args:
             q_s, q_f: coordinates.
-            joints: the constants in the axes of the roots: "turn" T (n, 4, 3) and "slide", the first row of S (n, 3),
-                of all links, "zero" Z (n, 4, 3) of all bodies.
+            joints: the constants in the axes of the roots: "turn" T and "slide" S (n, 4, 4) of all links, "zero" Z
+                (n, 4, 4) of all bodies.
         """
         if not self.bodies:
             return q_s, q_f
         frames, _ = self._against_roots(q_s, q_f, joints)
         slow, roots = sum(body.part == "s" for body in self.bodies), [body.root for body in self.bodies]
-        frames = after(frames, self._roots(q_s, q_f, roots)) if set(roots) != {GROUND} else frames
-        return jnp.concatenate([q_s, frames[:slow].reshape(-1)]), jnp.concatenate([q_f, frames[slow:].reshape(-1)])
+        frames = product(frames, self._roots(q_s, q_f, roots)) if set(roots) != {GROUND} else frames[:, :, 1:]
+        parts = (q_s, frames[:slow].reshape(-1)), (q_f, frames[slow:].reshape(-1))
+        q_slow, q_fast = (library(part).concatenate(part) for part in parts)
+        return q_slow, q_fast
 
     def _against_roots(self, q_s, q_f, joints: dict[str, Any]):
-        """A (bodies, 4, 3) and J (links, 4, 3), in the axes of the roots."""
+        """A (bodies, 4, 4) and J (links, 4, 4), in the axes of the roots."""
         link, body = self.first
-        constants = [joints[name][link : link + len(self.links)] for name in ("turn", "slide")]
-        x = Rows.of([link.place for link in self.links]).take(q_s, q_f).reshape(-1) if self.links else jnp.zeros(0)
-        return placed(self, x, *constants, joints["zero"][body : body + len(self.bodies)])
+        turn, slide = (joints[name][link : link + len(self.links)] for name in ("turn", "slide"))
+        zero = joints["zero"][body : body + len(self.bodies)]
+        x = Rows.of([link.place for link in self.links]).take(q_s, q_f).reshape(-1) if self.links else np.zeros(0)
+        if any(link.turns for link in self.links):
+            return (_placed if is_concrete((x, joints)) else placed)(self, x, turn, slide, zero)
+        # shifts alone add up, which JAX differentiates as well: A_b = Z_b + sum of x_i S_i over the links before b, J_i = S_i
+        return zero + self.summed(x[:, None, None] * slide)[0], slide
+
+    def _motions(self, q_s, q_f, joints: dict[str, Any]):
+        """A (bodies, 4, 4), and K (n, 4, 3) of all coordinates.
+
+        A body b on joints has the rates ``A_b sum_i K_i v_i`` over the coordinates i on the way to it. A link has ``K_i = J_i D``, a coordinate of
+        a root a unit row.
+        """
+        frames, twists = self._against_roots(q_s, q_f, joints)
+        links, roots, *_ = self._tables
+        twists = twists[:, :, 1:]
+        if set(self._owners) - {GROUND}:
+            twists = product(twists, self._roots(q_s, q_f, self._owners)[:, 1:])
+        columns = (product(links, twists.reshape(-1, SIZE)) if self.links else 0.0) + roots
+        return frames, columns.reshape(-1, 4, 3)
+
+    def with_jacobian(self, q_s, q_f, joints: dict[str, Any]):
+        """Q = (Q_s, Q_f) as one vector, and its Jacobian dQ/dq; of NumPy unless a number is traced."""
+        bodies = self(q_s, q_f, joints)
+        xp, n, (n_s, _) = library(q_s, q_f, joints), sum(self.sizes), self.sizes
+        frames, columns = self._motions(q_s, q_f, joints)
+        # A_b K_i if b is behind i, else zero
+        of_bodies = product(frames[:, None], columns[None]) * self._tables[2].T[:, :, None, None]
+        rows = xp.moveaxis(of_bodies, 1, -1).reshape(-1, n)
+        end = bodies[0].size - n_s
+        return xp.concatenate(bodies), xp.concatenate([np.eye(n)[:n_s], rows[:end], np.eye(n)[n_s:], rows[end:]])
 
     def mass_matrix(self, q_s, q_f, joints: dict[str, Any], masses: Sequence[Any]):
         """``(dQ/dq)^T m dQ/dq`` (n, n), in which the bodies behind a coordinate move as one, composite body.
 
-        A body b on joints has the rates ``A_b sum_i K_i v_i`` over the coordinates i on the way to it, with the column (1, 0, 0, 0) before those
-        of A_b. A link has ``K_i = J_i D``, a coordinate of a root a unit row. With the masses ``G_j = sum_b A_b^T m_b A_b`` of the bodies b
-        behind a coordinate j,
+        With the masses ``G_j = sum_b A_b^T m_b A_b`` of the bodies b behind a coordinate j, and K of `_motions`,
 
             M_ij = M_ji = tr(K_i^T G_j K_j)    for i on the way to j.
 
@@ -152,19 +185,13 @@ class Kinematics:
         of_coordinates = jnp.diag(jnp.concatenate(own))
         if not self.bodies:
             return of_coordinates
-        frames, twists = self._against_roots(q_s, q_f, joints)
-        links, roots, behind, on_way = self._tables
-        # G_b = A_b^T m_b A_b
-        rows = jnp.concatenate([jnp.broadcast_to(np.eye(4)[:, :1], (len(frames), 4, 1)), frames], axis=2)
+        frames, columns = self._motions(q_s, q_f, joints)
+        *_, behind, on_way = self._tables
         of_rows = jnp.concatenate(of_bodies).reshape(-1, 4, 3)[:, :, :1]
-        of_frames = matmul(jnp.swapaxes(rows, 1, 2), of_rows * rows).reshape(-1, 16)
-        # K_i, then tr(K_i^T G_j K_j)
-        if set(self._owners) - {GROUND}:
-            twists = matmul(twists, self._roots(q_s, q_f, self._owners)[:, 1:])
-        columns = (matmul(links, twists.reshape(-1, SIZE)) if self.links else 0.0) + roots
+        of_frames = matmul(jnp.swapaxes(frames, 1, 2), of_rows * frames).reshape(-1, 16)
         composite = matmul(behind, of_frames).reshape(n, 4, 4)
-        momenta = matmul(composite, columns.reshape(n, 4, 3)).reshape(n, SIZE)
-        half = matmul(columns, momenta.T) * on_way
+        momenta = matmul(composite, columns).reshape(n, SIZE)
+        half = matmul(columns.reshape(n, SIZE), momenta.T) * on_way
         return half + half.T + of_coordinates
 
     def velocities(self, q_s, q_f, v_s, v_f, joints: dict[str, Any]):
@@ -176,7 +203,7 @@ class Kinematics:
         """The inverse of `dataclasses.asdict`, also after a round trip through JSON."""
         return cls(
             tuple(Place(*root) for root in data["roots"]),
-            tuple(Link(Place(*place), parent) for place, parent in data["links"]),
+            tuple(Link(Place(*place), *others) for place, *others in data["links"]),
             tuple(Carried(*body) for body in data["bodies"]),
             tuple(data["sizes"]),
             tuple(data["first"]),
@@ -212,28 +239,28 @@ class Kinematics:
             parents = np.append(parents, -1)[parents]
 
     def summed(self, of_links):
-        """Sums of (n, 4, 3) of the links before each body (bodies, 4, 3), and of the links before each link (n, 4, 3).
+        """Sums of (n, 4, 4) of the links before each body (bodies, 4, 4), and of the links before each link (n, 4, 4).
 
         By a product with the matrix `before`, whose program is small; beyond `LARGEST_MATRIX` links over 1, 2, 4, ...
         links at once, so that the time grows nearly in proportion to the number of links.
         """
-        rows = of_links.reshape(-1, SIZE)
+        rows = of_links.reshape(-1, 16)
         if len(self.links) <= LARGEST_MATRIX:
             # without deep links the lower part is zero
-            sums = matmul(self.before if self.is_deep else self.before[: len(self.bodies)], rows)
+            sums = product(self.before if self.is_deep else self.before[: len(self.bodies)], rows)
         else:
             for parents in self.jumps():
                 rows = rows + _taken(rows, parents)
             sums = _taken(rows, self.lasts)
-        return jnp.split(sums.reshape(-1, 4, 3), [len(self.bodies)])
+        return library(sums).split(sums.reshape(-1, 4, 4), [len(self.bodies)])
 
     def _roots(self, q_s, q_f, numbers: Sequence[int]):
         """(k, 4, 3) centre and directors of roots by their numbers (k,); (1, 4, 3) if all are the same."""
         roots = [(q_s if part == "s" else q_f)[start : start + size] for part, start, size in self.roots]
         if len(set(numbers)) == 1:
             return roots[numbers[0]].reshape(1, 4, 3)
-        chosen = np.array(numbers)[:, None] == [*range(len(roots)), GROUND]
-        return matmul(chosen.astype(float), jnp.stack([*roots, UNMOVED.ravel()])).reshape(-1, 4, 3)
+        chosen, roots = np.array(numbers)[:, None] == [*range(len(roots)), GROUND], [*roots, UNMOVED.ravel()]
+        return product(chosen.astype(float), library(roots).stack(roots)).reshape(-1, 4, 3)
 
     @cached_property
     def _owners(self) -> list[int]:
@@ -259,22 +286,24 @@ class Kinematics:
 
 
 def _placed(tree: Kinematics, x, turn, slide, zero):
-    """A (bodies, 4, 3) and J (links, 4, 3).
+    """A (bodies, 4, 4) and J (links, 4, 4).
 
     Args:
         x: (n,) coordinates of the links.
-        turn, slide, zero: T (n, 4, 3), the first row of S (n, 3), and Z (bodies, 4, 3).
+        turn, slide, zero: T (n, 4, 4), S (n, 4, 4), and Z (bodies, 4, 4).
     """
-    sine, versine = jnp.sin(x)[:, None, None], (1 - jnp.cos(x))[:, None, None]
-    motions = UNMOVED + sine * turn + versine * matmul(turn, turn[:, 1:]) + _pad((x[:, None] * slide)[:, None])
+    xp = library(x, turn, slide, zero)
+    sine, versine, way = (values[:, None, None] for values in (xp.sin(x), 1 - xp.cos(x), x))
+    motions = np.eye(4) + sine * turn + versine * product(turn, turn) + way * slide
     for parents in tree.jumps():
-        motions = after(motions, _with_unmoved(motions)[parents])  # after k turns, motions of the last 2^k links
-    twists = turn + _pad(slide[:, None])
+        motions = product(motions, _with_unmoved(motions)[parents])  # after k turns, motions of the last 2^k links
+    twists = turn + slide
     if tree.is_deep:  # else E_i = exp(x_i Y_i), which leaves its own Y_i as it is
-        twists = matmul(twists, motions[:, 1:])
-        turning = matmul(jnp.swapaxes(motions[:, 1:], 1, 2), twists[:, 1:])
-        twists = jnp.concatenate([twists[:, :1] - matmul(motions[:, :1], turning), turning], axis=1)
-    return after(zero, _with_unmoved(motions)[tree.lasts[: len(tree.bodies)]]), twists
+        # E^-1 = (1, -r M^T; 0, M^T)
+        twists = product(twists, motions)
+        turning = product(xp.swapaxes(motions[:, 1:, 1:], 1, 2), twists[:, 1:])
+        twists = xp.concatenate([twists[:, :1] - product(motions[:, :1, 1:], turning), turning], axis=1)
+    return product(zero, _with_unmoved(motions)[tree.lasts[: len(tree.bodies)]]), twists
 
 
 placed = jax.custom_jvp(_placed, nondiff_argnums=(0,))
@@ -288,9 +317,9 @@ def _change(tree: Kinematics, arguments, tangents):
     d_frames, d_twists = jnp.zeros_like(frames), jnp.zeros_like(twists)
     if not isinstance(dx, SymbolicZero):
         of_bodies, of_links = tree.summed(dx[:, None, None] * twists)
-        d_frames = after(frames, of_bodies)
+        d_frames = matmul(frames, of_bodies)
         if tree.is_deep:
-            d_twists = matmul(twists, of_links[:, 1:]) - matmul(of_links, twists[:, 1:])
+            d_twists = matmul(twists, of_links) - matmul(of_links, twists)
     if not all(isinstance(change, SymbolicZero) for change in changes):
         changes = [
             jnp.zeros_like(c) if isinstance(change, SymbolicZero) else change
@@ -301,32 +330,22 @@ def _change(tree: Kinematics, arguments, tangents):
     return (frames, twists), (d_frames, d_twists)
 
 
-def after(rows, bodies):
-    """Origins and axes of frames with the relative rows (r, M), in bodies with the rows (s, D): ``(s + r D, M D)``.
-
-    Args:
-        rows: (n, 4, 3) of the frames.
-        bodies: (n, 4, 3).
-    """
-    return matmul(rows, bodies[:, 1:]) + _pad(bodies[:, :1])
-
-
 def _taken(rows, numbers):
     """Rows (n, k) by their numbers, zeros for -1, by static slices: derivatives in reverse mode are no scatters."""
     follows = [b - a == (a >= 0) for a, b in pairwise(numbers)]
     ends = [0, *(i for i, goes_on in enumerate(follows, 1) if not goes_on), len(numbers)]
     pieces = [
-        rows[numbers[i] : numbers[i] + j - i] if numbers[i] >= 0 else jnp.zeros((j - i, rows.shape[1]))
+        rows[numbers[i] : numbers[i] + j - i] if numbers[i] >= 0 else np.zeros((j - i, rows.shape[1]))
         for i, j in pairwise(ends)
     ]
-    return jnp.concatenate(pieces)
+    return library(pieces).concatenate(pieces)
 
 
-def _pad(first):
-    """(n, 4, 3) rows of which only the first one (n, 1, 3) is not zero."""
-    return jnp.pad(first, ((0, 0), (0, 3), (0, 0)))
+def product(a, b):
+    """``a @ b``, of NumPy unless an entry is traced."""
+    return a @ b if is_concrete((a, b)) else matmul(a, b)
 
 
 def _with_unmoved(motions):
-    """Motions (n, 4, 3), and the motion of nothing as the last one, number -1."""
-    return jnp.concatenate([motions, UNMOVED[None]])
+    """Motions (n, 4, 4), and the motion of nothing as the last one, number -1."""
+    return library(motions).concatenate([motions, np.eye(4)[None]])

@@ -8,6 +8,8 @@ from typing import Literal, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from vmri_jax.mechanics.arrays import library
+
 Part = Literal["s", "f"]
 
 
@@ -133,8 +135,8 @@ class Rows:
             q = q_s if part == "s" else q_f
             if same or count == 1:
                 piece = q[start : start + self.size]
-                pieces.append(jnp.tile(piece, count) if same else piece)
+                pieces.append(library(piece).tile(piece, count) if same else piece)
             else:
                 whole = q[start : start + self.stride * count].reshape(count, self.stride)
                 pieces.append(whole[:, : self.size].reshape(-1))
-        return jnp.concatenate(pieces).reshape(-1, self.size)
+        return library(pieces).concatenate(pieces).reshape(-1, self.size)

@@ -15,7 +15,7 @@ from vmri_jax.mechanics.slots import Computed
 from vmri_jax.refusals import Refused
 from vmri_jax.scene.body import GROUND, Attachment, Bodies, Point, body_of, end_of, label_of, moving, weights_of
 from vmri_jax.scene.declare import Declared, Elements, Parameter, real_tree, stacked
-from vmri_jax.scene.terms import Applied, EffectTerm, Role, Source, choose, is_of_package
+from vmri_jax.scene.terms import ARGUMENTS, Applied, EffectTerm, Role, Source, choose, is_of_package
 
 MOST_ROLES = 32
 """Most bodies of an element: the two bodies of each of sixteen joints that one equation couples. More are refused."""
@@ -101,6 +101,7 @@ class Bindable(Declared, ABC):
     What depends on bodies is known of bound effects alone, see `bound`.
     """
 
+    kind: ClassVar[Any]
     function: ClassVar[Any]
     rest: ClassVar[Any] = None
     """``rest(q, params) -> (n,)``: the values of a `measured` parameter of n elements at the start; () of a single element."""
@@ -146,8 +147,24 @@ class Bindable(Declared, ABC):
     @property
     def called(self) -> Any:
         """The function that terms call; the functions of time of the user are its first arguments, see `of_time`."""
-        of_time = tuple(getattr(self, f.name) for f in fields(self) if "of_time" in f.metadata)
+        of_time = tuple(self.functions_of_time.values())
         return Applied(self.function, of_time) if of_time else self.function
+
+    @property
+    def functions_of_time(self) -> dict[str, Any]:
+        """The functions of time of the user by the names of their fields."""
+        return {f.name: getattr(self, f.name) for f in fields(self) if "of_time" in f.metadata}
+
+    @property
+    def params_of_time(self) -> Any:
+        """The params of the functions of time."""
+        return real_tree(f"{self.name}: params", vars(self)["params"])
+
+    @property
+    def arguments(self) -> tuple[str, ...]:
+        """Names of the arguments of the function before params."""
+        of_kind = ARGUMENTS[self.kind]
+        return ("t", *of_kind) if self.timed and "t" not in of_kind else of_kind
 
     @cached_property
     def elements(self) -> Elements:
@@ -183,9 +200,8 @@ class Bindable(Declared, ABC):
         for name, parameter in self.declared.items():
             if getattr(self, name) is not None:
                 params[name] = parameter.array(f"{self.name}: {name}", getattr(self, name), firsts)
-        for argument in fields(self):
-            if "of_time" in argument.metadata:
-                params[argument.name] = real_tree(f"{self.name}: params", vars(self)["params"])
+        if self.functions_of_time:
+            params |= dict.fromkeys(self.functions_of_time, self.params_of_time)
         for role, name in enumerate(self.masses):
             params[name] = stacked([self._mass(element[role]) for element in self.elements])
         params |= self.points
@@ -228,6 +244,12 @@ class Bindable(Declared, ABC):
         """The argument q of the function for elements of the same size at the start."""
         roles = zip(*(self.ends[i] for i in group), strict=True)
         return tuple(stacked([end.position for end in role]) for role in roles)
+
+    def arguments_at_start(self, group: Sequence[int]) -> list[Any]:
+        """The arguments of the function for elements of the same size at the start, at rest."""
+        q = self.positions(group)
+        values = {"t": np.zeros(()), "q": q, "v": tuple(np.zeros(x.shape) for x in q)}
+        return [*map(values.get, self.arguments), self.params_of(group)]
 
     def params_of(self, group: Sequence[int], params: Any = None) -> Any:
         """The argument params of the function for some elements, from the `params` of all elements."""
@@ -280,14 +302,16 @@ class Bindable(Declared, ABC):
         roles = zip(POINTS, zip(*(self.attached[i] for i in group), strict=True), strict=False)
         return self._term([self._role(*role, layout.bodies) for role in roles], group)
 
-    def _term(self, roles: Iterable[Role], group: Sequence[int], through: Any = None) -> EffectTerm:
-        """Some elements as a term."""
+    def _term(
+        self, roles: Iterable[Role], group: Sequence[int], through: Any = None, unused: Sequence[str] = ()
+    ) -> EffectTerm:
+        """Some elements as a term, whose function does not use the parameters `unused`."""
         select = None if len(group) == len(self.elements) else tuple(group)
-        split, sources = self.split_of(self.parameters), (Source(self.name, len(group), select),)
-        function = self.called
+        split = tuple(name for name in self.split_of(self.parameters) if name not in unused)
         # A function of the user may be right for a single element alone; no parameter may be common to all elements.
-        is_joined = is_of_package(function) and len(split) == len(self.parameters)
-        return EffectTerm(sources, function, tuple(roles), split, self.timed, is_joined, through)
+        is_joined = is_of_package(self.called) and not self.parameters.keys() - {*split, *unused}
+        sources, of_kinds = (Source(self.name, len(group), select),), tuple((role,) for role in roles)
+        return EffectTerm(sources, self.called, self.arguments, of_kinds, split, is_joined, through)
 
     def _role(self, parameter: str, names: Sequence[str], places: Mapping[str, Place]) -> Role:
         """The map from q_s and q_f to the coordinates of the bodies of a role, all of the same kind, or to points in them, which are a parameter."""

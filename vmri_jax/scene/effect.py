@@ -91,12 +91,11 @@ class Effect(Bindable):
         if not self.name:
             object.__setattr__(self, "name", self.default_name or type(self).__name__.lower())
         for argument in fields(self):
-            about, value = f"{self.name}: {argument.name}", lasting(getattr(self, argument.name))
-            object.__setattr__(self, argument.name, value)
-            if "of_time" in argument.metadata:
-                if not callable(value):
-                    raise Refused(f"{about} is {value!r}; give a function of (t, params).")
-                check_arguments(about, value, "t, params")
+            object.__setattr__(self, argument.name, lasting(getattr(self, argument.name)))
+        for name, function in self.functions_of_time.items():
+            if not callable(function):
+                raise Refused(f"{self.name}: {name} is {function!r}; give a function of (t, params).")
+            check_arguments(f"{self.name}: {name}", function, "t, params")
         is_number = isinstance(self.rate, int) and not isinstance(self.rate, bool) and self.rate > 0
         if not (is_number and self.kind == "potential") and self.rate not in ("slow", "fast", "auto"):
             number = ", or of a potential a whole number k, for every k-th micro node"
@@ -115,6 +114,9 @@ class Effect(Bindable):
                 the class of the effect forbids.
         """
         self.check_bodies()
+        for name, function in self.functions_of_time.items():
+            about = f"{self.name}: {name}"
+            self.check_of_time(about, shape_of(about, function, jnp.zeros(()), self.params_of_time))
         self.check_parameters()
         check_function(self, moved)
         if self.kind == "constraint" and not moved:
@@ -151,15 +153,12 @@ class Effect(Bindable):
         if any(parameter.shape == "vector" for parameter in self.declared.values()):
             self._check_sizes([element[0] for element in self.elements])
 
-    def check_of_time(self, name: str, params: Any) -> None:
-        """Refuse a function of time, in the field of this name, whose values do not have the dimension of the bodies."""
-        value = shape_of(f"{self.name}: {name}", getattr(self, name), jnp.zeros(()), params)
+    def check_of_time(self, about: str, value: Any) -> None:
+        """Refuse a function of time whose value, as shapes, does not have the dimension of the bodies; `about` begins messages."""
         shape = getattr(value, "shape", None)
         for (body,), (end,) in zip(self.elements, self.ends, strict=True):
             if shape != (end.size,) and (shape, end.size) != ((), 1):
-                raise Refused(
-                    f"{self.name}: {name} returns shape {shape}; {body} has dimension {end.size}, return ({end.size},)."
-                )
+                raise Refused(f"{about} returns shape {shape}; {body} has dimension {end.size}, return ({end.size},).")
 
     def check_parameters(self) -> None:
         """Refuse bodies at one place, parameters of another shape or sign, or that are not finite."""
@@ -242,12 +241,10 @@ def check_function(effect: Any, moved: bool) -> None:
     if effect.kind == "control" or getattr(effect.function, "__module__", "").startswith(LIBRARY):
         return
     for group in effect.groups():
-        q = jax.device_put(effect.positions(group))
-        t, v = jax.device_put(((np.zeros(()),), tuple(np.zeros(x.shape) for x in q)))
-        before = {"force": (*t, q, v), "kinetic": (q, v)}.get(effect.kind, (*t, q) if effect.timed else (q,))
-        arguments = *before, arrays(effect.params_of(group))
+        *arguments, params = effect.arguments_at_start(group)
+        arguments = *jax.device_put(arguments), arrays(params)
         value = shape_of(f"{effect.name}: function", effect.called, *arguments)
-        _check_value(effect, value, [x.shape for x in q], len(group))
+        _check_value(effect, value, [x.shape for x in effect.positions(group)], len(group))
         if effect.kind == "constraint" and not moved and is_concrete(arguments):
             rows = _rows(effect.called, *arguments)
             if np.any(np.abs(rows.values) > rows.allowed(START)):

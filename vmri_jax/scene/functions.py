@@ -3,7 +3,7 @@
 All classes here are compared by value: scenes of the same structure give equal functions, which JAX compiles only once.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from typing import Any
@@ -17,7 +17,7 @@ from vmri_jax.mechanics.masses import WithMassMatrix
 from vmri_jax.mechanics.rows import Entries
 from vmri_jax.mechanics.slots import Computed
 from vmri_jax.mechanics.system import ConstantMass, Rheonomic, System
-from vmri_jax.mechanics.terms import KINDS
+from vmri_jax.mechanics.terms import KINDS, POSITIONS, VELOCITIES
 from vmri_jax.scene.binding import Layout
 from vmri_jax.scene.declare import arrays
 from vmri_jax.scene.sorting import HOMES, Placed, Sorting, rows_of
@@ -49,45 +49,44 @@ class _OfTerms:
     kinematics: Kinematics = UNCHANGED
     rows: Entries | None = None
 
-    def by_name(self, arguments) -> tuple[Any, ...]:
-        """(t, q_s, q_f, v_s, v_f, params) of the arguments of a call, with None for those that the function does not take."""
+    def on_bodies(self, arguments) -> tuple[dict[str, Any], Any]:
+        """Of the arguments of a call: "t", "q" with (Q_s, Q_f) and "v" with ``dQ/dq v``, as terms take them; and params."""
         *arguments, params = arguments
         names = ("t", *KINDS[self.field].arguments)[-len(arguments) :]  # rows that depend on time get t first
         values = dict(zip(names, arguments, strict=True))
-        return *map(values.get, ("t", "q_s", "q_f", "v_s", "v_f")), params
+        # the function does not depend on parts that it does not take
+        zeros = tuple(map(jnp.zeros, self.kinematics.sizes))
+        q, v = (tuple(map(values.get, pair, zeros)) for pair in (POSITIONS, VELOCITIES))
+        if "v_s" not in values:
+            return values | {"q": self.bodies(params)(*q)}, params
+        q, v = jax.jvp(self.bodies(params), q, v)
+        return values | {"q": q, "v": v}, params
 
-    def bodies(self, q_s, q_f, params) -> tuple[Any, Any]:
-        """(Q_s, Q_f) of q_s and q_f; one of these may be None if the terms do not depend on it, and zeros take its place."""
-        slow, fast = (jnp.zeros(n) if q is None else q for q, n in zip((q_s, q_f), self.kinematics.sizes, strict=True))
-        return self.kinematics(slow, fast, params.get(JOINTS))
-
-    def motions(self, q_s, q_f, v_s, v_f, params):
-        """Coordinates (Q_s, Q_f) of the bodies, and their velocities (V_s, V_f), ``V = dQ/dq v``."""
-        return jax.jvp(lambda q_s, q_f: self.bodies(q_s, q_f, params), (q_s, q_f), (v_s, v_f))
+    def bodies(self, params) -> Callable:
+        """The map from (q_s, q_f) to (Q_s, Q_f)."""
+        return lambda q_s, q_f: self.kinematics(q_s, q_f, params.get(JOINTS))
 
     def forces_on(self, q_s, q_f, params, forces):
-        """Generalised forces on (q_s, q_f) of forces F on the coordinates of bodies: ``(dQ/dq)^T F``."""
-        return jax.vjp(lambda q_s, q_f: self.bodies(q_s, q_f, params), q_s, q_f)[1](forces)
+        """Generalised forces on (q_s, q_f) of the sum F of forces on the coordinates of bodies: ``(dQ/dq)^T F``."""
+        return jax.vjp(self.bodies(params), q_s, q_f)[1](totals(forces))
 
 
 class PotentialEnergy(_OfTerms):
     """V, W or V_i, the sum of its terms."""
 
     def __call__(self, *arguments):
-        _, q_s, q_f, *_, params = self.by_name(arguments)
-        bodies = self.bodies(q_s, q_f, params)
-        return total([term.value(*bodies, params) for term in self.terms])
+        values, params = self.on_bodies(arguments)
+        return total([term(values, params) for term in self.terms])
 
 
 class ConstraintValues(_OfTerms):
     """g or g_s, the values of its terms one after the other; g_i, the values of the dropped rows over their sizes."""
 
     def __call__(self, *arguments):
-        t, q_s, q_f, *_, params = self.by_name(arguments)
-        bodies = self.bodies(q_s, q_f, params)
-        values = jnp.concatenate([jnp.ravel(term.value(*bodies, params, t)) for term in self.terms])
-        values = values if self.rows is None else self.rows.take(values)
-        return values / params[IMPLIED] if self.field == "implied" else values
+        values, params = self.on_bodies(arguments)
+        rows = jnp.concatenate([jnp.ravel(term(values, params)) for term in self.terms])
+        rows = rows if self.rows is None else self.rows.take(rows)
+        return rows / params[IMPLIED] if self.field == "implied" else rows
 
 
 @dataclass(frozen=True)
@@ -100,13 +99,10 @@ class KineticEnergy(_OfTerms, WithMassMatrix):
     whole: Kinematics = UNCHANGED
 
     def __call__(self, *arguments):
-        _, q_s, q_f, v_s, v_f, params = self.by_name(arguments)
+        values, params = self.on_bodies(arguments)
         part, number = ("slow", 0) if self.field == "slow_kinetic" else ("fast", 1)
-        if q_f is None:
-            q_f = v_f = jnp.zeros(self.kinematics.sizes[1])
-        bodies, rates = self.motions(q_s, q_f, v_s, v_f, params)
-        of_bodies = jnp.sum(params[MASS][part] * rates[number] ** 2) / 2
-        return total([of_bodies, *(term.kinetic(*bodies, *rates, params) for term in self.terms)])
+        of_bodies = jnp.sum(params[MASS][part] * values["v"][number] ** 2) / 2
+        return total([of_bodies, *(term(values, params) for term in self.terms)])
 
     @property
     def has_mass_matrix(self) -> bool:
@@ -123,9 +119,8 @@ class TotalForce(_OfTerms):
     """F, the sum of its terms."""
 
     def __call__(self, t, q_s, q_f, v_s, v_f, params):
-        bodies, rates = self.motions(q_s, q_f, v_s, v_f, params)
-        forces = totals([term.forces(t, *bodies, *rates, params) for term in self.terms])
-        return self.forces_on(q_s, q_f, params, forces)
+        values, _ = self.on_bodies((t, q_s, q_f, v_s, v_f, params))
+        return self.forces_on(q_s, q_f, params, [term.forces(values, params) for term in self.terms])
 
 
 @dataclass(frozen=True)
@@ -140,10 +135,9 @@ class Actuation(_OfTerms):
         return tuple(chain(*self.names))
 
     def __call__(self, q_s, q_f, u, params):
-        ends, bodies = np.cumsum([len(names) for names in self.names])[:-1], self.bodies(q_s, q_f, params)
-        controls = zip(self.terms, jnp.split(u, ends), strict=True)
-        forces = totals([term.controlled(*bodies, u_effect, params) for term, u_effect in controls])
-        return self.forces_on(q_s, q_f, params, forces)
+        ends = np.cumsum([len(names) for names in self.names])[:-1]
+        q, controls = self.bodies(params)(q_s, q_f), zip(self.terms, jnp.split(u, ends), strict=True)
+        return self.forces_on(q_s, q_f, params, [term.forces({"q": q, "u": u}, params) for term, u in controls])
 
 
 FUNCTIONS: dict[str, Any] = {
@@ -183,7 +177,9 @@ def build(sorting: Sorting, placed: Sequence[Placed]) -> System:
         if field == "potentials":
             functions[field][home] = function
         else:
-            functions[home] = Rheonomic(function) if is_rows and any(term.timed for term in terms) else function
+            functions[home] = (
+                Rheonomic(function) if is_rows and any("t" in term.arguments for term in terms) else function
+            )
     params: dict[str, Any] = {part.effect.name: arrays(part.effect.parameters) for part in placed}
     masses, num_slow = sorting.of_bodies("masses"), layout.ends[0]
     slow, fast = masses[:num_slow], masses[num_slow:]

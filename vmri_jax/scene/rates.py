@@ -135,9 +135,7 @@ def _linearise(effect: Effect, i: int, bodies: Bodies, columns: Mapping[str, np.
     """Element i of an effect at the start; `columns` of each body, see `Linearised`."""
     names, (term, params) = moving(effect.elements[i]), effect.element_term(i)
     q, v = (np.concatenate([getattr(bodies[name], of) for name in names]) for of in ("coordinates", "rates"))
-    is_kinetic = effect.kind == "kinetic"
-    function = TracedOnce(term.kinetic if is_kinetic else term.value)
-    force, *matrices = map(np.asarray, _derivatives(function, is_kinetic, q, v, params))
+    force, *matrices = map(np.asarray, _derivatives(TracedOnce(term), effect.kind == "kinetic", q, v, params))
     motions = block_diag(*(bodies[name].motions for name in names))
     parts = [motions.T @ force, *(motions.T @ matrix @ motions for matrix in matrices)]
     if not all(np.isfinite(part).all() for part in parts):
@@ -150,26 +148,29 @@ def _linearise(effect: Effect, i: int, bodies: Bodies, columns: Mapping[str, np.
 
 @partial(quickly_compiled, static_argnames="kinetic")
 def _derivatives(function: TracedOnce, kinetic: bool, q, v, params):
-    """The force, K, G and d2L/dv2 of an element, whose value or kinetic energy is `function`, in the coordinates of its bodies."""
+    """The force, K, G and d2L/dv2 of an element, whose energy is `function`, in the coordinates of its bodies."""
+    # the term of an element takes the coordinates of its bodies as q_s
+
+    def energy(q, v):
+        none = jnp.zeros(0)
+        return function({"q": (q, none), "v": (v, none)}, params)
+
     # the derivatives of L = -V(q) by velocities are zero: tracing and compiling them would take time for nothing
     if not kinetic:
 
         def gradient(q):
-            values = jax.grad(function)(q, None, params)
+            values = jax.grad(energy)(q, v)
             return values, values
 
         stiffness, values = jax.jacfwd(gradient, has_aux=True)(q)
         zero = jnp.zeros_like(stiffness)
         return -values, stiffness, zero, zero
 
-    def lagrangian(q, v):
-        return function(q, None, v, None, params)
-
-    force = partial(force_of, lagrangian)
+    force = partial(force_of, energy)
     by_velocities = jax.jacfwd(force, 1)(q, v)
-    at_rest = jax.grad(lagrangian)(q, jnp.zeros_like(v))
+    at_rest = jax.grad(energy)(q, jnp.zeros_like(v))
     gyroscopic = (by_velocities - by_velocities.T) / 2
-    return at_rest, -jax.jacfwd(force)(q, v), gyroscopic, jax.hessian(lagrangian, 1)(q, v)
+    return at_rest, -jax.jacfwd(force)(q, v), gyroscopic, jax.hessian(energy, 1)(q, v)
 
 
 def positions(bodies: Bodies) -> np.ndarray:

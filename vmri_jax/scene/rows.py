@@ -44,14 +44,16 @@ def _derivatives(
 
     ``g(q + i h e) = g + i h dg/dq e`` to round-off, with a tiny h.
     """
-    of_roles = [_columns(role, num_slow) for role in term.roles]
+    roles = [role for (role,) in term.roles]
+    of_roles = [_columns(role, num_slow) for role in roles]
     columns = np.concatenate(of_roles, axis=-1)  # (n, c), or (c,) of a single element
     steps = 1j * COMPLEX_STEP * np.eye(columns.shape[-1])
     x = q[columns] + (steps if columns.ndim == 1 else steps[:, None])
     parts = np.split(x, np.cumsum([of_role.shape[-1] for of_role in of_roles])[:-1], axis=-1)
     params = term.params_of(params)
-    points = term.of_roles([role.of_bodies(x, params) for role, x in zip(term.roles, parts, strict=True)], params)
-    values = np.asarray(term.function(*((np.asarray(t),) if term.timed else ()), points, params))
+    points = term.of_roles([role.of_bodies(x, params) for role, x in zip(roles, parts, strict=True)], params)
+    arguments = map({"t": np.asarray(t), "q": points}.get, term.arguments)
+    values = np.asarray(term.function(*arguments, params))
     columns = np.atleast_2d(columns)
     values = values.reshape(*columns.shape[::-1], -1)  # of each step, element, and row of the element
     rows, jacobian = np.arange(values[0].size).reshape(*values.shape[1:], 1), np.zeros((values[0].size, q.size))

@@ -27,17 +27,15 @@ if constraints tie it to fast bodies that cannot move without it, as in a closed
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property, partial
+from functools import cached_property
 from itertools import chain
 from typing import Any, Literal, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from scipy.sparse import eye_array
 
-from vmri_jax.mechanics.arrays import is_concrete, library, quickly_compiled
-from vmri_jax.mechanics.kinematics import Kinematics
+from vmri_jax.mechanics.arrays import is_concrete, library
 from vmri_jax.refusals import Refused
 from vmri_jax.scene.binding import DecidedPace, Layout
 from vmri_jax.scene.body import GROUND, Bodies, joined, label_of, listed
@@ -145,26 +143,13 @@ class Sorting:
         """Q = (Q_s, Q_f) of q = (q_s, q_f), each one vector, and the Jacobian dQ/dq."""
         if self.layout.kinematics is None:
             return q, eye_array(q.size)
-        bodies, jacobian = _bodies_and_jacobian(self.layout.kinematics, q, self.joints)
-        return (np.asarray(bodies), np.asarray(jacobian)) if is_concrete(jacobian) else (bodies, jacobian)
+        n_s = self.layout.sizes[0]
+        return self.layout.kinematics.with_jacobian(q[:n_s], q[n_s:], self.joints)
 
     @cached_property
     def joints(self) -> dict[str, Any]:
         """Constants of the joints that carry bodies, see `joint_constants`; empty if no joint does."""
         return joint_constants(self.bodies, self.branches) if self.branches else {}
-
-
-@partial(quickly_compiled, static_argnames="kinematics")
-def _bodies_and_jacobian(kinematics: Kinematics, q, joints):
-    """Q and dQ/dq."""
-
-    def bodies(q):
-        n_s = kinematics.sizes[0]
-        coordinates = jnp.concatenate(kinematics(q[:n_s], q[n_s:], joints))
-        return coordinates, coordinates
-
-    jacobian, coordinates = jax.jacfwd(bodies, has_aux=True)(q)
-    return coordinates, jacobian
 
 
 def _nearest_rates(jacobian, rates, masses) -> tuple[Any, Any]:
@@ -371,8 +356,7 @@ def rows_of(placed: Sequence[Placed], layout: Layout) -> list[Row]:
         effect, number = part.effect, 0
         for group in effect.groups(part.elements, layout) if part.home in HOMES else ():
             # all elements of a group have as many rows
-            t, one = (np.zeros(()),) if effect.timed else (), group[:1]
-            size = jax.eval_shape(effect.called, *t, effect.positions(one), effect.params_of(one)).size
+            size = jax.eval_shape(effect.called, *effect.arguments_at_start(group[:1])).size
             for element in group:
                 named = f"{effect.name} {'-'.join(map(label_of, effect.elements[element]))}"
                 label = effect.name if len(effect.elements) == 1 else named

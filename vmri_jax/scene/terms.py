@@ -3,7 +3,7 @@
 All classes here are compared by value: scenes of the same structure give equal functions, which JAX compiles only once.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
 from itertools import chain, groupby
@@ -17,6 +17,15 @@ import numpy as np
 from vmri_jax.mechanics.arrays import library
 from vmri_jax.mechanics.kinematics import UNMOVED
 from vmri_jax.mechanics.rows import Place, Rows
+
+ARGUMENTS: dict[str, tuple[str, ...]] = {
+    "potential": ("q",),
+    "constraint": ("q",),
+    "kinetic": ("q", "v"),
+    "force": ("t", "q", "v"),
+    "control": ("q", "u"),
+}
+"""For each kind of effects the arguments of its function before params; a constraint that depends on time gets t before them."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +63,7 @@ def place(q, weights):
 
 @dataclass(frozen=True)
 class Role:
-    """The map from q_s and q_f to the coordinates of the bodies, or to points in them, that elements have in one role: linear but on the ground.
+    """The map from q_s and q_f to the bodies, or to points in them, that elements between bodies of one kind have in one role: linear but on the ground.
 
     rows: coordinates of the bodies, all of one kind; None for the ground.
     count, size: number of elements, and of coordinates that the function takes of each.
@@ -66,11 +75,6 @@ class Role:
     count: int
     size: int
     point: str = ""
-
-    @property
-    def pieces(self) -> "tuple[Role, ...]":
-        """The role itself, see `Roles`."""
-        return (self,)
 
     def positions(self, q_s, q_f, params) -> Any:
         """(d,) or (n, d) coordinates or points."""
@@ -84,37 +88,6 @@ class Role:
             return params[self.point][..., : self.size]
         ground = UNMOVED.ravel()  # the ground as a rigid body
         return ground if self.count == 1 else np.broadcast_to(ground, (self.count, self.size))
-
-
-@dataclass(frozen=True)
-class Roles:
-    """Roles of bodies of several kinds as one role: the elements of the first one, then of the second one, and so on."""
-
-    pieces: tuple[Role, ...]
-
-    @classmethod
-    def joined(cls, roles: "Iterable[Role | Roles]") -> "Role | Roles":
-        """One role of the elements of roles of one size, one after the other."""
-        pieces: list[Any] = [*chain(*(role.pieces for role in roles))]
-        of_kinds = []
-        for (stride, _), (*same,) in groupby(pieces, key=lambda role: (role.rows and role.rows.stride, role.point)):
-            rows = Rows.of([*chain(*(role.rows.places for role in same))], same[0].rows.size) if stride else None
-            of_kinds.append(replace(same[0], rows=rows, count=sum(role.count for role in same)))
-        return of_kinds[0] if len(of_kinds) == 1 else cls(tuple(of_kinds))
-
-    @property
-    def size(self) -> int:
-        """As of each of the roles."""
-        return self.pieces[0].size
-
-    def positions(self, q_s, q_f, params):
-        """(n, d) coordinates or points."""
-        of_pieces, end = [], 0
-        for role in self.pieces:
-            first, end = end, end + role.count
-            points = {role.point: pick(params[role.point], range(first, end))} if role.point else {}
-            of_pieces.append(role.positions(q_s, q_f, points).reshape(role.count, role.size))
-        return jnp.concatenate(of_pieces)
 
 
 class Source(NamedTuple):
@@ -134,18 +107,19 @@ class EffectTerm:
     """The function of one or more effects of a kind on some of their elements.
 
     sources: the elements.
-    roles: the maps from q_s and q_f to the coordinates of each role, `Role` or `Roles`.
+    arguments: names of the arguments of the function before params, see `ARGUMENTS`.
+    roles: for each role the maps from (q_s, q_f) to the coordinates of its bodies: of the elements between bodies of one kind, then of another
+        kind, and so on.
     split: names of the parameters that have an entry for each element.
-    timed: whether the first argument of the function is the time.
     is_joined: whether the terms of several effects with this function are one term, see `joined`.
     through: ``through(q, params)``, the argument q of the function by the coordinates of each role; None if it is these coordinates.
     """
 
     sources: tuple[Source, ...]
     function: Callable
-    roles: tuple[Any, ...]
+    arguments: tuple[str, ...]
+    roles: tuple[tuple[Role, ...], ...]
     split: tuple[str, ...] = ()
-    timed: bool = False
     is_joined: bool = False
     through: Callable | None = None
 
@@ -164,26 +138,26 @@ class EffectTerm:
             for name in self.split
         }
 
-    def value(self, q_s, q_f, params, t=None):
-        """Energy or constraint values."""
-        params = self.params_of(params)
-        return self.function(*((t,) if self.timed else ()), self._map(params)(q_s, q_f), params)
+    def __call__(self, values: Mapping[str, Any], params):
+        """The value of the function: an energy, values of constraints, or forces on its argument q.
 
-    def kinetic(self, q_s, q_f, v_s, v_f, params):
-        """Velocity-dependent energy."""
+        Args:
+            values: (q_s, q_f) as "q", their rates as "v", and "t" and "u", as far as the function takes them.
+            params: the parameters of all effects by name.
+        """
         params = self.params_of(params)
-        return self.function(*jax.jvp(self._map(params), (q_s, q_f), (v_s, v_f)), params)
+        values = dict(values)
+        if "v" in self.arguments:
+            values["q"], values["v"] = jax.jvp(self._map(params), values["q"], values["v"])
+        else:
+            values["q"] = self._map(params)(*values["q"])
+        return self.function(*(values[name] for name in self.arguments), params)
 
-    def forces(self, t, q_s, q_f, v_s, v_f, params):
-        """Force on all slow and on all fast coordinates."""
-        params = self.params_of(params)
-        q, v = jax.jvp(self._map(params), (q_s, q_f), (v_s, v_f))
-        return self._put(self.function(t, q, v, params), params, q_s, q_f)
-
-    def controlled(self, q_s, q_f, u, params):
-        """Force of the controls u on all slow and on all fast coordinates."""
-        params = self.params_of(params)
-        return self._put(self.function(self._map(params)(q_s, q_f), u, params), params, q_s, q_f)
+    def forces(self, values: Mapping[str, Any], params):
+        """Forces F on the argument q of the function, as forces ``(dq/dq_s)^T F`` and ``(dq/dq_f)^T F``; arguments as of a call."""
+        q, pull = jax.vjp(self._map(self.params_of(params)), *values["q"])
+        forces = zip(self(values, params), q, strict=True)
+        return pull(tuple(jnp.broadcast_to(jnp.asarray(f, float), x.shape) for f, x in forces))
 
     def of_roles(self, coordinates: Iterable[Any], params) -> tuple[Any, ...]:
         """The argument q of the function, by the coordinates of each role."""
@@ -191,17 +165,12 @@ class EffectTerm:
 
     def _map(self, params) -> Callable:
         """The map from (q_s, q_f) to the argument q of the function."""
-        return lambda q_s, q_f: self.of_roles((role.positions(q_s, q_f, params) for role in self.roles), params)
-
-    def _put(self, forces, params, q_s, q_f):
-        """Forces F on the argument q of the function, as forces ``(dq/dq_s)^T F`` and ``(dq/dq_f)^T F``."""
-        q, pull = jax.vjp(self._map(params), q_s, q_f)
-        return pull(tuple(jnp.broadcast_to(jnp.asarray(f, float), x.shape) for f, x in zip(forces, q, strict=True)))
+        return lambda q_s, q_f: self.of_roles((_positions(role, q_s, q_f, params) for role in self.roles), params)
 
     @property
     def places(self) -> list[Place]:
         """Places of the coordinates that the term depends on."""
-        return [*chain(*(piece.rows.places for role in self.roles for piece in role.pieces if piece.rows))]
+        return [place for of_kind in chain(*self.roles) if of_kind.rows for place in of_kind.rows.places]
 
 
 @dataclass(frozen=True)
@@ -211,21 +180,32 @@ class TangentDamping:
     terms: tuple[EffectTerm, ...]
     name: str
 
-    def forces(self, t, q_s, q_f, v_s, v_f, params):
-        """Force on all slow and on all fast coordinates."""
+    def forces(self, values, params):
+        """Force on (q_s, q_f), as of `EffectTerm`."""
 
         def energy(q):
-            q_s, q_f = q
-            return total([term.value(q_s, q_f, params) for term in self.terms])
+            return total([term({"q": q}, params) for term in self.terms])
 
         # K v as the derivative of the gradient along v, without the matrix K
-        products = jax.jvp(jax.grad(energy), ((q_s, q_f),), ((v_s, v_f),))[1]
+        products = jax.jvp(jax.grad(energy), (values["q"],), (values["v"],))[1]
         return tuple(-params[self.name]["stiffness"] * product for product in products)
 
     @property
     def places(self) -> list[Place]:
         """Places of the coordinates that the terms depend on."""
         return [*chain(*(term.places for term in self.terms))]
+
+
+def _positions(role: Sequence[Role], q_s, q_f, params):
+    """Coordinates or points of all elements in a role, (d,) or (n, d)."""
+    if len(role) == 1:
+        return role[0].positions(q_s, q_f, params)
+    of_kinds, end = [], 0
+    for of_kind in role:
+        first, end = end, end + of_kind.count
+        points = {of_kind.point: pick(params[of_kind.point], range(first, end))} if of_kind.point else {}
+        of_kinds.append(of_kind.positions(q_s, q_f, points).reshape(of_kind.count, of_kind.size))
+    return jnp.concatenate(of_kinds)
 
 
 def choose(params, select: Sequence[int], split: Sequence[str]):
@@ -246,7 +226,7 @@ def joined(terms: Iterable[Any], in_order: bool = False) -> tuple[Any, ...]:
     for term in terms:
         kind: Any = id(term)
         if getattr(term, "is_joined", False):
-            kind = term.function, term.through, tuple(role.size for role in term.roles), term.split, term.timed
+            kind = term.function, term.arguments, term.through, tuple(role[0].size for role in term.roles), term.split
         run += in_order and kind != last
         groups.setdefault((run, kind), []).append(term)
         last = kind
@@ -257,8 +237,17 @@ def _as_one(terms: Sequence[Any]) -> Any:
     """A term of all elements of terms of one kind."""
     if len(terms) == 1:
         return terms[0]
-    roles = (Roles.joined(roles) for roles in zip(*(term.roles for term in terms), strict=True))
-    return replace(terms[0], sources=tuple(chain(*(term.sources for term in terms))), roles=tuple(roles))
+    roles = tuple(_role_of_all(chain(*roles)) for roles in zip(*(term.roles for term in terms), strict=True))
+    return replace(terms[0], sources=tuple(chain(*(term.sources for term in terms))), roles=roles)
+
+
+def _role_of_all(roles: Iterable[Any]) -> tuple[Role, ...]:
+    """The maps of elements one after the other, those of neighbours with bodies of one kind as one."""
+    of_kinds = []
+    for (stride, _), (*same,) in groupby(roles, key=lambda role: (role.rows and role.rows.stride, role.point)):
+        rows = Rows.of([*chain(*(role.rows.places for role in same))], same[0].rows.size) if stride else None
+        of_kinds.append(replace(same[0], rows=rows, count=sum(role.count for role in same)))
+    return tuple(of_kinds)
 
 
 def pick(values, select: Sequence[int]):

@@ -221,7 +221,7 @@ def _kinematics(branches: Sequence[Branch], places, freedoms, sizes) -> tuple[Ki
         numbers[branch.child] = numbers[branch.parent]
         last = lasts.get(branch.parent, -1)
         for number, key in enumerate(branch.way, firsts[branch.child]):
-            links[number], last = Link(freedoms[key], last), number
+            links[number], last = Link(freedoms[key], last, key[2] in ANGLES), number
         lasts[branch.child] = last
     carried = (Carried("f" if b.child in fast else "s", numbers[b.child], lasts[b.child]) for b in ordered)
     roots = tuple(places[name] for name in numbers if name in places)
@@ -250,8 +250,10 @@ def joint_constants(bodies: Bodies, branches: Sequence[Branch]) -> dict[str, Any
             turns.append((freedom in ANGLES) * _turn(axis, point))
             slides.append((pitch if freedom in ANGLES else 1.0) * axis)
     xp = library(zeros, turns, slides)
-    of_links = {"turn": xp.reshape(xp.asarray(turns), (-1, 4, 3)), "slide": xp.reshape(xp.asarray(slides), (-1, 3))}
-    return of_links | {"zero": xp.stack(zeros)}
+    # in matrices (4, 4), see `vmri_jax.mechanics.kinematics`
+    rows = xp.reshape(xp.asarray(turns), (-1, 4, 3)), xp.reshape(xp.asarray(slides), (-1, 1, 3)), xp.stack(zeros)
+    turn, slide, zero = (xp.pad(x, ((0, 0), (0, 4 - x.shape[1]), (1, 0))) for x in rows)
+    return {"turn": turn, "slide": slide, "zero": zero + np.diag([1.0, 0, 0, 0])}
 
 
 def _root(branch: Branch | None, on_joints: Mapping[str, Branch]) -> tuple[str, Any]:

@@ -18,7 +18,6 @@ from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -26,7 +25,7 @@ from jaxtyping import Array, Float
 
 from vmri_jax.kernels import DIAGONAL_MATRICES, LARGEST_RENEWED, inverse
 from vmri_jax.kernels.band import Band, BandInverse, Full, FullInverse, Sparsity, sparsity
-from vmri_jax.mechanics.arrays import is_concrete
+from vmri_jax.mechanics.arrays import is_concrete, quickly_compiled
 from vmri_jax.mechanics.constraint_pattern import MOST_ROWS_OF_FULL_MATRIX, fast_rows
 from vmri_jax.mechanics.masses import ConstantMass
 from vmri_jax.mechanics.state import State
@@ -176,7 +175,7 @@ def _curved(system: System, scheme: Scheme, n_s: int, n_f: int) -> Sparsity:
     return sparsity(touched | touched.T, scheme.degree)
 
 
-@eqx.filter_jit
+@quickly_compiled
 def _touched(parts: tuple[System, Scheme], numbers, fast):
     """(n_f, n_f) whether the rows of each coordinate change with each other one, on the path with these positions and increments."""
     system, scheme = parts

@@ -17,8 +17,6 @@ from vmri_jax.scene.body import end_of, entry, is_entry
 from vmri_jax.scene.declare import real_tree
 from vmri_jax.scene.effect import Effect
 
-ARGUMENTS = {"potential": "q, params", "constraint": "q, params", "kinetic": "q, v, params", "force": "t, q, v, params"}
-"""Arguments of the functions by kind; a constraint with timed=True takes t first."""
 _INSTEAD = {
     "force": "Force(function, bodies), function(t, q, v, params)",
     "moving": "Constraint(..., timed=True), whose function gets t first",
@@ -52,7 +50,7 @@ class CustomEffect(Effect):
         if not self.name:
             object.__setattr__(self, "name", getattr(self.function, "__name__", type(self).__name__.lower()))
         instead = {"constraint": NO_VELOCITY, "force": ""}.get(self.kind, NO_TIME).format(**_INSTEAD)
-        arguments = f"t, {ARGUMENTS[self.kind]}" if self.timed else ARGUMENTS[self.kind]
+        arguments = ", ".join((*self.arguments, "params"))
         check_arguments(f"{type(self).__name__}: function", self.function, arguments, instead)
         super().__post_init__()
         if self.drawn_as not in (None, "link", "spring"):

@@ -11,7 +11,7 @@ import numpy as np
 from vmri_jax.mechanics.names import unknown
 from vmri_jax.refusals import Refused
 from vmri_jax.scene.body import end_of
-from vmri_jax.scene.declare import array, common, names, number, of_time, positive, real_tree, vector
+from vmri_jax.scene.declare import array, common, names, number, of_time, positive, vector
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.effects.springs import BetweenPoints
 from vmri_jax.scene.terms import TangentDamping, joined
@@ -146,14 +146,10 @@ class Drive(Effect):
         return (history(t, params),)
 
     def _parameters(self):
-        params = real_tree(f"{self.name}: params", self.params)
+        params = self.params_of_time
         if not isinstance(params, dict):
             raise Refused(f"{self.name}: params is {self.params!r}; give numbers by name, such as {{'size': 2.0}}.")
         return params | self.points
-
-    def check_parameters(self):
-        super().check_parameters()
-        self.check_of_time("history", self.parameters)
 
 
 class FollowerForce(BetweenPoints):

@@ -55,29 +55,27 @@ REACH = 5 * np.pi / 6
 a third of a turn between REACH and -REACH is too wide to be jumped over by a run with six steps in a turn. A larger value narrows the gap."""
 
 
-def products_in_space(pairs, q, params):
-    """Products (...) of pairs of vectors, from the `VECTORS` "of_a", "of_b" of a joint as factors of centres and directors."""
-    factors = (params[f"of_{role}"][..., : x.shape[-1] // 3] for role, x in zip("ab", q, strict=True))
-    a, b = (numbers @ x.reshape(*x.shape[:-1], -1, 3) for numbers, x in zip(factors, q, strict=True))
-    vectors = {name: rows[..., i, :] for rows, own in zip((a, b), VECTORS, strict=True) for i, name in enumerate(own)}
-    vectors["D"] = a[..., 0, :] + b[..., 0, :]
-    return tuple((vectors[u] * vectors[v]).sum(axis=-1) for u, v in pairs)
+def sine_and_cosine(q, params):
+    """Sine and cosine of an angle, times a common factor near 1."""
+    values = products(2, q, params)
+    return values[..., 0], values[..., 1]
 
 
-def angle(pairs, q, params):
+def angle(q, params):
     """An angle, rad, between -pi and pi."""
-    return jnp.arctan2(*products_in_space(pairs, q, params))
+    sine, cosine = sine_and_cosine(q, params)
+    return library(sine).arctan2(sine, cosine)
 
 
-def within_reach(pairs, q, params):
+def within_reach(q, params):
     """An angle, rad; beyond `REACH` NaN with all its derivatives, which ends a run in place of a wrong number of turns."""
-    x = angle(pairs, q, params)
+    x = angle(q, params)
     return x * jnp.where(jnp.abs(x) < REACH, 1.0, jnp.nan)
 
 
-def distance(pairs, q, params):
+def distance(q, params):
     """A displacement, m."""
-    return products_in_space(pairs, q, params)[0]
+    return products(1, q, params)[..., 0]
 
 
 def coordinate(q, params):
@@ -110,7 +108,7 @@ class Joint(Effect):
     is_analytic = True
     whole = True
     same_size = False
-    derived = ("factors", "offsets", "of_a", "of_b")
+    derived = ("factors", "offsets")
     rows: ClassVar[tuple[tuple[str, str], ...]] = GAP
     """Pairs of vectors whose scalar products are the rows: of the gap D, both triads, and the axes x, y, z of space."""
     carries: ClassVar[bool] = False
@@ -132,16 +130,11 @@ class Joint(Effect):
         return tuple((b if a == GROUND else a, a if b == GROUND else b) for a, b in self.elements)
 
     def _parameters(self):
-        return super()._parameters() | self._numbers()
+        return super()._parameters() | self.numbers(self.rows)
 
-    @property
-    def frames(self) -> dict[str, Any]:
-        """The `VECTORS` of both bodies, see `products_in_space`."""
-        return {f"of_{role}": stacked([*vectors]) for role, vectors in zip("ab", self.vectors, strict=True)}
-
-    def _numbers(self) -> dict[str, Any]:
-        """The numbers of the rows of all pairs, see `products`."""
-        named, halves = [name for side in zip(*self.rows, strict=True) for name in side], []
+    def numbers(self, pairs: Sequence[tuple[str, str]]) -> dict[str, Any]:
+        """The numbers of the products of pairs of `VECTORS` and axes of space for all elements, see `products`."""
+        named, halves = [name for side in zip(*pairs, strict=True) for name in side], []
         offsets = np.stack([AXES.get(name, np.zeros(3)) for name in named])
         for role, vectors in enumerate(self.vectors):
             half = (np.array(named)[:, None] == VECTORS[role][: vectors.shape[1]]) @ vectors
@@ -158,9 +151,8 @@ class Joint(Effect):
 
     def value(self, freedom: str, i: int, coordinates: Mapping[str, Any]):
         """A freedom of the i-th pair, (...) rad or m, by the coordinates (..., n) of bodies by name; an angle is between -pi and pi."""
-        ends = (UNMOVED.ravel() if name == GROUND else coordinates[name] for name in self.elements[i])
-        function = angle if freedom in ANGLES else distance
-        return function(FREEDOMS[freedom], tuple(map(jnp.asarray, ends)), self.params_of((i,), self.frames))
+        q, function = (coordinates[name] for name in self.attached[i]), angle if freedom in ANGLES else distance
+        return function(tuple(map(jnp.asarray, q)), self.params_of((i,), self.numbers(FREEDOMS[freedom])))
 
     @cached_property
     def triads(self) -> Any:
@@ -307,11 +299,17 @@ class OfFreedoms(Effect):
 
     def by_directors(self, freedom: str) -> Any:
         """The function of the coordinates of both bodies for a freedom that is no coordinate of the scene."""
-        of_angle = within_reach if self.counts_turns else angle
-        return Applied(of_angle if freedom in ANGLES else distance, (FREEDOMS[freedom],))
+        if freedom not in ANGLES:
+            return distance
+        return within_reach if self.counts_turns else angle
 
     def _elements(self):
         pairs = zip(*(joint.elements for joint, _ in self.joint_freedoms), strict=False)
+        return tuple(tuple(chain(*names)) for names in pairs)
+
+    @cached_property
+    def attached(self):
+        pairs = zip(*(joint.attached for joint, _ in self.joint_freedoms), strict=False)
         return tuple(tuple(chain(*names)) for names in pairs)
 
     def positions(self, group):
@@ -332,8 +330,10 @@ class OfFreedoms(Effect):
                 continue
             freedoms.append(self.by_directors(keys[0][2]))
             for role in (2 * j, 2 * j + 1):
-                roles.append(self._role("", [self.elements[i][role] for i in group], layout.bodies))
-        return self._term(roles, group, Applied(freedoms_of, (tuple(freedoms),)))
+                roles.append(self._role("", [self.attached[i][role] for i in group], layout.bodies))
+        # freedoms that are coordinates need no numbers of joints
+        unused = self.derived if set(freedoms) == {coordinate} else ()
+        return self._term(roles, group, Applied(freedoms_of, (tuple(freedoms),)), unused)
 
     def check_bodies(self):
         """Nothing: the joints check their bodies themselves."""

@@ -23,7 +23,7 @@ from vmri_jax.scene.effects.joint_base import (
     OfFreedoms,
     freedom_of,
     joint_named,
-    products_in_space,
+    sine_and_cosine,
 )
 from vmri_jax.scene.effects.potentials import penalty
 from vmri_jax.scene.effects.springs import elastic_energy
@@ -54,14 +54,13 @@ class InJoint(OfFreedoms):
         return ((self.joint, self.of),)
 
     def _parameters(self):
-        return super()._parameters() | self.joint.frames
+        return super()._parameters() | self.joint.numbers(FREEDOMS[self.of])
 
-    def check_of_time(self, name, params):
+    def check_of_time(self, about, value):
         """Refuse a function of time that returns no number; of forces also one number for each pair of the joint."""
-        value: Any = shape_of(f"{self.name}: {name}", getattr(self, name), jnp.zeros(()), params)
         sizes = {1, len(self.elements)} if self.kind == "force" else {1}
         if getattr(value, "size", None) not in sizes:
-            raise Refused(f"{self.name}: {name} returns {describe(value)}; it must return a number, ().")
+            raise Refused(f"{about} returns {describe(value)}; it must return a number, ().")
 
 
 class JointSpring(InJoint):
@@ -183,10 +182,6 @@ class JointDrive(InJoint):
     def function(history, t, q, v, params):
         return (history(t, params["history"]),)
 
-    def check_parameters(self):
-        super().check_parameters()
-        self.check_of_time("history", self.parameters["history"])
-
 
 class JointMotion(InJoint):
     """A prescribed angle or displacement of a joint, ``x = a(t)``.
@@ -218,12 +213,10 @@ class JointMotion(InJoint):
         return sine * xp.cos(a) - cosine * xp.sin(a)
 
     def by_directors(self, freedom):
-        is_angle = freedom in ANGLES
-        return Applied(products_in_space, (FREEDOMS[freedom],)) if is_angle else super().by_directors(freedom)
+        return sine_and_cosine if freedom in ANGLES else super().by_directors(freedom)
 
     def check_parameters(self):
         super().check_parameters()
-        self.check_of_time("path", self.parameters["path"])
         start = self.path(np.zeros(()), self.parameters["path"])
         self.require(abs(library(start).asarray(start)) < START, "path(0)", start, "the joint starts at zero")
 
@@ -290,7 +283,10 @@ class JointCoupling(OfFreedoms):
         return real_tree(f"{self.name}: params", self.params)
 
     def _parameters(self):
-        return {"law": self.numbers(), "joints": tuple(joint.frames for joint, _ in self.joints)}
+        return {
+            "law": self.numbers(),
+            "joints": tuple(joint.numbers(FREEDOMS[freedom]) for joint, freedom in self.joints),
+        }
 
     def check_parameters(self):
         value: Any = shape_of(f"{self.name}: law", self.law, jnp.zeros(len(self.joints)), self.numbers())

@@ -14,7 +14,7 @@ from vmri_jax.mechanics.arrays import library
 from vmri_jax.mechanics.constraints import START
 from vmri_jax.refusals import Refused
 from vmri_jax.scene.body import end_of, label_of
-from vmri_jax.scene.declare import array, names, of_time, positive, real_tree, vector
+from vmri_jax.scene.declare import array, names, of_time, positive, vector
 from vmri_jax.scene.effect import Effect
 
 
@@ -105,10 +105,6 @@ class ToPath(ToPoint):
 
     def point_at_start(self, params):
         return self.path(np.zeros(()), params["path"])
-
-    def check_bodies(self):
-        super().check_bodies()
-        self.check_of_time("path", real_tree(f"{self.name}: params", vars(self)["params"]))
 
 
 def elastic_energy(stiffness, elongation):
