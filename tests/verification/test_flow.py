@@ -272,6 +272,7 @@ def only_differences(q_s, q_f, params):
     return jnp.sum(jnp.sum((q[1:] - q[:-1]) ** 2, axis=1) ** 2)
 
 
+@pytest.mark.full  # `test_rates` has linear momentum, the runs above the constraints
 def test_linear_momentum_of_free_particles():
     system = PROBLEMS["tsp"]().system.replace(slow_potential=only_differences, slow_constraint=None)
     state = generic_state("tsp")
