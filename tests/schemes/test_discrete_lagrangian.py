@@ -41,7 +41,7 @@ def test_reference_schemes_are_the_formulas_of_the_paper(fpu, make):
     fast = ends if make is vm.fully_explicit else np.mean(list(map(W, middle)))
     kinetic = (np.sum((s[1] - s[0]) ** 2) / H + np.sum((f[1:] - f[:-1]) ** 2) * N / H) / 2  # unit masses
     scheme = make(N) if make is vm.fully_implicit else make(N, ALPHA)
-    value = float(vm.discrete_lagrangian(system, scheme)(s, f, H))
+    value = float(jax.jit(vm.discrete_lagrangian(system, scheme))(s, f, H))
     assert value == pytest.approx(kinetic - H * (slow + fast), rel=1e-14)
 
 
@@ -148,6 +148,6 @@ def test_explicit_chain_evaluates_v_once_and_w_num_micro_times_per_macro_step(fp
 )
 def test_each_term_is_evaluated_at_its_own_nodes_only(counted, scheme, v_nodes, w_nodes):
     EVALUATIONS.clear()
-    jax.block_until_ready(vm.discrete_lagrangian(counted, scheme)(*control_points(scheme.degree), H))
+    jax.block_until_ready(jax.jit(vm.discrete_lagrangian(counted, scheme))(*control_points(scheme.degree), H))
     jax.effects_barrier()
     assert Counter(V=v_nodes, W=w_nodes) == EVALUATIONS

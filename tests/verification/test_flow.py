@@ -75,7 +75,8 @@ SEVERAL = {
 }
 
 
-@pytest.mark.parametrize("name", SEVERAL)
+# for --full: Gauss's rule over several intervals is of the order of Simpson's
+@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.full if n == "gauss 2" else ()) for n in SEVERAL])
 def test_observed_order_of_rules_over_several_micro_intervals(name):
     scheme, order = SEVERAL[name], 4 if name.endswith("one interval") else 2
     macro_dt, *errors = convergence(PROBLEMS["fpu"](), scheme, ground_truth(TRUTH["fpu"]), STEPS[order])
