@@ -97,16 +97,10 @@ def in_parts(monkeypatch):
 
 @pytest.mark.parametrize("case", [pytest.param(c, marks=pytest.mark.full if c in LONG else ()) for c in CASES])
 def test_derivatives_in_parts(case, in_parts):
-    """Of macro nodes and of micro nodes."""
+    """Of macro nodes and of micro nodes; gradients of `test_parts` see macro nodes alone."""
     expected = stored_gradient(case, 4, micro=True)
     in_parts()
     assert_agree(gradient(case, 4, micro=True), expected)
-
-
-def test_parts_of_saved_nodes_alone(in_parts):
-    expected = stored_gradient("kicks", 1)
-    in_parts()
-    assert_agree(gradient("kicks", 1), expected, 1e-11)
 
 
 @pytest.mark.full
