@@ -25,7 +25,11 @@ def whole_and_cut(equations, x):
     return equations.evaluate(x), rows, arriving, ((slow, intervals.slow_constraints(x.slow)), p_s)
 
 
-@pytest.mark.parametrize("name", SCHEMES)
+ALIKE = ("fully implicit", "one micro step", "gauss 2")
+"""For --full: their nodes are among those of others."""
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.full if n in ALIKE else ()) for n in SCHEMES])
 def test_intervals_add_up_to_the_step(name):
     equations, x = equations_and_unknowns(SCHEMES[name])
     (expected, (p_s, p_f)), rows, arriving, ((slow, g_slow), p_end) = whole_and_cut(equations, x)
