@@ -7,18 +7,7 @@ import pytest
 
 from tests.support import NAMES, area_change, largest_difference, node
 from tests.textbook.residual import residual
-from vmri_jax import (
-    ConstantMass,
-    Problem,
-    Save,
-    System,
-    discrete_lagrangian,
-    fully_implicit,
-    galerkin,
-    initial_state,
-    simulate,
-    textbook,
-)
+from vmri_jax import ConstantMass, Problem, Save, System, fully_implicit, galerkin, initial_state, simulate, textbook
 from vmri_jax.diagnostics import fit_order
 
 
@@ -104,7 +93,7 @@ def test_constant_inertia_may_be_on_either_grid():
     scheme, random = SCHEMES["fully implicit"][0], np.random.default_rng(0)
     points = random.normal(size=(2, 1)), random.normal(size=(scheme.num_micro + 1, 1))
     apart, together = (
-        jax.jit(discrete_lagrangian(p.system, scheme))(*points, 0.1)
+        jax.jit(textbook.discrete_lagrangian)(p.system, scheme, *points, 0.1)
         for p in (problem(steady_arm), problem(None, steady_together))
     )
     assert float(apart) == pytest.approx(float(together), rel=1e-13)
