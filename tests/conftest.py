@@ -20,8 +20,9 @@ MANY_MAPS = 20_000
 """Memory maps of a process from which on compiled programs are forgotten; Linux allows 65 530."""
 MUCH_MEMORY = 1.0e9
 """Bytes of a process from which on compiled programs are forgotten after a file; the tests of a file share programs, files few."""
-MOST_MEMORY = 1.25e9
-"""Bytes of a process from which on programs are forgotten after any test; two workers with 1.5 GiB each fit into a small machine."""
+MOST_MEMORY = 1.75e9
+"""Bytes of a process from which on programs are forgotten after any test, which the next tests of a file compile again; two workers
+with 2 GiB each fit into a small machine."""
 GROWTH = 2e8
 """Fewest bytes that tests add between two times when programs are forgotten: else a process that stays large would forget after every test."""
 LONGEST = ("textbook", "verification", "steppers", "pages")

@@ -13,9 +13,9 @@ import pytest
 
 from tests.programs import Programs
 
-PROGRAMS_OF_A_TEST = 40
+PROGRAMS_OF_A_TEST = 20
 """Most programs of one test; a developer who runs this test alone waits for them."""
-PROGRAMS_OF_A_FILE = 80
+PROGRAMS_OF_A_FILE = 70
 """Most programs of one file: a worker takes whole files, so a longer one may leave the other worker without work."""
 SECONDS_OF_THE_MEASURE = 0.17
 """Processor time of the loop of `slowness` on the machine of reference: two idle cores of 2025."""

@@ -32,7 +32,7 @@ def run():
     [
         ("fpu", vm.explicit_slow(10), 0.005, 1e6),  # measured 4e6
         ("fpu", vm.compose(vm.fully_explicit(2), "suzuki4"), 0.01, 30),  # the energy itself is kept better: 80
-        ("tsp", vm.explicit_slow(10), 0.001, 1e5),  # 2e6
+        pytest.param("tsp", vm.explicit_slow(10), 0.001, 1e5, marks=pytest.mark.full),  # 2e6
         pytest.param("sam", vm.explicit_slow(10), 0.002, 1e5, marks=pytest.mark.full),  # 3e5
     ],
 )

@@ -4,6 +4,7 @@ import sys
 from dataclasses import replace
 from typing import Any, cast
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -56,7 +57,7 @@ def test_parts_of_a_driven_motion_start_at_their_times():
     data = measured(steps=24, problem=driven(), scheme=vm.fully_explicit(2))
     unknowns, steps, u = Unknowns({"speed": Unknown(1.0)}), [np.arange(25)], np.zeros(1)
     shooting = Shooting(model, unknowns, [data], steps, vm.fully_explicit(2), vm.Solver("masses"), DT, 3)
-    _, gaps = shooting.predict(u, shooting.starts(u))
+    _, gaps = jax.jit(shooting.predict)(u, shooting.starts(u))
     assert np.abs(gaps).max() < 1e-12
 
 
@@ -224,6 +225,7 @@ def spring(q_s, q_f, params):
     return params["stiffness"] * (q_s @ q_s + q_f @ q_f) / 2
 
 
+@pytest.mark.full  # the reverse is in the test of a scene
 def test_systems_without_slow_variables_are_fitted():
     """Those without fast variables are in the test of a scene."""
     system = vm.System(vm.ConstantMass([], [1.0]), spring, params={"stiffness": np.array(8.0)})

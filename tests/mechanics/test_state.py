@@ -48,14 +48,14 @@ def test_momenta_of_a_mass_matrix(fpu):
 
 def test_legendre_transform_of_a_kinetic_function():
     problem = double_pendulum()
-    q_s, q_f, v_s, v_f = problem.q_s, problem.q_f, jnp.array([0.7]), jnp.array([-3.0])
+    q_s, q_f, v_s, v_f = problem.q_s, problem.q_f, np.array([0.7]), np.array([-3.0])
     state = initial_state(problem.system, q_s, q_f, v_s, v_f)
-    (m_1, m_2), (l_1, l_2) = problem.system.params["masses"], problem.system.params["lengths"]
-    coupling = m_2 * l_1 * l_2 * jnp.cos(q_s - q_f)
+    (m_1, m_2), (l_1, l_2) = (np.asarray(problem.system.params[name]) for name in ("masses", "lengths"))
+    coupling = m_2 * l_1 * l_2 * np.cos(q_s - q_f)
     assert largest_difference(state.p_s, (m_1 + m_2) * l_1**2 * v_s + coupling * v_f) < 1e-14
     assert largest_difference(state.p_f, m_2 * l_2**2 * v_f + coupling * v_s) < 1e-14
-    _, _, *back, _ = project_momentum(problem.system, state)
-    assert largest_difference(jnp.concatenate(back), jnp.concatenate([v_s, v_f])) < 1e-12
+    _, _, *back, _ = projected(problem.system, state)
+    assert largest_difference(np.concatenate(back), np.concatenate([v_s, v_f])) < 1e-12
 
 
 residual_of, projected = jax.jit(constraint_residual), jax.jit(project_momentum)

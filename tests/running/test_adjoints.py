@@ -26,7 +26,8 @@ PENDULUM = vm.Problem(
     [0.0, 0.5],
 )
 SIMPLE = {"kicks": vm.fully_explicit(2), "solved": vm.fully_implicit(1)}
-LONG = ("fpu", "kicks", "tsp", "cart", "composed")
+LONG = ("fpu", "tsp", "cart", "pendulum", "composed")
+"""For --full: `test_parts` has steps that are solved, with and without constraints, in parts."""
 CASES = {  # problem, scheme, macro_dt, steps
     "fpu": (PROBLEMS["fpu"], vm.fully_implicit(4), 0.02, 40),
     "tsp": (PROBLEMS["tsp"], vm.fully_implicit(3), 0.01, 40),
@@ -96,16 +97,10 @@ def in_parts(monkeypatch):
 
 @pytest.mark.parametrize("case", [pytest.param(c, marks=pytest.mark.full if c in LONG else ()) for c in CASES])
 def test_derivatives_in_parts(case, in_parts):
-    """Of macro nodes and of micro nodes."""
+    """Of macro nodes and of micro nodes; gradients of `test_parts` see macro nodes alone."""
     expected = stored_gradient(case, 4, micro=True)
     in_parts()
     assert_agree(gradient(case, 4, micro=True), expected)
-
-
-def test_parts_of_saved_nodes_alone(in_parts):
-    expected = stored_gradient("kicks", 1)
-    in_parts()
-    assert_agree(gradient("kicks", 1), expected, 1e-11)
 
 
 @pytest.mark.full
@@ -152,12 +147,12 @@ def test_lanes_of_gradients(in_parts):
     np.testing.assert_allclose(lanes[1], expected, rtol=1e-11, atol=1e-12)
 
 
-@pytest.mark.parametrize(("second", "parts"), [(jax.jacrev, False), (jax.jacfwd, True)])
-def test_second_derivatives(second, parts, in_parts):
-    """Reverse or forward over reverse; `tests/verification/test_gradients.py` has steps under forward over forward."""
-    program, (cost, at), h = simple_gradient(), simple_cost(), 1e-5
+@pytest.mark.parametrize(("second", "steps"), [(jax.jacrev, "solved"), (jax.jacfwd, "kicks")])
+def test_second_derivatives(second, steps, in_parts):
+    """Reverse over reverse, and forward over reverse in parts; `tests/verification/test_gradients.py` has steps under forward over forward."""
+    program, (cost, at), h = simple_gradient(steps), simple_cost(steps), 1e-5
     expected = jnp.stack([(program(at + h * e)[1] - program(at - h * e)[1]) / (2 * h) for e in jnp.eye(at.size)])
-    if parts:
+    if steps == "kicks":
         in_parts()
     np.testing.assert_allclose(jax.jit(second(jax.grad(cost)))(at), expected, rtol=1e-6, atol=1e-8)
 

@@ -49,10 +49,15 @@ def single(way: str, lane: int):
     return vm.simulate(problem.system, scheme, lane_of(spread(problem, 5), lane), macro_dt=macro_dt, **RUN)
 
 
-@pytest.mark.parametrize(("way", "chunk"), [(way, 2 if way == "nested" else None) for way in WAYS])
-def test_lanes_equal_single_runs(way, chunk):
+LONG = ("collocation", "composition")
+"""For --full: what a step of one lane decides for itself, the nested iteration has, too."""
+
+
+@pytest.mark.parametrize("way", [pytest.param(way, marks=pytest.mark.full if way in LONG else ()) for way in WAYS])
+def test_lanes_equal_single_runs(way):
     name, scheme, macro_dt, bound = WAYS[way]
     problem = SYSTEMS[name]()
+    chunk = 2 if way == "nested" else None
     batch = vm.simulate_batch(problem.system, scheme, spread(problem, 5), macro_dt=macro_dt, chunk=chunk, **RUN)
     assert batch.q_f.shape == (5, 5, problem.q_f.size)
     assert np.all(np.asarray(batch.result) <= vm.Result.CONVERGED_AT_ROUNDOFF)

@@ -180,7 +180,7 @@ def test_a_batch_with_its_own_parameters():
     state = vm.initial_state(system, [], [0.1, 0.0], [], [0.0, 1.0])
     states = jax.tree.map(lambda a: jnp.stack([a, a]), state)
     params = {"k": np.array([100.0, 200.0]), "m": np.array([2.0, 5.0])}
-    runs = vm.simulate_batch(system, vm.fully_implicit(2), states, macro_dt=0.01, num_steps=10, params=params)
+    runs = vm.simulate_batch(system, vm.fully_implicit(1), states, macro_dt=0.01, num_steps=10, params=params)
     assert len(runs) == 11
     assert runs[-1].q_f.shape == (2, 2)
     assert runs[2:5].q_f.shape == (2, 3, 2)
@@ -196,7 +196,7 @@ def spring(q_f, params):
 
 
 WEIGHED = vm.Problem(vm.System(weighed, params={"m": 2.0}), [], [0.0], [], [1.0])
-HOW = {"scheme": vm.fully_implicit(2), "macro_dt": 0.1, "num_steps": 2, "solver": vm.Solver("masses")}
+HOW = {"scheme": vm.fully_implicit(1), "macro_dt": 0.1, "num_steps": 2, "solver": vm.Solver("masses")}
 
 
 def test_transformations_keep_the_origin(swing):

@@ -10,6 +10,7 @@ import pytest
 
 import vmri_jax as vm
 from tests.support import largest_difference, until_failure
+from tests.user_systems import cart
 from vmri_jax.running.engine import Cursor
 from vmri_jax.scene import Body, Scene, Spring
 
@@ -284,7 +285,7 @@ def test_lengths_of_runs_share_a_program(fpu, request):
         np.testing.assert_array_equal(run.q_f, longest.q_f[: num_steps + 1])
 
 
-def test_pieces_of_a_run_make_the_whole(fpu, tsp, monkeypatch):
+def test_pieces_of_a_run_make_the_whole(fpu, monkeypatch):
     """Short pieces: the same nodes, to the last bit, micro nodes too; and after a failure in one of them NaN to the end."""
     whole = vm.simulate(fpu, vm.fully_implicit(2), macro_dt=0.05, num_steps=36, save=vm.Save(2, micro=True))
     monkeypatch.setattr("vmri_jax.running.simulation.NUMBERS_PER_PIECE", 100)
@@ -292,7 +293,7 @@ def test_pieces_of_a_run_make_the_whole(fpu, tsp, monkeypatch):
     jax.tree.map(np.testing.assert_array_equal, whole, pieces)
 
     # each piece starts with the saved node at which the one before ends, momenta on the hidden constraints
-    constrained = vm.prepare(tsp, vm.fully_explicit(2), macro_dt=0.02, num_steps=8, save=2)
+    constrained = vm.prepare(cart(), vm.fully_explicit(1), macro_dt=0.02, num_steps=8, save=2)
     first, cursor, _ = constrained.advance(Cursor.at_start(constrained.state), 2)
     second, *_ = constrained.advance(cursor, 2)
     columns = constrained.columns
@@ -328,7 +329,7 @@ def test_systems_of_the_same_functions_and_other_sizes(monkeypatch):
     for n_s, n_f in ((1, 2), (2, 1), (2, 2), (1, 2)):
         system = vm.System(vm.ConstantMass([1.0] * n_s, [1.0] * n_f), springs, None)
         problem = vm.Problem(system, q_s=[0.1] * n_s, q_f=[0.2] * n_f)
-        run = vm.simulate(problem, vm.fully_implicit(2), macro_dt=0.01, num_steps=4, save=vm.Save(micro=True))
+        run = vm.simulate(problem, vm.fully_explicit(2), macro_dt=0.01, num_steps=4, save=vm.Save(micro=True))
         assert (run.q_s.shape, run.q_f.shape, run.q_f_micro.shape) == ((5, n_s), (5, n_f), (4, 2, n_f))
         np.testing.assert_allclose(run.q_s[-1], 0.1, atol=1e-3)
         np.testing.assert_allclose(run.q_f[-1], 0.2, atol=1e-3)

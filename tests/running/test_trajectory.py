@@ -11,7 +11,7 @@ import pytest
 import vmri_jax as vm
 from tests.support import joined
 
-SCHEME = vm.explicit_slow(3)
+SCHEME = vm.fully_explicit(3)
 FIELDS = ("t", "q_s", "q_f", "p_s", "p_f", "energy", "constraint_residual")
 
 

@@ -137,7 +137,11 @@ def test_few_passes_and_errors_within_the_tolerance(name, scheme, macro_dt, pass
 
 @pytest.mark.parametrize(
     ("make", "scheme", "macro_dt"),
-    [(free, vm.galerkin(1, 4), 0.2), (slow_only, vm.galerkin(1, 4), 0.1), (weight_only, vm.galerkin(1, 3), 0.05)],
+    [
+        (free, vm.galerkin(1, 4), 0.2),
+        (slow_only, vm.galerkin(1, 4), 0.1),
+        pytest.param(weight_only, vm.galerkin(1, 3), 0.05, marks=pytest.mark.full),  # constraints are in slow_only, too
+    ],
     ids=["free", "slow only", "weight only"],
 )
 def test_it_solves_the_equations_of_the_step(make, scheme, macro_dt):

@@ -46,7 +46,7 @@ def equations_and_unknowns(scheme):
     return equations, jax.tree.map(lambda x: x + 0.1 * rng.normal(size=x.shape), jax.tree.map(np.asarray, guess))
 
 
-SIMILAR = ("fully implicit", "explicit slow", "gauss 2", "lobatto 2")
+SIMILAR = ("fully implicit", "explicit slow", "one micro step", "macro gauss", "gauss 2", "lobatto 2")
 """Their blocks are those of others: V on the macro and W on the micro grid, Gauss and Lobatto rules of a higher degree."""
 
 

@@ -125,6 +125,7 @@ def test_structure_with_constraints():
     assert float(residuals.max()) < 1e-14  # measured 5e-16
 
 
+@pytest.mark.full  # kicks are taken before and after whatever solves the equations between them
 def test_average_of_a_nonlinear_vibration_by_all_methods():
     masses, exact = (dumbbell_step(dumbbell_step(dumbbell_start()), matrix) for matrix in ("masses", "exact"))
     for name in NAMES:

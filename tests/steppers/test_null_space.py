@@ -82,11 +82,6 @@ def test_trajectories_of_rigid_bodies(name, num_micro):
     np.testing.assert_allclose(runs[0].q_f, runs[1].q_f, atol=1e-11)
 
 
-def test_steps_are_symplectic():
-    product = vm.stability.monodromy(cart(), vm.fully_implicit(2), macro_dt=0.1, num_steps=1, solver=NULL_SPACE)
-    assert product.symplectic_defect < 1e-11
-
-
 def null_space_condition(system, scheme, state, macro_dt) -> float:
     """Condition number of ``P_0^T A P_1`` with the Newton matrix A and bases of null spaces, ``G_0 P_0 = 0`` at the start, ``G_1 P_1 = 0`` at the end."""
     whole = np.asarray(newton_matrix(system, scheme, state, macro_dt))

@@ -162,11 +162,11 @@ def test_derivatives_by_parameters():
 
 
 def test_stored_run_goes_on(tmp_path):
-    system, path = SYSTEMS["pivot on a sprung cart"], tmp_path / "run.zarr"
-    whole = run(system, vm.fully_implicit(3), 20)
-    step = {"macro_dt": T_END / 20, "out": path}
-    vm.stream(system, vm.fully_implicit(3), start(system), num_steps=10, **step)
-    found = vm.stream(system, vm.fully_implicit(3), start(system), num_steps=20, resume=True, **step).load()
+    system, scheme, solver = SYSTEMS["pivot on a sprung cart"], vm.galerkin(2, 2), Solver("masses")
+    whole = run(system, scheme, 20, solver=solver)
+    step = {"macro_dt": T_END / 20, "solver": solver, "out": tmp_path / "run.zarr"}
+    vm.stream(system, scheme, start(system), num_steps=10, **step)
+    found = vm.stream(system, scheme, start(system), num_steps=20, resume=True, **step).load()
     assert np.array_equal(found.q_f, whole.q_f)
 
 

@@ -21,9 +21,9 @@ CASES = {  # problem, scheme, macro_dt, name and entry of the parameter
     "tsp, fully implicit": (PROBLEMS["tsp"](), vm.fully_implicit(3), 0.02, "stiffness", None),
     "sam, fully implicit": (PROBLEMS["sam"](), vm.fully_implicit(2), 0.02, "stiffness", 2),
 }
-FALLS_BACK = "chain, fully implicit"
+FALLS_BACK = "chain, gauss 2"
 """The case with the fallback in its program."""
-LONG = ("fpu, fully implicit", "tsp, fully implicit", "sam, fully implicit")
+LONG = ("chain, fully implicit", "fpu, fully implicit", "tsp, fully implicit", "sam, fully implicit")
 
 
 def central_difference(function, x, step):
