@@ -11,11 +11,12 @@ with
 import hashlib
 import os
 import platform
-import warnings
 from functools import lru_cache
 from pathlib import Path
 
 import jax
+
+from vmri_jax.refusals import warn_user
 
 FAST_LOOPS = (
     "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=100000000,-memdep-block-scan-limit=10000",
@@ -87,12 +88,11 @@ def loops_are_fast() -> bool:
 def warn_if_slow() -> None:
     """Warn, once per process, that runs on the CPU are slow because `configure` was not called."""
     if jax.default_backend() == "cpu" and not loops_are_fast():
-        warnings.warn(
+        warn_user(
             "runs take 2 to 5 times as long as they could, because JAX started without the settings of vmri_jax; "
             "results are the same. Add this line at the start of the program, before any array is made: vm.configure() "
             "(with import vmri_jax as vm)",
             NotConfiguredWarning,
-            stacklevel=4,
         )
 
 

@@ -1,7 +1,11 @@
-"""The two errors by which the package refuses a call: an argument that it cannot take, a package that is missing.
+"""The errors by which the package refuses a call, for an argument that it cannot take or a package that is missing, and
+its warnings.
 
-The command line shows them as messages; any other ValueError or TypeError is a fault of the package.
+The command line shows refusals as messages; any other ValueError or TypeError is a fault of the package.
 """
+
+import sys
+import warnings
 
 
 class Refused(ValueError, TypeError):
@@ -11,3 +15,11 @@ class Refused(ValueError, TypeError):
 
 class NotInstalled(ImportError):
     """An optional package is missing; the message has the command that installs it."""
+
+
+def warn_user(message: str | Warning, category: type[Warning] = UserWarning) -> None:
+    """Warn at the line of the user: the innermost one that is neither in the package nor in a library that calls it."""
+    level, frame = 2, sys._getframe(1)
+    while frame.f_back and frame.f_globals.get("__name__", "").partition(".")[0] in ("vmri_jax", "jax", "equinox"):
+        level, frame = level + 1, frame.f_back
+    warnings.warn(message, category, stacklevel=level)

@@ -117,8 +117,9 @@ def test_moving_constraints_say_that_they_change_a_start_at_rest():
     def start(*v_f, **options):
         return initial_state(winch, [], [1.0, 0.0], [], v_f, **options)
 
-    with pytest.warns(UserWarning, match=r"all velocities are zero, but the constraints move"):
+    with pytest.warns(UserWarning, match=r"all velocities are zero, but the constraints move") as warned:
         assert np.allclose(start(0.0, 0.0).p_f, [0.0, 2.0], atol=1e-15)
+    assert warned[0].filename == __file__  # it points at the line of the user
     with pytest.raises(ValueError, match=r"differ by 100.00% "):  # 2 / sqrt(4 + 1e-6)
         start(1e-3, 0.0)
     for quiet in (start(0.0, 0.0, project=True), start(0.0, 2.0), jax.jit(start)(0.0, 0.0)):

@@ -25,7 +25,6 @@ all nodes before it are small against the extent of the motion.
 """
 
 import math
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -36,7 +35,7 @@ import numpy as np
 from vmri_jax.accuracy.families import Family
 from vmri_jax.mechanics.arrays import of_one_type
 from vmri_jax.mechanics.driving import Events
-from vmri_jax.refusals import Refused
+from vmri_jax.refusals import Refused, warn_user
 from vmri_jax.running.arguments import Save
 from vmri_jax.running.observables import LostEnergyWarning, SingularCoordinatesWarning, concerns
 from vmri_jax.running.run_error import RunError, largest_of
@@ -141,7 +140,7 @@ def told_error(trial: Trial, of: Callable | None = None, shares: bool = False) -
         error = run_error(trial, of, shares)
         reason = "" if error.is_certified else _uncertified(error, trial)
     if reason:
-        warnings.warn(f"simulate: {reason}", UncertifiedWarning, stacklevel=3)
+        warn_user(f"simulate: {reason}", UncertifiedWarning)
     return error
 
 

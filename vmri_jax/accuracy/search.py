@@ -17,7 +17,6 @@ families that promise the least time; their steps for the accuracy. `vmri_jax.si
 of two families, `vmri_jax.tune` compares the best of many.
 """
 
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
@@ -39,7 +38,7 @@ from vmri_jax.mechanics.driving import Events, events
 from vmri_jax.mechanics.invariants import velocity
 from vmri_jax.mechanics.linearisation import Linearisation, linearise
 from vmri_jax.mechanics.state import Movable, State, start_of
-from vmri_jax.refusals import Refused
+from vmri_jax.refusals import Refused, warn_user
 from vmri_jax.running.arguments import refuse_tracers
 from vmri_jax.running.origin import Settings
 from vmri_jax.running.progress import Progress, silent
@@ -305,15 +304,14 @@ class Search:
         for trial, seconds in zip(trials, seconds_of_steps(*[trial.run for trial in trials]), strict=True):
             self.seconds[trial.family.expression] = float(seconds)
 
-    def warn_of_events(self, caller: str, scheme: SchemeLike, stacklevel: int) -> None:
+    def warn_of_events(self, caller: str, scheme: SchemeLike) -> None:
         """Warn if the events of a driven system demand `MANY_STEPS` of a run."""
         drives, fewest = self.drives, fewest_steps(scheme, self.drives, self.length)
         if fewest > MANY_STEPS:
-            warnings.warn(
+            warn_user(
                 f"{caller}: {' and '.join(drives.names)} of the system changes and changes back within "
                 f"{drives.shortest:.2g}, so that the run takes at least {fewest} macro steps until "
                 f"t = {self.t_end:g}; a run in parts, with its steps for each part, takes fewer.",
-                stacklevel=stacklevel,
             )
 
     def settings(self, trial: Trial) -> Settings:

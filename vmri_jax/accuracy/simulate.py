@@ -1,7 +1,6 @@
 """`simulate`: a run with given steps, or with steps chosen for an accuracy, with an estimate of its error on request; and
 `simulate_batch`: runs side by side."""
 
-import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cache, partial
@@ -25,7 +24,7 @@ from vmri_jax.mechanics.arrays import is_concrete
 from vmri_jax.mechanics.checks import check_flags, check_system, check_type
 from vmri_jax.mechanics.driving import Events, driven, events
 from vmri_jax.mechanics.state import Movable, State
-from vmri_jax.refusals import Refused
+from vmri_jax.refusals import Refused, warn_user
 from vmri_jax.running.arguments import Save, refuse_tracers
 from vmri_jax.running.batch import batch, lane, shared
 from vmri_jax.running.origin import is_repeated
@@ -143,15 +142,14 @@ def _with_accuracy(search: Search, scheme: SchemeLike | None, accuracy: float) -
     else:
         menu = [of_scheme(scheme)]
     (best,) = search.cheapest(menu, accuracy)
-    search.warn_of_events("simulate", best.run.scheme, stacklevel=4)
+    search.warn_of_events("simulate", best.run.scheme)
     if not best.error <= accuracy:
         uncertified = "no error is certified over its length"
         reached_error = f"its error is {best.error:.1e}" if np.isfinite(best.error) else uncertified
-        warnings.warn(
+        warn_user(
             f"simulate: accuracy {accuracy:g} is not reached with {best.run.num_steps} macro steps, {reached_error}; "
             "give a shorter t_end, a larger accuracy, or another scheme.",
             AccuracyNotReached,
-            stacklevel=3,
         )
     return best
 
@@ -229,7 +227,7 @@ def simulate_batch(
     if error:
         trajectory = replace(trajectory, error=_errors(runs, computed, saved))
     for warning in _about_lanes(trajectory) if warn else ():
-        warnings.warn(warning, stacklevel=2)
+        warn_user(warning)
     return trajectory
 
 

@@ -1,7 +1,6 @@
 """The work of an ensemble: a small object that pickle can send, with which a worker computes some of the runs; and its preparation, the checks of all
 arguments, its chunks, the arrays of its store, and the record that identifies it."""
 
-import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property, partial
@@ -37,7 +36,7 @@ from vmri_jax.mechanics.names import Names, near, unknown
 from vmri_jax.mechanics.places import START
 from vmri_jax.mechanics.state import Problem
 from vmri_jax.mechanics.structure import depends_on
-from vmri_jax.refusals import Refused
+from vmri_jax.refusals import Refused, warn_user
 from vmri_jax.running.arguments import Save, check_step_size, steps_until
 from vmri_jax.running.batch import consistent_states, lanes_at_once
 from vmri_jax.running.export import STATUS
@@ -273,9 +272,7 @@ def prepared(work: Work, design: Design, chunk: int | None = None) -> tuple[dict
     used = depends_on(lambda *values: lane(dict(zip(row, values, strict=True))), *row.values())
     unused = [name for name, is_used in zip(row, used, strict=True) if not is_used]
     if unused:
-        warnings.warn(
-            f"ensemble: no run depends on {', '.join(unused)}: vary does not use these columns.", stacklevel=3
-        )
+        warn_user(f"ensemble: no run depends on {', '.join(unused)}: vary does not use these columns.")
     runs = [work.simulation(group) for group in all_groups(work, design)]  # one of each group
     runs[0].check("ensemble: the start", constraints=False)
     over_nodes = [name for name in OVER_NODES if name in work.save]

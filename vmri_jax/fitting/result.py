@@ -1,6 +1,5 @@
 """The result of a fit: the parameters, how well they are known, and how well the motion fits."""
 
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
@@ -16,7 +15,7 @@ from vmri_jax.fitting.shooting import Shooting
 from vmri_jax.mechanics.arrays import whole_number
 from vmri_jax.mechanics.state import Problem
 from vmri_jax.mechanics.summary import summary
-from vmri_jax.refusals import Refused
+from vmri_jax.refusals import Refused, warn_user
 from vmri_jax.running.trajectory import Trajectory
 
 SINGULAR_VALUE_TOLERANCE = 1e-7
@@ -117,7 +116,7 @@ class Fit:
         """
         tail = _below(level)
         if self.doubts:
-            warnings.warn(f"intervals: the fit is doubted. {' '.join(self.doubts)}", UncertifiedWarning, stacklevel=2)
+            warn_user(f"intervals: the fit is doubted. {' '.join(self.doubts)}", UncertifiedWarning)
         q = stats.norm.ppf(tail) if self.shooting.knows_sigma else stats.t.ppf(tail, max(self.freedom, 1))
         pairs = zip(self.values, self.standard_errors.values(), strict=True)
         return dict(zip(self.labels, ((float(x - q * s), float(x + q * s)) for x, s in pairs), strict=True))

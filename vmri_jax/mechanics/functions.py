@@ -7,7 +7,6 @@ back into its order before a function is called, while JAX traces.
 
 import dataclasses
 import inspect
-import warnings
 from collections import Counter
 from collections.abc import Callable, Hashable
 from functools import lru_cache, partial, wraps
@@ -16,7 +15,7 @@ from typing import Any, NamedTuple
 import jax
 
 from vmri_jax.mechanics.surroundings import Surroundings, innermost, name_of
-from vmri_jax.refusals import Refused
+from vmri_jax.refusals import Refused, warn_user
 
 COPIES_UNTIL_WARNING = 5
 """Number of surroundings of one piece of code, each compiled anew, at which the user is warned. A larger number warns late; a smaller one warns
@@ -178,12 +177,11 @@ def _count(function: Callable) -> None:
         return
     _made[code] += 1
     if _made[code] == COPIES_UNTIL_WARNING:
-        warnings.warn(
+        warn_user(
             f"the function {function.__name__} (line {code.co_firstlineno} of {code.co_filename}) has been traced {COPIES_UNTIL_WARNING} times, and "
             "everything that contains it compiled as often, since it reads other values from around it each time. Hand over what varies "
             "as params.",
             CompiledAgainWarning,
-            stacklevel=2,
         )
 
 

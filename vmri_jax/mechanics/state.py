@@ -1,6 +1,5 @@
 """States (time, positions and momenta on the constraint manifold), and the start of a run: `initial_state` and `Problem`."""
 
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -22,7 +21,7 @@ from vmri_jax.mechanics.rows import Part
 from vmri_jax.mechanics.slots import Slots
 from vmri_jax.mechanics.summary import coordinates, has_values, listed, numbers, summary
 from vmri_jax.mechanics.system import System
-from vmri_jax.refusals import Refused
+from vmri_jax.refusals import Refused, warn_user
 
 REPORTED_VIOLATION = 1e-6
 """Violation of the constraints by the velocities, relative to their norm (of the kinetic energy), above which a warning is given. A smaller value
@@ -188,23 +187,20 @@ def tell_of_velocities(
     message = f"{caller}: the velocities differ by {violation:.2%} (in the norm of the kinetic energy) from the nearest velocities that fit {constraints}"
     scenes = "for a scene, with_rates({joint: rate}) gives all velocities that belong to the rate of a joint"
     if project and violation > REPORTED_PROJECTION and not at_rest:
-        warnings.warn(f"{message}, and project=True has replaced them; {scenes}.", stacklevel=3)
+        warn_user(f"{message}, and project=True has replaced them; {scenes}.")
     if project:
         return
     if at_rest and violation > REPORTED_VIOLATION:
-        warnings.warn(
+        warn_user(
             f"{caller}: all velocities are zero, but {constraints} move; the nearest velocities that fit are taken. Pass project=True if "
             "that is meant.",
-            stacklevel=3,
         )
     elif violation > REFUSED_VIOLATION:
         raise Refused(
             f"{message}. Correct the velocities, or pass project=True for the nearest consistent velocities; {scenes}."
         )
     elif violation > REPORTED_VIOLATION:
-        warnings.warn(
-            f"{message}; the nearest consistent velocities are taken. Pass project=True if that is meant.", stacklevel=3
-        )
+        warn_user(f"{message}; the nearest consistent velocities are taken. Pass project=True if that is meant.")
 
 
 @dataclass(frozen=True)

@@ -25,8 +25,9 @@ class LostEnergyWarning(UserWarning):
 
     sentence = (
         "the computed motion is wrong: the energy, which the system keeps, has changed by {change:.3g} at t = {t:.4g}, "
-        "and the largest kinetic energy is {kinetic:.3g}. Take smaller steps, or ask "
-        "vmri_jax.stability.advise(problem, scheme, macro_dt=...) which are stable."
+        "and the largest kinetic energy is {kinetic:.3g}. Take smaller steps, where "
+        "slow forces are kicks below half a period of the fastest vibration; vmri_jax.stability.advise(problem, scheme, "
+        "macro_dt=...) says which are stable for small motions."
     )
 
 

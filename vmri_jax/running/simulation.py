@@ -10,7 +10,6 @@ All of them return `Saved`. With the matrix "auto" a piece that is not solved is
 (`vmri_jax.running.engine`), with the same tolerance and limit of iterations; so are all pieces after it.
 """
 
-import warnings
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
@@ -29,7 +28,7 @@ from vmri_jax.mechanics.projection import at_same_velocities
 from vmri_jax.mechanics.state import REPORTED_VIOLATION, Movable, State, opened, start_of
 from vmri_jax.mechanics.summary import numbers, summary
 from vmri_jax.mechanics.system import System
-from vmri_jax.refusals import Refused
+from vmri_jax.refusals import Refused, warn_user
 from vmri_jax.running.arguments import Save, check_once, check_run, check_step_size, nothing_fast
 from vmri_jax.running.engine import FALLING_BACK, Cursor, Engine, blank_memory, engine, solved_again, unsolved
 from vmri_jax.running.failures import simulation_error
@@ -203,17 +202,16 @@ class Simulation:
         given, taken = (np.concatenate([a.p_s, a.p_f], axis=-1) for a in (self.state, trajectory.states))
         change, size = (np.max(np.abs(p), initial=0.0) for p in (taken[..., 0, :] - given, given))
         if change > REPORTED_VIOLATION * size:
-            warnings.warn(
+            warn_user(
                 f"{caller}: the momenta of the start are off the hidden constraints, by {change:.3g} where the largest of them is {size:.3g}; the run "
                 "starts with their projection. Make the start by initial_state(...).",
-                stacklevel=4,
             )
 
     def warn(self, caller: str, table, t) -> bool:
         """Give the warnings about the motion of a run, or of runs with an axis of lanes, see `concerns`; returns whether there are any."""
         all_concerns = concerns(table, t, self.system, self.macro_dt, self.save_every)
         for concern in all_concerns:
-            warnings.warn(type(concern)(f"{caller}: {concern}"), stacklevel=4)
+            warn_user(type(concern)(f"{caller}: {concern}"))
         return bool(all_concerns)
 
     def __repr__(self) -> str:
@@ -368,7 +366,7 @@ def simulation(
     # Scenes only: `opened` returns problems as they are.
     advice = nothing_fast(scheme, state.q_f.size) if moving is not problem else ""
     if advice:
-        warnings.warn(f"simulate: {advice}", stacklevel=3)
+        warn_user(f"simulate: {advice}")
     chosen_solver, scheme, system = of_one_type((solver or Solver(), scheme, system))
     motion = (_float(macro_dt), _with_arrays(state), chosen_solver, scheme, system)
     return Simulation(*motion, num_steps, save_every, Save.of(save), getattr(problem, "names", None), of_problem)

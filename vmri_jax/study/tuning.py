@@ -169,7 +169,7 @@ def tune(
         if choice.setting is None:
             raise _nothing(tuning, error)
     progress("done", 1, 1)
-    tuning.warn_of_events("tune", choice.scheme, stacklevel=4)
+    tuning.warn_of_events("tune", choice.scheme)
     return choice
 
 

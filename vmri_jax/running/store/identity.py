@@ -4,7 +4,6 @@ import dataclasses
 import json
 import os
 import platform
-import warnings
 from importlib.metadata import version
 from pathlib import Path
 
@@ -16,7 +15,7 @@ from vmri_jax.mechanics.functions import TracedOnce
 from vmri_jax.mechanics.masses import ConstantMass
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.terms import Named
-from vmri_jax.refusals import Refused
+from vmri_jax.refusals import Refused, warn_user
 from vmri_jax.running.simulation import Simulation
 
 MOST_NUMBERS_PRINTED = 8
@@ -76,10 +75,9 @@ def check_same(path: Path, attributes: dict, stored: dict, chunk: int | None, co
         raise Refused(f"{other}. Give the arguments it was started with, or another name.")
     changed = [f"{name} {value} ({then.get(name)} then)" for name, value in now.items() if value != then.get(name)]
     if changed and not complete:
-        warnings.warn(
+        warn_user(
             f"{path} was started under other conditions; its last digits may differ from those of an uninterrupted {kind}. "
             f"Now: {', '.join(changed)}.",
-            stacklevel=3,
         )
 
 
