@@ -33,7 +33,7 @@ def test_a_plan_says_how_a_step_is_solved(fpu, tsp):
         "masses: micro intervals in order with matrices of the masses"
     )
     assert str(vm.plan(double_pendulum(), vm.fully_implicit(3), solver=Solver("exact"))).startswith(whole)
-    with pytest.raises(ValueError, match="the matrix 'masses' needs a ConstantMass, and potentials"):
+    with pytest.raises(ValueError, match="the matrix 'masses' needs potentials and forces on the micro grid"):
         vm.plan(fpu, inside, solver=Solver("masses"))
     with pytest.raises(ValueError, match=r"the matrix 'modes' needs .* here num_micro = 4, degree = 1"):
         vm.plan(fpu, vm.fully_implicit(4), solver=Solver("modes"))

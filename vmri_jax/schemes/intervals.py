@@ -56,7 +56,7 @@ class IntervalPath(NamedTuple):
 class Arriving(NamedTuple):
     """The quantities that the intervals before hand on.
 
-    q_f, p_f: fast position, and fast momentum times h.
+    q_f, p_f: fast position, and fast momentum times h, whose product with ``M_f^-1`` is a displacement.
     start, slow: gradients of their actions (times h) by the start and by the increments of the slow path.
     """
 

@@ -8,12 +8,15 @@ The slow variables have their increments over the macro step and their positions
 increments over a micro interval and their positions. A solver may take the largest free motion ``|h M^-1 p|`` for the size of the increments.
 Maxima compare numbers of one unit: if masses are constant, slow and fast variables as they are; else numbers times `Weights`.
 
-- The omitted corrections are the error of a step, and errors of steps accumulate: the tenth is a safety factor for that.
+- The test is of one correction, of the slow variables and of the fast ones in each micro interval. Omitted corrections of intervals and of steps
+  add up, and so do the corrections after them: the tenth is a safety factor for that. With 100 micro steps the error of a macro step may be some
+  times the tolerance of a micro step's increments, far below that of its own.
 - Positions are known up to their round-off.
 - Variables at rest have increments of size zero: the last term allows them the round-off of the other increments.
 
-Solvers compute the next correction from the residual, or extrapolate it from the last two (`expected`). They also accept corrections
-that no longer shrink near round-off, of the positions (`Accepted.at_floor`) or of the momentum equations (`is_solved`).
+Solvers compute the next correction from the residual, or extrapolate it from the last two (`expected`). The march
+(`vmri_jax.steppers.marched`) also accepts corrections that no longer shrink near round-off, of the positions
+(`Accepted.at_floor`) or of the momentum equations (`is_solved`).
 """
 
 from typing import Any, NamedTuple

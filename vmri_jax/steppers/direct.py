@@ -10,7 +10,7 @@ from vmri_jax.mechanics.system import System
 from vmri_jax.schemes.equations import StepEquations
 from vmri_jax.schemes.intervals import Intervals
 from vmri_jax.schemes.scheme import Scheme
-from vmri_jax.steppers.interval import Interval, Matrix, constant_mass
+from vmri_jax.steppers.interval import IntervalStructure, Matrix, constant_mass
 from vmri_jax.steppers.results import Method
 from vmri_jax.steppers.stepper import StepInfo, Stepper, StepStatus
 
@@ -37,7 +37,7 @@ class Linear(Stepper):
 
     system: System
     scheme: Scheme
-    interval: Interval
+    interval: IntervalStructure
 
     def init(self, state: State, macro_dt) -> Matrix:
         return self.interval.matrix(StepEquations.of(self.system, self.scheme, state, macro_dt))

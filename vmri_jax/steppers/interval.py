@@ -85,7 +85,7 @@ Matrix = DiagonalMatrix | JoinedMatrix
 
 
 @dataclass(frozen=True)
-class Interval:
+class IntervalStructure:
     """The structure of a micro interval.
 
     is_explicit: whether the fast increments are explicit functions of the multipliers, ``x = M_f^-1 (h p_f - G_0^T mu)``.
@@ -104,7 +104,7 @@ class Interval:
     sparsity: Sparsity
 
     @classmethod
-    def of(cls, system: System, scheme: Scheme, q_s, q_f) -> "Interval":
+    def of(cls, system: System, scheme: Scheme, q_s, q_f) -> "IntervalStructure":
         """The structure for a system, a scheme, and positions of these shapes."""
         terms = implicit_terms(system, scheme)
         of_fast = [term for term in terms if term.arguments == ("q_f",)]

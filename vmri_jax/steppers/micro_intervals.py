@@ -11,7 +11,7 @@ from vmri_jax.kernels.band import BandInverse, FullInverse
 from vmri_jax.mechanics.arrays import Numbers
 from vmri_jax.schemes.intervals import Arriving, Intervals
 from vmri_jax.schemes.path import control_nodes
-from vmri_jax.steppers.interval import Interval, Matrix, constant_mass
+from vmri_jax.steppers.interval import IntervalStructure, Matrix, constant_mass
 from vmri_jax.steppers.solver import only_if
 
 
@@ -38,7 +38,7 @@ class MicroSweep(NamedTuple):
     """
 
     intervals: Intervals
-    structure: Interval
+    structure: IntervalStructure
     matrix: Matrix
     scale: Float[Numbers, "num_micro r 1"]
     multiplier: Float[Array, "r n_g"]

@@ -6,7 +6,7 @@ multipliers by the residual of the slow equations. All equations are those of th
 approximations:
 
 * micro interval: ``[K, -G_0^T; G_1, 0]`` with K of `vmri_jax.steppers.interval`, e.g. ``-(M_f + h^2 W'' / 4)`` for the implicit midpoint
-  rule, at the start of the macro step, or of an earlier one while that costs at most `EXTRA_PASSES`. Where the fast equations are explicit,
+  rule, on the straight path over the first interval of the macro step, or of an earlier step while that costs at most `EXTRA_PASSES`. Where the fast equations are explicit,
   ``K = -M_f`` and only the multipliers are unknown. ``G_1 K^-1 G_0^T`` is computed in the first pass and kept;
 * slow equations: the slow masses, the fast masses that constraints tie to them, and the slow constraint (`SlowEquations`). Without
   constraints, the derivative of the slow forces is added where updates by the masses alone would cost a pass.
@@ -29,7 +29,7 @@ from vmri_jax.schemes.equations import StepEquations, Unknowns
 from vmri_jax.schemes.intervals import Arriving, Intervals
 from vmri_jax.schemes.path import control_nodes
 from vmri_jax.steppers.accept import Accepted, expected
-from vmri_jax.steppers.interval import Interval, Matrix, constant_mass
+from vmri_jax.steppers.interval import IntervalStructure, Matrix, constant_mass
 from vmri_jax.steppers.micro_intervals import FastUnknowns, MicroSweep
 from vmri_jax.steppers.predictors import PolynomialPredictor
 from vmri_jax.steppers.results import RUNNING, Method
@@ -98,7 +98,7 @@ class Nested(StepSolver):
     """
 
     newton: Solver
-    interval: Interval
+    interval: IntervalStructure
 
     def init(self, equations: StepEquations) -> NestedState:
         r, (n_g, n_gs) = equations.scheme.degree, equations.system.num_constraints(equations.q_s, equations.q_f)

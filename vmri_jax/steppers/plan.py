@@ -39,7 +39,7 @@ from vmri_jax.steppers.composed import Composed
 from vmri_jax.steppers.custom import check_shapes, whole_step
 from vmri_jax.steppers.decoupled import Decoupled, Joined
 from vmri_jax.steppers.direct import FreeFlight, Linear
-from vmri_jax.steppers.interval import SMALL, Interval, implicit_terms
+from vmri_jax.steppers.interval import SMALL, IntervalStructure, implicit_terms
 from vmri_jax.steppers.kicked import Kicked, Repeated, average_over_fast_motion
 from vmri_jax.steppers.marched import Marched
 from vmri_jax.steppers.nested import Nested
@@ -171,7 +171,7 @@ def _between_kicks(system: System, scheme: Scheme, solver: Solver, q_s, q_f, num
         custom = solver.stepper.called(system, scheme)
         return Solved(system, scheme, custom, rows)
     # the structure of a micro interval, found where it is needed, once
-    interval = cache(partial(Interval.of, system, scheme, q_s, q_f))
+    interval = cache(partial(IntervalStructure.of, system, scheme, q_s, q_f))
     if q_s.size and _joins(system, scheme, solver, interval, q_s.size, q_f.size):
         (n_g, _), q = system.num_constraints(q_s, q_f), jnp.concatenate([q_s, q_f])
         num_slow = q_s.size if q_f.size else 0  # of slow variables alone the Hessian has all
@@ -190,7 +190,7 @@ def _between_kicks(system: System, scheme: Scheme, solver: Solver, q_s, q_f, num
 
 
 def _joins(
-    system: System, scheme: Scheme, solver: Solver, interval: Callable[[], Interval], n_s: int, n_f: int
+    system: System, scheme: Scheme, solver: Solver, interval: Callable[[], IntervalStructure], n_s: int, n_f: int
 ) -> bool:
     """Whether slow and fast variables are unknowns of one kind: on one micro interval, where the nested iteration does not keep to smaller matrices.
 
@@ -209,7 +209,7 @@ def _approximate(
     system: System,
     scheme: Scheme,
     solver: Solver,
-    interval: Interval,
+    interval: IntervalStructure,
     rows: Sparsity,
     n_s: int,
     n_f: int,
@@ -225,10 +225,14 @@ def _approximate(
 
 def _check_matrix(matrix: str, system: System, scheme: Scheme, can_be_nested: bool) -> None:
     """Refuse a matrix that the structure of the system and the scheme does not allow."""
-    if (matrix == "modes" or (matrix == "masses" and system.has_constant_mass)) and not can_be_nested:
+    if matrix == "modes" and not system.has_constant_mass:
         raise Refused(
-            f"Solver: the matrix {matrix!r} needs a ConstantMass, and potentials and forces on the micro grid or as kicks at the macro nodes or "
-            "at every k-th micro node; a term of this scheme has other nodes inside the macro interval. Take the matrix 'auto' or 'exact'."
+            "Solver: the matrix 'modes' needs a System whose kinetic is a ConstantMass. Take 'auto' or 'exact'."
+        )
+    if matrix in ("masses", "modes") and system.has_constant_mass and not can_be_nested:
+        raise Refused(
+            f"Solver: the matrix {matrix!r} needs potentials and forces on the micro grid, or as kicks at the macro nodes or at every k-th "
+            "micro node; a term of this scheme has other nodes inside the macro interval. Take the matrix 'auto' or 'exact'."
         )
     if matrix == "modes" and not _has_modes(system, scheme):
         raise Refused(
@@ -255,7 +259,7 @@ def _is_drift(system: System, scheme: Scheme) -> bool:
     return scheme.num_micro == scheme.degree == 1 and is_free
 
 
-def _is_linear(system: System, scheme: Scheme, interval: Interval, q_s) -> bool:
+def _is_linear(system: System, scheme: Scheme, interval: IntervalStructure, q_s) -> bool:
     """Whether only the fast equations of one interval are left, and K is their exact, constant matrix.
 
     A diagonal K is exact only if all implicit terms are functions of q_f alone.

@@ -56,7 +56,7 @@ class StepSolver(ABC):
 
     @abstractmethod
     def solve(self, equations: StepEquations, guess: Unknowns, memory) -> tuple[Solution, Any]:
-        """The root of ``equations.residual``.
+        """The root of ``Intervals(equations).residual`` (`vmri_jax.schemes.intervals`).
 
         Args:
             equations: of the step.

@@ -48,11 +48,12 @@ class Solver(eqx.Module):
         tolerance: the iteration ends when the next correction is below ``tolerance / 10 * max |increments|`` plus the round-off of the
             positions, for slow and for fast variables each (`vmri_jax.steppers.accept`). A saved node fails if the value of a constraint is above
             ``max(1e-6, 100 tolerance)`` of its size (`vmri_jax.mechanics.constraints`).
-        max_iterations: a step that needs more iterations has failed; for the micro intervals in order the passes count.
+        max_iterations: a step that needs more iterations has failed; of "masses" and "exact" the passes count.
         stepper: steps of one's own in place of a matrix: a function ``stepper(system, scheme)`` that returns a
             `vmri_jax.steppers.stepper.Stepper` for the whole step, or a `vmri_jax.steppers.solved.StepSolver` for the equations between the
-            kicks; of a composition it gets the scheme of a stage. It is called while JAX traces the run, so that runs, batches, files
-            and gradients work as with other solvers, see docs/how_to/steppers.md.
+            kicks; of a composition it gets the scheme of a stage, and where slow and fast variables decouple it is called for each part.
+            It is called while JAX traces the run, so that runs, batches, files and gradients work as with other solvers, see
+            docs/how_to/steppers.md. It has a tolerance of its own; that of this class decides on constraints at saved nodes.
 
     Raises:
         ValueError: an unknown matrix, a matrix beside a stepper, a tolerance that is not positive, a number of iterations below 1.
@@ -76,10 +77,11 @@ class Solver(eqx.Module):
             raise Refused(
                 f"Solver: stepper is {self.stepper!r}; give a function of (system, scheme) that makes a Stepper."
             )
-        if self.matrix != "auto":
-            raise Refused(
-                f"Solver: matrix is {self.matrix!r} beside a stepper, which has its own way to solve; leave one of them out."
-            )
+        for name, value in {"matrix": self.matrix, "max_iterations": self.max_iterations}.items():
+            if value != getattr(type(self), name):
+                raise Refused(
+                    f"Solver: {name} is {value!r} beside a stepper, which has its own way to solve; leave one of them out."
+                )
 
     def exact(self) -> "Solver":
         """The same with exact matrices."""
