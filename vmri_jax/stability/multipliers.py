@@ -22,14 +22,8 @@ from vmri_jax.mechanics.system import System
 from vmri_jax.refusals import Refused
 from vmri_jax.running.arguments import check_step_size
 from vmri_jax.schemes.composition import SchemeLike, stage_lengths, stage_scheme
-from vmri_jax.schemes.equations import StepEquations, Unknowns
-from vmri_jax.schemes.intervals import Intervals
-from vmri_jax.schemes.scheme import Scheme
-from vmri_jax.steppers.newton.implicit import newton_direction
-from vmri_jax.steppers.results import Method, Result
-from vmri_jax.steppers.solved import Solution, StepSolver
+from vmri_jax.steppers.results import Result
 from vmri_jax.steppers.solver import Solver
-from vmri_jax.steppers.stepper import StepStatus
 
 TOLERANCE = 1e-6
 """Growth per step that counts as instability. Round-off alone splits two equal multipliers by its square root, up to
@@ -37,9 +31,9 @@ TOLERANCE = 1e-6
 LANES = 64
 """Step sizes that a compiled call computes side by side for up to 18 degrees of freedom; larger systems get fewer, at
 least 4, to limit memory. With more a call for a single step size takes longer."""
-CORRECTIONS_AT_REST = 2
-"""Newton corrections of the step at rest, whose equations are linear: one solves them, two reach round-off. More only
-take longer."""
+PASSES_AT_REST = 5
+"""Exact passes of the step at rest, whose equations are linear: two bring the multipliers to round-off. More take
+longer where round-off goes on."""
 FREE_MOTION_ANGLE = 1e-5
 """Angle, rad, up to which a multiplier is of a free motion, which has no signature; a larger one drops slow ones."""
 
@@ -117,33 +111,14 @@ def multipliers(linear: Linearisation, scheme: SchemeLike, macro_dt) -> Multipli
     return Multipliers(values, vectors.astype(complex), growing)
 
 
-@dataclass(frozen=True)
-class _AtRest(StepSolver):
-    """The step of an expansion from rest: its equations are linear, and take no iteration."""
-
-    def solve(self, equations: StepEquations, guess: Unknowns, memory: tuple) -> tuple[Solution, tuple]:
-        intervals, correction, x = Intervals(equations), newton_direction(equations, guess), guess
-        for _ in range(CORRECTIONS_AT_REST):
-            x = jax.tree.map(jnp.add, x, correction(intervals.residual(x)[0]))
-        # the status does not count: a step at rest that fails has a derivative that is not finite
-        status = StepStatus(jnp.asarray(Result.CONVERGED), jnp.asarray(Method.EXACT), jnp.asarray(1), jnp.zeros(()))
-        return Solution(x, intervals.residual(x)[1], status), memory
-
-    def describe(self) -> list[str]:
-        return ["two Newton corrections, of linear equations"]
-
-
-def _at_rest(system: System, scheme: Scheme) -> StepSolver:
-    return _AtRest()
-
-
 @partial(jax.jit, compiler_options=QUICK)
 def _step_matrices(system: System, scheme, rest: State, embed, read, macro_dt):
     """(k, 2 d, 2 d) derivatives of the macro step at rest, for k lengths of the step."""
 
-    solver = Solver(stepper=_at_rest)
-
     def matrix(macro_dt):
+        # The status does not count: corrections of a step at rest are round-off, and are compared with no motion. With
+        # all iterations spent on the whole step no part of it is taken for the step.
+        solver = Solver("exact", max_iterations=PASSES_AT_REST)
         step = partial(phase_step, system, scheme, rest, rest.t, macro_dt=macro_dt, solver=solver)
         return read @ with_slopes(step, phase_vector(rest), embed.T)[2].T
 
