@@ -229,7 +229,7 @@ def test_a_full_disk_is_told(vmri, monkeypatch):
         (["simulate", "fpu", "--macro-dt", -1, "--steps", 4], "macro_dt is -1.0; it must be a positive number"),
         (["simulate", "fpu", "--macro-dt", 1, "--steps", 0], "num_steps is 0; it must be an integer of at least 1"),
         (["simulate", "fpu", *RUN, "--save-every", 3], "not a multiple of save = 3"),
-        (["simulate", "fpu", *RUN, "--num-micro", 0], "num_micro is 0; it must be at least 1"),
+        (["simulate", "fpu", *RUN, "--num-micro", 0], "num_micro is 0; it must be an integer of at least 1"),
         (["simulate", "fpu", *RUN, "--degree", 2], "the scheme fully-explicit has no degree"),
         (["simulate", "fpu", *RUN[:4], "--alpha", 0.5], "use explicit-slow or mollified-impulse or fully-explicit"),
         (["simulate", "fpu", *RUN[:4], "--scheme", "galerkin"], "needs the degree"),

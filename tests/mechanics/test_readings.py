@@ -80,12 +80,9 @@ def test_one_vector_is_no_force_on_several_elements():
     class Uniform(Drive):
         function = staticmethod(uniform)  # pyright: ignore[reportAssignmentType]
 
-        def check_parameters(self):
-            """None: `Drive` would check its history."""
-
     bodies = [Body("a", 1.0, [0.0, 0.0]), Body("b", 1.0, [1.0, 0.0])]
     with pytest.raises(ValueError, match=r"function returns \(shape \(2,\)\); .* a force for each body"):
-        Scene(bodies, [Uniform(["a", "b"], np.sin, {"force": np.array([0.0, 1.0])})]).system()
+        Scene(bodies, [Uniform(["a", "b"], lambda t, params: jnp.zeros(2), {"force": np.array([0.0, 1.0])})]).system()
 
 
 TREE = {"z": {"d": 1.0, "c": [{"y": 2.0, "x": 3.0}]}, "a": OrderedDict(q=4.0, p={"n": 5.0, "m": 6.0}), "e": None}

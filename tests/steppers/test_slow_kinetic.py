@@ -93,7 +93,7 @@ def test_constant_inertia_may_be_on_either_grid():
     scheme, random = SCHEMES["fully implicit"][0], np.random.default_rng(0)
     points = random.normal(size=(2, 1)), random.normal(size=(scheme.num_micro + 1, 1))
     apart, together = (
-        jax.jit(textbook.discrete_lagrangian)(p.system, scheme, *points, 0.1)
+        jax.jit(textbook.discrete_lagrangian(p.system, scheme))(*points, 0.1)
         for p in (problem(steady_arm), problem(None, steady_together))
     )
     assert float(apart) == pytest.approx(float(together), rel=1e-13)
