@@ -45,7 +45,8 @@ app.command()(refusals()(hard))
 
 
 COMPILES = ("chains", "mechanisms", "kills", "programs")
-"""Commands that report seconds of compilation, or start processes: programs in the cache would be no measure of them."""
+"""Commands that report seconds of compilation, or start processes: programs in the cache would be no measure of
+them."""
 MANY_CORES = ("ensembles", "gpu", "kills")
 """Commands that keep to no core."""
 
@@ -59,7 +60,8 @@ HELP = {
 
 
 def _register(name: str, module) -> None:
-    """A command with the arguments of the function `sizes` of its module as options; its help is the docstring of the module."""
+    """A command with the arguments of the function `sizes` of its module as options; its help is the docstring of the
+    module."""
 
     def command(full: Full = False, core: Core = None, out: Out = OUT, **options) -> None:
         prepare(-1 if core is None and name in MANY_CORES else core, cache=name not in COMPILES)

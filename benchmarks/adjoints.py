@@ -1,4 +1,5 @@
-"""Gradients of runs: time of a gradient over the time of the run, memory of short and of long ones, seconds to compile."""
+"""Gradients of runs: time of a gradient over the time of the run, memory of short and of long ones, seconds to
+compile."""
 
 import time
 from collections.abc import Callable, Iterator
@@ -13,14 +14,16 @@ from benchmarks.measure import Ratio, Tell, exactly, interleaved, quartiles, sil
 from benchmarks.report import Claim, Report
 
 FACTOR, GROWTH = 4.0, 4.0
-"""Targets: time of a gradient over the time of a run, memory of a gradient of a million steps over that of a thousand."""
+"""Targets: time of a gradient over the time of a run, memory of a gradient of a million steps over that of a
+thousand."""
 SHORT, LONG = 1_000, 1_000_000
 """Steps of the gradients that are timed, and of those whose memory is read off the compiled program."""
 
 
 @dataclass(frozen=True)
 class Case:
-    """A system whose squared positions at the end are differentiated with respect to its parameters and the momenta of the start."""
+    """A system whose squared positions at the end are differentiated with respect to its parameters and the momenta of
+    the start."""
 
     name: str
     problem: Callable[[], vm.Problem]

@@ -1,4 +1,5 @@
-"""Hand-written C loops, the speed floor of the three systems and of molecules with all pairs, compiled when first used."""
+"""Hand-written C loops, the speed floor of the three systems and of molecules with all pairs, compiled when first
+used."""
 
 import ctypes
 import dataclasses
@@ -87,10 +88,12 @@ def fpu(problem: Problem, num_micro: int, micro_dt: float, num_macro_steps: int)
 def molecules(
     problem: Problem, length: float, stiffness: float, num_micro: int, micro_dt: float, num_macro_steps: int
 ) -> CLoop:
-    """`fully_explicit(num_micro)` on diatomic molecules with Lennard-Jones forces between all pairs: the impulse method.
+    """`fully_explicit(num_micro)` on diatomic molecules with Lennard-Jones forces between all pairs: the impulse
+    method.
 
     Args:
-        problem: fast coordinates alone, atom by atom, unit masses, as of `benchmarks.dear.systems.molecules`; its potentials are not looked at.
+        problem: fast coordinates alone, atom by atom, unit masses, as of `benchmarks.dear.systems.molecules`; its
+            potentials are not looked at.
         length, stiffness: of the bonds.
         num_micro, micro_dt, num_macro_steps: the steps.
     """

@@ -1,4 +1,5 @@
-"""Linear in the number of bodies: time of one step of hinged chains and stars, by directors (a band, the full matrix) and in joint coordinates."""
+"""Linear in the number of bodies: time of one step of hinged chains and stars, by directors (a band, the full matrix)
+and in joint coordinates."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -21,7 +22,8 @@ SHORT, LONG = 50, 250
 """Steps of two runs; what a call costs besides its steps is in both."""
 MACRO_DT = 1e-3
 FROM = 20
-"""Below so many bodies the band is not what `vm.simulate` takes, or what does not depend on their number counts as well."""
+"""Below so many bodies the band is not what `vm.simulate` takes, or what does not depend on their number counts as
+well."""
 JOINT_FROM = 10
 """The same in joint coordinates."""
 LEVEL = [[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]]
@@ -90,7 +92,8 @@ SHAPES: dict[str, Callable[[int, Coordinates], Scene]] = {"chain": chain, "star"
 
 
 def measure(shape: str, bodies: int, coordinates: Coordinates, few: int, repeats: int) -> Measured:
-    """One step of kicks and RATTLE, or of kicks and free motion in joint coordinates; a band where there are more than `few` rows."""
+    """One step of kicks and RATTLE, or of kicks and free motion in joint coordinates; a band where there are more than
+    `few` rows."""
     before, constraint_pattern.MOST_ROWS_OF_FULL_MATRIX = constraint_pattern.MOST_ROWS_OF_FULL_MATRIX, few
     engine.cache_clear()  # another limit is another program of the same scene
     try:
@@ -144,7 +147,8 @@ def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
 
 
 def _slopes(shape: str, number: int, band: dict[int, float], joint: dict[int, float], size: Size) -> list[Claim]:
-    """Of log time against log bodies, after the largest number of a shape: of the band a target, in joint coordinates none."""
+    """Of log time against log bodies, after the largest number of a shape: of the band a target, in joint coordinates
+    none."""
     claims = []
     if number != (size.bodies if shape == "chain" else size.stars)[-1]:
         return claims

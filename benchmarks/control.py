@@ -1,4 +1,5 @@
-"""Optimal control: a satellite with booms turned from rest to rest, error of the cost against time, and one turned by wheels."""
+"""Optimal control: a satellite with booms turned from rest to rest, error of the cost against time, and one turned by
+wheels."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -43,7 +44,8 @@ def effort(state, u):
 
 @cache
 def satellite() -> Scene:
-    """A rigid hub, slow, that a torque turns, and two booms of two masses: their mounts bend slowly, and stretch fast (100 rad/s)."""
+    """A rigid hub, slow, that a torque turns, and two booms of two masses: their mounts bend slowly, and stretch fast
+    (100 rad/s)."""
     bodies, effects = [], []
     for side, name in ((-1.0, "left"), (1.0, "right")):
         middle, tip, root = f"{name} middle", f"{name} tip", ("hub", [side / 2, 0.0, 0.0])

@@ -1,4 +1,5 @@
-"""Linear in the number of micro steps: time and memory of a macro step with 10 to 5000 of them, at a constant micro step."""
+"""Linear in the number of micro steps: time and memory of a macro step with 10 to 5000 of them, at a constant micro
+step."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -15,9 +16,13 @@ from benchmarks.report import Claim, Report, spread
 MICRO_DT = 1e-5
 """So small that the largest macro step is still an ordinary one."""
 MACRO_STEPS = 20
-"""Macro steps with the most micro steps; all runs of a system have the same length. With fewer steps the call counts."""
+"""Macro steps with the most micro steps; all runs of a system have the same length.
+
+With fewer steps the call counts.
+"""
 MEMORY_FROM = 100
-"""Fewest micro steps whose memory counts: with fewer of them, memory that does not depend on num_micro counts as well."""
+"""Fewest micro steps whose memory counts: with fewer of them, memory that does not depend on num_micro counts as
+well."""
 CASES = (
     ("FPU l=3", "fully implicit"),
     ("FPU l=50", "explicit slow"),

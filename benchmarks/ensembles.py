@@ -127,7 +127,8 @@ def _batch(first: int, last: int):
 
 # --- what tasks and stores cost --------------------------------------------------------------------------------------
 def tasks(size: Size, name: str, folder: Path, tell: Tell) -> Report:
-    """Runs a second and worker, bytes and files of a run, and what a task costs: handing it over, the first one, to see whether it is done."""
+    """Runs a second and worker, bytes and files of a run, and what a task costs: handing it over, the first one, to see
+    whether it is done."""
     tell("runs a second")
     _sweep(folder / "runs.zarr", 2**14, chunk=CHUNK)
     runs = _sweep(folder / "runs.zarr", 2**15, chunk=CHUNK)
@@ -148,8 +149,9 @@ def tasks(size: Size, name: str, folder: Path, tell: Tell) -> Report:
         rows.append(row)
     of_chunks = sum("/c." in str(file) or file.name.isdecimal() for file in files)
     notes = [
-        f"{sum(file.stat().st_size for file in files) / len(runs):.0f} bytes and {of_chunks / len(runs):.4f} files a run in chunks of {CHUNK}; "
-        f"a worker's first chunk takes {first - again:.1f} s longer; {listing:,.0f} chunks a second are seen to be done."
+        f"{sum(file.stat().st_size for file in files) / len(runs):.0f} bytes and {of_chunks / len(runs):.4f} files a "
+        f"run in chunks of {CHUNK}; a worker's first chunk takes {first - again:.1f} s longer; {listing:,.0f} chunks "
+        "a second are seen to be done."
     ]
     return Report("ensembles_tasks", name, rows, [], notes)
 

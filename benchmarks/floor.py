@@ -116,7 +116,8 @@ def _measure(case: Case, size: Size, report: Report, tell: Tell) -> None:
 
 
 def _batch(problem: vm.Problem, case: Case, lanes: int, seconds: float):
-    """``simulate(num_steps)``, and macro steps that last about long enough; few numbers are tried, since a batch is compiled for each."""
+    """``simulate(num_steps)``, and macro steps that last about long enough; few numbers are tried, since a batch is
+    compiled for each."""
     states, scheme = starts(problem, lanes), vm.fully_explicit(case.num_micro)
 
     def simulate(num_steps: int) -> vm.Trajectory:

@@ -1,4 +1,5 @@
-"""Batches on a GPU: lanes per second, beside `simulate_batch` on this machine's CPU and diffrax on the card, and how far both devices are apart."""
+"""Batches on a GPU: lanes per second, beside `simulate_batch` on this machine's CPU and diffrax on the card, and how
+far both devices are apart."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -23,9 +24,15 @@ COMPARED = 256
 """Lanes whose ends are compared between devices and with a reference."""
 GRADIENT_LANES = 1000
 APART = 1e-9
-"""Largest difference of positions between CPU and GPU, relative to the largest position. Sums are taken in another order there."""
+"""Largest difference of positions between CPU and GPU, relative to the largest position.
+
+Sums are taken in another order there.
+"""
 FINER = 8
-"""Steps of the reference over steps of the run. At order 2 the error of the reference is a sixty-fourth of the error of the run."""
+"""Steps of the reference over steps of the run.
+
+At order 2 the error of the reference is a sixty-fourth of the error of the run.
+"""
 TOLERANCES = 10.0 ** -np.arange(2.0, 12.0)
 """Of diffrax: the loosest one that is as accurate as our run is timed."""
 
@@ -35,7 +42,8 @@ class System:
     """A problem with the step that its batches take.
 
     num_steps: macro steps to `T_END`.
-    acceleration: ``a(q, v)`` with all constraints and masses eliminated by hand, for diffrax; None where it is not written.
+    acceleration: ``a(q, v)`` with all constraints and masses eliminated by hand, for diffrax; None where it is not
+        written.
     """
 
     name: str
@@ -81,7 +89,10 @@ def of_peers(name: str) -> Callable | None:
 
 
 def systems_of(names: tuple[str, ...]) -> Iterator[System]:
-    """The systems with these names. Long steps of high degree suit a card: kernels of a step start one after the other, for any number of lanes."""
+    """The systems with these names.
+
+    Long steps of high degree suit a card: kernels of a step start one after the other, for any number of lanes.
+    """
     if "FPU" in names:
         yield System("FPU", problem("FPU l=3"), vm.fully_explicit(10), 100, of_peers("FPU l=3"))
     if "TSP" in names:

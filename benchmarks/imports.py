@@ -1,8 +1,8 @@
 """Model files that ship with gymnasium and dm_control: which are read, and how their motion differs from MuJoCo's.
 
 From a random start, with what is ignored switched off, the accelerations of both are compared. All models then move for
-half a second: in MuJoCo by its Runge-Kutta method of order four, as scenes by a composition of order four. The files alone are needed:
-pip install --no-deps gymnasium==1.4.0 dm_control==1.0.50.
+half a second: in MuJoCo by its Runge-Kutta method of order four, as scenes by a composition of order four. The files
+alone are needed: pip install --no-deps gymnasium==1.4.0 dm_control==1.0.50.
 """
 
 import time
@@ -28,8 +28,9 @@ QUICK = ("hopper", "reacher", "acrobot", "cartpole", "swimmer", "point")
 T_END, STEP, THEIR_STEP = 0.5, 2e-3, 5e-5
 """s: length of the motion, the macro step, and MuJoCo's step, at both of which errors are below 1e-8."""
 SHORTER = 5.0
-"""Factor by which MuJoCo's step is shortened where its motion overflows: strong dampers on light bodies, of some 2e5/s in a gripper, make its
-method unstable. A smaller one would try more steps in vain, a larger one takes longer than it must."""
+"""Factor by which MuJoCo's step is shortened where its motion overflows: strong dampers on light bodies, of some 2e5/s
+in a gripper, make its method unstable. A smaller one would try more steps in vain, a larger one takes longer than it
+must."""
 SPREAD, RATE = 0.2, 0.5
 """Standard deviations of coordinates and velocities at the start, rad, rad/s, m and m/s."""
 
@@ -57,7 +58,8 @@ def _mujoco() -> Any:
 
 
 def start(model: Any) -> tuple[np.ndarray, np.ndarray]:
-    """(qpos, qvel) at random, and the model without what is ignored and without its equalities, which MuJoCo keeps softly."""
+    """(qpos, qvel) at random, and the model without what is ignored and without its equalities, which MuJoCo keeps
+    softly."""
     mujoco = _mujoco()
     off = mujoco.mjtDisableBit
     for flag in (off.mjDSBL_CONTACT, off.mjDSBL_LIMIT, off.mjDSBL_ACTUATION, off.mjDSBL_EQUALITY):
@@ -78,7 +80,8 @@ def their_centres(model: Any, qpos: np.ndarray, qvel: np.ndarray) -> dict[str, n
 
 
 def their_accelerations(model: Any, data: Any) -> dict[str, np.ndarray]:
-    """Accelerations of the centres of mass by MuJoCo at the state of its data, by the names that a scene gives to its bodies."""
+    """Accelerations of the centres of mass by MuJoCo at the state of its data, by the names that a scene gives to its
+    bodies."""
     mujoco, accelerations = _mujoco(), np.zeros((model.nbody, 3))
     has_gravity = not model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_GRAVITY)
     mujoco.mj_forward(model, data)
@@ -92,7 +95,7 @@ def their_accelerations(model: Any, data: Any) -> dict[str, np.ndarray]:
 
 def apart(scene: Any, model: Any, data: Any) -> tuple[float, float]:
     """Largest difference of the accelerations of a scene and of MuJoCo, and their size, the largest of MuJoCo."""
-    from vmri_jax.scene.body_motions import accelerations, state_of  # only now: scenes start JAX
+    from benchmarks.body_motions import accelerations, state_of  # only now: scenes start JAX
 
     ours, theirs = accelerations(scene, state_of(scene)), their_accelerations(model, data)
     differences = (float(np.abs(ours[name][2][:3] - a).max()) for name, a in theirs.items())
@@ -112,7 +115,8 @@ def of_centres(model: Any, values: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def moved(model: Any, data: Any, qpos: np.ndarray, qvel: np.ndarray) -> bool:
-    """Whether MuJoCo has moved the data to the end; else its accelerations have overflowed, after which it starts anew without a word."""
+    """Whether MuJoCo has moved the data to the end; else its accelerations have overflowed, after which it starts anew
+    without a word."""
     mujoco = _mujoco()
     mujoco.mj_resetData(model, data)
     data.qpos[:], data.qvel[:] = qpos, qvel
@@ -160,9 +164,14 @@ def run(files: list[tuple[str, Path]], name: str, tell: Tell = silent) -> Iterat
         errors = [row["error"] for row in rows if "error" in row]
         apart = [row["acceleration"] for row in rows if "acceleration" in row]
         notes = [
-            f"{len(apart)} of {len(rows)} files are read with ignore={IGNORED}; accelerations at the start differ by at most "
-            f"{max(apart, default=0.0):.1e} of the largest one",
-            f"largest error of a centre of mass after {T_END:g} s, in {len(errors)} models: {max(errors, default=0.0):.1e} m",
+            (
+                f"{len(apart)} of {len(rows)} files are read with ignore={IGNORED}; accelerations at the start differ "
+                f"by at most {max(apart, default=0.0):.1e} of the largest one"
+            ),
+            (
+                f"largest error of a centre of mass after {T_END:g} s, in {len(errors)} models: "
+                f"{max(errors, default=0.0):.1e} m"
+            ),
             "scene and first run: seconds of processor time, the run with its compiling",
         ]
         yield Report("imports", name, rows, [], notes)

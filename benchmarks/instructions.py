@@ -1,5 +1,5 @@
-"""Programs of prepared runs, with the observables of their nodes, and of gradients: their instructions after XLA's optimisation, and the
-processor time until they are compiled."""
+"""Programs of prepared runs, with the observables of their nodes, and of gradients: their instructions after XLA's
+optimisation, and the processor time until they are compiled."""
 
 import re
 import time

@@ -1,4 +1,5 @@
-"""A streaming run, and an ensemble or its workers, killed at random moments: resumed they are the same to the last bit."""
+"""A streaming run, and an ensemble or its workers, killed at random moments: resumed they are the same to the last
+bit."""
 
 import multiprocessing
 import os
@@ -46,7 +47,8 @@ class Kind:
 
     start: how Python starts them; "forkserver" from a process that has imported everything.
     target: ``target(path)`` in a process of its own, starts a store or goes on with it.
-    same: ``same(whole, path, complete)``, whether a store has all of one that nobody disturbed, before the end its beginning.
+    same: ``same(whole, path, complete)``, whether a store has all of one that nobody disturbed, before the end its
+        beginning.
     """
 
     name: str
@@ -117,7 +119,8 @@ def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
 
 
 def kill_processes(kind: Kind, count: int, random, folder: Path, tell: Tell, moments: Counter[str]) -> Iterator[dict]:
-    """Processes are killed and started again until their store is complete, and further ones until `count` were killed."""
+    """Processes are killed and started again until their store is complete, and further ones until `count` were
+    killed."""
     done, whole, out = 0, folder / f"whole {kind.name}.zarr", folder / f"{kind.name}.zarr"
     if count:
         kind.finish(kind.process(whole))
@@ -139,7 +142,8 @@ def kill_processes(kind: Kind, count: int, random, folder: Path, tell: Tell, mom
 
 
 def _moment(path: Path) -> str:
-    """The part of its work in which the process was killed; files beyond the completed chunks belong to the chunk that it was writing."""
+    """The part of its work in which the process was killed; files beyond the completed chunks belong to the chunk that
+    it was writing."""
     if not path.exists():
         return "before there was a store"
     torn = any(path.rglob("*.partial")) or any(path.glob(f"*/c.{chunks_of(path)}*"))

@@ -1,4 +1,7 @@
-"""Before anything is measured: the process keeps to one core, and JAX is told how to compile. Ratios of times with their spread."""
+"""Before anything is measured: the process keeps to one core, and JAX is told how to compile.
+
+Ratios of times with their spread.
+"""
 
 import os
 import platform
@@ -67,8 +70,8 @@ def ratio(above: Sequence[float], below: Sequence[float]) -> Ratio:
 def steps_for(run: Callable[[int], object], seconds: float, unit: int = 1, most: int = 10**9) -> int:
     """A multiple of `unit`, at most `most`, for which ``run(steps)`` takes about `seconds`.
 
-    The first call, which compiles, is not counted. Steps are added until the time of a call is several times the time of a
-    call with `unit` steps, so that the fixed cost of a call does not count either.
+    The first call, which compiles, is not counted. Steps are added until the time of a call is several times the time
+    of a call with `unit` steps, so that the fixed cost of a call does not count either.
     """
     steps = unit
     jax.block_until_ready(run(steps))

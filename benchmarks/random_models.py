@@ -1,7 +1,8 @@
-"""Random models of MuJoCo with every feature of its table: those that are read accelerate as in MuJoCo, all others are refused by name.
+"""Random models of MuJoCo with every feature of its table: those that are read accelerate as in MuJoCo, all others are
+refused by name.
 
-A model is a tree of up to four bodies with random joints, inertias, springs, keyframe and actuators, with the fields that have no influence on the
-motion away from their defaults, and with flags and refused features drawn at random.
+A model is a tree of up to four bodies with random joints, inertias, springs, keyframe and actuators, with the fields
+that have no influence on the motion away from their defaults, and with flags and refused features drawn at random.
 """
 
 from collections import Counter
@@ -18,8 +19,8 @@ from benchmarks.report import Report
 CHANCE = 0.12
 """Probability of each feature that a scene does not express, of each flag and of each actuator that acts."""
 LARGEST_DIFFERENCE = 1e-8
-"""Difference of accelerations, relative to the largest of the model, above which a model counts as wrong: round-off of chains of four bodies
-is below 1e-10, and a missing feature changes accelerations by parts of one."""
+"""Difference of accelerations, relative to the largest of the model, above which a model counts as wrong: round-off of
+chains of four bodies is below 1e-10, and a missing feature changes accelerations by parts of one."""
 REFUSED_PARTS = {
     "limits": ("joint", 'range="-50 60"'),
     "frictionloss": ("joint", 'frictionloss="0.3"'),
@@ -41,12 +42,13 @@ ACTUATORS = (
 )
 """Actuators; {low} is -1, or 1 so that a control of zero acts as 1."""
 IDLE = (
-    'integrator="implicitfast"', 'integrator="RK4"', 'timestep="0.01"', 'cone="elliptic"', 'solver="CG"', 'jacobian="sparse"',
-    'iterations="3"', 'tolerance="1e-3"', 'impratio="5"', 'magnetic="1 2 3"', 'noslip_iterations="2"', 'ls_iterations="9"',
+    'integrator="implicitfast"', 'integrator="RK4"', 'timestep="0.01"', 'cone="elliptic"', 'solver="CG"',
+    'jacobian="sparse"', 'iterations="3"', 'tolerance="1e-3"', 'impratio="5"', 'magnetic="1 2 3"',
+    'noslip_iterations="2"', 'ls_iterations="9"',
 )  # fmt: skip
 """Options without influence on accelerations."""
-FLAGS = ("spring", "damper", "gravity", "actuation", "limit", "frictionloss", "clampctrl", "contact", "equality", "eulerdamp", "warmstart", "sensor",
-         "midphase", "island", "filterparent", "refsafe")  # fmt: skip
+FLAGS = ("spring", "damper", "gravity", "actuation", "limit", "frictionloss", "clampctrl", "contact", "equality",
+         "eulerdamp", "warmstart", "sensor", "midphase", "island", "filterparent", "refsafe")  # fmt: skip
 """Features that a flag may switch off."""
 
 
@@ -105,11 +107,15 @@ def xml(seed: int) -> str:
         inner += [shape(), shape(welded=True)] if chance(0.3) else [shape()]
         if chance(0.3):
             inner.append(
-                f'<inertial pos="{numbers(3, 0.1)}" mass="{random.uniform(0.5, 2):.4f}" diaginertia="0.03 0.02 0.04" euler="{numbers(3, 40.0)}"/>'
+                f'<inertial pos="{numbers(3, 0.1)}" mass="{random.uniform(0.5, 2):.4f}" diaginertia="0.03 0.02 0.04"'
+                f' euler="{numbers(3, 40.0)}"/>'
             )
         inner.append(f'<site name="s{number}" pos="{numbers(3, 0.1)}"/>')
         inner += [body(child, children) for child in children[number]]
-        return f'<body name="b{number}" pos="{numbers(3, 0.4)}" euler="{numbers(3, 40.0)}" {gravcomp} user="7">{"".join(inner)}</body>'
+        return (
+            f'<body name="b{number}" pos="{numbers(3, 0.4)}" euler="{numbers(3, 40.0)}" {gravcomp}'
+            f' user="7">{"".join(inner)}</body>'
+        )
 
     count = int(random.integers(1, 5))
     children: dict[int, Any] = {number: [] for number in range(count)} | {-1: 0}
@@ -136,7 +142,8 @@ def xml(seed: int) -> str:
 
 
 def model_of(seed: int) -> tuple[Any, Any]:
-    """The compiled model, and its `mujoco.MjData` at a random start with controls and activations, some of them not zero."""
+    """The compiled model, and its `mujoco.MjData` at a random start with controls and activations, some of them not
+    zero."""
     mujoco: Any = import_module("mujoco")
     model = mujoco.MjModel.from_xml_string(xml(seed))
     data, random = mujoco.MjData(model), np.random.default_rng(seed)
@@ -150,7 +157,8 @@ def model_of(seed: int) -> tuple[Any, Any]:
 
 
 def compare(seed: int) -> dict[str, Any]:
-    """The row of one model: the difference of accelerations relative to the largest one, or the features that are refused."""
+    """The row of one model: the difference of accelerations relative to the largest one, or the features that are
+    refused."""
     from vmri_jax.scene import Scene  # only now: scenes start JAX
     from vmri_jax.scene.mujoco_model import Compiled
 
@@ -186,7 +194,10 @@ def run(seeds: range, name: str, tell: Tell = silent) -> Iterator[Report]:
     read = [row["difference"] for row in rows if "difference" in row]
     counts = Counter(kind for row in rows if "refused" in row for kind in row["refused"].split(", "))
     notes = [
-        f"{len(read)} of {len(rows)} models are read; their accelerations differ by at most {max(read, default=0.0):.1e} of the largest one",
+        (
+            f"{len(read)} of {len(rows)} models are read; their accelerations differ by at most "
+            f"{max(read, default=0.0):.1e} of the largest one"
+        ),
         f"refused: {', '.join(f'{kind} {number}' for kind, number in counts.most_common())}",
     ]
     yield Report("models", name, rows, [], notes)

@@ -46,7 +46,8 @@ class Claim:
 
 @dataclass(frozen=True)
 class Report:
-    """All that one benchmark has measured by now; figures are functions that draw, by file name, about is what else belongs into the file."""
+    """All that one benchmark has measured by now; figures are functions that draw, by file name, about is what else
+    belongs into the file."""
 
     name: str
     size: str

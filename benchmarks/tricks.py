@@ -1,4 +1,5 @@
-"""What each tuned function of the kernels, and each thing that steppers remember or know, buys against its plain form."""
+"""What each tuned function of the kernels, and each thing that steppers remember or know, buys against its plain
+form."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack

@@ -1,7 +1,7 @@
 """One side of a comparison: a process that runs what it is told, when it is its turn.
 
-``python .../benchmarks/worker.py`` imports the `vmri_jax` of the checkout that it is started in, and nothing of this folder.
-Questions and answers are lines of JSON on standard input and output; `benchmarks.seats` asks.
+``python .../benchmarks/worker.py`` imports the `vmri_jax` of the checkout that it is started in, and nothing of this
+folder. Questions and answers are lines of JSON on standard input and output; `benchmarks.seats` asks.
 """
 
 import argparse
@@ -79,7 +79,8 @@ class Case:
 
 
 class Timed(NamedTuple):
-    """What takes turns with others: its number of steps, the end of a short run, ``sample()`` in seconds, the worst status of a run."""
+    """What takes turns with others: its number of steps, the end of a short run, ``sample()`` in seconds, the worst
+    status of a run."""
 
     num_steps: int
     end: np.ndarray
@@ -191,7 +192,8 @@ def _seconds(function, *arguments) -> float:
 
 
 def _steps_for(simulate, seconds: float, first: int = 1, factor: int = 4) -> int:
-    """The number of steps that take `seconds`, besides the time of a call; few numbers are tried, since a batch is compiled for each."""
+    """The number of steps that take `seconds`, besides the time of a call; few numbers are tried, since a batch is
+    compiled for each."""
     jax.block_until_ready(simulate(first))
     call, steps = min(_seconds(simulate, first) for _ in range(CALLS)), first
     while True:

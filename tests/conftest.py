@@ -19,12 +19,14 @@ settings.load_profile("repeatable")
 MANY_MAPS = 20_000
 """Memory maps of a process from which on compiled programs are forgotten; Linux allows 65 530."""
 MUCH_MEMORY = 1.0e9
-"""Bytes of a process from which on compiled programs are forgotten after a file; the tests of a file share programs, files few."""
+"""Bytes of a process from which on compiled programs are forgotten after a file; the tests of a file share programs,
+files few."""
 MOST_MEMORY = 1.75e9
-"""Bytes of a process from which on programs are forgotten after any test, which the next tests of a file compile again; two workers
-with 2 GiB each fit into a small machine."""
+"""Bytes of a process from which on programs are forgotten after any test, which the next tests of a file compile again;
+two workers with 2 GiB each fit into a small machine."""
 GROWTH = 2e8
-"""Fewest bytes that tests add between two times when programs are forgotten: else a process that stays large would forget after every test."""
+"""Fewest bytes that tests add between two times when programs are forgotten: else a process that stays large would
+forget after every test."""
 LONGEST = ("textbook", "verification", "steppers", "pages")
 """Folders whose files take longest come first, so that workers end together."""
 
@@ -76,7 +78,8 @@ def pytest_configure(config):
     config.pluginmanager.register(Durations(programs, config.getoption("--budget")), "durations")
     if config.getoption("--quick"):
         config.pluginmanager.register(Quick(programs), "quick")
-    # Tests make functions of one piece of code again for each case, runs that lose their energy, and starts with random velocities.
+    # Tests make functions of one piece of code again for each case, runs that lose their energy, and starts with random
+    # velocities.
     config.addinivalue_line("filterwarnings", "ignore::vmri_jax.CompiledAgainWarning")
     config.addinivalue_line("filterwarnings", "ignore::vmri_jax.LostEnergyWarning")
     config.addinivalue_line("filterwarnings", "ignore:.*project=True has replaced them")

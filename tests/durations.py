@@ -1,7 +1,8 @@
-"""A plugin of pytest that lists programs and processor time of tests and files, and with --budget fails a run of too many programs.
+"""A plugin of pytest that lists programs and processor time of tests and files, and with --budget fails a run of too
+many programs.
 
-A number of programs is the same on every machine, and compiling them is nearly all of the time. Processor time is that of the
-test's process and of the processes that it has waited for; wall time with two workers is about half of its sum.
+A number of programs is the same on every machine, and compiling them is nearly all of the time. Processor time is that
+of the test's process and of the processes that it has waited for; wall time with two workers is about half of its sum.
 """
 
 import os
@@ -104,8 +105,8 @@ class Durations:
             terminalreporter.write_line("".join(lines))
         seconds, count = (sum(cost[k] for cost in self.costs.values()) for k in range(2))
         terminalreporter.write_line(
-            f"{seconds:7.1f} s {count:4d} programs of {len(self.costs)} tests; largest memory of a process: {self.memory:.1f} GiB; "
-            f"this machine takes {slowness():.1f} times as long as the machine of reference"
+            f"{seconds:7.1f} s {count:4d} programs of {len(self.costs)} tests; largest memory of a process: "
+            f"{self.memory:.1f} GiB; this machine takes {slowness():.1f} times as long as the machine of reference"
         )
         if self.budget:
             for sentence in self.excesses():

@@ -39,7 +39,8 @@ def executed(path: Path, folder: Path) -> nbformat.NotebookNode:
 
 
 def shown(notebook: nbformat.NotebookNode) -> list[dict]:
-    """What every code cell shows: its printed text, which kinds of other outputs; the kinds alone where the text varies.
+    """What every code cell shows: its printed text, which kinds of other outputs; the kinds alone where the text
+    varies.
 
     Args:
         notebook: with outputs.
@@ -55,7 +56,8 @@ def shown(notebook: nbformat.NotebookNode) -> list[dict]:
 
 
 def _joined(outputs: list) -> list:
-    """Pieces of one stream as one, without what goes to stderr (progress); addresses of objects are not the same twice."""
+    """Pieces of one stream as one, without what goes to stderr (progress); addresses of objects are not the same
+    twice."""
     kept = []
     for output in outputs:
         if output.output_type == "stream" and output.name == "stderr":

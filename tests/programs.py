@@ -1,7 +1,7 @@
 """Which programs tests compile, as `jax.monitoring` tells: nearly all of the time of tests is compiling.
 
-Operations of JAX that a test calls outside of `jax.jit`, such as ``jnp.ones``, are programs of one operation, which compile in
-milliseconds; they do not count.
+Operations of JAX that a test calls outside of `jax.jit`, such as ``jnp.ones``, are programs of one operation, which
+compile in milliseconds; they do not count.
 """
 
 from collections import defaultdict
@@ -12,7 +12,8 @@ import pytest
 COMPILED = "/jax/core/compile/backend_compile_duration"
 """The event of `jax.monitoring` for a program that is compiled, or read from the cache on disk."""
 OPERATIONS = {name for module in (jax.lax, jax.numpy, jax.numpy.linalg) for name in dir(module)}
-"""Names of programs of a single operation; names that start with an underscore are of JAX or of helpers, and small too."""
+"""Names of programs of a single operation; names that start with an underscore are of JAX or of helpers, and small
+too."""
 
 
 class Programs:

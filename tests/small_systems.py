@@ -1,4 +1,5 @@
-"""One small system of every kind: which variables there are, which constraints, which forces, which kinetic energy, which scene.
+"""One small system of every kind: which variables there are, which constraints, which forces, which kinetic energy,
+which scene.
 
 Systems of functions have two slow and two fast variables in the plane where they have both, and share what they can.
 """
@@ -67,7 +68,8 @@ SLOW, FAST = jnp.array([1.0, 0.0]), jnp.array([0.02, -0.01])
 ANGLE = 0.1
 HANGING = SLOW - jnp.array([jnp.cos(ANGLE), jnp.sin(ANGLE)])
 ACROSS = 0.5 * jnp.array([jnp.sin(ANGLE), -jnp.cos(ANGLE)])
-"""The fast end of a rod from the slow point, near the rest of its spring, and a velocity across the rod: a gentle motion."""
+"""The fast end of a rod from the slow point, near the rest of its spring, and a velocity across the rod: a gentle
+motion."""
 
 
 def _system(masses, *potentials, **parts) -> vm.System:

@@ -74,7 +74,8 @@ STENCIL = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}
 
 
 def slopes(function, directions: np.ndarray, step: float = 0.01) -> np.ndarray:
-    """Derivatives at zero of a function along directions, the last axis, by differences of order 8, which compile nothing."""
+    """Derivatives at zero of a function along directions, the last axis, by differences of order 8, which compile
+    nothing."""
 
     def slope(direction):
         differences = ((k, function(k * step * direction) - function(-k * step * direction)) for k in STENCIL)
@@ -99,7 +100,8 @@ def phase(states) -> np.ndarray:
 def area_change(ends, dimension: int) -> float:
     """Relative change of ``omega(u, v)``, the symplectic form of one pair of random directions, between two states.
 
-    The states are ``ends(x)``, with x of `dimension` coordinates near zero. Where any other pair of directions changes, this one does.
+    The states are ``ends(x)``, with x of `dimension` coordinates near zero. Where any other pair of directions changes,
+    this one does.
     """
     pair = np.random.default_rng(0).standard_normal((2, dimension))
     pair /= np.linalg.norm(pair, axis=1, keepdims=True)

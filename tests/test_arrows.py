@@ -1,4 +1,5 @@
-"""Imports: each module of the package imports from modules before it, lazy and typed-only imports included; benchmarks import no tests."""
+"""Imports: each module of the package imports from modules before it, lazy and typed-only imports included; benchmarks
+import no tests."""
 
 import ast
 from collections.abc import Iterator
@@ -13,7 +14,8 @@ DENSE = "benchmarks.gail2014.dense"
 
 
 def modules(package: Path) -> dict[str, Path]:
-    """Files of all modules of a package by name; the face of the package itself is left out, since it imports all of them."""
+    """Files of all modules of a package by name; the face of the package itself is left out, since it imports all of
+    them."""
     names = {path: path.relative_to(package.parent).with_suffix("").parts for path in package.rglob("*.py")}
     named = {".".join(parts[:-1] if parts[-1] == "__init__" else parts): path for path, parts in names.items()}
     return {name: path for name, path in named.items() if name != package.name}
@@ -54,7 +56,10 @@ def test_no_module_imports_the_face_of_the_package():
 
 
 def test_benchmarks_and_tests_stand_beside_each_other():
-    """Benchmarks import no test; tests of benchmarks, and of pages that print their commands, import benchmarks. All others import the dense solve alone."""
+    """Benchmarks import no test; tests of benchmarks, and of pages that print their commands, import benchmarks.
+
+    All others import the dense solve alone.
+    """
     root = PACKAGE.parent
     for folder, other, allowed in (("benchmarks", "tests", ()), ("tests", "benchmarks", ("benchmarks", "pages"))):
         for path in (root / folder).rglob("*.py"):

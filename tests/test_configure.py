@@ -18,7 +18,8 @@ for line in sys.stdin:
         os._exit(0)
     print("ended", os.waitpid(child, 0)[1], flush=True)
 """
-"""Forks a process for each program that it reads: JAX, which is imported once, has no settings and has not started in any of them."""
+"""Forks a process for each program that it reads: JAX, which is imported once, has no settings and has not started in
+any of them."""
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +63,10 @@ except RuntimeError as error:
 """
     assert printed(program).splitlines() == [
         " ".join(["--xla_cpu_enable_fast_math=false", *FAST_LOOPS, "2 float64"]),
-        "configure: JAX has already started, its settings can no longer change; call vm.configure() before any array is made.",
+        (
+            "configure: JAX has already started, its settings can no longer change; call vm.configure() before any "
+            "array is made."
+        ),
     ]
 
 

@@ -184,7 +184,8 @@ def test_global_settings_stay_as_they_were():
     assert dict(matplotlib.rcParams) == before
 
 
-# --- nothing to show ---------------------------------------------------------------------------------------------------
+# --- nothing to show
+# ---------------------------------------------------------------------------------------------------
 
 EXACT = ReferenceSolution(np.zeros((2, 2)), np.zeros((2, 2)))
 
@@ -235,7 +236,8 @@ def is_drawn(figure) -> bool:
     return file.tell() > 1000
 
 
-# --- scenes in joint coordinates ---------------------------------------------------------------------------------------
+# --- scenes in joint coordinates
+# ---------------------------------------------------------------------------------------
 @pytest.fixture(scope="module")
 def sliding_door():
     """A cart on a rail with a door on a hinge, at rest at its start; nothing is computed."""

@@ -18,7 +18,8 @@ def test_a_refusal_is_caught_as_an_error_of_the_builtin_classes(builtin):
 
 
 def test_the_package_raises_refusals_only_by_their_class():
-    """A ValueError, TypeError or ImportError that the package raises itself would be shown as a fault of the program."""
+    """A ValueError, TypeError or ImportError that the package raises itself would be shown as a fault of the
+    program."""
     raised = [
         (path.name, node.lineno, name.id)
         for path in PACKAGE.rglob("*.py")

@@ -125,7 +125,8 @@ def cart() -> Problem:
     return Problem(system, zero, jnp.array([0.0, -0.5]), zero, jnp.array([0.4, 0.0]))
 
 
-# --- a pendulum: a point on a rod, at rest or on a pivot that swings, in still air -----------------------------------------
+# --- a pendulum: a point on a rod, at rest or on a pivot that swings, in still air
+# -----------------------------------------
 
 GRAVITY, MASS, LENGTH = 9.81, 2.0, 1.5
 

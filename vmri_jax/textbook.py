@@ -1,13 +1,13 @@
 """The whole method on one page: variational multirate integration as in a textbook, written for reading, not for speed.
 
-A macro step of length H carries a slow polynomial of degree r, and one fast polynomial of degree r on each of its ``num_micro``
-micro intervals. Both go through control points at Gauss-Lobatto nodes, S_0..S_r and F_0..F_{num_micro r}. The discrete
-Lagrangian is a sum over the terms of the Lagrangian, each at the nodes of its own quadrature rule,
+A macro step of length H carries a slow polynomial of degree r, and one fast polynomial of degree r on each of its
+``num_micro`` micro intervals. Both go through control points at Gauss-Lobatto nodes, S_0..S_r and F_0..F_{num_micro r}.
+The discrete Lagrangian is a sum over the terms of the Lagrangian, each at the nodes of its own quadrature rule,
 
     L_d(S, F) = sum over terms, over nodes i:  H w_i term(q(theta_i), qdot(theta_i)),
 
-and multipliers hold the constraints at the control nodes. With the quadrature weights absorbed in the multipliers the augmented
-action is
+and multipliers hold the constraints at the control nodes. With the quadrature weights absorbed in the multipliers the
+augmented action is
 
     A = L_d - sum_j lambda_j . g(node j) - sum_i nu_i . g_s(S_i)              (all control nodes but the last).
 
@@ -15,9 +15,10 @@ A step solves, from the momenta p at its start,
 
     p + D_first A = 0,    D_inner A = 0,    g = 0 and g_s = 0 at all control nodes but the first,
 
-and ends with ``p+ = D_last A``, projected onto the hidden constraints ``G v + dg/dt = 0``. Kicks are rules with nodes at the ends of
-the step; forces enter by their virtual work, and a composition is a sequence of steps. The steppers of `vmri_jax.simulate` solve the
-same equations faster; tests compare them with this page. Source: Ober-Bloebaum, Wenger, Gail, Leyendecker 2024, arXiv:2406.12991.
+and ends with ``p+ = D_last A``, projected onto the hidden constraints ``G v + dg/dt = 0``. Kicks are rules with nodes
+at the ends of the step; forces enter by their virtual work, and a composition is a sequence of steps. The steppers of
+`vmri_jax.simulate` solve the same equations faster; tests compare them with this page. Source: Ober-Bloebaum, Wenger,
+Gail, Leyendecker 2024, arXiv:2406.12991.
 """
 
 from collections.abc import Callable
@@ -72,7 +73,8 @@ def lagrange_polynomials(scheme: Scheme) -> list[Polynomial]:
 def quadrature_nodes(placed: PlacedRule, num_micro: int):
     """Nodes theta_i in [0, 1], the micro interval in which each lies, and weights.
 
-    Where two micro intervals meet, each copy of a rule on the micro grid has a node of its own, because the fast velocity has two values there.
+    Where two micro intervals meet, each copy of a rule on the micro grid has a node of its own, because the fast
+    velocity has two values there.
     """
     nodes = np.array(placed.rule.nodes)
     if placed.grid == "macro":
@@ -97,7 +99,8 @@ def sample(scheme: Scheme, placed: PlacedRule, slow, fast, macro_dt) -> Samples:
     def values(polynomials, arguments):
         return np.stack([polynomial(arguments) for polynomial in polynomials], axis=1)
 
-    # q_s(theta) = sum_j l_j(theta) S_j and its derivative with respect to t = H theta; the fast path alike, on intervals of length H / num_micro
+    # q_s(theta) = sum_j l_j(theta) S_j and its derivative with respect to t = H theta; the fast path alike, on
+    # intervals of length H / num_micro
     return Samples(
         theta,
         values(basis, theta) @ slow,
@@ -109,14 +112,16 @@ def sample(scheme: Scheme, placed: PlacedRule, slow, fast, macro_dt) -> Samples:
 
 
 def discrete_lagrangian(system: System, scheme: Scheme) -> Callable:
-    """The discrete Lagrangian ``L_d = sum H w_i (T - V - W - sum_j V_j)`` of a macro step, ``L_d(slow, fast, macro_dt) -> ()``.
+    """The discrete Lagrangian ``L_d = sum H w_i (T - V - W - sum_j V_j)`` of a macro step,
+    ``L_d(slow, fast, macro_dt) -> ()``.
 
-    Arguments of L_d: (r + 1, n_s) slow and (num_micro r + 1, n_f) fast control points, shared ones once, and the length H of the step. Its
-    derivatives by the control points are ``jax.grad(L_d, argnums=(0, 1))``; the first and the last of them are the `discrete_legendre` transforms.
+    Arguments of L_d: (r + 1, n_s) slow and (num_micro r + 1, n_f) fast control points, shared ones once, and the length
+    H of the step. Its derivatives by the control points are ``jax.grad(L_d, argnums=(0, 1))``; the first and the last
+    of them are the `discrete_legendre` transforms.
 
     Raises:
-        ValueError: mollified kicks, corrected kicks without a ConstantMass, velocities on the border of two micro intervals; of L_d, other numbers
-            of control points.
+        ValueError: mollified kicks, corrected kicks without a ConstantMass, velocities on the border of two micro
+            intervals; of L_d, other numbers of control points.
     """
     check("discrete_lagrangian", system, scheme)
 
@@ -191,7 +196,8 @@ def potentials(system: System, scheme: Scheme, macro_dt) -> tuple[Callable, Call
 
 
 def virtual_work(system: System, scheme: Scheme, path, along, t, macro_dt):
-    """Lagrange-d'Alembert: ``sum H w_i F(t_i, q_i, v_i) . Q_i``, with q_i and v_i on the path `along`, which is not varied, and Q_i on `path`."""
+    """Lagrange-d'Alembert: ``sum H w_i F(t_i, q_i, v_i) . Q_i``, with q_i and v_i on the path `along`, which is not
+    varied, and Q_i on `path`."""
     known, varied = (sample(scheme, scheme.force, slow, fast, macro_dt) for slow, fast in (along, path))
     f_s, f_f = jax.vmap(system.forces)(t + macro_dt * known.theta, known.q_s, known.q_f, known.v_s, known.v_f)
     weights = varied.weights[:, None]
@@ -207,7 +213,8 @@ def constraints(system: System, scheme: Scheme, slow, fast, t, macro_dt):
 
 
 def solver(residual: Callable, guess, max_iterations: int = 50):
-    """The root of ``residual(x)``, with the shapes of `guess`, by Newton's method; NaN where the method does not converge.
+    """The root of ``residual(x)``, with the shapes of `guess`, by Newton's method; NaN where the method does not
+    converge.
 
     The method iterates until a change is below 1e-9 of x, and then once more, which reaches round-off. The root can be
     differentiated, by the implicit function theorem.
@@ -282,14 +289,16 @@ def step(system: System, scheme: Scheme | Composition, state: State, macro_dt) -
         return jnp.concatenate([state.q_s[None], x.slow]), jnp.concatenate([state.q_f[None], x.fast])
 
     def action(path, along, x: Unknowns):
-        """A times h: Newton's matrix then has entries of the size of masses and constraint Jacobians at every step size."""
+        """A times h: Newton's matrix then has entries of the size of masses and constraint Jacobians at every step
+        size."""
         slow, fast = path
         g, g_slow = constraints(system, scheme, slow, fast, t, macro_dt)
         free = L_d(slow, fast, macro_dt) + virtual_work(system, scheme, path, along, t, macro_dt)
         return micro_dt * free - jnp.sum(x.multiplier * g[:-1]) - jnp.sum(x.slow_multiplier * g_slow[:-1])
 
     def slots(x: Unknowns):
-        """h D A: derivatives with respect to every slow and every fast control point, with the forces of the path held fixed."""
+        """h D A: derivatives with respect to every slow and every fast control point, with the forces of the path held
+        fixed."""
         return jax.grad(action)(path(x), path(x), x)
 
     # h (p + D_first A) = 0,    h D_inner A = 0,    g = 0 and g_s = 0 at all control nodes but the first
@@ -316,8 +325,9 @@ def check(caller: str, system: System, scheme: Scheme) -> None:
     """Refuse schemes that this page leaves out, or that have no meaning."""
     if scheme.slow.mollified:
         raise Refused(
-            f"{caller}: the slow potential of this scheme is mollified, it depends on more than the control points of a step; "
-            "take macro_step or simulate, or a scheme without mollified kicks, e.g. explicit_slow(num_micro)."
+            f"{caller}: the slow potential of this scheme is mollified, it depends on more than the control points of "
+            "a step; take macro_step or simulate, or a scheme without mollified kicks, e.g. "
+            "explicit_slow(num_micro)."
         )
     if (scheme.slow.gradient_corrected or scheme.fast.gradient_corrected) and not system.has_constant_mass:
         raise Refused(f"{caller}: corrected kicks need a System whose kinetic is a ConstantMass.")

@@ -1,4 +1,5 @@
-"""Time to an error: single and micro steps of kicks, compositions, three rates, one interval of high degree, and other programs."""
+"""Time to an error: single and micro steps of kicks, compositions, three rates, one interval of high degree, and other
+programs."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -30,7 +31,8 @@ COUNTS = 30
 SLOWEST, SLOWEST_PEER = 60.0, 10.0
 """Seconds of a run of ours and of another program after which a ladder ends."""
 LONG = 5.0
-"""Seconds of a run above which it is not timed again, in turn with the others; a larger value makes the benchmark take longer."""
+"""Seconds of a run above which it is not timed again, in turn with the others; a larger value makes the benchmark take
+longer."""
 LINE = "kicks, N = 1"
 """The scheme whose time the gain of every other one is measured by."""
 
@@ -43,7 +45,8 @@ class Case:
     problem: the system with its start; ``problem(three_rates=True)`` has the potential `MIDDLE`.
     num_micro: numbers of micro steps of kicks, the smallest first.
     composed: compositions of kicks, with one micro step and with the largest number of them but one.
-    every: micro steps from one kick of `MIDDLE` to the next, with the largest number of micro steps; 0 for no three rates.
+    every: micro steps from one kick of `MIDDLE` to the next, with the largest number of micro steps; 0 for no three
+        rates.
     degree: of one interval without micro steps; 0 for none, as where Newton's matrix is large.
     t_end: simulated time.
     errors: largest and smallest error of a ladder of steps.
@@ -68,7 +71,8 @@ class Case:
 
 
 def sizes(name: str, only: Sequence[str] = ()) -> list[Case]:
-    """ "quick": 8 molecules, and the spacecraft in a field of degree 20; "full": 8 to 256 molecules, the teacher, and the spacecraft.
+    """ "quick": 8 molecules, and the spacecraft in a field of degree 20; "full": 8 to 256 molecules, the teacher, and
+    the spacecraft.
 
     Args:
         name: "quick" or "full".

@@ -55,8 +55,8 @@ FAMILIES: dict[str, tuple[Callable[[str], bool], int | str, str, str, float]] = 
     "OpenMM": (lambda name: name.startswith("OpenMM"), "rod", "--", "D", 1.4),
     "C loop": (lambda name: name.startswith("C loop"), "ink", "--", "^", 1.4),
 }
-"""Of each family: its schemes, the colour of the theme, line, marker and width. Micro steps are in full colour, single steps of the same order
-beside them, other programs dashed."""
+"""Of each family: its schemes, the colour of the theme, line, marker and width. Micro steps are in full colour, single
+steps of the same order beside them, other programs dashed."""
 
 
 def families(curves: Mapping[str, Any], target: float) -> dict[str, tuple[str, Any]]:

@@ -4,16 +4,17 @@ The potential of a mass at ``x = (x, y, z)`` with ``r = |x|`` and ``(s, t, u) = 
 
     U = -mu / r (1 + sum_n (R / r)^n sum_m (C_nm Re (s + i t)^m + S_nm Im (s + i t)^m) A_nm(u)),        2 <= n <= degree
 
-with fully normalised coefficients and the functions ``A_nm(u) = P_nm(u) / (1 - u^2)^(m / 2)`` of Pines, which have no singularity at the poles. Their
-recursion by growing n,
+with fully normalised coefficients and the functions ``A_nm(u) = P_nm(u) / (1 - u^2)^(m / 2)`` of Pines, which have no
+singularity at the poles. Their recursion by growing n,
 
     A_nn = sqrt((2 n + 1) / (2 n)) A_n-1,n-1,        A_nm = a_nm u A_n-1,m - b_nm A_n-2,m,
 
-is stable. S. Pines, Uniform representation of the gravitational potential and its derivatives, AIAA J. 11 (1973); J. B. Lundberg, B. E. Schutz,
-Recursion formulas of Legendre functions for use with nonsingular geopotential models, J. Guidance 11 (1988).
+is stable. S. Pines, Uniform representation of the gravitational potential and its derivatives, AIAA J. 11 (1973); J. B.
+Lundberg, B. E. Schutz, Recursion formulas of Legendre functions for use with nonsingular geopotential models, J.
+Guidance 11 (1988).
 
-Coefficients are random, of the size that Kaula's rule gives to those of the Earth: standard deviation ``1e-5 / n^2`` at degree n; only that of the
-flattening is set.
+Coefficients are random, of the size that Kaula's rule gives to those of the Earth: standard deviation ``1e-5 / n^2`` at
+degree n; only that of the flattening is set.
 """
 
 from functools import cache, partial
@@ -106,7 +107,8 @@ def masses() -> np.ndarray:
 
 
 def places(q_f):
-    """(5, 3) hub and tips, from the centre of the Earth: coordinates are differences from the place of the hub at the start, to lose no digits."""
+    """(5, 3) hub and tips, from the centre of the Earth: coordinates are differences from the place of the hub at the
+    start, to lose no digits."""
     return q_f.reshape(-1, 3) + jnp.array([RADIUS + ALTITUDE, 0.0, 0.0])
 
 

@@ -1,4 +1,5 @@
-"""Molecules with all pairs, and a network with its student: each with one dear force, and with that force split over two rates."""
+"""Molecules with all pairs, and a network with its student: each with one dear force, and with that force split over
+two rates."""
 
 from functools import partial
 from itertools import combinations, pairwise
@@ -9,7 +10,8 @@ import numpy as np
 import vmri_jax as vm
 
 BOND, STIFFNESS = 0.8, 5e4
-"""Length of a bond and its stiffness with unit masses: frequency 316, about 30 times the frequency of neighbours in the lattice, as of nitrogen."""
+"""Length of a bond and its stiffness with unit masses: frequency 316, about 30 times the frequency of neighbours in the
+lattice, as of nitrogen."""
 SPACING, SPEED = 1.9, 0.5
 """Distance of the molecules of the lattice, in diameters of an atom, and the size of their random velocities."""
 WIDTHS = {"student": (16,), "teacher": (300, 300)}

@@ -37,7 +37,8 @@ class CostRow:
     iterations: most Newton iterations of a step.
     solved_by: name of the `Method` that took the steps, which "auto" chooses, as in ``run.info.method``.
     result: name of the `Result` of the run.
-    us_in_short_step: microseconds per micro step in the macro step of `Curve.settled` micro steps; NaN where that was not timed.
+    us_in_short_step: microseconds per micro step in the macro step of `Curve.settled` micro steps; NaN where that was
+        not timed.
     samples: microseconds per micro step, in turns with all other programs of the study; not in files.
     """
 
@@ -94,10 +95,10 @@ class Curve:
     method: of Newton's iteration: a matrix of `vmri_jax.Solver`, or "dense", the method of the reference paper.
     problem: system and start.
     num_micro: numbers of micro steps per macro step.
-    t_end: simulated time, rounded to whole macro steps: long enough (thousands of micro steps for small systems) that the start of a program
-        takes a negligible part of the time.
-    settled: number of micro steps in whose macro step the runs with more of them are timed, too, by the same programs: what their cost is
-        without the length of their own macro steps. 0 for none.
+    t_end: simulated time, rounded to whole macro steps: long enough (thousands of micro steps for small systems) that
+        the start of a program takes a negligible part of the time.
+    settled: number of micro steps in whose macro step the runs with more of them are timed, too, by the same programs:
+        what their cost is without the length of their own macro steps. 0 for none.
     """
 
     method: str
@@ -119,7 +120,8 @@ def cost_study(
 ) -> CostStudy:
     """Time ``scheme(n)`` for every num_micro n of every curve; times are per unit of simulated time and per micro step.
 
-    All programs take turns in every repeat, so that a slow moment of the machine hits all of them; a row has the median.
+    All programs take turns in every repeat, so that a slow moment of the machine hits all of them; a row has the
+    median.
 
     Args:
         label: name of this scheme or system in the rows.

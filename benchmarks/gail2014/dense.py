@@ -1,9 +1,11 @@
-"""The dense solve of the reference study: Newton's iteration on all unknowns of a macro step at once, with one dense matrix.
+"""The dense solve of the reference study: Newton's iteration on all unknowns of a macro step at once, with one dense
+matrix.
 
     vm.simulate(problem, scheme, solver=dense(), macro_dt=0.01, num_steps=100)
 
-The matrix is the derivative of the whole residual, factorised by LAPACK: O(num_micro^3) operations per macro step. Where the iteration fails,
-parts of the step are solved first (`vmri_jax.steppers.continuation`). Tests and studies take it as their reference.
+The matrix is the derivative of the whole residual, factorised by LAPACK: O(num_micro^3) operations per macro step.
+Where the iteration fails, parts of the step are solved first (`vmri_jax.steppers.continuation`). Tests and studies take
+it as their reference.
 """
 
 from dataclasses import dataclass
@@ -26,10 +28,13 @@ from vmri_jax.steppers.solved import Solution, StepSolver, status_of
 from vmri_jax.steppers.solver import iterated
 
 MARGIN = 100.0
-"""Safety factor on the contraction that quadratic convergence predicts for the next update. With a larger one most steps take one more iteration;
-with a smaller one the test trusts an update that is small by chance."""
+"""Safety factor on the contraction that quadratic convergence predicts for the next update. With a larger one most
+steps take one more iteration; with a smaller one the test trusts an update that is small by chance."""
 PLAIN_ITERATIONS = 15
-"""Most Newton iterations of each attempt at the whole step, before parts of the step are tried. A larger number makes failing runs slower."""
+"""Most Newton iterations of each attempt at the whole step, before parts of the step are tried.
+
+A larger number makes failing runs slower.
+"""
 
 
 def dense(tolerance: float = 1e-12, max_iterations: int = 100) -> vm.Solver:
@@ -81,9 +86,9 @@ class Dense(StepSolver):
     def _iterate(self, equations: StepEquations, guess: Unknowns, limit, is_first):
         """Newton's iteration from a guess: (x, x, `Result`, iterations).
 
-        Converged when the sum of all further updates is accepted (`Accepted`). With ``theta = |d_k| / |d_(k-1)|``, every further update
-        is expected to shrink by ``s = theta min(1, MARGIN theta)``: quadratic convergence with a margin, linear convergence at worst.
-        The sum is ``|d_k| s / (1 - s)``.
+        Converged when the sum of all further updates is accepted (`Accepted`). With ``theta = |d_k| / |d_(k-1)|``,
+        every further update is expected to shrink by ``s = theta min(1, MARGIN theta)``: quadratic convergence with a
+        margin, linear convergence at worst. The sum is ``|d_k| s / (1 - s)``.
         """
         weights = Weights.of(equations)
         accepted = Accepted.of(equations, self.settings, weights)
@@ -106,7 +111,8 @@ class Dense(StepSolver):
 
 
 def _result(last: Iterate, size, residual: Unknowns, *, is_roundoff, is_last):
-    """`Result` of an iteration, or RUNNING, from the iterate before, its residual and the `size` of the new update as in `Iterate`."""
+    """`Result` of an iteration, or RUNNING, from the iterate before, its residual and the `size` of the new update as
+    in `Iterate`."""
     # sum of all further updates, |d_k| s / (1 - s) with s = theta min(1, MARGIN theta)
     theta = size / jnp.maximum(last.size, jnp.finfo(float).tiny)
     s = theta * jnp.minimum(1.0, MARGIN * theta)

@@ -24,16 +24,24 @@ SETTLED = 10
 
 
 SAMPLE = 0.02
-"""Least seconds of a sample of a time. The medians of several short samples in turns bear a busy machine better than means of long ones."""
+"""Least seconds of a sample of a time.
+
+The medians of several short samples in turns bear a busy machine better than means of long ones.
+"""
 NO_OVERHEAD = "compiled code has hardly any cost of a macro step that more micro steps could share"
 """Why a dense solve is cheapest with fewer micro steps here than in the paper."""
-LONG_STEPS = "longer macro steps take more passes of Newton's iteration, and newer matrices: in macro steps of one length the cost is {:.2f} times"
-"""Reason for which the cost of a structured solve grows with the macro step, while macro steps of one length cost the same."""
+LONG_STEPS = (
+    "longer macro steps take more passes of Newton's iteration, and newer matrices: in macro steps of one length the "
+    "cost is {:.2f} times"
+)
+"""Reason for which the cost of a structured solve grows with the macro step, while macro steps of one length cost the
+same."""
 
 
 @contextmanager
 def compiled_quickly() -> Iterator[None]:
-    """Within this context programs are compiled without most optimisations, in half the time: for errors, not for times."""
+    """Within this context programs are compiled without most optimisations, in half the time: for errors, not for
+    times."""
     before = jax.config.read("jax_disable_most_optimizations")
     jax.config.update("jax_disable_most_optimizations", True)
     try:
@@ -46,8 +54,8 @@ def compiled_quickly() -> Iterator[None]:
 class Check:
     """One number held against what the source, e.g. "paper" or "theory", expects of it.
 
-    kind: "order"; "turn" or "minimum" of the dense solve; "structured", in macro steps of one length, or "longer", in macro steps that grow with
-        the number of micro steps.
+    kind: "order"; "turn" or "minimum" of the dense solve; "structured", in macro steps of one length, or "longer", in
+        macro steps that grow with the number of micro steps.
     reason: why the number is known to differ from the source; empty where it has to agree.
     """
 
@@ -222,7 +230,12 @@ def _cost_checks(panel: CostPanel, study: CostStudy) -> list[Check]:
     in_short_step = ratio if most is settled else most.us_in_short_step / settled.us_per_micro_step
     quantity = f"{panel.title}, exact: cost at {most.num_micro} micro steps over that at {settled.num_micro}"
     bound = f"at most {UPTURN:g}", "theory"
-    of_one_length = f"{quantity}, in macro steps of one length", *bound, f"{in_short_step:.2f}", in_short_step <= UPTURN
+    of_one_length = (
+        f"{quantity}, in macro steps of one length",
+        *bound,
+        f"{in_short_step:.2f}",
+        in_short_step <= UPTURN,
+    )
     reason = LONG_STEPS.format(in_short_step) if in_short_step <= UPTURN else ""
     of_one_micro_step = quantity, *bound, f"{ratio:.2f}", ratio <= UPTURN, "longer", reason
     return [*checks, Check(*of_one_length, "structured"), Check(*of_one_micro_step)]

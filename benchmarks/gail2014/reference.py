@@ -1,8 +1,8 @@
 """The reference study as data: which figures there are, what they run, and what the paper saw.
 
 Gail, Leyendecker, Ober-Bloebaum (2014), "On the role of quadrature rules and system dimensions in variational multirate
-integrators"; orders of higher degree from Ober-Bloebaum, Wenger, Gail, Leyendecker (2024), arXiv:2406.12991. The explicit
-schemes of the paper have order 1: they have alpha = 0 here.
+integrators"; orders of higher degree from Ober-Bloebaum, Wenger, Gail, Leyendecker (2024), arXiv:2406.12991. The
+explicit schemes of the paper have order 1: they have alpha = 0 here.
 """
 
 from dataclasses import dataclass, replace
@@ -41,8 +41,8 @@ class Size:
     """How much is run.
 
     fpu_steps, tsp_steps: macro steps of the convergence figures.
-    fpu, sam, chain: micro steps per macro step, of the dense and of the structured solve, in Fig. 4 and 5; the structured cost is compared
-        from about `SETTLED` on.
+    fpu, sam, chain: micro steps per macro step, of the dense and of the structured solve, in Fig. 4 and 5; the
+        structured cost is compared from about `SETTLED` on.
     chain_lengths: l in Fig. 5.
     others: solvers beside the dense and the structured one in Fig. 4.
     largest_dense: most unknowns for which the dense solve is run.
@@ -118,8 +118,8 @@ def _cost_figures(size: Size) -> tuple[CostFigure, ...]:
         CostFigure(
             "fig5",
             "Computing time of longer chains",
-            "The cheapest number of micro steps falls with the number of springs: fully implicit from 12 at l = 70 to 1, "
-            "no gain, from l = 110; explicit slow from 12 to 8 (l = 120); fully explicit from 8 to 4 (l = 140).",
+            "The cheapest number of micro steps falls with the number of springs: fully implicit from 12 at l = 70 to "
+            "1, no gain, from l = 110; explicit slow from 12 to 8 (l = 120); fully explicit from 8 to 4 (l = 140).",
             chains,
         ),
     )

@@ -1,4 +1,5 @@
-"""`python -m benchmarks gail2014` runs the reference study and writes it down: figures, tables and one self-contained HTML report."""
+"""`python -m benchmarks gail2014` runs the reference study and writes it down: figures, tables and one self-contained
+HTML report."""
 
 import base64
 import time
@@ -71,10 +72,19 @@ class Report:
         )
         return [
             f"Orders: {agreeing['order']} as expected, of positions and of momenta.",
-            f"Dense solve: {agreeing['turn']} curves of cost turn up again; cheapest numbers of micro steps: {'; '.join(minima) or 'none'}.",
-            f"Structured solve: with the most micro steps a micro step costs at most {most['structured']:g} times as much as with about {SETTLED} "
-            f"in macro steps of one length, at most {most['longer']:g} times in macro steps that grow with their number.",
-            f"Different from what was expected: {surprising or 'nothing'}. Different for reasons that the page gives: {known or 'nothing'}.",
+            (
+                f"Dense solve: {agreeing['turn']} curves of cost turn up again; cheapest numbers of micro steps: "
+                f"{'; '.join(minima) or 'none'}."
+            ),
+            (
+                f"Structured solve: with the most micro steps a micro step costs at most {most['structured']:g} times "
+                f"as much as with about {SETTLED} in macro steps of one length, at most {most['longer']:g} times in "
+                "macro steps that grow with their number."
+            ),
+            (
+                f"Different from what was expected: {surprising or 'nothing'}. Different for reasons that the page "
+                f"gives: {known or 'nothing'}."
+            ),
             f"Page: {self.path}",
         ]
 

@@ -1,4 +1,5 @@
-"""Hard cases of this project beside those of `vmri check`: where multirate variational integrators break, and what counts as a pass."""
+"""Hard cases of this project beside those of `vmri check`: where multirate variational integrators break, and what
+counts as a pass."""
 
 import importlib
 import inspect
@@ -16,7 +17,8 @@ MODULES = ("resonance", "large_steps", "chains", "long_runs", "encounters")
 
 
 def hard_case(title: str) -> Callable[..., Case]:
-    """Makes a `Case` of ``run(full)``, whose docstring is the set-up, an empty line and the criterion; the catalogue numbers it."""
+    """Makes a `Case` of ``run(full)``, whose docstring is the set-up, an empty line and the criterion; the catalogue
+    numbers it."""
 
     def made(run: Callable[[bool], Outcome]) -> Case:
         setup, criterion = inspect.cleandoc(run.__doc__ or "").split("\n\n")

@@ -1,4 +1,5 @@
-"""A constraint that hardly sees the fast variables, linkages through singular configurations, a chain that hardly stretches."""
+"""A constraint that hardly sees the fast variables, linkages through singular configurations, a chain that hardly
+stretches."""
 
 import numpy as np
 
@@ -95,8 +96,8 @@ def stiff_springs_in_a_chain(full: bool) -> Outcome:
     band = max(energy(t, n, float(abs(t.energy[0]))).band for t, n in ((implicit, steps), (explicit, 100_000)))
     largest = ", ".join(f"{s.max():.2f} (omega h = {name})" for name, s in strain.items())
     return Outcome(
-        f"{steps} implicit steps: {status(implicit)}, 1e5 explicit ones: {status(explicit)}; strain over that at rest at most "
-        f"{largest}, in the second half {growth:.2f} x that of the first; relative energy error {band:.1e}",
+        f"{steps} implicit steps: {status(implicit)}, 1e5 explicit ones: {status(explicit)}; strain over that at rest "
+        f"at most {largest}, in the second half {growth:.2f} x that of the first; relative energy error {band:.1e}",
         implicit.success
         and explicit.success
         and max(map(np.max, strain.values())) < 3

@@ -35,8 +35,8 @@ def penalty_contact(full: bool) -> Outcome:
         jumps.append(np.abs(np.diff(level)).max())
         lost.append(abs(level[-1] - level[0]))
     return Outcome(
-        f"{bounces} bounces, omega h = 0.05: height within {max(heights):.1e}, largest jump of the relative energy at a bounce "
-        f"{jumps[0]:.1e} (explicit), {jumps[1]:.1e} (implicit)",
+        f"{bounces} bounces, omega h = 0.05: height within {max(heights):.1e}, largest jump of the relative energy at "
+        f"a bounce {jumps[0]:.1e} (explicit), {jumps[1]:.1e} (implicit)",
         max(heights) < 0.01 and max(jumps) < 1e-3,
         {"height": max(heights), "jump_explicit": jumps[0], "jump_implicit": jumps[1], "lost": max(lost)},
     )
@@ -110,8 +110,8 @@ def three_time_scales(full: bool) -> Outcome:
     at_end = np.abs(actions[0][-1] - actions[1][-1])
     third = actions[0][:, 2].max()
     return Outcome(
-        f"omega_3 h = 100: {status(coarse)}; at t = 50 I_1, I_2 within {at_end[0]:.3f}, {at_end[1]:.3f} of the resolved run, "
-        f"I_3 stays below {third:.0e}",
+        f"omega_3 h = 100: {status(coarse)}; at t = 50 I_1, I_2 within {at_end[0]:.3f}, {at_end[1]:.3f} of the "
+        f"resolved run, I_3 stays below {third:.0e}",
         coarse.success and at_end[:2].max() < 0.05 and third < 0.05,
         {"I_1": at_end[0], "I_2": at_end[1], "I_3": third},
     )

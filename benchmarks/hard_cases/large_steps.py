@@ -75,7 +75,8 @@ def large_constrained_step(full: bool) -> Outcome:
     newton = _pendulum_run(problem, 0.05, steps, DENSE)
     kept = float(np.nanmax(np.asarray(large.constraint_residual)[:, 0]))
     return Outcome(
-        f"H = 0.05: {iterations(newton)} iterations, {status(usual)} in {iterations(usual)} passes; H = 0.2: {status(large)}, constraint {kept:.1e}",
+        f"H = 0.05: {iterations(newton)} iterations, {status(usual)} in {iterations(usual)} passes; H = 0.2: "
+        f"{status(large)}, constraint {kept:.1e}",
         usual.success and newton.success and iterations(newton) <= 4 and kept < 1e-10,
         {
             "iterations": iterations(newton),

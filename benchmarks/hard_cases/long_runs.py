@@ -39,8 +39,8 @@ def hanging_pendulum() -> vm.Problem:
 def smooth_shift(trajectory: vm.Trajectory, num_steps: int, scale: float) -> float:
     """Change of the mean energy per 1e5 steps, between the halves of a run, for motion that is quasi-periodic.
 
-    The means are weighted by ``exp(-1 / (x (1 - x)))``, x from 0 to 1: they converge faster than any power of the length
-    (Das, Saiki, Sander and Yorke 2017), so that the shift is not hidden by oscillations.
+    The means are weighted by ``exp(-1 / (x (1 - x)))``, x from 0 to 1: they converge faster than any power of the
+    length (Das, Saiki, Sander and Yorke 2017), so that the shift is not hidden by oscillations.
     """
     e = np.asarray(trajectory.energy) / scale
     half = len(e) // 2
@@ -53,8 +53,8 @@ def smooth_shift(trajectory: vm.Trajectory, num_steps: int, scale: float) -> flo
 def constraints_for_long(full: bool) -> Outcome:
     """triple pendulum, fully_implicit, num_micro 5, H = 0.01, 1e6 steps
 
-    position constraint below 1e-12, relative energy shift below 1e-6 per 1e5 steps; no drift seen in chaotic motion, nor of the
-    shadow energy of the hanging one
+    position constraint below 1e-12, relative energy shift below 1e-6 per 1e5 steps; no drift seen in chaotic motion,
+    nor of the shadow energy of the hanging one
     """
     steps = 1_000_000 if full else 200_000  # in fewer chaotic motion alone may move the mean by half of the band
     wild, calm = vm.systems.triple_spherical_pendulum(), hanging_pendulum()
@@ -65,8 +65,9 @@ def constraints_for_long(full: bool) -> Outcome:
     meter = drift_meter(calm, vm.fully_implicit(5), 0.01, METERED)
     assert meter is not None
     return Outcome(
-        f"{steps:.0e} steps: |g| {position:.1e}, |G v| {velocity:.1e}; relative energy per 1e5 steps: hanging {shift:.0e}, "
-        f"chaotic {change.drift:.0e} in a band of {change.band:.1e}; {METERED:.0e} steps hanging, {meter}",
+        f"{steps:.0e} steps: |g| {position:.1e}, |G v| {velocity:.1e}; relative energy per 1e5 steps: hanging "
+        f"{shift:.0e}, chaotic {change.drift:.0e} in a band of {change.band:.1e}; {METERED:.0e} steps hanging, "
+        f"{meter}",
         position < 1e-12 and abs(shift) < 1e-6 and not change.drifts and not meter.drifts,
         {
             "constraint": position,
@@ -126,8 +127,8 @@ def chaotic_pendulum(full: bool) -> Outcome:
         ends.append(positions(run(problem, scheme, h, round(1 / h), save=round(1 / h)))[-1])
     order = vm.diagnostics.fit_order(steps[:-2], [difference(a, ends[-1]) for a in ends[:-2]]).order
     return Outcome(
-        f"t = {t_end:g}: {status(trajectory)}, |g| {position:.1e}, energy error {change.band:.1e} of the fall; order {order:.2f} "
-        "on t <= 1",
+        f"t = {t_end:g}: {status(trajectory)}, |g| {position:.1e}, energy error {change.band:.1e} of the fall; order "
+        f"{order:.2f} on t <= 1",
         position < 1e-12 and change.band < 1e-2 and abs(order - 2) < 0.2,
         {"constraint": position, "band": change.band, "order": order},
     )

@@ -82,7 +82,8 @@ def combination_resonance(full: bool) -> Outcome:
     measured = np.polyfit(k[len(k) // 3 :], np.log(e[len(k) // 3 :]) / 2, 1)[0]  # energies grow as squares
     advice = advise(model, scheme, macro_dt=at / 50.0)
     return Outcome(
-        f"growth {growth:.2e} per step from the eigenvalues, {measured:.2e} in a run of {steps} steps; {advised(advice)}",
+        f"growth {growth:.2e} per step from the eigenvalues, {measured:.2e} in a run of {steps} steps; "
+        f"{advised(advice)}",
         abs(growth / 8.4e-4 - 1) < 0.2 and abs(measured / growth - 1) < 0.2 and not advice.ok,
         {"growth": growth, "growth_of_run": measured, "warned": not advice.ok},
     )

@@ -19,7 +19,8 @@ PUBLISHED = np.array(
         *(0.5244099658805304, 0.5347301163226948, 1.048080741042263),
     ]
 )
-"""Angles of the squeezer at t = 0.03 s, rad: E. Hairer, G. Wanner, Solving Ordinary Differential Equations II, VII.7."""
+"""Angles of the squeezer at t = 0.03 s, rad: E. Hairer, G. Wanner, Solving Ordinary Differential Equations II,
+VII.7."""
 
 
 # --- a satellite with two booms --------------------------------------------------------------------------------------

@@ -25,7 +25,8 @@ OURS = ("joint", "directors", "functions")
 
 @dataclass(frozen=True)
 class Size:
-    """Mechanisms, numbers of micro steps in joint coordinates and by directors, errors, longest run (s), samples of a time.
+    """Mechanisms, numbers of micro steps in joint coordinates and by directors, errors, longest run (s), samples of a
+    time.
 
     ways: beginnings of names, of which one is asked for; all by default.
     """
@@ -92,7 +93,8 @@ def _error(mechanism: Mechanism, centres, judge: np.ndarray, end) -> float:
 
 
 def timed(mechanism: Mechanism, title: str, found: dict[str, list[Point]], size: Size) -> list[dict]:
-    """A row for each level and way: the cheapest setting that reaches the level, timed in turns with those of the other ways."""
+    """A row for each level and way: the cheapest setting that reaches the level, timed in turns with those of the other
+    ways."""
     rows = []
     for level in size.levels:
         best = {way: some[0] for way, points in found.items() if (some := candidates(points, level))}

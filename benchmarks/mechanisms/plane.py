@@ -1,4 +1,5 @@
-"""Mechanisms in the plane as data, and their equations in coordinates chosen by hand: nothing here comes from the package.
+"""Mechanisms in the plane as data, and their equations in coordinates chosen by hand: nothing here comes from the
+package.
 
 With the poses X(q) = (x, y, angle) of all bars, masses W and the potential V(X),
 

@@ -1,4 +1,5 @@
-"""Mechanisms as scenes, by directors or in joint coordinates, and as plain functions of the coordinates chosen by hand."""
+"""Mechanisms as scenes, by directors or in joint coordinates, and as plain functions of the coordinates chosen by
+hand."""
 
 import jax.numpy as jnp
 import numpy as np

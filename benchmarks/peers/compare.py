@@ -79,7 +79,8 @@ def sizes(name: str, only: Sequence[str] = (), peers: Sequence[str] = ()) -> Siz
 
 
 def load(peer: str) -> Any:
-    """The module of a peer, if its package is installed, with equations by automatic differentiation where its name says so."""
+    """The module of a peer, if its package is installed, with equations by automatic differentiation where its name
+    says so."""
     module = importlib.import_module(f"benchmarks.peers.{PEERS[peer]}")
     if not peer.endswith("autodiff"):
         return module

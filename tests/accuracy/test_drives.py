@@ -1,4 +1,5 @@
-"""Forces that act for a short time: runs of an accuracy see them, and runs with steps of the user say where they do not."""
+"""Forces that act for a short time: runs of an accuracy see them, and runs with steps of the user say where they do
+not."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -42,7 +43,8 @@ def oscillator(kind: float, center: float, width: float, size: float) -> vm.Prob
 
 
 def motion(t, params) -> np.ndarray:
-    """``x(t) = cos t + int_0^t sin(t - s) F(s) ds``, by Gauss quadrature between times among which are t, and all jumps and kinks of F."""
+    """``x(t) = cos t + int_0^t sin(t - s) F(s) ds``, by Gauss quadrature between times among which are t, and all jumps
+    and kinks of F."""
     t = np.minimum(t, LENGTH)
     dense = params["center"] + params["width"] * np.linspace(-8, 8, 1601)
     edges = np.unique(np.clip(np.concatenate([np.linspace(0, LENGTH, 20001), dense, t]), 0, LENGTH))

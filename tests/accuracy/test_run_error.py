@@ -1,4 +1,5 @@
-"""Estimated errors of runs against references, their shares against the limits of each grid, and how they are printed."""
+"""Estimated errors of runs against references, their shares against the limits of each grid, and how they are
+printed."""
 
 from dataclasses import replace
 
@@ -176,8 +177,8 @@ def test_the_order_is_that_of_all_potentials():
 
 
 def test_past_a_singular_configuration():
-    """A parallelogram of bars turns through its flat poses, where the rows of its constraints depend on each other: it stays a parallelogram, and its
-    error is that of the pendulum that it is."""
+    """A parallelogram of bars turns through its flat poses, where the rows of its constraints depend on each other: it
+    stays a parallelogram, and its error is that of the pendulum that it is."""
     start, speed = 0.3, -6.0
 
     def bars(q_s, q_f, params):

@@ -1,4 +1,5 @@
-"""Runs of an accuracy: their true errors, the choice as arguments, resonant steps, and requests that nothing can meet."""
+"""Runs of an accuracy: their true errors, the choice as arguments, resonant steps, and requests that nothing can
+meet."""
 
 import pickle
 from dataclasses import replace
@@ -122,7 +123,8 @@ def test_a_later_start_and_a_single_saved_interval():
 
 
 def test_a_motion_without_error():
-    """Free flight in steps of 2^-k: no scheme has an error, a third run with other steps says so, and no share is divided by."""
+    """Free flight in steps of 2^-k: no scheme has an error, a third run with other steps says so, and no share is
+    divided by."""
     free = vm.Problem(vm.System(vm.ConstantMass([1.0], [1.0])), [0.0], [0.0], [1.0], [1.0])
     hows: tuple[dict[str, Any], ...] = (
         {"accuracy": 1e-3, "t_end": 1.0},

@@ -103,7 +103,8 @@ def test_the_script_draws_the_shapes_that_pictures_have(pendulum, tmp_path):
         + "const camera = { ...axes, project: (point) => (seen.push(point), point) };"
         + f"const painter = {{ camera, data: {json.dumps(data)}, add() {{}} }};"
         + f"spring({arguments}, [0, 0, 0], {turns});"
-        + f"console.log(JSON.stringify([joint(painter.data, {arguments.removeprefix('painter, ')}).slice(0, 2), seen]));"
+        + f"console.log(JSON.stringify([joint(painter.data, {arguments.removeprefix('painter, ')}).slice(0, 2),"
+        " seen]));"
     )
     seen = subprocess.run([str(NODE), "-e", program], capture_output=True, text=True, check=True).stdout
     ends, points = json.loads(seen)

@@ -24,7 +24,8 @@ ARM = RigidBody("arm", 1.0, Ball(0.1), [1.0, 1.0, 2.0], pace="fast")
 
 @pytest.fixture(scope="module")
 def run():
-    """Both bodies, each on its own: joints and springs of other scenes change what is drawn, not what it takes to draw it."""
+    """Both bodies, each on its own: joints and springs of other scenes change what is drawn, not what it takes to draw
+    it."""
     return vm.simulate(Scene([HUB, ARM]), vm.fully_explicit(1), macro_dt=0.1, num_steps=3)
 
 

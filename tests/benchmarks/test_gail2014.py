@@ -106,7 +106,8 @@ def test_checks_compare_what_was_measured(made):
     ],
 )
 def test_a_difference_is_known_where_its_reason_holds(times, agree, surprise):
-    """Times of the dense solve with 1 and 60 micro steps, of the structured one with 10 and 100, and with 100 in short macro steps."""
+    """Times of the dense solve with 1 and 60 micro steps, of the structured one with 10 and 100, and with 100 in short
+    macro steps."""
     rows = [
         CostRow("FPU", method, n, 3, 10, 1.0, us, 1.0, 5, "EXACT", "CONVERGED", times[4])
         for method, n, us in zip(("dense", "dense", "exact", "exact"), (1, 60, 10, 100), times, strict=False)

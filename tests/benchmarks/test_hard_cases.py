@@ -1,4 +1,5 @@
-"""Quick forms of the hard cases of this project: every criterion is met, and what a prototype measured is measured again."""
+"""Quick forms of the hard cases of this project: every criterion is met, and what a prototype measured is measured
+again."""
 
 import pytest
 from typer.testing import CliRunner

@@ -1,4 +1,5 @@
-"""Mechanisms: the equations by hand, scenes and other integrators are the same mechanics, and their times are compared at equal error."""
+"""Mechanisms: the equations by hand, scenes and other integrators are the same mechanics, and their times are compared
+at equal error."""
 
 import json
 

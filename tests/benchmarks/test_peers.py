@@ -133,7 +133,8 @@ def from_zero(end) -> float:
 
 
 def test_scan():
-    """Levels are reached where no finer setting misses them; a ladder ends when it is fine enough, and is finer where it reaches one."""
+    """Levels are reached where no finer setting misses them; a ladder ends when it is fine enough, and is finer where
+    it reaches one."""
     errors = {1: np.nan, 2: 1e-5, 4: 1e-3, 8: 1e-6, 16: 1e-10, 32: 1e-12}
     between = {5: 1e-3, 6: 2e-6, 11: 1e-6, 13: 1e-9}
     ladder = Ladder("method", "steps", list(errors), lambda n: lambda: np.array([(errors | between)[n]]))

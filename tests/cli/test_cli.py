@@ -108,7 +108,8 @@ def test_a_saved_run_keeps_the_names_of_its_problem(vmri, tmp_path, monkeypatch,
 
 
 def test_what_a_figure_compiles_is_no_part_of_the_run(vmri, tmp_path):
-    """The work of the force is compiled for the figure, after the run: the compilation is not taken from the time of the run."""
+    """The work of the force is compiled for the figure, after the run: the compilation is not taken from the time of
+    the run."""
     forced = "soft, stiff, force=lambda t, q_s, q_f, v_s, v_f, params: (-v_s, 0 * v_f))"
     (tmp_path / "forced.py").write_text(USER_FILE.replace("soft, stiff)", forced))
     code, text = vmri("simulate", "forced.py:my_problem", *RUN, "--plot", "run.png")
@@ -352,7 +353,8 @@ def test_simulate_composes(vmri):
     assert "15 micro steps" in text
 
 
-# --- places that cannot be written, and parts that fail late -----------------------------------------------------------
+# --- places that cannot be written, and parts that fail late
+# -----------------------------------------------------------
 
 
 COMPUTING = (
@@ -394,7 +396,8 @@ def test_a_place_that_cannot_be_written_is_refused_before_any_compute(vmri, monk
 
 
 def test_a_fault_inside_is_no_usage_error(tmp_path, monkeypatch):
-    """An error that another library raises, or Python itself, is shown with its origin, and what was computed is told first."""
+    """An error that another library raises, or Python itself, is shown with its origin, and what was computed is told
+    first."""
     monkeypatch.chdir(tmp_path)
 
     def broken(*_):

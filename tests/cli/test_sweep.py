@@ -147,7 +147,10 @@ def test_axes_and_files_are_seen_from_the_folder(tmp_path):
         (("omega = [20.0, 50.0]", "omega = { values = [1], from = 1 }"), "the axis omega: there is no entry 'from'"),
         (("omega = [20.0, 50.0]", "omega = { from = 1, to = 2, count = 3.7 }"), "the axis omega: count is 3.7"),
         (("omega = [20.0, 50.0]", "omega = { from = 0, to = 2, count = 3, log = true }"), "both are positive"),
-        (("omega = [20.0, 50.0]", "omega = { from = 1, to = 2, count = 3, log = 'false' }"), "log is 'false'; it must"),
+        (
+            ("omega = [20.0, 50.0]", "omega = { from = 1, to = 2, count = 3, log = 'false' }"),
+            "log is 'false'; it must",
+        ),
         (("omega = [20.0, 50.0]", "omega = { form = 1 }"), "no entry 'form'. Did you mean from?"),
         (("omega", "omga"), "the column 'omga' sets no number of the problem. Did you mean omega?"),
         (("omega", '"q_s[7]"'), "the column 'q_s[7]' sets no number of the problem"),
@@ -188,7 +191,8 @@ def test_bad_options_are_refused(vmri):
 
 
 @pytest.mark.parametrize(
-    ("package", "options"), [("dask.array", ["--plot", "map.png"]), ("distributed", ["--workers", "tcp://localhost:1"])]
+    ("package", "options"),
+    [("dask.array", ["--plot", "map.png"]), ("distributed", ["--workers", "tcp://localhost:1"])],
 )
 def test_a_package_that_is_not_installed_is_named_before_any_compute(vmri, tmp_path, monkeypatch, package, options):
     monkeypatch.setitem(sys.modules, package, None)

@@ -60,8 +60,9 @@ def miss(state):
 
 
 def test_a_final_cost_instead_of_a_goal():
-    """The least of ``int u^2 / 2 + 3 (x(1) - 1)^2 / 2`` is ``x(1) = 3 W / (1 + 3 W)`` and ``J = 3 / 2 / (1 + 3 W)``, with the sum
-    ``W = sum_k H (1 - t_k)^2`` over the middles t_k of the intervals, exact for controls that are constant in them."""
+    """The least of ``int u^2 / 2 + 3 (x(1) - 1)^2 / 2`` is ``x(1) = 3 W / (1 + 3 W)`` and ``J = 3 / 2 / (1 + 3 W)``,
+    with the sum ``W = sum_k H (1 - t_k)^2`` over the middles t_k of the intervals, exact for controls that are constant
+    in them."""
     optimum = least(goal=None, final_cost=miss)
     W = np.mean((1 - (np.arange(20) + 0.5) / 20) ** 2)
     assert optimum.success
@@ -85,8 +86,8 @@ def push_the_hub(q_s, q_f, u, params):
 
 
 def test_a_hub_with_flexible_modes():
-    """From t = 2 on, under the force -t, by dictionaries and a composition: ``u* = B^T exp(A^T (T - s)) W^-1 d``, with what the
-    motion without controls misses, d, and half of ``d . W^-1 d`` as its cost."""
+    """From t = 2 on, under the force -t, by dictionaries and a composition: ``u* = B^T exp(A^T (T - s)) W^-1 d``, with
+    what the motion without controls misses, d, and half of ``d . W^-1 d`` as its cost."""
     masses = vm.ConstantMass(slow={"hub": [1.0]}, fast={"tips": TIPS})
     system = vm.System(masses, springs, force=weight, params={"stiffness": jnp.asarray(STIFFNESS)})
     problem = vm.Problem(system, q_s={"hub": [0.0]}, q_f={"tips": [0.0, 0.0]}, t=2.0)
@@ -209,7 +210,8 @@ BY_ARRAY = vm.Problem(vm.System(vm.ConstantMass([1.0], NONE), params=jnp.ones(2)
         ("final_cost has shape", {"final_cost": lambda state: state.q_s}),
         (r"goal has shape \(\); it must be a vector", {"goal": lambda state: state.q_s[0]}),
         ("grid is 'fine'", {"grid": "fine"}),
-        # The cost of such an optimum was a tenth of the least cost: a force in an interval of large weight costs little.
+        # The cost of such an optimum was a tenth of the least cost: a force in an interval of large weight costs
+        # little.
         ("weigh each control", {"grid": "micro", "scheme": vm.compose(vm.fully_explicit(4), "suzuki4")}),
         # Micro steps beyond the macro step take controls of its neighbours in a run: the goal was missed by 1e-4.
         ("weigh each control", {"scheme": vm.compose(vm.fully_explicit(4), "yoshida4")}),

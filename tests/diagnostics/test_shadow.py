@@ -1,4 +1,5 @@
-"""The drift meter: shadow energies stand still where energies oscillate, and show drifts that are far below the band."""
+"""The drift meter: shadow energies stand still where energies oscillate, and show drifts that are far below the
+band."""
 
 from itertools import pairwise
 

@@ -101,7 +101,10 @@ def test_steps_are_those_of_the_textbook():
 @pytest.mark.full
 @pytest.mark.parametrize("make", [crane, hoist, damped, two_oscillators])
 def test_every_criterion_that_applies_is_met(make):
-    """At rest, driven or damped; a crane keeps its rope. The tests of pages run `vmri check` on the crane of the nutshell."""
+    """At rest, driven or damped; a crane keeps its rope.
+
+    The tests of pages run `vmri check` on the crane of the nutshell.
+    """
     report = run_cases(cases_for(make()))
     assert report.passed, str(report)
     if make is crane:

@@ -1,4 +1,5 @@
-"""Reports of hard cases: a case that raises is a failed row, tables and files say the same, and the command ends plainly."""
+"""Reports of hard cases: a case that raises is a failed row, tables and files say the same, and the command ends
+plainly."""
 
 import csv
 from functools import partial

@@ -143,7 +143,10 @@ def printing(q):
 
 @pytest.mark.parametrize("function", [lambda q: jnp.sum(new(q)), printing])
 def test_what_is_not_known_gets_the_safe_answer(function):
-    """Operations that a later version may bring, and effects. The derivative of the new operation acts entry by entry."""
+    """Operations that a later version may bring, and effects.
+
+    The derivative of the new operation acts entry by entry.
+    """
     assert has_diagonal_hessian(function, Q) == (function is not printing)
     assert not has_constant_hessian(function, Q)
     assert np.linalg.matrix_rank(curved_directions(function, Q)) == 4

@@ -1,4 +1,5 @@
-"""Functions of users that change, and functions that are not pure: a run uses what its functions say when it is made."""
+"""Functions of users that change, and functions that are not pure: a run uses what its functions say when it is
+made."""
 
 import dataclasses
 import itertools
@@ -129,7 +130,10 @@ def changes():
         "attribute of a module": (lambda q, *_: module.K * q[0] ** 2 / 2, setting(module, "K")),
         "import inside of the function": (by_import, setting(module, "K")),
         "entry of a list in a dictionary": (lambda q, *_: TABLE["k"][0] * q[0] ** 2 / 2, entry(TABLE["k"], 0)),
-        "attribute by a text": (lambda q, *_: getattr(settings, "k") * q[0] ** 2 / 2, setting(settings, "k")),  # noqa: B009
+        "attribute by a text": (
+            lambda q, *_: getattr(settings, "k") * q[0] ** 2 / 2,  # noqa: B009
+            setting(settings, "k"),
+        ),
         "default": (by_default, lambda k: setattr(by_default, "__defaults__", (k,))),
         "operator of a dataclass": (lambda q, *_: law * q[0] ** 2 / 2, setting(law, "k")),
         "partial": (partial(keyword, k=table), table.fill),

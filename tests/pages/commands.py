@@ -31,7 +31,9 @@ NOT_RUN = {
     ".ci/run": "CI itself",
     "pip": "installs from the internet, as the first step of CI does",
     "#!/bin/bash": "a job for a cluster",
-    "python -m benchmarks": "takes minutes to hours on an idle machine; only its options are tested here, small forms in tests/benchmarks",
+    "python -m benchmarks": (
+        "takes minutes to hours on an idle machine; only its options are tested here, small forms in tests/benchmarks"
+    ),
 }
 """Beginnings of commands that are not run, and why."""
 BLOCK = re.compile(r"```sh\n(.*?)```\n(?:(?:\n[^\n`]*\n)?\n```text\n(.*?)```)?", re.DOTALL)
@@ -117,7 +119,8 @@ def output(command: str, folder: Path, code: int = 0) -> str:
 
 
 def shows(printed: str, line: str) -> bool:
-    """Whether a line is among those that were printed; `...` in it stands for anything, spaces for any number of spaces."""
+    """Whether a line is among those that were printed; `...` in it stands for anything, spaces for any number of
+    spaces."""
     pattern = re.escape(" ".join(line.split())).replace(r"\.\.\.", ".*")
     return any(re.fullmatch(pattern, " ".join(other.split())) for other in printed.splitlines())
 

@@ -1,7 +1,7 @@
 """Every shell command that a page prints runs as printed, and prints the lines that the page shows below it.
 
-A block marked `text` below a block marked `sh`, with one line of words between them at most, holds lines that the last of its
-commands prints. Commands that two pages print run once.
+A block marked `text` below a block marked `sh`, with one line of words between them at most, holds lines that the last
+of its commands prints. Commands that two pages print run once.
 """
 
 import shlex

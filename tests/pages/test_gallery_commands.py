@@ -1,7 +1,8 @@
 """The two commands of every scene of the gallery run as printed: the run converges, and the picture is drawn.
 
-Without --full, those of four scenes: points with micro steps, a scene without slow bodies, one body with forces, a linkage of rigid bodies. The
-runs of all scenes are those of `tests/scene/test_gallery.py`, which also reads their commands.
+Without --full, those of four scenes: points with micro steps, a scene without slow bodies, one body with forces, a
+linkage of rigid bodies. The runs of all scenes are those of `tests/scene/test_gallery.py`, which also reads their
+commands.
 """
 
 import pytest

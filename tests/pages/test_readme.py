@@ -1,4 +1,5 @@
-"""The programs in the README and in the pages of `docs` run as printed, their numbers hold, and their links lead somewhere."""
+"""The programs in the README and in the pages of `docs` run as printed, their numbers hold, and their links lead
+somewhere."""
 
 import re
 import subprocess
@@ -21,7 +22,8 @@ def programs(page: str) -> list[str]:
 
 
 def printed(program: str, folder: Path) -> str:
-    """What a program prints, which runs in a folder and in a process of its own, since settings are read when JAX starts."""
+    """What a program prints, which runs in a folder and in a process of its own, since settings are read when JAX
+    starts."""
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False, cwd=folder)
     assert done.returncode == 0, done.stderr
     return done.stdout
@@ -69,7 +71,8 @@ def test_programs_with_figures(call, picture, tmp_path):
     assert (tmp_path / picture).stat().st_size > 10_000
 
 
-SHOWN = {  # a phrase from each program of a page, with the output that the page prints below it; the programs share a namespace
+# a phrase from each program of a page, with the output that the page prints below it; the programs share a namespace
+SHOWN = {
     "how_to/systems.md": ("", 'q_f["radius"]'),
     "how_to/steppers.md": ("class Rotation",),
     "coming_from/index.md": ("25.0 * q_s[",),

@@ -39,7 +39,8 @@ CASES = {  # problem, scheme, macro_dt, steps
 
 
 def cost_of(problem: vm.Problem, scheme, macro_dt, steps, save: vm.Save, solver=None):
-    """A function of everything a run depends on and tells, ``cost(params, p_s, p_f, macro_dt)``, and where to take it."""
+    """A function of everything a run depends on and tells, ``cost(params, p_s, p_f, macro_dt)``, and where to take
+    it."""
     state, system = problem.state(), problem.system
 
     def cost(params, p_s, p_f, macro_dt):
@@ -149,7 +150,8 @@ def test_lanes_of_gradients(in_parts):
 
 @pytest.mark.parametrize(("second", "steps"), [(jax.jacrev, "solved"), (jax.jacfwd, "kicks")])
 def test_second_derivatives(second, steps, in_parts):
-    """Reverse over reverse, and forward over reverse in parts; `tests/verification/test_gradients.py` has steps under forward over forward."""
+    """Reverse over reverse, and forward over reverse in parts; `tests/verification/test_gradients.py` has steps under
+    forward over forward."""
     program, (cost, at), h = simple_gradient(steps), simple_cost(steps), 1e-5
     expected = jnp.stack([(program(at + h * e)[1] - program(at - h * e)[1]) / (2 * h) for e in jnp.eye(at.size)])
     if steps == "kicks":
@@ -158,7 +160,8 @@ def test_second_derivatives(second, steps, in_parts):
 
 
 def test_a_gradient_has_the_values_of_the_run():
-    """The steps of both are the same, up to the round-off of their two programs: the value of a gradient is no Newton step beside the root."""
+    """The steps of both are the same, up to the round-off of their two programs: the value of a gradient is no Newton
+    step beside the root."""
     cost, at = simple_cost()
     value, expected = simple_gradient()(at)[0], jax.jit(cost)(at)
     assert float(value) == pytest.approx(float(expected), rel=1e-14)  # 2e-16; the same bits without optimisations

@@ -1,4 +1,5 @@
-"""Lanes of batches: each is the single run, with parameters and steps of its own; failures, chunks, devices, and what is refused."""
+"""Lanes of batches: each is the single run, with parameters and steps of its own; failures, chunks, devices, and what
+is refused."""
 
 import subprocess
 import sys
@@ -220,7 +221,8 @@ def test_states_without_a_batch_axis_and_tracers_are_refused(fpu):
 
 
 def test_devices_share_a_batch():
-    """In a process of its own: flags are read when JAX starts; `tests/test_configure.py` has settings that come too late."""
+    """In a process of its own: flags are read when JAX starts; `tests/test_configure.py` has settings that come too
+    late."""
     program = """
 import numpy as np
 import vmri_jax as vm
@@ -284,7 +286,8 @@ def rod() -> vm.Problem:
 
 
 def test_params_nested_partial_and_shared():
-    """Momenta of the start fit the constraint of each lane; an array of the shape of the parameter holds for all lanes."""
+    """Momenta of the start fit the constraint of each lane; an array of the shape of the parameter holds for all
+    lanes."""
     heavier = {"rods": {"mass": [2.0, 6.0, 2.0]}, "gravity": np.array([0.0, 4.0])}
     batch = vm.simulate_batch(rod(), vm.fully_implicit(2), params=heavier, macro_dt=0.01, num_steps=3)
     assert (np.asarray(batch.failed_at) == -1).all()

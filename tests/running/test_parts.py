@@ -1,4 +1,5 @@
-"""Gradients of systems with an empty part, and with respect to lengths, against finite differences; sound runs under `jax_debug_nans`."""
+"""Gradients of systems with an empty part, and with respect to lengths, against finite differences; sound runs under
+`jax_debug_nans`."""
 
 import jax
 import jax.numpy as jnp

@@ -58,7 +58,8 @@ def counted(q_f, params):
 
 
 def test_after_a_failure_no_step_is_taken(fpu):
-    """The first of 40 steps fails: the potential is evaluated for the energies of the nodes and in that step, no more."""
+    """The first of 40 steps fails: the potential is evaluated for the energies of the nodes and in that step, no
+    more."""
     system, state = fpu.system.replace(fast_potential=counted), fpu.state()
     run = vm.prepare(system, vm.fully_explicit(1), state, macro_dt=0.01, num_steps=40)
     jax.effects_barrier()

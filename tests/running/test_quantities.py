@@ -95,7 +95,8 @@ def test_work_accounts_for_the_energy():
 
 
 def test_work_at_nodes_that_are_too_far_apart_is_uncertain(hanging_run):
-    """The bell vibrates at 283 rad/s: what its damper takes is not seen at every 50th of a second, but at micro nodes."""
+    """The bell vibrates at 283 rad/s: what its damper takes is not seen at every 50th of a second, but at micro
+    nodes."""
     coarse = replace(hanging_run, micro=None).work()
     fine = hanging_run.work()
     assert fine.uncertainty < coarse.uncertainty / 20
@@ -233,7 +234,8 @@ def test_pickles_keep_the_origin_where_python_can():
 
 
 def test_prepared_runs_know_their_parameters():
-    """A run of a problem keeps the velocities of its start, as `simulate` of the problem with these parameters does; a run of a state the momenta."""
+    """A run of a problem keeps the velocities of its start, as `simulate` of the problem with these parameters does; a
+    run of a state the momenta."""
     run, of_state = vm.prepare(WEIGHED, **HOW), vm.prepare(WEIGHED.system, state=WEIGHED.state(), **HOW)
     heavier = run(params={"m": 4.0})
     assert np.allclose(heavier.v_f, 1.0)

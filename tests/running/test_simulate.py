@@ -260,7 +260,10 @@ def test_ends_of_runs(fpu):
 
 
 def test_lengths_of_runs_share_a_program(fpu, request):
-    """Six step sizes, all nodes saved, and the companion of an error: one program. A node is the same whatever the length of its run."""
+    """Six step sizes, all nodes saved, and the companion of an error: one program.
+
+    A node is the same whatever the length of its run.
+    """
     compiled = []
 
     def note(event: str, duration_secs: float, **_: str | int) -> None:
@@ -286,7 +289,8 @@ def test_lengths_of_runs_share_a_program(fpu, request):
 
 
 def test_pieces_of_a_run_make_the_whole(fpu, monkeypatch):
-    """Short pieces: the same nodes, to the last bit, micro nodes too; and after a failure in one of them NaN to the end."""
+    """Short pieces: the same nodes, to the last bit, micro nodes too; and after a failure in one of them NaN to the
+    end."""
     whole = vm.simulate(fpu, vm.fully_implicit(2), macro_dt=0.05, num_steps=36, save=vm.Save(2, micro=True))
     monkeypatch.setattr("vmri_jax.running.simulation.NUMBERS_PER_PIECE", 100)
     pieces = vm.simulate(fpu, vm.fully_implicit(2), macro_dt=0.05, num_steps=36, save=vm.Save(2, micro=True))

@@ -20,7 +20,8 @@ EXPLICIT, MIDPOINT = vm.fully_explicit(1), vm.fully_implicit(1)
 
 # --- causes: systems of one structure, so that a road compiles one program for all causes of a structure -------------
 def potential(q_f, params):
-    """A spring, and a logarithm that is no number for negative q, though its force is: it acts on a point that passes q = 0."""
+    """A spring, and a logarithm that is no number for negative q, though its force is: it acts on a point that passes q
+    = 0."""
     beyond = jnp.log(jnp.where(params["pole"] > 0.0, q_f[0], 1.0))
     return params["k"] * q_f[0] ** 2 / 2 + 1e-9 * params["pole"] * beyond
 
@@ -132,7 +133,8 @@ def by_trace(moving, scheme, steps, out):
 
 
 BEYOND_A_POLE = (by_prepare, by_batch, by_ensemble, by_trace)
-"""Roads whose steps past a pole compile for up to 18 s; `test_lanes_and_runs_that_are_asked_afterwards` has their nodes."""
+"""Roads whose steps past a pole compile for up to 18 s; `test_lanes_and_runs_that_are_asked_afterwards` has their
+nodes."""
 AS_SIMULATE = (by_prepare, by_trace)
 """Roads to which a force is nothing of its own, where another road has its nodes or lanes."""
 ROADS = (by_simulate, by_prepare, by_stream, by_batch, by_ensemble, by_trace)
@@ -151,7 +153,8 @@ ROADS = (by_simulate, by_prepare, by_stream, by_batch, by_ensemble, by_trace)
     ],
 )
 def test_every_road_says_it(road, cause, tmp_path):
-    """Observables of a run do not ask how its steps were taken: one road suffices for a kinetic energy that is a function."""
+    """Observables of a run do not ask how its steps were taken: one road suffices for a kinetic energy that is a
+    function."""
     moving, scheme, macro_dt, num_steps, expected = CAUSES[cause]
     with warnings.catch_warnings(record=True) as given:
         warnings.simplefilter("always")

@@ -1,4 +1,5 @@
-"""The mechanics of a scene as values of functions, which scenes of the same bodies share whatever their coordinates are."""
+"""The mechanics of a scene as values of functions, which scenes of the same bodies share whatever their coordinates
+are."""
 
 from dataclasses import replace
 from functools import partial
@@ -14,7 +15,8 @@ from vmri_jax.scene import Scene
 
 
 class Mechanics(NamedTuple):
-    """Coordinates and rates of all bodies by name, the energies, the power of the forces, and the rows of all constraints."""
+    """Coordinates and rates of all bodies by name, the energies, the power of the forces, and the rows of all
+    constraints."""
 
     bodies: dict
     kinetic: float
@@ -54,7 +56,8 @@ def _of_bodies(kinematics, joints, q_s, q_f, v_s, v_f):
 
 
 def by_directors(scene: Scene, bodies: dict) -> tuple[Scene, tuple]:
-    """The scene by directors, all of them slow, and its ``(q_s, q_f, v_s, v_f)`` with these coordinates and rates of bodies."""
+    """The scene by directors, all of them slow, and its ``(q_s, q_f, v_s, v_f)`` with these coordinates and rates of
+    bodies."""
     slow = [replace(body, pace="slow") for body in scene.bodies]
     twin = replace(scene, bodies=slow, coordinates="directors", joint_starts={})
     q, v = (jnp.concatenate([bodies[name][k] for name in twin.places]) for k in range(2))
@@ -77,9 +80,11 @@ def assert_same_mechanics(ours: Mechanics, theirs: Mechanics, atol: float = 1e-1
 
 
 def assert_mechanics_as_by_directors(scene: Scene, seed: int = 0, t: float = 0.0) -> None:
-    """At random coordinates x of joints the rows of bodies and joints by directors are zero, and energies and the power of forces are the same.
+    """At random coordinates x of joints the rows of bodies and joints by directors are zero, and energies and the power
+    of forces are the same.
 
-    So the equations of motion are the same too: the Lagrangian of x is ``L(q(x), q'(x) v)``, and reactions do no work along ``q'(x)``.
+    So the equations of motion are the same too: the Lagrangian of x is ``L(q(x), q'(x) v)``, and reactions do no work
+    along ``q'(x)``.
     """
     random = np.random.default_rng(seed)
     sizes = (scene.names.slow, scene.names.fast) * 2

@@ -1,4 +1,5 @@
-"""Random trees and rings of rigid bodies on joints: roots on the ground or free, every kind of joint, springs, dampers, forces."""
+"""Random trees and rings of rigid bodies on joints: roots on the ground or free, every kind of joint, springs, dampers,
+forces."""
 
 from typing import Any
 
@@ -37,7 +38,8 @@ def random_scene(seed: int) -> tuple[sc.Scene, dict[str, tuple[float, float]]]:
 
 
 def random_ring(seed: int) -> tuple[sc.Scene, dict[str, dict[str, tuple[float, float]]]]:
-    """As `random_scene`, of bodies in one closed loop, from the ground back to the ground or from a free body back to it.
+    """As `random_scene`, of bodies in one closed loop, from the ground back to the ground or from a free body back to
+    it.
 
     Args:
         seed: of the random numbers; the ground is in rings of odd ones.

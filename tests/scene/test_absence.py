@@ -25,7 +25,8 @@ CASES = [(BASE, effect) for effect in EFFECTS] + [(RIGID, effect) for effect in 
 
 @pytest.mark.parametrize(("base", "effect"), CASES, ids=lambda part: part.name if isinstance(part, sc.Effect) else "")
 def test_what_is_taken_out_was_never_there(base, effect):
-    """Equal static structure and equal shapes: the compiled program is the same one, by the rule that `jax.jit` follows."""
+    """Equal static structure and equal shapes: the compiled program is the same one, by the rule that `jax.jit`
+    follows."""
     scene = scene_with(effect, base)
     with_it, without, never = scene.system(), scene.without(effect.name).system(), base.system()
     assert jax.tree.structure(without) == jax.tree.structure(never)

@@ -280,7 +280,8 @@ def test_functions_that_return_something_else(effect, message):
 
 
 def test_functions_of_classes_are_named_where_they_return_wrong_values():
-    """A force that is no tuple has the right number of rows between two bodies in the plane, and would be taken apart by coordinates."""
+    """A force that is no tuple has the right number of rows between two bodies in the plane, and would be taken apart
+    by coordinates."""
 
     class Tether(Effect):
         pair: Any = names(2)

@@ -51,7 +51,8 @@ def test_every_that_does_not_divide_is_refused():
 
 
 def test_a_stiff_hinge_between_a_slow_and_a_fast_body():
-    """Frequency 71: kicks at the macro nodes, 0.05 apart, are beyond their limit 2; on the micro grid the energy is kept."""
+    """Frequency 71: kicks at the macro nodes, 0.05 apart, are beyond their limit 2; on the micro grid the energy is
+    kept."""
     assert homes(HUB)["hinge"] == "fast"
     assert {name: pace.value for name, pace in HUB.sorting.paces.items()} == {
         "hub": "slow",

@@ -1,4 +1,5 @@
-"""Several joints of one body, rotors and gears: the same accelerations as of joints and bodies that say the same otherwise."""
+"""Several joints of one body, rotors and gears: the same accelerations as of joints and bodies that say the same
+otherwise."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -7,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tests.scene.body_motions import accelerations, state_of
+from benchmarks.body_motions import accelerations, state_of
 from tests.scene.mechanics import assert_mechanics_as_by_directors, assert_same_mechanics, by_directors, mechanics
 from vmri_jax import scene as sc
 from vmri_jax.scene.effects.joint_base import AXES_OF
@@ -22,7 +23,8 @@ def scene_of(bodies, effects):
 
 
 def test_joints_in_a_row_are_one_joint_of_several_freedoms():
-    """Two hinges a cardan joint, two slides and a hinge one in a plane; springs and dampers of each freedom act alike."""
+    """Two hinges a cardan joint, two slides and a hinge one in a plane; springs and dampers of each freedom act
+    alike."""
     axis, second = [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]  # the triad of a planar joint about z is (x, y, z)
     cases = [
         (

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import vmri_jax as vm
-from tests.scene.body_motions import accelerations
+from benchmarks.body_motions import accelerations
 from tests.scene.mechanics import assert_mechanics_as_by_directors, mechanics
 from tests.scene.random_trees import random_scene
 from vmri_jax import scene as sc
@@ -54,7 +54,8 @@ def test_the_mass_matrix_of_trees_in_closed_form(seed):
 
 @pytest.mark.parametrize("seed", [7, 11])  # of joints behind joints
 def test_the_derivative_of_the_kinetic_energy_of_trees(seed):
-    """By positions, against differences: it contains the derivatives of twists, `vmri_jax.mechanics.kinematics.placed`."""
+    """By positions, against differences: it contains the derivatives of twists,
+    `vmri_jax.mechanics.kinematics.placed`."""
     problem = random_scene(seed)[0].problem()
     random, n_s = np.random.default_rng(seed), problem.q_s.size
     q = np.concatenate([problem.q_s, problem.q_f])
@@ -136,7 +137,8 @@ def test_reaction_forces_are_those_of_the_rows(run):
 
 
 def test_reaction_forces_of_a_joint_with_a_rotor():
-    """A rotor adds to the momenta of directors: ``M v`` of the body alone is the momentum of a slower motion, with other forces."""
+    """A rotor adds to the momenta of directors: ``M v`` of the body alone is the momentum of a slower motion, with
+    other forces."""
     arm = sc.RigidBody("arm", 2.0, [0.2, 0.3, 0.4], [0.5, 0.0, 0.0])
     hinge = sc.Revolute(("ground", "arm"), at=[0.0, 0.0, 0.0], axis=[0.0, 0.0, 1.0], name="hinge")
     scene = sc.Scene([arm], [hinge, sc.RotorInertia("hinge", 3.0)], coordinates="joint").with_rates({"hinge": 2.0})
@@ -283,7 +285,8 @@ def test_deep_trees_keep_directors_where_the_scene_chooses(monkeypatch):
 
 
 def test_joints_of_a_loop_follow_those_that_are_named():
-    """Within reach, on the branch of the start and with their rates; beyond, and where all are named, by how much the loop is open."""
+    """Within reach, on the branch of the start and with their rates; beyond, and where all are named, by how much the
+    loop is open."""
     scene = four_bar()
     moved = scene.with_joints({"pin 0": (-0.5, 1.0)})
     q, q_f, v, _ = moved.start

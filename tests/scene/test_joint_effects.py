@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tests.scene.body_motions import accelerations, state_of
+from benchmarks.body_motions import accelerations, state_of
 from vmri_jax import scene as sc
 from vmri_jax.scene.rows import ConstraintRows
 
@@ -34,7 +34,8 @@ EFFECTS = {  # the effect in the hinge of this name, and the torque about the hi
 
 
 def bars(turned=0.0, spin=0.0):
-    """Bars that hang on hinges about the y axis, turned from where their angles are zero: one for each effect, a free and a moved one."""
+    """Bars that hang on hinges about the y axis, turned from where their angles are zero: one for each effect, a free
+    and a moved one."""
     names, tilt = (*EFFECTS, "free", "motion"), TILT + turned
     out = np.array([np.sin(tilt), 0.0, -np.cos(tilt)])
     bodies = [
@@ -55,7 +56,8 @@ def bars(turned=0.0, spin=0.0):
 
 
 def test_hinged_bars_obey_the_equation_of_the_compound_pendulum():
-    """``I x'' = -m g l sin(tilt + x) + torque`` for slow and fast bars; the bar whose motion is given has the acceleration of this motion."""
+    """``I x'' = -m g l sin(tilt + x) + torque`` for slow and fast bars; the bar whose motion is given has the
+    acceleration of this motion."""
     bodies, effects = bars()
     moved, same = bars(ANGLE, RATE)
     given = sc.JointMotion("motion", swing, {"far": 0.4})  # 0.4 t^2: at TIME the angle and rate of all bars
@@ -98,7 +100,8 @@ def test_rayleigh_damping_of_a_spring_in_a_joint():
 
 
 def test_motions_of_pairs_with_and_without_coordinates_have_the_names_of_their_pairs():
-    """The pair of b closes a loop, and its angle comes from directors: its row is a term of its own, after those of the other pairs."""
+    """The pair of b closes a loop, and its angle comes from directors: its row is a term of its own, after those of the
+    other pairs."""
     bodies = [
         sc.RigidBody(name, 1.0, [1.0, 1.0, 1.0], [x, 1.0, 0.0]) for name, x in (("a", 0.0), ("b", 1.0), ("e", 5.0))
     ]

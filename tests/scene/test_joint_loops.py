@@ -12,7 +12,8 @@ X, Y, Z = np.eye(3)
 
 
 def test_a_joint_between_a_slow_and_a_fast_body():
-    """A hub that turns slowly with a stiff boom: the rows of the joint are held at the micro nodes, and their rates are zero at the start."""
+    """A hub that turns slowly with a stiff boom: the rows of the joint are held at the micro nodes, and their rates are
+    zero at the start."""
     hub = sc.RigidBody("hub", 50.0, [20.0, 20.0, 30.0], np.zeros(3), spin=[0.0, 0.0, 0.3], pace="slow")
     boom = sc.RigidBody(
         "boom", 1.0, sc.Cylinder(0.05, 2.0), [2.0, 0, 0], [0.0, np.pi / 2, 0.0], [0, 1.8, 0], [0, 0, 1.5], pace="fast"

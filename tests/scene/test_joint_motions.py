@@ -52,7 +52,10 @@ def test_order_and_energy_of_a_long_run():
 
 
 def test_micro_steps_have_the_order_of_their_scheme():
-    """A fast bar on a slow one: the spring between them is W, and is felt by its angle alone. Order 6 needs symmetric steps of order 2."""
+    """A fast bar on a slow one: the spring between them is W, and is felt by its angle alone.
+
+    Order 6 needs symmetric steps of order 2.
+    """
     scheme, scene = vm.compose(vm.fully_implicit(2), "kahan-li6"), arm(stiffness=60.0, rate="fast")
     runs = [vm.simulate(scene, scheme, macro_dt=0.4 / n, num_steps=n, save=n) for n in (20, 40, 80)]
     assert order(runs) == pytest.approx(6, abs=0.3)
@@ -72,7 +75,8 @@ def swing(numbers):
 
 
 def test_gradients_through_length_mass_and_stiffness():
-    """Of the momentum at the start, and of energies, forces and their power; derivatives of steps are in `tests/verification`."""
+    """Of the momentum at the start, and of energies, forces and their power; derivatives of steps are in
+    `tests/verification`."""
 
     @jax.jit
     def seen(numbers):

@@ -1,4 +1,5 @@
-"""Closed loops in joint coordinates, random ones and a slider-crank: the same mechanics and reaction forces as by directors."""
+"""Closed loops in joint coordinates, random ones and a slider-crank: the same mechanics and reaction forces as by
+directors."""
 
 from typing import Any
 
@@ -6,7 +7,7 @@ import jax
 import numpy as np
 import pytest
 
-from tests.scene.body_motions import accelerations, state_of
+from benchmarks.body_motions import accelerations, state_of
 from tests.scene.mechanics import state_by_directors
 from tests.scene.random_trees import random_ring
 from vmri_jax.mechanics.motion import reaction_forces
@@ -52,7 +53,8 @@ def slider_crank():
 
 
 def test_reaction_forces_of_a_slider_crank():
-    """The balance of each body in joint coordinates, by the angles and accelerations alone, has the forces that multipliers give by directors.
+    """The balance of each body in joint coordinates, by the angles and accelerations alone, has the forces that
+    multipliers give by directors.
 
     Nine equations in the plane for eight unknowns: two forces in each hinge, a force and a moment in the cylinder.
     """

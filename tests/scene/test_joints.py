@@ -57,8 +57,8 @@ JOINTS = {
     "planar": (Planar(("a", "b"), AT, Y), 3),
 }
 RUN = "cylindrical"
-"""The joint whose run is quick. That rows of all joints are zero along their freedoms is in `test_joint_coordinates`, that they leave
-no more free in `test_what_a_joint_leaves_free`."""
+"""The joint whose run is quick. That rows of all joints are zero along their freedoms is in `test_joint_coordinates`,
+that they leave no more free in `test_what_a_joint_leaves_free`."""
 
 
 @pytest.mark.parametrize("name", JOINTS)

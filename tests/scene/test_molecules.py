@@ -1,4 +1,5 @@
-"""What molecules need: torsion of any sign, pairs that are left out, rates that are declared, lengths that are given."""
+"""What molecules need: torsion of any sign, pairs that are left out, rates that are declared, lengths that are
+given."""
 
 import itertools
 

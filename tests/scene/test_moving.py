@@ -1,4 +1,5 @@
-"""Bodies on points whose motion is given: a pendulum below a cart that is moved, in three ways, against the same by hand."""
+"""Bodies on points whose motion is given: a pendulum below a cart that is moved, in three ways, against the same by
+hand."""
 
 import jax
 import jax.numpy as jnp

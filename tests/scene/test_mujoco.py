@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.scene.body_motions import accelerations as motions
-from tests.scene.body_motions import state_of
+from benchmarks.body_motions import accelerations as motions
+from benchmarks.body_motions import state_of
 from tests.scene.mechanics import mechanics
 from tests.scene.mujoco_model_fields import IDLE, READ, REFUSED_FIELDS
 from vmri_jax.scene import Fixed, Scene, Spherical
@@ -101,7 +101,8 @@ def their_accelerations(model, data):
 
 
 def test_a_tree_accelerates_as_in_mujoco():
-    """With springs, a damper, and gravity that is compensated in part, differently in bodies that are welded together."""
+    """With springs, a damper, and gravity that is compensated in part, differently in bodies that are welded
+    together."""
     model = mujoco.MjModel.from_xml_string(TREE)
     data = mujoco.MjData(model)
     rng = np.random.default_rng(0)
@@ -206,7 +207,8 @@ def test_an_arm_from_a_urdf_accelerates_as_in_mujoco(tmp_path):
 
 
 def test_joints_and_tendons_that_equalities_tie():
-    """Two rows, zero where the angles satisfy the laws of the model and nowhere else; all else is in `test_a_robot_accelerates_as_in_mujoco`."""
+    """Two rows, zero where the angles satisfy the laws of the model and nowhere else; all else is in
+    `test_a_robot_accelerates_as_in_mujoco`."""
     scene = Scene.from_mujoco(mujoco.MjModel.from_xml_string(ROBOT.format(flags='limit="disable"')))
     angles = {"hip pitch": 0.4, "knee": np.polyval([0.3, -0.1, 0.2, 0.5, 0.0], 0.4), "hip roll": 0.6, "slide": 0.3}
 
@@ -423,7 +425,10 @@ def test_a_ball_over_the_floor_is_refused():
 
 def test_several_joints_of_one_body_cannot_be_ignored():
     """Leaving one out would weld the body to the other's."""
-    body = '<body name="point"><joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 1 0"/><geom fromto="0 0 0 1 0 0"/></body>'
+    body = (
+        '<body name="point"><joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 1 0"/><geom fromto="0 0 0 1'
+        ' 0 0"/></body>'
+    )
     with pytest.raises(ValueError, match=r"several joints of one body \(body point\).*take coordinates=\"joint\""):
         Scene.from_mujoco(arm(body=body), ignore=["several joints of one body"], coordinates="directors")
     ball = body.replace('type="slide" axis="0 1 0"', 'type="ball"')
@@ -493,14 +498,20 @@ def test_every_field_is_read_or_refused_or_without_influence():
     every = " ".join([*READ.values(), *IDLE.values(), *REFUSED_FIELDS.values()])
     assert [entry for entry in every.split() if not any(fnmatchcase(name, entry) for name in names)] == []
     counts = Counter(treatments(name)[0][0] for name in names)
-    said = f"{len(names)} fields of a model: {counts['read']} are read, {counts['refused']} refused when they are not at their default, "
+    said = (
+        f"{len(names)} fields of a model: {counts['read']} are read, {counts['refused']} refused when they are not at "
+        "their default, "
+    )
     assert f"{said}and {counts['idle']} have no influence on the motion" in PAGE.read_text(), counts
 
 
 QUIET = {
     "option": 'actuatorgroupdisable="0"',
     "geom": 'contype="2" conaffinity="1"',
-    "child": '<body name="link" pos=".3 0 0" gravcomp="0.5"><joint name="k" axis="0 1 0"/><geom fromto="0 0 0 .1 0 0"/></body>',
+    "child": (
+        '<body name="link" pos=".3 0 0" gravcomp="0.5"><joint name="k" axis="0 1 0"/><geom fromto="0 0 0 .1 0'
+        ' 0"/></body>'
+    ),
     "body": '<geom name="floor" type="plane" size="5 5 .1" contype="2" conaffinity="1"/>',
     "more": PINNED + MOTOR + '<tendon><fixed><joint joint="hinge" coef="1"/></fixed></tendon>',
 }
@@ -509,10 +520,16 @@ BY_ELEMENT = {
     "npair": {"more": '<contact><pair geom1="floor" geom2="g"/></contact>', "geom": 'name="g"', "body": QUIET["body"]},
     "nmocap": {"body": '<body name="m" mocap="true"/>'},
     "nflex": {
-        "body": '<flexcomp name="f" type="grid" count="3 1 1" spacing=".1 .1 .1" dim="1" mass="1"><contact contype="0" conaffinity="0"/><edge stiffness="1"/></flexcomp>'
+        "body": (
+            '<flexcomp name="f" type="grid" count="3 1 1" spacing=".1 .1 .1" dim="1" mass="1"><contact contype="0"'
+            ' conaffinity="0"/><edge stiffness="1"/></flexcomp>'
+        )
     },
     "nplugin": {
-        "more": '<extension><plugin plugin="mujoco.sensor.touch_grid"><instance name="p"><config key="size" value="1 1"/><config key="fov" value="9 9"/></instance></plugin></extension>'
+        "more": (
+            '<extension><plugin plugin="mujoco.sensor.touch_grid"><instance name="p"><config key="size" value="1'
+            ' 1"/><config key="fov" value="9 9"/></instance></plugin></extension>'
+        )
     },
 }
 """Models that have what no assignment can bring about: fields that are sizes."""
@@ -544,7 +561,10 @@ def test_each_refused_field_is_refused_by_name_and_ignored_by_name():
             with pytest.raises(ValueError, match=rf"does not express: (.*; )?{kind} \("):
                 compiled.refuse([])
             others = [name for name, _ in compiled.beyond() if name != kind]
-            assert others in ([], ["several joints of one body"]), (field, others)  # vertices of a flex are such bodies
+            assert others in ([], ["several joints of one body"]), (
+                field,
+                others,
+            )  # vertices of a flex are such bodies
             if refusal.ignorable:
                 compiled.refuse([kind])
             else:
@@ -574,7 +594,10 @@ def test_springs_that_are_ignored_are_left_out_whole():
 
 def test_mocap_bodies_that_are_ignored_rest_where_a_keyframe_puts_them():
     body = '<body name="m" mocap="true" pos=".3 0 1"/>'
-    more = '<equality><connect name="e" body1="arm" body2="m" anchor=".3 0 0"/></equality><keyframe><key mpos="0.3 0 1.4"/></keyframe>'
+    more = (
+        '<equality><connect name="e" body1="arm" body2="m" anchor=".3 0 0"/></equality><keyframe><key mpos="0.3 0'
+        ' 1.4"/></keyframe>'
+    )
     scene = Scene.from_mujoco(arm(more, body=body), ignore=["mocap bodies"])
     assert [body.name for body in scene.bodies] == ["arm"]
     assert scene.effects[1].between == ("arm", "ground")

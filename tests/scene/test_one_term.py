@@ -1,4 +1,5 @@
-"""Effects of one kind on one grid are one term of the system; their parameters, rows and names stay those of each effect."""
+"""Effects of one kind on one grid are one term of the system; their parameters, rows and names stay those of each
+effect."""
 
 from itertools import pairwise
 from typing import Any
@@ -30,7 +31,8 @@ def well(q, params):
 
 
 def one_by_one() -> sc.Scene:
-    """A hanging chain in which every effect has several of its kind: of one element, of several, on the ground, in bodies, and with elements on both grids."""
+    """A hanging chain in which every effect has several of its kind: of one element, of several, on the ground, in
+    bodies, and with elements on both grids."""
     hinges = [
         sc.Revolute(pair, point, SIDE, name=f"hinge {i}")
         for i, (pair, point) in enumerate(zip(PAIRS, POINTS, strict=True))

@@ -1,4 +1,7 @@
-"""Effects against their laws: accelerations, exact decay. Orders with forces are in `tests/verification/test_forces.py`."""
+"""Effects against their laws: accelerations, exact decay.
+
+Orders with forces are in `tests/verification/test_forces.py`.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -64,7 +67,8 @@ def test_bodies_move_by_the_laws_of_their_effects():
 
 
 def test_linear_damping_contracts_exactly():
-    """One midpoint step contracts area by d = (A' + B) / (A + B); a modified energy decays by d in every step, to round-off.
+    """One midpoint step contracts area by d = (A' + B) / (A + B); a modified energy decays by d in every step, to
+    round-off.
 
     A = m / H + c / 2, A' = m / H - c / 2, B = H k / 4, and d = exp(-c H / m) + O(H^3).
     """

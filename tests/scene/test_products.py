@@ -1,4 +1,5 @@
-"""Rows of joints and of rigidity as products of vectors, against the vectors themselves and against derivatives by JAX, at random coordinates."""
+"""Rows of joints and of rigidity as products of vectors, against the vectors themselves and against derivatives by JAX,
+at random coordinates."""
 
 from typing import Any
 
@@ -36,7 +37,8 @@ Q = RANDOM.normal(size=ROWS.sorting.positions.size)
 
 
 def test_rows_are_the_products_of_the_table():
-    """Each row of a joint is the product of two of the vectors D, m, m', n, e, e', f and x, y, z, which the joint has by name."""
+    """Each row of a joint is the product of two of the vectors D, m, m', n, e, e', f and x, y, z, which the joint has
+    by name."""
     values, _ = ROWS.evaluate(0.0, Q)
     coordinates = {name: Q[place.start : place.start + place.size] for name, place in SCENE.places.items()}
     coordinates["ground"] = np.append(np.zeros(3), np.eye(3))

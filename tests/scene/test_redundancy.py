@@ -22,7 +22,8 @@ def molecule(places, mass=16.0):
 
 
 def four_bar(crank, rocker, foot):
-    """Three bars between hinges about y that start at the origin, where crank and rocker end, and at the foot of the rocker."""
+    """Three bars between hinges about y that start at the origin, where crank and rocker end, and at the foot of the
+    rocker."""
 
     def bar(name, start, end):
         start, end = np.asarray(start, float), np.asarray(end, float)
@@ -37,7 +38,8 @@ def four_bar(crank, rocker, foot):
 
 
 def bennett(alpha=0.6, beta=1.1, turned=1.2):
-    """Bennett's loop of four hinges in space, ``sin(alpha) / a = sin(beta) / b``: one freedom, where counting says minus two."""
+    """Bennett's loop of four hinges in space, ``sin(alpha) / a = sin(beta) / b``: one freedom, where counting says
+    minus two."""
     a, b = 1.0, np.sin(beta) / np.sin(alpha)
     second = 2 * np.arctan(np.sin((beta + alpha) / 2) / np.sin((beta - alpha) / 2) / np.tan(turned / 2))
     axes, points, frame, place = [], [], np.eye(3), np.zeros(3)

@@ -42,7 +42,8 @@ def assert_trajectories_are_equal(name, scheme):
 @pytest.mark.full  # forces, masses and rows are compared below, to round-off
 @pytest.mark.parametrize(("name", "scheme"), CASES)
 def test_trajectories_are_equal(name, scheme, monkeypatch):
-    """In a process of its own: to the last bit only as XLA compiles by default, not with the flags of these tests and the options of runs."""
+    """In a process of its own: to the last bit only as XLA compiles by default, not with the flags of these tests and
+    the options of runs."""
     monkeypatch.setenv("XLA_FLAGS", "")
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as process:
         process.submit(assert_trajectories_are_equal, name, scheme).result()

@@ -24,7 +24,8 @@ def spins(run, name="hub"):
 
 
 def free_motion(t):
-    """Of a free body that starts with the spin (w_1, 0, w_3), by Jacobi's functions (Landau, Lifshitz, Mechanics, 37)."""
+    """Of a free body that starts with the spin (w_1, 0, w_3), by Jacobi's functions (Landau, Lifshitz, Mechanics,
+    37)."""
     (a, b, c), energy, momentum = MOMENTS, MOMENTS @ SPIN**2, MOMENTS**2 @ SPIN**2
     high, low = energy * c - momentum, momentum - energy * a
     rate = np.sqrt((c - b) * low / (a * b * c))

@@ -75,7 +75,8 @@ def test_gyration_and_stiffness_share_the_border():
 
 
 def test_the_reason_of_a_slow_body_names_a_stiff_spring_that_is_part_of_v():
-    """A spring of 300 rad/s to a body with the pace "slow" leaves the other body slow; its reason does not say that none touches it."""
+    """A spring of 300 rad/s to a body with the pace "slow" leaves the other body slow; its reason does not say that
+    none touches it."""
     bodies = [sc.Body("a", 1.0, [0.0, 0.0], pace="slow"), sc.Body("b", 1.0, [1.0, 0.0])]
     scene = sc.Scene(bodies, [sc.Gravity(), sc.Spring(("a", "b"), 4.5e4)])
     pace = scene.sorting.paces["b"]

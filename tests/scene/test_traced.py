@@ -98,7 +98,8 @@ def test_traced_numbers_decide_nothing(what):
 
 
 def test_names_hold_in_a_trace():
-    """A scene made of traced numbers is simulated, and its run asked by name and differentiated; what needs numbers says so.
+    """A scene made of traced numbers is simulated, and its run asked by name and differentiated; what needs numbers
+    says so.
 
     `test_joint_motions` has derivatives of starts, forces and energies by lengths, masses and stiffnesses.
     """

@@ -83,7 +83,8 @@ def directors(angles):
 
 @partial(jax.jit, static_argnums=0)
 def seen(scene, angles):
-    """What the effects of a scene do to the angles: forces of potentials, forces, controls, energy of rotors, rows of couplings."""
+    """What the effects of a scene do to the angles: forces of potentials, forces, controls, energy of rotors, rows of
+    couplings."""
     q, motions = (angles, jnp.eye(2)) if scene.branches else directors(angles)
     v, none, system = motions @ jnp.array([0.8, 0.0]), jnp.zeros(0), scene.system()
     numbers = [system.kinetic_energy(q, none, v, none) if not system.has_constant_mass else v @ v / 4]
@@ -102,7 +103,8 @@ def seen(scene, angles):
 
 @pytest.mark.parametrize("name", EFFECTS)
 def test_effects_know_turns_or_need_none(name):
-    """In joint coordinates, and by directors within reach or without turns: the same; beyond reach NaN, which ends a run."""
+    """In joint coordinates, and by directors within reach or without turns: the same; beyond reach NaN, which ends a
+    run."""
     make, counts = EFFECTS[name]
     joint, bodies = (wheels(make("hinge"), coordinates=kind) for kind in ("auto", "directors"))
     assert (len(joint.branches), len(bodies.branches)) == (2, 0)
@@ -212,7 +214,8 @@ def sprung(stiffness):
 
 
 def test_springs_and_limits_beyond_half_a_turn():
-    """A spring of 2 N m/rad at 8 rad/s turns by 8 / sqrt(2) = 5.657 rad, a limit at 4.15 rad turns back at about 4.2 rad."""
+    """A spring of 2 N m/rad at 8 rad/s turns by 8 / sqrt(2) = 5.657 rad, a limit at 4.15 rad turns back at about 4.2
+    rad."""
     effects = sprung(2.0)
     scene = wheels(*effects, spin=(8.0, 2.0))
     run = vm.simulate(scene, ONE, **STEPS)
@@ -227,7 +230,10 @@ def test_springs_and_limits_beyond_half_a_turn():
 
 
 def test_runs_by_directors():
-    """A spring ends a run before half a turn. Where nothing counts them, turns are counted from node to node, here of a motion that is put in."""
+    """A spring ends a run before half a turn.
+
+    Where nothing counts them, turns are counted from node to node, here of a motion that is put in.
+    """
     scene = wheels(sc.JointSpring("hinge", 2.0), coordinates="directors", spin=(8.0, 0.0))
     run = until_failure(scene, ONE, macro_dt=0.01, num_steps=100, solver=vm.Solver("masses"))
     assert Result(int(run.result)) == Result.NON_FINITE

@@ -54,7 +54,8 @@ STEPS = {
 
 
 LONG = ("tsp", "suzuki4"), ("tsp", "kahan-li8")
-"""For --full: coefficients meet their conditions whatever the system; with constraints order 6 shows that stages are put together rightly."""
+"""For --full: coefficients meet their conditions whatever the system; with constraints order 6 shows that stages are
+put together rightly."""
 
 
 @pytest.mark.parametrize(

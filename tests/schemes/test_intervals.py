@@ -1,4 +1,5 @@
-"""The equations cut into micro intervals are those of the whole step in the textbook, at the nodes of the rules and nowhere else."""
+"""The equations cut into micro intervals are those of the whole step in the textbook, at the nodes of the rules and
+nowhere else."""
 
 import jax
 import jax.numpy as jnp
@@ -28,7 +29,8 @@ def control_points(equations, x: Unknowns):
 
 @jax.jit
 def whole_and_cut(equations, x):
-    """The equations of the step from the textbook's action without kicks, with the momenta at its end, and those of its intervals."""
+    """The equations of the step from the textbook's action without kicks, with the momenta at its end, and those of its
+    intervals."""
     system, scheme, t, H = equations.system, equations.scheme, equations.t, equations.macro_dt
     path, h, n = control_points(equations, x), equations.micro_dt, equations.scheme.num_micro
 

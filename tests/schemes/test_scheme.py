@@ -97,7 +97,10 @@ def test_potentials_have_rules_by_name():
     ("make", "message"),
     [
         (lambda: galerkin(2, 2, "simpson"), "rule is 'simpson'; it must be 'gauss', 'lobatto' or a Rule"),
-        (lambda: Scheme(2, 3, kinetic=TWO, slow=TWO, fast=TWO), r"kinetic rule .* gives no positive kinetic energy to"),
+        (
+            lambda: Scheme(2, 3, kinetic=TWO, slow=TWO, fast=TWO),
+            r"kinetic rule .* gives no positive kinetic energy to",
+        ),
         (
             lambda: Scheme(2, kinetic=HALF, slow=HALF, fast=HALF, slow_constraint=OFF),
             "weight of the slow_constraint rule is zero",
@@ -110,7 +113,10 @@ def test_potentials_have_rules_by_name():
         ),
         (lambda: fully_explicit(8).rule_of(3), r"the potential 3 is placed with every=3"),
         (lambda: fully_explicit(8).rule_of("bends"), r"no rule for the potential 'bends'"),
-        (lambda: fully_explicit(8).with_potentials(bends=quadrature.midpoint), "bends is a bare rule"),  # pyright: ignore[reportArgumentType]
+        (
+            lambda: fully_explicit(8).with_potentials(bends=quadrature.midpoint),  # pyright: ignore[reportArgumentType]
+            "bends is a bare rule",
+        ),
         (
             lambda: Scheme(4, kinetic=micro(quadrature.midpoint, every=2), slow=HALF, fast=HALF),
             "kinetic is placed with every=2; only potentials can be",

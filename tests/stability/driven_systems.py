@@ -1,4 +1,5 @@
-"""Twelve driven or moving systems: what is said about them, and what a run of a thousand periods does, ``python -m tests.stability.driven_systems``."""
+"""Twelve driven or moving systems: what is said about them, and what a run of a thousand periods does,
+``python -m tests.stability.driven_systems``."""
 
 from dataclasses import dataclass
 
@@ -29,7 +30,8 @@ class Driven:
         return self.period / self.steps
 
     def largest(self) -> float:
-        """Largest position in a run of `PERIODS` periods over that in its first ten periods; infinite if the run fails."""
+        """Largest position in a run of `PERIODS` periods over that in its first ten periods; infinite if the run
+        fails."""
         steps = round(PERIODS * self.steps)
         run = until_failure(self.problem, self.scheme, macro_dt=self.macro_dt, num_steps=steps)
         away = np.abs(np.concatenate([run.states.q_s - run.states.q_s[0], run.states.q_f - run.states.q_f[0]], axis=1))
@@ -140,7 +142,8 @@ def pumped(t, q_s, q_f, v_s, v_f, params):
 
 
 def chain(omega, stable) -> Driven:
-    """Two slow and four fast coordinates; the slow ones have frequency 2.23 and are pumped at twice that, or beside it."""
+    """Two slow and four fast coordinates; the slow ones have frequency 2.23 and are pumped at twice that, or beside
+    it."""
     params = {"depth": jnp.asarray(1.0), "omega": jnp.asarray(omega)}
     masses = vm.ConstantMass([1.0, 1.0], [1.0, 1.0, 1.0, 1.0])
     system = vm.System(masses, links, bonds, force=pumped, params=params)

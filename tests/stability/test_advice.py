@@ -40,7 +40,8 @@ def test_impulse_resonance_of_the_chain(fpu):
 
 
 def test_combination_resonance():
-    """Linear model, kappa 25, omega h = 0.1, num_micro 57, fully implicit: in advice and in a map; `test_linear` has the derivative of a step itself."""
+    """Linear model, kappa 25, omega h = 0.1, num_micro 57, fully implicit: in advice and in a map; `test_linear` has
+    the derivative of a step itself."""
     problem = linear_model()
     advice = advise(problem, fully_implicit(57), macro_dt=0.114)
     assert kinds(advice) == ["combination resonance"]

@@ -38,7 +38,10 @@ def test_what_is_said_is_what_a_run_of_a_thousand_periods_does(name):
 
 @pytest.mark.parametrize(("steps", "kind"), [(32.0, "motion"), (0.5, "drive")])
 def test_multipliers_of_the_motion_are_those_of_the_equation(steps, kind):
-    """Mathieu's characteristic exponent at a = 1, q = 0.2, from an ODE solver: 0.3123 per period. Two periods in a step see no drive."""
+    """Mathieu's characteristic exponent at a = 1, q = 0.2, from an ODE solver: 0.3123 per period.
+
+    Two periods in a step see no drive.
+    """
     driven = mathieu(1.0, 0.2, steps=steps)
     advice = vm.advise(driven.problem, driven.scheme, macro_dt=driven.macro_dt)
     assert advice.findings[0].kind == kind
@@ -99,7 +102,8 @@ def test_a_drive_without_a_period_is_said_to_be_frozen():
 
 
 def test_disturbances_of_a_linear_system_repeat_themselves():
-    """The driven oscillator comes back elsewhere after a period, and its disturbances do the same in each: it is linear."""
+    """The driven oscillator comes back elsewhere after a period, and its disturbances do the same in each: it is
+    linear."""
     driven = mathieu(2.5, 0.0, 1.0)
     motion = driven_motion(driven.problem.system, driven.scheme, driven.problem.state(), 0.1, np.pi)
     assert motion.growth == 0
@@ -128,7 +132,8 @@ def shaken_pivot(t, q_s, q_f, v_s, v_f, params):
 
 @pytest.mark.parametrize(("omega", "growth"), [(61.0, 0.115), (62.4, 0.0506), (66.0, 0.0)])
 def test_steps_that_do_not_divide_the_period(omega, growth):
-    """Near the border of stability, 62.6 rad/s, the product of steps over nearly three periods would have other multipliers."""
+    """Near the border of stability, 62.6 rad/s, the product of steps over nearly three periods would have other
+    multipliers."""
     system = vm.System(vm.ConstantMass([], [1.0]), force=shaken_pivot, params={"omega": omega})
     advice = vm.advise(vm.Problem(system, [], [0.0]), vm.fully_explicit(10), macro_dt=0.01)
     assert [finding.kind for finding in advice.findings] == ["motion"]

@@ -49,7 +49,8 @@ def test_the_step_of_the_expansion_is_the_derivative_of_the_step(case, scheme):
 
 
 def test_constraint_forces_stiffen_a_pendulum():
-    """Point mass on a rod, hanging: ``omega^2 = g / l`` comes from the tension alone; standing, it grows at that rate."""
+    """Point mass on a rod, hanging: ``omega^2 = g / l`` comes from the tension alone; standing, it grows at that
+    rate."""
 
     def rod(q_s, q_f, params):
         return (q_f @ q_f - 4.0)[None] / 2

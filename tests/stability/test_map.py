@@ -82,7 +82,8 @@ def test_bad_input():
         found.windows("other")
 
 
-# --- the search for windows, on a label that is known ---------------------------------------------------------------------
+# --- the search for windows, on a label that is known
+# ---------------------------------------------------------------------
 WINDOWS = [(0.1, 0.35), (0.5, 0.50004), (0.8, 0.80002), (0.95, 1.0)]
 
 

@@ -72,7 +72,8 @@ def test_on_a_constraint_manifold(swinging):
 
 
 def test_at_rest_the_multipliers_of_constraints_count():
-    """Corrections of a step at rest are zero from the first pass on, and the weights that the rods carry make its frequencies."""
+    """Corrections of a step at rest are zero from the first pass on, and the weights that the rods carry make its
+    frequencies."""
     system = double_pendulum()
     at_rest = monodromy(system, galerkin(2, 2), hanging(system), macro_dt=0.05, num_steps=1, solver=MARCH)
     frequencies = linearise(system, hanging(system)).frequencies

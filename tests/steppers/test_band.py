@@ -1,4 +1,5 @@
-"""Long chains: constraints that share no coordinates leave zeros, as do springs; a band takes the same steps as the full matrix."""
+"""Long chains: constraints that share no coordinates leave zeros, as do springs; a band takes the same steps as the
+full matrix."""
 
 import jax
 import jax.numpy as jnp
@@ -57,7 +58,8 @@ def test_a_chain_is_a_band_of_its_neighbours_and_a_dense_mass_leaves_no_zeros():
 
 
 def linear_springs(q_f, params):
-    """A ring: each mass is tied to its neighbours, the last one to the first; one pair across the ring by a very weak spring."""
+    """A ring: each mass is tied to its neighbours, the last one to the first; one pair across the ring by a very weak
+    spring."""
     return 50.0 * jnp.sum((q_f - jnp.roll(q_f, 1)) ** 2) + 1e-9 * (q_f[0] - q_f[3]) ** 2
 
 

@@ -1,5 +1,5 @@
-"""A single interval of higher degree in modes of time: the step is that of the whole equations, in few passes. With constraints
-of all kinds it is held to the textbook in `tests/textbook`."""
+"""A single interval of higher degree in modes of time: the step is that of the whole equations, in few passes. With
+constraints of all kinds it is held to the textbook in `tests/textbook`."""
 
 import jax
 import jax.numpy as jnp
@@ -152,7 +152,8 @@ def test_it_solves_the_equations_of_the_step(make, scheme, macro_dt):
 
 @pytest.mark.parametrize(("name", "bound"), [("tsp", 8), pytest.param("sam", 6, marks=pytest.mark.full)])
 def test_few_iterations_at_high_degree(name, bound, request):
-    """Steps of about two thirds of a period of the stiff springs; the first of them settles the springs, the others the rotation."""
+    """Steps of about two thirds of a period of the stiff springs; the first of them settles the springs, the others the
+    rotation."""
     run = vm.simulate(request.getfixturevalue(name), vm.galerkin(1, 8), macro_dt=0.04, num_steps=25)
     assert run.info.iterations.mean() < bound  # measured 6.7 and 5.0
 

@@ -1,4 +1,5 @@
-"""Corrected kicks: frequencies of harmonic vibrations of order 4 on both grids, the same step by every method, and what they refuse."""
+"""Corrected kicks: frequencies of harmonic vibrations of order 4 on both grids, the same step by every method, and what
+they refuse."""
 
 import jax
 import numpy as np

@@ -1,4 +1,5 @@
-"""A stepper of one's own as an argument: runs, batches and gradients by the exact rotation of stiff springs between kicks."""
+"""A stepper of one's own as an argument: runs, batches and gradients by the exact rotation of stiff springs between
+kicks."""
 
 import dataclasses
 
@@ -170,7 +171,8 @@ class Verlet(Stepper):
 
 
 def test_stages_of_a_composition_start_with_their_own_memory(fpu):
-    """Memory that depends on the state, and a wrong time: compositions of the stepper equal compositions of the library's scheme."""
+    """Memory that depends on the state, and a wrong time: compositions of the stepper equal compositions of the
+    library's scheme."""
     for scheme in (vm.fully_explicit(1), vm.compose(vm.fully_explicit(1), "suzuki4")):
         ours = vm.simulate(fpu, scheme, solver=vm.Solver(stepper=lambda system, scheme: Verlet(system)), **STEPS)
         theirs = vm.simulate(fpu, scheme, **STEPS)

@@ -1,5 +1,5 @@
-"""Drift along the constraints: the multipliers alone are solved for, errors are within the tolerance. Its steps are held to the
-textbook in `tests/textbook`."""
+"""Drift along the constraints: the multipliers alone are solved for, errors are within the tolerance. Its steps are
+held to the textbook in `tests/textbook`."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,5 @@
-"""Which solver takes a step: the words of a plan, the fallback of passes that do not converge, the programs that are compiled."""
+"""Which solver takes a step: the words of a plan, the fallback of passes that do not converge, the programs that are
+compiled."""
 
 import os
 
@@ -20,8 +21,9 @@ def drag(t, q_s, q_f, v_s, v_f, params):
 
 
 def test_a_plan_says_how_a_step_is_solved(fpu, tsp):
-    """Only kicks by V let slow and fast variables go their own ways, a force couples them; a term inside the macro interval needs the whole
-    equations with exact matrices, a kinetic energy that is a function the matrices of its masses."""
+    """Only kicks by V let slow and fast variables go their own ways, a force couples them; a term inside the macro
+    interval needs the whole equations with exact matrices, a kinetic energy that is a function the matrices of its
+    masses."""
     rule = vm.micro(vm.quadrature.midpoint)
     inside = vm.Scheme(4, kinetic=rule, slow=vm.macro(vm.quadrature.gauss(2)), fast=rule)
     forced, whole = fpu.system.replace(force=drag), "exact: micro intervals in order with exact matrices"
@@ -86,7 +88,10 @@ def test_the_fallback_stays_out_of_the_loop_in_a_compiled_function(tsp):
 
 
 def test_a_run_that_fails_late_is_made_again_with_exact_matrices(tsp, capsys, monkeypatch):
-    """At this step passes with masses solve seven or eight steps, as round-off has it, and not the next one. A prepared run says so."""
+    """At this step passes with masses solve seven or eight steps, as round-off has it, and not the next one.
+
+    A prepared run says so.
+    """
     monkeypatch.setattr(progress, "SECONDS_BETWEEN_LINES", 0.0)
     step = {"macro_dt": 0.2, "num_steps": 20}
     march, exact = (

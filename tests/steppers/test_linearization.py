@@ -1,4 +1,5 @@
-"""The Newton matrix, factored interval by interval, against the derivative of the whole residual, on a system with everything in it."""
+"""The Newton matrix, factored interval by interval, against the derivative of the whole residual, on a system with
+everything in it."""
 
 from dataclasses import replace
 
@@ -47,7 +48,8 @@ def equations_and_unknowns(scheme):
 
 
 SIMILAR = ("fully implicit", "explicit slow", "one micro step", "macro gauss", "gauss 2", "lobatto 2")
-"""Their blocks are those of others: V on the macro and W on the micro grid, Gauss and Lobatto rules of a higher degree."""
+"""Their blocks are those of others: V on the macro and W on the micro grid, Gauss and Lobatto rules of a higher
+degree."""
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.full if n in SIMILAR else ()) for n in SCHEMES])
@@ -74,7 +76,8 @@ def test_all_take_the_direction_of_the_derivative_of_the_residual(name):
 
 
 def test_the_masses_at_the_start_stand_in_for_a_kinetic_energy():
-    """Matrices of the masses are the exact ones of the system with ``v^T M v / 2`` in place of T, M at the start of the step."""
+    """Matrices of the masses are the exact ones of the system with ``v^T M v / 2`` in place of T, M at the start of the
+    step."""
     equations, x = equations_and_unknowns(SCHEMES["gauss 2"])
     q_s, q_f, n_s = equations.q_s, equations.q_f, equations.q_s.size
     v = np.concatenate([x.slow[-1] / equations.macro_dt, x.fast[0, -1] / equations.micro_dt])

@@ -1,5 +1,6 @@
-"""The nested iteration: few passes, errors within the tolerance, honest about what it did. Its steps are held to the textbook in
-`tests/textbook`, and those of the reference problems to trajectories of another program in `tests/verification`."""
+"""The nested iteration: few passes, errors within the tolerance, honest about what it did. Its steps are held to the
+textbook in `tests/textbook`, and those of the reference problems to trajectories of another program in
+`tests/verification`."""
 
 import jax
 import jax.numpy as jnp
@@ -142,8 +143,8 @@ def test_equal_masses_converge():
 
 
 def test_momenta_have_their_full_precision(tsp):
-    """The heavy slow bob turns round-off of positions into impulses on the light ones, unless momenta are sums of impulses. Measured over 300 steps:
-    4e-14; 3e-13 with momenta from the increments of the last correction."""
+    """The heavy slow bob turns round-off of positions into impulses on the light ones, unless momenta are sums of
+    impulses. Measured over 300 steps: 4e-14; 3e-13 with momenta from the increments of the last correction."""
 
     def end(solver):
         return vm.simulate(tsp, vm.fully_explicit(1), macro_dt=0.002, num_steps=300, save=100, solver=solver)[-1]

@@ -15,7 +15,8 @@ from vmri_jax.steppers.solver import Solver
 
 @pytest.mark.parametrize("fast", [midpoint, trapezoidal], ids=["midpoint", "kicks"])
 def test_average_of_a_vibration(fast):
-    """``a(q) = sin(N theta) cot(theta / 2) / (2 N) q`` for the phase theta of a micro step: zero at ``N theta = k pi``."""
+    """``a(q) = sin(N theta) cot(theta / 2) / (2 N) q`` for the phase theta of a micro step: zero at ``N theta = k
+    pi``."""
     system, n, h = two_oscillators().system, 10, 0.013
     scheme = vm.Scheme(n, kinetic=vm.micro(midpoint), slow=mollified(vm.macro(trapezoidal)), fast=vm.micro(fast))
     theta = 2 * np.arctan(50.0 * h / 2) if fast is midpoint else 2 * np.arcsin(50.0 * h / 2)
@@ -46,7 +47,8 @@ def hardening(q_s, q_f, params):
 
 @pytest.fixture(scope="module")
 def hardened():
-    """``hardened(scheme, macro_dt, num_steps, state)``: the end of a run of two oscillators with a nonlinear coupling."""
+    """``hardened(scheme, macro_dt, num_steps, state)``: the end of a run of two oscillators with a nonlinear
+    coupling."""
     problem = two_oscillators()
     system = problem.system.replace(slow_potential=hardening)
 

@@ -101,7 +101,8 @@ def test_huge_steps_end_at_the_solution_that_is_meant(tsp):
 def test_continuation_finds_the_solution_that_plain_newton_misses(tsp):
     """The whole step, from what the steps before lead to and from straight motion, has no solution that passes find.
 
-    The motion is chaotic, so that round-off decides which start meets such a step: of 64 starts 34 end, and most of these need continuation.
+    The motion is chaotic, so that round-off decides which start meets such a step: of 64 starts 34 end, and most of
+    these need continuation.
     """
     state, ended = tsp.state(), []
     for k in range(16):
@@ -154,7 +155,8 @@ def test_slow_variable_that_only_sees_round_off():
 
 
 def test_round_off_of_coupled_masses_ends_the_iteration():
-    """Masses of condition number 1e8, like the masses of a chain of a hundred bars: corrections stay at 1e-10 of the increments."""
+    """Masses of condition number 1e8, like the masses of a chain of a hundred bars: corrections stay at 1e-10 of the
+    increments."""
     lever = np.tril(np.ones((60, 60))).T @ np.tril(np.ones((60, 60)))
     masses = lever.T @ lever
 

@@ -1,4 +1,5 @@
-"""The null space method: the same trajectory without multipliers among the unknowns, and a matrix that no step makes worse."""
+"""The null space method: the same trajectory without multipliers among the unknowns, and a matrix that no step makes
+worse."""
 
 from dataclasses import replace
 from functools import partial
@@ -83,7 +84,8 @@ def test_trajectories_of_rigid_bodies(name, num_micro):
 
 
 def null_space_condition(system, scheme, state, macro_dt) -> float:
-    """Condition number of ``P_0^T A P_1`` with the Newton matrix A and bases of null spaces, ``G_0 P_0 = 0`` at the start, ``G_1 P_1 = 0`` at the end."""
+    """Condition number of ``P_0^T A P_1`` with the Newton matrix A and bases of null spaces, ``G_0 P_0 = 0`` at the
+    start, ``G_1 P_1 = 0`` at the end."""
     whole = np.asarray(newton_matrix(system, scheme, state, macro_dt))
     n, r = scheme.num_micro, scheme.degree
     n_g, n_gs = system.num_constraints(state.q_s, state.q_f)

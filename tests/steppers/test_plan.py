@@ -97,7 +97,8 @@ def test_a_mollified_scheme_refuses_potentials_on_the_micro_grid(fpu):
 
 
 def test_slow_variables_are_joined_where_the_matrices_are_no_larger(fpu, tsp, sam):
-    """Modes leave out the curvature of slow variables; an iteration with a diagonal or a kept matrix of the fast variables keeps to it."""
+    """Modes leave out the curvature of slow variables; an iteration with a diagonal or a kept matrix of the fast
+    variables keeps to it."""
     steppers: dict[Any, Any] = {
         (name, scheme.degree): vm.plan(problem, scheme).stepper
         for name, problem in (("fpu", fpu), ("tsp", tsp), ("sam", sam))

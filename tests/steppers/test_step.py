@@ -37,7 +37,8 @@ def test_split_and_coupled_routes_agree():
 
 
 def test_the_step_is_the_discrete_legendre_transform(fpu):
-    """The control points of the step have the start's momenta at one end and the new ones at the other; `tests/textbook` has other schemes."""
+    """The control points of the step have the start's momenta at one end and the new ones at the other;
+    `tests/textbook` has other schemes."""
     start, scheme = fpu.state(), vm.explicit_slow(3, 0.2)
     end, info = step(fpu, scheme, 0.05)
     slow = np.stack([start.q_s, end.q_s])

@@ -128,7 +128,8 @@ def test_ctrl_c_keeps_the_rows(reference, words, rows):
 
 
 class Travelling(Executor):
-    """Tasks and results travel as bytes, as to a worker and back, but the worker is this process: programs are compiled once."""
+    """Tasks and results travel as bytes, as to a worker and back, but the worker is this process: programs are compiled
+    once."""
 
     def submit(self, fn, /, *args, **kwargs) -> Future:
         fn, args, kwargs = pickle.loads(pickle.dumps((fn, args, kwargs)))

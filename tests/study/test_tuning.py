@@ -1,4 +1,5 @@
-"""The search for the cheapest setting: what it promises, refuses, and keeps when it fails; the page of cost, and prices of functions."""
+"""The search for the cheapest setting: what it promises, refuses, and keeps when it fails; the page of cost, and prices
+of functions."""
 
 import dataclasses
 from importlib import import_module

@@ -1,7 +1,7 @@
 """Steppers against the textbook, on random systems: shared by the tests of this folder.
 
-Steps of degree 1 are put into the textbook's equations; others, whose inner control points no run saves, and compositions end where
-the textbook's own solution ends.
+Steps of degree 1 are put into the textbook's equations; others, whose inner control points no run saves, and
+compositions end where the textbook's own solution ends.
 """
 
 from functools import partial

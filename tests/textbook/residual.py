@@ -10,7 +10,8 @@ from vmri_jax import Trajectory, textbook
 
 @jax.jit
 def _equations(system, scheme, slow, fast, t, macro_dt):
-    """Derivatives of ``L_d`` and the work of forces by all control points, and constraints at them with their Jacobian."""
+    """Derivatives of ``L_d`` and the work of forces by all control points, and constraints at them with their
+    Jacobian."""
 
     def action(path):
         free = textbook.discrete_lagrangian(system, scheme)(*path, macro_dt)
@@ -25,10 +26,11 @@ def _equations(system, scheme, slow, fast, t, macro_dt):
 
 
 def residual(system, scheme, run: Trajectory, macro_dt) -> float:
-    """Largest part, over the largest momentum, of the slots that no constraint forces balance; or largest constraint or rate of one, if it is larger.
+    """Largest part, over the largest momentum, of the slots that no constraint forces balance; or largest constraint or
+    rate of one, if it is larger.
 
-    With ``d = (p + D_first A, D_inner A, D_last A - p+)`` without multipliers, a step solves ``d = C^T lambda`` for some lambda, where
-    C is the Jacobian of all constraints by the control points.
+    With ``d = (p + D_first A, D_inner A, D_last A - p+)`` without multipliers, a step solves ``d = C^T lambda`` for
+    some lambda, where C is the Jacobian of all constraints by the control points.
 
     Args:
         system: what has been simulated.

@@ -1,8 +1,9 @@
-"""The table of tools and small systems: what a cell has to work with, and how a file of tests runs its part of the table.
+"""The table of tools and small systems: what a cell has to work with, and how a file of tests runs its part of the
+table.
 
-A file of tests has TOOLS, functions of a `Cell` by name; each of them is run on every system of `tests.small_systems`. A tool that
-cannot apply to a system refuses: REFUSED has a part of its sentence by (tool, system). All cells share a scheme, a step and a
-number of nodes, so that they share compiled programs.
+A file of tests has TOOLS, functions of a `Cell` by name; each of them is run on every system of `tests.small_systems`.
+A tool that cannot apply to a system refuses: REFUSED has a part of its sentence by (tool, system). All cells share a
+scheme, a step and a number of nodes, so that they share compiled programs.
 """
 
 import re
@@ -83,7 +84,8 @@ QUICK = ("one_coordinate", "fast_alone")
 
 
 def cells(tools: Tools, full: Collection[tuple[str, str]] = ()):
-    """A decorator: a test for each tool and each system; those of `full`, and systems that are not quick, run with --full only."""
+    """A decorator: a test for each tool and each system; those of `full`, and systems that are not quick, run with
+    --full only."""
     pairs = [(tool, system) for system in SYSTEMS for tool in tools]
     marked = [
         pytest.param(*pair, marks=() if pair[1] in QUICK and pair not in full else pytest.mark.full) for pair in pairs

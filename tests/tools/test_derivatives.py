@@ -83,8 +83,8 @@ TOOLS = {tool.__name__: tool for tool in (gradient, fit, minimize, minimize_with
 REFUSED = {("minimize_without_controls", system): "minimize" for system in SYSTEMS}
 DEAR = {"fit": ("one_coordinate", "fast_alone"), "minimize": ("one_coordinate", "fast_alone")}
 FULL = {(tool, system) for tool, quick in DEAR.items() for system in SYSTEMS if system not in quick}
-"""A fit compiles the Jacobian of a whole run and a search, controls the derivatives of steps, a search and a roll-out: 7 to 12 s of
-processor time for one coordinate, 30 s for a scene."""
+"""A fit compiles the Jacobian of a whole run and a search, controls the derivatives of steps, a search and a roll-out:
+7 to 12 s of processor time for one coordinate, 30 s for a scene."""
 
 
 @cells(TOOLS, FULL)

@@ -66,7 +66,8 @@ OF_STUDIES = reference_solution, convergence_study, work_and_precision
 TOOLS = {tool.__name__: tool for tool in (*OF_STUDIES, monodromy, linearise, two_cases, all_cases)}
 REFUSED = {}
 FULL = {("all_cases", system) for system in SYSTEMS}
-"""A minute of processor time each: ten programs are compiled, of which the batch with a lane that fails takes a third."""
+"""A minute of processor time each: ten programs are compiled, of which the batch with a lane that fails takes a
+third."""
 
 
 @cells(TOOLS, FULL)

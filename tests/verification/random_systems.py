@@ -1,7 +1,8 @@
-"""Random systems, starts, schemes and steps: tame ones that every method must solve, or any, most of them hard and some hopeless.
+"""Random systems, starts, schemes and steps: tame ones that every method must solve, or any, most of them hard and some
+hopeless.
 
-A `Structure` decides what is compiled, a `Draw` all numbers: many draws of a structure share its compiled programs. Both are
-drawn from a `random.Random`, so that a seed names them; Hypothesis has one that it can shrink.
+A `Structure` decides what is compiled, a `Draw` all numbers: many draws of a structure share its compiled programs.
+Both are drawn from a `random.Random`, so that a seed names them; Hypothesis has one that it can shrink.
 """
 
 import dataclasses
@@ -284,7 +285,10 @@ def functions(of: Structure) -> dict:
 
 
 def problem(of: Structure, at: Draw) -> vm.Problem:
-    """System and start. The constraints hold at the start up to ``off``; where they hold, velocities are projected onto them."""
+    """System and start.
+
+    The constraints hold at the start up to ``off``; where they hold, velocities are projected onto them.
+    """
     n_s = of.dimension * of.slow
     q, v, masses = (np.array(x) for x in (at.positions, at.velocities, at.masses))
     params = {

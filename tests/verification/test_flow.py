@@ -85,8 +85,8 @@ def test_observed_order_of_rules_over_several_micro_intervals(name):
     assert scheme.order == order
 
 
-# An independent re-run of the reference study: FPU chain, t = 1, largest errors over all components at the end, not a sup
-# over the nodes on the way, which is up to 9 times larger for the momenta (the fast momenta are worst in between).
+# An independent re-run of the reference study: FPU chain, t = 1, largest errors over all components at the end, not a
+# sup over the nodes on the way, which is up to 9 times larger for the momenta (the fast momenta are worst in between).
 # Scheme, order of q and p between H = 0.01 and 0.0005, errors of q at H = 0.01 and 0.001, errors of p.
 TABLE = {
     "fully explicit, 0, 5": (vm.fully_explicit(5, 0.0), (0.98, 0.91), (1.0e-3, 1.1e-4), (8.5e-3, 1.0e-3)),

@@ -111,7 +111,11 @@ def test_verdicts(changes, found):
 
 
 def test_errors_of_others_are_no_refusals():
-    for wrong in (lambda: jnp.ones(2) + jnp.ones(3), lambda: vm.ConstantMass.velocity(None, 0, 0), lambda: {}["x"]):  # pyright: ignore
+    for wrong in (
+        lambda: jnp.ones(2) + jnp.ones(3),
+        lambda: vm.ConstantMass.velocity(None, 0, 0),  # pyright: ignore[reportArgumentType]
+        lambda: {}["x"],
+    ):
         with pytest.raises(Exception) as caught:  # noqa: PT011
             wrong()
         assert fuzz.refusal(caught.value).startswith("foreign error: " + type(caught.value).__name__)

@@ -34,8 +34,9 @@ def central_difference(function, x, step):
 
 @cache
 def gradient_program(case: str):
-    """Value and gradient of the sum of cosines of the fast positions after 10 steps by ``(stiffness, v, q_f, macro_dt)``, compiled; and
-    the arguments of the case. The start has the velocities v, projected onto the constraints, and the fast positions q_f."""
+    """Value and gradient of the sum of cosines of the fast positions after 10 steps by
+    ``(stiffness, v, q_f, macro_dt)``, compiled; and the arguments of the case. The start has the velocities v,
+    projected onto the constraints, and the fast positions q_f."""
     problem, scheme, macro_dt, parameter, entry = CASES[case]
     params, n_s = problem.system.params, problem.q_s.size
     solver = vm.Solver() if case == FALLS_BACK else without_fallback(problem, scheme)
@@ -97,7 +98,8 @@ def test_gradient_with_respect_to_the_start_and_the_step():
 
 
 def position_after_a_step(case: str, matrix: str):
-    """The sum of fast positions after one macro step, by a matrix, as a function of the stiffness; and the stiffness of the case."""
+    """The sum of fast positions after one macro step, by a matrix, as a function of the stiffness; and the stiffness of
+    the case."""
     problem, scheme, macro_dt, parameter, _ = CASES[case]
 
     def function(stiffness):
@@ -119,7 +121,8 @@ def test_exact_matrices_have_the_same_derivative():
 
 @pytest.mark.full
 def test_second_derivative():
-    """Forward over forward, of a step; `tests/running/test_adjoints.py` has second derivatives of runs, over reverse."""
+    """Forward over forward, of a step; `tests/running/test_adjoints.py` has second derivatives of runs, over
+    reverse."""
     function, at = position_after_a_step("chain, fully implicit", "masses")
     slope, step = jax.jit(jax.jacfwd(function)), 1e-3
     difference = (slope(at + step) - slope(at - step)) / (2 * step)
@@ -131,7 +134,8 @@ def stiffness_times_square(q_f, params):
 
 
 def test_a_third_derivative_is_no_number():
-    """It would be wrong where equations are solved; where nothing is solved it is that of the polynomial through the values."""
+    """It would be wrong where equations are solved; where nothing is solved it is that of the polynomial through the
+    values."""
     system = vm.System(vm.ConstantMass([], [1.0]), None, stiffness_times_square, params={"omega": 30.0})
     state = vm.initial_state(system, [], [1.0], [], [0.5])
 

@@ -1,6 +1,7 @@
 """Potentials with rates of their own: r-RESPA of three levels written out in numpy, and what holds for every placement.
 
-A chain of four atoms in the plane, all of them fast: bonds on every micro node, bends on every fourth, pairs at the macro nodes.
+A chain of four atoms in the plane, all of them fast: bonds on every micro node, bends on every fourth, pairs at the
+macro nodes.
 """
 
 from collections import Counter
@@ -60,7 +61,8 @@ START = vm.initial_state(CHAIN, NONE, POINTS, NONE, VELOCITY)
 
 
 def respa(q, p, num_steps: int, rows=None):
-    """(q, p) after steps of nested velocity Verlet; with constraint `rows` its drifts are SHAKE's, and p is projected at the end."""
+    """(q, p) after steps of nested velocity Verlet; with constraint `rows` its drifts are SHAKE's, and p is projected
+    at the end."""
     inverse, (slow, between, fast) = 1 / np.asarray(MASS), map(_force, LEVELS.values())
     h = H / NUM_MICRO
     value = jax.jit(rows or (lambda q: q[:0]))
@@ -270,7 +272,8 @@ PLACEMENTS = {
 
 
 ALIKE = ("another rule", "degree 2", "kinetic function", "W between the grids", "slow and fast, on the micro grid")
-"""For --full: rules and kinetic functions are in `tests/textbook`, W between the grids is beside V there, and `hinge` is on other grids."""
+"""For --full: rules and kinetic functions are in `tests/textbook`, W between the grids is beside V there, and `hinge`
+is on other grids."""
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.full if n in ALIKE else ()) for n in PLACEMENTS])

@@ -44,7 +44,8 @@ def rigid(q_s, q_f, params):
 
 @pytest.mark.parametrize(("constrained", "bound"), [(False, 1e-12), (True, 5e-9)])
 def test_equals_openmm(constrained, bound):
-    """Measured 1e-13; with constraints 1.4e-9, which OpenMM's own constraints are good for at their smallest tolerance."""
+    """Measured 1e-13; with constraints 1.4e-9, which OpenMM's own constraints are good for at their smallest
+    tolerance."""
     openmm = pytest.importorskip("openmm")
     mts = pytest.importorskip("openmm.mtsintegrator")
     system = openmm.System()

@@ -1,4 +1,5 @@
-"""Known methods as special cases, each written out in numpy: midpoint variational integrator, Verlet, impulses, RATTLE."""
+"""Known methods as special cases, each written out in numpy: midpoint variational integrator, Verlet, impulses,
+RATTLE."""
 
 import jax
 import jax.numpy as jnp
@@ -64,7 +65,8 @@ def test_one_implicit_micro_step_is_the_midpoint_variational_integrator(fpu):
 
 @pytest.mark.parametrize(("num_micro", "alpha"), [(1, 0.5), (1, 1.0), (4, 0.5)], ids=["verlet", "euler", "r-RESPA"])
 def test_explicit_micro_steps_are_the_impulse_method(fpu, num_micro, alpha):
-    """Kick by V, num_micro steps of W by kicks and drifts, kick by V; a single one is Verlet's step, or symplectic Euler's."""
+    """Kick by V, num_micro steps of W by kicks and drifts, kick by V; a single one is Verlet's step, or symplectic
+    Euler's."""
     slow, fast, _ = forces(fpu)
     h = H / num_micro
 

@@ -22,10 +22,13 @@ def scheme_of(case):
 
 RUNS = [(name, method) for name in sorted(CASES) for method in ("auto", "dense", "masses", "exact")]
 DENSE = ("sam_explicit_slow_a05_p4",)
-"""Case that the dense method solves also without --full, with constraints of both kinds; `tests/textbook` and `tests/steppers/test_march.py` have it on
-other systems."""
+"""Case that the dense method solves also without --full, with constraints of both kinds; `tests/textbook` and
+`tests/steppers/test_march.py` have it on other systems."""
 OFTEN = ("fpu_fully_explicit_a025_p5", "tsp_fully_implicit_a05_p5", "tsp_explicit_slow_a10_p5", *DENSE)
-"""Cases that are solved without --full: each system and each scheme. `tests/textbook` has all other pairs on systems of its own."""
+"""Cases that are solved without --full: each system and each scheme.
+
+`tests/textbook` has all other pairs on systems of its own.
+"""
 
 
 def is_long(name, method) -> bool:

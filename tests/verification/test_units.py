@@ -1,4 +1,5 @@
-"""A system in other units is the same system: every number of a run comes out the same, scaled, and every check decides the same.
+"""A system in other units is the same system: every number of a run comes out the same, scaled, and every check decides
+the same.
 
 Units are powers of two, so that scaling rounds nothing: runs are equal bit for bit, but for those of `ROUNDED`.
 """
@@ -19,8 +20,8 @@ from vmri_jax.systems import fermi_pasta_ulam, simple_atomic_model, triple_spher
 SCALES = [(60, 0, 0), (-60, 17, 23), (0, -60, 60), (23, 60, -60)]
 """Exponents of 2 of the units of length, time and mass."""
 ROUNDED = dict.fromkeys(("sam", "polar", "on_a_spiral", "joints"), 1e-14)
-"""Largest relative differences of runs that are not equal bit for bit: 1e-33 in the projected start of sam; 3e-16 in energies, whose velocities come
-from mass matrices over square roots of odd powers of two."""
+"""Largest relative differences of runs that are not equal bit for bit: 1e-33 in the projected start of sam; 3e-16 in
+energies, whose velocities come from mass matrices over square roots of odd powers of two."""
 
 
 class Units:
@@ -182,7 +183,8 @@ def numbers_of(system, units):
 
 
 LONG = (sam, on_a_spiral)
-"""Runs for --full: terms of sam are in tsp and in fpu; a constraint between a length and an angle is refused in all units below."""
+"""Runs for --full: terms of sam are in tsp and in fpu; a constraint between a length and an angle is refused in all
+units below."""
 
 
 @pytest.mark.parametrize(

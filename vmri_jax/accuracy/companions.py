@@ -4,24 +4,25 @@ A run with macro steps H and micro steps h = H / N has, with a scheme of order p
 
     x_{H,h}(t) - x(t) = S(t) H^p + F(t) h^p + ...
 
-The slow share ``S H^p`` vanishes with H at fixed h, the fast share ``F h^p`` with h at fixed H. With ``r = 2^p / (2^p - 1)`` (Richardson's
-extrapolation), from companion runs from the same start,
+The slow share ``S H^p`` vanishes with H at fixed h, the fast share ``F h^p`` with h at fixed H. With
+``r = 2^p / (2^p - 1)`` (Richardson's extrapolation), from companion runs from the same start,
 
     half the macro step:        S H^p + F h^p = r (x_{H,h} - x_{H/2,h/2})
     twice the micro steps:              F h^p = r (x_{H,h} - x_{H,h/2})
 
-The first companion halves H and h: it is the program of the run with other numbers. The second one is another program, and is run where the
-shares are asked for.
+The first companion halves H and h: it is the program of the run with other numbers. The second one is another program,
+and is run where the shares are asked for.
 
-A jump of a force can act at the same node in steps of H and of H / 2, too early or too late in both. In systems that are driven in time, and where an
-estimate is small beyond belief, a third companion takes about 1.6 times the steps, with few nodes in common with the run, and a fourth one 2.6
-times where forces jump, with the order p = 1; the largest estimate of each node counts. Steps with fewer than `NODES_OF_EVENT` nodes in an event of `vmri_jax.mechanics.driving` are not certified
-from this event on.
+A jump of a force can act at the same node in steps of H and of H / 2, too early or too late in both. In systems that
+are driven in time, and where an estimate is small beyond belief, a third companion takes about 1.6 times the steps,
+with few nodes in common with the run, and a fourth one 2.6 times where forces jump, with the order p = 1; the largest
+estimate of each node counts. Steps with fewer than `NODES_OF_EVENT` nodes in an event of `vmri_jax.mechanics.driving`
+are not certified from this event on.
 
-This is an estimate, not a bound. If the error falls with an order q below p, as for vibrations that the steps do not resolve, the true error
-is ``(1 - 2^-p) / (1 - 2^-q)`` times the estimate: 1.5 times for p = 2 and q = 1. Above order 2 an error also has mixed terms ``H^a h^b``,
-which count in part to both shares. The error of a node is *certified* if the estimates at this node and at
-all nodes before it are small against the extent of the motion.
+This is an estimate, not a bound. If the error falls with an order q below p, as for vibrations that the steps do not
+resolve, the true error is ``(1 - 2^-p) / (1 - 2^-q)`` times the estimate: 1.5 times for p = 2 and q = 1. Above order 2
+an error also has mixed terms ``H^a h^b``, which count in part to both shares. The error of a node is *certified* if the
+estimates at this node and at all nodes before it are small against the extent of the motion.
 """
 
 import math
@@ -46,27 +47,32 @@ from vmri_jax.schemes.composition import SchemeLike, stage_lengths, stage_scheme
 from vmri_jax.steppers.results import Result
 
 LARGEST_CERTIFIED = 0.1
-"""Largest certified error, as a part of the extent of the motion; from the first node with a larger one, no error is certified. Above it the
-leading term of the error no longer dominates, so that a larger value certifies meaningless numbers."""
+"""Largest certified error, as a part of the extent of the motion; from the first node with a larger one, no error is
+certified. Above it the leading term of the error no longer dominates, so that a larger value certifies meaningless
+numbers."""
 CHAOTIC_GROWTH = 32.0
-"""Growth of the error in the second half of a time, above which the motion may be chaotic: it is if the difference of two runs with smaller steps
-grows as much. Errors of regular motions grow like t or t^2, by 2 or 4, errors of chaotic motions like exp(L t). A larger value overlooks chaos that
-begins late."""
+"""Growth of the error in the second half of a time, above which the motion may be chaotic: it is if the difference of
+two runs with smaller steps grows as much. Errors of regular motions grow like t or t^2, by 2 or 4, errors of chaotic
+motions like exp(L t). A larger value overlooks chaos that begins late."""
 
 DOUBTED = 1e-5
-"""Error, as a part of the accuracy that is asked for, below which an estimate is not believed without a third companion: a run at rest has no error
-until its force begins. A larger value takes one more run where a scheme is exact."""
+"""Error, as a part of the accuracy that is asked for, below which an estimate is not believed without a third
+companion: a run at rest has no error until its force begins. A larger value takes one more run where a scheme is
+exact."""
 LENGTH_TOLERANCE = 0.01
-"""Relative error of the lengths of events, so that steps chosen for an event see it; a larger value certifies steps with fewer nodes."""
+"""Relative error of the lengths of events, so that steps chosen for an event see it; a larger value certifies steps
+with fewer nodes."""
 NODES_OF_EVENT = 4
-"""Least nodes of forces, or of moving constraints, in an event. With fewer nodes the errors of a run and its companions say nothing about each
-other; with more of them driven systems take more steps than their accuracy needs."""
+"""Least nodes of forces, or of moving constraints, in an event. With fewer nodes the errors of a run and its companions
+say nothing about each other; with more of them driven systems take more steps than their accuracy needs."""
 FURTHER_PARTS = (1.6, 2.6)
-"""Steps of further companions over the steps of the run, near multiples of the golden ratio: hardly any of their nodes is near a node of the run.
-Forces that jump take both, other driven systems the first one. More companions take longer."""
+"""Steps of further companions over the steps of the run, near multiples of the golden ratio: hardly any of their nodes
+is near a node of the run. Forces that jump take both, other driven systems the first one. More companions take
+longer."""
 FEWEST_DIVIDED = 20
-"""Least number of macro steps between nodes that a further companion has in common with the run. With a smaller number a jump may act at the same
-node in all runs, so that none tells the error; with a larger one fewer nodes are compared."""
+"""Least number of macro steps between nodes that a further companion has in common with the run. With a smaller number
+a jump may act at the same node in all runs, so that none tells the error; with a larger one fewer nodes are
+compared."""
 
 
 class UncertifiedWarning(UserWarning):
@@ -77,7 +83,8 @@ class UncertifiedWarning(UserWarning):
 class Trial:
     """A run, or a lane of a batch, beside its companion with half the macro step.
 
-    errors: (k, n_s + n_f) of the positions; NaN after a failure of the run or of this companion, infinite if a further companion fails.
+    errors: (k, n_s + n_f) of the positions; NaN after a failure of the run or of this companion, infinite if a further
+        companion fails.
     drives: events that the steps have to see.
     family: the family that a search took the scheme from; None of other runs.
     """
@@ -99,8 +106,8 @@ class Trial:
         accuracy: float = 0.0,
         family: Any = None,
     ) -> "Trial":
-        """A run with its errors, from the companion ``companion_of(2)``, and from further ones, ``companion_of(parts, whole)``, if the system is
-        driven or its errors are below `DOUBTED` of the accuracy."""
+        """A run with its errors, from the companion ``companion_of(2)``, and from further ones,
+        ``companion_of(parts, whole)``, if the system is driven or its errors are below `DOUBTED` of the accuracy."""
         halved, order, trajectory = companion_of(2), 1 if drives.jump else run.order, saved.trajectory(run)
         errors = extrapolated(order, trajectory, halved)
         has_failed = max(int(saved.failed_at), int(halved.failed_at)) >= 0
@@ -131,7 +138,8 @@ class Trial:
 
 
 def told_error(trial: Trial, of: Callable | None = None, shares: bool = False) -> Any:
-    """The `RunError` of a run without a failed step, None if its companion fails; warns if the error is not certified over the whole run."""
+    """The `RunError` of a run without a failed step, None if its companion fails; warns if the error is not certified
+    over the whole run."""
     halved, error = trial.halved, None
     if int(halved.failed_at) >= 0:
         failed = float(halved.t[0]) + int(halved.failed_at) * float(trial.run.macro_dt) / 2
@@ -167,12 +175,14 @@ def ratio(order: int, parts: float = 2) -> float:
 
 
 def extrapolated(order: int, trajectory: Trajectory, finer: Trajectory) -> np.ndarray:
-    """(k, n_s + n_f) ``r (x - x')``: the part of the error of the positions x that vanishes with the steps halved in the companion x'."""
+    """(k, n_s + n_f) ``r (x - x')``: the part of the error of the positions x that vanishes with the steps halved in
+    the companion x'."""
     return ratio(order) * (positions(trajectory) - positions(finer))
 
 
 def _with_further_companions(run, trajectory, errors, drives: Events, companion_of, order: int) -> np.ndarray:
-    """The largest of the errors and of the errors from further companions at each node; infinite if one of them fails."""
+    """The largest of the errors and of the errors from further companions at each node; infinite if one of them
+    fails."""
     # From a compared node to the next, `stride` saved nodes later: `whole` steps of the run, `parts` of the companion.
     strides = [s for s in range(1, run.num_saves + 1) if run.num_saves % s == 0]
     stride = next((s for s in strides if s * run.save_every >= FEWEST_DIVIDED), run.num_saves)
@@ -189,7 +199,8 @@ def _with_further_companions(run, trajectory, errors, drives: Events, companion_
 
 
 def node_distance(scheme: SchemeLike, drives: Events) -> float:
-    """Largest distance in time of the nodes at which a scheme sees the terms that depend on time, in units of the macro step."""
+    """Largest distance in time of the nodes at which a scheme sees the terms that depend on time, in units of the macro
+    step."""
     stage = stage_scheme(scheme)
     longest = float(np.abs(stage_lengths(scheme)).max())
     return longest * max(getattr(stage, name).largest_gap(stage.num_micro) for name in drives.names)
@@ -222,7 +233,8 @@ def _of_error(of: Callable, trial: Trial, certified: np.ndarray) -> np.ndarray:
 
 
 def certified_nodes(trajectory: Trajectory, error: np.ndarray) -> tuple[np.ndarray, float]:
-    """(k,) whether the error (k, n_s + n_f) of each node is certified, and its growth in the second half of the certified time."""
+    """(k,) whether the error (k, n_s + n_f) of each node is certified, and its growth in the second half of the
+    certified time."""
     t, extent = np.asarray(trajectory.t), extent_of(trajectory)
     envelope = np.maximum.accumulate(largest_of(error))
     certified = envelope <= LARGEST_CERTIFIED * extent if extent > 0 else np.isfinite(envelope)
@@ -238,7 +250,8 @@ def extent_of(trajectory: Trajectory) -> float:
 
 
 def check_function_of_run(of: Callable | None, run: Simulation) -> None:
-    """Refuse a function whose error is to be estimated and that returns no numbers; it is called with a run that rests at the start."""
+    """Refuse a function whose error is to be estimated and that returns no numbers; it is called with a run that rests
+    at the start."""
     if of is None:
         return
     value = of(resting(run))
@@ -249,7 +262,8 @@ def check_function_of_run(of: Callable | None, run: Simulation) -> None:
 
 
 def resting(run: Simulation) -> Trajectory:
-    """A trajectory at the times of a run that stays at the start, without micro nodes: an argument to try functions of runs on."""
+    """A trajectory at the times of a run that stays at the start, without micro nodes: an argument to try functions of
+    runs on."""
     run = replace(run, save=Save())
     _, *phase = vars(run.state).values()
     row = np.concatenate([*phase, np.zeros(run.width - sum(map(len, phase)))])
@@ -300,20 +314,21 @@ def _uncertified(error: RunError, trial: Trial) -> str:
     if unseen <= trajectory.t[-1]:
         step = drives.shortest / (NODES_OF_EVENT * node_distance(trial.run.scheme, drives))
         return (
-            f"from t = {unseen:.4g} on no error is certified: {' and '.join(drives.names)} of the system changes and changes back within "
-            f"{drives.shortest:.2g}, which steps of {macro_dt:.4g} see too seldom or not at all; take macro_dt = {step:.2g} or less, or accuracy="
+            f"from t = {unseen:.4g} on no error is certified: {' and '.join(drives.names)} of the system changes and "
+            f"changes back within {drives.shortest:.2g}, which steps of {macro_dt:.4g} see too seldom or not at all; "
+            f"take macro_dt = {step:.2g} or less, or accuracy="
         )
     t, energy = float(error.certified_until), np.asarray(trajectory.energy)
     change = np.abs(energy - energy[0]).max()
     kept = f" The energy has changed by at most {change:.1e}." if trajectory.keeps_energy else ""
     if _is_chaotic(error, trial):
         return (
-            f"the motion is chaotic, small errors have grown {float(error.growth):.0f} times in the second half of the time until t = {t:.4g}: "
-            f"from there on an error of positions means nothing.{kept}"
+            f"the motion is chaotic, small errors have grown {float(error.growth):.0f} times in the second half of the "
+            f"time until t = {t:.4g}: from there on an error of positions means nothing.{kept}"
         )
     reasons = [f" {concern}" for concern in trial.concerns if isinstance(concern, SingularCoordinatesWarning)]
     advice = "".join(reasons) or " Take smaller steps, or a scheme of higher order."
     return (
-        f"from t = {t:.4g} on positions are wrong by more than {LARGEST_CERTIFIED:.0%} of the extent of the motion, and no error is "
-        f"certified.{advice}{kept}"
+        f"from t = {t:.4g} on positions are wrong by more than {LARGEST_CERTIFIED:.0%} of the extent of the motion, "
+        f"and no error is certified.{advice}{kept}"
     )

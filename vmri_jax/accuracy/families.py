@@ -40,8 +40,8 @@ class Family:
     make: the scheme with a number of micro steps (per stage, in a composition).
     options: options of the scheme on the command line.
     python: Python expression of the scheme, with ``{}`` for num_micro.
-    first: the num_micro that a search tries first; each trial has a family of its own, whose first is its num_micro. One far from the best number makes
-        trials take longer.
+    first: the num_micro that a search tries first; each trial has a family of its own, whose first is its num_micro.
+        One far from the best number makes trials take longer.
     """
 
     name: str

@@ -82,8 +82,8 @@ NUM_MICRO = (1, 2, 3, 5, 8, 12, 20, 30, 50)
 MOST_MICRO = 64
 """Most micro steps chosen; more save little unless the slow force takes a hundred times as long as the fast one."""
 WORTH_COMPILING = 1.5
-"""Time of a run over the time that a third number of micro steps promises, above which its program is compiled. A larger
-value misses savings; a smaller one compiles for seconds to save milliseconds."""
+"""Time of a run over the time that a third number of micro steps promises, above which its program is compiled. A
+larger value misses savings; a smaller one compiles for seconds to save milliseconds."""
 LEAST_SHARE = 1e-3
 """Least slow share of the error, as a part of the fast share: the number of micro steps stays finite where the slow
 share vanishes. A larger value allows fewer micro steps."""
@@ -145,7 +145,8 @@ class Search:
 
     @cached_property
     def has_two_rates(self) -> bool:
-        """Whether micro steps may save time: there are fast coordinates, and slow ones or potentials for the macro grid."""
+        """Whether micro steps may save time: there are fast coordinates, and slow ones or potentials for the macro
+        grid."""
         has_slow = self.start.q_s.size or self.system.slow_potential is not None or self.system.potentials
         return bool(self.start.q_f.size and has_slow)
 

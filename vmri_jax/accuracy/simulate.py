@@ -1,5 +1,5 @@
-"""`simulate`: a run with given steps, or with steps chosen for an accuracy, with an estimate of its error on request; and
-`simulate_batch`: runs side by side."""
+"""`simulate`: a run with given steps, or with steps chosen for an accuracy, with an estimate of its error on request;
+and `simulate_batch`: runs side by side."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -60,18 +60,21 @@ def simulate(
         run = vm.simulate(problem, vm.fully_implicit(10), macro_dt=0.01, t_end=10.0)
         run = vm.simulate(problem, accuracy=1e-5, t_end=10.0)
 
-    With an accuracy, trial runs choose the steps, and the scheme if none is given, see `vmri_jax.accuracy.search`; ``run.settings`` has the
-    choice, ``run.error`` the error of the run. Resonant steps are avoided in systems of up to 60 coordinates.
+    With an accuracy, trial runs choose the steps, and the scheme if none is given, see `vmri_jax.accuracy.search`;
+    ``run.settings`` has the choice, ``run.error`` the error of the run. Resonant steps are avoided in systems of up to
+    60 coordinates.
 
-    Outside of transformations, `simulate` compiles once per structure of system and scheme: macro steps, parameters, rule weights, starts,
-    numbers of steps and of saved nodes vary without another compilation; num_micro and ``Save.micro`` are part of the structure. It works
-    under ``jax.vmap`` over state, params and macro_dt, and under ``jax.grad`` and ``jax.jacfwd``, where the numbers of steps and of saved
-    nodes are part of the structure, too. There a failed step does not raise: the status is in the trajectory. Names work inside of the
-    transformed function: ``run.position("load")``. Under ``jax.vmap`` the matrix "auto" computes its fallback for every lane: take
+    Outside of transformations, `simulate` compiles once per structure of system and scheme: macro steps, parameters,
+    rule weights, starts, numbers of steps and of saved nodes vary without another compilation; num_micro and
+    ``Save.micro`` are part of the structure. It works under ``jax.vmap`` over state, params and macro_dt, and under
+    ``jax.grad`` and ``jax.jacfwd``, where the numbers of steps and of saved nodes are part of the structure, too. There
+    a failed step does not raise: the status is in the trajectory. Names work inside of the transformed function:
+    ``run.position("load")``. Under ``jax.vmap`` the matrix "auto" computes its fallback for every lane: take
     `simulate_batch`, or ``solver=vm.plan(system, scheme, state).first``.
 
-    A run whose system keeps its energy warns with `LostEnergyWarning` if the energy changes by more than half of the largest kinetic energy, and a run
-    across a pole of its coordinates with `SingularCoordinatesWarning`; ``run.concerns()`` has these sentences, also after a run in a transformation.
+    A run whose system keeps its energy warns with `LostEnergyWarning` if the energy changes by more than half of the
+    largest kinetic energy, and a run across a pole of its coordinates with `SingularCoordinatesWarning`;
+    ``run.concerns()`` has these sentences, also after a run in a transformation.
 
     Args:
         system: a `Problem` or a scene; or a `System`, with a state.
@@ -79,22 +82,26 @@ def simulate(
         state: start, from `initial_state` or an earlier run; None for the start of the problem.
         macro_dt: macro step H, num_micro times the micro step.
         num_steps, t_end: number of macro steps, or the time of the end; exactly one of them.
-        save: every how many macro steps a node is saved, which divides num_steps; or a `Save`, for saved intervals by number, micro nodes,
-            derivatives in little memory, and a bar. With an accuracy only the number of saved intervals is the user's: one per macro
-            step, at most 1000, unless ``save=vm.Save(number=200)`` says how many, for a smooth curve.
+        save: every how many macro steps a node is saved, which divides num_steps; or a `Save`, for saved intervals by
+            number, micro nodes, derivatives in little memory, and a bar. With an accuracy only the number of saved
+            intervals is the user's: one per macro step, at most 1000, unless ``save=vm.Save(number=200)`` says how
+            many, for a smooth curve.
         solver: for implicit equations; None for ``Solver()``.
-        accuracy: largest error of a position at a saved node, in the unit of the positions; replaces the step size, and needs `t_end`.
-        error: True to estimate the error of the positions, ``run.error``, a `RunError`, by a run of the same program with half the macro step;
-            or a function of a run (without micro nodes) whose error is estimated, too, ``run.error.of``. It returns numbers, such as
-            ``lambda run: run.position("load")``. "shares" for the slow and the fast share of the error as well, by a run with twice the
-            micro steps, which is another program. A failed run has no error.
+        accuracy: largest error of a position at a saved node, in the unit of the positions; replaces the step size, and
+            needs `t_end`.
+        error: True to estimate the error of the positions, ``run.error``, a `RunError`, by a run of the same program
+            with half the macro step; or a function of a run (without micro nodes) whose error is estimated, too,
+            ``run.error.of``. It returns numbers, such as ``lambda run: run.position("load")``. "shares" for the slow
+            and the fast share of the error as well, by a run with twice the micro steps, which is another program. A
+            failed run has no error.
 
     Returns:
         The `Trajectory`, with ``num_steps / save + 1`` saved nodes. Times are ``t_0 + k macro_dt``, computed from
         the step number k, never accumulated.
 
     Raises:
-        ValueError, TypeError: bad arguments, before anything is computed; an accuracy larger than the motion, after the first trial runs.
+        ValueError, TypeError: bad arguments, before anything is computed; an accuracy larger than the motion, after the
+            first trial runs.
         SimulationError: a step failed; its `trajectory` is NaN from the failure on.
         Interrupted: Ctrl-C while a bar is shown; it carries the trajectory computed so far.
     """
@@ -132,7 +139,8 @@ def simulate(
 
 
 def _with_accuracy(search: Search, scheme: SchemeLike | None, accuracy: float) -> Trial:
-    """The trial whose largest estimated error of a position is at most `accuracy`, with a scheme of the user or with one of the usual menu."""
+    """The trial whose largest estimated error of a position is at most `accuracy`, with a scheme of the user or with
+    one of the usual menu."""
     check_type("simulate: scheme", scheme, SchemeLike | None, "a Scheme, e.g. fully_implicit(num_micro=10), or None")
     search.check(accuracy)
     if scheme is None:
@@ -188,32 +196,36 @@ def simulate_batch(
     warn: bool = True,
     error: bool = False,
 ) -> Trajectory:
-    """Simulate a lane for each set of parameters, start or step size, each as `simulate` would; arrays returned have a leading axis of lanes.
+    """Simulate a lane for each set of parameters, start or step size, each as `simulate` would; arrays returned have a
+    leading axis of lanes.
 
-        batch = vm.simulate_batch(car, scheme, params={"omega": omegas}, macro_dt=0.01, t_end=10.0)  # a lane for each omega
-        print(batch.lane(3))
+        batch = vm.simulate_batch(car, scheme, params={"omega": omegas}, macro_dt=0.01, t_end=10.0)  # a lane for each
+        omega print(batch.lane(3))
 
-    Whatever has no axis of lanes holds for all lanes. Lanes are computed side by side (`jax.vmap`), in chunks that fit into the cache. Unlike
-    `simulate`, a failed step never raises: its
-    lane is NaN after the step and has its status in ``.result`` and ``.failed_at``; other lanes do not change. A
-    `FailedLanesWarning` says how many lanes failed. A lane fails in its first step if its start violates the constraints of its parameters, in
-    positions or velocities. Lanes that the first matrix of "auto" does not solve are run again with exact
-    matrices, whose program is compiled at the first such lane.
+    Whatever has no axis of lanes holds for all lanes. Lanes are computed side by side (`jax.vmap`), in chunks that fit
+    into the cache. Unlike `simulate`, a failed step never raises: its lane is NaN after the step and has its status in
+    ``.result`` and ``.failed_at``; other lanes do not change. A `FailedLanesWarning` says how many lanes failed. A lane
+    fails in its first step if its start violates the constraints of its parameters, in positions or velocities. Lanes
+    that the first matrix of "auto" does not solve are run again with exact matrices, whose program is compiled at the
+    first such lane.
 
     Args:
         system: a `Problem` or a scene; or a `System`, with states.
         scheme: a scheme or composition.
         states: a `State` whose arrays have an axis of lanes, e.g. ``jax.vmap(make)(q_s, ...)`` or
-            ``jax.tree.map(lambda *a: jnp.stack(a), *list_of_states)``; None for positions and velocities of the problem in all lanes.
+            ``jax.tree.map(lambda *a: jnp.stack(a), *list_of_states)``; None for positions and velocities of the problem
+            in all lanes.
         macro_dt: macro step H, a number or one per lane.
         num_steps, t_end, save, solver: as in `simulate`; t_end with one step size and one time of the start for all.
-        params: some or all of ``system.params``, by name: ``{"springs": {"stiffness": k}}``, or "springs.stiffness". An array of the shape of the
-            parameter holds for all lanes; one with an axis of lanes in front of this shape has a value for each lane.
+        params: some or all of ``system.params``, by name: ``{"springs": {"stiffness": k}}``, or "springs.stiffness". An
+            array of the shape of the parameter holds for all lanes; one with an axis of lanes in front of this shape
+            has a value for each lane.
         chunk: lanes that are computed side by side; chosen from the size of the problem if None.
         devices: CPU devices over which chunks are spread, see `vmri_jax.configure`.
         warn: give warnings about lanes; False for a program that looks at the statuses itself.
-        error: estimate the error of the positions of each lane as `simulate` does, ``run.error``, a `RunError` whose arrays have the axis of lanes;
-            without slow and fast share. It takes runs with half the macro step, by the same program, and further ones in driven systems.
+        error: estimate the error of the positions of each lane as `simulate` does, ``run.error``, a `RunError` whose
+            arrays have the axis of lanes; without slow and fast share. It takes runs with half the macro step, by the
+            same program, and further ones in driven systems.
 
     Raises:
         ValueError, TypeError: bad arguments, before anything is computed.
@@ -252,20 +264,23 @@ def _errors(runs: Simulation, computed: Callable[[Simulation], Saved], saved: Sa
 
 
 def _about_lanes(trajectory: Trajectory) -> Iterator[UserWarning]:
-    """Warnings about the lanes that failed, and about those that did not and whose error is not certified, with their number and the first of them."""
+    """Warnings about the lanes that failed, and about those that did not and whose error is not certified, with their
+    number and the first of them."""
     failed_at = np.asarray(trajectory.failed_at)
     failed = np.flatnonzero(failed_at >= 0)
     if failed.size:
         first = int(failed[0])
         result = Result(int(trajectory.result[first]))
         yield FailedLanesWarning(
-            f"simulate_batch: {failed.size} of {failed_at.size} lanes failed and are NaN from there on; .result and .failed_at say "
-            f"which. The first is lane {first}, at macro step {failed_at[first]} ({result.name}): {result.message}"
+            f"simulate_batch: {failed.size} of {failed_at.size} lanes failed and are NaN from there on; .result and "
+            f".failed_at say which. The first is lane {first}, at macro step {failed_at[first]} ({result.name}): "
+            f"{result.message}"
         )
     error = trajectory.error
     lanes = np.flatnonzero((failed_at < 0) & ~np.asarray(error is None or error.is_certified))
     if lanes.size:
         yield UncertifiedWarning(
-            f"simulate_batch: the error of {lanes.size} of {failed_at.size} lanes is not certified over the whole run, as run.error.largest says; the first "
-            f"is lane {lanes[0]}, certified until t = {error.certified_until[lanes[0]]:.4g}. Take smaller steps, or a scheme of higher order."
+            f"simulate_batch: the error of {lanes.size} of {failed_at.size} lanes is not certified over the whole run, "
+            f"as run.error.largest says; the first is lane {lanes[0]}, certified until t = "
+            f"{error.certified_until[lanes[0]]:.4g}. Take smaller steps, or a scheme of higher order."
         )

@@ -1,4 +1,5 @@
-"""The macro step as a map of phase space, ``z -> Phi(z)`` with ``z = (q_s, q_f, p_s, p_f)``: its derivative, and the condition of its equations."""
+"""The macro step as a map of phase space, ``z -> Phi(z)`` with ``z = (q_s, q_f, p_s, p_f)``: its derivative, and the
+condition of its equations."""
 
 from collections.abc import Callable
 
@@ -19,7 +20,10 @@ from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.solver import Solver
 
 SWEEPS = 10
-"""Scalings of the rows and columns of a Newton matrix. With fewer their lengths are not one to round-off, with more nothing changes."""
+"""Scalings of the rows and columns of a Newton matrix.
+
+With fewer their lengths are not one to round-off, with more nothing changes.
+"""
 
 
 def phase_vector(state: State):
@@ -34,7 +38,8 @@ def state_of(z, t, like: State) -> State:
 
 
 def phase_step(system: System, scheme: SchemeLike, like: State, t, z, *, macro_dt, solver: Solver | None):
-    """The end (2 n,) of a macro step from z (2 n,) at time t, and the `StepStatus` of the step; `like` is any state of the system."""
+    """The end (2 n,) of a macro step from z (2 n,) at time t, and the `StepStatus` of the step; `like` is any state of
+    the system."""
     end, info = macro_step(system, scheme, state_of(z, t, like), macro_dt, solver)
     return phase_vector(end), info.status
 
@@ -52,8 +57,8 @@ def with_slopes(function: Callable, x, directions):
 def step_condition(system: Movable, scheme: Scheme, state: State | None = None, *, macro_dt) -> float:
     """Condition number of the Newton matrix of a macro step, rows and columns scaled to length one.
 
-    The Newton matrix of the first iteration, which starts from straight motion, is formed as a dense matrix: take few micro steps. Each
-    sweep divides rows and columns by the square roots of their lengths (Ruiz 2001).
+    The Newton matrix of the first iteration, which starts from straight motion, is formed as a dense matrix: take few
+    micro steps. Each sweep divides rows and columns by the square roots of their lengths (Ruiz 2001).
 
     Args:
         system, scheme, state, macro_dt: as in `simulate`.

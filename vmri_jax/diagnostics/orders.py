@@ -18,8 +18,8 @@ class OrderFit(NamedTuple):
 def fit_order(macro_dt, errors, plateau: float = 10.0, floor: float = 0.0) -> OrderFit:
     """Order of convergence: least-squares slope of log error over log step, without the round-off plateau.
 
-    The plateau begins, towards smaller steps, at the first interval after the steepest one with less than half its slope.
-    Errors below `plateau` times its level, or times `floor`, are left out; at least the two largest steps stay.
+    The plateau begins, towards smaller steps, at the first interval after the steepest one with less than half its
+    slope. Errors below `plateau` times its level, or times `floor`, are left out; at least the two largest steps stay.
 
     Args:
         macro_dt: (k,) step sizes.

@@ -1,14 +1,15 @@
-"""The shadow energy, which a symplectic scheme conserves, computed from the nodes of a run; it measures the drift of a run.
+"""The shadow energy, which a symplectic scheme conserves, computed from the nodes of a run; it measures the drift of a
+run.
 
-The nodes of a symplectic scheme lie on a motion of a modified Hamiltonian, whose action over a step is the discrete Lagrangian
-``L_d``. Along any motion the energy is ``E = p . q' - (action)'``. Therefore, with
+The nodes of a symplectic scheme lie on a motion of a modified Hamiltonian, whose action over a step is the discrete
+Lagrangian ``L_d``. Along any motion the energy is ``E = p . q' - (action)'``. Therefore, with
 
     b_n = 2 L_d(n) + p_n . q_n - p_{n+1} . q_{n+1}        beta_{n+1} = beta_n + b_n
     E_n = (q' . p - q . p' - beta') / 2
 
-and derivatives by central differences over 2 k + 1 nodes, the modified Hamiltonian is known up to ``O(H^{2k})`` without its formula. The
-energy of the system itself oscillates by ``O(H^r)``, r the order of the scheme; the shadow energy does not, so that it shows drifts smaller
-by many digits.
+and derivatives by central differences over 2 k + 1 nodes, the modified Hamiltonian is known up to ``O(H^{2k})`` without
+its formula. The energy of the system itself oscillates by ``O(H^r)``, r the order of the scheme; the shadow energy does
+not, so that it shows drifts smaller by many digits.
 
 Source: R. D. Skeel, D. J. Hardy, Practical construction of modified Hamiltonians, SIAM J. Sci. Comput. 23 (2001).
 """
@@ -38,11 +39,11 @@ from vmri_jax.steppers.solver import Solver
 from vmri_jax.textbook import discrete_lagrangian
 
 BLOCKS = 20
-"""Parts of a run to whose means the drift is fitted; with more parts neighbouring means are correlated, with fewer the standard error of the
-slope is uncertain."""
+"""Parts of a run to whose means the drift is fitted; with more parts neighbouring means are correlated, with fewer the
+standard error of the slope is uncertain."""
 LARGEST_MISS = 1e-6
-"""Largest distance between a recomputed node and the node of the run, as a part of the length of the step; a larger value accepts runs of
-another system or scheme."""
+"""Largest distance between a recomputed node and the node of the run, as a part of the length of the step; a larger
+value accepts runs of another system or scheme."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +55,8 @@ class ShadowEnergy:
         energy: (m,) shadow energy at these nodes.
         band: largest minus smallest shadow energy.
         energy_band: largest minus smallest energy of the system at these nodes.
-        drift, drift_error: slope of a straight line through the means of 20 parts of the run, and its standard error, in energy per time.
+        drift, drift_error: slope of a straight line through the means of 20 parts of the run, and its standard error,
+            in energy per time.
         rounding: drift of a run in which every step changes the energy by a unit of round-off in the same direction.
     """
 
@@ -88,11 +90,13 @@ def shadow_energy(system: Movable, scheme: SchemeLike, trajectory: Trajectory, k
         run = vm.simulate(problem, scheme, macro_dt=0.01, num_steps=10_000)
         print(vm.diagnostics.shadow_energy(problem, scheme, run))
 
-    The macro nodes must resolve the fast motion: the band shrinks with k if ``omega H`` is below about 2, fast below 1/2. From
-    ``omega H = 0.9 pi`` on the band grows with k: a sign of the resonance of kicks at pi, which the energy shows only from 0.95 pi on.
+    The macro nodes must resolve the fast motion: the band shrinks with k if ``omega H`` is below about 2, fast below
+    1/2. From ``omega H = 0.9 pi`` on the band grows with k: a sign of the resonance of kicks at pi, which the energy
+    shows only from 0.95 pi on.
 
     Args:
-        system, scheme: as of the run. The system has neither forces nor constraints that depend on time, since it must conserve its energy.
+        system, scheme: as of the run. The system has neither forces nor constraints that depend on time, since it must
+            conserve its energy.
         trajectory: a run with every macro node saved, at least 2 k + 21 of them.
         k: nodes on either side of the central differences, whose order is 2 k.
 
@@ -106,7 +110,10 @@ def shadow_energy(system: Movable, scheme: SchemeLike, trajectory: Trajectory, k
     macro_dt = (t[-1] - t[0]) / (len(t) - 1)
     actions, miss, result = _actions(system, scheme, nodes, macro_dt)
     if int(result) > Result.CONVERGED_AT_ROUNDOFF or not float(miss) < LARGEST_MISS:
-        far = f"steps of {macro_dt:.6g} from the nodes of the trajectory miss the next ones by {float(miss):.1e} of a step"
+        far = (
+            f"steps of {macro_dt:.6g} from the nodes of the trajectory miss the next ones by {float(miss):.1e} of a "
+            "step"
+        )
         raise Refused(f"shadow_energy: {far}. Give a run of this system and scheme with every macro node saved.")
     q, p = (np.concatenate(pair, axis=1) for pair in ((nodes.q_s, nodes.q_f), (nodes.p_s, nodes.p_f)))
     energy = _energy(q, p, np.asarray(actions), macro_dt, k)
@@ -136,7 +143,8 @@ def _checked(system: Movable, scheme: SchemeLike, trajectory: Trajectory, k: int
 
 @jax.jit
 def _actions(system: System, scheme: SchemeLike, nodes: State, macro_dt):
-    """Discrete Lagrangian of every step, largest distance of a step from the next node relative to its length, worst `Result`."""
+    """Discrete Lagrangian of every step, largest distance of a step from the next node relative to its length, worst
+    `Result`."""
 
     def step(nodes):
         start, end = nodes
@@ -200,7 +208,8 @@ def _energy(q, p, actions, macro_dt, k: int):
         2 * actions[k + j : nodes - k + j] + momentum_sum(shifted[k + j]) - momentum_sum(shifted[k + j + 1])
         for j in range(-k, k)
     ]
-    # f' = sum_j w_j (f_j - f_-j) / H with w_j = (-1)^(j+1) k!^2 / (j (k-j)! (k+j)!); q . p' vanishes since q - q_0 is zero in the middle
+    # f' = sum_j w_j (f_j - f_-j) / H with w_j = (-1)^(j+1) k!^2 / (j (k-j)! (k+j)!); q . p' vanishes since q - q_0 is
+    # zero in the middle
     twice_energy = np.zeros(len(q_0))
     beta = np.zeros(len(q_0))  # beta_j - beta_-j
     for j in range(1, k + 1):
@@ -213,7 +222,8 @@ def _energy(q, p, actions, macro_dt, k: int):
 def _slope(t, values) -> tuple[float, float]:
     """Slope of a straight line through the means of `BLOCKS` parts, and its standard error.
 
-    If the residuals of neighbouring parts have the correlation rho, the variance of the slope grows by ``(1 + rho) / (1 - rho)``.
+    If the residuals of neighbouring parts have the correlation rho, the variance of the slope grows by
+    ``(1 + rho) / (1 - rho)``.
     """
     means = np.array([[part.mean() for part in np.array_split(a, BLOCKS)] for a in (t - t.mean(), values)])
     x, y = means - means.mean(axis=1, keepdims=True)

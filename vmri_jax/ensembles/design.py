@@ -1,13 +1,15 @@
-"""Designs: the runs of an ensemble. A design is a table with a row for each run; only the rows of a chunk are made at a time.
+"""Designs: the runs of an ensemble. A design is a table with a row for each run; only the rows of a chunk are made at a
+time.
 
     Product({"omega": [10, 50], "num_micro": [1, 5]})          all combinations, the last axis varies fastest
     Table({"omega": [10, 50], "v_s[0]": [0.1, 0.2]})           a run for each row: 10 with 0.1, 50 with 0.2
     Draws(1000, {"omega": ("uniform", 10, 50)}, seed=1)        1000 runs with random values
 
-A function ``(problem, row) -> problem`` makes the problem of a run from the values of its row by column; columns with the names macro_dt,
-num_steps, num_micro and scheme choose steps and schemes instead.
+A function ``(problem, row) -> problem`` makes the problem of a run from the values of its row by column; columns with
+the names macro_dt, num_steps, num_micro and scheme choose steps and schemes instead.
 
-Rows are numbered from 0. Any row can be made without the others: a random row depends on the seed and on its number alone.
+Rows are numbered from 0. Any row can be made without the others: a random row depends on the seed and on its number
+alone.
 """
 
 import math
@@ -28,8 +30,9 @@ Rows = dict[str, np.ndarray]
 """Some rows of a design: an array for each column, its first axis the rows."""
 
 MOST_POINTS = {"sobol": 2**30, "latin-hypercube": 2**22, "random": np.inf}
-"""Largest number of rows by the method that draws them. The numbers of a sequence of Sobol have 30 bits, after which the sequence ends. Every
-worker makes the whole table of a Latin hypercube: 32 MiB for each column, more with a larger number."""
+"""Largest number of rows by the method that draws them. The numbers of a sequence of Sobol have 30 bits, after which
+the sequence ends. Every worker makes the whole table of a Latin hypercube: 32 MiB for each column, more with a larger
+number."""
 ALIASES = {"normal": "norm", "exponential": "expon"}
 """Further names of distributions, and the names that `scipy.stats` has for them."""
 STEPS = ("macro_dt", "num_steps")
@@ -58,8 +61,8 @@ class Axis:
 class Draw:
     """A distribution from which the values of a column are drawn.
 
-    name: "uniform" (lowest, highest), "loguniform" (lowest, highest), "normal" (mean, standard deviation), or any continuous
-        distribution of `scipy.stats` with its arguments.
+    name: "uniform" (lowest, highest), "loguniform" (lowest, highest), "normal" (mean, standard deviation), or any
+        continuous distribution of `scipy.stats` with its arguments.
     unit, description: stored with the results.
     """
 
@@ -140,7 +143,8 @@ class Product:
 class Table:
     """Given rows.
 
-    columns: for each column, values or an `Axis`; the first axis of the array is the runs. A value may be a vector, for a whole q_s or v_f.
+    columns: for each column, values or an `Axis`; the first axis of the array is the runs. A value may be a vector, for
+        a whole q_s or v_f.
 
     Raises:
         ValueError: no column, columns of different length, or values that are not finite.
@@ -174,7 +178,8 @@ class Draws:
     """Random rows.
 
     count: number of runs.
-    columns: for each column a `Draw`, or a tuple of the name of a distribution and its arguments, ``("uniform", 10, 50)``.
+    columns: for each column a `Draw`, or a tuple of the name of a distribution and its arguments,
+        ``("uniform", 10, 50)``.
     method: "sobol" (a scrambled sequence: averages converge faster), "latin-hypercube", or "random" (independent).
     seed: of the generator of random numbers; the same seed gives the same rows.
 

@@ -89,10 +89,11 @@ OVER_NODES = ("energy_error", "energy_drift", "constraint_residual", "extremes",
 
 
 def quantity(saved: Saved) -> Quantity:
-    """One of `QUANTITIES` by name, or a function of the user: itself, ``my_file.py:function`` or ``my_package.my_module:function``.
+    """One of `QUANTITIES` by name, or a function of the user: itself, ``my_file.py:function`` or
+    ``my_package.my_module:function``.
 
-    A user's function takes the `Trajectory` of a single run and returns an array, which has the name of the function, or arrays by name, by
-    operations of JAX.
+    A user's function takes the `Trajectory` of a single run and returns an array, which has the name of the function,
+    or arrays by name, by operations of JAX.
 
     Raises:
         ValueError: an unknown name, a name without a function, or a function without a name.
@@ -144,14 +145,16 @@ def what_is_kept(quantities: Sequence[Quantity], run: Simulation) -> dict[str, K
 
 
 def drawn_by_default(names: Sequence[str], problem: Problem) -> list[str]:
-    """Arrays of these quantities that `vmri_jax.plots.plot_ensemble` draws: one number per run, or one per saved node."""
+    """Arrays of these quantities that `vmri_jax.plots.plot_ensemble` draws: one number per run, or one per saved
+    node."""
     run = simulation(problem, fully_implicit(1), None, None, 1.0, num_steps=1)
     arrays = what_is_kept(list(map(quantity, names)), run)
     return [name for name, kept in arrays.items() if kept.dimensions in ((), ("node",)) and name != "node_t"]
 
 
 def of_lanes(quantities: Sequence[Quantity], run: Trajectory) -> dict[str, Any]:
-    """The arrays that the store keeps of a batch, a row for each run, by a program that JAX keeps for these quantities."""
+    """The arrays that the store keeps of a batch, a row for each run, by a program that JAX keeps for these
+    quantities."""
     return {name: array.value for name, array in _of_lanes(list(map(TracedOnce, quantities)), run).items()}
 
 

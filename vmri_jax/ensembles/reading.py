@@ -23,9 +23,9 @@ def open_ensemble(path: str | os.PathLike) -> "xarray.Dataset":
         data = vm.open_ensemble("runs.zarr")
         data.energy_error.sel(num_micro=5, omega=50, method="nearest")
 
-    A product of axes has a dimension for each of them. Other designs have the dimension "lane", with the columns of the design
-    as coordinates. Runs that are not in the store yet are NaN, with the result -1. A failed run is NaN from its failure on. "result" has
-    the status of each run, an integer whose meanings are in the attributes of the array.
+    A product of axes has a dimension for each of them. Other designs have the dimension "lane", with the columns of the
+    design as coordinates. Runs that are not in the store yet are NaN, with the result -1. A failed run is NaN from its
+    failure on. "result" has the status of each run, an integer whose meanings are in the attributes of the array.
 
     Args:
         path: folder of the store.
@@ -59,7 +59,8 @@ def open_ensemble(path: str | os.PathLike) -> "xarray.Dataset":
 
 
 def _without_missing(data, path: Path, attributes: dict[str, Any], xarray):
-    """The data with rows of uncommitted chunks set to missing: a killed worker may have written some of their arrays."""
+    """The data with rows of uncommitted chunks set to missing: a killed worker may have written some of their
+    arrays."""
     lanes, chunk = attributes["rows"], attributes["chunk"]
     is_committed = np.zeros(-(-lanes // chunk), dtype=bool)
     is_committed[layout.committed(path)] = True

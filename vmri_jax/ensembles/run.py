@@ -1,4 +1,5 @@
-"""`ensemble`: many runs of a system, in chunks, on one core or on a cluster, into a store that keeps them whatever stops the program."""
+"""`ensemble`: many runs of a system, in chunks, on one core or on a cluster, into a store that keeps them whatever
+stops the program."""
 
 import os
 import time
@@ -52,8 +53,9 @@ class EnsembleError(RuntimeError):
         reason = f"{type(error).__name__}: {error}".rstrip(".").splitlines()[-1]
         count = ensemble.chunks.count
         super().__init__(
-            f"{len(self.failures)} of {count} chunks could not be computed: runs {lanes}{ellipsis}. Chunk {number}: {reason}. "
-            f"{len(ensemble.done)} of {count} chunks are in {ensemble.path}; with resume=True only the missing ones are tried."
+            f"{len(self.failures)} of {count} chunks could not be computed: runs {lanes}{ellipsis}. Chunk {number}: "
+            f"{reason}. {len(ensemble.done)} of {count} chunks are in {ensemble.path}; with resume=True only the "
+            "missing ones are tried."
         )
 
 
@@ -143,38 +145,44 @@ def ensemble(
         runs = vm.ensemble("fpu", "explicit-slow", axes, vary=stiffer, t_end=1.0, macro_dt=0.01, out="runs.zarr")
         data = vm.open_ensemble("runs.zarr")
 
-    Runs are computed chunk by chunk. A chunk is committed when all its files are on disk: whatever ends early (a worker, this
-    process, the scheduler), committed chunks stay, and `resume` computes the missing ones only. Processors of the same kind with the
-    same versions compute a chunk to the same last bit. A run that fails is NaN from there on and has its status in the results; it
-    does not change other runs.
+    Runs are computed chunk by chunk. A chunk is committed when all its files are on disk: whatever ends early (a
+    worker, this process, the scheduler), committed chunks stay, and `resume` computes the missing ones only. Processors
+    of the same kind with the same versions compute a chunk to the same last bit. A run that fails is NaN from there on
+    and has its status in the results; it does not change other runs.
 
     Args:
-        system: a problem, a scene, or a name: of a built-in system, ``my_file.py:my_problem``, ``my_package.my_module:my_problem``.
-            Problems whose functions belong to the running program, or to no module, can only be computed in this process.
-        scheme: a `Scheme`, the name of one, or a function that makes a scheme from num_micro, such as `vmri_jax.fully_implicit`.
-            A mapping from labels to schemes is an axis "scheme" of the design.
+        system: a problem, a scene, or a name: of a built-in system, ``my_file.py:my_problem``,
+            ``my_package.my_module:my_problem``. Problems whose functions belong to the running program, or to no
+            module, can only be computed in this process.
+        scheme: a `Scheme`, the name of one, or a function that makes a scheme from num_micro, such as
+            `vmri_jax.fully_implicit`. A mapping from labels to schemes is an axis "scheme" of the design.
         design: `Product`, `Table` or `Draws` of `vmri_jax.ensembles`; a mapping is a `Product`. The columns "macro_dt",
             "num_steps", "num_micro" and "scheme" choose steps and schemes; `vary` takes all others.
         out: folder of the store, a zarr group; conventionally named .zarr. All workers must see it.
         t_end, num_steps, macro_dt: two of: the time at the end, the number of macro steps, the macro step H.
         num_micro: number of micro steps, for schemes given by name or by a function.
-        vary: a function ``(problem, row) -> problem`` that makes the problem of a run from the values of its row by column,
-            ``lambda problem, row: replace(problem, v_s=row["speed"] * problem.v_s)``, for example. It may change the values of
-            parameters and of the start, and is traced, so that its operations must be operations of JAX.
-        save: quantities that are kept of each run: names from `vmri_jax.ensembles.QUANTITIES`, or functions of a trajectory, themselves or
-            as ``my_file.py:function``. A function returns an array, or a dictionary of arrays.
-        num_saves: number of saved nodes of a run after the start, equally spaced, from which the quantities are computed.
+        vary: a function ``(problem, row) -> problem`` that makes the problem of a run from the values of its row by
+            column, ``lambda problem, row: replace(problem, v_s=row["speed"] * problem.v_s)``, for example. It may
+            change the values of parameters and of the start, and is traced, so that its operations must be operations
+            of JAX.
+        save: quantities that are kept of each run: names from `vmri_jax.ensembles.QUANTITIES`, or functions of a
+            trajectory, themselves or as ``my_file.py:function``. A function returns an array, or a dictionary of
+            arrays.
+        num_saves: number of saved nodes of a run after the start, equally spaced, from which the quantities are
+            computed.
         solver, project: as in `simulate` and `initial_state`.
         chunk: number of runs of a chunk; None for about a second of computation. The store keeps this number.
-        executor: computes the chunks: None for this process; a `dask.distributed.Client`, of a cluster of any kind; or a
-            `concurrent.futures.Executor` that spawns processes.
-        processes: in place of an executor, the number of workers that Dask starts on this machine (needs the extra ``vmri_jax[ensemble]``). They import the
-            program that starts them, which therefore needs ``if __name__ == "__main__":``.
-        resume: compute the missing chunks of the store in `out`, which must be of this ensemble; start a store if there is none.
+        executor: computes the chunks: None for this process; a `dask.distributed.Client`, of a cluster of any kind; or
+            a `concurrent.futures.Executor` that spawns processes.
+        processes: in place of an executor, the number of workers that Dask starts on this machine (needs the extra
+            ``vmri_jax[ensemble]``). They import the program that starts them, which therefore needs
+            ``if __name__ == "__main__":``.
+        resume: compute the missing chunks of the store in `out`, which must be of this ensemble; start a store if there
+            is none.
         overwrite: replace the store in `out`.
         throw: raise `EnsembleError` at the end if chunks could not be computed.
-        progress: True for a bar with the number of runs done, their speed and the number of failed runs; or a function that is called
-            with this text and the numbers of runs.
+        progress: True for a bar with the number of runs done, their speed and the number of failed runs; or a function
+            that is called with this text and the numbers of runs.
 
     Returns:
         The `Ensemble`; ``.open()`` gives its results.
@@ -235,7 +243,8 @@ def ensemble(
 
 
 def chunk_task(path: Path, chunks: Chunks, work: Work, number: int, rows: Rows | Design) -> int:
-    """Compute a chunk, write and commit its results to the store, and return how many runs failed; `rows` are its rows, or the design that makes them."""
+    """Compute a chunk, write and commit its results to the store, and return how many runs failed; `rows` are its rows,
+    or the design that makes them."""
     first, last = chunks.ends(number)
     rows = rows if isinstance(rows, dict) else rows.rows(first, last)
     values = work.compute(rows, last - first, chunks.width)

@@ -1,5 +1,5 @@
-"""The work of an ensemble: a small object that pickle can send, with which a worker computes some of the runs; and its preparation, the checks of all
-arguments, its chunks, the arrays of its store, and the record that identifies it."""
+"""The work of an ensemble: a small object that pickle can send, with which a worker computes some of the runs; and its
+preparation, the checks of all arguments, its chunks, the arrays of its store, and the record that identifies it."""
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
@@ -47,14 +47,14 @@ from vmri_jax.schemes.composition import SchemeLike
 from vmri_jax.steppers.solver import Solver
 
 MOST_CHUNKS = 20_000
-"""Largest number of chunks of an ensemble, unless limits need more. A scheduler hands out some hundreds of tasks a second,
-and every chunk has its files: a larger number costs more time than the runs."""
+"""Largest number of chunks of an ensemble, unless limits need more. A scheduler hands out some hundreds of tasks a
+second, and every chunk has its files: a larger number costs more time than the runs."""
 FEWEST_CHUNKS = 64
-"""Target for the smallest number of chunks, so that workers share the runs evenly; batches that are computed side by side are not cut for
-it. A larger one makes chunks so small that writing their files takes most of the time."""
+"""Target for the smallest number of chunks, so that workers share the runs evenly; batches that are computed side by
+side are not cut for it. A larger one makes chunks so small that writing their files takes most of the time."""
 MICRO_STEP_NANOSECONDS = {"explicit": 1.0, "implicit": 25.0}
-"""Rough nanoseconds of a micro step, for each coordinate of each run in a batch, by kind of step. They only choose the size of chunks: with
-larger ones chunks have fewer runs."""
+"""Rough nanoseconds of a micro step, for each coordinate of each run in a batch, by kind of step. They only choose the
+size of chunks: with larger ones chunks have fewer runs."""
 
 AnyScheme = str | SchemeLike | Callable[[int], SchemeLike]
 """A scheme, the name of one, or a function from the number of micro steps to a scheme."""
@@ -93,7 +93,8 @@ class Work:
         return {part.name: getattr(self, part.name) for part in fields(self)}  # without cached properties
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Refuse a worker on which a file of the user is missing, or differs from the file where the ensemble was started."""
+        """Refuse a worker on which a file of the user is missing, or differs from the file where the ensemble was
+        started."""
         self.__dict__.update(state)
         for file, digest_at_start in self.sources.items():
             if not Path(file).is_file():
@@ -122,8 +123,8 @@ class Work:
     def lane(self, problem: Problem, row: Row) -> tuple[Any, tuple[Any, ...]]:
         """The parameters of the run of a row, None if `vary` changes none, and its start (t, q_s, q_f, v_s, v_f).
 
-        The problem is an argument, since this function is traced: a problem that it made would have tracers. `vary` gets the columns in their order in
-        the design, which JAX would sort.
+        The problem is an argument, since this function is traced: a problem that it made would have tracers. `vary`
+        gets the columns in their order in the design, which JAX would sort.
         """
         columns = columns_of_problems(self.columns)
         if self.vary is None and columns:
@@ -140,7 +141,8 @@ class Work:
 
     @cached_property
     def lanes(self) -> Callable[[Rows, int], tuple]:
-        """The compiled function from the numbers of some rows, and their count, to the parameters and starts of their runs."""
+        """The compiled function from the numbers of some rows, and their count, to the parameters and starts of their
+        runs."""
         lane = partial(self.lane, self.problem)
         return jax.jit(lambda rows, count: jax.vmap(lane, axis_size=count)(rows), static_argnums=1)
 
@@ -176,7 +178,8 @@ class Work:
         return simulation(self.problem, group.scheme, state, self.solver, macro_dt, num_steps, save=save)
 
     def compute(self, rows: Rows, count: int, width: int) -> dict[str, np.ndarray]:
-        """Kept quantities and status of the runs of `count` rows, `width` of them side by side; arrays by name, a row for each run."""
+        """Kept quantities and status of the runs of `count` rows, `width` of them side by side; arrays by name, a row
+        for each run."""
         arrays: dict[str, np.ndarray] = {}
         for group in self.groups(rows, count):
             part = self._compute(group, {name: values[group.lanes] for name, values in rows.items()}, width)
@@ -245,7 +248,8 @@ def all_groups(work: Work, design: Design) -> Iterator[Group]:
 
 
 def _check_only_values_differ(problem: Problem, changed: Problem) -> None:
-    """Refuse a row whose run the program of the problem cannot compute: another system but for parameters, or arrays of other shapes."""
+    """Refuse a row whose run the program of the problem cannot compute: another system but for parameters, or arrays of
+    other shapes."""
     leaves, structure = jax.tree.flatten(problem.system.replace(params=None))
     new_leaves, new_structure = jax.tree.flatten(changed.system.replace(params=None))
     are_equal = (a is b or (is_concrete(b) and np.array_equal(a, b)) for a, b in zip(leaves, new_leaves, strict=False))
@@ -264,7 +268,8 @@ def _whole(name: str, value) -> int:
 
 
 def prepared(work: Work, design: Design, chunk: int | None = None) -> tuple[dict[str, Any], dict[str, Kept], Chunks]:
-    """Attributes and arrays of the store of an ensemble, and the division of its runs, after all checks; nothing is computed.
+    """Attributes and arrays of the store of an ensemble, and the division of its runs, after all checks; nothing is
+    computed.
 
     Attributes: the design, names of coordinates, the record that identifies the ensemble, versions.
     """

@@ -1,6 +1,7 @@
 """Executors of tasks: this process, workers on this machine, or an executor that the user gives.
 
-A worker gets bytes and unpacks them after it has set up JAX: to unpack an array of JAX starts JAX, with default settings.
+A worker gets bytes and unpacks them after it has set up JAX: to unpack an array of JAX starts JAX, with default
+settings.
 """
 
 import os
@@ -23,14 +24,15 @@ from vmri_jax.running.interrupts import Interrupted, interrupts_noted
 from vmri_jax.running.store.identity import package_versions
 
 DASK_RETRIES = 2
-"""Number of times that Dask repeats a task that raised an error; a larger one delays the report of an error that is no accident. A
-setting of Dask tells how often it repeats a task whose worker died."""
+"""Number of times that Dask repeats a task that raised an error; a larger one delays the report of an error that is no
+accident. A setting of Dask tells how often it repeats a task whose worker died."""
 MOST_UNDER_WAY = 1000
-"""Largest number of tasks that an executor has at once: enough for several hundred workers. The arguments of all of them are in memory:
-with a larger number ensembles of large systems need more of it, with a smaller one large clusters wait for tasks."""
+"""Largest number of tasks that an executor has at once: enough for several hundred workers. The arguments of all of
+them are in memory: with a larger number ensembles of large systems need more of it, with a smaller one large clusters
+wait for tasks."""
 POLL_SECONDS = 1.0
-"""Seconds between two looks at the workers and at all futures: `wait` does not return for futures that Dask cancels when its scheduler
-ends. With a larger value the program notices later that the scheduler is gone."""
+"""Seconds between two looks at the workers and at all futures: `wait` does not return for futures that Dask cancels
+when its scheduler ends. With a larger value the program notices later that the scheduler is gone."""
 
 
 class NotAWorker(RuntimeError):
@@ -38,15 +40,16 @@ class NotAWorker(RuntimeError):
 
 
 def packed(caller: str, task: Callable, *shared) -> bytes:
-    """A function and its first arguments as bytes that another process can read; refuses functions that workers cannot import."""
+    """A function and its first arguments as bytes that another process can read; refuses functions that workers cannot
+    import."""
     try:
         data = pickle.dumps((task, shared))
         if b"__main__" in data:
             raise pickle.PicklingError("it has functions of the running program")
     except (pickle.PicklingError, AttributeError, TypeError) as error:
         raise Refused(
-            f"{caller}: workers cannot import this system or scheme ({error}): functions of the running program or of an "
-            "interactive session, lambdas, and functions within functions. Put the problem into a file, "
+            f"{caller}: workers cannot import this system or scheme ({error}): functions of the running program or of "
+            "an interactive session, lambdas, and functions within functions. Put the problem into a file, "
             "'my_file.py:my_problem', or into a package that workers have, 'my_package.my_module:my_problem'."
         ) from error
     return data
@@ -55,7 +58,8 @@ def packed(caller: str, task: Callable, *shared) -> bytes:
 def in_worker(versions: dict[str, str], data: bytes, *plain):
     """Set up JAX in this process and return ``task(*shared, *plain)`` for the task that `packed` has packed.
 
-    Refuses a process with other `versions` than the one that started the work, or one where JAX has started with other settings.
+    Refuses a process with other `versions` than the one that started the work, or one where JAX has started with other
+    settings.
     """
     here = package_versions()
     differ = [f"{name} {here[name]} instead of {versions[name]}" for name in versions if here[name] != versions[name]]
@@ -83,8 +87,9 @@ def _prepare(process: int) -> None:
         configure(cache=cache_folder() / "workers" / processor())
     except RuntimeError as error:
         raise NotAWorker(
-            f"process {process} on {socket.gethostname()} runs JAX already, without the settings of vmri_jax; perhaps it "
-            "was forked. Give new processes, ProcessPoolExecutor(n, mp_context=multiprocessing.get_context('spawn'))."
+            f"process {process} on {socket.gethostname()} runs JAX already, without the settings of vmri_jax; perhaps "
+            "it was forked. Give new processes, ProcessPoolExecutor(n, "
+            "mp_context=multiprocessing.get_context('spawn'))."
         ) from error
 
 
@@ -102,7 +107,8 @@ class Here(Executor):
 
 @contextmanager
 def executor_of(caller: str, executor: Any, processes: int | None = None) -> Iterator[Executor]:
-    """The `concurrent.futures.Executor` that computes the tasks of a call; `executor` and `processes` are those of `ensemble`."""
+    """The `concurrent.futures.Executor` that computes the tasks of a call; `executor` and `processes` are those of
+    `ensemble`."""
     if executor is not None and processes is not None:
         raise Refused(f"{caller}: executor and processes are given; choose one of them.")
     with ExitStack() as resources:

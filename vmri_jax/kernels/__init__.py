@@ -1,8 +1,8 @@
 """Small dense algebra and settings of the steppers: the only place for code that is written for speed alone.
 
-Two modules define the same functions and constants: `plain`, the textbook form, and `cpu`, the tuned form. The environment variable VMRI_KERNELS (``plain`` or
-``cpu``, the default) chooses one when the package is imported. `band` inverts matrices with many zeros. `inverse_in_loop`
-comes from `cpu` in both cases.
+Two modules define the same functions and constants: `plain`, the textbook form, and `cpu`, the tuned form. The
+environment variable VMRI_KERNELS (``plain`` or ``cpu``, the default) chooses one when the package is imported. `band`
+inverts matrices with many zeros. `inverse_in_loop` comes from `cpu` in both cases.
 """
 
 import os

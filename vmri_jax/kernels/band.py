@@ -1,9 +1,10 @@
-"""Inverses of ``G M^-1 G^T``, and of the matrix K of a micro interval, as a full or as a band matrix: for a chain of n bodies a band takes
-O(n) operations, a full matrix O(n^3).
+"""Inverses of ``G M^-1 G^T``, and of the matrix K of a micro interval, as a full or as a band matrix: for a chain of n
+bodies a band takes O(n) operations, a full matrix O(n^3).
 
-Two rows of G without a common body have a zero entry in the product, and so have two coordinates without a common spring in K. The order of Cuthill and McKee brings the other entries close to
-the diagonal, so that the matrix is block tridiagonal. Columns without a common row are computed together, as one product with the sum of
-their unit vectors, a seed (Curtis, Powell, Reid, J. Inst. Math. Appl. 13, 1974).
+Two rows of G without a common body have a zero entry in the product, and so have two coordinates without a common
+spring in K. The order of Cuthill and McKee brings the other entries close to the diagonal, so that the matrix is block
+tridiagonal. Columns without a common row are computed together, as one product with the sum of their unit vectors, a
+seed (Curtis, Powell, Reid, J. Inst. Math. Appl. 13, 1974).
 
 Time of a RATTLE step of a hinged chain on one core, full over band: 2.8 with 10 bodies, 6 with 20, 16 with 40.
 """
@@ -20,8 +21,8 @@ from vmri_jax import kernels
 from vmri_jax.kernels.saddle import regularized
 
 LARGEST_HALF_WIDTH = 0.2
-"""Largest half width of a band, relative to the number of rows, for which the band is used. With a larger value wide bands cost more than the
-full matrix."""
+"""Largest half width of a band, relative to the number of rows, for which the band is used. With a larger value wide
+bands cost more than the full matrix."""
 
 
 class FullInverse(NamedTuple):
@@ -46,7 +47,8 @@ class Full:
         return jnp.eye(self.size)
 
     def inverse(self, products, may_depend: bool = True) -> FullInverse:
-        """The inverse of a matrix, from its products (n, n) with the seeds, one product in each row; as of `Band.inverse`."""
+        """The inverse of a matrix, from its products (n, n) with the seeds, one product in each row; as of
+        `Band.inverse`."""
         return FullInverse(kernels.inverse(regularized(products) if may_depend else products).T)
 
     def solve(self, products, g):
@@ -55,7 +57,8 @@ class Full:
 
 
 class BandInverse(NamedTuple):
-    """Block LU decomposition of a block tridiagonal matrix. Row i has the blocks L_i, D_i, U_i, and ``D'_i = D_i - L_i D'_(i-1)^-1 U_(i-1)``.
+    """Block LU decomposition of a block tridiagonal matrix. Row i has the blocks L_i, D_i, U_i, and
+    ``D'_i = D_i - L_i D'_(i-1)^-1 U_(i-1)``.
 
     diagonal: ``D'_i^-1``.
     upper: ``D'_i^-1 U_i``.
@@ -92,7 +95,8 @@ class BandInverse(NamedTuple):
 
 @dataclass(frozen=True)
 class Band:
-    """The sparsity of a matrix whose entries lie within `width` of the diagonal, with rows and columns in this order."""
+    """The sparsity of a matrix whose entries lie within `width` of the diagonal, with rows and columns in this
+    order."""
 
     order: tuple[int, ...]
     width: int
@@ -109,7 +113,8 @@ class Band:
 
     @property
     def seeds(self):
-        """(3 b, n) seeds: one for each place in a block and each of three colours of blocks, the sum of its unit vectors in every third block."""
+        """(3 b, n) seeds: one for each place in a block and each of three colours of blocks, the sum of its unit
+        vectors in every third block."""
         n = len(self.order)
         place = np.arange(n)
         color = place % self.width + self.width * (place // self.width % 3)

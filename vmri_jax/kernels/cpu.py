@@ -1,43 +1,47 @@
-"""Small dense algebra as elementwise operations, and settings of the steppers: the names of `plain`, tuned for small systems on CPUs.
+"""Small dense algebra as elementwise operations, and settings of the steppers: the names of `plain`, tuned for small
+systems on CPUs.
 
-XLA compiles a loop without library calls into one kernel; a LAPACK call or a matrix product inside the loop costs about a microsecond
-each. Elementwise operations therefore eliminate systems of up to `ELEMENTWISE` rows, LAPACK larger ones.
+XLA compiles a loop without library calls into one kernel; a LAPACK call or a matrix product inside the loop costs about
+a microsecond each. Elementwise operations therefore eliminate systems of up to `ELEMENTWISE` rows, LAPACK larger ones.
 """
 
 import jax
 import jax.numpy as jnp
 
 UNROLLED = 8
-"""Most rows of a system whose elimination is unrolled. A larger number makes steps of small systems faster and compiling slower: larger systems
-are eliminated in a loop."""
+"""Most rows of a system whose elimination is unrolled. A larger number makes steps of small systems faster and
+compiling slower: larger systems are eliminated in a loop."""
 UNROLLED_TURNS = 3
 """Turns of that loop that XLA unrolls. A larger number makes compiling slower."""
 FEW = 3
-"""Most variables whose velocities ``M^-1 p`` are solved for without LAPACK. Up to this number a macro step of joint coordinates or angles is one kernel,
-1.5 us for two angles in place of 4.6. Larger steps compile in parts: with a larger number LLVM takes 1.5 times as long for an arm of four joints."""
+"""Most variables whose velocities ``M^-1 p`` are solved for without LAPACK. Up to this number a macro step of joint
+coordinates or angles is one kernel, 1.5 us for two angles in place of 4.6. Larger steps compile in parts: with a larger
+number LLVM takes 1.5 times as long for an arm of four joints."""
 REGISTER = 4
 """Float64 numbers in a vector register (AVX2); rows of matrices are padded to a multiple of it."""
 ELEMENTWISE = 16
 """Most rows of a system that elementwise operations eliminate. Beyond, LAPACK is faster in spite of its call."""
 
-# Memory of the steppers from step to step, and special cases that they know. Results agree without them, up to the tolerance.
+# Memory of the steppers from step to step, and special cases that they know. Results agree without them, up to the
+# tolerance.
 
 SLOW_ORDER = 10
-"""Highest order of the polynomial through the unknowns of the last steps that predicts the next step. With a lower order small steps take
-more passes; a higher order is never the best."""
+"""Highest order of the polynomial through the unknowns of the last steps that predicts the next step. With a lower
+order small steps take more passes; a higher order is never the best."""
 CONTRACTION = 0.03
-"""Largest ratio of the corrections of two passes with which exact matrices are kept. An exact pass costs about as much as four passes with
-kept matrices for constant masses, more in joint coordinates. A smaller ratio makes more passes exact. A larger ratio makes passes cheaper but
-raises their number: 0.1 takes a quarter more passes, in 0.8 of the time for the satellite of the gallery, in 0.9 to 1.0 of it for a double
-pendulum in angles."""
+"""Largest ratio of the corrections of two passes with which exact matrices are kept. An exact pass costs about as much
+as four passes with kept matrices for constant masses, more in joint coordinates. A smaller ratio makes more passes
+exact. A larger ratio makes passes cheaper but raises their number: 0.1 takes a quarter more passes, in 0.8 of the time
+for the satellite of the gallery, in 0.9 to 1.0 of it for a double pendulum in angles."""
 LARGEST_RENEWED = 16
-"""Most rows of the matrix K of a micro interval that every macro step computes anew; a larger K is kept until a step takes
-more than `EXTRA_PASSES` passes above the fewest with it (`vmri_jax.steppers.nested`). With a larger number, macro steps of large systems spend
-most of their time on K."""
+"""Most rows of the matrix K of a micro interval that every macro step computes anew; a larger K is kept until a step
+takes more than `EXTRA_PASSES` passes above the fewest with it (`vmri_jax.steppers.nested`). With a larger number, macro
+steps of large systems spend most of their time on K."""
 DIAGONAL_MATRICES = True
 """Whether K is one matrix per coordinate where W is a sum over the coordinates."""
 LINEARISES_FORCES = True
-"""Whether updates of the slow unknowns use the derivative of the slow forces where an update by the masses alone would cost a pass."""
+"""Whether updates of the slow unknowns use the derivative of the slow forces where an update by the masses alone would
+cost a pass."""
 COLLOCATES = True
 """Whether `Collocation` solves a single interval of high degree, for all variables at once."""
 DRIFTS = True
@@ -59,10 +63,11 @@ def matvec(a, x):
 
 
 def solve(a, b):
-    """The x with ``a x = b`` for a (n, n), b (n, m): Gauss-Jordan without pivoting, or LU with it beyond `ELEMENTWISE` rows.
+    """The x with ``a x = b`` for a (n, n), b (n, m): Gauss-Jordan without pivoting, or LU with it beyond `ELEMENTWISE`
+    rows.
 
-    Without pivoting the leading blocks of a must be regular: those of mass matrices, of ``G M^-1 G^T``, of saddles in the order (unknowns,
-    multipliers), of the derivatives k_ij of a path, and of matrices that differ little from these.
+    Without pivoting the leading blocks of a must be regular: those of mass matrices, of ``G M^-1 G^T``, of saddles in
+    the order (unknowns, multipliers), of the derivatives k_ij of a path, and of matrices that differ little from these.
     """
     n = a.shape[0]
     if n > ELEMENTWISE:
@@ -71,7 +76,8 @@ def solve(a, b):
     rows = jnp.concatenate([a, b], axis=1)
     if n > UNROLLED:
         return jax.lax.fori_loop(0, n, _eliminated, rows, unroll=UNROLLED_TURNS)[:, n:]
-    # pivot row r_1 <- r_1 / a_11, others r_i <- r_i - a_i1 r_1; the used column is dropped, and after n turns b has become x
+    # pivot row r_1 <- r_1 / a_11, others r_i <- r_i - a_i1 r_1; the used column is dropped, and after n turns b has
+    # become x
     for _ in range(n):
         row = rows[0, 1:] / rows[0, 0]
         rows = jnp.concatenate([rows[1:, 1:] - rows[1:, :1] * row, row[None]])  # the first row becomes the last
@@ -92,7 +98,8 @@ def _eliminated(k, rows):
 
 
 def inverse(a):
-    """The inverses of a (..., n, n), real or complex, without pivoting (see `solve`): every turn replaces one column by a column of the inverse."""
+    """The inverses of a (..., n, n), real or complex, without pivoting (see `solve`): every turn replaces one column by
+    a column of the inverse."""
     n = a.shape[-1]
     if n > ELEMENTWISE:
         return jnp.linalg.inv(a)
@@ -102,8 +109,8 @@ def inverse(a):
 def inverse_in_loop(a):
     """`inverse` without LAPACK for every size.
 
-    `jnp.linalg.inv` of 18 rows inside the loop of a march, with a batch of tangents (`advise` for docs/how_to/molecules.md), blocks XLA's CPU
-    runtime for ever (jaxlib 0.10.2).
+    `jnp.linalg.inv` of 18 rows inside the loop of a march, with a batch of tangents (`advise` for
+    docs/how_to/molecules.md), blocks XLA's CPU runtime for ever (jaxlib 0.10.2).
     """
     n = a.shape[-1]
     if n > UNROLLED:
@@ -125,7 +132,10 @@ def _exchanged(k, a):
 
 
 def _first_exchanged(a):
-    """The exchange step of `_exchanged` with the first pivot. All rows and columns then move up by one; the first row and column become the last."""
+    """The exchange step of `_exchanged` with the first pivot.
+
+    All rows and columns then move up by one; the first row and column become the last.
+    """
     pivot, unit = 1 / a[..., :1, :1], jnp.ones((*a.shape[:-2], 1, 1))
     row = jnp.concatenate([a[..., :1, 1:] * pivot, pivot], axis=-1)
     column = jnp.concatenate([a[..., 1:, :1], -unit], axis=-2)
@@ -136,8 +146,9 @@ def _first_exchanged(a):
 def max_abs(a):
     """The largest absolute value in a; 0 if a is empty, not finite if an entry is not.
 
-    The bits of ``|a|``, read as integers, have the same order. XLA may take a maximum of integers in any order, and uses vector registers;
-    a maximum of floats it takes number by number, and may lose a NaN. The maximum goes axis by axis, so that rows fill the registers.
+    The bits of ``|a|``, read as integers, have the same order. XLA may take a maximum of integers in any order, and
+    uses vector registers; a maximum of floats it takes number by number, and may lose a NaN. The maximum goes axis by
+    axis, so that rows fill the registers.
     """
     order = jax.lax.bitcast_convert_type(jnp.abs(a), jnp.int64)
     while order.ndim:

@@ -1,4 +1,5 @@
-"""Small dense algebra by LAPACK, and steppers without special cases and without predictors: the reference for tests of `cpu`."""
+"""Small dense algebra by LAPACK, and steppers without special cases and without predictors: the reference for tests of
+`cpu`."""
 
 import jax.numpy as jnp
 

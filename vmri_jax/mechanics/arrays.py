@@ -21,10 +21,11 @@ ADVICE = "give float64: lists of numbers, NumPy arrays by .astype(float), JAX ar
 """Advice in messages about floats of less than 64 bits."""
 
 QUICK = {"xla_backend_optimization_level": 0}
-"""Compiler options for programs that run for milliseconds: with `OLDER_EMITTERS` they compile in a third of the time, and run as fast on small matrices."""
+"""Compiler options for programs that run for milliseconds: with `OLDER_EMITTERS` they compile in a third of the time,
+and run as fast on small matrices."""
 OLDER_EMITTERS = {"xla_cpu_use_fusion_emitters": False}
-"""Compiler options for programs of runs: XLA writes kernels in LLVM's language at once, not by dozens of MLIR passes. First results take
-8 to 33 % less time; steps take as long, but for one of eight programs (1.14 times as long)."""
+"""Compiler options for programs of runs: XLA writes kernels in LLVM's language at once, not by dozens of MLIR passes.
+First results take 8 to 33 % less time; steps take as long, but for one of eight programs (1.14 times as long)."""
 
 
 def is_concrete(tree) -> bool:
@@ -49,7 +50,8 @@ def numbers_of(tree):
 
 
 class Known:
-    """A pytree of concrete numbers as an argument of cached functions: equal to every other one of the same structure and numbers."""
+    """A pytree of concrete numbers as an argument of cached functions: equal to every other one of the same structure
+    and numbers."""
 
     def __init__(self, tree):
         self.tree = tree
@@ -64,13 +66,19 @@ class Known:
 
 
 def library(*values):
-    """NumPy, or `jax.numpy` if a value is traced. NumPy is faster outside of programs: the first call of a JAX function takes some 20 ms."""
+    """NumPy, or `jax.numpy` if a value is traced.
+
+    NumPy is faster outside of programs: the first call of a JAX function takes some 20 ms.
+    """
     return np if is_concrete(values) else jnp
 
 
 @lru_cache
 def options_of_runs() -> dict:
-    """`OLDER_EMITTERS` if XLA has this option. XLA refuses programs with unknown options, and versions without this one have to run."""
+    """`OLDER_EMITTERS` if XLA has this option.
+
+    XLA refuses programs with unknown options, and versions without this one have to run.
+    """
     try:
         jax.jit(lambda: 0.0, compiler_options=OLDER_EMITTERS).lower().compile()
     except jax.errors.JaxRuntimeError:
@@ -79,7 +87,8 @@ def options_of_runs() -> dict:
 
 
 def quickly_compiled(function: Callable, static_argnames: str | Sequence[str] = ()) -> Callable:
-    """A function that runs a few times, compiled with the options `QUICK` and those of runs; inside a traced function it is a part of that program.
+    """A function that runs a few times, compiled with the options `QUICK` and those of runs; inside a traced function
+    it is a part of that program.
 
     Args:
         function: of arrays, and of the arguments that `static_argnames` names.
@@ -100,8 +109,8 @@ def quickly_compiled(function: Callable, static_argnames: str | Sequence[str] = 
 
 
 def of_one_type(tree):
-    """A pytree for a run: numbers as NumPy arrays, tracers unchanged, since JAX would trace functions anew for each type of number; and functions
-    with what they read from around them now."""
+    """A pytree for a run: numbers as NumPy arrays, tracers unchanged, since JAX would trace functions anew for each
+    type of number; and functions with what they read from around them now."""
 
     def settled(leaf):
         if isinstance(leaf, TracedOnce):
@@ -115,9 +124,9 @@ def require_x64() -> None:
     """Raise unless JAX's 64-bit mode is on."""
     if jnp.result_type(float) != np.float64:
         raise Refused(
-            "vmri_jax needs 64-bit floats: Newton and the constraints are solved to round-off. Switch them on at the start "
-            "of the program with vm.configure() (vm is vmri_jax), which also makes runs fast, or with "
-            'jax.config.update("jax_enable_x64", True).'
+            "vmri_jax needs 64-bit floats: Newton and the constraints are solved to round-off. Switch them on at the "
+            "start of the program with vm.configure() (vm is vmri_jax), which also makes runs fast, or with"
+            ' jax.config.update("jax_enable_x64", True).'
         )
 
 

@@ -1,8 +1,9 @@
-"""Configurations as dictionaries of arrays: functions of the user get ``q_f["load"]``, all other code has one flat vector.
+"""Configurations as dictionaries of arrays: functions of the user get ``q_f["load"]``, all other code has one flat
+vector.
 
-`Slots` give the place of every array in the flat vector. `vmri_jax.Problem` knows them, and `flat_system` wraps every function
-of its system once: the function gets dictionaries, and forces and constraint rows that it returns as dictionaries become vectors. No
-code behind the problem handles dictionaries.
+`Slots` give the place of every array in the flat vector. `vmri_jax.Problem` knows them, and `flat_system` wraps every
+function of its system once: the function gets dictionaries, and forces and constraint rows that it returns as
+dictionaries become vectors. No code behind the problem handles dictionaries.
 """
 
 from collections.abc import Callable, Mapping
@@ -22,7 +23,8 @@ from vmri_jax.refusals import Refused
 
 @dataclass(frozen=True)
 class ByName:
-    """A function of dictionaries as a function of flat vectors; two of these are equal if their functions and slots are.
+    """A function of dictionaries as a function of flat vectors; two of these are equal if their functions and slots
+    are.
 
     Args:
         function: of the user.
@@ -101,7 +103,7 @@ def _flat_mass(name: str, mass, slots: Slots | None):
         return mass
     if slots is None:
         raise Refused(
-            f"ConstantMass: {name} has masses by name, {', '.join(mass)}, but the {name} coordinates are a vector; give both as dictionaries, "
-            "or both as arrays."
+            f"ConstantMass: {name} has masses by name, {', '.join(mass)}, but the {name} coordinates are a vector; "
+            "give both as dictionaries, or both as arrays."
         )
     return slots.flat(f"ConstantMass: {name}", mass, per_row=True)

@@ -22,7 +22,8 @@ from vmri_jax.refusals import Refused
 
 
 def check_arrays(**arrays):
-    """Arrays as float64 vectors, of JAX if they are, else of NumPy; velocities shaped like their positions; finite where concrete."""
+    """Arrays as float64 vectors, of JAX if they are, else of NumPy; velocities shaped like their positions; finite
+    where concrete."""
     out = {}
     for name, value in arrays.items():
         array = real_array(name, value)
@@ -60,7 +61,8 @@ def check_type(name: str, value, kind: type | UnionType, example: str) -> Any:
 
 
 def check_params(params) -> None:
-    """Refuse parameters that are no numbers, or floats of less than 64 bits; the message gives their place in the pytree."""
+    """Refuse parameters that are no numbers, or floats of less than 64 bits; the message gives their place in the
+    pytree."""
     leaves = jax.tree.leaves(params)
     are_doubles = all(type(leaf) is float or getattr(leaf, "dtype", None) == np.float64 for leaf in leaves)
     if are_doubles and is_concrete(leaves) and all(np.isfinite(leaf).all() for leaf in leaves):
@@ -70,8 +72,8 @@ def check_params(params) -> None:
         check_precision(name, leaf)
         if is_concrete(leaf) and getattr(leaf, "dtype", np.asarray(leaf).dtype).kind not in "biufc":
             raise Refused(
-                f"{name} is {leaf!r}; give arrays of numbers, which are handed to every function. Keep all other objects "
-                "inside the functions. A class of your own becomes a pytree by "
+                f"{name} is {leaf!r}; give arrays of numbers, which are handed to every function. Keep all other "
+                "objects inside the functions. A class of your own becomes a pytree by "
                 "jax.tree_util.register_dataclass or as an equinox.Module."
             )
         if is_concrete(leaf) and not np.isfinite(leaf).all():
@@ -102,15 +104,17 @@ def check_system(system: System, q_s, q_f) -> None:
             _check_float64(term.place, part)
     if system.implied is not None and not system.is_constrained:
         raise Refused(
-            "System: implied is given, but neither constraint nor slow_constraint: its rows are watched, not solved for, and must "
-            "follow from rows that are. Give it as constraint."
+            "System: implied is given, but neither constraint nor slow_constraint: its rows are watched, not solved "
+            "for, and must follow from rows that are. Give it as constraint."
         )
 
 
 def shape_of(name: str, function: Callable, *args):
-    """Shape and type of the value of a user function, by tracing; two derivatives in forward mode, by all arguments but params, must exist.
+    """Shape and type of the value of a user function, by tracing; two derivatives in forward mode, by all arguments but
+    params, must exist.
 
-    Functions without code of the user are not differentiated: to trace their derivatives takes a tenth of the time to the first result of a scene.
+    Functions without code of the user are not differentiated: to trace their derivatives takes a tenth of the time to
+    the first result of a scene.
 
     Args:
         name: name of the function in messages.
@@ -136,8 +140,8 @@ def shape_of(name: str, function: Callable, *args):
         shape = jax.eval_shape(called if is_of_package else differentiated_twice, *args)
     except (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError) as error:
         raise Refused(
-            f"{name} cannot be traced{_line_of(error)}: JAX knows shapes there, no numbers. Use jax.numpy (jnp.sin) instead of "
-            "numpy and math, jnp.where(condition, a, b) instead of if, and no float(...) or int(...)."
+            f"{name} cannot be traced{_line_of(error)}: JAX knows shapes there, no numbers. Use jax.numpy (jnp.sin) "
+            "instead of numpy and math, jnp.where(condition, a, b) instead of if, and no float(...) or int(...)."
         ) from None
     except Exception as error:
         if "custom_vjp" in str(error) or "custom_lin" in str(error):
@@ -147,8 +151,8 @@ def shape_of(name: str, function: Callable, *args):
             ) from error
         raise Refused(
             f"{name} could not be evaluated on arguments of shapes "
-            f"{[getattr(a, 'shape', type(a).__name__) for a in args[:-1]]} and {'params=None' if args[-1] is None else 'the params'}"
-            f"{_line_of(error)}: {type(error).__name__}: {error}"
+            f"{[getattr(a, 'shape', type(a).__name__) for a in args[:-1]]} and "
+            f"{'params=None' if args[-1] is None else 'the params'}{_line_of(error)}: {type(error).__name__}: {error}"
         ) from error
     if not isinstance(function, ConstantMass):
         leaves, structure = jax.tree.flatten(args)
@@ -160,10 +164,12 @@ def shape_of(name: str, function: Callable, *args):
 
 @lru_cache(maxsize=1024)
 def _fault(function: TracedOnce, structure, types: tuple[tuple[tuple[int, ...], np.dtype], ...]) -> str:
-    """Faults of a function that none of its values shows, in words; empty for none. Cached, since tracing takes milliseconds.
+    """Faults of a function that none of its values shows, in words; empty for none. Cached, since tracing takes
+    milliseconds.
 
-    A function that takes ``q[3]`` of three entries: JAX returns the last entry instead, NumPy raises an IndexError; its other errors do not
-    count, since NumPy arrays lack some operations of JAX arrays. And a function that is not pure: two traces of it differ.
+    A function that takes ``q[3]`` of three entries: JAX returns the last entry instead, NumPy raises an IndexError; its
+    other errors do not count, since NumPy arrays lack some operations of JAX arrays. And a function that is not pure:
+    two traces of it differ.
     """
     arguments = jax.tree.unflatten(structure, [np.zeros(*of_leaf) for of_leaf in types])
     try:
@@ -175,8 +181,9 @@ def _fault(function: TracedOnce, structure, types: tuple[tuple[tuple[int, ...], 
         pass
     if function.is_of_user and operations(function.called, *arguments) != operations(function.called, *arguments):
         return (
-            f"is {name_of(function)}, which is not pure: two calls with the same arguments do not do the same. JAX calls it once for a whole run. "
-            "A state belongs in coordinates; noise is drawn before the run, and handed over in params"
+            f"is {name_of(function)}, which is not pure: two calls with the same arguments do not do the same. JAX "
+            "calls it once for a whole run. A state belongs in coordinates; noise is drawn before the run, and "
+            "handed over in params"
         )
     return ""
 
@@ -210,8 +217,8 @@ def _line_of(error: Exception) -> str:
 def _check_float64(name: str, value) -> None:
     if value.dtype != np.float64:
         raise Refused(
-            f"System: {name} returns {value.dtype}; it must return float64. Whole numbers become floats as 0.0 instead of 0, "
-            "arrays by .astype(float)."
+            f"System: {name} returns {value.dtype}; it must return float64. Whole numbers become floats as 0.0 instead "
+            "of 0, arrays by .astype(float)."
         )
 
 

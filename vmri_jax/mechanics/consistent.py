@@ -1,7 +1,8 @@
 """Consistent starts: positions moved onto the constraints, and momenta onto the hidden constraints ``G v + dg/dt = 0``.
 
-Of traced numbers these functions are parts of programs. Of known numbers NumPy does the linear algebra, and the `Configuration` has values and
-Jacobians: a program of its own for every step of the start would take seconds to compile.
+Of traced numbers these functions are parts of programs. Of known numbers NumPy does the linear algebra, and the
+`Configuration` has values and Jacobians: a program of its own for every step of the start would take seconds to
+compile.
 """
 
 from contextlib import suppress
@@ -19,11 +20,15 @@ from vmri_jax.mechanics.structure import has_constant_hessian
 from vmri_jax.mechanics.system import System
 
 PROJECTION_STEPS = 20
-"""Gauss-Newton steps onto the constraints. They converge quadratically from close positions; a larger number takes longer."""
+"""Gauss-Newton steps onto the constraints.
+
+They converge quadratically from close positions; a larger number takes longer.
+"""
 
 
 def project_positions(system: System, t, q_s, q_f):
-    """Positions moved onto the constraints at a time, along ``M^-1 G^T`` of the start: to first order the nearest point in the mass metric."""
+    """Positions moved onto the constraints at a time, along ``M^-1 G^T`` of the start: to first order the nearest point
+    in the mass metric."""
     n_s, q = q_s.shape[0], library(q_s, q_f).concatenate([q_s, q_f])
     start = configuration(system, t, q_s, q_f)
     xp = library(start)
@@ -49,10 +54,11 @@ def project_positions(system: System, t, q_s, q_f):
 
 
 def consistent_momenta(system: System, t, q_s, q_f, v_s, v_f):
-    """(p_s, p_f, violation): momenta projected onto the hidden constraints, and the violation of the hidden constraints, between 0 and 1.
+    """(p_s, p_f, violation): momenta projected onto the hidden constraints, and the violation of the hidden
+    constraints, between 0 and 1.
 
-    The violation is ``|v - v'| / max(|v|, |v'|)`` in the norm of the kinetic energy, with the projected velocities v': constraints may take
-    velocity away, and moving constraints may add it.
+    The violation is ``|v - v'| / max(|v|, |v'|)`` in the norm of the kinetic energy, with the projected velocities v':
+    constraints may take velocity away, and moving constraints may add it.
     """
     n_s, arguments = np.shape(q_s)[0], (system, t, q_s, q_f, v_s, v_f)
 

@@ -12,12 +12,13 @@ from vmri_jax.mechanics.masses import ConstantMass
 from vmri_jax.mechanics.system import System
 
 MOST_ROWS_OF_FULL_MATRIX = 80
-"""Number of constraint rows up to which the full matrix is used, without a search for zeros. For hinged chains in director coordinates the band
-takes 0.9 of the time of the full matrix at 77 rows, and 0.3 of it at 88 (`python -m benchmarks chains --full`). A larger number makes steps of
-short chains slower; a smaller one makes the first run of small systems some seconds longer."""
+"""Number of constraint rows up to which the full matrix is used, without a search for zeros. For hinged chains in
+director coordinates the band takes 0.9 of the time of the full matrix at 77 rows, and 0.3 of it at 88
+(`python -m benchmarks chains --full`). A larger number makes steps of short chains slower; a smaller one makes the
+first run of small systems some seconds longer."""
 LEAST_CHANGE = 1e-6
-"""Least change of a constraint, relative to its largest change, that counts as a dependence. A larger value misses weak dependences, which costs
-iterations; a smaller one takes round-off for a dependence."""
+"""Least change of a constraint, relative to its largest change, that counts as a dependence. A larger value misses weak
+dependences, which costs iterations; a smaller one takes round-off for a dependence."""
 
 
 def all_rows(system: System, q_s, q_f) -> Sparsity:
@@ -31,7 +32,8 @@ def all_rows(system: System, q_s, q_f) -> Sparsity:
 
 
 def fast_rows(system: System, q_s, q_f, degree: int) -> Sparsity:
-    """Sparsity of ``G_f M_f^-1 G_f^T`` with the constraints g and the fast coordinates, at the nodes of one interval; for diagonal masses."""
+    """Sparsity of ``G_f M_f^-1 G_f^T`` with the constraints g and the fast coordinates, at the nodes of one interval;
+    for diagonal masses."""
     count = system.num_constraints(q_s, q_f)[0]
     if count <= MOST_ROWS_OF_FULL_MATRIX:
         return Full(degree * count)
@@ -39,10 +41,11 @@ def fast_rows(system: System, q_s, q_f, degree: int) -> Sparsity:
 
 
 def _shared(system: System, n_s: int, n_f: int, nodes: int | None = None) -> Sparsity:
-    """Sparsity of the matrix: two rows have a common entry if both constraints change with some coordinate, at a random position.
+    """Sparsity of the matrix: two rows have a common entry if both constraints change with some coordinate, at a random
+    position.
 
-    A dependence that this test misses costs iterations, not accuracy: the matrix serves Newton's iteration alone. With a number of `nodes` it
-    is the matrix of g with the fast coordinates, else of all constraints with all coordinates.
+    A dependence that this test misses costs iterations, not accuracy: the matrix serves Newton's iteration alone. With
+    a number of `nodes` it is the matrix of g with the fast coordinates, else of all constraints with all coordinates.
     """
     rng = np.random.default_rng(0)
     # random numbers in place of traced ones
@@ -56,7 +59,8 @@ def _shared(system: System, n_s: int, n_f: int, nodes: int | None = None) -> Spa
 
 @partial(quickly_compiled, static_argnames=("n_s", "slow_too"))
 def _touched(system: System, n_s: int, q, moves, slow_too: bool):
-    """(k, m) whether each of m constraints changes to first order with each of the moves (k, n), and (m,) whether it is finite."""
+    """(k, m) whether each of m constraints changes to first order with each of the moves (k, n), and (m,) whether it is
+    finite."""
 
     def constraints(q):
         values = system.constraints if slow_too else system.g

@@ -5,9 +5,10 @@ Every number is judged in its own unit. A row ``g_i(t, q)`` of the constraints c
     allowed_i = tolerance size_i + ROUNDING eps (terms_i + reach_i)
     size_i = max(terms_i, min(|G_i|^2 / |hess g_i|, reach_i))        reach_i = sum_j |dg_i/dq_j| / w_j max_k |w_k q_k|
 
-with the size terms_i of the terms that cancel in it, ``|d| + L`` of ``|d| - L`` (`sizes_of_terms`), and its change over its radius of curvature. The
-weights w, square roots of the masses, give all coordinates one unit: lengths of gradients and reach_i, the change of a row over the largest
-position, which bounds its round-off, are taken with them. Mass matrices are judged with a diagonal of ones.
+with the size terms_i of the terms that cancel in it, ``|d| + L`` of ``|d| - L`` (`sizes_of_terms`), and its change over
+its radius of curvature. The weights w, square roots of the masses, give all coordinates one unit: lengths of gradients
+and reach_i, the change of a row over the largest position, which bounds its round-off, are taken with them. Mass
+matrices are judged with a diagonal of ones.
 """
 
 from contextlib import nullcontext
@@ -29,40 +30,61 @@ from vmri_jax.mechanics.terms import Term
 from vmri_jax.refusals import Refused
 
 START = 1e-9
-"""Largest value of a row at the start, relative to its size. A larger one would start runs off the constraints; a smaller one would refuse numbers
-that are written with ten digits."""
+"""Largest value of a row at the start, relative to its size. A larger one would start runs off the constraints; a
+smaller one would refuse numbers that are written with ten digits."""
 CONSTRAINT_TOLERANCE = 1e-6
-"""Largest value of a row that is kept along a run, relative to its size. A smaller value would refuse starts that are rounded to six digits."""
+"""Largest value of a row that is kept along a run, relative to its size.
+
+A smaller value would refuse starts that are rounded to six digits.
+"""
 CONSTRAINT_OVER_TOLERANCE = 100
-"""Loose Newton tolerances raise the value of a row that is kept, relative to its size, to this factor times the tolerance. A smaller factor would
-refuse converged steps."""
+"""Loose Newton tolerances raise the value of a row that is kept, relative to its size, to this factor times the
+tolerance. A smaller factor would refuse converged steps."""
 ROUNDING = 100
-"""Value of a row in units of its rounding, ``eps (terms + reach)``, that always counts as zero: a row has tens of operations. A smaller value
-refuses starts far from the origin, a larger one lets short rods there have the wrong length."""
+"""Value of a row in units of its rounding, ``eps (terms + reach)``, that always counts as zero: a row has tens of
+operations. A smaller value refuses starts far from the origin, a larger one lets short rods there have the wrong
+length."""
 RANK = 1e-8
-"""Largest singular value of a dependence among rows of length one. A larger value refuses nearly dependent constraints that can be solved."""
+"""Largest singular value of a dependence among rows of length one.
+
+A larger value refuses nearly dependent constraints that can be solved.
+"""
 LEAST_EIGENVALUE = 1e-12
-"""Smallest eigenvalue of a regular mass matrix with a diagonal of ones, relative to the largest one. A larger value refuses nearly singular ones."""
+"""Smallest eigenvalue of a regular mass matrix with a diagonal of ones, relative to the largest one.
+
+A larger value refuses nearly singular ones.
+"""
 SPEED = 1e-5
-"""Velocity, in units of the user, at which the mass matrix is checked: it is the same at all velocities unless T is not quadratic. T may then be
-singular at rest, or have a largest velocity, which this value has to stay below."""
+"""Velocity, in units of the user, at which the mass matrix is checked: it is the same at all velocities unless T is not
+quadratic. T may then be singular at rest, or have a largest velocity, which this value has to stay below."""
 LEAST_COEFFICIENT = 1e-6
-"""Rows with at least this coefficient in a normalised linear dependence are named in messages. A larger value leaves rows out."""
+"""Rows with at least this coefficient in a normalised linear dependence are named in messages.
+
+A larger value leaves rows out.
+"""
 LEAST_FAST_PART = 1e-12
-"""Least ratio ``|dg/dq_f| / |dg/dq|`` of a constraint that counts as dependent on fast variables. A larger value refuses weak dependences."""
+"""Least ratio ``|dg/dq_f| / |dg/dq|`` of a constraint that counts as dependent on fast variables.
+
+A larger value refuses weak dependences.
+"""
 VANISHING_GRADIENT = 1e-6
-"""Ratio of the gradient of a constraint to its gradient at a generic configuration nearby, below which the gradient counts as zero. A larger value
-refuses constraints that are nearly singular at the start."""
+"""Ratio of the gradient of a constraint to its gradient at a generic configuration nearby, below which the gradient
+counts as zero. A larger value refuses constraints that are nearly singular at the start."""
 NEARBY = 1e-2
-"""Distance to a configuration nearby, relative to the distance over which rows change by their size. From a larger one rows may be others."""
+"""Distance to a configuration nearby, relative to the distance over which rows change by their size.
+
+From a larger one rows may be others.
+"""
 MICRO_GRID = (
-    "A constraint held on the micro grid must be satisfiable by the fast variables: the slow path is one polynomial per macro step, of degree r, "
-    "so that a slow-only constraint held at every micro node is over-determined (rank deficit r (num_micro - 1) per row)."
+    "A constraint held on the micro grid must be satisfiable by the fast variables: the slow path is one polynomial "
+    "per macro step, of degree r, so that a slow-only constraint held at every micro node is over-determined (rank "
+    "deficit r (num_micro - 1) per row)."
 )
 
 
 def decomposed(rows) -> tuple[np.ndarray, int, np.ndarray]:
-    """U (k, k), the rank, and V^T (n, n) of the singular values of a matrix (k, n) with each row scaled to length one."""
+    """U (k, k), the rank, and V^T (n, n) of the singular values of a matrix (k, n) with each row scaled to length
+    one."""
     rows = np.asarray(rows)
     size = np.linalg.norm(rows, axis=1, keepdims=True)
     left, values, right = np.linalg.svd(rows / np.where(size > 0, size, 1))
@@ -70,7 +92,8 @@ def decomposed(rows) -> tuple[np.ndarray, int, np.ndarray]:
 
 
 def rank_of(rows) -> tuple[int, list[int]]:
-    """Rank of a matrix (k, n), with each row scaled to length one, and the indices of the rows in a linear dependence."""
+    """Rank of a matrix (k, n), with each row scaled to length one, and the indices of the rows in a linear
+    dependence."""
     left, rank, _ = decomposed(rows)
     return rank, np.flatnonzero(np.linalg.norm(left[:, rank:], axis=1) > LEAST_COEFFICIENT).tolist()
 
@@ -140,7 +163,8 @@ def _values(system: System, *configuration):
 
 
 def residual_of(rows: Rows, system: System, state, weighted_velocity):
-    """Largest ``|g|`` and largest ``|G v + dg/dt|``, shape (2,), from the rows at a state, and w v (n,) with their weights."""
+    """Largest ``|g|`` and largest ``|G v + dg/dt|``, shape (2,), from the rows at a state, and w v (n,) with their
+    weights."""
     rates, t = matvec(rows.gradients, weighted_velocity), state.t
     if any(term.moves for term in system.terms):
         rates += jax.jvp(lambda t: _values(system, t, state.q_s, state.q_f), (t,), (jnp.ones_like(t),))[1]
@@ -167,7 +191,8 @@ def are_kept(rows: Rows, solved: int, tolerance):
 
 
 class Configuration(NamedTuple):
-    """The `Rows` at a configuration, the mass matrix, and of the rows that are solved for the values g, the Jacobian G, and dg/dt."""
+    """The `Rows` at a configuration, the mass matrix, and of the rows that are solved for the values g, the Jacobian G,
+    and dg/dt."""
 
     rows: Rows
     mass: Any
@@ -177,8 +202,8 @@ class Configuration(NamedTuple):
 
 
 def configuration(system: System, t, q_s, q_f, mass=None) -> Configuration:
-    """The `Configuration`, with the mass matrix at rest unless it is given: of numbers, one program for the projection of a start, its momenta,
-    and its checks."""
+    """The `Configuration`, with the mass matrix at rest unless it is given: of numbers, one program for the projection
+    of a start, its momenta, and its checks."""
     if mass is None:
         mass, _ = mass_and_momentum(system, q_s, q_f, np.zeros(np.shape(q_s)), np.zeros(np.shape(q_f)))
     weights = weights_of(mass.diagonal())
@@ -218,9 +243,9 @@ def check_mass(system: System, q_s, q_f) -> None:
         n_s = np.size(q_s)
         names = [f"q_s[{i}]" if i < n_s else f"q_f[{i - n_s}]" for i in np.flatnonzero(without)]
         raise Refused(
-            f"System: the mass matrix d2T/dv2 of kinetic is not positive definite at these positions, along {', '.join(names)} "
-            f"(with a diagonal of ones, its eigenvalues go from {values[0]:.3g} to {values[-1]:.3g}). Give every coordinate a mass, one that "
-            "constraints move too."
+            "System: the mass matrix d2T/dv2 of kinetic is not positive definite at these positions, along "
+            f"{', '.join(names)} (with a diagonal of ones, its eigenvalues go from {values[0]:.3g} to "
+            f"{values[-1]:.3g}). Give every coordinate a mass, one that constraints move too."
         )
 
 
@@ -257,8 +282,9 @@ def check_constraints(
         worst = int(np.argmax(np.abs(solved) / np.where(violated, allowed, np.inf)))
         [part] = [part for part in held if part.rows.start <= worst < part.rows.stop]
         raise Refused(
-            f"{place} violate {part.term.field}, row {part.in_words([worst - part.rows.start]).strip('[]')}, by {abs(solved[worst]):.3e} (allowed: "
-            f"{allowed[worst]:.0e}, {tolerance:.0e} of its size, and round-off); {advice}"
+            f"{place} violate {part.term.field}, row {part.in_words([worst - part.rows.start]).strip('[]')}, by "
+            f"{abs(solved[worst]):.3e} (allowed: {allowed[worst]:.0e}, {tolerance:.0e} of its size, and round-off); "
+            f"{advice}"
         )
     _check_implied(rows, len(solved), place)
     for part in held:
@@ -267,28 +293,29 @@ def check_constraints(
         slow_only = np.flatnonzero((size > 0) & (np.linalg.norm(by_variables, axis=1) <= LEAST_FAST_PART * size))
         if slow_only.size:
             raise Refused(
-                f"System: row(s) {part.in_words(slow_only)} of constraint do not depend on the fast variables q_f. {MICRO_GRID} Give them as "
-                "System(slow_constraint=...), a function of (q_s, params), which is held at the macro nodes; or make the variables that "
-                "they hold fast."
+                f"System: row(s) {part.in_words(slow_only)} of constraint do not depend on the fast variables q_f. "
+                f"{MICRO_GRID} Give them as System(slow_constraint=...), a function of (q_s, params), which is held "
+                "at the macro nodes; or make the variables that they hold fast."
             )
         (values, variables), pace = by_variables.shape, part.pace
         if values > variables:
             raise Refused(
-                f"System: {part.term.field} returns {values} values for {variables} {pace} variables; at most {variables} can be satisfied."
-                f"{part.grid} Remove rows, or make the variables that they hold {pace}."
+                f"System: {part.term.field} returns {values} values for {variables} {pace} variables; at most "
+                f"{variables} can be satisfied.{part.grid} Remove rows, or make the variables that they hold {pace}."
             )
     _check_gradients(system, state, held, rows, weights)
     if any(rank_of(rows.gradients[part.rows, part.variables])[1] for part in held):
-        # At a singular configuration (a linkage folded flat) rows are dependent there and nowhere else, and runs pass it: only rows that are
-        # dependent at a generic configuration nearby are refused.
+        # At a singular configuration (a linkage folded flat) rows are dependent there and nowhere else, and runs pass
+        # it: only rows that are dependent at a generic configuration nearby are refused.
         rows = configuration(system, state.t, *_nearby(state, rows, weights)).rows
         for part in held:
             jacobian = rows.gradients[part.rows, part.variables]
             rank, dependent = rank_of(jacobian)
             if dependent:
                 raise Refused(
-                    f"System: rows {part.in_words(dependent)} of {part.term.field} depend on each other: {len(jacobian)} rows have rank {rank} in "
-                    f"the {part.pace} variables.{part.grid} Remove redundant ones of these rows, or make the variables they need fast."
+                    f"System: rows {part.in_words(dependent)} of {part.term.field} depend on each other: "
+                    f"{len(jacobian)} rows have rank {rank} in the {part.pace} variables.{part.grid} Remove redundant "
+                    "ones of these rows, or make the variables they need fast."
                 )
 
 
@@ -310,7 +337,8 @@ class Held(NamedTuple):
     grid: str
 
     def in_words(self, rows) -> str:
-        """Numbers of some of its rows, with the names of rows that the constraint returns by name: ``[0, 2]`` or ``0 (rope), 2 (rail)``."""
+        """Numbers of some of its rows, with the names of rows that the constraint returns by name: ``[0, 2]`` or
+        ``0 (rope), 2 (rail)``."""
         sizes = constraint_sizes(self.term.function, *self.term.of_arguments(self.values), self.values["params"])
         names = [name for name, size in sizes.items() for _ in range(size)]
         return ", ".join(f"{row} ({names[row]})" for row in rows) if names else str(list(map(int, rows)))
@@ -328,7 +356,8 @@ def _held(system: System, state) -> list[Held]:
 
 
 def _check_gradients(system: System, state, held: list[Held], rows: Rows, weights) -> None:
-    """Refuse rows whose gradient is zero at the state, but not at a generic configuration `NEARBY` relative to its positions."""
+    """Refuse rows whose gradient is zero at the state, but not at a generic configuration `NEARBY` relative to its
+    positions."""
     q = np.concatenate([state.q_s, state.q_f])
     change = NEARBY * np.abs(weights * q).max() * np.random.default_rng(0).normal(size=q.size) / weights
     nearby = configuration(system, state.t, *np.split(q + change, [np.size(state.q_s)])).rows
@@ -337,9 +366,9 @@ def _check_gradients(system: System, state, held: list[Held], rows: Rows, weight
     for part in held:
         if vanishes[part.rows].any():
             raise Refused(
-                f"System: the gradient of row(s) {part.in_words(np.flatnonzero(vanishes[part.rows]))} of {part.term.field} vanishes at these "
-                "positions, and no force along it can hold the constraint. A square, (|x| - L)**2, has such a gradient wherever it is 0: take "
-                "its root, |x| - L."
+                f"System: the gradient of row(s) {part.in_words(np.flatnonzero(vanishes[part.rows]))} of "
+                f"{part.term.field} vanishes at these positions, and no force along it can hold the constraint. A "
+                "square, (|x| - L)**2, has such a gradient wherever it is 0: take its root, |x| - L."
             )
 
 
@@ -348,13 +377,15 @@ def _check_implied(rows: Rows, solved: int, place: str) -> None:
     opened = np.flatnonzero(~(np.abs(values) <= allowed))
     if opened.size:
         raise Refused(
-            f"System: implied does not follow from the constraints: {place} keep these, and row(s) {opened.tolist()} of implied are "
-            f"{values[opened]} there (allowed: {allowed[opened]}). Take parameters for which they follow, or hold them as constraint."
+            f"System: implied does not follow from the constraints: {place} keep these, and row(s) {opened.tolist()} "
+            f"of implied are {values[opened]} there (allowed: {allowed[opened]}). Take parameters for which they "
+            "follow, or hold them as constraint."
         )
 
 
 def _nearby(state, rows: Rows, weights):
-    """A generic configuration at a distance `NEARBY` from a state, always the same; the distance over which a row changes by its size is 1."""
+    """A generic configuration at a distance `NEARBY` from a state, always the same; the distance over which a row
+    changes by its size is 1."""
     lengths = np.linalg.norm(rows.gradients, axis=1)
     size = NEARBY * np.min(rows.sizes[lengths > 0] / lengths[lengths > 0], initial=np.inf)
     change = np.where(np.isfinite(size), size, 0.0) * np.random.default_rng(0).normal(size=weights.size) / weights

@@ -1,8 +1,9 @@
 """Explicit time in a system: forces and moving constraints that drive it, and the events in them.
 
-An *event* is a peak or a dip in time of an entry of the force F, of a moving constraint g, or of dg/dt. It lasts as long as the entry keeps more
-than half of the smaller of its swings before and after the turning point: a rectangular pulse its length, half a sine wave half a period.
-A jump or a ramp to another value is no event: no step passes over it, since all later nodes see the new value.
+An *event* is a peak or a dip in time of an entry of the force F, of a moving constraint g, or of dg/dt. It lasts as
+long as the entry keeps more than half of the smaller of its swings before and after the turning point: a rectangular
+pulse its length, half a sine wave half a period. A jump or a ramp to another value is no event: no step passes over it,
+since all later nodes see the new value.
 """
 
 from functools import lru_cache, partial
@@ -17,7 +18,10 @@ from vmri_jax.mechanics.system import System
 from vmri_jax.mechanics.terms import Term
 
 SAMPLES = 2**20
-"""Samples in time of an entry. With fewer samples short pulses are overlooked, with more of them the search for events takes longer."""
+"""Samples in time of an entry.
+
+With fewer samples short pulses are overlooked, with more of them the search for events takes longer.
+"""
 MOST_NUMBERS = 2**23
 """Samples times varying entries, 64 MiB of memory: systems with more than 8 varying entries get fewer samples."""
 CHUNK = 2**22
@@ -25,9 +29,11 @@ CHUNK = 2**22
 LEAST_HEIGHT = 1e-6
 """Least height of an event, as a part of the range of its entry; a smaller value takes round-off for events."""
 REFINEMENTS, PARTS = 3, 16
-"""Rounds of refinement about events that last less than `COARSE` samples, and the parts of a refined interval: 16^3 times finer samples."""
+"""Rounds of refinement about events that last less than `COARSE` samples, and the parts of a refined interval: 16^3
+times finer samples."""
 LEAST_JUMP = 1e-3
-"""Change of an entry in a part of 16^3 of a sample, relative to its range, that counts as a jump: smooth pulses change by at most 1 / 16^3."""
+"""Change of an entry in a part of 16^3 of a sample, relative to its range, that counts as a jump: smooth pulses change
+by at most 1 / 16^3."""
 COARSE = 8
 """Samples of an event below which its length is measured again. With fewer samples the length is known less well."""
 GOLDEN = (np.sqrt(5) - 1) / 2
@@ -57,8 +63,9 @@ class Events(NamedTuple):
 def driven(system: System, state) -> tuple[str, ...]:
     """Names of the terms of a system that depend explicitly on time: "force", "constraint", "slow_constraint".
 
-    The operations of the traced functions decide, whatever their values: ``jnp.where(t > 2, F, 0)`` depends on time, also before t = 2; a
-    `Rheonomic` function that does not use t does not. Nothing is computed, so that state and params may be traced.
+    The operations of the traced functions decide, whatever their values: ``jnp.where(t > 2, F, 0)`` depends on time,
+    also before t = 2; a `Rheonomic` function that does not use t does not. Nothing is computed, so that state and
+    params may be traced.
 
     Args:
         state: a `State`, or any object with arrays q_s (n_s,) and q_f (n_f,).
@@ -72,11 +79,12 @@ def driven(system: System, state) -> tuple[str, ...]:
 def events(system: System, state, t_end: float) -> Events:
     """The events of a system from the time of a state to `t_end`; none if nothing in it depends on time.
 
-    All terms of `driven` are sampled at 2^20 times (fewer if more than 8 entries vary), at one generic configuration near the state, since a
-    parametric drive has no force at an equilibrium. Two neighbouring samples are at most twice the mean distance apart, and their times are
-    no multiples of each other, so that no train of pulses falls between them. Short events are sampled again on finer grids. Overlooked
-    are: pulses that last less than two samples and have no flanks (2e-5 in a run of length 10), events of a millionth of the range of their
-    entry, and a drive that begins only in other configurations.
+    All terms of `driven` are sampled at 2^20 times (fewer if more than 8 entries vary), at one generic configuration
+    near the state, since a parametric drive has no force at an equilibrium. Two neighbouring samples are at most twice
+    the mean distance apart, and their times are no multiples of each other, so that no train of pulses falls between
+    them. Short events are sampled again on finer grids. Overlooked are: pulses that last less than two samples and have
+    no flanks (2e-5 in a run of length 10), events of a millionth of the range of their entry, and a drive that begins
+    only in other configurations.
 
     Args:
         state: a `State`; its t is the start.
@@ -128,7 +136,8 @@ def _steepest(f: np.ndarray, num: int) -> np.ndarray:
 
 
 def _jumps(values, t: np.ndarray, f: np.ndarray) -> bool:
-    """Whether an entry changes by more than `LEAST_JUMP` of its range in the 16^3-th part of one of the steepest intervals."""
+    """Whether an entry changes by more than `LEAST_JUMP` of its range in the 16^3-th part of one of the steepest
+    intervals."""
     steepest, span = _steepest(f, PARTS), np.maximum(np.ptp(f, axis=0), np.finfo(float).tiny)
     begin, end, change = t[steepest], t[steepest + 1], np.abs(np.diff(f, axis=0)[steepest] / span).max(initial=0.0)
     for _ in range(REFINEMENTS):
@@ -164,12 +173,14 @@ def _sampled(system: System, names: tuple[str, ...], configuration, times):
 
 @partial(jax.jit, static_argnames="names")
 def sampled_with_rates(system: System, names: tuple[str, ...], configuration, times):
-    """(k, m) entries of the terms `names` at the times (k,) in a configuration (q_s, q_f, v_s, v_f), and their rates of change."""
+    """(k, m) entries of the terms `names` at the times (k,) in a configuration (q_s, q_f, v_s, v_f), and their rates of
+    change."""
     return jax.jvp(partial(_sampled, system, names, configuration), (times,), (jnp.ones_like(times),))
 
 
 def generic(state, length: float) -> tuple:
-    """Positions and velocities (q_s, q_f, v_s, v_f) near a state, always the same: positions a hundredth away, velocities of ten sizes in a run."""
+    """Positions and velocities (q_s, q_f, v_s, v_f) near a state, always the same: positions a hundredth away,
+    velocities of ten sizes in a run."""
     random, q = np.random.default_rng(0), (np.asarray(state.q_s), np.asarray(state.q_f))
     size = max(float(np.abs(a).max(initial=0.0)) for a in q) or 1.0
     moved = [a + 1e-2 * size * random.normal(size=a.shape) for a in q]
@@ -178,7 +189,8 @@ def generic(state, length: float) -> tuple:
 
 @lru_cache(maxsize=4)
 def _unit_times(num: int) -> np.ndarray:
-    """(num,) increasing times in [0, 1], one in each of num equal intervals, placed in it by multiples of the golden ratio."""
+    """(num,) increasing times in [0, 1], one in each of num equal intervals, placed in it by multiples of the golden
+    ratio."""
     i = np.arange(num)
     times = (i + i * GOLDEN % 1.0) / num
     times[-1] = 1.0

@@ -1,8 +1,9 @@
-"""Functions of the user: checks of their arguments, the order of their params, and tracing once for all programs that contain them.
+"""Functions of the user: checks of their arguments, the order of their params, and tracing once for all programs that
+contain them.
 
-JAX sorts the names of a dictionary whenever it takes a pytree apart: in jit, grad and vmap, and in ``jax.tree.map``. Functions of the user may rely on
-the order of writing, ``zip(params["k"].values(), q_f.values())``. So the order is kept with the functions, and every dictionary is put
-back into its order before a function is called, while JAX traces.
+JAX sorts the names of a dictionary whenever it takes a pytree apart: in jit, grad and vmap, and in ``jax.tree.map``.
+Functions of the user may rely on the order of writing, ``zip(params["k"].values(), q_f.values())``. So the order is
+kept with the functions, and every dictionary is put back into its order before a function is called, while JAX traces.
 """
 
 import dataclasses
@@ -18,17 +19,18 @@ from vmri_jax.mechanics.surroundings import Surroundings, innermost, name_of
 from vmri_jax.refusals import Refused, warn_user
 
 COPIES_UNTIL_WARNING = 5
-"""Number of surroundings of one piece of code, each compiled anew, at which the user is warned. A larger number warns late; a smaller one warns
-about programs that define a few variants on purpose."""
+"""Number of surroundings of one piece of code, each compiled anew, at which the user is warned. A larger number warns
+late; a smaller one warns about programs that define a few variants on purpose."""
 NO_TIME = (
-    "Energies and masses that depend on time are out of scope. Take instead a force that depends on time, {force}, or a constraint that "
-    "moves with time, {moving}."
+    "Energies and masses that depend on time are out of scope. Take instead a force that depends on time, {force}, or "
+    "a constraint that moves with time, {moving}."
 )
-"""Advice for an energy function that takes the time; {force} and {moving} are the signatures of forces and of `Rheonomic` constraints."""
+"""Advice for an energy function that takes the time; {force} and {moving} are the signatures of forces and of
+`Rheonomic` constraints."""
 NO_VELOCITY = (
-    "Constraints hold positions; one that moves with time is {moving}. Constraints on velocities (rolling without slip, skates) are out "
-    "of scope. Take instead the positions that they hold, where there are such (x - radius * angle of a wheel that rolls along a line), or a "
-    "strong damper on the velocity that is forbidden, {force}."
+    "Constraints hold positions; one that moves with time is {moving}. Constraints on velocities (rolling without "
+    "slip, skates) are out of scope. Take instead the positions that they hold, where there are such (x - radius * "
+    "angle of a wheel that rolls along a line), or a strong damper on the velocity that is forbidden, {force}."
 )
 """Advice for a constraint that takes the time or velocities."""
 TIME_AND_VELOCITIES = ("t", "v_s", "v_f")
@@ -79,16 +81,19 @@ def _children(tree: Any) -> tuple[list, Any]:
 @jax.tree_util.register_pytree_node_class
 @dataclasses.dataclass(frozen=True, eq=False)
 class TracedOnce:
-    """A function of arrays that JAX traces once per process, for given shapes of its arguments and for what it reads from around it.
+    """A function of arrays that JAX traces once per process, for given shapes of its arguments and for what it reads
+    from around it.
 
-    Later programs inline the traced operations, as if they had called the function. Two instances are equal if the codes of their functions,
-    their surroundings and their orders are. A pytree node without arrays, whose structure is what the function reads.
+    Later programs inline the traced operations, as if they had called the function. Two instances are equal if the
+    codes of their functions, their surroundings and their orders are. A pytree node without arrays, whose structure is
+    what the function reads.
 
     Args:
         function: of the user.
-        seen: key of its `Surroundings` when a run was made; None for what the function reads now. With `seen` new traces after a change are
-            refused: they would mix old and new numbers.
-        order: in which the function gets the dictionaries in its last argument, the params; None for the order in which they come.
+        seen: key of its `Surroundings` when a run was made; None for what the function reads now. With `seen` new
+            traces after a change are refused: they would mix old and new numbers.
+        order: in which the function gets the dictionaries in its last argument, the params; None for the order in which
+            they come.
     """
 
     function: Callable
@@ -103,8 +108,8 @@ class TracedOnce:
         around = Surroundings(self.function)
         if self.seen not in (None, around.key):
             raise Refused(
-                f"{name_of(self)} reads something else from around it than when its run was made. Make the run again; what varies is better "
-                "handed over in params."
+                f"{name_of(self)} reads something else from around it than when its run was made. Make the run again; "
+                "what varies is better handed over in params."
             )
         if self.order is not None:
             *others, params = arguments
@@ -154,7 +159,8 @@ class TracedOnce:
 
 
 class CompiledAgainWarning(UserWarning):
-    """A function reads other numbers from around it again and again, and JAX compiles every program that contains it again."""
+    """A function reads other numbers from around it again and again, and JAX compiles every program that contains it
+    again."""
 
 
 @lru_cache(maxsize=1024)
@@ -169,7 +175,8 @@ def _traced(function: TracedOnce) -> Callable:
 
 
 def _count(function: Callable) -> None:
-    """Count the surroundings in which one piece of code is traced, and warn once about `COPIES_UNTIL_WARNING` of them."""
+    """Count the surroundings in which one piece of code is traced, and warn once about `COPIES_UNTIL_WARNING` of
+    them."""
     function = innermost(function)
     code = getattr(function, "__code__", None)
     package = __name__.partition(".")[0]
@@ -178,9 +185,9 @@ def _count(function: Callable) -> None:
     _made[code] += 1
     if _made[code] == COPIES_UNTIL_WARNING:
         warn_user(
-            f"the function {function.__name__} (line {code.co_firstlineno} of {code.co_filename}) has been traced {COPIES_UNTIL_WARNING} times, and "
-            "everything that contains it compiled as often, since it reads other values from around it each time. Hand over what varies "
-            "as params.",
+            f"the function {function.__name__} (line {code.co_firstlineno} of {code.co_filename}) has been traced "
+            f"{COPIES_UNTIL_WARNING} times, and everything that contains it compiled as often, since it reads other "
+            "values from around it each time. Hand over what varies as params.",
             CompiledAgainWarning,
         )
 

@@ -12,7 +12,8 @@ from vmri_jax.mechanics.system import System
 
 
 def energy_parts(system: System, q_s, q_f, p_s, p_f, velocities=None, masses=None) -> dict:
-    """Parts of the Hamiltonian ``p . v - T(q, v) + V + W + sum_i V_i``: "kinetic", "slow", "fast" and the names of `System.potentials`.
+    """Parts of the Hamiltonian ``p . v - T(q, v) + V + W + sum_i V_i``: "kinetic", "slow", "fast" and the names of
+    `System.potentials`.
 
     Velocities (v_s, v_f) of the momenta and masses (n, n) that are known already are not computed again.
     """

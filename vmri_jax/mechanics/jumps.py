@@ -1,11 +1,13 @@
-"""Search for discontinuous forces, such as dry friction: a step across a jump has no solution, or one that no iteration reaches.
+"""Search for discontinuous forces, such as dry friction: a step across a jump has no solution, or one that no iteration
+reaches.
 
-The search evaluates the forces ``F + dL/dq`` along two lines from a state, straight ahead and to the reversed velocities:
+The search evaluates the forces ``F + dL/dq`` along two lines from a state, straight ahead and to the reversed
+velocities:
 
     t + s,  q + s v,  v + s a,    0 <= s <= duration          t,  q,  v - s v,    0 <= s <= 2
 
-It divides the piece of a line with the largest change of a force repeatedly: the change of a smooth force shrinks with the piece, the
-change of a discontinuous force does not.
+It divides the piece of a line with the largest change of a force repeatedly: the change of a smooth force shrinks with
+the piece, the change of a discontinuous force does not.
 """
 
 from functools import partial
@@ -23,19 +25,34 @@ from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
 
 PIECES = 65
-"""Pieces of a division. Odd, since a force such as v / |v| is not finite at the middle of the second line, where v = 0."""
+"""Pieces of a division.
+
+Odd, since a force such as v / |v| is not finite at the middle of the second line, where v = 0.
+"""
 ROUNDS = 3
 """Divisions. A change within 65^-3 of a line is a jump; with more divisions, steep smooth forces are not reported."""
 LEAST_KEPT_CHANGE = 0.5
-"""Least change over the last piece of a jump, relative to the change over the first piece. A larger value misses jumps of forces that also vary."""
+"""Least change over the last piece of a jump, relative to the change over the first piece.
+
+A larger value misses jumps of forces that also vary.
+"""
 LEAST_CONTRAST = 10.0
-"""Least ratio of a jump to all other changes in the last division. A smaller value reports round-off, whose changes are alike."""
+"""Least ratio of a jump to all other changes in the last division.
+
+A smaller value reports round-off, whose changes are alike.
+"""
 ROUND_OFF = 1e-6
-"""Least jump relative to the force. A smaller value reports round-off of the positions; a larger one misses small friction forces."""
+"""Least jump relative to the force.
+
+A smaller value reports round-off of the positions; a larger one misses small friction forces.
+"""
 MOST_COORDINATES = 8
 """Number of forces that the search follows, those with the most uneven changes. A larger number takes longer."""
 ZERO_VELOCITY = 1e-4
-"""Velocity at a jump, relative to the largest one on the line, that counts as zero. A larger value blames friction for other jumps."""
+"""Velocity at a jump, relative to the largest one on the line, that counts as zero.
+
+A larger value blames friction for other jumps.
+"""
 
 
 class Jump(NamedTuple):
@@ -79,18 +96,21 @@ def in_words(jump: Jump | None, names: Names) -> str:
     sides = f"The likely cause: the force on {label} jumps from {jump.before:.4g} to {jump.behind:.4g} just ahead"
     if jump.reverses:
         return (
-            f"{sides}, where the velocity of {label} passes zero, as dry friction does. A step across a jump has no solution that the "
-            "iteration could reach, and sticking is out of scope. Take f tanh(v / eps) instead of f sign(v), with eps well below the "
-            "velocities of interest and a step below 2 m eps / f: what sticks then creeps, slower than eps."
+            f"{sides}, where the velocity of {label} passes zero, as dry friction does. A step across a jump has no "
+            "solution that the iteration could reach, and sticking is out of scope. Take f tanh(v / eps) instead of "
+            "f sign(v), with eps well below the velocities of interest and a step below 2 m eps / f: what sticks "
+            "then creeps, slower than eps."
         )
     return (
-        f"{sides}. A step across a jump has no solution that the iteration could reach. Take a smooth function instead of sign, "
-        "where, abs or round in forces and potentials, tanh(x / eps) for sign(x), and a step that resolves eps."
+        f"{sides}. A step across a jump has no solution that the iteration could reach. Take a smooth function instead "
+        "of sign, where, abs or round in forces and potentials, tanh(x / eps) for sign(x), and a step that resolves "
+        "eps."
     )
 
 
 def _jump_on_line(system: System, state: State, line: tuple, end: float, may_jump: np.ndarray) -> Jump | None:
-    """The first discontinuity on a line, given by its rates of t, q and v, among the forces on coordinates that `may_jump` marks."""
+    """The first discontinuity on a line, given by its rates of t, q and v, among the forces on coordinates that
+    `may_jump` marks."""
     s = np.linspace(0.0, end, PIECES + 1)
     forces, velocities = jax.device_get(_on_line(system, state, line, s))
     changes = _changes(forces)

@@ -3,8 +3,8 @@
 A body hangs on the root of its tree, or on the ground, by a chain of links, each with a coordinate x that turns all
 bodies behind the link about an axis, moves them along the axis, or both. At x = 0 all bodies have known places. Motions
 are matrices (4, 4), ``(1, r; 0, M)`` with a vector r and a matrix M in the axes of the root: they act on rows (1, y),
-and a point y goes to ``r + y M``. Rates of motions are twists ``(0, m; 0, K)``: the point y has the velocity ``m + y K =
-m + k x y``.
+and a point y goes to ``r + y M``. Rates of motions are twists ``(0, m; 0, K)``: the point y has the velocity
+``m + y K = m + k x y``.
 
     E_i = exp(x_i Y_i) E_parent      exp(x Y) = 1 + sin x T + (1 - cos x) T T + x S      Y = T + S, turn T and slide S
     A_b = Z_b E_b                    origin and axes of body b, of Z_b at x = 0, moved by the last link of b
@@ -139,14 +139,15 @@ class Kinematics:
         x = Rows.of([link.place for link in self.links]).take(q_s, q_f).reshape(-1) if self.links else np.zeros(0)
         if any(link.turns for link in self.links):
             return (_placed if is_concrete((x, joints)) else placed)(self, x, turn, slide, zero)
-        # shifts alone add up, which JAX differentiates as well: A_b = Z_b + sum of x_i S_i over the links before b, J_i = S_i
+        # shifts alone add up, which JAX differentiates as well: A_b = Z_b + sum of x_i S_i over the links before b, J_i
+        # = S_i
         return zero + self.summed(x[:, None, None] * slide)[0], slide
 
     def _motions(self, q_s, q_f, joints: dict[str, Any]):
         """A (bodies, 4, 4), and K (n, 4, 3) of all coordinates.
 
-        A body b on joints has the rates ``A_b sum_i K_i v_i`` over the coordinates i on the way to it. A link has ``K_i = J_i D``, a coordinate of
-        a root a unit row.
+        A body b on joints has the rates ``A_b sum_i K_i v_i`` over the coordinates i on the way to it. A link has
+        ``K_i = J_i D``, a coordinate of a root a unit row.
         """
         frames, twists = self._against_roots(q_s, q_f, joints)
         links, roots, *_ = self._tables
@@ -270,8 +271,9 @@ class Kinematics:
 
     @cached_property
     def _tables(self) -> tuple[np.ndarray, ...]:
-        """Over the n coordinates: the matrix (n, links) that puts the rows K_i of links at their places, and the rows (n, SIZE) of roots; (n, bodies) 1
-        for the bodies behind a coordinate; (n, n) 1 for each coordinate on the way to another one, 1/2 for two that move the same bodies."""
+        """Over the n coordinates: the matrix (n, links) that puts the rows K_i of links at their places, and the rows
+        (n, SIZE) of roots; (n, bodies) 1 for the bodies behind a coordinate; (n, n) 1 for each coordinate on the way to
+        another one, 1/2 for two that move the same bodies."""
         n = sum(self.sizes)
         links, roots, behind = (np.zeros((n, k)) for k in (len(self.links), SIZE, len(self.bodies)))
         for i, link in enumerate(self.links):

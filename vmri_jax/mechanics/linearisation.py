@@ -1,12 +1,14 @@
-"""The linearisation of a system at a state: the one that frequencies, advice, maps of stable steps and choices of steps read.
+"""The linearisation of a system at a state: the one that frequencies, advice, maps of stable steps and choices of steps
+read.
 
-Every term is expanded to second order in its variables: ``c . x + x^T H x / 2`` with the slope c and the curvature H; constraints have one of
-each per row. Displacements that fit the constraints are ``N eta`` with ``G N = 0`` and ``N^T M N = 1``, and they obey
+Every term is expanded to second order in its variables: ``c . x + x^T H x / 2`` with the slope c and the curvature H;
+constraints have one of each per row. Displacements that fit the constraints are ``N eta`` with ``G N = 0`` and
+``N^T M N = 1``, and they obey
 
     eta'' + D eta' + K eta = 0
 
-At an equilibrium the expansion is the linearised system. Elsewhere it describes the *frozen* problem: constant forces hold the configuration
-at rest. In both cases it is a `System`, to which every scheme applies unchanged.
+At an equilibrium the expansion is the linearised system. Elsewhere it describes the *frozen* problem: constant forces
+hold the configuration at rest. In both cases it is a `System`, to which every scheme applies unchanged.
 """
 
 from dataclasses import dataclass, replace
@@ -28,30 +30,34 @@ from vmri_jax.mechanics.terms import Term
 from vmri_jax.refusals import Refused
 
 LEAST_GROWTH = 1e-6
-"""Growth rate up to which a motion does not grow, as a part of the largest rate: round-off of the eigenvalues. A larger value takes slowly
-growing motions for instabilities of the step."""
+"""Growth rate up to which a motion does not grow, as a part of the largest rate: round-off of the eigenvalues. A larger
+value takes slowly growing motions for instabilities of the step."""
 LEAST_MOTION = 1e-8
-"""Velocity v and acceleration a up to which a state is an equilibrium, in units of omega |q| and omega^2 |q|, with the largest rate omega and norms
-of the kinetic energy: round-off, and residuals of solved equilibria. A larger value takes slow motions for equilibria."""
+"""Velocity v and acceleration a up to which a state is an equilibrium, in units of omega |q| and omega^2 |q|, with the
+largest rate omega and norms of the kinetic energy: round-off, and residuals of solved equilibria. A larger value takes
+slow motions for equilibria."""
 ROWS_SHOWN, MOST_NAMED, LEAST_PART = 12, 3, 0.05
-"""Vibrations in the printed table, coordinates named for each of them, and the least part of the kinetic energy of a named coordinate. With more
-rows the table is longer than a screen; with more names, or a smaller part, its lines are longer."""
+"""Vibrations in the printed table, coordinates named for each of them, and the least part of the kinetic energy of a
+named coordinate. With more rows the table is longer than a screen; with more names, or a smaller part, its lines are
+longer."""
 SWAPPED_RATIO = 2.0
-"""Ratio of the highest frequency of slow variables to the highest frequency of fast variables, above which their labels are probably swapped;
-a larger value overlooks more swapped labels."""
+"""Ratio of the highest frequency of slow variables to the highest frequency of fast variables, above which their labels
+are probably swapped; a larger value overlooks more swapped labels."""
 
 
 @dataclass(frozen=True, eq=False)
 class Linearisation:
-    """A system linearised at a state, in d coordinates eta of the constraint manifold; printed, a table of its vibrations.
+    """A system linearised at a state, in d coordinates eta of the constraint manifold; printed, a table of its
+    vibrations.
 
     state: the point of linearisation.
     system: the expansion; its equilibrium is zero, its `params` are the slope and the curvature of each term.
     shapes: N, (n_s + n_f, d).
     mass, coupling: (n, n) derivatives ``d2T/dv2`` and ``d2T/dv dq`` at rest.
-    hessians: (d, d) Hessians of the potentials: of V with its share of the constraint forces ("slow"), of W ("fast"), of each further
-        potential ("potential " and its name), and minus the derivative of F in eta ("force").
-    stiffness: K, (d, d) minus the derivative of all forces in eta: of potentials, constraints, the kinetic energy, and F.
+    hessians: (d, d) Hessians of the potentials: of V with its share of the constraint forces ("slow"), of W ("fast"),
+        of each further potential ("potential " and its name), and minus the derivative of F in eta ("force").
+    stiffness: K, (d, d) minus the derivative of all forces in eta: of potentials, constraints, the kinetic energy, and
+        F.
     damping: D, (d, d) matrix of the velocities, gyroscopic and dissipative.
     slow_force: (d,) force of V at the state, which is constant in the expansion.
     driven: names of the terms that depend on time.
@@ -86,13 +92,15 @@ class Linearisation:
 
     @cached_property
     def _vibrations(self) -> tuple[np.ndarray, np.ndarray]:
-        """Squares (d,) of the frequencies, the largest first, and the shapes (d, d), one per column, of all forces without D."""
+        """Squares (d,) of the frequencies, the largest first, and the shapes (d, d), one per column, of all forces
+        without D."""
         values, vectors = np.linalg.eigh((self.stiffness + self.stiffness.T) / 2)
         return values[::-1], vectors[:, ::-1]
 
     @property
     def frequencies(self) -> np.ndarray:
-        """(d,) angular frequencies of the vibrations under all forces that depend on positions, the largest first; zero for other motions."""
+        """(d,) angular frequencies of the vibrations under all forces that depend on positions, the largest first; zero
+        for other motions."""
         return np.sqrt(np.maximum(self._vibrations[0], 0.0))
 
     @property
@@ -101,13 +109,15 @@ class Linearisation:
         return self._vibrations[1]
 
     def frequencies_of(self, name: str) -> np.ndarray:
-        """(d,) frequencies of a single potential, a key of `hessians`, the largest first; zero where it is not convex."""
+        """(d,) frequencies of a single potential, a key of `hessians`, the largest first; zero where it is not
+        convex."""
         hessian = self.hessians[name]
         return np.sqrt(np.maximum(np.linalg.eigvalsh((hessian + hessian.T) / 2)[::-1], 0.0))
 
     @property
     def kinetic_shares(self) -> np.ndarray:
-        """(n_s + n_f, d) share ``u_i (M u)_i`` of coordinate i in the kinetic energy of each vibration u, with ``u^T M u = 1``."""
+        """(n_s + n_f, d) share ``u_i (M u)_i`` of coordinate i in the kinetic energy of each vibration u, with
+        ``u^T M u = 1``."""
         u = self.shapes @ self.modes
         return u * (self.mass @ u)
 
@@ -136,13 +146,14 @@ class Linearisation:
         if self.driven:
             terms = f"{' and the '.join(self.driven)} depend{'s' if len(self.driven) == 1 else ''}".replace("_", " ")
             return (
-                f"The {terms} on time: the motion is linearised at t = {float(self.state.t):.4g} alone, as if time stood still there. Whether "
-                "it is stable, a run over many periods of the drive decides."
+                f"The {terms} on time: the motion is linearised at t = {float(self.state.t):.4g} alone, as if time "
+                "stood still there. Whether it is stable, a run over many periods of the drive decides."
             )
         if self.moves:
             return (
-                "The state is no equilibrium: the motion is linearised there as if constant forces held it at rest. Whether it is stable, its "
-                "multipliers over a period decide, vm.stability.monodromy(..., num_steps=...), or a long run."
+                "The state is no equilibrium: the motion is linearised there as if constant forces held it at rest. "
+                "Whether it is stable, its multipliers over a period decide, vm.stability.monodromy(..., "
+                "num_steps=...), or a long run."
             )
         return ""
 
@@ -158,7 +169,8 @@ class Linearisation:
         )
 
     def swapped(self) -> tuple[str, float] | None:
-        """Advice if slow variables vibrate faster than fast ones, and the ratio of their highest frequencies; else None."""
+        """Advice if slow variables vibrate faster than fast ones, and the ratio of their highest frequencies; else
+        None."""
         n_s, shares, frequencies = self.state.q_s.size, self.kinetic_shares, self.frequencies
         slow = shares[:n_s].sum(axis=0) > 0.5
         slow_highest, fast_highest = frequencies[slow].max(initial=0.0), frequencies[~slow].max(initial=0.0)
@@ -167,8 +179,9 @@ class Linearisation:
         carried = shares[:n_s, frequencies > slow_highest / SWAPPED_RATIO].sum(axis=1)
         sentence = (
             f"The fastest vibration, of frequency {slow_highest:.4g}, is one of the slow variables "
-            f"{', '.join(self._labels[i] for i in np.flatnonzero(carried > 0.1))}; vibrations of the fast variables reach {fast_highest:.4g}. "
-            "Swap the labels: make these variables fast and put their energy into fast_potential, and the soft ones slow."
+            f"{', '.join(self._labels[i] for i in np.flatnonzero(carried > 0.1))}; vibrations of the fast variables "
+            f"reach {fast_highest:.4g}. Swap the labels: make these variables fast and put their energy into "
+            "fast_potential, and the soft ones slow."
         )
         return sentence, float(slow_highest / fast_highest) if fast_highest else np.inf
 
@@ -198,15 +211,18 @@ def linearise(system: Movable, state: State | None = None, names: Names | None =
 
         vm.diagnostics.linearise(problem).frequencies  # rad/s
 
-    Every term is expanded separately, ``V(q + d) ~ d^T V'' d / 2`` and so on, and keeps its quadrature rule in the scheme. Constraints
-    become ``G d + d^T g'' d / 2``. Their multipliers ``lambda`` are taken from the moving state, so that a swinging rod is under tension,
-    and act through ``lambda . g''``. A linear term in the expanded V balances the constraint forces due to dV/dq, on the grid of V; a
-    constant force on the micro grid balances all other constraint forces. At an equilibrium this reproduces the original terms. The
-    kinetic energy is expanded at rest, forces at the velocity of the state.
+    Every term is expanded separately, ``V(q + d) ~ d^T V'' d / 2`` and so on, and keeps its quadrature rule in the
+    scheme. Constraints become ``G d + d^T g'' d / 2``. Their multipliers ``lambda`` are taken from the moving state, so
+    that a swinging rod is under tension, and act through ``lambda . g''``. A linear term in the expanded V balances the
+    constraint forces due to dV/dq, on the grid of V; a constant force on the micro grid balances all other constraint
+    forces. At an equilibrium this reproduces the original terms. The kinetic energy is expanded at rest, forces at the
+    velocity of the state.
 
     Args:
-        system: a system, problem or scene whose potentials, constraints, kinetic energy and forces have second derivatives at the state.
-        state: point of expansion, None for the start of the problem; its velocity enters through lambda and the derivatives of the force.
+        system: a system, problem or scene whose potentials, constraints, kinetic energy and forces have second
+            derivatives at the state.
+        state: point of expansion, None for the start of the problem; its velocity enters through lambda and the
+            derivatives of the force.
         names: of the coordinates; None for the names of the problem.
 
     Raises:
@@ -255,7 +271,8 @@ def linearise(system: Movable, state: State | None = None, names: Names | None =
 
 
 def tangents(rows: np.ndarray) -> np.ndarray:
-    """Orthonormal basis (n, k), one vector per column, of the space orthogonal to rows (m, n); dependent rows count once."""
+    """Orthonormal basis (n, k), one vector per column, of the space orthogonal to rows (m, n); dependent rows count
+    once."""
     _, rank, directions = decomposed(rows)
     return directions[rank:].T
 
@@ -272,7 +289,8 @@ def mass_orthonormal(mass: np.ndarray, rows: np.ndarray | None = None) -> np.nda
 
 
 def _key(term: Term) -> str:
-    """The key of a term: "slow" and "fast" of V and W, "potential " and the name of a further potential, else its field."""
+    """The key of a term: "slow" and "fast" of V and W, "potential " and the name of a further potential, else its
+    field."""
     return f"potential {term.name}" if term.field == "potentials" else term.field.removesuffix("_potential")
 
 
@@ -280,7 +298,8 @@ def _key(term: Term) -> str:
 def _expansion(system: System, state: State) -> dict[str, tuple]:
     """Slope and curvature of the kinetic energy in (q, v) at rest, and of potentials and constraints in q = (q_s, q_f).
 
-    Also the derivatives of F by q and v ("force"); and velocity, acceleration, multipliers and the share of V in the multipliers ("motion").
+    Also the derivatives of F by q and v ("force"); and velocity, acceleration, multipliers and the share of V in the
+    multipliers ("motion").
     """
     n_s, q, now = state.q_s.size, jnp.concatenate([state.q_s, state.q_f]), motion(system, state)
     v, a = jnp.concatenate([now.v_s, now.v_f]), jnp.concatenate([now.a_s, now.a_f])

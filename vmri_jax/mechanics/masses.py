@@ -43,7 +43,8 @@ class MassMatrix(eqx.Module):
 
 
 def correlation(matrix: np.ndarray) -> np.ndarray:
-    """A matrix over the square roots of its diagonal, ``M_ij / sqrt(M_ii M_jj)``: the units of its coordinates cancel."""
+    """A matrix over the square roots of its diagonal, ``M_ij / sqrt(M_ii M_jj)``: the units of its coordinates
+    cancel."""
     diagonal = np.diagonal(matrix)
     root = np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
     return matrix / root[:, None] / root
@@ -53,9 +54,10 @@ class ConstantMass(eqx.Module):
     """Kinetic energy ``T = v_s^T M_s v_s / 2 + v_f^T M_f v_f / 2`` with constant masses.
 
     Args:
-        slow, fast: (n,) masses per coordinate, or an (n, n) symmetric positive definite mass matrix. If q_s and q_f are dictionaries: a
-            dictionary with the mass of each body. An array with the leading axes of the position is per row: for positions (atoms, 3) a
-            number is the mass of all atoms, (atoms,) has a mass for each atom, and (atoms, 3) a mass for each coordinate.
+        slow, fast: (n,) masses per coordinate, or an (n, n) symmetric positive definite mass matrix. If q_s and q_f are
+            dictionaries: a dictionary with the mass of each body. An array with the leading axes of the position is per
+            row: for positions (atoms, 3) a number is the mass of all atoms, (atoms,) has a mass for each atom, and
+            (atoms, 3) a mass for each coordinate.
 
     Raises:
         TypeError: masses that are not real numbers.
@@ -105,7 +107,8 @@ class ConstantMass(eqx.Module):
 
 
 class WithMassMatrix(ABC):
-    """A kinetic energy that may have the form ``T = v^T M v / 2`` with masses M, functions of the positions, in closed form."""
+    """A kinetic energy that may have the form ``T = v^T M v / 2`` with masses M, functions of the positions, in closed
+    form."""
 
     @property
     @abstractmethod
@@ -118,7 +121,8 @@ class WithMassMatrix(ABC):
 
 
 def _masses(name: str, masses):
-    """Masses as `ConstantMass` takes them, as float64: lists and NumPy arrays as NumPy arrays, which keep all digits before 64-bit mode is on."""
+    """Masses as `ConstantMass` takes them, as float64: lists and NumPy arrays as NumPy arrays, which keep all digits
+    before 64-bit mode is on."""
     if isinstance(masses, Mapping):
         return {
             body: _positive(f"{name}[{body!r}]", real_array(f"{name}[{body!r}]", mass)) for body, mass in masses.items()
@@ -145,7 +149,7 @@ def _positive(name: str, masses):
 def _operator(masses) -> MassMatrix:
     if isinstance(masses, dict):
         raise Refused(
-            f"ConstantMass: the masses of {', '.join(masses)} are given by name, and the sizes of these bodies are not known. Give the start "
-            "as dictionaries, too: vmri_jax.Problem(system, q_s={...}, q_f={...})."
+            f"ConstantMass: the masses of {', '.join(masses)} are given by name, and the sizes of these bodies are not "
+            "known. Give the start as dictionaries, too: vmri_jax.Problem(system, q_s={...}, q_f={...})."
         )
     return MassMatrix(masses)

@@ -75,8 +75,8 @@ def reaction_forces(system: System, state: State, chosen):
     """Forces ``-G^T lambda`` (m, n_s + n_f) of m constraints, and (m, n_s + n_f) whether each acts on each coordinate.
 
     Args:
-        chosen: (m, rows) for each of them which rows of `constraint` and `slow_constraint`, joined, are its rows. They are
-            values and no part of the program, so that one program computes the forces of every constraint.
+        chosen: (m, rows) for each of them which rows of `constraint` and `slow_constraint`, joined, are its rows. They
+            are values and no part of the program, so that one program computes the forces of every constraint.
     """
     jacobians = jax.jacrev(system.constraints, argnums=(1, 2))(state.t, state.q_s, state.q_f)
     jacobian, multipliers = jnp.concatenate(jacobians, axis=1), motion(system, state).multipliers
@@ -85,7 +85,8 @@ def reaction_forces(system: System, state: State, chosen):
 
 
 def powers(system: System, state: State):
-    """Powers (2,) that change the energy: of forces, ``F . v``, and of constraints that depend on time, ``lambda . dg/dt``."""
+    """Powers (2,) that change the energy: of forces, ``F . v``, and of constraints that depend on time,
+    ``lambda . dg/dt``."""
     of_forces = of_constraints = jnp.zeros(())
     if system.force is not None:
         v_s, v_f = velocity(system, state.q_s, state.q_f, state.p_s, state.p_f)

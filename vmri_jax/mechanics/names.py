@@ -22,15 +22,19 @@ Sizes = Mapping[str, int | tuple[int, ...]]
 
 @dataclass(frozen=True)
 class Names:
-    """Names and sizes of the bodies in q_s and q_f, and of the constraints in the values of the constraint functions, in order.
+    """Names and sizes of the bodies in q_s and q_f, and of the constraints in the values of the constraint functions,
+    in order.
 
         Names(slow={"trolley": 1}, fast={"hook": 2, "load": 2}, constraint={"rope": 1})
 
     Args:
-        slow, fast: bodies, or single coordinates, in the order of q_s and q_f, with their numbers of coordinates; with the shapes of their
-            arrays if the user gave dictionaries of arrays: a run then returns its positions in the same form.
-        constraint, slow_constraint: constraints in the order of the values of these functions, with their numbers of rows.
-        numbered: bodies with generalised coordinates: these have the names "name[0]", "name[1]", not "name x", "name y".
+        slow, fast: bodies, or single coordinates, in the order of q_s and q_f, with their numbers of coordinates; with
+            the shapes of their arrays if the user gave dictionaries of arrays: a run then returns its positions in the
+            same form.
+        constraint, slow_constraint: constraints in the order of the values of these functions, with their numbers of
+            rows.
+        numbered: bodies with generalised coordinates: these have the names "name[0]", "name[1]", not "name x", "name
+            y".
         rigid: bodies whose coordinates are a centre and directors: "name x", "name y", "name z", "name d1 x" and so on.
         carried: places in Q_s and Q_f of the bodies that are functions of the coordinates, by name.
         kinematics: the map from q_s, q_f to Q_s, Q_f, see `vmri_jax.mechanics.kinematics`; None without such bodies.
@@ -60,8 +64,8 @@ class Names:
             named = isinstance(sizes, Mapping) and all(isinstance(name, str) for name in sizes)
             if not (named and all(isinstance(n, tuple) or (isinstance(n, int) and n > 0) for n in sizes.values())):
                 raise Refused(
-                    f"Names: {field_name} is {sizes!r}; give a dictionary of names and sizes in the order of the coordinates or "
-                    "rows, e.g. {'hook': 2, 'load': 2}."
+                    f"Names: {field_name} is {sizes!r}; give a dictionary of names and sizes in the order of the "
+                    "coordinates or rows, e.g. {'hook': 2, 'load': 2}."
                 )
         both = sorted(set(self.slow) & set(self.fast))
         if both:
@@ -82,7 +86,10 @@ class Names:
         return bodies
 
     def arrays(self, part: Part, size: int) -> Slots | None:
-        """The arrays in q_s or q_f, of `size` coordinates, if the user gave a dictionary, else None. An empty part is like the other one."""
+        """The arrays in q_s or q_f, of `size` coordinates, if the user gave a dictionary, else None.
+
+        An empty part is like the other one.
+        """
         parts = (self.slow, self.fast) if part == "s" else (self.fast, self.slow)
         sizes = parts[0] if size else parts[0] or parts[1]
         return self.slots(part) if any(isinstance(shape, tuple) for shape in sizes.values()) else None
@@ -151,14 +158,16 @@ class Names:
         return replace(names, numbered=(*self.numbered, "q_s", "q_f"))
 
     def _completed(self, fields: Mapping[str, tuple[str, int]]) -> "Names":
-        """These names, with a plain name for the entries of each field without names; fields have a plain name and the number of entries."""
+        """These names, with a plain name for the entries of each field without names; fields have a plain name and the
+        number of entries."""
         complete = {}
         for name, (plain, number) in fields.items():
             complete[name] = dict(getattr(self, name)) or ({plain: number} if number else {})
             size = Slots.of_sizes(complete[name]).size
             if size != number:
                 raise Refused(
-                    f"Names: {name} is {complete[name]}, which names {size}; the system has {number}. The sizes must add up to that."
+                    f"Names: {name} is {complete[name]}, which names {size}; the system has {number}. The sizes must "
+                    "add up to that."
                 )
         return replace(self, **complete)
 

@@ -24,7 +24,8 @@ Index = tuple[int, tuple[int, ...]]
 
 @dataclass(frozen=True)
 class Placed:
-    """A function ``(problem, values) -> problem`` that puts each value in the place of its name, and that pickle can send."""
+    """A function ``(problem, values) -> problem`` that puts each value in the place of its name, and that pickle can
+    send."""
 
     places: dict[str, Index]
 
@@ -44,7 +45,8 @@ def _arrays(problem: Problem) -> tuple[list, Any]:
 
 
 def places_of(problem: Problem) -> dict[str, tuple[Index, tuple[int, ...]]]:
-    """The place and the shape of all arrays and all numbers by name; a parameter goes before a coordinate of the same name."""
+    """The place and the shape of all arrays and all numbers by name; a parameter goes before a coordinate of the same
+    name."""
     labels = [name or "params" for name in leaves_by_name(problem.system.params)[0]]
     known: dict[str, tuple[Index, tuple[int, ...]]] = {}
     for number, (label, array) in enumerate(zip([*labels, *START], _arrays(problem)[0], strict=True)):

@@ -1,4 +1,5 @@
-"""Projection of momenta onto the hidden constraints ``G v + dg/dt = 0``, with the velocities of the projected momenta."""
+"""Projection of momenta onto the hidden constraints ``G v + dg/dt = 0``, with the velocities of the projected
+momenta."""
 
 from collections.abc import Iterable
 from dataclasses import replace
@@ -20,14 +21,23 @@ from vmri_jax.mechanics.system import System
 from vmri_jax.mechanics.terms import Term
 
 MAX_ITERATIONS = 50
-"""Most Newton iterations for the velocities of a kinetic energy that is not quadratic. A larger number makes failures slower."""
+"""Most Newton iterations for the velocities of a kinetic energy that is not quadratic.
+
+A larger number makes failures slower.
+"""
 SMALL_STEP = 1e-9
-"""Newton step, relative to the velocities, at which the line search ends: the two further steps bring it to round-off. A smaller value costs steps."""
+"""Newton step, relative to the velocities, at which the line search ends: the two further steps bring it to round-off.
+
+A smaller value costs steps.
+"""
 ON_CONSTRAINTS = 1e-9
-"""Largest violation of the hidden constraints, relative to the terms of a row, of an iterate whose energy is compared. A larger value compares energies of
-velocities that violate the constraints."""
+"""Largest violation of the hidden constraints, relative to the terms of a row, of an iterate whose energy is compared.
+A larger value compares energies of velocities that violate the constraints."""
 LARGEST_LAST_STEP = 1e-6
-"""Largest last Newton step, relative to the velocities, of a converged iteration. A larger value accepts iterates that have not converged."""
+"""Largest last Newton step, relative to the velocities, of a converged iteration.
+
+A larger value accepts iterates that have not converged.
+"""
 
 
 def legendre(system: System, q_s, q_f, v_s, v_f):
@@ -38,7 +48,8 @@ def legendre(system: System, q_s, q_f, v_s, v_f):
 
 
 def mass_and_momentum(system: System, q_s, q_f, v_s, v_f):
-    """Mass matrix ``d2T/dv2`` (n, n) and momentum ``dT/dv`` (n,): of known numbers by NumPy, and for constant masses without a program."""
+    """Mass matrix ``d2T/dv2`` (n, n) and momentum ``dT/dv`` (n,): of known numbers by NumPy, and for constant masses
+    without a program."""
     v = library(v_s, v_f).concatenate([v_s, v_f])
     if system.has_constant_mass:
         mass = system.kinetic.matrix
@@ -75,11 +86,13 @@ def closed_masses(energies: Iterable[Term], q_s, q_f, params):
 
 
 def project_momentum(system: System, state, guess=None, sparsity: Sparsity | None = None):
-    """Momenta projected onto the hidden constraints, ``p <- p - G^T mu`` with ``G v + dg/dt = 0``, and their velocities.
+    """Momenta projected onto the hidden constraints, ``p <- p - G^T mu`` with ``G v + dg/dt = 0``, and their
+    velocities.
 
-    The velocity v of the projected momentum, ``p - G^T mu = dT/dv``, minimises ``T(v) - p . v`` over all v with ``G v + dg/dt = 0``. If T is
-    quadratic in v with the masses M, that takes one linear solve, ``G M^-1 G^T mu = G v + dg/dt`` with the velocity v of p. Else it takes Newton's
-    iteration with a line search, and T must be convex in v.
+    The velocity v of the projected momentum, ``p - G^T mu = dT/dv``, minimises ``T(v) - p . v`` over all v with
+    ``G v + dg/dt = 0``. If T is quadratic in v with the masses M, that takes one linear solve,
+    ``G M^-1 G^T mu = G v + dg/dt`` with the velocity v of p. Else it takes Newton's iteration with a line search, and T
+    must be convex in v.
 
     Args:
         system: with its kinetic energy and constraints.
@@ -88,8 +101,8 @@ def project_momentum(system: System, state, guess=None, sparsity: Sparsity | Non
         sparsity: of ``G M^-1 G^T``, for constant masses; found if it is None.
 
     Returns:
-        (p_s, p_f, v_s, v_f, masses), the last one the mass matrix ``d2T/dv2`` (n, n), None for constant masses; NaN where Newton's iteration does
-        not converge.
+        (p_s, p_f, v_s, v_f, masses), the last one the mass matrix ``d2T/dv2`` (n, n), None for constant masses; NaN
+        where Newton's iteration does not converge.
     """
     if system.has_constant_mass:
         return *_with_constant_masses(system, state, sparsity), None
@@ -161,7 +174,8 @@ def time_rates(system: System, t, q_s, q_f):
 
 
 def _velocity_and_impulse(system: System, q_s, q_f, constraints, p, guess):
-    """The v that minimises ``T(v) - p . v`` over ``G v + dg/dt = 0``, and ``G^T mu``, with `constraints` (G, dg/dt); NaN without convergence."""
+    """The v that minimises ``T(v) - p . v`` over ``G v + dg/dt = 0``, and ``G^T mu``, with `constraints` (G, dg/dt);
+    NaN without convergence."""
 
     def kinetic(system, q_s, q_f, v):
         return system.kinetic_energy(q_s, q_f, v[: q_s.size], v[q_s.size :])
@@ -194,7 +208,8 @@ def _velocity_and_impulse(system: System, q_s, q_f, constraints, p, guess):
     fractions = jnp.append(0.5 ** jnp.arange(12.0), 0.0)
     start = (guess, 0, jnp.asarray(False))
     v = jax.lax.while_loop(lambda carry: ~carry[2] & (carry[1] < MAX_ITERATIONS), search, start)[0]
-    # Newton's map has the derivative zero by v at its fixed point: two steps outside of the loop carry first and second derivatives
+    # Newton's map has the derivative zero by v at its fixed point: two steps outside of the loop carry first and second
+    # derivatives
     for _ in range(2):
         d, impulse, size = direction(data, v)
         v = v + d

@@ -26,7 +26,8 @@ class Place(NamedTuple):
         return self.part == "f", self.start
 
     def numbers(self, num_slow: int) -> np.ndarray:
-        """(size,) numbers of the coordinates in (q_s, q_f), taken as one vector whose first `num_slow` entries are q_s."""
+        """(size,) numbers of the coordinates in (q_s, q_f), taken as one vector whose first `num_slow` entries are
+        q_s."""
         return self.start + (num_slow if self.part == "f" else 0) + np.arange(self.size)
 
 

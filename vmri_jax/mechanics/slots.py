@@ -88,14 +88,16 @@ class Slots:
             if value.shape != shape and not (per_row and _repeats(value.shape, shape)):
                 row = f"one number, an array {shape[:1]} with a number for each row, or" if per_row and shape else ""
                 raise Refused(
-                    f"{name}[{body!r}] has shape {seen}, and the position has {shape}; give {row or 'an array of'} shape {shape}."
+                    f"{name}[{body!r}] has shape {seen}, and the position has {shape}; give {row or 'an array of'} "
+                    f"shape {shape}."
                 )
             pieces.append(library(value).broadcast_to(value, shape).reshape(-1))
         return library(pieces).concatenate([*pieces, library(pieces).zeros(0)])
 
 
 class Computed(str):
-    """Key of a parameter that is computed from numbers of which a system has other copies, such as the mass in the weight of a body.
+    """Key of a parameter that is computed from numbers of which a system has other copies, such as the mass in the
+    weight of a body.
 
     A change of this parameter alone belongs to no scene, see `check_computed`.
     """
@@ -121,7 +123,8 @@ def free(names: Iterable[str]) -> list[str]:
 
 
 def check_computed(params: Any, changed: Any) -> None:
-    """Refuse params of a system whose `Computed` numbers are changed; a leading axis of lanes with equal numbers changes nothing.
+    """Refuse params of a system whose `Computed` numbers are changed; a leading axis of lanes with equal numbers
+    changes nothing.
 
     Where all numbers are traced, as in the derivative with respect to all params, nothing shows whether they change.
     """
@@ -135,9 +138,10 @@ def check_computed(params: Any, changed: Any) -> None:
         fits = is_concrete(new) and np.shape(new)[np.ndim(new) - np.ndim(old) :] == np.shape(old)
         if not (fits and np.all(np.asarray(new) == np.asarray(old))):
             raise Refused(
-                f"params: {name} is {new}, and the system has {old}: the scene computes this number from its bodies and from fields of its "
-                "effects, and has other copies of these. Make a scene with other bodies or fields instead, one for each value; jax.jit, grad "
-                "and vmap may trace them, if every body has a pace and every potential a rate."
+                f"params: {name} is {new}, and the system has {old}: the scene computes this number from its bodies "
+                "and from fields of its effects, and has other copies of these. Make a scene with other bodies or "
+                "fields instead, one for each value; jax.jit, grad and vmap may trace them, if every body has a pace "
+                "and every potential a rate."
             )
 
 

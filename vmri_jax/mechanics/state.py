@@ -1,4 +1,5 @@
-"""States (time, positions and momenta on the constraint manifold), and the start of a run: `initial_state` and `Problem`."""
+"""States (time, positions and momenta on the constraint manifold), and the start of a run: `initial_state` and
+`Problem`."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -24,13 +25,16 @@ from vmri_jax.mechanics.system import System
 from vmri_jax.refusals import Refused, warn_user
 
 REPORTED_VIOLATION = 1e-6
-"""Violation of the constraints by the velocities, relative to their norm (of the kinetic energy), above which a warning is given. A smaller value
-warns about rounded starts, a larger one passes over mistakes."""
+"""Violation of the constraints by the velocities, relative to their norm (of the kinetic energy), above which a warning
+is given. A smaller value warns about rounded starts, a larger one passes over mistakes."""
 REFUSED_VIOLATION = 1e-2
-"""Violation, as in REPORTED_VIOLATION, above which a start is refused. A smaller value refuses rounded starts, a larger one passes over mistakes."""
+"""Violation, as in REPORTED_VIOLATION, above which a start is refused.
+
+A smaller value refuses rounded starts, a larger one passes over mistakes.
+"""
 REPORTED_PROJECTION = 0.85
-"""Violation, as in REPORTED_VIOLATION, above which a warning is given even with ``project=True``: a projection that removes most of the velocities
-is hardly intended. A larger value passes over mistakes."""
+"""Violation, as in REPORTED_VIOLATION, above which a warning is given even with ``project=True``: a projection that
+removes most of the velocities is hardly intended. A larger value passes over mistakes."""
 A_SYSTEM = "a vmri_jax.System; of a scene its .system(), of a problem its .system"
 """A right argument in messages about objects that are no system."""
 
@@ -75,19 +79,22 @@ def initial_state(
 
     Args:
         system: a `Problem` or a scene, or a `System`.
-        q_s, q_f, v_s, v_f: (n_s,), (n_f,) arrays of float64, or for a problem as of `Problem`; None for the arrays of the problem, of a system for
-            no velocity.
+        q_s, q_f, v_s, v_f: (n_s,), (n_f,) arrays of float64, or for a problem as of `Problem`; None for the arrays of
+            the problem, of a system for no velocity.
         t: start time; None for the time of the problem, or 0.
-        project: move positions onto the constraints, and velocities onto the hidden constraints, instead of refusing them. A warning tells
-            of velocities of which the projection leaves little. None for the choice of the problem, of a system for no projection.
-        tolerance: largest value of a satisfied constraint, relative to its size, mostly of the terms that cancel in it: ``|d| + L`` of ``|d| - L``.
+        project: move positions onto the constraints, and velocities onto the hidden constraints, instead of refusing
+            them. A warning tells of velocities of which the projection leaves little. None for the choice of the
+            problem, of a system for no projection.
+        tolerance: largest value of a satisfied constraint, relative to its size, mostly of the terms that cancel in it:
+            ``|d| + L`` of ``|d| - L``.
 
     Raises:
         TypeError: a system without positions.
-        ValueError: float32 data or 64-bit mode off, wrong shapes, not finite, positions that violate a constraint (with
-            the size of the violation), velocities against a constraint, constraints that the fast variables cannot satisfy, a
-            kinetic energy without mass along some coordinate. Within transformations of JAX, positions that violate a constraint and velocities against
-            a constraint are starts of runs that fail at once, see `vmri_jax.Result`.
+        ValueError: float32 data or 64-bit mode off, wrong shapes, not finite, positions that violate a constraint
+            (with the size of the violation), velocities against a constraint, constraints that the fast variables
+            cannot satisfy, a kinetic energy without mass along some coordinate. Within transformations of JAX,
+            positions that violate a constraint and velocities against a constraint are starts of runs that fail at
+            once, see `vmri_jax.Result`.
     """
     require_x64()
     start = {"q_s": q_s, "q_f": q_f, "v_s": v_s, "v_f": v_f, "t": t}
@@ -108,8 +115,8 @@ def initial_state(
     for name, value in start.items():
         if isinstance(value, Mapping):
             raise Refused(
-                f"initial_state: {name} is a dictionary; give real numbers, or Problem(system, q_s, q_f, v_s, v_f).state(): a problem "
-                "knows the order of the bodies."
+                f"initial_state: {name} is a dictionary; give real numbers, or Problem(system, q_s, q_f, v_s, "
+                "v_f).state(): a problem knows the order of the bodies."
             )
     project = False if project is None else project
     check_flags(project=project)
@@ -130,7 +137,8 @@ def initial_state(
 
 
 def _start(arguments, project: bool):
-    """The state with projected momenta, with projected positions if `project`, and the violation of `consistent_momenta`."""
+    """The state with projected momenta, with projected positions if `project`, and the violation of
+    `consistent_momenta`."""
     system, t, q_s, q_f, *velocities = arguments
     if project and system.is_constrained:
         q_s, q_f = project_positions(system, t, q_s, q_f)
@@ -140,7 +148,8 @@ def _start(arguments, project: bool):
 
 
 def _traced_start(arguments, project: bool) -> State:
-    """The state in a program, which cannot refuse: of velocities against the constraints it has momenta that are NaN, so that its run fails."""
+    """The state in a program, which cannot refuse: of velocities against the constraints it has momenta that are NaN,
+    so that its run fails."""
     state, violation = _start(arguments, project)
     if project or not arguments[0].is_constrained:
         return state
@@ -182,9 +191,13 @@ def tell_of_velocities(
         violation: as of `consistent_momenta`.
         project: whether the user wants the projected velocities.
         constraints: name of the constraints in the message.
-        at_rest: whether all velocities of the user are zero; moving constraints may demand others, which are then taken.
+        at_rest: whether all velocities of the user are zero; moving constraints may demand others, which are then
+            taken.
     """
-    message = f"{caller}: the velocities differ by {violation:.2%} (in the norm of the kinetic energy) from the nearest velocities that fit {constraints}"
+    message = (
+        f"{caller}: the velocities differ by {violation:.2%} (in the norm of the kinetic energy) from the nearest "
+        f"velocities that fit {constraints}"
+    )
     scenes = "for a scene, with_rates({joint: rate}) gives all velocities that belong to the rate of a joint"
     if project and violation > REPORTED_PROJECTION and not at_rest:
         warn_user(f"{message}, and project=True has replaced them; {scenes}.")
@@ -192,8 +205,8 @@ def tell_of_velocities(
         return
     if at_rest and violation > REPORTED_VIOLATION:
         warn_user(
-            f"{caller}: all velocities are zero, but {constraints} move; the nearest velocities that fit are taken. Pass project=True if "
-            "that is meant.",
+            f"{caller}: all velocities are zero, but {constraints} move; the nearest velocities that fit are taken. "
+            "Pass project=True if that is meant.",
         )
     elif violation > REFUSED_VIOLATION:
         raise Refused(
@@ -207,10 +220,11 @@ def tell_of_velocities(
 class Problem:
     """A system with initial positions and velocities.
 
-    Positions may be dictionaries, an array of any shape for each body, ``q_f={"hook": [3.0, -4.0], "load": [3.0, -5.0]}``. The functions of
-    the system then get such dictionaries, ``q_f["load"] - q_f["hook"]``; a force may return a dictionary (a body without an entry has no
-    force), and a constraint may return its rows by name, ``{"rope": ...}``. The problem stores vectors, in the order of the dictionaries;
-    a run returns dictionaries again, ``run.q_f["load"]``.
+    Positions may be dictionaries, an array of any shape for each body,
+    ``q_f={"hook": [3.0, -4.0], "load": [3.0, -5.0]}``. The functions of the system then get such dictionaries,
+    ``q_f["load"] - q_f["hook"]``; a force may return a dictionary (a body without an entry has no force), and a
+    constraint may return its rows by name, ``{"rope": ...}``. The problem stores vectors, in the order of the
+    dictionaries; a run returns dictionaries again, ``run.q_f["load"]``.
 
     Args:
         system: the `System` that moves.
@@ -219,10 +233,12 @@ class Problem:
         t: start time.
         drawing: appearance of the system, plain data for `vmri_jax.animation.Drawing`, or None.
         project: whether `state` projects positions and velocities onto the constraints, see `initial_state`.
-        names: `Names` of bodies and constraints, or None; runs, figures and files have them as labels. Dictionaries give the names of bodies.
+        names: `Names` of bodies and constraints, or None; runs, figures and files have them as labels. Dictionaries
+            give the names of bodies.
 
     Raises:
-        TypeError, ValueError: arrays as `initial_state` refuses them; names that do not add up to coordinates and constraints.
+        TypeError, ValueError: arrays as `initial_state` refuses them; names that do not add up to coordinates and
+            constraints.
     """
 
     system: System
@@ -254,7 +270,8 @@ class Problem:
         self.names.of(self.system, self.q_s.size, self.q_f.size)
 
     def _make_flat(self, part: Part) -> Slots | None:
-        """Replace dictionaries by vectors, and missing velocities by zeros; the arrays of the dictionary, None if the user gave vectors."""
+        """Replace dictionaries by vectors, and missing velocities by zeros; the arrays of the dictionary, None if the
+        user gave vectors."""
         position, velocity = (getattr(self, f"{kind}_{part}") for kind in "qv")
         names, is_named = self.names or Names(), isinstance(position, Mapping)
         slots = names.arrays(part, len(position) if is_named else np.size(position))
@@ -266,7 +283,8 @@ class Problem:
         elif isinstance(velocity, Mapping):
             if slots is None:
                 raise Refused(
-                    f"Problem: v_{part} is a dictionary and q_{part} is none; give both as dictionaries, or both as arrays."
+                    f"Problem: v_{part} is a dictionary and q_{part} is none; give both as dictionaries, or both as "
+                    "arrays."
                 )
             velocity = slots.flat(f"Problem: v_{part}", velocity, zeros=True)
         object.__setattr__(self, f"q_{part}", position)

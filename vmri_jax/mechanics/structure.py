@@ -1,14 +1,16 @@
-"""Properties of functions from their jaxprs: dependence of outputs on inputs, the structure of Hessians, and the sizes of terms that cancel.
+"""Properties of functions from their jaxprs: dependence of outputs on inputs, the structure of Hessians, and the sizes
+of terms that cancel.
 
-The answers on structure are conservative. "Independent", "constant" and "diagonal" are certain; "dependent" may be wrong (``0 * x``
-depends on x). Outputs of an operation that is unknown here depend on all its inputs, and nothing is known about functions with effects.
+The answers on structure are conservative. "Independent", "constant" and "diagonal" are certain; "dependent" may be
+wrong (``0 * x`` depends on x). Outputs of an operation that is unknown here depend on all its inputs, and nothing is
+known about functions with effects.
 
-Derivatives at random points would also show zeros of a Hessian, but no zeros of functions with `where`, and to compile them takes 0.3 s of
-processor time for each question, thirty times as long as to trace the function.
+Derivatives at random points would also show zeros of a Hessian, but no zeros of functions with `where`, and to compile
+them takes 0.3 s of processor time for each question, thirty times as long as to trace the function.
 
-The sizes of the terms that cancel in a function are ``|d| + L`` for the constraint ``|d| - L``. The jaxpr is evaluated once more with a size for every
-number: the sizes of a sum are added, a rearrangement, and a product with a number that does not depend on the arguments, take the size
-along, and every other operation starts from the modulus of its value.
+The sizes of the terms that cancel in a function are ``|d| + L`` for the constraint ``|d| - L``. The jaxpr is evaluated
+once more with a size for every number: the sizes of a sum are added, a rearrangement, and a product with a number that
+does not depend on the arguments, take the size along, and every other operation starts from the modulus of its value.
 """
 
 from collections.abc import Callable
@@ -26,8 +28,9 @@ ENTRY_BY_ENTRY = frozenset(["add", "add_any", "convert_element_type", "copy", "d
 # fmt: off
 SUMS = frozenset(["add", "add_any", "sub"])
 TAKES_SIZES_ALONG = frozenset([
-    "broadcast_in_dim", "concatenate", "convert_element_type", "copy", "cumsum", "dynamic_slice", "dynamic_update_slice", "gather", "neg",
-    "pad", "reduce_sum", "reshape", "rev", "scatter", "scatter-add", "select_n", "slice", "split", "squeeze", "stack", "transpose", "unstack",
+    "broadcast_in_dim", "concatenate", "convert_element_type", "copy", "cumsum", "dynamic_slice",
+    "dynamic_update_slice", "gather", "neg", "pad", "reduce_sum", "reshape", "rev", "scatter", "scatter-add",
+    "select_n", "slice", "split", "squeeze", "stack", "transpose", "unstack",
 ])
 PRODUCTS = frozenset(["mul", "div", "dot_general"])
 # fmt: on
@@ -86,9 +89,11 @@ def is_linear(function: Callable, q) -> bool:
 
 
 def has_diagonal_hessian(function: Callable, q) -> bool:
-    """Whether ``function(q) -> ()`` is a sum over the entries of the vector q: entry i of the gradient depends on q_i alone.
+    """Whether ``function(q) -> ()`` is a sum over the entries of the vector q: entry i of the gradient depends on q_i
+    alone.
 
-    The product of the Hessian with a vector is linear in the vector, and of the linear operations few act entry by entry.
+    The product of the Hessian with a vector is linear in the vector, and of the linear operations few act entry by
+    entry.
     """
     jaxpr, mixes = _kept(_times_hessian(function), q, q), []
 
@@ -103,7 +108,8 @@ def has_diagonal_hessian(function: Callable, q) -> bool:
 
 
 def _kept(function: Callable, *args):
-    """The jaxpr of ``function(*args)`` with the operations alone on which its outputs depend; None for a function with effects."""
+    """The jaxpr of ``function(*args)`` with the operations alone on which its outputs depend; None for a function with
+    effects."""
     jaxpr = jax.make_jaxpr(function)(*args).jaxpr
     return None if jaxpr.effects else dce_jaxpr(jaxpr, [True] * len(jaxpr.outvars), instantiate=True)[0]
 
@@ -116,9 +122,9 @@ def _times_hessian(function: Callable) -> Callable:
 def curved_directions(function: Callable, q) -> np.ndarray:
     """L (d, n) of rank d, with the Hessian of ``function(q) -> ()`` of the form ``L^T w(q) L`` everywhere.
 
-    For a potential of the distance of two points, L takes the difference of their positions. The rows of L are read from the jaxpr of the
-    product of the Hessian with a vector: linear combinations of its entries with known coefficients are followed up to the first operation
-    that is not linear in this sense.
+    For a potential of the distance of two points, L takes the difference of their positions. The rows of L are read
+    from the jaxpr of the product of the Hessian with a vector: linear combinations of its entries with known
+    coefficients are followed up to the first operation that is not linear in this sense.
     """
     n = q.size
     used = _combinations(_kept(_times_hessian(function), q, q), [np.zeros((n, n)), np.eye(n)])
@@ -126,7 +132,8 @@ def curved_directions(function: Callable, q) -> np.ndarray:
 
 
 def _independent(rows: np.ndarray) -> np.ndarray:
-    """A sparse basis of the row space, chosen among the rows (k, n); unit vectors if its rank is the number of columns with non-zeros."""
+    """A sparse basis of the row space, chosen among the rows (k, n); unit vectors if its rank is the number of columns
+    with non-zeros."""
     kept = np.zeros((0, rows.shape[1]))
     for row in sorted(rows, key=np.count_nonzero):
         if np.linalg.matrix_rank(more := np.concatenate([kept, row[None]])) == len(more):
@@ -136,7 +143,8 @@ def _independent(rows: np.ndarray) -> np.ndarray:
 
 
 def _combinations(jaxpr, inputs: list[np.ndarray]) -> list[np.ndarray]:
-    """Coefficients (..., n) of the linear combinations of n numbers that a jaxpr returns, or takes into an operation that is not in `_LINEAR`.
+    """Coefficients (..., n) of the linear combinations of n numbers that a jaxpr returns, or takes into an operation
+    that is not in `_LINEAR`.
 
     `inputs` are the coefficients of its arguments. A jaxpr that is not known, None, may take every number alone.
     """

@@ -1,4 +1,5 @@
-"""Summaries that `print` and notebooks show: a title, and named lines in words and a few numbers, never whole arrays."""
+"""Summaries that `print` and notebooks show: a title, and named lines in words and a few numbers, never whole
+arrays."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -10,7 +11,10 @@ import numpy as np
 from vmri_jax.mechanics.arrays import is_concrete
 
 MOST_LISTED = 6
-"""Most names or numbers in a line; of a longer list the first ones and the last one are shown. A larger number makes lines longer."""
+"""Most names or numbers in a line; of a longer list the first ones and the last one are shown.
+
+A larger number makes lines longer.
+"""
 MOST_PARAMETERS = 12
 """Most entries of `params` in a line. A larger number makes lines longer."""
 
@@ -23,7 +27,8 @@ def summary(title: str, lines: Mapping[str, str]) -> str:
 
 
 def has_values(tree) -> bool:
-    """Whether a pytree has leaves, and all are readable numbers or arrays: no tracers, placeholders or donated arrays."""
+    """Whether a pytree has leaves, and all are readable numbers or arrays: no tracers, placeholders or donated
+    arrays."""
     leaves = jax.tree.leaves(tree)
     kinds = (np.ndarray, np.generic, jax.Array, int, float)
     return (
@@ -42,7 +47,8 @@ def listed(items: Sequence[str]) -> str:
 
 
 def numbers(values) -> str:
-    """The numbers of a vector in a line, with names if it is a mapping; of a matrix, a tracer or another object its shape."""
+    """The numbers of a vector in a line, with names if it is a mapping; of a matrix, a tracer or another object its
+    shape."""
     if isinstance(values, Mapping):
         return listed([f"{name} {numbers(value)}" for name, value in values.items()]) or "none"
     if not has_values(values) or np.ndim(values) > 1:

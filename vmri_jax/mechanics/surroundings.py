@@ -1,14 +1,15 @@
 """What functions of the user read from around them: a run uses what its functions say when it is made.
 
-JAX runs the Python code of a function once and keeps its operations, with the numbers that the function read from globals, closures or
-attributes at that time. `Surroundings` are all values that a function reads, as one value that can be compared: functions of the same code
-with equal surroundings share their programs, and a changed number, helper or array makes a new program. `vmri_jax.mechanics.functions`
-brings them into every program, as the structure of an argument, which JAX compares at every call.
+JAX runs the Python code of a function once and keeps its operations, with the numbers that the function read from
+globals, closures or attributes at that time. `Surroundings` are all values that a function reads, as one value that can
+be compared: functions of the same code with equal surroundings share their programs, and a changed number, helper or
+array makes a new program. `vmri_jax.mechanics.functions` brings them into every program, as the structure of an
+argument, which JAX compares at every call.
 
-Code and objects of libraries (Python, installed packages, this package) count as constant, but for objects that can be called or have no
-hash. Containers and fields of dataclasses are compared as a whole; attributes of other objects, classes and modules of the user by the
-names that occur in the code. Out of sight: `eval`, ``globals()``, and functions behind a `jax.jit` or a cache of the user, which keep
-what they read first.
+Code and objects of libraries (Python, installed packages, this package) count as constant, but for objects that can be
+called or have no hash. Containers and fields of dataclasses are compared as a whole; attributes of other objects,
+classes and modules of the user by the names that occur in the code. Out of sight: `eval`, ``globals()``, and functions
+behind a `jax.jit` or a cache of the user, which keep what they read first.
 """
 
 import dataclasses
@@ -30,8 +31,8 @@ import numpy as np
 from vmri_jax.refusals import Refused
 
 LARGEST_COPIED = 1024
-"""Bytes of the largest array that is compared by its numbers; larger arrays are compared by a digest. A larger value fills the keys of programs
-with copies of arrays."""
+"""Bytes of the largest array that is compared by its numbers; larger arrays are compared by a digest. A larger value
+fills the keys of programs with copies of arrays."""
 APPENDING = ("append", "extend", "add", "update")
 """Methods that write to a log: a name before one of them is not read."""
 _NUMBERS = frozenset((bool, int, float, complex))
@@ -40,7 +41,8 @@ _METHODS = frozenset((MethodType, partial, cached_property, property, staticmeth
 _INSIDE_METHODS = ("__func__", "__self__", "func", "args", "keywords", "fget")
 _MISSING = object()
 _unchanged: dict[Hashable, Hashable] = {}
-"""Surroundings after functions wrote to them while they were traced (counters, tables filled on demand), and the surroundings before."""
+"""Surroundings after functions wrote to them while they were traced (counters, tables filled on demand), and the
+surroundings before."""
 
 
 class Surroundings:
@@ -51,7 +53,8 @@ class Surroundings:
         have_code: whether there is code of the user.
 
     Raises:
-        ValueError: the function reads a number that a transformation of JAX traces; programs outlive the transformation.
+        ValueError: the function reads a number that a transformation of JAX traces; programs outlive the
+            transformation.
     """
 
     def __init__(self, function: Callable):
@@ -122,8 +125,9 @@ class Surroundings:
     def _of_array(self, array) -> Hashable:
         if isinstance(array, jax.core.Tracer):  # pyright: ignore[reportAttributeAccessIssue]
             raise Refused(
-                f"{name_of(self._function)} reads {self._name}, which jax.grad, jit, vmap or jvp traces, and which is not among its arguments. Hand "
-                "it over in the params: System(..., params={'k': k}), and params['k'] in the function."
+                f"{name_of(self._function)} reads {self._name}, which jax.grad, jit, vmap or jvp traces, and which is "
+                "not among its arguments. Hand it over in the params: System(..., params={'k': k}), and "
+                "params['k'] in the function."
             )
         numbers = np.asarray(array if isinstance(array.dtype, np.dtype) else jax.random.key_data(array))
         self._mutable |= not isinstance(array, jax.Array)
@@ -133,7 +137,10 @@ class Surroundings:
         return isinstance(array, jax.Array), numbers.dtype.str, numbers.shape, content
 
     def _of_namespace(self, value) -> Hashable:
-        """A module or class. Attributes of those of the user follow by name, but for operators of classes, which Python calls without names."""
+        """A module or class.
+
+        Attributes of those of the user follow by name, but for operators of classes, which Python calls without names.
+        """
         if is_of_library(value.__name__ if isinstance(value, ModuleType) else value.__module__):
             return value
         self._namespaces.append(vars(value))
@@ -146,7 +153,8 @@ class Surroundings:
         return value.__qualname__, *map(self._of, value.__bases__), *key
 
     def _of_object(self, value) -> Hashable:
-        """An object by its fields and attributes; an object of a library by itself, unless it can be called or has no hash."""
+        """An object by its fields and attributes; an object of a library by itself, unless it can be called or has no
+        hash."""
         kind, inside = type(value), getattr(value, "__dict__", None)
         is_data = dataclasses.is_dataclass(kind)
         if is_of_library(kind.__module__) and not is_data:
@@ -164,7 +172,8 @@ class Surroundings:
         return self._of(kind), *(self._read(name, getattr, value, name, _MISSING) for name in names)
 
     def _of_namespaces(self) -> list[Hashable]:
-        """Attributes of modules, classes and objects of the user, by all names in the code of functions; both grow on the way."""
+        """Attributes of modules, classes and objects of the user, by all names in the code of functions; both grow on
+        the way."""
         key: list[Hashable] = []
         old = 0, 0
         while old != (size := (len(self._namespaces), len(self._attributes))):
@@ -178,8 +187,8 @@ class Surroundings:
 
 @lru_cache(maxsize=4096)
 def names_in(code: CodeType) -> tuple[tuple[str, ...], frozenset[str], dict[str, None], tuple[str, ...]]:
-    """Names that code reads, with the functions inside of it: globals, cells of closures, attributes, also those in texts for `getattr`, and modules
-    that the code itself imports."""
+    """Names that code reads, with the functions inside of it: globals, cells of closures, attributes, also those in
+    texts for `getattr`, and modules that the code itself imports."""
     read = [now for now, after in pairwise(dis.get_instructions(code)) if after.argval not in APPENDING]
     inner = [names_in(constant) for constant in code.co_consts if isinstance(constant, CodeType)]
     texts = [text for text in code.co_consts if isinstance(text, str) and text.isidentifier()]

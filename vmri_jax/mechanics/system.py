@@ -28,12 +28,13 @@ from vmri_jax.mechanics.terms import KINDS, Named, Term, label
 from vmri_jax.refusals import Refused
 
 RESERVED = ("kinetic", "path", "order", "solves", *(kind.symbol for kind in KINDS.values() if kind.symbol))
-"""Names that potentials in `System.potentials` must not have: symbols of other terms, and names of rows in the description of a scheme."""
+"""Names that potentials in `System.potentials` must not have: symbols of other terms, and names of rows in the
+description of a scheme."""
 RATE_OF: dict[str | int, str] = {"V": "slow", "W": "fast"}
 """The rates of V and W: a potential of this name in `System.potentials` has the same rule."""
 FAST_ALONE = (
-    "It sees fast variables alone: whatever a stiff spring joins is fast, also a heavy body, and stands in q_f. Or give the function as "
-    "potentials={{'fast': W}}, which may join slow and fast variables on the micro grid."
+    "It sees fast variables alone: whatever a stiff spring joins is fast, also a heavy body, and stands in q_f. Or "
+    "give the function as potentials={{'fast': W}}, which may join slow and fast variables on the micro grid."
 )
 """Advice for a fast potential that takes slow variables."""
 _INSTEAD = {
@@ -53,24 +54,28 @@ class System(eqx.Module):
         slow_constraint: ``g_s(q_s, params) -> (n_gs,)``, holonomic, of slow variables alone. Constraints that depend on
             time are given as `Rheonomic` functions.
         force: ``F(t, q_s, q_f, v_s, v_f, params) -> (F_s, F_f)``, not derived from a potential.
-        params: any pytree of arrays, handed to every function; traced, so that sweeps and gradients over it
-            never recompile. Dictionaries reach functions in the order in which they are written here; other params of the same names, in
-            `replace` or of single runs, are put into this order. JAX sorts the names of a dictionary that is an argument of a function in
-            jit, grad or vmap: make the system outside of it, and `replace` its params inside.
-        implied: ``g_i(q_s, q_f, params) -> (n_i,)``, redundant rows that follow from the constraints, scaled to order one; or a
-            `Rheonomic` function. Steps do not solve for them, and they have no multipliers. A run checks them at its saved nodes: they
-            count in `constraint_residual`, and if one of them is not zero the run ends as `NOT_IMPLIED`.
-        slow_kinetic: ``T_s(q_s, v_s, params) -> ()``, the part of the kinetic energy that depends on slow variables alone, besides the
-            function `kinetic`. Schemes evaluate it on the macro grid, see `vmri_jax.schemes.discrete_lagrangian`.
-        potentials: further potentials ``V_i(q_s, q_f, params) -> ()`` by name, each with a rate of its own: a scheme has a rule for each
-            name, see `vmri_jax.Scheme.with_potentials`. The names "slow" and "fast" have the rules of V and of W unless the scheme says
-            otherwise, so that ``{"fast": V_1}`` is a potential on the micro grid that may join slow and fast variables. The name k, a
-            whole number, has the trapezoidal rule on every k-th micro node.
+        params: any pytree of arrays, handed to every function; traced, so that sweeps and gradients over it never
+            recompile. Dictionaries reach functions in the order in which they are written here; other params of the
+            same names, in `replace` or of single runs, are put into this order. JAX sorts the names of a dictionary
+            that is an argument of a function in jit, grad or vmap: make the system outside of it, and `replace` its
+            params inside.
+        implied: ``g_i(q_s, q_f, params) -> (n_i,)``, redundant rows that follow from the constraints, scaled to order
+            one; or a `Rheonomic` function. Steps do not solve for them, and they have no multipliers. A run checks them
+            at its saved nodes: they count in `constraint_residual`, and if one of them is not zero the run ends as
+            `NOT_IMPLIED`.
+        slow_kinetic: ``T_s(q_s, v_s, params) -> ()``, the part of the kinetic energy that depends on slow variables
+            alone, besides the function `kinetic`. Schemes evaluate it on the macro grid, see
+            `vmri_jax.schemes.discrete_lagrangian`.
+        potentials: further potentials ``V_i(q_s, q_f, params) -> ()`` by name, each with a rate of its own: a scheme
+            has a rule for each name, see `vmri_jax.Scheme.with_potentials`. The names "slow" and "fast" have the rules
+            of V and of W unless the scheme says otherwise, so that ``{"fast": V_1}`` is a potential on the micro grid
+            that may join slow and fast variables. The name k, a whole number, has the trapezoidal rule on every k-th
+            micro node.
 
     A run uses what its functions read from around them when it is made: globals, helpers, closures, attributes, see
-    `vmri_jax.mechanics.surroundings`. Functions with the same code and surroundings are the same; for others everything is compiled again, so
-    that what varies belongs in `params`. They are kept as `TracedOnce`, so that ``system.force`` is called like the function itself,
-    which is the innermost ``function`` of it.
+    `vmri_jax.mechanics.surroundings`. Functions with the same code and surroundings are the same; for others everything
+    is compiled again, so that what varies belongs in `params`. They are kept as `TracedOnce`, so that ``system.force``
+    is called like the function itself, which is the innermost ``function`` of it.
     """
 
     kinetic: Any
@@ -112,12 +117,13 @@ class System(eqx.Module):
             setattr(self, name, _checked(name, function, order))
         if isinstance(kinetic, ConstantMass) and slow_kinetic is not None:
             raise Refused(
-                "System: slow_kinetic is given besides a ConstantMass, which has the masses of all slow variables; give the whole kinetic "
-                "energy as ConstantMass, or kinetic as a function."
+                "System: slow_kinetic is given besides a ConstantMass, which has the masses of all slow variables; "
+                "give the whole kinetic energy as ConstantMass, or kinetic as a function."
             )
         if not callable(kinetic):
             raise Refused(
-                f"System: kinetic is {kinetic!r}; give ConstantMass(slow, fast) or a function kinetic(q_s, q_f, v_s, v_f, params)."
+                f"System: kinetic is {kinetic!r}; give ConstantMass(slow, fast) or a function kinetic(q_s, q_f, v_s, "
+                "v_f, params)."
             )
         self.kinetic = kinetic if isinstance(kinetic, ConstantMass) else _checked("kinetic", kinetic, order)
         self.params = params
@@ -144,7 +150,8 @@ class System(eqx.Module):
         return self.mapped(lambda term: term.function if term.kind == "kinetic" or keep(term) else None)
 
     def mapped(self, changed: Callable[[Term], Any]) -> "System":
-        """The system whose functions are those that `changed` returns for its terms, each in place of its function; None for no function."""
+        """The system whose functions are those that `changed` returns for its terms, each in place of its function;
+        None for no function."""
         fields: dict[str, Any] = {"potentials": {}}
         for term, function in [(term, changed(term)) for term in self.terms]:
             if function is not None and term.field == "potentials":
@@ -176,7 +183,8 @@ class System(eqx.Module):
         """The same system with other parameters, without the checks of the constructor, which take a millisecond.
 
         Raises:
-            ValueError: changed numbers that a scene computes from its bodies and has other copies of, such as ``gravity.mass``.
+            ValueError: changed numbers that a scene computes from its bodies and has other copies of, such as
+                ``gravity.mass``.
         """
         check_computed(self.params, params)
         system = object.__new__(type(self))
@@ -185,7 +193,8 @@ class System(eqx.Module):
         return system
 
     def all_potentials(self, q_s, q_f) -> dict:
-        """Values of V ("slow"), of W ("fast") and of `potentials` by name; zero without V or W. A potential named "slow" or "fast" is added."""
+        """Values of V ("slow"), of W ("fast") and of `potentials` by name; zero without V or W. A potential named
+        "slow" or "fast" is added."""
         values: dict[str | int, Any] = {"slow": jnp.zeros(()), "fast": jnp.zeros(())}
         for term in self.of_kind("potential"):
             name = RATE_OF.get(term.name, term.name)
@@ -256,7 +265,10 @@ class System(eqx.Module):
 
 
 def _checked(name: str, function: Any, order: Order | None, place: str = "") -> Any:
-    """The function of a field as `TracedOnce` or `Rheonomic`, after checks; None for no function. `order` is of the params, `place` for messages."""
+    """The function of a field as `TracedOnce` or `Rheonomic`, after checks; None for no function.
+
+    `order` is of the params, `place` for messages.
+    """
     kind, place = KINDS[name], f"System: {place or name}"
     if function is None and name != "potentials":
         return None
@@ -272,8 +284,8 @@ def _checked(name: str, function: Any, order: Order | None, place: str = "") -> 
         hash(inner)
     except TypeError:
         raise Refused(
-            f"{place} is {inner!r}, which has no hash: programs are compiled once per function. Give a plain function, with what varies in "
-            "params."
+            f"{place} is {inner!r}, which has no hash: programs are compiled once per function. Give a plain function, "
+            "with what varies in params."
         ) from None
     instead = "" if name == "force" else NO_VELOCITY if holds else NO_TIME
     if name == "fast_potential" and "q_s" in getattr(getattr(inner, "__code__", None), "co_varnames", ()):
@@ -289,18 +301,19 @@ def _named_potentials(potentials, order: Order | None) -> Named:
         named = dict(potentials)
     except (TypeError, ValueError):
         raise Refused(
-            f"System: potentials is {potentials!r}; give functions by name, e.g. potentials={{'bends': V_1, 'bonds': V_2}}."
+            f"System: potentials is {potentials!r}; give functions by name, e.g. potentials={{'bends': V_1, 'bonds': "
+            "V_2}."
         ) from None
     for name in named:
         if isinstance(name, bool) or not isinstance(name, str | int) or (isinstance(name, int) and name < 1):
             raise Refused(
-                f"System: potentials has the name {name!r}; give a text, or a whole number k of at least 1 for a potential on every k-th "
-                "micro node."
+                f"System: potentials has the name {name!r}; give a text, or a whole number k of at least 1 for a "
+                "potential on every k-th micro node."
             )
         if name in RESERVED or [label(other) for other in named].count(label(name)) > 1:
             raise Refused(
-                f"System: potentials has the name {name!r}, which is the name of another term: one of {', '.join(RESERVED)}, or V_k of the "
-                "potential k. Take another name."
+                f"System: potentials has the name {name!r}, which is the name of another term: one of "
+                f"{', '.join(RESERVED)}, or V_k of the potential k. Take another name."
             )
     places = {name: f"potentials[{name!r}]" for name in named}
     return Named({name: _checked("potentials", named[name], order, place) for name, place in places.items()})

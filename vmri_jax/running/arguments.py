@@ -14,13 +14,14 @@ from vmri_jax.schemes.composition import SchemeLike, stage_scheme
 from vmri_jax.steppers.solver import Solver
 
 WHOLE_NUMBER_TOLERANCE = 1e-9
-"""Relative distance from a whole number up to which ``(t_end - t) / macro_dt`` counts as one. The end of a run misses t_end by at most this
-part of its length; a larger value lets runs end visibly beside t_end."""
+"""Relative distance from a whole number up to which ``(t_end - t) / macro_dt`` counts as one. The end of a run misses
+t_end by at most this part of its length; a larger value lets runs end visibly beside t_end."""
 
 
 @dataclass(frozen=True)
 class Save:
-    """The nodes and states of a run that are kept while it is computed; ``save=10`` of `vmri_jax.simulate` is short for ``save=vm.Save(10)``.
+    """The nodes and states of a run that are kept while it is computed; ``save=10`` of `vmri_jax.simulate` is short for
+    ``save=vm.Save(10)``.
 
         vm.simulate(problem, scheme, macro_dt=0.01, t_end=10.0, save=vm.Save(every=10, micro=True))
 
@@ -28,8 +29,9 @@ class Save:
         every: macro steps from one saved node to the next; 1 where neither `every` nor `number` is given.
         number: in place of `every`, the number of saved intervals, equally spaced, of which there is one node more.
         micro: also keep the fast positions at the micro nodes of the macro step that ends at each saved node.
-        progress: True for a bar of the nodes saved so far, or a function of (what, done, total); Ctrl-C then raises `Interrupted` with
-            these nodes. With False a run that takes more than two seconds prints lines on the error stream.
+        progress: True for a bar of the nodes saved so far, or a function of (what, done, total); Ctrl-C then raises
+            `Interrupted` with these nodes. With False a run that takes more than two seconds prints lines on the error
+            stream.
 
     Raises:
         ValueError: both `every` and `number`, a number below 1.
@@ -72,7 +74,8 @@ class Save:
 
 
 def check_run(system, scheme, state, solver, macro_dt, num_steps, t_end, save) -> tuple[int, int]:
-    """Refuse bad arguments of `simulate`; returns the number of macro steps, and how many of them lie between two saved nodes."""
+    """Refuse bad arguments of `simulate`; returns the number of macro steps, and how many of them lie between two saved
+    nodes."""
     require_x64()
     if not isinstance(scheme, SchemeLike):
         raise Refused(f"simulate: scheme is {type(scheme).__name__}; give a Scheme, e.g. fully_implicit(num_micro=10).")
@@ -97,8 +100,8 @@ def nothing_fast(scheme: SchemeLike, num_fast: int) -> str:
     if num_fast or stage_scheme(scheme).num_micro == 1:
         return ""
     return (
-        "no body of the scene is fast, so that all micro steps but one resolve nothing. Take num_micro=1; or say which potential is fast, "
-        'rate="fast", or which bodies are fast, pace="fast".'
+        "no body of the scene is fast, so that all micro steps but one resolve nothing. Take num_micro=1; or say which"
+        ' potential is fast, rate="fast", or which bodies are fast, pace="fast".'
     )
 
 
@@ -136,7 +139,10 @@ def refuse_tracers(caller: str, arguments, instead: str = "") -> None:
 
 @lru_cache(maxsize=256)
 def check_once(known: Known, state_name: str, constraints: bool) -> None:
-    """Check a system, the tree of `known` with a state, at its time and positions. The check takes longer than a short run: equal ones are checked once."""
+    """Check a system, the tree of `known` with a state, at its time and positions.
+
+    The check takes longer than a short run: equal ones are checked once.
+    """
     system, state = known.tree
     check_system(system, state.q_s, state.q_f)
     check_mass(system, state.q_s, state.q_f)

@@ -1,7 +1,7 @@
 """Batches of runs: a lane for each start, step size or parameter set of one system; lanes do not influence each other.
 
-Every array of a batch has the lanes as its first axis. An array that all lanes share is a view without copies, see `shared`: compiled programs
-get it once.
+Every array of a batch has the lanes as its first axis. An array that all lanes share is a view without copies, see
+`shared`: compiled programs get it once.
 """
 
 from collections.abc import Callable, Collection, Iterator
@@ -30,22 +30,25 @@ from vmri_jax.running.simulation import STEPPING, Simulation, simulation
 from vmri_jax.schemes.composition import SchemeLike, stage_scheme
 
 NUMBERS_PER_CHUNK = 4096
-"""Positions at all nodes of a macro step, summed over the lanes of a chunk: 32 kB of float64, the first-level cache of a core. Chunks with
-more of them wait for slower memory."""
+"""Positions at all nodes of a macro step, summed over the lanes of a chunk: 32 kB of float64, the first-level cache of
+a core. Chunks with more of them wait for slower memory."""
 FEWEST_LANES = 64
-"""Fewest lanes of a chunk, even where they exceed `NUMBERS_PER_CHUNK`: with fewer lanes the fixed cost of an operation outweighs the cache."""
+"""Fewest lanes of a chunk, even where they exceed `NUMBERS_PER_CHUNK`: with fewer lanes the fixed cost of an operation
+outweighs the cache."""
 MOST_LANES = 1024
 """Most lanes of a chunk; with more, the last chunk of a batch may be mostly padding."""
 
 
 def computed(runs: Simulation, width: int, devices: int) -> Saved:
-    """Runs whose arrays have an axis of lanes, `width` of them side by side, on CPU devices; lanes that are not solved are computed again by the fallback."""
+    """Runs whose arrays have an axis of lanes, `width` of them side by side, on CPU devices; lanes that are not solved
+    are computed again by the fallback."""
     run, lanes = lane(runs, 0), len(runs.macro_dt)
     with Working(f"simulate_batch, {lanes} lanes", running=STEPPING):
         done = _in_chunks(run, runs.leaves, np.arange(lanes), width, devices)
     failed = np.flatnonzero(run.unsolved(done))
     if failed.size:
-        # Failed lanes are padded to a power of two with copies of the last one, so that few programs serve all numbers of failures.
+        # Failed lanes are padded to a power of two with copies of the last one, so that few programs serve all numbers
+        # of failures.
         padded = failed[np.minimum(np.arange(2 ** int(failed.size - 1).bit_length()), failed.size - 1)]
         with Working(f"simulate_batch, {failed.size} of {lanes} lanes: {FALLING_BACK}"):
             again = _in_chunks(run.exact, runs.leaves, padded, width, devices)
@@ -60,8 +63,8 @@ def lane(runs: Simulation, i: int) -> Simulation:
 
 
 def _in_chunks(run: Simulation, leaves: list, lanes: np.ndarray, width: int, devices: int) -> Saved:
-    """Some lanes of runs shaped like `run`, `width` at a time; the last chunk is padded with copies of its last lane, so that one program computes all
-    chunks."""
+    """Some lanes of runs shaped like `run`, `width` at a time; the last chunk is padded with copies of its last lane,
+    so that one program computes all chunks."""
     width, chunks = min(width, -(-len(lanes) // devices) * devices), []
     program = _side_by_side(run.engine, tuple(not is_repeated(a) for a in leaves), devices)
     for start in range(0, len(lanes), width):
@@ -175,7 +178,8 @@ def _with_lanes(all_params, params, start: State, macro_dt) -> tuple[Any, State,
 
 
 def lanes_at_once(run: Simulation) -> int:
-    """Lanes of a chunk where the user gives none: the largest power of two that fits into the cache, between the two limits."""
+    """Lanes of a chunk where the user gives none: the largest power of two that fits into the cache, between the two
+    limits."""
     nodes = run.scheme.num_micro * stage_scheme(run.scheme).degree
     numbers_per_lane = nodes * (run.state.q_s.size + run.state.q_f.size)
     return 2 ** int(np.log2(np.clip(NUMBERS_PER_CHUNK / numbers_per_lane, FEWEST_LANES, MOST_LANES)))
@@ -183,7 +187,8 @@ def lanes_at_once(run: Simulation) -> int:
 
 @lru_cache(maxsize=32)
 def _side_by_side(engine: Engine, differs: tuple[bool, ...], devices: int):
-    """``program(leaves, save_every)``: `Engine.steps` for each lane; `differs` says which of the leaves have an axis of lanes."""
+    """``program(leaves, save_every)``: `Engine.steps` for each lane; `differs` says which of the leaves have an axis of
+    lanes."""
     program = jax.vmap(engine.steps, ([0 if differ else None for differ in differs], None))
     if devices > 1:
         mesh = jax.sharding.Mesh(np.array(jax.devices()[:devices]), ("lanes",))

@@ -1,15 +1,16 @@
-"""The engine of all runs: a loop of macro steps inside a loop over saved nodes, compiled once per structure. It returns states and statuses, and
-beside each saved state its `Observables`, which it computes after all steps.
+"""The engine of all runs: a loop of macro steps inside a loop over saved nodes, compiled once per structure. It returns
+states and statuses, and beside each saved state its `Observables`, which it computes after all steps.
 
-Names: `save_every` macro steps lie between two saved nodes; `num_saves` saved intervals fit into the arrays of an engine; a call computes
-the first `saves` of them.
+Names: `save_every` macro steps lie between two saved nodes; `num_saves` saved intervals fit into the arrays of an
+engine; a call computes the first `saves` of them.
 
-The derivative of a step is the derivative of the root of its equations (`vmri_jax.steppers.newton.implicit`). Reverse mode visits
-the steps from the last to the first and needs the state at which each step started, see `loops`. Runs have derivatives in both modes, up to second
-ones; third derivatives are NaN where equations are solved by iteration.
+The derivative of a step is the derivative of the root of its equations (`vmri_jax.steppers.newton.implicit`). Reverse
+mode visits the steps from the last to the first and needs the state at which each step started, see `loops`. Runs have
+derivatives in both modes, up to second ones; third derivatives are NaN where equations are solved by iteration.
 
-The fallback: what the first matrix of "auto" does not solve is solved again with exact matrices, in a program of its own. `unsolved` decides for all
-runs: for a step (`macro_step`), a run or a piece of it, the lanes of a batch, and runs under transformations of JAX (`solved_again`).
+The fallback: what the first matrix of "auto" does not solve is solved again with exact matrices, in a program of its
+own. `unsolved` decides for all runs: for a step (`macro_step`), a run or a piece of it, the lanes of a batch, and runs
+under transformations of JAX (`solved_again`).
 """
 
 from collections.abc import Callable
@@ -31,16 +32,19 @@ from vmri_jax.steppers.plan import Plan
 from vmri_jax.steppers.results import Method, Result
 from vmri_jax.steppers.stepper import StepStatus
 
-FALLING_BACK = 'a step was not solved: computing its part of the run again with exact matrices (matrix "exact"), as accurate but slower'
+FALLING_BACK = (
+    'a step was not solved: computing its part of the run again with exact matrices (matrix "exact"), as accurate but'
+    " slower"
+)
 """Line about a fallback that takes more than two seconds."""
 NODES_AT_ONCE = 16
-"""Nodes whose observables are computed side by side. With fewer nodes XLA uses no vector instructions; with 64 the matrices of scenes no longer fit into
-the first-level cache, and a run of a few nodes takes longer."""
+"""Nodes whose observables are computed side by side. With fewer nodes XLA uses no vector instructions; with 64 the
+matrices of scenes no longer fit into the first-level cache, and a run of a few nodes takes longer."""
 
 
 class Cursor(NamedTuple):
-    """A run between two steps, all that its next steps depend on: state and memory of the stepper before macro step `step`, the worst `result` so far,
-    the failed step or -1. Memory None: the stepper has none of earlier steps."""
+    """A run between two steps, all that its next steps depend on: state and memory of the stepper before macro step
+    `step`, the worst `result` so far, the failed step or -1. Memory None: the stepper has none of earlier steps."""
 
     state: State
     memory: Any
@@ -56,7 +60,8 @@ class Cursor(NamedTuple):
 
 @dataclass(frozen=True)
 class Engine:
-    """Compiled runs of all systems and schemes of one structure, as functions of the leaves of a `Simulation` and of numbers of steps.
+    """Compiled runs of all systems and schemes of one structure, as functions of the leaves of a `Simulation` and of
+    numbers of steps.
 
     A run is flattened once: to flatten a system at every call would take longer than a short run. `structure` is the
     structure of a run without its length and names, whose arrays have room for `num_saves` saved intervals.
@@ -71,7 +76,8 @@ class Engine:
         return jax.jit(self.steps, compiler_options=options_of_runs())
 
     def steps(self, leaves: list, save_every, saves=None, cursor: Cursor | None = None, is_first: Any = True):
-        """The first `saves` saved intervals: rows of `Saved`, more of them by a part of a block, and the cursor after them.
+        """The first `saves` saved intervals: rows of `Saved`, more of them by a part of a block, and the cursor after
+        them.
 
         `saves` None: all intervals, failed or not. The end of the loop then depends on no lane of a batch, and
         `jax.vmap` need not select between old and new values in every lane.
@@ -110,7 +116,8 @@ class Engine:
         return min(NODES_AT_ONCE, self.num_saves + 1)
 
     def _observed(self, run, rows, step, save_every, saves):
-        """The rows as they are saved, block by block, up to the node `saves`, and copies of this node up to the end of its block."""
+        """The rows as they are saved, block by block, up to the node `saves`, and copies of this node up to the end of
+        its block."""
 
         def block(i, rows):
             number = jnp.minimum(i * self._block + jnp.arange(self._block), saves)  # beyond it there may be no state
@@ -121,8 +128,8 @@ class Engine:
 
     @cached_property
     def differentiable(self):
-        """``differentiable(leaves, save_every)``: a whole run as `Saved` without observables, by `jax.lax.scan`, which reverse mode can
-        differentiate; the numbers of steps are static."""
+        """``differentiable(leaves, save_every)``: a whole run as `Saved` without observables, by `jax.lax.scan`, which
+        reverse mode can differentiate; the numbers of steps are static."""
 
         def by_scan(leaves: list, save_every: int) -> Saved:
             run: Any = jax.tree.unflatten(self.structure, leaves)
@@ -154,8 +161,9 @@ class Engine:
 
 
 engine = lru_cache(maxsize=32)(Engine)
-"""``engine(structure, num_saves)``: the `Engine` with these attributes, made once. The 33rd structure displaces the one used
-least recently, which compiles again when it is needed: each program takes memory maps, of which a process has a limited number."""
+"""``engine(structure, num_saves)``: the `Engine` with these attributes, made once. The 33rd structure displaces the one
+used least recently, which compiles again when it is needed: each program takes memory maps, of which a process has a
+limited number."""
 
 
 @lru_cache(maxsize=256)
@@ -206,7 +214,8 @@ def _interval(stepper: Plan, run, repeat: Callable):
         worst = jax.tree.map(lambda a, b: jnp.where(alive, jnp.maximum(a, b), a), worst, info.status)
         # NaN in the momenta alone: the next step carries it into all positions.
         p_s, p_f = (jnp.where(ok, p, jnp.nan) for p in (state.p_s, state.p_f))
-        # t_k = t_0 + k H from the step number, since a sum of steps would accumulate round-off; the time of the stepper is ignored.
+        # t_k = t_0 + k H from the step number, since a sum of steps would accumulate round-off; the time of the stepper
+        # is ignored.
         state = State(t_start + (cursor.step + 1) * macro_dt, state.q_s, state.q_f, p_s, p_f)
         failed_at = jnp.where(alive & ~ok, cursor.step, cursor.failed_at)
         micro = jnp.where(ok, info.q_f_micro, jnp.nan) if run.save.micro else micro
@@ -230,8 +239,9 @@ def unsolved(result, method):
 def solved_again(first: Callable, exact: Callable, failed: Callable, arguments: Any) -> Any:
     """``first(arguments)``, or ``exact(arguments)`` where that has failed, in one program, to be transformed.
 
-    The derivative is the derivative of `exact`, with its value: to differentiate both would compile two programs. Values of the two differ by
-    the tolerance of the solver. ``failed(value)`` says whether a value of `first` is computed again.
+    The derivative is the derivative of `exact`, with its value: to differentiate both would compile two programs.
+    Values of the two differ by the tolerance of the solver. ``failed(value)`` says whether a value of `first` is
+    computed again.
     """
 
     @jax.custom_jvp

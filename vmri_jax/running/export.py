@@ -1,4 +1,5 @@
-"""A run for readers and for other programs: a summary in a few lines; tables of named columns, CSV, pandas, Parquet, xarray."""
+"""A run for readers and for other programs: a summary in a few lines; tables of named columns, CSV, pandas, Parquet,
+xarray."""
 
 import csv
 import importlib
@@ -38,7 +39,8 @@ DIMENSIONS = {
 }
 """Names of the axes of every array that has a row for each saved node."""
 NODES = tuple(DIMENSIONS)[:7]
-"""Arrays that a run has for each saved node, the start included; it has all others of `DIMENSIONS` for the intervals between them, or none of them."""
+"""Arrays that a run has for each saved node, the start included; it has all others of `DIMENSIONS` for the intervals
+between them, or none of them."""
 INFO = ("method", "iterations", "residual")
 MICRO = ("t_micro", "q_f_micro")
 STATUS = ("result", "failed_at")
@@ -74,8 +76,8 @@ class Exports(Quantities):
     error: Any
 
     def columns(self) -> dict[str, np.ndarray]:
-        """Columns (k,) by name: time, coordinates by their names, velocities "v ..." if the system is known, momenta "p ...",
-        energy, constraint residuals, and the work of the solver since the previous node.
+        """Columns (k,) by name: time, coordinates by their names, velocities "v ..." if the system is known, momenta "p
+        ...", energy, constraint residuals, and the work of the solver since the previous node.
 
         Raises:
             ValueError: this is a batch.
@@ -120,7 +122,8 @@ class Exports(Quantities):
         return extra("pandas", "to_pandas").DataFrame(self.columns()).set_index("t")
 
     def to_parquet(self, path) -> None:
-        """Write `columns` to a .parquet file, time first (needs the extra ``vmri_jax[parquet]``); an existing file is replaced.
+        """Write `columns` to a .parquet file, time first (needs the extra ``vmri_jax[parquet]``); an existing file is
+        replaced.
 
         Raises:
             ImportError: pyarrow is not installed.
@@ -131,10 +134,11 @@ class Exports(Quantities):
             parquet.write_table(pyarrow.table(self.columns()), file)
 
     def to_xarray(self):
-        """The run as an `xarray.Dataset` over time (needs the extra ``vmri_jax[xarray]``), with a dimension of lanes in a batch.
+        """The run as an `xarray.Dataset` over time (needs the extra ``vmri_jax[xarray]``), with a dimension of lanes in
+        a batch.
 
-        Row k of "method", "iterations", "residual" and of the micro nodes belongs to the steps from node k - 1 to node k, so that row 0 is
-        empty (-1 or NaN). The store of `vmri_jax.stream` has the same dimensions.
+        Row k of "method", "iterations", "residual" and of the micro nodes belongs to the steps from node k - 1 to node
+        k, so that row 0 is empty (-1 or NaN). The store of `vmri_jax.stream` has the same dimensions.
 
         Raises:
             ImportError: xarray is not installed.
@@ -196,7 +200,8 @@ def named_coordinates(names: Names | None, run: SavedRun) -> dict[str, str]:
 
 
 def statuses(result: np.ndarray, failed_at: np.ndarray) -> str:
-    """The status of a run by name; of a batch the number of runs of each status, and the numbers of the failed lanes."""
+    """The status of a run by name; of a batch the number of runs of each status, and the numbers of the failed
+    lanes."""
     if not result.ndim:
         failure = "" if failed_at < 0 else f" at macro step {failed_at}; all saved nodes after it are NaN"
         return f"{Result(int(result)).name}{failure}"

@@ -1,4 +1,5 @@
-"""The exception of a failed run, with its probable cause: the body that moves most in the step, a force that jumps, swapped rates."""
+"""The exception of a failed run, with its probable cause: the body that moves most in the step, a force that jumps,
+swapped rates."""
 
 from typing import Any, NamedTuple
 
@@ -14,14 +15,15 @@ from vmri_jax.running.origin import SavedRun
 from vmri_jax.steppers.results import Result, SimulationError
 
 LARGE_TURN = 0.5
-"""Radians that a rigid body may turn in a step. Beyond one radian the constraint forces at the start of a step, which hold the directors,
-cannot make them unit vectors again at its end; with a larger value a step near that limit is no longer blamed."""
+"""Radians that a rigid body may turn in a step. Beyond one radian the constraint forces at the start of a step, which
+hold the directors, cannot make them unit vectors again at its end; with a larger value a step near that limit is no
+longer blamed."""
 LARGE_MOVE = 0.25
-"""Distance that a point or a coordinate may move in a step, as a part of the extent of all positions; with a larger value a step that throws
-a point through other points is no longer blamed."""
+"""Distance that a point or a coordinate may move in a step, as a part of the extent of all positions; with a larger
+value a step that throws a point through other points is no longer blamed."""
 RUN_AWAY = 20.0
-"""Multiple of `LARGE_TURN` or `LARGE_MOVE` above which a motion is the result of an instability, not its cause; with a larger value the advice
-computes steps from positions that have already exploded."""
+"""Multiple of `LARGE_TURN` or `LARGE_MOVE` above which a motion is the result of an instability, not its cause; with a
+larger value the advice computes steps from positions that have already exploded."""
 
 
 class Motion(NamedTuple):
@@ -46,11 +48,14 @@ class Motion(NamedTuple):
         step = "micro step" if self.micro else "macro step"
         moves = f"turns {self.amount:.2g} rad" if self.turns else f"moves {self.amount:.1%} of the extent of the system"
         if self.size < 1:
-            return f"By the velocities before the failed step, {self.name} {moves} in a {step}, which is little; its forces may be too large for the step."
+            return (
+                f"By the velocities before the failed step, {self.name} {moves} in a {step}, which is little; its "
+                "forces may be too large for the step."
+            )
         if self.size > RUN_AWAY:
             return (
-                f"{self.name} ran away before the failure: the run was unstable, its steps too large for a vibration. Look at the "
-                "energy of earlier nodes."
+                f"{self.name} ran away before the failure: the run was unstable, its steps too large for a vibration. "
+                "Look at the energy of earlier nodes."
             )
         else_fast = ", or more micro steps" if self.micro else ", or make it fast, so that micro steps follow it"
         return (
@@ -60,7 +65,8 @@ class Motion(NamedTuple):
 
 
 def largest_motion(system: System, state: State, names: Names | None, macro_dt: float, num_micro: int) -> Motion | None:
-    """The motion of largest `Motion.size` in the macro step H from a state; None where there are no coordinates or no finite numbers.
+    """The motion of largest `Motion.size` in the macro step H from a state; None where there are no coordinates or no
+    finite numbers.
 
     A rigid body turns by ``h |omega|`` with ``2 |omega|^2 = sum_i |dd_i/dt|^2`` over its three directors d_i.
     """
@@ -90,7 +96,8 @@ def largest_motion(system: System, state: State, names: Names | None, macro_dt: 
 
 
 def simulation_error(run: Any, trajectory: SavedRun) -> SimulationError:
-    """The `SimulationError` of a `Simulation`, whose trajectory is in memory or in a store, with the largest motion before the failing step."""
+    """The `SimulationError` of a `Simulation`, whose trajectory is in memory or in a store, with the largest motion
+    before the failing step."""
     failed_at, dt = int(trajectory.failed_at), float(run.macro_dt)
     interval, step = divmod(failed_at, run.save_every)
     part, moved, jump = trajectory[interval : interval + 2], "", ""  # from the node before the failure
@@ -105,7 +112,8 @@ def simulation_error(run: Any, trajectory: SavedRun) -> SimulationError:
 
 
 def _swapped(start: SavedRun) -> str:
-    """The advice of `Linearisation.swapped` at the start of a run; empty if its labels are right or its system is not known."""
+    """The advice of `Linearisation.swapped` at the start of a run; empty if its labels are right or its system is not
+    known."""
     if not start.states.q_s.shape[-1] or not start.states.q_f.shape[-1]:
         return ""  # nothing to swap: the linearisation would take seconds to compile
     try:

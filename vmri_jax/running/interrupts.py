@@ -12,8 +12,9 @@ class Interrupted(KeyboardInterrupt):
     It is a `KeyboardInterrupt`: a program that does not catch it stops, as after any Ctrl-C.
 
     Attributes:
-        done: the `Trajectory` of `simulate`, the `StoredTrajectory` of `stream`, the `Report` of `check`, the `Ensemble` of an ensemble, the
-            table of rows of a study, or the list of results of a mapping over tasks, with None for tasks that were not done.
+        done: the `Trajectory` of `simulate`, the `StoredTrajectory` of `stream`, the `Report` of `check`, the
+            `Ensemble` of an ensemble, the table of rows of a study, or the list of results of a mapping over tasks,
+            with None for tasks that were not done.
         number: macro steps, tasks or rows done.
         total: their number in the complete work; None where it is not known before.
         units: their name, "macro steps", "cases", "chunks", "runs".
@@ -30,9 +31,11 @@ class Interrupted(KeyboardInterrupt):
 
 @contextmanager
 def interrupts_noted() -> Iterator[Callable[[], bool]]:
-    """Context in which a first Ctrl-C is only noted and a second one raises; yields a function that tells whether Ctrl-C was pressed.
+    """Context in which a first Ctrl-C is only noted and a second one raises; yields a function that tells whether
+    Ctrl-C was pressed.
 
-    Outside of the main thread, where Python allows no handlers, and where the program has its own handler, nothing changes.
+    Outside of the main thread, where Python allows no handlers, and where the program has its own handler, nothing
+    changes.
     """
     default = signal.default_int_handler
     active = threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGINT) is default

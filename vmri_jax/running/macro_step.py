@@ -24,16 +24,17 @@ def macro_step(
 ) -> tuple[State, StepInfo]:
     """One macro step, ``(state, info) = macro_step(system, scheme, state, macro_dt)``; a pure function.
 
-    Compiled once for all systems, schemes and states of the same structure. The momenta returned are projected onto the hidden
-    constraints, ``G v + dg/dt = 0``. `simulate` takes many steps faster: it reuses gradients and starts Newton from the step
-    before.
+    Compiled once for all systems, schemes and states of the same structure. The momenta returned are projected onto the
+    hidden constraints, ``G v + dg/dt = 0``. `simulate` takes many steps faster: it reuses gradients and starts Newton
+    from the step before.
 
     Args:
         system: the system.
         scheme: a scheme or composition.
         state: a consistent state, from `initial_state` or a former step.
         macro_dt: length H of the macro step, positive.
-        solver: for implicit equations; None for ``Solver()``. What "auto" does not solve is solved again with exact matrices.
+        solver: for implicit equations; None for ``Solver()``. What "auto" does not solve is solved again with exact
+            matrices.
 
     Returns:
         The state at the end of the step, and the status, method, iterations and micro nodes of the step.

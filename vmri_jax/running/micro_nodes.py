@@ -1,8 +1,8 @@
 """Positions and velocities at the micro nodes between the macro nodes of a run.
 
-A run keeps the fast positions at its micro nodes. Slow positions and velocities there come from the cubic Hermite polynomial through
-the positions and velocities of the two macro nodes. Fast velocities come from the cubic spline through the micro nodes of a macro step
-with the known velocities at its ends, an approximation of order 4.
+A run keeps the fast positions at its micro nodes. Slow positions and velocities there come from the cubic Hermite
+polynomial through the positions and velocities of the two macro nodes. Fast velocities come from the cubic spline
+through the micro nodes of a macro step with the known velocities at its ends, an approximation of order 4.
 """
 
 from typing import Any, NamedTuple
@@ -10,11 +10,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 ROUND_OFF = 1e-6
-"""Relative difference of two times up to which they count as equal. A larger value takes runs of some hundred micro steps for runs with all nodes."""
+"""Relative difference of two times up to which they count as equal.
+
+A larger value takes runs of some hundred micro steps for runs with all nodes.
+"""
 
 
 class Nodes(NamedTuple):
-    """Positions and velocities at all nodes in order, macro and micro: t is (k,), positions and velocities are (k, n)."""
+    """Positions and velocities at all nodes in order, macro and micro: t is (k,), positions and velocities are (k,
+    n)."""
 
     t: np.ndarray
     q_s: np.ndarray
@@ -34,8 +38,8 @@ def why_not(t, micro) -> str:
         return "it has a single node"
     if np.any(np.diff(np.append(t[:1], t_micro)) <= 0):
         return "the stages of its composition go back in time"
-    # Micro nodes belong to the last macro step of a saved interval. The first of its micro steps is at most half of it: if more time lies before
-    # the first micro node than after it, there are further macro steps.
+    # Micro nodes belong to the last macro step of a saved interval. The first of its micro steps is at most half of it:
+    # if more time lies before the first micro node than after it, there are further macro steps.
     before, after = t_micro[:, 0] - t[:-1], t[1:] - t_micro[:, 0]
     if t_micro.shape[1] > 1 and np.any(before > after * (1 + ROUND_OFF)):
         return "it kept the micro nodes of some macro steps only; simulate with save=vm.Save(every=1, micro=True)"

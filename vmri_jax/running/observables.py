@@ -1,8 +1,9 @@
-"""Observables of a run at its saved nodes, and the one place that looks at them: failures, and warnings about the motion.
+"""Observables of a run at its saved nodes, and the one place that looks at them: failures, and warnings about the
+motion.
 
-An observable is a function of the system and the state, evaluated after the steps, in the same program. All roads look at the same `Observables`:
-`Saved.marked` ends a run that has left its constraints or its domain, `concerns` says what is wrong with the motion of a run whose steps all
-succeeded.
+An observable is a function of the system and the state, evaluated after the steps, in the same program. All roads look
+at the same `Observables`: `Saved.marked` ends a run that has left its constraints or its domain, `concerns` says what
+is wrong with the motion of a run whose steps all succeeded.
 """
 
 from typing import Any, NamedTuple
@@ -25,9 +26,9 @@ class LostEnergyWarning(UserWarning):
 
     sentence = (
         "the computed motion is wrong: the energy, which the system keeps, has changed by {change:.3g} at t = {t:.4g}, "
-        "and the largest kinetic energy is {kinetic:.3g}. Take smaller steps, where "
-        "slow forces are kicks below half a period of the fastest vibration; vmri_jax.stability.advise(problem, scheme, "
-        "macro_dt=...) says which are stable for small motions."
+        "and the largest kinetic energy is {kinetic:.3g}. Take smaller steps, where slow forces are kicks below half "
+        "a period of the fastest vibration; vmri_jax.stability.advise(problem, scheme, macro_dt=...) says which are "
+        "stable for small motions."
     )
 
 
@@ -36,24 +37,26 @@ class SingularCoordinatesWarning(LostEnergyWarning):
 
     sentence = (
         "the coordinates are singular near t = {t:.4g}: the mass matrix changes by a factor from one saved node to the "
-        "next, and the energy by {change:.3g}, with a largest kinetic energy of {kinetic:.3g}. Take other coordinates, "
-        "or accuracy=."
+        "next, and the energy by {change:.3g}, with a largest kinetic energy of {kinetic:.3g}. Take other "
+        "coordinates, or accuracy=."
     )
 
 
 REPORTED_CHANGE = 0.5
-"""Change of the energy, as a part of the largest kinetic energy, above which the user is warned; a larger value misses slower instabilities."""
+"""Change of the energy, as a part of the largest kinetic energy, above which the user is warned; a larger value misses
+slower instabilities."""
 ROUNDOFF_OF_ENERGY = 1e-9
-"""Change of the energy, as a part of the sum of the moduli of its terms, up to which it is round-off. A larger value hides losses in systems
-whose terms cancel."""
+"""Change of the energy, as a part of the sum of the moduli of its terms, up to which it is round-off. A larger value
+hides losses in systems whose terms cancel."""
 ROUNDOFF_OF_STEP = 10 * np.finfo(float).eps
 """Round-off of a position in a step, as a part of the position; a larger value hides slower motions."""
 UNRESOLVED = 2.0
-"""Change of log det M from one saved node to the next, above which the steps do not resolve the mass matrix M. Steps across a pole, where det M goes to
-zero with the square of the distance, change it by 2 log 3 = 2.2 or more. A larger value misses poles between two nodes."""
+"""Change of log det M from one saved node to the next, above which the steps do not resolve the mass matrix M. Steps
+across a pole, where det M goes to zero with the square of the distance, change it by 2 log 3 = 2.2 or more. A larger
+value misses poles between two nodes."""
 CHANGE_AT_POLE = 1e-2
-"""Change of the energy between two saved nodes next to a pole, as a part of the largest kinetic energy, above which the user is warned. A larger value
-misses runs whose angles are wrong after the pole."""
+"""Change of the energy between two saved nodes next to a pole, as a part of the largest kinetic energy, above which the
+user is warned. A larger value misses runs whose angles are wrong after the pole."""
 
 
 class Observables(NamedTuple):
@@ -62,9 +65,11 @@ class Observables(NamedTuple):
     energy: Hamiltonian.
     position, velocity: largest |g| and largest |G v + dg/dt|, implied rows included.
     solved, implied: 1 where the rows that are solved for, and the implied rows, are kept, see `are_kept`; else 0.
-    kinetic: ``v . M v / 2``: T may have terms of lower degree in v, as in a frame that turns, and ``p . v - T`` is then no size.
+    kinetic: ``v . M v / 2``: T may have terms of lower degree in v, as in a frame that turns, and ``p . v - T`` is then
+        no size.
     terms: ``|T| + |V| + |W| + sum_i |V_i|``.
-    rounding: ``q . M q / 2``, whose part eps^2 / H^2 is the kinetic energy of velocities that come from round-off of the positions.
+    rounding: ``q . M q / 2``, whose part eps^2 / H^2 is the kinetic energy of velocities that come from round-off of
+        the positions.
     volume: log det M of a mass matrix M that depends on positions; 0 for constant masses.
     """
 
@@ -84,15 +89,17 @@ class Observables(NamedTuple):
         return cls(*(table[..., i] for i in range(len(cls._fields))))
 
     def so_far(self) -> np.ndarray:
-        """(1, 9) the energy of the first node of a run, and the largest of all other columns: a node in place of all nodes."""
+        """(1, 9) the energy of the first node of a run, and the largest of all other columns: a node in place of all
+        nodes."""
         return np.array([[self.energy[0], *(column.max() for column in self[1:-1]), self.volume[-1]]])
 
 
 def observed(system: System, state: State, tolerance: Any = 0.0) -> tuple[State, Any]:
-    """A state as it is saved, with momenta projected onto the hidden constraints, ``G v + dg/dt = 0``, and its `Observables` as an array (9,).
+    """A state as it is saved, with momenta projected onto the hidden constraints, ``G v + dg/dt = 0``, and its
+    `Observables` as an array (9,).
 
-    A step depends on the momentum through ``h p - G_0^T mu`` alone. A projection ``p - G_0^T nu`` at its start changes mu, and not the motion: only
-    momenta that are saved are projected. `tolerance` is of the solver.
+    A step depends on the momentum through ``h p - G_0^T mu`` alone. A projection ``p - G_0^T nu`` at its start changes
+    mu, and not the motion: only momenta that are saved are projected. `tolerance` is of the solver.
     """
     p_s, p_f, *velocities, masses = project_momentum(system, state)
     phase, v = (state.q_s, state.q_f, p_s, p_f), jnp.concatenate(velocities)
@@ -120,9 +127,9 @@ def observables(system: System, state: State):
 def is_right(now: Observables) -> Any:
     """Whether nodes may be right.
 
-    A node may be wrong although its steps succeeded, for four reasons: the energy is not finite although its gradient is (a logarithm beyond
-    its pole); a lane of a batch started off its constraints; the rows of ``system.implied``, redundant constraints that the solver leaves
-    out, are violated; or a stepper of the user leaves the constraints.
+    A node may be wrong although its steps succeeded, for four reasons: the energy is not finite although its gradient
+    is (a logarithm beyond its pole); a lane of a batch started off its constraints; the rows of ``system.implied``,
+    redundant constraints that the solver leaves out, are violated; or a stepper of the user leaves the constraints.
     """
     return library(now.energy).isfinite(now.energy) & (now.solved > 0) & (now.implied > 0)
 
@@ -135,14 +142,16 @@ def fault(now: Observables) -> Any:
 
 
 def concerns(table: np.ndarray, t, system: System, macro_dt, save_every: int) -> list[LostEnergyWarning]:
-    """What is wrong with the motion of a run, or of the lanes of a batch, whose steps all succeeded: warnings to be given; failed lanes are left out.
+    """What is wrong with the motion of a run, or of the lanes of a batch, whose steps all succeeded: warnings to be
+    given; failed lanes are left out.
 
-    *Lost energy*: the system keeps its energy, and the energy has changed by more than half of the largest kinetic energy. A system at rest moves by
-    round-off: n steps H change velocities by up to ``sqrt(n) ROUNDOFF_OF_STEP |q| / H``, in random directions; changes below the kinetic energy of
-    these velocities, or below the round-off of the energy's terms, do not count.
+    *Lost energy*: the system keeps its energy, and the energy has changed by more than half of the largest kinetic
+    energy. A system at rest moves by round-off: n steps H change velocities by up to
+    ``sqrt(n) ROUNDOFF_OF_STEP |q| / H``, in random directions; changes below the kinetic energy of these velocities, or
+    below the round-off of the energy's terms, do not count.
 
-    *Singular coordinates*: the mass matrix changes by a factor between two nodes, and the energy changes beside them. Forces change the energy, too:
-    where they do, only steps that are all saved tell.
+    *Singular coordinates*: the mass matrix changes by a factor between two nodes, and the energy changes beside them.
+    Forces change the energy, too: where they do, only steps that are all saved tell.
 
     `table` has the `Observables` (..., k, 9) at the times t (..., k); of the system only the structure counts.
     """

@@ -1,4 +1,5 @@
-"""The origin of a run: its system and names, and the settings that were chosen for an accuracy; and the evaluation of functions of system and state at all nodes of a run."""
+"""The origin of a run: its system and names, and the settings that were chosen for an accuracy; and the evaluation of
+functions of system and state at all nodes of a run."""
 
 import math
 import pickle
@@ -26,13 +27,14 @@ SavedRun: TypeAlias = Any
 """A `vmri_jax.Trajectory` in annotations of modules that its own module imports."""
 
 NODES_PER_CALL = 64
-"""Nodes of a call, evaluated side by side. With a larger value runs of a few nodes take longer; with a smaller one long runs take more calls of some
-20 microseconds each."""
+"""Nodes of a call, evaluated side by side. With a larger value runs of a few nodes take longer; with a smaller one long
+runs take more calls of some 20 microseconds each."""
 
 
 @dataclass(frozen=True)
 class Settings:
-    """The arguments of `vmri_jax.simulate` that repeat a run from the same start: ``vm.simulate(problem, **run.settings.arguments)``.
+    """The arguments of `vmri_jax.simulate` that repeat a run from the same start:
+    ``vm.simulate(problem, **run.settings.arguments)``.
 
     Attributes:
         scheme: the scheme or composition.
@@ -41,8 +43,8 @@ class Settings:
         macro_dt: macro step H.
         num_steps: macro steps of the run.
         save_every: macro steps from one saved node to the next.
-        gain: computing time with one micro step per macro step, divided by the time with the chosen number, for the same error; computed
-            from the prices and error shares of the trial runs.
+        gain: computing time with one micro step per macro step, divided by the time with the chosen number, for the
+            same error; computed from the prices and error shares of the trial runs.
     """
 
     scheme: SchemeLike = field(compare=False)  # `python` and the numbers identify it
@@ -60,7 +62,8 @@ class Settings:
         return {"scheme": self.scheme, **steps}
 
     def command(self, system: str) -> str:
-        """The command line that repeats the run of a system; without the scheme's options if the scheme is the user's."""
+        """The command line that repeats the run of a system; without the scheme's options if the scheme is the
+        user's."""
         steps = f"--macro-dt {self.macro_dt!r} --steps {self.num_steps} --save-every {self.save_every}"
         num_micro = stage_scheme(self.scheme).num_micro
         return f"vmri simulate {shlex.quote(system)} {self.options} --num-micro {num_micro} {steps}"
@@ -81,7 +84,8 @@ class Settings:
 @partial(jax.tree_util.register_dataclass, data_fields=["simulated"], meta_fields=["names", "settings"])
 @dataclass(frozen=True, eq=False)
 class Origin:
-    """The origin of a run, as far as it is known; a pytree, whose arrays have the lanes of a batch of runs as their first axes.
+    """The origin of a run, as far as it is known; a pytree, whose arrays have the lanes of a batch of runs as their
+    first axes.
 
     Attributes:
         names: names of bodies and constraints; None if there are none.
@@ -169,7 +173,8 @@ def at_nodes(function, origin: Origin, nodes, *static):
 
 
 def is_repeated(array, axes: int = 1) -> bool:
-    """Whether an array of NumPy is a view with zero strides along the lanes, as `Origin.repeated` makes it, or is empty, with any strides."""
+    """Whether an array of NumPy is a view with zero strides along the lanes, as `Origin.repeated` makes it, or is
+    empty, with any strides."""
     return isinstance(array, np.ndarray) and axes > 0 and not (array.size and any(array.strides[:axes]))
 
 
@@ -181,7 +186,8 @@ def _in_a_row(tree, axes: int):
 
 @lru_cache(maxsize=64)
 def _at_all(function, structure, is_shared: tuple[bool, ...], static: tuple) -> Callable:
-    """``program(arrays, nodes)``: values at all nodes; arrays of the system that are not shared have one for each node."""
+    """``program(arrays, nodes)``: values at all nodes; arrays of the system that are not shared have one for each
+    node."""
 
     def at_node(arrays, node):
         return function(jax.tree.unflatten(structure, arrays), node, *static)

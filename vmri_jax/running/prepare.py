@@ -28,10 +28,10 @@ def prepare(
         trajectory = run()
         other = run(other_state, macro_dt=0.02, params=other_params)
 
-    A call costs some ten microseconds besides its steps, and raises `SimulationError` if a step fails, as `simulate` does. The first call
-    that needs the fallback compiles it, which takes as long as `prepare`. The run keeps what the functions of the system
-    read from around them (globals, closures, attributes) when it was prepared. Arguments as of `simulate`; the run is one program, so that
-    it has no bar.
+    A call costs some ten microseconds besides its steps, and raises `SimulationError` if a step fails, as `simulate`
+    does. The first call that needs the fallback compiles it, which takes as long as `prepare`. The run keeps what the
+    functions of the system read from around them (globals, closures, attributes) when it was prepared. Arguments as of
+    `simulate`; the run is one program, so that it has no bar.
 
     Returns:
         The `Simulation`.

@@ -9,9 +9,15 @@ from rich.table import Table
 from rich.text import Text
 
 SENTENCE_COLUMNS = 120
-"""Characters in a line of a table with lines between its rows, whose cells are sentences. Longer lines are hard to read."""
+"""Characters in a line of a table with lines between its rows, whose cells are sentences.
+
+Longer lines are hard to read.
+"""
 PIPE_COLUMNS = 1000
-"""Characters in a line of a pipe or a file. It is wider than any table, so that no cell is broken into lines; a larger value changes nothing."""
+"""Characters in a line of a pipe or a file.
+
+It is wider than any table, so that no cell is broken into lines; a larger value changes nothing.
+"""
 
 
 class OutputConsole(Console):
@@ -29,7 +35,8 @@ class OutputConsole(Console):
 
 
 class PrintedTable(Table):
-    """A table of rich that the built-in `print` shows, too; its caption takes the width of the console, not of the table."""
+    """A table of rich that the built-in `print` shows, too; its caption takes the width of the console, not of the
+    table."""
 
     def __init__(self, *headers: str, box: Box | None = None, pad_edge: bool = False, **look: Any):
         super().__init__(*headers, box=box, pad_edge=pad_edge, **look)

@@ -1,8 +1,9 @@
 """Progress of long work, shown as a bar in a terminal and as lines elsewhere.
 
-Work that takes more than two seconds prints a line about its current task, even if the user did not ask for progress. A separate
-thread writes the lines, so that they appear while JAX compiles, too. Lines say whether JAX is tracing or compiling, which events of `jax.monitoring`
-tell; a program that is compiled has no such events, so that its calls cost nothing.
+Work that takes more than two seconds prints a line about its current task, even if the user did not ask for progress. A
+separate thread writes the lines, so that they appear while JAX compiles, too. Lines say whether JAX is tracing or
+compiling, which events of `jax.monitoring` tell; a program that is compiled has no such events, so that its calls cost
+nothing.
 """
 
 import sys
@@ -18,17 +19,19 @@ import jax.monitoring
 from vmri_jax.refusals import Refused
 
 Progress = Callable[[str, int, int], None]
-"""Called as ``progress(what, done, total)`` before every piece of work and once at the end: `what` names the piece, `done` of `total` pieces
-are finished."""
+"""Called as ``progress(what, done, total)`` before every piece of work and once at the end: `what` names the piece,
+`done` of `total` pieces are finished."""
 P = ParamSpec("P")
 R = TypeVar("R")
 ShowsProgress = bool | Progress
-"""The argument ``progress`` of all functions that take long: True for a bar, False for occasional lines, or a `Progress` of the user."""
+"""The argument ``progress`` of all functions that take long: True for a bar, False for occasional lines, or a
+`Progress` of the user."""
 SECONDS_BETWEEN_LINES = 2.0
-"""Seconds before the first line, and between two lines with different texts; with a larger value the user waits longer in silence."""
+"""Seconds before the first line, and between two lines with different texts; with a larger value the user waits longer
+in silence."""
 LONGEST_SILENCE = 5.0
-"""Most seconds between two lines. The wait before a line that repeats the last one doubles each time up to this value; with a larger value a
-program seems to hang."""
+"""Most seconds between two lines. The wait before a line that repeats the last one doubles each time up to this value;
+with a larger value a program seems to hang."""
 POLL_SECONDS = 0.5
 """Seconds between two checks of the thread; a larger value delays every line by as much."""
 STAGES = {
@@ -36,7 +39,8 @@ STAGES = {
     "/jax/core/compile/jaxpr_to_mlir_module_duration": "compiling",
     "/jax/core/compile/backend_compile_duration": "compiling",
 }
-"""Work of JAX on a program, by the events that `jax.monitoring` records at its begin (as a scalar) and at its end (as a duration)."""
+"""Work of JAX on a program, by the events that `jax.monitoring` records at its begin (as a scalar) and at its end
+(as a duration)."""
 
 
 class Working:
@@ -125,7 +129,8 @@ def _watch() -> None:
 
 @contextmanager
 def progress_shown() -> Iterator[Progress]:
-    """A `Progress` that shows itself on the error stream: a bar, or a line every few seconds where that is a pipe or a file."""
+    """A `Progress` that shows itself on the error stream: a bar, or a line every few seconds where that is a pipe or a
+    file."""
     from rich.console import Console
     from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
     from rich.progress import Progress as Bars

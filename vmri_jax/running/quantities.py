@@ -1,4 +1,5 @@
-"""Quantities computed from the positions and momenta of a run: velocities, multipliers, reaction forces, work, by name."""
+"""Quantities computed from the positions and momenta of a run: velocities, multipliers, reaction forces, work, by
+name."""
 
 from typing import Any, NamedTuple
 
@@ -22,8 +23,8 @@ from vmri_jax.running.observables import LostEnergyWarning, concerns, observable
 from vmri_jax.running.origin import Origin, SavedRun, at_nodes
 
 RANDOM_RATIO = 0.5
-"""Von Neumann ratio, mean squared difference of neighbours over variance, above which the values at the nodes count as random: the nodes do
-not resolve the function. A larger value trusts the rules of integration on noise."""
+"""Von Neumann ratio, mean squared difference of neighbours over variance, above which the values at the nodes count as
+random: the nodes do not resolve the function. A larger value trusts the rules of integration on noise."""
 
 
 class Work(NamedTuple):
@@ -32,8 +33,8 @@ class Work(NamedTuple):
     forces: work of ``force``, the forces without a potential.
     constraints: work of constraints that move with time.
     balance: ``E - E_0 - forces - constraints``: the error of the run plus the error of these integrals.
-    uncertainty: error of the integrals: the largest difference between Simpson's and the trapezoidal rule; where the power jumps from node
-        to node, the standard deviation of a sum of random numbers of the same scatter.
+    uncertainty: error of the integrals: the largest difference between Simpson's and the trapezoidal rule; where the
+        power jumps from node to node, the standard deviation of a sum of random numbers of the same scatter.
     """
 
     forces: np.ndarray
@@ -112,7 +113,8 @@ class Quantities:
         return self._of_body("position", body, body in self.names.carried, (self.states.q_s, self.states.q_f))
 
     def momentum(self, body: str):
-        """Momenta of a body at the saved nodes, (..., k, size); for a rigid body in joint coordinates its own ``M v``, without bodies that it carries.
+        """Momenta of a body at the saved nodes, (..., k, size); for a rigid body in joint coordinates its own ``M v``,
+        without bodies that it carries.
 
         Args, Raises: as of `position`.
         """
@@ -136,14 +138,15 @@ class Quantities:
         return values[part == "f"][..., start : start + size]
 
     def multipliers(self, micro: bool = False) -> dict:
-        """Lagrange multipliers of the equations of motion at the saved nodes, (..., k, rows) for each constraint by name.
+        """Lagrange multipliers of the equations of motion at the saved nodes, (..., k, rows) for each constraint by
+        name.
 
-        They solve ``M a = -dU/dq + F - G^T lambda`` together with the second time derivative of the constraints, ``G a + ... = 0``. For
-        dependent constraints lambda has the least norm.
+        They solve ``M a = -dU/dq + F - G^T lambda`` together with the second time derivative of the constraints,
+        ``G a + ... = 0``. For dependent constraints lambda has the least norm.
 
         Args:
-            micro: values at the micro nodes ``t_micro`` instead, (k - 1, num_micro, rows), with velocities from a spline through
-                the micro nodes; for runs with ``save=vm.Save(micro=True)``.
+            micro: values at the micro nodes ``t_micro`` instead, (k - 1, num_micro, rows), with velocities from a
+                spline through the micro nodes; for runs with ``save=vm.Save(micro=True)``.
 
         Raises:
             ValueError: the run does not know its system, or did not keep the micro nodes.
@@ -153,11 +156,12 @@ class Quantities:
         return {name: _shaped(self, values[..., rows], micro) for name, rows in self.names.rows.items()}
 
     def reaction_forces(self, constraint: str | None = None, micro: bool = False) -> dict:
-        """Forces ``-G^T lambda`` of a constraint on the bodies that it touches, (..., k, size) for each of them by name.
+        """Forces ``-G^T lambda`` of a constraint on the bodies that it touches, (..., k, size) for each of them by
+        name.
 
         Args:
-            constraint: its name; "constraint" or "slow_constraint" for all rows of a system without names. None for the forces of all
-                constraints, a dictionary of bodies for each constraint by name.
+            constraint: its name; "constraint" or "slow_constraint" for all rows of a system without names. None for the
+                forces of all constraints, a dictionary of bodies for each constraint by name.
             micro: values at the micro nodes instead, see `multipliers`.
 
         Raises:
@@ -189,8 +193,8 @@ class Quantities:
     def work(self) -> Work:
         """Work of forces and of moving constraints since the start, and the balance with the energy.
 
-        The powers ``F . v`` and ``lambda . dg/dt`` are integrated over the saved nodes by Simpson's rule, over micro nodes
-        where the run kept all of them.
+        The powers ``F . v`` and ``lambda . dg/dt`` are integrated over the saved nodes by Simpson's rule, over micro
+        nodes where the run kept all of them.
 
         Raises:
             ValueError: the run does not know its system, or it is a batch.
@@ -214,7 +218,8 @@ class Quantities:
         return Work(forces, constraints, energy - energy[0] - forces - constraints, uncertainty)
 
     def concerns(self) -> list[LostEnergyWarning]:
-        """What is wrong with the motion: the warnings that `simulate` gives; for a run in a transformation of JAX they are asked for afterwards.
+        """What is wrong with the motion: the warnings that `simulate` gives; for a run in a transformation of JAX they
+        are asked for afterwards.
 
         Failures are in the status of the run. Macro steps between saved nodes are not known: they count as one step.
 
@@ -230,17 +235,20 @@ class Quantities:
         if not is_concrete(self.energy):
             raise Refused(
                 f"{method}: the run is traced by JAX, inside of jit, grad or vmap. Return the run and ask outside, "
-                f"run.of(problem).{method}(...); of one state, vmri_jax.mechanics.motion.motion(system, run[-1]) can be traced."
+                f"run.of(problem).{method}(...); of one state, vmri_jax.mechanics.motion.motion(system, run[-1]) can "
+                "be traced."
             )
 
     def plot(self, title: str = ""):
-        """Positions, energy and constraints against time, a matplotlib `Figure` with a title; more in `vmri_jax.plots`."""
+        """Positions, energy and constraints against time, a matplotlib `Figure` with a title; more in
+        `vmri_jax.plots`."""
         from vmri_jax.plots import plot_trajectory  # here: its import takes half a second
 
         return plot_trajectory(self, title)
 
     def plot_forces(self, title: str = ""):
-        """Reaction forces of all constraints against time, a `Figure` with a title, see `vmri_jax.plots.plot_forces`."""
+        """Reaction forces of all constraints against time, a `Figure` with a title, see
+        `vmri_jax.plots.plot_forces`."""
         from vmri_jax.plots import plot_forces
 
         return plot_forces(self, title)
@@ -295,7 +303,8 @@ def _shaped(run: SavedRun, values: np.ndarray, micro: bool) -> np.ndarray:
 def _deviation_of_integral(t: np.ndarray, power: np.ndarray) -> float:
     """Standard deviation of the integral of a power whose values at the nodes look random; zero for a smooth power.
 
-    The von Neumann ratio ``sum (P_{k+1} - P_k)^2 / sum (P_k - mean P)^2`` is 2 for random values and about zero for a smooth function.
+    The von Neumann ratio ``sum (P_{k+1} - P_k)^2 / sum (P_k - mean P)^2`` is 2 for random values and about zero for a
+    smooth function.
     """
     power = power[np.isfinite(power)]
     jumps, scatter = np.sum(np.diff(power) ** 2), np.sum((power - np.mean(power)) ** 2)

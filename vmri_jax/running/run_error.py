@@ -15,8 +15,9 @@ class RunError(NamedTuple):
 
     Attributes:
         q_s, q_f: (k, n_s), (k, n_f) positions of the run minus positions of the exact motion.
-        slow, fast: (k,) largest modulus of the slow and of the fast share of the error over all coordinates. Shares have signs and add up
-            to the error, so that each may be larger. NaN unless ``error="shares"`` asked for them, or if their companion run failed.
+        slow, fast: (k,) largest modulus of the slow and of the fast share of the error over all coordinates. Shares
+            have signs and add up to the error, so that each may be larger. NaN unless ``error="shares"`` asked for
+            them, or if their companion run failed.
         of: error of the user's function of the run, in its shape; None without a function.
         certified_until: time of the last node whose error is certified.
         growth: factor by which the error grows in the second half of the time up to `certified_until`.
@@ -47,7 +48,8 @@ class RunError(NamedTuple):
         return largest if largest.ndim else float(largest)
 
     def part(self, nodes: slice) -> "RunError":
-        """The error at some of the nodes; the error of the user's function stays whole unless it has a value for each node."""
+        """The error at some of the nodes; the error of the user's function stays whole unless it has a value for each
+        node."""
         lanes = (slice(None),) * (np.ndim(self.slow) - 1)
         of = self.of[*lanes, nodes] if np.shape(self.of)[: len(lanes) + 1] == np.shape(self.slow) else self.of
         at_nodes = {name: getattr(self, name)[*lanes, nodes] for name in ("q_s", "q_f", "slow", "fast")}

@@ -1,6 +1,7 @@
 """Saved nodes of a run: rows of numbers with the same columns, and the status of the run.
 
-A program writes the numbers of a node as one row into one array: XLA on CPU would take longer for one write into each column.
+A program writes the numbers of a node as one row into one array: XLA on CPU would take longer for one write into each
+column.
 """
 
 from itertools import accumulate, pairwise
@@ -18,8 +19,8 @@ from vmri_jax.running.trajectory import MicroNodes, RunInfo, Trajectory, status
 
 BYTES_PER_NUMBER = 8
 UNCHECKED_BYTES = 100e6
-"""Bytes of a trajectory up to which free memory is not looked up: the look-up takes some ten microseconds, as long as a short run. With a
-larger value more runs may fill a small machine."""
+"""Bytes of a trajectory up to which free memory is not looked up: the look-up takes some ten microseconds, as long as a
+short run. With a larger value more runs may fill a small machine."""
 
 
 class Columns(NamedTuple):
@@ -41,7 +42,8 @@ class Columns(NamedTuple):
 
     @classmethod
     def of(cls, state: State, num_micro: int) -> "Columns":
-        """The columns of nodes shaped like a state, or like the states of a batch, with `num_micro` saved micro nodes."""
+        """The columns of nodes shaped like a state, or like the states of a batch, with `num_micro` saved micro
+        nodes."""
         n_s, n_f = state.q_s.shape[-1], state.q_f.shape[-1]
         sizes = n_s, n_f, n_s, n_f, len(RunInfo._fields), num_micro * n_f, len(Observables._fields)
         return cls(*(slice(*ends) for ends in pairwise(accumulate(sizes, initial=0))))
@@ -55,7 +57,8 @@ class Saved(NamedTuple):
     failed_at: Int[Numbers, ""]
 
     def marked(self, run: Any, step: int = 0) -> "Saved":
-        """The nodes of a `Simulation`, NaN from a failure on; a node that cannot be right, see `is_right`, is a failure, of the last step before it.
+        """The nodes of a `Simulation`, NaN from a failure on; a node that cannot be right, see `is_right`, is a
+        failure, of the last step before it.
 
         Nodes after a failed step may have any numbers. There are `step` macro steps before the first node.
         """
@@ -77,7 +80,8 @@ class Saved(NamedTuple):
         return Saved(rows, module.where(breaks, cause, result), module.where(breaks, failed_here, failed_at))
 
     def trajectory(self, run: Any, step: int = 0) -> Trajectory:
-        """The nodes as a trajectory of a `Simulation`, in a batch one whose arrays have an axis of lanes, after a number of macro steps."""
+        """The nodes as a trajectory of a `Simulation`, in a batch one whose arrays have an axis of lanes, after a
+        number of macro steps."""
         *phase, info, q_f_micro, table = (self.rows[..., column] for column in run.columns)
         t_start, macro_dt = (np.asarray(a) if is_concrete(a) else a for a in (run.state.t, run.macro_dt))
         t = t_start[..., None] + (step + np.arange(table.shape[-2]) * run.save_every) * macro_dt[..., None]
@@ -94,7 +98,8 @@ class Saved(NamedTuple):
 
 
 def joined(pieces: list[Saved]) -> Saved:
-    """Consecutive pieces as one; each starts with the last node of the piece before, and has the worst status of all before it."""
+    """Consecutive pieces as one; each starts with the last node of the piece before, and has the worst status of all
+    before it."""
     if len(pieces) == 1:
         return pieces[0]
     rows = [piece.rows[min(i, 1) :] for i, piece in enumerate(pieces)]

@@ -3,7 +3,7 @@
 | call | program | used by |
 |---|---|---|
 | ``run()`` | `Engine.program` from the start, compiled for its number of saved nodes | `prepare` |
-| ``run.in_pieces()``, ``run.advance(...)`` | `Engine.program` from a cursor, one for runs of all lengths | `simulate`, `stream` |
+| ``run.in_pieces()``, ``run.advance(...)`` | the same from a cursor, for runs of all lengths | `simulate`, `stream` |
 | ``run.traced()`` | `Engine.differentiable`, with derivatives | `simulate` under transformations |
 
 All of them return `Saved`. With the matrix "auto" a piece that is not solved is computed again with exact matrices
@@ -43,10 +43,13 @@ from vmri_jax.steppers.plan import Plan, plan, with_rules_for
 from vmri_jax.steppers.solver import Solver
 
 NUMBERS_PER_PIECE = 2**15
-"""Numbers in the nodes of a piece of a run, 256 kB. With a larger value short runs wait for memory that they do not use; a smaller one divides
-long runs into more calls of some 50 microseconds each."""
+"""Numbers in the nodes of a piece of a run, 256 kB. With a larger value short runs wait for memory that they do not
+use; a smaller one divides long runs into more calls of some 50 microseconds each."""
 PARTS_OF_A_BAR = 50
-"""Parts of a run with a progress bar. More parts move the bar more smoothly, and each costs a call of some 30 microseconds."""
+"""Parts of a run with a progress bar.
+
+More parts move the bar more smoothly, and each costs a call of some 30 microseconds.
+"""
 STEPPING = "stepping"
 """The work of a run that is compiled, for lines about runs that take more than two seconds."""
 
@@ -62,15 +65,16 @@ LENGTH = ("num_steps", "save_every", "save", "names", "of_problem", "may_fall_ba
 class Simulation:
     """A run with checked arguments, ready to be computed; a pytree of the numbers that its motion follows from.
 
-    The matrix of its plan computes the run. If it fails in a run or a piece, the fallback computes the run or piece again; the program
-    of the fallback is compiled only then.
+    The matrix of its plan computes the run. If it fails in a run or a piece, the fallback computes the run or piece
+    again; the program of the fallback is compiled only then.
 
     Attributes:
         macro_dt: macro step H, an array of shape ().
         state, solver, scheme, system, num_steps, save: as of `simulate`.
         save_every: macro steps from one saved node to the next.
         names: names of bodies and constraints; None if there are none.
-        of_problem: whether the start is the positions and velocities of a problem: with other parameters, the momenta are others.
+        of_problem: whether the start is the positions and velocities of a problem: with other parameters, the momenta
+            are others.
         may_fall_back: whether the fallback is tried where the first matrix fails; else the run fails.
     """
 
@@ -90,10 +94,12 @@ class Simulation:
         """The trajectory of the run; arguments replace its start, macro step, parameters or number of steps.
 
         Args:
-            state, macro_dt, params: in the shapes of the run; None for the values of the run. With other params, a run of a problem
-                keeps the velocities of its start, a run of a system and a state the momenta.
-            num_steps: macro steps, a multiple of `num_saves`, which stays while `save_every` changes; None for the number of the run.
-            throw: raise `SimulationError` if a step fails, as `simulate` does; else return the trajectory, NaN from the failure on.
+            state, macro_dt, params: in the shapes of the run; None for the values of the run. With other params, a run
+                of a problem keeps the velocities of its start, a run of a system and a state the momenta.
+            num_steps: macro steps, a multiple of `num_saves`, which stays while `save_every` changes; None for the
+                number of the run.
+            throw: raise `SimulationError` if a step fails, as `simulate` does; else return the trajectory, NaN from the
+                failure on.
 
         Raises:
             ValueError: arrays whose shapes differ from the shapes of the run.
@@ -181,8 +187,9 @@ class Simulation:
         return self.engine.observed(self.leaves, saved, self.save_every).trajectory(self)
 
     def finished(self, caller: str, saved: Saved, throw: bool = True, is_told: bool = False) -> Trajectory:
-        """The trajectory of a whole run, or of runs with an axis of lanes, after the warnings about its start, unless the user `is_told`, and about its
-        motion; raises the `SimulationError` of a run with a failed step if `throw` is true."""
+        """The trajectory of a whole run, or of runs with an axis of lanes, after the warnings about its start, unless
+        the user `is_told`, and about its motion; raises the `SimulationError` of a run with a failed step if `throw` is
+        true."""
         trajectory = saved.trajectory(self)
         if not is_told:
             self.tell_of_start(caller, trajectory)
@@ -196,19 +203,21 @@ class Simulation:
         return saved.rows[..., self.columns.table]
 
     def tell_of_start(self, caller: str, trajectory: Trajectory) -> None:
-        """Warn about momenta of the start that are off the hidden constraints: the run takes their projection, which its first node has."""
+        """Warn about momenta of the start that are off the hidden constraints: the run takes their projection, which
+        its first node has."""
         if not self.system.is_constrained:
             return
         given, taken = (np.concatenate([a.p_s, a.p_f], axis=-1) for a in (self.state, trajectory.states))
         change, size = (np.max(np.abs(p), initial=0.0) for p in (taken[..., 0, :] - given, given))
         if change > REPORTED_VIOLATION * size:
             warn_user(
-                f"{caller}: the momenta of the start are off the hidden constraints, by {change:.3g} where the largest of them is {size:.3g}; the run "
-                "starts with their projection. Make the start by initial_state(...).",
+                f"{caller}: the momenta of the start are off the hidden constraints, by {change:.3g} where the largest "
+                f"of them is {size:.3g}; the run starts with their projection. Make the start by initial_state(...).",
             )
 
     def warn(self, caller: str, table, t) -> bool:
-        """Give the warnings about the motion of a run, or of runs with an axis of lanes, see `concerns`; returns whether there are any."""
+        """Give the warnings about the motion of a run, or of runs with an axis of lanes, see `concerns`; returns
+        whether there are any."""
         all_concerns = concerns(table, t, self.system, self.macro_dt, self.save_every)
         for concern in all_concerns:
             warn_user(type(concern)(f"{caller}: {concern}"))
@@ -290,8 +299,8 @@ class Simulation:
             check_once(Known((self.system, replace(self.state, p_s=None, p_f=None))), state_name, constraints)
 
     def advance(self, cursor: Cursor, saves: int) -> "tuple[Saved, Cursor, Simulation]":
-        """The next `saves` saved intervals, the cursor after them, and the run that goes on from there: the fallback from the first piece on that
-        is not solved.
+        """The next `saves` saved intervals, the cursor after them, and the run that goes on from there: the fallback
+        from the first piece on that is not solved.
 
         After a failure nothing is computed, and all further nodes are NaN.
         """
@@ -329,7 +338,8 @@ class Simulation:
         return saved.rows[..., self.columns.info.start].max(axis=-1)
 
     def in_pieces(self) -> Saved:
-        """The nodes of the whole run; with a progress bar Ctrl-C raises `Interrupted` with the trajectory computed so far."""
+        """The nodes of the whole run; with a progress bar Ctrl-C raises `Interrupted` with the trajectory computed so
+        far."""
         bar, cursor, run, pieces = self.save.progress is not False, Cursor.at_start(self.state), self, []
         size = -(-self.num_saves // (PARTS_OF_A_BAR if bar else 1))
         noted = interrupts_noted() if bar else nullcontext(lambda: False)

@@ -7,10 +7,11 @@ import jax
 import numpy as np
 
 MIN_SECONDS = 0.02
-"""Least seconds of a sample; shorter runs are called several times. It is long against the resolution of clocks and the time slices of
-schedulers; a larger value makes measurements take longer."""
+"""Least seconds of a sample; shorter runs are called several times. It is long against the resolution of clocks and the
+time slices of schedulers; a larger value makes measurements take longer."""
 LEAST_SECONDS = 1e-7
-"""Seconds of a call that is too short for the clock, or only waits; a smaller value repeats calls that wait for minutes."""
+"""Seconds of a call that is too short for the clock, or only waits; a smaller value repeats calls that wait for
+minutes."""
 
 
 def interleaved(
@@ -20,8 +21,8 @@ def interleaved(
 ) -> dict[str, list[float]]:
     """Seconds per call of every run by a `stopwatch`, `repeats` samples each, after one call that is not counted.
 
-    The runs take turns, and every round starts with another run, so that a slow moment of the machine, or the caches as the previous run
-    left them, affect all runs alike. A sample is the mean of the calls in `min_seconds`.
+    The runs take turns, and every round starts with another run, so that a slow moment of the machine, or the caches as
+    the previous run left them, affect all runs alike. A sample is the mean of the calls in `min_seconds`.
     """
     calls, seconds = {}, {name: [] for name in runs}
     for name, run in runs.items():
@@ -55,7 +56,8 @@ def stopwatch() -> Callable[[], float]:
 
 
 def least_seconds(runs: Sequence[Callable[[], object]], samples: int) -> list[float]:
-    """Estimated seconds of every run on an idle machine: the least of `samples` samples by a `stopwatch`, taken in turns."""
+    """Estimated seconds of every run on an idle machine: the least of `samples` samples by a `stopwatch`, taken in
+    turns."""
     least = [float("inf")] * len(runs)
     for i in [*range(len(runs))] * samples:
         least[i] = min(least[i], seconds_per_call(runs[i], 1))

@@ -31,8 +31,8 @@ FORMAT = "vmri_jax trajectory 3"
 NOT_READ = ("drawing", "slow_names", "fast_names")
 """Arrays of a file for other programs."""
 ENERGY_TOLERANCE = 1e-9
-"""Difference of two energies of the same state, as a part of the sum of the moduli of their terms, up to which it is round-off. A larger value
-accepts a run whose parameters differ by little."""
+"""Difference of two energies of the same state, as a part of the sum of the moduli of their terms, up to which it is
+round-off. A larger value accepts a run whose parameters differ by little."""
 ERROR = tuple(f"error_{name}" for name in RunError._fields)
 """Arrays of the estimated error; absent in runs without one."""
 
@@ -77,21 +77,24 @@ class MicroNodes(NamedTuple):
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False, repr=False)
 class Trajectory(Exports):
-    """Trajectory at the k saved macro nodes, the first one the start; in a batch every array has a leading axis of lanes.
+    """Trajectory at the k saved macro nodes, the first one the start; in a batch every array has a leading axis of
+    lanes.
 
-    ``len(run)`` is k; ``run[i]`` is the `State` at a node, ``run[-1]`` that at the end; ``run[a:b]`` and ``run[a:b:n]`` are the
-    `Trajectory` of these nodes. Velocities, multipliers, reaction forces and work are `Quantities` of it. It is a pytree of arrays; its
-    origin travels with it through ``jax.tree.map``, ``jax.vmap``, ``jax.jit`` and pickle.
+    ``len(run)`` is k; ``run[i]`` is the `State` at a node, ``run[-1]`` that at the end; ``run[a:b]`` and ``run[a:b:n]``
+    are the `Trajectory` of these nodes. Velocities, multipliers, reaction forces and work are `Quantities` of it. It is
+    a pytree of arrays; its origin travels with it through ``jax.tree.map``, ``jax.vmap``, ``jax.jit`` and pickle.
 
-    Positions, velocities and momenta are dictionaries of arrays, ``run.q_f["load"]``, if the problem was given its start as dictionaries;
-    `states` always has vectors.
+    Positions, velocities and momenta are dictionaries of arrays, ``run.q_f["load"]``, if the problem was given its
+    start as dictionaries; `states` always has vectors.
 
     Attributes:
         states: all saved nodes as a `State` of arrays (k,), (k, n); NaN after a failure.
         energy: Hamiltonian.
-        constraint_residual: largest |g| and largest |G v|, including rows that the solver leaves out as implied by other rows.
+        constraint_residual: largest |g| and largest |G v|, including rows that the solver leaves out as implied by
+            other rows.
         info: work of the solver since the previous node.
-        result: status of the run, the number of a `Result`, which prints as a sentence; after a failure the status of the failed step.
+        result: status of the run, the number of a `Result`, which prints as a sentence; after a failure the status of
+            the failed step.
         failed_at: number of the macro step that failed; -1 if no step failed.
         micro: the micro nodes of the macro step that ends at each saved node; None without ``Save(micro=True)``.
         error: estimated error of the positions, a `RunError`; None without error=True or an accuracy.
@@ -180,7 +183,8 @@ class Trajectory(Exports):
         return replace(self, origin=origin.repeated(np.shape(self.t)[:-1]))
 
     def _check_energy(self) -> None:
-        """Refuse an origin whose energy at the first or the last node is not the energy of the run: its parameters are other ones."""
+        """Refuse an origin whose energy at the first or the last node is not the energy of the run: its parameters are
+        other ones."""
         axis = np.ndim(self.t) - 1
         states, energy = jax.tree.map(lambda a: np.take(a, (0, -1), axis), (self.states, self.energy))
         parts = at_nodes(energies_at, self.origin, states)
@@ -188,12 +192,13 @@ class Trajectory(Exports):
         if off.any():
             ours, theirs = parts.sum(axis=-1)[off][0], energy[off][0]
             raise Refused(
-                f"of: the energy of the system is {ours:.9g} where the energy of the run is {theirs:.9g}; give the system that was "
-                "simulated, with its parameters."
+                f"of: the energy of the system is {ours:.9g} where the energy of the run is {theirs:.9g}; give the "
+                "system that was simulated, with its parameters."
             )
 
     def with_arrays(self, **arrays) -> "Trajectory":
-        """The same run with other arrays, named as in a file written by `save`: ``run.with_arrays(q_f=..., energy=...)``."""
+        """The same run with other arrays, named as in a file written by `save`:
+        ``run.with_arrays(q_f=..., energy=...)``."""
         return from_named_arrays(named_arrays(self) | arrays, self.origin)
 
     def __len__(self) -> int:
@@ -238,9 +243,11 @@ class Trajectory(Exports):
         return self.result <= Result.CONVERGED_AT_ROUNDOFF
 
     def save(self, path, drawing: dict | None = None) -> None:
-        """Write all arrays to a .npz file (no pickled objects); an existing file is replaced after all bytes are on disk.
+        """Write all arrays to a .npz file (no pickled objects); an existing file is replaced after all bytes are on
+        disk.
 
-        Names of coordinates are the arrays ``slow_names`` and ``fast_names``; ``settings`` of a run with an accuracy are JSON.
+        Names of coordinates are the arrays ``slow_names`` and ``fast_names``; ``settings`` of a run with an accuracy
+        are JSON.
 
         Args:
             path: of the file.
@@ -300,7 +307,8 @@ def in_coordinates(
 ) -> Trajectory:
     """The motion of a run in the coordinates of another system, without micro nodes and error.
 
-    Its momenta are ``dT/dv`` of that system: kinetic effects, such as rotors and charges in a magnetic field, add to the M v of bodies.
+    Its momenta are ``dT/dv`` of that system: kinetic effects, such as rotors and charges in a magnetic field, add to
+    the M v of bodies.
 
     Args:
         run: the motion.

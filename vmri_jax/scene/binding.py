@@ -1,4 +1,7 @@
-"""Binding of effects to the bodies of a scene: elements, parameters, values at the start, and terms are computed once. And the places of all coordinates."""
+"""Binding of effects to the bodies of a scene: elements, parameters, values at the start, and terms are computed once.
+
+And the places of all coordinates.
+"""
 
 from abc import ABC
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -41,8 +44,8 @@ class Layout:
     """Places of the coordinates q of the scene and of the coordinates Q of its bodies.
 
     Attributes:
-        bodies: by name of the body, the place in Q_s or Q_f of its coordinates as a point or rigid body, see `Kinematics`. A body that is
-            no function of joint coordinates has the same place in q_s or q_f.
+        bodies: by name of the body, the place in Q_s or Q_f of its coordinates as a point or rigid body, see
+            `Kinematics`. A body that is no function of joint coordinates has the same place in q_s or q_f.
         coordinates: by name, the place in q_s or q_f of the coordinates of a body or of a freedom of a joint.
         freedoms: places of the freedoms of joints in q_s or q_f.
         kinematics: the map from q to Q; None if Q = q.
@@ -64,7 +67,8 @@ class Layout:
         return _ends([*self.coordinates.values(), *self.bodies.values()])
 
     def of(self, names: Collection[str]) -> "Layout":
-        """The layout of functions of some bodies alone, and of the bodies on joints between them in the order of the kinematics."""
+        """The layout of functions of some bodies alone, and of the bodies on joints between them in the order of the
+        kinematics."""
         if self.kinematics is None:
             return self
         carried = sorted(self.bodies.keys() - self.coordinates.keys(), key=lambda name: self.bodies[name].order)
@@ -79,7 +83,8 @@ class Layout:
 
     @property
     def columns(self) -> dict[str | Key, np.ndarray]:
-        """Numbers of the coordinates of every body, and of every freedom of a joint, in (Q_s, Q_f), taken as one vector."""
+        """Numbers of the coordinates of every body, and of every freedom of a joint, in (Q_s, Q_f), taken as one
+        vector."""
         num_slow, places = self.ends[0], {**self.bodies, **self.freedoms}
         return {name: place.numbers(num_slow) for name, place in places.items()}
 
@@ -104,15 +109,20 @@ class Bindable(Declared, ABC):
     kind: ClassVar[Any]
     function: ClassVar[Any]
     rest: ClassVar[Any] = None
-    """``rest(q, params) -> (n,)``: the values of a `measured` parameter of n elements at the start; () of a single element."""
+    """``rest(q, params) -> (n,)``: the values of a `measured` parameter of n elements at the start; () of a single
+    element."""
     timed: ClassVar[bool] = False
     """Whether a constraint depends on time."""
     is_analytic: ClassVar[bool] = False
-    """Whether the function is an analytic function of the coordinates, and takes complex arrays of NumPy: its derivatives need no program."""
+    """Whether the function is an analytic function of the coordinates, and takes complex arrays of NumPy: its
+    derivatives need no program."""
     masses: ClassVar[tuple[str, ...]] = ()
     """Names of parameters that hold the masses of the bodies, one for each role."""
     derived: ClassVar[tuple[str, ...]] = ()
-    """Names of parameters that are computed from fields and bodies, and have an entry for each element. As `masses`, they are `Computed`."""
+    """Names of parameters that are computed from fields and bodies, and have an entry for each element.
+
+    As `masses`, they are `Computed`.
+    """
     whole: ClassVar[bool] = False
     """Whether the function gets all coordinates of a rigid body instead of the coordinates of its centre."""
     name: str = field(default="", kw_only=True)
@@ -185,7 +195,8 @@ class Bindable(Declared, ABC):
 
     @cached_property
     def attached(self) -> Elements:
-        """Names of the bodies whose coordinates the function gets for every element, one for each role: those of `elements`."""
+        """Names of the bodies whose coordinates the function gets for every element, one for each role: those of
+        `elements`."""
         return self.elements
 
     def _elements(self) -> Elements:
@@ -215,17 +226,20 @@ class Bindable(Declared, ABC):
         mass = end_of(self.by_name, name).mass
         if mass is None:
             raise Refused(
-                f"{self.name}: {label_of(name)} has no mass; this effect needs the mass of a whole body. Name a body with mass, without a point."
+                f"{self.name}: {label_of(name)} has no mass; this effect needs the mass of a whole body. Name a body "
+                "with mass, without a point."
             )
         if mass.ndim:
             raise Refused(
-                f"{self.name}: {name} has a mass for each coordinate; this effect needs one mass for each body. Leave this body out, or give it one mass."
+                f"{self.name}: {name} has a mass for each coordinate; this effect needs one mass for each body. Leave "
+                "this body out, or give it one mass."
             )
         return mass
 
     @cached_property
     def points(self) -> dict[str, Any]:
-        """For each role with points fixed in rigid bodies, the components X of these points along the directors; zeros for whole bodies."""
+        """For each role with points fixed in rigid bodies, the components X of these points along the directors; zeros
+        for whole bodies."""
         points = {}
         for parameter, role in zip(POINTS, zip(*self.elements, strict=True), strict=False):
             if any(isinstance(name, Attachment) for name in role):
@@ -257,13 +271,15 @@ class Bindable(Declared, ABC):
         return params if len(self.elements) == len(group) else choose(params, group, self.split_of(params))
 
     def split_of(self, params: Any) -> tuple[str, ...]:
-        """Names in params that have an entry for each element, or a single number for all; none in a tree of a user that is no dictionary."""
+        """Names in params that have an entry for each element, or a single number for all; none in a tree of a user
+        that is no dictionary."""
         declared = [name for name, parameter in self.declared.items() if parameter.shape in ("number", "vector")]
         names = (*declared, *self.masses, *self.derived, *POINTS) if isinstance(params, dict) else ()
         return tuple(name for name in names if name in params)
 
     def element_term(self, i: int) -> tuple[EffectTerm, dict[str, Any]]:
-        """Element i as a term of the coordinates of its moving bodies, one after the other, and its part of the params of all elements.
+        """Element i as a term of the coordinates of its moving bodies, one after the other, and its part of the params
+        of all elements.
 
         The term takes these coordinates as q_s, and no q_f.
         """
@@ -314,7 +330,8 @@ class Bindable(Declared, ABC):
         return EffectTerm(sources, self.called, self.arguments, of_kinds, split, is_joined, through)
 
     def _role(self, parameter: str, names: Sequence[str], places: Mapping[str, Place]) -> Role:
-        """The map from q_s and q_f to the coordinates of the bodies of a role, all of the same kind, or to points in them, which are a parameter."""
+        """The map from q_s and q_f to the coordinates of the bodies of a role, all of the same kind, or to points in
+        them, which are a parameter."""
         size = end_of(self.by_name, names[0], self.whole).size
         point = parameter if isinstance(names[0], Attachment) else ""
         rows = None if names[0] == GROUND else Rows.of([places[name] for name in names], None if point else size)

@@ -1,4 +1,5 @@
-"""Bodies: points of a scene, blocks of general coordinates, frames, the ground, and the points of a body that effects act on."""
+"""Bodies: points of a scene, blocks of general coordinates, frames, the ground, and the points of a body that effects
+act on."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -151,7 +152,8 @@ class AnyBody:
             raise Refused(f"{kind} {self.name}: pace is {self.pace!r}; it must be 'slow', 'fast' or 'auto'.")
 
     def _numbers(self, name: str, argument, shape: tuple[int, ...] | None = None):
-        """An argument as an array of float64; of NumPy unless it is traced, so that the precision does not depend on JAX's mode."""
+        """An argument as an array of float64; of NumPy unless it is traced, so that the precision does not depend on
+        JAX's mode."""
         about = f"{type(self).__name__} {self.name}: {name}"
         numbers = real_array(about, argument)
         if shape not in (None, numbers.shape):
@@ -176,10 +178,10 @@ class Body(AnyBody):
         velocity: (n,) at the start; at rest by default.
         pace: "slow" coordinates take macro steps, "fast" coordinates micro steps; "auto" lets the scene decide from
             estimates of frequencies.
-        radius: of the drawn ball, m; by default the drawing chooses it. It does not change the motion: contacts have an argument
-            `radius` of their own.
-        block: whether the coordinates are general coordinates of any kind, not the position of a point; more than three always are. Effects
-            between points refuse a block; custom effects take it.
+        radius: of the drawn ball, m; by default the drawing chooses it. It does not change the motion: contacts have an
+            argument `radius` of their own.
+        block: whether the coordinates are general coordinates of any kind, not the position of a point; more than three
+            always are. Effects between points refuse a block; custom effects take it.
 
     Raises:
         TypeError: an argument that is no real number.
@@ -202,11 +204,13 @@ class Body(AnyBody):
         mass = self._numbers("mass", self.mass)
         if velocity.shape != position.shape:
             raise Refused(
-                f"Body {self.name}: velocity has shape {velocity.shape}, position has {position.shape}; they must be equal."
+                f"Body {self.name}: velocity has shape {velocity.shape}, position has {position.shape}; they must be "
+                "equal."
             )
         if mass.shape not in ((), position.shape):
             raise Refused(
-                f"Body {self.name}: mass has shape {mass.shape}; give one number, or one for each of {position.size} coordinates."
+                f"Body {self.name}: mass has shape {mass.shape}; give one number, or one for each of {position.size} "
+                "coordinates."
             )
         if is_concrete(mass) and not np.all(mass > 0):
             raise Refused(f"Body {self.name}: mass is {mass}; every mass must be positive.")
@@ -251,7 +255,8 @@ class Ground(AnyBody):
 
 @dataclass(frozen=True, eq=False)
 class Frame(AnyBody):
-    """A frame without mass between two joints: a hip is three hinges with frames between them, a planar robot two slides and a hinge.
+    """A frame without mass between two joints: a hip is three hinges with frames between them, a planar robot two
+    slides and a hinge.
 
         bodies = [Frame("yoke", [0, 0, 1]), RigidBody("thigh", 4.0, Cylinder(0.06, 0.4), [0, 0, 0.8])]
         joints = [
@@ -298,7 +303,8 @@ def end_of(bodies: Bodies, name: str, whole: bool = False) -> Point:
 
 
 def weights_of(bodies: Bodies, name: str) -> Any:
-    """(3,) components of the point in a body that a name stands for, see `AnyBody.weights`; zeros for the body itself."""
+    """(3,) components of the point in a body that a name stands for, see `AnyBody.weights`; zeros for the body
+    itself."""
     offset = getattr(name, "offset", None)
     return np.zeros(3) if offset is None else body_of(bodies, name).weights(offset)
 

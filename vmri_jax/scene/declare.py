@@ -54,7 +54,8 @@ class Names:
         if not elements or wrong:
             expected = "the name of a body" if self.count == 1 else f"{self.count} names of bodies"
             raise Refused(
-                f"{about} is {argument!r}; give {expected}, or a list of such. A point in a rigid body is (name, [x, y, z])."
+                f"{about} is {argument!r}; give {expected}, or a list of such. A point in a rigid body is (name, [x, "
+                "y, z])."
             )
         return tuple(tuple(map(entry, element)) for element in elements)
 
@@ -69,10 +70,12 @@ class Parameter:
     """A field with numbers that the function of an effect gets as an array.
 
     Args:
-        shape: "number", () the same for all n elements or (n,); "vector", (d,) or (n, d), which the function gets as (n, d), for n = 1 as (d,);
-            "common", (d,) the same for all elements; "array", any shape, the same for all elements.
+        shape: "number", () the same for all n elements or (n,); "vector", (d,) or (n, d), which the function gets as
+            (n, d), for n = 1 as (d,); "common", (d,) the same for all elements; "array", any shape, the same for all
+            elements.
         sign: "positive", "at least zero", or "" for any.
-        measured: if True, the value at the start takes the place of None, see `Effect.rest`; if False, params lack a field that is None.
+        measured: if True, the value at the start takes the place of None, see `Effect.rest`; if False, params lack a
+            field that is None.
         may_be_number: whether a number () is allowed instead of a common vector.
     """
 
@@ -139,7 +142,8 @@ def array(*, default: Any = MISSING, sign: Sign = "") -> Any:
 
 
 def of_time() -> Any:
-    """A function of the user, ``f(t, params)``: the first argument of the function of the effect, which gets `params` by the name of this field."""
+    """A function of the user, ``f(t, params)``: the first argument of the function of the effect, which gets `params`
+    by the name of this field."""
     return field(metadata={"of_time": True})
 
 
@@ -149,14 +153,18 @@ def of_time() -> Any:
     field_specifiers=(names, number, positive, vector, common, array, of_time, field),
 )
 class Declared:
-    """Base class of frozen dataclasses: subclasses declare their fields by the functions above, and need no decorator."""
+    """Base class of frozen dataclasses: subclasses declare their fields by the functions above, and need no
+    decorator."""
 
     def __init_subclass__(cls):
         dataclass(frozen=True, eq=False)(cls)
 
 
 def stacked(values: Sequence[Any]):
-    """The values (n, ...) of n elements in one array; for n = 1 without this axis. Of NumPy unless a value is traced."""
+    """The values (n, ...) of n elements in one array; for n = 1 without this axis.
+
+    Of NumPy unless a value is traced.
+    """
     return library(values).asarray(values[0]) if len(values) == 1 else library(values).stack(values)
 
 
@@ -173,7 +181,8 @@ def arrays(tree: Any) -> Any:
 
 
 def real_tree(about: str, tree):
-    """A pytree of real numbers as a pytree of arrays, in the order of writing; the error for another leaf begins with `about` and its place."""
+    """A pytree of real numbers as a pytree of arrays, in the order of writing; the error for another leaf begins with
+    `about` and its place."""
 
     def convert(path, leaf):
         array = real_array(about + jax.tree_util.keystr(path), leaf)

@@ -1,4 +1,5 @@
-"""The drawing of a scene: bodies, links, springs and the rest as plain lists, see `vmri_jax.animation.Drawing.from_dict`."""
+"""The drawing of a scene: bodies, links, springs and the rest as plain lists, see
+`vmri_jax.animation.Drawing.from_dict`."""
 
 from collections.abc import Sequence
 from dataclasses import asdict

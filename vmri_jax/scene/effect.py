@@ -1,4 +1,5 @@
-"""Effects: each adds a function of positions, velocities and time of some bodies to the Lagrangian, the constraints or the forces."""
+"""Effects: each adds a function of positions, velocities and time of some bodies to the Lagrangian, the constraints or
+the forces."""
 
 from collections.abc import Sequence
 from dataclasses import fields
@@ -29,34 +30,40 @@ LIBRARY = "vmri_jax."
 class Effect(Bindable):
     """Base class of effects: a function, the bodies that it depends on, and its parameters.
 
-    An effect has one or more *elements*, and an element has a body in each *role*: ``Spring([("hub", "tip"), ("tip", "load")], 1.0)`` has
-    two elements; "hub" and "tip" have the role a in them, "tip" and "load" the role b. The signature of its function depends on `kind`:
+    An effect has one or more *elements*, and an element has a body in each *role*:
+    ``Spring([("hub", "tip"), ("tip", "load")], 1.0)`` has two elements; "hub" and "tip" have the role a in them, "tip"
+    and "load" the role b. The signature of its function depends on `kind`:
 
     | kind | function | returns |
     |---|---|---|
     | "potential" | ``function(q, params)`` | energy, () |
-    | "constraint" | ``function(q, params)``, `timed` ``function(t, q, params)`` | values that the scene keeps zero, (k,) or () for each element |
+    | "constraint" | ``function(q, params)`` | values that the scene keeps zero, (k,) or () for each element |
     | "kinetic" | ``function(q, v, params)`` | energy added to ``sum m v^2 / 2``, () |
     | "force" | ``function(t, q, v, params)`` | tuple of forces, shaped like q |
     | "control" | ``function(q, u, params)`` | tuple of forces of the controls u, shaped like q |
 
-    q and v are tuples with an entry for each role: the coordinates (d,) of its body or, with n > 1 elements, (n, d). A rigid body
-    enters with the coordinates of its centre, or of the point in ``(name, [x, y, z])``. The ground is a body, too. params
-    holds the fields that a class declares as numbers, vectors or arrays (see `vmri_jax.scene.declare`), by name.
+    A `timed` constraint has ``function(t, q, params)``. q and v are tuples with an entry for each role: the coordinates
+    (d,) of its body or, with n > 1 elements, (n, d). A rigid body enters with the coordinates of its centre, or of the
+    point in ``(name, [x, y, z])``. The ground is a body, too. params holds the fields that a class declares as numbers,
+    vectors or arrays (see `vmri_jax.scene.declare`), by name.
 
-    The effects that a user gives to a scene are declarations. The scene works with *bound* effects, copies that know the bodies of the scene,
-    `by_name`: only these have `elements`, `parameters`, and the other quantities that depend on bodies. Each is computed once.
+    The effects that a user gives to a scene are declarations. The scene works with *bound* effects, copies that know
+    the bodies of the scene, `by_name`: only these have `elements`, `parameters`, and the other quantities that depend
+    on bodies. Each is computed once.
 
     Args:
-        name: of this effect in its scene; by default `default_name` of its class, or the name of the class in small letters.
-        rate: how often a potential is evaluated: "slow" (as part of V), "fast" (on the micro grid, with the rule of W), a whole number k
-            (on every k-th micro node), or "auto" (the scene decides by stiffness). A potential with the rate "fast" or k makes its bodies fast, except bodies
-            with the pace "slow": the positions of these slow bodies are then solved for by iteration over the macro step. Of a kinetic effect "slow",
-            "fast" or "auto"; here the rate decides only whether its bodies are fast, since all kinetic effects are on the micro grid.
+        name: of this effect in its scene; by default `default_name` of its class, or the name of the class in small
+            letters.
+        rate: how often a potential is evaluated: "slow" (as part of V), "fast" (on the micro grid, with the rule of W),
+            a whole number k (on every k-th micro node), or "auto" (the scene decides by stiffness). A potential with
+            the rate "fast" or k makes its bodies fast, except bodies with the pace "slow": the positions of these slow
+            bodies are then solved for by iteration over the macro step. Of a kinetic effect "slow", "fast" or "auto";
+            here the rate decides only whether its bodies are fast, since all kinetic effects are on the micro grid.
 
     Raises:
-        TypeError, ValueError: arguments other than the docstring of the class says; of the scene, see `check`: wrong shapes or signs,
-            unknown names, points at one place where a line between them is needed, constraints that the start violates.
+        TypeError, ValueError: arguments other than the docstring of the class says; of the scene, see `check`: wrong
+            shapes or signs, unknown names, points at one place where a line between them is needed, constraints that
+            the start violates.
     """
 
     kind: ClassVar[Kind]
@@ -66,7 +73,8 @@ class Effect(Bindable):
     same_size: ClassVar[bool] = True
     """Whether all bodies of an element must have the same dimension."""
     apart: ClassVar[bool] = False
-    """Whether neighbouring bodies of an element, or a body and the fixed point it is tied to, must start at different places."""
+    """Whether neighbouring bodies of an element, or a body and the fixed point it is tied to, must start at different
+    places."""
     drawn_as: ClassVar[Literal["link", "spring"] | None] = None
     """The symbol that is drawn between neighbouring bodies of an element."""
 
@@ -74,7 +82,8 @@ class Effect(Bindable):
         """A new effect, of a class that is complete.
 
         Raises:
-            TypeError: the class has no `kind`, no field with names of bodies, or a `function` that would get the effect itself.
+            TypeError: the class has no `kind`, no field with names of bodies, or a `function` that would get the effect
+                itself.
         """
         about = f"the class of effects {cls.__name__}"
         if getattr(cls, "kind", None) not in get_args(Kind):
@@ -110,8 +119,8 @@ class Effect(Bindable):
         Raises:
             TypeError: parameters that are no real numbers.
             ValueError: unknown bodies, a body twice in one element, bodies of different dimension, at one point, or of
-                general coordinates where points are needed; parameters of another shape, sign or precision, and arguments that
-                the class of the effect forbids.
+                general coordinates where points are needed; parameters of another shape, sign or precision, and
+                arguments that the class of the effect forbids.
         """
         self.check_bodies()
         for name, function in self.functions_of_time.items():
@@ -127,8 +136,9 @@ class Effect(Bindable):
         for element in self.elements:
             if len(element) > MOST_ROLES:
                 raise Refused(
-                    f"{self.name}: an element of {len(element)} bodies, {', '.join(map(str, element[:3]))}, ...; at most {MOST_ROLES} bodies "
-                    "may share a function. Write the function with vmri_jax.System, or join bodies to one with more coordinates."
+                    f"{self.name}: an element of {len(element)} bodies, {', '.join(map(str, element[:3]))}, ...; at "
+                    f"most {MOST_ROLES} bodies may share a function. Write the function with vmri_jax.System, or join "
+                    "bodies to one with more coordinates."
                 )
             if not moving(element):
                 raise Refused(f"{self.name}: {element} is about the ground alone, which does not move; name a body.")
@@ -146,7 +156,8 @@ class Effect(Bindable):
                 if self.dimensions and (end.block or end.size not in self.dimensions):
                     general, allowed = "general " if end.block else "", " or ".join(map(str, self.dimensions))
                     raise Refused(
-                        f"{self.name}: {name} has {end.size} {general}coordinates; this effect is between points of dimension {allowed}."
+                        f"{self.name}: {name} has {end.size} {general}coordinates; this effect is between points of "
+                        f"dimension {allowed}."
                     )
             if self.same_size:
                 self._check_sizes(element)
@@ -154,7 +165,8 @@ class Effect(Bindable):
             self._check_sizes([element[0] for element in self.elements])
 
     def check_of_time(self, about: str, value: Any) -> None:
-        """Refuse a function of time whose value, as shapes, does not have the dimension of the bodies; `about` begins messages."""
+        """Refuse a function of time whose value, as shapes, does not have the dimension of the bodies; `about` begins
+        messages."""
         shape = getattr(value, "shape", None)
         for (body,), (end,) in zip(self.elements, self.ends, strict=True):
             if shape != (end.size,) and (shape, end.size) != ((), 1):
@@ -176,12 +188,14 @@ class Effect(Bindable):
                 self.require(fits, name, value, f"it must be {parameter.sign}")
 
     def curvature(self):
-        """Largest second derivative of the energy of each element, () or (n,), if the start does not show it (contacts that are open); else None."""
+        """Largest second derivative of the energy of each element, () or (n,), if the start does not show it
+        (contacts that are open); else None."""
         return None
 
     def drawing(self) -> dict[str, Any]:
-        """Entries of this effect in the lists of `Scene.drawing`, "radii" of bodies as pairs (name, number), and "points": by label the points in rigid
-        bodies where a drawn link or spring ends, with the body and the components of the point in it."""
+        """Entries of this effect in the lists of `Scene.drawing`, "radii" of bodies as pairs (name, number), and
+        "points": by label the points in rigid bodies where a drawn link or spring ends, with the body and the
+        components of the point in it."""
         if self.drawn_as is None:
             return {}
         points = {
@@ -249,8 +263,9 @@ def check_function(effect: Any, moved: bool) -> None:
             rows = _rows(effect.called, *arguments)
             if np.any(np.abs(rows.values) > rows.allowed(START)):
                 raise Refused(
-                    f"{effect.name}: the positions at the start violate this constraint by {np.abs(rows.values).max():.3g}; move the "
-                    "bodies, or let the scene do so, Scene(..., project=True)."
+                    f"{effect.name}: the positions at the start violate this constraint by "
+                    f"{np.abs(rows.values).max():.3g}; move the bodies, or let the scene do so, Scene(..., "
+                    "project=True)."
                 )
 
 

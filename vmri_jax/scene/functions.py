@@ -50,7 +50,8 @@ class _OfTerms:
     rows: Entries | None = None
 
     def on_bodies(self, arguments) -> tuple[dict[str, Any], Any]:
-        """Of the arguments of a call: "t", "q" with (Q_s, Q_f) and "v" with ``dQ/dq v``, as terms take them; and params."""
+        """Of the arguments of a call: "t", "q" with (Q_s, Q_f) and "v" with ``dQ/dq v``, as terms take them; and
+        params."""
         *arguments, params = arguments
         names = ("t", *KINDS[self.field].arguments)[-len(arguments) :]  # rows that depend on time get t first
         values = dict(zip(names, arguments, strict=True))
@@ -91,7 +92,8 @@ class ConstraintValues(_OfTerms):
 
 @dataclass(frozen=True)
 class KineticEnergy(_OfTerms, WithMassMatrix):
-    """``T = sum m V_f^2 / 2`` of bodies that depend on fast coordinates, plus the velocity-dependent terms; ``T_s = sum m V_s^2 / 2`` of all others.
+    """``T = sum m V_f^2 / 2`` of bodies that depend on fast coordinates, plus the velocity-dependent terms;
+    ``T_s = sum m V_s^2 / 2`` of all others.
 
     whole: the map from q to the coordinates of all bodies, whose masses T and T_s have together.
     """

@@ -1,7 +1,9 @@
-"""Freedoms of joints by name: velocities of all bodies from the rates of a few joints, closed loops from the values of a few joints, and whole turns.
+"""Freedoms of joints by name: velocities of all bodies from the rates of a few joints, closed loops from the values of
+a few joints, and whole turns.
 
-A coordinate of a joint counts whole turns, directors do not: those of two bodies give the sine and the cosine of the angle between them. An effect to
-which turns matter takes such an angle up to `REACH` alone; along a run turns are counted from one saved node to the next.
+A coordinate of a joint counts whole turns, directors do not: those of two bodies give the sine and the cosine of the
+angle between them. An effect to which turns matter takes such an angle up to `REACH` alone; along a run turns are
+counted from one saved node to the next.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -27,25 +29,34 @@ from vmri_jax.scene.sorting import Sorting
 from vmri_jax.scene.trees import Branch
 
 RATE_ERROR = 1e-8
-"""Largest error of rates, relative to the largest rate, that counts as round-off. A larger value accepts rates that contradict each other."""
+"""Largest error of rates, relative to the largest rate, that counts as round-off.
+
+A larger value accepts rates that contradict each other.
+"""
 STEPS = 20
-"""Steps from the start of a joint to its new value, at least; loops are closed after each. With fewer steps a loop may fold over into its
-other configuration; more take longer."""
+"""Steps from the start of a joint to its new value, at least; loops are closed after each. With fewer steps a loop may
+fold over into its other configuration; more take longer."""
 LONGEST_STEP = 0.35
-"""Longest of these steps of an angle, rad: other joints of the loop count their turns from step to step. A longer step may lose a turn."""
+"""Longest of these steps of an angle, rad: other joints of the loop count their turns from step to step.
+
+A longer step may lose a turn.
+"""
 
 
 def with_rates(
     sorting: Sorting, effects: Sequence[Effect], system: System, rates: Mapping[str, Any]
 ) -> tuple[list[AnyBody], dict[Key, tuple[Any, Any]]]:
-    """The bodies with velocities that give joints these rates, see `Scene.with_rates`, and (value, rate) of all joint coordinates.
+    """The bodies with velocities that give joints these rates, see `Scene.with_rates`, and (value, rate) of all joint
+    coordinates.
 
-    The constraints and the rates are rows ``C v = b``. Of all solutions, v is the nearest to the present velocities v_0 in the norm
-    of the kinetic energy: with ``M = R R^T``, ``x = R^T (v - v_0)`` is the shortest solution of ``C R^-T x = b - C v_0``.
+    The constraints and the rates are rows ``C v = b``. Of all solutions, v is the nearest to the present velocities v_0
+    in the norm of the kinetic energy: with ``M = R R^T``, ``x = R^T (v - v_0)`` is the shortest solution of
+    ``C R^-T x = b - C v_0``.
     """
     if not is_concrete((sorting.start, system, rates)):
         raise Refused(
-            "Scene.with_rates: jax.jit, grad or vmap traces numbers of the scene or rates; call with_rates outside of these."
+            "Scene.with_rates: jax.jit, grad or vmap traces numbers of the scene or rates; call with_rates outside of "
+            "these."
         )
     start, columns = tuple(map(np.asarray, sorting.start)), sorting.layout.columns
     q, v = np.concatenate(start[:2]), np.concatenate(start[2:])
@@ -65,7 +76,8 @@ def with_rates(
         values.append(np.broadcast_to(numbers, (len(pairs),)))
     c, b = np.concatenate(rows), np.concatenate(values)
     root = np.linalg.cholesky(mass_and_momentum(system, *start)[0])  # M = R R^T
-    # rows of C R^-T and b in units of their lengths: all have the unit of R^T v, whose squared length is twice the kinetic energy
+    # rows of C R^-T and b in units of their lengths: all have the unit of R^T v, whose squared length is twice the
+    # kinetic energy
     c_by_root = np.linalg.solve(root, c.T).T
     lengths = np.linalg.norm(c_by_root, axis=1)
     lengths[lengths == 0] = 1.0
@@ -75,8 +87,9 @@ def with_rates(
     errors = np.abs(c @ v - b)
     if errors.max() > RATE_ERROR * size:
         raise Refused(
-            f"Scene.with_rates: no velocities have these rates of {', '.join(rates)} and keep the constraints: the nearest ones differ by "
-            f"{(errors * lengths).max():.3g}. Give fewer rates: the rate of a joint follows from those of others, or the joint cannot move here."
+            f"Scene.with_rates: no velocities have these rates of {', '.join(rates)} and keep the constraints: the "
+            f"nearest ones differ by {(errors * lengths).max():.3g}. Give fewer rates: the rate of a joint follows "
+            "from those of others, or the joint cannot move here."
         )
     # the velocities of bodies belong to their positions as the user gave them, where joint coordinates are zero
     body_rates = sorting.to_bodies(sorting.assembled)[1] @ v
@@ -93,8 +106,9 @@ def check_replaced(
     rated = [b.joint.name for b in branches if b.child == name and starts.keys() & set(b.keys)]
     if rated and changes.keys() & {"velocity", "spin"}:
         raise Refused(
-            f"Scene.replace: {name}: {' and '.join(changes)} would change nothing, because with_joints or with_rates has set "
-            f"the rate of {rated[0]}, which carries {name}. Give that rate to them, or call them after replace."
+            f"Scene.replace: {name}: {' and '.join(changes)} would change nothing, because with_joints or with_rates "
+            f"has set the rate of {rated[0]}, which carries {name}. Give that rate to them, or call them after "
+            "replace."
         )
 
 
@@ -110,19 +124,21 @@ def joint_starts(sorting: Sorting, effects: Sequence[Effect], starts: Mapping[st
             key = name, i, freedom
             if key not in sorting.layout.freedoms:
                 raise Refused(
-                    f"Scene.with_joints: {joint.label(i)} has no coordinate of its own: it closes a loop, where you may set "
-                    'the other joints, or its bodies have directors: then give the scene coordinates="joint".'
+                    f"Scene.with_joints: {joint.label(i)} has no coordinate of its own: it closes a loop, where you "
+                    "may set the other joints, or its bodies have directors: then give the scene"
+                    ' coordinates="joint".'
                 )
             by_key[key] = tuple(number if number.ndim == 0 else number[i] for number in numbers)
     return with_closed_loops(sorting, by_key)
 
 
 def with_closed_loops(sorting: Sorting, starts: dict[Key, tuple[Any, Any]]) -> dict[Key, tuple[Any, Any]]:
-    """The starts of the named joint coordinates and of all other joint coordinates that loops and couplings tie to them.
+    """The starts of the named joint coordinates and of all other joint coordinates that loops and couplings tie to
+    them.
 
-    The named coordinates go to their values in steps. In each step Newton's iteration on ``g(q) = 0`` moves the other joint coordinates
-    x, ``dx = -(dg/dx)^+ g``. At the end the rates of x solve ``dg/dq v = 0``. Rows that bodies with directors can satisfy, such as the
-    rows of a ball joint, are left to the projection of the initial state.
+    The named coordinates go to their values in steps. In each step Newton's iteration on ``g(q) = 0`` moves the other
+    joint coordinates x, ``dx = -(dg/dx)^+ g``. At the end the rates of x solve ``dg/dq v = 0``. Rows that bodies with
+    directors can satisfy, such as the rows of a ball joint, are left to the projection of the initial state.
     """
     rows = ConstraintRows.of(sorting)
     if rows is None or not is_concrete((sorting.start, starts)):
@@ -138,7 +154,8 @@ def with_closed_loops(sorting: Sorting, starts: dict[Key, tuple[Any, Any]]) -> d
         moved = q.copy()
         moved[held] = begin + fraction * (end - begin)
         moved, values, is_closed = rows.onto(numbers, moved, free)
-        # a loop with several named joints may be open on the way and close again at the end: go on from the last closed position
+        # a loop with several named joints may be open on the way and close again at the end: go on from the last closed
+        # position
         if is_closed:
             q, reached = moved, moved[held]
     if not is_closed:
@@ -146,8 +163,8 @@ def with_closed_loops(sorting: Sorting, starts: dict[Key, tuple[Any, Any]]) -> d
         row, size = rows.rows[worst].name, abs(values[worst]) * rows.sizes[worst]
         named = " and ".join(f"{joint} at {value:.4g}" for (joint, *_), value in zip(starts, reached, strict=True))
         raise Refused(
-            f"Scene.with_joints: no configuration of the other joints keeps {row}, which stays open by {size:.3g}. It is kept up to "
-            f"{named}; give values up to there, or values of fewer joints."
+            f"Scene.with_joints: no configuration of the other joints keeps {row}, which stays open by {size:.3g}. It "
+            f"is kept up to {named}; give values up to there, or values of fewer joints."
         )
     v[held] = [float(rate) for _, rate in starts.values()]
     jacobian = rows.evaluate(0.0, q)[1][numbers]
@@ -163,7 +180,8 @@ def steps_of(keys: Iterable[Key], changes: Iterable[float]) -> int:
 
 
 def _of_joints_alone(sorting: Sorting, rows: ConstraintRows) -> np.ndarray:
-    """Numbers of the rows that depend on joint coordinates alone: no motion of a body with directors or of a point changes them."""
+    """Numbers of the rows that depend on joint coordinates alone: no motion of a body with directors or of a point
+    changes them."""
     changes, numbers = np.zeros(len(rows.rows), bool), sorting.layout.numbers
     for name in sorting.layout.coordinates:
         if name in sorting.bodies:
@@ -173,7 +191,8 @@ def _of_joints_alone(sorting: Sorting, rows: ConstraintRows) -> np.ndarray:
 
 
 def _by_freedom(method: str, effects: Sequence[Effect], numbers: Mapping[str, Any]) -> Iterator[tuple[Joint, str, Any]]:
-    """(joint, freedom, numbers) from a mapping by names of joints, whose values may be mappings by freedoms; `method` begins messages."""
+    """(joint, freedom, numbers) from a mapping by names of joints, whose values may be mappings by freedoms; `method`
+    begins messages."""
     if not isinstance(numbers, Mapping):
         raise Refused(f'{method}: got {numbers!r}; give numbers by the names of joints, {{"hinge": 0.3}}.')
     for name, of_joint in numbers.items():
@@ -204,7 +223,8 @@ def along_run(sorting: Sorting, joint: Joint, run: Any, of: str, pair: int) -> n
     if unknown.size:
         node = unknown[0, -1]
         raise Refused(
-            f"Scene.joint_motion: {joint.label(pair)} may turn by half a turn or more between the saved nodes {node} and "
+            f"Scene.joint_motion: {joint.label(pair)} may turn by half a turn or more between the saved nodes {node} "
+            "and "
             f"{node + 1}, and its angle comes from directors, which know no whole turns. Save nodes less than "
             f'{np.pi / 2 / np.nanmax(fastest):.2g} s apart, save=..., or give the scene coordinates="joint".'
         )
@@ -229,7 +249,8 @@ def check_run(sorting: Sorting, run: Any, twin: Sorting) -> None:
 
 
 def _from_directors(sorting: Sorting) -> Iterator[tuple[OfFreedoms, int, Joint, str]]:
-    """(effect, number of its element and of the pair of the joint, joint, freedom) for all angles that effects which count turns take from directors."""
+    """(effect, number of its element and of the pair of the joint, joint, freedom) for all angles that effects which
+    count turns take from directors."""
     for part in sorting.placed:
         effect = part.effect
         if isinstance(effect, OfFreedoms) and effect.counts_turns:
@@ -242,8 +263,9 @@ def _from_directors(sorting: Sorting) -> Iterator[tuple[OfFreedoms, int, Joint, 
 def _require_reach(effect: OfFreedoms, quantity: str, value: Any, joint: Joint) -> None:
     """Refuse an angle of `REACH` or more."""
     expected = (
-        f"the angle of {joint.name} comes from directors, which know no whole turns, and has to stay within {REACH:.4g} rad: give the scene "
-        'coordinates="joint", or where all joints of a loop have such effects leave one of these out'
+        f"the angle of {joint.name} comes from directors, which know no whole turns, and has to stay within"
+        f' {REACH:.4g} rad: give the scene coordinates="joint", or where all joints of a loop have such effects leave'
+        " one of these out"
     )
     effect.require(abs(value) < REACH, quantity, value, expected)
 

@@ -1,4 +1,5 @@
-"""The ledger of a scene or of a system of functions: grid, unknowns, evaluations and computing time of every body and effect."""
+"""The ledger of a scene or of a system of functions: grid, unknowns, evaluations and computing time of every body and
+effect."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -25,9 +26,15 @@ from vmri_jax.schemes.composition import Composition, stage_scheme
 from vmri_jax.schemes.scheme import Scheme
 
 STEPS = 20
-"""Macro steps of the program that is timed: enough that the call of the program takes little of the time. More take longer."""
+"""Macro steps of the program that is timed: enough that the call of the program takes little of the time.
+
+More take longer.
+"""
 DEFAULT_FREQUENCY = 10.0
-"""rad/s, from which the step size of a timed step follows if the system neither vibrates nor turns. A larger one takes smaller steps."""
+"""rad/s, from which the step size of a timed step follows if the system neither vibrates nor turns.
+
+A larger one takes smaller steps.
+"""
 
 
 @dataclass(frozen=True)
@@ -37,7 +44,8 @@ class LedgerRow:
     kind: "body", or the term that the effect is part of.
     grid, why: "macro" or "micro", the grid of its unknowns or evaluations, and the reason for it.
     unknowns, multipliers: how many of each it adds to the equations of a macro step.
-    evaluations: number of nodes in a macro step at which its function is evaluated (by implicit schemes in every Newton iteration).
+    evaluations: number of nodes in a macro step at which its function is evaluated (by implicit schemes in every Newton
+        iteration).
     microseconds: computing time of its first derivatives once at all these nodes, None if not measured.
     """
 
@@ -53,14 +61,16 @@ class LedgerRow:
 
 @dataclass(frozen=True)
 class Ledger:
-    """Rows of bodies and effects, and the computing time of a macro step of the whole scene in microseconds (None if not measured)."""
+    """Rows of bodies and effects, and the computing time of a macro step of the whole scene in microseconds
+    (None if not measured)."""
 
     rows: tuple[LedgerRow, ...]
     microseconds: float | None = None
 
     @property
     def unknowns(self) -> int:
-        """Unknowns and multipliers of all stages of a macro step: ``r (n_s + n_gs + num_micro (n_f + n_g))`` for each, with degree r and rows n_gs of g_s, n_g of g."""
+        """Unknowns and multipliers of all stages of a macro step: ``r (n_s + n_gs + num_micro (n_f + n_g))`` for each,
+        with degree r and rows n_gs of g_s, n_g of g."""
         return sum(row.unknowns + row.multipliers for row in self.rows)
 
     def table(self) -> PrintedTable:
@@ -148,7 +158,8 @@ def _ledger(bodies, functions, system: System, start, scheme, macro_dt: float | 
 
     Args:
         bodies: (name, number of coordinates, pace, reason for it).
-        functions: (name, key of its rule, name of its kind, reason for its grid, the system with this function alone, whether steps evaluate it).
+        functions: (name, key of its rule, name of its kind, reason for its grid, the system with this function alone,
+            whether steps evaluate it).
         start: (q_s, q_f, v_s, v_f), where the functions are measured.
     """
     stage, stages = stage_scheme(scheme), scheme.num_stages if isinstance(scheme, Composition) else 1
@@ -183,7 +194,8 @@ def _macro_step(system: System, scheme, start, macro_dt: float | None) -> float:
 
 
 def _first_derivatives(system: System, n_s: int, v_s, v_f):
-    """All first derivatives of a system that a step takes, added up, as a function of its positions q (n,) that returns (n,)."""
+    """All first derivatives of a system that a step takes, added up, as a function of its positions q (n,) that returns
+    (n,)."""
 
     def lagrangian(q):
         potentials = invariants.potential_energy(system, q[:n_s], q[n_s:])

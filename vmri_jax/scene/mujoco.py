@@ -10,7 +10,8 @@
 | equalities joint, tendon (fixed) | `JointCoupling` |
 | gravity, gravcomp | `Gravity`, `Potential` |
 
-MuJoCo's equalities are soft; here they are constraints, satisfied to round-off. The parts of a model that the reader refuses are in `mujoco_model`.
+MuJoCo's equalities are soft; here they are constraints, satisfied to round-off. The parts of a model that the reader
+refuses are in `mujoco_model`.
 """
 
 from collections.abc import Collection, Iterator
@@ -35,8 +36,8 @@ from vmri_jax.scene.mujoco_model import CONSTRAINTS, Compiled
 from vmri_jax.scene.rigid import RigidBody
 
 SMOOTHING = 1e-3
-"""Smoothing of a limit as a spring, relative to the range of the joint. With a larger value the force sets in visibly before the limit;
-a smaller value needs smaller steps there."""
+"""Smoothing of a limit as a spring, relative to the range of the joint. With a larger value the force sets in visibly
+before the limit; a smaller value needs smaller steps there."""
 OLDEST_VERSION = 4
 """First major version of MuJoCo with the fields of `mujoco_model`; older versions have other flags."""
 
@@ -51,7 +52,8 @@ def bodies_and_effects(
         raise NotInstalled("Scene.from_mujoco needs the package mujoco: pip install 'vmri_jax[mujoco]'.") from error
     if int(mujoco.__version__.split(".")[0]) < OLDEST_VERSION:
         raise NotInstalled(
-            f"Scene.from_mujoco needs mujoco {OLDEST_VERSION}.0 or newer, and finds {mujoco.__version__}: pip install 'vmri_jax[mujoco]'."
+            f"Scene.from_mujoco needs mujoco {OLDEST_VERSION}.0 or newer, and finds {mujoco.__version__}: pip install "
+            "'vmri_jax[mujoco]'."
         )
     if isinstance(model, str | PathLike):
         if not Path(model).is_file():
@@ -174,11 +176,12 @@ class _Reader(Compiled):
     def limits(self, ignored: bool) -> Iterator[JointLimit]:
         """Limits of joints as springs, with MuJoCo's stiffness for the inertia that the joint moves at qpos0.
 
-        MuJoCo's solref of a limit is (T, z), its time constant and damping ratio: at the depth d it pulls back with the acceleration
-        ``d / (T z)^2``. Negative numbers are (-k, -c), with the acceleration ``k d``. The inertia is ``1 / dof_invweight0``. The depth is
-        counted from the margin of the joint, which lies inside its range. This is the stiffness of an impact; MuJoCo scales a steady load, too,
-        by one minus the impedance of solimp, so that its limits give way to a load by a twentieth of the depth here.
-        Limits of ball joints and of tendons are refused unless they are `ignored`.
+        MuJoCo's solref of a limit is (T, z), its time constant and damping ratio: at the depth d it pulls back with the
+        acceleration ``d / (T z)^2``. Negative numbers are (-k, -c), with the acceleration ``k d``. The inertia is
+        ``1 / dof_invweight0``. The depth is counted from the margin of the joint, which lies inside its range. This is
+        the stiffness of an impact; MuJoCo scales a steady load, too, by one minus the impedance of solimp, so that its
+        limits give way to a load by a twentieth of the depth here. Limits of ball joints and of tendons are refused
+        unless they are `ignored`.
         """
         model = self.model
         if self.off(CONSTRAINTS, "LIMIT"):
@@ -187,8 +190,8 @@ class _Reader(Compiled):
         unfit += [model.tendon(int(i)).name or f"tendon {i}" for i in np.flatnonzero(model.tendon_limited)]
         if unfit and not ignored:
             raise Refused(
-                f"Scene.from_mujoco: limits='spring' is for limits of hinges and slides, and {', '.join(unfit)} have limits of another "
-                "kind. Leave these out of the motion, ignore=['limits'], or change the model."
+                f"Scene.from_mujoco: limits='spring' is for limits of hinges and slides, and {', '.join(unfit)} have "
+                "limits of another kind. Leave these out of the motion, ignore=['limits'], or change the model."
             )
         for j in np.flatnonzero(np.asarray(model.jnt_limited) & ~self.turning).tolist():
             time, ratio = model.jnt_solref[j]
@@ -206,7 +209,8 @@ class _Reader(Compiled):
             yield kind(tuple(map(self.group, loop.bodies)), loop.points[0], name=self.name("equality", loop.number))
 
     def weights(self, bodies: list[RigidBody | Frame]) -> Iterator[Effect]:
-        """Gravity, unless the model switches it off, and the forces ``-c m g`` in centres of mass that compensate a fraction c of it."""
+        """Gravity, unless the model switches it off, and the forces ``-c m g`` in centres of mass that compensate a
+        fraction c of it."""
         model, g = self.model, self.gravity
         if g.any():
             yield Gravity(g.tolist())

@@ -1,7 +1,8 @@
-"""The equalities of a model of MuJoCo: connect and weld, which close loops, and couplings of two joints or of two fixed tendons.
+"""The equalities of a model of MuJoCo: connect and weld, which close loops, and couplings of two joints or of two fixed
+tendons.
 
-MuJoCo's equalities are soft, so that a configuration from a simulation of MuJoCo has gaps. Newton's iteration on MuJoCo's coordinates
-closes the gaps of loops,
+MuJoCo's equalities are soft, so that a configuration from a simulation of MuJoCo has gaps. Newton's iteration on
+MuJoCo's coordinates closes the gaps of loops,
 
     J dq = -r,    r = (x_1 - x_2, rotation vector of R_1 R_2^T),    J = (J_x1 - J_x2, J_w1 - J_w2),
 
@@ -11,8 +12,8 @@ A coupling is a polynomial,
 
     y - y_0 = a_0 + a_1 (x - x_0) + ... + a_4 (x - x_0)^4.
 
-y and x are the coordinates of the joints, or the lengths of the tendons: sums of joint coordinates with constant ratios. y_0 and
-x_0 are their values at qpos0. Without a second joint or tendon the equality is ``y = y_0 + a_0``.
+y and x are the coordinates of the joints, or the lengths of the tendons: sums of joint coordinates with constant
+ratios. y_0 and x_0 are their values at qpos0. Without a second joint or tendon the equality is ``y = y_0 + a_0``.
 
 Source: MuJoCo's documentation, "XML reference", equality.
 """
@@ -29,21 +30,27 @@ from vmri_jax.scene.effects.joint_effects import JointCoupling
 from vmri_jax.scene.mujoco_model import Compiled
 
 WIDEST_GAP = 1e-3
-"""Widest gap that the reader closes, in extents of the model or rad; MuJoCo's softness leaves some 1e-4. To close a wider gap joints would
-move so far that the start has another shape than in the file."""
+"""Widest gap that the reader closes, in extents of the model or rad; MuJoCo's softness leaves some 1e-4. To close a
+wider gap joints would move so far that the start has another shape than in the file."""
 ROUND_OFF_GAP = 1e-13
-"""Gap that is round-off, in extents of the model or rad: Newton's iteration ends there. A larger value leaves wider gaps in the scene."""
+"""Gap that is round-off, in extents of the model or rad: Newton's iteration ends there.
+
+A larger value leaves wider gaps in the scene.
+"""
 WIDEST_LEFT = 1e-6
-"""Widest gap after the iteration, in extents of the model or rad. Files have about seven digits, and in planar loops no motion of the
-joints closes a gap out of the plane. A larger value accepts loops that do not fit."""
+"""Widest gap after the iteration, in extents of the model or rad. Files have about seven digits, and in planar loops no
+motion of the joints closes a gap out of the plane. A larger value accepts loops that do not fit."""
 ITERATIONS = 50
-"""Most iterations; about three are needed, and 20 at a start where the Jacobian loses rank. More only delay the error message."""
+"""Most iterations; about three are needed, and 20 at a start where the Jacobian loses rank.
+
+More only delay the error message.
+"""
 RANK = 1e-10
-"""Singular values of the Jacobian below this fraction of the largest count as zero, so that dependent rows do no harm. A larger value
-ignores motions that close a gap."""
+"""Singular values of the Jacobian below this fraction of the largest count as zero, so that dependent rows do no harm.
+A larger value ignores motions that close a gap."""
 ADVICE = (
-    "Here equalities hold exactly: give a qpos where they do, as one at which MuJoCo's simulation comes to rest, or switch the equality off "
-    "in the model."
+    "Here equalities hold exactly: give a qpos where they do, as one at which MuJoCo's simulation comes to rest, or "
+    "switch the equality off in the model."
 )
 """End of messages about equalities that the start violates."""
 
@@ -54,7 +61,8 @@ class Loop(NamedTuple):
     number: in the model.
     bodies: numbers of both.
     points: (2, 3) of both ends in space.
-    gap: r of the module: (1, 3) m between the points; of a weld (2, 3), followed by the rotation vector between the frames, rad.
+    gap: r of the module: (1, 3) m between the points; of a weld (2, 3), followed by the rotation vector between the
+        frames, rad.
     """
 
     number: int

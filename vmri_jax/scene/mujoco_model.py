@@ -1,6 +1,8 @@
-"""A compiled model of MuJoCo: names of its elements, its flags, and the features that no scene expresses, by the fields that bring them about.
+"""A compiled model of MuJoCo: names of its elements, its flags, and the features that no scene expresses, by the fields
+that bring them about.
 
-A field has its name in Python, ``jnt_stiffness``, ``opt.density``, and a flag the name of its bit, ``opt.disableflags.SPRING``.
+A field has its name in Python, ``jnt_stiffness``, ``opt.density``, and a flag the name of its bit,
+``opt.disableflags.SPRING``.
 
 Source: the comments in MuJoCo's mjmodel.h, and its documentation, "XML reference".
 """
@@ -19,7 +21,8 @@ from vmri_jax.scene.body import GROUND, listed
 CONSTRAINTS = "CONSTRAINT"
 """The flag that switches off contact, limits, dry friction and equalities at once."""
 PASSIVE = "SPRING DAMPER"
-"""The flags that together switch off all passive forces, with the forces of the fluid and the compensation of gravity."""
+"""The flags that together switch off all passive forces, with the forces of the fluid and the compensation of
+gravity."""
 
 
 @dataclass(frozen=True)
@@ -99,16 +102,17 @@ REFUSED = {
 }
 """The parts that the reader refuses, by their names in messages and in `ignore`."""
 SOFTEST_TIME = 0.02
-"""s, default time constant in MuJoCo's solref. The author of a model sets a larger one to get a spring, which a constraint does not
-replace; a larger value here accepts such equalities."""
+"""s, default time constant in MuJoCo's solref. The author of a model sets a larger one to get a spring, which a
+constraint does not replace; a larger value here accepts such equalities."""
 SOFTEST_IMPEDANCE = 0.9
-"""Default of the smallest impedance in MuJoCo's solimp. The author of a model sets a smaller one to get a soft equality, which a
-constraint does not replace; a larger value here refuses equalities with default numbers."""
+"""Default of the smallest impedance in MuJoCo's solimp. The author of a model sets a smaller one to get a soft
+equality, which a constraint does not replace; a larger value here refuses equalities with default numbers."""
 ELEMENTS = {"jnt": "joint", "dof": "joint", "body": "body", "tendon": "tendon", "actuator": "actuator"}
 """For each prefix of fields with a row for each element, the word for these elements."""
 STATES_ASKED = (0.1, 1.0)
-"""Standard deviations, in m, rad, m/s and rad/s, of random changes of the start at which MuJoCo is asked for the forces of actuators: a force
-that is zero at the start, as of a servo at its target, is not zero there. More states take longer."""
+"""Standard deviations, in m, rad, m/s and rad/s, of random changes of the start at which MuJoCo is asked for the forces
+of actuators: a force that is zero at the start, as of a servo at its target, is not zero there. More states take
+longer."""
 
 
 @dataclass(frozen=True)
@@ -136,8 +140,8 @@ class Compiled:
 
     @cached_property
     def extent(self) -> float:
-        """Size of the moving bodies, m: of the box around their centres and joints, and their radius of gyration. (MuJoCo's own extent may be set by
-        the author for the camera.)"""
+        """Size of the moving bodies, m: of the box around their centres and joints, and their radius of gyration.
+        (MuJoCo's own extent may be set by the author for the camera.)"""
         model, moving = self.model, [b for b in range(1, self.model.nbody) if self.root(b)]
         points = np.concatenate([self.data.xipos[moving], self.data.xanchor])
         radii = np.sqrt(model.body_inertia[moving].sum(axis=1) / 2 / np.maximum(model.body_mass[moving], 1e-300))
@@ -145,7 +149,8 @@ class Compiled:
 
     @property
     def compensated(self) -> list[int]:
-        """Numbers of the moving bodies with gravcomp; none where MuJoCo has not counted them, as after a change without mj_setConst."""
+        """Numbers of the moving bodies with gravcomp; none where MuJoCo has not counted them, as after a change without
+        mj_setConst."""
         if self.off(PASSIVE) or not self.gravity.any() or not self.model.ngravcomp:
             return []
         return [b for b in np.flatnonzero(self.model.body_gravcomp).tolist() if self.root(b)]
@@ -187,11 +192,13 @@ class Compiled:
 
     @cached_property
     def roots(self) -> list[int]:
-        """The first body of every group of bodies that are welded together, without the groups of the world and of mocap bodies."""
+        """The first body of every group of bodies that are welded together, without the groups of the world and of
+        mocap bodies."""
         return [b for b in range(1, self.model.nbody) if self.root(b) == b]
 
     def root(self, body: int) -> int:
-        """The first body of the group that a body is welded to; 0 for the groups of the world and of mocap bodies, which do not move."""
+        """The first body of the group that a body is welded to; 0 for the groups of the world and of mocap bodies,
+        which do not move."""
         root = int(self.model.body_weldid[body])
         return 0 if self.model.body_mocapid[root] >= 0 else root
 
@@ -201,7 +208,8 @@ class Compiled:
         return self.name("body", root) if root else GROUND
 
     def name(self, kind: str, i: int) -> str:
-        """Name of an element in the scene: its name in the model, or else its number; "arm joint" if a body has the name "arm", too."""
+        """Name of an element in the scene: its name in the model, or else its number; "arm joint" if a body has the
+        name "arm", too."""
         name = getattr(self.model, kind)(int(i)).name or f"{kind} {int(i)}"
         return f"{name} {kind}" if name == GROUND or (kind != "body" and name in self._bodies) else name
 
@@ -210,7 +218,8 @@ class Compiled:
         return {self.model.body(b).name for b in range(self.model.nbody)}
 
     def refuse(self, ignore: Collection[str]) -> None:
-        """Raise ValueError with all features of the model that a scene does not express, except those in `ignore`, see `REFUSED`."""
+        """Raise ValueError with all features of the model that a scene does not express, except those in `ignore`, see
+        `REFUSED`."""
         if isinstance(ignore, str):
             raise Refused(f"Scene.from_mujoco: ignore is {ignore!r}; give a list, ignore=[{ignore!r}].")
         ignorable = [kind for kind, refusal in REFUSED.items() if refusal.ignorable]
@@ -225,11 +234,13 @@ class Compiled:
         advice += [f"for {kind}, {REFUSED[kind].without}" for kind in refused if not REFUSED[kind].ignorable]
         raise Refused(
             "Scene.from_mujoco: the model has features that a scene of rigid bodies does not express: "
-            f"{'; '.join(f'{kind} ({part})' for kind, part in refused.items())}. Change the model, or {'; '.join(advice)}."
+            f"{'; '.join(f'{kind} ({part})' for kind, part in refused.items())}. Change the model, or "
+            f"{'; '.join(advice)}."
         )
 
     def beyond(self) -> Iterator[tuple[str, str]]:
-        """The features of the model that a scene does not express: the name in `REFUSED`, and the elements that have the feature."""
+        """The features of the model that a scene does not express: the name in `REFUSED`, and the elements that have
+        the feature."""
         model = self.model
         kept = [i for i in self.equalities if self.closes(i) or self.ties(i)]
         # bodies with several joints, if one of these is a ball joint or the scene has directors alone
@@ -275,7 +286,8 @@ class Compiled:
         return listed(list(dict.fromkeys(f"{kind} {getattr(self.model, kind)(int(i)).name or int(i)}" for i in rows)))
 
     def _actuators(self) -> str:
-        """Actuators with a force, joints with a force of actuators (a range without zero), and all actuators with armature or damping."""
+        """Actuators with a force, joints with a force of actuators (a range without zero), and all actuators with
+        armature or damping."""
         model = self.model
         forces, rates, loads = self._actuation()
         acting = np.zeros(model.nactuator, dtype=bool)
@@ -316,7 +328,8 @@ class Compiled:
         return f"{len(pairs)} pair{several} of geoms, as of {bodies[0]} and {bodies[1]}"
 
     def touching(self) -> np.ndarray:
-        """(n, 2) pairs of geoms that may collide by MuJoCo's rules for types, parents and exclusions, and pairs that the model names."""
+        """(n, 2) pairs of geoms that may collide by MuJoCo's rules for types, parents and exclusions, and pairs that
+        the model names."""
         model = self.model
         if self.off(CONSTRAINTS, "CONTACT"):
             return np.zeros((0, 2), dtype=int)
@@ -348,7 +361,8 @@ class Compiled:
         return sorted({*sprung, *([] if self.off("DAMPER") else self._turning_joints("dof_damping"))})
 
     def _is_soft(self, i: int) -> bool:
-        """Whether an equality is softer than by default, or has a solref with negative numbers, which define a spring."""
+        """Whether an equality is softer than by default, or has a solref with negative numbers, which define a
+        spring."""
         time, impedance = self.model.eq_solref[i, 0], self.model.eq_solimp[i, :2].min()
         return not (0 < time <= SOFTEST_TIME and impedance >= SOFTEST_IMPEDANCE)
 

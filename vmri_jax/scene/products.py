@@ -1,11 +1,13 @@
 """Rows of constraints that are scalar products of two vectors, each an affine function of the coordinates of bodies.
 
-With the triples ``z = (phi, d_1, d_2, d_3)`` of each body of an element, one body after the other, the rows and their derivatives are
+With the triples ``z = (phi, d_1, d_2, d_3)`` of each body of an element, one body after the other, the rows and their
+derivatives are
 
     g_r = u_r . v_r,    u_r = sum_i U_ri z_i + u_0r,    v_r = sum_i V_ri z_i + v_0r,
     dg_r = sum_i J_ri . dz_i,    J_ri = V_ri u_r + U_ri v_r.
 
-The arrays U, V, u_0, v_0 are numbers of the params. The rows of all joints in a scene are one term, of few instructions.
+The arrays U, V, u_0, v_0 are numbers of the params. The rows of all joints in a scene are one term, of few
+instructions.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,7 +21,10 @@ from jax.custom_derivatives import SymbolicZero
 from vmri_jax.mechanics.arrays import library
 
 FRAME = 4
-"""Triples of a rigid body: its centre and three directors. A plate, a rod or a point has fewer; zeros take the place of the others."""
+"""Triples of a rigid body: its centre and three directors.
+
+A plate, a rod or a point has fewer; zeros take the place of the others.
+"""
 
 
 def products(count: int, q: Sequence[Any], params: Mapping[str, Any]) -> Any:
@@ -59,7 +64,8 @@ _rows_of_jax = jax.custom_jvp(_rows, nondiff_argnums=(0,))
 
 
 def _derivative(count: int, primals, tangents):
-    """The rows and dg; by autodiff a Jacobian would take the products with U and V once more for each of its columns."""
+    """The rows and dg; by autodiff a Jacobian would take the products with U and V once more for each of its
+    columns."""
     factors, offsets, z = primals
     *of_numbers, dz = tangents
     # XLA would compute the vectors anew for each entry of J

@@ -1,12 +1,14 @@
 """The rate at which each effect alone would move its bodies, and the border between slow and fast rates.
 
-An effect adds L(q, v) to the Lagrangian; of a potential, ``L = -V``. At constant v its force is ``f = dL/dq - d/dt dL/dv = L_q - L_vq v``; a
-total time derivative in L adds nothing to f. The stiffness is ``K = -df/dq``, the gyroscopic matrix G is the antisymmetric part of df/dv,
-and M is the mass matrix of the bodies of an element. The frequency of the element is the largest w at the start with
-``det(K - w^2 M) = 0`` or ``det(G - i w M) = 0``.
+An effect adds L(q, v) to the Lagrangian; of a potential, ``L = -V``. At constant v its force is
+``f = dL/dq - d/dt dL/dv = L_q - L_vq v``; a total time derivative in L adds nothing to f. The stiffness is
+``K = -df/dq``, the gyroscopic matrix G is the antisymmetric part of df/dv, and M is the mass matrix of the bodies of an
+element. The frequency of the element is the largest w at the start with ``det(K - w^2 M) = 0`` or
+``det(G - i w M) = 0``.
 
-The rate of the element is the largest of this frequency, ``sqrt(a / L)`` and ``sqrt(alpha)``, with the largest acceleration a and angular
-acceleration alpha that it gives to bodies at rest, and the size L of the scene. The border is the middle of the widest gap between all rates, on a logarithmic scale.
+The rate of the element is the largest of this frequency, ``sqrt(a / L)`` and ``sqrt(alpha)``, with the largest
+acceleration a and angular acceleration alpha that it gives to bodies at rest, and the size L of the scene. The border
+is the middle of the widest gap between all rates, on a logarithmic scale.
 """
 
 from collections.abc import Mapping, Sequence
@@ -28,14 +30,15 @@ from vmri_jax.scene.body import LARGEST_POINT, Bodies, label_of, moving
 from vmri_jax.scene.effect import Effect
 
 SEPARATION = 3.0
-"""Smallest ratio of neighbouring rates that separates slow from fast: below it micro steps cost more than they save. With a larger value
-fewer scenes have fast bodies."""
+"""Smallest ratio of neighbouring rates that separates slow from fast: below it micro steps cost more than they save.
+With a larger value fewer scenes have fast bodies."""
 SPAN = 1e3
-"""Rates below the fastest rate over SPAN count as the fastest rate over SPAN. Their effects are slow in any case, and with a larger value the
-gap between these effects and all others may be wider than the gap between slow and fast effects."""
+"""Rates below the fastest rate over SPAN count as the fastest rate over SPAN. Their effects are slow in any case, and
+with a larger value the gap between these effects and all others may be wider than the gap between slow and fast
+effects."""
 ROUND_OFF = 1e-12
-"""An eigenvalue of the stiffness below this fraction of its largest entry is round-off, and the frequency zero. A larger value hides soft
-motions of stiff elements."""
+"""An eigenvalue of the stiffness below this fraction of its largest entry is round-off, and the frequency zero. A
+larger value hides soft motions of stiff elements."""
 
 
 class Rates(NamedTuple):
@@ -79,9 +82,11 @@ def measure(bodies: Bodies, effects: Sequence[Effect]) -> dict[str, Rates]:
 
 
 def border(measured: Mapping[str, Rates], effects: Sequence[Effect]) -> float | None:
-    """The border between slow and fast: the middle of the widest gap between rates, rad/s; None if no gap is wide enough.
+    """The border between slow and fast: the middle of the widest gap between rates, rad/s; None if no gap is wide
+    enough.
 
-    It is above the largest rate of the effects that are declared slow, and below the smallest one of those declared fast.
+    It is above the largest rate of the effects that are declared slow, and below the smallest one of those declared
+    fast.
     """
     of_slow, of_fast = (
         [measured[effect.name].rate for effect in effects if effect.rate == rate and effect.name in measured]
@@ -99,7 +104,8 @@ def border(measured: Mapping[str, Rates], effects: Sequence[Effect]) -> float | 
 
 
 def _rates(effect: Effect, elements: Sequence[Linearised], mass: np.ndarray, motions: Sequence, size: float) -> Rates:
-    """Of the elements of an effect; `motions` are matrices from all velocities to rates of positions, and to rates of directors."""
+    """Of the elements of an effect; `motions` are matrices from all velocities to rates of positions, and to rates of
+    directors."""
     declared = effect.curvature()
     curvatures = np.broadcast_to(-np.inf if declared is None else declared, len(elements))
     frequency, rate = np.zeros(len(elements)), np.zeros(len(elements))
@@ -108,12 +114,12 @@ def _rates(effect: Effect, elements: Sequence[Linearised], mass: np.ndarray, mot
         element_mass = mass[np.ix_(element.columns, element.columns)]
         if not np.linalg.eigvalsh(element_mass).min() > 0:
             raise Refused(
-                f"{effect.name}: the kinetic energy of {', '.join(names)} is not positive at the start; change masses or kinetic "
-                "effects, or give every body a pace and every potential between fast bodies a rate."
+                f"{effect.name}: the kinetic energy of {', '.join(names)} is not positive at the start; change masses "
+                "or kinetic effects, or give every body a pace and every potential between fast bodies a rate."
             )
         N = mass_orthonormal(element_mass)
-        # w^2: the largest eigenvalue of N^T K N, or the declared curvature k times the largest eigenvalue of A M^-1 A^T, where A v are the rates of
-        # positions: k / m for a body of mass m
+        # w^2: the largest eigenvalue of N^T K N, or the declared curvature k times the largest eigenvalue of A M^-1
+        # A^T, where A v are the rates of positions: k / m for a body of mass m
         matrix = N.T @ (element.stiffness + element.stiffness.T) @ N / 2
         largest = max(np.linalg.eigvalsh(matrix).max(), curvatures[i] * np.linalg.norm(translation @ N, 2) ** 2)
         if largest > ROUND_OFF * np.abs(matrix).max(initial=0.0):
@@ -140,8 +146,8 @@ def _linearise(effect: Effect, i: int, bodies: Bodies, columns: Mapping[str, np.
     parts = [motions.T @ force, *(motions.T @ matrix @ motions for matrix in matrices)]
     if not all(np.isfinite(part).all() for part in parts):
         raise Refused(
-            f"{effect.name}: its energy between {', '.join(map(label_of, effect.elements[i]))} has no finite derivatives at the "
-            "start; move these bodies, or smooth the energy."
+            f"{effect.name}: its energy between {', '.join(map(label_of, effect.elements[i]))} has no finite "
+            "derivatives at the start; move these bodies, or smooth the energy."
         )
     return Linearised(np.concatenate([columns[name] for name in names]), *parts)
 
@@ -174,6 +180,7 @@ def _derivatives(function: TracedOnce, kinetic: bool, q, v, params):
 
 
 def positions(bodies: Bodies) -> np.ndarray:
-    """(n, 3) positions of all points and centres, padded with zeros; without the blocks, or the origin if there are only blocks."""
+    """(n, 3) positions of all points and centres, padded with zeros; without the blocks, or the origin if there are
+    only blocks."""
     points = [np.asarray(body.point().position) for body in bodies.values() if not body.block] or [np.zeros(1)]
     return np.stack([np.pad(point, (0, LARGEST_POINT - point.size)) for point in points])

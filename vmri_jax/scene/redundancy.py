@@ -1,9 +1,11 @@
-"""Redundant constraints: naming the dependent rows, dropping some of them, and checking that the dropped rows follow from the others.
+"""Redundant constraints: naming the dependent rows, dropping some of them, and checking that the dropped rows follow
+from the others.
 
-A row whose gradient depends on the gradients of the other rows at the start need not depend on them elsewhere: examples are the third
-distance of three atoms in line, and a linkage that lies flat. The kept rows g_k are independent at the start, so that ``g_k = 0`` is a
-smooth surface there. The dropped rows follow from the kept rows, that is are implied by them, if and only if they vanish on this surface
-around the start. The check evaluates them at the ends of random motions along the surface.
+A row whose gradient depends on the gradients of the other rows at the start need not depend on them elsewhere: examples
+are the third distance of three atoms in line, and a linkage that lies flat. The kept rows g_k are independent at the
+start, so that ``g_k = 0`` is a smooth surface there. The dropped rows follow from the kept rows, that is are implied by
+them, if and only if they vanish on this surface around the start. The check evaluates them at the ends of random
+motions along the surface.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -25,18 +27,29 @@ from vmri_jax.scene.sorting import HOMES, Sorting, sort
 from vmri_jax.scene.trees import Branch
 
 MOTIONS = 3
-"""Number of random motions on which dropped rows are evaluated: on a single motion a row may by chance change little. More take longer."""
+"""Number of random motions on which dropped rows are evaluated: on a single motion a row may by chance change little.
+
+More take longer.
+"""
 NEARBY = 0.1
-"""Length of a motion, as a fraction of the smallest singular value of the kept rows: this value bounds the region where they are independent. A
-row that changes with the second power of the motion changes by some 1e-3; a longer motion may reach another branch of a mechanism."""
+"""Length of a motion, as a fraction of the smallest singular value of the kept rows: this value bounds the region where
+they are independent. A row that changes with the second power of the motion changes by some 1e-3; a longer motion may
+reach another branch of a mechanism."""
 CONTRACTION = 0.1
-"""Largest ratio of consecutive corrections of Newton's iteration from the end of a motion back to the surface. With a larger ratio the
-iteration may end on another branch."""
+"""Largest ratio of consecutive corrections of Newton's iteration from the end of a motion back to the surface. With a
+larger ratio the iteration may end on another branch."""
 SHORTENING = 4.0
-"""Factor by which a motion is shortened after corrections that shrink too slowly; a larger factor may skip usable lengths."""
+"""Factor by which a motion is shortened after corrections that shrink too slowly; a larger factor may skip usable
+lengths."""
 NUM_LENGTHS = 10
-"""Most lengths of a motion that are tried. The last of ten suits a molecule of a millionth of the extent of the scene."""
-BEND = "Bend bodies that lie in line or flat at the start by a little, leave other rows out of the scene, or hold the shape by other constraints"
+"""Most lengths of a motion that are tried.
+
+The last of ten suits a molecule of a millionth of the extent of the scene.
+"""
+BEND = (
+    "Bend bodies that lie in line or flat at the start by a little, leave other rows out of the scene, or hold the "
+    "shape by other constraints"
+)
 """Advice for rows that depend on others at the start alone."""
 
 
@@ -59,7 +72,8 @@ def sort_with_loops(
 
 
 def check_constraints(sorting: Sorting) -> None:
-    """Refuse redundant constraints, dropped rows that do not follow from the others, and constraints that the fast bodies cannot satisfy."""
+    """Refuse redundant constraints, dropped rows that do not follow from the others, and constraints that the fast
+    bodies cannot satisfy."""
     rows = ConstraintRows.of(sorting)
     if rows is None:
         return
@@ -74,7 +88,8 @@ def check_constraints(sorting: Sorting) -> None:
 def without_redundant(sorting: Sorting) -> Sorting:
     """The sorting without as many rows of constraints as depend on others at the start.
 
-    A QR decomposition with pivoting chooses the kept rows, scaled by the masses and to length one. All rows of `Rigidity` are kept.
+    A QR decomposition with pivoting chooses the kept rows, scaled by the masses and to length one. All rows of
+    `Rigidity` are kept.
     """
     rows = ConstraintRows.of(sorting)
     if rows is None:
@@ -82,7 +97,8 @@ def without_redundant(sorting: Sorting) -> Sorting:
     scaled = rows.by_masses
     lengths = np.linalg.norm(scaled, axis=1, keepdims=True)
     scaled /= np.where(lengths > 0, lengths, 1.0)
-    # remove the span of the rigidity rows from the other rows, then rank these: the last ones in the order of pivots depend on the first
+    # remove the span of the rigidity rows from the other rows, then rank these: the last ones in the order of pivots
+    # depend on the first
     rigid = np.array([isinstance(row.effect, Rigidity) for row in rows.rows])
     basis = np.linalg.qr(scaled[rigid].T)[0]
     candidates = np.flatnonzero(~rigid)
@@ -97,11 +113,12 @@ def without_redundant(sorting: Sorting) -> Sorting:
 
 
 def find_opening(rows: ConstraintRows) -> tuple[dict[int, float], float]:
-    """The dropped rows that do not follow from the kept rows g_k: their largest values over their sizes by number, {} if all follow; and the
-    length of the motion to them relative to the scales of coordinates, 0 if they are violated at the start itself.
+    """The dropped rows that do not follow from the kept rows g_k: their largest values over their sizes by number, {}
+    if all follow; and the length of the motion to them relative to the scales of coordinates, 0 if they are violated at
+    the start itself.
 
-    In coordinates over their scales, motions z along the surface solve ``dg_k(q_0) z = 0``. Newton's iteration leads from
-    ``q_0 + s z`` back onto ``g_k = 0``, where the dropped rows are evaluated.
+    In coordinates over their scales, motions z along the surface solve ``dg_k(q_0) z = 0``. Newton's iteration leads
+    from ``q_0 + s z`` back onto ``g_k = 0``, where the dropped rows are evaluated.
     """
     kept, dropped = rows.numbers(), [i for i, row in enumerate(rows.rows) if not row.kept]
     if not dropped:
@@ -138,7 +155,8 @@ def _cure(sorting: Sorting) -> str:
 
 
 def _joined_twice(sorting: Sorting) -> str:
-    """The joints between the same two bodies, for a message: a joint that carries a body has no rows, which the message could name."""
+    """The joints between the same two bodies, for a message: a joint that carries a body has no rows, which the message
+    could name."""
     joints = {branch.joint.name: branch.joint for branch in sorting.branches}
     joints |= {part.effect.name: part.effect for part in sorting.placed if isinstance(part.effect, Joint)}
     labels: dict[frozenset[str], list[str]] = {}
@@ -160,18 +178,19 @@ def _opening_in_words(rows: ConstraintRows) -> str:
     errors = listed([f"{rows.rows[i].name} by {value:.1e}" for i, value in values.items()])
     if not motion:
         return (
-            f"{listed(names)} contradicts the other constraints. Where they hold, its violation relative to its size is not zero: {errors}. "
-            "Correct its numbers, or leave it out"
+            f"{listed(names)} contradicts the other constraints. Where they hold, its violation relative to its size "
+            f"is not zero: {errors}. Correct its numbers, or leave it out"
         )
     return (
-        f"{listed(names)} depends on the other constraints at the start alone. Nearby, where coordinates have moved by some "
-        f"{motion:.1g} of the extent of the scene and the other constraints hold, its violation relative to its size is not zero: "
-        f"{errors}. {BEND}"
+        f"{listed(names)} depends on the other constraints at the start alone. Nearby, where coordinates have moved by "
+        f"some {motion:.1g} of the extent of the scene and the other constraints hold, its violation relative to its "
+        f"size is not zero: {errors}. {BEND}"
     )
 
 
 def tied_to_fast(sorting: Sorting) -> dict[str, str]:
-    """The bodies with the pace "auto" that are slow, and without which the fast bodies cannot satisfy constraints on the micro grid; with reasons."""
+    """The bodies with the pace "auto" that are slow, and without which the fast bodies cannot satisfy constraints on
+    the micro grid; with reasons."""
     rows = ConstraintRows.of(sorting)
     micro = rows.numbers("constraint") if rows else []
     if rows is None or not micro:
@@ -182,7 +201,8 @@ def tied_to_fast(sorting: Sorting) -> dict[str, str]:
 
 
 def _beyond_fast(rows: ConstraintRows, micro: list[int]) -> tuple[list[str], list[str]]:
-    """The slow bodies whose motion changes the rows on the micro grid that the fast bodies cannot satisfy, and the effects of these rows."""
+    """The slow bodies whose motion changes the rows on the micro grid that the fast bodies cannot satisfy, and the
+    effects of these rows."""
     sorting, jacobian = rows.sorting, rows.by_masses[micro]
     num_slow, carried = sorting.layout.sizes[0], _carried(sorting)
     _, dependent = rank_of(jacobian[:, num_slow:])
@@ -208,7 +228,8 @@ def _advice(rows: ConstraintRows, micro: list[int]) -> str:
     touched, _ = _beyond_fast(rows, micro)
     make_fast = f"make {' or '.join(touched)} fast too" if touched else "make more of their bodies fast"
     return (
-        f"they touch fast bodies and are held on the micro grid, where only {', '.join(dict.fromkeys(fast))} can move; leave one out, or "
+        f"they touch fast bodies and are held on the micro grid, where only {', '.join(dict.fromkeys(fast))} can move; "
+        "leave one out, or "
         f'{make_fast}, pace="fast"'
     )
 

@@ -1,9 +1,9 @@
 """Rigid bodies by directors: a point and three axes, constrained to stay orthonormal.
 
-The coordinates of a body are ``q = (phi, d_1, d_2, d_3)``, its centre of mass and its principal axes of inertia in space.
-A point with the components X along the principal axes is at ``phi + sum_i X_i d_i``, which is linear in q. The kinetic energy
-``m |phi'|^2 / 2 + sum_i E_i |d_i'|^2 / 2`` has constant masses ``E_i = (J_1 + J_2 + J_3) / 2 - J_i`` with the principal moments of
-inertia J. Rigidity is six constraints, ``d_i . d_j = delta_ij``.
+The coordinates of a body are ``q = (phi, d_1, d_2, d_3)``, its centre of mass and its principal axes of inertia in
+space. A point with the components X along the principal axes is at ``phi + sum_i X_i d_i``, which is linear in q. The
+kinetic energy ``m |phi'|^2 / 2 + sum_i E_i |d_i'|^2 / 2`` has constant masses ``E_i = (J_1 + J_2 + J_3) / 2 - J_i``
+with the principal moments of inertia J. Rigidity is six constraints, ``d_i . d_j = delta_ij``.
 
 Source: P. Betsch, S. Leyendecker, The discrete null space method for the energy consistent integration of constrained
 mechanical systems, part II: multibody dynamics, Int. J. Numer. Meth. Engng 67 (2006).
@@ -25,32 +25,33 @@ from vmri_jax.scene.shapes import Ball, Rod, Shape, box_of
 from vmri_jax.scene.terms import split
 
 THIN = 1e-12
-"""A mass E below this fraction of the largest is round-off: the body has no width in this direction, and no director. A larger value
-takes the width of thin plates away."""
+"""A mass E below this fraction of the largest is round-off: the body has no width in this direction, and no director. A
+larger value takes the width of thin plates away."""
 COVERED = 1.01
-"""A point within this multiple of half the size of the drawn shape counts as inside it; slightly above 1, so that points on the surface
-do. With a larger one a point that is visibly outside gets no line to the body."""
+"""A point within this multiple of half the size of the drawn shape counts as inside it; slightly above 1, so that
+points on the surface do. With a larger one a point that is visibly outside gets no line to the body."""
 ORTHONORMAL = 1e-9
-"""Largest difference of ``R^T R`` from the identity, of the length of a quaternion from 1, and of an inertia matrix from its transpose
-relative to its largest entry. A larger value accepts rotations that stretch bodies; a smaller one refuses numbers with ten digits."""
+"""Largest difference of ``R^T R`` from the identity, of the length of a quaternion from 1, and of an inertia matrix
+from its transpose relative to its largest entry. A larger value accepts rotations that stretch bodies; a smaller one
+refuses numbers with ten digits."""
 
 
 @dataclass(frozen=True, eq=False)
 class RigidBody(AnyBody):
     """A rigid body: ``q = (phi, d_1, d_2, d_3)``, its centre of mass and its principal axes of inertia.
 
-    Effects between points that name the body act at its centre. With ``(name, [x, y, z])`` they act at a point that is fixed in the body,
-    this far from the centre of mass along the axes of the body. Rods and plates have directors only along the axes in which they have
-    width.
+    Effects between points that name the body act at its centre. With ``(name, [x, y, z])`` they act at a point that is
+    fixed in the body, this far from the centre of mass along the axes of the body. Rods and plates have directors only
+    along the axes in which they have width.
 
     Args:
         name: of the body in effects.
         mass: m, kg, positive.
-        inertia: about the centre of mass, kg m^2: (3,) principal moments J, a symmetric matrix (3, 3) in the axes of the
-            body, or a `Shape`: `Box`, `Cylinder`, `Ball`, `Rod`.
+        inertia: about the centre of mass, kg m^2: (3,) principal moments J, a symmetric matrix (3, 3) in the axes of
+            the body, or a `Shape`: `Box`, `Cylinder`, `Ball`, `Rod`.
         position: (3,) centre of mass at the start, m.
-        rotation: of the axes of the body at the start: a matrix (3, 3) with these as columns, a quaternion (w, x, y, z),
-            or a rotation vector (3,), angle times axis, rad; the axes of space by default.
+        rotation: of the axes of the body at the start: a matrix (3, 3) with these as columns, a quaternion
+            (w, x, y, z), or a rotation vector (3,), angle times axis, rad; the axes of space by default.
         velocity: (3,) of the centre of mass, m/s; at rest by default.
         spin: (3,) angular velocity at the start in space, rad/s; none by default.
         pace: "slow", "fast" or "auto", as of `Body`.
@@ -62,8 +63,9 @@ class RigidBody(AnyBody):
 
     Raises:
         TypeError: an argument that is no real number.
-        ValueError: a mass that is not positive, a negative moment of inertia, moments that no body has (the largest above the sum of
-            the other two), a matrix that is no rotation, numbers that are not finite or of float32, other shapes, another pace.
+        ValueError: a mass that is not positive, a negative moment of inertia, moments that no body has (the largest
+            above the sum of the other two), a matrix that is no rotation, numbers that are not finite or of float32,
+            other shapes, another pace.
     """
 
     name: str
@@ -97,7 +99,8 @@ class RigidBody(AnyBody):
         vars(self).update(mass=mass, shape=shape, moments=moments, axes=axes, rotation=self._matrix())
 
     def _principal(self, inertia) -> tuple[Any, np.ndarray]:
-        """Principal moments (3,), and the principal axes as columns, in the axes of the body, of the argument `inertia` as an array."""
+        """Principal moments (3,), and the principal axes as columns, in the axes of the body, of the argument `inertia`
+        as an array."""
         about = f"RigidBody {self.name}: inertia"
         axes = np.eye(3)
         if inertia.shape == (3, 3) and is_concrete(inertia):
@@ -119,8 +122,8 @@ class RigidBody(AnyBody):
                 )
             if largest > other_two * (1 + ORTHONORMAL):
                 raise Refused(
-                    f"{about} has the principal moments {inertia}, which no body has: the largest, {largest:g}, must not be larger than "
-                    f"the sum of the others, {other_two:g}."
+                    f"{about} has the principal moments {inertia}, which no body has: the largest, {largest:g}, must "
+                    f"not be larger than the sum of the others, {other_two:g}."
                 )
         return inertia, axes
 
@@ -131,20 +134,22 @@ class RigidBody(AnyBody):
         about, rotation = f"RigidBody {self.name}: rotation", self._numbers("rotation", self.rotation)
         if rotation.shape not in ((3, 3), (4,), (3,)):
             raise Refused(
-                f"{about} has shape {rotation.shape}; give a matrix (3, 3), a quaternion (w, x, y, z) or a rotation vector (3,)."
+                f"{about} has shape {rotation.shape}; give a matrix (3, 3), a quaternion (w, x, y, z) or a rotation "
+                "vector (3,)."
             )
         if not is_concrete(rotation):
             return matrix_of(rotation)
         if rotation.shape == (4,) and abs(np.linalg.norm(rotation) - 1) > ORTHONORMAL:
             raise Refused(
-                f"{about} is the quaternion {rotation} of length {np.linalg.norm(rotation):.12g}; divide it by its length, which must be 1."
+                f"{about} is the quaternion {rotation} of length {np.linalg.norm(rotation):.12g}; divide it by its "
+                "length, which must be 1."
             )
         if rotation.shape == (3, 3):
             error = np.abs(rotation.T @ rotation - np.eye(3)).max()
             if error > ORTHONORMAL or np.linalg.det(rotation) < 0:
                 raise Refused(
-                    f"{about} is {rotation.tolist()}, which is no rotation: R^T R differs from 1 by {error:.2g} and the determinant is "
-                    f"{np.linalg.det(rotation):.3g}."
+                    f"{about} is {rotation.tolist()}, which is no rotation: R^T R differs from 1 by {error:.2g} and "
+                    f"the determinant is {np.linalg.det(rotation):.3g}."
                 )
         return np.asarray(matrix_of(rotation))
 
@@ -156,7 +161,8 @@ class RigidBody(AnyBody):
 
     @property
     def wide(self) -> tuple[int, ...]:
-        """Indices of the directors of the body: of the principal axes in which it has width, all three of a traced inertia."""
+        """Indices of the directors of the body: of the principal axes in which it has width, all three of a traced
+        inertia."""
         return tuple(np.flatnonzero(self.inertias).tolist()) if is_concrete(self.moments) else (0, 1, 2)
 
     @property
@@ -177,7 +183,8 @@ class RigidBody(AnyBody):
 
     @property
     def motions(self) -> np.ndarray:
-        """(n, 6) matrix from the velocity of the centre and the angular velocity to q'; (6, 5) basis of the same space for a rod."""
+        """(n, 6) matrix from the velocity of the centre and the angular velocity to q'; (6, 5) basis of the same space
+        for a rod."""
         turns = self._turns()
         matrix = np.block([[np.eye(3), np.zeros((3, 3))], [np.zeros((len(turns), 3)), turns]])
         return matrix if len(self.wide) > 1 else np.linalg.svd(matrix)[0][:, :5]  # a rod does not turn about itself
@@ -191,7 +198,8 @@ class RigidBody(AnyBody):
         return replace(self, velocity=rates[:3], spin=np.linalg.lstsq(self._turns(), rates[3:], rcond=None)[0])
 
     def weights(self, offset: Any) -> Any:
-        """(3,) components X of a point ``phi + sum_i X_i d_i``, first those along the directors that the body has, then zeros.
+        """(3,) components X of a point ``phi + sum_i X_i d_i``, first those along the directors that the body has, then
+        zeros.
 
         Refused along an axis without width and director.
         """
@@ -201,8 +209,9 @@ class RigidBody(AnyBody):
             sizes = np.abs(np.asarray(components))
             if np.any(sizes[thin] > ORTHONORMAL * sizes.max()):
                 raise Refused(
-                    f"{np.asarray(offset)} sticks out of {self.name}: with the moments of inertia {np.asarray(self.moments)} it is a plate "
-                    "or a rod without width in this direction. Give the body some width."
+                    f"{np.asarray(offset)} sticks out of {self.name}: with the moments of inertia "
+                    f"{np.asarray(self.moments)} it is a plate or a rod without width in this direction. Give the "
+                    "body some width."
                 )
         return joined([components[np.array(self.wide)], np.zeros(len(thin))])
 
@@ -240,7 +249,8 @@ class RigidBody(AnyBody):
 
 
 class Rigidity(Effect):
-    """The constraints of rigid bodies by directors, ``g = (d_i . d_j - delta_ij) / (1 + delta_ij)``; every scene adds this effect itself.
+    """The constraints of rigid bodies by directors, ``g = (d_i . d_j - delta_ij) / (1 + delta_ij)``; every scene adds
+    this effect itself.
 
     Args:
         bodies: names of the rigid bodies.
@@ -282,7 +292,8 @@ def _cross_matrix(u):
 
 
 def rotation(q):
-    """Rotation matrices (..., 3, 3) of a rigid body from its coordinates: its directors, the principal axes of inertia, as columns.
+    """Rotation matrices (..., 3, 3) of a rigid body from its coordinates: its directors, the principal axes of inertia,
+    as columns.
 
     The columns of ``rotation(q) @ body.axes.T`` are the axes of `RigidBody.rotation` along the run.
 
@@ -310,7 +321,8 @@ def quaternion(q):
         .reshape(*matrices.shape[:-2], 4)
     )
     if quaternions.ndim > 1:
-        # p and -p are the same rotation: a negative product with the quaternion before asks for the other sign from there on
+        # p and -p are the same rotation: a negative product with the quaternion before asks for the other sign from
+        # there on
         products = np.sum(quaternions[..., 1:, :] * quaternions[..., :-1, :], axis=-1)
         changes = np.where(products < 0, -1, 1)
         signs = np.concatenate([np.ones_like(products[..., :1]), np.cumprod(changes, axis=-1)], axis=-1)
@@ -321,11 +333,12 @@ def quaternion(q):
 def angular_velocity(q, v):
     """``omega`` of ``d_i' = omega x d_i``, in space, (..., 3) rad/s, from directors d_i of length 1.
 
-    The sum over i of ``d_i x d_i' = (1 - d_i d_i^T) omega`` is solved for omega. A body with two directors, a plate, has all three components; a
-    body with one, a rod, has no spin about itself, and gets the omega across it.
+    The sum over i of ``d_i x d_i' = (1 - d_i d_i^T) omega`` is solved for omega. A body with two directors, a plate,
+    has all three components; a body with one, a rod, has no spin about itself, and gets the omega across it.
 
     Args:
-        q, v: (..., 12), (..., 9) or (..., 6) coordinates and velocities, ``run.position("hub")`` and ``run.velocity("hub")``.
+        q, v: (..., 12), (..., 9) or (..., 6) coordinates and velocities, ``run.position("hub")`` and
+            ``run.velocity("hub")``.
     """
     (_, d), (_, rate) = split(np.asarray(q)), split(np.asarray(v))
     matrix = np.sum(np.eye(3) - d[..., :, None] * d[..., None, :], axis=-3)

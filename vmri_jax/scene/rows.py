@@ -23,24 +23,28 @@ from vmri_jax.scene.sorting import HOMES, Home, Row, Sorting, rows_of
 from vmri_jax.scene.terms import EffectTerm, Role
 
 CANCELLED = 1e-14
-"""An entry of the Jacobian dg/dq is the product of the row dg/dQ and the column dQ/dq. If it is below this fraction of the product of
-their lengths it is round-off and set to zero, as for the rows that hold a planar loop in its plane. A larger value removes rows with
-short levers; with a smaller value round-off counts as an independent row."""
+"""An entry of the Jacobian dg/dq is the product of the row dg/dQ and the column dQ/dq. If it is below this fraction of
+the product of their lengths it is round-off and set to zero, as for the rows that hold a planar loop in its plane. A
+larger value removes rows with short levers; with a smaller value round-off counts as an independent row."""
 
 REACHED = 1e-12
-"""Newton's iteration ends when rows, relative to their sizes, are below this value, which is near round-off. With a larger value loops have a
-visible gap, which the initial state refuses, and dropped rows carry the remaining error."""
+"""Newton's iteration ends when rows, relative to their sizes, are below this value, which is near round-off. With a
+larger value loops have a visible gap, which the initial state refuses, and dropped rows carry the remaining error."""
 COMPLEX_STEP = 1e-30
-"""Imaginary step h of derivatives, in any unit: its square is below round-off of every value. A larger step is felt in values; a smaller one may
-underflow in products."""
+"""Imaginary step h of derivatives, in any unit: its square is below round-off of every value. A larger step is felt in
+values; a smaller one may underflow in products."""
 CORRECTIONS = 20
-"""Most corrections of Newton's iteration; from nearby six reach round-off. More only delay the message that it fails."""
+"""Most corrections of Newton's iteration; from nearby six reach round-off.
+
+More only delay the message that it fails.
+"""
 
 
 def _derivatives(
     term: EffectTerm, params: Any, t: float, q: np.ndarray, num_slow: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Values (k,) of a term of analytic functions and their derivatives (k, n) by q = (Q_s, Q_f), by complex steps for all elements at once.
+    """Values (k,) of a term of analytic functions and their derivatives (k, n) by q = (Q_s, Q_f), by complex steps for
+    all elements at once.
 
     ``g(q + i h e) = g + i h dg/dq e`` to round-off, with a tiny h.
     """
@@ -83,7 +87,8 @@ def _compiled_derivatives(functions: Sequence[TracedOnce], params, t, q_s, q_f):
 
 @dataclass(frozen=True)
 class ConstraintRows:
-    """The k rows of all constraints of a scene, in the order of `Sorting.placed`, over its n coordinates, slow ones first."""
+    """The k rows of all constraints of a scene, in the order of `Sorting.placed`, over its n coordinates, slow ones
+    first."""
 
     sorting: Sorting
 
@@ -128,8 +133,8 @@ class ConstraintRows:
         return values, np.where(np.abs(jacobian) > CANCELLED * lengths, jacobian, 0.0)
 
     def onto(self, numbers: Any, q: np.ndarray, free: Any, t: float = 0.0, contraction: float = np.inf):
-        """The nearest positions where rows vanish, by Newton's iteration in the `free` coordinates, the values of all rows (k,) over their
-        sizes, and whether these positions are reached.
+        """The nearest positions where rows vanish, by Newton's iteration in the `free` coordinates, the values of all
+        rows (k,) over their sizes, and whether these positions are reached.
 
         Args:
             numbers: of the rows.
@@ -160,8 +165,8 @@ class ConstraintRows:
     def by_masses(self) -> np.ndarray:
         """`jacobian` with the columns over the square roots of masses, so that the entries of a row have one unit.
 
-        The masses of coordinates are the diagonal of J^T M J with J = dQ/dq; 1 if masses are traced, since they only weigh the choice of
-        the rows to drop.
+        The masses of coordinates are the diagonal of J^T M J with J = dQ/dq; 1 if masses are traced, since they only
+        weigh the choice of the rows to drop.
         """
         of_bodies, masses = self.sorting.of_bodies("masses"), np.ones(1)
         if is_concrete(of_bodies):
@@ -171,10 +176,11 @@ class ConstraintRows:
 
     @cached_property
     def scales(self) -> np.ndarray:
-        """(n,) change of each coordinate in a large motion: the extent of the scene for positions, 1 for directors of rigid bodies and angles
-        of joints, and for general coordinates their largest value, or 1 if all are zero."""
+        """(n,) change of each coordinate in a large motion: the extent of the scene for positions, 1 for directors of
+        rigid bodies and angles of joints, and for general coordinates their largest value, or 1 if all are zero."""
         sorting, layout, points = self.sorting, self.sorting.layout, positions(self.sorting.bodies)
-        # largest distance from the mean along an axis; of bodies at one place their largest coordinate, or 1 at the origin
+        # largest distance from the mean along an axis; of bodies at one place their largest coordinate, or 1 at the
+        # origin
         extent = float(np.abs(points - points.mean(axis=0)).max() or np.abs(points).max() or 1.0)
         numbers, scales = layout.numbers, np.zeros(self.sorting.positions.size)
         for name in layout.coordinates.keys() & sorting.bodies.keys():
@@ -188,7 +194,8 @@ class ConstraintRows:
 
     @cached_property
     def sizes(self) -> np.ndarray:
-        """(k,) change of each row in a large motion: the length of its gradient with respect to coordinates over `scales`; 1 if this is zero."""
+        """(k,) change of each row in a large motion: the length of its gradient with respect to coordinates over
+        `scales`; 1 if this is zero."""
         lengths = np.linalg.norm(self.jacobian * self.scales, axis=1)
         return np.where(lengths > 0, lengths, 1.0)
 

@@ -24,7 +24,14 @@ from vmri_jax.scene.drawing import drawing
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.effects.joint_base import Freedom, joint_named
 from vmri_jax.scene.functions import RESERVED, Actuation, actuation, build
-from vmri_jax.scene.joint_coordinates import along_run, check_reach, check_replaced, check_run, joint_starts, with_rates
+from vmri_jax.scene.joint_coordinates import (
+    along_run,
+    check_reach,
+    check_replaced,
+    check_run,
+    joint_starts,
+    with_rates,
+)
 from vmri_jax.scene.ledger import Ledger, ledger
 from vmri_jax.scene.redundancy import check_constraints, sort_with_loops
 from vmri_jax.scene.rigid import Rigidity
@@ -45,31 +52,36 @@ class Scene:
         )
         run = simulate(scene, fully_implicit(10), macro_dt=0.01, num_steps=1000)
 
-    Absent terms cost nothing: a scene without constraints gives a system without multipliers, a scene without forces a system without a
-    force function. Scenes of the same structure (the same names, bodies of each effect, slow and fast bodies) share compiled programs.
-    The numbers of each effect are in the params of the system by its name, ``params["springs"]["stiffness"]``.
+    Absent terms cost nothing: a scene without constraints gives a system without multipliers, a scene without forces a
+    system without a force function. Scenes of the same structure (the same names, bodies of each effect, slow and fast
+    bodies) share compiled programs. The numbers of each effect are in the params of the system by its name,
+    ``params["springs"]["stiffness"]``.
 
     Args:
-        bodies: list of `Body`, `RigidBody` and `Frame`. The coordinates of slow bodies become q_s and those of fast bodies q_f, in the
-            order of the list.
-        effects: list of effects of `vmri_jax.scene`, also custom ones: `Potential`, `Constraint`, `Kinetic`, `Force`. The scene adds
-            their energies and stacks their constraints in the order of the list.
-        project: at the start, move positions onto the constraints and remove the part of the velocities that violates them,
-            instead of refusing such a start.
-        redundant: for constraints that depend on others, as in a planar loop of hinges: "refuse" raises an error with their names,
-            "drop" leaves out as many rows as there are dependences, see `dropped`. The dropped rows must follow from the others along the
-            motion, not only at the start: the scene tries random motions, and runs watch the rows, see `System.implied`.
-        coordinates: of rigid bodies. "joint": bodies in trees are functions of the freedoms of their joints; each freedom is a coordinate,
-            zero at the positions in `bodies`, and the joint has no constraint rows. Roots of trees other than the ground keep directors;
-            joints that close loops and `Spherical` joints keep their rows. "directors": a centre and directors for each body, joints are
-            constraints. "auto": joint coordinates, but directors for mechanisms with chains or loops so many that these are faster, see
-            `vmri_jax.scene.trees.LONGEST` and `JOINTS_OF_A_LOOP`; the angle of a joint with a spring, a limit or a gear is a coordinate there, too.
-        joint_starts: values and rates of joint coordinates at the start; `with_joints` sets them. They go before the velocities of bodies.
+        bodies: list of `Body`, `RigidBody` and `Frame`. The coordinates of slow bodies become q_s and those of fast
+            bodies q_f, in the order of the list.
+        effects: list of effects of `vmri_jax.scene`, also custom ones: `Potential`, `Constraint`, `Kinetic`, `Force`.
+            The scene adds their energies and stacks their constraints in the order of the list.
+        project: at the start, move positions onto the constraints and remove the part of the velocities that violates
+            them, instead of refusing such a start.
+        redundant: for constraints that depend on others, as in a planar loop of hinges: "refuse" raises an error with
+            their names, "drop" leaves out as many rows as there are dependences, see `dropped`. The dropped rows must
+            follow from the others along the motion, not only at the start: the scene tries random motions, and runs
+            watch the rows, see `System.implied`.
+        coordinates: of rigid bodies. "joint": bodies in trees are functions of the freedoms of their joints; each
+            freedom is a coordinate, zero at the positions in `bodies`, and the joint has no constraint rows. Roots of
+            trees other than the ground keep directors; joints that close loops and `Spherical` joints keep their rows.
+            "directors": a centre and directors for each body, joints are constraints. "auto": joint coordinates, but
+            directors for mechanisms with chains or loops so many that these are faster, see
+            `vmri_jax.scene.trees.LONGEST` and `JOINTS_OF_A_LOOP`; the angle of a joint with a spring, a limit or a gear
+            is a coordinate there, too.
+        joint_starts: values and rates of joint coordinates at the start; `with_joints` sets them. They go before the
+            velocities of bodies.
 
     Raises:
         TypeError: an object of another class in `bodies` or `effects`.
-        ValueError: 64-bit mode is off, no bodies, a name that occurs twice, arguments that an effect refuses (see its class), redundant
-            constraints, a limit or a neutral angle that an angle of directors cannot reach.
+        ValueError: 64-bit mode is off, no bodies, a name that occurs twice, arguments that an effect refuses
+            (see its class), redundant constraints, a limit or a neutral angle that an angle of directors cannot reach.
     """
 
     bodies: Any
@@ -110,7 +122,8 @@ class Scene:
         for name, count in Counter(freedoms + [item.name for item in (*self.bodies, *self.everything)]).items():
             if count > 1:
                 raise Refused(
-                    f"Scene: the name {name!r} occurs twice among bodies, effects and freedoms of joints; give each its own, name=..."
+                    f"Scene: the name {name!r} occurs twice among bodies, effects and freedoms of joints; give each "
+                    "its own, name=..."
                 )
         for name, content in RESERVED.items():
             if name in [effect.name for effect in self.effects]:
@@ -135,26 +148,29 @@ class Scene:
         limits: Literal["refuse", "spring"] = "refuse",
         coordinates: Literal["joint", "directors"] = "joint",
     ) -> "Scene":
-        """The scene of a model of MuJoCo: bodies, inertias, joints with springs, dampers and armature, equalities, gravity and gravcomp.
+        """The scene of a model of MuJoCo: bodies, inertias, joints with springs, dampers and armature, equalities,
+        gravity and gravcomp.
 
-        The reader leaves out features that the flags of the model switch off, and does not refuse them. Every body gets the pace "auto";
-        ``scene.replace("arm", pace="fast")`` changes that.
+        The reader leaves out features that the flags of the model switch off, and does not refuse them. Every body gets
+        the pace "auto"; ``scene.replace("arm", pace="fast")`` changes that.
 
         Args:
             model: path of an MJCF or URDF file, or a compiled `mujoco.MjModel`.
-            qpos, qvel: MuJoCo's coordinates and velocities at the start; by default qpos0 of the model, at rest. The reader moves the
-                joints to close loops that qpos leaves open by less than a thousandth of the model's extent.
+            qpos, qvel: MuJoCo's coordinates and velocities at the start; by default qpos0 of the model, at rest. The
+                reader moves the joints to close loops that qpos leaves open by less than a thousandth of the model's
+                extent.
             key: a keyframe of the model, name or number, in place of qpos and qvel.
             ignore: features of the model that the scene leaves out, by the names in the message that refuses them.
-            limits: "refuse" a model with joint limits, or read each as a smooth "spring", see `JointLimit`, as stiff as MuJoCo's limit for
-                the inertia at the joint.
+            limits: "refuse" a model with joint limits, or read each as a smooth "spring", see `JointLimit`, as stiff as
+                MuJoCo's limit for the inertia at the joint.
             coordinates: of the scene; with "directors" each body can have only one joint.
 
         Raises:
             ImportError: without the package mujoco, or with one before 4.0.
             TypeError: a model of another class, `ignore` that is no list.
-            ValueError: a file that MuJoCo cannot read; features that a scene cannot express, all in one list; equalities that do not hold
-                at the start; an unknown name in `ignore`, an unknown keyframe; qpos or qvel of another shape or not finite.
+            ValueError: a file that MuJoCo cannot read; features that a scene cannot express, all in one list;
+                equalities that do not hold at the start; an unknown name in `ignore`, an unknown keyframe; qpos or qvel
+                of another shape or not finite.
         """
         from vmri_jax.scene.mujoco import bodies_and_effects  # the package mujoco is an optional dependency
 
@@ -170,19 +186,22 @@ class Scene:
 
     @cached_property
     def bound(self) -> tuple[Effect, ...]:
-        """The effects of the user on the bodies of this scene: their elements, parameters and values at the start, each computed once."""
+        """The effects of the user on the bodies of this scene: their elements, parameters and values at the start, each
+        computed once."""
         return bound(self.effects, self.by_name)
 
     @cached_property
     def branches(self) -> tuple[Branch, ...]:
-        """The bodies that are functions of the freedoms of joints, each with its joint and the body that it hangs on."""
+        """The bodies that are functions of the freedoms of joints, each with its joint and the body that it hangs
+        on."""
         if self.coordinates == "directors":
             return ()
         return grow(self.by_name, self.bound, everywhere=self.coordinates == "joint")
 
     @cached_property
     def everything(self) -> tuple[Effect, ...]:
-        """All effects: `Rigidity` of the bodies that have directors, then the effects of the user, all bound to the bodies."""
+        """All effects: `Rigidity` of the bodies that have directors, then the effects of the user, all bound to the
+        bodies."""
         carried = {branch.child for branch in self.branches}
         rigid = [body.name for body in self.bodies if body.rigid and body.name not in carried]
         return (Rigidity(rigid).bound(self.by_name), *self.bound) if rigid else self.bound
@@ -199,7 +218,8 @@ class Scene:
 
     @property
     def places(self) -> dict[str, Place]:
-        """Where each body's coordinates are in q_s and q_f; with joint coordinates, in the (Q_s, Q_f) that `Names.kinematics` computes."""
+        """Where each body's coordinates are in q_s and q_f; with joint coordinates, in the (Q_s, Q_f) that
+        `Names.kinematics` computes."""
         return self.sorting.layout.bodies
 
     @cached_property
@@ -217,7 +237,8 @@ class Scene:
         """(q_s, q_f, v_s, v_f) at the start.
 
         Raises:
-            ValueError: velocities of bodies that their joints do not allow, unless `project` is set, which takes the nearest allowed ones.
+            ValueError: velocities of bodies that their joints do not allow, unless `project` is set, which takes the
+                nearest allowed ones.
         """
         start, violation = self.sorting.start_and_violation
         if is_concrete(violation):
@@ -230,11 +251,13 @@ class Scene:
         return actuation(self.sorting)
 
     def system(self) -> System:
-        """The system of the Lagrangian ``T - V - W`` with constraints and forces; each function without effects is None."""
+        """The system of the Lagrangian ``T - V - W`` with constraints and forces; each function without effects is
+        None."""
         return build(self.sorting, self.sorting.placed)
 
     def problem(self) -> Problem:
-        """The `Problem`: the system with positions and velocities at the start, and with the drawing unless jax.jit, grad or vmap traces numbers of the scene."""
+        """The `Problem`: the system with positions and velocities at the start, and with the drawing unless jax.jit,
+        grad or vmap traces numbers of the scene."""
         if self._problems:
             return self._problems[0]
         drawn = self.drawing() if is_concrete((self.params, [body.radius for body in self.bodies])) else None
@@ -248,9 +271,11 @@ class Scene:
         return initial_state(self.system(), *self.start, project=self.project)
 
     def joint_motion(self, run, joint: str, of: Freedom | Literal["auto"] = "auto", pair: int = 0) -> np.ndarray:
-        """How far a joint has turned (rad, whole turns included) or moved along its axis (m) from the given position, (k,).
+        """How far a joint has turned (rad, whole turns included) or moved along its axis (m) from the given position,
+        (k,).
 
-        The coordinate of the joint where it has one. Where it has none, turns are counted from node to node by the angle and its rate.
+        The coordinate of the joint where it has one. Where it has none, turns are counted from node to node by the
+        angle and its rate.
 
         Args:
             run: of this scene.
@@ -259,13 +284,15 @@ class Scene:
             pair: number of the pair of bodies, if the joint has several.
 
         Raises:
-            ValueError: no such joint or freedom; a joint without a coordinate that may turn by half a turn or more between two nodes.
+            ValueError: no such joint or freedom; a joint without a coordinate that may turn by half a turn or more
+                between two nodes.
             IndexError: no such pair.
         """
         return along_run(self.sorting, joint_named("Scene.joint_motion", joint, self.bound), run, of, pair)
 
     def by_directors(self, run: Trajectory) -> Trajectory:
-        """The same run with bodies described by their centres and directors, where joints have rows, multipliers and reaction forces.
+        """The same run with bodies described by their centres and directors, where joints have rows, multipliers and
+        reaction forces.
 
             scene.by_directors(run).reaction_forces("hinge")["panel"]  # on the centre and the directors of the panel
 
@@ -273,13 +300,15 @@ class Scene:
             run: of this scene.
 
         Raises:
-            ValueError: frames without mass, which cannot move by directors; angles too far for effects that take them from directors.
+            ValueError: frames without mass, which cannot move by directors; angles too far for effects that take them
+                from directors.
         """
         frames = [body.name for body in self.bodies if isinstance(body, Frame)]
         if frames:
             raise Refused(
-                f"Scene.by_directors: {', '.join(frames)} have no mass, which bodies with directors need. Reaction forces are known of scenes "
-                "without frames: join bodies by Universal, Cylindrical or Planar, or put bodies of small mass in place of the frames."
+                f"Scene.by_directors: {', '.join(frames)} have no mass, which bodies with directors need. Reaction "
+                "forces are known of scenes without frames: join bodies by Universal, Cylindrical or Planar, or put "
+                "bodies of small mass in place of the frames."
             )
         # all bodies slow: on the micro grid, rows that the fast bodies alone cannot satisfy would be refused
         bodies = [replace(body, pace="slow") for body in self.bodies]
@@ -320,7 +349,8 @@ class Scene:
             changes: new values of its arguments.
 
         Raises:
-            ValueError: no body or effect of this name, an argument that its class does not have, a velocity that a joint sets.
+            ValueError: no body or effect of this name, an argument that its class does not have, a velocity that a
+                joint sets.
         """
         items = {item.name: item for item in (*self.bodies, *self.effects)}
         if name not in items:
@@ -338,15 +368,18 @@ class Scene:
 
             scene.with_rates({"bearing": 100.0})  # rad/s; all bodies on the crank move with it
 
-        Of all such velocities the scene takes those nearest to the present velocities, in the norm of the kinetic energy.
+        Of all such velocities the scene takes those nearest to the present velocities, in the norm of the kinetic
+        energy.
 
         Args:
-            rates: by the name of a joint such as `Revolute` or `Prismatic`: rad/s or m/s, of the second body against the first; one
-                number, or a number for each pair of the joint. Of a joint with several freedoms, ``{"turn": 1.0, "slide": 0.1}``.
+            rates: by the name of a joint such as `Revolute` or `Prismatic`: rad/s or m/s, of the second body against
+                the first; one number, or a number for each pair of the joint. Of a joint with several freedoms,
+                ``{"turn": 1.0, "slide": 0.1}``.
 
         Raises:
             TypeError: no mapping, or numbers of the scene that jax.jit, grad or vmap traces.
-            ValueError: no joint of this name, a joint without this freedom, rates that contradict each other or the constraints.
+            ValueError: no joint of this name, a joint without this freedom, rates that contradict each other or the
+                constraints.
         """
         bodies, starts = with_rates(self.sorting, self.bound, self.system(), rates)
         return replace(self, bodies=bodies, joint_starts=starts)
@@ -356,28 +389,32 @@ class Scene:
 
             scene.with_joints({"shoulder": 0.3, "elbow": (-0.5, 2.0), "axle": {"turn": (0.0, 10.0), "slide": 0.1}})
 
-        The positions of the bodies in `bodies` remain the zero of all joint coordinates, and springs still measure their rest lengths
-        there. In loops and through gears, joints that are not named follow the named ones.
+        The positions of the bodies in `bodies` remain the zero of all joint coordinates, and springs still measure
+        their rest lengths there. In loops and through gears, joints that are not named follow the named ones.
 
         Args:
-            joints: by the name of the joint: its value, an angle (rad) or a distance (m), or a pair (value, rate); the rate is zero by
-                default. Of a joint with several freedoms, a dictionary by their names. For a joint of several pairs of bodies, a value or
-                rate is one number for all pairs, or a number for each.
+            joints: by the name of the joint: its value, an angle (rad) or a distance (m), or a pair (value, rate); the
+                rate is zero by default. Of a joint with several freedoms, a dictionary by their names. For a joint of
+                several pairs of bodies, a value or rate is one number for all pairs, or a number for each.
 
         Raises:
             TypeError: no mapping.
-            ValueError: no joint of this name; a joint without this freedom, or without joint coordinates; numbers that are not finite; a
-                loop that does not close with these values, or whose last joint, without a coordinate, would turn too far for its effects.
+            ValueError: no joint of this name; a joint without this freedom, or without joint coordinates; numbers that
+                are not finite; a loop that does not close with these values, or whose last joint, without a coordinate,
+                would turn too far for its effects.
         """
         return replace(self, joint_starts={**self.joint_starts, **joint_starts(self.sorting, self.bound, joints)})
 
     def explain(self, scheme: Scheme | Composition, *, macro_dt: float | None = None, measure: bool = True) -> Ledger:
-        """The grid, unknowns, evaluations and computing time that every body and effect adds to a macro step of a scheme.
+        """The grid, unknowns, evaluations and computing time that every body and effect adds to a macro step of a
+        scheme.
 
         Args:
             scheme: of the macro steps.
-            macro_dt: s, the macro step that is timed; by default micro steps have the length 0.1 / w, with the largest frequency w.
-            measure: compile and time a macro step, and the first derivatives of every effect; without it the ledger has no times.
+            macro_dt: s, the macro step that is timed; by default micro steps have the length 0.1 / w, with the largest
+                frequency w.
+            measure: compile and time a macro step, and the first derivatives of every effect; without it the ledger has
+                no times.
         """
         return ledger(self.sorting, scheme, macro_dt, measure)
 

@@ -10,7 +10,8 @@ SIDES = 20
 """Side faces of a drawn cylinder. More look rounder and take longer to draw."""
 
 Polyhedron = tuple[np.ndarray, list[list[int]]]
-"""Corners (n, 3) in the axes of a body, and faces as lists of numbers of corners, anticlockwise as seen from outside."""
+"""Corners (n, 3) in the axes of a body, and faces as lists of numbers of corners, anticlockwise as seen from
+outside."""
 
 
 @dataclass(frozen=True)

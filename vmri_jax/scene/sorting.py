@@ -1,7 +1,7 @@
 """Sorting of bodies into slow and fast, and of effects into the functions of a `System`.
 
-An effect touches the bodies whose coordinates it depends on. Each of its elements has a home, the argument of `System` that it is part of.
-Of several lines that fit, the first one counts:
+An effect touches the bodies whose coordinates it depends on. Each of its elements has a home, the argument of `System`
+that it is part of. Of several lines that fit, the first one counts:
 
 | element of a | home | function |
 |---|---|---|
@@ -11,18 +11,21 @@ Of several lines that fit, the first one counts:
 | potential between fast bodies with the rate "slow", or not stiff | "slow_potential" | V |
 | potential between fast bodies with the rate "fast", or stiff | "fast_potential" | W(q_f), on the micro grid |
 | constraint that touches a fast body | "constraint" | g, on the micro grid |
-| constraint between slow bodies | "slow_constraint" | g_s, on the macro grid; on the micro grid it would have more rows than unknowns |
+| constraint between slow bodies | "slow_constraint" | g_s, on the macro grid |
 | kinetic effect | "kinetic" | T, on the micro grid: the momenta of fast bodies follow from it |
 | force | "force" | F |
 | control | "control" | none: a run has no controls |
 
-The kinetic energy T_s of bodies that depend on slow coordinates alone is on the macro grid.
+The kinetic energy T_s of bodies that depend on slow coordinates alone is on the macro grid. On the micro grid g_s would
+have more rows than unknowns.
 
-A body with the pace "auto" is fast if one of these effects moves it against another body: a potential or kinetic effect that has the rate
-"fast", a potential with the rate k, or a stiff potential or kinetic effect that has the rate "auto". A stiff potential that touches a body with the pace "slow" does not count, since it is
-part of V. An effect is stiff if its frequency is above the border between slow and fast, see `vmri_jax.scene.rates`. Without a border no
-effect makes bodies fast by its frequency, and every potential between fast bodies with a frequency above zero is stiff. A body with the pace "auto" is fast, too,
-if constraints tie it to fast bodies that cannot move without it, as in a closed loop, see `vmri_jax.scene.redundancy.tied_to_fast`.
+A body with the pace "auto" is fast if one of these effects moves it against another body: a potential or kinetic effect
+that has the rate "fast", a potential with the rate k, or a stiff potential or kinetic effect that has the rate "auto".
+A stiff potential that touches a body with the pace "slow" does not count, since it is part of V. An effect is stiff if
+its frequency is above the border between slow and fast, see `vmri_jax.scene.rates`. Without a border no effect makes
+bodies fast by its frequency, and every potential between fast bodies with a frequency above zero is stiff. A body with
+the pace "auto" is fast, too, if constraints tie it to fast bodies that cannot move without it, as in a closed loop, see
+`vmri_jax.scene.redundancy.tied_to_fast`.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -50,7 +53,8 @@ Home = (
     Literal["kinetic", "slow_potential", "fast_potential", "constraint", "slow_constraint", "force", "control", "fast"]
     | int
 )
-"""The argument of `System` that an element is part of; "fast" or a whole number is the key of a potential in `System.potentials`."""
+"""The argument of `System` that an element is part of; "fast" or a whole number is the key of a potential in
+`System.potentials`."""
 
 HOMES: tuple[Home, ...] = ("slow_constraint", "constraint")
 """The arguments of `System` that hold constraints, in the order of the grids macro, micro."""
@@ -83,8 +87,8 @@ class Sorting:
     """Bodies with their paces and places, and the effects, each with its home.
 
     branches: the bodies on joints, in the order of the kinematics.
-    joint_starts: values and rates of freedoms of joints at the start, by the keys of `Layout.freedoms`. Other freedoms start at zero,
-        with the rates that follow from the velocities of bodies.
+    joint_starts: values and rates of freedoms of joints at the start, by the keys of `Layout.freedoms`. Other freedoms
+        start at zero, with the rates that follow from the velocities of bodies.
     """
 
     bodies: Bodies
@@ -106,7 +110,8 @@ class Sorting:
 
     @property
     def assembled(self) -> Any:
-        """(n,) q = (q_s, q_f) at the positions of the bodies as the user gave them, where freedoms of joints are zero."""
+        """(n,) q = (q_s, q_f) at the positions of the bodies as the user gave them, where freedoms of joints are
+        zero."""
         q, (n_s, n_f), first_fast = self.of_bodies("coordinates"), self.layout.sizes, self.layout.ends[0]
         return q if self.layout.kinematics is None else joined([q[:n_s], q[first_fast : first_fast + n_f]])
 
@@ -116,8 +121,8 @@ class Sorting:
         for key, value_and_rate in self.joint_starts.items():
             if key not in numbers:
                 raise Refused(
-                    f"Scene: with_joints has set a start of {key[0]}, which has no coordinate in this scene. Change effects, bodies and "
-                    "coordinates first, and call with_joints then."
+                    f"Scene: with_joints has set a start of {key[0]}, which has no coordinate in this scene. Change "
+                    "effects, bodies and coordinates first, and call with_joints then."
                 )
             (i,), number = numbers[key], value_and_rate[order]
             q = joined([q[:i], library(number).reshape(number, (1,)), q[i + 1 :]])
@@ -125,7 +130,8 @@ class Sorting:
 
     @cached_property
     def start_and_violation(self) -> tuple[tuple, Any]:
-        """`start`, and the part of the velocities of bodies that their joints do not allow, relative to all, by masses."""
+        """`start`, and the part of the velocities of bodies that their joints do not allow, relative to all, by
+        masses."""
         q, v, violation, n_s = self.positions, self.of_bodies("rates"), 0.0, self.layout.sizes[0]
         if self.layout.kinematics is not None:
             v, violation = _nearest_rates(self.to_bodies(self.assembled)[1], v, self.of_bodies("masses"))
@@ -161,15 +167,16 @@ def _nearest_rates(jacobian, rates, masses) -> tuple[Any, Any]:
 
 
 Owners = tuple[tuple[str, ...], tuple[str, ...]]
-"""The bodies whose coordinates an element of an effect depends on: all, and the ones among these that move the bodies of the element
-against each other, not together."""
+"""The bodies whose coordinates an element of an effect depends on: all, and the ones among these that move the bodies
+of the element against each other, not together."""
 
 
 def _owners(effect: Effect, branches: Sequence[Branch]) -> list[Owners]:
     """The bodies whose coordinates each element of an effect depends on.
 
-    Every body of an element depends on a chain of bodies, from itself to the root of its tree. All bodies are the union of these chains; the
-    bodies that move the bodies of the element against each other are this union without the bodies that are in every chain.
+    Every body of an element depends on a chain of bodies, from itself to the root of its tree. All bodies are the union
+    of these chains; the bodies that move the bodies of the element against each other are this union without the bodies
+    that are in every chain.
     """
     on_joints = {branch.child: branch for branch in branches}
     carried = {(branch.joint.name, branch.element): branch.child for branch in branches}
@@ -245,9 +252,9 @@ def _measure(bodies, energies, owned: Mapping[str, Sequence[Owners]]) -> dict[st
     numbers = [(body.masses, body.coordinates, body.rates if kinetic else None) for body in bodies.values()]
     if not is_concrete((numbers, [effect.parameters for effect in energies])):
         raise Refused(
-            f"Scene: whether {', '.join(undecided or bodies)} is slow or fast depends on numbers that jax.jit, grad or vmap traces, so that "
-            "their values are unknown. Give every body a pace and every potential between fast bodies a rate, or build the system outside of "
-            "jit and vary its params."
+            f"Scene: whether {', '.join(undecided or bodies)} is slow or fast depends on numbers that jax.jit, grad or "
+            "vmap traces, so that their values are unknown. Give every body a pace and every potential between fast "
+            "bodies a rate, or build the system outside of jit and vary its params."
         )
     return measure(bodies, energies)
 
@@ -318,7 +325,8 @@ def _home(effect: Effect, i: int, slow: tuple[str, ...], size: int, measured, li
 
 
 def _summary(reasons: Iterable[tuple[str, tuple[str, ...]]]) -> str:
-    """The distinct reasons of the elements of an effect, each with all its slow bodies; of several reasons each with its number of elements."""
+    """The distinct reasons of the elements of an effect, each with all its slow bodies; of several reasons each with
+    its number of elements."""
     bodies_by_text: dict[str, list[tuple[str, ...]]] = {}
     for text, slow in reasons:
         bodies_by_text.setdefault(text, []).append(slow)

@@ -1,4 +1,5 @@
-"""Terms: effects as functions of the coordinates of bodies, of which `vmri_jax.scene.functions` makes the functions of a `System`.
+"""Terms: effects as functions of the coordinates of bodies, of which `vmri_jax.scene.functions` makes the functions of
+a `System`.
 
 All classes here are compared by value: scenes of the same structure give equal functions, which JAX compiles only once.
 """
@@ -25,7 +26,8 @@ ARGUMENTS: dict[str, tuple[str, ...]] = {
     "force": ("t", "q", "v"),
     "control": ("q", "u"),
 }
-"""For each kind of effects the arguments of its function before params; a constraint that depends on time gets t before them."""
+"""For each kind of effects the arguments of its function before params; a constraint that depends on time gets t before
+them."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +42,8 @@ class Applied:
 
 
 def is_of_package(function: Callable) -> bool:
-    """Whether a function, with all functions that are filled in, is part of this package: these act element by element on any number of elements.
+    """Whether a function, with all functions that are filled in, is part of this package: these act element by element
+    on any number of elements.
 
     A function of the user may be right for a single element alone, such as ``sum(q**2)**2``.
     """
@@ -50,25 +53,29 @@ def is_of_package(function: Callable) -> bool:
 
 
 def split(q):
-    """Centre (..., 3) and directors (..., k, 3), a director per row, of the coordinates q (..., 3 + 3 k) of a rigid body."""
+    """Centre (..., 3) and directors (..., k, 3), a director per row, of the coordinates q (..., 3 + 3 k) of a rigid
+    body."""
     triples = q.reshape(*q.shape[:-1], -1, 3)
     return triples[..., 0, :], triples[..., 1:, :]
 
 
 def place(q, weights):
-    """``phi + sum_i X_i d_i``, (..., 3), of the coordinates q of a body, which may have fewer than three directors, and the components X of a point."""
+    """``phi + sum_i X_i d_i``, (..., 3), of the coordinates q of a body, which may have fewer than three directors, and
+    the components X of a point."""
     phi, d = split(q)
     return phi + (weights[..., : d.shape[-2], None] * d).sum(axis=-2)
 
 
 @dataclass(frozen=True)
 class Role:
-    """The map from q_s and q_f to the bodies, or to points in them, that elements between bodies of one kind have in one role: linear but on the ground.
+    """The map from q_s and q_f to the bodies, or to points in them, that elements between bodies of one kind have in
+    one role: linear but on the ground.
 
     rows: coordinates of the bodies, all of one kind; None for the ground.
     count, size: number of elements, and of coordinates that the function takes of each.
-    point: name of the parameter with the components X of points ``phi + sum_i X_i d_i`` fixed in rigid bodies or, on the ground, of
-        points in space; "" for bodies themselves. The ground itself is a rigid body with the axes of space.
+    point: name of the parameter with the components X of points ``phi + sum_i X_i d_i`` fixed in rigid bodies or, on
+        the ground, of points in space; "" for bodies themselves. The ground itself is a rigid body with the axes of
+        space.
     """
 
     rows: Rows | None
@@ -108,11 +115,12 @@ class EffectTerm:
 
     sources: the elements.
     arguments: names of the arguments of the function before params, see `ARGUMENTS`.
-    roles: for each role the maps from (q_s, q_f) to the coordinates of its bodies: of the elements between bodies of one kind, then of another
-        kind, and so on.
+    roles: for each role the maps from (q_s, q_f) to the coordinates of its bodies: of the elements between bodies of
+        one kind, then of another kind, and so on.
     split: names of the parameters that have an entry for each element.
     is_joined: whether the terms of several effects with this function are one term, see `joined`.
-    through: ``through(q, params)``, the argument q of the function by the coordinates of each role; None if it is these coordinates.
+    through: ``through(q, params)``, the argument q of the function by the coordinates of each role; None if it is these
+        coordinates.
     """
 
     sources: tuple[Source, ...]
@@ -154,7 +162,8 @@ class EffectTerm:
         return self.function(*(values[name] for name in self.arguments), params)
 
     def forces(self, values: Mapping[str, Any], params):
-        """Forces F on the argument q of the function, as forces ``(dq/dq_s)^T F`` and ``(dq/dq_f)^T F``; arguments as of a call."""
+        """Forces F on the argument q of the function, as forces ``(dq/dq_s)^T F`` and ``(dq/dq_f)^T F``; arguments as
+        of a call."""
         q, pull = jax.vjp(self._map(self.params_of(params)), *values["q"])
         forces = zip(self(values, params), q, strict=True)
         return pull(tuple(jnp.broadcast_to(jnp.asarray(f, float), x.shape) for f, x in forces))
@@ -209,18 +218,21 @@ def _positions(role: Sequence[Role], q_s, q_f, params):
 
 
 def choose(params, select: Sequence[int], split: Sequence[str]):
-    """The parameters of some elements; each parameter in `split` has an entry for each element, or one number for all."""
+    """The parameters of some elements; each parameter in `split` has an entry for each element, or one number for
+    all."""
     return params | {name: pick(params[name], select) for name in split if jnp.ndim(params[name])} if split else params
 
 
 def _rows(numbers, count: int):
-    """A parameter of `count` elements with an axis for them, which a single element and a number for all elements lack."""
+    """A parameter of `count` elements with an axis for them, which a single element and a number for all elements
+    lack."""
     numbers = jnp.asarray(numbers)
     return numbers[None] if count == 1 else jnp.broadcast_to(numbers, (count,)) if numbers.ndim == 0 else numbers
 
 
 def joined(terms: Iterable[Any], in_order: bool = False) -> tuple[Any, ...]:
-    """The terms, with one term in place of several of one kind; if `in_order`, of neighbours alone, so that the elements keep their order."""
+    """The terms, with one term in place of several of one kind; if `in_order`, of neighbours alone, so that the
+    elements keep their order."""
     groups: dict[Any, list] = {}
     last, run = None, 0
     for term in terms:

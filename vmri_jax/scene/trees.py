@@ -1,11 +1,12 @@
 """Trees of bodies on joints: which joints carry a body as a function of their freedoms, and which close loops.
 
-A joint whose freedoms are coordinates without a singularity may carry a body. In each loop of such joints one joint closes the loop: it
-carries no body, and its rows stay constraints. Prim's algorithm chooses these joints. It grows a spanning tree from the ground, and from
-a body of each mechanism that is not tied to the ground: a body with the pace "slow", then the one with most directors, then the heaviest.
-It adds joints in this order: joints whose whole turns an effect counts, since an angle of directors has none; joints in which another
-effect acts; joints with few freedoms, so that the joints left over have few rows; joints near the root, so that trees are not deep. Names
-decide among equals: the order in which bodies and joints are listed has no influence.
+A joint whose freedoms are coordinates without a singularity may carry a body. In each loop of such joints one joint
+closes the loop: it carries no body, and its rows stay constraints. Prim's algorithm chooses these joints. It grows a
+spanning tree from the ground, and from a body of each mechanism that is not tied to the ground: a body with the pace
+"slow", then the one with most directors, then the heaviest. It adds joints in this order: joints whose whole turns an
+effect counts, since an angle of directors has none; joints in which another effect acts; joints with few freedoms, so
+that the joints left over have few rows; joints near the root, so that trees are not deep. Names decide among equals:
+the order in which bodies and joints are listed has no influence.
 """
 
 from collections import defaultdict
@@ -28,13 +29,15 @@ from vmri_jax.scene.rigid import RigidBody
 from vmri_jax.scene.terms import split
 
 LONGEST = 100
-"""Most bodies between the root and a leaf of a tree for which coordinates="auto" chooses joint coordinates. The kinetic energy couples all
-joints of a tree, so that the time of a step grows at last with the third power of this length; by directors it grows in proportion. On a
-hinged chain of 30 bars a step in joint coordinates takes 0.17 of the time by directors, on 100 bars 0.94 of it."""
+"""Most bodies between the root and a leaf of a tree for which coordinates="auto" chooses joint coordinates. The kinetic
+energy couples all joints of a tree, so that the time of a step grows at last with the third power of this length; by
+directors it grows in proportion. On a hinged chain of 30 bars a step in joint coordinates takes 0.17 of the time by
+directors, on 100 bars 0.94 of it."""
 JOINTS_OF_A_LOOP = 5
-"""Fewest joints for each loop of a scene for which coordinates="auto" chooses joint coordinates. In denser loops the constraints of the cut joints
-take away most of the coordinates, and each depends on all joints of its loop: in a row of six four-bars, with 3.2 joints for each loop, a step in joint
-coordinates takes 0.13 of the time by directors, and the first result, nearly all of it compiling, 1.5 times as long; of two four-bars 3 times."""
+"""Fewest joints for each loop of a scene for which coordinates="auto" chooses joint coordinates. In denser loops the
+constraints of the cut joints take away most of the coordinates, and each depends on all joints of its loop: in a row of
+six four-bars, with 3.2 joints for each loop, a step in joint coordinates takes 0.13 of the time by directors, and the
+first result, nearly all of it compiling, 1.5 times as long; of two four-bars 3 times."""
 COUNTED, USED, UNUSED = range(3)
 """Ranks of a pair of bodies in a joint: an effect counts whole turns of its angle, an effect acts in it, none does."""
 
@@ -65,7 +68,8 @@ class Branch(NamedTuple):
     @property
     def way(self) -> list[Key]:
         """The freedoms in the order from the parent to the child."""
-        # the motions are defined from body a to body b of the joint; a child that is body a undoes them, the last one first
+        # the motions are defined from body a to body b of the joint; a child that is body a undoes them, the last one
+        # first
         return self.keys[:: 1 if self.forward else -1]
 
     @property
@@ -130,7 +134,8 @@ def _ranks(effects: Sequence[Effect]) -> dict[tuple[str, int], int]:
 
 
 def _root_rank(name: str, bodies: Bodies) -> tuple:
-    """Sort key, the best root first: the ground, bodies with the pace "slow", with all three directors, with a large mass."""
+    """Sort key, the best root first: the ground, bodies with the pace "slow", with all three directors, with a large
+    mass."""
     if name == GROUND:
         return (False,)
     body = bodies[name]
@@ -139,14 +144,16 @@ def _root_rank(name: str, bodies: Bodies) -> tuple:
 
 
 def check_frames(bodies: Bodies, branches: Sequence[Branch]) -> None:
-    """Refuse frames that hang on no joint, or that carry no body; there are no branches if all bodies have directors."""
+    """Refuse frames that hang on no joint, or that carry no body; there are no branches if all bodies have
+    directors."""
     hanging, carrying = ({getattr(branch, end) for branch in branches} for end in ("child", "parent"))
     for name, body in bodies.items():
         if not isinstance(body, Frame):
             continue
         if not branches:
             raise Refused(
-                f'Scene: {name} is a frame without mass, which moves with joints alone; give the scene coordinates="joint".'
+                f"Scene: {name} is a frame without mass, which moves with joints alone; give the scene"
+                ' coordinates="joint".'
             )
         if name not in hanging or name not in carrying:
             lack = f"no joint carries the frame {name}" if name not in hanging else f"the frame {name} carries no body"
@@ -229,7 +236,8 @@ def _kinematics(branches: Sequence[Branch], places, freedoms, sizes) -> tuple[Ki
 
 
 def joint_constants(bodies: Bodies, branches: Sequence[Branch]) -> dict[str, Any]:
-    """The constants "turn", "slide" and "zero" of the branches, see `Kinematics` with its letters, in the axes of their roots."""
+    """The constants "turn", "slide" and "zero" of the branches, see `Kinematics` with its letters, in the axes of their
+    roots."""
     on_joints = {branch.child: branch for branch in branches}
     zeros, turns, slides = [], [], []
     for branch in branches:

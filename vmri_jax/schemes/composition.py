@@ -4,9 +4,9 @@ A composition runs a scheme Phi over parts of the macro step,
 
     Psi_H = Phi_{c_s H} o ... o Phi_{c_1 H},        c_1 + ... + c_s = 1,
 
-and chooses the c_i such that the leading errors cancel. It keeps the properties of the scheme (symplecticity, momentum maps,
-constraints), needs no new equations, and stays explicit if the scheme is. Beyond order 2 some c_i are negative (Sheng
-1989, Suzuki 1991). Source of the coefficients and of the theory: Hairer, Lubich, Wanner, *Geometric Numerical
+and chooses the c_i such that the leading errors cancel. It keeps the properties of the scheme (symplecticity, momentum
+maps, constraints), needs no new equations, and stays explicit if the scheme is. Beyond order 2 some c_i are negative
+(Sheng 1989, Suzuki 1991). Source of the coefficients and of the theory: Hairer, Lubich, Wanner, *Geometric Numerical
 Integration* (2006), V.3.2.
 """
 
@@ -39,7 +39,8 @@ class NamedComposition:
 
 
 def _jump(num_stages: int) -> tuple[float, ...]:
-    """First half of s coefficients, all equal to c but c_mid in the middle: ``(s - 1) c + c_mid = 1`` and ``(s - 1) c^3 + c_mid^3 = 0``."""
+    """First half of s coefficients, all equal to c but c_mid in the middle: ``(s - 1) c + c_mid = 1`` and
+    ``(s - 1) c^3 + c_mid^3 = 0``."""
     outer = 1 / (num_stages - 1 - (num_stages - 1) ** (1 / 3))
     return (outer,) * (num_stages // 2) + (1 - (num_stages - 1) * outer,)
 
@@ -126,7 +127,8 @@ class Composition(eqx.Module):
 
     @property
     def micro_times(self):
-        """(num_micro,) ends of the micro steps in units of the macro step; they decrease in stages that go backwards."""
+        """(num_micro,) ends of the micro steps in units of the macro step; they decrease in stages that go
+        backwards."""
         ends = jnp.cumsum(self.coefficients)
         return (ends[:, None] - self.coefficients[:, None] * (1 - self.scheme.micro_times)).reshape(-1)
 
@@ -140,8 +142,9 @@ class Composition(eqx.Module):
     def order(self) -> int:
         """Order of convergence, from the order conditions; needs concrete coefficients and weights.
 
-        The steps of the scheme are flows of ``h A + h^(p+1) B_1 + h^(p+2) B_2 + ...`` for some fields that do not commute;
-        the conditions are those of the product of their exponentials, compared with exp(H A) for random matrices.
+        The steps of the scheme are flows of ``h A + h^(p+1) B_1 + h^(p+2) B_2 + ...`` for some fields that do not
+        commute; the conditions are those of the product of their exponentials, compared with exp(H A) for random
+        matrices.
         """
         return _order(np.asarray(self.coefficients), self.scheme.order, self.scheme.is_symmetric)
 
@@ -182,8 +185,8 @@ def compose(scheme: SchemeLike, coefficients: str | Sequence[float]) -> Composit
         if is_concrete(scheme) and not (scheme.is_symmetric and scheme.order == 2):
             kind = "symmetric" if scheme.is_symmetric else "not symmetric"
             raise Refused(
-                f"compose: {coefficients} is made for symmetric schemes of order 2; this one has order {scheme.order} and is "
-                f"{kind}. Take e.g. fully_explicit(num_micro, alpha=0.5), or give coefficients of your own."
+                f"compose: {coefficients} is made for symmetric schemes of order 2; this one has order {scheme.order} "
+                f"and is {kind}. Take e.g. fully_explicit(num_micro, alpha=0.5), or give coefficients of your own."
             )
         coefficients = COMPOSITIONS[coefficients].coefficients
     c = real_array("compose: coefficients", coefficients)
@@ -210,8 +213,8 @@ def stage_lengths(scheme: SchemeLike):
 def _order(coefficients: np.ndarray, order: int, symmetric: bool) -> int:
     """Order of the composition of a generic scheme of this order, by power series in H with matrix coefficients.
 
-    A stage with the step c H is ``exp(c H A + (c H)^(p+1) B_1 + ...)`` for random matrices A, B_i (for a symmetric scheme only odd powers).
-    The product of the stages agrees with exp(H A) up to the order of the composition.
+    A stage with the step c H is ``exp(c H A + (c H)^(p+1) B_1 + ...)`` for random matrices A, B_i (for a symmetric
+    scheme only odd powers). The product of the stages agrees with exp(H A) up to the order of the composition.
     """
     size, powers = 4, range(order + 10)  # no composition here gains more than 8 orders
     random = np.random.default_rng(0)

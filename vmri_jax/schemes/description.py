@@ -10,7 +10,8 @@ import numpy as np
 from vmri_jax.mechanics.summary import has_values
 
 RULES = {"T": "kinetic", "V": "slow", "W": "fast", "F": "force", "g": "constraint", "g_s": "slow_constraint"}
-"""The arguments of `Scheme` for the rules of terms: of the kinetic energy, the slow and the fast potential, forces, constraints."""
+"""The arguments of `Scheme` for the rules of terms: of the kinetic energy, the slow and the fast potential, forces,
+constraints."""
 
 
 @dataclass(frozen=True)
@@ -20,11 +21,11 @@ class Description:
     order, symmetric: order of convergence; whether the scheme is time-reversible.
     rules: rules in words, by the term: one of `RULES`, or the name of a potential.
     stages, num_micro, degree: steps of the scheme per macro step, micro steps per macro step, degree of the path.
-    slow_evaluations, fast_evaluations: number of gradients of V and of W, and of products of their Hessians with a vector, which cost about
-        as much; a node that two macro steps share counts once.
-    solves: number of systems of equations to solve, with constant masses and without constraints and forces: none for explicit schemes,
-        one per micro step (for its fast variables) if V only kicks, else one per stage. Further potentials on the micro grid count as
-        functions of fast variables alone.
+    slow_evaluations, fast_evaluations: number of gradients of V and of W, and of products of their Hessians with a
+        vector, which cost about as much; a node that two macro steps share counts once.
+    solves: number of systems of equations to solve, with constant masses and without constraints and forces: none for
+        explicit schemes, one per micro step (for its fast variables) if V only kicks, else one per stage. Further
+        potentials on the micro grid count as functions of fast variables alone.
     constrained_solves: number of systems with constraints on slow and fast variables together.
     evaluations: number of gradients of the further potentials, by name.
     """
@@ -65,7 +66,8 @@ class Description:
 
 
 def printed(scheme) -> str:
-    """The text that a scheme or composition prints: its class and its description; its fields where weights are traced or have lanes."""
+    """The text that a scheme or composition prints: its class and its description; its fields where weights are traced
+    or have lanes."""
     if not has_values(scheme) or any(np.ndim(leaf) > 1 for leaf in jax.tree.leaves(scheme)):
         return eqx.Module.__repr__(scheme)
     return "\n".join([type(scheme).__name__, *(f"  {line}" for line in str(scheme.describe()).splitlines())])

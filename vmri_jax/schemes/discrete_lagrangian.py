@@ -4,15 +4,15 @@
 
 `lagrangian` builds the sum ``T - V - W - sum_i V_i``, with every term on the nodes of its rule.
 
-The part ``T_s(q_s, q_s')`` of the kinetic energy that depends on slow variables alone, `System.slow_kinetic`, has the rule of T on the
-macro grid, just as g_s has the rule of g:
+The part ``T_s(q_s, q_s')`` of the kinetic energy that depends on slow variables alone, `System.slow_kinetic`, has the
+rule of T on the macro grid, just as g_s has the rule of g:
 
     sum_i H w_i T_s(S(c_i H), S'(c_i H))        in place of        sum_m sum_i h w_i T_s at the nodes (m + c_i) h
 
-S is one polynomial over the macro interval, so that both sums have the order of the rule, and both are discrete Lagrangians, whose steps
-are symplectic and keep momentum maps. The sums are equal if T_s has constant masses (as for rigid bodies in director coordinates) and the
-rule is exact for the square of S'. Else they differ by the error of the rule, of the order of the scheme. The cost of the left sum does
-not grow with the number of micro steps.
+S is one polynomial over the macro interval, so that both sums have the order of the rule, and both are discrete
+Lagrangians, whose steps are symplectic and keep momentum maps. The sums are equal if T_s has constant masses (as for
+rigid bodies in director coordinates) and the rule is exact for the square of S'. Else they differ by the error of the
+rule, of the order of the scheme. The cost of the left sum does not grow with the number of micro steps.
 """
 
 from collections.abc import Callable
@@ -37,7 +37,8 @@ class TermOnNodes:
 
     integrand, arguments: function of the path, and the names of its arguments, e.g. ``("q_s", "q_f")``.
     inside: nodes inside the macro interval.
-    start, end: weights at the ends of the macro interval, for terms without velocities; None without such a node. These nodes are kicks.
+    start, end: weights at the ends of the macro interval, for terms without velocities; None without such a node. These
+        nodes are kicks.
     sign: of the term in the Lagrangian.
     grid, every: placement of its rule, see `PlacedRule`.
     mollified: whether kicks take averaged fast positions.
@@ -76,8 +77,8 @@ class QuadraticKinetic:
 
         sum_ij k_ij Delta_i^T M Delta_j / (2 T),        k_ij = sum_n w_n l_i'(c_n) l_j'(c_n)
 
-    for the slow increments over the macro interval, T = H, and for the fast increments over each micro interval, T = h; the weights w_n
-    sum to 1 over the interval.
+    for the slow increments over the macro interval, T = H, and for the fast increments over each micro interval, T = h;
+    the weights w_n sum to 1 over the interval.
     """
 
     mass: ConstantMass

@@ -2,21 +2,23 @@
 
     A = L - sum_j H w_j lambda_j . g(q at node j) - sum_i H w_i nu_i . g_s(S_i)
 
-with L the terms of L_d without kicks, and sums over all control nodes but the last: the constraint force at the last node belongs to the
-next step, so that the momenta at the end are off the hidden constraints until they are projected. The equations are
+with L the terms of L_d without kicks, and sums over all control nodes but the last: the constraint force at the last
+node belongs to the next step, so that the momenta at the end are off the hidden constraints until they are projected.
+The equations are
 
     p_s + D_{S_0} A = 0      D_{S_i} A = 0  (0 < i < r)           g_s(S_i) = 0  (i = 1..r)
     p_f + D_{F_0} A = 0      D_{F_j} A = 0  (all but the last)    g = 0 at every micro control node but the first
 
-Forces add their virtual work ``H sum_i w_i F(t_i, q_i, v_i) . dq_i / dX`` to every D_X A (Lagrange-d'Alembert). Kicks are not part
-of these equations: p_s and p_f are the momenta after the kicks at the start of the step (`vmri_jax.steppers.kicked`).
+Forces add their virtual work ``H sum_i w_i F(t_i, q_i, v_i) . dq_i / dX`` to every D_X A (Lagrange-d'Alembert). Kicks
+are not part of these equations: p_s and p_f are the momenta after the kicks at the start of the step
+(`vmri_jax.steppers.kicked`).
 
 The momentum equations are multiplied by the micro step h, and the multipliers absorb their weights: the unknowns are
-``mu_j = h H w_j lambda_j`` and ``H^2 w_i nu_i``, so that for constant masses M_s, M_f the Newton matrix consists of ``k_ij M_f``,
-``k_ij M_s / num_micro`` and the constraint Jacobian for every step size, up to ``h^2`` times the curvature of potentials, with
-``k_ij = sum_n w_n l_i'(c_n) l_j'(c_n)`` of the rule of T. The w_j are weights on the macro interval: with
-n = num_micro, the weight of the constraint rule over n, summed over both intervals at nodes where two intervals meet
-(`StepEquations.multiplier_scales`).
+``mu_j = h H w_j lambda_j`` and ``H^2 w_i nu_i``, so that for constant masses M_s, M_f the Newton matrix consists of
+``k_ij M_f``, ``k_ij M_s / num_micro`` and the constraint Jacobian for every step size, up to ``h^2`` times the
+curvature of potentials, with ``k_ij = sum_n w_n l_i'(c_n) l_j'(c_n)`` of the rule of T. The w_j are weights on the
+macro interval: with n = num_micro, the weight of the constraint rule over n, summed over both intervals at nodes where
+two intervals meet (`StepEquations.multiplier_scales`).
 """
 
 from typing import NamedTuple
@@ -34,8 +36,9 @@ from vmri_jax.schemes.path import Nodes, control_nodes, lagrange_basis, velocity
 from vmri_jax.schemes.scheme import Scheme
 
 LEAST_SUM = 0.2
-"""Smallest length of a step and the step before together, relative to the step, with which multipliers at their common node count. If a forward and a
-backward step of a composition nearly cancel, they are round-off. A larger value loses predictions of multipliers, a smaller one amplifies round-off."""
+"""Smallest length of a step and the step before together, relative to the step, with which multipliers at their common
+node count. If a forward and a backward step of a composition nearly cancel, they are round-off. A larger value loses
+predictions of multipliers, a smaller one amplifies round-off."""
 
 
 class Unknowns(NamedTuple):
@@ -61,7 +64,8 @@ class StepEquations(eqx.Module):
     `vmri_jax.schemes.intervals.Intervals` evaluates them.
 
     before: length of the step before, whose momenta are off the hidden constraints; 0 for momenta on them.
-    masses: mass matrix ``d2T/dv2`` (n, n) at the start of the step, of a kinetic energy that is a function; solvers need it.
+    masses: mass matrix ``d2T/dv2`` (n, n) at the start of the step, of a kinetic energy that is a function; solvers
+        need it.
     """
 
     system: System
@@ -117,8 +121,9 @@ class StepEquations(eqx.Module):
             h^2 (w_0 + w_r)                 where micro intervals meet
             h^2 w_j                         inside
 
-        and, with the weights of the slow constraint rule, those of g_s are ``H^2 (w_0 + (H_before / H) w_r)`` at S_0 and ``H^2 w_i`` at S_i:
-        the constraint force that the step before has left out at the common node belongs to this step.
+        and, with the weights of the slow constraint rule, those of g_s are ``H^2 (w_0 + (H_before / H) w_r)`` at S_0
+        and ``H^2 w_i`` at S_i: the constraint force that the step before has left out at the common node belongs to
+        this step.
         """
         scheme, macro_dt = self.scheme, self.macro_dt
         w, w_slow = (jnp.asarray(placed.rule.weights) for placed in (scheme.constraint, scheme.slow_constraint))
@@ -128,7 +133,8 @@ class StepEquations(eqx.Module):
         return self.micro_dt**2 * shared[..., None], macro_dt**2 * slow_shared[:, None]
 
     def multipliers(self, x: Unknowns, multiplier, slow_multiplier):
-        """The multipliers lambda (num_micro, r, n_g) and (r, n_gs) of the unknowns; those of the step before, where both steps cancel.
+        """The multipliers lambda (num_micro, r, n_g) and (r, n_gs) of the unknowns; those of the step before, where
+        both steps cancel.
 
         Args:
             x: unknowns.

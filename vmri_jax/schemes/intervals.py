@@ -1,24 +1,26 @@
 """The equations of a macro step, cut into its micro intervals.
 
-Interval m starts with the fast position F_0 and the momentum p at the end of the interval before. Its part of the augmented action is
+Interval m starts with the fast position F_0 and the momentum p at the end of the interval before. Its part of the
+augmented action is
 
     A_m(S, F) = sum over terms, over their nodes i in this interval:  H w_i term(q(theta_i), qdot(theta_i))
                 - sum_j mu_j . g(q at its control node j) / h        (0 <= j < r)
 
-with S_0..S_r the slow control points of the macro step, F_0..F_r the fast ones of this interval. A node where two intervals meet belongs
-to the later one. The equations, all times h, are
+with S_0..S_r the slow control points of the macro step, F_0..F_r the fast ones of this interval. A node where two
+intervals meet belongs to the later one. The equations, all times h, are
 
     p + D_{F_0} A_m = 0      D_{F_j} A_m = 0  (0 < j < r)      g = 0 at its control nodes 1..r
 
-for the fast increments and the scaled multipliers mu. It hands on ``F_r`` and ``D_{F_r} A_m``, and pushes the slow control points by
-``D_{S_i} A_m``. The sum of these impulses over the intervals enters the slow equations:
+for the fast increments and the scaled multipliers mu. It hands on ``F_r`` and ``D_{F_r} A_m``, and pushes the slow
+control points by ``D_{S_i} A_m``. The sum of these impulses over the intervals enters the slow equations:
 
     p_s + D_{S_0} A = 0      D_{S_i} A = 0  (0 < i < r)        g_s = 0 at S_1..S_r
 
 Terms of slow variables alone, such as `System.slow_kinetic`, belong to no interval: they enter the slow equations once.
 
-These are the equations of `vmri_jax.schemes.equations`, in the order in which a march over the intervals meets them. All solvers and all
-derivatives of steps have them from here; `vmri_jax.textbook` has those of the whole step, to compare with.
+These are the equations of `vmri_jax.schemes.equations`, in the order in which a march over the intervals meets them.
+All solvers and all derivatives of steps have them from here; `vmri_jax.textbook` has those of the whole step, to
+compare with.
 """
 
 from collections.abc import Callable
@@ -41,7 +43,8 @@ from vmri_jax.schemes.path import Nodes, control_nodes, lagrange_basis, lagrange
 
 
 class IntervalPath(NamedTuple):
-    """The path over one micro interval, with the n_v slow variables on which terms in the interval depend, see `Intervals`.
+    """The path over one micro interval, with the n_v slow variables on which terms in the interval depend, see
+    `Intervals`.
 
     slow_start, slow: start and increments of the slow control points, of the whole macro step.
     fast_start, fast: start and increments of the fast control points of this interval.
@@ -67,7 +70,8 @@ class Arriving(NamedTuple):
 
 
 class IntervalUnknowns(NamedTuple):
-    """Unknowns of a micro interval, and with the same shapes its residual: fast equations at nodes 0..r-1, g at nodes 1..r."""
+    """Unknowns of a micro interval, and with the same shapes its residual: fast equations at nodes 0..r-1, g at nodes
+    1..r."""
 
     fast: Float[Array, "r n_f"]
     multiplier: Float[Array, "r n_g"]
@@ -103,8 +107,8 @@ class IntervalNodes:
     def of(cls, nodes: Nodes) -> "list[IntervalNodes]":
         """The nodes of a rule: one entry for all rows with a node in every interval, and one for each other row.
 
-        So functions are evaluated at the nodes of their rule alone: a potential may not be defined elsewhere, and a rule on the macro step
-        has no node in most intervals.
+        So functions are evaluated at the nodes of their rule alone: a potential may not be defined elsewhere, and a
+        rule on the macro step has no node in most intervals.
         """
         # row k has the nodes that are the k-th of their interval
         k = [np.sum(nodes.interval[:i] == m) for i, m in enumerate(nodes.interval)]
@@ -115,7 +119,8 @@ class IntervalNodes:
         return [cls(nodes, part) for part in parts]
 
     def sample(self, path: IntervalPath, equations: StepEquations, seen: Entries, m, names: tuple[str, ...]) -> list:
-        """Values of the path at the k nodes of interval m, by name: times ``t`` (k,), ``q_s``, ``q_f``, ``v_s``, ``v_f`` (k, n).
+        """Values of the path at the k nodes of interval m, by name: times ``t`` (k,), ``q_s``, ``q_f``, ``v_s``,
+        ``v_f`` (k, n).
 
         Slow variables on which no term depends have their values at the start of the macro step.
         """
@@ -127,7 +132,8 @@ class IntervalNodes:
             table = of_interval(self.tables[name], m)
             is_start = isinstance(table, np.ndarray) and not table.any()  # there JAX has to know that nothing moves
             moved = jnp.zeros((len(table), start.size)) if is_start else matmul(table, increments)
-            # q(c) = q_0 + sum_j l_j(c) Delta_j,  v(c) = sum_j l_j'(c) Delta_j / T, with T = H for slow and T = h for fast variables
+            # q(c) = q_0 + sum_j l_j(c) Delta_j,  v(c) = sum_j l_j'(c) Delta_j / T, with T = H for slow and T = h for
+            # fast variables
             if name[0] == "q":
                 values = start + moved
             else:
@@ -138,7 +144,8 @@ class IntervalNodes:
 
 
 def with_unseen(values, name: str, equations: StepEquations, seen: Entries):
-    """All slow positions or velocities (k, n_s), "q_s" or "v_s", from the seen ones (k, n_v); the others stay at rest at the start."""
+    """All slow positions or velocities (k, n_s), "q_s" or "v_s", from the seen ones (k, n_v); the others stay at rest
+    at the start."""
     at_rest = equations.q_s if name == "q_s" else jnp.zeros_like(equations.q_s)
     return seen.put(values, jnp.broadcast_to(at_rest, (len(values), at_rest.size)))
 
@@ -153,12 +160,14 @@ def of_interval(table, m):
 class Intervals:
     """The equations of the micro intervals of a macro step, and the slow ones.
 
-    The terms on the micro grid may depend on only some of the slow variables. In a satellite with vibrating panels they depend on the
-    position of the hub that carries the panels, and not on the angles of its wheels. The intervals then take and hand on quantities of
-    these "seen" slow variables only, so that their cost does not grow with the number of the others.
+    The terms on the micro grid may depend on only some of the slow variables. In a satellite with vibrating panels they
+    depend on the position of the hub that carries the panels, and not on the angles of its wheels. The intervals then
+    take and hand on quantities of these "seen" slow variables only, so that their cost does not grow with the number of
+    the others.
 
     Attributes:
-        seen: the slow variables on which terms on the micro grid depend; all of them with forces, which may act on any variable.
+        seen: the slow variables on which terms on the micro grid depend; all of them with forces, which may act on any
+            variable.
     """
 
     def __init__(self, equations: StepEquations):
@@ -177,8 +186,8 @@ class Intervals:
         self._slow_basis = slow_basis_at_control_nodes(n, r)[..., 1:]  # at the control nodes, by slow increments
 
     def by_masses(self) -> "Intervals":
-        """The equations with ``v^T M v / 2`` in place of kinetic energies T that are functions, with the masses M at the start of the step: their
-        derivatives contain none of T.
+        """The equations with ``v^T M v / 2`` in place of kinetic energies T that are functions, with the masses M at
+        the start of the step: their derivatives contain none of T.
 
         The intervals have the masses of the variables that they see, and the slow equations all others.
         """
@@ -225,7 +234,8 @@ class Intervals:
         return IntervalPath(self.seen.take(self.equations.q_s), slow, arriving.q_f, fast)
 
     def gradient(self, m, path: IntervalPath) -> IntervalPath:
-        """The gradient of ``h A_m`` by the path, without constraints and without the kinetic energy of constant masses."""
+        """The gradient of ``h A_m`` by the path, without constraints and without the kinetic energy of constant
+        masses."""
         return jax.grad(self._action)(path, path, m)
 
     def constraint_impulses(self, m, path: IntervalPath) -> Callable[..., IntervalPath]:
@@ -234,7 +244,8 @@ class Intervals:
         return lambda mu: pull(mu)[0]
 
     def rows(self, d: IntervalPath, p_f: Any = 0.0):
-        """The momentum equations ``p + D_{F_0}``, then ``D_{F_j}``, 0 < j < r, (r, n_f) of a function with the gradient d."""
+        """The momentum equations ``p + D_{F_0}``, then ``D_{F_j}``, 0 < j < r, (r, n_f) of a function with the gradient
+        d."""
         return jnp.concatenate([(p_f + d.fast_start - d.fast.sum(0))[None], d.fast[:-1]])
 
     def with_inertia(self, d: IntervalPath, fast) -> IntervalPath:
@@ -242,10 +253,12 @@ class Intervals:
         return d if self.kinetic is None else d._replace(fast=d.fast + self.kinetic.fast_rows(fast))
 
     def handed_on(self, arriving: Arriving, d: IntervalPath, last) -> Arriving:
-        """The quantities that an interval hands on, from the gradient d of ``h A_m`` without the inertia of constant masses.
+        """The quantities that an interval hands on, from the gradient d of ``h A_m`` without the inertia of constant
+        masses.
 
-        The momentum is ``h p + h D_{F_0} A_m + ... + h D_{F_r} A_m``, the start momentum plus all impulses. At a root that is h D_{F_r} A_m; but an error
-        e of the increments, below the round-off of the positions, would change that by M e, and does not change the impulses of the inertia.
+        The momentum is ``h p + h D_{F_0} A_m + ... + h D_{F_r} A_m``, the start momentum plus all impulses. At a root
+        that is h D_{F_r} A_m; but an error e of the increments, below the round-off of the positions, would change that
+        by M e, and does not change the impulses of the inertia.
 
         Args:
             last: (n_f,) fast increment from the start of the interval to its end.
@@ -268,7 +281,8 @@ class Intervals:
         return residual, self.handed_on(arriving, d, x.fast[-1])
 
     def residual(self, x: Unknowns) -> tuple[Unknowns, tuple[Any, Any, Any]]:
-        """Residual of all equations of the step, and fast position, slow and fast momentum at its end, from the momenta at its start and all impulses."""
+        """Residual of all equations of the step, and fast position, slow and fast momentum at its end, from the momenta
+        at its start and all impulses."""
 
         def interval(arriving, of_interval):
             m, *unknowns = of_interval
@@ -278,7 +292,8 @@ class Intervals:
         intervals = jnp.arange(len(x.fast)), x.fast, x.multiplier
         end, (fast, g) = jax.lax.scan(interval, self.start(), intervals)
         slow, p_s = self.slow_rows(x.slow, self.slow_impulses(x.slow, x.slow_multiplier), end)
-        # intervals hand on the momentum at the start plus all impulses: D_{F_r} A plus their rows, which are zero at the solution alone
+        # intervals hand on the momentum at the start plus all impulses: D_{F_r} A plus their rows, which are zero at
+        # the solution alone
         fast = fast.at[1:, 0].add(-fast[:-1].sum(axis=1))
         end = end.q_f, p_s, end.p_f / self.equations.micro_dt
         return Unknowns(slow, self.slow_constraints(x.slow), fast, g), end
@@ -289,8 +304,8 @@ class Intervals:
         return Arriving(jnp.zeros_like(arriving.q_f), d.fast_start, d.slow_start, d.slow)
 
     def _action(self, path: IntervalPath, held: IntervalPath, m):
-        """``h A_m`` without constraints and without the kinetic energy of constant masses, with the work of forces along `held` on displacements of
-        `path`."""
+        """``h A_m`` without constraints and without the kinetic energy of constant masses, with the work of forces
+        along `held` on displacements of `path`."""
         total = jnp.zeros(())
         for term, nodes in self.terms:
             total += _where_there_are_nodes(nodes, m, partial(self._of_term, term, nodes, m), path)
@@ -336,8 +351,9 @@ class Intervals:
     def slow_rows(self, slow, impulses, arriving: Arriving):
         """Rows (r, n_s) of the slow momentum equations, and the slow momentum at the end of the step.
 
-        The end momentum is computed as the start momentum plus all impulses, ``p_s + D_{S_0} A + ... + D_{S_r} A``. Potentials that are
-        invariant under translations of the slow variables have impulses of sum zero, so that momentum is conserved to round-off.
+        The end momentum is computed as the start momentum plus all impulses, ``p_s + D_{S_0} A + ... + D_{S_r} A``.
+        Potentials that are invariant under translations of the slow variables have impulses of sum zero, so that
+        momentum is conserved to round-off.
 
         Args:
             slow: (r, n_s) increments.
@@ -364,7 +380,8 @@ class Intervals:
         return jax.vmap(equations.system.g_slow)(times, equations.q_s + slow)
 
     def slow_impulses(self, slow, multiplier):
-        """(r, n_s) impulses ``G_s^T nu``, times h, of the slow constraint at S_0..S_{r-1}, for increments (r, n_s) and scaled multipliers (r, n_gs)."""
+        """(r, n_s) impulses ``G_s^T nu``, times h, of the slow constraint at S_0..S_{r-1}, for increments (r, n_s) and
+        scaled multipliers (r, n_gs)."""
         equations = self.equations
         times = equations.t + equations.macro_dt * control_nodes(equations.scheme.degree)[:-1]
         nodes = jnp.concatenate([equations.q_s[None], equations.q_s + slow[:-1]])
@@ -373,7 +390,8 @@ class Intervals:
 
 
 def _quadratic_form(matrix) -> Callable:
-    """``v -> v^T M v / 2`` of a symmetric matrix M, with the derivative M v: JAX would take the sum with the transposed product."""
+    """``v -> v^T M v / 2`` of a symmetric matrix M, with the derivative M v: JAX would take the sum with the transposed
+    product."""
 
     @jax.custom_jvp
     def energy(v):

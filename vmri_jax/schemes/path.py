@@ -86,23 +86,24 @@ def velocity_nodes(placed: PlacedRule, num_micro: int, degree: int) -> Nodes:
     between = (nodes.c == 0.0) & (nodes.interval > 0)
     if placed.grid == "macro" and between.any():
         raise Refused(
-            f"macro rule: node {nodes.theta[between.argmax()]} falls on the border of two of the {num_micro} micro intervals, "
-            "where the velocity is not defined; place this term with micro(...) or choose another rule."
+            f"macro rule: node {nodes.theta[between.argmax()]} falls on the border of two of the {num_micro} micro "
+            "intervals, where the velocity is not defined; place this term with micro(...) or choose another rule."
         )
     return nodes
 
 
 def slow_velocity_nodes(placed: PlacedRule, num_micro: int, degree: int) -> Nodes:
-    """Nodes of a term that depends on slow positions and velocities alone: the nodes of the rule, once on the macro interval."""
+    """Nodes of a term that depends on slow positions and velocities alone: the nodes of the rule, once on the macro
+    interval."""
     return _nodes(macro(placed.rule), num_micro, degree, range(len(placed.rule.nodes)))
 
 
 def position_nodes(placed: PlacedRule, num_micro: int, degree: int) -> tuple[Any, Nodes, Any]:
     """Nodes of a term that depends on positions only: (weight at 0, nodes inside, weight at 1).
 
-    Nodes at the ends of the macro interval are kicks: they shift the momenta before or after the step, and are no part of its
-    equations. Their weight is None if the rule has no such node. Where two copies of the rule meet, the right node of the first copy
-    and the left node of the second are one node.
+    Nodes at the ends of the macro interval are kicks: they shift the momenta before or after the step, and are no part
+    of its equations. Their weight is None if the rule has no such node. Where two copies of the rule meet, the right
+    node of the first copy and the left node of the second are one node.
     """
     rule, size, every = placed.rule, placed.copies(num_micro), placed.every
     has_start, has_end = rule.nodes[0] <= NODE_TOLERANCE, rule.nodes[-1] >= 1 - NODE_TOLERANCE
@@ -129,7 +130,8 @@ def _nodes(
 
 
 def _interval_of(node: float, count: int) -> tuple[int, float]:
-    """Number m of the interval that a node lies in, of `count` equal intervals of [0, 1], and its local coordinate there."""
+    """Number m of the interval that a node lies in, of `count` equal intervals of [0, 1], and its local coordinate
+    there."""
     m = min(int(np.floor(node * count + NODE_TOLERANCE)), count - 1)
     c = node * count - m
     return m, 0.0 if abs(c) <= NODE_TOLERANCE else c

@@ -48,7 +48,8 @@ class Rule(eqx.Module):
         self.weights = real_array("Rule: weights", weights)
         if not self.nodes or self.weights.shape != (len(self.nodes),):
             raise Refused(
-                f"Rule: got {len(self.nodes)} nodes and weights of shape {self.weights.shape}; give one weight per node, and at least one node."
+                f"Rule: got {len(self.nodes)} nodes and weights of shape {self.weights.shape}; give one weight per "
+                "node, and at least one node."
             )
         if any(not -NODE_TOLERANCE <= node <= 1 + NODE_TOLERANCE for node in self.nodes):
             raise Refused(f"Rule: nodes {self.nodes} must lie in [0, 1], the unit interval.")
@@ -190,8 +191,9 @@ def affine(alpha) -> Rule:
     """``alpha * left + (1 - alpha) * right``; order 2 for alpha = 1/2, else 1.
 
     Args:
-        alpha: weight of the start of the interval, 1 - alpha is the weight of its end; a traced alpha is not checked. 1/2 is the
-            trapezoidal rule, 1 and 0 have one end alone. `vmri_jax.schemes.scheme` says how alpha changes a step.
+        alpha: weight of the start of the interval, 1 - alpha is the weight of its end; a traced alpha is not checked.
+            1/2 is the trapezoidal rule, 1 and 0 have one end alone. `vmri_jax.schemes.scheme` says how alpha changes a
+            step.
 
     Raises:
         ValueError: alpha is not from 0 to 1.
@@ -199,8 +201,9 @@ def affine(alpha) -> Rule:
     value = real_array("affine: alpha", alpha, 0)
     if is_concrete(value) and not 0 <= value <= 1:
         raise Refused(
-            f"affine: alpha is {alpha}; it must be from 0 to 1: it is the part of a kick that is given at the start of an interval, and "
-            "1 - alpha at its end. With other numbers one of these parts points backwards, and momenta at the nodes are off by more than half a kick."
+            f"affine: alpha is {alpha}; it must be from 0 to 1: it is the part of a kick that is given at the start of "
+            "an interval, and 1 - alpha at its end. With other numbers one of these parts points backwards, and "
+            "momenta at the nodes are off by more than half a kick."
         )
     return alpha * left + (1 - alpha) * right
 
@@ -240,8 +243,8 @@ class PlacedRule(eqx.Module):
         return len(nodes) - (nodes[0] <= NODE_TOLERANCE and nodes[-1] >= 1 - NODE_TOLERANCE)
 
     def order(self, num_micro: int) -> int:
-        """Order of a scheme by this rule, for a term of fast variables. Their path has a corner at every micro node: a copy of the rule that
-        spans several micro intervals acts by kicks at its nodes, and counts as order 2 at most.
+        """Order of a scheme by this rule, for a term of fast variables. Their path has a corner at every micro node: a
+        copy of the rule that spans several micro intervals acts by kicks at its nodes, and counts as order 2 at most.
         """
         return min(self.rule.order, 2) if self.copies(num_micro) < num_micro else self.rule.order
 
@@ -257,7 +260,10 @@ class PlacedRule(eqx.Module):
 
     @property
     def only_kicks(self) -> bool:
-        """Whether all nodes are ends of the macro interval: kicks at macro nodes alone. Kicks at micro nodes have `only_ends`."""
+        """Whether all nodes are ends of the macro interval: kicks at macro nodes alone.
+
+        Kicks at micro nodes have `only_ends`.
+        """
         return self.grid == "macro" and self.only_ends
 
     @property
@@ -299,8 +305,9 @@ def micro(rule: Rule, every: int = 1) -> PlacedRule:
 
     Args:
         rule: on [0, 1].
-        every: micro intervals that one copy of the rule spans: a rate between the rates of the two grids. ``micro(trapezoidal, every=4)`` has
-            its nodes at every fourth micro node. `every` must divide `num_micro` of the scheme; ``every=num_micro`` is `macro`.
+        every: micro intervals that one copy of the rule spans: a rate between the rates of the two grids.
+            ``micro(trapezoidal, every=4)`` has its nodes at every fourth micro node. `every` must divide `num_micro` of
+            the scheme; ``every=num_micro`` is `macro`.
 
     Raises:
         TypeError: `rule` is no Rule.
@@ -319,9 +326,10 @@ def _placed(rule: Rule, grid: Literal["macro", "micro"]) -> PlacedRule:
 def mollified(placed: PlacedRule) -> PlacedRule:
     """The same nodes, with the slow potential at averaged fast positions: ``V(q_s, a(q_s, q_f))``.
 
-    The average a is the mean of the fast motion from rest over the macro step (`vmri_jax.steppers.kicked.average_over_fast_motion`). Kicks
-    by V then have the force ``a'(q)^T grad V``. Without the filter a', kicks resonate with vibrations of frequency omega where ``omega H = k pi``, at macro
-    steps that are multiples of half a period: Garcia-Archilla, Sanz-Serna and Skeel, *Long-time-step methods for oscillatory
+    The average a is the mean of the fast motion from rest over the macro step
+    (`vmri_jax.steppers.kicked.average_over_fast_motion`). Kicks by V then have the force ``a'(q)^T grad V``. Without
+    the filter a', kicks resonate with vibrations of frequency omega where ``omega H = k pi``, at macro steps that are
+    multiples of half a period: Garcia-Archilla, Sanz-Serna and Skeel, *Long-time-step methods for oscillatory
     differential equations* (1998), the mollified impulse method with LongAverage.
     """
     if not isinstance(placed, PlacedRule) or placed.grid != "macro" or not placed.only_ends:
@@ -333,10 +341,11 @@ def gradient_corrected(placed: PlacedRule) -> PlacedRule:
     """The same nodes, with a square of the gradient subtracted from the potential.
 
     Fast kicks act through ``W - h^2/24 grad W . M^-1 grad W``, slow ones through
-    ``V - H^2/24 grad V . M^-1 grad V - h^2/12 grad V . M^-1 grad W``, the last term where W is corrected too. With
-    a free drift between the kicks this is the method of Takahashi and Imada, J. Phys. Soc. Jpn. 53 (1984), and Rowlands,
-    J. Comput. Phys. 97 (1991). Its order is 2, its effective order 4: a change of coordinates by O(h^2) conjugates it to a method of order
-    4. Frequencies of harmonic vibrations do not depend on coordinates, and are of order 4 without that change.
+    ``V - H^2/24 grad V . M^-1 grad V - h^2/12 grad V . M^-1 grad W``, the last term where W is corrected too. With a
+    free drift between the kicks this is the method of Takahashi and Imada, J. Phys. Soc. Jpn. 53 (1984), and Rowlands,
+    J. Comput. Phys. 97 (1991). Its order is 2, its effective order 4: a change of coordinates by O(h^2) conjugates it
+    to a method of order 4. Frequencies of harmonic vibrations do not depend on coordinates, and are of order 4 without
+    that change.
     """
     if not isinstance(placed, PlacedRule) or not placed.only_ends or placed.mollified or placed.every > 1:
         raise Refused(

@@ -5,16 +5,19 @@ A scheme is data. The reference schemes and the Galerkin family are points in on
 | scheme | V | W | explicit | order |
 |---|---|---|---|---|
 | `fully_implicit(num_micro)` | micro(midpoint) | micro(midpoint) | no | 2 |
-| `explicit_slow(num_micro, alpha)` | macro(affine(alpha)) | micro(midpoint) | in V | 2 at alpha = 1/2, else 1 |
-| `mollified_impulse(num_micro, alpha)` | mollified(macro(affine(alpha))) | micro(midpoint) | in V | 2 at alpha = 1/2, else 1 |
-| `fully_explicit(num_micro, alpha)` | macro(affine(alpha)) | micro(affine(alpha)) | yes | 2 at alpha = 1/2, else 1 |
-| `takahashi_imada(num_micro)` | gradient_corrected(macro(trapezoidal)) | gradient_corrected(micro(trapezoidal)) | yes | 2, frequencies 4 |
+| `explicit_slow(num_micro, alpha)` | macro(affine(alpha)) | micro(midpoint) | in V | 2 if alpha = 1/2 |
+| `mollified_impulse(num_micro, alpha)` | mollified(macro(affine(alpha))) | micro(midpoint) | in V | 2 if alpha = 1/2 |
+| `fully_explicit(num_micro, alpha)` | macro(affine(alpha)) | micro(affine(alpha)) | yes | 2 if alpha = 1/2 |
+| `takahashi_imada(num_micro)` | trapezoidal, corrected | trapezoidal, corrected | yes | 2, 4 in frequencies |
 | `galerkin(num_micro, degree, rule)` | micro(rule) | micro(rule) | no | min(2 degree, rule order) |
 
-**alpha** is the part of a kick at the start of an interval of length T; the part 1 - alpha acts at its end. It is the weight of the rule
-`vmri_jax.schemes.quadrature.affine`, ``T (alpha f(0) + (1 - alpha) f(T))``. The default 1/2 gives the trapezoidal rule: order 2 and
-symmetric, as in the methods of Verlet and r-RESPA. 1 and 0 give one kick, before or after the motion: the two symplectic Euler methods
-of order 1, each the adjoint of the other. Any other alpha also has order 1. alpha may be traced, for sweeps and derivatives.
+Corrected rules are ``gradient_corrected(macro(trapezoidal))`` and ``gradient_corrected(micro(trapezoidal))``.
+
+**alpha** is the part of a kick at the start of an interval of length T; the part 1 - alpha acts at its end. It is the
+weight of the rule `vmri_jax.schemes.quadrature.affine`, ``T (alpha f(0) + (1 - alpha) f(T))``. The default 1/2 gives
+the trapezoidal rule: order 2 and symmetric, as in the methods of Verlet and r-RESPA. 1 and 0 give one kick, before or
+after the motion: the two symplectic Euler methods of order 1, each the adjoint of the other. Any other alpha also has
+order 1. alpha may be traced, for sweeps and derivatives.
 """
 
 import math
@@ -53,10 +56,11 @@ GRIDS = {"slow": "macro", "fast": "micro"}
 class Scheme(eqx.Module):
     """Variational multirate scheme: the degree of the path and the rule of every term.
 
-    Without forces every scheme is symplectic and conserves the momentum maps its discrete Lagrangian inherits. Its order is ``min(2 degree,
-    order of the rules of energies and forces)`` (Ober-Bloebaum, Wenger, Gail, Leyendecker 2024, arXiv:2406.12991), where a rule that spans several
-    micro intervals counts as order 2 at most: the fast path has a corner at every micro node, and the nodes of the rule act as kicks. A scheme is
-    symmetric (time-reversible) exactly when these rules are.
+    Without forces every scheme is symplectic and conserves the momentum maps its discrete Lagrangian inherits. Its
+    order is ``min(2 degree, order of the rules of energies and forces)`` (Ober-Bloebaum, Wenger, Gail, Leyendecker
+    2024, arXiv:2406.12991), where a rule that spans several micro intervals counts as order 2 at most: the fast path
+    has a corner at every micro node, and the nodes of the rule act as kicks. A scheme is symmetric (time-reversible)
+    exactly when these rules are.
 
     Args:
         num_micro: micro intervals per macro interval.
@@ -64,8 +68,8 @@ class Scheme(eqx.Module):
         kinetic, slow, fast, force: placed rules (``macro(...)`` or ``micro(...)``) of T, V, W and the forces;
             `kinetic` must be placed with micro, `force` defaults to the rule of `kinetic`.
         constraint: where g holds: micro(rule) whose nodes are the control nodes; default micro(lobatto(degree + 1)).
-        slow_constraint: where g_s holds: macro(rule) on the same nodes; default macro(lobatto(degree + 1)). With one micro interval the weights
-            of `constraint` count for both.
+        slow_constraint: where g_s holds: macro(rule) on the same nodes; default macro(lobatto(degree + 1)). With one
+            micro interval the weights of `constraint` count for both.
         potentials: placed rules of `System.potentials` by name (a string or a whole number), see `with_potentials`.
 
     Raises:
@@ -114,8 +118,8 @@ class Scheme(eqx.Module):
         for name, placed in rules.items():
             if placed.every > 1 and name not in GRIDS:
                 raise Refused(
-                    f"Scheme: {name} is placed with every={placed.every}; only potentials can be: slow, fast, and those of "
-                    "with_potentials(...). Take micro(rule) or macro(rule)."
+                    f"Scheme: {name} is placed with every={placed.every}; only potentials can be: slow, fast, and "
+                    "those of with_potentials(...). Take micro(rule) or macro(rule)."
                 )
             setattr(self, name, _on_grid(name, placed, self.num_micro))
         self.potentials = Named({name: _on_grid(name, placed, self.num_micro) for name, placed in further.items()})
@@ -128,13 +132,14 @@ class Scheme(eqx.Module):
         for field, name, placed in [*of_fields, *(("", name, placed) for name, placed in further.items())]:
             if placed.mollified and (field != "slow" or self.fast.grid != "micro"):
                 raise Refused(
-                    f"Scheme: {name} is mollified; only kicks of the slow potential can be, along fast motion on the micro grid: "
-                    "slow=mollified(macro(...)) with fast=micro(...)."
+                    f"Scheme: {name} is mollified; only kicks of the slow potential can be, along fast motion on the "
+                    "micro grid: slow=mollified(macro(...)) with fast=micro(...)."
                 )
             if placed.gradient_corrected and (placed.grid != GRIDS.get(field) or self.degree > 1):
                 raise Refused(
-                    f"Scheme: {name} on the {placed.grid} grid, degree {self.degree}, is corrected; only kicks of V and W, of a path of degree 1, "
-                    "can be: slow=gradient_corrected(macro(...)), fast=gradient_corrected(micro(...))."
+                    f"Scheme: {name} on the {placed.grid} grid, degree {self.degree}, is corrected; only kicks of V "
+                    "and W, of a path of degree 1, can be: slow=gradient_corrected(macro(...)), "
+                    "fast=gradient_corrected(micro(...))."
                 )
         for name, grid in (("constraint", "micro"), ("slow_constraint", "macro")):
             placed = getattr(self, name)
@@ -149,10 +154,11 @@ class Scheme(eqx.Module):
 
     @property
     def order(self) -> int:
-        """Order of convergence, ``min(2 degree, order of the rules of T, all potentials and the forces)``; needs concrete weights.
+        """Order of convergence, ``min(2 degree, order of the rules of T, all potentials and the forces)``; needs
+        concrete weights.
 
-        A rule that spans several micro intervals counts as order 2 at most. Potentials and forces of slow variables alone have the full order
-        of their rule; a scheme does not know the variables of potentials and forces.
+        A rule that spans several micro intervals counts as order 2 at most. Potentials and forces of slow variables
+        alone have the full order of their rule; a scheme does not know the variables of potentials and forces.
         """
         return min(2 * self.degree, *(placed.order(self.num_micro) for placed in self._of_energies_and_forces))
 
@@ -190,10 +196,10 @@ class Scheme(eqx.Module):
             kicks = vm.quadrature.trapezoidal
             vm.fully_explicit(32).with_potentials(bends=vm.micro(kicks, every=8), bonds=vm.micro(kicks))
 
-        A potential with the rule ``micro(trapezoidal, every=k)`` kicks at every k-th micro node. If these potentials depend on fast variables
-        alone, and V and W kick, the scheme is r-RESPA with any number of levels (Tuckerman, Berne and Martyna, J. Chem. Phys. 97, 1992).
-        A potential that depends on slow variables is implicit in them, because the slow path is one polynomial over the macro step.
-        Evaluations per macro step: num_micro / k.
+        A potential with the rule ``micro(trapezoidal, every=k)`` kicks at every k-th micro node. If these potentials
+        depend on fast variables alone, and V and W kick, the scheme is r-RESPA with any number of levels (Tuckerman,
+        Berne and Martyna, J. Chem. Phys. 97, 1992). A potential that depends on slow variables is implicit in them,
+        because the slow path is one polynomial over the macro step. Evaluations per macro step: num_micro / k.
 
         Args:
             rules: placed rules by name of the potential.
@@ -220,12 +226,14 @@ class Scheme(eqx.Module):
             placed = getattr(self, name)
             return PlacedRule(placed.rule, placed.grid, every=placed.every)
         raise Refused(
-            f"Scheme: there is no rule for the potential {name!r} of the system; the scheme has rules for {list(self.potentials) or 'V and W only'}. "
-            f"Give it one, e.g. scheme.with_potentials({name}=vm.micro(vm.quadrature.trapezoidal, every=2))."
+            f"Scheme: there is no rule for the potential {name!r} of the system; the scheme has rules for "
+            f"{list(self.potentials) or 'V and W only'}. Give it one, e.g. "
+            f"scheme.with_potentials({name}=vm.micro(vm.quadrature.trapezoidal, every=2))."
         )
 
     def evaluations_of(self, name: str | int) -> int:
-        """Number of gradients of a potential in `System.potentials` per macro step; a node that two macro steps share counts once.
+        """Number of gradients of a potential in `System.potentials` per macro step; a node that two macro steps share
+        counts once.
 
         Raises:
             ValueError: as of `rule_of`.
@@ -244,7 +252,8 @@ class Scheme(eqx.Module):
         drifts = self.degree == 1 and self.fast.only_ends and self.fast.grid == "micro"
         drifts = drifts and all(placed.only_ends for placed in further)
         kicked = self.degree == 1 and self.slow.only_kicks and all(p.grid == "micro" or p.only_ends for p in further)
-        # solves without constraints: none if V and W only kick, one per micro step if V only kicks, else one of all unknowns
+        # solves without constraints: none if V and W only kick, one per micro step if V only kicks, else one of all
+        # unknowns
         free = 0 if drifts and kicked else self.num_micro if kicked and self.fast.grid == "micro" else 1
         slow, fast = (
             placed.evaluations(self.num_micro) * (1 + placed.gradient_corrected) for placed in (self.slow, self.fast)
@@ -262,20 +271,22 @@ def _on_grid(name: str | int, placed: PlacedRule, num_micro: int) -> PlacedRule:
     if placed.every > 1 and num_micro % placed.every:
         divisors = [k for k in range(1, num_micro + 1) if num_micro % k == 0]
         raise Refused(
-            f"Scheme: {name} is placed with every={placed.every}, which does not divide num_micro={num_micro}: its last copy would end in "
-            f"the next macro step. Take one of {divisors}, or another num_micro."
+            f"Scheme: {name} is placed with every={placed.every}, which does not divide num_micro={num_micro}: its "
+            f"last copy would end in the next macro step. Take one of {divisors}, or another num_micro."
         )
     return PlacedRule(placed.rule, "macro") if placed.every == num_micro > 1 else placed
 
 
 def _check_kinetic(rule: Rule, degree: int) -> None:
-    """Refuse rules by which a motion of the path has no positive kinetic energy: ``sum_i w_i l_j'(c_i) l_k'(c_i)`` is not positive definite."""
+    """Refuse rules by which a motion of the path has no positive kinetic energy: ``sum_i w_i l_j'(c_i) l_k'(c_i)`` is
+    not positive definite."""
     slopes = lagrange_derivative(degree, np.array(rule.nodes))[:, 1:]
     weights = np.asarray(rule.weights) if is_concrete(rule) else np.ones(len(rule.nodes))
     if np.linalg.eigvalsh(slopes.T @ (weights[:, None] * slopes)).min() <= 1e-9:
         raise Refused(
-            f"Scheme: the kinetic rule with nodes {list(rule.nodes)} gives no positive kinetic energy to some motion of a path of "
-            f"degree {degree}: it has too few nodes, or a negative weight. Give another, e.g. micro(gauss({degree}))."
+            f"Scheme: the kinetic rule with nodes {list(rule.nodes)} gives no positive kinetic energy to some motion "
+            f"of a path of degree {degree}: it has too few nodes, or a negative weight. Give another, e.g. "
+            f"micro(gauss({degree}))."
         )
 
 
@@ -293,10 +304,11 @@ def _check_placed(name: str | int, placed) -> None:
 def fully_implicit(num_micro: int) -> Scheme:
     """V and W at the midpoint of every micro interval. Order 2, symmetric, implicit.
 
-    Evaluations per macro step and Newton iteration: V num_micro, W num_micro. The first choice for stiff springs: ``omega h``
-    limits the step only of springs that turn, to ``omega h`` times the angle of a turn in the step (in radians) below about 2. Constraint forces act at the nodes, as in `fully_explicit`: a light link with two equal masses at
-    its ends, together ``mass``, stretched by a force, swings about the direction of the force with ``omega = 2 sqrt(force / (mass length))``
-    and needs ``omega h < 2``.
+    Evaluations per macro step and Newton iteration: V num_micro, W num_micro. The first choice for stiff springs:
+    ``omega h`` limits the step only of springs that turn, to ``omega h`` times the angle of a turn in the step
+    (in radians) below about 2. Constraint forces act at the nodes, as in `fully_explicit`: a light link with two equal
+    masses at its ends, together ``mass``, stretched by a force, swings about the direction of the force with
+    ``omega = 2 sqrt(force / (mass length))`` and needs ``omega h < 2``.
 
     Args:
         num_micro: micro steps per macro step.
@@ -333,13 +345,14 @@ def mollified_impulse(num_micro: int, alpha=0.5) -> Scheme:
 def fully_explicit(num_micro: int, alpha=0.5) -> Scheme:
     """V as a kick at the macro nodes, W as kicks at the micro nodes (impulse method, r-RESPA at alpha = 1/2).
 
-    Order 2 and symmetric at alpha = 1/2, else order 1. Explicit for constant mass without constraints and forces: V once and
-    W num_micro times per macro step, no Newton. Stable only for omega h < 2. The first choice if the fast motion is the motion of rigid
-    links: under `fully_implicit`, too, their steps are bounded by omega h < 2.
+    Order 2 and symmetric at alpha = 1/2, else order 1. Explicit for constant mass without constraints and forces: V
+    once and W num_micro times per macro step, no Newton. Stable only for omega h < 2. The first choice if the fast
+    motion is the motion of rigid links: under `fully_implicit`, too, their steps are bounded by omega h < 2.
 
     Args:
         num_micro: micro steps per macro step.
-        alpha: part of the kicks at the start, by V of the macro step and by W of every micro step; see the top of this module.
+        alpha: part of the kicks at the start, by V of the macro step and by W of every micro step; see the top of this
+            module.
     """
     return Scheme(num_micro, kinetic=micro(midpoint), slow=macro(affine(alpha)), fast=micro(affine(alpha)))
 
@@ -348,11 +361,11 @@ def takahashi_imada(num_micro: int) -> Scheme:
     """`fully_explicit` with corrected kicks. Order 2, symmetric; frequencies of harmonic vibrations are of order 4.
 
     The method is conjugate to a method of order 4 by a change of coordinates of O(h^2), see
-    `vmri_jax.schemes.quadrature.gradient_corrected`. So phases of harmonic vibrations stay accurate; a period that depends on the amplitude
-    is off by O(h^2), since the change shifts the amplitude of the start. With constraints frequencies are of order 2: the correction
-    leaves out the constraint forces. It needs constant masses, is explicit without constraints, and is stable for
-    ``omega h < 2 sqrt(3)``. Evaluations per macro step: V once and W num_micro times, each with a product of its Hessian, and one more
-    product of the Hessian of W.
+    `vmri_jax.schemes.quadrature.gradient_corrected`. So phases of harmonic vibrations stay accurate; a period that
+    depends on the amplitude is off by O(h^2), since the change shifts the amplitude of the start. With constraints
+    frequencies are of order 2: the correction leaves out the constraint forces. It needs constant masses, is explicit
+    without constraints, and is stable for ``omega h < 2 sqrt(3)``. Evaluations per macro step: V once and W num_micro
+    times, each with a product of its Hessian, and one more product of the Hessian of W.
 
     Args:
         num_micro: micro steps per macro step.

@@ -4,13 +4,15 @@ A solver may omit the next correction c of the slow (or of the fast) increments 
 
     max |c|  <=  tolerance / 10 * max |increments|  +  4 eps max |positions|  +  eps max |all increments|
 
-The slow variables have their increments over the macro step and their positions on the right-hand side, the fast variables their
-increments over a micro interval and their positions. A solver may take the largest free motion ``|h M^-1 p|`` for the size of the increments.
-Maxima compare numbers of one unit: if masses are constant, slow and fast variables as they are; else numbers times `Weights`.
+The slow variables have their increments over the macro step and their positions on the right-hand side, the fast
+variables their increments over a micro interval and their positions. A solver may take the largest free motion
+``|h M^-1 p|`` for the size of the increments. Maxima compare numbers of one unit: if masses are constant, slow and fast
+variables as they are; else numbers times `Weights`.
 
-- The test is of one correction, of the slow variables and of the fast ones in each micro interval. Omitted corrections of intervals and of steps
-  add up, and so do the corrections after them: the tenth is a safety factor for that. With 100 micro steps the error of a macro step may be some
-  times the tolerance of a micro step's increments, far below that of its own.
+- The test is of one correction, of the slow variables and of the fast ones in each micro interval. Omitted corrections
+  of intervals and of steps add up, and so do the corrections after them: the tenth is a safety factor for that. With
+  100 micro steps the error of a macro step may be some times the tolerance of a micro step's increments, far below that
+  of its own.
 - Positions are known up to their round-off.
 - Variables at rest have increments of size zero: the last term allows them the round-off of the other increments.
 
@@ -31,30 +33,33 @@ from vmri_jax.mechanics.arrays import Number
 from vmri_jax.schemes.equations import StepEquations
 
 ROUNDOFF = 4.0
-"""Accepted correction in units of ``eps max |positions|``. With a smaller value steps at round-off would not end; with a larger one the momenta
-would lose digits."""
+"""Accepted correction in units of ``eps max |positions|``. With a smaller value steps at round-off would not end; with
+a larger one the momenta would lose digits."""
 ITERATIONS_BEFORE_TIED_ROUNDOFF = 20
-"""Iterations after which slow variables are also allowed the round-off of the fast ones, and these the round-off of the slow ones: constraints
-carry it from one to the other. With a smaller number slow variables near the origin, whose own round-off is small, would lose digits."""
+"""Iterations after which slow variables are also allowed the round-off of the fast ones, and these the round-off of the
+slow ones: constraints carry it from one to the other. With a smaller number slow variables near the origin, whose own
+round-off is small, would lose digits."""
 FLOOR = 100.0
-"""Largest correction, in units of ``eps max |positions|``, that is accepted if corrections no longer shrink: with nearly dependent constraints
-they fluctuate at this size. A larger value would cut off steps that converge slowly."""
+"""Largest correction, in units of ``eps max |positions|``, that is accepted if corrections no longer shrink: with
+nearly dependent constraints they fluctuate at this size. A larger value would cut off steps that converge slowly."""
 FLOOR_OF_NEWTON = 1e5
-"""`FLOOR` for a pass with exact matrices. Near a regular solution the corrections of such passes shrink down to round-off times the condition number of
-the constraint Jacobian, which is large if constraints hardly depend on the fast variables: up to this size they count as round-off. A larger value
-would accept singular solutions, near which corrections also stop shrinking."""
+"""`FLOOR` for a pass with exact matrices. Near a regular solution the corrections of such passes shrink down to
+round-off times the condition number of the constraint Jacobian, which is large if constraints hardly depend on the fast
+variables: up to this size they count as round-off. A larger value would accept singular solutions, near which
+corrections also stop shrinking."""
 SAFETY = 10.0
 """Tolerance of a run over tolerance of a correction, since errors of steps accumulate. A larger factor costs passes."""
 MARGIN = 10.0
-"""Safety factor on the contraction ``|d_k| / |d_(k-1)|`` that is expected of the next correction. A larger factor costs passes; with a smaller one
-an iteration whose correction is small by chance ends too early."""
+"""Safety factor on the contraction ``|d_k| / |d_(k-1)|`` that is expected of the next correction. A larger factor costs
+passes; with a smaller one an iteration whose correction is small by chance ends too early."""
 
 
 class Weights(NamedTuple):
-    """Factors that give all variables the same unit: the square roots of their masses, of a kinetic energy that is a function.
+    """Factors that give all variables the same unit: the square roots of their masses, of a kinetic energy that is a
+    function.
 
-    Variables with constant masses have no factors, None: with the square roots of masses a light body would be computed to fewer digits than
-    a heavy one. They have one unit, of which the library knows nothing.
+    Variables with constant masses have no factors, None: with the square roots of masses a light body would be computed
+    to fewer digits than a heavy one. They have one unit, of which the library knows nothing.
     """
 
     slow: Any
@@ -85,13 +90,15 @@ def largest(numbers, weights=None):
 
 
 class Accepted(NamedTuple):
-    """Accepted corrections of the increments: a part relative to the motion over the step, and a part for round-off of the positions.
+    """Accepted corrections of the increments: a part relative to the motion over the step, and a part for round-off of
+    the positions.
 
     tolerance: `Solver.tolerance` over `SAFETY`.
-    slow, fast: accepted round-off. First entry: of these variables, used in the first `ITERATIONS_BEFORE_TIED_ROUNDOFF` iterations. Second
-        entry, used later: with the round-off of the variables that constraints tie to them.
+    slow, fast: accepted round-off. First entry: of these variables, used in the first `ITERATIONS_BEFORE_TIED_ROUNDOFF`
+        iterations. Second entry, used later: with the round-off of the variables that constraints tie to them.
     roundoff: `ROUNDOFF` units of round-off of all positions, ``4 eps max |q|``, for `at_floor`.
-    constraints: the same with `constraint_length` in place of the positions; zero where a solver does not use `at_floor`.
+    constraints: the same with `constraint_length` in place of the positions; zero where a solver does not use
+        `at_floor`.
     """
 
     tolerance: Number
@@ -112,8 +119,8 @@ class Accepted(NamedTuple):
         return cls(newton.tolerance / SAFETY, *roundoff)
 
     def at_floor(self, size, before, floor=FLOOR):
-        """Whether corrections no longer shrink, from `before` to `size`, and are round-off, see `is_roundoff`. With `before` zero, in a first pass,
-        round-off is enough.
+        """Whether corrections no longer shrink, from `before` to `size`, and are round-off, see `is_roundoff`. With
+        `before` zero, in a first pass, round-off is enough.
         """
         return (size > before / 2) & self.is_roundoff(size, floor)
 
@@ -122,12 +129,14 @@ class Accepted(NamedTuple):
         return self._replace(constraints=ROUNDOFF * jnp.finfo(float).eps * constraint_length(equations, weights))
 
     def is_roundoff(self, size, floor=FLOOR):
-        """Whether a correction is at most `floor` units ``eps max |positions|``, or `FLOOR` units of the round-off of constraints."""
+        """Whether a correction is at most `floor` units ``eps max |positions|``, or `FLOOR` units of the round-off of
+        constraints."""
         # `roundoff` and `constraints` count ROUNDOFF of these units
         return (size <= floor / ROUNDOFF * self.roundoff) | (size <= FLOOR / ROUNDOFF * self.constraints)
 
     def ratio(self, changes, motions, iterations):
-        """Ratio of the next corrections (slow, fast) to the right-hand sides of the formula at the top of this module, the larger of the two.
+        """Ratio of the next corrections (slow, fast) to the right-hand sides of the formula at the top of this module,
+        the larger of the two.
 
         Args:
             changes: largest next corrections (slow, fast).
@@ -137,14 +146,16 @@ class Accepted(NamedTuple):
         numbers = jnp.finfo(float)
         at_rest = numbers.eps * jnp.maximum(*motions) + numbers.tiny
         late = (iterations >= ITERATIONS_BEFORE_TIED_ROUNDOFF) * 1
-        # where a correction is larger than the motion, as from rest at the origin, the ratio is 1 / tolerance and does not overflow
+        # where a correction is larger than the motion, as from rest at the origin, the ratio is 1 / tolerance and does
+        # not overflow
         pairs = zip(changes, map(jnp.maximum, motions, changes), (self.slow[late], self.fast[late]), strict=True)
         return jnp.maximum(*(change / (self.tolerance * size + floor + at_rest) for change, size, floor in pairs))
 
 
 def is_solved(rows, motions):
-    """Whether a residual is round-off of the momenta, ``4 eps max sqrt(M) |increments|``. Masses whose condition number is large make more of it than
-    round-off of the increments: a chain of 100 bars has corrections ``M^-1 R`` of 1e-11 of them.
+    """Whether a residual is round-off of the momenta, ``4 eps max sqrt(M) |increments|``. Masses whose condition number
+    is large make more of it than round-off of the increments: a chain of 100 bars has corrections ``M^-1 R`` of 1e-11
+    of them.
 
     Args:
         rows: largest residual of the momentum equations, times h, with the weights of momenta.
@@ -154,10 +165,12 @@ def is_solved(rows, motions):
 
 
 def constraint_length(equations: StepEquations, weights: Weights = NO_WEIGHTS):
-    """Largest radius of curvature of the constraints at the start of a step, ``max_i |e . grad g_i| / |e^T (hess g_i) e|`` along a direction e.
+    """Largest radius of curvature of the constraints at the start of a step,
+    ``max_i |e . grad g_i| / |e^T (hess g_i) e|`` along a direction e.
 
-    A constraint has the round-off of the lengths in it, which may be far larger than the positions: for ``g = |q - c| - R`` with q near the
-    origin it moves q by ``eps R``. Straight constraints count as zero. The direction e is arbitrary, but the same in all steps.
+    A constraint has the round-off of the lengths in it, which may be far larger than the positions: for
+    ``g = |q - c| - R`` with q near the origin it moves q by ``eps R``. Straight constraints count as zero. The
+    direction e is arbitrary, but the same in all steps.
     """
     system, n_s = equations.system, equations.q_s.size
     if not system.is_constrained:
@@ -177,5 +190,6 @@ def constraint_length(equations: StepEquations, weights: Weights = NO_WEIGHTS):
 
 
 def expected(moved, before):
-    """The expected next correction ``min(MARGIN moved / before, 1) moved`` after the corrections `before` and then `moved`."""
+    """The expected next correction ``min(MARGIN moved / before, 1) moved`` after the corrections `before` and then
+    `moved`."""
     return jnp.minimum(MARGIN * moved / (before + jnp.finfo(float).tiny), 1.0) * moved

@@ -1,19 +1,22 @@
 """One interval of fast variables with a path of degree r > 1, by simplified Newton steps in modes of time.
 
-With the Hessian of the potentials and the Jacobian of the constraints taken at one point, in the middle of the step, the Newton matrix is
+With the Hessian of the potentials and the Jacobian of the constraints taken at one point, in the middle of the step,
+the Newton matrix is
 
     [A (x) M - h^2 B (x) W'',  -1 (x) G^T;  1 (x) G,  0]        (x): Kronecker product
 
-with A, B (r, r) the stiffness and the mass matrix of the polynomials in time, rows of the nodes 0..r-1, columns of 1..r. Multiply the first
-rows by ``A^-1 (x) 1``, and take ``nu = (A^-1 (x) 1) mu`` for the multipliers. In the eigenvectors of A^-1 B, which depend on the degree
-alone, the matrix then decouples into one complex saddle per pair of eigenvalues gamma,
+with A, B (r, r) the stiffness and the mass matrix of the polynomials in time, rows of the nodes 0..r-1, columns of
+1..r. Multiply the first rows by ``A^-1 (x) 1``, and take ``nu = (A^-1 (x) 1) mu`` for the multipliers. In the
+eigenvectors of A^-1 B, which depend on the degree alone, the matrix then decouples into one complex saddle per pair of
+eigenvalues gamma,
 
     [M - h^2 gamma W'',  -G^T;  G,  0],
 
-so that matrices have the size of the system for every degree (Butcher 1976; Hairer, Wanner, Solving
-Ordinary Differential Equations II, IV.8). The Hessian has the form ``L^T w L`` with a (d, n) matrix L, where d may be much smaller than n: each
-saddle is eliminated down to d rows and the constraints (`Saddles`). Where slow variables are joined to the fast ones, it leaves out their
-curvature, which a macro step resolves. The residual is exact, so that these approximations change only the number of iterations.
+so that matrices have the size of the system for every degree (Butcher 1976; Hairer, Wanner, Solving Ordinary
+Differential Equations II, IV.8). The Hessian has the form ``L^T w L`` with a (d, n) matrix L, where d may be much
+smaller than n: each saddle is eliminated down to d rows and the constraints (`Saddles`). Where slow variables are
+joined to the fast ones, it leaves out their curvature, which a macro step resolves. The residual is exact, so that
+these approximations change only the number of iterations.
 """
 
 from dataclasses import dataclass
@@ -43,7 +46,8 @@ class IntervalEquations:
     """The equations of the step, with the nodes as the last axis.
 
     num_slow: of the variables, whose curvature the Hessian leaves out; they come first.
-    directions, along: L (d, n), the combinations of variables along which the potentials are curved, and its pseudo-inverse (n, d).
+    directions, along: L (d, n), the combinations of variables along which the potentials are curved, and its
+        pseudo-inverse (n, d).
     """
 
     def __init__(self, equations: StepEquations, num_slow: int):
@@ -105,7 +109,8 @@ class IntervalEquations:
             g, pull = jax.vjp(lambda q: self.constraints(t, q), q)
             return g, -pull(mu)[0]
 
-        # constraint forces -G(q_j)^T mu_j at the nodes 0..r-1: `first` at node 0, the others in `total`; no multiplier at node r
+        # constraint forces -G(q_j)^T mu_j at the nodes 0..r-1: `first` at node 0, the others in `total`; no multiplier
+        # at node r
         later = jnp.concatenate([mu[:, 1:], jnp.zeros_like(mu[:, :1])], axis=1)
         g, total = at_nodes(at_node)((self.times[1:], q, later))
         first = -jnp.sum(mu[:, :1] * self.at_start, axis=0)
@@ -149,7 +154,8 @@ class Forces(NamedTuple):
 
 
 class Saddles(NamedTuple):
-    """The saddles of all modes after elimination, with z = L x for the d combinations of variables along which the potentials are curved.
+    """The saddles of all modes after elimination, with z = L x for the d combinations of variables along which the
+    potentials are curved.
 
     With ``h^2 W'' = L^T w L`` and ``Q = M^-1 L^T w``, the equation ``M x - gamma L^T w z - G^T nu = M y`` gives
 
@@ -193,7 +199,8 @@ class Saddles(NamedTuple):
         bent = matmul(along, bend)
         denominator = inverse(np.eye(d) - 2 * re * bent + (re**2 + im**2) * matmul(bent, bent))
 
-        # (1 - gamma L Q)^-1 L M^-1 G^T = |1 - gamma L Q|^-2 (1 - conj(gamma) L Q) L M^-1 G^T, by real and imaginary part
+        # (1 - gamma L Q)^-1 L M^-1 G^T = |1 - gamma L Q|^-2 (1 - conj(gamma) L Q) L M^-1 G^T, by real and imaginary
+        # part
         pulled = matmul(along, pull)
         columns = jnp.concatenate([pulled, matmul(bent, pulled)], axis=1)
         products = (matmul(denominator.reshape(k * d, d), columns)).reshape(k, d, 2 * n_g)
@@ -258,7 +265,8 @@ at_nodes = partial(jax.vmap, in_axes=-1, out_axes=-1)
 
 @dataclass(frozen=True)
 class Collocation(StepSolver):
-    """Newton steps until the next one would change no increment (`Accepted`); its correction is extrapolated from the last two.
+    """Newton steps until the next one would change no increment (`Accepted`); its correction is extrapolated from the
+    last two.
 
     newton: settings.
     num_slow: of `IntervalEquations`.
@@ -288,7 +296,8 @@ class Collocation(StepSolver):
             return Increments(x, mu, moved, iterations, result)
 
         def step(iterate: Evaluated) -> Evaluated:
-            """Forces of the last iterate, then a correction unless it has converged: one place for the forces compiles them once."""
+            """Forces of the last iterate, then a correction unless it has converged: one place for the forces compiles
+            them once."""
             last = iterate.last
             forces = interval.forces(last.x, last.mu)
             return Evaluated(

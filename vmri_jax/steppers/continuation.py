@@ -1,9 +1,11 @@
 """Continuation in the length of a step, where Newton's iteration from the guess fails.
 
-A step may have several solutions; the physical one is connected to the straight motion of a short step. If plain iteration from the
-guess fails, the solver solves the equations of a shorter step, then of longer and longer ones, each from the scaled solution of the one
-before (Deuflhard, *Newton Methods for Nonlinear Problems*, 2011, chapter 5). The stride doubles after a success
-and halves after a part that ends early, by a singular matrix or a NaN; a part that uses up all iterations ends the continuation. Plain iteration and continuation are one loop, compiled once; a step that converges at once takes one turn.
+A step may have several solutions; the physical one is connected to the straight motion of a short step. If plain
+iteration from the guess fails, the solver solves the equations of a shorter step, then of longer and longer ones, each
+from the scaled solution of the one before (Deuflhard, *Newton Methods for Nonlinear Problems*, 2011, chapter 5). The
+stride doubles after a success and halves after a part that ends early, by a singular matrix or a NaN; a part that uses
+up all iterations ends the continuation. Plain iteration and continuation are one loop, compiled once; a step that
+converges at once takes one turn.
 
 The first attempt is the whole step from the prediction of the steps before, the
 second the whole step from straight motion, all further attempts are parts of the step.
@@ -25,10 +27,14 @@ from vmri_jax.steppers.results import RUNNING, Result
 from vmri_jax.steppers.stepper import StepStatus
 
 SHORTEST_PART = 1 / 64
-"""Smallest stride, relative to the step. Continuation has failed if it would need a smaller one; a smaller value makes failing runs slower."""
+"""Smallest stride, relative to the step.
+
+Continuation has failed if it would need a smaller one; a smaller value makes failing runs slower.
+"""
 RANK = 1e-7
-"""Constraint gradients, in the norm of the kinetic energy and scaled to length one, count as dependent if their smallest singular value is below this number. A larger
-value names nearly dependent constraints as the cause of a failed step."""
+"""Constraint gradients, in the norm of the kinetic energy and scaled to length one, count as dependent if their
+smallest singular value is below this number. A larger value names nearly dependent constraints as the cause of a failed
+step."""
 
 
 class Part(NamedTuple):
@@ -73,13 +79,14 @@ def solve_in_parts(
 
     Args:
         equations: of the step.
-        guess: straight motion, from which attempts start until a part is solved; then they start from its scaled solution.
+        guess: straight motion, from which attempts start until a part is solved; then they start from its scaled
+            solution.
         solution: any pytree of the type of solutions.
-        iterate: function of the equations of the part, a guess, the most iterations, and whether this is the first attempt; returns
-            a solution, its unknowns, `Result` and the number of iterations.
+        iterate: function of the equations of the part, a guess, the most iterations, and whether this is the first
+            attempt; returns a solution, its unknowns, `Result` and the number of iterations.
         max_iterations: of all attempts together.
-        plain_iterations: of each of the first two attempts. An attempt that needs more is far from the guess, and might end at another
-            solution than the physical one.
+        plain_iterations: of each of the first two attempts. An attempt that needs more is far from the guess, and might
+            end at another solution than the physical one.
     """
 
     def attempt(part: Part) -> Part:

@@ -20,8 +20,8 @@ from vmri_jax.steppers.stepper import Stepper
 def whole_step(made: Any, system: System, scheme: Scheme, average: Callable | None) -> Kicked:
     """The stepper of a run, made of a user's stepper.
 
-    A `Solved` stepper solves the equations between the kicks, so that the kicks of the scheme are added before and after; any other stepper
-    takes the whole step.
+    A `Solved` stepper solves the equations between the kicks, so that the kicks of the scheme are added before and
+    after; any other stepper takes the whole step.
 
     Args:
         made: value of ``Solver.stepper``.
@@ -57,6 +57,7 @@ def check_shapes(stepper: Stepper, system: System, scheme: Scheme, state: State)
         returned = np.shape(getattr(owner, name))
         if returned != shape:
             raise Refused(
-                f"plan: advance of the stepper of Solver.stepper returns {type(owner).__name__}.{name} of shape {returned}; it must be {shape} for num_micro = {micro}, "
-                f"degree = {r}, {n_g} constraints and {n_gs} slow ones."
+                f"plan: advance of the stepper of Solver.stepper returns {type(owner).__name__}.{name} of shape "
+                f"{returned}; it must be {shape} for num_micro = {micro}, degree = {r}, {n_g} constraints and {n_gs} "
+                "slow ones."
             )

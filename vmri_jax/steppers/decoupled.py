@@ -1,7 +1,7 @@
 """Slow and fast variables apart, or joined.
 
-*Decoupled*: slow equations that do not depend on the fast unknowns; the slow variables make one step, then the fast variables several shorter
-ones. *Joined*: on one micro interval slow and fast unknowns are of one kind.
+*Decoupled*: slow equations that do not depend on the fast unknowns; the slow variables make one step, then the fast
+variables several shorter ones. *Joined*: on one micro interval slow and fast unknowns are of one kind.
 """
 
 from dataclasses import dataclass, replace
@@ -25,8 +25,9 @@ class DecoupledState(NamedTuple):
 class Decoupled(Stepper):
     """Two independent parts, the slow and the fast variables.
 
-    Each part is a `System` of its own in which all variables count as fast (slow variables are stored as q_f), on a single interval, so that
-    the same steppers apply. Kicks that depend on both parts are applied outside of this stepper.
+    Each part is a `System` of its own in which all variables count as fast (slow variables are stored as q_f), on a
+    single interval, so that the same steppers apply. Kicks that depend on both parts are applied outside of this
+    stepper.
 
     slow: stepper of the slow variables, one step over the macro interval.
     fast: stepper of the fast variables, `num_fast` steps.

@@ -1,17 +1,18 @@
 """The structure of a micro interval, and the Newton matrix K of its fast increments.
 
-K (r n_f, r n_f) is the derivative of the fast momentum equations, times h and without constraint forces, by the fast increments.
-Its rows i = 0..r-1 and columns j = 1..r are
+K (r n_f, r n_f) is the derivative of the fast momentum equations, times h and without constraint forces, by the fast
+increments. Its rows i = 0..r-1 and columns j = 1..r are
 
-    K_ij = k_ij M_f - h^2 sum_k w_k l_i(c_k) l_j(c_k) U''(c_k) + h^2 sum_k w_k l_i(c_k) (dF/dq l_j(c_k) + dF/dv l_j'(c_k) / h)
-    k_ij = sum_n w_n l_i'(c_n) l_j'(c_n)
+    K_ij = k_ij M_f - h^2 sum_k w_k l_i(c_k) l_j(c_k) U''(c_k) + h^2 sum_k w_k l_i(c_k) (dF/dq l_j(c_k) + dF/dv
+    l_j'(c_k) / h) k_ij = sum_n w_n l_i'(c_n) l_j'(c_n)
 
-k_ij has the nodes c_n and weights w_n of T. The terms with U'' are summed over W and all other potentials U with nodes c_k inside micro
-intervals. U'' and the derivatives of the forces F, both in fast variables, are evaluated on the straight path over the first micro interval of a macro step. A
-`DiagonalMatrix` takes only potentials of q_f alone, and no forces.
+k_ij has the nodes c_n and weights w_n of T. The terms with U'' are summed over W and all other potentials U with nodes
+c_k inside micro intervals. U'' and the derivatives of the forces F, both in fast variables, are evaluated on the
+straight path over the first micro interval of a macro step. A `DiagonalMatrix` takes only potentials of q_f alone, and
+no forces.
 
-For r = 1, without forces and with W at the midpoint, ``K = -(M_f + h^2 W'' / 4)``: negative definite where the mass dominates. The entries of K
-that couple coordinates of a long chain lie in a band, which O(n_f) operations eliminate.
+For r = 1, without forces and with W at the midpoint, ``K = -(M_f + h^2 W'' / 4)``: negative definite where the mass
+dominates. The entries of K that couple coordinates of a long chain lie in a band, which O(n_f) operations eliminate.
 """
 
 from dataclasses import dataclass
@@ -38,10 +39,11 @@ from vmri_jax.schemes.path import control_nodes, lagrange_basis
 from vmri_jax.schemes.scheme import Scheme
 
 SMALL = 24
-"""Most fast variables for which an interval of high degree is solved with one full matrix. For more variables, matrices per coordinate, or
-matrices that are kept over many steps, are cheaper."""
+"""Most fast variables for which an interval of high degree is solved with one full matrix. For more variables, matrices
+per coordinate, or matrices that are kept over many steps, are cheaper."""
 PATHS = 3
-"""Random paths on which the entries of K are looked for; fewer of them miss entries that are zero by chance, or in a part of the positions."""
+"""Random paths on which the entries of K are looked for; fewer of them miss entries that are zero by chance, or in a
+part of the positions."""
 
 
 def constant_mass(system: System) -> ConstantMass:
@@ -88,10 +90,12 @@ Matrix = DiagonalMatrix | JoinedMatrix
 class IntervalStructure:
     """The structure of a micro interval.
 
-    is_explicit: whether the fast increments are explicit functions of the multipliers, ``x = M_f^-1 (h p_f - G_0^T mu)``.
-    is_diagonal: whether K is taken as one matrix per fast coordinate: M_f is diagonal, and inside the interval either all potentials are
-        linear in q_f, or there are only V and W, and each function of q_f alone among V and W is a sum over the coordinates. K then leaves
-        out forces and potentials that depend on slow variables: this costs passes, not accuracy.
+    is_explicit: whether the fast increments are explicit functions of the multipliers,
+        ``x = M_f^-1 (h p_f - G_0^T mu)``.
+    is_diagonal: whether K is taken as one matrix per fast coordinate: M_f is diagonal, and inside the interval either
+        all potentials are linear in q_f, or there are only V and W, and each function of q_f alone among V and W is a
+        sum over the coordinates. K then leaves out forces and potentials that depend on slow variables: this costs
+        passes, not accuracy.
     is_constant: whether K is the same for a whole run.
     curved: sparsity of K, where it is not diagonal.
     sparsity: of ``G K^-1 G^T``.
@@ -154,7 +158,8 @@ class IntervalStructure:
 
 
 def _rows(intervals: Intervals, path: IntervalPath, fast):
-    """Fast momentum equations (r, n_f) of the first interval, without constraints and the momentum that arrives, with forces along the same path."""
+    """Fast momentum equations (r, n_f) of the first interval, without constraints and the momentum that arrives, with
+    forces along the same path."""
     d = intervals.gradient(0, path._replace(fast=fast))
     return intervals.rows(intervals.with_inertia(d, fast))
 
@@ -177,7 +182,8 @@ def _curved(system: System, scheme: Scheme, n_s: int, n_f: int) -> Sparsity:
 
 @quickly_compiled
 def _touched(parts: tuple[System, Scheme], numbers, fast):
-    """(n_f, n_f) whether the rows of each coordinate change with each other one, on the path with these positions and increments."""
+    """(n_f, n_f) whether the rows of each coordinate change with each other one, on the path with these positions and
+    increments."""
     system, scheme = parts
     start = State(jnp.zeros(()), *numbers)
     intervals = Intervals(StepEquations.of(system, scheme, start, jnp.asarray(float(scheme.num_micro))))

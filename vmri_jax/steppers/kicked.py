@@ -29,7 +29,8 @@ class KickedState(NamedTuple):
 
 @dataclass(frozen=True)
 class Kicked(Stepper):
-    """Kicks before and after an inner step, ``p <- p - H w dV/dq`` with the weight w of the rule at that end of the interval.
+    """Kicks before and after an inner step, ``p <- p - H w dV/dq`` with the weight w of the rule at that end of the
+    interval.
 
     Corrections have the factor H^3 instead of H, see `TermOnNodes.times_step`.
 
@@ -84,8 +85,8 @@ class Kicked(Stepper):
         state = kicked(state, self.kicks, memory.gradients, macro_dt, start=1.0)
         best = StepStatus(jnp.asarray(0), jnp.asarray(0), jnp.asarray(0), jnp.zeros(()))
         (state, inner, worst), (q_f, multiplier) = jax.lax.scan(between, (state, inner, best), length=count - 1)
-        # The last step stands outside of the loop: a weight that depends on the number of the step, and a carry with its gradients, would
-        # cost as much as half of a short step.
+        # The last step stands outside of the loop: a weight that depends on the number of the step, and a carry with
+        # its gradients, would cost as much as half of a short step.
         state, last, memory = step(state, inner, 0.0)
         is_same = is_concrete(last.status)  # a stepper with a constant status, known while tracing, has it in all steps
         status = last.status if is_same else worst.worse(last.status)
@@ -159,7 +160,8 @@ def _all_steps(before, last):
 def kicked(
     state: State, kicks: tuple[TermOnNodes, ...], gradients, macro_dt, start: float = 0.0, end: float = 0.0
 ) -> State:
-    """The state after kicks with these gradients: `start` times the weight at the start of an interval plus `end` times that at its end."""
+    """The state after kicks with these gradients: `start` times the weight at the start of an interval plus `end` times
+    that at its end."""
     p_s, p_f = state.p_s, state.p_f
     for term, (d_s, d_f) in zip(kicks, gradients, strict=True):
         weights = [part * w for part, w in ((start, term.start), (end, term.end)) if part and w is not None]
@@ -172,12 +174,14 @@ def kicked(
 def average_over_fast_motion(stepper_of: Callable, num_micro: int) -> Callable:
     """The filter of a mollified slow potential, ``average(macro_dt)(q_s, q_f) -> a``.
 
-    ``a = (x_0 / 2 + x_1 + ... + x_{n - 1} + x_n / 2) / n`` over the n + 1 micro nodes ``x_0 = q_f, ..., x_n``, n = num_micro, of the fast motion
-    from rest at q_f with the slow variables at rest: the trapezoidal rule on the micro grid. A harmonic vibration whose discrete phase advances
-    by k pi over the macro step, with a whole number k that is no multiple of 2 n, has the average zero, so that V cannot excite it.
+    ``a = (x_0 / 2 + x_1 + ... + x_{n - 1} + x_n / 2) / n`` over the n + 1 micro nodes ``x_0 = q_f, ..., x_n``, n =
+    num_micro, of the fast motion from rest at q_f with the slow variables at rest: the trapezoidal rule on the micro
+    grid. A harmonic vibration whose discrete phase advances by k pi over the macro step, with a whole number k that is
+    no multiple of 2 n, has the average zero, so that V cannot excite it.
 
     Args:
-        stepper_of: ``(q_s, q_f) -> Kicked``, the stepper of one micro interval of the fast variables with the slow variables at rest.
+        stepper_of: ``(q_s, q_f) -> Kicked``, the stepper of one micro interval of the fast variables with the slow
+            variables at rest.
         num_micro: micro steps per macro step.
     """
 

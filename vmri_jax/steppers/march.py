@@ -1,26 +1,28 @@
 """The march: a macro step of any Lagrangian, micro interval by micro interval.
 
-A micro interval is a map ``(q_f, p_f, slow path) -> (q_f, p_f, impulses on the slow path)``, given by its equations R_m = 0 for its
-unknowns x_m (`vmri_jax.schemes.intervals`). The macro step has the unknowns x_m of all intervals, and z: slow increments and slow
-multipliers.
+A micro interval is a map ``(q_f, p_f, slow path) -> (q_f, p_f, impulses on the slow path)``, given by its equations R_m
+= 0 for its unknowns x_m (`vmri_jax.schemes.intervals`). The macro step has the unknowns x_m of all intervals, and z:
+slow increments and slow multipliers.
 
-A pass goes over the intervals in order. Each interval corrects its unknowns once, and hands on its end position, momentum and
-impulses, corrected to first order:
+A pass goes over the intervals in order. Each interval corrects its unknowns once, and hands on its end position,
+momentum and impulses, corrected to first order:
 
     d_m = -(dR_m/dx_m)^-1 R_m        x_m <- x_m + d_m
 
-After the last interval the pass computes a correction of z by the slow equations R_s = 0, which the impulses of all intervals enter; the next
-pass starts with it,
+After the last interval the pass computes a correction of z by the slow equations R_s = 0, which the impulses of all
+intervals enter; the next pass starts with it,
 
     d = -S^-1 R_s                    z <- z + d,    x_m <- x_m + (dx_m/dz) d
 
-with S the total derivative of R_s by z, the Schur complement of the intervals: z acts on R_s itself, and through all x_m.
+with S the total derivative of R_s by z, the Schur complement of the intervals: z acts on R_s itself, and through all
+x_m.
 
-The matrices, the derivatives of the intervals in forward mode, come from a pass that computes them (`linearised_pass`). It carries along how x_m
-and the numbers that are handed on change with z, so that S is known at the end. They are exact, or of the *masses*: with the quadratic form
-``v^T M v / 2`` in place of a kinetic energy T that is a function, ``M = d2T/dv2`` at the start of the step. The residual is exact in both cases, so
-that the matrices change only the number of passes. Passes keep all matrices, also those of the steps before, while the corrections shrink, and
-cost one gradient of the action each.
+The matrices, the derivatives of the intervals in forward mode, come from a pass that computes them (`linearised_pass`).
+It carries along how x_m and the numbers that are handed on change with z, so that S is known at the end. They are
+exact, or of the *masses*: with the quadratic form ``v^T M v / 2`` in place of a kinetic energy T that is a function,
+``M = d2T/dv2`` at the start of the step. The residual is exact in both cases, so that the matrices change only the
+number of passes. Passes keep all matrices, also those of the steps before, while the corrections shrink, and cost one
+gradient of the action each.
 
 This module remembers nothing from step to step: the guess and the kept matrices come from `vmri_jax.steppers.marched`.
 """
@@ -56,11 +58,12 @@ class Matrices(NamedTuple):
 
 
 class Handed(NamedTuple):
-    """The quantities that arrive at an interval, as vectors, or their derivatives, as matrices with one column for each direction.
+    """The quantities that arrive at an interval, as vectors, or their derivatives, as matrices with one column for each
+    direction.
 
     position: q_f.
-    gradients: of h times the action of the intervals before: by q_f (the momentum ``h p_f``), by the start of the slow path, by its
-        increments.
+    gradients: of h times the action of the intervals before: by q_f (the momentum ``h p_f``), by the start of the slow
+        path, by its increments.
     """
 
     position: Float[Array, "n_f ..."]
@@ -94,7 +97,8 @@ class MarchEquations:
         return self.n > 1 or self.num_slow + self.n_gs > 0
 
     def predicted(self, z, x):
-        """The unknowns that steps before predict, z or those of the only interval, and how many of them are increments."""
+        """The unknowns that steps before predict, z or those of the only interval, and how many of them are
+        increments."""
         return (z, self.num_slow) if self.has_slow_path else (x[0], self.num_fast)
 
     def by_masses(self) -> "MarchEquations":
@@ -165,14 +169,17 @@ class MarchEquations:
         return Arriving(arriving.position, p_f, start, slow.reshape(self.r, self.n_v))
 
     def slow_inverse(self, z, arriving: Handed, sensitivities: Handed):
-        """The inverse (b, b) of the total derivative S of the slow residual, and `slow_equations`, whose values it shares.
+        """The inverse (b, b) of the total derivative S of the slow residual, and `slow_equations`, whose values it
+        shares.
 
         Args:
-            sensitivities: derivative of `arriving` with respect to the slow increments, one column for each increment that intervals see.
+            sensitivities: derivative of `arriving` with respect to the slow increments, one column for each increment
+                that intervals see.
         """
         (residual, p_s), push = jax.linearize(self.slow_equations, z, arriving)
 
-        # zero columns for the slow increments that no interval sees and for the slow multipliers: they do not change `arriving`
+        # zero columns for the slow increments that no interval sees and for the slow multipliers: they do not change
+        # `arriving`
         def for_all(sensitivity):
             none = jnp.zeros((len(sensitivity), self.r, self.n_s))
             seen = self.intervals.seen.put(sensitivity.reshape(len(sensitivity), self.r, self.n_v), none)
@@ -192,10 +199,12 @@ class MarchEquations:
         return x[self.num_fast - self.n_f : self.num_fast]
 
     def corrected(self, m, matrices, x, slow, arriving: Handed, values, worst: "Worst") -> tuple[Any, Handed, "Worst"]:
-        """Interval m after the correction ``d = -(dR/dx)^-1 R``: x + d, its end position and gradients, corrected to first order, and the maxima.
+        """Interval m after the correction ``d = -(dR/dx)^-1 R``: x + d, its end position and gradients, corrected to
+        first order, and the maxima.
 
-        The impulses of constraints are taken at x itself. Kept matrices would give them a direction of earlier positions, and the multipliers
-        follow the round-off of the constraints: momenta would get errors that no projection onto the hidden constraints removes.
+        The impulses of constraints are taken at x itself. Kept matrices would give them a direction of earlier
+        positions, and the multipliers follow the round-off of the constraints: momenta would get errors that no
+        projection onto the hidden constraints removes.
 
         Args:
             matrices: ``(dR/dx)^-1``, and the derivative of the gradients that are handed on.
@@ -215,7 +224,8 @@ class MarchEquations:
     def passed(self, matrices: Matrices, z, x, worst: "Worst", end: Handed, slow_values) -> "Passed":
         """The pass after its last interval: the slow correction ``dz = -S^-1 R_s``, and ``dx_m = (dx_m/dz) dz``.
 
-        The returned z and p_s contain the correction of the slow multipliers already, dz the correction of the increments alone.
+        The returned z and p_s contain the correction of the slow multipliers already, dz the correction of the
+        increments alone.
 
         Args:
             matrices: of this pass or kept ones.
@@ -230,7 +240,8 @@ class MarchEquations:
         rows = largest(residual[: self.num_slow], self.of_momenta.slow)
         worst = worst.add(residual, dz, rows, worst.moved)
         if self.n_gs:
-            # Slow multipliers take their correction in this pass, as those of the intervals: a step at rest has no other pass.
+            # Slow multipliers take their correction in this pass, as those of the intervals: a step at rest has no
+            # other pass.
             slow, dnu = z[: self.num_slow].reshape(self.r, self.n_s), dz[self.num_slow :]
             z, dz = z.at[self.num_slow :].add(dnu), dz.at[self.num_slow :].set(0.0)
             p_s -= self.intervals.slow_impulses(slow, dnu.reshape(self.r, self.n_gs)).sum(0) / self.equations.micro_dt
@@ -243,7 +254,8 @@ def _gradients(on: Arriving):
 
 
 def inverse_with_multipliers(a, b, c, nodes: int):
-    """The inverse of ``[[A, B], [C, 0]]`` by elimination, regularised for dependent constraints (`vmri_jax.kernels.saddle`)."""
+    """The inverse of ``[[A, B], [C, 0]]`` by elimination, regularised for dependent constraints
+    (`vmri_jax.kernels.saddle`)."""
     return inverse_in_loop(saddle(a, b, c) if b.shape[-1] else a)
 
 
@@ -303,12 +315,12 @@ def linearised_pass(
         z, x: unknowns.
         last: (k,) unknowns of the last interval of the step before.
         from_last: whether each interval starts from the unknowns of the interval before, instead of its unknowns in x.
-        corrects: whether every interval starts from the corrected end of the interval before, so that far from the solution the matrices are those
-            of a path that is closer to it; else the matrices are those of z and x.
+        corrects: whether every interval starts from the corrected end of the interval before, so that far from the
+            solution the matrices are those of a path that is closer to it; else the matrices are those of z and x.
 
     Returns:
-        The matrices, the pass, and the derivatives (num_micro, k, n_f) and (num_micro, o, n_f) of the residual of every interval and of the
-        gradients that it hands on, with respect to the position that arrives: `solve` needs them.
+        The matrices, the pass, and the derivatives (num_micro, k, n_f) and (num_micro, o, n_f) of the residual of every
+        interval and of the gradients that it hands on, with respect to the position that arrives: `solve` needs them.
     """
     slow, unit, n_f = march.seen(z), jnp.eye(march.num_seen), march.n_f
 
@@ -317,8 +329,9 @@ def linearised_pass(
         x = jnp.where(from_last, last, x)
         values, push = jax.linearize(partial(march.interval, m), x, arriving, slow)
 
-        # Columns: the unknowns of the interval, the slow increments together with the sensitivities d(arriving)/dz of the intervals before, and the
-        # arriving position alone. One vmap for all of them: the tangents of the action are most of the program, and each call compiles them.
+        # Columns: the unknowns of the interval, the slow increments together with the sensitivities d(arriving)/dz of
+        # the intervals before, and the arriving position alone. One vmap for all of them: the tangents of the action
+        # are most of the program, and each call compiles them.
         ends = x.size, x.size + march.num_seen
         by_unknowns = jnp.eye(x.size, ends[1] + n_f)
         by_arriving, by_slow = jax.tree.map(lambda a: jnp.pad(a, ((0, 0), (x.size, n_f))), (sensitivities, unit))
@@ -350,7 +363,10 @@ def linearised_pass(
 
 
 def kept_pass(march: MarchEquations, matrices: Matrices, z, x, last, from_last) -> Passed:
-    """A pass with matrices of earlier unknowns: every interval starts from the corrected end of the interval before. Arguments as of `linearised_pass`."""
+    """A pass with matrices of earlier unknowns: every interval starts from the corrected end of the interval before.
+
+    Arguments as of `linearised_pass`.
+    """
     slow = march.seen(z)
 
     def interval(carry, unknowns_and_matrices):
@@ -369,14 +385,16 @@ def kept_pass(march: MarchEquations, matrices: Matrices, z, x, last, from_last) 
 def solve(march: MarchEquations, factors: tuple[Matrices, list], rows_z, rows_x):
     """(dz, dx) with ``dR/d(z, x) (dz, dx) = -(rows_z, rows_x)``; linear in the rows, and JAX can transpose it.
 
-    Forward elimination with z fixed, then ``S dz = -(rows_z + change of R_s)``, then back substitution ``dx + (dx/dz) dz``.
+    Forward elimination with z fixed, then ``S dz = -(rows_z + change of R_s)``, then back substitution
+    ``dx + (dx/dz) dz``.
     """
 
     (matrices, by_positions), n_f = factors, march.n_f
 
     def interval(arriving, of_interval):
         rows, inverse, hands_on, by_position, hands_on_by_position = of_interval
-        # dx = -(dR/dx)^-1 (rows + dR/dq dq + dR/dp dp); h p_f is added to the first momentum equation: dR/dp is the unit matrix there
+        # dx = -(dR/dx)^-1 (rows + dR/dq dq + dR/dp dp); h p_f is added to the first momentum equation: dR/dp is the
+        # unit matrix there
         on_left = (rows + matvec(by_position, arriving.position)).at[:n_f].add(arriving.gradients[:n_f])
         dx = -matvec(inverse, on_left)
         gradients = arriving.gradients + matvec(hands_on, dx) + matvec(hands_on_by_position, arriving.position)

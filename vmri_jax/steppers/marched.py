@@ -26,8 +26,9 @@ from vmri_jax.steppers.solved import Solution, StepSolver, status_of
 from vmri_jax.steppers.solver import Solver, iterated, only_if
 
 PLAIN_PASSES = 30
-"""Most passes of an attempt at the whole step, before parts of the step are tried. Newton's method needs at most 15 exact passes from a good
-guess, and about half of the passes are exact. A larger number makes failing runs slower; a smaller one tries parts without need."""
+"""Most passes of an attempt at the whole step, before parts of the step are tried. Newton's method needs at most 15
+exact passes from a good guess, and about half of the passes are exact. A larger number makes failing runs slower; a
+smaller one tries parts without need."""
 
 
 class MarchMemory(NamedTuple):
@@ -36,8 +37,8 @@ class MarchMemory(NamedTuple):
     path: predictor of the slow unknowns z, or of the unknowns x of a single interval without slow unknowns.
     fast: unknowns of the last micro interval.
     matrices: the last ones.
-    rate: ratio of the last two corrections with these matrices, of the masses the largest ratio; infinite if there are none. Corrections at
-        round-off do not count.
+    rate: ratio of the last two corrections with these matrices, of the masses the largest ratio; infinite if there are
+        none. Corrections at round-off do not count.
     """
 
     path: PolynomialPredictor
@@ -53,8 +54,9 @@ class Progress(NamedTuple):
     matrices: the last ones.
     size: largest correction ``|d|`` of slow and fast increments in the last pass.
     rate: expected ratio ``|d_next| / |d|`` with the kept matrices.
-    curvature: kappa, with ``|d_next| = kappa |d_new| |d|`` for passes that keep exact matrices: the simplified Newton iteration converges
-        linearly, at a rate that is proportional to the correction d_new of the first pass with them.
+    curvature: kappa, with ``|d_next| = kappa |d_new| |d|`` for passes that keep exact matrices: the simplified Newton
+        iteration converges linearly, at a rate that is proportional to the correction d_new of the first pass with
+        them.
     new_size: ``|d_new|``; infinite before there are new matrices.
     still_moves: correction of the fast increments that the next pass is expected to make.
     passes, result: number of passes, and `Result` or RUNNING.
@@ -75,10 +77,12 @@ class Progress(NamedTuple):
 class Marched(StepSolver):
     """Passes until the next one would change neither the slow nor the fast increments.
 
-    newton: settings; its matrix is "exact", "masses", or "null_space", which is exact and eliminates without multipliers.
+    newton: settings; its matrix is "exact", "masses", or "null_space", which is exact and eliminates without
+        multipliers.
     sizes: (n_s, n_gs, n_f, n_g) and the degree r, for `describe` of the null space method.
 
-    There are new matrices where the old ones contract too slowly: exact ones in every pass, those of the masses before the first pass of an attempt.
+    There are new matrices where the old ones contract too slowly: exact ones in every pass, those of the masses before
+    the first pass of an attempt.
     """
 
     newton: Solver
@@ -127,14 +131,16 @@ class Marched(StepSolver):
         return self.newton.matrix != "null_space"
 
     def _pass(self, march: MarchEquations, renews, last: Progress, start) -> tuple[Matrices, Passed]:
-        """A pass from `start`, the unknowns as in `linearised_pass`, with new matrices if `renews`, else with the last ones."""
+        """A pass from `start`, the unknowns as in `linearised_pass`, with new matrices if `renews`, else with the last
+        ones."""
         if not self.is_exact:
             return last.matrices, kept_pass(march, last.matrices, *start)
         matrices, now = only_if(renews, lambda _: linearised_pass(march, *start)[:2], (last.matrices, last.passed))
         return matrices, only_if(~renews, lambda _: kept_pass(march, matrices, *start), now)
 
     def _prepared(self, march: MarchEquations, progress: Progress, last, from_last) -> Progress:
-        """The start of an attempt, with new matrices of the masses: outside of the loop of passes, which XLA compiles as a whole."""
+        """The start of an attempt, with new matrices of the masses: outside of the loop of passes, which XLA compiles
+        as a whole."""
         if self.is_exact:
             return progress
         z, x = progress.passed.z, progress.passed.x
@@ -160,7 +166,10 @@ class Marched(StepSolver):
         limit,
         is_first,
     ) -> Progress:
-        """At most `limit` passes. The first attempt starts from the predicted unknowns, later attempts from the guess."""
+        """At most `limit` passes.
+
+        The first attempt starts from the predicted unknowns, later attempts from the guess.
+        """
         z, x = march.flat(guess)
         unknowns, measured = march.predicted(z, x)
         unknowns = jnp.where(is_first, memory.path.next(measured, unknowns), unknowns)
@@ -173,19 +182,22 @@ class Marched(StepSolver):
 
         def judged(now: Passed, before: Progress) -> Progress:
             slow, fast = march.slow_size(now.dz), now.worst.moved
-            # dz is the next slow correction itself; the next fast one is expected from the last two, or without a pair from the last one
+            # dz is the next slow correction itself; the next fast one is expected from the last two, or without a pair
+            # from the last one
             still_moves = jnp.where(before.passes > 0, expected(fast, before.passed.worst.moved), fast)
             motions = march.slow_size(now.z), march.fast_size(now.x)
             passes, size = before.passes + 1, jnp.maximum(slow, fast)
             ratio = accepted.ratio((slow, still_moves), motions, passes)
-            # a first correction that is round-off: the prediction was exact, and matrices that contract leave less than the floor of the next
+            # a first correction that is round-off: the prediction was exact, and matrices that contract leave less than
+            # the floor of the next
             at_floor = accepted.at_floor(size, jnp.where(before.passes > 0, before.size, 0.0))
             if march.weights is not NO_WEIGHTS:
                 at_floor |= (size > before.size / 2) & is_solved(now.worst.rows, motions)
             result = jnp.where(ratio <= 1, Result.CONVERGED, jnp.where(at_floor, Result.CONVERGED_AT_ROUNDOFF, RUNNING))
             failed = jnp.where(size > before.size, Result.DIVERGED, Result.STAGNATED)
             result = jnp.where((passes >= limit) & (result == RUNNING), failed, result)
-            # a correction that grows in the first attempt: the prediction was poor, and the next attempt starts from straight motion
+            # a correction that grows in the first attempt: the prediction was poor, and the next attempt starts from
+            # straight motion
             lost = is_first & (size > before.size)
             result = jnp.where(lost & (result == RUNNING), Result.DIVERGED, result)
             broken = jnp.where(now.worst.is_singular, Result.SINGULAR, Result.NON_FINITE)

@@ -1,4 +1,5 @@
-"""One pass over the micro intervals of a macro step: every interval is corrected once, in order, with the slow path held fixed."""
+"""One pass over the micro intervals of a macro step: every interval is corrected once, in order, with the slow path
+held fixed."""
 
 from typing import NamedTuple
 
@@ -16,7 +17,8 @@ from vmri_jax.steppers.solver import only_if
 
 
 class FastUnknowns(NamedTuple):
-    """Unknowns of one micro interval, or of all with the intervals as first axis, and the matrix that corrects the multipliers.
+    """Unknowns of one micro interval, or of all with the intervals as first axis, and the matrix that corrects the
+    multipliers.
 
     increments, multiplier: fast increments, and scaled multipliers mu.
     schur_inverse: ``S = (G_1 K^-1 G_0^T)^-1`` of the first pass, kept in the later ones.
@@ -52,7 +54,8 @@ class MicroSweep(NamedTuple):
         return jax.tree.map(lambda a: jnp.zeros((equations.scheme.num_micro, *a.shape), a.dtype), of_interval)
 
     def corrected(self, slow, fast: FastUnknowns, is_first) -> tuple[FastUnknowns, Arriving, Float[Array, ""]]:
-        """A pass. In the first one every interval starts from straight motion at the momentum that arrives, with the multipliers of the interval before.
+        """A pass. In the first one every interval starts from straight motion at the momentum that arrives, with the
+        multipliers of the interval before.
 
         Args:
             slow: (r, n_s) increments of the slow path.
@@ -60,7 +63,8 @@ class MicroSweep(NamedTuple):
             is_first: whether this is the first pass.
 
         Returns:
-            The unknowns, the quantities that the last interval hands on, and the largest correction of a fast increment.
+            The unknowns, the quantities that the last interval hands on, and the largest correction of a fast
+            increment.
         """
         equations, r = self.intervals.equations, self.intervals.equations.scheme.degree
         velocity = constant_mass(equations.system).fast_mass.inverse().times
@@ -88,9 +92,9 @@ class MicroSweep(NamedTuple):
 
             K dx - G_0^T dmu = -R        R = rows - G_0^T mu        G_1 dx = -g
 
-        where R is the residual of the momentum equations, `rows` its part without constraint forces, and G_0, G_1 the Jacobians of g at the
-        nodes 0..r-1 and 1..r. Solved by the Schur complement: first dx without dmu, then ``G_1 K^-1 G_0^T dmu = -g`` with g at x + dx, then dx
-        with dmu.
+        where R is the residual of the momentum equations, `rows` its part without constraint forces, and G_0, G_1 the
+        Jacobians of g at the nodes 0..r-1 and 1..r. Solved by the Schur complement: first dx without dmu, then
+        ``G_1 K^-1 G_0^T dmu = -g`` with g at x + dx, then dx with dmu.
 
         Args:
             guess: unknowns before the correction.

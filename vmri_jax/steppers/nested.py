@@ -1,20 +1,23 @@
-"""Nested iteration: an outer iteration on the slow path, and within it the micro intervals in order, each with a small system of its own.
+"""Nested iteration: an outer iteration on the slow path, and within it the micro intervals in order, each with a small
+system of its own.
 
-A pass holds the slow path fixed. It visits the micro intervals in order; each corrects its fast increments and multipliers once, by a
-Newton step on its exact residual, and adds its impulse to the slow equations. Then the pass corrects the slow increments and slow
-multipliers by the residual of the slow equations. All equations are those of the march (`vmri_jax.schemes.intervals`); all matrices are cheap
-approximations:
+A pass holds the slow path fixed. It visits the micro intervals in order; each corrects its fast increments and
+multipliers once, by a Newton step on its exact residual, and adds its impulse to the slow equations. Then the pass
+corrects the slow increments and slow multipliers by the residual of the slow equations. All equations are those of the
+march (`vmri_jax.schemes.intervals`); all matrices are cheap approximations:
 
-* micro interval: ``[K, -G_0^T; G_1, 0]`` with K of `vmri_jax.steppers.interval`, e.g. ``-(M_f + h^2 W'' / 4)`` for the implicit midpoint
-  rule, on the straight path over the first interval of the macro step, or of an earlier step while that costs at most `EXTRA_PASSES`. Where the fast equations are explicit,
-  ``K = -M_f`` and only the multipliers are unknown. ``G_1 K^-1 G_0^T`` is computed in the first pass and kept;
-* slow equations: the slow masses, the fast masses that constraints tie to them, and the slow constraint (`SlowEquations`). Without
-  constraints, the derivative of the slow forces is added where updates by the masses alone would cost a pass.
+* micro interval: ``[K, -G_0^T; G_1, 0]`` with K of `vmri_jax.steppers.interval`, e.g. ``-(M_f + h^2 W'' / 4)`` for the
+  implicit midpoint rule, on the straight path over the first interval of the macro step, or of an earlier step while
+  that costs at most `EXTRA_PASSES`. Where the fast equations are explicit, ``K = -M_f`` and only the multipliers are
+  unknown. ``G_1 K^-1 G_0^T`` is computed in the first pass and kept;
+* slow equations: the slow masses, the fast masses that constraints tie to them, and the slow constraint
+  (`SlowEquations`). Without constraints, the derivative of the slow forces is added where updates by the masses alone
+  would cost a pass.
 
-The slow unknowns start from a polynomial through the last steps (`PolynomialPredictor`), the fast increments from straight motion, the
-multipliers from the interval before. The residual is exact, so that these approximations change only the number of passes: mostly two
-or three where the slow motion is smooth. A pass costs one gradient of each term at each of its nodes; memory holds the path and the
-small matrices.
+The slow unknowns start from a polynomial through the last steps (`PolynomialPredictor`), the fast increments from
+straight motion, the multipliers from the interval before. The residual is exact, so that these approximations change
+only the number of passes: mostly two or three where the slow motion is smooth. A pass costs one gradient of each term
+at each of its nodes; memory holds the path and the small matrices.
 """
 
 from dataclasses import dataclass
@@ -38,8 +41,8 @@ from vmri_jax.steppers.solved import Solution, StepSolver, status_of
 from vmri_jax.steppers.solver import Solver, iterated, only_if
 
 EXTRA_PASSES = 1
-"""Passes above the fewest with a matrix K that the solver tolerates; it renews K after a step with more. A larger number lets steps with an old K
-take more passes; with zero, every fluctuation of the number of passes renews K."""
+"""Passes above the fewest with a matrix K that the solver tolerates; it renews K after a step with more. A larger
+number lets steps with an old K take more passes; with zero, every fluctuation of the number of passes renews K."""
 PASSES_OF_UNUSED_MATRIX = 10**6
 """Initial value of the least number of passes with a new matrix: larger than the number of any step."""
 
@@ -50,8 +53,9 @@ class NestedState(NamedTuple):
     matrix: K of the micro intervals.
     slow: predictor of slow increments and slow multipliers.
     multiplier: multipliers lambda of the last micro interval.
-    slow_model_error: relative error of the slow update d by the masses alone: ``|next update| / |d|`` after a pass that moved by d, and
-        ``|d_F - d| / |d_F|`` after a pass that moved by the update d_F with the derivative of the slow forces.
+    slow_model_error: relative error of the slow update d by the masses alone: ``|next update| / |d|`` after a pass that
+        moved by d, and ``|d_F - d| / |d_F|`` after a pass that moved by the update d_F with the derivative of the slow
+        forces.
     fewest_passes: least number of passes of a step with this matrix.
     last_passes: number of passes of the last step.
     """
@@ -68,11 +72,13 @@ class Pass(NamedTuple):
     """Unknowns after a pass, the quantities that its last interval hands on, and the state of the iteration.
 
     moved: largest correction of a fast increment.
-    d: the next update of the slow increments, by the linearised slow equations; their update of the multipliers is in `slow_multiplier` already.
+    d: the next update of the slow increments, by the linearised slow equations; their update of the multipliers is in
+        `slow_multiplier` already.
     inertia: masses that constraints tie to the slow variables, from the first pass.
     p_s: slow momentum at the end of the step.
-    rows: estimated residual of the momentum equations, times h: ``max(|R_s|, max M_f |c|)`` with the expected fast correction c. M_f stands
-        for K here: for stiff W at the midpoint, |K c| is larger by the factor ``1 + h^2 W'' / (4 M_f)``.
+    rows: estimated residual of the momentum equations, times h: ``max(|R_s|, max M_f |c|)`` with the expected fast
+        correction c. M_f stands for K here: for stiff W at the midpoint, |K c| is larger by the factor
+        ``1 + h^2 W'' / (4 M_f)``.
     """
 
     slow: Float[Array, "r n_s"]
@@ -93,8 +99,8 @@ class Pass(NamedTuple):
 class Nested(StepSolver):
     """Passes until the next one would change neither the slow nor the fast increments (`Accepted`).
 
-    The next slow correction follows from the residual of the slow equations, the next fast one is extrapolated from the last two, as in
-    stiff solvers (Hairer, Wanner, *Solving Ordinary Differential Equations II*, IV.8).
+    The next slow correction follows from the residual of the slow equations, the next fast one is extrapolated from the
+    last two, as in stiff solvers (Hairer, Wanner, *Solving Ordinary Differential Equations II*, IV.8).
     """
 
     newton: Solver
@@ -171,7 +177,8 @@ class _Passes:
         self.num_multipliers = equations.system.num_constraints(equations.q_s, equations.q_f)[1]
 
     def start(self) -> Pass:
-        """The unknowns before the first pass: slow ones as predicted; in the first step, whose momenta are on the hidden constraints, from straight motion."""
+        """The unknowns before the first pass: slow ones as predicted; in the first step, whose momenta are on the
+        hidden constraints, from straight motion."""
         increment = self.equations.macro_dt * self.mass.slow_mass.inverse().times(self.equations.p_s)
         straight = (control_nodes(self.r)[1:, None] * increment).reshape(-1)
         slow = self.memory.slow.next(self.r * self.n_s, jnp.pad(straight, (0, self.r * self.num_multipliers)))
@@ -185,9 +192,10 @@ class _Passes:
         """The next pass, with corrected slow unknowns."""
         if self.equations.system.is_constrained or not (self.n_s and LINEARISES_FORCES):
             return self._moved_by(last.d, last)
-        # With eps = slow_model_error, the update d by the masses alone leaves a next update eps |d|. If a next update of this size would not
-        # be accepted, this pass solves for d with the derivative of the slow forces. After pass 1, passes 2 and 3 each make a slow update
-        # at no cost, since the fast unknowns mostly need pass 3: the test takes eps^2 |d|, the update after these two.
+        # With eps = slow_model_error, the update d by the masses alone leaves a next update eps |d|. If a next update
+        # of this size would not be accepted, this pass solves for d with the derivative of the slow forces. After pass
+        # 1, passes 2 and 3 each make a slow update at no cost, since the fast unknowns mostly need pass 3: the test
+        # takes eps^2 |d|, the update after these two.
         error = last.slow_model_error
         still_missing = jnp.where(last.passes == 1, error**2, error)
         is_hard = (

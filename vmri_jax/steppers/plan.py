@@ -4,15 +4,15 @@ The plan chooses the cheapest stepper that the rules and the system allow, from 
 
 * *composed*: a composition runs its stage over parts of the step;
 * *kicked*: potentials at the ends of the interval only shift momenta, before and after the motion inside;
-* *decoupled*: where no term but kicks couples slow and fast variables, the slow variables make one step over the macro interval and the
-  fast variables num_micro steps over the micro intervals; each part is planned like a whole system. Potentials on every k-th micro
-  node kick between groups of k fast steps (*repeated*);
+* *decoupled*: where no term but kicks couples slow and fast variables, the slow variables make one step over the macro
+  interval and the fast variables num_micro steps over the micro intervals; each part is planned like a whole system.
+  Potentials on every k-th micro node kick between groups of k fast steps (*repeated*);
 * *joined*: on one micro interval slow and fast unknowns are of one kind, so that all variables count as fast;
 * *free flight*: only kinetic energy of constant masses is left;
 * *linear*: only fast variables with linear equations are left;
-* else an iteration, by the matrix of `Solver`: masses and constraints, for the multipliers of a drift alone (*Rattle*) or for the micro
-  intervals in order (*nested*, with masses that vary *march*); modes of time, for one interval of high degree (*collocation*); or exact
-  (*march*), which is also the *fallback* of the others.
+* else an iteration, by the matrix of `Solver`: masses and constraints, for the multipliers of a drift alone (*Rattle*)
+  or for the micro intervals in order (*nested*, with masses that vary *march*); modes of time, for one interval of high
+  degree (*collocation*); or exact (*march*), which is also the *fallback* of the others.
 """
 
 from collections.abc import Callable
@@ -50,13 +50,14 @@ from vmri_jax.steppers.stepper import StepInfo, Stepper, indented
 from vmri_jax.steppers.subsystems import fast_part, frozen_slow, joined, slow_part
 
 Parts = tuple[list[Placed], dict[int, list[Placed]]]
-"""Potentials of the slow variables, on the macro grid, and of the fast variables, by the number k of micro intervals that a copy of their rule
-spans; the keys k increase, start with 1, and each is a multiple of the one before."""
+"""Potentials of the slow variables, on the macro grid, and of the fast variables, by the number k of micro intervals
+that a copy of their rule spans; the keys k increase, start with 1, and each is a multiple of the one before."""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """A stepper with its system and scheme: ``memory = init(state, dt)``, then ``state, info, memory = step(state, memory, dt)``.
+    """A stepper with its system and scheme: ``memory = init(state, dt)``, then
+    ``state, info, memory = step(state, memory, dt)``.
 
     ``print`` shows it in words, ``print(plan.describe())`` with the rules of the scheme.
 
@@ -80,7 +81,8 @@ class Plan:
 
     @property
     def has_fallback(self) -> bool:
-        """Whether the steps are taken by another matrix than the exact one, which "auto" has chosen: a run with `Solver.exact` may solve what fails."""
+        """Whether the steps are taken by another matrix than the exact one, which "auto" has chosen: a run with
+        `Solver.exact` may solve what fails."""
         chosen = self.solver.matrix == "auto" and self.solver.stepper is None
         return chosen and not all(solver.is_exact for solver in _solvers(self.stepper))
 
@@ -91,7 +93,8 @@ class Plan:
         return replace(self.solver, matrix="modes" if modes else "masses") if self.has_fallback else self.solver
 
     def describe(self) -> str:
-        """The scheme applied to the system in words: rules of the terms that the system has, order, symmetry, and the steppers."""
+        """The scheme applied to the system in words: rules of the terms that the system has, order, symmetry, and the
+        steppers."""
         system = self.system
         has = {term.label for term in system.terms}
         scheme = with_rules_for(system, self.scheme).describe()
@@ -119,8 +122,8 @@ def plan(
         system: a `Problem` or a scene, or a `System` with a state.
         scheme: a `Scheme` or a `Composition`.
         state: any state of the system; only the shapes of its arrays matter.
-        solver: for implicit equations, by default ``Solver()``. The plan of the matrix "auto" has the first matrix that the structure allows; runs
-            solve again what it does not solve (`vmri_jax.running.engine`).
+        solver: for implicit equations, by default ``Solver()``. The plan of the matrix "auto" has the first matrix that
+            the structure allows; runs solve again what it does not solve (`vmri_jax.running.engine`).
 
     Raises:
         ValueError: a matrix that the system or the scheme does not allow; a scheme that the system does not allow.
@@ -154,8 +157,8 @@ def _whole_step(system: System, scheme: Scheme, solver: Solver, q_s, q_f) -> Kic
     parts = _apart(system, scheme, q_s, q_f)
     if parts is not None:
         between = _decoupled(system, scheme, solver, q_s, q_f, parts)
-        # Kicks of terms at the macro nodes alone stay here. All other terms, on the micro grid or with further nodes inside, belong to the
-        # slow or the fast part, with their kicks.
+        # Kicks of terms at the macro nodes alone stay here. All other terms, on the micro grid or with further nodes
+        # inside, belong to the slow or the fast part, with their kicks.
         kicks = tuple(term for term in kicks if term.grid == "macro" and not len(term.inside.c))
         return Kicked(kicks, between, average)
     return Kicked(kicks, _between_kicks(system, scheme, solver, q_s, q_f), average)
@@ -192,10 +195,11 @@ def _between_kicks(system: System, scheme: Scheme, solver: Solver, q_s, q_f, num
 def _joins(
     system: System, scheme: Scheme, solver: Solver, interval: Callable[[], IntervalStructure], n_s: int, n_f: int
 ) -> bool:
-    """Whether slow and fast variables are unknowns of one kind: on one micro interval, where the nested iteration does not keep to smaller matrices.
+    """Whether slow and fast variables are unknowns of one kind: on one micro interval, where the nested iteration does
+    not keep to smaller matrices.
 
-    Of many variables it keeps a matrix of the fast ones alone, of a diagonal K one number for each, and it solves for slow variables alone by their
-    masses.
+    Of many variables it keeps a matrix of the fast ones alone, of a diagonal K one number for each, and it solves for
+    slow variables alone by their masses.
     """
     nested = _can_be_nested(system, scheme) and solver.matrix in ("auto", "masses") and not _is_drift(system, scheme)
     if scheme.num_micro > 1 or not nested:
@@ -215,7 +219,8 @@ def _approximate(
     n_f: int,
     num_slow: int,
 ) -> StepSolver:
-    """The matrix "masses" or "modes", or the first one of "auto", for constant masses; modes and drifts know fast variables alone (`_joins`)."""
+    """The matrix "masses" or "modes", or the first one of "auto", for constant masses; modes and drifts know fast
+    variables alone (`_joins`)."""
     small = n_s == 0 and n_f <= SMALL  # Nested keeps a larger matrix over many steps, Collocation does not
     chosen = COLLOCATES and small and not interval.is_diagonal and _has_modes(system, scheme)
     if solver.matrix == "modes" or (solver.matrix == "auto" and chosen):
@@ -231,13 +236,15 @@ def _check_matrix(matrix: str, system: System, scheme: Scheme, can_be_nested: bo
         )
     if matrix in ("masses", "modes") and system.has_constant_mass and not can_be_nested:
         raise Refused(
-            f"Solver: the matrix {matrix!r} needs potentials and forces on the micro grid, or as kicks at the macro nodes or at every k-th "
-            "micro node; a term of this scheme has other nodes inside the macro interval. Take the matrix 'auto' or 'exact'."
+            f"Solver: the matrix {matrix!r} needs potentials and forces on the micro grid, or as kicks at the macro "
+            "nodes or at every k-th micro node; a term of this scheme has other nodes inside the macro interval. "
+            "Take the matrix 'auto' or 'exact'."
         )
     if matrix == "modes" and not _has_modes(system, scheme):
         raise Refused(
-            f"Solver: the matrix 'modes' needs a scheme with num_micro = 1 and a degree above 1, such as galerkin(1, 3), and a System without "
-            f"force; here num_micro = {scheme.num_micro}, degree = {scheme.degree}. Take the matrix 'auto' or 'exact'."
+            "Solver: the matrix 'modes' needs a scheme with num_micro = 1 and a degree above 1, such as galerkin(1, "
+            f"3), and a System without force; here num_micro = {scheme.num_micro}, degree = {scheme.degree}. Take the "
+            "matrix 'auto' or 'exact'."
         )
 
 
@@ -247,14 +254,16 @@ def _has_modes(system: System, scheme: Scheme) -> bool:
 
 
 def _can_be_nested(system: System, scheme: Scheme) -> bool:
-    """Whether masses are constant, and every term has its nodes inside single micro intervals or at nodes where they meet."""
+    """Whether masses are constant, and every term has its nodes inside single micro intervals or at nodes where they
+    meet."""
     local = all(rule.is_local or rule.only_ends for _, rule in placed_potentials(system, scheme))
     force = system.force is None or scheme.force.grid == "micro"
     return system.has_constant_mass and local and force
 
 
 def _is_drift(system: System, scheme: Scheme) -> bool:
-    """Whether, apart from kicks, a single micro interval has kinetic energy of constant masses and constraints alone."""
+    """Whether, apart from kicks, a single micro interval has kinetic energy of constant masses and constraints
+    alone."""
     is_free = system.has_constant_mass and system.force is None and not implicit_terms(system, scheme)
     return scheme.num_micro == scheme.degree == 1 and is_free
 
@@ -272,8 +281,9 @@ def _is_linear(system: System, scheme: Scheme, interval: IntervalStructure, q_s)
 def _apart(system: System, scheme: Scheme, q_s, q_f) -> Parts | None:
     """The potentials with nodes inside the macro interval, if no term but kicks couples slow and fast variables.
 
-    None if the variables must be solved for together: a term depends on slow and fast variables, or a potential has nodes between the steps
-    of its part (a slow potential on the micro grid, copies of rules whose lengths do not divide each other).
+    None if the variables must be solved for together: a term depends on slow and fast variables, or a potential has
+    nodes between the steps of its part (a slow potential on the micro grid, copies of rules whose lengths do not divide
+    each other).
     """
     if scheme.degree > 1 or system.force is not None or not system.has_constant_mass:
         return None
@@ -334,11 +344,14 @@ def _average(system: System, scheme: Scheme, solver: Solver) -> Callable | None:
         every = f"W has nodes on every {scheme.fast.every}th micro node" if scheme.fast.every > 1 else ""
         others = every or f"the potentials {', '.join(on_micro_grid)} are on the micro grid"
         raise Refused(
-            f"Scheme: the slow potential is mollified, which averages over the motion under W alone; here {others}. Give W the rule micro(...) and the others macro(trapezoidal), or take a scheme without mollified kicks, e.g. explicit_slow(num_micro)."
+            f"Scheme: the slow potential is mollified, which averages over the motion under W alone; here {others}. "
+            "Give W the rule micro(...) and the others macro(trapezoidal), or take a scheme without mollified kicks, "
+            "e.g. explicit_slow(num_micro)."
         )
     if not system.has_constant_mass or system.is_rheonomic:
         raise Refused(
-            "Scheme: a mollified slow potential needs a System whose kinetic is a ConstantMass, without Rheonomic constraints."
+            "Scheme: a mollified slow potential needs a System whose kinetic is a ConstantMass, without Rheonomic "
+            "constraints."
         )
 
     def stepper_of(q_s, q_f) -> Kicked:

@@ -9,15 +9,15 @@ from jaxtyping import Array, Bool, Float
 from vmri_jax.kernels import SLOW_ORDER, matmul
 
 FADING = 0.84
-"""Factor per step by which the weight of an old prediction error decreases. With a larger factor the order adapts slowly; with a smaller one a
-single accurate prediction decides on it."""
+"""Factor per step by which the weight of an old prediction error decreases. With a larger factor the order adapts
+slowly; with a smaller one a single accurate prediction decides on it."""
 
 
 class PolynomialPredictor(NamedTuple):
     """Backward differences of the unknowns x_n of step n, ``d_0^n = x_n``, ``d_(j+1)^n = d_j^n - d_j^(n-1)``.
 
-    The polynomial of degree k through the last k + 1 values extrapolates to ``x_(n+1) = d_0 + ... + d_k``; d_(k+1) is the error of this
-    prediction for x_n. Few or rough steps need a low order, smooth motion a high one.
+    The polynomial of degree k through the last k + 1 values extrapolates to ``x_(n+1) = d_0 + ... + d_k``; d_(k+1) is
+    the error of this prediction for x_n. Few or rough steps need a low order, smooth motion a high one.
 
     is_empty: whether there is no step yet; the values are then zero.
     misses: largest prediction error of every order so far, with a weight that decreases by `FADING` per step.
@@ -33,7 +33,8 @@ class PolynomialPredictor(NamedTuple):
         return cls(jnp.asarray(True), jnp.zeros((SLOW_ORDER + 2, size)), jnp.zeros(SLOW_ORDER + 1))
 
     def next(self, measured: int, guess):
-        """The predicted values, by the lowest order with the least error in the first `measured` entries; the guess before the first step."""
+        """The predicted values, by the lowest order with the least error in the first `measured` entries; the guess
+        before the first step."""
         missed, orders = self._missed(measured), jnp.arange(SLOW_ORDER + 1)
         best = jnp.min(jnp.where(missed <= jnp.min(missed), orders, SLOW_ORDER))
         taken = jnp.arange(SLOW_ORDER + 2) <= best

@@ -4,9 +4,9 @@ The increments are explicit functions of the multipliers mu, which are the only 
 
     x = M^-1 (h p - G_0^T mu)        g(q + x) = 0        dmu = (G_1 M^-1 G_0^T)^-1 g(q + x)
 
-G_0 is the Jacobian at the start of the step, G_1 at the predicted end. The prediction extrapolates the multipliers of the last two
-steps, ``mu = s (2 lambda_n - lambda_(n-1))`` with the scale s of `StepEquations.multiplier_scales`. With kicks before and after the step this is
-RATTLE (Andersen 1983).
+G_0 is the Jacobian at the start of the step, G_1 at the predicted end. The prediction extrapolates the multipliers of
+the last two steps, ``mu = s (2 lambda_n - lambda_(n-1))`` with the scale s of `StepEquations.multiplier_scales`. With
+kicks before and after the step this is RATTLE (Andersen 1983).
 """
 
 from dataclasses import dataclass
@@ -66,7 +66,8 @@ class Rattle(StepSolver):
         pull = jax.vjp(partial(constraints, equations.t), q)[1]
         forces = jax.vmap(lambda seed: pull(seed)[0])(seeds)
         columns = move_by(forces)
-        # mu -> G_0^T mu and mu -> M^-1 G_0^T mu. A full pattern has all rows of G_0 at hand; else one product by reverse mode is cheaper.
+        # mu -> G_0^T mu and mu -> M^-1 G_0^T mu. A full pattern has all rows of G_0 at hand; else one product by
+        # reverse mode is cheaper.
         if isinstance(self.sparsity, Full):
             force, move = partial(_weighted_sum, increments=forces), partial(_weighted_sum, increments=columns)
         else:

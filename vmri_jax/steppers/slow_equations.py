@@ -1,24 +1,25 @@
 """The slow equations of a macro step, linearised by a cheap matrix: masses, tied masses and the slow constraint.
 
-A change dx of the slow increments changes the slow velocity, and constraints make the fast variables follow it. An impulse of the
-multipliers of the first micro interval, ``dmu = -S G_1 dx``, gives the fast variables the changed velocity; in the later intervals they
-keep it by inertia, and the multipliers hardly change. With the slow masses ``K_s = k_ij M_s / n``, the matrix of the slow equations is
-therefore
+A change dx of the slow increments changes the slow velocity, and constraints make the fast variables follow it. An
+impulse of the multipliers of the first micro interval, ``dmu = -S G_1 dx``, gives the fast variables the changed
+velocity; in the later intervals they keep it by inertia, and the multipliers hardly change. With the slow masses
+``K_s = k_ij M_s / n``, the matrix of the slow equations is therefore
 
     K_s + G_0^T S G_1        (Woodbury)   (K_s + G_0^T S G_1)^-1 = (1 - U P) K_s^-1
     U = K_s^-1 G_0^T         P = (1 + S G_1 U)^-1 S G_1
 
-S is the inverse of ``G K^-1 G^T`` of the first interval, in the fast variables (`vmri_jax.steppers.micro_intervals`). With
-``G_s = dg/dq_s`` at the start of the macro step, the nodes c_j of the first interval and the basis l_i of the slow path,
+S is the inverse of ``G K^-1 G^T`` of the first interval, in the fast variables (`vmri_jax.steppers.micro_intervals`).
+With ``G_s = dg/dq_s`` at the start of the macro step, the nodes c_j of the first interval and the basis l_i of the slow
+path,
 
     G_0 = l_i(c_j) G_s  for i, j = 0..r-1, where multipliers act
     G_1 = l_i(c_j) G_s  for i, j = 1..r, where constraints hold
 
-For r = 1 and explicit fast equations (``K = -M_f``) the matrix is ``-(M_s + G_s^T (G_f M_f^-1 G_f^T)^-1 G_s) / n``: the second term is the
-inertia of the fast masses that constraints tie to the slow variables.
+For r = 1 and explicit fast equations (``K = -M_f``) the matrix is ``-(M_s + G_s^T (G_f M_f^-1 G_f^T)^-1 G_s) / n``: the
+second term is the inertia of the fast masses that constraints tie to the slow variables.
 
-Without constraints this matrix leaves out the derivative of the slow forces with respect to the slow path. Over a long macro step that derivative
-is as large as the masses, and `SlowEquations.with_forces` solves for an update with it.
+Without constraints this matrix leaves out the derivative of the slow forces with respect to the slow path. Over a long
+macro step that derivative is as large as the masses, and `SlowEquations.with_forces` solves for an update with it.
 """
 
 from collections.abc import Callable
@@ -41,12 +42,15 @@ from vmri_jax.schemes.quadrature import gauss
 from vmri_jax.steppers.interval import constant_mass
 
 NODES = 4
-"""Gauss nodes per macro step at which the slow forces are linearised. A larger number makes the solve dearer; with a smaller one, steps in which
-slow forces change sign take more passes."""
+"""Gauss nodes per macro step at which the slow forces are linearised. A larger number makes the solve dearer; with a
+smaller one, steps in which slow forces change sign take more passes."""
 ITERATIONS = 6
 """Most iterations of `minimal_residuals`. With a larger number a solve may cost as much as a pass."""
 LEFT_OVER = 1e-5
-"""Accepted residual of `minimal_residuals`, relative to the right-hand side. With a larger value the update costs another pass."""
+"""Accepted residual of `minimal_residuals`, relative to the right-hand side.
+
+With a larger value the update costs another pass.
+"""
 
 
 class ConstraintInertia(NamedTuple):
@@ -66,7 +70,8 @@ class ConstraintInertia(NamedTuple):
 
 
 class SlowEquations(NamedTuple):
-    """The slow equations, with ``K_s^-1`` as the Kronecker product of a matrix for the nodes and an operator for the coordinates.
+    """The slow equations, with ``K_s^-1`` as the Kronecker product of a matrix for the nodes and an operator for the
+    coordinates.
 
     inverse_form: ``n (k_ij)^-1``, i = 0..r-1, j = 1..r, with the form k of the kinetic energy.
     inverse_mass: ``v -> M_s^-1 v``.
@@ -104,11 +109,14 @@ class SlowEquations(NamedTuple):
         return ConstraintInertia(responses, solve(both, multipliers).reshape(responses.shape))
 
     def update(self, slow, multiplier, arriving: Arriving, inertia: ConstraintInertia):
-        """Update of the slow unknowns, residual R of the slow momentum equations, times h, and slow momentum at the end of the step.
+        """Update of the slow unknowns, residual R of the slow momentum equations, times h, and slow momentum at the end
+        of the step.
 
-        A step at rest ends with its first pass: its multipliers are those of this update, whose impulse the momentum contains.
+        A step at rest ends with its first pass: its multipliers are those of this update, whose impulse the momentum
+        contains.
 
-        With the masses K_s (and the tied ones), and the Jacobians G_0, G_1 of g_s at the macro control nodes 0..r-1 and 1..r,
+        With the masses K_s (and the tied ones), and the Jacobians G_0, G_1 of g_s at the macro control nodes 0..r-1 and
+        1..r,
 
             K_s dx - G_0^T dnu = -R        G_1 dx = -g_s
 
@@ -133,13 +141,14 @@ class SlowEquations(NamedTuple):
         return (dx.reshape(-1), n * d_nu), rows, p_s
 
     def with_forces(self, d, x: Unknowns):
-        """The update ``(1 + K_s^-1 C)^-1 d`` for an update d by the masses alone, with the derivative C of the slow forces,
+        """The update ``(1 + K_s^-1 C)^-1 d`` for an update d by the masses alone, with the derivative C of the slow
+        forces,
 
             (C dx)_i = h H sum_k w_k l_i(c_k) dF_s(sum_j l_j(c_k) dx_j, sum_j l_j'(c_k) dx_j / H)
 
-        on a few Gauss nodes c_k. ``F_s = F - dV/dq_s`` has all potentials and forces with nodes inside the macro interval. The fast path is
-        approximated: q_f at the start of the micro interval that contains c_k, and the mean velocity over that interval. C only decides
-        on the number of passes.
+        on a few Gauss nodes c_k. ``F_s = F - dV/dq_s`` has all potentials and forces with nodes inside the macro
+        interval. The fast path is approximated: q_f at the start of the micro interval that contains c_k, and the mean
+        velocity over that interval. C only decides on the number of passes.
 
         Args:
             d: (r n_s,) update by the masses alone.
@@ -196,8 +205,8 @@ def solve_saddle(solve_k, jacobian, push, rows, g):
     r, n_g = g.shape
     if n_g == 0:
         return -solve_k(rows), g
-    # Columns of G_0^T and -rows, then K^-1 and G_1 of them: one map for all, since each use of a function is compiled anew. vmap stacks
-    # columns in rows, so that `schur` is the transposed complement.
+    # Columns of G_0^T and -rows, then K^-1 and G_1 of them: one map for all, since each use of a function is compiled
+    # anew. vmap stacks columns in rows, so that `schur` is the transposed complement.
     columns = np.eye(r)[:, None, :, None] * jacobian[:, :, None, :]  # (node, constraint, row, coordinate)
     columns = jnp.concatenate([columns.reshape(r * n_g, r, -1), -rows[None]])
     response = jax.vmap(solve_k)(columns)
@@ -212,7 +221,8 @@ def minimal_residuals(operator, b):
 
     Where the iteration stalls, the x that it has reached only makes the passes of the solver more numerous.
 
-    Orthomin(1) (Vinsome 1976; Eisenstat, Elman, Schultz, SIAM J. Numer. Anal. 20, 1983), with residual r and direction p:
+    Orthomin(1) (Vinsome 1976; Eisenstat, Elman, Schultz, SIAM J. Numer. Anal. 20, 1983), with residual r and direction
+    p:
 
         p <- r - beta p,         beta  = (A r . A p) / (A p . A p)
         x <- x + alpha p,        alpha = (r . A p) / (A p . A p)

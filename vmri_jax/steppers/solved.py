@@ -23,7 +23,8 @@ from vmri_jax.steppers.newton.implicit import differentiable
 from vmri_jax.steppers.stepper import StepInfo, Stepper, StepStatus
 
 ROOT = "root"
-"""Name of the solution and the status of a step for `jax.checkpoint`: a policy that saves this name lets derivatives reuse the solution."""
+"""Name of the solution and the status of a step for `jax.checkpoint`: a policy that saves this name lets derivatives
+reuse the solution."""
 
 
 class Solution(NamedTuple):
@@ -60,7 +61,8 @@ class StepSolver(ABC):
 
         Args:
             equations: of the step.
-            guess: straight motion with the multipliers of the last step; a solver may predict its unknowns from `memory` instead.
+            guess: straight motion with the multipliers of the last step; a solver may predict its unknowns from
+                `memory` instead.
             memory: from `init`, or of the step before.
         """
 
@@ -78,7 +80,8 @@ class SolvedState(NamedTuple):
 
     multiplier, slow_multiplier: Lagrange multipliers of the step before, at its last control node with multipliers.
     last_dt: length of the step before, 0 before the first step.
-    velocity: mean velocities (v_s, v_f) of the last intervals, ``(q_s(H) - q_s(0)) / H`` and ``(q_f(H) - q_f(H - h)) / h``; () for constant masses.
+    velocity: mean velocities (v_s, v_f) of the last intervals, ``(q_s(H) - q_s(0)) / H`` and
+        ``(q_f(H) - q_f(H - h)) / h``; () for constant masses.
     solver: memory of the solver.
     """
 
@@ -93,8 +96,8 @@ class SolvedState(NamedTuple):
 class Solved(Stepper):
     """A step whose unknowns a solver computes; differentiable in both modes, twice; third derivatives are NaN.
 
-    Derivatives follow from the implicit function theorem, ``dx = -(dR/dx)^-1 (dR/de) de`` with the data e of the equations: iterations are
-    never differentiated.
+    Derivatives follow from the implicit function theorem, ``dx = -(dR/dx)^-1 (dR/de) de`` with the data e of the
+    equations: iterations are never differentiated.
 
     sparsity: of ``G M^-1 G^T`` with all constraints.
     """
@@ -133,8 +136,9 @@ class Solved(Stepper):
         return end, info, memory
 
     def _solve(self, equations: StepEquations, memory: SolvedState) -> tuple[Solution, Any]:
-        """The solution, from straight motion: at the velocities of the projected momenta for constant masses; else, since near poles of angles a
-        velocity ``M^-1 p`` says little about the next step, at the mean velocities of the last intervals."""
+        """The solution, from straight motion: at the velocities of the projected momenta for constant masses; else,
+        since near poles of angles a velocity ``M^-1 p`` says little about the next step, at the mean velocities of the
+        last intervals."""
         system, phase = equations.system, (equations.q_s, equations.q_f, equations.p_s, equations.p_f)
         if system.has_constant_mass:
             state = State(equations.t, *phase)

@@ -20,11 +20,12 @@ class StepInfo(eqx.Module):
     result: status code, see `Result`.
     method: see `Method`; with the matrix "auto" EXACT says that cheaper matrices are not possible, or did not converge.
     iterations: most Newton iterations or passes of a solve in the step; 0 for explicit steps.
-    residual: ``max |R| / max |p|`` with the residual R of the momentum equations; 0 for linear equations. The matrices "masses" and "exact" estimate R
-        after their last correction, a drift takes the next impulse of the constraints, "modes" evaluates it.
+    residual: ``max |R| / max |p|`` with the residual R of the momentum equations; 0 for linear equations. The matrices
+        "masses" and "exact" estimate R after their last correction, a drift takes the next impulse of the constraints,
+        "modes" evaluates it.
     q_f_micro: fast positions at the micro nodes, the start excluded.
-    multiplier, slow_multiplier: Lagrange multipliers at the control nodes, with r the degree of the scheme. A composition of s
-        stages joins those of its stages: ``(s num_micro, r, n_g)`` and ``(s r, n_gs)``.
+    multiplier, slow_multiplier: Lagrange multipliers at the control nodes, with r the degree of the scheme. A
+        composition of s stages joins those of its stages: ``(s num_micro, r, n_g)`` and ``(s r, n_gs)``.
     """
 
     result: Int[Numbers, ""]
@@ -61,11 +62,12 @@ class StepStatus(NamedTuple):
 
 @dataclass(frozen=True)
 class Stepper(ABC):
-    """Takes macro steps: ``memory = init(state, dt)``, then ``state, info, memory = step(state, memory, dt)`` again and again.
+    """Takes macro steps: ``memory = init(state, dt)``, then ``state, info, memory = step(state, memory, dt)`` again and
+    again.
 
-    The methods take the `State` at the start of a step, the `memory` that the stepper carries from step to step, and the length of the
-    step. A memory is a pytree whose structure, shapes and types do not change: it is the carry of a loop. Only `advance` and
-    `describe` must be written.
+    The methods take the `State` at the start of a step, the `memory` that the stepper carries from step to step, and
+    the length of the step. A memory is a pytree whose structure, shapes and types do not change: it is the carry of a
+    loop. Only `advance` and `describe` must be written.
     """
 
     def init(self, state: State, macro_dt) -> Any:
@@ -73,7 +75,10 @@ class Stepper(ABC):
         return ()
 
     def renew(self, state: State, memory, macro_dt) -> Any:
-        """The memory with new matrices, which all steps until the next `renew` share. `Kicked` calls it before the first kick."""
+        """The memory with new matrices, which all steps until the next `renew` share.
+
+        `Kicked` calls it before the first kick.
+        """
         return memory
 
     @abstractmethod

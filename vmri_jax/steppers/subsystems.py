@@ -1,4 +1,5 @@
-"""Decoupled parts of a system, and all of its variables joined: systems in which all variables count as fast, on a single interval.
+"""Decoupled parts of a system, and all of its variables joined: systems in which all variables count as fast, on a
+single interval.
 
 Slow variables of a part are stored as q_f, joined ones as ``(q_s, q_f)`` in q_f.
 
@@ -25,7 +26,8 @@ from vmri_jax.steppers.interval import constant_mass
 
 @dataclass(frozen=True)
 class OfPart:
-    """A term that depends on one part alone, as a function of the fast variables of that part, with the time first if it is a constraint.
+    """A term that depends on one part alone, as a function of the fast variables of that part, with the time first if
+    it is a constraint.
 
     part, other: names of the positions of the part and of all others.
     num_other: number of the others, which the term gets as zeros.
@@ -117,7 +119,8 @@ class OfJoined(WithMassMatrix):
 
 
 def joined(system: System, scheme: Scheme, num_slow: int) -> tuple[System, Scheme]:
-    """All variables as fast ones, and the scheme of their step on one micro interval, without potentials that only kick.
+    """All variables as fast ones, and the scheme of their step on one micro interval, without potentials that only
+    kick.
 
     Args:
         system, scheme: the whole ones.
@@ -165,7 +168,8 @@ class AtRest:
 
 
 def frozen_slow(system: System, scheme: Scheme, q_s) -> tuple[System, Scheme]:
-    """The system of the fast variables under W and g with the slow variables at rest in q_s, and the scheme of one micro interval."""
+    """The system of the fast variables under W and g with the slow variables at rest in q_s, and the scheme of one
+    micro interval."""
     functions: dict[str, Any] = {
         term.field: AtRest(term) for term in system.terms if term.field in ("fast_potential", "constraint")
     }

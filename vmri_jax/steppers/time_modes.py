@@ -1,7 +1,7 @@
 """Modes of time: coordinates of the polynomials on one interval that decouple its stiffness and mass matrix.
 
-With A, B (r, r) the stiffness and the mass matrix of the polynomials, the equations of one interval are decoupled by the
-eigenvectors of A^-1 B (Butcher 1976; Hairer, Wanner, *Solving Ordinary Differential Equations II*, IV.8). Complex
+With A, B (r, r) the stiffness and the mass matrix of the polynomials, the equations of one interval are decoupled by
+the eigenvectors of A^-1 B (Butcher 1976; Hairer, Wanner, *Solving Ordinary Differential Equations II*, IV.8). Complex
 arrays are stored as all real parts before all imaginary ones, so that rows fill vector registers.
 """
 
@@ -19,8 +19,8 @@ from vmri_jax.schemes.scheme import Scheme
 class TimeModes(NamedTuple):
     """Eigenvectors of ``A^-1 B``, one of every complex pair.
 
-    An axis of size k = 2 m stores m complex slots: m real parts, then m imaginary parts. A slot holds one complex mode, or two real modes;
-    an unused half is zero.
+    An axis of size k = 2 m stores m complex slots: m real parts, then m imaginary parts. A slot holds one complex mode,
+    or two real modes; an unused half is zero.
 
     gamma: eigenvalues, real and imaginary parts.
     mode: number of the mode of each half of a slot.
@@ -57,8 +57,8 @@ class TimeModes(NamedTuple):
             return np.concatenate([np.pad(a, [(0, half - len(a)), (0, 0)]) for a in both])
 
         to = np.linalg.inv(vectors)
-        # A mode v z and its conjugate add up to 2 Re(v z) = 2 (Re v Re z - Im v Im z). `parts` keeps Re v and Im v with the sign plus: the minus
-        # comes from conj(v).
+        # A mode v z and its conjugate add up to 2 Re(v z) = 2 (Re v Re z - Im v Im z). `parts` keeps Re v and Im v with
+        # the sign plus: the minus comes from conj(v).
         back = (np.where(np.imag(gamma) > 0, 2.0, 1.0) * vectors.conj()).T
         mode = np.concatenate([np.pad(a, (0, half - len(a)), mode="edge") for a in (first, second)])
         eigenvalues = np.stack([np.real(gamma), np.imag(gamma)])[:, :distinct]
@@ -66,7 +66,8 @@ class TimeModes(NamedTuple):
 
 
 def _form(basis, degree: int, nodes) -> np.ndarray:
-    """``sum_n w_n b_i(c_n) b_j(c_n)`` (r + 1, r + 1), with the functions b of the basis and the interpolatory rule on the nodes c_n."""
+    """``sum_n w_n b_i(c_n) b_j(c_n)`` (r + 1, r + 1), with the functions b of the basis and the interpolatory rule on
+    the nodes c_n."""
     values = basis(degree, np.array(nodes))
     return values.T @ (interpolatory_weights(nodes)[:, None] * values)
 
@@ -78,6 +79,7 @@ def times_i(z):
 
 
 def product(matrix, z):
-    """(rows, k) products of complex matrices, real and imaginary part (columns, rows, k), with vectors z (columns, k)."""
+    """(rows, k) products of complex matrices, real and imaginary part (columns, rows, k), with vectors z (columns,
+    k)."""
     re, im = matrix
     return jnp.sum(re * z[:, None] + im * times_i(z)[:, None], axis=0)

@@ -123,7 +123,8 @@ class ConvergenceStudy(RunTable):
         return lines
 
     def work(self, case: str | None = None) -> WorkPrecision:
-        """The runs of a case, the first one by default, by their errors and their work; times where the study has them."""
+        """The runs of a case, the first one by default, by their errors and their work; times where the study has
+        them."""
         case = self.cases[0] if case is None else case
         return WorkPrecision(tuple(row for row in self.rows if row.case == case), self.references[case])
 
@@ -155,7 +156,8 @@ def convergence_study(
 ) -> ConvergenceStudy:
     """Run every scheme with every macro step to `t_end` and compare with a reference.
 
-    Each scheme is compiled once for all its step sizes and sets of parameters. A run that fails becomes a row of NaN with its status.
+    Each scheme is compiled once for all its step sizes and sets of parameters. A run that fails becomes a row of NaN
+    with its status.
 
     Args:
         problem: system and start; a `Problem` or a scene.
@@ -166,13 +168,14 @@ def convergence_study(
         params: parameters of the system by label, if there are several sets, with the start of `problem`.
         reference: what errors are measured against, by label of several sets; by default `reference_solution`.
         solver: how implicit equations are solved.
-        repeats: timed samples of every run; 0 for no times. The runs take turns on the clock of this process, so that a slow
-            moment of the machine hits all of them; a row has the median.
+        repeats: timed samples of every run; 0 for no times. The runs take turns on the clock of this process, so that a
+            slow moment of the machine hits all of them; a row has the median.
         executor: where runs are computed, as of `vmri_jax.ensemble`; None for this process.
         progress: True for a bar, or a function (what, done, total) that is told about every run before it starts.
 
     Raises:
-        ValueError: no scheme, a step that does not divide `t_end` into a multiple of `num_saves` steps, a reference of another shape.
+        ValueError: no scheme, a step that does not divide `t_end` into a multiple of `num_saves` steps, a reference of
+            another shape.
         Interrupted: Ctrl-C; carries the study of the runs that were done.
     """
     problem = problem_of("convergence_study", problem)
@@ -243,7 +246,8 @@ def _cases(problem: Problem, params, reference, t_end: float, num_saves: int, pr
 
 
 def _energies(problem: Problem, reference: ReferenceSolution) -> np.ndarray | None:
-    """(num_saves + 1,) energies of the reference; None where the system keeps its energy: the energy at the start then serves."""
+    """(num_saves + 1,) energies of the reference; None where the system keeps its energy: the energy at the start then
+    serves."""
     if problem.system.keeps_energy:
         return None
     phase = [part for array in (reference.q, reference.p) for part in np.split(array, [problem.q_s.size], axis=1)]

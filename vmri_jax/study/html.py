@@ -1,4 +1,5 @@
-"""Self-contained HTML pages in one style, with embedded figures for light and dark screens, and a footer that names the machine."""
+"""Self-contained HTML pages in one style, with embedded figures for light and dark screens, and a footer that names the
+machine."""
 
 import base64
 import os
@@ -19,14 +20,19 @@ STYLE_FOLDER = Path(__file__).parent
 
 
 def write_page(path: Path, template: Path, **values) -> None:
-    """Render a template to `path`. The template may include ``style.css``; it gets `values`, and date, machine and versions."""
+    """Render a template to `path`.
+
+    The template may include ``style.css``; it gets `values`, and date, machine and versions.
+    """
     threads = os.environ.get("OPENBLAS_NUM_THREADS", "all")
     algebra = f"linear algebra on {threads} {'thread' if threads == '1' else 'threads'}"
     loader = jinja2.FileSystemLoader([template.parent, STYLE_FOLDER])
     environment = jinja2.Environment(loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True)
     text = environment.get_template(template.name).render(
         date=datetime.now().strftime("%-d %B %Y, %H:%M"),
-        machine=f"{processor()}, {os.cpu_count()} cores, {platform.system()}, JAX on {jax.default_backend()}, {algebra}",
+        machine=(
+            f"{processor()}, {os.cpu_count()} cores, {platform.system()}, JAX on {jax.default_backend()}, {algebra}"
+        ),
         versions=f"vmri_jax {version('vmri_jax')}, JAX {jax.__version__}, Python {platform.python_version()}",
         **values,
     )

@@ -1,5 +1,5 @@
-"""Runs of a study: a row with errors, invariants, evaluations and time, and their table; the reference solution that errors
-of runs are measured against, with its own errors."""
+"""Runs of a study: a row with errors, invariants, evaluations and time, and their table; the reference solution that
+errors of runs are measured against, with its own errors."""
 
 import math
 from collections.abc import Mapping
@@ -28,9 +28,11 @@ from vmri_jax.steppers.results import Method, Result
 from vmri_jax.study.table import Column, ResultTable
 
 ROUNDOFF = 1e-13
-"""Difference of two runs, relative to the largest coordinate, that counts as round-off; a larger value ends with coarser steps."""
+"""Difference of two runs, relative to the largest coordinate, that counts as round-off; a larger value ends with
+coarser steps."""
 MAX_STEPS = 2**17
-"""Number of macro steps from which steps are not halved any more; a larger number lets failing systems take longer to fail."""
+"""Number of macro steps from which steps are not halved any more; a larger number lets failing systems take longer to
+fail."""
 
 
 @dataclass(frozen=True)
@@ -110,7 +112,8 @@ def reference_solution(
             error_q, error_p = (float(np.abs(a - b).max()) for a, b in zip(coarse, fine, strict=True))
             if best is None or error_q < best.error_q:
                 best = ReferenceSolution(*fine, error_q, error_p)
-            # a difference that no longer falls has reached round-off or the floor of a chaotic motion; above 1e-6 of the positions the steps may still be too large
+            # a difference that no longer falls has reached round-off or the floor of a chaotic motion; above 1e-6 of
+            # the positions the steps may still be too large
             size = np.abs(fine[0]).max()
             if error_q <= ROUNDOFF * size or last_error / 2 < error_q < 1e-6 * size:
                 break
@@ -127,15 +130,15 @@ class Row:
 
     scheme: label.
     family: name of the family of schemes that a search took the scheme from.
-    error_q, error_p: largest error over the compared nodes, see `ReferenceSolution`; in a search `error_q` is the estimated
-        error of the run, see `vmri_jax.accuracy.companions`.
+    error_q, error_p: largest error over the compared nodes, see `ReferenceSolution`; in a search `error_q` is the
+        estimated error of the run, see `vmri_jax.accuracy.companions`.
     case: label of the parameters, "" if there is one set only.
-    energy_error: largest error of the energy: its change since the start where the system keeps its energy; its difference
-        from the energy of the reference where forces or moving constraints do work.
+    energy_error: largest error of the energy: its change since the start where the system keeps its energy; its
+        difference from the energy of the reference where forces or moving constraints do work.
     constraint_residual: largest constraint value, of positions or velocities.
     seconds: median of the time of the run, without compiling; in a search of the time of its steps.
-    slow_evaluations, fast_evaluations: evaluations of the gradients of V and of W in the whole run, counted from the scheme
-        and the Newton passes that the run reports, one evaluation per pass.
+    slow_evaluations, fast_evaluations: evaluations of the gradients of V and of W in the whole run, counted from the
+        scheme and the Newton passes that the run reports, one evaluation per pass.
     evaluations: evaluations of the gradients of further potentials, by name.
     solves: systems of equations solved in the whole run.
     iterations: most Newton iterations of a step.
@@ -245,7 +248,8 @@ def duration(seconds: float) -> str:
 class WorkPrecision(RunTable):
     """Runs by their errors and their work; its table is the Pareto front.
 
-    reference: the solution that errors are measured against; None for a search, whose errors are estimated by companion runs.
+    reference: the solution that errors are measured against; None for a search, whose errors are estimated by companion
+        runs.
     """
 
     columns = (

@@ -18,7 +18,8 @@ from vmri_jax.running.printed import PrintedTable
 
 @dataclass(frozen=True)
 class Column:
-    """A column of a printed table: its heading, the function that gives the text of a row, and whether it is flush right."""
+    """A column of a printed table: its heading, the function that gives the text of a row, and whether it is flush
+    right."""
 
     name: str
     text: Callable[[Any], str | Text]

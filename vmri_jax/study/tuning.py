@@ -80,7 +80,8 @@ class NothingReached(ValueError):
 
 @dataclass(frozen=True, repr=False)
 class Recommendation(WorkPrecision):
-    """The cheapest setting for an error, and all runs of the search that led to it; prints as a table of the best few settings.
+    """The cheapest setting for an error, and all runs of the search that led to it; prints as a table of the best few
+    settings.
 
     error: the accepted error, in the unit of the positions.
     """
@@ -89,8 +90,8 @@ class Recommendation(WorkPrecision):
 
     @property
     def setting(self) -> Row:
-        """The recommended run, with its error and time; `setting.settings.arguments` are all arguments for `vmri_jax.simulate`. None, in a report on several
-        errors, where no run keeps the error."""
+        """The recommended run, with its error and time; `setting.settings.arguments` are all arguments for
+        `vmri_jax.simulate`. None, in a report on several errors, where no run keeps the error."""
         return next(iter(self.keeping(self.error)), None)  # pyright: ignore[reportReturnType] `tune` raises then
 
     @property
@@ -181,7 +182,10 @@ def _nothing(tuning: Tuning, error: float) -> Exception:
     best = min(runs.rows, key=lambda row: np.nan_to_num(row.error_q, nan=np.inf))
     certified = f"the best error was {best.error_q:.1e}, with {best.scheme} and {best.num_steps} steps"
     reason = certified if np.isfinite(best.error_q) else "no error is certified until t_end"
-    text = f"tune: no setting reached {error:g} in {len(runs.rows)} runs; {reason}. Give a larger error or a shorter t_end."
+    text = (
+        f"tune: no setting reached {error:g} in {len(runs.rows)} runs; {reason}. Give a larger error or a shorter "
+        "t_end."
+    )
     return NothingReached(text, runs)
 
 
@@ -218,7 +222,8 @@ class CostReport(ResultTable):
 
     @property
     def rows(self) -> list[Recommendation]:
-        """The answers by error, the largest first: the fastest run that keeps the error, for whichever error the search made it."""
+        """The answers by error, the largest first: the fastest run that keeps the error, for whichever error the search
+        made it."""
         return [Recommendation(self.runs.rows, error=error) for error in sorted(self.errors, reverse=True)]
 
     @property

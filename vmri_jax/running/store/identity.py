@@ -1,4 +1,5 @@
-"""The identity of a run: functions, parameters, scheme, step and start as text, so that a run can be compared with the run of a store."""
+"""The identity of a run: functions, parameters, scheme, step and start as text, so that a run can be compared with the
+run of a store."""
 
 import dataclasses
 import json
@@ -19,8 +20,8 @@ from vmri_jax.refusals import Refused, warn_user
 from vmri_jax.running.simulation import Simulation
 
 MOST_NUMBERS_PRINTED = 8
-"""Numbers of the largest array that is written out in the identity; larger arrays appear as a digest. A larger value makes messages about
-different runs longer."""
+"""Numbers of the largest array that is written out in the identity; larger arrays appear as a digest. A larger value
+makes messages about different runs longer."""
 
 
 def identity(simulation: Simulation, start: State) -> dict[str, str]:
@@ -56,7 +57,8 @@ def check_same(path: Path, attributes: dict, stored: dict, chunk: int | None, co
     """Refuse to go on with the store of another run; warn if its environment was another one, unless it is complete.
 
     `attributes` are of the store that the user wants, `stored` of the store on disk; `chunk` is the user's, or None.
-    Operations are compared only if both were made with the same version of JAX: another version prints them differently.
+    Operations are compared only if both were made with the same version of JAX: another version prints them
+    differently.
     """
     kind = stored["kind"]
     # a column of the store has the name of its coordinate
@@ -76,8 +78,8 @@ def check_same(path: Path, attributes: dict, stored: dict, chunk: int | None, co
     changed = [f"{name} {value} ({then.get(name)} then)" for name, value in now.items() if value != then.get(name)]
     if changed and not complete:
         warn_user(
-            f"{path} was started under other conditions; its last digits may differ from those of an uninterrupted {kind}. "
-            f"Now: {', '.join(changed)}.",
+            f"{path} was started under other conditions; its last digits may differ from those of an uninterrupted "
+            f"{kind}. Now: {', '.join(changed)}.",
         )
 
 

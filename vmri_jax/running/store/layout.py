@@ -7,9 +7,10 @@ A store is a folder, a zarr group of format 3 that any zarr library reads, and `
     resume/chunks/table.npz  columns of a design that is a table
     attributes           format, kind, rows, rows of a chunk, identity, names, versions and machine
 
-The note commits a chunk: it is written as a whole after all other files of the chunk are on disk. Readers leave out chunks
-without a note, and whoever resumes writes them again. Any number of processes can write chunks at once, and be killed at
-any moment. A new store is made beside its place and moved there when it is complete: a kill leaves a valid store or none.
+The note commits a chunk: it is written as a whole after all other files of the chunk are on disk. Readers leave out
+chunks without a note, and whoever resumes writes them again. Any number of processes can write chunks at once, and be
+killed at any moment. A new store is made beside its place and moved there when it is complete: a kill leaves a valid
+store or none.
 
 zarr takes seconds to import: the functions that need it import it themselves.
 """
@@ -37,7 +38,8 @@ NOTES = Path("resume", "chunks")
 """Folder of the notes within a store; in a group of its own, which datasets leave out."""
 TABLE = NOTES / "table.npz"
 CONFIG: Any = {"write_empty_chunks": True}
-"""Configuration of the arrays: every chunk gets a file, even if all its values are the fill value, so that a missing file is an error."""
+"""Configuration of the arrays: every chunk gets a file, even if all its values are the fill value, so that a missing
+file is an error."""
 KEYS: Any = {"name": "default", "separator": "."}
 """Names of the files of an array: c.0.0, c.1.0, ..."""
 FLAGS = {
@@ -46,9 +48,13 @@ FLAGS = {
 }
 """Attributes of an array "result", by the conventions of CF: the numbers and the names of all statuses."""
 CHUNK_SECONDS = 1.0
-"""Target seconds of computation of a chunk. A larger one loses more at a kill; with a smaller one runs wait for files."""
+"""Target seconds of computation of a chunk.
+
+A larger one loses more at a kill; with a smaller one runs wait for files.
+"""
 MOST_CHUNK_BYTES = 2**26
-"""Largest size of a chunk, which is in memory as a whole, in bytes: 64 MiB. A larger one needs more memory per worker."""
+"""Largest size of a chunk, which is in memory as a whole, in bytes: 64 MiB. A larger one needs more memory per
+worker."""
 
 
 class Kept(eqx.Module):
@@ -203,7 +209,8 @@ def read_attributes(path: Path, kind: str) -> dict[str, Any]:
 
 @contextmanager
 def locked(path: Path) -> Iterator[None]:
-    """Context in which no other process writes to this store; the system releases the lock even if this process is killed."""
+    """Context in which no other process writes to this store; the system releases the lock even if this process is
+    killed."""
     try:
         import fcntl
     except ImportError:  # Windows has no such locks

@@ -1,4 +1,5 @@
-"""`StoredTrajectory`: reads the status of a store and any part of its trajectory; `Record`, the note of a chunk, with which a run goes on."""
+"""`StoredTrajectory`: reads the status of a store and any part of its trajectory; `Record`, the note of a chunk, with
+which a run goes on."""
 
 import io
 import zipfile
@@ -28,7 +29,8 @@ OF_ONE_NODE = {"names": slice(1), "keeps_energy": slice(1), "final_state": slice
 
 
 class Record(NamedTuple):
-    """A `Cursor` after the committed saved intervals: their number, its counts, whether the fallback goes on from there, leaves of state and memory."""
+    """A `Cursor` after the committed saved intervals: their number, its counts, whether the fallback goes on from
+    there, leaves of state and memory."""
 
     saved: int = 0
     result: int = int(Result.CONVERGED)
@@ -64,7 +66,8 @@ class Record(NamedTuple):
         return out.getvalue()
 
     def cursor(self, run: Simulation) -> tuple[Cursor, Simulation]:
-        """The cursor, and the run that goes on from it, `run` or its fallback; a ValueError if the arrays do not fit the memory of its stepper."""
+        """The cursor, and the run that goes on from it, `run` or its fallback; a ValueError if the arrays do not fit
+        the memory of its stepper."""
         if not self.leaves:
             return Cursor.at_start(run.state), run
         run = run.exact if self.fell_back else run
@@ -78,10 +81,11 @@ class Record(NamedTuple):
 class StoredTrajectory:
     """A trajectory on disk, written by `stream`; it reads only the nodes that are requested.
 
-    ``len(stored)`` is the number of saved nodes, including the start (0 before the first chunk is complete); ``stored[i]`` is
-    the `State` at a node, ``stored[a:b]`` and ``stored[a:b:n]`` are a `Trajectory` of these nodes, ``stored.load()`` is the `Trajectory` of
-    all nodes. It has all fields, properties and methods of a `Trajectory`, which read all nodes. Length and status are from the moment
-    when the store was opened: open it again to follow a running simulation. `xarray.open_zarr` reads its folder, too.
+    ``len(stored)`` is the number of saved nodes, including the start (0 before the first chunk is complete);
+    ``stored[i]`` is the `State` at a node, ``stored[a:b]`` and ``stored[a:b:n]`` are a `Trajectory` of these nodes,
+    ``stored.load()`` is the `Trajectory` of all nodes. It has all fields, properties and methods of a `Trajectory`,
+    which read all nodes. Length and status are from the moment when the store was opened: open it again to follow a
+    running simulation. `xarray.open_zarr` reads its folder, too.
 
     Args:
         path: folder of the store.

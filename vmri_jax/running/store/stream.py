@@ -28,7 +28,10 @@ from vmri_jax.schemes.composition import SchemeLike
 from vmri_jax.steppers.solver import Solver
 
 CHUNKS_PER_RUN = 100
-"""Most chunks of a run, unless their size is limited. With more chunks a kill loses less, and the store has more files."""
+"""Most chunks of a run, unless their size is limited.
+
+With more chunks a kill loses less, and the store has more files.
+"""
 MICRO_STEP_SECONDS = 1e-6
 """Rough seconds of a micro step, which only choose the size of chunks: a larger value makes smaller ones."""
 
@@ -51,18 +54,19 @@ def stream(
 ) -> StoredTrajectory:
     """`simulate` that writes the trajectory to disk chunk by chunk; `resume` continues a run whose process was killed.
 
-    A chunk counts when all of it is on disk, together with a checkpoint of everything that the next steps depend on, the
-    state and the memory of the solver: on the same machine with the same versions, a resumed run is identical
-    to an uninterrupted one to the last bit. One chunk is held in memory at a time. The run keeps what its functions read from around them at its
-    start; a resumed run whose functions do other operations is refused.
+    A chunk counts when all of it is on disk, together with a checkpoint of everything that the next steps depend on,
+    the state and the memory of the solver: on the same machine with the same versions, a resumed run is identical to an
+    uninterrupted one to the last bit. One chunk is held in memory at a time. The run keeps what its functions read from
+    around them at its start; a resumed run whose functions do other operations is refused.
 
     Args:
         system, scheme, state, macro_dt, t_end, save, solver: as in `simulate`.
         out: folder of the store, a zarr group; conventionally named .zarr.
         num_steps: macro steps. A larger number than before makes a resumed run longer.
-        chunk: saved intervals that are computed and written together, kept by the store; None for a hundredth of the run,
-            within limits.
-        resume: continue the run in `out`, which must be this run; start it if `out` does not exist. A complete run is returned at once.
+        chunk: saved intervals that are computed and written together, kept by the store; None for a hundredth of the
+            run, within limits.
+        resume: continue the run in `out`, which must be this run; start it if `out` does not exist. A complete run is
+            returned at once.
         overwrite: replace a store in `out`.
         drawing: plain data of a `vmri_jax.animation.Drawing`, kept in the store (see `Trajectory.save`).
 
@@ -129,7 +133,8 @@ def _continue(stored: StoredTrajectory, run: Simulation, tell: Progress) -> Iter
         raise Refused(f"{path} can be read, but its run cannot go on: {error}.") from error
     with explained(path, _advice(record.step)):
         writer = layout.Writer(path)
-    # The start and the largest values so far, as a node before each chunk but the first: energies are compared with the start of the run.
+    # The start and the largest values so far, as a node before each chunk but the first: energies are compared with the
+    # start of the run.
     start, has_warned = jax.tree.map(lambda a: a[None], run.state), False
     before = at_nodes(observables, run.origin, start) if record.saved else np.zeros((0, len(Observables._fields)))
     while record.saved < rows and record.failed_at < 0:

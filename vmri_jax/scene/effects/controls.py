@@ -42,8 +42,8 @@ class Controlled(Effect):
         Scene([hub, ...], [Controlled("hub", "torque"), Controlled(("hub", [0.5, 0, 0]), "force", along=[0, 1, 0])])
 
     Args:
-        body: name of a body or of a joint, or a point in a rigid body. In a joint the torque acts about its axis and the force along it,
-            on b, with the opposite on a.
+        body: name of a body or of a joint, or a point in a rigid body. In a joint the torque acts about its axis and
+            the force along it, on b, with the opposite on a.
         load: "force" or "torque"; a torque acts on a rigid body or in a joint.
         along: (d,) the direction of a single control, of any length; by default there is a control for each axis.
         axes: "space", or "body" for the principal axes of inertia of the rigid body, its directors.

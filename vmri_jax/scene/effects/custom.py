@@ -28,10 +28,11 @@ class CustomEffect(Effect):
 
     Args:
         function: see `Effect`.
-        bodies: names of the bodies, in the order in which the function takes them. The function gets all coordinates of a rigid body;
-            with ``(name, [x, y, z])`` the position of this point in it, and with ``("ground", [x, y, z])`` a fixed point.
-        params: of the function: numbers, arrays, or lists and dictionaries of them. They may change without a new compilation, and
-            runs have derivatives with respect to them.
+        bodies: names of the bodies, in the order in which the function takes them. The function gets all coordinates of
+            a rigid body; with ``(name, [x, y, z])`` the position of this point in it, and with
+            ``("ground", [x, y, z])`` a fixed point.
+        params: of the function: numbers, arrays, or lists and dictionaries of them. They may change without a new
+            compilation, and runs have derivatives with respect to them.
         name: the name of the function by default.
         drawn_as: "link" or "spring", drawn between each of the bodies and the next; None draws nothing.
     """
@@ -61,8 +62,9 @@ class CustomEffect(Effect):
         if not names or not all(map(is_entry, names)):
             kind = type(self).__name__
             raise Refused(
-                f"{self.name}: bodies is {self.bodies!r}; give the names of the bodies that the function takes. A custom effect has one "
-                f"element: for several tuples of bodies write a {kind}(...) for each, with name=..."
+                f"{self.name}: bodies is {self.bodies!r}; give the names of the bodies that the function takes. A "
+                f"custom effect has one element: for several tuples of bodies write a {kind}(...) for each, with "
+                "name=..."
             )
         return (tuple(map(entry, names)),)
 
@@ -108,7 +110,8 @@ class Constraint(CustomEffect):
 
 
 class Kinetic(CustomEffect):
-    """A velocity-dependent part of the Lagrangian, ``function(q, v, params) -> ()``, added to the kinetic energy; see `CustomEffect`."""
+    """A velocity-dependent part of the Lagrangian, ``function(q, v, params) -> ()``, added to the kinetic energy; see
+    `CustomEffect`."""
 
     kind = "kinetic"
 

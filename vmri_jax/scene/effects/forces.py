@@ -1,5 +1,6 @@
-"""Fields and forces: gravity on masses, a magnetic field on charges; forces that are constant, functions of time, or turn with two bodies; forces against
-motion: linear damping, quadratic drag, dashpots between points, Rayleigh damping."""
+"""Fields and forces: gravity on masses, a magnetic field on charges; forces that are constant, functions of time, or
+turn with two bodies; forces against motion: linear damping, quadratic drag, dashpots between points, Rayleigh
+damping."""
 
 from collections.abc import Callable
 from dataclasses import field, replace
@@ -132,7 +133,8 @@ class Drive(Effect):
     Args:
         bodies: a name, or a list of names; each gets this force.
         history: ``history(t, params) -> (d,)``, N.
-        params: of `history`, numbers by name. They may change without a new compilation, and runs have derivatives with respect to them.
+        params: of `history`, numbers by name. They may change without a new compilation, and runs have derivatives with
+            respect to them.
     """
 
     bodies: Any = names()
@@ -153,7 +155,8 @@ class Drive(Effect):
 
 
 class FollowerForce(BetweenPoints):
-    """A force on b that turns with the line from a to b: ``F = f (q_b - q_a) / |q_b - q_a|``, a jet at the end of a rod.
+    """A force on b that turns with the line from a to b: ``F = f (q_b - q_a) / |q_b - q_a|``, a jet at the end of a
+    rod.
 
     Args:
         between: names (a, b), or a list of such pairs.
@@ -207,7 +210,8 @@ class QuadraticDrag(_AgainstMotion):
     """Drag of a resting fluid, ``F = -c |v| v``.
 
     Args:
-        coefficient: c, kg/m, positive: density times drag coefficient times area, over 2; one number, or one for each body.
+        coefficient: c, kg/m, positive: density times drag coefficient times area, over 2; one number, or one for each
+            body.
         bodies: names; all bodies of the scene by default.
     """
 
@@ -220,7 +224,8 @@ class QuadraticDrag(_AgainstMotion):
 
 
 class Dashpot(BetweenPoints):
-    """Dampers between points, against the change of their distance: ``F_b = -c ((v_b - v_a) . n) n = -F_a``, n from a to b.
+    """Dampers between points, against the change of their distance: ``F_b = -c ((v_b - v_a) . n) n = -F_a``, n from a
+    to b.
 
     Args:
         between: names of two bodies, or a list of such pairs.
@@ -246,8 +251,8 @@ class RayleighDamping(Effect):
 
     M has the masses of points and of the centres of rigid bodies: alpha does not damp rotations.
 
-    The damping ratio of a vibration of frequency w is ``alpha / (2 w) + beta w / 2``. K is the Hessian at the present configuration; along
-    directions of negative curvature the force adds energy.
+    The damping ratio of a vibration of frequency w is ``alpha / (2 w) + beta w / 2``. K is the Hessian at the present
+    configuration; along directions of negative curvature the force adds energy.
 
     Args:
         mass: alpha, 1/s, positive; None for zero.

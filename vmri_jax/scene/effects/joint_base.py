@@ -1,4 +1,5 @@
-"""Base classes of joints: two bodies, the points and triads of the joint in them, and its freedoms, functions of the coordinates of both bodies.
+"""Base classes of joints: two bodies, the points and triads of the joint in them, and its freedoms, functions of the
+coordinates of both bodies.
 
 For the letters see `vmri_jax.scene.effects.joints`.
 """
@@ -36,7 +37,8 @@ VECTORS = ["D", "m", "m'", "n"], ["D", "e", "e'", "f"]
 """The vectors that a row may have from a and from b; the gap D is the point of b less the point of a."""
 
 Freedom = Literal["turn", "slide", "tilt", "along", "across"]
-"""In this order: the angle about the axis n, the distance along n, the angle about the second axis e, the distances along m and m'."""
+"""In this order: the angle about the axis n, the distance along n, the angle about the second axis e, the distances
+along m and m'."""
 FREEDOMS: dict[str, tuple[tuple[str, str], ...]] = {
     "turn": (("m'", "e"), ("m", "e")),
     "slide": (("n", "D"),),
@@ -44,15 +46,16 @@ FREEDOMS: dict[str, tuple[tuple[str, str], ...]] = {
     "along": (("m", "D"),),
     "across": (("m'", "D"),),
 }
-"""For each freedom, the pairs of vectors whose products are its value against the given position, m; of an angle its sine and its cosine, times a
-common factor near 1."""
+"""For each freedom, the pairs of vectors whose products are its value against the given position, m; of an angle its
+sine and its cosine, times a common factor near 1."""
 ANGLES = ("turn", "tilt")
 """The freedoms that are angles."""
 AXES_OF = {"turn": 2, "slide": 2, "tilt": 0, "along": 0, "across": 1}
 """For each freedom, the number of the vector of the triad (m, m', n) about which or along which b moves."""
 REACH = 5 * np.pi / 6
-"""rad: an effect that counts whole turns may take an angle from directors up to this size. Directors know angles up to whole turns; the gap of
-a third of a turn between REACH and -REACH is too wide to be jumped over by a run with six steps in a turn. A larger value narrows the gap."""
+"""rad: an effect that counts whole turns may take an angle from directors up to this size. Directors know angles up to
+whole turns; the gap of a third of a turn between REACH and -REACH is too wide to be jumped over by a run with six steps
+in a turn. A larger value narrows the gap."""
 
 
 def sine_and_cosine(q, params):
@@ -68,7 +71,8 @@ def angle(q, params):
 
 
 def within_reach(q, params):
-    """An angle, rad; beyond `REACH` NaN with all its derivatives, which ends a run in place of a wrong number of turns."""
+    """An angle, rad; beyond `REACH` NaN with all its derivatives, which ends a run in place of a wrong number of
+    turns."""
     x = angle(q, params)
     return x * jnp.where(jnp.abs(x) < REACH, 1.0, jnp.nan)
 
@@ -96,9 +100,10 @@ class Joint(Effect):
 
     Args:
         between: names (a, b), or a list of such pairs. A name may come with a point that is fixed in the body,
-            ``(("hub", [1, 0, 0]), ("arm", [-1, 0, 0]))``: the body is joined there, and both points must coincide at the start.
-            Along the axes of a joint both bodies need directors.
-        at: (3,) m, the point of the joint in space at the start; or a point for each pair, (n, 3). It takes the place of points in `between`.
+            ``(("hub", [1, 0, 0]), ("arm", [-1, 0, 0]))``: the body is joined there, and both points must coincide at
+            the start. Along the axes of a joint both bodies need directors.
+        at: (3,) m, the point of the joint in space at the start; or a point for each pair, (n, 3). It takes the place
+            of points in `between`.
     """
 
     between: Any = names(2)
@@ -112,7 +117,8 @@ class Joint(Effect):
     rows: ClassVar[tuple[tuple[str, str], ...]] = GAP
     """Pairs of vectors whose scalar products are the rows: of the gap D, both triads, and the axes x, y, z of space."""
     carries: ClassVar[bool] = False
-    """Whether the joint can carry a body, whose position is then a function of the freedoms: these must be coordinates without a singularity."""
+    """Whether the joint can carry a body, whose position is then a function of the freedoms: these must be coordinates
+    without a singularity."""
     freedoms: ClassVar[tuple[Freedom, ...]] = ()
     """The motions of the triad of b against the triad of a, applied one after the other."""
 
@@ -125,8 +131,8 @@ class Joint(Effect):
 
     @cached_property
     def attached(self):
-        # the numbers of a row hold what it has from the ground, so that the other body may stand in for it: joints to the ground and joints
-        # between bodies are one term
+        # the numbers of a row hold what it has from the ground, so that the other body may stand in for it: joints to
+        # the ground and joints between bodies are one term
         return tuple((b if a == GROUND else a, a if b == GROUND else b) for a, b in self.elements)
 
     def _parameters(self):
@@ -145,18 +151,21 @@ class Joint(Effect):
         return {"factors": stacked([*factors]), "offsets": stacked([*offsets])}
 
     def label(self, i: int, freedom: str = "") -> str:
-        """The name of the joint, followed by the names of both bodies of the i-th pair if there are several, and by the freedom likewise."""
+        """The name of the joint, followed by the names of both bodies of the i-th pair if there are several, and by the
+        freedom likewise."""
         pair = "" if len(self.elements) == 1 else f" {'-'.join(self.elements[i])}"
         return f"{self.name}{pair}" + (f" {freedom}" if freedom and len(self.freedoms) > 1 else "")
 
     def value(self, freedom: str, i: int, coordinates: Mapping[str, Any]):
-        """A freedom of the i-th pair, (...) rad or m, by the coordinates (..., n) of bodies by name; an angle is between -pi and pi."""
+        """A freedom of the i-th pair, (...) rad or m, by the coordinates (..., n) of bodies by name; an angle is
+        between -pi and pi."""
         q, function = (coordinates[name] for name in self.attached[i]), angle if freedom in ANGLES else distance
         return function(tuple(map(jnp.asarray, q)), self.params_of((i,), self.numbers(FREEDOMS[freedom])))
 
     @cached_property
     def triads(self) -> Any:
-        """(n, 3, 3) axes (m, m', n) of the joint in space, for all pairs, where the freedoms are zero; None if the joint has no axis."""
+        """(n, 3, 3) axes (m, m', n) of the joint in space, for all pairs, where the freedoms are zero; None if the
+        joint has no axis."""
         return None
 
     def check_bodies(self):
@@ -165,7 +174,8 @@ class Joint(Effect):
             body = body_of(self.by_name, name)
             if not body.rigid and (body.block or body.size != 3):
                 raise Refused(
-                    f"{self.name}: {name} has {body.size} coordinates; joints are between rigid bodies and points in space."
+                    f"{self.name}: {name} has {body.size} coordinates; joints are between rigid bodies and points in "
+                    "space."
                 )
 
     def check_parameters(self):
@@ -192,7 +202,8 @@ class Joint(Effect):
 
     @cached_property
     def joining_points(self):
-        """For each pair the point of the joint in space as a has it and as b has it, at the start: [((3,), (3,)), ...]."""
+        """For each pair the point of the joint in space as a has it and as b has it, at the start: [((3,), (3,)),
+        ...]."""
         pairs = super()._elements()  # as the user wrote them: `Attachment` where a name came with a point
         if self.at is not None:
             if any(isinstance(name, Attachment) for pair in pairs for name in pair):
@@ -200,7 +211,8 @@ class Joint(Effect):
             return [(point, point) for point in _vectors(f"{self.name}: at", self.at, len(pairs))]
         joining = []
         for pair in pairs:
-            # a point mass is joined at its position; a rigid body that came without a point, at the point of the other body
+            # a point mass is joined at its position; a rigid body that came without a point, at the point of the other
+            # body
             points = [
                 body_of(self.by_name, name).point(getattr(name, "offset", None)).position
                 for name in pair
@@ -208,15 +220,16 @@ class Joint(Effect):
             ]
             if not points:
                 raise Refused(
-                    f"{self.name}: nothing says where {pair[0]} and {pair[1]} are joined; give at=[x, y, z], or a point in one of "
-                    f"them, as in ({pair[0]!r}, ({pair[1]!r}, [x, y, z]))."
+                    f"{self.name}: nothing says where {pair[0]} and {pair[1]} are joined; give at=[x, y, z], or a "
+                    f"point in one of them, as in ({pair[0]!r}, ({pair[1]!r}, [x, y, z]))."
                 )
             joining.append((points[0], points[-1]))
         return joining
 
     @cached_property
     def vectors(self) -> list[Any]:
-        """Of a and of b: the `VECTORS` of all pairs as factors (c, X) of the centre and the directors of the body, (n, 4, 4); (n, 1, 4) without axes."""
+        """Of a and of b: the `VECTORS` of all pairs as factors (c, X) of the centre and the directors of the body,
+        (n, 4, 4); (n, 1, 4) without axes."""
         ends: list[list] = [[], []]
         for element, points, triad in zip(self.elements, self.joining_points, self.triads or repeat(()), strict=False):
             for of_role, name, point, sign in zip(ends, element, points, (-1.0, 1.0), strict=True):
@@ -237,7 +250,8 @@ class Joint(Effect):
 
 
 class AboutAxis(Joint):
-    """Joints with an axis: (3,) its direction in space at the start, of any length; or a direction for each of k pairs, (k, 3)."""
+    """Joints with an axis: (3,) its direction in space at the start, of any length; or a direction for each of k pairs,
+    (k, 3)."""
 
     axis: Any = (0.0, 0.0, 1.0)
 
@@ -261,8 +275,8 @@ def joint_named(about: str, name: str, effects: Iterable[Effect]) -> Joint:
     joints = {effect.name: effect for effect in effects if isinstance(effect, Joint)}
     if not isinstance(name, str):
         raise Refused(
-            f"{about}: joint is {name!r}; give the name of one joint. Each joint has an effect of its own with a name=, or several pairs of "
-            "bodies are one joint."
+            f"{about}: joint is {name!r}; give the name of one joint. Each joint has an effect of its own with a "
+            "name=, or several pairs of bodies are one joint."
         )
     if name not in joints:
         raise Refused(f"{about}: {unknown('joint', name, joints)}")
@@ -270,7 +284,10 @@ def joint_named(about: str, name: str, effects: Iterable[Effect]) -> Joint:
 
 
 def freedom_of(joint: Joint, of: str, about: str = "") -> Freedom:
-    """The freedom of a joint with the name `of`; with "auto" its only freedom. `about` begins the message if there is none, or several."""
+    """The freedom of a joint with the name `of`; with "auto" its only freedom.
+
+    `about` begins the message if there is none, or several.
+    """
     fitting: list[Freedom] = [freedom for freedom in joint.freedoms if of in (freedom, "auto")]
     if len(fitting) == 1:
         return fitting[0]
@@ -279,13 +296,14 @@ def freedom_of(joint: Joint, of: str, about: str = "") -> Freedom:
 
 
 class OfFreedoms(Effect):
-    """Base class of effects whose functions get freedoms of joints, () each or (n,) of n elements, as q, and their rates as v."""
+    """Base class of effects whose functions get freedoms of joints, () each or (n,) of n elements, as q, and their
+    rates as v."""
 
     whole = True
     same_size = False
     counts_turns: ClassVar[bool] = True
-    """Whether another number of whole turns of an angle changes the effect. A joint with such an effect is the last one that a loop is cut
-    at; where its angle comes from directors all the same, it is `within_reach`."""
+    """Whether another number of whole turns of an angle changes the effect. A joint with such an effect is the last one
+    that a loop is cut at; where its angle comes from directors all the same, it is `within_reach`."""
     marks: ClassVar[tuple[str, ...]] = ()
     """Names of parameters that are values of the freedom, such as limits."""
 
@@ -356,7 +374,8 @@ def _vectors(argument: str, numbers, count: int):
 
 
 def for_pairs(about: str, numbers: Any, count: int, form: str, shape: tuple[int, ...] = ()) -> Any:
-    """Finite numbers of a shape, or (count, *shape) for the pairs of a joint; `form` is the form of a single one, for messages."""
+    """Finite numbers of a shape, or (count, *shape) for the pairs of a joint; `form` is the form of a single one, for
+    messages."""
     values = real_array(about, numbers)
     if values.shape not in (shape, (count, *shape)):
         for_each = f", or one for each pair, {(count, *shape)}" if count > 1 else ""

@@ -1,5 +1,5 @@
-"""Effects along a freedom of a joint: springs, limits, dampers, rotors, drives, prescribed motions; and equations between the freedoms of several joints:
-gears, racks, differentials, tendon-driven fingers."""
+"""Effects along a freedom of a joint: springs, limits, dampers, rotors, drives, prescribed motions; and equations
+between the freedoms of several joints: gears, racks, differentials, tendon-driven fingers."""
 
 from collections.abc import Callable
 from dataclasses import KW_ONLY, field, replace
@@ -31,11 +31,12 @@ from vmri_jax.scene.terms import Applied
 
 
 class InJoint(OfFreedoms):
-    """Base class of effects along the freedom x of a joint: the angle or displacement of b against a from the given position.
+    """Base class of effects along the freedom x of a joint: the angle or displacement of b against a from the given
+    position.
 
     Args:
-        joint: name of a joint in the scene with an angle or a displacement. Angles count their turns where they are coordinates, see
-            `Scene`; of directors an effect takes them up to 5/6 of half a turn, where a run ends.
+        joint: name of a joint in the scene with an angle or a displacement. Angles count their turns where they are
+            coordinates, see `Scene`; of directors an effect takes them up to 5/6 of half a turn, where a run ends.
         of: name of the freedom, if the joint has several; "auto" for the only freedom.
     """
 
@@ -88,11 +89,13 @@ class JointSpring(InJoint):
 class JointLimit(InJoint):
     """Stops of a joint by a smooth penalty: ``V = sum k/2 (d_-^2 + d_+^2)``.
 
-    The depths are ``d_- = s log(1 + exp((lower - x) / s))`` and ``d_+ = s log(1 + exp((x - upper) / s))``, with the freedom x of the joint.
+    The depths are ``d_- = s log(1 + exp((lower - x) / s))`` and ``d_+ = s log(1 + exp((x - upper) / s))``, with the
+    freedom x of the joint.
 
     Args:
         joint, of: as of `InJoint`.
-        lower, upper: rad or m, from the given position, lower below upper; one number, or one for each pair of the joint.
+        lower, upper: rad or m, from the given position, lower below upper; one number, or one for each pair of the
+            joint.
         stiffness: k, N m/rad or N/m, positive; likewise.
         smoothing: s, rad or m, positive: the distance from the limit at which the force sets in.
     """
@@ -146,8 +149,8 @@ class RotorInertia(InJoint):
 
     Args:
         joint, of: as of `InJoint`.
-        inertia: J, positive, kg m^2 for an angle and kg for a displacement: the inertia of the rotor times its gear ratio squared; one
-            number, or one for each pair of the joint.
+        inertia: J, positive, kg m^2 for an angle and kg for a displacement: the inertia of the rotor times its gear
+            ratio squared; one number, or one for each pair of the joint.
     """
 
     inertia: Any = positive()
@@ -186,7 +189,8 @@ class JointDrive(InJoint):
 class JointMotion(InJoint):
     """A prescribed angle or displacement of a joint, ``x = a(t)``.
 
-    Minus the multiplier is the torque (N m) or the force (N) of the drive that turns or shifts b against a along a(t); it does work.
+    Minus the multiplier is the torque (N m) or the force (N) of the drive that turns or shifts b against a along a(t);
+    it does work.
 
     Args:
         joint, of: as of `InJoint`.
@@ -236,10 +240,12 @@ class JointCoupling(OfFreedoms):
         JointCoupling(["camshaft", "valve"], cam, {"stroke": 0.01})
 
     Args:
-        joints: names of 1 to 16 joints of the scene, each with a single pair of bodies; ``(name, freedom)`` for a joint with several freedoms.
-        law: ``g(x, params) -> ()`` or (k,) with the freedoms x (n,) in the order of `joints`, rad and m from the given position; zero at x = 0.
-        params: numbers, arrays or trees of them that the law gets. They may change without a new compilation, and runs have derivatives
-            with respect to them.
+        joints: names of 1 to 16 joints of the scene, each with a single pair of bodies; ``(name, freedom)`` for a joint
+            with several freedoms.
+        law: ``g(x, params) -> ()`` or (k,) with the freedoms x (n,) in the order of `joints`, rad and m from the given
+            position; zero at x = 0.
+        params: numbers, arrays or trees of them that the law gets. They may change without a new compilation, and runs
+            have derivatives with respect to them.
     """
 
     joints: Any
@@ -255,7 +261,8 @@ class JointCoupling(OfFreedoms):
         joints = () if isinstance(self.joints, str) else tuple(self.joints)
         if not 1 <= len(joints) <= MOST_ROLES // 2:
             raise Refused(
-                f"{self.name}: joints is {self.joints!r}; give names of 1 to {MOST_ROLES // 2} joints, ['motor', 'wheel']."
+                f"{self.name}: joints is {self.joints!r}; give names of 1 to {MOST_ROLES // 2} joints, ['motor', "
+                "'wheel']."
             )
         object.__setattr__(self, "joints", joints)
         instead = NO_VELOCITY.format(moving="JointMotion, of one joint", force="JointDamper")

@@ -1,7 +1,8 @@
 """Joints between rigid bodies: each is a set of constraints, listed below.
 
-The point of the joint is at ``phi + rho`` in each body, so that the gap is ``D = phi_b + rho_b - phi_a - rho_a``. The triad
-``(m, m', n)`` is fixed in a and the triad ``(e, e', f)`` in b; they coincide at the start, and n points along the axis.
+The point of the joint is at ``phi + rho`` in each body, so that the gap is ``D = phi_b + rho_b - phi_a - rho_a``. The
+triad ``(m, m', n)`` is fixed in a and the triad ``(e, e', f)`` in b; they coincide at the start, and n points along the
+axis.
 
 | joint | rows |
 |---|---|
@@ -14,8 +15,8 @@ The point of the joint is at ``phi + rho`` in each body, so that the gap is ``D 
 | screw | ``m . D``, ``m' . D``, ``n . e``, ``n . e'``, ``m' . e cos a - m . e sin a`` with ``a = 2 pi n . D / pitch`` |
 | planar | ``n . D``, ``n . e``, ``n . e'`` |
 
-Between macro nodes the interpolated directors of a slow body are a little too short. A row that is a product of vectors of both triads is
-then only scaled: it still vanishes for the right directions of the axes.
+Between macro nodes the interpolated directors of a slow body are a little too short. A row that is a product of vectors
+of both triads is then only scaled: it still vanishes for the right directions of the axes.
 
 Source: P. Betsch, S. Leyendecker, Int. J. Numer. Meth. Engng 67 (2006).
 """
@@ -61,7 +62,8 @@ class Universal(AboutAxis):
     Args:
         between, at: as of `Joint`.
         axis: (3,) the axis n that is fixed in a, in space at the start; or an axis for each pair, (n, 3).
-        second: (3,) the axis e that is fixed in b, perpendicular to `axis` at the start; or an axis for each pair, (n, 3).
+        second: (3,) the axis e that is fixed in b, perpendicular to `axis` at the start; or an axis for each pair,
+            (n, 3).
     """
 
     second: Any = (1.0, 0.0, 0.0)
@@ -109,14 +111,15 @@ def screwed(q, params):
 
 
 class Screw(AboutAxis):
-    """Nuts on bolts: b moves along the axis as it turns; five rows, the four of `Cylindrical` and ``m' . e cos a = m . e sin a``.
+    """Nuts on bolts: b moves along the axis as it turns; five rows, the four of `Cylindrical` and
+    ``m' . e cos a = m . e sin a``.
 
     The angle a follows from the distance along the axis, ``a = 2 pi n . D / pitch``.
 
     Args:
         between, at, axis: as of `Revolute`.
-        pitch: how far b moves along the axis per turn, m, not zero, negative for a left-handed screw; one number, or a number for each
-            pair. A millimetre by default.
+        pitch: how far b moves along the axis per turn, m, not zero, negative for a left-handed screw; one number, or a
+            number for each pair. A millimetre by default.
     """
 
     pitch: Any = number(default=1e-3)
@@ -137,8 +140,9 @@ class Screw(AboutAxis):
 class Planar(AboutAxis):
     """b moves in the plane of m and m' and turns about n; three rows, ``n . D = 0, n . e = n . e' = 0``.
 
-    The freedoms are "along" and "across", the distances along m and m', and "turn". m is the first of the axes x, y, z of space that make the
-    largest angle with n, or its part in the plane; m' is n x m: x and y for a normal z, x and -z for a normal y, y and z for a normal x.
+    The freedoms are "along" and "across", the distances along m and m', and "turn". m is the first of the axes x, y, z
+    of space that make the largest angle with n, or its part in the plane; m' is n x m: x and y for a normal z, x and -z
+    for a normal y, y and z for a normal x.
 
     Args:
         between, at: as of `Joint`.

@@ -1,4 +1,5 @@
-"""Potentials between several points: Newton's gravity, Coulomb, Lennard-Jones, angles, bending, torsion; smooth penalty contact with planes and spheres."""
+"""Potentials between several points: Newton's gravity, Coulomb, Lennard-Jones, angles, bending, torsion; smooth penalty
+contact with planes and spheres."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import KW_ONLY, field
@@ -143,7 +144,8 @@ class LennardJones(_Nonbonded):
     Args:
         depth: eps, J, positive; one number, or one for each pair.
         distance: s, m, positive; likewise.
-        between: names of bodies, every pair of which interacts; or a list of pairs. All bodies by default, bonded ones too.
+        between: names of bodies, every pair of which interacts; or a list of pairs. All bodies by default, bonded ones
+            too.
         exclude: pairs without this force, see `within_bonds`.
     """
 
@@ -186,8 +188,8 @@ class Angle(_AmongPoints):
     Args:
         between: names (a, b, c), or a list of such.
         stiffness: k, N m, positive; one number, or one for each angle.
-        angle: theta_0, rad, between 0 and pi, where the energy is smooth (take `Bending` for pi); likewise. The angle at the positions in
-            `bodies` by default.
+        angle: theta_0, rad, between 0 and pi, where the energy is smooth (take `Bending` for pi); likewise. The angle
+            at the positions in `bodies` by default.
     """
 
     between: Any = names(3)
@@ -274,7 +276,8 @@ class Torsion(_AmongPoints):
 
 
 def penalty(gap, params):
-    """``k/2 d^2`` of the smooth depth ``d = s log(1 + exp(-gap / s))``: about -gap if the bodies overlap, decaying like ``s exp(-gap / s)`` outside."""
+    """``k/2 d^2`` of the smooth depth ``d = s log(1 + exp(-gap / s))``: about -gap if the bodies overlap, decaying like
+    ``s exp(-gap / s)`` outside."""
     depth = params["smoothing"] * jax.nn.softplus(-gap / params["smoothing"])
     return jnp.sum(params["stiffness"] / 2 * depth**2)
 
@@ -301,9 +304,11 @@ class _Contact(Effect):
 
 
 class PlaneContact(_Contact):
-    """Contact with the side of a plane that its normal points to: ``V = k/2 sum d^2``, ``d = s log(1 + exp(-gap / s))``.
+    """Contact with the side of a plane that its normal points to: ``V = k/2 sum d^2``,
+    ``d = s log(1 + exp(-gap / s))``.
 
-    ``gap = n . (q - p) - r``. The energy has derivatives of every order, so that schemes keep their order once the steps of its grid resolve the contact.
+    ``gap = n . (q - p) - r``. The energy has derivatives of every order, so that schemes keep their order once the
+    steps of its grid resolve the contact.
 
     Args:
         point: p, (d,), in the plane.

@@ -77,8 +77,9 @@ class ToFixedPoint(ToPoint):
         super().__post_init__()
         if callable(self.point):
             raise Refused(
-                f"{self.name}: point is {self.point!r}; {type(self).__name__} holds bodies at fixed points, give (d,) or (n, d). For a "
-                "point that moves take MovingPivot (a rigid link), Guide (the point itself) or MovingAnchor (a spring)."
+                f"{self.name}: point is {self.point!r}; {type(self).__name__} holds bodies at fixed points, give (d,) "
+                "or (n, d). For a point that moves take MovingPivot (a rigid link), Guide (the point itself) or "
+                "MovingAnchor (a spring)."
             )
 
     def drawing(self):
@@ -91,7 +92,8 @@ class ToFixedPoint(ToPoint):
 
 
 class ToPath(ToPoint):
-    """Between each body and a point that moves along a path; derived classes declare the `params` of the path as their last field."""
+    """Between each body and a point that moves along a path; derived classes declare the `params` of the path as their
+    last field."""
 
     path: Callable = of_time()
 
@@ -134,14 +136,16 @@ class Spring(BetweenPoints):
 
 
 class NonlinearSpring(BetweenPoints):
-    """Springs whose force is a polynomial of the elongation ``e = |q_b - q_a| - l``: ``k_1 e + k_2 e^2 + k_3 e^3 + ...``
+    """Springs whose force is a polynomial of the elongation ``e = |q_b - q_a| - l``:
+    ``k_1 e + k_2 e^2 + k_3 e^3 + ...``
 
     ``V = sum_j k_j e^(j+1) / (j+1)``; (k, 0, k_3) is a Duffing spring, stiffening for k_3 > 0.
 
     Args:
         between: names of two bodies, or a list of such pairs.
         coefficients: (k_1, k_2, ...), N/m^j, at least one, the same for all springs.
-        length: l, at rest, positive; one number, or one for each spring. The distance at the positions in `bodies` by default.
+        length: l, at rest, positive; one number, or one for each spring. The distance at the positions in `bodies` by
+            default.
     """
 
     coefficients: Any = array()
@@ -236,8 +240,8 @@ class RigidLink(_Rigid, BetweenPoints):
 
     Args:
         between: names of two bodies, or a list of such pairs.
-        length: l, positive; one number, or one for each link. The distance at the positions in `bodies` by default, and no other one unless
-            the scene projects.
+        length: l, positive; one number, or one for each link. The distance at the positions in `bodies` by default, and
+            no other one unless the scene projects.
     """
 
     default_name = "links"
@@ -275,7 +279,8 @@ class MovingPivot(_Rigid, ToPath):
 
 
 class Guide(ToPath):
-    """A body with a prescribed motion, ``g = q - a(t) = 0``. Minus the multiplier is the force (N) that moves the body along a(t); it does work.
+    """A body with a prescribed motion, ``g = q - a(t) = 0``. Minus the multiplier is the force (N) that moves the body
+    along a(t); it does work.
 
     Args:
         bodies: a name.

@@ -1,7 +1,8 @@
 """Derivative of the solution of a step, by the implicit function theorem.
 
-The unknowns x of a step solve ``R(e, x) = 0``, where e are the equations with all data that they depend on: the state at the start, the
-step, the parameters. So ``dx = -(dR/dx)^-1 (dR/de) de``, with one matrix in both modes; no iteration is differentiated.
+The unknowns x of a step solve ``R(e, x) = 0``, where e are the equations with all data that they depend on: the state
+at the start, the step, the parameters. So ``dx = -(dR/dx)^-1 (dR/de) de``, with one matrix in both modes; no iteration
+is differentiated.
 """
 
 from functools import partial
@@ -25,11 +26,12 @@ def _direction(equations: StepEquations, x: Unknowns):
 
 
 def _with_derivative_of(values, others):
-    """The values, with the derivatives of `others`, which equal the values up to round-off and are computed for derivatives alone.
+    """The values, with the derivatives of `others`, which equal the values up to round-off and are computed for
+    derivatives alone.
 
-    ``y = (value, 1)`` solves ``A y = (value - other, 1)`` with ``A = [[1, -other], [0, 1]]``, and ``dy = -A^-1 dA y = (d other, 0)``, since the
-    first component of the right-hand side is held. `custom_linear_solve` takes its value from the solve alone, here the known one, and
-    differentiates A.
+    ``y = (value, 1)`` solves ``A y = (value - other, 1)`` with ``A = [[1, -other], [0, 1]]``, and
+    ``dy = -A^-1 dA y = (d other, 0)``, since the first component of the right-hand side is held. `custom_linear_solve`
+    takes its value from the solve alone, here the known one, and differentiates A.
     """
     (value, by_name), (other, _) = ravel_pytree(values), ravel_pytree(others)
 
@@ -43,9 +45,11 @@ def _with_derivative_of(values, others):
 
 
 def _no_third_derivative(residual):
-    """Zero, with the derivative zero, and second derivatives that are not finite: ``|s - s_0|^1.5`` at s_0 = s, the sum of all rows.
+    """Zero, with the derivative zero, and second derivatives that are not finite: ``|s - s_0|^1.5`` at s_0 = s, the sum
+    of all rows.
 
-    Added to a point with the right first derivative only, it turns third derivatives of the step, which would be wrong, into NaN.
+    Added to a point with the right first derivative only, it turns third derivatives of the step, which would be wrong,
+    into NaN.
     """
     total = sum(jnp.sum(rows) for rows in jax.tree.leaves(residual))
     return jnp.abs(total - jax.lax.stop_gradient(total)) ** 1.5
@@ -61,9 +65,9 @@ def differentiable(equations: StepEquations, x: Unknowns, end):
 def _implicit_derivative(primals, tangents):
     equations, root, end = primals
     direction = _direction(equations, root)
-    # For second derivatives: a Newton step x - (dR/dx)^-1 R at the root changes nothing, but makes x a function of the equations with the
-    # right first derivative. A recursive call of `differentiable` would not do: for reverse mode JAX evaluates the first derivative in part,
-    # and this partial evaluation drops the rules of custom derivatives.
+    # For second derivatives: a Newton step x - (dR/dx)^-1 R at the root changes nothing, but makes x a function of the
+    # equations with the right first derivative. A recursive call of `differentiable` would not do: for reverse mode JAX
+    # evaluates the first derivative in part, and this partial evaluation drops the rules of custom derivatives.
     residual, _ = Intervals(equations).residual(root)
     unknown_beyond = _no_third_derivative(residual)
     newton = jax.tree.map(lambda a, step: a + step + unknown_beyond, root, direction(residual))
@@ -71,8 +75,8 @@ def _implicit_derivative(primals, tangents):
     (_, end_of_x), push = jax.linearize(lambda e, x: Intervals(e).residual(x), equations, x)
     change, _ = push(tangents[0], jax.tree.map(jnp.zeros_like, x))
 
-    # dR/dx dx = -dR/de de. `custom_linear_solve` differentiates dx through `product`, that is through dR/dx at x; its own solves take the
-    # factors of `direction`, computed once.
+    # dR/dx dx = -dR/de de. `custom_linear_solve` differentiates dx through `product`, that is through dR/dx at x; its
+    # own solves take the factors of `direction`, computed once.
     rows, by_name = ravel_pytree(jax.tree.map(jnp.negative, change))
     none = jax.tree.map(jnp.zeros_like, tangents[0])
 

@@ -19,7 +19,8 @@ def state_of(scene: Scene) -> State:
 
 
 def accelerations(scene: Scene, state: State) -> dict[str, tuple[jax.Array, jax.Array, jax.Array]]:
-    """Position, velocity and acceleration of every body by name: (d,) each for a point, (12,) for a rigid body, its centre and directors.
+    """Position, velocity and acceleration of every body by name: (d,) each for a point, (12,) for a rigid body, its
+    centre and directors.
 
     Args:
         scene: with joint coordinates or directors.
