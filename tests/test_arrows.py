@@ -9,8 +9,17 @@ from pathlib import Path
 import pytest
 
 PACKAGE = Path(__file__).parents[1] / "vmri_jax"
-DENSE = "benchmarks.gail2014.dense"
-"""The reference solver of tests."""
+REFERENCES = ("benchmarks.gail2014.dense", "benchmarks.body_motions")
+"""Dense solves and accelerations of bodies, which tests compare with."""
+LINES = {
+    ("animation",): 1860,
+    ("cli",): 990,
+    ("control",): 880,
+    ("ensembles", "executors"): 1490,
+    ("plots",): 1000,
+    (".",): 36_270,
+}
+"""Most lines of packages that have reached their number, and of the whole: a change that adds takes away."""
 
 
 def modules(package: Path) -> dict[str, Path]:
@@ -58,7 +67,7 @@ def test_no_module_imports_the_face_of_the_package():
 def test_benchmarks_and_tests_stand_beside_each_other():
     """Benchmarks import no test; tests of benchmarks, and of pages that print their commands, import benchmarks.
 
-    All others import the dense solve alone.
+    All others import `REFERENCES` alone.
     """
     root = PACKAGE.parent
     for folder, other, allowed in (("benchmarks", "tests", ()), ("tests", "benchmarks", ("benchmarks", "pages"))):
@@ -66,7 +75,13 @@ def test_benchmarks_and_tests_stand_beside_each_other():
             if path.relative_to(root).parts[1] not in allowed:
                 nodes = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.ImportFrom)]
                 names = [node.module or "" for node in nodes]
-                assert not [name for name in names if name.split(".")[0] == other and name != DENSE], path
+                assert not [name for name in names if name.split(".")[0] == other and name not in REFERENCES], path
+
+
+@pytest.mark.parametrize(("folders", "most"), LINES.items())
+def test_packages_do_not_grow(folders, most):
+    files = (path for folder in folders for path in (PACKAGE / folder).rglob("*.py"))
+    assert sum(len(path.read_text().splitlines()) for path in files) <= most
 
 
 def test_a_circle_is_seen(tmp_path):
