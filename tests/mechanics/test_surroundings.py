@@ -6,6 +6,7 @@ import itertools
 import random
 import sys
 import time
+from enum import Enum, IntEnum
 from functools import partial
 from types import ModuleType, SimpleNamespace
 from typing import Any
@@ -228,6 +229,80 @@ def test_what_a_function_writes_itself_is_no_change():
     assert spring.calls == 1
     FILLED["k"] = 3.0
     assert slope(filled) == 3.0
+
+
+class Law(IntEnum):
+    SOFT = 1
+    HARD = 3
+
+
+class Material(Enum):
+    SOFT = 1.0
+    HARD = 3.0
+
+
+class Stiffness(float):
+    """A number of a class of the user."""
+
+
+class Bound(partial):
+    """A function of a class of the user with an argument that it knows."""
+
+
+class Sum:
+    def __init__(self, k):
+        self.k = k
+
+    def add(self, q_s):
+        return self.k * q_s[0] ** 2 / 2
+
+
+@pytest.mark.parametrize(
+    "made",
+    [
+        lambda hard: partial(scaled, Law.HARD if hard else Law.SOFT),
+        lambda hard: partial(scaled_by_value, Material.HARD if hard else Material.SOFT),
+        lambda hard: partial(scaled, Stiffness(3.0 if hard else 1.0)),
+        lambda hard: Bound(scaled, 3.0 if hard else 1.0),
+        lambda hard: added(Sum(3.0 if hard else 1.0)),
+    ],
+    ids=[
+        "whole number of an enumeration",
+        "value of an enumeration",
+        "subclass of float",
+        "subclass of partial",
+        "add",
+    ],
+)
+def test_values_of_derived_classes_and_methods_called_as_those_of_logs_count(made):
+    assert (slope(made(False)), slope(made(True))) == (1.0, 3.0)
+
+
+def scaled(k, q_s, q_f, params):
+    return float(k) * q_s[0] ** 2 / 2
+
+
+def scaled_by_value(material, q_s, q_f, params):
+    return material.value * q_s[0] ** 2 / 2
+
+
+def added(law):
+    return lambda q_s, q_f, params: law.add(q_s)
+
+
+def test_starts_and_prepared_runs_keep_their_numbers_when_arrays_of_the_user_change():
+    system = vm.System(vm.ConstantMass(np.ones(1000), []))
+    for _ in range(5):  # JAX takes the memory of some arrays, as they lie
+        q, state = np.full(1000, 0.5), None
+        state = vm.initial_state(system, q, [])
+        q[:] = 9.0
+        assert np.array_equal(state.q_s, np.full(1000, 0.5))
+        assert np.array_equal(vm.initial_state(system, np.full(1000, 0.5), []).q_s, np.full(1000, 0.5))
+    k = np.ones(())
+    run = vm.prepare(problem(by_params, k), SCHEME, **STEPS)
+    before = run().q_s[-1, 0]
+    k[...] = 9.0
+    assert run().q_s[-1, 0] == before
 
 
 STEPS = {"macro_dt": 0.1, "num_steps": 3}

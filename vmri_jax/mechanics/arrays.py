@@ -108,14 +108,20 @@ def quickly_compiled(function: Callable, static_argnames: str | Sequence[str] = 
     return call
 
 
+def own_array(value, dtype=None) -> np.ndarray:
+    """Numbers as an array of NumPy that nobody else writes to."""
+    is_shared = isinstance(value, np.ndarray) and value.flags.writeable
+    return np.array(value, dtype) if is_shared else np.asarray(value, dtype)
+
+
 def of_one_type(tree):
-    """A pytree for a run: numbers as NumPy arrays, tracers unchanged, since JAX would trace functions anew for each
-    type of number; and functions with what they read from around them now."""
+    """A pytree for a run: numbers as NumPy arrays of its own, tracers unchanged, since JAX would trace functions anew
+    for each type of number; and functions with what they read from around them now."""
 
     def settled(leaf):
         if isinstance(leaf, TracedOnce):
             return leaf.now()
-        return leaf if _is_traced(leaf) else np.asarray(leaf)
+        return leaf if _is_traced(leaf) else own_array(leaf)
 
     return jax.tree.map(settled, tree, is_leaf=lambda leaf: isinstance(leaf, TracedOnce))
 

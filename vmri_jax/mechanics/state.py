@@ -166,7 +166,8 @@ def _checked_start(known: Known, project: bool, tolerance: float) -> tuple[State
     if not system.has_constant_mass:  # before the projection, which divides by the masses
         check_system(system, q_s, q_f)
         check_mass(system, q_s, q_f)
-    state, violation = jax.device_put(_start(known.tree, project))
+    # copies: JAX takes the memory of arrays of NumPy as it is, and users go on writing to theirs
+    state, violation = jax.tree.map(jnp.array, _start(known.tree, project))
     advice = (
         "projection did not reach the constraints; start closer to them."
         if project

@@ -18,6 +18,7 @@ import hashlib
 import sys
 from collections import deque
 from collections.abc import Callable, Hashable, Mapping
+from enum import Enum
 from functools import cached_property, lru_cache, partial
 from itertools import chain, pairwise
 from operator import attrgetter
@@ -34,10 +35,12 @@ LARGEST_COPIED = 1024
 """Bytes of the largest array that is compared by its numbers; larger arrays are compared by a digest. A larger value
 fills the keys of programs with copies of arrays."""
 APPENDING = ("append", "extend", "add", "update")
-"""Methods that write to a log: a name before one of them is not read."""
+"""Methods that write to a log: a list, set or dictionary before one of them alone is not read."""
+LOGS = (list, set, dict, deque)
 _NUMBERS = frozenset((bool, int, float, complex))
 _CONSTANTS = frozenset((str, bytes, type(None), type(...), CodeType))
-_METHODS = frozenset((MethodType, partial, cached_property, property, staticmethod, classmethod))
+_BASES = (int, float, complex, str, bytes)
+_METHODS = (MethodType, partial, cached_property, property, staticmethod, classmethod)
 _INSIDE_METHODS = ("__func__", "__self__", "func", "args", "keywords", "fget")
 _MISSING = object()
 _unchanged: dict[Hashable, Hashable] = {}
@@ -95,8 +98,14 @@ class Surroundings:
         self._visited[id(value)] = len(self._visited), value
         if kind is FunctionType:
             return self._of_function(value)
-        if kind in _METHODS:
-            return kind, *(self._of(getattr(value, name)) for name in _INSIDE_METHODS if hasattr(value, name))
+        if isinstance(value, _METHODS):
+            own = () if kind in _METHODS else (self._of_object(value),)
+            return kind, *own, *(self._of(getattr(value, name)) for name in _INSIDE_METHODS if hasattr(value, name))
+        if isinstance(value, Enum):
+            return self._of(kind), value.name, self._of(value.value)
+        if isinstance(value, _BASES):  # of a class derived from them
+            base = next(base for base in _BASES if isinstance(value, base))
+            return self._of_object(value), base.__repr__(value)
         if kind is ModuleType or isinstance(value, type):
             return self._of_namespace(value)
         if isinstance(value, (np.ndarray, np.generic, jax.Array)):
@@ -111,14 +120,18 @@ class Surroundings:
         of_library = is_of_library(function.__module__)
         if of_library and not cells:
             return function
-        around, read, attributes, imported = names_in(code)
+        around, logs, attributes, imported = names_in(code)
         key = [self._read(name, attrgetter(name), function) for name in ("__code__", "__defaults__", "__kwdefaults__")]
-        cells = [(name, cell) for name, cell in zip(code.co_freevars, cells, strict=True) if name in read]
-        key += [self._read(name, attrgetter("cell_contents"), cell) for name, cell in cells]
+        inside = attrgetter("cell_contents")
+        named = zip(code.co_freevars, cells, strict=True)
+        cells = [(name, cell) for name, cell in named if not (name in logs and isinstance(inside(cell), LOGS))]
+        key += [self._read(name, inside, cell) for name, cell in cells]
         if not of_library:
             self.have_code = True
             self._attributes |= attributes
-            key += [self._read(name, function.__globals__.get, name, _MISSING) for name in around]
+            there = function.__globals__.get
+            around = [name for name in around if not (name in logs and isinstance(there(name), LOGS))]
+            key += [self._read(name, there, name, _MISSING) for name in around]
             key += [self._read(name, sys.modules.get, name, _MISSING) for name in imported]
         return tuple(key)
 
@@ -187,18 +200,19 @@ class Surroundings:
 
 @lru_cache(maxsize=4096)
 def names_in(code: CodeType) -> tuple[tuple[str, ...], frozenset[str], dict[str, None], tuple[str, ...]]:
-    """Names that code reads, with the functions inside of it: globals, cells of closures, attributes, also those in
-    texts for `getattr`, and modules that the code itself imports."""
-    read = [now for now, after in pairwise(dis.get_instructions(code)) if after.argval not in APPENDING]
+    """Names that code reads, with the functions inside of it: globals, names of globals and cells that stand before
+    `APPENDING` alone, attributes, also those in texts for `getattr`, and modules that the code itself imports."""
     inner = [names_in(constant) for constant in code.co_consts if isinstance(constant, CodeType)]
     texts = [text for text in code.co_consts if isinstance(text, str) and text.isidentifier()]
-    around = [now.argval for now in read if "GLOBAL" in now.opname or now.opname == "LOAD_NAME"]
-    cells = frozenset(now.argval for now in read if "DEREF" in now.opname)
-    modules = [now.argval for now in read if now.opname == "IMPORT_NAME"]
-    globals_inside, cells_inside, attributes_inside, modules_inside = zip(*inner, strict=True) if inner else ((),) * 4
+    pairs = [(now, after.argval in APPENDING) for now, after in pairwise(dis.get_instructions(code))]
+    around = [now.argval for now, _ in pairs if "GLOBAL" in now.opname or now.opname == "LOAD_NAME"]
+    named = [(now.argval, is_log) for now, is_log in pairs if "DEREF" in now.opname or now.argval in around]
+    modules = [now.argval for now, _ in pairs if now.opname == "IMPORT_NAME"]
+    globals_inside, logs_inside, attributes_inside, modules_inside = zip(*inner, strict=True) if inner else ((),) * 4
+    logs, others = ({name for name, is_log in named if is_log == kind} for kind in (True, False))
     return (
         tuple(dict.fromkeys([*around, *chain(*globals_inside)])),
-        cells.union(*cells_inside),
+        frozenset(logs.union(*logs_inside) - others),
         dict.fromkeys([*code.co_names, *texts, *chain(*attributes_inside)]),
         tuple(dict.fromkeys([*modules, *chain(*modules_inside)])),
     )

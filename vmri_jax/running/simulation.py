@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.configure import warn_if_slow
-from vmri_jax.mechanics.arrays import Known, is_concrete, of_one_type, whole_number
+from vmri_jax.mechanics.arrays import Known, is_concrete, of_one_type, own_array, whole_number
 from vmri_jax.mechanics.checks import check_arrays, check_number, check_params, check_type
 from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.projection import at_same_velocities
@@ -149,7 +149,7 @@ class Simulation:
             (old, expected), (new, structure) = map(jax.tree.flatten, (self.system.params, params))
             if structure != expected or list(map(np.shape, new)) != list(map(np.shape, old)):
                 raise Refused(f"params is {params!r}; give the pytree of system.params with other numbers in it.")
-            changes["system"] = self.system.with_params(jax.tree.map(np.asarray, params))
+            changes["system"] = self.system.with_params(jax.tree.map(own_array, params))
             if state is None and self.of_problem and not self.system.has_constant_mass:
                 changes["state"] = _with_arrays(at_same_velocities(self.system, changes["system"], self.state))
         if num_steps is not None:
@@ -388,4 +388,4 @@ def _with_arrays(state: State) -> State:
 
 def _float(value):
     """Numbers as an array of float64: of JAX if they are traced, else of NumPy, which is made faster."""
-    return np.asarray(value, dtype=float) if is_concrete(value) else jnp.asarray(value, dtype=float)
+    return own_array(value, float) if is_concrete(value) else jnp.asarray(value, dtype=float)
