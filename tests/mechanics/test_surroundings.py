@@ -231,7 +231,7 @@ def test_what_a_function_writes_itself_is_no_change():
     assert slope(filled) == 3.0
 
 
-class Law(IntEnum):
+class Order(IntEnum):
     SOFT = 1
     HARD = 3
 
@@ -260,7 +260,7 @@ class Sum:
 @pytest.mark.parametrize(
     "made",
     [
-        lambda hard: partial(scaled, Law.HARD if hard else Law.SOFT),
+        lambda hard: partial(scaled, Order.HARD if hard else Order.SOFT),
         lambda hard: partial(scaled_by_value, Material.HARD if hard else Material.SOFT),
         lambda hard: partial(scaled, Stiffness(3.0 if hard else 1.0)),
         lambda hard: Bound(scaled, 3.0 if hard else 1.0),

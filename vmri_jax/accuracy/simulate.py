@@ -20,7 +20,7 @@ from vmri_jax.accuracy.companions import (
 )
 from vmri_jax.accuracy.families import for_system, of_scheme, two_families
 from vmri_jax.accuracy.search import MOST_COORDINATES, Search
-from vmri_jax.mechanics.arrays import is_concrete
+from vmri_jax.mechanics.arrays import is_known
 from vmri_jax.mechanics.checks import check_flags, check_system, check_type
 from vmri_jax.mechanics.driving import Events, driven, events
 from vmri_jax.mechanics.state import Movable, State
@@ -120,7 +120,7 @@ def simulate(
     if scheme is None:
         raise Refused("simulate: scheme is None without an accuracy; give one of them, e.g. accuracy=1e-5.")
     run = simulation(system, scheme, state, solver, macro_dt, num_steps, t_end, save)
-    if not is_concrete(run.leaves):
+    if not is_known(run.leaves):
         if error:
             refuse_tracers("simulate: an error", run.leaves)
         check_system(run.system, run.state.q_s, run.state.q_f)

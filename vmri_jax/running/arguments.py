@@ -5,7 +5,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from vmri_jax.mechanics.arrays import Known, is_concrete, real_array, require_x64, whole_number
+from vmri_jax.mechanics.arrays import Known, is_concrete, is_known, real_array, require_x64, whole_number
 from vmri_jax.mechanics.checks import check_arrays, check_flags, check_number, check_params, check_system
 from vmri_jax.mechanics.constraints import check_constraints, check_mass
 from vmri_jax.refusals import Refused
@@ -132,9 +132,11 @@ def check_step_size(macro_dt, caller: str = "simulate", ndim: int | None = 0) ->
 
 
 def refuse_tracers(caller: str, arguments, instead: str = "") -> None:
-    """Refuse a pytree of arguments within a transformation of JAX; `instead` ends the advice."""
-    if not is_concrete(arguments):
-        raise Refused(f"{caller}: arguments are tracers; call it outside of jax.jit, vmap and grad{instead}.")
+    """Refuse a pytree of arguments within a transformation of JAX, or a call within a program; `instead` ends the
+    advice."""
+    if not is_known(arguments):
+        traced = "it is called in a program that JAX traces" if is_concrete(arguments) else "arguments are tracers"
+        raise Refused(f"{caller}: {traced}; call it outside of jax.jit, vmap and grad{instead}.")
 
 
 @lru_cache(maxsize=256)
