@@ -121,7 +121,7 @@ class Engine:
 
         def block(i, rows):
             number = jnp.minimum(i * self._block + jnp.arange(self._block), saves)  # beyond it there may be no state
-            row = _as_saved(run, rows[number], step + number * save_every)
+            row = jnp.concatenate(_as_saved(run, rows[number], step + number * save_every), axis=1)
             return jax.lax.dynamic_update_slice(rows, row, (i * self._block, 0))
 
         return jax.lax.fori_loop(0, saves // self._block + 1, block, rows)
@@ -154,8 +154,13 @@ class Engine:
 
         def observed(leaves: list, saved: Saved, save_every) -> Saved:
             run: Any = jax.tree.unflatten(self.structure, leaves)
-            rows = _as_saved(run, saved.rows, jnp.arange(self.num_saves + 1) * save_every)
-            return saved._replace(rows=rows).marked(replace(run, save_every=save_every))
+            columns = _as_saved(run, saved.rows, jnp.arange(self.num_saves + 1) * save_every)
+            rows = jax.lax.stop_gradient(jnp.concatenate(columns, axis=1))
+            marked = saved._replace(rows=rows).marked(replace(run, save_every=save_every))
+            # Column by column: the derivative of positions then has no part of that of the observables beside them.
+            lost = jnp.isnan(marked.rows[:, run.columns.table.start, None])  # the energy of a lost node
+            values = run.columns._make(jnp.where(lost, jnp.nan, a) for a in columns)
+            return marked._replace(rows=values._replace(info=marked.rows[:, run.columns.info]))
 
         return jax.jit(observed)  # else JAX would compile the operations of a gradient outside of jit one by one
 
@@ -179,7 +184,7 @@ def blank_memory(engine: Engine, shapes: tuple):
 
 
 def _as_saved(run, rows, steps):
-    """The rows of nodes after these numbers of macro steps, with projected momenta, and with their `Observables`."""
+    """The columns of nodes after these numbers of macro steps, with projected momenta and `Observables`."""
     *phase, info, micro = (rows[:, column] for column in run.columns[:-1])
 
     def node(t, *phase):
@@ -187,7 +192,7 @@ def _as_saved(run, rows, steps):
         return *list(vars(state).values())[1:], table
 
     *phase, table = jax.vmap(node)(run.state.t + steps * run.macro_dt, *phase)
-    return jnp.concatenate([*phase, info, micro, table], axis=1)
+    return *phase, info, micro, table
 
 
 def _row(state: State, worst: StepStatus, micro) -> Float[Numbers, "numbers"]:

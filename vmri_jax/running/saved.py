@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import psutil
-from jaxtyping import Float, Int
+from jaxtyping import Int
 
 from vmri_jax.mechanics.arrays import Numbers, is_concrete, library
 from vmri_jax.mechanics.state import State
@@ -50,9 +50,12 @@ class Columns(NamedTuple):
 
 
 class Saved(NamedTuple):
-    """Nodes of a run, a row for each, and its status; of JAX or NumPy; in a batch with lanes."""
+    """Nodes of a run, a row for each, and its status; of JAX or NumPy; in a batch with lanes.
 
-    rows: Float[Numbers, "k width"]
+    rows: an array, or of a run under a transformation its columns.
+    """
+
+    rows: Any
     result: Int[Numbers, ""]
     failed_at: Int[Numbers, ""]
 
@@ -82,7 +85,9 @@ class Saved(NamedTuple):
     def trajectory(self, run: Any, step: int = 0) -> Trajectory:
         """The nodes as a trajectory of a `Simulation`, in a batch one whose arrays have an axis of lanes, after a
         number of macro steps."""
-        *phase, info, q_f_micro, table = (self.rows[..., column] for column in run.columns)
+        rows = self.rows
+        columns = rows if isinstance(rows, tuple) else [rows[..., column] for column in run.columns]
+        *phase, info, q_f_micro, table = columns
         t_start, macro_dt = (np.asarray(a) if is_concrete(a) else a for a in (run.state.t, run.macro_dt))
         t = t_start[..., None] + (step + np.arange(table.shape[-2]) * run.save_every) * macro_dt[..., None]
         states, micro = State(t, *phase), None
