@@ -184,7 +184,7 @@ def _stage(system: System, scheme: Scheme, state: State, macro_dt):
     end = with_kicks(State(state.t + macro_dt, q_s, q_f, p_s, p_f), end=1.0)
     slow, fast = solution.x.slow, solution.x.fast
     starts = jnp.concatenate([state.q_f[None], state.q_f + jnp.cumsum(fast[:, -1], axis=0)])  # of the micro intervals
-    points = (starts[:-1, None] + fast).reshape(-1, state.q_f.size)
+    points = jnp.concatenate(starts[:-1, None] + fast)
     slow, fast = (
         jnp.concatenate([start[None], a]) for start, a in ((state.q_s, state.q_s + slow), (state.q_f, points))
     )
