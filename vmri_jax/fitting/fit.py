@@ -182,10 +182,10 @@ class _Search:
         unknowns = {name: unknown.numbers for name, unknown in self.shooting.unknowns.unknowns.items()}
         return partial(program, ((unknowns, self.shooting.sigma, self.shooting.macro_dt), self.scale))
 
-    def residual(self, x, args, shooting: Shooting | None = None):
+    def residual(self, x, args):
         """Misses of all values in standard deviations, and weighted gaps between the parts, at x = (u, z): search
         variables, and starts of the parts in units of `scale`; `args` are the values and the weight of gaps."""
-        (u, z), (values, weight), shooting = x, args, shooting or self.shooting
+        (u, z), (values, weight), shooting = x, args, self.shooting
         predicted, gaps = shooting.predict(u, z * self.scale)
         misses = (predicted - values) / shooting.sigma
         finite = jnp.isfinite(misses)
@@ -254,9 +254,9 @@ class _Search:
         stiffness makes up for it. Neither the misses nor the covariance show this error.
         """
         point = (u, z), (self.shooting.values, GAP_WEIGHTS[-1])
-        runs = self.shooting
-        halved = replace(runs, macro_dt=runs.macro_dt / 2, steps=[2 * steps for steps in runs.steps])
-        coarse, fine = (jax.jit(partial(self.residual, shooting=shooting))(*point) for shooting in (runs, halved))
+        runs, halved = self.shooting, copy(self)
+        halved.shooting = replace(runs, macro_dt=runs.macro_dt / 2, steps=[2 * steps for steps in runs.steps])
+        coarse, fine = (search.compiled(_Search.residual)(*point) for search in (self, halved))
         difference = np.concatenate([np.ravel(b - a) for a, b in zip(coarse, fine, strict=True)])
         jacobian = np.asarray(without_starts(*jacobians))
         size = np.linalg.norm(jacobian, axis=0)

@@ -33,8 +33,8 @@ from vmri_jax.steppers.results import Method, Result
 from vmri_jax.steppers.stepper import StepStatus
 
 FALLING_BACK = (
-    'a step was not solved: computing its part of the run again with exact matrices (matrix "exact"), as accurate but'
-    " slower"
+    'a step was not solved: computing its part of the run again with exact matrices (matrix "exact"), as accurate '
+    "but slower"
 )
 """Line about a fallback that takes more than two seconds."""
 NODES_AT_ONCE = 16
