@@ -286,9 +286,8 @@ class Collocation(StepSolver):
         accepted = Accepted.of(equations, newton)
 
         def corrected(last: Increments, forces: Forces) -> Increments:
-            # residual R = M x A^T + forces, times (A x M)^-1: x + M^-1 forces A^-T
-            moves = matmul(interval.over_mass(forces.inside), modes.of_rows)
-            residual = last.x + moves
+            # (A (x) M)^-1 R. Its equal x + M^-1 forces A^-T has the round-off of A^-1 in every step, always the same.
+            residual = matmul(interval.over_mass(interval.residual(last.x, forces)), modes.of_rows)
             dx, dmu = saddles.solve(-residual, -forces.g)
             x, mu, moved, iterations = last.x + dx, last.mu + dmu, max_abs(dx), last.iterations + 1
             ratio = accepted.ratio((0.0, expected(moved, last.moved)), (0.0, max_abs(x)), iterations)
