@@ -11,7 +11,9 @@ and reach_i, the change of a row over the largest position, which bounds its rou
 matrices are judged with a diagonal of ones.
 """
 
+from collections.abc import Callable
 from contextlib import nullcontext
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -23,7 +25,7 @@ from vmri_jax.kernels import matvec, max_abs
 from vmri_jax.mechanics.arrays import Numbers, is_known, library, numbers_of, quickly_compiled
 from vmri_jax.mechanics.by_name import constraint_sizes
 from vmri_jax.mechanics.masses import correlation
-from vmri_jax.mechanics.projection import mass_and_momentum, time_rates
+from vmri_jax.mechanics.projection import mass_and_momentum
 from vmri_jax.mechanics.structure import sizes_of_terms
 from vmri_jax.mechanics.system import System
 from vmri_jax.mechanics.terms import Term
@@ -133,42 +135,55 @@ class Rows(NamedTuple):
         """(k,) the values up to which rows count as kept."""
         return tolerance * self.sizes + ROUNDING * np.finfo(float).eps * self.rounding
 
-    @classmethod
-    def of(cls, function, q, weights: Any = 1.0) -> "Rows":
-        """The rows (k,) of a function of q (n,)."""
-        direction = np.random.default_rng(0).normal(size=q.size) / weights
 
-        def gradients_and_values(q):
-            values, pull = jax.vjp(function, q)
-            return jax.vmap(pull)(jnp.eye(values.size))[0], values
+class Slopes(NamedTuple):
+    """The rows at a configuration to first order, those that are solved for first.
 
-        gradients, bends, values = jax.jvp(gradients_and_values, (q,), (direction,), has_aux=True)
-        gradients, bends = gradients / weights, bends / weights
-        terms, reach = sizes_of_terms(function, q), jnp.sum(jnp.abs(gradients), axis=1) * jnp.max(jnp.abs(weights * q))
+    q: (q_s, q_f).
+    values, jacobian, rates: g, G and dg/dt.
+    terms: terms_i, see the top of this module.
+    bent: the derivative of G along a direction (n,).
+    """
+
+    q: Float[Numbers, "n"]
+    values: Float[Numbers, "k"]
+    jacobian: Float[Numbers, "k n"]
+    rates: Float[Numbers, "k"]
+    terms: Float[Numbers, "k"]
+    bent: Callable
+
+    def residual(self, v):
+        """Largest ``|g|`` and largest ``|G v + dg/dt|``, shape (2,), for velocities (n,)."""
+        return jnp.stack([max_abs(self.values), max_abs(matvec(self.jacobian, v) + self.rates)])
+
+    def rows(self, weights) -> Rows:
+        """The `Rows`, for weights w (n,) of the coordinates."""
+        direction = np.random.default_rng(0).normal(size=self.q.size) / weights
+        gradients, bends = self.jacobian / weights, self.bent(direction) / weights
+        reach = jnp.sum(jnp.abs(gradients), axis=1) * jnp.max(jnp.abs(weights * self.q))
         # |hess g e| of a random direction e for the norm of the Hessian
         squared, bend = jnp.sum(gradients**2, axis=1), jnp.linalg.norm(bends, axis=1)
         radius = jnp.where(bend > 0, squared / jnp.where(bend > 0, bend, 1.0), 0.0)
-        return cls(values, jnp.maximum(terms, jnp.minimum(radius, reach)), terms + reach, gradients)
+        sizes = jnp.maximum(self.terms, jnp.minimum(radius, reach))
+        return Rows(self.values, sizes, self.terms + reach, gradients)
 
 
-def rows_at(system: System, t, q_s, q_f, weights) -> Rows:
-    """The `Rows` of a system, for weights w (n,) of the coordinates."""
-    n_s = q_s.shape[0]
-    return Rows.of(lambda q: _values(system, t, q[:n_s], q[n_s:]), jnp.concatenate([q_s, q_f]), weights)
+def slopes_at(system: System, t, q_s, q_f) -> Slopes:
+    """The `Slopes` of a system."""
+    n_s, q = q_s.shape[0], jnp.concatenate([q_s, q_f])
 
+    def rows(t, q):
+        return jnp.concatenate([f(t, q[:n_s], q[n_s:]) for f in (system.constraints, system.g_implied)])
 
-def _values(system: System, *configuration):
-    """(k,) values of all rows."""
-    return jnp.concatenate([system.constraints(*configuration), system.g_implied(*configuration)])
+    def gradients_and_values(q):
+        values, pull = jax.vjp(partial(rows, t), q)
+        return jax.vmap(pull)(jnp.eye(values.size))[0], values
 
-
-def residual_of(rows: Rows, system: System, state, weighted_velocity):
-    """Largest ``|g|`` and largest ``|G v + dg/dt|``, shape (2,), from the rows at a state, and w v (n,) with their
-    weights."""
-    rates, t = matvec(rows.gradients, weighted_velocity), state.t
+    jacobian, bent, values = jax.linearize(gradients_and_values, q, has_aux=True)
+    rates = jnp.zeros_like(values)
     if any(term.moves for term in system.terms):
-        rates += jax.jvp(lambda t: _values(system, t, state.q_s, state.q_f), (t,), (jnp.ones_like(t),))[1]
-    return jnp.stack([max_abs(rows.values), max_abs(rates)])
+        rates = jax.jvp(lambda t: rows(t, q), (t,), (jnp.ones_like(t),))[1]
+    return Slopes(q, values, jacobian, rates, sizes_of_terms(partial(rows, t), q), bent)
 
 
 def weights_of(masses):
@@ -206,15 +221,15 @@ def configuration(system: System, t, q_s, q_f, mass=None) -> Configuration:
     of a start, its momenta, and its checks."""
     if mass is None:
         mass, _ = mass_and_momentum(system, q_s, q_f, np.zeros(np.shape(q_s)), np.zeros(np.shape(q_f)))
-    weights = weights_of(mass.diagonal())
-    rows, rates = numbers_of(_rows_and_rates(system, t, q_s, q_f, weights))
-    solved = len(rates)
-    return Configuration(rows, mass, rows.values[:solved], rows.gradients[:solved] * weights, rates)
+    solved = sum(system.num_constraints(q_s, q_f))
+    rows, *of_all = numbers_of(_rows_and_slopes(system, t, q_s, q_f, weights_of(mass.diagonal())))
+    return Configuration(rows, mass, *(a[:solved] for a in of_all))
 
 
 @quickly_compiled
-def _rows_and_rates(system, t, q_s, q_f, weights):
-    return rows_at(system, t, q_s, q_f, weights), time_rates(system, t, q_s, q_f)
+def _rows_and_slopes(system, t, q_s, q_f, weights):
+    slopes = slopes_at(system, t, q_s, q_f)
+    return slopes.rows(weights), slopes.values, slopes.jacobian, slopes.rates
 
 
 def check_mass(system: System, q_s, q_f) -> None:

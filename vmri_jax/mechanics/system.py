@@ -14,7 +14,6 @@ from vmri_jax.mechanics.functions import (
     NO_VELOCITY,
     Order,
     Rheonomic,
-    TracedOnce,
     check_arguments,
     order_of,
 )
