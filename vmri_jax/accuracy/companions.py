@@ -267,8 +267,8 @@ def resting(run: Simulation) -> Trajectory:
     run = replace(run, save=Save())
     _, *phase = vars(run.state).values()
     row = np.concatenate([*phase, np.zeros(run.width - sum(map(len, phase)))])
-    saved = Saved(np.tile(row, (run.num_saves + 1, 1)), np.asarray(int(Result.CONVERGED)), np.asarray(-1))
-    return saved.trajectory(run)
+    nodes = run.columns.split(np.tile(row, (run.num_saves + 1, 1)))
+    return Saved(nodes, np.asarray(int(Result.CONVERGED)), np.asarray(-1)).trajectory(run)
 
 
 def companion(run: Simulation, parts: int, whole: int = 1) -> Trajectory:

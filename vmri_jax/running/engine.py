@@ -4,7 +4,7 @@ states and statuses, and beside each saved state its `Observables`, which it com
 Names: `save_every` macro steps lie between two saved nodes; `num_saves` saved intervals fit into the arrays of an
 engine; a call computes the first `saves` of them.
 
-The derivative of a step is the derivative of the root of its equations (`vmri_jax.steppers.newton.implicit`). Reverse
+The derivative of a step is the derivative of the root of its equations (`vmri_jax.steppers.implicit`). Reverse
 mode visits the steps from the last to the first and needs the state at which each step started, see `loops`. Runs have
 derivatives in both modes, up to second ones; third derivatives are NaN where equations are solved by iteration.
 
