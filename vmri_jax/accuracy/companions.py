@@ -125,7 +125,7 @@ class Trial:
     def concerns(self) -> list[LostEnergyWarning]:
         """What is wrong with its motion."""
         run = self.run
-        return concerns(run.table(self.saved), self.trajectory.t, run.system, run.macro_dt, run.save_every)
+        return concerns(self.saved.nodes.table, self.trajectory.t, run.system, run.macro_dt, run.save_every)
 
     @cached_property
     def error(self) -> float:

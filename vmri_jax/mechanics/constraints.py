@@ -152,6 +152,17 @@ class Slopes(NamedTuple):
     terms: Float[Numbers, "k"]
     bent: Callable
 
+    @classmethod
+    def of(cls, function, q) -> "Slopes":
+        """The slopes of a function of q (n,) that does not depend on time."""
+
+        def gradients_and_values(q):
+            values, pull = jax.vjp(function, q)
+            return jax.vmap(pull)(jnp.eye(values.size))[0], values
+
+        jacobian, bent, values = jax.linearize(gradients_and_values, q, has_aux=True)
+        return cls(q, values, jacobian, jnp.zeros_like(values), sizes_of_terms(function, q), bent)
+
     def residual(self, v):
         """Largest ``|g|`` and largest ``|G v + dg/dt|``, shape (2,), for velocities (n,)."""
         return jnp.stack([max_abs(self.values), max_abs(matvec(self.jacobian, v) + self.rates)])
@@ -175,15 +186,10 @@ def slopes_at(system: System, t, q_s, q_f) -> Slopes:
     def rows(t, q):
         return jnp.concatenate([f(t, q[:n_s], q[n_s:]) for f in (system.constraints, system.g_implied)])
 
-    def gradients_and_values(q):
-        values, pull = jax.vjp(partial(rows, t), q)
-        return jax.vmap(pull)(jnp.eye(values.size))[0], values
-
-    jacobian, bent, values = jax.linearize(gradients_and_values, q, has_aux=True)
-    rates = jnp.zeros_like(values)
+    slopes = Slopes.of(partial(rows, t), q)
     if any(term.moves for term in system.terms):
-        rates = jax.jvp(lambda t: rows(t, q), (t,), (jnp.ones_like(t),))[1]
-    return Slopes(q, values, jacobian, rates, sizes_of_terms(partial(rows, t), q), bent)
+        return slopes._replace(rates=jax.jvp(lambda t: rows(t, q), (t,), (jnp.ones_like(t),))[1])
+    return slopes
 
 
 def weights_of(masses):

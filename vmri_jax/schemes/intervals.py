@@ -39,7 +39,7 @@ from vmri_jax.mechanics.structure import entries_seen
 from vmri_jax.schemes.discrete_lagrangian import QuadraticKinetic, TermOnNodes, lagrangian
 from vmri_jax.schemes.equations import StepEquations, Unknowns, slow_basis_at_control_nodes
 from vmri_jax.schemes.interval_nodes import IntervalNodes, IntervalPath, of_interval, with_unseen
-from vmri_jax.schemes.path import control_nodes, lagrange_basis, lagrange_derivative
+from vmri_jax.schemes.path import control_nodes, lagrange_basis, lagrange_derivative, velocity_nodes
 
 
 class Arriving(NamedTuple):
@@ -85,10 +85,9 @@ class Intervals:
         self._slow_terms = [term for term, alone in zip(inner, of_slow, strict=True) if alone]
         of_fast = (term for term, alone in zip(inner, of_slow, strict=True) if not alone)
         self.terms = [(term, nodes) for term in of_fast for nodes in IntervalNodes.of(term.inside)]
-        has_force = equations.system.force is not None
-        self._force_nodes = IntervalNodes.of(equations.force_nodes) if has_force else []
+        n, r, has_force = equations.scheme.num_micro, equations.scheme.degree, equations.system.force is not None
+        self._force_nodes = IntervalNodes.of(velocity_nodes(equations.scheme.force, n, r)) if has_force else []
         self.seen = self._seen()
-        n, r = equations.scheme.num_micro, equations.scheme.degree
         self._slow_basis = slow_basis_at_control_nodes(n, r)[..., 1:]  # at the control nodes, by slow increments
 
     def by_masses(self) -> "Intervals":

@@ -112,7 +112,10 @@ class Marched(StepSolver):
 
         parts = solve_in_parts(equations, guess, start, part, self.settings.max_iterations, PLAIN_PASSES)
         done = parts.solution
-        return self._solution(march, done, parts.result, parts.iterations), self._learned(march, memory, done)
+        passed = done.passed
+        path = memory.path.add(*march.predicted(passed.z, passed.x))
+        learned = MarchMemory(path, passed.x[-1], done.matrices, done.rate)
+        return self._solution(march, done, parts.result, parts.iterations), learned
 
     @property
     def is_exact(self) -> bool:
@@ -228,11 +231,6 @@ class Marched(StepSolver):
         if self.is_exact:  # else the fallback names the cause
             status = with_dependent_constraints(equations, status)
         return Solution(x, end, status)
-
-    def _learned(self, march: MarchEquations, memory: MarchMemory, done: Progress) -> MarchMemory:
-        passed = done.passed
-        path = memory.path.add(*march.predicted(passed.z, passed.x))
-        return MarchMemory(path, passed.x[-1], done.matrices, done.rate)
 
     def describe(self) -> list[str]:
         if not self.is_exact:

@@ -141,7 +141,7 @@ class Nested(StepSolver):
 
         learned = NestedMemory(
             memory.matrix,
-            memory.slow.add(_flat(done.slow, done.slow_multiplier), done.slow.size),
+            memory.slow.add(jnp.append(done.slow, done.slow_multiplier), done.slow.size),
             equations.multipliers(x, memory.multiplier[-1], x.slow_multiplier[-1])[0][-1],
             done.slow_model_error,
             jnp.minimum(memory.fewest_passes, done.passes),
@@ -154,14 +154,12 @@ class Nested(StepSolver):
 
     def describe(self) -> list[str]:
         inside = "the multipliers alone" if self.interval.is_explicit else "fast increments and multipliers"
+        kind = "per coordinate" if self.interval.is_diagonal else "of its fast variables"
+        renewed = "computed once" if self.interval.is_constant else "renewed with the macro steps"
         return [
             "masses: passes over the slow path, with the micro intervals in order inside",
-            f"  each interval solves for {inside}, with a matrix {self._matrix_in_words()}",
+            f"  each interval solves for {inside}, with a matrix {kind}, {renewed}",
         ]
-
-    def _matrix_in_words(self) -> str:
-        kind = "per coordinate" if self.interval.is_diagonal else "of its fast variables"
-        return f"{kind}, {'computed once' if self.interval.is_constant else 'renewed with the macro steps'}"
 
 
 class _Passes:
@@ -245,8 +243,3 @@ class _Passes:
         """Slow increments (r, n_s) and slow multipliers (r, n_gs) of z."""
         size = self.r * self.n_s
         return z[:size].reshape(self.r, self.n_s), z[size:].reshape(self.r, -1)
-
-
-def _flat(slow, slow_multiplier):
-    """The slow unknowns z: slow increments, then slow multipliers."""
-    return jnp.concatenate([slow.reshape(-1), slow_multiplier.reshape(-1)])

@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import jax.numpy as jnp
-from jax.scipy.linalg import block_diag
 
 from vmri_jax.mechanics.functions import Rheonomic
 from vmri_jax.mechanics.masses import ConstantMass, WithMassMatrix
@@ -135,7 +134,8 @@ def joined(system: System, scheme: Scheme, num_slow: int) -> tuple[System, Schem
     if system.is_constrained:
         functions["constraint"] = Rheonomic(OfJoined(system.of_kind("constraint"), ("t", *POSITIONS), num_slow))
     if system.has_constant_mass:
-        kinetic = ConstantMass(jnp.zeros(0), _joined_masses(constant_mass(system)))
+        masses = constant_mass(system)
+        kinetic = ConstantMass(jnp.zeros(0), jnp.concatenate(masses.diagonal) if masses.is_diagonal else masses.matrix)
     else:
         kinetic = OfJoined(system.of_kind("kinetic"), KINDS["kinetic"].arguments, num_slow)
     together = System(kinetic, **functions, params=system.params, potentials=potentials)
@@ -146,14 +146,6 @@ def joined(system: System, scheme: Scheme, num_slow: int) -> tuple[System, Schem
         place[name] = micro(rule.rule)
     rules |= {"kinetic": scheme.kinetic, "constraint": scheme.constraint, "force": micro(scheme.force.rule)}
     return together, Scheme(1, scheme.degree, **rules)
-
-
-def _joined_masses(kinetic: ConstantMass):
-    """The masses of the slow and then of the fast variables, as one diagonal or one matrix."""
-    masses = kinetic.slow, kinetic.fast
-    if all(mass.ndim == 1 for mass in masses):
-        return jnp.concatenate(masses)
-    return block_diag(*(mass if mass.ndim == 2 else jnp.diag(mass) for mass in masses))
 
 
 @dataclass(frozen=True)
