@@ -117,7 +117,7 @@ def is_rank_deficient(rows, scaled_with=None, tolerance: float = RANK):
     return jnp.isfinite(whole).all() & (too_many | (values[-1] <= tolerance))
 
 
-class Rows(NamedTuple):
+class ScaledRows(NamedTuple):
     """The rows at a configuration: those that are solved for, then the implied ones; see the top of this module.
 
     values: g.
@@ -167,8 +167,8 @@ class Slopes(NamedTuple):
         """Largest ``|g|`` and largest ``|G v + dg/dt|``, shape (2,), for velocities (n,)."""
         return jnp.stack([max_abs(self.values), max_abs(matvec(self.jacobian, v) + self.rates)])
 
-    def rows(self, weights) -> Rows:
-        """The `Rows`, for weights w (n,) of the coordinates."""
+    def scaled(self, weights) -> ScaledRows:
+        """The `ScaledRows`, for weights w (n,) of the coordinates."""
         direction = np.random.default_rng(0).normal(size=self.q.size) / weights
         gradients, bends = self.jacobian / weights, self.bent(direction) / weights
         reach = jnp.sum(jnp.abs(gradients), axis=1) * jnp.max(jnp.abs(weights * self.q))
@@ -176,7 +176,7 @@ class Slopes(NamedTuple):
         squared, bend = jnp.sum(gradients**2, axis=1), jnp.linalg.norm(bends, axis=1)
         radius = jnp.where(bend > 0, squared / jnp.where(bend > 0, bend, 1.0), 0.0)
         sizes = jnp.maximum(self.terms, jnp.minimum(radius, reach))
-        return Rows(self.values, sizes, self.terms + reach, gradients)
+        return ScaledRows(self.values, sizes, self.terms + reach, gradients)
 
 
 def slopes_at(system: System, t, q_s, q_f) -> Slopes:
@@ -198,7 +198,7 @@ def weights_of(masses):
     return xp.sqrt(xp.where(masses > 0, masses, 1.0))
 
 
-def are_kept(rows: Rows, solved: int, tolerance):
+def are_kept(rows: ScaledRows, solved: int, tolerance):
     """Whether a state of a run keeps the rows that are solved for, and the implied ones.
 
     Args:
@@ -212,10 +212,10 @@ def are_kept(rows: Rows, solved: int, tolerance):
 
 
 class Configuration(NamedTuple):
-    """The `Rows` at a configuration, the mass matrix, and of the rows that are solved for the values g, the Jacobian G,
-    and dg/dt."""
+    """The `ScaledRows` at a configuration, the mass matrix, and of the rows that are solved for the values g, the
+    Jacobian G, and dg/dt."""
 
-    rows: Rows
+    rows: ScaledRows
     mass: Any
     values: Any
     jacobian: Any
@@ -235,7 +235,7 @@ def configuration(system: System, t, q_s, q_f, mass=None) -> Configuration:
 @quickly_compiled
 def _rows_and_slopes(system, t, q_s, q_f, weights):
     slopes = slopes_at(system, t, q_s, q_f)
-    return slopes.rows(weights), slopes.values, slopes.jacobian, slopes.rates
+    return slopes.scaled(weights), slopes.values, slopes.jacobian, slopes.rates
 
 
 def check_mass(system: System, q_s, q_f) -> None:
@@ -376,7 +376,7 @@ def _held(system: System, state) -> list[Held]:
     return [Held(term, values, *parts[term.field]) for term in system.of_kind("constraint")]
 
 
-def _check_gradients(system: System, state, held: list[Held], rows: Rows, weights) -> None:
+def _check_gradients(system: System, state, held: list[Held], rows: ScaledRows, weights) -> None:
     """Refuse rows whose gradient is zero at the state, but not at a generic configuration `NEARBY` relative to its
     positions."""
     q = np.concatenate([state.q_s, state.q_f])
@@ -393,7 +393,7 @@ def _check_gradients(system: System, state, held: list[Held], rows: Rows, weight
             )
 
 
-def _check_implied(rows: Rows, solved: int, place: str) -> None:
+def _check_implied(rows: ScaledRows, solved: int, place: str) -> None:
     values, allowed = rows.values[solved:], rows.allowed(CONSTRAINT_TOLERANCE)[solved:]
     opened = np.flatnonzero(~(np.abs(values) <= allowed))
     if opened.size:
@@ -404,7 +404,7 @@ def _check_implied(rows: Rows, solved: int, place: str) -> None:
         )
 
 
-def _nearby(state, rows: Rows, weights):
+def _nearby(state, rows: ScaledRows, weights):
     """A generic configuration at a distance `NEARBY` from a state, always the same; the distance over which a row
     changes by its size is 1."""
     lengths = np.linalg.norm(rows.gradients, axis=1)

@@ -85,7 +85,7 @@ def closed_masses(energies: Iterable[Term], q_s, q_f, params):
     return first.mass_matrix(q_s, q_f, params, *others)
 
 
-def project_momentum(system: System, state, guess=None, constraints=None):
+def project_momentum(system: System, state, guess=None, constraints=None, sparsity: Sparsity | None = None):
     """Momenta projected onto the hidden constraints, ``p <- p - G^T mu`` with ``G v + dg/dt = 0``, and their
     velocities.
 
@@ -99,6 +99,7 @@ def project_momentum(system: System, state, guess=None, constraints=None):
         state: a `State`: time, positions and momenta.
         guess: velocities (v_s, v_f) from which Newton's iteration starts, by default zero.
         constraints: G (m, n) and dg/dt (m,); None for those of the system.
+        sparsity: of ``G M^-1 G^T``, for constant masses; found if it is None.
 
     Returns:
         (p_s, p_f, v_s, v_f, masses), the last one the mass matrix ``d2T/dv2`` (n, n), None for constant masses; NaN
@@ -109,29 +110,14 @@ def project_momentum(system: System, state, guess=None, constraints=None):
     if constraints is None:
         jacobian = jnp.concatenate(jax.jacrev(system.constraints, argnums=(1, 2))(t, q_s, q_f), axis=1)
         constraints = jacobian, time_rates(system, t, q_s, q_f)
-    by_masses = _with_constant_masses if system.has_constant_mass else _with_masses
-    p, v, masses = by_masses(system, q_s, q_f, p, constraints, guess)
+    if system.has_constant_mass:
+        (p, v), masses = _with_constant_masses(system, q_s, q_f, p, constraints, sparsity), None
+    else:
+        p, v, masses = _with_masses(system, q_s, q_f, p, constraints, guess)
     return p[:n_s], p[n_s:], v[:n_s], v[n_s:], masses
 
 
-def projected_velocities(system: System, state, sparsity: Sparsity):
-    """The velocities (v_s, v_f) of the projected momenta for constant masses, without the whole matrix G: the sparsity
-    of ``G M^-1 G^T`` says how many products with it are needed."""
-    t, p_s, p_f, velocity = state.t, state.p_s, state.p_f, system.kinetic.velocity
-    constraints = partial(system.constraints, t)
-    g, pull = jax.vjp(constraints, state.q_s, state.q_f)
-    if g.size:
-        push = jax.linearize(constraints, state.q_s, state.q_f)[1]
-        # G M^-1 times G^T seeds and p: one map for all, since each use of `push` is compiled anew
-        impulses = zip(jax.vmap(pull)(sparsity.seeds), (p_s, p_f), strict=True)
-        pushed = jax.vmap(lambda *p: push(*velocity(*p)))(*(jnp.concatenate([a, p[None]]) for a, p in impulses))
-        rates = pushed[-1] + time_rates(system, t, state.q_s, state.q_f)
-        pull_s, pull_f = pull(sparsity.solve(pushed[:-1], rates))
-        p_s, p_f = p_s - pull_s, p_f - pull_f
-    return velocity(p_s, p_f)
-
-
-def _with_constant_masses(system: System, q_s, q_f, p, constraints, _):
+def _with_constant_masses(system: System, q_s, q_f, p, constraints, sparsity: Sparsity | None):
     jacobian, rates = constraints
 
     def over_masses(p):
@@ -139,11 +125,11 @@ def _with_constant_masses(system: System, q_s, q_f, p, constraints, _):
         return jnp.concatenate(system.kinetic.velocity(p[..., : q_s.size], p[..., q_s.size :]), axis=-1)
 
     if rates.size:
-        sparsity = all_rows(system, q_s, q_f)
+        sparsity = sparsity or all_rows(system, q_s, q_f)
         seeded = jacobian if isinstance(sparsity, Full) else matmul(sparsity.seeds, jacobian)
         products = matmul(over_masses(seeded), jacobian.T)
         p -= matvec(jacobian.T, sparsity.solve(products, matvec(jacobian, over_masses(p)) + rates))
-    return p, over_masses(p), None
+    return p, over_masses(p)
 
 
 def _with_masses(system: System, q_s, q_f, p, constraints, guess):

@@ -114,7 +114,7 @@ def observed(system: System, state: State, tolerance: Any = 0.0) -> tuple[State,
         q, diagonal = jnp.concatenate([state.q_s, state.q_f]), jnp.diagonal(masses)
         kinetic, rounding = v @ masses @ v / 2, q @ masses @ q / 2
         volume = 2 * jnp.sum(jnp.log(jnp.diagonal(jnp.linalg.cholesky(masses))))
-    kept = are_kept(slopes.rows(weights_of(diagonal)), solved, tolerance)
+    kept = are_kept(slopes.scaled(weights_of(diagonal)), solved, tolerance)
     values = sum(parts), *slopes.residual(v), *kept, kinetic, sum(map(jnp.abs, parts)), rounding, volume
     return State(state.t, *phase), jnp.stack([jnp.asarray(value, dtype=float) for value in values])
 

@@ -30,7 +30,7 @@ from vmri_jax.mechanics.structure import depends_on
 from vmri_jax.mechanics.system import System
 from vmri_jax.refusals import Refused
 from vmri_jax.schemes.composition import Composition, stage_scheme
-from vmri_jax.schemes.discrete_lagrangian import Placed, lagrangian, placed_potentials
+from vmri_jax.schemes.discrete_lagrangian import PlacedTerm, lagrangian, placed_potentials
 from vmri_jax.schemes.quadrature import macro
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.collocation import Collocation
@@ -48,7 +48,7 @@ from vmri_jax.steppers.solver import Solver
 from vmri_jax.steppers.stepper import StepInfo, Stepper, indented
 from vmri_jax.steppers.subsystems import fast_part, frozen_slow, joined, slow_part
 
-Parts = tuple[list[Placed], dict[int, list[Placed]]]
+Parts = tuple[list[PlacedTerm], dict[int, list[PlacedTerm]]]
 """Potentials of the slow variables, on the macro grid, and of the fast variables, by the number k of micro intervals
 that a copy of their rule spans; the keys k increase, start with 1, and each is a multiple of the one before."""
 

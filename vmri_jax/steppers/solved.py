@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from vmri_jax.kernels.band import Sparsity
 from vmri_jax.mechanics.arrays import Number, Numbers
 from vmri_jax.mechanics.invariants import velocity_and_masses
-from vmri_jax.mechanics.projection import projected_velocities
+from vmri_jax.mechanics.projection import project_momentum
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
 from vmri_jax.schemes.equations import StepEquations, Unknowns
@@ -141,7 +141,8 @@ class Solved(Stepper):
         last intervals."""
         system, phase = equations.system, (equations.q_s, equations.q_f, equations.p_s, equations.p_f)
         if system.has_constant_mass:
-            (v_s, v_f), masses = projected_velocities(system, State(equations.t, *phase), self.sparsity), None
+            state = State(equations.t, *phase)
+            _, _, v_s, v_f, masses = project_momentum(system, state, sparsity=self.sparsity)
         else:
             velocities, masses = velocity_and_masses(system, *phase)
             is_first = equations.before == 0
