@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import vmri_jax as vm
-from vmri_jax.running.failures import largest_motion
+from vmri_jax.running.failures import Move, largest_motion
 from vmri_jax.scene import Cylinder, RigidBody, Rod, Scene
 
 SPIN, H = 30.0, 0.04  # 1.2 rad a step: directors that multipliers hold reach no more than 1
