@@ -81,8 +81,9 @@ class System(eqx.Module):
 
     A run uses what its functions read from around them when it is made: globals, helpers, closures, attributes, see
     `vmri_jax.mechanics.surroundings`. Functions with the same code and surroundings are the same; for others everything
-    is compiled again, so that what varies belongs in `params`. They are kept as `TracedOnce`, so that ``system.force``
-    is called like the function itself, which is the innermost ``function`` of it.
+    is compiled again, so that what varies belongs in `params`. A system stores its `terms`, and shows the arguments
+    above as attributes. Functions are kept as `TracedOnce`, so that ``system.force`` is called like the function
+    itself, which is the innermost ``function`` of it.
     """
 
     terms: tuple[Term, ...]
