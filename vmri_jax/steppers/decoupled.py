@@ -44,7 +44,9 @@ class Decoupled(Stepper):
     def advance(self, state: State, memory: DecoupledMemory, macro_dt) -> tuple[State, StepInfo, DecoupledMemory]:
         slow, fast = apart(state)
         slow, slow_info, slow_memory = self.slow.advance(slow, memory.slow, macro_dt)
-        fast, info, fast_memory = self.fast.advance_many(fast, memory.fast, macro_dt / self.num_fast, self.num_fast)
+        micro_dt = macro_dt / self.num_fast
+        renewed = self.fast.renew(fast, memory.fast, micro_dt)
+        fast, info, fast_memory = self.fast.advance_many(fast, renewed, micro_dt, self.num_fast)
         status = slow_info.status.worse(info.status)
         end = State(state.t + macro_dt, slow.q_f, fast.q_f, slow.p_f, fast.p_f)
         info = StepInfo(*status, info.q_f_micro, info.multiplier, slow_info.multiplier[0])

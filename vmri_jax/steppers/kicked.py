@@ -62,13 +62,7 @@ class Kicked(Stepper):
     def advance_many(
         self, state: State, memory: KickedMemory, macro_dt, count: int
     ) -> tuple[State, StepInfo, KickedMemory]:
-        """`count` steps with the same matrices; the two kicks at a node that two steps share are one."""
-        return self.advance_with_matrices(state, self.renew(state, memory, macro_dt), macro_dt, count)
-
-    def advance_with_matrices(
-        self, state: State, memory: KickedMemory, macro_dt, count: int
-    ) -> tuple[State, StepInfo, KickedMemory]:
-        """`count` steps with the matrices in `memory`."""
+        """`count` steps with the matrices in `memory`; the two kicks at a node that two steps share are one."""
 
         def step(state, inner, start: float):
             state, info, inner = self.inner.advance(state, inner, macro_dt)
@@ -137,7 +131,7 @@ class Repeated(Stepper):
         return self.inner.renew(state, memory, macro_dt / self.count)
 
     def advance(self, state: State, memory: KickedMemory, macro_dt) -> tuple[State, StepInfo, KickedMemory]:
-        return self.inner.advance_with_matrices(state, memory, macro_dt / self.count, self.count)
+        return self.inner.advance_many(state, memory, macro_dt / self.count, self.count)
 
     def continued(self, memory: KickedMemory, last: KickedMemory, state: State, macro_dt) -> KickedMemory:
         return self.inner.continued(memory, last, state, macro_dt / self.count)
@@ -189,7 +183,7 @@ def average_over_fast_motion(stepper_of: Callable, num_micro: int) -> Callable:
     def averaged(macro_dt, q_s, q_f):
         stepper, micro_dt, none = stepper_of(q_s, q_f), macro_dt / num_micro, jnp.zeros(0)
         start = State(jnp.zeros(()), none, q_f, none, jnp.zeros_like(q_f))
-        memory = stepper.init(start, micro_dt)
+        memory = stepper.renew(start, stepper.init(start, micro_dt), micro_dt)
         _, info, _ = stepper.advance_many(start, memory, micro_dt, num_micro)
         x = info.q_f_micro
         a = (q_f / 2 + jnp.sum(x[:-1], axis=0) + x[-1] / 2) / num_micro
