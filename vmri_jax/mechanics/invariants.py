@@ -5,8 +5,8 @@ from operator import add
 
 import jax.numpy as jnp
 
-from vmri_jax.mechanics.constraints import slopes_at
 from vmri_jax.mechanics.projection import have_closed_masses, project_momentum
+from vmri_jax.mechanics.slopes import slopes_at
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
 

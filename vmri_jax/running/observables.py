@@ -13,9 +13,10 @@ import numpy as np
 from jaxtyping import Float
 
 from vmri_jax.mechanics.arrays import Numbers, library
-from vmri_jax.mechanics.constraints import are_kept, slopes_at, weights_of
+from vmri_jax.mechanics.constraints import are_kept
 from vmri_jax.mechanics.invariants import energy_parts
 from vmri_jax.mechanics.projection import project_momentum
+from vmri_jax.mechanics.slopes import slopes_at, weights_of
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
 from vmri_jax.steppers.results import Result

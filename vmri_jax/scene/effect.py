@@ -14,9 +14,10 @@ from jax.flatten_util import ravel_pytree
 
 from vmri_jax.mechanics.arrays import is_concrete, library
 from vmri_jax.mechanics.checks import describe, shape_of
-from vmri_jax.mechanics.constraints import START, ScaledRows, Slopes
+from vmri_jax.mechanics.constraints import START
 from vmri_jax.mechanics.functions import check_arguments
 from vmri_jax.mechanics.names import unknown
+from vmri_jax.mechanics.slopes import ScaledRows, Slopes
 from vmri_jax.refusals import Refused
 from vmri_jax.scene.binding import MOST_ROLES, Bindable
 from vmri_jax.scene.body import GROUND, Attachment, end_of, label_of, moving, weights_of
